@@ -1,0 +1,1 @@
+"""Pictures in and out: video, masks, meshes, and the CPU rasteriser that projects meshes into them."""
