@@ -1,0 +1,55 @@
+"""Piecewise cubic curves with given values and slopes, the building block of additive models and of bounds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class HermiteCurve:
+    """A C1 cubic Hermite curve of one variable that goes on as a straight line outside its knots.
+
+    Attributes:
+        knots: Rising parameter values, shape (n,), n >= 2.
+        values: Points of the curve at the knots, shape (n, k).
+        slopes: Derivatives at the knots, shape (n, k).
+    """
+
+    knots: Array
+    values: Array
+    slopes: Array
+    _coefficients: Array = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        # Per interval the powers 0..3 of s = x - knot; intervals 0 and n are the straight ends, so that no
+        # evaluation has to treat them apart.
+        h = np.diff(self.knots)[:, None]
+        y, m = self.values, self.slopes
+        rise = (y[1:] - y[:-1]) / h
+        square = (3 * rise - 2 * m[:-1] - m[1:]) / h
+        cube = (m[:-1] + m[1:] - 2 * rise) / (h * h)
+        inner = np.stack([y[:-1], m[:-1], square, cube], axis=1)
+        straight = np.zeros((2, *inner.shape[1:]))
+        straight[0, :2] = y[0], m[0]
+        straight[1, :2] = y[-1], m[-1]
+        object.__setattr__(self, "_coefficients", np.concatenate([straight[:1], inner, straight[1:]]))
+
+    def value(self, x: Array) -> Array:
+        """Return the points at x (n,), shape (n, k)."""
+        c, s = self._locate(x)
+        return ((c[:, 3] * s + c[:, 2]) * s + c[:, 1]) * s + c[:, 0]
+
+    def slope(self, x: Array) -> Array:
+        """Return the derivatives at x (n,), shape (n, k)."""
+        c, s = self._locate(x)
+        return (3 * c[:, 3] * s + 2 * c[:, 2]) * s + c[:, 1]
+
+    def _locate(self, x: Array) -> tuple[Array, Array]:
+        interval = np.searchsorted(self.knots, x, side="right")
+        start = self.knots[np.maximum(interval - 1, 0)]
+        return self._coefficients[interval], (x - start)[:, None]

@@ -1,0 +1,244 @@
+"""The two forms of the jaw model: parameters d [mm] to a rigid motion of the mandible, with exact derivatives.
+
+Everything here is in the anatomical frame (x left, y up, z anterior, mm, origin at the upper incisal point): a model
+gives the motion ``M(d)`` away from the closed bite, ``M(0) = I``. `jawusd.evaluator.rig` carries it to the skull frame.
+Rows only: d has shape (n, 3); a row with a NaN gives NaN.
+
+Derivatives are *spatial*: ``S`` of shape (n, 6, 3) with ``M(d + e) = exp(S e) M(d)`` to first order, twists being
+(omega [rad], v [mm]).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.evaluator.curves import HermiteCurve
+from jawusd.evaluator.gauge import Gauge
+from jawusd.geometry.se3 import se3_exp, se3_left_jacobian, se3_left_jacobian_inverse
+from jawusd.geometry.so3 import so3_exp, so3_left_jacobian, so3_left_jacobian_inverse
+
+Array = NDArray[np.float64]
+
+KINDS = ("anchored", "additive")
+
+
+@dataclass(frozen=True)
+class AnchoredModel:
+    """Rotation as a function of where the lower incisal point is: ``omega = f(u), t = u + p - R(omega) p``.
+
+    f is a polyharmonic r^3 spline with a linear tail (Duchon 1977) in the displacement u of the incisal point p,
+    sheared by the habitual opening path so that its first axis runs along opening; ``f(0) = 0``.
+
+    Attributes:
+        gauge: Map between d and u.
+        incisor: The incisal point p at rest [mm], shape (3,).
+        scales: Lengths dividing the sheared displacement [mm], shape (3,).
+        centres: Spline centres, sheared and scaled, shape (m, 3).
+        weights: Of the m kernels and the 3 linear terms [rad], shape (m + 3, 3).
+    """
+
+    gauge: Gauge
+    incisor: Array
+    scales: Array
+    centres: Array
+    weights: Array
+    _centres_squared: Array = field(init=False, repr=False)
+    _moments: Array = field(init=False, repr=False)
+    _offset: Array = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        # Sum_i W_i r_i^3 and its gradient need only sums of r_i times W_i, W_i c_i and W_i |c_i|^2 (see _spline):
+        # one matrix product gives both.
+        squared = np.einsum("ij,ij->i", self.centres, self.centres)
+        kernel = self.weights[: len(self.centres)]
+        by_centre = (kernel[:, :, None] * self.centres[:, None, :]).reshape(len(kernel), 9)
+        moments = np.concatenate([kernel, by_centre, kernel * squared[:, None]], axis=1)
+        object.__setattr__(self, "_centres_squared", squared)
+        object.__setattr__(self, "_moments", np.ascontiguousarray(moments))
+        object.__setattr__(self, "_offset", np.zeros(3))
+        object.__setattr__(self, "_offset", self._spline(np.zeros((1, 3)))[0][0])
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, Array]) -> AnchoredModel:
+        """Build the model from the named arrays of a rig."""
+        return cls(
+            gauge=Gauge.from_arrays(arrays),
+            incisor=np.asarray(arrays["incisor"], dtype=float),
+            scales=np.asarray(arrays["spline_scales"], dtype=float),
+            centres=np.asarray(arrays["spline_centres"], dtype=float),
+            weights=np.asarray(arrays["spline_weights"], dtype=float),
+        )
+
+    def decode(self, d: Array) -> tuple[Array, Array]:
+        """Return the rotation (n, 3, 3) and translation (n, 3) [mm] of M(d)."""
+        return self.motion_at(self.gauge.displacement(d))
+
+    def motion_at(self, u: Array) -> tuple[Array, Array]:
+        """Return rotation and translation of the motion that carries the incisal point by u (n, 3) [mm]."""
+        R = so3_exp(self.rotation(u))
+        return R, u + self.incisor - R @ self.incisor
+
+    def decode_derivative(self, d: Array) -> tuple[Array, Array, Array]:
+        """Return rotation, translation [mm] and the spatial derivative S (n, 6, 3) of M(d)."""
+        u, du = self.gauge.displacement_jacobian(d)
+        R, t, by_u = self.motion_derivative_at(u)
+        return R, t, by_u @ du
+
+    def motion_derivative_at(self, u: Array) -> tuple[Array, Array, Array]:
+        """Return rotation, translation [mm] and the spatial derivative (n, 6, 3) by u (n, 3) [mm]."""
+        omega, omega_u = self.rotation_jacobian(u)
+        R = so3_exp(omega)
+        S = np.empty((len(u), 6, 3))
+        S[:, :3] = so3_left_jacobian(omega) @ omega_u
+        # The incisal point itself moves by du: w x (u + p) + v = du.
+        S[:, 3:] = np.eye(3) + np.cross((u + self.incisor)[:, :, None], S[:, :3], axis=1)
+        return R, u + self.incisor - R @ self.incisor, S
+
+    def log(self, d: Array) -> Array:
+        """Return the twist log M(d), shape (n, 6)."""
+        u = self.gauge.displacement(d)
+        omega = self.rotation(u)
+        t = u + self.incisor - so3_exp(omega) @ self.incisor
+        return np.concatenate([omega, np.einsum("nij,nj->ni", so3_left_jacobian_inverse(omega), t)], axis=1)
+
+    def log_jacobian(self, d: Array) -> Array:
+        """Return d log M / dd, shape (n, 6, 3)."""
+        return se3_left_jacobian_inverse(self.log(d)) @ self.decode_derivative(d)[2]
+
+    def read_off(self, R: Array, t: Array) -> Array:
+        """Return the d (n, 3) [mm] that put the incisal point where the motions (R, t) put it."""
+        return self.gauge.inverse(self.displacement_of(R, t))
+
+    def displacement_of(self, R: Array, t: Array) -> Array:
+        """Return the displacement u (n, 3) [mm] of the incisal point under the motions (R, t)."""
+        return R @ self.incisor + t - self.incisor
+
+    def rotation(self, u: Array) -> Array:
+        """Return the rotation vector f(u) (n, 3) [rad] for incisal displacements u (n, 3) [mm]."""
+        gx, gz, _, _ = self.gauge.path(-u[:, 1])
+        return self._spline(self._sheared(u, gx, gz))[0]
+
+    def rotation_jacobian(self, u: Array) -> tuple[Array, Array]:
+        """Return f(u) (n, 3) [rad] and df/du (n, 3, 3) [rad/mm]."""
+        gx, gz, gx_1, gz_1 = self.gauge.path(-u[:, 1])
+        omega, omega_q = self._spline(self._sheared(u, gx, gz))
+        by_opening, by_side, by_front = np.moveaxis(omega_q / self.scales, 2, 0)
+        by_y = -by_opening + by_side * gx_1[:, None] + by_front * gz_1[:, None]
+        return omega, np.stack([by_side, by_y, by_front], axis=2)
+
+    def _sheared(self, u: Array, gx: Array, gz: Array) -> Array:
+        return np.stack([-u[:, 1], u[:, 0] - gx, u[:, 2] - gz], axis=1) / self.scales
+
+    def _spline(self, q: Array) -> tuple[Array, Array]:
+        """Return the spline at q (n, 3) and its gradient (n, 3 outputs, 3 inputs).
+
+        With ``r_i = |q - c_i|``: ``sum W_i r_i^3 = sum W_i r_i (|q|^2 - 2 q.c_i + |c_i|^2)`` and its gradient is
+        ``3 sum W_i r_i (q - c_i)``.
+        """
+        q_squared = np.einsum("ni,ni->n", q, q)
+        r = q @ (-2.0 * self.centres.T)
+        r += self._centres_squared
+        r += q_squared[:, None]
+        np.maximum(r, 0.0, out=r)  # the expanded square may round to just below zero at a centre
+        np.sqrt(r, out=r)
+        sums = r @ self._moments
+        plain, by_centre = sums[:, :3], sums[:, 3:12].reshape(-1, 3, 3)
+        linear = self.weights[len(self.centres) :]
+        value = q_squared[:, None] * plain + sums[:, 12:] + q @ linear - self._offset
+        value -= 2.0 * np.einsum("nij,nj->ni", by_centre, q)
+        return value, 3.0 * (plain[:, :, None] * q[:, None, :] - by_centre) + linear.T
+
+
+@dataclass(frozen=True)
+class AdditiveModel:
+    """A sum of three curves in se(3): ``log M(d) = Phi1(d1) + Phi2(d2) + Phi3(d3)`` (Yang et al. 2019, eq. 5).
+
+    The constant is counted once: the sum is zero at d = 0.
+
+    Attributes:
+        curves: The three curves of twists, about the origin of the anatomical frame.
+        incisor: The incisal point at rest [mm], shape (3,).
+        d_range: Box of valid d [mm], shape (3, 2); starts for `read_off` are searched in it.
+    """
+
+    curves: tuple[HermiteCurve, HermiteCurve, HermiteCurve]
+    incisor: Array
+    d_range: Array
+    _starts: Array = field(init=False, repr=False)
+    _start_displacements: Array = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        # opening is long and curved, the other two short: 13 x 9 x 9 starts lie within the basin of Gauss-Newton
+        axes = [np.linspace(low, high, n) for (low, high), n in zip(self.d_range, (13, 9, 9))]
+        starts = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        object.__setattr__(self, "_starts", starts)
+        object.__setattr__(self, "_start_displacements", self.displacement_of(*self.decode(starts)))
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, Array]) -> AdditiveModel:
+        """Build the model from the named arrays of a rig."""
+        parts = ("knots", "twists", "slopes")
+        first, second, third = (
+            HermiteCurve(*(np.asarray(arrays[f"curve{i}_{part}"], dtype=float) for part in parts)) for i in (1, 2, 3)
+        )
+        return cls(
+            curves=(first, second, third),
+            incisor=np.asarray(arrays["incisor"], dtype=float),
+            d_range=np.asarray(arrays["d_range"], dtype=float),
+        )
+
+    def decode(self, d: Array) -> tuple[Array, Array]:
+        """Return the rotation (n, 3, 3) and translation (n, 3) [mm] of M(d)."""
+        M = se3_exp(self.log(d))
+        return M[:, :3, :3], M[:, :3, 3]
+
+    def decode_derivative(self, d: Array) -> tuple[Array, Array, Array]:
+        """Return rotation, translation [mm] and the spatial derivative S (n, 6, 3) of M(d)."""
+        twist = self.log(d)
+        M = se3_exp(twist)
+        return M[:, :3, :3], M[:, :3, 3], se3_left_jacobian(twist) @ self.log_jacobian(d)
+
+    def log(self, d: Array) -> Array:
+        """Return the twist log M(d), shape (n, 6)."""
+        return sum(curve.value(d[:, i]) for i, curve in enumerate(self.curves))
+
+    def log_jacobian(self, d: Array) -> Array:
+        """Return d log M / dd, shape (n, 6, 3)."""
+        return np.stack([curve.slope(d[:, i]) for i, curve in enumerate(self.curves)], axis=2)
+
+    def displacement_of(self, R: Array, t: Array) -> Array:
+        """Return the displacement (n, 3) [mm] of the incisal point under the motions (R, t)."""
+        return R @ self.incisor + t - self.incisor
+
+    def read_off(self, R: Array, t: Array) -> Array:
+        """Return the grid point d (n, 3) [mm] whose incisal displacement is nearest to that of the motions (R, t).
+
+        Good enough to start Gauss-Newton from; the curves have no closed-form inverse.
+        """
+        u = self.displacement_of(R, t)
+        grid = self._start_displacements
+        distance = np.einsum("ij,ij->i", grid, grid) - 2.0 * u @ grid.T
+        return np.where(np.isfinite(u).all(axis=1)[:, None], self._starts[np.argmin(distance, axis=1)], np.nan)
+
+
+JawModelForm = AnchoredModel | AdditiveModel
+
+
+def model_from_arrays(arrays: Mapping[str, Array]) -> JawModelForm:
+    """Build the model its named arrays describe: splines make it anchored, curves additive.
+
+    Raises:
+        KeyError: an array of the model is missing.
+    """
+    return AnchoredModel.from_arrays(arrays) if "spline_weights" in arrays else AdditiveModel.from_arrays(arrays)
+
+
+def decode_anatomical(arrays: Mapping[str, Array], d: Array) -> tuple[Array, Array]:
+    """Return rotation (..., 3, 3) and translation (..., 3) [mm] of M(d), anatomical frame, for d (..., 3) [mm]."""
+    d = np.asarray(d, dtype=float)
+    R, t = model_from_arrays(arrays).decode(d.reshape(-1, 3))
+    return R.reshape(*d.shape[:-1], 3, 3), t.reshape(d.shape)
