@@ -1,0 +1,38 @@
+"""jawusd: capture in, jaw rig out.
+
+Importing this package loads nothing heavy; `load` brings in OpenUSD when it is called.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from os import PathLike
+
+    from jawusd.evaluator import JawRig
+
+__all__ = ["__version__", "load"]
+__version__ = "0.1.0.dev0"
+
+
+def load(path: str | PathLike[str]) -> JawRig:
+    """Load a rig for posing, validation and inverse kinematics.
+
+    Args:
+        path: `actor.usda` (or any layer or package that carries the rig), or a `model.npz`.
+
+    Returns:
+        The evaluator of the rig.
+
+    Raises:
+        FormatError: the file is not a rig, is incomplete, or was written by a newer version.
+        RigError: the stage cannot be opened.
+    """
+    if str(path).endswith(".npz"):
+        from jawusd import evaluator
+
+        return evaluator.load(path)
+    from jawusd.rig import load_rig
+
+    return load_rig(path)

@@ -1,0 +1,133 @@
+"""The exceptions of jawusd: one tree, one exit code per family.
+
+    JawusdError                     exit 1, never raised itself
+      FormatError          exit 3   a file is not what its reader expects
+        VersionError                written by a newer jawusd
+        UnitsError                  lengths or angles in another unit
+      MissingDependencyError exit 4 an optional package is not installed
+      CaptureError         exit 5   the capture cannot be used
+        CalibrationError
+        SyncError
+      TrackingError        exit 6
+      FittingError         exit 7
+      RigError             exit 8
+      EvaluatorError       exit 9
+      OutputError          exit 10  the output cannot be written, or must not be
+
+A message says where (file, frame, camera), what was found, what is allowed with its unit, and what to do.
+"""
+
+from __future__ import annotations
+
+from os import PathLike
+
+__all__ = [
+    "CalibrationError",
+    "CaptureError",
+    "EvaluatorError",
+    "FittingError",
+    "FormatError",
+    "JawusdError",
+    "MissingDependencyError",
+    "OutputError",
+    "RigError",
+    "SyncError",
+    "TrackingError",
+    "UnitsError",
+    "VersionError",
+]
+
+
+class JawusdError(Exception):
+    """Carry one clear sentence for the person at the keyboard.
+
+    Args:
+        message: what was found and what is allowed, with units.
+        path: the file or folder it is about.
+        hint: what to do about it.
+    """
+
+    exit_code = 1
+
+    def __init__(self, message: str, *, path: str | PathLike[str] | None = None, hint: str | None = None) -> None:
+        self.message = message
+        self.path = None if path is None else str(path)
+        self.hint = hint
+        super().__init__(message)
+
+    def __str__(self) -> str:
+        where = f"{self.path}: " if self.path is not None else ""
+        advice = f" {self.hint}" if self.hint else ""
+        return f"{where}{self.message}{advice}"
+
+    def __reduce__(self) -> tuple:
+        # Exceptions cross process boundaries; keyword arguments are lost by the default protocol.
+        return (_rebuild, (type(self), self.message, self.path, self.hint))
+
+
+def _rebuild(kind: type[JawusdError], message: str, path: str | None, hint: str | None) -> JawusdError:
+    return kind(message, path=path, hint=hint)
+
+
+class FormatError(JawusdError):
+    """Report a file that does not follow its format."""
+
+    exit_code = 3
+
+
+class VersionError(FormatError):
+    """Report a file written by a newer version of jawusd."""
+
+
+class UnitsError(FormatError):
+    """Report lengths or angles in a unit the format does not allow."""
+
+
+class MissingDependencyError(JawusdError):
+    """Report an optional package that is needed here and not installed."""
+
+    exit_code = 4
+
+
+class CaptureError(JawusdError):
+    """Report a capture that cannot be used."""
+
+    exit_code = 5
+
+
+class CalibrationError(CaptureError):
+    """Report cameras whose calibration is missing or wrong."""
+
+
+class SyncError(CaptureError):
+    """Report cameras that could not be aligned in time."""
+
+
+class TrackingError(JawusdError):
+    """Report teeth that could not be tracked."""
+
+    exit_code = 6
+
+
+class FittingError(JawusdError):
+    """Report poses that no jaw model can be fitted to."""
+
+    exit_code = 7
+
+
+class RigError(JawusdError):
+    """Report a rig that cannot be written or read."""
+
+    exit_code = 8
+
+
+class EvaluatorError(JawusdError):
+    """Report a model that cannot be evaluated."""
+
+    exit_code = 9
+
+
+class OutputError(JawusdError):
+    """Report an output that cannot, or must not, be written."""
+
+    exit_code = 10

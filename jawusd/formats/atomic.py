@@ -1,0 +1,110 @@
+"""Write files so that a reader never meets half of one: temporary file, fsync, rename."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jawusd.errors import OutputError
+
+
+@contextlib.contextmanager
+def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Give a temporary path in the same folder and move it over `path` when the block ends well.
+
+    Args:
+        path: the file to be written; its folder is made if missing.
+
+    Yields:
+        A path with the same suffix; write the file there.
+
+    Raises:
+        OutputError: the folder cannot be written, or the disk is full.
+    """
+    target = Path(path)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.stem}-", suffix=target.suffix)
+        os.close(handle)
+    except OSError as error:
+        raise OutputError(f"cannot write here: {error.strerror}.", path=target) from error
+    temporary = Path(name)
+    try:
+        yield temporary
+        with open(temporary, "rb+") as written:
+            os.fsync(written.fileno())
+        os.chmod(temporary, 0o666 & ~_umask())
+        os.replace(temporary, target)
+        _sync_folder(target.parent)
+    except OSError as error:
+        raise OutputError(
+            f"could not be written: {error.strerror}. What was there before is untouched.", path=target
+        ) from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _umask() -> int:
+    # The umask can only be read by setting it.
+    current = os.umask(0o022)
+    os.umask(current)
+    return current
+
+
+def _sync_folder(folder: Path) -> None:
+    # Without this a power cut may lose the rename on some file systems; Windows cannot open folders.
+    with contextlib.suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+
+
+def write_bytes_atomic(path: str | os.PathLike[str], data: bytes) -> None:
+    """Write bytes to a file atomically.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def write_text_atomic(path: str | os.PathLike[str], text: str) -> None:
+    """Write UTF-8 text to a file atomically.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    write_bytes_atomic(path, text.encode())
+
+
+def write_npz_atomic(path: str | os.PathLike[str], arrays: dict[str, ArrayLike]) -> None:
+    """Write a compressed npz atomically, byte for byte the same for the same arrays.
+
+    Args:
+        path: file to write.
+        arrays: named arrays; object arrays are refused.
+
+    Raises:
+        OutputError: the file cannot be written.
+        ValueError: an array would need a pickle.
+    """
+    buffer = io.BytesIO()
+    checked = {}
+    for name, value in arrays.items():
+        array = np.asarray(value)
+        if array.dtype.hasobject:
+            raise ValueError(f"{name} holds Python objects; files carry plain arrays only")
+        checked[name] = array
+    # numpy stamps every member with 1980-01-01, so equal content gives equal bytes.
+    np.savez_compressed(buffer, **checked)
+    write_bytes_atomic(path, buffer.getvalue())

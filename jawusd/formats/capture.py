@@ -1,0 +1,237 @@
+"""The description of a capture: `capture.toml`, format jawusd-capture/1."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from jawusd.errors import CaptureError, FormatError, UnitsError
+from jawusd.formats.npz import check_format
+from jawusd.formats.toml import read_toml
+from jawusd.geometry import rigidity_defect
+
+FAMILY, VERSION = "jawusd-capture", 1
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
+
+
+class Scans(_Strict):
+    """Name the meshes, all in one frame with the teeth in occlusion [mm]."""
+
+    upper_teeth: Path
+    lower_teeth: Path
+    mandible: Path | None = None
+    skull: Path | None = None
+
+
+class Masks(_Strict):
+    """Name the teeth masks of one camera: a PNG pattern with %06d, or a lossless video."""
+
+    upper: Path
+    lower: Path
+
+
+class CameraSource(_Strict):
+    """Name one camera's footage and masks."""
+
+    name: Annotated[str, Field(min_length=1, pattern=r"^[A-Za-z0-9_\-]+$")]
+    video: Path | None = None
+    masks: Masks | None = None
+
+    @model_validator(mode="after")
+    def _has_source(self) -> CameraSource:
+        if self.video is None and self.masks is None:
+            raise ValueError("needs a video or masks")
+        return self
+
+
+class Boards(_Strict):
+    """Describe the calibration boards; counts are inner corners."""
+
+    pattern: Literal["chessboard", "charuco"] = "chessboard"
+    cols: Annotated[int, Field(ge=3, le=50)]
+    rows: Annotated[int, Field(ge=3, le=50)]
+    square_mm: Annotated[float, Field(gt=0, le=200)]
+    videos: tuple[Path, ...]
+
+
+class Sync(_Strict):
+    """Say how the cameras are aligned in time.
+
+    `offsets` gives, per camera, the whole number with: frame k of the camera shows the instant of frame k + offset of
+    the reference camera.
+    """
+
+    method: Literal["flash", "offsets"] = "flash"
+    reference: str | None = None
+    offsets: dict[str, int] | None = None
+
+
+class PickView(_Strict):
+    """Give the pixel of a picked vertex in one camera (OpenCV pixels of the recorded picture)."""
+
+    camera: str
+    x: float
+    y: float
+
+
+class Pick(_Strict):
+    """Join a vertex of a teeth scan with the pixels where it is seen."""
+
+    vertex: Annotated[int, Field(ge=0)]
+    views: Annotated[tuple[PickView, ...], Field(min_length=2)]
+
+
+class Bootstrap(_Strict):
+    """Give the picks that start the tracking, on one frame of the reference camera."""
+
+    frame: Annotated[int, Field(ge=0)]
+    upper: tuple[Pick, ...] = ()
+    lower: tuple[Pick, ...] = ()
+
+
+class Motion(_Strict):
+    """Name a reference frame with the teeth in occlusion."""
+
+    rest_frame: Annotated[int, Field(ge=0)] | None = None
+
+
+class Anatomy(_Strict):
+    """Override what is else derived from the scans."""
+
+    T_anatomical_skull: list[list[float]] | None = None
+    landmarks: dict[str, tuple[float, float, float]] | None = None
+
+    @field_validator("T_anatomical_skull")
+    @classmethod
+    def _rigid(cls, value: list[list[float]] | None) -> list[list[float]] | None:
+        if value is not None:
+            T = np.array(value, dtype=np.float64)
+            if T.shape != (4, 4) or not np.isfinite(T).all() or rigidity_defect(T) > 1e-6:
+                raise ValueError("must be a rigid 4 x 4 matrix")
+        return value
+
+
+class Capture(_Strict):
+    """Describe a capture; all paths are absolute once loaded."""
+
+    folder: Path
+    name: Annotated[str, Field(min_length=1, pattern=r"^[A-Za-z0-9_\-. ]+$")]
+    fps: Annotated[float, Field(gt=0, le=10000)]
+    frames: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]] | None = None
+    calibration: Path | None = None
+    scans: Scans
+    cameras: Annotated[tuple[CameraSource, ...], Field(min_length=1, max_length=64)]
+    boards: Boards | None = None
+    sync: Sync = Sync()
+    bootstrap: Bootstrap | None = None
+    motion: Motion = Motion()
+    anatomy: Anatomy = Anatomy()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Capture:
+        names = [camera.name for camera in self.cameras]
+        if len(set(names)) != len(names):
+            raise ValueError(f"camera names must differ, found {', '.join(names)}")
+        if self.frames is not None and self.frames[0] >= self.frames[1]:
+            raise ValueError(f"frames = {list(self.frames)} is empty; the second number is one past the last frame")
+        mentioned = {self.sync.reference} if self.sync.reference else set()
+        mentioned |= set(self.sync.offsets or {})
+        for pick in (*self.bootstrap.upper, *self.bootstrap.lower) if self.bootstrap else ():
+            mentioned |= {view.camera for view in pick.views}
+        unknown = sorted(mentioned - set(names))
+        if unknown:
+            raise ValueError(f"names camera {unknown[0]}, known are {', '.join(names)}")
+        return self
+
+    @property
+    def reference(self) -> str:
+        """Return the name of the reference camera, the first one unless [sync] names it."""
+        return self.sync.reference or self.cameras[0].name
+
+
+def load_capture(path: str | os.PathLike[str], *, allow_outside: bool = False) -> Capture:
+    """Read a capture description.
+
+    Args:
+        path: `capture.toml`, or the folder that holds it.
+        allow_outside: let paths in the file leave its folder.
+
+    Returns:
+        The capture with absolute paths.
+
+    Raises:
+        FormatError: not such a file; the message names the key.
+        UnitsError: lengths not in mm.
+        VersionError: written for a newer jawusd.
+        CaptureError: a file it names does not exist, or lies outside its folder.
+    """
+    path = Path(path)
+    if path.is_dir():
+        path = path / "capture.toml"
+    data = read_toml(path)
+    check_format(data.pop("format", None), FAMILY, VERSION, path)
+    units = data.pop("units", "mm")
+    if units != "mm":
+        raise UnitsError(f'units are "{units}", allowed is "mm".', path=path)
+    folder = path.resolve().parent
+    data["folder"] = folder
+    if "camera" in data:
+        data["cameras"] = data.pop("camera")
+    try:
+        capture = Capture.model_validate(data)
+    except ValidationError as error:
+        raise FormatError(_first_problem(error), path=path) from error
+    except RecursionError as error:
+        raise FormatError("is nested too deeply.", path=path) from error
+    return _resolve(capture, folder, path, allow_outside)
+
+
+def _first_problem(error: ValidationError) -> str:
+    problem = error.errors()[0]
+    where = ".".join("camera" if part == "cameras" else str(part) for part in problem["loc"])
+    found = problem.get("input")
+    shown = "" if isinstance(found, dict | list | tuple) or problem["type"] == "missing" else f' (found "{found}")'
+    return f"{where or 'the file'}: {problem['msg']}{shown}."
+
+
+def _resolve(capture: Capture, folder: Path, source: Path, allow_outside: bool) -> Capture:
+    """Make every path absolute, inside the folder, and check that it exists."""
+
+    def absolute(value: Path, key: str) -> Path:
+        full = Path(os.path.normpath(folder / value))
+        # Resolve links as well: a link may lead out of the folder though its name does not.
+        anchor = full.parent if "%" in full.name else full
+        if not allow_outside and not anchor.resolve().is_relative_to(folder):
+            raise CaptureError(
+                f'{key} = "{value}" leads out of the folder of the capture.',
+                path=source,
+                hint="Move the file inside, or allow it with --allow-outside.",
+            )
+        if not anchor.exists():
+            kind = "folder" if "%" in full.name else "file"
+            raise CaptureError(f"{key}: there is no {kind} {anchor}.", path=source, hint="Check the path in the file.")
+        return full
+
+    def walk(value: object, key: str) -> object:
+        if isinstance(value, BaseModel):
+            changed = {
+                name: walk(getattr(value, name), f"{key}.{name}" if key else name)
+                for name in type(value).model_fields
+                if name != "folder"
+            }
+            return value.model_copy(update=changed)
+        if isinstance(value, tuple):
+            return tuple(walk(item, f"{key}[{i}]") for i, item in enumerate(value))
+        return absolute(value, key) if isinstance(value, Path) else value
+
+    resolved = walk(capture, "")
+    if not isinstance(resolved, Capture):
+        raise TypeError("resolving a capture must give a capture")
+    return resolved

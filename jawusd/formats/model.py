@@ -1,0 +1,81 @@
+"""The fitted jaw model: `model.npz`, format jawusd-model/1.
+
+The arrays that a decoder needs (`JawModel.arrays`) carry the same names here, in the rig and in the evaluator, which
+checks them when it is made; this module checks only what it adds.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.formats.atomic import write_npz_atomic
+from jawusd.formats.npz import TWIST_ORDER, UNITS, read_npz, take
+
+FAMILY, VERSION = "jawusd-model", 1
+_CAPTURED = ("captured_frames", "captured_d", "captured_residual_mm", "captured_trained")
+
+
+@dataclass(eq=False)
+class JawModel:
+    """Hold a fitted model and what it says of the captured poses.
+
+    Attributes:
+        arrays: the decoder's named arrays, see `jawusd.evaluator`.
+        frames: captured frame numbers, shape (F,).
+        d: parameters of the captured poses [mm], NaN where the frame was lost, shape (F, 3).
+        residual_mm: rms landmark distance of pose and model [mm], NaN where lost, shape (F,).
+        trained: the frame took part in the fit, shape (F,).
+        meta: kind, method, actor, error tables, warnings, configuration, versions, hashes.
+    """
+
+    arrays: dict[str, NDArray]
+    frames: NDArray[np.int64]
+    d: NDArray[np.float64]
+    residual_mm: NDArray[np.float64]
+    trained: NDArray[np.bool_]
+    meta: dict = field(default_factory=dict)
+
+
+def save_model(path: str | os.PathLike[str], model: JawModel) -> None:
+    """Write a model atomically.
+
+    Raises:
+        OutputError: the file cannot be written.
+        ValueError: the captured arrays differ in length.
+    """
+    count = len(model.frames)
+    captured = dict(zip(_CAPTURED, (model.frames, model.d, model.residual_mm, model.trained), strict=True))
+    for name, value in captured.items():
+        if len(value) != count:
+            raise ValueError(f"{name} has {len(value)} rows, expected {count}")
+    meta = {"units": UNITS, "twist_order": TWIST_ORDER, **model.meta, "format": f"{FAMILY}/{VERSION}"}
+    write_npz_atomic(path, {**model.arrays, **captured, "meta": np.array(json.dumps(meta, sort_keys=True))})
+
+
+def load_model(path: str | os.PathLike[str]) -> JawModel:
+    """Read a model.
+
+    Raises:
+        FormatError: not a model file, or wrong shapes.
+        VersionError: written by a newer version.
+        UnitsError: other units or twist order.
+    """
+    arrays, meta = read_npz(path, FAMILY, VERSION)
+    frames = take(arrays, "captured_frames", (None,), path)
+    count = len(frames)
+    shapes = {"captured_d": (count, 3), "captured_residual_mm": (count,), "captured_trained": (count,)}
+    captured = {name: take(arrays, name, shape, path, finite=False) for name, shape in shapes.items()}
+    decoder = {name: value for name, value in arrays.items() if name not in _CAPTURED}
+    return JawModel(
+        arrays=decoder,
+        frames=frames,
+        d=captured["captured_d"],
+        residual_mm=captured["captured_residual_mm"],
+        trained=captured["captured_trained"].astype(bool),
+        meta=meta,
+    )

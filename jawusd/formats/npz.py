@@ -1,0 +1,117 @@
+"""Read npz files that hold plain arrays and a JSON string `meta`."""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.errors import FormatError, UnitsError, VersionError
+
+UNITS = {"length": "mm", "angle": "rad"}
+TWIST_ORDER = ["omega", "v"]
+
+# Larger arrays than any real file holds; guards against archives that unpack to fill the memory.
+_MAX_ARRAY_BYTES = 2 << 30
+
+
+def read_npz(path: str | os.PathLike[str], family: str, version: int) -> tuple[dict[str, NDArray], dict]:
+    """Read the arrays and the meta data of a jawusd npz file and check format, version and units.
+
+    Args:
+        path: the file.
+        family: format name without version, e.g. ``"jawusd-tracks"``.
+        version: newest version this reader knows.
+
+    Returns:
+        Arrays by name, and the meta data.
+
+    Raises:
+        FormatError: not such a file, or damaged.
+        VersionError: written by a newer version.
+        UnitsError: other units or twist order.
+    """
+    path = Path(path)
+    arrays: dict[str, NDArray] = {}
+    try:
+        with zipfile.ZipFile(path) as archive:
+            total = sum(member.file_size for member in archive.infolist())
+        if total > _MAX_ARRAY_BYTES:
+            raise FormatError(f"unpacks to {total / 1e9:.1f} GB; at most 2 GB are read.", path=path)
+        with np.load(path, allow_pickle=False) as archive:
+            for name in archive.files:
+                arrays[name] = archive[name]
+    except FileNotFoundError as error:
+        raise FormatError("there is no such file.", path=path) from error
+    except (OSError, ValueError, zipfile.BadZipFile, EOFError, KeyError) as error:
+        raise FormatError(f"is not a readable npz file ({error}).", path=path) from error
+    if "meta" not in arrays:
+        raise FormatError(f'has no "meta"; a {family} file carries its format and units there.', path=path)
+    try:
+        meta = json.loads(str(arrays.pop("meta")))
+    except ValueError as error:
+        raise FormatError(f'"meta" is not JSON ({error}).', path=path) from error
+    if not isinstance(meta, dict):
+        raise FormatError('"meta" must be a JSON object.', path=path)
+    check_format(meta.get("format"), family, version, path)
+    check_units(meta, path)
+    return arrays, meta
+
+
+def check_format(found: object, family: str, version: int, path: str | os.PathLike[str]) -> int:
+    """Check a format label such as ``"jawusd-tracks/1"`` and return its version.
+
+    Raises:
+        FormatError: another format, or no label.
+        VersionError: a newer version.
+    """
+    name, _, number = str(found).partition("/")
+    if name != family or not number.isdigit():
+        raise FormatError(f'format is "{found}", expected "{family}/{version}".', path=path)
+    if int(number) > version:
+        raise VersionError(
+            f'format is "{found}", this jawusd reads up to "{family}/{version}".', path=path, hint="Update jawusd."
+        )
+    return int(number)
+
+
+def check_units(meta: dict, path: str | os.PathLike[str]) -> None:
+    """Check the units and the twist order written in a file's meta data.
+
+    Raises:
+        UnitsError: they differ from mm, rad and (omega, v), or are missing.
+    """
+    if meta.get("units") != UNITS:
+        raise UnitsError(f"units are {meta.get('units')}, allowed are {UNITS}.", path=path)
+    if meta.get("twist_order") != TWIST_ORDER:
+        raise UnitsError(f"twist order is {meta.get('twist_order')}, allowed is {TWIST_ORDER}.", path=path)
+
+
+def take(
+    arrays: dict[str, NDArray], name: str, shape: tuple[int | None, ...], path: object, *, finite: bool = True
+) -> NDArray:
+    """Return one array after checking its shape and finiteness.
+
+    Args:
+        arrays: what `read_npz` gave.
+        name: the array.
+        shape: required shape, None where any length goes.
+        path: file name for the message.
+        finite: refuse NaN and infinity.
+
+    Raises:
+        FormatError: missing, of another shape, or not finite.
+    """
+    if name not in arrays:
+        raise FormatError(f'has no array "{name}".', path=str(path))
+    value = arrays[name]
+    if value.ndim != len(shape) or any(w is not None and w != g for w, g in zip(shape, value.shape, strict=True)):
+        wanted = "(" + ", ".join("any" if w is None else str(w) for w in shape) + ")"
+        raise FormatError(f'"{name}" has shape {value.shape}, expected {wanted}.', path=str(path))
+    if finite and value.dtype.kind == "f" and not np.isfinite(value).all():
+        raise FormatError(f'"{name}" holds values that are not finite.', path=str(path))
+    return value

@@ -1,0 +1,146 @@
+"""The tracked poses of both rows of teeth: `tracks.npz`, format jawusd-tracks/1."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.errors import FormatError
+from jawusd.formats.atomic import write_npz_atomic
+from jawusd.formats.npz import TWIST_ORDER, UNITS, read_npz, take
+from jawusd.geometry import LANDMARKS, rigidity_defect
+
+FAMILY, VERSION = "jawusd-tracks", 1
+
+#: Values of `Tracks.status`.
+LOST, TRACKED, RECOVERED, PARTIAL = 0, 1, 2, 3
+
+
+@dataclass(eq=False)
+class Tracks:
+    """Hold the tracked poses of a take; NaN where a jaw was not tracked.
+
+    The plain poses are final; the `raw_` poses are the first pass, without smoothing or kinematic prior: models are
+    fitted to them and scored on them.
+
+    Attributes:
+        frames: frame numbers of the reference camera, shape (F,).
+        T_world_upper, T_world_lower, T_upper_lower: final poses, shape (F, 4, 4); the last is T_skull_mandible.
+        raw_T_world_upper, raw_T_world_lower, raw_T_upper_lower: first-pass poses, shape (F, 4, 4).
+        status: 0 lost, 1 tracked, 2 recovered after a loss, 3 tracked without one of the cameras; (upper, lower),
+            shape (F, 2).
+        prior_aided: a kinematic prior took part in the final pose, shape (F,).
+        coverage_error: mask pixels the projected scan leaves uncovered, as a fraction of the mask (E_SP of paper
+            eq. 8 over segmented pixels), shape (F, 2, C); NaN without a mask.
+        covariance_upper, covariance_lower: covariance of the left twist xi [rad, mm] with T_true = exp(xi) T, world
+            frame, about the world origin, shape (F, 6, 6).
+        covariance_relative: the same of T_upper_lower in the skull frame, shape (F, 6, 6).
+        sigma_mm: standard deviation of the landmarks' position in the skull frame [mm], shape (F, 5).
+        residual_px: rms distance of matched contour samples at the working size [px], shape (F, 2).
+        matched_px: matched contour length at the working size [px], shape (F, 2).
+        camera_names: the cameras, length C.
+        meta: configuration, versions, hashes, estimated nuisances.
+    """
+
+    frames: NDArray[np.int64]
+    T_world_upper: NDArray[np.float64]
+    T_world_lower: NDArray[np.float64]
+    T_upper_lower: NDArray[np.float64]
+    raw_T_world_upper: NDArray[np.float64]
+    raw_T_world_lower: NDArray[np.float64]
+    raw_T_upper_lower: NDArray[np.float64]
+    status: NDArray[np.int8]
+    prior_aided: NDArray[np.bool_]
+    coverage_error: NDArray[np.float64]
+    covariance_upper: NDArray[np.float64]
+    covariance_lower: NDArray[np.float64]
+    covariance_relative: NDArray[np.float64]
+    sigma_mm: NDArray[np.float64]
+    residual_px: NDArray[np.float64]
+    matched_px: NDArray[np.float64]
+    camera_names: tuple[str, ...]
+    meta: dict = field(default_factory=dict)
+
+    def tracked(self) -> NDArray[np.bool_]:
+        """Return which frames have both final poses, shape (F,)."""
+        return np.isfinite(self.T_upper_lower).all((1, 2))
+
+
+def _shapes(count: int, cameras: int) -> dict[str, tuple[int, ...]]:
+    poses = {
+        name: (count, 4, 4)
+        for kind in ("", "raw_")
+        for name in (f"{kind}T_world_upper", f"{kind}T_world_lower", f"{kind}T_upper_lower")
+    }
+    covariances = {f"covariance_{name}": (count, 6, 6) for name in ("upper", "lower", "relative")}
+    return {
+        "frames": (count,),
+        **poses,
+        "status": (count, 2),
+        "prior_aided": (count,),
+        "coverage_error": (count, 2, cameras),
+        **covariances,
+        "sigma_mm": (count, len(LANDMARKS)),
+        "residual_px": (count, 2),
+        "matched_px": (count, 2),
+    }
+
+
+def save_tracks(path: str | os.PathLike[str], tracks: Tracks) -> None:
+    """Write tracks atomically.
+
+    Raises:
+        OutputError: the file cannot be written.
+        ValueError: an array has the wrong shape.
+    """
+    arrays: dict[str, NDArray] = {}
+    for name, shape in _shapes(len(tracks.frames), len(tracks.camera_names)).items():
+        value = np.asarray(getattr(tracks, name))
+        if value.shape != shape:
+            raise ValueError(f"tracks.{name} has shape {value.shape}, expected {shape}")
+        arrays[name] = value
+    meta = {
+        "units": UNITS,
+        "twist_order": TWIST_ORDER,
+        "frames": "T_a_b maps b to a; world, upper = skull, lower = mandible",
+        **tracks.meta,
+        "format": f"{FAMILY}/{VERSION}",
+        "camera_names": list(tracks.camera_names),
+        "landmark_names": list(LANDMARKS),
+    }
+    write_npz_atomic(path, {**arrays, "meta": np.array(json.dumps(meta, sort_keys=True))})
+
+
+def load_tracks(path: str | os.PathLike[str]) -> Tracks:
+    """Read tracks and check them.
+
+    Raises:
+        FormatError: not a tracks file, wrong shapes, or poses that are not rigid.
+        VersionError: written by a newer version.
+        UnitsError: other units or twist order.
+    """
+    arrays, meta = read_npz(path, FAMILY, VERSION)
+    names = meta.get("camera_names")
+    if not isinstance(names, list) or not all(isinstance(n, str) for n in names):
+        raise FormatError('"meta" has no list "camera_names".', path=path)
+    count = len(take(arrays, "frames", (None,), path))
+    values = {
+        # NaN is how a lost frame is written, so only the frame numbers must be finite.
+        name: take(arrays, name, shape, path, finite=name == "frames")
+        for name, shape in _shapes(count, len(names)).items()
+    }
+    for name in values:
+        if "T_" in name:
+            present = np.isfinite(values[name]).all((1, 2))
+            defect = rigidity_defect(values[name][present])
+            if defect.size and defect.max() > 1e-6:
+                frame = values["frames"][present][int(defect.argmax())]
+                raise FormatError(
+                    f'"{name}" of frame {frame} is not rigid (off by {defect.max():.2g}, allowed 1e-6).', path=path
+                )
+    known = {f.name for f in fields(Tracks)}
+    return Tracks(**{k: v for k, v in values.items() if k in known}, camera_names=tuple(names), meta=meta)

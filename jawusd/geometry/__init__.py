@@ -1,0 +1,69 @@
+"""Rotations, rigid motions, cameras and the anatomical frame; numpy only.
+
+Conventions of the whole package:
+
+* ``T_a_b`` maps b-coordinates to a-coordinates, ``p_a = T_a_b @ p_b``; column vectors, float64, shape (..., 4, 4).
+* A twist is ``(omega [rad], v [mm])``, rotation first, and ``T = se3_exp(twist)``.
+* Lengths mm, angles rad, image coordinates px with the centre of the top-left pixel at (0, 0).
+"""
+
+from jawusd.geometry.anatomy import LANDMARKS, anatomical_frame, find_landmarks, mandible_metric
+from jawusd.geometry.camera import Camera
+from jawusd.geometry.quaternion import matrix_from_wxyz, wxyz_from_matrix
+from jawusd.geometry.rigid import rigid_fit, triangulate
+from jawusd.geometry.se3 import (
+    make_transform,
+    orthonormalise,
+    relative_pose,
+    rigidity_defect,
+    se3_adjoint,
+    se3_exp,
+    se3_inverse,
+    se3_left_jacobian,
+    se3_left_jacobian_inverse,
+    se3_log,
+    se3_right_jacobian,
+    transform_points,
+)
+from jawusd.geometry.so3 import (
+    hat,
+    random_rotation,
+    so3_exp,
+    so3_left_jacobian,
+    so3_left_jacobian_inverse,
+    so3_log,
+    so3_right_jacobian,
+    vee,
+)
+
+__all__ = [
+    "LANDMARKS",
+    "Camera",
+    "anatomical_frame",
+    "find_landmarks",
+    "hat",
+    "make_transform",
+    "mandible_metric",
+    "matrix_from_wxyz",
+    "orthonormalise",
+    "random_rotation",
+    "relative_pose",
+    "rigid_fit",
+    "rigidity_defect",
+    "se3_adjoint",
+    "se3_exp",
+    "se3_inverse",
+    "se3_left_jacobian",
+    "se3_left_jacobian_inverse",
+    "se3_log",
+    "se3_right_jacobian",
+    "so3_exp",
+    "so3_left_jacobian",
+    "so3_left_jacobian_inverse",
+    "so3_log",
+    "so3_right_jacobian",
+    "transform_points",
+    "triangulate",
+    "vee",
+    "wxyz_from_matrix",
+]

@@ -1,0 +1,185 @@
+"""The anatomical frame, the named landmarks and the mandible metric, found from the scans.
+
+Anatomical axes: x to the subject's left, y up, z anterior, origin at the upper incisal point.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jawusd.geometry.se3 import make_transform, transform_points
+from jawusd.geometry.so3 import hat
+
+#: Order of the landmarks in every table and file; all move with the mandible.
+LANDMARKS = ("incisor", "molar_left", "molar_right", "condyle_left", "condyle_right")
+
+# Mean adult distances from the lower incisal point to the condyle centres, used only when there is no mandible mesh:
+# the Bonwill triangle (about 100 mm between the condyles and from each to the incisal point), condyles 37 mm above
+# the occlusal plane.
+_CONDYLE_FROM_INCISOR_MM = np.array([50.0, 36.0, -80.0])
+# The first molars sit about this far behind the incisal point along the anterior axis.
+_MOLAR_BEHIND_INCISOR_MM = 25.0
+_MIDLINE_MM = 4.0
+
+
+def anatomical_frame(upper_vertices: ArrayLike, lower_vertices: ArrayLike) -> NDArray[np.float64]:
+    """Find the anatomical frame of two dental scans in occlusion, in any common scan frame.
+
+    Up is the normal of the common plane of both arches, from the lower to the upper one; the midline is the mirror
+    axis of the arches in that plane; anterior is the closed end of the horseshoe.
+
+    Args:
+        upper_vertices: crown vertices of the upper scan [mm], shape (N, 3).
+        lower_vertices: crown vertices of the lower scan [mm], shape (M, 3).
+
+    Returns:
+        T_anatomical_skull, shape (4, 4).
+    """
+    upper, lower = np.asarray(upper_vertices, dtype=np.float64), np.asarray(lower_vertices, dtype=np.float64)
+    both = np.concatenate([_thin(upper), _thin(lower)])
+    centre = both.mean(0)
+    normal = np.linalg.svd(both - centre, full_matrices=False)[2][2]
+    if normal @ (upper.mean(0) - lower.mean(0)) < 0:
+        normal = -normal
+    e1 = np.linalg.svd(both - centre, full_matrices=False)[2][0]
+    e1 = e1 - normal * (normal @ e1)
+    e1 /= np.linalg.norm(e1)
+    flat = np.stack([(both - centre) @ e1, (both - centre) @ np.cross(normal, e1)], axis=-1)
+    angle = _mirror_angle(flat)
+    anterior = np.cos(angle) * e1 + np.sin(angle) * np.cross(normal, e1)
+    # The arch is wide and open at the back: its lateral spread grows away from the front.
+    depth = (both - centre) @ anterior
+    lateral = np.abs((both - centre) @ np.cross(normal, anterior))
+    if np.corrcoef(depth, lateral)[0, 1] > 0:
+        anterior = -anterior
+    R, midline = _centre_midline(both, np.stack([np.cross(normal, anterior), normal, anterior]))
+    crown = upper @ R.T
+    crown[:, 0] -= midline
+    front = crown[np.abs(crown[:, 0]) < _MIDLINE_MM]
+    front = front[front[:, 2] > front[:, 2].max() - 5.0]
+    edge = front[front[:, 1] < front[:, 1].min() + 0.6]
+    origin = np.array([midline, edge[:, 1].min(), edge[:, 2].mean()])
+    return make_transform(R, -origin)
+
+
+def _centre_midline(
+    points: NDArray[np.float64], R: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], float]:
+    """Turn the lateral axis until the middle between the buccal outlines is a straight sagittal line.
+
+    Args:
+        points: crown vertices [mm], shape (N, 3).
+        R: rows are the first guess of left, up and anterior, shape (3, 3).
+
+    Returns:
+        The corrected rotation (3, 3) and the midline's lateral coordinate in it [mm].
+    """
+    midline = 0.0
+    for _ in range(8):
+        x, z = points @ R[0], points @ R[2]
+        bins = np.linspace(np.percentile(z, 3), np.percentile(z, 85), 17)
+        depth, middle = [], []
+        for low, high in zip(bins[:-1], bins[1:], strict=True):
+            slab = x[(z >= low) & (z < high)]
+            if len(slab) >= 20:
+                depth.append(0.5 * (low + high))
+                middle.append(0.5 * (np.percentile(slab, 1.5) + np.percentile(slab, 98.5)))
+        slope, midline = np.polyfit(depth, middle, 1)
+        if abs(slope) < 1e-6:
+            break
+        left = R[0] - np.tanh(slope) * R[2]
+        left /= np.linalg.norm(left)
+        R = np.stack([left, R[1], np.cross(left, R[1])])
+    return R, float(midline)
+
+
+def _thin(points: NDArray[np.float64], count: int = 3000) -> NDArray[np.float64]:
+    return points[:: max(1, len(points) // count)]
+
+
+def _mirror_angle(flat: NDArray[np.float64]) -> float:
+    """Return the angle of the axis about which a planar point set is most nearly symmetric, shape (N, 2) -> rad."""
+    # Compare angular-radial histograms of the outline with their mirror image; robust to uneven sampling.
+    flat = flat - 0.5 * (np.percentile(flat, 1, axis=0) + np.percentile(flat, 99, axis=0))
+    bins = 360
+    polar = np.arctan2(flat[:, 1], flat[:, 0])
+    radius = np.linalg.norm(flat, axis=1)
+    index = np.floor((polar + np.pi) / (2 * np.pi) * bins).astype(int) % bins
+    profile = np.zeros(bins)
+    np.maximum.at(profile, index, radius)
+    kernel = np.hanning(13)
+    profile = np.convolve(np.pad(profile, 12, mode="wrap"), kernel / kernel.sum(), mode="same")[12:-12]
+    angles = -np.pi + (np.arange(bins) + 0.5) * 2 * np.pi / bins
+    # Mirroring at angle a maps direction phi to 2a - phi; with phi at bin centres this permutes the bins.
+    cost = np.array([np.mean((profile - profile[(shift - np.arange(bins)) % bins]) ** 2) for shift in range(bins)])
+    shift = int(np.argmin(cost))
+    around = [cost[(shift + k) % bins] for k in (-1, 0, 1)]
+    bend = around[0] - 2 * around[1] + around[2]
+    fraction = 0.0 if bend <= 0 else 0.5 * (around[0] - around[2]) / bend
+    # bins i and shift - i are images of each other: a = (phi_i + phi_{shift-i}) / 2.
+    return float(0.5 * (2 * angles[0] + (shift + fraction) * 2 * np.pi / bins))
+
+
+def find_landmarks(
+    lower_vertices: ArrayLike,
+    mandible_vertices: ArrayLike | None,
+    T_anatomical_skull: ArrayLike,
+) -> NDArray[np.float64]:
+    """Find the five landmarks of `LANDMARKS` on the mandible.
+
+    Args:
+        lower_vertices: crown vertices of the lower scan, scan frame [mm], shape (N, 3).
+        mandible_vertices: mandible mesh in the same frame [mm], shape (M, 3), or None: the condyles are then placed
+            at mean adult distances from the incisal point.
+        T_anatomical_skull: scan frame to anatomical frame with the teeth in occlusion, shape (4, 4).
+
+    Returns:
+        Landmarks in the mandible (scan) frame [mm], shape (5, 3).
+    """
+    A = np.asarray(T_anatomical_skull, dtype=np.float64)
+    lower = transform_points(A, np.asarray(lower_vertices, dtype=np.float64))
+    out = np.empty((5, 3))
+    midline = lower[np.abs(lower[:, 0]) < _MIDLINE_MM]
+    midline = midline[midline[:, 2] > midline[:, 2].max() - 6.0]
+    edge = midline[midline[:, 1] > midline[:, 1].max() - 0.4]
+    out[0] = [0.0, edge[:, 1].max(), edge[:, 2].mean()]
+    for row, side in ((1, 1.0), (2, -1.0)):
+        z = out[0, 2] - _MOLAR_BEHIND_INCISOR_MM
+        near = lower[(lower[:, 0] * side > 0) & (np.abs(lower[:, 2] - z) < 3.0)]
+        crown = near[near[:, 1] > np.percentile(near[:, 1], 70)]
+        out[row] = crown.mean(0)
+    if mandible_vertices is None:
+        for row, side in ((3, 1.0), (4, -1.0)):
+            out[row] = out[0] + _CONDYLE_FROM_INCISOR_MM * [side, 1.0, 1.0]
+    else:
+        mandible = transform_points(A, np.asarray(mandible_vertices, dtype=np.float64))
+        out[3], out[4] = _condyle(mandible, 1.0), _condyle(mandible, -1.0)
+    return transform_points(np.linalg.inv(A), out)
+
+
+def _condyle(mandible: NDArray[np.float64], side: float) -> NDArray[np.float64]:
+    """Return the centre of one condylar head in anatomical coordinates, shape (3,)."""
+    half = mandible[mandible[:, 0] * side > 0]
+    # The coronoid process may be as high as the condyle but lies well in front of it.
+    posterior = half[half[:, 2] < half[:, 2].min() + 0.28 * np.ptp(half[:, 2])]
+    top = posterior[:, 1].max()
+    head = posterior[posterior[:, 1] > top - 8.0]
+    low, high = head.min(0), head.max(0)
+    return np.array([0.5 * (low[0] + high[0]), top - 4.0, 0.5 * (low[2] + high[2])])
+
+
+def mandible_metric(points: ArrayLike) -> NDArray[np.float64]:
+    """Return M with ``xi^T M xi`` = mean squared displacement of the points under a small twist xi.
+
+    A point p moves by ``omega x p + v``, so M = mean of [-hat(p), I]^T [-hat(p), I].
+
+    Args:
+        points: points [mm], shape (N, 3), in the frame of the twist.
+
+    Returns:
+        Symmetric positive definite matrix in (omega, v) order, shape (6, 6).
+    """
+    p = np.asarray(points, dtype=np.float64)
+    J = np.concatenate([-hat(p), np.broadcast_to(np.eye(3), (len(p), 3, 3))], axis=-1)
+    return np.einsum("nij,nik->jk", J, J) / len(p)

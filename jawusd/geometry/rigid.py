@@ -1,0 +1,72 @@
+"""Rigid alignment of point sets and triangulation of image points."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jawusd.geometry.se3 import make_transform
+
+
+def rigid_fit(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = None) -> NDArray[np.float64]:
+    """Return the rigid T minimising sum w |T source - target|^2 (Arun et al. 1987, Umeyama 1991).
+
+    Args:
+        source: points [mm], shape (N, 3), N >= 3, not on one line.
+        target: points [mm], shape (N, 3).
+        weights: non-negative weights, shape (N,).
+
+    Returns:
+        Transform, shape (4, 4).
+
+    Raises:
+        ValueError: wrong shapes, fewer than three points, or points on one line.
+    """
+    P, Q = np.asarray(source, dtype=np.float64), np.asarray(target, dtype=np.float64)
+    if P.shape != Q.shape or P.ndim != 2 or P.shape[1] != 3 or len(P) < 3:
+        raise ValueError(f"source and target must both have shape (N >= 3, 3), got {P.shape} and {Q.shape}")
+    w = np.ones(len(P)) if weights is None else np.asarray(weights, dtype=np.float64)
+    w = w / w.sum()
+    p0, q0 = w @ P, w @ Q
+    spread = np.linalg.svd((P - p0) * np.sqrt(w)[:, None], compute_uv=False)
+    if spread[1] < 1e-9 * max(spread[0], 1e-300):
+        raise ValueError("the source points lie on one line: their rotation about it is free")
+    U, _, Vt = np.linalg.svd(((P - p0) * w[:, None]).T @ (Q - q0))
+    D = np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
+    R = (U @ D @ Vt).T
+    return make_transform(R, q0 - R @ p0)
+
+
+def triangulate(projections: ArrayLike, pixels: ArrayLike) -> NDArray[np.float64]:
+    """Return the point seen at the given pixels: linear start, then Gauss-Newton on the reprojection error.
+
+    The linear system is Hartley & Zisserman, Multiple View Geometry, section 12.2.
+
+    Args:
+        projections: pinhole projection matrices (world mm -> px), shape (C, 3, 4), C >= 2.
+        pixels: undistorted image points [px], shape (C, 2).
+
+    Returns:
+        World point [mm], shape (3,).
+
+    Raises:
+        ValueError: wrong shapes or fewer than two views.
+    """
+    M, x = np.asarray(projections, dtype=np.float64), np.asarray(pixels, dtype=np.float64)
+    if M.ndim != 3 or M.shape[1:] != (3, 4) or x.shape != (len(M), 2) or len(M) < 2:
+        raise ValueError(f"need projections (C >= 2, 3, 4) and pixels (C, 2), got {M.shape} and {x.shape}")
+    rows = (x[:, :, None] * M[:, None, 2, :] - M[:, :2, :]).reshape(-1, 4)
+    rows = rows / np.linalg.norm(rows, axis=1, keepdims=True)
+    X = np.linalg.svd(rows)[2][-1]
+    X = X[:3] / X[3]
+    for _ in range(10):
+        h = M @ np.append(X, 1.0)
+        seen = h[:, :2] / h[:, 2:]
+        residual = (seen - x).ravel()
+        J = (M[:, :2, :3] - seen[:, :, None] * M[:, None, 2, :3]) / h[:, 2, None, None]
+        J = J.reshape(-1, 3)
+        step = np.linalg.lstsq(J, residual, rcond=None)[0]
+        X = X - step
+        if np.linalg.norm(step) < 1e-10:
+            break
+    return X

@@ -1,0 +1,236 @@
+"""Rigid motions: exponential, logarithm, adjoint and their Jacobians; twists are (omega, v).
+
+Formulas: Solà et al. 2018, section 4 of the appendix, reordered to rotation first; the relative jaw pose is eqs. 1-3
+of Yang et al., "Building Anatomically Realistic Jaw Kinematics Model from Data" (2019).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jawusd.geometry.so3 import hat, so3_exp, so3_left_jacobian, so3_left_jacobian_inverse, so3_log
+
+# Below this angle [rad] the coupling block uses its series; the closed form loses digits like a^-5 there.
+_COUPLING_SERIES_RAD = 0.3
+
+
+def make_transform(R: ArrayLike, t: ArrayLike) -> NDArray[np.float64]:
+    """Assemble transforms from rotation and translation.
+
+    Args:
+        R: rotation matrices, shape (..., 3, 3).
+        t: translations [mm], shape (..., 3).
+
+    Returns:
+        Transforms, shape (..., 4, 4).
+    """
+    R, t = np.asarray(R, dtype=np.float64), np.asarray(t, dtype=np.float64)
+    shape = np.broadcast_shapes(R.shape[:-2], t.shape[:-1])
+    T = np.zeros((*shape, 4, 4))
+    T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = R, t, 1.0
+    return T
+
+
+def se3_inverse(T: ArrayLike) -> NDArray[np.float64]:
+    """Invert rigid transforms: ``T_b_a`` from ``T_a_b``.
+
+    Args:
+        T: rigid transforms, shape (..., 4, 4).
+
+    Returns:
+        Inverses, shape (..., 4, 4).
+    """
+    T = np.asarray(T, dtype=np.float64)
+    Rt = np.swapaxes(T[..., :3, :3], -1, -2)
+    return make_transform(Rt, -np.einsum("...ij,...j->...i", Rt, T[..., :3, 3]))
+
+
+def transform_points(T: ArrayLike, points: ArrayLike) -> NDArray[np.float64]:
+    """Apply transforms to points, ``p_a = T_a_b p_b``.
+
+    Args:
+        T: transforms, shape (..., 4, 4).
+        points: points [mm], shape (..., 3), or (N, 3) per transform.
+
+    Returns:
+        Points: shape (..., 3) for one point per transform, (..., N, 3) when `points` is (N, 3) or (..., N, 3) and `T`
+        has fewer leading axes than it.
+    """
+    T, points = np.asarray(T, dtype=np.float64), np.asarray(points, dtype=np.float64)
+    if points.ndim >= 2 and points.shape[:-1] != T.shape[:-2]:
+        return points @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3]
+    return np.einsum("...ij,...j->...i", T[..., :3, :3], points) + T[..., :3, 3]
+
+
+def relative_pose(T_world_upper: ArrayLike, T_world_lower: ArrayLike) -> NDArray[np.float64]:
+    """Return the jaw pose T_skull_mandible from the world poses of both rows of teeth (Yang et al. eqs. 1-3).
+
+    Args:
+        T_world_upper: upper teeth (skull) poses, shape (..., 4, 4).
+        T_world_lower: lower teeth (mandible) poses, shape (..., 4, 4).
+
+    Returns:
+        T_skull_mandible, shape (..., 4, 4).
+    """
+    return se3_inverse(T_world_upper) @ np.asarray(T_world_lower, dtype=np.float64)
+
+
+def _coupling(w: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the block Q(w, v) of the left Jacobian of SE(3) (Barfoot 2017, eq. 7.86; Solà et al. eq. 180)."""
+    W, V = hat(w), hat(v)
+    a = np.linalg.norm(w, axis=-1)[..., None, None]
+    small = a < _COUPLING_SERIES_RAD
+    s = np.where(small, 1.0, a)
+    a2 = a * a
+    c1 = np.where(
+        small, 1 / 6 - a2 / 120 * (1 - a2 / 42 * (1 - a2 / 72 * (1 - a2 / 110))), (s - np.sin(s)) / s**3
+    )
+    c2 = np.where(
+        small,
+        1 / 24 - a2 / 720 * (1 - a2 / 56 * (1 - a2 / 90 * (1 - a2 / 132))),
+        (s * s / 2 + np.cos(s) - 1) / s**4,
+    )
+    # (c2 - 3 (s - sin s - s^3/6)/s^5)/2 in the literature's signs
+    c3 = np.where(
+        small,
+        1 / 120 - a2 / 2520 * (1 - a2 / 48 * (1 - 2 * a2 / 165)),
+        0.5 * ((s * s / 2 + np.cos(s) - 1) / s**4 - 3 * (s**3 / 6 - s + np.sin(s)) / s**5),
+    )
+    WV, VW = W @ V, V @ W
+    WVW = WV @ W
+    return (
+        0.5 * V
+        + c1 * (WV + VW + WVW)
+        + c2 * (W @ WV + VW @ W - 3 * WVW)
+        + c3 * (WVW @ W + W @ WVW)
+    )
+
+
+def se3_left_jacobian(twist: ArrayLike) -> NDArray[np.float64]:
+    """Return J with ``exp(twist + d) = exp(J d) exp(twist)`` to first order.
+
+    Args:
+        twist: twists (omega [rad], v [mm]), shape (..., 6).
+
+    Returns:
+        Left Jacobians in (omega, v) order, shape (..., 6, 6).
+    """
+    twist = np.asarray(twist, dtype=np.float64)
+    w, v = twist[..., :3], twist[..., 3:]
+    J = np.zeros((*twist.shape[:-1], 6, 6))
+    J[..., :3, :3] = J[..., 3:, 3:] = so3_left_jacobian(w)
+    J[..., 3:, :3] = _coupling(w, v)
+    return J
+
+
+def se3_right_jacobian(twist: ArrayLike) -> NDArray[np.float64]:
+    """Return J with ``exp(twist + d) = exp(twist) exp(J d)`` to first order.
+
+    Args:
+        twist: twists (omega [rad], v [mm]), shape (..., 6).
+
+    Returns:
+        Right Jacobians in (omega, v) order, shape (..., 6, 6).
+    """
+    return se3_left_jacobian(-np.asarray(twist, dtype=np.float64))
+
+
+def se3_left_jacobian_inverse(twist: ArrayLike) -> NDArray[np.float64]:
+    """Return the inverse of `se3_left_jacobian`.
+
+    Args:
+        twist: twists (omega [rad], v [mm]), shape (..., 6).
+
+    Returns:
+        Inverse left Jacobians, shape (..., 6, 6).
+    """
+    twist = np.asarray(twist, dtype=np.float64)
+    w, v = twist[..., :3], twist[..., 3:]
+    Ji = so3_left_jacobian_inverse(w)
+    out = np.zeros((*twist.shape[:-1], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = Ji
+    out[..., 3:, :3] = -Ji @ _coupling(w, v) @ Ji
+    return out
+
+
+def se3_exp(twist: ArrayLike) -> NDArray[np.float64]:
+    """Map twists to rigid transforms.
+
+    Args:
+        twist: twists (omega [rad], v [mm]), shape (..., 6).
+
+    Returns:
+        Transforms, shape (..., 4, 4).
+    """
+    twist = np.asarray(twist, dtype=np.float64)
+    if twist.shape[-1:] != (6,):
+        raise ValueError(f"twists must have shape (..., 6), got {twist.shape}")
+    w, v = twist[..., :3], twist[..., 3:]
+    return make_transform(so3_exp(w), np.einsum("...ij,...j->...i", so3_left_jacobian(w), v))
+
+
+def se3_log(T: ArrayLike) -> NDArray[np.float64]:
+    """Map rigid transforms to twists of rotation angle in [0, pi].
+
+    Args:
+        T: rigid transforms, shape (..., 4, 4).
+
+    Returns:
+        Twists (omega [rad], v [mm]), shape (..., 6).
+    """
+    T = np.asarray(T, dtype=np.float64)
+    if T.shape[-2:] != (4, 4):
+        raise ValueError(f"transforms must have shape (..., 4, 4), got {T.shape}")
+    w = so3_log(T[..., :3, :3])
+    v = np.einsum("...ij,...j->...i", so3_left_jacobian_inverse(w), T[..., :3, 3])
+    return np.concatenate([w, v], axis=-1)
+
+
+def se3_adjoint(T: ArrayLike) -> NDArray[np.float64]:
+    """Return Ad(T) with ``T exp(x) T^-1 = exp(Ad(T) x)``.
+
+    Args:
+        T: rigid transforms, shape (..., 4, 4).
+
+    Returns:
+        Adjoint matrices in (omega, v) order, shape (..., 6, 6).
+    """
+    T = np.asarray(T, dtype=np.float64)
+    R = T[..., :3, :3]
+    out = np.zeros((*T.shape[:-2], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = R
+    out[..., 3:, :3] = hat(T[..., :3, 3]) @ R
+    return out
+
+
+def orthonormalise(T: ArrayLike) -> NDArray[np.float64]:
+    """Return the nearest rigid transforms (SVD of the rotation block, Arun et al. 1987).
+
+    Args:
+        T: nearly rigid transforms, shape (..., 4, 4).
+
+    Returns:
+        Rigid transforms with exact bottom row, shape (..., 4, 4).
+    """
+    T = np.asarray(T, dtype=np.float64)
+    U, _, Vt = np.linalg.svd(T[..., :3, :3])
+    sign = np.ones((*T.shape[:-2], 3))
+    sign[..., 2] = np.sign(np.linalg.det(U @ Vt))
+    return make_transform((U * sign[..., None, :]) @ Vt, T[..., :3, 3])
+
+
+def rigidity_defect(T: ArrayLike) -> NDArray[np.float64]:
+    """Measure how far transforms are from rigid.
+
+    Args:
+        T: transforms, shape (..., 4, 4).
+
+    Returns:
+        Largest absolute entry of R R^T - I and of the bottom row's error, and 2 for reflections; shape (...).
+    """
+    T = np.asarray(T, dtype=np.float64)
+    R = T[..., :3, :3]
+    defect = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max((-1, -2))
+    defect = np.maximum(defect, np.abs(T[..., 3, :] - np.array([0.0, 0.0, 0.0, 1.0])).max(-1))
+    return np.where(np.linalg.det(R) < 0, np.maximum(defect, 2.0), defect)
