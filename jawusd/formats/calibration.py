@@ -77,7 +77,7 @@ def _camera(path: Path, table: str, values: object) -> Camera:
             hint="Undistort the footage first, or calibrate with the standard model.",
         )
     if (size < 16).any() or (size != np.round(size)).any():
-        raise CalibrationError(f"[{table}] size is {size.tolist()} px, expected whole numbers of 16 or more.", path=path)
+        raise CalibrationError(f"[{table}] size is {size.tolist()} px, allowed: whole numbers from 16.", path=path)
     if K[0, 0] <= 0 or K[1, 1] <= 0 or np.abs(K[[1, 2, 2], [0, 0, 1]]).max() > 0 or K[2, 2] != 1:
         raise CalibrationError(
             f"[{table}] matrix must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0 px.", path=path

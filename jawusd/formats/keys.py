@@ -1,0 +1,81 @@
+"""Animation keys: `keys.json`, parameters d at chosen frames."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from jawusd.errors import FormatError
+from jawusd.formats.atomic import write_text_atomic
+
+_MAX_BYTES = 64 << 20
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class Key(BaseModel):
+    """Hold the parameters d [mm] at one frame."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    frame: Finite
+    d: tuple[Finite, Finite, Finite]
+
+
+class Keys(BaseModel):
+    """Hold an animation: frames rise strictly, `fps` frames per second."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    fps: Annotated[float, Field(gt=0, le=10000, allow_inf_nan=False)]
+    interpolation: Literal["linear", "smooth"] = "linear"
+    keys: Annotated[tuple[Key, ...], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _rising(self) -> Keys:
+        frames = [key.frame for key in self.keys]
+        for before, after in zip(frames, frames[1:], strict=False):
+            if after <= before:
+                raise ValueError(f"frames must rise, frame {after:g} follows {before:g}")
+        return self
+
+    def arrays(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the key frames (K,) and their parameters d [mm] (K, 3)."""
+        return np.array([key.frame for key in self.keys]), np.array([key.d for key in self.keys])
+
+
+def load_keys(path: str | os.PathLike[str]) -> Keys:
+    """Read animation keys.
+
+    Raises:
+        FormatError: not such a file; the message names the entry.
+    """
+    path = Path(path)
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise FormatError(f"is {path.stat().st_size} bytes, at most {_MAX_BYTES} are read.", path=path)
+        return Keys.model_validate_json(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise FormatError("there is no such file.", path=path) from error
+    except UnicodeDecodeError as error:
+        raise FormatError(f"is not UTF-8 text ({error}).", path=path) from error
+    except OSError as error:
+        raise FormatError(f"cannot be read: {error.strerror}.", path=path) from error
+    except ValidationError as error:
+        problem = error.errors()[0]
+        where = ".".join(str(part) for part in problem["loc"])
+        raise FormatError(f"{where or 'the file'}: {problem['msg']}.", path=path) from error
+
+
+def save_keys(path: str | os.PathLike[str], keys: Keys) -> None:
+    """Write animation keys atomically.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    write_text_atomic(path, json.dumps(keys.model_dump(mode="json"), indent=1) + "\n")

@@ -1,0 +1,216 @@
+"""Poses and parameters as tables: CSV with a header, or JSON with the same columns.
+
+Poses:      frame, m00, m01, ... m33   (row-major T_skull_mandible [mm])
+        or  frame, tx, ty, tz, qw, qx, qy, qz
+Parameters: frame, d1, d2, d3   [mm]
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.errors import FormatError
+from jawusd.formats.atomic import write_text_atomic
+from jawusd.geometry import make_transform, matrix_from_wxyz, rigidity_defect
+
+MATRIX_COLUMNS = tuple(f"m{row}{column}" for row in range(4) for column in range(4))
+QUATERNION_COLUMNS = ("tx", "ty", "tz", "qw", "qx", "qy", "qz")
+PARAMETER_COLUMNS = ("d1", "d2", "d3")
+_MAX_BYTES = 1 << 30
+# A matrix written with 5 decimals is rigid to about this.
+_RIGID_TOLERANCE = 1e-3
+
+
+def _read_table(path: Path) -> dict[str, list[str]]:
+    """Return the columns of a CSV or JSON table as text."""
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise FormatError(f"is {path.stat().st_size} bytes, at most {_MAX_BYTES} are read.", path=path)
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError as error:
+        raise FormatError("there is no such file.", path=path) from error
+    except UnicodeDecodeError as error:
+        raise FormatError(f"is not UTF-8 text ({error}).", path=path) from error
+    except OSError as error:
+        raise FormatError(f"cannot be read: {error.strerror}.", path=path) from error
+    if path.suffix.lower() == ".json":
+        return _json_columns(text, path)
+    try:
+        rows = list(csv.reader(io.StringIO(text), strict=True))
+    except csv.Error as error:
+        raise FormatError(f"is not a CSV table ({error}).", path=path) from error
+    rows = [row for row in rows if row and not row[0].lstrip().startswith("#")]
+    if not rows:
+        raise FormatError("is empty; the first line must name the columns.", path=path)
+    header = [name.strip() for name in rows[0]]
+    if len(set(header)) != len(header):
+        raise FormatError(f"names a column twice: {', '.join(header)}.", path=path)
+    for number, row in enumerate(rows[1:], start=2):
+        if len(row) != len(header):
+            raise FormatError(f"line {number} has {len(row)} values, the header names {len(header)}.", path=path)
+    return {name: [row[i] for row in rows[1:]] for i, name in enumerate(header)}
+
+
+def _json_columns(text: str, path: Path) -> dict[str, list[str]]:
+    try:
+        records = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise FormatError(f"is not JSON ({error}).", path=path) from error
+    if not isinstance(records, list) or not all(isinstance(record, dict) for record in records):
+        raise FormatError("must be a JSON list of objects, one per frame.", path=path)
+    if not records:
+        raise FormatError("is empty.", path=path)
+    names = list(records[0])
+    for index, record in enumerate(records):
+        if set(record) != set(names):
+            raise FormatError(f"record {index} has other keys than the first one.", path=path)
+    return {name: [str(record[name]) for record in records] for name in names}
+
+
+def _numbers(columns: dict[str, list[str]], names: tuple[str, ...], path: Path) -> NDArray[np.float64]:
+    """Return the named columns as finite numbers, shape (F, len(names))."""
+    out = np.empty((len(columns[names[0]]), len(names)))
+    for j, name in enumerate(names):
+        for i, text in enumerate(columns[name]):
+            try:
+                out[i, j] = float(text)
+            except ValueError as error:
+                raise FormatError(f'row {i + 1}, column "{name}": "{text}" is not a number.', path=path) from error
+    bad = np.argwhere(~np.isfinite(out))
+    if len(bad):
+        i, j = bad[0]
+        raise FormatError(
+            f'row {i + 1}, column "{names[j]}" is {columns[names[j]][i]}; all values must be finite.',
+            path=path,
+            hint="Leave out frames without a pose.",
+        )
+    return out
+
+
+def _frames(columns: dict[str, list[str]], path: Path) -> NDArray[np.int64]:
+    if "frame" not in columns:
+        raise FormatError(f'has no column "frame"; it has {", ".join(columns) or "none"}.', path=path)
+    values = _numbers(columns, ("frame",), path)[:, 0]
+    if (values != np.round(values)).any() or np.abs(values).max(initial=0) > 2**53:
+        raise FormatError('column "frame" must hold whole numbers.', path=path)
+    return values.astype(np.int64)
+
+
+def read_poses(path: str | os.PathLike[str]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Read jaw poses from CSV or JSON.
+
+    Args:
+        path: table with matrix or quaternion columns, see the module.
+
+    Returns:
+        Frame numbers (F,) and T_skull_mandible (F, 4, 4).
+
+    Raises:
+        FormatError: columns missing, a value that is not a finite number, or a matrix that is not rigid.
+    """
+    path = Path(path)
+    columns = _read_table(path)
+    frames = _frames(columns, path)
+    if all(name in columns for name in MATRIX_COLUMNS):
+        T = _numbers(columns, MATRIX_COLUMNS, path).reshape(-1, 4, 4)
+    elif all(name in columns for name in QUATERNION_COLUMNS):
+        values = _numbers(columns, QUATERNION_COLUMNS, path)
+        norm = np.linalg.norm(values[:, 3:], axis=1)
+        if (norm < 1e-6).any():
+            raise FormatError(f"row {int(norm.argmin()) + 1}: the quaternion is zero.", path=path)
+        T = make_transform(matrix_from_wxyz(values[:, 3:]), values[:, :3])
+    else:
+        raise FormatError(
+            f"has neither the columns m00 ... m33 nor {', '.join(QUATERNION_COLUMNS)}; it has {', '.join(columns)}.",
+            path=path,
+        )
+    return frames, _checked_rigid(T, path)
+
+
+def _checked_rigid(T: NDArray[np.float64], path: Path) -> NDArray[np.float64]:
+    defect = rigidity_defect(T) if len(T) else np.zeros(0)
+    if defect.size and defect.max() > _RIGID_TOLERANCE:
+        raise FormatError(
+            f"row {int(defect.argmax()) + 1}: the matrix is not rigid (off by {defect.max():.2g}, "
+            f"allowed {_RIGID_TOLERANCE:g}).",
+            path=path,
+            hint="Matrices are row-major with the translation [mm] in the last column.",
+        )
+    return T
+
+
+def read_parameters(path: str | os.PathLike[str]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Read parameters d from CSV or JSON.
+
+    Returns:
+        Frame numbers (F,) and d [mm] (F, 3).
+
+    Raises:
+        FormatError: columns missing, or a value that is not a finite number.
+    """
+    path = Path(path)
+    columns = _read_table(path)
+    frames = _frames(columns, path)
+    missing = [name for name in PARAMETER_COLUMNS if name not in columns]
+    if missing:
+        raise FormatError(f'has no column "{missing[0]}"; it has {", ".join(columns)}.', path=path)
+    return frames, _numbers(columns, PARAMETER_COLUMNS, path)
+
+
+def table_columns(path: str | os.PathLike[str]) -> tuple[str, ...]:
+    """Return the column names of a CSV or JSON table.
+
+    Raises:
+        FormatError: the file is not such a table.
+    """
+    return tuple(_read_table(Path(path)))
+
+
+def write_poses(path: str | os.PathLike[str], frames: NDArray[np.int64], T: NDArray[np.float64]) -> None:
+    """Write jaw poses as CSV with matrix columns, atomically and with all digits.
+
+    Args:
+        path: file to write.
+        frames: frame numbers, shape (F,).
+        T: T_skull_mandible, shape (F, 4, 4).
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    write_table(path, ("frame", *MATRIX_COLUMNS), frames, np.asarray(T).reshape(len(frames), 16))
+
+
+def write_parameters(path: str | os.PathLike[str], frames: NDArray[np.int64], d: NDArray[np.float64]) -> None:
+    """Write parameters d [mm] (F, 3) as CSV, atomically and with all digits.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    write_table(path, ("frame", *PARAMETER_COLUMNS), frames, d)
+
+
+def write_table(
+    path: str | os.PathLike[str], header: tuple[str, ...], frames: NDArray[np.int64], values: NDArray[np.float64]
+) -> None:
+    """Write a CSV table of one frame column and numbers, atomically.
+
+    Args:
+        path: file to write.
+        header: column names, the frame's first.
+        frames: frame numbers, shape (F,).
+        values: numbers, shape (F, len(header) - 1).
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    lines = [",".join(header)]
+    for frame, row in zip(frames, values, strict=True):
+        lines.append(",".join([str(int(frame)), *(repr(float(value)) for value in row)]))
+    write_text_atomic(path, "\n".join([*lines, ""]))
