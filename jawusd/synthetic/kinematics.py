@@ -1,0 +1,245 @@
+"""A temporomandibular joint: two condyles on curved eminences, steered by opening, lateral and protrusion controls.
+
+Frame: scan frame (x to the subject's left, y up, z anterior, mm), teeth in occlusion at identity. The mandible has four
+joint coordinates: the pitch about the condylar axis, the forward slide of each condyle, and the side shift. Heights
+follow from the eminences, the spread of the condyles from the constant distance between them, so every pose keeps both
+condyles on their slopes. The form (joint surfaces, guidance, ranges) follows textbook TMJ mechanics (Posselt 1952,
+Okeson 2019) and shares nothing with the models jawusd fits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jawusd.geometry import make_transform, so3_exp
+
+Array = NDArray[np.float64]
+
+# Pitch [rad] at which the tooth contact has let go of the mandible: one e-folding of its Gaussian fade.
+_CONTACT_FADE_RAD = np.deg2rad(4.0)
+# Rounding [mm] of the corners in the tooth guidance: cusps are not knife edges.
+_CUSP_ROUNDING_MM = 0.3
+
+
+@dataclass(frozen=True)
+class Joint:
+    """Parameters of one person's joint; pairs are (left, right), lengths mm, angles rad.
+
+    Attributes:
+        condyles: centres of the condyles at rest, shape (2, 3).
+        incisor: lower incisal point at rest, shape (3,).
+        eminence_height_mm: drop of each eminence from fossa to the far side of its crest, shape (2,).
+        eminence_width_mm: half width of the slope, shape (2,).
+        eminence_start_mm: forward distance from rest to the steepest point, shape (2,).
+        medial_slope: drop per medial mm, shape (2,).
+        bennett_rad: angle of each condyle's path to the sagittal plane when it is the balancing one, shape (2,).
+        side_shift_mm: immediate side shift when that side works, shape (2,).
+        lateral_max_mm: largest difference of the two slides when that side works, shape (2,).
+        lateral_shrink: share of it that is lost at full opening.
+        working_share: share of that difference which the balancing condyle takes, closed.
+        rotation_max_rad: pitch at full opening.
+        rotation_bend: curvature of pitch over opening (0: proportional).
+        slide_open_mm: forward slide at full opening.
+        slide_limit_mm: forward slide at which a condyle is stopped.
+        slide_early: share of the slide that follows the rotation from the first millimetre.
+        slide_onset: opening (0..1) by which that share has come up to speed.
+        protrusion_max_mm: forward slide in full protrusion, closed.
+        retrusion_max_mm: backward slide in full retrusion, closed.
+        hinge_share: share of the opening slide that retrusion takes back while the mouth is less than half open.
+        deviation_mm: sideways wander of the opening path: S-shaped and one-sided part, shape (2,).
+        protrusive_guidance: glide of the teeth: initial slope, later slope, transition [mm], shape (3,).
+        lateral_guidance: same for lateral movements, shape (3,).
+    """
+
+    condyles: Array
+    incisor: Array
+    eminence_height_mm: Array
+    eminence_width_mm: Array
+    eminence_start_mm: Array
+    medial_slope: Array
+    bennett_rad: Array
+    side_shift_mm: Array
+    lateral_max_mm: Array
+    lateral_shrink: float
+    working_share: float
+    rotation_max_rad: float
+    rotation_bend: float
+    slide_open_mm: float
+    slide_limit_mm: float
+    slide_early: float
+    slide_onset: float
+    protrusion_max_mm: float
+    retrusion_max_mm: float
+    hinge_share: float
+    deviation_mm: Array
+    protrusive_guidance: Array
+    lateral_guidance: Array
+
+    @property
+    def lever_mm(self) -> float:
+        """Distance [mm] from the condylar axis forward to the lower incisors."""
+        return float(self.incisor[2] - self.condyles[:, 2].mean())
+
+    @property
+    def condylar_distance_mm(self) -> float:
+        """Distance [mm] between the condyle centres; the same in every pose."""
+        return float(np.linalg.norm(self.condyles[0] - self.condyles[1]))
+
+
+def smoothstep(x: ArrayLike) -> Array:
+    """Blend from 0 to 1 over 0..1 with zero end slopes, any shape."""
+    x = np.clip(x, 0.0, 1.0)
+    return x * x * (3.0 - 2.0 * x)
+
+
+def eminence(joint: Joint, side: int, slide_mm: ArrayLike, medial_mm: ArrayLike = 0.0) -> Array:
+    """Return the height [mm] of a condyle centre over its rest height, negative going down the eminence.
+
+    The sagittal section is an S (concave fossa, slope, convex crest) in closed form, flat far in front and behind.
+
+    Args:
+        joint: the joint.
+        side: 0 left, 1 right.
+        slide_mm: forward distance from rest, any shape.
+        medial_mm: displacement towards the midline, same shape.
+    """
+    slide = np.asarray(slide_mm, dtype=np.float64)
+    start, width = joint.eminence_start_mm[side], joint.eminence_width_mm[side]
+    height = -joint.eminence_height_mm[side] / 2 * (np.tanh((slide - start) / width) + np.tanh(start / width))
+    return height - joint.medial_slope[side] * np.asarray(medial_mm) * smoothstep(slide / 8.0)
+
+
+def joint_pose(
+    joint: Joint, pitch_rad: ArrayLike, slides_mm: ArrayLike, shift_mm: ArrayLike, lifts_mm: ArrayLike
+) -> Array:
+    """Return the mandible poses that put both condyles on their eminences.
+
+    Args:
+        joint: the joint.
+        pitch_rad: opening rotation about the condylar axis, shape (...).
+        slides_mm: forward slide of the (left, right) condyle, shape (..., 2).
+        shift_mm: shift of the condylar midpoint to the left, shape (...).
+        lifts_mm: distance of the (left, right) condyle below its eminence, shape (..., 2).
+
+    Returns:
+        T_skull_mandible, shape (..., 4, 4).
+    """
+    pitch, slides, shift = np.asarray(pitch_rad), np.asarray(slides_mm), np.asarray(shift_mm)
+    lifts = np.asarray(lifts_mm)
+    left, right = joint.condyles
+    rest_axis = left - right
+    distance = joint.condylar_distance_mm
+    spread = np.full(pitch.shape, rest_axis[0])
+    middle_x = (left[0] + right[0]) / 2 + shift
+    for _ in range(4):  # heights depend on the spread and back; each round gains two digits
+        y_left = left[1] + eminence(joint, 0, slides[..., 0], left[0] - middle_x - spread / 2) - lifts[..., 0]
+        y_right = right[1] + eminence(joint, 1, slides[..., 1], middle_x - spread / 2 - right[0]) - lifts[..., 1]
+        dy, dz = y_left - y_right, rest_axis[2] + slides[..., 0] - slides[..., 1]
+        spread = np.sqrt(distance**2 - dy**2 - dz**2)
+    unit, rest_unit = np.stack([spread, dy, dz], -1) / distance, rest_axis / distance
+    middle = np.stack([middle_x, (y_left + y_right) / 2, (left[2] + right[2] + slides.sum(-1)) / 2], -1)
+    normal = np.cross(np.broadcast_to(rest_unit, unit.shape), unit)
+    sine = np.linalg.norm(normal, axis=-1)
+    scale = np.where(sine > 1e-9, np.arcsin(np.minimum(sine, 1.0)) / np.maximum(sine, 1e-9), 1.0)
+    R = so3_exp(normal * scale[..., None]) @ so3_exp(pitch[..., None] * rest_unit)
+    return make_transform(R, middle - R @ ((left + right) / 2))
+
+
+def controlled_pose(
+    joint: Joint, opening: ArrayLike, lateral: ArrayLike, protrusion: ArrayLike, extra_mm: ArrayLike | None = None
+) -> Array:
+    """Return mandible poses for controls; outside their ranges the ranges continue smoothly.
+
+    Args:
+        joint: the joint.
+        opening: 0 closed .. 1 wide open, shape (...).
+        lateral: -1 right .. 1 left, of the range at that opening, shape (...).
+        protrusion: -1 retruded .. 1 protruded, of the range at that opening, shape (...).
+        extra_mm: small movements outside the three controls: side shift, lift of the left and of the right condyle,
+            shape (..., 3); None is zero.
+
+    Returns:
+        T_skull_mandible, shape (..., 4, 4); the identity for zero controls.
+    """
+    opening, lateral, protrusion = np.broadcast_arrays(
+        *(np.asarray(c, dtype=np.float64) for c in (opening, lateral, protrusion))
+    )
+    extra = np.zeros((*opening.shape, 3)) if extra_mm is None else np.asarray(extra_mm, dtype=np.float64)
+    wide = np.clip(opening, -0.1, 1.15)
+    share = _coupling(joint, np.maximum(wide, 0.0))
+    habitual_mm = joint.slide_open_mm * share
+    mean_mm = habitual_mm + protrusion * _protrusive_range(joint, wide, share, protrusion)
+    difference_mm = lateral * _lateral_range(joint, wide, mean_mm, lateral)
+    balancing = joint.working_share - 0.45 * smoothstep(wide)
+    slides = _slides(mean_mm, difference_mm, balancing)
+    shift = _side_shift(joint, wide, difference_mm, balancing)
+    pitch = joint.rotation_max_rad * wide * (1.0 + joint.rotation_bend * (1.0 - wide))
+    pitch = _guided(joint, pitch, slides, mean_mm - habitual_mm, difference_mm)
+    return joint_pose(joint, pitch, slides, shift + extra[..., 0], extra[..., 1:])
+
+
+def _coupling(joint: Joint, opening: Array) -> Array:
+    """Share of the opening slide at an opening: translation starts early but lags behind the rotation."""
+    onset = joint.slide_onset
+    early = opening**2 * (1.0 + onset) / (opening + onset)
+    return joint.slide_early * early + (1.0 - joint.slide_early) * smoothstep(opening)
+
+
+def _protrusive_range(joint: Joint, opening: Array, share: Array, protrusion: Array) -> Array:
+    """Forward or, for negative protrusion, backward room [mm] of both condyles."""
+    forward = joint.protrusion_max_mm * (1.0 - 0.85 * np.clip(share, 0.0, 1.1))
+    hinge = joint.hinge_share * joint.slide_open_mm * share * (1.0 - smoothstep((opening - 0.3) / 0.5))
+    backward = joint.retrusion_max_mm * (1.0 - np.clip(opening, 0.0, 1.0)) + 0.15 + hinge
+    return np.where(protrusion > 0, forward, backward)
+
+
+def _lateral_range(joint: Joint, opening: Array, mean_mm: Array, lateral: Array) -> Array:
+    """Largest difference of the slides [mm], also limited by the stop in front of the balancing condyle."""
+    own = np.where(lateral > 0, joint.lateral_max_mm[0], joint.lateral_max_mm[1])
+    own = own * (1.0 - joint.lateral_shrink * np.clip(opening, 0.0, 1.1) ** 1.1)
+    room = (joint.slide_limit_mm + 1.2 - mean_mm) / (joint.working_share - 0.45 * smoothstep(opening))
+    return np.maximum(-0.6 * np.logaddexp(-own / 0.6, -room / 0.6), 0.3)
+
+
+def _slides(mean_mm: Array, difference_mm: Array, balancing: Array) -> Array:
+    """Slides of the (left, right) condyle; in a movement to the left the right condyle is the balancing one."""
+    forward, backward = balancing * np.abs(difference_mm), (1.0 - balancing) * np.abs(difference_mm)
+    to_left = difference_mm > 0
+    left = mean_mm + np.where(to_left, -backward, forward)
+    right = mean_mm + np.where(to_left, forward, -backward)
+    return np.stack([left, right], -1)
+
+
+def _side_shift(joint: Joint, opening: Array, difference_mm: Array, balancing: Array) -> Array:
+    """Shift of the condylar midpoint to the left [mm]: Bennett movement and the wander of the opening path."""
+    size = np.abs(difference_mm)
+    # the balancing condyle's own path makes the Bennett angle: the right one in a movement to the left
+    tangent = np.tan(np.where(difference_mm > 0, joint.bennett_rad[1], joint.bennett_rad[0]))
+    immediate = np.where(difference_mm > 0, joint.side_shift_mm[0], joint.side_shift_mm[1])
+    bennett = tangent * balancing * size + immediate * np.tanh(size / 1.5) * (1.0 - smoothstep(opening / 0.6))
+    wander = joint.deviation_mm[0] * np.sin(2 * np.pi * np.clip(opening, 0.0, 1.0))
+    return np.sign(difference_mm) * bennett + wander + joint.deviation_mm[1] * smoothstep(opening)
+
+
+def _guided(joint: Joint, pitch: Array, slides: Array, forward_mm: Array, difference_mm: Array) -> Array:
+    """Pitch with tooth contact: near closure the incisors drop along the glide, whatever the condyles do."""
+    lateral_mm = difference_mm * joint.lever_mm / joint.condylar_distance_mm
+    drop_mm = _glide(joint.protrusive_guidance, _soft_positive(forward_mm))
+    drop_mm = drop_mm + _glide(joint.lateral_guidance, np.hypot(lateral_mm, _CUSP_ROUNDING_MM) - _CUSP_ROUNDING_MM)
+    condyles_mm = (eminence(joint, 0, slides[..., 0]) + eminence(joint, 1, slides[..., 1])) / 2
+    contact = (drop_mm + condyles_mm) / joint.lever_mm
+    return pitch + contact * np.exp(-((pitch / _CONTACT_FADE_RAD) ** 2))
+
+
+def _glide(guidance: Array, distance_mm: Array) -> Array:
+    """Drop [mm] of the lower incisors after a glide: steep at first, flatter towards edge-to-edge."""
+    steep, flat, transition_mm = guidance
+    return flat * distance_mm + (steep - flat) * transition_mm * -np.expm1(-distance_mm / transition_mm)
+
+
+def _soft_positive(x: Array) -> Array:
+    """Positive part with a rounded corner, zero at zero."""
+    return (x + np.hypot(x, _CUSP_ROUNDING_MM) - _CUSP_ROUNDING_MM) / 2

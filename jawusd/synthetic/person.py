@@ -1,0 +1,198 @@
+"""A synthetic person: seeded joint parameters within human ranges, poses, and the truth about which poses are possible.
+
+Ranges: opening and excursions after Hirsch et al. 2006 and Travers et al. 2000, condylar inclination and Bennett angle
+after Johnson and Winstanley 1997 and Cadiax studies, condylar travel after Muto and Kanazawa 1996.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jawusd.geometry import transform_points
+from jawusd.synthetic.envelope import Envelope
+from jawusd.synthetic.kinematics import Joint, controlled_pose
+
+Array = NDArray[np.float64]
+EnvelopeKind = Literal["box", "competing"]
+
+
+def _asymmetric(rng: np.random.Generator, value: float, relative: float) -> Array:
+    """Left and right value around a common one."""
+    return value * (1.0 + relative * rng.uniform(-1.0, 1.0, 2))
+
+
+def _draw_joint(rng: np.random.Generator) -> Joint:
+    """Draw the joint of one person."""
+    u = rng.uniform
+    half_distance, middle_x = u(47.0, 53.0), u(-0.7, 0.7)
+    height, depth = u(41.0, 47.0), u(86.0, 92.0)
+    skew = np.array([u(-0.8, 0.8), u(-1.2, 1.2)])
+    condyles = np.array(
+        [[side * half_distance + middle_x, height + side * skew[0], -depth + side * skew[1]] for side in (1, -1)]
+    )
+    slide_open = u(10.0, 13.0)
+    return Joint(
+        condyles=condyles,
+        incisor=np.array([u(-0.4, 0.4), u(1.6, 2.2), -u(2.6, 3.2)]),
+        eminence_height_mm=_asymmetric(rng, u(9.5, 11.5), 0.08),
+        eminence_width_mm=_asymmetric(rng, u(5.6, 6.6), 0.06),
+        eminence_start_mm=_asymmetric(rng, u(4.2, 5.8), 0.10),
+        medial_slope=u(0.03, 0.10, 2),
+        bennett_rad=np.deg2rad(u(7.0, 16.0, 2)),
+        side_shift_mm=u(0.1, 0.6, 2),
+        lateral_max_mm=_asymmetric(rng, u(6.4, 7.8), 0.09),
+        lateral_shrink=u(0.70, 0.85),
+        working_share=u(0.95, 0.98),
+        rotation_max_rad=np.deg2rad(u(29.0, 34.0)),
+        rotation_bend=u(-0.12, 0.12),
+        slide_open_mm=slide_open,
+        slide_limit_mm=slide_open + u(1.3, 2.5),
+        slide_early=u(0.2, 0.8),
+        slide_onset=u(0.05, 0.2),
+        protrusion_max_mm=u(7.0, 9.0),
+        retrusion_max_mm=u(0.7, 1.2),
+        hinge_share=u(0.5, 0.75),
+        deviation_mm=np.array([u(-0.45, 0.45), u(-0.5, 0.5)]),
+        protrusive_guidance=np.array([u(0.5, 0.7), u(0.12, 0.22), u(2.5, 3.5)]),
+        lateral_guidance=np.array([u(0.35, 0.5), u(0.08, 0.15), u(2.5, 3.5)]),
+    )
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations of what the three controls do not explain.
+
+    Attributes:
+        tracking_mm: tracking noise at the middle of the dental arch, per axis, independent between frames.
+        tracking_rad: tracking noise of the rotation, per axis, independent between frames.
+        side_mm: side shift outside the three controls, smooth in time.
+        lift_mm: lift of each condyle off its eminence, smooth in time.
+    """
+
+    tracking_mm: float
+    tracking_rad: float
+    side_mm: float
+    lift_mm: float
+
+
+class Person:
+    """One synthetic person, all numbers drawn from the seed.
+
+    Attributes:
+        seed: the seed.
+        joint: parameters of the joint.
+        noise: sizes of tracking noise and extra movements.
+        landmarks: incisal point, left and right first molar, left and right condyle centre on the mandible, scan frame,
+            shape (5, 3), in the order of `jawusd.geometry.LANDMARKS`.
+        mandible_points: points spread over the whole mandible, scan frame, shape (42, 3); errors of poses are measured
+            on them.
+    """
+
+    def __init__(self, seed: int, envelope: EnvelopeKind = "box") -> None:
+        """Draw a person.
+
+        Args:
+            seed: any non-negative integer.
+            envelope: "box": lateral and protrusive range do not depend on each other; "competing": a wide lateral
+                movement leaves less room for protrusion (|lateral|^1.3 + protrusion^1.3 <= 1).
+
+        Raises:
+            ValueError: unknown envelope.
+        """
+        if envelope not in ("box", "competing"):
+            raise ValueError(f"envelope must be 'box' or 'competing', got {envelope!r}")
+        rng = np.random.default_rng([seed, 0x7A77])
+        self.seed = seed
+        self.joint = _draw_joint(rng)
+        self.noise = Noise(0.12, float(np.deg2rad(0.08)), rng.uniform(0.12, 0.25), rng.uniform(0.08, 0.15))
+        self.mandible_points = _mandible_points(self.joint)
+        self.landmarks = np.concatenate([_dental_landmarks(self.joint), self.joint.condyles])
+        self._envelope = Envelope(self.pose, self.mandible_points, exponent=1.3 if envelope == "competing" else None)
+
+    def pose(self, opening: ArrayLike, lateral: ArrayLike, protrusion: ArrayLike) -> Array:
+        """Return mandible poses on the person's three-parameter manifold.
+
+        Args:
+            opening: 0 closed .. 1 wide open, shape (...).
+            lateral: -1 full right .. 1 full left, of the range at that opening, shape (...).
+            protrusion: -1 fully retruded .. 1 fully protruded, of the range at that opening, shape (...).
+
+        Returns:
+            T_skull_mandible, shape (..., 4, 4); the identity (closed bite) for zero controls.
+        """
+        return controlled_pose(self.joint, opening, lateral, protrusion)
+
+    def pose_with_extra(self, controls: ArrayLike, extra_mm: ArrayLike) -> Array:
+        """Return poses that also move outside the three controls.
+
+        Args:
+            controls: opening, lateral, protrusion, shape (..., 3).
+            extra_mm: side shift, lift of the left and of the right condyle, shape (..., 3).
+
+        Returns:
+            T_skull_mandible, shape (..., 4, 4).
+        """
+        return controlled_pose(self.joint, *np.moveaxis(np.asarray(controls, dtype=np.float64), -1, 0), extra_mm)
+
+    def limit(self, controls: ArrayLike) -> Array:
+        """Bring controls into the envelope, shape (..., 3); what is inside stays."""
+        return self._envelope.limit(np.asarray(controls, dtype=np.float64))
+
+    def nearest(self, T_skull_mandible: ArrayLike, bounded: bool = True) -> tuple[Array, Array]:
+        """Find the poses of the manifold nearest to given ones, in the rms distance of the mandible points.
+
+        Args:
+            T_skull_mandible: shape (..., 4, 4).
+            bounded: stay within the envelope; False lets the controls leave it (the floor of any three-parameter fit).
+
+        Returns:
+            controls, shape (..., 3), and the largest distance of a mandible point [mm], shape (...).
+        """
+        return self._envelope.nearest(np.asarray(T_skull_mandible, dtype=np.float64), bounded)
+
+    def is_valid(self, T_skull_mandible: ArrayLike, tolerance_mm: float = 1.0) -> NDArray[np.bool_]:
+        """Tell which poses this person can take: no mandible point further than the tolerance from a possible pose.
+
+        Args:
+            T_skull_mandible: shape (..., 4, 4).
+            tolerance_mm: allowed distance [mm]; the extra movements alone reach 0.7.
+
+        Returns:
+            Verdicts, shape (...).
+        """
+        return self.nearest(T_skull_mandible)[1] <= tolerance_mm
+
+    def incisor(self, T_skull_mandible: ArrayLike) -> Array:
+        """Return the displacement of the lower incisal point from rest [mm], scan axes, shape (..., 3)."""
+        return transform_points(T_skull_mandible, self.joint.incisor) - self.joint.incisor
+
+
+def _dental_landmarks(joint: Joint) -> Array:
+    """Incisal point and the first molars (left, right), scan frame, shape (3, 3)."""
+    x, y, z = joint.incisor
+    return np.array([[x, y, z], [x + 22.0, y + 0.5, z - 26.0], [x - 22.0, y + 0.5, z - 26.0]])
+
+
+def _mandible_points(joint: Joint) -> Array:
+    """Points on condyles, coronoids, rami, lower border, chin and teeth, scan frame, shape (42, 3)."""
+    x, y, z = joint.incisor
+    points = []
+    for side, centre in zip((1.0, -1.0), joint.condyles, strict=True):
+        from_condyle = np.array(
+            [
+                [9, 0, 0], [-9, 0, 0], [0, 4, 0], [0, 0, -4], [0, 0, 5], [0, -18, -3],  # head and neck of the condyle
+                [-3, 4, 26], [-2, -12, 20],  # coronoid and notch
+                [-4, -45, 0], [-2, -58, 10], [-6, -30, 14], [-14, -62, 35], [-22, -66, 60],  # ramus and lower border
+            ]
+        )  # fmt: skip
+        points.append(centre + from_condyle * [side, 1, 1])
+        from_incisor = np.array(
+            [[22, -26, -7], [27, 6, -42], [24, 3, -28], [16, 1, -9], [6, 0, -1], [10, -32, -4], [9, -16, -2]]
+        )
+        points.append([x, y, z] + from_incisor * [side, 1, 1])
+    points.append([[x, y, z], [x, y - 34, z - 6]])
+    return np.concatenate(points).astype(np.float64)
