@@ -1,0 +1,1 @@
+"""Poses of both rows of teeth from masks in several views."""

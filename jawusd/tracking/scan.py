@@ -1,0 +1,128 @@
+"""A teeth scan prepared for tracking: crowns with an edge table, gum as occluder, the crown-gum line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.errors import TrackingError
+from jawusd.formats.mesh import Mesh
+from jawusd.tracking.margin import crown_gum_segments
+
+# How far red or green must stand out from the other channels (of 255) for a vertex to count as painted crown:
+# label colours stand out by more than 100, the pinks and ivories of photographic scan textures by less.
+_PAINT_CONTRAST = 60
+_FEWEST_CROWN_FACES = 100  # fewer cannot show a contour in several directions
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """Hold one row of teeth ready for projection.
+
+    Attributes:
+        name: "upper" or "lower".
+        vertices: welded vertices in scan coordinates [mm], float64, shape (V, 3).
+        vertices_single: the same in float32 for the rasteriser.
+        crown_faces: faces to be matched, int32, shape (F, 3).
+        gum_faces: faces that only hide what lies behind them, int32, shape (G, 3).
+        planes: normal and offset (n, n.p) of every crown face, shape (F, 4); only signs of n.x - offset are used.
+        edges: vertex, vertex, face, other face or -1 at a border, int32, shape (E, 4).
+        margin: segments of the crown-gum line that are no mesh edges [mm], shape (S, 2, 3).
+        centre: centroid of the crown vertices [mm], shape (3,).
+        radius_mm: largest distance of a crown vertex from the centre.
+        painted: whether the scan's colours told crown from gum; otherwise the whole scan counts as crown.
+    """
+
+    name: str
+    vertices: NDArray[np.float64]
+    vertices_single: NDArray[np.float32]
+    crown_faces: NDArray[np.int32]
+    gum_faces: NDArray[np.int32]
+    planes: NDArray[np.float64]
+    edges: NDArray[np.int32]
+    margin: NDArray[np.float64]
+    centre: NDArray[np.float64]
+    radius_mm: float
+    painted: bool
+
+    def crown_vertices(self, limit: int | None = None) -> NDArray[np.float64]:
+        """Return the vertices of the crowns [mm], shape (N, 3), at most about `limit` of them."""
+        points = self.vertices[np.unique(self.crown_faces)]
+        return points if limit is None else points[:: max(1, len(points) // limit)]
+
+
+def prepare_scan(mesh: Mesh, name: str) -> Scan:
+    """Split a teeth scan into crowns and gum and build the tables of the contour search.
+
+    Args:
+        mesh: the teeth scan; vertex colours red and green mark crowns, anything else gum. Without such colours the
+            whole scan counts as crown.
+        name: "upper" or "lower", for messages.
+
+    Raises:
+        TrackingError: the scan has too few faces to be tracked.
+    """
+    vertices, faces = _weld(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int32))
+    crown = np.ones(len(faces), bool)
+    painted = False
+    if mesh.colors is not None:
+        paint = _painted(np.asarray(mesh.colors))[np.asarray(mesh.faces)].sum(1) >= 2
+        # A handful of reddish vertices is no labelling.
+        painted = paint.sum() >= _FEWEST_CROWN_FACES
+        crown = paint if painted else crown
+    solid = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    crown_faces = np.ascontiguousarray(faces[crown & solid])
+    gum_faces = np.ascontiguousarray(faces[~crown & solid])
+    if len(crown_faces) < _FEWEST_CROWN_FACES:
+        raise TrackingError(
+            f"{name} teeth scan: {len(crown_faces)} tooth faces, at least {_FEWEST_CROWN_FACES} are needed",
+            hint="Check the scan file and that its teeth are painted red and green.",
+        )
+    corner = vertices[crown_faces]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    centre = vertices[np.unique(crown_faces)].mean(0)
+    return Scan(
+        name=name,
+        vertices=vertices,
+        vertices_single=vertices.astype(np.float32),
+        crown_faces=crown_faces,
+        gum_faces=gum_faces,
+        planes=np.column_stack([normal, np.einsum("ij,ij->i", normal, corner[:, 0])]),
+        edges=_edge_table(crown_faces),
+        margin=crown_gum_segments(vertices, crown_faces, gum_faces),
+        centre=centre,
+        radius_mm=float(np.linalg.norm(corner.reshape(-1, 3) - centre, axis=1).max()),
+        painted=bool(painted),
+    )
+
+
+def _painted(colors: NDArray) -> NDArray[np.bool_]:
+    rgb = colors[:, :3].astype(np.int16)
+    red = rgb[:, 0] - np.maximum(rgb[:, 1], rgb[:, 2])
+    green = rgb[:, 1] - np.maximum(rgb[:, 0], rgb[:, 2])
+    return np.maximum(red, green) > _PAINT_CONTRAST
+
+
+def _weld(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> tuple[NDArray, NDArray[np.int32]]:
+    """Merge vertices at the same place: triangle soups would otherwise consist of borders only."""
+    unique, inverse = np.unique(vertices, axis=0, return_inverse=True)
+    return np.ascontiguousarray(unique), np.ascontiguousarray(inverse.reshape(-1)[faces], np.int32)
+
+
+def _edge_table(faces: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Return vertex, vertex, face, other face (-1 at a border) of every edge, shape (E, 4).
+
+    Where more than two faces meet in an edge, all but the first two are paired off as edges of their own.
+    """
+    pairs = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    owner = np.repeat(np.arange(len(faces), dtype=np.int32), 3)
+    order = np.lexsort((owner, pairs[:, 1], pairs[:, 0]))
+    pairs, owner = pairs[order], owner[order]
+    new = np.r_[True, (pairs[1:] != pairs[:-1]).any(1)]
+    rank = np.arange(len(pairs)) - np.flatnonzero(new)[np.cumsum(new) - 1]
+    first = rank % 2 == 0
+    has_second = np.r_[~first[1:], False]
+    second = np.where(has_second, np.r_[owner[1:], -1], -1)
+    return np.ascontiguousarray(np.column_stack([pairs, owner, second])[first], np.int32)

@@ -1,0 +1,217 @@
+"""Gauss-Newton alignment of both rows of teeth with their masks in all views at one instant."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.geometry import make_transform, orthonormalise, se3_exp, transform_points
+from jawusd.imaging.raster import draw_depth_labels, project
+from jawusd.tracking.config import TrackingConfig
+from jawusd.tracking.contour import CROWN, GUM, contour_samples
+from jawusd.tracking.correspond import accumulate, search_edges
+from jawusd.tracking.scan import Scan
+
+_ROWS = (0, 1)  # upper, lower
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """Hold what one camera shows of both rows of teeth at one instant, undistorted, at the working size.
+
+    Attributes:
+        matrix: world [mm] to homogeneous px of this picture, shape (3, 4).
+        eye: camera centre in the world [mm], shape (3,).
+        masks: of the upper and the lower row, uint8, 255 = teeth, shape (2, h, w); zeros where there is none.
+        present: which of the two masks exist, shape (2,).
+    """
+
+    matrix: NDArray[np.float64]
+    eye: NDArray[np.float64]
+    masks: NDArray[np.uint8]
+    present: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Hold the outcome of one alignment.
+
+    Attributes:
+        poses: T_world_upper and T_world_lower, shape (2, 4, 4).
+        systems: normal equations per row and view as `accumulate` sums them, shape (2, C, 8, 8).
+        centres: points the twists turn about, world coordinates [mm], shape (2, 3).
+        visible_px: contour length that could have been matched, per row and view [px], shape (2, C).
+        iterations: how many linearised steps were taken.
+    """
+
+    poses: NDArray[np.float64]
+    systems: NDArray[np.float64]
+    centres: NDArray[np.float64]
+    visible_px: NDArray[np.float64]
+    iterations: int
+
+
+class ContourSolver:
+    """Align two scans with masks; keeps buffers, so one solver serves one thread of control."""
+
+    def __init__(self, scans: Sequence[Scan], config: TrackingConfig, executor: Executor | None = None) -> None:
+        self.scans = tuple(scans)
+        self.config = config
+        self._map: Callable[..., Iterable] = executor.map if executor else map
+        self._points = [[] for _ in _ROWS]
+
+    def solve(
+        self,
+        poses: NDArray[np.float64],
+        views: Sequence[View],
+        gates_px: Sequence[float],
+        use: NDArray[np.bool_] | None = None,
+    ) -> Solution:
+        """Align both rows, starting from given poses.
+
+        Args:
+            poses: start T_world_upper, T_world_lower, shape (2, 4, 4).
+            views: one picture per camera.
+            gates_px: residual gate of every iteration.
+            use: masks that take part, shape (2, C); by default all present ones.
+        """
+        poses = np.array(poses, np.float64)
+        use = np.array([[v.present[r] for v in views] for r in _ROWS]) if use is None else use
+        render = _Rendering(self, views)
+        for iteration, gate in enumerate(gates_px, start=1):
+            state = self._linearise(poses, views, use, gate, render)
+            step = self._step(state)
+            for r in _ROWS:
+                poses[r] = _moved(poses[r], step[r], state.centres[r])
+            if gate == gates_px[-1] and self._motion_mm(step) < self.config.converged_mm:
+                break
+        state = self._linearise(poses, views, use, gates_px[-1], render)
+        return Solution(poses, state.systems, state.centres, state.visible_px, iteration)
+
+    def _linearise(self, poses, views, use, gate, render: _Rendering) -> Solution:
+        """Find correspondences at the given poses and sum up the normal equations."""
+        config = self.config
+        render.update(poses)
+        tasks = [(r, c) for r in _ROWS for c in range(len(views)) if use[r, c]]
+        centres = np.stack([transform_points(poses[r], self.scans[r].centre) for r in _ROWS])
+        reach = gate + 1.0
+
+        def match(task):
+            r, c = task
+            return self._match(poses[r], views[c], r, render.labels[c], render.depths[c], reach)
+
+        matches = dict(zip(tasks, self._map(match, tasks), strict=True))
+        systems = np.zeros((2, len(views), 8, 8))
+        visible = np.zeros((2, len(views)))
+        for r in _ROWS:
+            used = gate
+            if gate <= config.final_gate_px[1]:
+                used = self._final_gate([matches[t][1] for t in tasks if t[0] == r], gate)
+            pull = config.pull if gate > config.pull_above_px else 0.0
+            for c in range(len(views)):
+                if use[r, c]:
+                    samples, distances, visible[r, c] = matches[r, c]
+                    accumulate(samples, distances, used, pull, poses[r], views[c].matrix, centres[r], systems[r, c])
+        return Solution(poses, systems, centres, visible, 0)
+
+    def _match(self, pose, view: View, r: int, labels, depths, reach):
+        config, scan = self.config, self.scans[r]
+        eye = pose[:3, :3].T @ (view.eye - pose[:3, 3])
+        samples = contour_samples(
+            scan, view.matrix @ pose, eye, labels[r], depths[r], config.sample_step_px, config.depth_tolerance_mm
+        )
+        distances = np.empty(len(samples))
+        search_edges(
+            samples,
+            view.masks[r],
+            view.masks[1 - r],
+            depths[1 - r],
+            reach,
+            config.overlap_tolerance_mm,
+            config.normal_cosine,
+            distances,
+        )
+        return samples, distances, float(samples[:, 7].sum())
+
+    def _final_gate(self, distances: list[NDArray], gate: float) -> float:
+        """Return the Tukey gate that suits the spread of the residuals (median absolute deviation)."""
+        d = np.concatenate(distances) if distances else np.empty(0)
+        d = np.abs(d[np.isfinite(d)])
+        d = d[d < gate]
+        if len(d) < 20:
+            return gate
+        return float(np.clip(self.config.gate_sigmas * 1.4826 * np.median(d), *self.config.final_gate_px))
+
+    def _step(self, state: Solution) -> NDArray[np.float64]:
+        """Solve the joint 12x12 normal equations; twists about the centres, shape (2, 6)."""
+        H, g = np.zeros((12, 12)), np.zeros(12)
+        for r in _ROWS:
+            total = state.systems[r].sum(0)
+            H[6 * r : 6 * r + 6, 6 * r : 6 * r + 6] = total[:6, :6]
+            g[6 * r : 6 * r + 6] = total[:6, 6]
+        H += np.diag(self.config.damping * np.diag(H) + 1e-9)
+        return np.linalg.solve(H, g).reshape(2, 6)
+
+    def _motion_mm(self, step: NDArray[np.float64]) -> float:
+        """Return the largest motion of a crown vertex under twists about the centres [mm]."""
+        return max(
+            float(np.linalg.norm(step[r, :3]) * self.scans[r].radius_mm + np.linalg.norm(step[r, 3:])) for r in _ROWS
+        )
+
+
+class _Rendering:
+    """Keep pictures of both scans in every view, drawn again only after they have moved."""
+
+    def __init__(self, solver: ContourSolver, views: Sequence[View]) -> None:
+        self._solver = solver
+        self._views = views
+        self._drawn: list[list[NDArray | None]] = [[None] * len(views) for _ in _ROWS]
+        shapes = [v.masks.shape for v in views]
+        self.labels = [np.zeros(s, np.uint8) for s in shapes]
+        self.depths = [np.zeros(s, np.float32) for s in shapes]
+        self._points = [np.empty((len(s.vertices), 3), np.float32) for s in solver.scans]
+
+    def update(self, poses: NDArray[np.float64]) -> None:
+        """Draw the scans whose projection has moved by more than the allowed pixels."""
+        tasks = [(r, c) for r in _ROWS for c in range(len(self._views)) if self._moved(r, c, poses[r])]
+        list(self._solver._map(lambda task: self._draw(*task, poses[task[0]]), tasks))
+
+    def _moved(self, r: int, c: int, pose: NDArray[np.float64]) -> bool:
+        last = self._drawn[r][c]
+        if last is None:
+            return True
+        scan = self._solver.scans[r]
+        corners = scan.centre + scan.radius_mm * np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, 0, -1]])
+        change = _pixels(self._views[c].matrix, transform_points(pose, corners)) - _pixels(
+            self._views[c].matrix, transform_points(last, corners)
+        )
+        return float(np.abs(change).max()) > self._solver.config.redraw_px
+
+    def _draw(self, r: int, c: int, pose: NDArray[np.float64]) -> None:
+        scan, view = self._solver.scans[r], self._views[c]
+        points = np.empty((len(scan.vertices), 3), np.float32)
+        project(scan.vertices_single, (view.matrix @ pose).astype(np.float32), points)
+        labels, depth = self.labels[c][r], self.depths[c][r]
+        labels[:] = 0
+        depth[:] = 0
+        draw_depth_labels(points, scan.crown_faces, 0, 0, False, depth, labels, CROWN)
+        draw_depth_labels(points, scan.gum_faces, 0, 0, False, depth, labels, GUM)
+        self._drawn[r][c] = pose.copy()
+
+
+def _pixels(matrix: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+    h = points @ matrix[:, :3].T + matrix[:, 3]
+    return h[:, :2] / h[:, 2:]
+
+
+def _moved(pose: NDArray[np.float64], twist: NDArray[np.float64], centre: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the pose after a left twist about a world point; rotations are made orthonormal again.
+
+    Without the last step rounding grows exponentially when predictions multiply poses frame after frame.
+    """
+    to, back = make_transform(np.eye(3), -centre), make_transform(np.eye(3), centre)
+    return orthonormalise(back @ se3_exp(twist) @ to @ pose)
