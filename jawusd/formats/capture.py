@@ -194,7 +194,8 @@ def load_capture(path: str | os.PathLike[str], *, allow_outside: bool = False) -
 
 
 def _first_problem(error: ValidationError) -> str:
-    problem = error.errors()[0]
+    # A misspelt key also makes the right one missing; the misspelling is the cause.
+    problem = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
     where = ".".join("camera" if part == "cameras" else str(part) for part in problem["loc"])
     found = problem.get("input")
     shown = "" if isinstance(found, dict | list | tuple) or problem["type"] == "missing" else f' (found "{found}")'

@@ -1,0 +1,116 @@
+"""tracks.npz and model.npz: round trips, and refusal of what they must not hold."""
+
+import json
+import pickle
+
+import numpy as np
+import pytest
+
+from jawusd.errors import FormatError, UnitsError, VersionError
+from jawusd.formats.atomic import write_npz_atomic
+from jawusd.formats.model import JawModel, load_model, save_model
+from jawusd.formats.tracks import Tracks, load_tracks, save_tracks
+from jawusd.geometry import se3_exp
+
+
+def make_tracks(count=5, cameras=("a", "b")):
+    rng = np.random.default_rng(0)
+    poses = [se3_exp(rng.normal(size=(count, 6)) * 0.2) for _ in range(6)]
+    for pose in poses:
+        pose[2] = np.nan
+    cov = np.broadcast_to(np.eye(6) * 1e-3, (count, 6, 6)).copy()
+    cov[2] = np.nan
+    return Tracks(
+        np.arange(30, 30 + count), *poses, np.ones((count, 2), np.int8), np.zeros(count, bool),
+        np.full((count, 2, len(cameras)), 0.01), cov, cov.copy(), cov.copy(), np.full((count, 5), 0.05),
+        np.full((count, 2), 0.5), np.full((count, 2), 800.0), cameras, {"config": {"gate_px": 2.5}},
+    )  # fmt: skip
+
+
+def test_tracks_round_trip_bit_for_bit(tmp_path):
+    tracks = make_tracks()
+    save_tracks(tmp_path / "t.npz", tracks)
+    again = load_tracks(tmp_path / "t.npz")
+    for name in ("frames", "T_world_upper", "raw_T_upper_lower", "status", "covariance_relative", "coverage_error"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(tracks, name))
+    assert again.camera_names == ("a", "b") and again.meta["config"] == {"gate_px": 2.5}
+    assert again.meta["units"] == {"length": "mm", "angle": "rad"} and again.meta["twist_order"] == ["omega", "v"]
+    np.testing.assert_array_equal(again.tracked(), [True, True, False, True, True])
+    first = (tmp_path / "t.npz").read_bytes()
+    save_tracks(tmp_path / "t.npz", tracks)
+    assert (tmp_path / "t.npz").read_bytes() == first
+
+
+def rewrite(path, change):
+    with np.load(path) as archive:
+        arrays = {name: archive[name] for name in archive.files}
+    change(arrays)
+    write_npz_atomic(path, arrays)
+
+
+def set_meta(**changes):
+    def change(arrays):
+        meta = json.loads(str(arrays["meta"]))
+        meta.update(changes)
+        arrays["meta"] = np.array(json.dumps(meta))
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "words"),
+    [
+        (set_meta(format="jawusd-tracks/2"), VersionError, "Update jawusd"),
+        (set_meta(format="jawusd-model/1"), FormatError, "jawusd-tracks/1"),
+        (set_meta(units={"length": "m", "angle": "rad"}), UnitsError, "units"),
+        (set_meta(twist_order=["v", "omega"]), UnitsError, "twist order"),
+        (set_meta(camera_names="ab"), FormatError, "camera_names"),
+        (lambda a: a.pop("sigma_mm"), FormatError, "sigma_mm"),
+        (lambda a: a.pop("meta"), FormatError, "meta"),
+        (lambda a: a.update(meta=np.array("{")), FormatError, "not JSON"),
+        (lambda a: a.update(status=a["status"][:, :1]), FormatError, "shape"),
+        (lambda a: a["T_world_upper"].__setitem__((0, 0, 0), 1.5), FormatError, "frame 30 is not rigid"),
+    ],
+)
+def test_each_fault_in_tracks_is_named(tmp_path, change, error, words):
+    path = tmp_path / "t.npz"
+    save_tracks(path, make_tracks())
+    rewrite(path, change)
+    with pytest.raises(error, match=words):
+        load_tracks(path)
+
+
+def test_pickles_are_neither_written_nor_read(tmp_path):
+    with pytest.raises(ValueError, match="Python objects"):
+        write_npz_atomic(tmp_path / "x.npz", {"a": np.array([{}], dtype=object)})
+    path = tmp_path / "evil.npz"
+    np.savez(path, meta=np.array([pickle.loads], dtype=object))
+    with pytest.raises(FormatError, match="not a readable npz"):
+        load_tracks(path)
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04rubbish", b"not a zip at all"])
+def test_rubbish_is_one_clear_error(tmp_path, content):
+    path = tmp_path / "t.npz"
+    path.write_bytes(content)
+    with pytest.raises(FormatError, match="t.npz"):
+        load_tracks(path)
+
+
+def test_wrong_shapes_are_not_written(tmp_path):
+    tracks = make_tracks()
+    tracks.sigma_mm = tracks.sigma_mm[:, :2]
+    with pytest.raises(ValueError, match="sigma_mm"):
+        save_tracks(tmp_path / "t.npz", tracks)
+    assert not list(tmp_path.iterdir())
+
+
+def test_model_round_trip(tmp_path):
+    model = JawModel(
+        {"incisor": np.zeros(3)}, np.arange(4), np.full((4, 3), np.nan), np.zeros(4), np.ones(4, bool), {"kind": "x"}
+    )
+    save_model(tmp_path / "m.npz", model)
+    again = load_model(tmp_path / "m.npz")
+    assert set(again.arrays) == {"incisor"} and again.meta["kind"] == "x" and again.trained.all()
+    with pytest.raises(FormatError, match="jawusd-tracks"):
+        load_tracks(tmp_path / "m.npz")
