@@ -260,9 +260,7 @@ def draw_depth_labels(
 _NO_LABELS = np.zeros((0, 0), np.uint8)
 
 
-def draw_depth(
-    points: np.ndarray, faces: np.ndarray, x0: int, y0: int, cull: bool, inverse_depth: np.ndarray
-) -> None:
+def draw_depth(points: np.ndarray, faces: np.ndarray, x0: int, y0: int, cull: bool, inverse_depth: np.ndarray) -> None:
     """Draw projected triangles into a nearest-surface buffer without labels; see `draw_depth_labels`."""
     draw_depth_labels(points, faces, x0, y0, cull, inverse_depth, _NO_LABELS, 0)
 

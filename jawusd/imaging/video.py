@@ -1,0 +1,232 @@
+"""Read videos by presentation time with PyAV.
+
+Frame k is the k-th picture in order of presentation, whatever order the file stores them in. The table of times is
+read from the packets once, without decoding; seeking goes to the key frame before and decodes from there, and every
+decoded picture is placed by its time stamp, so that B-frames, edit lists and variable rates cannot shift the count.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import av
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.errors import CaptureError
+
+__all__ = ["Video", "VideoFrame"]
+
+_REENCODE = "Re-encode it, for example: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp4."
+# ITU-R BT.709 / BT.601 video range: 16 is black, 235 is white.
+_STRETCH = np.clip(np.round((np.arange(256) - 16.0) * 255 / 219), 0, 255).astype(np.uint8)
+_FULL_RANGE = 2  # AVCOL_RANGE_JPEG
+_PLANAR_VIDEO_RANGE = ("yuv420p", "yuv422p", "yuv444p", "nv12", "nv21")
+_PLANAR_FULL_RANGE = ("gray", "yuvj420p", "yuvj422p", "yuvj444p")
+
+
+class VideoFrame(NamedTuple):
+    """One decoded picture.
+
+    Attributes:
+        index: number in order of presentation, the first is 0.
+        time_s: presentation time after the first picture [s].
+        image: (h, w) gray or (h, w, 3) RGB, uint8, 0..255, read-only.
+    """
+
+    index: int
+    time_s: float
+    image: NDArray[np.uint8]
+
+
+class Video:
+    """Give access to the pictures of a video file; holds no open file, so threads may share it.
+
+    Attributes:
+        path: the file.
+        count: number of pictures.
+        times_s: presentation times after the first picture [s], shape (count,), increasing.
+        fps: average pictures per second.
+        rotation_deg: counter-clockwise turn the file asks for: 0, 90, 180 or 270. It is applied to every picture.
+        size_px: (width, height) after rotation.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        """Read the table of frames and the first picture.
+
+        Args:
+            path: video file of any format FFmpeg knows.
+
+        Raises:
+            CaptureError: the file is missing, empty, truncated, not a video, or carries no presentation times.
+        """
+        self.path = Path(path)
+        if not self.path.is_file():
+            raise CaptureError("no such video.", path=path, hint="Check the path in capture.toml.")
+        if self.path.stat().st_size == 0:
+            raise CaptureError("the file is empty.", path=path, hint="Copy it again from the camera.")
+        with self._open() as container:
+            stream = container.streams.video[0]
+            announced = stream.frames
+            self._time_base = float(stream.time_base)
+            self._pts, self._seek_dts, stored = self._packet_table(container, stream)
+            self.fps = float(stream.average_rate or 0)
+        self.count = len(self._pts)
+        if self.count == 0:
+            raise CaptureError("the video holds no pictures.", path=path, hint="Copy it again from the camera.")
+        if announced > stored:
+            raise CaptureError(
+                f"frame {stored} of {announced} cannot be read: the file is truncated.",
+                path=path,
+                hint="Copy it again from the camera, or cut it to the part that is whole.",
+            )
+        self.times_s = (self._pts - self._pts[0]) * self._time_base
+        self.rotation_deg = 0
+        first = next(self._decode(0, 1, threads=1))[1]
+        if first.rotation % 90:
+            raise CaptureError(
+                f"the file asks for a turn by {first.rotation} degrees; only quarter turns can be honoured.",
+                path=path,
+                hint=_REENCODE,
+            )
+        self.rotation_deg = first.rotation % 360
+        turned = self.rotation_deg in (90, 270)
+        self.size_px = (first.height, first.width) if turned else (first.width, first.height)
+
+    def frames(
+        self,
+        first: int = 0,
+        last: int | None = None,
+        *,
+        colour: Literal["gray", "rgb"] = "gray",
+        region: tuple[int, int, int, int] | None = None,
+        threads: int = 0,
+    ) -> Iterator[VideoFrame]:
+        """Yield the pictures first, first + 1, .. last - 1.
+
+        Gray is the luma at full range (black 0, white 255); for gray and full-range files it is the decoder's own
+        buffer, without a copy.
+
+        Args:
+            first: first picture.
+            last: one after the last picture; None = to the end.
+            colour: what to make of each picture.
+            region: (x0, y0, x1, y1) [px], x1 and y1 exclusive, in the turned picture; None = all of it.
+            threads: decoder threads; 0 lets the codec choose.
+
+        Raises:
+            CaptureError: a picture lies outside the file or cannot be decoded.
+            ValueError: the region is empty or outside the picture.
+        """
+        last = self.count if last is None else last
+        if not 0 <= first <= last <= self.count:
+            raise CaptureError(
+                f"frames {first} to {last - 1} asked for, the video holds frames 0 to {self.count - 1}.",
+                path=self.path,
+                hint="Correct `frames` in capture.toml, or copy the video again if it should be longer.",
+            )
+        width, height = self.size_px
+        x0, y0, x1, y1 = region or (0, 0, width, height)
+        if not (0 <= x0 < x1 <= width and 0 <= y0 < y1 <= height):
+            raise ValueError(f"region {region} is not inside the picture of {width} x {height} px")
+        window = (slice(y0, y1), slice(x0, x1))
+        return self._pictures(first, last, colour, window, threads)
+
+    def _pictures(self, first: int, last: int, colour: str, window: tuple, threads: int) -> Iterator[VideoFrame]:
+        convert = _rgb if colour == "rgb" else _gray
+        for index, frame in self._decode(first, last, threads):
+            image = convert(frame, self.rotation_deg, window)
+            image.flags.writeable = False  # the gray buffer may be a reference the decoder still needs
+            yield VideoFrame(index, float(self.times_s[index]), image)
+
+    def _open(self) -> av.container.InputContainer:
+        try:
+            container = av.open(str(self.path))
+        except (av.FFmpegError, OSError) as error:
+            raise CaptureError(
+                f"the video cannot be opened ({error.strerror}).",
+                path=self.path,
+                hint="Copy it again from the camera; a recording that was cut off has to be repaired first.",
+            ) from error
+        if not container.streams.video:
+            container.close()
+            raise CaptureError("the file holds no video stream.", path=self.path, hint="Check capture.toml.")
+        return container
+
+    def _packet_table(
+        self, container: av.container.InputContainer, stream: av.VideoStream
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], int]:
+        """Return per picture its time stamp and where to seek for it, and how many pictures the file stores."""
+        pts, dts, key, stored = [], [], [], 0
+        try:
+            for packet in container.demux(stream):
+                if packet.size == 0:  # end of stream
+                    continue
+                stored += 1
+                if packet.pts is None:
+                    raise CaptureError(f"frame {stored - 1} has no time stamp.", path=self.path, hint=_REENCODE)
+                if not packet.is_discard:
+                    pts.append(packet.pts)
+                    dts.append(packet.pts if packet.dts is None else packet.dts)
+                    key.append(packet.is_keyframe)
+        except av.FFmpegError:
+            # A file that breaks off: what stands before the break counts, `announced` tells whether more was promised.
+            pass
+        order = np.argsort(pts, kind="stable")
+        times = np.array(pts, np.int64)[order]
+        # Seeking by the decoding time of the last key frame shown no later than the picture: it decodes before it.
+        is_key = np.array(key, bool)[order]
+        latest = np.maximum.accumulate(np.where(is_key, np.arange(len(order)), 0)) if len(order) else order
+        return times, np.array(dts, np.int64)[order][latest], stored
+
+    def _decode(self, first: int, last: int, threads: int) -> Iterator[tuple[int, av.VideoFrame]]:
+        """Yield (index, decoded frame) for every index of [first, last), or raise naming the one that is missing."""
+        wanted = first
+        with self._open() as container:
+            stream = container.streams.video[0]
+            stream.thread_type = "AUTO"
+            stream.codec_context.thread_count = threads
+            if first > 0:
+                container.seek(int(self._seek_dts[first]), stream=stream, backward=True)
+            try:
+                for frame in container.decode(stream):
+                    if wanted == last:
+                        return
+                    if frame.pts is None or frame.pts < self._pts[wanted]:
+                        continue
+                    if frame.pts > self._pts[wanted] or frame.is_corrupt:
+                        break
+                    yield wanted, frame
+                    wanted += 1
+            except av.FFmpegError as error:
+                raise self._undecodable(wanted) from error
+        if wanted < last:
+            raise self._undecodable(wanted)
+
+    def _undecodable(self, index: int) -> CaptureError:
+        return CaptureError(
+            f"frame {index} of {self.count} (at {self.times_s[index]:.3f} s) cannot be decoded.",
+            path=self.path,
+            hint="Copy the video again from the camera, or cut it to the part that is whole.",
+        )
+
+
+def _gray(frame: av.VideoFrame, rotation_deg: int, window: tuple[slice, slice]) -> NDArray[np.uint8]:
+    name = frame.format.name
+    full = name in _PLANAR_FULL_RANGE or (name in _PLANAR_VIDEO_RANGE and frame.color_range == _FULL_RANGE)
+    if not full and name not in _PLANAR_VIDEO_RANGE:
+        frame = frame.reformat(format="gray")
+    plane = frame.planes[0]
+    stored = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: frame.height, : frame.width]
+    image = np.rot90(stored, rotation_deg // 90)[window]
+    if name in _PLANAR_VIDEO_RANGE and not full:
+        return cv2.LUT(np.ascontiguousarray(image), _STRETCH)
+    return image
+
+
+def _rgb(frame: av.VideoFrame, rotation_deg: int, window: tuple[slice, slice]) -> NDArray[np.uint8]:
+    return np.ascontiguousarray(np.rot90(frame.to_ndarray(format="rgb24"), rotation_deg // 90)[window])

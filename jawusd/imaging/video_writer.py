@@ -1,0 +1,99 @@
+"""Write videos: H.264 for people, lossless gray for masks."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from fractions import Fraction
+from types import TracebackType
+
+import av
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.formats.atomic import atomic_path
+
+__all__ = ["VideoWriter"]
+
+
+class VideoWriter:
+    """Write pictures to a video, one after the other, as a context manager.
+
+    The file appears under its name when the block ends well; after an exception there is none.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        size_px: tuple[int, int],
+        fps: float,
+        *,
+        lossless: bool = False,
+        quality_crf: int = 16,
+    ) -> None:
+        """Prepare a file.
+
+        Args:
+            path: `.mp4` for H.264 (yuv420p), `.mkv` for lossless FFV1 gray.
+            size_px: (width, height); both even for H.264.
+            fps: pictures per second.
+            lossless: FFV1 with one 8-bit gray channel instead of H.264.
+            quality_crf: H.264 constant rate factor, 0 (best) .. 51.
+
+        Raises:
+            ValueError: the suffix, the size or the rate does not fit.
+        """
+        suffix = ".mkv" if lossless else ".mp4"
+        if not str(path).endswith(suffix):
+            raise ValueError(f"{path}: a {'lossless' if lossless else 'H.264'} video is written to a {suffix} file")
+        if min(size_px) < 2 or (not lossless and (size_px[0] % 2 or size_px[1] % 2)):
+            raise ValueError(f"size {size_px} px: H.264 needs even sides of at least 2 px")
+        if not fps > 0:
+            raise ValueError(f"fps must be positive, got {fps}")
+        self._size_px = size_px
+        self._lossless = lossless
+        self._atomic = atomic_path(path)
+        self._rate = Fraction(fps).limit_denominator(1001)
+        self._crf = quality_crf
+
+    def __enter__(self) -> VideoWriter:
+        with contextlib.ExitStack() as stack:
+            temporary = stack.enter_context(self._atomic)
+            container = av.open(str(temporary), "w", format="matroska" if self._lossless else "mp4")
+            self._container = stack.enter_context(container)
+            stream = container.add_stream("ffv1" if self._lossless else "libx264", rate=self._rate)
+            stream.width, stream.height = self._size_px
+            stream.pix_fmt = "gray" if self._lossless else "yuv420p"
+            # Every FFV1 picture a key frame: seeking costs nothing and a broken byte spoils one picture.
+            stream.options = {"level": "3", "g": "1"} if self._lossless else {"crf": str(self._crf)}
+            self._stream = stream
+            self._next = 0
+            self._stack = stack.pop_all()
+        return self
+
+    def write(self, image: NDArray[np.uint8]) -> None:
+        """Append a picture.
+
+        Args:
+            image: (h, w) gray, or (h, w, 3) RGB for H.264; uint8, 0..255.
+
+        Raises:
+            ValueError: the picture's shape or type does not fit.
+        """
+        shape = (self._size_px[1], self._size_px[0])
+        colour = image.ndim == 3
+        if image.dtype != np.uint8 or image.shape not in ((shape,) if self._lossless else (shape, (*shape, 3))):
+            raise ValueError(f"picture must be uint8 of {shape}, got {image.dtype} of {image.shape}")
+        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24" if colour else "gray")
+        frame.pts = self._next
+        frame.time_base = 1 / self._rate
+        self._next += 1
+        self._container.mux(self._stream.encode(frame))
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with self._stack:
+            if error is not None:
+                raise error
+            self._container.mux(self._stream.encode(None))
