@@ -1,0 +1,165 @@
+"""The slice hull: which jaw parameters are anatomically possible, as a smooth signed distance in mm.
+
+Every opening d1 has a convex section in (d2, d3), the half-planes ``n_k . (d2, d3) <= h_k(d1)``; d1 itself is limited
+to the captured openings. The half-spaces are joined by a soft maximum,
+
+    v_k = n_k . (d2, d3) - h_k(d1),   v_low = d1_first - d1,   v_high = d1 - d1_last,
+    excess(d) = softness log sum exp(v / softness) - margin_mm,
+
+which is negative inside, close to the distance in mm near the boundary, and smooth everywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.evaluator.curves import HermiteCurve
+
+Array = NDArray[np.float64]
+
+_NEWTON_ITERATIONS = 60
+_ROOT_TOLERANCE_MM = 1e-12
+_CANDIDATE_SLICES = 48
+_CANDIDATE_RADII = (0.4, 0.75, 0.9, 0.97, 1.0)  # denser towards the outline, where nearest points lie
+
+
+@dataclass(frozen=True)
+class SliceHull:
+    """The bound of a rig.
+
+    Attributes:
+        supports: h_k(d1) [mm], constant outside the captured openings.
+        directions: Unit normals n_k in (d2, d3), shape (K, 2), pointing all around.
+        softness_mm: Radius of the rounding where half-spaces meet.
+        margin_mm: Distance by which the bound is wider than its supports.
+    """
+
+    supports: HermiteCurve
+    directions: Array
+    softness_mm: float
+    margin_mm: float
+    _gradients: Array = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        # d v_j / dd of the K sides (their d1 column is -h_k' and filled in per row), then of v_low and v_high
+        gradients = np.zeros((len(self.directions) + 2, 3))
+        gradients[:-2, 1:] = self.directions
+        gradients[-2:, 0] = -1.0, 1.0
+        object.__setattr__(self, "_gradients", gradients)
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, Array]) -> SliceHull:
+        """Build the bound from the named arrays of a rig."""
+        knots = np.asarray(arrays["slice_d1"], dtype=float)
+        values = np.asarray(arrays["slice_support"], dtype=float)
+        slopes = np.zeros_like(values)  # flat ends: the supports stay as they are beyond the captured openings
+        slopes[1:-1] = (values[2:] - values[:-2]) / (knots[2:] - knots[:-2])[:, None]  # Catmull-Rom
+        return cls(
+            supports=HermiteCurve(knots, values, slopes),
+            directions=np.asarray(arrays["slice_directions"], dtype=float),
+            softness_mm=float(arrays["slice_softness_mm"]),
+            margin_mm=float(arrays["slice_margin_mm"]),
+        )
+
+    def excess(self, d: Array) -> Array:
+        """Return how far outside d (n, 3) lies [mm], shape (n,); negative inside."""
+        peak, _, total = self._soft_maximum(d)
+        return peak + self.softness_mm * np.log(total) - self.margin_mm
+
+    def excess_gradient(self, d: Array) -> tuple[Array, Array]:
+        """Return the excess (n,) [mm] and its gradient by d, shape (n, 3)."""
+        peak, powers, total = self._soft_maximum(d)
+        weights = powers / total[:, None]
+        gradient = weights @ self._gradients
+        gradient[:, 0] -= np.einsum("nk,nk->n", weights[:, :-2], self.supports.slope(d[:, 0]))
+        return peak + self.softness_mm * np.log(total) - self.margin_mm, gradient
+
+    def excess_curvature(self, d: Array) -> tuple[Array, Array, Array]:
+        """Return excess (n,), gradient (n, 3) and the rounding's part of the Hessian, shape (n, 3, 3) [1/mm].
+
+        The rest of the Hessian, the bending of the supports along d1, is left out: what is returned is never
+        indefinite, which keeps the steps of a solver pointing downhill.
+        """
+        peak, powers, total = self._soft_maximum(d)
+        weights = powers / total[:, None]
+        slopes = np.broadcast_to(self._gradients, (len(d), *self._gradients.shape)).copy()
+        slopes[:, :-2, 0] = -self.supports.slope(d[:, 0])
+        gradient = np.einsum("nk,nki->ni", weights, slopes)
+        spread = slopes - gradient[:, None, :]
+        curvature = np.einsum("nk,nki,nkj->nij", weights, spread, spread) / self.softness_mm
+        return peak + self.softness_mm * np.log(total) - self.margin_mm, gradient, curvature
+
+    def chord(self, d: Array, axis: int) -> tuple[Array, Array]:
+        """Return the ends [mm] of the valid stretch through d (n, 3) along axis 1 or 2; NaN where there is none."""
+        return self._chord_end(d, axis, -1.0), self._chord_end(d, axis, 1.0)
+
+    def _chord_end(self, d: Array, axis: int, sign: float) -> Array:
+        # Newton from the corner of the sharp polygon, which contains the soft one: the excess is convex along the
+        # line, so the search runs inwards without overshooting, and turns back only if the line misses the section.
+        along, across = self.directions[:, axis - 1], self.directions[:, 2 - axis]
+        room = self.supports.value(d[:, 0]) + self.margin_mm - d[:, 3 - axis, None] * across
+        facing = along * sign > 0
+        x = sign * np.min(room[:, facing] / np.abs(along[facing]), axis=1)
+        point = d.copy()
+        active = np.flatnonzero(np.isfinite(x))
+        end = np.full(len(d), np.nan)
+        for _ in range(_NEWTON_ITERATIONS):
+            point[active, axis] = x[active]
+            excess, gradient = self.excess_gradient(point[active])
+            slope = gradient[:, axis]
+            done = np.abs(excess) <= _ROOT_TOLERANCE_MM
+            end[active[done]] = x[active[done]]
+            onward = ~done & (slope * sign > 0)
+            x[active[onward]] -= excess[onward] / slope[onward]
+            active = active[onward]
+            if not active.size:
+                break
+        return end
+
+    def candidates(self) -> Array:
+        """Return points (n, 3) [mm] spread over the valid volume, dense near its surface: starts for searches."""
+        low, high = self.supports.knots[0] - self.margin_mm, self.supports.knots[-1] + self.margin_mm
+        points = []
+        for d1 in np.linspace(low, high, _CANDIDATE_SLICES):
+            outline = self._sharp_outline(d1)
+            if not len(outline):
+                continue
+            centre = outline.mean(axis=0)
+            reach = np.concatenate([outline, 0.5 * (outline + np.roll(outline, 1, axis=0))]) - centre
+            section = np.concatenate([[centre], *(centre + radius * reach for radius in _CANDIDATE_RADII)])
+            points.append(np.column_stack([np.full(len(section), d1), section]))
+        found = np.concatenate([np.empty((0, 3)), *points])
+        return found[self.excess(found) <= 0]
+
+    def _sharp_outline(self, d1: float) -> Array:
+        """Return the corners (n, 2) of the section's unrounded polygon at d1, in order of angle."""
+        reach = self.supports.value(np.array([d1]))[0] + self.margin_mm
+        i, j = np.triu_indices(len(self.directions), 1)
+        a, b = self.directions[i], self.directions[j]
+        cross = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+        meet = np.abs(cross) > 1e-9
+        i, j, a, b, cross = i[meet], j[meet], a[meet], b[meet], cross[meet]
+        x = (reach[i] * b[:, 1] - reach[j] * a[:, 1]) / cross
+        y = (reach[j] * a[:, 0] - reach[i] * b[:, 0]) / cross
+        corners = np.stack([x, y], axis=1)
+        corners = corners[(corners @ self.directions.T <= reach + 1e-9).all(axis=1)]
+        from_centre = corners - corners.mean(axis=0) if len(corners) else corners
+        return corners[np.argsort(np.arctan2(from_centre[:, 1], from_centre[:, 0]))]
+
+    def _soft_maximum(self, d: Array) -> tuple[Array, Array, Array]:
+        """Return the largest v (n,), exp((v - largest) / softness) (n, K + 2) and the sum of those (n,)."""
+        knots = self.supports.knots
+        v = np.empty((len(d), len(self.directions) + 2))
+        np.matmul(d[:, 1:], self.directions.T, out=v[:, :-2])
+        v[:, :-2] -= self.supports.value(d[:, 0])
+        v[:, -2] = knots[0] - d[:, 0]
+        v[:, -1] = d[:, 0] - knots[-1]
+        peak = v.max(axis=1)
+        v -= peak[:, None]
+        v /= self.softness_mm
+        np.exp(v, out=v)
+        return peak, v, v.sum(axis=1)
