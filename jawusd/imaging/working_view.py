@@ -1,0 +1,122 @@
+"""Bring pictures to the undistorted working size the tracker computes at."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import ceil
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.geometry.camera import Camera
+
+__all__ = ["WorkingView"]
+
+_NODE_PX = 16  # spacing of the map samples that locate a region
+
+
+class WorkingView:
+    """Undistort and shrink the pictures of one camera.
+
+    A working pixel is the mean of n x n bilinear samples of the recorded picture, n = the reduction rounded up, at the
+    undistorted positions of an n times larger working picture: the same as undistorting at full size and averaging
+    areas, in one interpolation and only where there is something. Safe to use from several threads.
+
+    Attributes:
+        camera: the pinhole camera of the working pictures.
+        source: the camera as recorded.
+    """
+
+    def __init__(self, source: Camera, size_px: tuple[int, int]) -> None:
+        """Prepare the maps.
+
+        Args:
+            source: the calibrated camera.
+            size_px: (width, height) of the working pictures, no larger than the recorded ones.
+
+        Raises:
+            ValueError: the working size is larger than the recorded one, or empty.
+        """
+        if not (0 < size_px[0] <= source.size_px[0] and 0 < size_px[1] <= source.size_px[1]):
+            raise ValueError(f"working size {size_px} px must be within 1 x 1 and the recorded {source.size_px} px")
+        self.source = source
+        self.camera = replace(source.scaled(size_px), distortion=np.zeros(0))
+        self._samples = ceil(max(source.size_px[0] / size_px[0], source.size_px[1] / size_px[1]))
+        fine_size = (size_px[0] * self._samples, size_px[1] * self._samples)
+        distortion = source.distortion if source.distortion.size else None
+        self._map = cv2.initUndistortRectifyMap(
+            source.K, distortion, None, source.scaled(fine_size).K, fine_size, cv2.CV_32FC2
+        )[0]
+        self._nodes = np.ascontiguousarray(self._map[::_NODE_PX, ::_NODE_PX])
+        # No node of a region lies farther from its neighbour than this [px of the recorded picture].
+        steps = [np.abs(np.diff(self._nodes, axis=axis)).max(initial=_NODE_PX) for axis in (0, 1)]
+        self._reach_px = float(max(steps)) + 1
+
+    def mask(self, mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Bring a mask to the working size; touches only the surroundings of what is not black.
+
+        Args:
+            mask: (H, W) uint8 as recorded.
+
+        Returns:
+            (h, w) uint8, the share of each working pixel that is covered, 255 = all.
+
+        Raises:
+            ValueError: the mask has not the size of the recorded pictures.
+        """
+        self._check(mask)
+        width, height = self.camera.size_px
+        out = np.zeros((height, width), np.uint8)
+        window = self._window(mask)
+        if window is not None:
+            out[window] = self._averaged(mask, window)
+        return out
+
+    def picture(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Bring a whole picture to the working size.
+
+        Args:
+            image: (H, W) or (H, W, 3) uint8 as recorded.
+
+        Returns:
+            (h, w) or (h, w, 3) uint8; black where the recorded picture has nothing.
+
+        Raises:
+            ValueError: the picture has not the size of the recorded ones.
+        """
+        self._check(image)
+        width, height = self.camera.size_px
+        return self._averaged(image, (slice(0, height), slice(0, width)))
+
+    def _check(self, image: NDArray[np.uint8]) -> None:
+        if image.shape[1::-1] != self.source.size_px or image.dtype != np.uint8:
+            raise ValueError(f"picture must be uint8 of {self.source.size_px} px, got {image.dtype} {image.shape}")
+
+    def _averaged(self, image: NDArray[np.uint8], window: tuple[slice, slice]) -> NDArray[np.uint8]:
+        n, (rows, cols) = self._samples, window
+        part = self._map[rows.start * n : rows.stop * n, cols.start * n : cols.stop * n]
+        fine = cv2.remap(image, part, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        if n == 1:
+            return fine
+        return cv2.resize(fine, (cols.stop - cols.start, rows.stop - rows.start), interpolation=cv2.INTER_AREA)
+
+    def _window(self, mask: NDArray[np.uint8]) -> tuple[slice, slice] | None:
+        """Return the working pixels that can see a non-black pixel of the mask, or None."""
+        rows = np.flatnonzero(mask.max(axis=1))
+        if rows.size == 0:
+            return None
+        cols = np.flatnonzero(mask[rows[0] : rows[-1] + 1].max(axis=0))
+        low = np.array([cols[0], rows[0]], np.float32) - self._reach_px
+        high = np.array([cols[-1], rows[-1]], np.float32) + self._reach_px
+        # Within the reach of the box there is at least one node beyond each of its sides; the ring of cells around
+        # those nodes therefore holds the box.
+        inside = ((self._nodes >= low) & (self._nodes <= high)).all(axis=2)
+        spans = []
+        for hits, limit in zip((inside.any(axis=1), inside.any(axis=0)), self.camera.size_px[::-1]):
+            where = np.flatnonzero(hits)
+            if where.size == 0:
+                return None
+            first, last = (where[0] - 1) * _NODE_PX // self._samples, (where[-1] + 1) * _NODE_PX // self._samples
+            spans.append(slice(max(first, 0), min(last + 1, limit)))
+        return spans[0], spans[1]
