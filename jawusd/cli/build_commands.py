@@ -1,0 +1,150 @@
+"""Commands from a capture to a rig: build and its single stages."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from jawusd.cli.output import emit, progress, refuse_existing
+
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+Force = Annotated[bool, typer.Option("--force", help="Overwrite an existing output.")]
+Outside = Annotated[bool, typer.Option("--allow-outside", help="Let paths in the capture leave its folder.")]
+CaptureArg = Annotated[Path, typer.Argument(help="capture.toml, or the folder that holds it.", show_default=False)]
+
+
+class Method(StrEnum):
+    """Name the jaw models."""
+
+    anchored = "anchored"
+    additive = "additive"
+    paper = "paper"
+    pca = "pca"
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this module."""
+    app.command("build")(build)
+    app.command("sync")(sync)
+    app.command("track")(track)
+    app.command("fit")(fit)
+    app.command("bake")(bake)
+    app.command("demo")(demo)
+
+
+def build(
+    capture: CaptureArg,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the rig.", show_default=False)],
+    model: Annotated[Method, typer.Option(help="Form of the jaw model.")] = Method.anchored,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue an earlier build in this folder.")] = False,
+    fresh: Annotated[bool, typer.Option("--fresh", help="Delete an earlier build in this folder first.")] = False,
+    jobs: Annotated[int, typer.Option(min=1, max=64, help="Threads that draw and compare.")] = 2,
+    allow_outside: Outside = False,
+    as_json: Json = False,
+) -> None:
+    """Turn a capture into a rig: sync, track, fit, bake."""
+    from jawusd.pipeline.build import BuildOptions, build_rig
+    from jawusd.pipeline.summary import build_lines
+
+    options = BuildOptions(model.value, jobs=jobs, resume=resume, fresh=fresh, allow_outside=allow_outside)
+    with progress() as report:
+        summary = build_rig(capture, out, options, report)
+    emit(summary, as_json, lambda: build_lines(summary))
+
+
+def sync(capture: CaptureArg, allow_outside: Outside = False, as_json: Json = False) -> None:
+    """Find the frame offsets between the cameras from light flashes."""
+    from jawusd.pipeline.prepare import open_capture
+    from jawusd.pipeline.stages import sync_cameras
+
+    with progress() as report:
+        result = sync_cameras(open_capture(capture, allow_outside=allow_outside), report)
+    emit(result, as_json, lambda: [f"{name}: {offset:+d} frames" for name, offset in result["offsets"].items()])
+
+
+def track(
+    capture: CaptureArg,
+    out: Annotated[Path, typer.Option("-o", "--out", help="File of the tracks.")] = Path("tracks.npz"),
+    jobs: Annotated[int, typer.Option(min=1, max=64, help="Threads that draw and compare.")] = 2,
+    force: Force = False,
+    allow_outside: Outside = False,
+    as_json: Json = False,
+) -> None:
+    """Track both rows of teeth through the masks."""
+    from jawusd.formats.tracks import save_tracks
+    from jawusd.pipeline.prepare import open_capture
+    from jawusd.pipeline.stages import sync_cameras, track_teeth
+    from jawusd.pipeline.summary import track_lines, track_summary
+
+    refuse_existing(out, force)
+    opened = open_capture(capture, allow_outside=allow_outside)
+    with progress() as report:
+        offsets = sync_cameras(opened, report)["offsets"]
+        tracks = track_teeth(opened, offsets, jobs, report)
+    save_tracks(out, tracks)
+    summary = {**track_summary(tracks), "file": str(out)}
+    emit(summary, as_json, lambda: track_lines(summary))
+
+
+def fit(
+    poses: Annotated[Path, typer.Argument(help="tracks.npz, or a CSV of poses.", show_default=False)],
+    capture: Annotated[Path, typer.Option(help="The capture: gives scans and landmarks.", show_default=False)],
+    out: Annotated[Path, typer.Option("-o", "--out", help="File of the model.")] = Path("model.npz"),
+    model: Annotated[Method, typer.Option(help="Form of the jaw model.")] = Method.anchored,
+    force: Force = False,
+    allow_outside: Outside = False,
+    as_json: Json = False,
+) -> None:
+    """Fit a three-parameter jaw model to tracked or given poses."""
+    from jawusd.formats.model import save_model
+    from jawusd.pipeline.prepare import open_capture
+    from jawusd.pipeline.stages import fit_jaw, read_motion
+    from jawusd.pipeline.summary import fit_lines, fit_summary
+
+    refuse_existing(out, force)
+    motion = read_motion(poses)
+    opened = open_capture(capture, allow_outside=allow_outside)
+    with progress() as report:
+        fitted = fit_jaw(opened, motion, model.value, report)
+    save_model(out, fitted)
+    summary = {**fit_summary(fitted), "file": str(out)}
+    emit(summary, as_json, lambda: fit_lines(summary))
+
+
+def bake(
+    model: Annotated[Path, typer.Argument(help="model.npz.", show_default=False)],
+    capture: Annotated[Path, typer.Option(help="The capture: gives the meshes.", show_default=False)],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the rig.", show_default=False)],
+    force: Force = False,
+    allow_outside: Outside = False,
+    as_json: Json = False,
+) -> None:
+    """Write the OpenUSD rig of a model."""
+    from jawusd.formats.model import load_model
+    from jawusd.pipeline.prepare import open_capture
+    from jawusd.pipeline.stages import bake_files
+
+    refuse_existing(out / "actor.usda", force)
+    loaded = load_model(model)
+    opened = open_capture(capture, allow_outside=allow_outside)
+    with progress() as report:
+        files = bake_files(opened, loaded, out, report)
+    emit({"files": files}, as_json, lambda: [str(path) for path in files])
+
+
+def demo(
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the capture.", show_default=False)],
+    seed: Annotated[int, typer.Option(min=0, help="Another number is another person.")] = 0,
+    frames: Annotated[int, typer.Option(min=24, max=20000, help="Exercise frames.")] = 240,
+    force: Force = False,
+) -> None:
+    """Render a synthetic capture with known truth: a made-up person in front of three cameras."""
+    from jawusd.pipeline.stages import write_demo_capture
+
+    refuse_existing(out / "capture.toml", force)
+    with progress() as report:
+        path = write_demo_capture(out, seed, frames, report)
+    typer.echo(str(path))

@@ -1,0 +1,49 @@
+"""The program `jawusd`: its commands, and one place that turns errors into messages and exit codes."""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+
+from jawusd.cli import build_commands, rig_commands
+from jawusd.errors import JawusdError
+
+app = typer.Typer(
+    name="jawusd",
+    help="Capture in, jaw rig out: person-specific jaw kinematics from video as an OpenUSD rig.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+build_commands.register(app)
+rig_commands.register(app)
+
+#: Exit code of a run stopped with Ctrl+C, as shells report it.
+INTERRUPTED = 130
+
+
+@app.callback(invoke_without_command=True)
+def _root(version: bool = typer.Option(False, "--version", help="Print the version and stop.")) -> None:
+    if version:
+        from jawusd import __version__
+
+        typer.echo(f"jawusd {__version__}")
+        raise typer.Exit
+
+
+def main() -> None:
+    """Run the command line and leave with its exit code: 0 ok, 1 a "no", 2 usage, 3 and up one per error family."""
+    try:
+        app()
+    except JawusdError as error:
+        typer.echo(f"jawusd: {error}", err=True)
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        typer.echo("jawusd: stopped; finished stages are kept, continue with --resume.", err=True)
+        sys.exit(INTERRUPTED)
+    except BrokenPipeError:
+        # The reader of a pipe (head, less) went away: nothing to tell anybody.
+        sys.stderr.close()
+        sys.exit(0)

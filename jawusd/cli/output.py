@@ -1,0 +1,110 @@
+"""What commands print: results on stdout, progress on stderr, JSON where a machine reads."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from jawusd.errors import OutputError
+
+
+def emit(data: dict[str, Any], as_json: bool, lines: Callable[[], list[str]]) -> None:
+    """Print a result as one JSON object or as lines for people.
+
+    Args:
+        data: JSON-able result; NaN becomes null.
+        as_json: print `data`.
+        lines: gives the text lines otherwise.
+    """
+    if as_json:
+        typer.echo(json.dumps(plain(data), indent=1))
+    else:
+        for line in lines():
+            typer.echo(line)
+
+
+def plain(value: Any) -> Any:
+    """Return a value with numpy types turned into JSON's and NaN into null."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return str(value) if isinstance(value, Path) else value
+
+
+def refuse_existing(path: Path, force: bool) -> None:
+    """Refuse to overwrite a file unless forced.
+
+    Raises:
+        OutputError: the file exists.
+    """
+    if path.exists() and not force:
+        raise OutputError("exists already.", path=path, hint="Name another file, or overwrite it with --force.")
+
+
+@contextlib.contextmanager
+def progress(quiet: bool = False) -> Iterator[Callable[[str, int, int], None]]:
+    """Show the progress of long work on stderr.
+
+    Args:
+        quiet: show nothing.
+
+    Yields:
+        A function (stage, done, total) to call as work proceeds.
+    """
+    if quiet:
+        yield lambda stage, done, total: None
+        return
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("{task.description:<10}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield _plain_progress(console)
+        return
+    with Progress(*columns, console=console) as bars:
+        tasks: dict[str, Any] = {}
+
+        def report(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = bars.add_task(stage, total=total or None)
+            bars.update(tasks[stage], completed=done, total=total or None)
+
+        yield report
+
+
+def _plain_progress(console: Any) -> Callable[[str, int, int], None]:
+    """Return a reporter for log files: a line per stage and per tenth of it."""
+    last: dict[str, int] = {}
+
+    def report(stage: str, done: int, total: int) -> None:
+        tenth = 10 * done // total if total else -1
+        if last.get(stage) != tenth:
+            last[stage] = tenth
+            console.print(f"{stage} {done}/{total}" if total else stage, highlight=False)
+
+    return report

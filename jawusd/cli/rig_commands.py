@@ -1,0 +1,276 @@
+"""Commands on a finished rig: info, pose, encode, validate, ik, animate. They need only the base install."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from jawusd.cli.output import emit, refuse_existing
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from jawusd.evaluator import JawRig
+
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+Force = Annotated[bool, typer.Option("--force", help="Overwrite an existing output.")]
+RigArg = Annotated[Path, typer.Argument(help="actor.usda or another file of the rig, or model.npz.", show_default=False)]
+Triple = tuple[float, float, float]
+
+#: Exit code of a "no": an invalid pose, a rig with errors.
+NO = 1
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this module."""
+    app.command("info")(info)
+    app.command("pose")(pose)
+    app.command("encode")(encode)
+    app.command("validate")(validate)
+    app.command("ik")(ik)
+    app.command("animate")(animate)
+
+
+def info(rig: RigArg, as_json: Json = False) -> None:
+    """Say what a rig file holds."""
+    from jawusd.rig import describe
+
+    found = describe(rig)
+    emit(found, as_json, lambda: _info_lines(found))
+
+
+def _info_lines(found: dict[str, Any]) -> list[str]:
+    lines = [
+        f"actor {found['actor']}, format {found['format_version']}, prim {found['prim']}",
+        f"model: {found['model']['kind']} ({found['model']['method']}), onnx: {found['onnx'] or 'none'}",
+    ]
+    for name, (low, high) in found["ranges_mm"].items():
+        lines.append(f"  {name}: {low:.2f} .. {high:.2f} mm")
+    table = found["table"]
+    lines.append(f"table: {table['format']} {table['shape']}, worst error {table['max_error_mm']:.4f} mm")
+    lines += [f"mesh {name}: {count} points" for name, count in found["meshes"].items()]
+    if found["animation"]:
+        shown = found["animation"]
+        lines.append(f"animation: {shown['samples']} samples, frames {shown['first']:g} .. {shown['last']:g}")
+    return lines
+
+
+def pose(
+    rig: RigArg,
+    d: Annotated[Triple, typer.Option("--d", help="Opening, lateral (+ left), protrusion (+ forward) [mm].")],
+    as_json: Json = False,
+) -> None:
+    """Print the jaw pose of parameters d: 4x4 matrix, twist, landmarks, margin to the bound."""
+    import jawusd
+    from jawusd.geometry import transform_points
+
+    loaded = jawusd.load(rig)
+    _check_finite(d, "--d")
+    T = loaded.pose(d)
+    margin = float(loaded.margin(d))
+    result = {
+        "d": list(d),
+        "T_skull_mandible": T,
+        "twist": loaded.twist(d),
+        "landmarks_mm": dict(zip(_landmark_names(), transform_points(T, loaded.landmarks), strict=True)),
+        "margin_mm": margin,
+        "valid": margin >= float(loaded.arrays["margin_limit_mm"]),
+    }
+    emit(result, as_json, lambda: _pose_lines(result))
+
+
+def _landmark_names() -> tuple[str, ...]:
+    from jawusd.geometry import LANDMARKS
+
+    return LANDMARKS
+
+
+def _check_finite(values: Triple, option: str) -> None:
+    import math
+
+    if not all(math.isfinite(value) for value in values):
+        raise typer.BadParameter("values must be finite", param_hint=option)
+
+
+def _pose_lines(result: dict[str, Any]) -> list[str]:
+    rows = [" ".join(f"{value:12.6f}" for value in row) for row in result["T_skull_mandible"]]
+    lines = ["T_skull_mandible [mm]", *(f"  {row}" for row in rows)]
+    lines.append("twist (omega rad, v mm): " + " ".join(f"{value:.6f}" for value in result["twist"]))
+    for name, place in result["landmarks_mm"].items():
+        lines.append(f"  {name}: " + " ".join(f"{value:.3f}" for value in place) + " mm")
+    word = "inside" if result["valid"] else "OUTSIDE"
+    return [*lines, f"margin {result['margin_mm']:.3f} mm: {word} the bound"]
+
+
+def _read_poses(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Return frames (F,) and poses (F, 4, 4) of a table or a tracks file."""
+    from jawusd.formats.poses import read_poses
+    from jawusd.formats.tracks import load_tracks
+
+    if path.suffix == ".npz":
+        tracks = load_tracks(path)
+        return tracks.frames, tracks.T_upper_lower
+    return read_poses(path)
+
+
+def encode(
+    rig: RigArg,
+    poses: Annotated[Path, typer.Argument(help="CSV or JSON of poses, or tracks.npz.", show_default=False)],
+    out: Annotated[Path, typer.Option("-o", "--out", help="CSV of frame, d1, d2, d3, residual_mm.")] = Path("d.csv"),
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Find the parameters d whose poses are nearest to given ones."""
+    import numpy as np
+
+    import jawusd
+    from jawusd.formats.poses import PARAMETER_COLUMNS, write_table
+
+    refuse_existing(out, force)
+    frames, T = _read_poses(poses)
+    d, residual_mm = jawusd.load(rig).encode(T)
+    known = np.isfinite(d).all(1)
+    values = np.column_stack([d, residual_mm])
+    write_table(out, ("frame", *PARAMETER_COLUMNS, "residual_mm"), frames[known], values[known])
+    residual = residual_mm[known]
+    result = {
+        "file": str(out),
+        "poses": len(T),
+        "encoded": int(known.sum()),
+        "residual_mm": {
+            "mean": float(residual.mean()) if residual.size else None,
+            "max": float(residual.max()) if residual.size else None,
+        },
+    }
+    emit(result, as_json, lambda: [f"{out}: {result['encoded']} of {len(T)} poses, residual {result['residual_mm']}"])
+
+
+def validate(
+    rig: RigArg,
+    poses: Annotated[Path | None, typer.Argument(help="CSV or JSON of poses or of d, or tracks.npz.")] = None,
+    residual_mm: Annotated[float | None, typer.Option(help="Largest distance to the model; the rig's else.")] = None,
+    margin_mm: Annotated[float | None, typer.Option(help="Smallest margin to the bound; the rig's else.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Check a rig, or judge poses against it; leaves with exit code 1 when something is invalid."""
+    if poses is None:
+        _validate_rig(rig, as_json)
+        return
+    import jawusd
+
+    loaded = jawusd.load(rig)
+    frames, T = _poses_or_parameters(loaded, poses)
+    verdicts = loaded.validate(T, residual_limit_mm=residual_mm, margin_limit_mm=margin_mm)
+    rows = [
+        {"frame": int(frame), "valid": bool(ok), "reason": words, "residual_mm": float(res), "margin_mm": float(margin)}
+        for frame, ok, words, res, margin in zip(
+            frames, verdicts.valid, verdicts.words(), verdicts.residual_mm, verdicts.margin_mm, strict=True
+        )
+    ]
+    invalid = [row for row in rows if not row["valid"]]
+    result = {"poses": len(rows), "invalid": len(invalid), "verdicts": rows}
+    emit(result, as_json, lambda: _verdict_lines(rows, len(invalid)))
+    if invalid:
+        raise typer.Exit(NO)
+
+
+def _verdict_lines(rows: list[dict[str, Any]], invalid: int) -> list[str]:
+    lines = [
+        f"frame {row['frame']}: {row['reason']} (residual {row['residual_mm']:.2f} mm, margin {row['margin_mm']:.2f} mm)"
+        for row in rows
+        if not row["valid"]
+    ]
+    return [*lines, f"{len(rows) - invalid} of {len(rows)} poses are valid"]
+
+
+def _poses_or_parameters(rig: JawRig, path: Path) -> tuple[np.ndarray, np.ndarray]:
+    from jawusd.formats.poses import read_parameters, table_columns
+
+    if path.suffix != ".npz" and "d1" in table_columns(path):
+        frames, d = read_parameters(path)
+        return frames, rig.pose(d)
+    return _read_poses(path)
+
+
+def _validate_rig(path: Path, as_json: bool) -> None:
+    from jawusd.rig import validate_stage
+
+    findings = validate_stage(path)
+    errors = [finding for finding in findings if finding["severity"] == "error"]
+    result = {"file": str(path), "errors": len(errors), "findings": findings}
+    emit(
+        result,
+        as_json,
+        lambda: [
+            *(f"{f['severity']}: {f['name']} at {f['site']}: {f['message']}" for f in findings),
+            f"{path}: {len(errors)} errors, {len(findings) - len(errors)} warnings",
+        ],
+    )
+    if errors:
+        raise typer.Exit(NO)
+
+
+def ik(
+    rig: RigArg,
+    point: Annotated[Triple, typer.Option(help="Point on the mandible at rest [mm].")],
+    target: Annotated[Triple, typer.Option(help="Where it should go, skull frame [mm].")],
+    start: Annotated[Triple | None, typer.Option(help="Parameters to start from [mm].")] = None,
+    as_json: Json = False,
+) -> None:
+    """Find the valid parameters that bring a point of the mandible nearest to a target."""
+    import numpy as np
+
+    import jawusd
+    from jawusd.geometry import transform_points
+
+    for values, option in ((point, "--point"), (target, "--target"), (start or point, "--start")):
+        _check_finite(values, option)
+    loaded = jawusd.load(rig)
+    d = np.asarray(loaded.ik(np.array(point), np.array(target), start=start))
+    reached = transform_points(loaded.pose(d), np.array(point))
+    distance_mm = float(np.linalg.norm(reached - np.array(target)))
+    result = {"d": d, "reached": reached, "distance_mm": distance_mm, "margin_mm": float(loaded.margin(d))}
+    emit(result, as_json, lambda: [f"d {d[0]:.3f} {d[1]:.3f} {d[2]:.3f} mm, {distance_mm:.3f} mm from the target"])
+
+
+def animate(
+    rig: RigArg,
+    source: Annotated[Path, typer.Argument(help="keys.json, or a CSV of d or of poses.", show_default=False)],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Animation layer.")] = Path("anim.usdc"),
+    fps: Annotated[float | None, typer.Option(min=0.001, help="Frames per second of a CSV; the rig's else.")] = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Write an animation layer over a rig from keys, parameters or poses; clamping to the bound is reported."""
+    import numpy as np
+
+    import jawusd
+    from jawusd.cli.motion import read_motion
+    from jawusd.rig import describe, write_animation
+
+    refuse_existing(out, force)
+    loaded = jawusd.load(rig)
+    frames, d, source_fps = read_motion(loaded, source)
+    inside = loaded.margin(d) >= float(loaded.arrays["margin_limit_mm"])
+    kept = np.where(inside[:, None], d, loaded.project(d))
+    moved_mm = np.linalg.norm(kept - d, axis=1)
+    rate = fps or source_fps or describe(rig)["fps"]
+    write_animation(out, rig, frames, kept, rate)
+    result = {
+        "file": str(out),
+        "frames": [float(frames[0]), float(frames[-1])],
+        "fps": rate,
+        "clamped": int((~inside).sum()),
+        "largest_clamp_mm": float(moved_mm.max()),
+    }
+    emit(result, as_json, lambda: _animate_lines(result))
+
+
+def _animate_lines(result: dict[str, Any]) -> list[str]:
+    first, last = result["frames"]
+    lines = [f"{result['file']}: frames {first:g} .. {last:g} at {result['fps']:g} fps"]
+    if result["clamped"]:
+        lines.append(f"{result['clamped']} frames lay outside the bound, moved by up to {result['largest_clamp_mm']:.2f} mm")
+    return lines

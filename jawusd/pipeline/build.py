@@ -1,0 +1,154 @@
+"""From a capture to a rig in one call; finished stages are kept, and reused when nothing they read has changed."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from jawusd import __version__
+from jawusd.errors import OutputError
+from jawusd.formats.capture import Capture
+from jawusd.formats.model import load_model, save_model
+from jawusd.formats.tracks import load_tracks, save_tracks
+from jawusd.pipeline.prepare import input_files, open_capture
+from jawusd.pipeline.stages import bake_files, fit_jaw, sync_cameras, track_teeth
+from jawusd.pipeline.state import (
+    BUILD_FILE,
+    LOCK_FILE,
+    BuildState,
+    Progress,
+    StageRecord,
+    hash_files,
+    hash_value,
+    locked,
+)
+from jawusd.pipeline.summary import fit_summary, track_summary
+
+
+@dataclass(frozen=True)
+class BuildOptions:
+    """Choose how to build.
+
+    Attributes:
+        model: "anchored", "additive", "paper" or "pca".
+        jobs: threads of the tracker; the result does not depend on it.
+        resume: continue an earlier build in the folder.
+        fresh: delete an earlier build in the folder first.
+        allow_outside: let paths in the capture leave its folder.
+    """
+
+    model: str = "anchored"
+    jobs: int = 2
+    resume: bool = False
+    fresh: bool = False
+    allow_outside: bool = False
+
+
+def build_rig(
+    capture_path: str | os.PathLike[str], out: str | os.PathLike[str], options: BuildOptions, progress: Progress
+) -> dict:
+    """Build a rig from a capture.
+
+    Args:
+        capture_path: capture.toml or its folder.
+        out: the rig's folder.
+        options: how to build.
+        progress: told of every stage.
+
+    Returns:
+        Summary: files, seconds per stage, tracking and model error tables, what was inferred, warnings.
+
+    Raises:
+        JawusdError: one of its kinds; stages finished before stay valid for `resume`.
+    """
+    capture = open_capture(capture_path, allow_outside=options.allow_outside)
+    folder = Path(out)
+    _check_folder(folder, options)
+    with locked(folder):
+        state = BuildState(folder)
+        if options.fresh:
+            state.clear()
+        return _Build(capture, folder, options, state, progress).run()
+
+
+def _check_folder(folder: Path, options: BuildOptions) -> None:
+    if folder.is_file():
+        raise OutputError("is a file; the rig needs a folder.", path=folder)
+    if not folder.is_dir() or options.resume or options.fresh:
+        return
+    if (folder / BUILD_FILE).exists():
+        raise OutputError(
+            "holds an earlier build.", path=folder, hint="Continue it with --resume, or start over with --fresh."
+        )
+    if any(entry.name != LOCK_FILE for entry in folder.iterdir()):
+        raise OutputError("exists and is not empty.", path=folder, hint="Name a new folder.")
+
+
+class _Build:
+    """One run of the stages over one capture."""
+
+    def __init__(
+        self, capture: Capture, folder: Path, options: BuildOptions, state: BuildState, progress: Progress
+    ) -> None:
+        self.capture, self.folder, self.options = capture, folder, options
+        self.state, self.progress = state, progress
+        self.reused: list[str] = []
+
+    def run(self) -> dict:
+        capture, options = self.capture, self.options
+        sync = self._stage("sync", self._inputs(["videos"], capture.sync.model_dump()), self._sync)
+        # Paths stay out: the contents count, not where the capture lies.
+        described = capture.model_dump(mode="json", include={"frames", "bootstrap", "motion", "anatomy"})
+        described["cameras"] = [camera.name for camera in capture.cameras]
+        track = self._stage(
+            "track",
+            self._inputs(["scans", "calibration", "masks"], described, sync.result["offsets"]),
+            lambda: self._track(sync.result["offsets"]),
+        )
+        fit = self._stage("fit", hash_value([track.outputs, track.inputs, options.model, __version__]), self._fit)
+        bake = self._stage("bake", hash_value([fit.outputs, track.inputs, __version__]), self._bake)
+        return {
+            "capture": capture.name,
+            "folder": str(self.folder),
+            "files": sorted({*track.outputs, *fit.outputs, *bake.outputs}),
+            "seconds": {name: record.seconds for name, record in self.state.stages.items()},
+            "reused": self.reused,
+            "sync": sync.result,
+            "track": track.result,
+            "fit": fit.result,
+        }
+
+    def _inputs(self, parts: Iterable[str], *values: object) -> str:
+        return hash_value([hash_files(input_files(self.capture, parts)), *values, __version__])
+
+    def _stage(self, name: str, inputs: str, work: Callable[[], tuple[list[Path], dict]]) -> StageRecord:
+        record = self.state.valid(name, inputs)
+        if record is not None:
+            self.reused.append(name)
+            self.progress(name, 1, 1)
+            return record
+        start = time.perf_counter()
+        outputs, result = work()
+        return self.state.finish(name, inputs, outputs, time.perf_counter() - start, result)
+
+    def _sync(self) -> tuple[list[Path], dict]:
+        return [], sync_cameras(self.capture, self.progress)
+
+    def _track(self, offsets: dict[str, int]) -> tuple[list[Path], dict]:
+        tracks = track_teeth(self.capture, offsets, self.options.jobs, self.progress)
+        path = self.folder / "tracks.npz"
+        save_tracks(path, tracks)
+        return [path], track_summary(tracks)
+
+    def _fit(self) -> tuple[list[Path], dict]:
+        tracks = load_tracks(self.folder / "tracks.npz")
+        model = fit_jaw(self.capture, tracks, self.options.model, self.progress)
+        path = self.folder / "model.npz"
+        save_model(path, model)
+        return [path], fit_summary(model)
+
+    def _bake(self) -> tuple[list[Path], dict]:
+        return bake_files(self.capture, load_model(self.folder / "model.npz"), self.folder, self.progress), {}

@@ -1,0 +1,137 @@
+"""Load what a capture names and bring it into one shape: cameras, meshes, anatomy."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.errors import CalibrationError, CaptureError
+from jawusd.formats.calibration import load_calibration
+from jawusd.formats.capture import Capture, load_capture
+from jawusd.formats.mesh import Mesh
+from jawusd.geometry import LANDMARKS, Camera, anatomical_frame, find_landmarks
+from jawusd.pipeline.extras import stage
+
+MESHES = ("upper_teeth", "lower_teeth", "mandible", "skull")
+
+
+@dataclass(frozen=True, eq=False)
+class Anatomy:
+    """Place the person: axes and landmarks.
+
+    Attributes:
+        T_anatomical_skull: scan frame to anatomical frame, shape (4, 4).
+        landmarks: `geometry.LANDMARKS` in the mandible frame [mm], shape (5, 3).
+        inferred: what was derived from the scans instead of being given.
+    """
+
+    T_anatomical_skull: NDArray[np.float64]
+    landmarks: NDArray[np.float64]
+    inferred: tuple[str, ...]
+
+
+def open_capture(path: str | os.PathLike[str], *, allow_outside: bool = False) -> Capture:
+    """Read a capture and check that its calibration names its cameras.
+
+    Raises:
+        FormatError, CaptureError: see `formats.capture.load_capture`.
+    """
+    return load_capture(path, allow_outside=allow_outside)
+
+
+def load_cameras(capture: Capture) -> list[Camera]:
+    """Return the calibrated cameras in the capture's order.
+
+    Raises:
+        CalibrationError: there is no calibration, or it does not know a camera of the capture.
+    """
+    if capture.calibration is None:
+        raise CalibrationError(
+            'has no "calibration".',
+            path=capture.folder / "capture.toml",
+            hint="Name a calibration file (aniposelib TOML) there.",
+        )
+    known = {camera.name: camera for camera in load_calibration(capture.calibration)}
+    missing = [source.name for source in capture.cameras if source.name not in known]
+    if missing:
+        raise CalibrationError(
+            f"does not know camera {missing[0]} of the capture; it names {', '.join(known)}.", path=capture.calibration
+        )
+    return [known[source.name] for source in capture.cameras]
+
+
+def load_meshes(capture: Capture) -> dict[str, Mesh]:
+    """Read the scans and bones of a capture, by the names of `MESHES`; optional ones may be absent.
+
+    Raises:
+        CaptureError: a mesh is damaged, or of a size that cannot be in mm.
+    """
+    imaging = stage("jawusd.imaging.meshio")
+    paths = {name: getattr(capture.scans, name) for name in MESHES}
+    return {
+        name: imaging.load_mesh(path, kind="scan" if name.endswith("teeth") else "bone")
+        for name, path in paths.items()
+        if path is not None
+    }
+
+
+def find_anatomy(capture: Capture, meshes: dict[str, Mesh]) -> Anatomy:
+    """Return the anatomical frame and the landmarks, given ones before derived ones.
+
+    Raises:
+        CaptureError: a landmark has an unknown name, or the scans are swapped or not in occlusion.
+    """
+    imaging = stage("jawusd.imaging.meshio")
+    crowns = {name: mesh.vertices[imaging.tooth_labels(mesh) > 0] for name, mesh in meshes.items() if "teeth" in name}
+    inferred = []
+    given = capture.anatomy.T_anatomical_skull
+    if given is None:
+        T_anatomical_skull = anatomical_frame(crowns["upper_teeth"], crowns["lower_teeth"])
+        inferred.append("anatomical axes, from the scans")
+    else:
+        T_anatomical_skull = np.array(given, dtype=np.float64)
+    bone = meshes.get("mandible")
+    landmarks = find_landmarks(crowns["lower_teeth"], None if bone is None else bone.vertices, T_anatomical_skull)
+    named = capture.anatomy.landmarks or {}
+    unknown = sorted(set(named) - set(LANDMARKS))
+    if unknown:
+        raise CaptureError(
+            f'[anatomy.landmarks] names "{unknown[0]}", known are {", ".join(LANDMARKS)}.',
+            path=capture.folder / "capture.toml",
+        )
+    for index, name in enumerate(LANDMARKS):
+        if name in named:
+            landmarks[index] = named[name]
+        else:
+            source = "from the scans"
+            if name.startswith("condyle"):
+                source = "from the mandible mesh" if bone is not None else "at mean adult places: there is no mandible"
+            inferred.append(f"{name}, {source}")
+    return Anatomy(T_anatomical_skull, landmarks, tuple(inferred))
+
+
+def input_files(capture: Capture, names: Iterable[str]) -> list[Path]:
+    """Return the files behind parts of a capture, for hashing.
+
+    Args:
+        capture: the capture.
+        names: any of "scans", "calibration", "masks", "videos".
+    """
+    files: list[Path] = []
+    for name in names:
+        if name == "scans":
+            files += [path for key in MESHES if (path := getattr(capture.scans, key)) is not None]
+        elif name == "calibration" and capture.calibration is not None:
+            files.append(capture.calibration)
+        elif name == "videos":
+            files += [camera.video for camera in capture.cameras if camera.video is not None]
+        elif name == "masks":
+            for camera in capture.cameras:
+                for pattern in (camera.masks.upper, camera.masks.lower) if camera.masks else ():
+                    files += sorted(pattern.parent.iterdir()) if "%" in pattern.name else [pattern]
+    return [path for path in files if path.is_file()]

@@ -1,0 +1,150 @@
+"""Each stage as one function from objects to objects; `build` strings them together and keeps the record."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from jawusd.formats.capture import Capture
+from jawusd.formats.model import JawModel
+from jawusd.formats.poses import read_poses
+from jawusd.formats.tracks import Tracks, load_tracks
+from jawusd.pipeline.extras import stage
+from jawusd.pipeline.prepare import find_anatomy, load_cameras, load_meshes
+from jawusd.pipeline.state import Progress
+
+Motion = Tracks | tuple[np.ndarray, np.ndarray]
+
+
+def sync_cameras(capture: Capture, progress: Progress) -> dict:
+    """Return the frame offset of every camera to the reference camera.
+
+    Args:
+        capture: the capture.
+        progress: told of the work.
+
+    Returns:
+        `offsets` by camera name [frames], `method`, and what the method says of its confidence.
+
+    Raises:
+        SyncError: no flash was found, or the flashes of two cameras do not match.
+    """
+    progress("sync", 0, 1)
+    if capture.sync.offsets is not None:
+        offsets = {camera.name: capture.sync.offsets.get(camera.name, 0) for camera in capture.cameras}
+        result = {"offsets": offsets, "method": "given in the capture"}
+    elif len(capture.cameras) == 1 or any(camera.video is None for camera in capture.cameras):
+        # Masks alone carry no flash; numbered alike they are taken as simultaneous, and the report says so.
+        result = {"offsets": {camera.name: 0 for camera in capture.cameras}, "method": "taken as simultaneous"}
+    else:
+        found = stage("jawusd.capture.sync").estimate_offsets(capture)
+        result = {"offsets": found.offsets, "method": "light flash", "confidence": found.confidence}
+    progress("sync", 1, 1)
+    return result
+
+
+def track_teeth(capture: Capture, offsets: dict[str, int], jobs: int, progress: Progress) -> Tracks:
+    """Track both rows of teeth.
+
+    Args:
+        capture: the capture.
+        offsets: frame offset by camera.
+        jobs: threads.
+        progress: told of every frame.
+
+    Raises:
+        CaptureError, TrackingError: see `tracking.track_capture`.
+    """
+    tracking = stage("jawusd.tracking")
+    cameras, meshes = load_cameras(capture), load_meshes(capture)
+    anatomy = find_anatomy(capture, meshes)
+    return tracking.track_capture(
+        capture,
+        cameras,
+        offsets,
+        meshes["upper_teeth"],
+        meshes["lower_teeth"],
+        anatomy.landmarks,
+        tracking.TrackingConfig(threads=jobs),
+        progress=lambda done, total: progress("track", done, total),
+    )
+
+
+def read_motion(path: str | os.PathLike[str]) -> Motion:
+    """Read tracks, or a table of poses from elsewhere.
+
+    Returns:
+        `Tracks` of an npz file; of any other file frame numbers (F,) and T_skull_mandible (F, 4, 4).
+
+    Raises:
+        FormatError: not such a file.
+    """
+    return load_tracks(path) if Path(path).suffix == ".npz" else read_poses(path)
+
+
+def fit_jaw(capture: Capture, motion: Motion, method: str, progress: Progress) -> JawModel:
+    """Fit the jaw model.
+
+    Args:
+        capture: gives scans, landmarks and mandible.
+        motion: what `read_motion` gives.
+        method: "anchored", "additive", "paper" or "pca".
+        progress: told of the work.
+
+    Raises:
+        FittingError: the poses cannot carry a model.
+    """
+    fitting = stage("jawusd.fitting")
+    meshes = load_meshes(capture)
+    anatomy = find_anatomy(capture, meshes)
+    bone = meshes.get("mandible", meshes["lower_teeth"])
+    progress("fit", 0, 1)
+    model = fitting.fit_model(
+        motion,
+        T_anatomical_skull=anatomy.T_anatomical_skull,
+        landmarks=anatomy.landmarks,
+        mandible_vertices=bone.vertices,
+        config=fitting.FittingConfig(method=method),
+        actor=capture.name,
+    )
+    model.meta["fps"] = capture.fps
+    model.meta["inferred"] = list(anatomy.inferred)
+    progress("fit", 1, 1)
+    return model
+
+
+def bake_files(capture: Capture, model: JawModel, folder: Path, progress: Progress) -> list[Path]:
+    """Write the rig.
+
+    Args:
+        capture: gives the meshes and the name.
+        model: the fitted model with the captured parameters.
+        folder: where the rig goes.
+        progress: told of the work.
+
+    Returns:
+        The files written.
+
+    Raises:
+        RigError, OutputError: the rig cannot be written.
+    """
+    rig = stage("jawusd.rig.bake")
+    progress("bake", 0, 1)
+    files = rig.bake_rig(folder, model, load_meshes(capture), capture.name, capture.fps)
+    progress("bake", 1, 1)
+    return files
+
+
+def write_demo_capture(folder: Path, seed: int, frames: int, progress: Progress) -> Path:
+    """Render a synthetic capture and return its capture.toml.
+
+    Raises:
+        MissingDependencyError: OpenGL without a display (EGL) is not available.
+        OutputError: the folder cannot be written.
+    """
+    synthetic = stage("jawusd.synthetic.capture_writer")
+    config = synthetic.DemoConfig(seed=seed, frames=frames)
+    synthetic.write_demo(folder, config, progress=lambda done, total: progress("demo", done, total))
+    return folder / "capture.toml"

@@ -1,0 +1,162 @@
+"""What a build has finished: `build.json`, content hashes, and the lock of the output folder."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from jawusd.errors import FormatError, OutputError
+from jawusd.formats.atomic import write_text_atomic
+from jawusd.formats.npz import check_format
+
+FAMILY, VERSION = "jawusd-build", 1
+BUILD_FILE = "build.json"
+LOCK_FILE = ".jawusd-lock"
+_CHUNK_BYTES = 1 << 20
+
+#: Called with (stage, done, total) as work proceeds; total is 0 when unknown.
+Progress = Callable[[str, int, int], None]
+
+
+def hash_files(paths: Iterable[Path]) -> str:
+    """Return the SHA-256 of files' names and contents, in the given order.
+
+    Raises:
+        OSError: a file cannot be read.
+    """
+    total = hashlib.sha256()
+    for path in paths:
+        total.update(path.name.encode() + b"\0")
+        with open(path, "rb") as handle:
+            while chunk := handle.read(_CHUNK_BYTES):
+                total.update(chunk)
+        total.update(b"\1")
+    return total.hexdigest()
+
+
+def hash_value(value: object) -> str:
+    """Return the SHA-256 of a JSON-able value, independent of key order."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()
+
+
+@dataclass
+class StageRecord:
+    """Record one finished stage.
+
+    Attributes:
+        inputs: hash of everything the stage read: files, configuration, results of earlier stages.
+        outputs: hash by file name, relative to the folder.
+        seconds: how long it took [s].
+        result: small results that later stages or reports need.
+    """
+
+    inputs: str
+    outputs: dict[str, str]
+    seconds: float
+    result: dict = field(default_factory=dict)
+
+
+class BuildState:
+    """Keep the record of finished stages of one output folder.
+
+    Args:
+        folder: the output folder.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.stages: dict[str, StageRecord] = {}
+        path = folder / BUILD_FILE
+        if path.exists():
+            self.stages = _read(path)
+
+    def valid(self, stage: str, inputs: str) -> StageRecord | None:
+        """Return the record of a stage if its inputs and its files on disk are unchanged."""
+        record = self.stages.get(stage)
+        if record is None or record.inputs != inputs:
+            return None
+        for name, expected in record.outputs.items():
+            path = self.folder / name
+            if not path.is_file() or hash_files([path]) != expected:
+                return None
+        return record
+
+    def finish(self, stage: str, inputs: str, outputs: Iterable[Path], seconds: float, result: dict) -> StageRecord:
+        """Record a stage whose output files are complete, and write build.json.
+
+        Raises:
+            OutputError: build.json cannot be written.
+        """
+        hashes = {str(path.relative_to(self.folder)): hash_files([path]) for path in outputs}
+        self.stages[stage] = StageRecord(inputs, hashes, round(seconds, 3), result)
+        data = {
+            "format": f"{FAMILY}/{VERSION}",
+            "stages": {name: asdict(record) for name, record in self.stages.items()},
+        }
+        write_text_atomic(self.folder / BUILD_FILE, json.dumps(data, indent=1, sort_keys=True) + "\n")
+        return self.stages[stage]
+
+    def clear(self) -> None:
+        """Delete what earlier builds wrote here, and nothing else."""
+        for record in self.stages.values():
+            for name in record.outputs:
+                target = (self.folder / name).resolve()
+                # build.json is only a file: never follow a name out of the folder.
+                if target.is_relative_to(self.folder.resolve()):
+                    target.unlink(missing_ok=True)
+        (self.folder / BUILD_FILE).unlink(missing_ok=True)
+        self.stages = {}
+
+
+def _read(path: Path) -> dict[str, StageRecord]:
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        check_format(data.get("format"), FAMILY, VERSION, path)
+        return {str(name): StageRecord(**record) for name, record in data["stages"].items()}
+    except (OSError, ValueError, TypeError, AttributeError, KeyError) as error:
+        raise FormatError(
+            f"is damaged ({error}).", path=path, hint="Delete it, or build with --fresh into a new folder."
+        ) from error
+
+
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Hold the output folder for one build; the lock falls with the process, however it ends.
+
+    Raises:
+        OutputError: the folder cannot be written, or another build holds it.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT, 0o644)
+    except OSError as error:
+        raise OutputError(f"cannot write here: {error.strerror}.", path=folder) from error
+    try:
+        if not _try_lock(handle):
+            raise OutputError(
+                "another jawusd build is working in this folder.", path=folder, hint="Wait for it, or name another one."
+            )
+        yield
+    finally:
+        os.close(handle)
+
+
+def _try_lock(handle: int) -> bool:
+    """Take the operating system's lock on an open file; the system frees it when the process dies."""
+    try:
+        if os.name == "nt":
+            import msvcrt
+
+            msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
+        else:
+            import fcntl
+
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True

@@ -1,0 +1,76 @@
+"""The figures of a build, as data and as lines for people."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jawusd.formats.model import JawModel
+from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, Tracks
+from jawusd.geometry import LANDMARKS
+
+_LISTED_FRAMES = 20
+
+
+def track_summary(tracks: Tracks) -> dict:
+    """Return what a person should know of tracks: counts, uncertainty at the landmarks, coverage error."""
+    worst = tracks.status.min(1)
+    lost = tracks.frames[worst == LOST]
+    tracked = tracks.tracked()
+    sigma = np.median(tracks.sigma_mm[tracked], axis=0) if tracked.any() else np.full(len(LANDMARKS), np.nan)
+    coverage = tracks.coverage_error
+    return {
+        "frames": len(tracks.frames),
+        "tracked": int(tracked.sum()),
+        "lost": [int(frame) for frame in lost],
+        "recovered": int((tracks.status == RECOVERED).any(1).sum()),
+        "without_a_camera": int((tracks.status == PARTIAL).any(1).sum()),
+        "sigma_mm": {name: _rounded(value) for name, value in zip(LANDMARKS, sigma, strict=True)},
+        "coverage_error_percent": _rounded(100 * np.nanmean(coverage)) if np.isfinite(coverage).any() else None,
+    }
+
+
+def _rounded(value: float) -> float | None:
+    return round(float(value), 4) if np.isfinite(value) else None
+
+
+def track_lines(summary: dict) -> list[str]:
+    """Return `track_summary` as text."""
+    lost = summary["lost"]
+    lines = [f"tracked {summary['tracked']} of {summary['frames']} frames"]
+    if lost:
+        more = "" if len(lost) <= _LISTED_FRAMES else f" and {len(lost) - _LISTED_FRAMES} more"
+        lines.append(f"  lost: {', '.join(map(str, lost[:_LISTED_FRAMES]))}{more}")
+    lines.append(f"  recovered {summary['recovered']}, without one of the cameras {summary['without_a_camera']}")
+    sigma = ", ".join(f"{name} {value}" for name, value in summary["sigma_mm"].items())
+    lines.append(f"  expected error (1 sigma, median) [mm]: {sigma}")
+    lines.append(f"  mask left uncovered: {summary['coverage_error_percent']} %")
+    return lines
+
+
+def fit_summary(model: JawModel) -> dict:
+    """Return what a person should know of a model: its errors, ranges and warnings."""
+    keys = ("method", "kind", "errors", "ranges_mm", "warnings", "inferred", "trimmed_frames")
+    return {key: model.meta[key] for key in keys if key in model.meta}
+
+
+def fit_lines(summary: dict) -> list[str]:
+    """Return `fit_summary` as text."""
+    lines = [f"model: {summary.get('method')}"]
+    for name, table in summary.get("errors", {}).items():
+        figures = ", ".join(f"{key} {value}" for key, value in table.items()) if isinstance(table, dict) else table
+        lines.append(f"  {name} [mm]: {figures}")
+    lines += [f"  warning: {warning}" for warning in summary.get("warnings", [])]
+    return lines
+
+
+def build_lines(summary: dict) -> list[str]:
+    """Return the summary of a build as text."""
+    offsets = ", ".join(f"{name} {offset:+d}" for name, offset in summary["sync"]["offsets"].items())
+    lines = [f"sync ({summary['sync']['method']}): {offsets} frames"]
+    lines += track_lines(summary["track"])
+    lines += fit_lines(summary["fit"])
+    seconds = ", ".join(
+        f"{name} {'kept' if name in summary['reused'] else f'{value:.1f} s'}"
+        for name, value in summary["seconds"].items()
+    )
+    return [*lines, f"time: {seconds}", f"rig: {summary['folder']}/actor.usda"]
