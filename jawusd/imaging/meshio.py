@@ -1,0 +1,144 @@
+"""Read scans and bones from PLY, STL and OBJ, and tell teeth from gum by their colours."""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from jawusd.errors import CaptureError
+from jawusd.formats.mesh import Mesh
+
+__all__ = ["BOUNDARY", "GUM", "TOOTH", "Winding", "load_mesh", "tooth_labels", "winding"]
+
+GUM, TOOTH, BOUNDARY = 0, 1, 2
+
+_KINDS = (".ply", ".stl", ".obj")
+# Diagonal of the bounding box [mm]: smallest, typical, largest. A full arch has about 80, a mandible 165, a skull 290.
+_DIAGONAL_MM = {"scan": (20.0, 80.0, 150.0), "bone": (50.0, 200.0, 500.0)}
+_UNITS_MM = {"metres": 1000.0, "centimetres": 10.0, "inches": 25.4, "micrometres": 0.001}
+# How far red or green must stand out from the other channels (of 255) to be a label: painted labels stand out by more
+# (pure red by 255), the gum of photographic scan textures, such as (200, 110, 110), by less.
+_PAINT_CONTRAST = 100
+_FEWEST_PAINTED = 0.01  # share of the vertices; a handful of reddish ones is no labelling
+
+
+def load_mesh(path: str | os.PathLike[str], kind: Literal["scan", "bone"] = "scan") -> Mesh:
+    """Read a triangle mesh, its vertices in the order of the file.
+
+    Larger polygons are cut into triangles; STL files, which share no vertices, give three per triangle. Materials and
+    textures are not read.
+
+    Args:
+        path: PLY, STL or OBJ file, lengths in mm.
+        kind: "scan" for teeth, "bone" for mandible and skull; they differ in the size that is believed.
+
+    Raises:
+        CaptureError: the file is missing or damaged, holds no triangles or coordinates that are not finite, or is of
+            a size that cannot be in mm.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in _KINDS:
+        raise CaptureError(f"meshes are read from {', '.join(_KINDS)} files.", path=path, hint="Convert the mesh.")
+    try:
+        # As a stream and not by name, so that no file named inside (materials, textures) is opened.
+        with open(path, "rb") as stream:
+            loaded = trimesh.load_mesh(
+                stream, file_type=path.suffix[1:].lower(), process=False, maintain_order=True, skip_materials=True
+            )
+    except FileNotFoundError as error:
+        raise CaptureError("no such mesh.", path=path, hint="Check the path in capture.toml.") from error
+    except Exception as error:  # trimesh reports damaged files by whatever its parsers stumble over
+        raise CaptureError(f"the mesh cannot be read ({error}).", path=path, hint="Export it again.") from error
+    if not isinstance(loaded, trimesh.Trimesh) or len(loaded.faces) == 0:
+        raise CaptureError("the file holds no triangles.", path=path, hint="Export the surface, not a point cloud.")
+    colors = loaded.visual.vertex_colors[:, :3].astype(np.uint8) if loaded.visual.kind == "vertex" else None
+    return _checked(path, np.asarray(loaded.vertices), np.asarray(loaded.faces), colors, kind)
+
+
+def _checked(path: Path, vertices: NDArray, faces: NDArray, colors: NDArray[np.uint8] | None, kind: str) -> Mesh:
+    bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
+    if bad.size:
+        raise CaptureError(
+            f"vertex {bad[0]} has a coordinate that is not finite ({bad.size} such vertices).",
+            path=path,
+            hint="Export the mesh again.",
+        )
+    outside = np.flatnonzero(((faces < 0) | (faces >= len(vertices))).any(axis=1))
+    if outside.size:
+        raise CaptureError(
+            f"triangle {outside[0]} names a vertex that does not exist; there are {len(vertices)}.",
+            path=path,
+            hint="Export the mesh again.",
+        )
+    low, typical, high = _DIAGONAL_MM[kind]
+    diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    if not low <= diagonal <= high:
+        fitting = {unit: abs(math.log(diagonal * mm / typical)) for unit, mm in _UNITS_MM.items() if diagonal > 0}
+        unit = min(fitting, key=fitting.__getitem__) if fitting else ""
+        guess = f" It looks like {unit}." if fitting and low <= diagonal * _UNITS_MM[unit] <= high else ""
+        raise CaptureError(
+            f"the mesh is {diagonal:.4g} mm across its bounding box, a {kind} has {low:g} to {high:g} mm.{guess}",
+            path=path,
+            hint="Lengths must be in mm: scale the mesh and export it again.",
+        )
+    return Mesh(vertices.astype(np.float64), faces.astype(np.int32), colors)
+
+
+def tooth_labels(mesh: Mesh) -> NDArray[np.uint8]:
+    """Tell teeth from gum by vertex colour.
+
+    Red vertices are teeth, green ones teeth whose border is of interest (the incisal edge), all others gum. A scan
+    without colours, or with hardly any red or green, counts as teeth all over.
+
+    Args:
+        mesh: a teeth scan.
+
+    Returns:
+        GUM, TOOTH or BOUNDARY per vertex, shape (V,), uint8; everything that is tooth is > 0.
+    """
+    labels = np.full(len(mesh.vertices), GUM, np.uint8)
+    if mesh.colors is not None:
+        red, green, blue = mesh.colors.astype(np.int16).T
+        labels[red - np.maximum(green, blue) > _PAINT_CONTRAST] = TOOTH
+        labels[green - np.maximum(red, blue) > _PAINT_CONTRAST] = BOUNDARY
+    if np.count_nonzero(labels) < _FEWEST_PAINTED * len(labels) or mesh.colors is None:
+        labels[:] = TOOTH
+    return labels
+
+
+class Winding(NamedTuple):
+    """Say how the triangles of a mesh are turned.
+
+    Attributes:
+        closed: every edge is shared by exactly two triangles that run along it in opposite directions.
+        outward: triangles are counter-clockwise seen from outside; a strong hint only, unless the mesh is closed.
+        volume_mm3: signed volume, positive if outward.
+    """
+
+    closed: bool
+    outward: bool
+    volume_mm3: float
+
+
+def winding(mesh: Mesh) -> Winding:
+    """Find out whether a mesh is closed and which way its triangles are turned.
+
+    The signed volume is the sum of the tetrahedra over the triangles with the centroid as apex (C. Zhang, T. Chen,
+    "Efficient feature extraction for 2D/3D objects in mesh representation", ICIP 2001). Vertices at the same place
+    count as one.
+    """
+    unique, inverse = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    faces = inverse.reshape(-1)[mesh.faces]
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    there = edges[:, 0] * len(unique) + edges[:, 1]
+    back = edges[:, 1] * len(unique) + edges[:, 0]
+    closed = len(np.unique(there)) == len(there) and bool(np.isin(there, back).all())
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces] - mesh.vertices.mean(axis=0), 1, 0)
+    volume = float(np.einsum("fi,fi->", a, np.cross(b, c)) / 6)
+    return Winding(closed, volume > 0, volume)

@@ -1,0 +1,139 @@
+"""Mesh reading against trimesh's own exporters and hand-written files, and every guard."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from jawusd.errors import CaptureError
+from jawusd.formats.mesh import Mesh
+from jawusd.imaging import meshio
+
+
+def arch(scale: float = 1.0) -> trimesh.Trimesh:
+    """Make a closed mesh of a dental arch's size with shuffled vertices."""
+    mesh = trimesh.creation.torus(22, 5, 30, 12)
+    order = np.random.default_rng(0).permutation(len(mesh.vertices))
+    new = np.argsort(order)
+    return trimesh.Trimesh(mesh.vertices[order] * scale, new[mesh.faces], process=False)
+
+
+def paint(mesh: trimesh.Trimesh) -> np.ndarray:
+    colors = np.full((len(mesh.vertices), 3), (150, 150, 150), np.uint8)
+    colors[mesh.vertices[:, 0] > 0] = (215, 45, 40)
+    colors[mesh.vertices[:, 0] > 20] = (40, 190, 60)
+    mesh.visual = trimesh.visual.ColorVisuals(mesh, vertex_colors=colors)
+    return colors
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.PLY", "a.obj"])
+def test_vertex_order_faces_and_colours_survive(tmp_path: Path, name: str) -> None:
+    source = arch()
+    colors = paint(source)
+    path = tmp_path / name
+    source.export(path, file_type=path.suffix[1:].lower())
+    mesh = meshio.load_mesh(path)
+    assert np.allclose(mesh.vertices, source.vertices, atol=1e-5) and mesh.vertices.dtype == np.float64
+    assert np.array_equal(mesh.faces, source.faces) and mesh.faces.dtype == np.int32
+    assert np.abs(mesh.colors.astype(int) - colors).max() <= 1
+    labels = meshio.tooth_labels(mesh)
+    x = source.vertices[:, 0]
+    assert np.array_equal(labels, np.select([x > 20, x > 0], [meshio.BOUNDARY, meshio.TOOTH], meshio.GUM))
+
+
+def test_stl_keeps_the_triangles(tmp_path: Path) -> None:
+    source = arch()
+    source.export(tmp_path / "a.stl")
+    mesh = meshio.load_mesh(tmp_path / "a.stl")
+    assert mesh.colors is None and (meshio.tooth_labels(mesh) == meshio.TOOTH).all()
+    assert np.allclose(mesh.vertices[mesh.faces], source.triangles, atol=1e-5)
+    found = meshio.winding(mesh)
+    assert found.closed and found.outward and found.volume_mm3 == pytest.approx(source.volume, rel=1e-5)
+
+
+def test_textured_obj_with_quads_keeps_its_order(tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_text(
+        "mtllib missing.mtl\nv 0 0 0\nv 40 0 0\nv 40 30 0\nv 0 30 0\nv 5 5 5\n"
+        "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nusemtl x\nf 1/1 2/2 3/3 4/4\nf 1/2 3/1 5/4\n"
+    )
+    mesh = meshio.load_mesh(tmp_path / "a.obj")
+    assert np.array_equal(mesh.vertices, [[0, 0, 0], [40, 0, 0], [40, 30, 0], [0, 30, 0], [5, 5, 5]])
+    assert len(mesh.faces) == 3 and sorted(mesh.faces.ravel().tolist()) == [0, 0, 0, 1, 2, 2, 2, 3, 4]
+
+
+def test_missing_damaged_and_foreign_files(tmp_path: Path) -> None:
+    with pytest.raises(CaptureError, match=r"gone\.ply: no such mesh"):
+        meshio.load_mesh(tmp_path / "gone.ply")
+    with pytest.raises(CaptureError, match=r"a\.glb: meshes are read from \.ply, \.stl, \.obj"):
+        meshio.load_mesh(tmp_path / "a.glb")
+    source = arch()
+    source.export(tmp_path / "cut.ply")
+    data = (tmp_path / "cut.ply").read_bytes()
+    (tmp_path / "cut.ply").write_bytes(data[: len(data) // 2])
+    (tmp_path / "text.stl").write_text("hello")
+    for name in ("cut.ply", "text.stl"):
+        with pytest.raises(CaptureError, match=rf"{name}: "):
+            meshio.load_mesh(tmp_path / name)
+    trimesh.PointCloud(source.vertices).export(tmp_path / "cloud.ply")
+    with pytest.raises(CaptureError, match=r"cloud\.ply: .*no triangles"):
+        meshio.load_mesh(tmp_path / "cloud.ply")
+
+
+def write_ply(path: Path, vertices: list[str], faces: list[str]) -> Path:
+    path.write_text(
+        f"ply\nformat ascii 1.0\nelement vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
+        f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+        + "\n".join(vertices + faces)
+        + "\n"
+    )
+    return path
+
+
+def test_numbers_that_cannot_be(tmp_path: Path) -> None:
+    corners = ["0 0 0", "40 0 0", "40 30 0"]
+    assert len(meshio.load_mesh(write_ply(tmp_path / "good.ply", corners, ["3 0 1 2"])).faces) == 1
+    with pytest.raises(CaptureError, match=r"vertex 1 has a coordinate that is not finite"):
+        meshio.load_mesh(write_ply(tmp_path / "nan.ply", ["0 0 0", "nan 0 0", "40 30 0"], ["3 0 1 2"]))
+    with pytest.raises(CaptureError, match=r"index\.ply: "):
+        meshio.load_mesh(write_ply(tmp_path / "index.ply", corners, ["3 0 1 7"]))
+
+
+@pytest.mark.parametrize(
+    ("scale", "unit"), [(1 / 1000, "metres"), (1 / 25.4, "inches"), (0.1, "centimetres"), (1000, "micrometres")]
+)
+def test_wrong_units_are_named(tmp_path: Path, scale: float, unit: str) -> None:
+    arch(scale).export(tmp_path / "a.stl")
+    with pytest.raises(CaptureError, match=rf"a scan has 20 to 150 mm\. It looks like {unit}\..*must be in mm"):
+        meshio.load_mesh(tmp_path / "a.stl")
+
+
+def test_bones_may_be_larger_than_scans(tmp_path: Path) -> None:
+    arch(4).export(tmp_path / "a.stl")
+    assert len(meshio.load_mesh(tmp_path / "a.stl", kind="bone").faces) == len(arch().faces)
+    with pytest.raises(CaptureError, match="a scan has 20 to 150 mm"):
+        meshio.load_mesh(tmp_path / "a.stl")
+    arch(12).export(tmp_path / "b.stl")
+    with pytest.raises(CaptureError, match="a bone has 50 to 500 mm"):
+        meshio.load_mesh(tmp_path / "b.stl", kind="bone")
+
+
+def test_photographic_colours_are_no_labels() -> None:
+    source = arch()
+    rng = np.random.default_rng(1)
+    skin = np.clip(rng.normal((205, 125, 120), 4, (len(source.vertices), 3)), 0, 255).astype(np.uint8)
+    skin[0] = (255, 0, 0)
+    mesh = Mesh(source.vertices, source.faces, skin)
+    assert (meshio.tooth_labels(mesh) == meshio.TOOTH).all()
+
+
+def test_winding_tells_closed_from_open_and_out_from_in() -> None:
+    source = arch()
+    volume = source.volume
+    inside_out = meshio.winding(Mesh(source.vertices, source.faces[:, ::-1]))
+    assert inside_out.closed and not inside_out.outward and inside_out.volume_mm3 == pytest.approx(-volume)
+    holed = meshio.winding(Mesh(source.vertices, source.faces[5:]))
+    assert not holed.closed and holed.outward
+    one_flipped = source.faces.copy()
+    one_flipped[3] = one_flipped[3, ::-1]
+    assert not meshio.winding(Mesh(source.vertices, one_flipped)).closed
