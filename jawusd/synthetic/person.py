@@ -37,7 +37,7 @@ def _draw_joint(rng: np.random.Generator) -> Joint:
     slide_open = u(10.0, 13.0)
     return Joint(
         condyles=condyles,
-        incisor=np.array([u(-0.4, 0.4), u(1.6, 2.2), -u(2.6, 3.2)]),
+        incisor=np.array([u(-0.4, 0.4), u(1.3, 1.9), -u(2.6, 3.2)]),
         eminence_height_mm=_asymmetric(rng, u(9.5, 11.5), 0.08),
         eminence_width_mm=_asymmetric(rng, u(5.6, 6.6), 0.06),
         eminence_start_mm=_asymmetric(rng, u(4.2, 5.8), 0.10),
@@ -57,8 +57,8 @@ def _draw_joint(rng: np.random.Generator) -> Joint:
         retrusion_max_mm=u(0.7, 1.2),
         hinge_share=u(0.5, 0.75),
         deviation_mm=np.array([u(-0.45, 0.45), u(-0.5, 0.5)]),
-        protrusive_guidance=np.array([u(0.5, 0.7), u(0.12, 0.22), u(2.5, 3.5)]),
-        lateral_guidance=np.array([u(0.35, 0.5), u(0.08, 0.15), u(2.5, 3.5)]),
+        protrusive_guidance=np.array([u(0.75, 0.95), u(0.10, 0.18), u(2.0, 2.6)]),
+        lateral_guidance=np.array([u(0.70, 0.90), u(0.08, 0.15), u(2.0, 2.6)]),
     )
 
 
