@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 Force = Annotated[bool, typer.Option("--force", help="Overwrite an existing output.")]
-RigArg = Annotated[Path, typer.Argument(help="actor.usda or another file of the rig, or model.npz.", show_default=False)]
+RigArg = Annotated[Path, typer.Argument(help="actor.usda, another layer of it, or model.npz.", show_default=False)]
 Triple = tuple[float, float, float]
 
 #: Exit code of a "no": an invalid pose, a rig with errors.
@@ -177,11 +177,8 @@ def validate(
 
 
 def _verdict_lines(rows: list[dict[str, Any]], invalid: int) -> list[str]:
-    lines = [
-        f"frame {row['frame']}: {row['reason']} (residual {row['residual_mm']:.2f} mm, margin {row['margin_mm']:.2f} mm)"
-        for row in rows
-        if not row["valid"]
-    ]
+    shown = "frame {frame}: {reason} (residual {residual_mm:.2f} mm, margin {margin_mm:.2f} mm)"
+    lines = [shown.format(**row) for row in rows if not row["valid"]]
     return [*lines, f"{len(rows) - invalid} of {len(rows)} poses are valid"]
 
 
@@ -272,5 +269,6 @@ def _animate_lines(result: dict[str, Any]) -> list[str]:
     first, last = result["frames"]
     lines = [f"{result['file']}: frames {first:g} .. {last:g} at {result['fps']:g} fps"]
     if result["clamped"]:
-        lines.append(f"{result['clamped']} frames lay outside the bound, moved by up to {result['largest_clamp_mm']:.2f} mm")
+        moved = f"moved by up to {result['largest_clamp_mm']:.2f} mm"
+        lines.append(f"{result['clamped']} frames lay outside the bound, {moved}")
     return lines
