@@ -108,7 +108,7 @@ class Person:
         rng = np.random.default_rng([seed, 0x7A77])
         self.seed = seed
         self.joint = _draw_joint(rng)
-        self.noise = Noise(0.12, float(np.deg2rad(0.08)), rng.uniform(0.12, 0.25), rng.uniform(0.08, 0.15))
+        self.noise = Noise(0.12, float(np.deg2rad(0.08)), rng.uniform(0.10, 0.20), rng.uniform(0.065, 0.12))
         self.mandible_points = _mandible_points(self.joint)
         self.landmarks = np.concatenate([_dental_landmarks(self.joint), self.joint.condyles])
         self._envelope = Envelope(self.pose, self.mandible_points, exponent=1.3 if envelope == "competing" else None)
