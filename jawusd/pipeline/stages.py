@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from jawusd.evaluator import JawRig
 from jawusd.formats.capture import Capture
 from jawusd.formats.model import JawModel
 from jawusd.formats.poses import read_poses
@@ -96,22 +97,15 @@ def fit_jaw(capture: Capture, motion: Motion, method: str, progress: Progress) -
     Raises:
         FittingError: the poses cannot carry a model.
     """
-    fitting = stage("jawusd.fitting")
+    data, fitting = stage("jawusd.fitting.data"), stage("jawusd.fitting.fit")
+    config = stage("jawusd.fitting.config").FittingConfig(method=method)
     meshes = load_meshes(capture)
     anatomy = find_anatomy(capture, meshes)
     bone = meshes.get("mandible", meshes["lower_teeth"])
-    progress("fit", 0, 1)
-    model = fitting.fit_model(
-        motion,
-        T_anatomical_skull=anatomy.T_anatomical_skull,
-        landmarks=anatomy.landmarks,
-        mandible_vertices=bone.vertices,
-        config=fitting.FittingConfig(method=method),
-        actor=capture.name,
-    )
-    model.meta["fps"] = capture.fps
-    model.meta["inferred"] = list(anatomy.inferred)
-    progress("fit", 1, 1)
+    where = data.Anatomy(anatomy.T_anatomical_skull, anatomy.landmarks, bone.vertices)
+    model = fitting.fit_model(motion, where, config, lambda text, share: progress("fit", round(100 * share), 100))
+    model.meta.update(actor=capture.name, fps=capture.fps, inferred=list(anatomy.inferred))
+    progress("fit", 100, 100)
     return model
 
 
@@ -130,9 +124,17 @@ def bake_files(capture: Capture, model: JawModel, folder: Path, progress: Progre
     Raises:
         RigError, OutputError: the rig cannot be written.
     """
-    rig = stage("jawusd.rig.bake")
+    bake = stage("jawusd.rig.bake")
     progress("bake", 0, 1)
-    files = rig.bake_rig(folder, model, load_meshes(capture), capture.name, capture.fps)
+    files = bake.bake_rig(
+        folder,
+        JawRig(model.arrays, model.meta),
+        load_meshes(capture),
+        name=capture.name,
+        fps=capture.fps,
+        frames=model.frames,
+        d=model.d,
+    )
     progress("bake", 1, 1)
     return files
 
