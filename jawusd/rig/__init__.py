@@ -1,0 +1,23 @@
+"""The rig as OpenUSD: authoring, reading, validation, animation, ONNX sidecar.
+
+`jawusd.rig.bake` and `jawusd.rig.onnx_sidecar` need the package onnx (`jawusd[build]`); nothing else here does.
+"""
+
+from jawusd.rig.animation import write_animation
+from jawusd.rig.read import describe, load_rig
+from jawusd.rig.schema import register_schema, schema_is_live
+from jawusd.rig.validate import Finding, register_validators, validate_stage
+
+# As early as possible: OpenUSD ignores schemas that come after a process has used its first stage.
+register_schema()
+
+__all__ = [
+    "Finding",
+    "describe",
+    "load_rig",
+    "register_schema",
+    "register_validators",
+    "schema_is_live",
+    "validate_stage",
+    "write_animation",
+]

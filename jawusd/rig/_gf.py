@@ -1,0 +1,72 @@
+"""The only place where numpy arrays become Gf and Vt values and back.
+
+numpy side: column vectors (`p_a = T_a_b @ p_b`), quaternions (w, x, y, z), C-contiguous. USD side: row vectors.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pxr import Gf, Vt
+
+from jawusd.geometry.quaternion import matrix_from_wxyz, wxyz_from_matrix
+
+
+def double_array(values: ArrayLike) -> Vt.DoubleArray:
+    """Return a flat Vt.DoubleArray of an array of any shape, row-major."""
+    return Vt.DoubleArray.FromNumpy(np.ascontiguousarray(values, dtype=np.float64).reshape(-1))
+
+
+def float_array(values: ArrayLike) -> Vt.FloatArray:
+    """Return a flat Vt.FloatArray of an array of any shape, row-major; rounds to float32."""
+    return Vt.FloatArray.FromNumpy(np.ascontiguousarray(values, dtype=np.float32).reshape(-1))
+
+
+def int_array(values: ArrayLike) -> Vt.IntArray:
+    """Return a flat Vt.IntArray of integers of any shape, row-major."""
+    return Vt.IntArray.FromNumpy(np.ascontiguousarray(values, dtype=np.int32).reshape(-1))
+
+
+def vec3f_array(values: ArrayLike) -> Vt.Vec3fArray:
+    """Return a Vt.Vec3fArray of points or normals (n, 3); rounds to float32."""
+    return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values, dtype=np.float32))
+
+
+def vec2d(pair: ArrayLike) -> Gf.Vec2d:
+    """Return a Gf.Vec2d of two numbers."""
+    return Gf.Vec2d(*np.asarray(pair, dtype=np.float64).tolist())
+
+
+def translations(T: ArrayLike) -> list[Gf.Vec3d]:
+    """Return the translations [mm] of transforms (n, 4, 4)."""
+    return [Gf.Vec3d(*t) for t in np.asarray(T, dtype=np.float64)[:, :3, 3].tolist()]
+
+
+def rotations(T: ArrayLike) -> list[Gf.Quatd]:
+    """Return the rotations of transforms (n, 4, 4) as unit quaternions, each in the half-space of its predecessor.
+
+    USD's slerp takes the short way between two samples, but readers that interpolate the four numbers do not.
+    """
+    wxyz = wxyz_from_matrix(np.asarray(T, dtype=np.float64)[:, :3, :3])
+    if len(wxyz) > 1:
+        turn = np.where(np.einsum("ij,ij->i", wxyz[1:], wxyz[:-1]) < 0, -1.0, 1.0)
+        wxyz = wxyz * np.concatenate([[1.0], np.cumprod(turn)])[:, None]
+    return [Gf.Quatd(w, x, y, z) for w, x, y, z in wxyz.tolist()]
+
+
+def row_matrix(T: ArrayLike) -> Gf.Matrix4d:
+    """Return a transform (4, 4) for column vectors as a Gf.Matrix4d, which acts on row vectors."""
+    return Gf.Matrix4d(np.asarray(T, dtype=np.float64).T.tolist())
+
+
+def column_matrix(matrix: Gf.Matrix4d) -> NDArray[np.float64]:
+    """Return a Gf.Matrix4d as a transform (4, 4) for column vectors."""
+    return np.array(matrix, dtype=np.float64).T
+
+
+def transform_from_ops(translation: Gf.Vec3d, rotation: Gf.Quatd) -> NDArray[np.float64]:
+    """Return the transform (4, 4) of a translate and an orient op."""
+    T = np.eye(4)
+    T[:3, :3] = matrix_from_wxyz([rotation.GetReal(), *rotation.GetImaginary()])
+    T[:3, 3] = translation
+    return T

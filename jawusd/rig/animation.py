@@ -1,0 +1,152 @@
+"""Animation layers: samples of d for those who know the rig, baked mandible ops for everybody else.
+
+Between two samples of d every reader interpolates linearly; the baked ops follow that motion through the model. They
+are a translation and a quaternion: matrix samples shear, and layers or products of single parameters are millimetres
+wrong as soon as two parameters are combined.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pxr import Sdf
+
+from jawusd.errors import RigError
+from jawusd.evaluator import JawRig
+from jawusd.geometry.quaternion import matrix_from_wxyz, wxyz_from_matrix
+from jawusd.geometry.se3 import make_transform, transform_points
+from jawusd.rig import _gf
+from jawusd.rig.layers import new_layer, write_layer
+from jawusd.rig.layout import ACTOR, MANDIBLE, PARAMETERS
+from jawusd.rig.read import load_rig
+
+Array = NDArray[np.float64]
+
+# Half way between two baked samples no landmark may be farther from the model than this.
+_BETWEEN_MM = 0.02
+_MAX_HALVINGS = 5
+_LOST = "lostFrames"
+
+
+def write_animation(
+    out: str | os.PathLike[str],
+    actor: str | os.PathLike[str],
+    frames: ArrayLike,
+    d: ArrayLike,
+    fps: float,
+    *,
+    rig: JawRig | None = None,
+) -> Path:
+    """Write an animation layer that sublayers an actor; a time code is a frame number.
+
+    Args:
+        out: file to write, `.usdc` or `.usda`.
+        actor: the `actor.usda` it animates.
+        frames: increasing frame numbers (F,), whole or not; keys or every frame.
+        d: parameters (F, 3) [mm]; rows with NaN are lost frames, bridged linearly and listed in the layer's
+            `customLayerData["lostFrames"]`.
+        fps: frames per second.
+        rig: the evaluator, when the caller has it already; else it is read from `actor`.
+
+    Returns:
+        The file.
+
+    Raises:
+        RigError: frames do not increase, nothing to animate, or the frame rate is not positive.
+        FormatError: `actor` is not a rig.
+        OutputError: the file cannot be written.
+    """
+    out, actor = Path(out), Path(actor)
+    rig = load_rig(actor) if rig is None else rig
+    frames, d = np.asarray(frames, dtype=np.float64), np.asarray(d, dtype=np.float64)
+    if frames.ndim != 1 or d.shape != (len(frames), 3):
+        raise ValueError(f"frames (F,) and d (F, 3) are needed, got {frames.shape} and {d.shape}")
+    if not np.isfinite(frames).all() or (np.diff(frames) <= 0).any():
+        raise RigError("the frame numbers of an animation must increase.", path=out)
+    if not fps > 0:
+        raise RigError(f"{fps} frames per second; it must be more than 0.", path=out)
+    known = np.isfinite(d).all(axis=1)
+    if not known.any():
+        raise RigError("no frame has parameters; there is nothing to animate.", path=out)
+    layer = new_layer(fps)
+    layer.subLayerPaths.append(_relative(actor, out))
+    layer.startTimeCode, layer.endTimeCode = float(frames[0]), float(frames[-1])
+    if not known.all():
+        lost = _gf.int_array(np.floor(frames[~known]))
+        layer.customLayerData = {**layer.customLayerData, _LOST: lost}
+    _author(layer, rig, frames[known], d[known], frames[[0, -1]])
+    return write_layer(layer, out)
+
+
+def bake_times(rig: JawRig, frames: Array, d: Array, span: Array) -> tuple[Array, Array]:
+    """Choose the times of the baked samples: every whole frame, every sample of d, and between where it takes more.
+
+    Args:
+        rig: the model.
+        frames: times of the samples of d, increasing, shape (F,).
+        d: their values [mm], shape (F, 3).
+        span: first and last time to cover.
+
+    Returns:
+        Times (n,) and T_skull_mandible (n, 4, 4).
+    """
+    whole = np.arange(np.ceil(span[0]), np.floor(span[1]) + 1)
+    times = np.union1d(np.union1d(whole, span), frames)
+    poses = rig.pose(_at(times, frames, d))
+    for _ in range(_MAX_HALVINGS):
+        middles = 0.5 * (times[1:] + times[:-1])
+        exact = rig.pose(_at(middles, frames, d))
+        error = _landmark_distance(rig, exact, _half_way(poses[:-1], poses[1:]))
+        coarse = error > _BETWEEN_MM
+        if not coarse.any():
+            break
+        where = np.flatnonzero(coarse) + 1
+        times = np.insert(times, where, middles[coarse])
+        poses = np.insert(poses, where, exact[coarse], axis=0)
+    return times, poses
+
+
+def _author(layer: Sdf.Layer, rig: JawRig, frames: Array, d: Array, span: Array) -> None:
+    actor = Sdf.CreatePrimInLayer(layer, ACTOR)
+    for i, parameter in enumerate(PARAMETERS):
+        attribute = Sdf.AttributeSpec(
+            actor, parameter, Sdf.ValueTypeNames.Double, Sdf.VariabilityVarying, declaresCustom=True
+        )
+        _set_samples(layer, attribute, frames, d[:, i].tolist())
+    times, poses = bake_times(rig, frames, d, span)
+    mandible = Sdf.CreatePrimInLayer(layer, MANDIBLE)
+    translate = Sdf.AttributeSpec(mandible, "xformOp:translate", Sdf.ValueTypeNames.Double3)
+    _set_samples(layer, translate, times, _gf.translations(poses))
+    orient = Sdf.AttributeSpec(mandible, "xformOp:orient", Sdf.ValueTypeNames.Quatd)
+    _set_samples(layer, orient, times, _gf.rotations(poses))
+
+
+def _set_samples(layer: Sdf.Layer, attribute: Sdf.AttributeSpec, times: Array, values: list) -> None:
+    for time, value in zip(times.tolist(), values, strict=True):
+        layer.SetTimeSample(attribute.path, time, value)
+
+
+def _at(times: Array, frames: Array, d: Array) -> Array:
+    return np.stack([np.interp(times, frames, column) for column in d.T], axis=1)
+
+
+def _half_way(T_a: Array, T_b: Array) -> Array:
+    """Return what USD shows half way: mean translation, slerp of the quaternions."""
+    q_a, q_b = wxyz_from_matrix(T_a[:, :3, :3]), wxyz_from_matrix(T_b[:, :3, :3])
+    q = q_a + q_b * np.where(np.einsum("ij,ij->i", q_a, q_b) < 0, -1.0, 1.0)[:, None]
+    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    return make_transform(matrix_from_wxyz(q), 0.5 * (T_a[:, :3, 3] + T_b[:, :3, 3]))
+
+
+def _landmark_distance(rig: JawRig, T_a: Array, T_b: Array) -> Array:
+    landmarks = rig.arrays["landmarks"]
+    difference = T_a - T_b
+    return np.linalg.norm(transform_points(difference, landmarks[None]), axis=-1).max(axis=1)
+
+
+def _relative(actor: Path, out: Path) -> str:
+    relative = Path(os.path.relpath(actor.resolve(), out.resolve().parent)).as_posix()
+    return relative if relative.startswith(".") else f"./{relative}"

@@ -1,0 +1,75 @@
+"""Write a whole rig folder from a model and the actor's meshes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jawusd.errors import RigError
+from jawusd.evaluator import JawRig
+from jawusd.formats.mesh import Mesh
+from jawusd.rig.animation import write_animation
+from jawusd.rig.author import decoder_layer, interface_layer
+from jawusd.rig.geo import build_geometry
+from jawusd.rig.layers import write_layer
+from jawusd.rig.layout import ACTOR_FILE, GEO_FILE, ONNX_FILE, RIG_FILE
+from jawusd.rig.onnx_sidecar import write_onnx
+from jawusd.rig.table import DEFAULT_SIZE, build_table
+
+CAPTURED_MOTION = "anim_capture.usdc"
+
+
+def bake_rig(
+    folder: str | os.PathLike[str],
+    rig: JawRig,
+    meshes: Mapping[str, Mesh],
+    *,
+    name: str,
+    fps: float,
+    frames: ArrayLike | None = None,
+    d: ArrayLike | None = None,
+    table_size: int = DEFAULT_SIZE,
+) -> list[Path]:
+    """Write a rig: interface, decoder, geometry, ONNX graph, and the captured motion if there is one.
+
+    Every file is written in one step, `actor.usda` after all it refers to.
+
+    Args:
+        folder: where the files go; made if missing.
+        rig: the exact model.
+        meshes: `upper_teeth` and optionally `skull` in skull coordinates, `lower_teeth` and optionally `mandible` in
+            mandible coordinates [mm].
+        name: name of the actor.
+        fps: frames per second of the captured motion.
+        frames: captured frame numbers (F,), increasing.
+        d: parameters of the captured frames (F, 3) [mm], NaN where lost.
+        table_size: knots per axis of the sampled decoder, 17, 33 or 65.
+
+    Returns:
+        The files, in the order written.
+
+    Raises:
+        RigError: meshes, bounds or frames that make no rig.
+        OutputError: the folder cannot be written.
+    """
+    folder = Path(folder)
+    if (frames is None) != (d is None):
+        raise ValueError("frames and d belong together: give both or neither")
+    if not fps > 0:
+        raise RigError(f"{fps} frames per second; it must be more than 0.", path=folder)
+    geometry = build_geometry(meshes, rig.arrays["T_rest"])
+    moving = np.concatenate([meshes[key].vertices for key in ("mandible", "lower_teeth") if key in meshes])
+    table = build_table(rig, moving, table_size)
+    written = [
+        write_layer(geometry, folder / GEO_FILE),
+        write_layer(decoder_layer(rig, table), folder / RIG_FILE),
+        write_onnx(folder / ONNX_FILE, rig),
+        write_layer(interface_layer(rig, name, meshes, fps), folder / ACTOR_FILE),
+    ]
+    if frames is not None and d is not None:
+        written.append(write_animation(folder / CAPTURED_MOTION, folder / ACTOR_FILE, frames, d, fps, rig=rig))
+    return written

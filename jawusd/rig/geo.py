@@ -1,0 +1,154 @@
+"""The geometry payload: skull, teeth and mandible with normals and materials."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdShade
+
+from jawusd.errors import RigError
+from jawusd.formats.mesh import Mesh
+from jawusd.rig import _gf
+from jawusd.rig.layers import define_prim, new_layer, stage_of
+from jawusd.rig.layout import ACTOR, GEO, MANDIBLE, MATERIALS, SKULL
+
+# Every mesh name is unique: Blender merges an Xform with an only child and keeps the child's name.
+MESH_PATHS = {
+    "skull": f"{SKULL}/SkullMesh",
+    "upper_teeth": f"{SKULL}/UpperTeethMesh",
+    "mandible": f"{MANDIBLE}/MandibleMesh",
+    "lower_teeth": f"{MANDIBLE}/LowerTeethMesh",
+}
+_REQUIRED = ("upper_teeth", "lower_teeth")
+
+# base colour (linear RGB) and roughness
+_MATERIALS = {
+    "Enamel": ((0.85, 0.80, 0.70), 0.25),
+    "Gum": ((0.55, 0.16, 0.15), 0.45),
+    "Bone": ((0.75, 0.68, 0.54), 0.70),
+}
+# A vertex counts as crown when red or green stands out by this much of 255; grey is gum.
+_PAINT_CONTRAST = 60
+
+
+def build_geometry(meshes: Mapping[str, Mesh], T_rest: NDArray[np.float64]) -> Sdf.Layer:
+    """Build the layer with all meshes under /Actor.
+
+    Args:
+        meshes: `upper_teeth` and `skull` in skull coordinates, `lower_teeth` and `mandible` in mandible coordinates
+            [mm]; `skull` and `mandible` may be missing.
+        T_rest: T_skull_mandible of the closed bite, shape (4, 4); the mandible stands there by default.
+
+    Raises:
+        RigError: an unknown or missing mesh, or a mesh without faces or with values that are not finite.
+    """
+    _check_meshes(meshes)
+    layer = new_layer()
+    define_prim(layer, ACTOR, "Xform")
+    define_prim(layer, MATERIALS, "Scope")
+    define_prim(layer, GEO, "Scope")
+    define_prim(layer, SKULL, "Xform")
+    define_prim(layer, MANDIBLE, "Xform")
+    stage = stage_of(layer)
+    for path in (SKULL, MANDIBLE):
+        Usd.ModelAPI(stage.GetPrimAtPath(path)).SetKind(Kind.Tokens.subcomponent)
+    place_mandible(UsdGeom.Xformable(stage.GetPrimAtPath(MANDIBLE)), T_rest)
+    materials = {name: _material(stage, name) for name in _MATERIALS}
+    for name, path in MESH_PATHS.items():
+        if name in meshes:
+            _define_mesh(stage, path, meshes[name], materials, teeth=name.endswith("teeth"))
+    return layer
+
+
+def place_mandible(mandible: UsdGeom.Xformable, T: NDArray[np.float64]) -> None:
+    """Give the mandible its translate and orient ops and their default value, a pose (4, 4).
+
+    Never a matrix op: USD interpolates matrix samples number by number, which shears the mandible between frames.
+    """
+    mandible.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(_gf.translations(T[None])[0])
+    mandible.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(_gf.rotations(T[None])[0])
+
+
+def extent(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the smallest and largest corner, shape (2, 3), of points (n, 3)."""
+    return np.stack([vertices.min(axis=0), vertices.max(axis=0)])
+
+
+def _check_meshes(meshes: Mapping[str, Mesh]) -> None:
+    unknown = sorted(set(meshes) - set(MESH_PATHS))
+    if unknown:
+        raise RigError(f"there is no mesh called {unknown[0]!r}; allowed are {', '.join(MESH_PATHS)}.")
+    for name in _REQUIRED:
+        if name not in meshes:
+            raise RigError(f"the {name} mesh is missing; a rig needs both teeth scans.")
+    for name, mesh in meshes.items():
+        if not len(mesh.faces) or not np.isfinite(mesh.vertices).all():
+            raise RigError(f"the {name} mesh has no faces or has vertices that are not finite.")
+
+
+def _material(stage: Usd.Stage, name: str) -> UsdShade.Material:
+    color, roughness = _MATERIALS[name]
+    material = UsdShade.Material.Define(stage, f"{MATERIALS}/{name}")
+    surface = UsdShade.Shader.Define(stage, f"{MATERIALS}/{name}/Surface")
+    surface.CreateIdAttr("UsdPreviewSurface")
+    surface.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).Set(Gf.Vec3f(*color))
+    surface.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(roughness)
+    surface.CreateInput("metallic", Sdf.ValueTypeNames.Float).Set(0.0)
+    material.CreateSurfaceOutput().ConnectToSource(surface.ConnectableAPI(), "surface")
+    return material
+
+
+def _define_mesh(
+    stage: Usd.Stage, path: str, mesh: Mesh, materials: Mapping[str, UsdShade.Material], *, teeth: bool
+) -> None:
+    prim = UsdGeom.Mesh.Define(stage, path)
+    prim.CreatePointsAttr(_gf.vec3f_array(mesh.vertices))
+    prim.CreateFaceVertexIndicesAttr(_gf.int_array(mesh.faces))
+    prim.CreateFaceVertexCountsAttr(_gf.int_array(np.full(len(mesh.faces), 3)))
+    prim.CreateExtentAttr(_gf.vec3f_array(extent(mesh.vertices)))
+    prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    prim.CreateDoubleSidedAttr(True)  # scans are open surfaces
+    prim.CreateNormalsAttr(_gf.vec3f_array(corner_normals(mesh)))
+    prim.SetNormalsInterpolation(UsdGeom.Tokens.faceVarying)
+    gum = gum_faces(mesh) if teeth else np.zeros(len(mesh.faces), dtype=bool)
+    base = "Enamel" if teeth else "Bone"
+    prim.CreateDisplayColorAttr([Gf.Vec3f(*_MATERIALS[base][0])])
+    binding = UsdShade.MaterialBindingAPI.Apply(prim.GetPrim())
+    binding.Bind(materials[base])
+    if gum.any():
+        for name, faces in (("Gum", gum), ("Enamel", ~gum)):
+            subset = binding.CreateMaterialBindSubset(
+                f"{prim.GetPrim().GetName()}{name}", _gf.int_array(np.flatnonzero(faces))
+            )
+            UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(materials[name])
+        binding.SetMaterialBindSubsetsFamilyType(UsdGeom.Tokens.partition)
+
+
+def gum_faces(mesh: Mesh) -> NDArray[np.bool_]:
+    """Return which faces of a painted teeth scan are gum, shape (F,): two corners neither red nor green.
+
+    A scan without colours, or without any painted crown, is all enamel.
+    """
+    if mesh.colors is None:
+        return np.zeros(len(mesh.faces), dtype=bool)
+    color = mesh.colors.astype(np.int16)
+    red = color[:, 0] - np.maximum(color[:, 1], color[:, 2])
+    green = color[:, 1] - np.maximum(color[:, 0], color[:, 2])
+    crown = (np.maximum(red, green) > _PAINT_CONTRAST)[mesh.faces].sum(axis=1) >= 2
+    return ~crown if crown.any() else crown
+
+
+def corner_normals(mesh: Mesh) -> NDArray[np.float64]:
+    """Return smooth unit normals at every corner of every face, shape (3 F, 3): faces weighted by their area."""
+    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
+    area = np.cross(b - a, c - a)
+    normals = np.empty_like(mesh.vertices)
+    corners = mesh.faces.reshape(-1)
+    for axis in range(3):
+        normals[:, axis] = np.bincount(corners, np.repeat(area[:, axis], 3), minlength=len(mesh.vertices))
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    # corners of degenerate faces only: any unit vector is as good as another
+    normals = np.where(length > 0, normals / np.where(length > 0, length, 1.0), [0.0, 1.0, 0.0])
+    return normals[corners]

@@ -1,0 +1,98 @@
+"""Build USD layers in memory and put them on disk in one step."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from pxr import Sdf, Usd, UsdGeom
+
+from jawusd import __version__
+from jawusd.errors import RigError
+from jawusd.formats.atomic import atomic_path
+from jawusd.rig.layout import ACTOR
+from jawusd.rig.schema import SCHEMA_NAME
+
+
+def new_layer(fps: float | None = None) -> Sdf.Layer:
+    """Return a layer in memory with the units of every jawusd file: Y up, mm, /Actor the default prim.
+
+    Args:
+        fps: time codes per second; None leaves the layer without time.
+    """
+    layer = Sdf.Layer.CreateAnonymous(".usda")
+    root = layer.pseudoRoot
+    root.SetInfo(UsdGeom.Tokens.upAxis, UsdGeom.Tokens.y)
+    root.SetInfo(UsdGeom.Tokens.metersPerUnit, 0.001)
+    layer.defaultPrim = Sdf.Path(ACTOR).name
+    layer.customLayerData = {"creator": f"jawusd {__version__}"}
+    if fps is not None:
+        layer.timeCodesPerSecond = fps
+        layer.framesPerSecond = fps
+    return layer
+
+
+def stage_of(layer: Sdf.Layer) -> Usd.Stage:
+    """Return a stage on a layer in memory, for schema classes that want one."""
+    stage = Usd.Stage.Open(layer, load=Usd.Stage.LoadNone)
+    if stage is None:
+        raise RigError("OpenUSD could not open a layer in memory.")
+    return stage
+
+
+def define_prim(layer: Sdf.Layer, path: str, type_name: str) -> Sdf.PrimSpec:
+    """Define a prim of a type in a layer and return its spec; an existing spec becomes that definition."""
+    spec = Sdf.CreatePrimInLayer(layer, path)
+    spec.specifier = Sdf.SpecifierDef
+    spec.typeName = type_name
+    return spec
+
+
+def apply_jaw_api(spec: Sdf.PrimSpec, *others: str) -> None:
+    """Apply JawRigAPI, and other schemas, to a prim spec. Needs no plugin: the name is plain metadata."""
+    schemas = Sdf.TokenListOp()
+    schemas.prependedItems = [SCHEMA_NAME, *others]
+    spec.SetInfo("apiSchemas", schemas)
+
+
+def set_attribute(
+    spec: Sdf.PrimSpec, name: str, type_name: Sdf.ValueTypeName, value: object, *, animated: bool = False
+) -> None:
+    """Author an attribute with its default value.
+
+    `custom` is set on every one: Blender imports no other attribute.
+
+    Args:
+        spec: prim spec that gets it.
+        name: attribute name.
+        type_name: e.g. `Sdf.ValueTypeNames.Double`.
+        value: default value.
+        animated: may vary over time; everything else is uniform.
+    """
+    variability = Sdf.VariabilityVarying if animated else Sdf.VariabilityUniform
+    attribute = Sdf.AttributeSpec(spec, name, type_name, variability, declaresCustom=True)
+    attribute.default = value
+
+
+def set_relationship(spec: Sdf.PrimSpec, name: str, targets: Iterable[str]) -> None:
+    """Author a relationship to prims."""
+    relationship = Sdf.RelationshipSpec(spec, name, custom=True)
+    relationship.targetPathList.explicitItems = [Sdf.Path(target) for target in targets]
+
+
+def write_layer(layer: Sdf.Layer, path: Path) -> Path:
+    """Write a layer to a file atomically; a copy of that file already open in this process is reloaded.
+
+    Raises:
+        OutputError: the folder cannot be written.
+        RigError: OpenUSD refused the layer.
+    """
+    path = Path(path)
+    with atomic_path(path) as temporary:
+        if not layer.Export(str(temporary)):
+            raise RigError("OpenUSD could not write the layer.", path=path)
+    # OpenUSD keeps layers by name; without this a stage opened later in this process would show the old content.
+    in_use = Sdf.Layer.Find(str(path.resolve())) or Sdf.Layer.Find(str(path))
+    if in_use is not None:
+        in_use.Reload(force=True)
+    return path

@@ -1,0 +1,227 @@
+"""Read rigs from USD: by attribute name, whether or not this process knows the schema."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pxr import Sdf, Tf, Usd, UsdGeom
+
+from jawusd.errors import EvaluatorError, FormatError, RigError, UnitsError, VersionError
+from jawusd.evaluator import JawRig
+from jawusd.rig.arrays import read_arrays, read_value
+from jawusd.rig.layout import FORMAT_VERSION, PARAMETERS
+from jawusd.rig.schema import has_jaw_api
+from jawusd.rig.table import DecoderTable
+
+PathArg = str | os.PathLike[str]
+
+
+def load_rig(path: PathArg, prim_path: str | None = None) -> JawRig:
+    """Load the evaluator of a rig from a layer or package that carries it.
+
+    Args:
+        path: `actor.usda`, an animation layer, a package, or any stage that references an actor.
+        prim_path: which rig, where a stage has several.
+
+    Raises:
+        FormatError: no rig, several rigs, missing or malformed values.
+        VersionError: written by a newer version.
+        UnitsError: other units or twist order.
+        RigError: the stage cannot be opened, or names files outside its folder.
+    """
+    stage = open_stage(path)
+    return rig_of(find_rig_prim(stage, path, prim_path), path)
+
+
+def open_stage(path: PathArg) -> Usd.Stage:
+    """Open a stage.
+
+    Raises:
+        RigError: there is no such file, or it is not USD.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise RigError("there is no such file.", path=path)
+    try:
+        return Usd.Stage.Open(str(path))
+    except Tf.ErrorException as error:
+        raise RigError("is not a USD file that OpenUSD can read.", path=path) from error
+
+
+def find_rig_prim(stage: Usd.Stage, where: object, prim_path: str | None = None) -> Usd.Prim:
+    """Return the prim that carries the rig.
+
+    Raises:
+        FormatError: there is none, there are several, or the named prim is none.
+    """
+    if prim_path is not None:
+        prim = stage.GetPrimAtPath(prim_path) if Sdf.Path.IsValidPathString(prim_path) else None
+        if not prim or not has_jaw_api(prim):
+            raise FormatError(f"{prim_path} carries no jaw rig.", path=str(where))
+        return prim
+    prims = [prim for prim in stage.Traverse() if has_jaw_api(prim)]
+    if not prims:
+        raise FormatError("holds no jaw rig (no prim with JawRigAPI).", path=str(where))
+    if len(prims) > 1:
+        names = ", ".join(str(prim.GetPath()) for prim in prims)
+        raise FormatError(f"holds several jaw rigs: {names}.", path=str(where), hint="Name the prim.")
+    return prims[0]
+
+
+def rig_of(prim: Usd.Prim, where: object) -> JawRig:
+    """Build the evaluator from a rig prim; see `load_rig` for what it raises."""
+    check_version(prim, where)
+    check_units(prim, where)
+    check_assets(prim, where)
+    kind = read_value(prim, "jaw:model:kind", where)
+    arrays = read_arrays(prim, kind, where)
+    try:
+        meta = json.loads(read_value(prim, "jaw:meta", where))
+    except (TypeError, ValueError) as error:
+        raise FormatError(f"jaw:meta is not JSON ({error}).", path=str(where)) from error
+    if not isinstance(meta, dict):
+        raise FormatError("jaw:meta must be a JSON object.", path=str(where))
+    if meta.get("kind") != kind:
+        raise FormatError(f"jaw:model:kind is {kind!r}, jaw:meta says {meta.get('kind')!r}.", path=str(where))
+    try:
+        return JawRig(arrays, meta)
+    except EvaluatorError as error:
+        raise FormatError(error.message, path=str(where)) from error
+
+
+def check_version(prim: Usd.Prim, where: object) -> None:
+    """Check that this version can read the rig.
+
+    Raises:
+        FormatError: the version is not a positive whole number.
+        VersionError: it is newer.
+    """
+    version = read_value(prim, "jaw:formatVersion", where)
+    if not isinstance(version, int) or version < 1:
+        raise FormatError(f"jaw:formatVersion is {version!r}, expected a whole number from 1.", path=str(where))
+    if version > FORMAT_VERSION:
+        raise VersionError(
+            f"the rig has format version {version}, this jawusd reads up to {FORMAT_VERSION}.",
+            path=str(where),
+            hint="Update jawusd.",
+        )
+
+
+def check_units(prim: Usd.Prim, where: object) -> None:
+    """Check units and twist order.
+
+    Raises:
+        UnitsError: they are not mm, rad and (omega, v).
+    """
+    for name, wanted in (("jaw:lengthUnit", "mm"), ("jaw:angleUnit", "rad"), ("jaw:twistOrder", ["omega", "v"])):
+        value = read_value(prim, name, where)
+        found = value if isinstance(value, str) else list(value)
+        if found != wanted:
+            raise UnitsError(f"{name} is {found}, allowed is {wanted}.", path=str(where))
+
+
+def check_assets(prim: Usd.Prim, where: object) -> None:
+    """Check that the layers of a rig name only files in their own folder or below.
+
+    Layers that merely use a rig (animation, shots) may reach for it anywhere.
+
+    Raises:
+        RigError: naming the path.
+    """
+    for spec in prim.GetAttribute("jaw:formatVersion").GetPropertyStack():
+        layer = spec.layer
+        paths = [*layer.GetCompositionAssetDependencies(), *_authored_onnx(layer, spec.path.GetPrimPath())]
+        for asset in paths:
+            if escapes(asset):
+                raise RigError(f"names the file {asset}, outside its own folder.", path=layer.identifier or str(where))
+
+
+def escapes(asset: str) -> bool:
+    """Return whether an asset path leaves the folder of the layer that names it."""
+    parts = asset.replace("\\", "/").split("/")
+    depth = 0
+    for part in parts:
+        depth += {"..": -1, ".": 0, "": 0}.get(part, 1)
+        if depth < 0:
+            return True
+    return asset.startswith(("/", "\\")) or ":" in parts[0]
+
+
+def _authored_onnx(layer: Sdf.Layer, prim_path: Sdf.Path) -> list[str]:
+    attribute = layer.GetAttributeAtPath(prim_path.AppendProperty("jaw:onnx"))
+    return [attribute.default.path] if attribute is not None and attribute.default is not None else []
+
+
+def read_table(prim: Usd.Prim, where: object) -> DecoderTable:
+    """Read the sampled decoder of a rig prim.
+
+    Raises:
+        FormatError: values are missing, or do not fit one another.
+    """
+    names = ("shape", "d1Knots", "d2Knots", "d3Knots", "twists", "format", "maxError", "errorSamples")
+    values = {name: read_value(prim, f"jaw:decoder:{name}", where) for name in names}
+    knots = tuple(np.array(values[f"d{i}Knots"], dtype=np.float64) for i in (1, 2, 3))
+    twists = np.array(values["twists"], dtype=np.float32)
+    counts = [len(axis) for axis in knots]
+    if list(values["shape"]) != counts or min(counts) < 2 or any((np.diff(axis) <= 0).any() for axis in knots):
+        raise FormatError(f"jaw:decoder:shape is {list(values['shape'])}, the knots are {counts}.", path=str(where))
+    shape = (*counts, 6) if values["format"] == "grid" else (sum(counts), 6)
+    if twists.size != np.prod(shape):
+        raise FormatError(f"jaw:decoder:twists holds {twists.size} numbers, expected {shape}.", path=str(where))
+    if not np.isfinite(twists).all() or not all(np.isfinite(axis).all() for axis in knots):
+        raise FormatError("jaw:decoder holds values that are not finite.", path=str(where))
+    return DecoderTable(
+        values["format"], knots, twists.reshape(shape), float(values["maxError"]), int(values["errorSamples"])
+    )
+
+
+def describe(path: PathArg, prim_path: str | None = None) -> dict[str, Any]:
+    """Return what a rig file holds, as plain JSON values, for `jawusd info`.
+
+    Raises:
+        As `load_rig`.
+    """
+    stage = open_stage(path)
+    prim = find_rig_prim(stage, path, prim_path)
+    rig = rig_of(prim, path)
+    table = read_table(prim, path)
+    names = list(read_value(prim, "jaw:landmarks:names", path))
+    samples = prim.GetAttribute(PARAMETERS[0]).GetTimeSamples()
+    animation = {"samples": len(samples), "first": samples[0], "last": samples[-1]} if samples else None
+    onnx = prim.GetAttribute("jaw:onnx").Get()
+    return {
+        "file": str(path),
+        "prim": str(prim.GetPath()),
+        "format_version": read_value(prim, "jaw:formatVersion", path),
+        "actor": read_value(prim, "jaw:actor", path),
+        "model": {"kind": read_value(prim, "jaw:model:kind", path), "method": rig.meta.get("method")},
+        "model_hash": read_value(prim, "jaw:modelHash", path),
+        "units": {"length": "mm", "angle": "rad"},
+        "twist_order": ["omega", "v"],
+        "ranges_mm": {name.removeprefix("jaw:"): row.tolist() for name, row in zip(PARAMETERS, rig.arrays["d_range"])},
+        "landmarks_mm": dict(zip(names, rig.arrays["landmarks"].tolist(), strict=True)),
+        "thresholds_mm": {
+            "residual": float(rig.arrays["residual_limit_mm"]),
+            "margin": float(rig.arrays["margin_limit_mm"]),
+        },
+        "table": {
+            "format": table.format,
+            "shape": [len(axis) for axis in table.knots],
+            "max_error_mm": table.max_error_mm,
+        },
+        "onnx": onnx.path if onnx is not None else None,
+        "fps": stage.GetTimeCodesPerSecond(),
+        "animation": animation,
+        "meshes": _meshes(prim),
+        "errors": rig.meta.get("errors"),
+    }
+
+
+def _meshes(prim: Usd.Prim) -> dict[str, int]:
+    """Return the number of points of every mesh below a prim, by name."""
+    meshes = [UsdGeom.Mesh(p) for p in Usd.PrimRange(prim) if p.IsA(UsdGeom.Mesh)]
+    return {mesh.GetPrim().GetName(): len(mesh.GetPointsAttr().Get() or []) for mesh in meshes}

@@ -1,0 +1,196 @@
+"""The rules a rig must keep: plain functions of a rig prim, independent of UsdValidation and of the schema plugin."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pxr import Gf, Sdf, Usd, UsdGeom
+
+from jawusd.errors import JawusdError
+from jawusd.evaluator import JawRig
+from jawusd.geometry.se3 import se3_exp, transform_points
+from jawusd.rig import _gf
+from jawusd.rig.layout import PARAMETERS
+from jawusd.rig.read import read_table, rig_of
+from jawusd.rig.table import sample_valid
+
+Array = NDArray[np.float64]
+
+_TABLE_SLACK_MM = 0.01  # the table states its error over more parameters than are tried here
+_ONNX_MM = 0.01
+_BAKED_MM = 0.01
+_PROBES = 500
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Say what breaks a rule.
+
+    Attributes:
+        severity: "error", "warning" or "info".
+        rule: name of the rule.
+        path: prim or attribute it is about.
+        message: what was found and what is allowed.
+    """
+
+    severity: str
+    rule: str
+    path: str
+    message: str
+
+
+Rule = Callable[[Usd.Prim], Iterator[Finding]]
+
+
+def check_model(prim: Usd.Prim) -> Iterator[Finding]:
+    """Version, units, asset paths and model arrays can be read: all there, right shapes, finite."""
+    try:
+        rig_of(prim, _where(prim))
+    except JawusdError as error:
+        yield _finding("error", "Model", prim, error.message)
+
+
+def check_table(prim: Usd.Prim) -> Iterator[Finding]:
+    """The sampled table is complete, and as near to the exact model as it says."""
+    try:
+        table = read_table(prim, _where(prim))
+    except JawusdError as error:
+        yield _finding("error", "Table", prim, error.message)
+        return
+    rig = _rig(prim)
+    if rig is None:
+        return
+    d = sample_valid(rig, _PROBES)
+    read = se3_exp(table.twist(d)) @ rig.arrays["T_rest"]
+    error_mm = _landmark_distance(rig, read, rig.pose(d)).max()
+    if error_mm > table.max_error_mm + _TABLE_SLACK_MM:
+        message = f"the table is {error_mm:.3f} mm from the model, maxError says {table.max_error_mm:.3f} mm."
+        yield _finding("error", "Table", prim, message)
+
+
+def check_onnx(prim: Usd.Prim) -> Iterator[Finding]:
+    """The ONNX file named by jaw:onnx was made from this model and gives its poses."""
+    asset = prim.GetAttribute("jaw:onnx").Get()
+    rig = _rig(prim)
+    if asset is None or not asset.path or rig is None:
+        return
+    if not asset.resolvedPath:
+        yield _finding("error", "Onnx", prim, f"{asset.path} is not there.")
+        return
+    try:
+        from jawusd.rig.onnx_check import onnx_error_mm
+    except ImportError:
+        yield _finding("info", "Onnx", prim, "not checked: the package onnx is not installed (jawusd[build]).")
+        return
+    try:
+        error_mm = onnx_error_mm(asset.resolvedPath, rig, sample_valid(rig, _PROBES))
+    except JawusdError as error:
+        yield _finding("error", "Onnx", prim, error.message)
+        return
+    if not error_mm <= _ONNX_MM:
+        message = f"{asset.path} is {error_mm:.3f} mm from the model, allowed {_ONNX_MM} mm."
+        yield _finding("error", "Onnx", prim, message)
+
+
+def check_bounds(prim: Usd.Prim) -> Iterator[Finding]:
+    """Every value of d1, d2, d3, at every time, lies inside the bounds."""
+    rig = _rig(prim)
+    if rig is None:
+        return
+    times = _times(prim, [prim.GetAttribute(name) for name in PARAMETERS])
+    d = _parameters(prim, times)
+    margin = rig.margin(d)
+    worst = int(np.argmin(np.where(np.isfinite(margin), margin, -np.inf)))
+    outside = ~(margin >= float(rig.arrays["margin_limit_mm"]))
+    if outside.any():
+        values = ", ".join(f"{x:.2f}" for x in d[worst])
+        message = f"{outside.sum()} of {len(d)} samples are outside; worst at {times[worst]}: d = ({values}) mm, "
+        message += f"margin {margin[worst]:.2f} mm."
+        yield _finding("warning", "Bounds", prim, message)
+
+
+def check_mandible(prim: Usd.Prim) -> Iterator[Finding]:
+    """The mandible moves by translate (double3) and orient (quatd) alone, and where the model says."""
+    targets = prim.GetRelationship("jaw:mandible").GetTargets() if prim.HasRelationship("jaw:mandible") else []
+    if len(targets) != 1:
+        yield _finding("error", "Mandible", prim, f"jaw:mandible names {len(targets)} prims, expected 1.")
+        return
+    if not prim.IsLoaded():
+        return
+    mandible = UsdGeom.Xformable(prim.GetStage().GetPrimAtPath(targets[0]))
+    if not mandible:
+        yield _finding("error", "Mandible", prim, f"{targets[0]}, named by jaw:mandible, is no Xformable prim.")
+        return
+    ops = mandible.GetOrderedXformOps()
+    names = [(op.GetOpName(), op.GetTypeName()) for op in ops]
+    if names != [("xformOp:translate", "double3"), ("xformOp:orient", "quatd")] or mandible.GetResetXformStack():
+        message = f"the ops are {names}, expected translate (double3) and orient (quatd)."
+        yield _finding("error", "Mandible", mandible.GetPrim(), message)
+        return
+    rig = _rig(prim)
+    if rig is not None:
+        yield from _check_baked(prim, rig, mandible.GetPrim(), *(op.GetAttr() for op in ops))
+
+
+def _check_baked(
+    prim: Usd.Prim, rig: JawRig, mandible: Usd.Prim, translate: Usd.Attribute, orient: Usd.Attribute
+) -> Iterator[Finding]:
+    times = _times(prim, [translate, orient])
+    baked = np.stack([_gf.transform_from_ops(_at(translate, time), _at(orient, time)) for time in times])
+    error_mm = _landmark_distance(rig, baked, rig.pose(_parameters(prim, times)))
+    worst = int(np.argmax(np.where(np.isfinite(error_mm), error_mm, np.inf)))
+    if not error_mm[worst] <= _BAKED_MM:
+        message = f"the baked pose at {times[worst]} is {error_mm[worst]:.3f} mm from that of d ({_BAKED_MM} allowed)."
+        yield _finding("error", "Mandible", mandible, message)
+
+
+RULES: dict[str, Rule] = {
+    "Model": check_model,
+    "Table": check_table,
+    "Onnx": check_onnx,
+    "Bounds": check_bounds,
+    "Mandible": check_mandible,
+}
+
+
+def _where(prim: Usd.Prim) -> str:
+    return prim.GetStage().GetRootLayer().identifier
+
+
+def _finding(severity: str, rule: str, prim: Usd.Prim, message: str) -> Finding:
+    return Finding(severity, rule, str(prim.GetPath()), message)
+
+
+def _rig(prim: Usd.Prim) -> JawRig | None:
+    """Return the evaluator, or None when the rule `check_model` has something to say."""
+    try:
+        return rig_of(prim, _where(prim))
+    except JawusdError:
+        return None
+
+
+def _times(prim: Usd.Prim, attributes: list[Usd.Attribute]) -> list[Usd.TimeCode]:
+    """Return every time at which one of the attributes has a sample; without any, the default time."""
+    samples = sorted({time for attribute in attributes for time in attribute.GetTimeSamples()})
+    return [Usd.TimeCode(time) for time in samples] or [Usd.TimeCode.Default()]
+
+
+def _at(attribute: Usd.Attribute, time: Usd.TimeCode) -> Gf.Vec3d | Gf.Quatd:
+    value = attribute.Get(time)
+    if value is not None:
+        return value
+    return Gf.Quatd(1) if attribute.GetTypeName() == Sdf.ValueTypeNames.Quatd else Gf.Vec3d(0)
+
+
+def _parameters(prim: Usd.Prim, times: list[Usd.TimeCode]) -> Array:
+    rows = [[prim.GetAttribute(name).Get(time) for name in PARAMETERS] for time in times]
+    return np.array(rows, dtype=np.float64)
+
+
+def _landmark_distance(rig: JawRig, T_a: Array, T_b: Array) -> Array:
+    """Return the largest distance [mm] of a landmark between poses (n, 4, 4), shape (n,)."""
+    points = transform_points(T_a - T_b, rig.arrays["landmarks"][None])
+    return np.linalg.norm(points, axis=-1).max(axis=-1)

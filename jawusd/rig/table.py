@@ -1,0 +1,177 @@
+"""The sampled decoder: a table of twists for readers that do not know the exact model, and how wrong it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jawusd.errors import RigError
+from jawusd.evaluator import JawRig
+from jawusd.geometry.se3 import se3_exp
+
+Array = NDArray[np.float64]
+
+DEFAULT_SIZE = 33
+SIZES = (17, 33, 65)
+_VALID_SAMPLES = 10_000
+_FULL_CHECKS = 200
+_PROBES_PER_AXIS = 41
+
+
+@dataclass(frozen=True, eq=False)
+class DecoderTable:
+    """Hold twists sampled over d.
+
+    Attributes:
+        format: "grid" (twists over the three axes) or "curves" (three curves, to be added).
+        knots: sample positions of d1, d2, d3 [mm], increasing, three arrays.
+        twists: twists (omega [rad], v [mm]) in the skull frame, float32: (n1, n2, n3, 6), or (n1 + n2 + n3, 6).
+        max_error_mm: largest distance to the exact model found at any vertex.
+        error_samples: number of valid d at which it was measured.
+    """
+
+    format: str
+    knots: tuple[Array, Array, Array]
+    twists: NDArray[np.float32]
+    max_error_mm: float = 0.0
+    error_samples: int = 0
+
+    def __post_init__(self) -> None:
+        counts = tuple(len(axis) for axis in self.knots)
+        wanted = (*counts, 6) if self.format == "grid" else (sum(counts), 6)
+        if self.twists.shape != wanted:
+            raise ValueError(f"twists of a {self.format} {counts} must have shape {wanted}, got {self.twists.shape}")
+
+    def twist(self, d: ArrayLike) -> Array:
+        """Return interpolated twists, shape (n, 6), at d (n, 3) [mm], d clamped to the knots."""
+        d = np.asarray(d, dtype=np.float64)
+        if self.format == "curves":
+            parts = np.split(self.twists.astype(np.float64), np.cumsum([len(axis) for axis in self.knots])[:2])
+            return sum(_along(part, axis, x) for part, axis, x in zip(parts, self.knots, d.T, strict=True))
+        located = [_locate(axis, d[:, i]) for i, axis in enumerate(self.knots)]
+        (i, a), (j, b), (k, c) = ((index, share[:, None]) for index, share in located)
+        twists = self.twists
+        total = np.zeros((len(d), 6))
+        for di, wi in ((0, 1 - a), (1, a)):
+            for dj, wj in ((0, 1 - b), (1, b)):
+                for dk, wk in ((0, 1 - c), (1, c)):
+                    total += wi * wj * wk * twists[i + di, j + dj, k + dk]
+        return total
+
+
+def build_table(rig: JawRig, vertices: Array, size: int = DEFAULT_SIZE) -> DecoderTable:
+    """Sample a rig and measure the table's error.
+
+    Args:
+        rig: the exact model.
+        vertices: mandible vertices (V, 3) in mandible coordinates [mm], at which the error is measured.
+        size: knots per axis, 17, 33 or 65.
+
+    Returns:
+        A grid, or three curves for an additive model, whose sum is exact between the axes.
+
+    Raises:
+        RigError: the size is not offered, or the bounds leave nothing valid.
+    """
+    if size not in SIZES:
+        raise RigError(f"a table of {size} knots per axis is not offered; allowed are {', '.join(map(str, SIZES))}.")
+    axes = tuple(np.linspace(low, high, size) for low, high in valid_box(rig))
+    if rig.meta["kind"] == "additive":
+        twists = np.concatenate([rig.twist(_on_axis(i, axis)) for i, axis in enumerate(axes)])
+        table = DecoderTable("curves", axes, twists.astype(np.float32))
+    else:
+        grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+        twists = rig.twist(grid.reshape(-1, 3)).reshape(*grid.shape[:3], 6)
+        table = DecoderTable("grid", axes, twists.astype(np.float32))
+    # the error of linear interpolation peaks in the middle of the cells
+    middles = np.stack(np.meshgrid(*(0.5 * (axis[1:] + axis[:-1]) for axis in axes[:3]), indexing="ij"), axis=-1)
+    middles = middles.reshape(-1, 3)
+    samples = np.concatenate([middles[rig.margin(middles) >= 0], sample_valid(rig, _VALID_SAMPLES)])
+    error = table_error(rig, table, vertices, samples)
+    return DecoderTable(table.format, table.knots, table.twists, error, len(samples))
+
+
+def table_error(rig: JawRig, table: DecoderTable, vertices: Array, d: Array) -> float:
+    """Return the largest distance [mm] between table and model at any vertex (V, 3), over parameters d (n, 3).
+
+    The distance is a convex function of the vertex, so vertices that are extreme in some direction find the worst
+    parameters; those are then checked at every vertex.
+    """
+    exact = rig.pose(d)
+    read = se3_exp(table.twist(d)) @ rig.arrays["T_rest"]
+    rough = largest_distance(exact, read, vertices[extreme_vertices(vertices)])
+    worst = np.argsort(rough)[-_FULL_CHECKS:]
+    return float(largest_distance(exact[worst], read[worst], vertices).max())
+
+
+def largest_distance(T_a: Array, T_b: Array, points: Array) -> Array:
+    """Return the largest distance [mm], shape (n,), of points (V, 3) under two sets of poses (n, 4, 4).
+
+    |(T_a - T_b) p|^2 is a quadratic form in (p, 1): ten numbers per pose and per point, one matrix product.
+    """
+    D = (T_a - T_b)[:, :3, :]
+    Q = np.swapaxes(D, 1, 2) @ D
+    rows, columns = np.triu_indices(4)
+    form = Q[:, rows, columns] * np.where(rows == columns, 1.0, 2.0)
+    homogeneous = np.concatenate([points, np.ones((len(points), 1))], axis=1)
+    monomials = (homogeneous[:, rows] * homogeneous[:, columns]).T
+    chunk = max(1, 4_000_000 // len(points))
+    squares = [(form[i : i + chunk] @ monomials).max(axis=1) for i in range(0, len(form), chunk)]
+    return np.sqrt(np.maximum(np.concatenate(squares), 0.0))
+
+
+def extreme_vertices(vertices: Array) -> NDArray[np.int64]:
+    """Return the indices of vertices (V, 3) that lie farthest in one of about 400 directions."""
+    i = np.arange(400) + 0.5
+    height, turn = 1 - 2 * i / len(i), np.pi * (1 + 5**0.5) * i  # Fibonacci sphere
+    radius = np.sqrt(1 - height**2)
+    directions = np.stack([radius * np.cos(turn), radius * np.sin(turn), height], axis=1)
+    return np.unique(np.argmax(vertices @ directions.T, axis=0))
+
+
+def valid_box(rig: JawRig) -> Array:
+    """Return the box (3, 2) [mm] of d that the table spans: `d_range`, widened to all d with a margin above zero."""
+    box = np.array(rig.arrays["d_range"], dtype=np.float64)
+    reach = 1.0 + float(rig.arrays["slice_margin_mm"]) + float(rig.arrays["slice_softness_mm"])
+    wide = box + np.array([-reach, reach])
+    axes = [np.linspace(low, high, _PROBES_PER_AXIS) for low, high in wide]
+    probes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    valid = probes[rig.margin(probes) >= 0]
+    if not len(valid):
+        raise RigError("the bounds of the model leave no valid parameters.")
+    step = np.array([axis[1] - axis[0] for axis in axes])
+    low, high = valid.min(axis=0) - step, valid.max(axis=0) + step
+    return np.stack([np.minimum(box[:, 0], low), np.maximum(box[:, 1], high)], axis=1).clip(wide[:, :1], wide[:, 1:])
+
+
+def sample_valid(rig: JawRig, count: int, seed: int = 0) -> Array:
+    """Return `count` valid d, shape (count, 3) [mm], spread evenly over the volume where the margin is not negative."""
+    rng = np.random.default_rng(seed)
+    box = valid_box(rig)
+    found: list[Array] = []
+    missing = count
+    while missing > 0:
+        d = rng.uniform(box[:, 0], box[:, 1], (4 * count, 3))
+        d = d[rig.margin(d) >= 0][:missing]
+        found.append(d)
+        missing -= len(d)
+    return np.concatenate(found)
+
+
+def _on_axis(i: int, values: Array) -> Array:
+    d = np.zeros((len(values), 3))
+    d[:, i] = values
+    return d
+
+
+def _locate(knots: Array, x: Array) -> tuple[NDArray[np.int64], Array]:
+    x = np.clip(x, knots[0], knots[-1])
+    index = np.clip(np.searchsorted(knots, x, side="right") - 1, 0, len(knots) - 2)
+    return index, (x - knots[index]) / (knots[index + 1] - knots[index])
+
+
+def _along(values: Array, knots: Array, x: Array) -> Array:
+    index, share = _locate(knots, x)
+    return values[index] * (1 - share[:, None]) + values[index + 1] * share[:, None]

@@ -1,0 +1,92 @@
+"""Validation: jawusd's rules as UsdValidation validators, and every finding about a file in one list."""
+
+from __future__ import annotations
+
+import os
+
+from pxr import Usd, UsdValidation
+
+from jawusd.rig.read import open_stage
+from jawusd.rig.rules import RULES, Finding, Rule
+from jawusd.rig.schema import has_jaw_api
+
+KEYWORD = "JawUsd"
+_PREFIX = "jawusd:"
+
+# UsdValidation takes validators written in Python from OpenUSD 26.05 on.
+_PLUGGABLE = hasattr(UsdValidation, "ValidatorMetadata")
+
+
+def register_validators() -> bool:
+    """Register the rules with UsdValidation, once per process, so that any tool that validates applies them.
+
+    Returns:
+        False if this OpenUSD takes no validators written in Python.
+    """
+    if not _PLUGGABLE:
+        return False
+    registry = UsdValidation.ValidationRegistry()
+    for name, rule in RULES.items():
+        if not registry.HasValidator(_PREFIX + name):
+            metadata = UsdValidation.ValidatorMetadata(name=_PREFIX + name, doc=rule.__doc__, keywords=[KEYWORD])
+            registry.RegisterStageValidator(metadata, _stage_validator(rule))
+    return True
+
+
+def validate_stage(path: str | os.PathLike[str]) -> list[Finding]:
+    """Return everything UsdValidation and jawusd's own rules have to say about a file; nothing means all is well.
+
+    Args:
+        path: any USD file. A file without a rig is checked by the stock validators alone.
+
+    Raises:
+        RigError: the file cannot be opened.
+    """
+    stage = open_stage(path)
+    if not register_validators():
+        return _apply_rules(stage)
+    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    return [_finding(error) for error in UsdValidation.ValidationContext(validators).Validate(stage)]
+
+
+def _apply_rules(stage: Usd.Stage) -> list[Finding]:
+    return [finding for prim in _rig_prims(stage) for rule in RULES.values() for finding in rule(prim)]
+
+
+def _rig_prims(stage: Usd.Stage) -> list[Usd.Prim]:
+    # by metadata, not by schema type: the schema may be unknown to this process
+    return [prim for prim in stage.Traverse() if has_jaw_api(prim)]
+
+
+def _stage_validator(rule: Rule):
+    severities = {
+        "error": UsdValidation.ValidationErrorType.Error,
+        "warning": UsdValidation.ValidationErrorType.Warn,
+        "info": UsdValidation.ValidationErrorType.Info,
+    }
+
+    def validate(stage: Usd.Stage, time_range: object = None) -> list:
+        return [
+            UsdValidation.ValidationError(
+                finding.rule,
+                severities[finding.severity],
+                [UsdValidation.ValidationErrorSite(stage, prim.GetPath())],
+                finding.message,
+            )
+            for prim in _rig_prims(stage)
+            for finding in rule(prim)
+        ]
+
+    return validate
+
+
+def _finding(error: UsdValidation.ValidationError) -> Finding:
+    severities = {
+        UsdValidation.ValidationErrorType.Error: "error",
+        UsdValidation.ValidationErrorType.Warn: "warning",
+        UsdValidation.ValidationErrorType.Info: "info",
+    }
+    sites = [str(site.GetPrim().GetPath()) for site in error.GetSites() if site.IsValid() and site.GetPrim()]
+    return Finding(
+        severities.get(error.GetType(), "error"), error.GetName(), sites[0] if sites else "/", error.GetMessage()
+    )
