@@ -18,12 +18,13 @@ class HermiteCurve:
         knots: Rising parameter values, shape (n,), n >= 2.
         values: Points of the curve at the knots, shape (n, k).
         slopes: Derivatives at the knots, shape (n, k).
+        coefficients: Powers 0..3 of (x - knot) per interval, the straight ends first and last, shape (n + 1, 4, k).
     """
 
     knots: Array
     values: Array
     slopes: Array
-    _coefficients: Array = field(init=False, repr=False)
+    coefficients: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         # Per interval the powers 0..3 of s = x - knot; intervals 0 and n are the straight ends, so that no
@@ -37,7 +38,7 @@ class HermiteCurve:
         straight = np.zeros((2, *inner.shape[1:]))
         straight[0, :2] = y[0], m[0]
         straight[1, :2] = y[-1], m[-1]
-        object.__setattr__(self, "_coefficients", np.concatenate([straight[:1], inner, straight[1:]]))
+        object.__setattr__(self, "coefficients", np.concatenate([straight[:1], inner, straight[1:]]))
 
     def value(self, x: Array) -> Array:
         """Return the points at x (n,), shape (n, k)."""
@@ -52,4 +53,4 @@ class HermiteCurve:
     def _locate(self, x: Array) -> tuple[Array, Array]:
         interval = np.searchsorted(self.knots, x, side="right")
         start = self.knots[np.maximum(interval - 1, 0)]
-        return self._coefficients[interval], (x - start)[:, None]
+        return self.coefficients[interval], (x - start)[:, None]

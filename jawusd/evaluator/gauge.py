@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-_FADE_SOFTNESS_MM = 1.0  # rounding of the kink at d1 = 0 in the fading of the glide surface
-_ARCH_BOW_MM = 10.0  # the quadratic arch features are d2^2 / 10 mm, to keep all coefficients of one order
-_DROP_BEND = 0.15  # slope gained by the bent drop features per mm, saturating at 4 mm (below)
-_DROP_SATURATION_MM2 = 16.0
+FADE_SOFTNESS_MM = 1.0  # rounding of the kink at d1 = 0 in the fading of the glide surface
+ARCH_BOW_MM = 10.0  # the quadratic arch features are d2^2 / 10 mm, to keep all coefficients of one order
+DROP_BEND = 0.15  # slope gained by the bent drop features per mm, saturating at 4 mm (below)
+DROP_SATURATION_MM2 = 16.0
 _INVERSE_TOLERANCE_MM = 1e-13
 _INVERSE_ITERATIONS = 60
 _INVERSE_STEP_MM = 20.0
@@ -89,9 +89,9 @@ class Gauge:
         c = self.glide_arch
         side, side_2 = soft_absolute(d2, self.glide_softness_mm)
         by_side, by_side_t = (c[2] * t + c[1]) * t + c[0], 2 * c[2] * t + c[1]
-        by_d2, by_bow = c[4] * t + c[3], (c[6] * t + c[5]) / _ARCH_BOW_MM
+        by_d2, by_bow = c[4] * t + c[3], (c[6] * t + c[5]) / ARCH_BOW_MM
         rho = side * by_side + d2 * (by_d2 + d2 * by_bow)
-        rho_1 = (side * by_side_t + d2 * (c[4] + d2 * (c[6] / _ARCH_BOW_MM))) * t_1
+        rho_1 = (side * by_side_t + d2 * (c[4] + d2 * (c[6] / ARCH_BOW_MM))) * t_1
         rho_2 = side_2 * by_side + by_d2 + 2 * d2 * by_bow
         return rho, rho_1, rho_2
 
@@ -107,7 +107,7 @@ class Gauge:
 
     def fade(self, d1: Array) -> tuple[Array, Array]:
         """Return the share of the glide surface felt at opening d1, and its derivative by d1."""
-        ramp, ramp_1 = soft_ramp(d1, _FADE_SOFTNESS_MM)
+        ramp, ramp_1 = soft_ramp(d1, FADE_SOFTNESS_MM)
         x = ramp / self.glide_fade_mm
         fade = np.exp(-x * x)
         return fade, fade * (-2.0 / self.glide_fade_mm) * x * ramp_1
@@ -188,9 +188,9 @@ def soft_ramp(x: Array, softness_mm: float) -> tuple[Array, Array]:
 def _bent(x: Array) -> tuple[Array, Array]:
     """Return ``0.15 x^2 / sqrt(1 + x^2 / 16)`` [mm] and its slope: a drop that steepens and then runs straight."""
     square = x * x
-    w = 1.0 + square / _DROP_SATURATION_MM2
+    w = 1.0 + square / DROP_SATURATION_MM2
     root = np.sqrt(w)
-    return _DROP_BEND * square / root, _DROP_BEND * x * (1.0 + w) / (w * root)
+    return DROP_BEND * square / root, DROP_BEND * x * (1.0 + w) / (w * root)
 
 
 def _newton_step(excess: Array, slope: Array) -> Array:

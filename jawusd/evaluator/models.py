@@ -39,6 +39,7 @@ class AnchoredModel:
         scales: Lengths dividing the sheared displacement [mm], shape (3,).
         centres: Spline centres, sheared and scaled, shape (m, 3).
         weights: Of the m kernels and the 3 linear terms [rad], shape (m + 3, 3).
+        offset: Value of the bare spline at u = 0 [rad], taken off so that f(0) = 0, shape (3,).
     """
 
     gauge: Gauge
@@ -48,7 +49,7 @@ class AnchoredModel:
     weights: Array
     _centres_squared: Array = field(init=False, repr=False)
     _moments: Array = field(init=False, repr=False)
-    _offset: Array = field(init=False, repr=False)
+    offset: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         # Sum_i W_i r_i^3 and its gradient need only sums of r_i times W_i, W_i c_i and W_i |c_i|^2 (see _spline):
@@ -59,8 +60,8 @@ class AnchoredModel:
         moments = np.concatenate([kernel, by_centre, kernel * squared[:, None]], axis=1)
         object.__setattr__(self, "_centres_squared", squared)
         object.__setattr__(self, "_moments", np.ascontiguousarray(moments))
-        object.__setattr__(self, "_offset", np.zeros(3))
-        object.__setattr__(self, "_offset", self._spline(np.zeros((1, 3)))[0][0])
+        object.__setattr__(self, "offset", np.zeros(3))
+        object.__setattr__(self, "offset", self._spline(np.zeros((1, 3)))[0][0])
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Array]) -> AnchoredModel:
@@ -148,7 +149,7 @@ class AnchoredModel:
         sums = r @ self._moments
         plain, by_centre = sums[:, :3], sums[:, 3:12].reshape(-1, 3, 3)
         linear = self.weights[len(self.centres) :]
-        value = q_squared[:, None] * plain + sums[:, 12:] + q @ linear - self._offset
+        value = q_squared[:, None] * plain + sums[:, 12:] + q @ linear - self.offset
         value -= 2.0 * np.einsum("nij,nj->ni", by_centre, q)
         return value, 3.0 * (plain[:, :, None] * q[:, None, :] - by_centre) + linear.T
 

@@ -1,0 +1,133 @@
+"""The named arrays a rig is made of: which there are, their shapes, and what must hold of their values."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jawusd.errors import EvaluatorError
+from jawusd.geometry.se3 import rigidity_defect
+
+_RIGID_TOLERANCE = 1e-6
+
+# letters stand for lengths that must agree wherever they appear
+_COMMON = {
+    "T_anatomical_skull": (4, 4),
+    "T_rest": (4, 4),
+    "incisor": (3,),
+    "d_range": (3, 2),
+    "landmarks": ("landmarks", 3),
+    "slice_d1": ("openings",),
+    "slice_directions": ("directions", 2),
+    "slice_support": ("openings", "directions"),
+    "slice_softness_mm": (),
+    "slice_margin_mm": (),
+    "polygon_d1d2": ("lateral corners", 2),
+    "polygon_d1d2_counts": ("lateral outlines",),
+    "polygon_d1d3": ("protrusion corners", 2),
+    "polygon_d1d3_counts": ("protrusion outlines",),
+    "residual_limit_mm": (),
+    "margin_limit_mm": (),
+    "codes": ("codes", 3),
+}
+_ANCHORED = {
+    "path_coefficients": (2, 5),
+    "path_scale_mm": (),
+    "path_limits": (2,),
+    "glide_arch": (7,),
+    "glide_drop": (4,),
+    "glide_softness_mm": (),
+    "glide_fade_mm": (),
+    "spline_scales": (3,),
+    "spline_centres": ("centres", 3),
+    "spline_weights": ("weights", 3),
+}
+_ADDITIVE = {
+    f"curve{i}_{part}": shape
+    for i in (1, 2, 3)
+    for part, shape in (("knots", (f"knots{i}",)), ("twists", (f"knots{i}", 6)), ("slopes", (f"knots{i}", 6)))
+}
+_POSITIVE = ("slice_softness_mm", "path_scale_mm", "glide_softness_mm", "glide_fade_mm", "spline_scales")
+_RISING = ("slice_d1", "path_limits", "curve1_knots", "curve2_knots", "curve3_knots")
+
+
+def checked_arrays(arrays: Mapping[str, ArrayLike], kind: str) -> dict[str, NDArray[np.float64]]:
+    """Return read-only float64 arrays of a rig of the given kind, and nothing else.
+
+    Args:
+        arrays: Named arrays; others than the rig's are left out.
+        kind: "anchored" or "additive".
+
+    Raises:
+        EvaluatorError: an unknown kind, or an array that is missing, of a wrong shape, not finite or out of range.
+    """
+    if kind not in ("anchored", "additive"):
+        raise EvaluatorError(f'the model is of kind "{kind}"; this jawusd knows "anchored" and "additive".')
+    shapes = _COMMON | (_ANCHORED if kind == "anchored" else _ADDITIVE)
+    lengths: dict[str, int] = {}
+    checked = {name: _checked(name, arrays, shape, lengths) for name, shape in shapes.items()}
+    _check_values(checked)
+    _check_sections(checked)
+    if kind == "anchored" and lengths["weights"] != lengths["centres"] + 3:
+        raise EvaluatorError(
+            f'"spline_weights" has {lengths["weights"]} rows for {lengths["centres"]} centres; '
+            f"it needs one for each centre and 3 linear ones, {lengths['centres'] + 3}."
+        )
+    return checked
+
+
+def _checked(
+    name: str, arrays: Mapping[str, ArrayLike], shape: tuple[int | str, ...], lengths: dict[str, int]
+) -> NDArray[np.float64]:
+    if name not in arrays:
+        raise EvaluatorError(f'the model has no array "{name}".')
+    try:
+        value = np.array(arrays[name], dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise EvaluatorError(f'"{name}" does not hold numbers ({error}).') from error
+    wanted = [lengths.get(size, size) if isinstance(size, str) else size for size in shape]
+    fits = value.ndim == len(shape) and all(isinstance(w, str) or w == n for w, n in zip(wanted, value.shape))
+    if not fits:
+        raise EvaluatorError(f'"{name}" has shape {value.shape}, expected ({", ".join(map(str, wanted))}).')
+    if not np.isfinite(value).all():
+        raise EvaluatorError(f'"{name}" holds values that are not finite.')
+    lengths.update((size, n) for size, n in zip(shape, value.shape) if isinstance(size, str))
+    value.flags.writeable = False
+    return value
+
+
+def _check_values(arrays: dict[str, NDArray[np.float64]]) -> None:
+    for name in ("T_anatomical_skull", "T_rest"):
+        defect = float(rigidity_defect(arrays[name]))
+        if defect > _RIGID_TOLERANCE:
+            raise EvaluatorError(f'"{name}" is not rigid: off by {defect:.2g}, allowed {_RIGID_TOLERANCE:g}.')
+    for name in _POSITIVE:
+        if name in arrays and not (arrays[name] > 0).all():
+            raise EvaluatorError(f'"{name}" is {arrays[name].tolist()}; it must be positive.')
+    for name in _RISING:
+        if name in arrays and (len(arrays[name]) < 2 or (np.diff(arrays[name]) <= 0).any()):
+            raise EvaluatorError(f'"{name}" must hold at least two rising values.')
+    low, high = arrays["d_range"].T
+    if not (low < high).all() or high[0] <= 0:
+        raise EvaluatorError(f'"d_range" is {arrays["d_range"].tolist()} mm; rows must be (low, high), opening > 0.')
+    if arrays["margin_limit_mm"] > 0 or arrays["residual_limit_mm"] <= 0:
+        raise EvaluatorError('"residual_limit_mm" must be positive and "margin_limit_mm" at most 0.')
+
+
+def _check_sections(arrays: dict[str, NDArray[np.float64]]) -> None:
+    directions = arrays["slice_directions"]
+    if (np.abs(np.linalg.norm(directions, axis=1) - 1.0) > 1e-6).any():
+        raise EvaluatorError('"slice_directions" must be unit vectors.')
+    angles = np.sort(np.arctan2(directions[:, 1], directions[:, 0]))
+    gaps = np.diff(np.append(angles, angles[0] + 2 * np.pi))
+    if gaps.max(initial=0.0) >= np.pi - 1e-9 or len(directions) < 3:
+        raise EvaluatorError('"slice_directions" leave a side open; they must surround the section.')
+    for name in ("polygon_d1d2", "polygon_d1d3"):
+        counts = arrays[f"{name}_counts"]
+        if counts.sum() != len(arrays[name]) or (counts < 3).any() or (counts != np.round(counts)).any():
+            raise EvaluatorError(
+                f'"{name}_counts" is {counts.tolist()}; it must split the {len(arrays[name])} corners of "{name}" into '
+                "outlines of 3 or more."
+            )

@@ -1,0 +1,74 @@
+"""Batches of any shape as rows, and rows in pieces small enough for the processor's cache."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+CHUNK_ROWS = 2048
+
+
+def as_rows(values: ArrayLike, tail: tuple[int, ...], name: str) -> tuple[Array, tuple[int, ...]]:
+    """Return values as float64 rows (n, *tail) and the batch shape; rows that are not finite become all NaN.
+
+    Raises:
+        ValueError: the trailing axes are not ``tail``.
+    """
+    values = np.asarray(values, dtype=np.float64)
+    batch = values.shape[: values.ndim - len(tail)]
+    if values.ndim < len(tail) or values.shape[len(batch) :] != tail:
+        raise ValueError(f"{name} must have shape (..., {', '.join(map(str, tail))}), got {values.shape}")
+    rows = values.reshape(-1, *tail) if values.size else np.empty((int(np.prod(batch)), *tail))
+    finite = np.isfinite(rows).all(axis=tuple(range(1, rows.ndim)))
+    if not finite.all():
+        rows = np.where(finite.reshape(-1, *(1,) * len(tail)), rows, np.nan)
+    return rows, batch
+
+
+def in_chunks(function: Callable[..., Any], *rows: Array) -> Any:
+    """Return ``function(*rows)``, an array or a tuple of arrays, computed in pieces of `CHUNK_ROWS` rows.
+
+    Temporary memory stays the same however many rows there are.
+    """
+    count = len(rows[0])
+    if count <= CHUNK_ROWS:
+        return function(*rows)
+    parts = [function(*(each[i : i + CHUNK_ROWS] for each in rows)) for i in range(0, count, CHUNK_ROWS)]
+    if isinstance(parts[0], tuple):
+        return tuple(np.concatenate(part) for part in zip(*parts))
+    return np.concatenate(parts)
+
+
+def as_points(points: ArrayLike, name: str) -> Array:
+    """Return one point (3,) or several (P, 3) as float64.
+
+    Raises:
+        ValueError: another shape, no point, or values that are not finite.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    if points.ndim not in (1, 2) or points.shape[-1] != 3 or not points.size:
+        raise ValueError(f"{name} must have shape (3,) or (P, 3), got {points.shape}")
+    if not np.isfinite(points).all():
+        raise ValueError(f"{name} must be finite")
+    return points
+
+
+def as_keys(frames: ArrayLike, d_keys: ArrayLike) -> tuple[Array, Array]:
+    """Return key times (K,) and keys (K, 3) as float64.
+
+    Raises:
+        ValueError: other shapes, no key, values that are not finite, or times that do not rise.
+    """
+    frames, keys = np.asarray(frames, dtype=np.float64), np.asarray(d_keys, dtype=np.float64)
+    if frames.ndim != 1 or not frames.size or keys.shape != (len(frames), 3):
+        raise ValueError(f"frames must have shape (K,) and d_keys (K, 3), K >= 1, got {frames.shape} and {keys.shape}")
+    if not (np.isfinite(frames).all() and np.isfinite(keys).all()):
+        raise ValueError("frames and d_keys must be finite")
+    if (np.diff(frames) <= 0).any():
+        raise ValueError("frames must rise")
+    return frames, keys

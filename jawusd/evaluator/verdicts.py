@@ -1,0 +1,133 @@
+"""Verdicts: may a jaw be in this pose, and if not, why and by how many millimetres."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntFlag
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+# A matrix written with 5 decimals or kept in half precision is rigid to about this; sheared or scaled ones are not.
+RIGID_TOLERANCE = 1e-3
+
+# Parameters on the bound itself, read back from a pose, may round to just outside.
+_ROUNDING_MM = 1e-6
+
+
+class Reason(IntFlag):
+    """Why a pose is invalid; several may hold at once."""
+
+    VALID = 0
+    NOT_FINITE = 1
+    NOT_RIGID = 2
+    OFF_MODEL = 4
+    OUTSIDE_BOUNDS = 8
+    TOO_FAST = 16
+
+    @property
+    def words(self) -> str:
+        """The reasons in plain words, joined by commas."""
+        return ", ".join(_WORDS[flag] for flag in Reason if flag in self and flag) or "valid"
+
+
+_WORDS = {
+    Reason.NOT_FINITE: "not finite",
+    Reason.NOT_RIGID: "not rigid",
+    Reason.OFF_MODEL: "off the model",
+    Reason.OUTSIDE_BOUNDS: "outside the bound",
+    Reason.TOO_FAST: "too fast",
+}
+
+
+@dataclass(frozen=True)
+class Verdicts:
+    """What `JawRig.validate` found, one entry per pose.
+
+    Attributes:
+        valid: No reason against the pose, bool, shape (...).
+        reason: `Reason` flags, uint8, shape (...).
+        residual_mm: rms landmark distance to the nearest pose of the model, shape (...); NaN if not finite or rigid.
+        margin_mm: Signed distance of d to the bound, > 0 inside, shape (...); NaN if not finite or rigid.
+        d: Nearest jaw parameters [mm], shape (..., 3); NaN if not finite or rigid.
+    """
+
+    valid: NDArray[np.bool_]
+    reason: NDArray[np.uint8]
+    residual_mm: Array
+    margin_mm: Array
+    d: Array
+
+    def finished(self, batch: tuple[int, ...], fast: NDArray[np.bool_]) -> Verdicts:
+        """Return the verdicts in a batch shape, with the frames marked in ``fast`` (of that shape) too fast."""
+        reason = self.reason.reshape(batch) | np.where(fast, Reason.TOO_FAST.value, 0).astype(np.uint8)
+        residual_mm, margin_mm = self.residual_mm.reshape(batch), self.margin_mm.reshape(batch)
+        return Verdicts(reason == 0, reason, residual_mm, margin_mm, self.d.reshape(*batch, 3))
+
+    def words(self) -> list[str]:
+        """Return the reasons in plain words, one per pose in row-major order."""
+        return [Reason(int(code)).words for code in self.reason.ravel()]
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Thresholds of a verdict.
+
+    Attributes:
+        residual_mm: Largest landmark distance to the model.
+        margin_mm: Smallest margin.
+        speed_mm_s: Largest speed of any landmark between consecutive poses; None asks no question.
+    """
+
+    residual_mm: float
+    margin_mm: float
+    speed_mm_s: float | None = None
+
+    def replaced(self, residual_mm: float | None, margin_mm: float | None, speed_mm_s: float | None) -> Limits:
+        """Return these limits with those that are given in place of their own."""
+        return Limits(
+            self.residual_mm if residual_mm is None else float(residual_mm),
+            self.margin_mm if margin_mm is None else float(margin_mm),
+            self.speed_mm_s if speed_mm_s is None else float(speed_mm_s),
+        )
+
+
+def judge(finite: Array, rigid: Array, residual_mm: Array, margin_mm: Array, d: Array, limits: Limits) -> Verdicts:
+    """Return the verdicts (n rows) for measurements and thresholds."""
+    reason = np.zeros(len(finite), dtype=np.uint8)
+    reason[~finite] |= Reason.NOT_FINITE.value
+    reason[finite & ~rigid] |= Reason.NOT_RIGID.value
+    measured = finite & rigid
+    # `not <=` so that a pose the model cannot measure (NaN) is refused
+    reason[measured & ~(residual_mm <= limits.residual_mm)] |= Reason.OFF_MODEL.value
+    reason[measured & ~(margin_mm >= limits.margin_mm - _ROUNDING_MM)] |= Reason.OUTSIDE_BOUNDS.value
+    return Verdicts(reason == 0, reason, residual_mm, margin_mm, d)
+
+
+def too_fast(positions: Array, times_s: ArrayLike | None, limit_mm_s: float) -> NDArray[np.bool_]:
+    """Tell which frames were reached too fast.
+
+    Args:
+        positions: Landmark positions [mm], shape (..., F, L, 3); NaN where there is no pose.
+        times_s: Rising times, shape (F,).
+        limit_mm_s: Largest speed [mm/s].
+
+    Returns:
+        Shape (..., F). A frame is compared with the one just before it; the first frame, and frames next to a NaN,
+        are never too fast.
+
+    Raises:
+        ValueError: no batch axis to go along, or times that do not fit it or do not rise.
+    """
+    times = np.asarray([] if times_s is None else times_s, dtype=np.float64)
+    if positions.ndim < 3 or times.shape != positions.shape[-3:-2] or not (np.diff(times) > 0).all():
+        raise ValueError(
+            "a speed limit needs poses of shape (..., F, ...) and times_s of shape (F,) that rise, got "
+            f"{positions.shape[:-2]} and {times.shape}"
+        )
+    flags = np.zeros(positions.shape[:-2], dtype=bool)
+    travelled = np.linalg.norm(np.diff(positions, axis=-3), axis=-1).max(axis=-1, initial=0.0)
+    flags[..., 1:] = travelled > limit_mm_s * np.diff(times)
+    return flags
