@@ -1,0 +1,1 @@
+"""Bring the cameras of a capture together in time and space."""
