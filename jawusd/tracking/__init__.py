@@ -1,1 +1,6 @@
 """Poses of both rows of teeth from masks in several views."""
+
+from jawusd.tracking.config import TrackingConfig
+from jawusd.tracking.sequence import track_capture
+
+__all__ = ["TrackingConfig", "track_capture"]

@@ -27,13 +27,45 @@ class TrackingConfig:
     pull_above_px: float = 4.0
     # Least cosine between contour and mask normals at a matched edge [-]: lips cross the contour at larger angles.
     normal_cosine: float = 0.7
-    # How much nearer a crown surface may lie one pixel inside its own contour [mm]: curvature of a cusp, not a second tooth.
-    depth_tolerance_mm: float = 1.2
+    # How much nearer a crown may lie one pixel inside its own contour [mm]: a cusp's curvature, not a second tooth.
+    depth_tolerance_mm: float = 1.5
     # Depth by which one row must lie in front of the other to hide it [mm]: above the error of the poses.
     overlap_tolerance_mm: float = 0.4
     # Update below which iterations stop [mm at the crowns]: a tenth of the accuracy that can be reached.
     converged_mm: float = 0.004
     # Motion after which a scan is drawn again for hidden parts [px]: hidden parts are judged to one pixel.
     redraw_px: float = 0.7
-    # Weight of the damping term relative to the diagonal [-]: keeps the first steps of an ill-posed view finite.
-    damping: float = 1e-4
+    # Distance a row may plausibly lie from its prediction [mm]: a weak pull that only matters where masks say nothing.
+    prediction_mm: float = 0.5
+    # Outline variance times correlation length behind that pull [px^3]: 0.4 px over 10 px, typical masks by hand.
+    typical_noise_px3: float = 1.6
+    # Contour length over which outline errors move together [px], until it has been measured on the take.
+    correlation_px: float = 10.0
+    # Good frames remembered to judge the next one [frames]: about a second, the time in which lips open or close.
+    history_frames: int = 31
+    # Score below this share of the recent median makes a row suspect [-]: lips seldom hide as much in one second.
+    suspect_score: float = 0.6
+    # Residual spread above this multiple of the recent median makes a row suspect [-].
+    suspect_residual: float = 1.4
+    # Uncovered mask above the recent median by more than this makes a row, or a mask, suspect [-].
+    suspect_coverage: float = 0.04
+    # A mask matching less than this share of what its best neighbour matches (both relative to before) is left out [-].
+    spoiled_share: float = 0.3
+    # Score gain over the first attempt that makes a frame count as recovered [-].
+    recovery_gain: float = 1.05
+    # Reach of the multi-start [mm, rad]: the prediction error of a fast chewing stroke.
+    search_mm: float = 2.0
+    search_rad: float = 0.05
+    # Gates of the first look at a start, and how many starts are followed to the end.
+    glance_gates_px: tuple[float, ...] = (14.0, 8.0)
+    search_finalists: int = 4
+    # Matched contour below which a row is lost [px]: 8 mm of tooth edge.
+    least_matched_px: float = 60.0
+    # Residual spread above this multiple of the recent median means lost [-].
+    lost_residual: float = 1.8
+    # Uncovered share of a mask above which the row is lost [-]: good poses leave about 0.01.
+    lost_coverage: float = 0.12
+    # Position uncertainty of the crowns above which a row is lost [mm].
+    lost_sigma_mm: float = 0.5
+    # Matched share of the visible contour the first frame must reach [-]: good ones reach 0.15 with lips nearly closed.
+    first_share: float = 0.1

@@ -43,7 +43,8 @@ def contour_samples(
     Returns:
         Samples, shape (n, COLUMNS).
     """
-    candidates = _silhouette(scan.vertices, scan.crown_faces, scan.planes, scan.edges, eye, matrix, step_px, labels.shape)
+    scan_tables = (scan.vertices, scan.crown_faces, scan.planes, scan.edges)
+    candidates = _silhouette(*scan_tables, eye, matrix, step_px, labels.shape)
     kept = _seen(candidates, labels, inverse_depth, depth_tolerance_mm)
     line = _gum_line(scan.margin, matrix, labels, inverse_depth, depth_tolerance_mm)
     return np.concatenate([kept, line])
@@ -86,9 +87,9 @@ def _silhouette(vertices, faces, planes, edges, eye, matrix, step_px, shape):
         nx = (vj - vi) / length
         ny = (ui - uj) / length
         k = faces[f, 0]
-        if k == i or k == j:
+        if k in (i, j):
             k = faces[f, 1]
-        if k == i or k == j:
+        if k in (i, j):
             k = faces[f, 2]
         uk, vk, wk = _pixel(matrix, vertices[k, 0], vertices[k, 1], vertices[k, 2])
         if nx * (uk - ui) + ny * (vk - vi) > 0:  # outward is away from the face's third corner

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.geometry import make_transform, orthonormalise, se3_exp, transform_points
+from jawusd.geometry import make_transform, orthonormalise, se3_exp, se3_inverse, se3_log, transform_points
 from jawusd.imaging.raster import draw_depth_labels, project
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour import CROWN, GUM, contour_samples
@@ -62,7 +62,6 @@ class ContourSolver:
         self.scans = tuple(scans)
         self.config = config
         self._map: Callable[..., Iterable] = executor.map if executor else map
-        self._points = [[] for _ in _ROWS]
 
     def solve(
         self,
@@ -79,18 +78,20 @@ class ContourSolver:
             gates_px: residual gate of every iteration.
             use: masks that take part, shape (2, C); by default all present ones.
         """
-        poses = np.array(poses, np.float64)
+        start, poses = poses, np.array(poses, np.float64)
         use = np.array([[v.present[r] for v in views] for r in _ROWS]) if use is None else use
         render = _Rendering(self, views)
-        for iteration, gate in enumerate(gates_px, start=1):
+        iterations = 0
+        for gate in gates_px:
+            iterations += 1
             state = self._linearise(poses, views, use, gate, render)
-            step = self._step(state)
+            step = self._step(state, start)
             for r in _ROWS:
                 poses[r] = _moved(poses[r], step[r], state.centres[r])
             if gate == gates_px[-1] and self._motion_mm(step) < self.config.converged_mm:
                 break
         state = self._linearise(poses, views, use, gates_px[-1], render)
-        return Solution(poses, state.systems, state.centres, state.visible_px, iteration)
+        return Solution(poses, state.systems, state.centres, state.visible_px, iterations)
 
     def _linearise(self, poses, views, use, gate, render: _Rendering) -> Solution:
         """Find correspondences at the given poses and sum up the normal equations."""
@@ -146,14 +147,20 @@ class ContourSolver:
             return gate
         return float(np.clip(self.config.gate_sigmas * 1.4826 * np.median(d), *self.config.final_gate_px))
 
-    def _step(self, state: Solution) -> NDArray[np.float64]:
-        """Solve the joint 12x12 normal equations; twists about the centres, shape (2, 6)."""
+    def _step(self, state: Solution, start: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Solve the joint 12x12 normal equations; twists about the centres, shape (2, 6).
+
+        A weak pull towards the start keeps motions finite that the masks leave free.
+        """
         H, g = np.zeros((12, 12)), np.zeros(12)
         for r in _ROWS:
             total = state.systems[r].sum(0)
-            H[6 * r : 6 * r + 6, 6 * r : 6 * r + 6] = total[:6, :6]
-            g[6 * r : 6 * r + 6] = total[:6, 6]
-        H += np.diag(self.config.damping * np.diag(H) + 1e-9)
+            arm = self.scans[r].radius_mm / 2
+            pull = self.config.typical_noise_px3 / self.config.prediction_mm**2 * np.array([arm**2] * 3 + [1.0] * 3)
+            away = _twist_between(start[r], state.poses[r], state.centres[r])
+            block = slice(6 * r, 6 * r + 6)
+            H[block, block] = total[:6, :6] + np.diag(pull)
+            g[block] = total[:6, 6] - pull * away
         return np.linalg.solve(H, g).reshape(2, 6)
 
     def _motion_mm(self, step: NDArray[np.float64]) -> float:
@@ -173,7 +180,6 @@ class _Rendering:
         shapes = [v.masks.shape for v in views]
         self.labels = [np.zeros(s, np.uint8) for s in shapes]
         self.depths = [np.zeros(s, np.float32) for s in shapes]
-        self._points = [np.empty((len(s.vertices), 3), np.float32) for s in solver.scans]
 
     def update(self, poses: NDArray[np.float64]) -> None:
         """Draw the scans whose projection has moved by more than the allowed pixels."""
@@ -206,6 +212,12 @@ class _Rendering:
 def _pixels(matrix: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
     h = points @ matrix[:, :3].T + matrix[:, 3]
     return h[:, :2] / h[:, 2:]
+
+
+def _twist_between(start: NDArray[np.float64], pose: NDArray[np.float64], centre: NDArray) -> NDArray[np.float64]:
+    """Return the twist about a world point that takes one pose to another, shape (6,)."""
+    to, back = make_transform(np.eye(3), -centre), make_transform(np.eye(3), centre)
+    return se3_log(to @ pose @ se3_inverse(start) @ back)
 
 
 def _moved(pose: NDArray[np.float64], twist: NDArray[np.float64], centre: NDArray[np.float64]) -> NDArray[np.float64]:

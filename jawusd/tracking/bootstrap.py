@@ -1,0 +1,143 @@
+"""First poses from picked vertices: triangulation, rigid fit by consensus, refinement on the pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.errors import TrackingError
+from jawusd.formats.capture import Pick
+from jawusd.geometry import Camera, make_transform, orthonormalise, rigid_fit, se3_exp, transform_points, triangulate
+
+_FEWEST = 3
+# A pick whose vertex projects farther than this from its pixel counts as wrong [mm at the teeth]: three times the
+# error of a careless click (5 px where a pixel is 0.07 mm).
+_TOLERANCE_MM = 1.1
+_MOST_TRIPLES = 500  # consensus over more start triples adds nothing but time
+
+
+@dataclass(frozen=True, eq=False)
+class _Sighting:
+    """One pick ready for fitting: the scan point and its undistorted pixels."""
+
+    number: int
+    point: NDArray[np.float64]
+    matrices: NDArray[np.float64]
+    pixels: NDArray[np.float64]
+
+
+def pose_from_picks(
+    picks: Sequence[Pick], vertices: NDArray[np.float64], cameras: Mapping[str, Camera], row: str
+) -> tuple[NDArray[np.float64], list[int]]:
+    """Return the pose of one row of teeth that agrees with its picks.
+
+    Args:
+        picks: vertices of the scan with pixels in at least two views each.
+        vertices: vertices of the scan file [mm], shape (V, 3).
+        cameras: calibrated cameras by name.
+        row: "upper" or "lower", for messages.
+
+    Returns:
+        T_world_row, shape (4, 4), and the numbers (from 1) of picks left out as wrong.
+
+    Raises:
+        TrackingError: too few picks, a pick that cannot be, or picks that contradict one another.
+    """
+    if len(picks) < _FEWEST:
+        raise TrackingError(
+            f"bootstrap: {len(picks)} picks on the {row} teeth, at least {_FEWEST} are needed",
+            hint="Pick more vertices, spread over the arch, each in two or more cameras.",
+        )
+    sightings = [_sighting(k, pick, vertices, cameras, row) for k, pick in enumerate(picks, start=1)]
+    places = np.stack([triangulate(s.matrices, s.pixels) for s in sightings])
+    points = np.stack([s.point for s in sightings])
+    best, best_cost = None, np.inf
+    triples = list(combinations(range(len(picks)), _FEWEST))
+    for triple in triples[:: max(1, len(triples) // _MOST_TRIPLES)]:
+        k = list(triple)
+        try:
+            pose = rigid_fit(points[k], places[k])
+        except ValueError:
+            continue  # three picks on a line leave a rotation free
+        cost = sum(min(_miss_mm(s, pose), _TOLERANCE_MM) ** 2 for s in sightings)
+        if cost < best_cost:
+            best, best_cost = pose, cost
+    if best is None:
+        raise TrackingError(
+            f"bootstrap: the picks on the {row} teeth lie on a line", hint="Pick front teeth and both sides."
+        )
+    for _ in range(3):
+        good = [s for s in sightings if _miss_mm(s, best) < _TOLERANCE_MM]
+        if len(good) < _FEWEST:
+            misses = ", ".join(f"pick {s.number}: {_miss_mm(s, best):.1f} mm" for s in sightings)
+            raise TrackingError(
+                f"bootstrap: the picks on the {row} teeth contradict one another "
+                f"({misses}; allowed {_TOLERANCE_MM} mm)",
+                hint="Check vertex numbers, pixels and camera names of the picks, and that the views show one instant.",
+            )
+        best = _refined(good, best)
+    return best, [s.number for s in sightings if s not in good]
+
+
+def _sighting(number: int, pick: Pick, vertices: NDArray, cameras: Mapping[str, Camera], row: str) -> _Sighting:
+    where = f"bootstrap: pick {number} on the {row} teeth"
+    if pick.vertex >= len(vertices):
+        raise TrackingError(f"{where} names vertex {pick.vertex}, the scan has {len(vertices)} (numbered from 0)")
+    names = [view.camera for view in pick.views]
+    if len(set(names)) < 2:
+        raise TrackingError(
+            f"{where} is seen by camera {names[0]} alone: its depth is unknown", hint="Give pixels in two cameras."
+        )
+    matrices, pixels = [], []
+    for view in pick.views:
+        if view.camera not in cameras:
+            raise TrackingError(f"{where} names camera {view.camera}, which is not calibrated")
+        camera = cameras[view.camera]
+        width, height = camera.size_px
+        if not (-0.5 <= view.x <= width - 0.5 and -0.5 <= view.y <= height - 0.5):
+            raise TrackingError(
+                f"{where} lies at ({view.x:g}, {view.y:g}) px in {view.camera}, "
+                f"outside of its {width} x {height} picture"
+            )
+        matrices.append(camera.projection_matrix())
+        pixels.append(camera.undistort_pixels([view.x, view.y]))
+    return _Sighting(number, vertices[pick.vertex], np.stack(matrices), np.stack(pixels))
+
+
+def _residuals_px(s: _Sighting, pose: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
+    """Return projection minus pixel (C, 2), depths (C,) and the derivative by the world point (C, 2, 3)."""
+    h = s.matrices @ np.append(transform_points(pose, s.point), 1.0)
+    projected = h[:, :2] / h[:, 2:]
+    slope = (s.matrices[:, :2, :3] - projected[:, :, None] * s.matrices[:, 2:, :3]) / h[:, 2, None, None]
+    return projected - s.pixels, h[:, 2], slope
+
+
+def _miss_mm(s: _Sighting, pose: NDArray[np.float64]) -> float:
+    """Return the largest distance between a pick's vertex and its pixel, measured at the vertex [mm]."""
+    residual, depth, slope = _residuals_px(s, pose)
+    if (depth <= 0).any():
+        return np.inf
+    px_per_mm = np.linalg.norm(slope, axis=(1, 2)) / np.sqrt(2)
+    return float((np.linalg.norm(residual, axis=1) / px_per_mm).max())
+
+
+def _refined(sightings: Sequence[_Sighting], pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Minimise the pixel error of the picks by Gauss-Newton, starting close by."""
+    for _ in range(10):
+        H, g = np.zeros((6, 6)), np.zeros(6)
+        centre = transform_points(pose, np.mean([s.point for s in sightings], axis=0))
+        for s in sightings:
+            residual, _, slope = _residuals_px(s, pose)
+            p = transform_points(pose, s.point) - centre
+            turn = np.stack([np.cross(p, row) for row in slope.reshape(-1, 3)])
+            J = np.hstack([turn, slope.reshape(-1, 3)])
+            H += J.T @ J
+            g -= J.T @ residual.ravel()
+        twist = np.linalg.solve(H, g)
+        to, back = make_transform(np.eye(3), -centre), make_transform(np.eye(3), centre)
+        pose = orthonormalise(back @ se3_exp(twist) @ to @ pose)
+    return pose

@@ -1,0 +1,95 @@
+"""The first frame: from picked poses to an aligned one, with the checks only a first frame needs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.errors import TrackingError
+from jawusd.formats.tracks import PARTIAL, TRACKED
+from jawusd.imaging.raster import count_and_not, count_bits, draw_silhouette, pack_bits, project
+from jawusd.tracking.config import TrackingConfig
+from jawusd.tracking.ladder import FrameRecord
+from jawusd.tracking.quality import coverage_error, score_px
+from jawusd.tracking.solver import ContourSolver, Solution, View
+from jawusd.tracking.views import MaskViews
+
+_ROWS = (0, 1)
+_NAMES = ("upper", "lower")
+
+
+def first_record(
+    solver: ContourSolver, config: TrackingConfig, start: NDArray[np.float64], masks: MaskViews, frame: int
+) -> FrameRecord:
+    """Align the bootstrap frame, starting from the picks.
+
+    Args:
+        start: T_world_upper, T_world_lower from the picks, shape (2, 4, 4).
+        masks: the masks of the take.
+        frame: the bootstrap frame.
+
+    Raises:
+        TrackingError: too few masks on this frame, masks of the two rows exchanged, or no alignment.
+    """
+    views = masks.at(frame)
+    names = [camera.name for camera in masks.cameras]
+    use = np.array([[v.present[r] for v in views] for r in _ROWS])
+    for r in _ROWS:
+        if use[r].sum() < 2:
+            raise TrackingError(
+                f"frame {frame}: {use[r].sum()} masks of the {_NAMES[r]} teeth, the first frame needs two",
+                hint="Choose a bootstrap frame that is segmented in every camera.",
+            )
+    _check_not_swapped(solver, start, views, names, frame)
+    best: Solution | None = None
+    for gates in (config.gates_px, config.wide_gates_px):
+        trial = solver.solve(start, views, gates, use)
+        if best is None:
+            best = trial
+        elif (score_px(trial) > score_px(best)).any():
+            take = score_px(trial) > score_px(best)
+            poses = np.where(take[:, None, None], trial.poses, best.poses)
+            best = solver.solve(poses, views, config.gates_px[-2:], use)
+    coverage = coverage_error(solver.scans, best, views)
+    for r in _ROWS:
+        share = score_px(best)[r] / max(best.visible_px[r].sum(), 1.0)
+        bare = np.nanmedian(coverage[r])
+        if share < config.first_share or bare > config.lost_coverage:
+            raise TrackingError(
+                f"frame {frame}: the {_NAMES[r]} teeth do not fit their masks: {share:.0%} of the visible contour "
+                f"matches (at least {config.first_share:.0%} is needed) and {bare:.1%} of the masks stays uncovered "
+                f"(at most {config.lost_coverage:.0%} is allowed)",
+                hint="Check the picks, the calibration, the time offsets and the masks of this frame.",
+            )
+    status = np.where(use.all(1), TRACKED, PARTIAL).astype(np.int8)
+    return FrameRecord(best, status, use, coverage)
+
+
+def _check_not_swapped(
+    solver: ContourSolver, poses: NDArray, views: Sequence[View], names: Sequence[str], frame: int
+) -> None:
+    """Refuse masks that lie on the other row of teeth."""
+    for view, name in zip(views, names, strict=True):
+        if not view.present.all():
+            continue
+        crowns = []
+        for r in _ROWS:
+            scan = solver.scans[r]
+            points = np.empty((len(scan.vertices), 3), np.float32)
+            bits = np.zeros_like(pack_bits(view.masks[0]))
+            project(scan.vertices_single, (view.matrix @ poses[r]).astype(np.float32), points)
+            draw_silhouette(points, scan.crown_faces, 0, 0, view.masks.shape[2], False, bits)
+            crowns.append(bits)
+        masks = [pack_bits(m > 127) for m in view.masks]
+        own = sum(count_and_not(masks[r], crowns[r]) for r in _ROWS)
+        crossed = sum(count_and_not(masks[r], crowns[1 - r]) for r in _ROWS)
+        total = sum(count_bits(m) for m in masks)
+        # The rows overlap in closed bites, so only a clear case counts.
+        if own > 0.5 * total and crossed < 0.5 * own:
+            raise TrackingError(
+                f"camera {name}, frame {frame}: the masks of the upper and lower teeth are exchanged "
+                f"({own / total:.0%} of them lies off its own scan, {crossed / total:.0%} off the other one)",
+                hint="Exchange masks.upper and masks.lower of this camera, or the picks of the two rows.",
+            )

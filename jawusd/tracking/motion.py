@@ -1,0 +1,66 @@
+"""Where both rows of teeth are expected next."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.geometry import orthonormalise, se3_inverse
+
+_GALLERY = 16  # earlier poses kept: enough to cover the exercises of a jaw at 2 mm
+_APART_MM = 2.0  # poses nearer than this have the same basin
+
+
+class Motion:
+    """Extrapolate with constant velocity; keep a gallery of earlier poses for getting back after a loss."""
+
+    def __init__(self, poses: NDArray[np.float64]) -> None:
+        """Start at rest at T_world_upper, T_world_lower, shape (2, 4, 4)."""
+        self._last = np.array(poses)
+        self._step: list[NDArray[np.float64] | None] = [None, None]
+        self._lost_for = np.zeros(2, int)
+        self._seen: list[NDArray[np.float64]] = []
+
+    def predict(self) -> NDArray[np.float64]:
+        """Return the expected T_world_upper, T_world_lower of the next frame, shape (2, 4, 4)."""
+        out = self._last.copy()
+        for r in (0, 1):
+            if self._step[r] is not None:
+                out[r] = self._step[r] @ self._last[r]
+        if self._lost_for[1] and not self._lost_for[0]:
+            out[1] = out[0] @ se3_inverse(self._last[0]) @ self._last[1]  # a lost jaw is carried along by the head
+        return orthonormalise(out)
+
+    def update(self, poses: NDArray[np.float64], found: NDArray[np.bool_]) -> None:
+        """Take in the poses of the next frame, shape (2, 4, 4); rows not found keep their predictions."""
+        expected = self.predict()
+        for r in (0, 1):
+            if found[r]:
+                # After a loss the last pose is a guess, and a velocity from it would be another.
+                self._step[r] = None if self._lost_for[r] else poses[r] @ se3_inverse(self._last[r])
+            else:
+                self._step[r] = None
+        self._lost_for = np.where(found, 0, self._lost_for + 1)
+        if not found[1]:
+            expected[1] = expected[0] @ se3_inverse(self._last[0]) @ self._last[1]
+        self._last = np.where(found[:, None, None], poses, expected)
+        self.remember(poses, found)
+
+    def remember(self, poses: NDArray[np.float64], found: NDArray[np.bool_]) -> None:
+        """Keep poses of both rows, shape (2, 4, 4), as later starts if they are unlike those kept."""
+        if not found.all():
+            return
+        new = se3_inverse(poses[0]) @ poses[1]
+        if any(np.linalg.norm((new - se3_inverse(p[0]) @ p[1])[:3, 3]) < _APART_MM for p in self._seen):
+            return
+        self._seen = [*self._seen[-_GALLERY + 1 :], np.array(poses)]
+
+    def worth_searching(self) -> bool:
+        """Tell whether a search from many starts is due: always at first, then ever less often while lost."""
+        longest = int(self._lost_for.max())
+        return longest & (longest - 1) == 0 or longest % 16 == 0
+
+    def gallery(self) -> list[NDArray[np.float64]]:
+        """Return earlier poses as starts for the next frame: the jaw relative to where the head is now."""
+        head = self.predict()[0]
+        return [np.stack([p[0], head @ se3_inverse(p[0]) @ p[1]]) for p in self._seen]

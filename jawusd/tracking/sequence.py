@@ -1,0 +1,181 @@
+"""A whole take: bootstrap, forwards, backwards, and once more from the far side into what was lost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.errors import TrackingError
+from jawusd.formats.capture import Capture
+from jawusd.formats.mesh import Mesh
+from jawusd.formats.tracks import LOST, RECOVERED, Tracks
+from jawusd.geometry import Camera, transform_points
+from jawusd.tracking.bootstrap import pose_from_picks
+from jawusd.tracking.config import TrackingConfig
+from jawusd.tracking.first import first_record
+from jawusd.tracking.ladder import FrameRecord, FrameTracker, History
+from jawusd.tracking.motion import Motion
+from jawusd.tracking.results import assemble
+from jawusd.tracking.scan import prepare_scan
+from jawusd.tracking.solver import ContourSolver, View
+from jawusd.tracking.views import MaskViews
+
+Progress = Callable[[int, int], None]
+
+
+def track_capture(
+    capture: Capture,
+    cameras: Sequence[Camera],
+    offsets: Mapping[str, int],
+    upper: Mesh,
+    lower: Mesh,
+    landmarks: NDArray[np.float64],
+    config: TrackingConfig | None = None,
+    *,
+    threads: int = 2,
+    progress: Progress | None = None,
+) -> Tracks:
+    """Track both rows of teeth through a capture.
+
+    Args:
+        capture: the capture; its masks, bootstrap picks and frame range are used.
+        cameras: calibrated cameras; world lengths in mm.
+        offsets: reference frame minus own frame number, per camera name.
+        upper, lower: teeth scans in one frame, in occlusion [mm].
+        landmarks: points whose uncertainty is reported, mandible (= scan) coordinates [mm], shape (5, 3).
+        config: the tracker's numbers.
+        threads: worker threads; the result does not depend on it.
+        progress: called with frames done and frames in all, once per frame.
+
+    Raises:
+        TrackingError: no picks, one camera only, or a first frame that cannot be aligned.
+        CaptureError: a mask cannot be read.
+    """
+    config = config or TrackingConfig()
+    table = {camera.name: camera for camera in cameras}
+    start, left_out = _start_poses(capture, table, upper, lower)
+    scans = (prepare_scan(upper, "upper"), prepare_scan(lower, "lower"))
+    centre = np.mean([transform_points(start[r], scans[r].centre) for r in (0, 1)], axis=0)
+    with (
+        MaskViews(capture.cameras, table, offsets, centre, config.working_px_per_mm) as masks,
+        ThreadPoolExecutor(threads) as pool,
+    ):
+        first, stop = capture.frames or masks.frames
+        if not first <= capture.bootstrap.frame < stop:
+            raise TrackingError(f"bootstrap.frame is {capture.bootstrap.frame}, frames run from {first} to {stop - 1}")
+        solver = ContourSolver(scans, config, pool if threads > 1 else None)
+        take = _Take(solver, config, masks, first, stop, progress)
+        take.begin(capture.bootstrap.frame, start)
+        take.run(range(capture.bootstrap.frame + 1, stop))
+        take.run(range(capture.bootstrap.frame - 1, first - 1, -1))
+        take.re_enter()
+        records = take.records if capture.frames else _trimmed(take.records)
+        names = tuple(camera.name for camera in masks.cameras)
+    notes = {"picks_left_out": left_out, "painted": [s.painted for s in scans]}
+    return assemble(records, scans, names, np.asarray(landmarks, np.float64), config, notes)
+
+
+def _start_poses(
+    capture: Capture, cameras: Mapping[str, Camera], upper: Mesh, lower: Mesh
+) -> tuple[NDArray[np.float64], dict[str, list[int]]]:
+    """Return T_world_upper, T_world_lower from the picks, shape (2, 4, 4), and the picks left out."""
+    if capture.bootstrap is None:
+        raise TrackingError(
+            "the capture has no [bootstrap] picks, so nothing tells where the teeth are at first",
+            path=capture.folder / "capture.toml",
+            hint="Add three or more picks per row of teeth, each seen by two cameras.",
+        )
+    poses, left_out = [], {}
+    for row, mesh, picks in (
+        ("upper", upper, capture.bootstrap.upper),
+        ("lower", lower, capture.bootstrap.lower),
+    ):
+        pose, wrong = pose_from_picks(picks, np.asarray(mesh.vertices, np.float64), cameras, row)
+        poses.append(pose)
+        left_out[row] = wrong
+    return np.stack(poses), left_out
+
+
+def _trimmed(records: dict[int, FrameRecord]) -> dict[int, FrameRecord]:
+    """Drop frames without any mask before the first and after the last frame that has one."""
+    masked = [frame for frame, record in records.items() if np.isfinite(record.coverage).any()]
+    return {f: r for f, r in records.items() if min(masked) <= f <= max(masked)}
+
+
+class _Take:
+    """Run the tracker over the frames of a take and keep one record per frame."""
+
+    def __init__(
+        self,
+        solver: ContourSolver,
+        config: TrackingConfig,
+        masks: MaskViews,
+        first: int,
+        stop: int,
+        progress: Progress | None,
+    ) -> None:
+        self._solver, self._config, self._masks = solver, config, masks
+        self._first, self._stop = first, stop
+        self._progress = progress or (lambda done, total: None)
+        self.records: dict[int, FrameRecord] = {}
+
+    def begin(self, frame: int, poses: NDArray[np.float64]) -> None:
+        """Align the bootstrap frame from the pick poses."""
+        self.records[frame] = first_record(self._solver, self._config, poses, self._masks, frame)
+        self._progress(1, self._stop - self._first)
+
+    def run(self, frames: range) -> None:
+        """Track away from the frame next to the first one given."""
+        if not len(frames):
+            return
+        tracker, motion = self._from(frames.start - frames.step)
+        for frame, views in self._masks.walk(frames.start, frames.stop, frames.step):
+            record = self._one(tracker, motion, views)
+            self.records[frame] = record
+            self._progress(len(self.records), self._stop - self._first)
+
+    def re_enter(self) -> None:
+        """Track backwards into every gap from the frame after it, and keep what is found."""
+        for first, stop in _gaps(self.records):
+            if stop not in self.records:
+                continue
+            tracker, motion = self._from(stop)
+            for frame, views in self._masks.walk(stop - 1, first - 1, -1):
+                record = self._one(tracker, motion, views)
+                lost, was_lost = record.status == LOST, self.records[frame].status == LOST
+                if (lost <= was_lost).all() and (lost != was_lost).any():
+                    status = np.where(was_lost & ~lost, RECOVERED, record.status).astype(np.int8)
+                    self.records[frame] = replace(record, status=status)
+
+    def _from(self, frame: int) -> tuple[FrameTracker, Motion]:
+        """Return a tracker that knows the frames around a tracked one."""
+        history = History(self._config.history_frames)
+        known = sorted(self.records, key=lambda f: -abs(f - frame))
+        for near in known[-self._config.history_frames :]:
+            history.add(self.records[near])
+        motion = Motion(self.records[frame].solution.poses)
+        for near in known[::10]:
+            motion.remember(self.records[near].solution.poses, self.records[near].status != LOST)
+        return FrameTracker(self._solver, self._config, history), motion
+
+    def _one(self, tracker: FrameTracker, motion: Motion, views: Sequence[View]) -> FrameRecord:
+        record = tracker.track(motion.predict(), views, motion.gallery() if motion.worth_searching() else None)
+        motion.update(record.solution.poses, record.status != LOST)
+        tracker.history.add(record)
+        return record
+
+
+def _gaps(records: Mapping[int, FrameRecord]) -> Iterable[tuple[int, int]]:
+    """Yield runs of frames in which a row is lost, as first frame and one past the last."""
+    lost = [frame for frame in sorted(records) if (records[frame].status == LOST).any()]
+    runs: list[list[int]] = []
+    for frame in lost:
+        if runs and runs[-1][1] == frame:
+            runs[-1][1] = frame + 1
+        else:
+            runs.append([frame, frame + 1])
+    return [(a, b) for a, b in runs]
