@@ -8,7 +8,7 @@ exposure only when the step happens to fall into it).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +20,7 @@ from jawusd.errors import SyncError
 from jawusd.formats.capture import Capture
 from jawusd.imaging.video import Video
 
-__all__ = ["Offset", "Step", "estimate_offsets", "find_steps", "match_steps", "synchronise"]
+__all__ = ["Alignment", "Offset", "Step", "align_videos", "estimate_offsets", "find_steps", "match_steps"]
 
 _FIRST_WINDOW_S = 4.0  # searched at either end; doubled until a flash is found
 _SPARSE = 8  # every 8th pixel in both directions tells the mean brightness
@@ -30,7 +30,6 @@ _TOLERANCE_FRAMES = 1.0  # steps this close are the same step
 _DROPPED_S = 0.5  # steps that fit with an offset this different tell of lost frames
 _FEWEST_STEPS = 2
 _RATE_TOLERANCE = 1e-3
-_OFFSETS_HINT = "Give whole-frame offsets instead, in capture.toml: [sync] offsets = {{ {} }}."
 
 
 @dataclass(frozen=True)
@@ -55,7 +54,7 @@ class Offset:
         exact_frames: the same with its estimated fraction.
         spread_frames: largest deviation of a matched step from exact_frames.
         matched_steps: number of steps found in both cameras.
-        confidence: share of the steps of both cameras that have a partner, 0 .. 1; 1 for given offsets.
+        confidence: share of the steps of both cameras that have a partner, 0 .. 1.
     """
 
     frames: int
@@ -65,43 +64,48 @@ class Offset:
     confidence: float
 
 
-def synchronise(capture: Capture) -> dict[str, Offset]:
-    """Return the offset of every camera of a capture, given ones before estimated ones.
+@dataclass(frozen=True)
+class Alignment:
+    """Hold the offsets of all cameras of a capture.
 
-    Args:
-        capture: its cameras and its [sync] section.
+    Attributes:
+        reference: the camera that counts the frames.
+        cameras: the offset per camera, in the order of the capture.
+    """
+
+    reference: str
+    cameras: dict[str, Offset]
+
+    @property
+    def offsets(self) -> dict[str, int]:
+        """Return the whole-frame offset per camera."""
+        return {name: offset.frames for name, offset in self.cameras.items()}
+
+    @property
+    def confidence(self) -> dict[str, float]:
+        """Return the confidence per camera, 0 .. 1."""
+        return {name: offset.confidence for name, offset in self.cameras.items()}
+
+
+def estimate_offsets(capture: Capture) -> Alignment:
+    """Align the cameras of a capture by the light flashes in their videos; see `align_videos`.
 
     Raises:
-        SyncError: a camera has neither an offset nor a video, or the flashes do not tell.
+        SyncError: a camera has no video, or the flashes do not tell.
         CaptureError: a video cannot be read.
     """
-    names = [camera.name for camera in capture.cameras]
-    given = capture.sync.offsets
-    if given is not None:
-        offsets = {capture.reference: 0} | given
-        missing = [name for name in names if name not in offsets]
-        if missing:
-            raise SyncError(
-                f"[sync] offsets does not name camera {missing[0]}; it names {', '.join(given)}.",
-                path=capture.folder / "capture.toml",
-                hint="Name every camera; the reference camera has 0.",
-            )
-        shift = offsets[capture.reference]
-        return {name: Offset(offsets[name] - shift, float(offsets[name] - shift), 0.0, 0, 1.0) for name in names}
-    if len(names) == 1:
-        return {names[0]: Offset(0, 0.0, 0.0, 0, 1.0)}
     videos = {camera.name: camera.video for camera in capture.cameras if camera.video is not None}
-    missing = [name for name in names if name not in videos]
-    if missing:
-        raise SyncError(
-            f"camera {missing[0]} has no video to find light flashes in.",
-            path=capture.folder / "capture.toml",
-            hint=_OFFSETS_HINT.format(", ".join(f"{name} = 0" for name in names)),
-        )
-    return estimate_offsets(videos, capture.reference)
+    for camera in capture.cameras:
+        if camera.video is None:
+            raise SyncError(
+                f"camera {camera.name} has no video to find light flashes in.",
+                path=capture.folder / "capture.toml",
+                hint=_offsets_hint([camera.name for camera in capture.cameras]),
+            )
+    return align_videos(videos, capture.reference)
 
 
-def estimate_offsets(videos: Mapping[str, Path], reference: str) -> dict[str, Offset]:
+def align_videos(videos: Mapping[str, Path], reference: str) -> Alignment:
     """Find the light flashes in all videos and align them with those of the reference camera.
 
     Only the beginning and the end of each video are decoded, more of it only while no flash is found.
@@ -110,15 +114,12 @@ def estimate_offsets(videos: Mapping[str, Path], reference: str) -> dict[str, Of
         videos: video file per camera name.
         reference: the camera that counts the frames.
 
-    Returns:
-        The offset per camera, in the order of videos; 0 for the reference.
-
     Raises:
         SyncError: no flash in a video, rates that differ, or steps that do not fit together.
         CaptureError: a video cannot be read.
     """
     opened = {name: Video(path) for name, path in videos.items()}
-    hint = _OFFSETS_HINT.format(", ".join(f"{name} = 0" for name in videos))
+    hint = _offsets_hint(videos)
     rate = opened[reference].fps
     for name, video in opened.items():
         if abs(video.fps / rate - 1) > _RATE_TOLERANCE:
@@ -137,7 +138,7 @@ def estimate_offsets(videos: Mapping[str, Path], reference: str) -> dict[str, Of
             raise SyncError(
                 f"camera {name}, against {reference}: {error.message}", path=video.path, hint=hint
             ) from error
-    return offsets
+    return Alignment(reference, offsets)
 
 
 def find_steps(brightness: NDArray[np.float64], first_frame: int = 0) -> list[Step]:
@@ -261,6 +262,10 @@ def _video_steps(name: str, video: Video, hint: str) -> list[Step]:
 
 def _brightness(video: Video, first: int, last: int) -> NDArray[np.float64]:
     return np.array([frame.image[::_SPARSE, ::_SPARSE].mean() for frame in video.frames(first, last, threads=1)])
+
+
+def _offsets_hint(names: Iterable[str]) -> str:
+    return f"Give whole-frame offsets instead, in capture.toml: [sync] offsets = {{ {' = .., '.join(names)} = .. }}."
 
 
 def _listed(steps: list[Step]) -> str:

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jawusd.capture.sync import Step, estimate_offsets, find_steps, match_steps, synchronise
+from jawusd.capture.sync import Step, align_videos, estimate_offsets, find_steps, match_steps
 from jawusd.errors import SyncError
 from jawusd.formats.capture import Capture
 from jawusd.imaging.video_writer import VideoWriter
@@ -45,15 +45,14 @@ def test_offsets_of_three_cameras(tmp_path: Path, polarity: str) -> None:
         lit = exposures(400, start)
         lit = lit if polarity == "off" else 1 - lit
         videos[name] = film(tmp_path / f"{name}.mp4", lit, bright=100 + 20 * k, seed=k)
-    found = estimate_offsets(videos, "a")
+    found = align_videos(videos, "a").cameras
     assert list(found) == ["a", "b", "c"]
     assert [found[name].frames for name in "abc"] == [0, 7, -4]
     for name, start in starts.items():
         assert found[name].exact_frames == pytest.approx(start, abs=0.05)
         assert found[name].spread_frames < 0.1
         assert found[name].matched_steps == 4 and found[name].confidence == 1.0
-    again = estimate_offsets(videos, "b")
-    assert [again[name].frames for name in "abc"] == [-7, 0, -11]
+    assert align_videos(videos, "b").offsets == {"a": -7, "b": 0, "c": -11}
 
 
 def test_only_both_ends_are_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -69,10 +68,10 @@ def test_only_both_ends_are_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         return frames(self, first, last, **options)
 
     monkeypatch.setattr(Video, "frames", spy)
-    estimate_offsets({"a": path}, "a")
+    align_videos({"a": path}, "a")
     assert decoded == [(0, 96), (304, 400)]
     decoded.clear()
-    estimate_offsets({"a": late}, "a")
+    align_videos({"a": late}, "a")
     assert decoded == [(0, 96), (304, 400), (0, 192)]
 
 
@@ -81,7 +80,7 @@ def test_one_flash_is_enough_and_lowers_the_confidence(tmp_path: Path) -> None:
         "a": film(tmp_path / "a.mp4", exposures(400, 0)),
         "b": film(tmp_path / "b.mp4", exposures(200, 5)),
     }
-    found = estimate_offsets(videos, "a")["b"]
+    found = align_videos(videos, "a").cameras["b"]
     assert (found.frames, found.matched_steps) == (5, 2)
     assert found.confidence == pytest.approx(2 / 3)
 
@@ -92,7 +91,7 @@ def test_a_video_without_flash_is_named(tmp_path: Path) -> None:
         "b": film(tmp_path / "b.mp4", np.ones(60)),
     }
     with pytest.raises(SyncError, match=r"b\.mp4: camera b shows no light flash: 0 .*60 frames.*\[sync\] offsets = \{"):
-        estimate_offsets(videos, "a")
+        align_videos(videos, "a")
 
 
 def test_different_rates_are_refused(tmp_path: Path) -> None:
@@ -101,7 +100,7 @@ def test_different_rates_are_refused(tmp_path: Path) -> None:
         "b": film(tmp_path / "b.mp4", exposures(60, 0), fps=25),
     }
     with pytest.raises(SyncError, match=r"b\.mp4: camera b runs at 25 frames per second, camera a at 24"):
-        estimate_offsets(videos, "a")
+        align_videos(videos, "a")
 
 
 def test_lost_frames_are_noticed(tmp_path: Path) -> None:
@@ -113,7 +112,7 @@ def test_lost_frames_are_noticed(tmp_path: Path) -> None:
     with pytest.raises(
         SyncError, match=r"camera b, against a: the offset is 3\.0 frames at frame 7 and 7\.0 at frame 3\d\d"
     ):
-        estimate_offsets(videos, "a")
+        align_videos(videos, "a")
 
 
 def steps(*times: float) -> list[Step]:
@@ -160,22 +159,14 @@ def capture(folder: Path, videos: dict[str, Path | None], **sync: object) -> Cap
     )  # fmt: skip
 
 
-def test_synchronise_takes_given_offsets_first(tmp_path: Path) -> None:
-    pair: dict[str, Path | None] = {"a": None, "b": None}
-    found = synchronise(capture(tmp_path, pair, offsets={"b": 12}))
-    assert {name: offset.frames for name, offset in found.items()} == {"a": 0, "b": 12}
-    assert found["b"].confidence == 1 and found["b"].matched_steps == 0
-    with pytest.raises(SyncError, match=r"capture\.toml: \[sync\] offsets does not name camera c"):
-        synchronise(capture(tmp_path, pair | {"c": None}, offsets={"b": 12}))
-    with pytest.raises(SyncError, match=r"camera a has no video"):
-        synchronise(capture(tmp_path, pair))
-    assert synchronise(capture(tmp_path, {"a": None}))["a"].frames == 0
-
-
-def test_synchronise_finds_flashes(tmp_path: Path) -> None:
+def test_a_capture_is_aligned_to_its_reference(tmp_path: Path) -> None:
     videos: dict[str, Path | None] = {
         "a": film(tmp_path / "a.mp4", exposures(80, 0)),
         "b": film(tmp_path / "b.mp4", exposures(80, -2)),
     }
-    found = synchronise(capture(tmp_path, videos, reference="b"))
-    assert {name: offset.frames for name, offset in found.items()} == {"a": 2, "b": 0}
+    found = estimate_offsets(capture(tmp_path, videos, reference="b"))
+    assert found.reference == "b"
+    assert found.offsets == {"a": 2, "b": 0} and found.confidence == {"a": 1.0, "b": 1.0}
+    message = r"capture\.toml: camera c has no video.*offsets = \{ a = \.\., b = \.\., c = \.\. \}"
+    with pytest.raises(SyncError, match=message):
+        estimate_offsets(capture(tmp_path, videos | {"c": None}))
