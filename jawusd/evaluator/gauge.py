@@ -27,7 +27,8 @@ ARCH_BOW_MM = 10.0  # the quadratic arch features are d2^2 / 10 mm, to keep all 
 DROP_BEND = 0.15  # slope gained by the bent drop features per mm, saturating at 4 mm (below)
 DROP_SATURATION_MM2 = 16.0
 _INVERSE_TOLERANCE_MM = 1e-13
-_INVERSE_ITERATIONS = 60
+_INVERSE_ITERATIONS = 120
+_PATIENCE = 8  # steps after which Newton is taken to crawl: steps double until there is a bracket, then it is halved
 _INVERSE_STEP_MM = 20.0
 
 
@@ -147,7 +148,7 @@ class Gauge:
         low, high = np.full(len(u), -np.inf), np.full(len(u), np.inf)
         d = np.full(u.shape, np.nan)
         active = np.flatnonzero(np.isfinite(u).all(axis=1))
-        for _ in range(_INVERSE_ITERATIONS):
+        for iteration in range(_INVERSE_ITERATIONS):
             x = d1[active]
             d2, d3, excess, slope = self._opening_equation(u[active], x)
             step = _newton_step(excess, slope)
@@ -155,7 +156,7 @@ class Gauge:
             d[active[done]] = np.stack([x, d2, d3], axis=-1)[done]
             low[active] = np.where(excess < 0, x, low[active])
             high[active] = np.where(excess > 0, x, high[active])
-            d1[active] = _bracketed(x + step, low[active], high[active])
+            d1[active] = _next_opening(x, step, low[active], high[active], iteration)
             active = active[~done]
             if not active.size:
                 break
@@ -198,9 +199,12 @@ def _newton_step(excess: Array, slope: Array) -> Array:
     return np.clip(-excess / np.where(slope > 0.2, slope, 1.0), -_INVERSE_STEP_MM, _INVERSE_STEP_MM)
 
 
-def _bracketed(x: Array, low: Array, high: Array) -> Array:
-    """Return x, or the middle of the bracket where x has left it."""
-    outside = (x <= low) | (x >= high)
+def _next_opening(x: Array, step: Array, low: Array, high: Array, iteration: int) -> Array:
+    """Return the next d1 to try: a Newton step, or the middle of the bracket where that leads out of it or crawls."""
     bounded = np.isfinite(low) & np.isfinite(high)
+    late = max(iteration - _PATIENCE, 0)
+    stride = np.clip(step * 2.0 ** min(late, 64), -_INVERSE_STEP_MM, _INVERSE_STEP_MM)
+    newton = x + np.where(bounded, step, stride)
+    halve = bounded & ((newton <= low) | (newton >= high) | (late % 2 == 1))
     middle = 0.5 * (np.where(bounded, low, 0.0) + np.where(bounded, high, 0.0))
-    return np.where(outside & bounded, middle, x)
+    return np.where(halve, middle, newton)
