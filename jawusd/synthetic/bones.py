@@ -1,0 +1,235 @@
+"""The mandible and the parts of the skull it meets: fossa and eminence, cheekbone, upper jaw bone.
+
+The bones carry no teeth of their own. The joint surfaces follow the person's kinematics: rolled along them, the
+condyles describe the paths of `jawusd.synthetic.kinematics`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.formats.mesh import Mesh
+from jawusd.synthetic.kinematics import Joint, eminence
+from jawusd.synthetic.surfaces import Faces, loft, merged
+
+Array = NDArray[np.float64]
+
+#: Half axes of a condyle [mm]: lateral, up, forward.
+CONDYLE_MM = np.array([9.0, 4.2, 4.8])
+#: Distance from the centre of a condyle to the bone of the fossa: its radius and the disc [mm].
+JOINT_SPACE_MM = 6.0
+_BONE = (222, 206, 178)
+_AROUND = 24
+
+
+def build_mandible(joint: Joint) -> Mesh:
+    """Build the mandible without teeth: body, rami, coronoid processes, condyles; closed parts that overlap.
+
+    Args:
+        joint: positions of the condyles and the incisors.
+
+    Returns:
+        The bone in the scan frame, teeth in occlusion [mm].
+    """
+    parts = [_body(joint)]
+    for side, centre in zip((1.0, -1.0), joint.condyles, strict=True):
+        parts += [_ramus(joint, side, centre), _condyle(side, centre), _coronoid(side, centre)]
+    return _mesh(merged(parts))
+
+
+def build_skull(joint: Joint) -> Mesh:
+    """Build the joint sockets, the cheekbones and the upper jaw bone; closed parts that overlap.
+
+    Args:
+        joint: positions and shapes of the joint surfaces.
+
+    Returns:
+        The bone in the scan frame [mm].
+    """
+    parts = [_maxilla(joint)]
+    for k, side in enumerate((1.0, -1.0)):
+        parts += [_socket(joint, k), _cheekbone(joint, k, side)]
+    return _mesh(merged(parts))
+
+
+def articular_surface(joint: Joint, side: int, slide_mm: Array) -> Array:
+    """Return the sagittal section of the socket's bone: the condyle's path moved out by the joint space.
+
+    Args:
+        joint: the joint.
+        side: 0 left, 1 right.
+        slide_mm: forward positions of the condyle [mm], shape (...).
+
+    Returns:
+        Height and depth (y, z) [mm], shape (..., 2).
+    """
+    step = 1e-4
+    slope = (eminence(joint, side, slide_mm + step) - eminence(joint, side, slide_mm - step)) / (2 * step)
+    length = np.hypot(slope, 1.0)
+    path_y = joint.condyles[side, 1] + eminence(joint, side, slide_mm)
+    path_z = joint.condyles[side, 2] + slide_mm
+    return np.stack([path_y + JOINT_SPACE_MM / length, path_z - JOINT_SPACE_MM * slope / length], -1)
+
+
+def _mesh(part: tuple[Array, Faces]) -> Mesh:
+    vertices, faces = part
+    return Mesh(vertices, faces, np.tile(np.uint8(_BONE), (len(vertices), 1)))
+
+
+def _ovals(centres: Array, half_x: Array, half_z: Array, squareness: float = 0.8) -> tuple[Array, Faces]:
+    """Loft of level rounded rectangles: centres (R, 3), half sizes (R,) [mm]."""
+    angle = 2 * np.pi * np.arange(_AROUND) / _AROUND
+    c, s = np.cos(angle), np.sin(angle)
+    x = np.sign(c) * np.abs(c) ** squareness
+    z = np.sign(s) * np.abs(s) ** squareness
+    offsets = np.stack([half_x[:, None] * x, np.zeros((len(centres), _AROUND)), half_z[:, None] * z], -1)
+    return loft(centres[:, None] + offsets)
+
+
+def _swept(path: Array, half_wide: Array, half_high: Array) -> tuple[Array, Faces]:
+    """Loft of upright ovals along a path (R, 3); half sizes across and upwards (R,) [mm]."""
+    tangent = np.gradient(path, axis=0) * [1.0, 0.0, 1.0]
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    across = np.stack([tangent[:, 2], np.zeros(len(path)), -tangent[:, 0]], -1)
+    angle = 2 * np.pi * np.arange(_AROUND) / _AROUND
+    c, s = np.cos(angle), np.sin(angle)
+    wide = np.sign(c) * np.abs(c) ** 0.8
+    high = np.sign(s) * np.abs(s) ** 0.8
+    rings = path[:, None] + half_wide[:, None, None] * wide[None, :, None] * across[:, None]
+    rings[..., 1] += half_high[:, None] * high
+    return loft(rings)
+
+
+def _spline(knots: Array, values: Array, at: Array) -> Array:
+    """Catmull-Rom interpolation of values (K, ...) at positions within the knots."""
+    slopes = np.gradient(values, knots, axis=0)
+    i = np.clip(np.searchsorted(knots, at) - 1, 0, len(knots) - 2)
+    h = (knots[i + 1] - knots[i])[:, None]
+    t = ((at - knots[i])[:, None]) / h
+    a, b, u, v = values[i], values[i + 1], slopes[i] * h, slopes[i + 1] * h
+    return (1 + 2 * t) * (1 - t) ** 2 * a + t * (1 - t) ** 2 * u + t**2 * (3 - 2 * t) * b + t**2 * (t - 1) * v
+
+
+def _body(joint: Joint) -> tuple[Array, Faces]:
+    """The horseshoe from ramus to ramus, below the lower gum."""
+    x, y, z = joint.incisor
+    half = []  # x, middle height, z, half width, half height; from the chin to the left ramus
+    half.append([0.0, y - 24.0, z - 5.5, 5.5, 10.5])
+    half.append([13.0, y - 23.5, z - 8.5, 5.5, 10.0])
+    half.append([22.0, y - 22.0, z - 20.0, 5.5, 9.5])
+    half.append([28.0, y - 20.0, z - 36.0, 6.0, 9.5])
+    half.append([34.0, y - 16.5, z - 52.0, 6.0, 11.0])
+    half.append([41.0, y - 11.0, z - 66.0, 5.0, 12.0])
+    rows = np.array(half)
+    mirrored = rows[:0:-1] * [-1.0, 1.0, 1.0, 1.0, 1.0]
+    rows = np.concatenate([mirrored, rows])
+    rows[:, 0] += x
+    at = np.linspace(0.0, len(rows) - 1.0, 61)
+    rows = _spline(np.arange(len(rows), dtype=np.float64), rows, at)
+    return _swept(rows[:, :3], rows[:, 3], rows[:, 4])
+
+
+def _ramus(joint: Joint, side: float, centre: Array) -> tuple[Array, Faces]:
+    """The plate from the angle of the jaw up to the notch."""
+    # height below the condyle, inward shift, forward position of its middle, half thickness, half length
+    rows = np.array(
+        [
+            [-60.0, 7.0, 15.0, 2.0, 6.0],
+            [-55.0, 6.0, 16.0, 4.5, 14.5],
+            [-44.0, 5.0, 17.0, 5.0, 18.0],
+            [-30.0, 3.5, 15.5, 4.5, 17.5],
+            [-18.0, 2.0, 13.5, 3.5, 16.5],
+            [-11.0, 1.5, 12.5, 2.0, 14.5],
+        ]
+    )
+    rows = _spline(rows[:, 0], rows, np.linspace(-60.0, -11.0, 26))
+    return _column(centre, side, rows)
+
+
+def _condyle(side: float, centre: Array) -> tuple[Array, Faces]:
+    """Neck and head of one condyle; the head is an ellipsoid about the centre."""
+    neck = np.array([[-24.0, 2.5, 5.0, 4.0, 8.0], [-15.0, 1.5, 1.5, 4.2, 5.0], [-8.0, 0.5, -0.3, 5.5, 4.0]])
+    neck = _spline(neck[:, 0], neck, np.linspace(-24.0, -8.0, 9))
+    turn = np.linspace(-0.35 * np.pi, 0.499 * np.pi, 13)
+    head = np.stack(
+        [
+            CONDYLE_MM[1] * np.sin(turn),
+            np.zeros(13),
+            np.zeros(13),
+            CONDYLE_MM[0] * np.cos(turn),
+            CONDYLE_MM[2] * np.cos(turn),
+        ],
+        -1,
+    )
+    return _column(centre, side, np.concatenate([neck, head]), squareness=1.0)
+
+
+def _coronoid(side: float, centre: Array) -> tuple[Array, Faces]:
+    """The process in front of the notch."""
+    rows = np.array(
+        [
+            [-24.0, 2.5, 21.0, 3.6, 9.0],
+            [-12.0, 2.5, 23.5, 2.8, 6.0],
+            [-3.0, 3.0, 25.5, 2.0, 3.4],
+            [1.0, 3.0, 25.0, 0.8, 1.2],
+        ]
+    )
+    return _column(centre, side, _spline(rows[:, 0], rows, np.linspace(-24.0, 1.0, 14)))
+
+
+def _column(centre: Array, side: float, rows: Array, squareness: float = 0.8) -> tuple[Array, Faces]:
+    """Loft upwards near a condyle: rows of height, inward shift, forward position, half thickness, half length."""
+    centres = centre + np.stack([-side * rows[:, 1], rows[:, 0], rows[:, 2]], -1)
+    return _ovals(centres, rows[:, 3], rows[:, 4], squareness)
+
+
+def _socket(joint: Joint, k: int) -> tuple[Array, Faces]:
+    """Fossa, eminence and what lies in front of it, as a slab over the condyle."""
+    slide = np.linspace(-7.0, 22.0, 40)
+    section = articular_surface(joint, k, slide)
+    behind = np.maximum(-3.0 - slide, 0.0)
+    section[:, 0] -= 0.35 * behind**2
+    across = np.linspace(-12.0, 12.0, 13)
+    vault = 1.6 * (across / 12.0) ** 2
+    under = np.stack(
+        [
+            np.broadcast_to(joint.condyles[k, 0] + across, (40, 13)),
+            section[:, :1] - vault,
+            np.broadcast_to(section[:, 1:], (40, 13)),
+        ],
+        -1,
+    )
+    roof = joint.condyles[k, 1] + JOINT_SPACE_MM + 4.0
+    over = under.copy()
+    over[..., 1] = roof
+    return loft(np.concatenate([under, over[:, ::-1]], 1))
+
+
+def _cheekbone(joint: Joint, k: int, side: float) -> tuple[Array, Faces]:
+    """Arch from the socket forward to the cheek and in to the upper jaw bone."""
+    x, y, z = joint.condyles[k]
+    rows = np.array(
+        [
+            [x + side * 9.0, y + 7.0, z + 8.0, 3.0, 4.0],
+            [x + side * 12.0, y + 4.0, z + 26.0, 2.4, 3.4],
+            [x + side * 9.0, y + 1.0, z + 44.0, 3.0, 5.0],
+            [side * 48.0, y - 5.0, -26.0, 5.0, 9.0],
+            [side * 34.0, y - 9.0, -18.0, 6.0, 10.0],
+            [side * 24.0, y - 12.0, -17.0, 5.0, 9.0],
+        ]
+    )
+    rows = _spline(np.arange(6.0), rows, np.linspace(0.0, 5.0, 36))
+    return _swept(rows[:, :3], rows[:, 3], rows[:, 4])
+
+
+def _maxilla(joint: Joint) -> tuple[Array, Faces]:
+    """The horseshoe of bone over the upper gum."""
+    y = 0.5 * joint.condyles[:, 1].mean()
+    half = np.array(
+        [[0.0, y, -8.0, 4.5, 8.0], [11.0, y, -9.0, 5.0, 9.0], [21.0, y, -19.0, 6.0, 9.5],
+         [26.0, y, -34.0, 6.0, 9.5], [28.0, y, -50.0, 5.0, 9.0]]
+    )  # fmt: skip
+    rows = np.concatenate([half[:0:-1] * [-1.0, 1.0, 1.0, 1.0, 1.0], half])
+    rows = _spline(np.arange(len(rows), dtype=np.float64), rows, np.linspace(0.0, len(rows) - 1.0, 49))
+    return _swept(rows[:, :3], rows[:, 3], rows[:, 4])

@@ -1,0 +1,223 @@
+"""Rows of teeth with their gum: crowns set along an arch, and a scalloped gum that hides the crowns' bases.
+
+Everything is built with the occlusal side up (x left, y occlusal, z anterior) and mirrored in y for the upper jaw.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.formats.mesh import Mesh
+from jawusd.geometry import so3_exp
+from jawusd.synthetic.surfaces import Faces, loft, merged, outward
+from jawusd.synthetic.teeth import CrownForm, crown
+
+Array = NDArray[np.float64]
+
+RED, GREEN, GREY = (215, 45, 40), (40, 190, 60), (150, 150, 150)
+# Depth of the contact points behind the incisal edges and buccal cusp tips [mm]; teeth are strung along them.
+_CONTACT_MM = 0.9
+_CONTACT_OVERLAP_MM = 0.22
+_BOUNDARY_MM = 2.5
+# Gum cross-section on one side, from the fold to the crest: distance outside the crown and height over the margin.
+_GUM_SIDE = np.array(
+    [[2.6, -9.0], [2.0, -6.2], [1.45, -3.8], [1.0, -2.1], [0.72, -1.0], [0.42, -0.3], [0.05, 0.0], [-0.8, -0.5]]
+)
+_COLUMN_MM = 0.55
+
+
+@dataclass(frozen=True)
+class ArchShape:
+    """Form and position of one row of teeth.
+
+    Attributes:
+        quadratic_per_mm: the line of edges and buccal cusps runs back as a x^2 + b x^4: a [1/mm].
+        quartic_per_mm3: b [1/mm^3].
+        setback_mm: how far this line lies inside that curve.
+        tips_mm: height of edge or highest cusp of each tooth, first incisor to second molar, left then right,
+            shape (2, 7).
+        midline_mm: x of the midline.
+    """
+
+    quadratic_per_mm: float
+    quartic_per_mm3: float
+    setback_mm: float
+    tips_mm: Array
+    midline_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class DentalArch:
+    """One row of teeth with gum, scan frame.
+
+    Attributes:
+        mesh: crowns first, then gum; red, green and grey.
+        tooth: tooth of each vertex, 1..7 left and -1..-7 right from the midline, 0 gum, shape (V,).
+    """
+
+    mesh: Mesh
+    tooth: NDArray[np.int8]
+
+
+class _Line:
+    """A planar curve through the contact points, by arc length from the midline; positive to the left."""
+
+    def __init__(self, shape: ArchShape) -> None:
+        x = np.linspace(-40.0, 40.0, 8001)
+        z = -shape.quadratic_per_mm * x**2 - shape.quartic_per_mm3 * x**4
+        slope = -2 * shape.quadratic_per_mm * x - 4 * shape.quartic_per_mm3 * x**3
+        normal = np.stack([-slope, np.ones_like(x)], -1) / np.hypot(slope, 1.0)[:, None]
+        points = np.stack([x, z], -1) - (shape.setback_mm + _CONTACT_MM) * normal
+        steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+        s = np.concatenate([[0.0], np.cumsum(steps)])
+        self._s = s - np.interp(0.0, x, s)
+        self._points = points + [shape.midline_mm, 0.0]
+        self._normal = normal
+
+    def at(self, s: Array) -> tuple[Array, Array]:
+        """Points and outward normals (x, z) at arc lengths, (..., 2) each."""
+        points = np.stack([np.interp(s, self._s, self._points[:, k]) for k in (0, 1)], -1)
+        normal = np.stack([np.interp(s, self._s, self._normal[:, k]) for k in (0, 1)], -1)
+        return points, normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+
+    def coordinates(self, xz: Array) -> tuple[Array, Array]:
+        """Arc length and outward offset of points (N, 2)."""
+        s = np.empty(len(xz))
+        for i in range(0, len(xz), 4000):
+            part = xz[i : i + 4000]
+            squares = ((part[:, None] - self._points[None, ::10]) ** 2).sum(-1)
+            s[i : i + 4000] = self._s[::10][squares.argmin(1)]
+        points, normal = self.at(s)
+        s = s + np.einsum("ni,ni->n", xz - points, np.stack([normal[:, 1], -normal[:, 0]], -1))
+        points, normal = self.at(s)
+        return s, np.einsum("ni,ni->n", xz - points, normal)
+
+
+def build_arch(forms: tuple[CrownForm, ...], shape: ArchShape, cusp_slope: float, upper: bool, seed: int) -> DentalArch:
+    """Build a row of teeth with gum.
+
+    Args:
+        forms: tooth kinds from the first incisor to the second molar.
+        shape: form and position.
+        cusp_slope: steepness of the cusps, drop per mm.
+        upper: mirror it downwards.
+        seed: draws positions and irregularities of the teeth; the same seed gives the same teeth whatever the tips.
+
+    Returns:
+        The row in the scan frame.
+    """
+    rng = np.random.default_rng([seed, 0x7EE7, int(upper)])
+    line = _Line(shape)
+    centres = _centres(forms)
+    parts, tooth, colors = [], [], []
+    for row, side in enumerate((1, -1)):
+        for k, form in enumerate(forms):
+            local, faces = crown(form, cusp_slope, rng)
+            placed = _placed(local, form, line, side * centres[k], side, shape.tips_mm[row, k], rng)
+            parts.append((placed, outward(placed, faces)))
+            colors.append(_crown_colors(local, form, k))
+            tooth.append(np.full(len(local), side * (k + 1)))
+    gum = _gum(forms, shape, line, np.concatenate([placed for placed, _ in parts]))
+    parts.append(gum)
+    colors.append(np.tile(np.uint8(GREY), (len(gum[0]), 1)))
+    tooth.append(np.zeros(len(gum[0])))
+    vertices, faces = merged(parts)
+    if upper:
+        vertices, faces = vertices * [1.0, -1.0, 1.0], faces[:, ::-1]
+    mesh = Mesh(vertices, faces, np.concatenate(colors).astype(np.uint8))
+    return DentalArch(mesh, np.concatenate(tooth).astype(np.int8))
+
+
+def _centres(forms: tuple[CrownForm, ...]) -> Array:
+    """Arc length of the tooth middles on one side."""
+    widths = np.array([form.width_mm - _CONTACT_OVERLAP_MM for form in forms])
+    return np.cumsum(widths) - widths / 2
+
+
+def _placed(
+    local: Array, form: CrownForm, line: _Line, s: float, side: int, tip_mm: float, rng: np.random.Generator
+) -> Array:
+    """Move a crown to its place, occlusal side up."""
+    point, normal = line.at(np.array(s))
+    distal = side * np.array([normal[1], 0.0, -normal[0]])
+    facial = np.array([normal[0], 0.0, normal[1]])
+    axes = np.stack([distal, [0.0, 1.0, 0.0], facial], 1)
+    jitter = np.deg2rad(rng.uniform(-1.0, 1.0, 3) * [2.0, 4.0, 2.0])
+    turn = so3_exp(np.array([np.deg2rad(form.torque_deg), 0.0, 0.0])) @ so3_exp(jitter)
+    tip = np.array([0.0, form.height_mm, form.tip_z_mm])
+    shift = rng.uniform(-0.12, 0.12, 2)
+    position = np.array([point[0], tip_mm, point[1]]) + (_CONTACT_MM + shift[0]) * facial + [0.0, shift[1], 0.0]
+    return (local - tip) @ (axes @ turn).T + position
+
+
+def _crown_colors(local: Array, form: CrownForm, k: int) -> NDArray[np.uint8]:
+    """Red, and green on the facial side of the last millimetres of the six front teeth."""
+    colors = np.tile(np.uint8(RED), (len(local), 1))
+    if k < 3:
+        middle = form.tip_z_mm
+        boundary = (local[:, 1] > local[:, 1].max() - _BOUNDARY_MM - form.tip_mm / 2) & (local[:, 2] > middle - 0.1)
+        colors[boundary] = GREEN
+    return colors
+
+
+def _gum(forms: tuple[CrownForm, ...], shape: ArchShape, line: _Line, crowns: Array) -> tuple[Array, Faces]:
+    """Closed gum ridge: margins scalloped between the teeth, faces standing a little proud of the crowns."""
+    half = _centres(forms)[-1] + forms[-1].width_mm / 2 + 2.5
+    s = np.linspace(-half, half, int(2 * half / _COLUMN_MM))
+    margin = _margin(forms, shape, s)
+    crown_s, crown_n = line.coordinates(crowns[:, [0, 2]])
+    facial, lingual = _crown_extent(s, margin, crown_s, crown_n, crowns[:, 1])
+    # near the crest the gum follows every crown, further down only the arch as a whole
+    follow = np.clip(1.0 + _GUM_SIDE[:, 1] / 5.0, 0.0, 1.0)
+    sides = []
+    for extent, sign in ((facial, 1.0), (lingual, -1.0)):
+        even = _averaged(extent, int(9.0 / _COLUMN_MM))[:, None]
+        offset = even + (extent[:, None] - even) * follow + sign * _GUM_SIDE[:, 0]
+        even_margin = _averaged(margin, int(9.0 / _COLUMN_MM))[:, None]
+        level = even_margin + (margin[:, None] - even_margin) * follow + _GUM_SIDE[:, 1]
+        sides.append(np.stack([offset, level], -1))
+    profile = np.concatenate([sides[0], sides[1][:, ::-1]], 1)
+    points, normal = line.at(s)
+    xz = points[:, None] + profile[..., :1] * normal[:, None]
+    rings = np.stack([xz[..., 0], profile[..., 1], xz[..., 1]], -1)
+    return loft(rings)
+
+
+def _margin(forms: tuple[CrownForm, ...], shape: ArchShape, s: Array) -> Array:
+    """Height of the gum margin: the gum line at each tooth, papillae in between."""
+    centres = _centres(forms)
+    line, papilla, centre, half = [], [], [], []
+    for row, side in enumerate((1, -1)):
+        for k, form in enumerate(forms):
+            line.append(shape.tips_mm[row, k] - form.height_mm)
+            papilla.append(0.38 * form.height_mm if k < 3 else 0.30 * form.height_mm)
+            centre.append(side * centres[k])
+            half.append(form.width_mm / 2)
+    order = np.argsort(centre)
+    line, papilla, centre, half = (np.array(v)[order] for v in (line, papilla, centre, half))
+    tooth = np.abs(s[:, None] - centre).argmin(1)
+    smooth_line = np.interp(s, centre, line)
+    across = np.minimum(np.abs(s - centre[tooth]) / half[tooth], 1.0)
+    return smooth_line + np.interp(s, centre, papilla) * across**2.6
+
+
+def _crown_extent(s: Array, margin: Array, crown_s: Array, crown_n: Array, crown_y: Array) -> tuple[Array, Array]:
+    """Outermost facial and lingual offset of the crowns at the margin, per column of the gum."""
+    facial, lingual = np.full(len(s), np.nan), np.full(len(s), np.nan)
+    for i, (column, level) in enumerate(zip(s, margin, strict=True)):
+        near = (np.abs(crown_s - column) < 0.8) & (np.abs(crown_y - level) < 1.2)
+        if near.any():
+            facial[i], lingual[i] = crown_n[near].max(), crown_n[near].min()
+    known = np.isfinite(facial)
+    facial, lingual = (np.interp(s, s[known], v[known]) for v in (facial, lingual))
+    return _averaged(facial, 3), _averaged(lingual, 3)
+
+
+def _averaged(values: Array, width: int) -> Array:
+    """Hann average along a row, edges repeated."""
+    width += 1 - width % 2
+    kernel = np.hanning(width + 2)[1:-1]
+    return np.convolve(np.pad(values, width // 2, mode="edge"), kernel / kernel.sum(), "valid")

@@ -1,0 +1,76 @@
+"""Building blocks of closed surfaces: grids, lofts, merged meshes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Faces = NDArray[np.int32]
+
+
+def grid_faces(rows: int, columns: int, closed: bool) -> Faces:
+    """Triangulate a grid of vertices numbered row by row.
+
+    Args:
+        rows: number of rows.
+        columns: number of columns.
+        closed: join the last column to the first.
+
+    Returns:
+        Faces, shape (F, 3).
+    """
+    i, j = np.meshgrid(np.arange(rows - 1), np.arange(columns if closed else columns - 1), indexing="ij")
+    k = (j + 1) % columns
+    a, b, c, d = i * columns + j, i * columns + k, (i + 1) * columns + j, (i + 1) * columns + k
+    return np.stack([np.stack([a, c, b], -1), np.stack([b, c, d], -1)], 2).reshape(-1, 3).astype(np.int32)
+
+
+def loft(rings: Array) -> tuple[Array, Faces]:
+    """Join stacked rings to a closed mesh; the first and the last ring are closed with a fan.
+
+    Args:
+        rings: ring points [mm], shape (R, A, 3).
+
+    Returns:
+        vertices, shape (R A + 2, 3), and faces with outward winding, shape (F, 3).
+    """
+    n_rings, around, _ = rings.shape
+    vertices = np.concatenate([rings.reshape(-1, 3), rings[[0, -1]].mean(1)])
+    i = np.arange(around)
+    j = (i + 1) % around
+    last, bottom, top = (n_rings - 1) * around, n_rings * around, n_rings * around + 1
+    caps = [
+        np.stack([np.full(around, bottom), i, j], -1),
+        np.stack([np.full(around, top), last + j, last + i], -1),
+    ]
+    faces = np.concatenate([grid_faces(n_rings, around, closed=True), *caps]).astype(np.int32)
+    return vertices, outward(vertices, faces)
+
+
+def outward(vertices: Array, faces: Faces) -> Faces:
+    """Return the faces of a closed mesh turned so that its signed volume is positive."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return faces if np.einsum("ij,ij->", a, np.cross(b, c)) > 0 else faces[:, ::-1].copy()
+
+
+def merged(parts: Iterable[tuple[Array, Faces]]) -> tuple[Array, Faces]:
+    """Put meshes (vertices (V, 3), faces (F, 3)) into one."""
+    vertices, faces, count = [], [], 0
+    for v, f in parts:
+        vertices.append(v)
+        faces.append(f + count)
+        count += len(v)
+    return np.concatenate(vertices), np.concatenate(faces).astype(np.int32)
+
+
+def vertex_normals(vertices: Array, faces: Faces) -> Array:
+    """Area-weighted unit normals of the vertices, shape (V, 3)."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    face_normals = np.cross(b - a, c - a)
+    corners = np.repeat(face_normals, 3, axis=0)
+    index = faces.ravel()
+    normals = np.stack([np.bincount(index, corners[:, k], len(vertices)) for k in range(3)], -1)
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
