@@ -74,7 +74,7 @@ def pose(
         "d": list(d),
         "T_skull_mandible": T,
         "twist": loaded.twist(d),
-        "landmarks_mm": dict(zip(_landmark_names(), transform_points(T, loaded.landmarks), strict=True)),
+        "landmarks_mm": dict(zip(_landmark_names(), transform_points(T, loaded.arrays["landmarks"]), strict=True)),
         "margin_mm": margin,
         "valid": margin >= float(loaded.arrays["margin_limit_mm"]),
     }

@@ -40,8 +40,13 @@ def sync_cameras(capture: Capture, progress: Progress) -> dict:
         # Masks alone carry no flash; numbered alike they are taken as simultaneous, and the report says so.
         result = {"offsets": {camera.name: 0 for camera in capture.cameras}, "method": "taken as simultaneous"}
     else:
-        found = stage("jawusd.capture.sync").estimate_offsets(capture)
-        result = {"offsets": found.offsets, "method": "light flash", "confidence": found.confidence}
+        found = stage("jawusd.capture.sync").estimate_offsets(capture).cameras
+        result = {
+            "offsets": {name: offset.frames for name, offset in found.items()},
+            "method": "light flash",
+            "exact_frames": {name: offset.exact_frames for name, offset in found.items()},
+            "confidence": {name: offset.confidence for name, offset in found.items()},
+        }
     progress("sync", 1, 1)
     return result
 
@@ -68,7 +73,7 @@ def track_teeth(capture: Capture, offsets: dict[str, int], jobs: int, progress: 
         meshes["upper_teeth"],
         meshes["lower_teeth"],
         anatomy.landmarks,
-        tracking.TrackingConfig(threads=jobs),
+        threads=jobs,
         progress=lambda done, total: progress("track", done, total),
     )
 
@@ -97,15 +102,20 @@ def fit_jaw(capture: Capture, motion: Motion, method: str, progress: Progress) -
     Raises:
         FittingError: the poses cannot carry a model.
     """
-    data, fitting = stage("jawusd.fitting.data"), stage("jawusd.fitting.fit")
-    config = stage("jawusd.fitting.config").FittingConfig(method=method)
+    fitting = stage("jawusd.fitting")
     meshes = load_meshes(capture)
     anatomy = find_anatomy(capture, meshes)
     bone = meshes.get("mandible", meshes["lower_teeth"])
-    where = data.Anatomy(anatomy.T_anatomical_skull, anatomy.landmarks, bone.vertices)
-    model = fitting.fit_model(motion, where, config, lambda text, share: progress("fit", round(100 * share), 100))
-    model.meta.update(actor=capture.name, fps=capture.fps, inferred=list(anatomy.inferred))
-    progress("fit", 100, 100)
+    model = fitting.fit_model(
+        motion,
+        T_anatomical_skull=anatomy.T_anatomical_skull,
+        landmarks=anatomy.landmarks,
+        mandible_vertices=bone.vertices,
+        config=fitting.FittingConfig(method=method),
+        actor=capture.name,
+        progress=lambda done, total: progress("fit", done, total),
+    )
+    model.meta.update(fps=capture.fps, inferred=list(anatomy.inferred))
     return model
 
 

@@ -55,12 +55,14 @@ def fit_summary(model: JawModel) -> dict:
 
 def fit_lines(summary: dict) -> list[str]:
     """Return `fit_summary` as text."""
-    lines = [f"model: {summary.get('method')}"]
-    for name, table in summary.get("errors", {}).items():
-        figures = ", ".join(f"{key} {value}" for key, value in table.items()) if isinstance(table, dict) else table
-        lines.append(f"  {name} [mm]: {figures}")
-    lines += [f"  warning: {warning}" for warning in summary.get("warnings", [])]
-    return lines
+    lines = [f"model: {summary.get('method')}; largest distance per pose [mm]:  mean  median     p95     max"]
+    for table, rows in summary.get("errors", {}).items():
+        for place, figures in rows.items():
+            values = "".join(f"{figures[key]:8.3f}" for key in ("mean", "median", "p95", "max"))
+            lines.append(f"  {table:<8} {place:<28}{values}")
+    if summary.get("trimmed_frames"):
+        lines.append(f"  frames left out as outliers: {', '.join(map(str, summary['trimmed_frames']))}")
+    return lines + [f"  warning: {warning['message']}" for warning in summary.get("warnings", [])]
 
 
 def build_lines(summary: dict) -> list[str]:
