@@ -1,0 +1,188 @@
+"""Draw tracked scans over the footage, to be judged by eye (paper figs. 10 and 11)."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.formats.atomic import write_bytes_atomic
+from jawusd.formats.mesh import Mesh
+from jawusd.formats.tracks import Tracks
+from jawusd.geometry import Camera, transform_points
+from jawusd.imaging.meshio import GUM, tooth_labels
+from jawusd.imaging.raster import draw_depth_labels
+from jawusd.imaging.video import Video
+
+__all__ = ["PlacedScan", "contact_sheet", "draw_overlay", "save_png", "tracking_sheet"]
+
+UPPER_COLOUR = (255, 170, 0)
+LOWER_COLOUR = (0, 200, 255)
+_LINE_PX = 2
+_CAPTION_PX = 22
+_MARGIN = 0.25  # of the teeth's extent, left around them in a tile
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedScan:
+    """Hold a teeth scan where it was tracked.
+
+    Attributes:
+        mesh: the scan [mm]; its gum hides what lies behind and is not painted.
+        T_world_scan: its pose, shape (4, 4); NaN leaves the scan out.
+        colour: red, green, blue.
+    """
+
+    mesh: Mesh
+    T_world_scan: NDArray[np.float64]
+    colour: tuple[int, int, int]
+
+
+def draw_overlay(
+    image: NDArray[np.uint8], camera: Camera, scans: Sequence[PlacedScan], *, fill: float = 0.3
+) -> NDArray[np.uint8]:
+    """Return a copy of a picture with the visible crowns tinted and outlined.
+
+    Args:
+        image: (h, w, 3) RGB, of the camera's size; recorded pictures are drawn on with their distortion.
+        camera: the camera that took the picture.
+        scans: what to draw; nearer surfaces hide farther ones.
+        fill: opacity of the tint, 0 .. 1; the outline is opaque.
+
+    Raises:
+        ValueError: the picture has not the camera's size.
+    """
+    if image.shape != (camera.size_px[1], camera.size_px[0], 3) or image.dtype != np.uint8:
+        raise ValueError(f"picture must be RGB of {camera.size_px} px, got {image.dtype} {image.shape}")
+    labels = _visible_crowns(camera, scans)
+    out = image.copy()
+    kernel = np.ones((2 * _LINE_PX + 1,) * 2, np.uint8)
+    for number, scan in enumerate(scans, start=1):
+        crown = (labels == number).astype(np.uint8)
+        inner = cv2.erode(crown, kernel, borderType=cv2.BORDER_REPLICATE) > 0
+        tint = (1 - fill) * image[inner] + fill * np.array(scan.colour)
+        out[inner] = np.round(tint).astype(np.uint8)
+        out[(crown > 0) & ~inner] = scan.colour
+    return out
+
+
+def tracking_sheet(
+    tracks: Tracks,
+    frames: Sequence[int],
+    cameras: Sequence[Camera],
+    videos: Mapping[str, Video],
+    offsets: Mapping[str, int],
+    upper: Mesh,
+    lower: Mesh,
+    *,
+    tile_px: tuple[int, int] = (480, 270),
+) -> NDArray[np.uint8]:
+    """Return one picture with a row per frame and a column per camera, cut to the teeth and captioned.
+
+    Args:
+        tracks: the tracked poses.
+        frames: frames of the reference camera, all of them in tracks.
+        cameras: the calibrated cameras to show.
+        videos: the video per camera name.
+        offsets: whole-frame offset per camera name, see `capture.sync`.
+        upper, lower: the teeth scans.
+        tile_px: (width, height) of a tile.
+
+    Returns:
+        RGB, (rows, columns, 3) uint8. A tile is gray where the camera was not recording, without tint where the jaw
+        was lost.
+
+    Raises:
+        ValueError: a frame is not in tracks.
+        CaptureError: a video cannot be decoded.
+    """
+    row_of = {int(frame): row for row, frame in enumerate(tracks.frames)}
+    missing = [frame for frame in frames if frame not in row_of]
+    if missing:
+        raise ValueError(f"frame {missing[0]} is not in the tracks, which hold {len(row_of)} frames")
+    tiles = []
+    for frame in frames:
+        row = row_of[frame]
+        scans = [
+            PlacedScan(upper, tracks.T_world_upper[row], UPPER_COLOUR),
+            PlacedScan(lower, tracks.T_world_lower[row], LOWER_COLOUR),
+        ]
+        for camera in cameras:
+            own = frame - offsets[camera.name]
+            tile = np.full((tile_px[1], tile_px[0], 3), 60, np.uint8)
+            video = videos[camera.name]
+            if 0 <= own < video.count:
+                picture = next(video.frames(own, own + 1, colour="rgb")).image
+                tile = _cut_to_teeth(draw_overlay(picture, camera, scans), camera, scans, tile_px)
+            tiles.append(_captioned(tile, f"{camera.name}  frame {frame}"))
+    return contact_sheet(tiles, len(cameras))
+
+
+def contact_sheet(tiles: Sequence[NDArray[np.uint8]], columns: int) -> NDArray[np.uint8]:
+    """Lay pictures of one size out in rows; return RGB uint8, the last row filled up with black.
+
+    Raises:
+        ValueError: there are no pictures, or they differ in size.
+    """
+    if not tiles or columns < 1 or len({tile.shape for tile in tiles}) != 1:
+        raise ValueError(f"needs pictures of one size, got {[tile.shape for tile in tiles]}")
+    height, width, channels = tiles[0].shape
+    rows = math.ceil(len(tiles) / columns)
+    sheet = np.zeros((rows * height, columns * width, channels), np.uint8)
+    for k, tile in enumerate(tiles):
+        top, left = k // columns * height, k % columns * width
+        sheet[top : top + height, left : left + width] = tile
+    return sheet
+
+
+def save_png(path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
+    """Write an RGB picture (h, w, 3) as PNG.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    write_bytes_atomic(path, cv2.imencode(".png", image[..., ::-1])[1].tobytes())
+
+
+def _points(camera: Camera, scan: PlacedScan) -> NDArray[np.float32]:
+    """Return recorded pixels and depth per vertex: triangles of a scan are small enough to stay straight."""
+    world = transform_points(scan.T_world_scan, scan.mesh.vertices)
+    return np.column_stack([camera.project(world), camera.depth(world)]).astype(np.float32)
+
+
+def _visible_crowns(camera: Camera, scans: Sequence[PlacedScan]) -> NDArray[np.uint8]:
+    width, height = camera.size_px
+    inverse_depth, labels = np.zeros((height, width), np.float32), np.zeros((height, width), np.uint8)
+    for number, scan in enumerate(scans, start=1):
+        if not np.isfinite(scan.T_world_scan).all():
+            continue
+        points = _points(camera, scan)
+        crown = (tooth_labels(scan.mesh)[scan.mesh.faces] != GUM).all(axis=1)
+        for faces, label in ((scan.mesh.faces[~crown], 0), (scan.mesh.faces[crown], number)):
+            draw_depth_labels(points, faces, 0, 0, False, inverse_depth, labels, label)
+    return labels
+
+
+def _cut_to_teeth(
+    image: NDArray[np.uint8], camera: Camera, scans: Sequence[PlacedScan], tile_px: tuple[int, int]
+) -> NDArray[np.uint8]:
+    """Cut the surroundings of the scans out of a picture and bring them to a tile, keeping the aspect."""
+    seen = [_points(camera, scan)[:, :2] for scan in scans if np.isfinite(scan.T_world_scan).all()]
+    whole = np.array([[0, 0], camera.size_px], float)
+    low, high = whole if not seen else (np.min(np.vstack(seen), axis=0), np.max(np.vstack(seen), axis=0))
+    centre = (low + high) / 2
+    scale = float(np.min(np.array(tile_px) / np.maximum((high - low) * (1 + 2 * _MARGIN), 1)))
+    to_tile = np.array([[scale, 0, tile_px[0] / 2 - scale * centre[0]], [0, scale, tile_px[1] / 2 - scale * centre[1]]])
+    shrinks = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    return cv2.warpAffine(image, to_tile, tile_px, flags=shrinks)
+
+
+def _captioned(tile: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
+    out = np.vstack([np.zeros((_CAPTION_PX, tile.shape[1], 3), np.uint8), tile])
+    cv2.putText(out, text, (6, _CAPTION_PX - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1, cv2.LINE_AA)
+    return out
