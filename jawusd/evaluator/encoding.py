@@ -11,52 +11,68 @@ derivatives, from the parameters read off the model itself.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.evaluator.bounds import SliceHull
+from jawusd.evaluator.distances import carried, distance_residual, landmark_vectors
+from jawusd.evaluator.frames import RigFrames
 from jawusd.evaluator.models import AnchoredModel, JawModelForm
-from jawusd.evaluator.solver import Residual, minimise
-from jawusd.geometry.se3 import make_transform, se3_inverse, se3_left_jacobian_inverse, se3_log
+from jawusd.evaluator.reach import Reach
+from jawusd.evaluator.solver import minimise
+from jawusd.geometry.se3 import make_transform, se3_inverse, se3_left_jacobian_inverse, se3_log, transform_points
 
 Array = NDArray[np.float64]
-# x (k, 3) -> rotations (k, 3, 3), translations (k, 3), spatial derivatives (k, 6, 3)
-Derivative = Callable[[Array], tuple[Array, Array, Array]]
-
-
-def landmark_vectors(landmarks: Array) -> Array:
-    """Return the four homogeneous vectors (4, 4), one a column, that stand for the landmarks (n, 3) [mm]."""
-    centre = landmarks.mean(axis=0)
-    scatter = (landmarks - centre).T @ (landmarks - centre) / len(landmarks)
-    variance, axes = np.linalg.eigh(scatter)
-    vectors = np.zeros((4, 4))
-    vectors[:3, :3] = axes * np.sqrt(np.maximum(variance, 0.0))
-    vectors[:, 3] = [*centre, 1.0]
-    return vectors
 
 
 class Encoder:
-    """Encode motions of the anatomical frame with one model.
+    """Encode poses with one model.
 
     Args:
         model: The jaw model.
+        frames: Of the rig.
         bound: The valid volume, for encoding inside it.
-        landmarks: Landmarks of the mandible at rest [mm], anatomical frame, shape (n, 3).
+        landmarks: Landmarks of the mandible [mm], mandible frame, shape (n, 3).
     """
 
-    def __init__(self, model: JawModelForm, bound: SliceHull, landmarks: Array) -> None:
-        self._model, self._bound = model, bound
-        self._vectors = landmark_vectors(landmarks)
+    def __init__(self, model: JawModelForm, frames: RigFrames, bound: SliceHull, landmarks: Array) -> None:
+        self._model, self._frames, self._bound = model, frames, bound
+        self._reach = Reach(model, bound)
+        self._vectors = landmark_vectors(transform_points(frames.closed, landmarks))
 
-    def residual_mm(self, d: Array, R: Array, t: Array) -> Array:
-        """Return the landmark distance [mm] (n,) of M(d), d (n, 3), from motions R (n, 3, 3), t (n, 3)."""
+    def encode(self, T: Array, *, bounded: bool) -> tuple[Array, Array]:
+        """Return the d (n, 3) nearest to poses T_skull_mandible (n, 4, 4), and the residuals (n,) [mm]."""
+        R, t = self._frames.motions(T)
+        d = self._nearest(R, t)
+        out = np.flatnonzero(self._bound.excess(d) > 0) if bounded else ()
+        if len(out):
+            target = carried(R[out], t[out], self._vectors)
+            d[out] = self._reach.pull(self._vectors, target, self._reach.nearest(d[out]))
+        return d, self._residual_mm(d, R, t)
+
+    def encode_weighted(self, T: Array, whitening: Array, *, bounded: bool) -> tuple[Array, Array]:
+        """Return the most likely d (n, 3) of noisy poses: the least ``|W xi|^2`` with ``T = exp(xi) pose(d)``.
+
+        Args:
+            T: Poses T_skull_mandible, shape (n, 4, 4).
+            whitening: W with ``W^T W`` the inverse covariance of xi, (omega, v), skull frame, shape (n, 6, 6).
+            bounded: Search only inside the bound.
+
+        Returns:
+            d [mm], shape (n, 3), and the residuals [mm], shape (n,).
+        """
+        R, t = self._frames.motions(T)
+        start = self._nearest(R, t)
+        start[np.isnan(whitening).any(axis=(1, 2))] = np.nan
+        start = self._reach.nearest(start) if bounded else start
+        d = self._most_likely(R, t, whitening @ self._frames.adjoint, start, self._bound if bounded else None)
+        return d, self._residual_mm(d, R, t)
+
+    def _residual_mm(self, d: Array, R: Array, t: Array) -> Array:
         difference = carried(*self._model.decode(d), self._vectors) - carried(R, t, self._vectors)
         return np.sqrt(np.einsum("nij,nij->n", difference, difference))
 
-    def nearest(self, R: Array, t: Array) -> Array:
-        """Return the d (n, 3) [mm] whose motions are nearest to R (n, 3, 3), t (n, 3) [mm]."""
+    def _nearest(self, R: Array, t: Array) -> Array:
         model, target = self._model, carried(R, t, self._vectors)
         if isinstance(model, AnchoredModel):
             # the nearest pose does not depend on the chart: searching over the incisal displacement spares the gauge
@@ -65,21 +81,7 @@ class Encoder:
         residual = distance_residual(model.decode_derivative, self._vectors, target)
         return minimise(residual, model.read_off(R, t))[0]
 
-    def nearest_valid(self, R: Array, t: Array, start: Array) -> Array:
-        """Return the d (n, 3) [mm] inside the bound nearest to motions (R, t), from starts inside it."""
-        target = carried(R, t, self._vectors)
-        return minimise(distance_residual(self._model.decode_derivative, self._vectors, target), start, self._bound)[0]
-
-    def most_likely(self, R: Array, t: Array, whitening: Array, start: Array, *, bounded: bool) -> Array:
-        """Return the most likely d (n, 3) [mm] of noisy motions: the least ``|W xi|^2``, ``(R, t) = exp(xi) M(d)``.
-
-        Args:
-            R: Measured rotations, shape (n, 3, 3).
-            t: Measured translations [mm], shape (n, 3).
-            whitening: W with ``W^T W`` the inverse covariance of xi, (omega, v), shape (n, 6, 6).
-            start: First d [mm], shape (n, 3).
-            bounded: Stay inside the bound, where the start must then lie.
-        """
+    def _most_likely(self, R: Array, t: Array, whitening: Array, start: Array, bound: SliceHull | None) -> Array:
         measured = make_transform(R, t)
 
         def residual(d: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]:
@@ -89,29 +91,20 @@ class Encoder:
             # exp(xi(d + e)) = exp(xi) exp(-S e), and the right Jacobian is the left one at -xi
             return np.einsum("nij,nj->ni", W, xi), -W @ se3_left_jacobian_inverse(-xi) @ S
 
-        return minimise(residual, start, self._bound if bounded else None)[0]
+        return minimise(residual, start, bound)[0]
 
 
-def carried(R: Array, t: Array, vectors: Array) -> Array:
-    """Return the images (n, 3, m) of homogeneous vectors (4, m) under motions R (n, 3, 3), t (n, 3) [mm]."""
-    return R @ vectors[:3] + t[:, :, None] * vectors[3]
+def whitening_of(covariance: Array) -> Array:
+    """Return W (n, 6, 6) with ``W^T W`` the inverse of the covariances (n, 6, 6); NaN for NaN.
 
-
-def distance_residual(derivative: Derivative, vectors: Array, target: Array) -> Residual:
-    """Return, for `minimise`, how far motions leave the vectors (4, m) from their targets (n, 3, m)."""
-    count = vectors.shape[1]
-
-    def residual(x: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]:
-        R, t, S = derivative(x)
-        image = carried(R, t, vectors)
-        # a vector (b, h) moves by w x image + v h under the spatial velocity (w, v)
-        J = np.empty((len(x), 3, count, 3))
-        px, py, pz = image[:, 0, :, None], image[:, 1, :, None], image[:, 2, :, None]
-        wx, wy, wz = S[:, None, 0], S[:, None, 1], S[:, None, 2]
-        v = S[:, 3:, None] * vectors[3][:, None]
-        J[:, 0] = wy * pz - wz * py + v[:, 0]
-        J[:, 1] = wz * px - wx * pz + v[:, 1]
-        J[:, 2] = wx * py - wy * px + v[:, 2]
-        return (image - target[rows]).reshape(len(x), 3 * count), J.reshape(len(x), 3 * count, 3)
-
-    return residual
+    Raises:
+        ValueError: a covariance is not positive definite.
+    """
+    lost = np.isnan(covariance).any(axis=(1, 2))
+    try:
+        factor = np.linalg.cholesky(np.where(lost[:, None, None], np.eye(6), covariance))
+    except np.linalg.LinAlgError as error:
+        raise ValueError("covariance must be positive definite") from error
+    whitening = np.linalg.inv(factor)
+    whitening[lost] = np.nan
+    return whitening

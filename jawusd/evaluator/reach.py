@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from jawusd.errors import EvaluatorError
 from jawusd.evaluator.bounds import SliceHull
-from jawusd.evaluator.encoding import carried, distance_residual
+from jawusd.evaluator.distances import carried, distance_residual
 from jawusd.evaluator.models import JawModelForm
 from jawusd.evaluator.rows import in_chunks
 from jawusd.evaluator.solver import minimise
@@ -23,27 +25,33 @@ class Reach:
     Args:
         model: The jaw model.
         bound: The valid volume.
-
-    Raises:
-        EvaluatorError: the valid volume is empty.
     """
 
     def __init__(self, model: JawModelForm, bound: SliceHull) -> None:
         self._model, self._bound = model, bound
-        self._points = bound.candidates()
-        if not len(self._points):
+
+    @cached_property
+    def _scan(self) -> tuple[Array, tuple[Array, Array]]:
+        """Points (p, 3) [mm] all over the valid volume, and their motions."""
+        points = self._bound.candidates()
+        if not len(points):
             raise EvaluatorError(
                 "the bound of this rig leaves no valid jaw parameters.", hint="Fit the model again with a wider margin."
             )
-        self._motions = in_chunks(model.decode, self._points)
+        return points, in_chunks(self._model.decode, points)
 
     def nearest(self, d: Array) -> Array:
-        """Return the nearest points (n, 3) [mm] inside the bound; d (n, 3) itself where it is inside."""
+        """Return the nearest points (n, 3) [mm] inside the bound; d (n, 3) itself where it is inside.
+
+        Raises:
+            EvaluatorError: the valid volume is empty.
+        """
         valid = d.copy()
         out = np.flatnonzero(self._bound.excess(d) > 0)
         if not out.size:
             return valid
-        start = self._points[_nearest_rows(self._points, d[out])]
+        points, _ = self._scan
+        start = points[_nearest_rows(points, d[out])]
         identity = np.eye(3)
 
         def residual(x: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]:
@@ -54,9 +62,10 @@ class Reach:
 
     def best_starts(self, vectors: Array, target: Array) -> Array:
         """Return the scanned points (n, 3) [mm] that bring the vectors (4, m) nearest to the targets (n, 3, m)."""
-        images = carried(*self._motions, vectors).reshape(len(self._points), -1)
+        points, motions = self._scan
+        images = carried(*motions, vectors).reshape(len(points), -1)
         lost = np.isnan(target).any(axis=(1, 2))
-        starts = self._points[_nearest_rows(images, target.reshape(len(target), -1))]
+        starts = points[_nearest_rows(images, target.reshape(len(target), images.shape[1]))]
         starts[lost] = np.nan
         return starts
 
@@ -69,18 +78,6 @@ class Reach:
             start: First d [mm], inside the bound, shape (n, 3).
         """
         return minimise(distance_residual(self._model.decode_derivative, vectors, target), start, self._bound)[0]
-
-
-def handle_vectors(points: Array, weights: ArrayLike | None) -> Array:
-    """Return points (H, 3) [mm] as homogeneous vectors (4, H) scaled so that squared lengths are weighted means.
-
-    Raises:
-        ValueError: weights of another shape, negative, not finite or all zero.
-    """
-    share = np.ones(len(points)) if weights is None else np.asarray(weights, dtype=np.float64)
-    if share.shape != (len(points),) or not np.isfinite(share).all() or (share < 0).any() or share.sum() == 0:
-        raise ValueError(f"weights must be {len(points)} numbers >= 0, not all zero, got {weights}")
-    return np.column_stack([points, np.ones(len(points))]).T * np.sqrt(share / share.sum())
 
 
 def nearest_distance(points: Array, queries: Array) -> Array:

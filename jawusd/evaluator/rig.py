@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cached_property
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -12,12 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 from jawusd.evaluator import sections
 from jawusd.evaluator.arrays import checked_arrays
 from jawusd.evaluator.bounds import SliceHull
-from jawusd.evaluator.encoding import Encoder, carried
+from jawusd.evaluator.distances import carried, handle_vectors
+from jawusd.evaluator.encoding import Encoder, whitening_of
 from jawusd.evaluator.frames import RigFrames
 from jawusd.evaluator.interpolation import interpolate_linear, interpolate_smooth
 from jawusd.evaluator.models import model_from_arrays
 from jawusd.evaluator.polygons import PolygonBound
-from jawusd.evaluator.reach import Reach, handle_vectors, nearest_distance
+from jawusd.evaluator.reach import Reach, nearest_distance
 from jawusd.evaluator.rows import as_keys, as_points, as_rows, in_chunks
 from jawusd.evaluator.single import SinglePose
 from jawusd.evaluator.verdicts import RIGID_TOLERANCE, Limits, Verdicts, judge, too_fast
@@ -62,16 +63,12 @@ class JawRig:
         self._opening_mm = float(self.arrays["d_range"][0, 1])
         self.limits = Limits(float(self.arrays["residual_limit_mm"]), float(self.arrays["margin_limit_mm"]))
         self._frames = RigFrames(self.arrays["T_anatomical_skull"], self.arrays["T_rest"])
-        landmarks = transform_points(self._frames.closed, self.arrays["landmarks"])
-        self._encoder = Encoder(self.model, self.bound, landmarks)
+        self._encoder = Encoder(self.model, self._frames, self.bound, self.arrays["landmarks"])
+        self._reach = Reach(self.model, self.bound)
         self._single = SinglePose(self.model, self._frames.from_anatomical, self._frames.closed)
 
     def __reduce__(self) -> tuple:
         return (JawRig, ({name: np.array(value) for name, value in self.arrays.items()}, self.meta))
-
-    @cached_property
-    def _reach(self) -> Reach:
-        return Reach(self.model, self.bound)
 
     def pose(self, d: ArrayLike) -> Array:
         """Return the pose T_skull_mandible for jaw parameters d.
@@ -162,38 +159,12 @@ class JawRig:
         """
         rows, batch = as_rows(T_skull_mandible, (4, 4), "T_skull_mandible")
         if covariance is None:
-            d, residual_mm = in_chunks(lambda T: self._encode(T, bounds), rows)
+            d, residual_mm = in_chunks(partial(self._encoder.encode, bounded=bounds), rows)
         else:
-            whitening = self._whitening(covariance, batch)
-            d, residual_mm = in_chunks(lambda T, W: self._encode_weighted(T, W, bounds), rows, whitening)
+            spread = np.broadcast_to(np.asarray(covariance, dtype=np.float64), (*batch, 6, 6))
+            whitening = whitening_of(as_rows(spread, (6, 6), "covariance")[0])
+            d, residual_mm = in_chunks(partial(self._encoder.encode_weighted, bounded=bounds), rows, whitening)
         return d.reshape(*batch, 3), residual_mm.reshape(batch)
-
-    def _encode(self, T: Array, bounds: bool) -> tuple[Array, Array]:
-        R, t = self._frames.motions(T)
-        d = self._encoder.nearest(R, t)
-        out = np.flatnonzero(self.bound.excess(d) > 0) if bounds else ()
-        if len(out):
-            d[out] = self._encoder.nearest_valid(R[out], t[out], self._reach.nearest(d[out]))
-        return d, self._encoder.residual_mm(d, R, t)
-
-    def _encode_weighted(self, T: Array, whitening: Array, bounds: bool) -> tuple[Array, Array]:
-        R, t = self._frames.motions(T)
-        start = self._encoder.nearest(R, t)
-        start[np.isnan(whitening).any(axis=(1, 2))] = np.nan
-        start = self._reach.nearest(start) if bounds else start
-        d = self._encoder.most_likely(R, t, whitening, start, bounded=bounds)
-        return d, self._encoder.residual_mm(d, R, t)
-
-    def _whitening(self, covariance: ArrayLike, batch: tuple[int, ...]) -> Array:
-        covariance, _ = as_rows(np.broadcast_to(np.asarray(covariance, float), (*batch, 6, 6)), (6, 6), "covariance")
-        lost = np.isnan(covariance).any(axis=(1, 2))
-        try:
-            factor = np.linalg.cholesky(np.where(lost[:, None, None], np.eye(6), covariance))
-        except np.linalg.LinAlgError as error:
-            raise ValueError("covariance must be positive definite") from error
-        whitening = np.linalg.inv(factor) @ self._frames.adjoint
-        whitening[lost] = np.nan
-        return whitening
 
     def margin(self, d: ArrayLike, *, bound: BoundName = "slices") -> Array:
         """Return the signed distance of d to the bound [mm]: positive inside, finite and smooth outside.
@@ -261,7 +232,7 @@ class JawRig:
         finite = np.isfinite(rows).all(axis=(1, 2))
         rigid = in_chunks(rigidity_defect, np.where(finite[:, None, None], rows, np.eye(4))) <= RIGID_TOLERANCE
         rows = np.where((finite & rigid)[:, None, None], rows, np.nan)
-        d, residual_mm = in_chunks(lambda T: self._encode(T, False), rows)
+        d, residual_mm = in_chunks(partial(self._encoder.encode, bounded=False), rows)
         limits = self.limits.replaced(residual_limit_mm, margin_limit_mm, speed_limit_mm_s)
         verdicts = judge(finite, rigid, residual_mm, self.margin(d, bound=bound), d, limits)
         return self._with_speed(verdicts, rows, batch, times_s, limits)
@@ -327,8 +298,8 @@ class JawRig:
         handles = as_points(p_mandible, "p_mandible")
         vectors = handle_vectors(transform_points(self._frames.closed, handles.reshape(-1, 3)), weights)
         targets, batch = as_rows(p_skull, handles.shape, "p_skull")
-        targets = transform_points(self._frames.to_anatomical, targets.reshape(-1, 3)).reshape(-1, *handles.shape)
-        scaled = np.swapaxes(targets.reshape(len(targets), -1, 3), 1, 2) * vectors[3]
+        targets = targets.reshape(len(targets), vectors.shape[1], 3)
+        scaled = np.swapaxes(transform_points(self._frames.to_anatomical, targets), 1, 2) * vectors[3]
         if start is None:
             d = in_chunks(lambda target: self._reach.best_starts(vectors, target), scaled)
         else:

@@ -11,10 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 CHUNK_ROWS = 2048
+_LARGEST = 1e9  # 1,000 km: no jaw, and squares and cubes of it still fit a float
 
 
 def as_rows(values: ArrayLike, tail: tuple[int, ...], name: str) -> tuple[Array, tuple[int, ...]]:
-    """Return values as float64 rows (n, *tail) and the batch shape; rows that are not finite become all NaN.
+    """Return values as float64 rows (n, *tail) and the batch shape.
+
+    Rows with a value that is not finite, or above 1e9, become all NaN.
 
     Raises:
         ValueError: the trailing axes are not ``tail``.
@@ -24,7 +27,7 @@ def as_rows(values: ArrayLike, tail: tuple[int, ...], name: str) -> tuple[Array,
     if values.ndim < len(tail) or values.shape[len(batch) :] != tail:
         raise ValueError(f"{name} must have shape (..., {', '.join(map(str, tail))}), got {values.shape}")
     rows = values.reshape(-1, *tail) if values.size else np.empty((int(np.prod(batch)), *tail))
-    finite = np.isfinite(rows).all(axis=tuple(range(1, rows.ndim)))
+    finite = (np.abs(rows) < _LARGEST).all(axis=tuple(range(1, rows.ndim)))  # False for NaN
     if not finite.all():
         rows = np.where(finite.reshape(-1, *(1,) * len(tail)), rows, np.nan)
     return rows, batch

@@ -1,0 +1,65 @@
+"""Distances between images of points under two motions, in the form the solver takes.
+
+Points are homogeneous vectors, one a column: a point is (p, 1), a direction (b, 0).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jawusd.evaluator.solver import Residual
+
+Array = NDArray[np.float64]
+# x (k, 3) -> rotations (k, 3, 3), translations (k, 3), spatial derivatives (k, 6, 3)
+Derivative = Callable[[Array], tuple[Array, Array, Array]]
+
+
+def landmark_vectors(landmarks: Array) -> Array:
+    """Return the four homogeneous vectors (4, 4), one a column, that stand for the landmarks (n, 3) [mm]."""
+    centre = landmarks.mean(axis=0)
+    scatter = (landmarks - centre).T @ (landmarks - centre) / len(landmarks)
+    variance, axes = np.linalg.eigh(scatter)
+    vectors = np.zeros((4, 4))
+    vectors[:3, :3] = axes * np.sqrt(np.maximum(variance, 0.0))
+    vectors[:, 3] = [*centre, 1.0]
+    return vectors
+
+
+def handle_vectors(points: Array, weights: ArrayLike | None) -> Array:
+    """Return points (H, 3) [mm] as homogeneous vectors (4, H) scaled so that squared lengths are weighted means.
+
+    Raises:
+        ValueError: weights of another shape, negative, not finite or all zero.
+    """
+    share = np.ones(len(points)) if weights is None else np.asarray(weights, dtype=np.float64)
+    if share.shape != (len(points),) or not np.isfinite(share).all() or (share < 0).any() or share.sum() == 0:
+        raise ValueError(f"weights must be {len(points)} numbers >= 0, not all zero, got {weights}")
+    return np.column_stack([points, np.ones(len(points))]).T * np.sqrt(share / share.sum())
+
+
+def carried(R: Array, t: Array, vectors: Array) -> Array:
+    """Return the images (n, 3, m) of homogeneous vectors (4, m) under motions R (n, 3, 3), t (n, 3) [mm]."""
+    return R @ vectors[:3] + t[:, :, None] * vectors[3]
+
+
+def distance_residual(derivative: Derivative, vectors: Array, target: Array) -> Residual:
+    """Return, for `minimise`, how far motions leave the vectors (4, m) from their targets (n, 3, m)."""
+    count = vectors.shape[1]
+
+    def residual(x: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]:
+        R, t, S = derivative(x)
+        image = carried(R, t, vectors)
+        # a vector (b, h) moves by w x image + v h under the spatial velocity (w, v)
+        J = np.empty((len(x), 3, count, 3))
+        px, py, pz = image[:, 0, :, None], image[:, 1, :, None], image[:, 2, :, None]
+        wx, wy, wz = S[:, None, 0], S[:, None, 1], S[:, None, 2]
+        v = S[:, 3:, None] * vectors[3][:, None]
+        J[:, 0] = wy * pz - wz * py + v[:, 0]
+        J[:, 1] = wz * px - wx * pz + v[:, 1]
+        J[:, 2] = wx * py - wy * px + v[:, 2]
+        return (image - target[rows]).reshape(len(x), 3 * count), J.reshape(len(x), 3 * count, 3)
+
+    return residual
