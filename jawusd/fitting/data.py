@@ -1,0 +1,253 @@
+"""Training data: captured poses, seen from the anatomical frame and from the closed bite."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jawusd.errors import FittingError
+from jawusd.fitting.metric import MandibleMetric
+from jawusd.formats.tracks import LOST, Tracks
+from jawusd.geometry import LANDMARKS, hat, orthonormalise, rigidity_defect, se3_inverse, transform_points
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_MODEL_SIGMA_MM = 0.3  # how far real jaws stray from a three-parameter model: smaller tracking errors hardly matter
+_LARGEST_SIGMA_MM = 2.0  # frames less certain than this over the mandible (rms) are left out
+_RIGID = 1e-3
+_FEWEST_POSES = 15
+_SMALLEST_MOTION_MM = 1.0  # between the 2 and 98 % quantiles, in the direction that moves most
+
+
+@dataclass(frozen=True)
+class Anatomy:
+    """Say where a person's jaw lies in the frames of the poses.
+
+    Attributes:
+        T_anatomical_skull: skull (scan) frame to anatomical frame, shape (4, 4).
+        landmarks: `geometry.LANDMARKS` in mandible coordinates [mm], shape (5, 3).
+        mandible_vertices: points whose motion is measured, mandible coordinates [mm], shape (V, 3).
+        T_rest: T_skull_mandible of the closed bite, shape (4, 4).
+    """
+
+    T_anatomical_skull: Array
+    landmarks: Array
+    mandible_vertices: Array
+    T_rest: Array
+
+    @classmethod
+    def of(
+        cls,
+        T_anatomical_skull: ArrayLike,
+        landmarks: ArrayLike,
+        mandible_vertices: ArrayLike | None,
+        T_rest: ArrayLike | None,
+    ) -> Anatomy:
+        """Check and complete the arrays.
+
+        Raises:
+            ValueError: a wrong shape, or values that are not finite.
+        """
+        landmarks = _array(landmarks, (len(LANDMARKS), 3), "landmarks")
+        vertices = landmarks if mandible_vertices is None else mandible_vertices
+        return cls(
+            _array(T_anatomical_skull, (4, 4), "T_anatomical_skull"),
+            landmarks,
+            _array(vertices, (None, 3), "mandible_vertices"),
+            np.eye(4) if T_rest is None else _array(T_rest, (4, 4), "T_rest"),
+        )
+
+    def at_rest(self, points: ArrayLike) -> Array:
+        """Return mandible points (N, 3) in the closed bite, anatomical coordinates [mm]."""
+        return transform_points(self.T_anatomical_skull @ self.T_rest, np.asarray(points, dtype=np.float64))
+
+    def metric(self) -> MandibleMetric:
+        """Return the mandible metric in anatomical coordinates."""
+        return MandibleMetric.of_points(self.at_rest(self.mandible_vertices))
+
+    def motion(self, T_skull_mandible: ArrayLike) -> Array:
+        """Return motions M = A T rest^-1 A^-1 away from the closed bite, shape (..., 4, 4)."""
+        to_rest = se3_inverse(self.T_anatomical_skull @ self.T_rest)
+        return self.T_anatomical_skull @ np.asarray(T_skull_mandible, dtype=np.float64) @ to_rest
+
+
+@dataclass(frozen=True)
+class TrainingData:
+    """Hold the poses a model is fitted to.
+
+    Attributes:
+        frames: frame numbers, shape (N,).
+        motion: motions away from the closed bite, anatomical frame, shape (N, 4, 4).
+        weights: between 0 and 1, shape (N,).
+        incisor: lower incisal point in the closed bite, anatomical frame [mm], shape (3,).
+        landmarks: all landmarks likewise, shape (5, 3).
+        metric: the mandible metric, anatomical frame.
+    """
+
+    frames: NDArray[np.int64]
+    motion: Array
+    weights: Array
+    incisor: Array
+    landmarks: Array
+    metric: MandibleMetric
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def displacement(self) -> Array:
+        """Return the displacement of the incisal point of every frame [mm], shape (N, 3)."""
+        return self.motion[:, :3, :3] @ self.incisor + self.motion[:, :3, 3] - self.incisor
+
+    def select(self, rows: Mask) -> TrainingData:
+        """Return the given frames only."""
+        return replace(self, frames=self.frames[rows], motion=self.motion[rows], weights=self.weights[rows])
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Hold training data and which captured frames became part of it.
+
+    Attributes:
+        data: the frames used.
+        used: of all captured frames, shape (F,).
+        excluded: reason to frame numbers left out.
+    """
+
+    data: TrainingData
+    used: Mask
+    excluded: dict[str, list[int]]
+
+
+def select_tracks(tracks: Tracks, anatomy: Anatomy) -> Selection:
+    """Select the frames of a take that can train a model: measured, not guessed by a prior, and certain enough.
+
+    Raises:
+        FittingError: too few frames or no motion.
+    """
+    T = tracks.raw_T_upper_lower
+    finite = np.isfinite(T).all((1, 2))
+    sigma = np.full(len(T), np.nan)
+    sigma[finite] = _mandible_sigma(T[finite], tracks.covariance_relative[finite], anatomy)
+    known = sigma[np.isfinite(sigma)]
+    sigma = np.where(np.isfinite(sigma), sigma, np.median(known) if known.size else 0.0)
+    reasons = {
+        "lost": (tracks.status == LOST).any(1),
+        "prior aided": tracks.prior_aided,
+        f"uncertain (sd over the mandible above {_LARGEST_SIGMA_MM} mm)": sigma > _LARGEST_SIGMA_MM,
+    }
+    weights = _MODEL_SIGMA_MM**2 / (_MODEL_SIGMA_MM**2 + sigma**2)
+    return _select(tracks.frames, T, weights, reasons, anatomy)
+
+
+def select_poses(frames: ArrayLike, T_skull_mandible: ArrayLike, anatomy: Anatomy) -> Selection:
+    """Select the frames of a list of poses that can train a model; rows with NaN count as lost.
+
+    Args:
+        frames: frame numbers, shape (F,).
+        T_skull_mandible: poses, shape (F, 4, 4).
+        anatomy: where the jaw lies.
+
+    Raises:
+        ValueError: wrong shapes.
+        FittingError: too few frames, no motion, or a pose that is not rigid.
+    """
+    T = np.asarray(T_skull_mandible, dtype=np.float64)
+    frames = np.asarray(frames, dtype=np.int64)
+    if T.shape != (len(frames), 4, 4):
+        raise ValueError(f"poses must have shape ({len(frames)}, 4, 4), got {T.shape}")
+    return _select(frames, T, np.ones(len(T)), {}, anatomy)
+
+
+def _array(value: ArrayLike, shape: tuple[int | None, ...], name: str) -> Array:
+    array = np.asarray(value, dtype=np.float64)
+    fits = array.ndim == len(shape) and all(want in (None, have) for want, have in zip(shape, array.shape, strict=True))
+    if not fits or not np.isfinite(array).all():
+        wanted = ", ".join("N" if size is None else str(size) for size in shape)
+        raise ValueError(f"{name} must be finite and of shape ({wanted}), got {array.shape}")
+    return array
+
+
+def _select(
+    frames: NDArray[np.int64], T: Array, weights: Array, reasons: dict[str, Mask], anatomy: Anatomy
+) -> Selection:
+    used = np.ones(len(frames), dtype=bool)
+    excluded: dict[str, list[int]] = {}
+    reasons = {"no pose": ~np.isfinite(T).all((1, 2)), **reasons}
+    for reason, mask in reasons.items():
+        _exclude(used, mask, reason, frames, excluded)
+    _exclude(used, _repeats(frames[:, None], used), "frame number repeated", frames, excluded)
+    _exclude(used, _repeats(T.reshape(len(T), 16), used), "same pose as an earlier frame", frames, excluded)
+    _check(frames[used], T[used])
+    data = TrainingData(
+        frames=frames[used],
+        motion=anatomy.motion(orthonormalise(T[used])),
+        weights=weights[used],
+        incisor=anatomy.at_rest(anatomy.landmarks)[0],
+        landmarks=anatomy.at_rest(anatomy.landmarks),
+        metric=anatomy.metric(),
+    )
+    _check_motion(data)
+    return Selection(data, used, excluded)
+
+
+def _exclude(used: Mask, mask: Mask, reason: str, frames: NDArray[np.int64], excluded: dict[str, list[int]]) -> None:
+    out = used & mask
+    if out.any():
+        excluded[reason] = frames[out].tolist()
+        used &= ~out
+
+
+def _repeats(rows: NDArray, used: Mask) -> Mask:
+    """Return which used rows equal an earlier used one, shape (F,)."""
+    index = np.flatnonzero(used)
+    repeats = np.zeros(len(rows), dtype=bool)
+    if index.size:
+        _, first = np.unique(rows[index], axis=0, return_index=True)
+        repeats[np.delete(index, first)] = True
+    return repeats
+
+
+def _check(frames: NDArray[np.int64], T: Array) -> None:
+    if len(frames) < _FEWEST_POSES:
+        raise FittingError(
+            f"{len(frames)} usable poses, at least {_FEWEST_POSES} are needed.",
+            hint="Capture opening, lateral and protrusive movements, about 30 s in all.",
+        )
+    defect = rigidity_defect(T)
+    if defect.max() > _RIGID:
+        worst = int(defect.argmax())
+        raise FittingError(
+            f"the pose of frame {frames[worst]} is not rigid (off by {defect[worst]:.2g}, allowed {_RIGID:g}).",
+            hint="Poses must be 4x4 rotation and translation without scale or mirroring.",
+        )
+
+
+def _check_motion(data: TrainingData) -> None:
+    moved = data.displacement()
+    spread = np.percentile(moved, 98, axis=0) - np.percentile(moved, 2, axis=0)
+    if np.linalg.norm(spread) < _SMALLEST_MOTION_MM:
+        raise FittingError(
+            f"the poses are all alike: the lower incisal point moves by {np.linalg.norm(spread):.2g} mm, at least "
+            f"{_SMALLEST_MOTION_MM:g} mm are needed.",
+            hint="If the jaw did move, check that the translations are in mm.",
+        )
+
+
+def _mandible_sigma(T: Array, covariance: Array, anatomy: Anatomy) -> Array:
+    """Return the rms standard deviation of the mandible's points [mm], shape (F,).
+
+    The twist covariance is that of xi in T_true = exp(xi) T, skull frame, about the skull origin; a point y moves by
+    omega x y + v, so its variance is the trace of J Sigma J^T with J = [-hat(y), I], averaged over the points.
+    """
+    points = anatomy.mandible_vertices
+    mean, spread = points.mean(0), np.cov(points.T, bias=True)
+    R = T[:, :3, :3]
+    y = R @ mean + T[:, :3, 3]
+    second = R @ spread @ np.swapaxes(R, 1, 2) + y[:, :, None] * y[:, None, :]
+    M = np.zeros((len(T), 6, 6))
+    M[:, :3, :3] = np.einsum("nii->n", second)[:, None, None] * np.eye(3) - second
+    M[:, :3, 3:], M[:, 3:, :3], M[:, 3:, 3:] = hat(y), -hat(y), np.eye(3)
+    return np.sqrt(np.maximum(np.einsum("nij,nji->n", M, covariance), 0.0))

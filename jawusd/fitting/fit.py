@@ -1,0 +1,198 @@
+"""Fit a jaw model to captured poses: selection, model, bounds, error tables, warnings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Protocol
+
+import numpy as np
+import scipy
+from numpy.typing import ArrayLike, NDArray
+
+from jawusd.errors import EvaluatorError, FittingError
+from jawusd.evaluator import JawRig
+from jawusd.evaluator.models import JawModelForm
+from jawusd.fitting.alpha_shape import alpha_shape
+from jawusd.fitting.anatomy_gate import AnatomyWarning, check_anatomy
+from jawusd.fitting.anchored import fit_anchored
+from jawusd.fitting.config import FittingConfig
+from jawusd.fitting.coverage import shown_parameters
+from jawusd.fitting.data import Anatomy, Selection, TrainingData, select_poses, select_tracks
+from jawusd.fitting.error_table import join, pose_errors, summarise
+from jawusd.fitting.slice_hull import fit_slice_hull, valid_box
+from jawusd.formats.model import JawModel
+from jawusd.formats.tracks import Tracks
+
+Array = NDArray[np.float64]
+
+#: Called with the steps done and the steps in all.
+Progress = Callable[[int, int], None]
+
+_LARGEST_CODES = 2000
+_RESIDUAL_QUANTILE = 99.5
+_SMALLEST_RESIDUAL_LIMIT_MM = 0.1  # noise-free poses must not make every measured pose "off the model"
+_FEW_POSES = 100
+
+
+class FittedForm(Protocol):
+    """What every fitting method returns."""
+
+    kind: str
+    model: JawModelForm
+    kept: NDArray[np.bool_]
+
+    def arrays(self) -> dict[str, Array]:
+        """Return the decoder's own arrays."""
+
+    def notes(self) -> dict[str, float]:
+        """Return what the header says about the fit."""
+
+
+def fit_model(
+    source: Tracks | tuple[ArrayLike, ArrayLike],
+    *,
+    T_anatomical_skull: ArrayLike,
+    landmarks: ArrayLike,
+    mandible_vertices: ArrayLike | None = None,
+    T_rest: ArrayLike | None = None,
+    config: FittingConfig = FittingConfig(),  # noqa: B008 - frozen
+    actor: str = "",
+    progress: Progress | None = None,
+) -> JawModel:
+    """Fit a person's jaw model.
+
+    Args:
+        source: tracks (their raw poses are used), or frame numbers (F,) and poses T_skull_mandible (F, 4, 4) with NaN
+            where there is none.
+        T_anatomical_skull: skull (scan) frame to anatomical frame, shape (4, 4).
+        landmarks: `geometry.LANDMARKS` in mandible coordinates [mm], shape (5, 3).
+        mandible_vertices: points whose motion is measured, mandible coordinates [mm], shape (V, 3); None: the
+            landmarks.
+        T_rest: T_skull_mandible of the closed bite, shape (4, 4); None when the scans lie in occlusion.
+        config: the method and its checks.
+        actor: name written into the model.
+        progress: told of the steps done.
+
+    Returns:
+        The model. `d` and `residual_mm` are those of the raw poses; `meta` holds the error tables [mm], the frames
+        left out and trimmed, warnings, and what the poses do not show.
+
+    Raises:
+        FittingError: too few poses, no motion, poses that are not rigid, or a model that cannot be made invertible.
+        ValueError: arrays of wrong shapes.
+    """
+    anatomy = Anatomy.of(T_anatomical_skull, landmarks, mandible_vertices, T_rest)
+    steps = config.holdout_folds + 2
+    tell = progress or (lambda done, total: None)
+    tell(0, steps)
+    if isinstance(source, Tracks):
+        frames, T, selection = source.frames, source.raw_T_upper_lower, select_tracks(source, anatomy)
+    else:
+        frames, T = np.asarray(source[0], dtype=np.int64), np.asarray(source[1], dtype=np.float64)
+        selection = select_poses(frames, T, anatomy)
+    data = selection.data
+    warnings = check_anatomy(data, anatomy)
+    shown, sentences = shown_parameters(data)
+    warnings += [AnatomyWarning("not_shown", sentence) for sentence in sentences]
+    if len(data) < _FEW_POSES:
+        warnings.append(AnatomyWarning("few_poses", f"only {len(data)} poses: the model interpolates coarsely."))
+    form = _fit_form(data, shown, config)
+    errors = _error_tables(data, form, shown, config, lambda done: tell(done, steps))
+    arrays = _arrays(data, form, anatomy, config)
+    model = _finish(arrays, form, selection, frames, T, errors, warnings, config)
+    model.meta["actor"] = actor
+    tell(steps, steps)
+    return model
+
+
+def _fit_form(data: TrainingData, shown: NDArray[np.bool_], config: FittingConfig) -> FittedForm:
+    return fit_anchored(data, shown, config.trim_mad)
+
+
+def _error_tables(
+    data: TrainingData,
+    form: FittedForm,
+    shown: NDArray[np.bool_],
+    config: FittingConfig,
+    tell: Callable[[int], None],
+) -> dict[str, dict[str, dict[str, float]]]:
+    """Return the tables "train", "trimmed" and "holdout"; the first and last over the frames that were not trimmed."""
+
+    def errors_of(fitted: FittedForm, rows: NDArray[np.bool_]) -> dict[str, Array]:
+        part = data.select(rows)
+        return pose_errors(part, part.metric.nearest(fitted.model, part.motion)[1])
+
+    tables = {"train": summarise(errors_of(form, form.kept))}
+    if not form.kept.all():
+        tables["trimmed"] = summarise(errors_of(form, ~form.kept))
+    if config.holdout_folds:
+        fold = np.arange(len(data)) * config.holdout_folds // len(data)
+        parts = []
+        for k in range(config.holdout_folds):
+            tell(k + 1)
+            parts.append(errors_of(_fit_form(data.select(fold != k), shown, config), (fold == k) & form.kept))
+        tables["holdout"] = summarise(join(parts))
+    return tables
+
+
+def _arrays(data: TrainingData, form: FittedForm, anatomy: Anatomy, config: FittingConfig) -> dict[str, Array]:
+    """Return all arrays of the model but the limits of the verdicts."""
+    d, _ = data.metric.nearest(form.model, data.motion[form.kept])
+    if not np.isfinite(d).all():
+        raise FittingError("the parameters of some training poses cannot be found.", hint="Check the poses' units.")
+    hull = fit_slice_hull(d)
+    lateral, lateral_counts = alpha_shape(d[:, [0, 1]], config.alpha)
+    protrusion, protrusion_counts = alpha_shape(d[:, [0, 2]], config.alpha)
+    step = -(-len(d) // _LARGEST_CODES)
+    return {
+        **form.arrays(),
+        **hull,
+        "T_anatomical_skull": anatomy.T_anatomical_skull,
+        "T_rest": anatomy.T_rest,
+        "incisor": data.incisor,
+        "landmarks": np.asarray(anatomy.landmarks, dtype=np.float64),
+        "d_range": valid_box(hull),
+        "polygon_d1d2": lateral,
+        "polygon_d1d2_counts": lateral_counts,
+        "polygon_d1d3": protrusion,
+        "polygon_d1d3_counts": protrusion_counts,
+        "codes": d[::step],
+    }
+
+
+def _finish(
+    arrays: dict[str, Array],
+    form: FittedForm,
+    selection: Selection,
+    frames: NDArray[np.int64],
+    T: Array,
+    errors: dict,
+    warnings: list[AnatomyWarning],
+    config: FittingConfig,
+) -> JawModel:
+    """Encode every captured pose with the evaluator and set the limits of the verdicts from the trained ones."""
+    limits = {"residual_limit_mm": np.array(1.0), "margin_limit_mm": np.array(0.0)}
+    meta = {
+        "kind": form.kind,
+        "method": config.method,
+        "config": asdict(config),
+        "versions": {"numpy": np.__version__, "scipy": scipy.__version__},
+        "errors": errors,
+        "fit": form.notes(),
+        "warnings": [asdict(warning) for warning in warnings],
+        "excluded_frames": selection.excluded,
+        "trimmed_frames": selection.data.frames[~form.kept].tolist(),
+    }
+    try:
+        rig = JawRig({**arrays, **limits}, meta)
+    except EvaluatorError as error:
+        advice = " ".join(warning.message for warning in warnings)
+        raise FittingError(f"the poses give no usable model: {error}", hint=advice or None) from error
+    d, residual_mm = rig.encode(T)
+    trained = np.zeros(len(frames), dtype=bool)
+    trained[np.flatnonzero(selection.used)[form.kept]] = True
+    limit = max(float(np.percentile(residual_mm[trained], _RESIDUAL_QUANTILE)), _SMALLEST_RESIDUAL_LIMIT_MM)
+    margin = min(0.0, float(rig.margin(d[trained]).min()))
+    arrays = {**arrays, "residual_limit_mm": np.array(limit), "margin_limit_mm": np.array(margin)}
+    return JawModel(arrays, frames, d, residual_mm, trained, meta)

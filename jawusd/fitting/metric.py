@@ -1,0 +1,100 @@
+"""How far apart two jaw poses are, in mm on the mandible.
+
+Two rigid motions differ at a point x by (R_a - R_b) x + (t_a - t_b), which is affine in x. Its mean square over a set
+of points therefore needs only their mean and covariance, and its maximum is reached at a vertex of their convex hull.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+from jawusd.evaluator.encoding import carried, distance_residual, landmark_vectors
+from jawusd.evaluator.models import AnchoredModel, JawModelForm
+from jawusd.evaluator.solver import minimise
+from jawusd.geometry import make_transform
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class MandibleMetric:
+    """Measure pose differences by the displacement of a set of mandible points.
+
+    Attributes:
+        vectors: four homogeneous columns that stand for the points, their mean last (see `evaluator.encoding`),
+            shape (4, 4).
+        extremes: vertices of the points' convex hull [mm], shape (H, 3).
+    """
+
+    vectors: Array
+    extremes: Array
+
+    @classmethod
+    def of_points(cls, points: Array) -> MandibleMetric:
+        """Build the metric of mandible points at rest.
+
+        Args:
+            points: anatomical coordinates at rest [mm], shape (N, 3), N >= 3.
+        """
+        try:
+            extremes = points[ConvexHull(points).vertices]
+        except QhullError:  # fewer than four points, or all in one plane
+            extremes = points
+        return cls(landmark_vectors(points), extremes)
+
+    def rms(self, M: Array, target: Array) -> Array:
+        """Return the root mean square displacement between motions (N, 4, 4) [mm], shape (N,)."""
+        difference = carried(*_parts(M), self.vectors) - carried(*_parts(target), self.vectors)
+        return np.linalg.norm(difference, axis=(1, 2))
+
+    def largest(self, M: Array, target: Array) -> Array:
+        """Return the largest displacement of any point between motions (N, 4, 4) [mm], shape (N,)."""
+        difference = M - target
+        moved = self.extremes @ np.swapaxes(difference[:, :3, :3], 1, 2) + difference[:, None, :3, 3]
+        return np.sqrt((moved**2).sum(-1).max(-1))
+
+    def nearest(self, model: JawModelForm, target: Array) -> tuple[Array, Array]:
+        """Return the parameters (N, 3) [mm] and motions (N, 4, 4) of a model nearest to motions (N, 4, 4)."""
+        R, t = _parts(target)
+        if isinstance(model, AnchoredModel):
+            # As in the evaluator: the nearest pose does not depend on the gauge, so search without it.
+            residual = distance_residual(model.motion_derivative_at, self.vectors, carried(R, t, self.vectors))
+            u, _ = minimise(residual, model.displacement_of(R, t))
+            return model.gauge.inverse(u), make_transform(*model.motion_at(u))
+        residual = distance_residual(model.decode_derivative, self.vectors, carried(R, t, self.vectors))
+        d, _ = minimise(residual, model.read_off(R, t))
+        return d, make_transform(*model.decode(d))
+
+    def best_rotation(self, target: Array, incisor: Array, at: Array) -> Array:
+        """Return the rotations that fit motions best when the incisal point is held (Kabsch 1976).
+
+        Args:
+            target: motions to fit, shape (N, 4, 4).
+            incisor: incisal point at rest [mm], shape (3,).
+            at: where the incisal point is held [mm], shape (N, 3).
+
+        Returns:
+            Rotation matrices, shape (N, 3, 3).
+        """
+        R, t = _parts(target)
+        mean, root = self.vectors[:3, 3], self.vectors[:3, :3]
+        arm = mean - incisor
+        second = root @ root.T + np.outer(arm, mean)  # mean of (x - p) x^T
+        U, _, Vt = np.linalg.svd(second @ np.swapaxes(R, 1, 2) + arm[:, None] * (t - at)[:, None, :])
+        sign = np.ones((len(target), 3))
+        sign[:, 2] = np.linalg.det(U @ Vt)
+        return np.swapaxes(U * sign[:, None, :] @ Vt, 1, 2)
+
+    def about(self, point: Array) -> Array:
+        """Return the inertia about a point: w^T I w = mean squared displacement under a rotation w [mm^2/rad^2]."""
+        offset = self.vectors[:3, 3] - point
+        second = self.vectors[:3, :3] @ self.vectors[:3, :3].T + np.outer(offset, offset)
+        return np.trace(second) * np.eye(3) - second
+
+
+def _parts(M: Array) -> tuple[Array, Array]:
+    return M[:, :3, :3], M[:, :3, 3]

@@ -1,0 +1,112 @@
+"""Smoothing polyharmonic splines: r^3 kernels on spread-out centres plus a linear tail.
+
+s(q) = sum_i w_i |q - c_i|^3 + L q - (the same at q = 0), with sum_i w_i = 0 and sum_i w_i c_i = 0, so that w^T K w is
+the bending energy of s (Duchon 1977; Wahba, Spline Models for Observational Data, 1990, section 2.4).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+
+Array = NDArray[np.float64]
+
+_RANK = 1e-9  # singular values below this share of the largest count as zero
+_SAME_CENTRE = 1e-6  # normalised distance below which two points are one centre
+
+
+def farthest_points(points: Array, count: int) -> Array:
+    """Return up to `count` of the points, each the farthest from those before it (Gonzalez 1985).
+
+    Args:
+        points: shape (N, D); the first taken is the one nearest the origin.
+        count: how many to take; fewer are returned when the points repeat.
+    """
+    chosen = [int(np.argmin((points**2).sum(1)))]
+    distance = ((points - points[chosen[0]]) ** 2).sum(1)
+    while len(chosen) < min(count, len(points)):
+        farthest = int(np.argmax(distance))
+        if distance[farthest] < _SAME_CENTRE**2:
+            break
+        chosen.append(farthest)
+        distance = np.minimum(distance, ((points - points[farthest]) ** 2).sum(1))
+    return points[chosen]
+
+
+@dataclass(frozen=True)
+class SplineBasis:
+    """Turn normalised points into regression columns whose bending energy is a quadratic form.
+
+    Attributes:
+        centres: shape (m, 3).
+        null_space: maps free coefficients to kernel weights that meet the side conditions, shape (m, k).
+        energy: bending energy of the free coefficients, zero rows for the linear tail, shape (k + 3, k + 3).
+        at_zero: kernel values at q = 0, shape (m,).
+    """
+
+    centres: Array
+    null_space: Array
+    energy: Array
+    at_zero: Array
+
+    @classmethod
+    def on_centres(cls, centres: Array) -> SplineBasis:
+        """Build the basis on centres, shape (m, 3)."""
+        sides = np.column_stack([np.ones(len(centres)), centres])
+        U, values, _ = np.linalg.svd(sides, full_matrices=True)
+        null_space = U[:, int((values > _RANK * values[0]).sum()) :]
+        kernel = _cubed_distance(centres, centres)
+        size = null_space.shape[1]
+        energy = np.zeros((size + 3, size + 3))
+        energy[:size, :size] = null_space.T @ kernel @ null_space
+        return cls(centres, null_space, energy, _cubed_distance(np.zeros((1, 3)), centres)[0])
+
+    def columns(self, q: Array) -> Array:
+        """Return the regression columns at points q (N, 3), zero at q = 0; shape (N, k + 3)."""
+        return np.column_stack([(_cubed_distance(q, self.centres) - self.at_zero) @ self.null_space, q])
+
+    def weights(self, coefficients: Array) -> Array:
+        """Return the kernel weights and linear tail, shape (m + 3, C), of fitted coefficients (k + 3, C)."""
+        size = self.null_space.shape[1]
+        return np.concatenate([self.null_space @ coefficients[:size], coefficients[size:]])
+
+
+def ridge_solve(normal: Array, right: Array, penalty: Array) -> Array:
+    """Solve (normal + penalty) x = right for symmetric positive definite sums."""
+    return cho_solve(cho_factor(normal + penalty, lower=True), right)
+
+
+def choose_smoothing(
+    columns: Array, values: Array, weights: Array, energy: Array, tail: Array, grid: Array, folds: Array, cap: float
+) -> float:
+    """Return the smoothing factor with the smallest capped error on left-out folds.
+
+    Args:
+        columns: regression columns, shape (N, k).
+        values: values to predict, in units in which their Euclidean norm is the error [mm], shape (N, C).
+        weights: frame weights, shape (N,).
+        energy: bending energy, shape (k, k).
+        tail: fixed part of the penalty, shape (k, k).
+        grid: smoothing factors to try, ascending.
+        folds: fold number of each frame, shape (N,); contiguous blocks, since neighbours in time are nearly equal.
+        cap: errors above this [mm] count as this, so that outliers do not choose the smoothness.
+    """
+    weighted = columns * weights[:, None]
+    total, right = weighted.T @ columns, weighted.T @ values
+    cost = np.zeros(len(grid))
+    for fold in np.unique(folds):
+        left = folds == fold
+        normal, target = total - weighted[left].T @ columns[left], right - weighted[left].T @ values[left]
+        for index, factor in enumerate(grid):
+            predicted = columns[left] @ ridge_solve(normal, target, factor * energy + tail)
+            error = np.minimum(((values[left] - predicted) ** 2).sum(1), cap**2)
+            cost[index] += (weights[left] * error).sum()
+    return float(grid[int(np.argmin(cost))])
+
+
+def _cubed_distance(a: Array, b: Array) -> Array:
+    square = np.maximum((a**2).sum(1)[:, None] + (b**2).sum(1) - 2 * a @ b.T, 0.0)
+    return square * np.sqrt(square)
