@@ -32,7 +32,7 @@ def load_mesh(path: str | os.PathLike[str], kind: Literal["scan", "bone"] = "sca
     """Read a triangle mesh, its vertices in the order of the file.
 
     Larger polygons are cut into triangles; STL files, which share no vertices, give three per triangle. Materials and
-    textures are not read.
+    textures are not read. A closed mesh that is inside out has its triangles turned; open ones stay as they are.
 
     Args:
         path: PLY, STL or OBJ file, lengths in mm.
@@ -87,7 +87,11 @@ def _checked(path: Path, vertices: NDArray, faces: NDArray, colors: NDArray[np.u
             path=path,
             hint="Lengths must be in mm: scale the mesh and export it again.",
         )
-    return Mesh(vertices.astype(np.float64), faces.astype(np.int32), colors)
+    mesh = Mesh(vertices.astype(np.float64), faces.astype(np.int32), colors)
+    turned = winding(mesh)
+    if turned.closed and not turned.outward:
+        return Mesh(mesh.vertices, mesh.faces[:, ::-1], colors)
+    return mesh
 
 
 def tooth_labels(mesh: Mesh) -> NDArray[np.uint8]:

@@ -19,16 +19,12 @@ import numpy as np
 from numba import types
 
 __all__ = [
-    "bit_at",
     "count_and_not",
     "count_bits",
-    "draw_depth",
     "draw_depth_labels",
     "draw_silhouette",
-    "inverse_depth",
     "pack_bits",
     "project",
-    "silhouette",
     "unpack_bits",
     "words_for",
 ]
@@ -257,14 +253,6 @@ def draw_depth_labels(
                         labels[y - y0, x - x0] = label
 
 
-_NO_LABELS = np.zeros((0, 0), np.uint8)
-
-
-def draw_depth(points: np.ndarray, faces: np.ndarray, x0: int, y0: int, cull: bool, inverse_depth: np.ndarray) -> None:
-    """Draw projected triangles into a nearest-surface buffer without labels; see `draw_depth_labels`."""
-    draw_depth_labels(points, faces, x0, y0, cull, inverse_depth, _NO_LABELS, 0)
-
-
 @numba.njit(types.uint64(types.uint64), nogil=True, cache=True)
 def _popcount(x):
     """Count the set bits of a word (H. S. Warren, Hacker's Delight, fig. 5-2; LLVM turns it into popcnt)."""
@@ -300,14 +288,6 @@ def count_and_not(first: np.ndarray, second: np.ndarray) -> int:
     return np.int64(total)
 
 
-@numba.njit(types.boolean(_BITS, _INT, _INT), nogil=True, cache=True)
-def bit_at(bits: np.ndarray, x: int, y: int) -> bool:
-    """Tell whether pixel (x, y) of a (h, words) uint64 bit-row picture is set; False outside the buffer."""
-    if x < 0 or y < 0 or y >= bits.shape[0] or x >= bits.shape[1] * 64:
-        return False
-    return (bits[y, x >> 6] >> np.uint64(x & _LOW6)) & _ONE != np.uint64(0)
-
-
 def words_for(width: int) -> int:
     """Return how many 64-bit words a row of width pixels takes."""
     return (width + 63) // 64
@@ -337,36 +317,3 @@ def unpack_bits(bits: np.ndarray, width: int) -> np.ndarray:
         raise ValueError(f"bits: needs shape (h, >= {words_for(width)}), found {bits.shape}")
     bytes_ = np.ascontiguousarray(bits.astype("<u8", copy=False)).view(np.uint8)
     return np.unpackbits(bytes_, axis=1, bitorder="little")[:, :width].view(bool)
-
-
-def _projected(vertices: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    points = np.empty((len(vertices), 3), np.float32)
-    project(np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(matrix, np.float32), points)
-    return points
-
-
-def silhouette(
-    vertices: np.ndarray, faces: np.ndarray, matrix: np.ndarray, size_px: tuple[int, int], cull: bool = False
-) -> np.ndarray:
-    """Return the silhouette of a mesh as a (h, w) bool picture; allocates, so not for inner loops.
-
-    Args:
-        vertices: (V, 3) mm.
-        faces: (F, 3) vertex indices.
-        matrix: (3, 4) projection to pixels.
-        size_px: (w, h) of the picture.
-        cull: see `draw_silhouette`.
-    """
-    width, height = size_px
-    bits = np.zeros((height, words_for(width)), np.uint64)
-    draw_silhouette(_projected(vertices, matrix), np.ascontiguousarray(faces, np.int32), 0, 0, width, cull, bits)
-    return unpack_bits(bits, width)
-
-
-def inverse_depth(
-    vertices: np.ndarray, faces: np.ndarray, matrix: np.ndarray, size_px: tuple[int, int], cull: bool = False
-) -> np.ndarray:
-    """Return 1/z [1/mm] of the nearest surface as a (h, w) float32 picture, 0 where empty; see `silhouette`."""
-    buffer = np.zeros((size_px[1], size_px[0]), np.float32)
-    draw_depth(_projected(vertices, matrix), np.ascontiguousarray(faces, np.int32), 0, 0, cull, buffer)
-    return buffer

@@ -137,3 +137,13 @@ def test_winding_tells_closed_from_open_and_out_from_in() -> None:
     one_flipped = source.faces.copy()
     one_flipped[3] = one_flipped[3, ::-1]
     assert not meshio.winding(Mesh(source.vertices, one_flipped)).closed
+
+
+def test_closed_meshes_inside_out_are_turned(tmp_path: Path) -> None:
+    source = arch()
+    inside_out = trimesh.Trimesh(source.vertices, source.faces[:, ::-1], process=False)
+    inside_out.export(tmp_path / "a.ply")
+    mesh = meshio.load_mesh(tmp_path / "a.ply")
+    assert np.allclose(mesh.vertices, source.vertices, atol=1e-5) and np.array_equal(mesh.faces, source.faces)
+    trimesh.Trimesh(source.vertices, source.faces[5:, ::-1], process=False).export(tmp_path / "open.ply")
+    assert np.array_equal(meshio.load_mesh(tmp_path / "open.ply").faces, source.faces[5:, ::-1])
