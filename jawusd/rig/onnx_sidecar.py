@@ -29,6 +29,7 @@ _IR_VERSION = 8  # the one that came with opset 17: older runtimes refuse a newe
 
 # constants of the gauge, as in jawusd.evaluator.gauge
 _FADE_SOFTNESS_MM = 1.0
+_LIMIT_SOFTNESS_MM = 4.0
 _ARCH_BOW_MM = 10.0
 _DROP_BEND = 0.15
 _DROP_SATURATION_MM2 = 16.0
@@ -104,7 +105,7 @@ def _anchored(g: Graph, arrays: Arrays, d: str) -> tuple[str, str, Rotation, str
     u = _displacement(g, arrays, d)
     ux, uy, uz = g.columns(u, 3)
     opening = g.op("Neg", uy)
-    gx, gz, _ = _path(g, arrays, opening)
+    gx, gz = _path(g, arrays, opening)
     q = g.div(g.concat(opening, g.sub(ux, gx), g.sub(uz, gz)), g.constant(arrays["spline_scales"][None]))
     to_skull = arrays["T_anatomical_skull"][:3, :3]  # a row vector times this is its skull coordinates
     omega = _spline(g, arrays["spline_centres"], arrays["spline_weights"] @ to_skull, q)
@@ -120,7 +121,11 @@ def _displacement(g: Graph, arrays: Arrays, d: str) -> str:
     """Add the gauge: displacement (n, 3) of the incisal point, anatomical frame (jawusd.evaluator.gauge)."""
     d1, d2, d3 = g.columns(d, 3)
     e = float(arrays["glide_softness_mm"])
-    gx, gz, s = _path(g, arrays, d1)
+    gx, gz = _path(g, arrays, d1)
+    low, high = (float(x) for x in arrays["path_limits"])
+    rise = _soft_ramp(g, g.sub(d1, low), _LIMIT_SOFTNESS_MM)
+    stop = _soft_ramp(g, g.sub(d1, high), _LIMIT_SOFTNESS_MM)
+    s = g.mul(g.add(g.sub(rise, stop), low), 1.0 / float(arrays["path_scale_mm"]))
     side = g.sub(g.op("Sqrt", g.add(g.mul(d2, d2), e * e)), e)
     front = _soft_ramp(g, d3, e)
 
@@ -138,8 +143,8 @@ def _displacement(g: Graph, arrays: Arrays, d: str) -> str:
     return g.concat(g.add(gx, d2), y, g.add(gz, rho, d3))
 
 
-def _path(g: Graph, arrays: Arrays, opening: str) -> tuple[str, str, str]:
-    """Add the habitual path at openings (n, 1); return gx, gz [mm] and the clipped, scaled opening."""
+def _path(g: Graph, arrays: Arrays, opening: str) -> tuple[str, str]:
+    """Add the habitual path at openings (n, 1); return gx and gz [mm]."""
     low, high = (float(x) for x in arrays["path_limits"])
     scale = float(arrays["path_scale_mm"])
     inside = g.clip(opening, low, high)
@@ -150,7 +155,7 @@ def _path(g: Graph, arrays: Arrays, opening: str) -> tuple[str, str, str]:
         value = g.mul(g.horner(s, c), s)
         slope = g.mul(g.horner(s, [k * x for k, x in enumerate(c, start=1)]), 1.0 / scale)
         points.append(g.add(value, g.mul(slope, beyond)))
-    return points[0], points[1], s
+    return points[0], points[1]
 
 
 def _soft_ramp(g: Graph, x: str, e: float) -> str:

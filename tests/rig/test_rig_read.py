@@ -1,0 +1,194 @@
+"""Reading rigs: exact round trip, refusals that name the field, shots with several actors."""
+
+import numpy as np
+import pytest
+from example_rig import assert_valid_usd, example_motion, example_rig
+from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+
+import jawusd
+from jawusd.errors import FormatError, RigError, UnitsError, VersionError
+from jawusd.rig import describe, load_rig
+from jawusd.rig.arrays import model_hash
+from jawusd.rig.read import escapes
+
+
+def edit(path, change):
+    """Change a layer on disk, without keeping it open."""
+    layer = Sdf.Layer.OpenAsAnonymous(str(path))
+    change(layer)
+    layer.Export(str(path))
+
+
+def set_value(name, value):
+    """Return an edit that gives an attribute of /Actor another default."""
+
+    def change(layer):
+        layer.GetAttributeAtPath(f"/Actor.{name}").default = value
+
+    return change
+
+
+def test_what_is_baked_is_read_back_exactly(folder, kind):
+    expected = example_rig(kind)
+    for name in ("actor.usda", "anim_capture.usdc"):
+        rig = load_rig(folder / name)
+        assert rig.meta == expected.meta
+        assert set(rig.arrays) == set(expected.arrays)
+        for key, value in expected.arrays.items():
+            np.testing.assert_array_equal(rig.arrays[key], value, err_msg=key)
+        assert model_hash(rig) == model_hash(expected)
+    d = example_motion()[1]
+    np.testing.assert_array_equal(jawusd.load(folder / "actor.usda").pose(d), expected.pose(d))
+
+
+def test_the_hash_follows_the_arrays(kind):
+    rig = example_rig(kind)
+    arrays = dict(rig.arrays)
+    arrays["incisor"] = arrays["incisor"] + [0, 0, 1e-9]
+    assert model_hash(type(rig)(arrays, rig.meta)) != model_hash(rig)
+
+
+def test_description_is_that_of_the_rig(folder, kind):
+    found = describe(folder / "anim_capture.usdc")
+    assert (found["actor"], found["model"]["kind"], found["format_version"]) == ("example", kind, 1)
+    assert found["ranges_mm"]["d1"] == [0.0, 42.0]
+    assert found["animation"] == {"samples": 40, "first": 30.0, "last": 69.0}
+    assert found["table"]["format"] == ("grid" if kind == "anchored" else "curves")
+    assert found["meshes"]["LowerTeethMesh"] == 3 * 86
+    assert describe(folder / "actor.usda")["animation"] is None
+
+
+def test_a_newer_rig_is_refused(anchored_folder):
+    actor = anchored_folder / "actor.usda"
+    edit(actor, set_value("jaw:formatVersion", 2))
+    with pytest.raises(VersionError, match="version 2, this jawusd reads up to 1"):
+        load_rig(actor)
+
+
+@pytest.mark.parametrize("version", [0, -1])
+def test_an_impossible_version_is_refused(anchored_folder, version):
+    actor = anchored_folder / "actor.usda"
+    edit(actor, set_value("jaw:formatVersion", version))
+    with pytest.raises(FormatError, match="jaw:formatVersion"):
+        load_rig(actor)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("jaw:lengthUnit", "cm"), ("jaw:angleUnit", "deg"), ("jaw:twistOrder", Vt.TokenArray(["v", "omega"]))],
+)
+def test_other_units_are_refused(anchored_folder, name, value):
+    actor = anchored_folder / "actor.usda"
+    edit(actor, set_value(name, value))
+    with pytest.raises(UnitsError, match=name):
+        load_rig(actor)
+
+
+def double_array(count, last=0.0):
+    return Vt.DoubleArray([0.0] * (count - 1) + [last])
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("jaw:model:splineCentres", double_array(10), "jaw:model:splineCentres holds 10 numbers"),
+        ("jaw:model:splineWeights", double_array(9), "spline_weights"),
+        ("jaw:model:incisor", double_array(3, np.nan), "incisor.*not finite"),
+        ("jaw:model:tRest", double_array(16), "T_rest.*not rigid"),
+        ("jaw:model:pathScale", -1.0, "path_scale_mm"),
+        ("jaw:model:kind", "magic", "magic"),
+        ("jaw:meta", "not JSON", "jaw:meta is not JSON"),
+        ("jaw:meta", "[1]", "JSON object"),
+        ("jaw:meta", '{"kind": "additive"}', "jaw:model:kind"),
+        ("jaw:bounds:sliceSupport", double_array(5), "jaw:bounds:sliceSupport holds 5 numbers"),
+    ],
+)
+def test_malformed_values_are_refused_by_name(anchored_folder, name, value, message):
+    edit(anchored_folder / "rig.usdc", set_value(name, value))
+    with pytest.raises(FormatError, match=message) as caught:
+        load_rig(anchored_folder / "actor.usda")
+    assert "actor.usda" in str(caught.value)
+
+
+def test_a_missing_value_is_named(anchored_folder):
+    def change(layer):
+        layer.GetPrimAtPath("/Actor").RemoveProperty(layer.GetAttributeAtPath("/Actor.jaw:bounds:sliceD1"))
+
+    edit(anchored_folder / "rig.usdc", change)
+    with pytest.raises(FormatError, match="jaw:bounds:sliceD1"):
+        load_rig(anchored_folder / "actor.usda")
+
+
+def test_an_attribute_of_another_type_is_refused(anchored_folder):
+    def change(layer):
+        actor = layer.GetPrimAtPath("/Actor")
+        actor.RemoveProperty(layer.GetAttributeAtPath("/Actor.jaw:model:incisor"))
+        Sdf.AttributeSpec(actor, "jaw:model:incisor", Sdf.ValueTypeNames.StringArray).default = Vt.StringArray(["a"])
+
+    edit(anchored_folder / "rig.usdc", change)
+    with pytest.raises(FormatError, match="jaw:model:incisor"):
+        load_rig(anchored_folder / "actor.usda")
+
+
+@pytest.mark.parametrize("asset", ["../elsewhere/actor.onnx", "/etc/passwd", "a/../../b.onnx", "C:/x.onnx"])
+def test_asset_paths_may_not_leave_the_folder(anchored_folder, asset):
+    actor = anchored_folder / "actor.usda"
+    edit(actor, set_value("jaw:onnx", Sdf.AssetPath(asset)))
+    with pytest.raises(RigError, match="outside its own folder"):
+        load_rig(actor)
+
+
+def test_sublayers_may_not_leave_the_folder(anchored_folder):
+    outside = anchored_folder.parent / "rig.usdc"
+    (anchored_folder / "rig.usdc").rename(outside)
+    edit(anchored_folder / "actor.usda", lambda layer: layer.subLayerPaths.__setitem__(0, "../rig.usdc"))
+    with pytest.raises(RigError, match="outside its own folder"):
+        load_rig(anchored_folder / "actor.usda")
+
+
+@pytest.mark.parametrize(
+    ("asset", "leaves"),
+    [("./a", False), ("a/../b", False), ("a/b", False), ("..", True), ("a/../..", True), ("\\\\host\\x", True)],
+)
+def test_escapes(asset, leaves):
+    assert escapes(asset) == leaves
+
+
+def test_files_that_are_no_rig(tmp_path, anchored_folder):
+    with pytest.raises(RigError, match="no such file"):
+        load_rig(tmp_path / "missing.usda")
+    broken = tmp_path / "broken.usda"
+    broken.write_text("this is no USD")
+    with pytest.raises(RigError, match="not a USD file"):
+        load_rig(broken)
+    with pytest.raises(FormatError, match="no jaw rig"):
+        load_rig(anchored_folder / "geo.usdc")
+
+
+def test_two_actors_in_a_shot_move_independently(folder, kind, tmp_path):
+    shot = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageUpAxis(shot, "Y")
+    UsdGeom.SetStageMetersPerUnit(shot, 0.01)
+    world = UsdGeom.Xform.Define(shot, "/World")
+    shot.SetDefaultPrim(world.GetPrim())
+    Usd.ModelAPI(world).SetKind("assembly")
+    shot.SetTimeCodesPerSecond(24)
+    for name, offset in (("One", 0.0), ("Two", -10.0)):
+        prim = UsdGeom.Xform.Define(shot, f"/World/{name}")
+        reference = Sdf.Reference(str(folder / "anim_capture.usdc"), layerOffset=Sdf.LayerOffset(offset))
+        prim.GetPrim().GetReferences().AddReference(reference)
+        prim.AddScaleOp().Set(Gf.Vec3f(0.1))
+    path = tmp_path / "shot.usda"
+    shot.GetRootLayer().Export(str(path))
+    assert_valid_usd(path)
+    with pytest.raises(FormatError, match="several jaw rigs: /World/One, /World/Two"):
+        load_rig(path)
+    with pytest.raises(FormatError, match="/World/Three carries no jaw rig"):
+        load_rig(path, "/World/Three")
+    rig = load_rig(path, "/World/Two")
+    frames, d = example_motion()
+    stage = Usd.Stage.Open(str(path))
+    for name, offset in (("One", 0), ("Two", -10)):
+        mandible = UsdGeom.Xformable(stage.GetPrimAtPath(f"/World/{name}/geo/Mandible"))
+        shown = np.array(mandible.GetLocalTransformation(float(frames[20] + offset))).T
+        assert np.abs(shown - rig.pose(d[20])).max() < 1e-9
