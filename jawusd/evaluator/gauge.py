@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 FADE_SOFTNESS_MM = 1.0  # rounding of the kink at d1 = 0 in the fading of the glide surface
+LIMIT_SOFTNESS_MM = 4.0  # rounding of the kinks where the gothic arch stops changing with opening
 ARCH_BOW_MM = 10.0  # the quadratic arch features are d2^2 / 10 mm, to keep all coefficients of one order
 DROP_BEND = 0.15  # slope gained by the bent drop features per mm, saturating at 4 mm (below)
 DROP_SATURATION_MM2 = 16.0
@@ -40,7 +41,7 @@ class Gauge:
         path_coefficients: Of gx and gz: ``sum_k c_k (d1 / path_scale_mm)^k, k = 1..5`` [mm], shape (2, 5).
         path_scale_mm: Length that makes the polynomials' argument of order one.
         path_limits: d1 interval [mm] in which the polynomials hold; outside they go on as straight lines (C1),
-            and ``rho`` sees d1 clipped to it.
+            and ``rho`` sees d1 softly clamped to it.
         glide_arch: Coefficients of rho, shape (7,).
         glide_drop: Coefficients of drop, shape (4,).
         glide_softness_mm: Radius ``e`` of the softened absolute value and ramp.
@@ -84,9 +85,8 @@ class Gauge:
 
     def arch(self, d1: Array, d2: Array) -> tuple[Array, Array, Array]:
         """Return rho(d2, d1) [mm] and its derivatives by d1 and by d2."""
-        inside = np.clip(d1, *self.path_limits)
-        t = inside / self.path_scale_mm
-        t_1 = np.where(d1 == inside, 1.0 / self.path_scale_mm, 0.0)
+        inside, inside_1 = soft_clamp(d1, *self.path_limits, LIMIT_SOFTNESS_MM)
+        t, t_1 = inside / self.path_scale_mm, inside_1 / self.path_scale_mm
         c = self.glide_arch
         side, side_2 = soft_absolute(d2, self.glide_softness_mm)
         by_side, by_side_t = (c[2] * t + c[1]) * t + c[0], 2 * c[2] * t + c[1]
@@ -184,6 +184,16 @@ def soft_ramp(x: Array, softness_mm: float) -> tuple[Array, Array]:
     """Return ``(x + sqrt(x^2 + e^2) - e) / 2`` and its slope: max(x, 0) with the kink rounded, zero at zero."""
     root = np.sqrt(x * x + softness_mm * softness_mm)
     return 0.5 * (x + root - softness_mm), 0.5 * (1.0 + x / root)
+
+
+def soft_clamp(x: Array, low: float, high: float, softness_mm: float) -> tuple[Array, Array]:
+    """Return x clamped to [low, high] with both kinks rounded, and its slope; smooth everywhere.
+
+    A hard clamp would put a kink into the decoder, which tables, solvers and eyes all notice.
+    """
+    rise, rise_1 = soft_ramp(x - low, softness_mm)
+    stop, stop_1 = soft_ramp(x - high, softness_mm)
+    return low + rise - stop, rise_1 - stop_1
 
 
 def _bent(x: Array) -> tuple[Array, Array]:

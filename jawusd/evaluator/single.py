@@ -14,7 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.evaluator.curves import HermiteCurve
-from jawusd.evaluator.gauge import ARCH_BOW_MM, DROP_BEND, DROP_SATURATION_MM2, FADE_SOFTNESS_MM, Gauge
+from jawusd.evaluator.gauge import (
+    ARCH_BOW_MM,
+    DROP_BEND,
+    DROP_SATURATION_MM2,
+    FADE_SOFTNESS_MM,
+    LIMIT_SOFTNESS_MM,
+    Gauge,
+)
 from jawusd.evaluator.models import AdditiveModel, AnchoredModel, JawModelForm
 
 Array = NDArray[np.float64]
@@ -111,7 +118,9 @@ class _FloatGauge:
 
     def displacement(self, d1: float, d2: float, d3: float) -> Vector:
         gx, gz = self.path(d1)
-        t = min(max(d1, self._low), self._high) / self._scale
+        rise, stop = d1 - self._low, d1 - self._high
+        e = LIMIT_SOFTNESS_MM
+        t = (self._low + 0.5 * (rise + sqrt(rise * rise + e * e) - stop - sqrt(stop * stop + e * e))) / self._scale
         e = self._softness
         c = self._arch
         side = sqrt(d2 * d2 + e * e) - e

@@ -15,7 +15,8 @@ def gauge(arrays, d):
     low, high = (mp.mpf(float(x)) for x in arrays["path_limits"])
     scale = mp.mpf(float(arrays["path_scale_mm"]))
     e = mp.mpf(float(arrays["glide_softness_mm"]))
-    t = min(max(d1, low), high) / scale
+    four = mp.mpf(4)
+    t = (low + _softplus(d1 - low, four) - _softplus(d1 - high, four)) / scale
     a = mp.sqrt(d2**2 + e**2) - e
     b = _softplus(d3, e) - _softplus(mp.mpf(0), e)
     features = [a, a * t, a * t**2, d2, d2 * t, d2**2 / 10, d2**2 * t / 10]
