@@ -49,7 +49,8 @@ def minimise(
 
     Args:
         residual: Residuals and their derivatives at given points of given rows.
-        start: First points [mm], shape (n, 3); inside the bound, if there is one. NaN rows stay NaN.
+        start: First points [mm], shape (n, 3); inside the bound, if there is one. Rows whose start or residual is NaN
+            come back NaN.
         bound: Where the points must stay.
         iterations: Most steps tried per row.
         tolerance_mm: A row is settled when its step is shorter.
@@ -62,8 +63,9 @@ def minimise(
     rows = np.flatnonzero(np.isfinite(x).all(axis=1))
     r, J = residual(x[rows], rows)
     cost[rows] = np.einsum("nm,nm->n", r, r)
-    rows_known = np.isfinite(cost[rows])
-    rows, r, J = rows[rows_known], r[rows_known], J[rows_known]
+    measured = np.isfinite(cost[rows])
+    x[rows[~measured]] = np.nan
+    rows, r, J = rows[measured], r[measured], J[measured]
     damping = np.full(len(rows), _START_DAMPING)
     pressure = np.zeros(len(rows))
     for _ in range(iterations):

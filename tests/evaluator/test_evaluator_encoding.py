@@ -1,0 +1,162 @@
+"""Encoding against scipy's least squares, inside and outside the bound, plain and weighted."""
+
+import numpy as np
+import pytest
+from example_model import example_arrays, example_meta
+from scipy.optimize import least_squares
+from scipy.optimize import minimize as scipy_minimize
+
+from jawusd.evaluator import JawRig
+from jawusd.geometry.se3 import se3_exp, se3_log
+
+RIGS = {kind: JawRig(example_arrays(kind), example_meta(kind)) for kind in ("anchored", "additive")}
+
+
+@pytest.fixture(params=sorted(RIGS))
+def rig(request):
+    return RIGS[request.param]
+
+
+def noisy_poses(rig, count, seed, angle_rad=0.004, shift_mm=0.3):
+    rng = np.random.default_rng(seed)
+    low, high = rig.arrays["d_range"].T
+    d = rng.uniform(low, high, (count, 3))
+    noise = rng.normal(size=(count, 6)) * ([angle_rad] * 3 + [shift_mm] * 3)
+    return d, se3_exp(noise) @ rig.pose(d)
+
+
+def landmark_differences(rig, d, T):
+    difference = rig.pose(d) - T
+    landmarks = rig.arrays["landmarks"]
+    return landmarks @ difference[:3, :3].T + difference[:3, 3]
+
+
+def test_encode_inverts_pose(rig):
+    d, _ = noisy_poses(rig, 500, 0)
+    found, residual_mm = rig.encode(rig.pose(d))
+    np.testing.assert_allclose(found, d, atol=1e-8)
+    np.testing.assert_allclose(residual_mm, 0.0, atol=1e-8)
+
+
+def test_residual_is_the_rms_landmark_distance(rig):
+    _, T = noisy_poses(rig, 50, 1)
+    d, residual_mm = rig.encode(T)
+    for i in range(len(T)):
+        expected = np.sqrt((landmark_differences(rig, d[i], T[i]) ** 2).sum(axis=1).mean())
+        assert residual_mm[i] == pytest.approx(expected, abs=1e-12)
+
+
+def test_encode_is_as_near_as_scipy_least_squares(rig):
+    """No start of the oracle ends nearer than 1e-4 mm, for noise up to a gross 4 mm."""
+    for seed, shift_mm in ((2, 0.3), (3, 4.0)):
+        true_d, T = noisy_poses(rig, 40, seed, shift_mm=shift_mm)
+        d, residual_mm = rig.encode(T)
+        for i in range(len(T)):
+            for start in (true_d[i], d[i]):
+                oracle = least_squares(
+                    lambda x, T=T[i]: landmark_differences(rig, x, T).ravel() / np.sqrt(5), start, xtol=1e-13
+                )
+                assert residual_mm[i] <= np.sqrt(2 * oracle.cost) + 1e-4
+
+
+def test_encode_accepts_matrices_that_are_not_quite_rigid(rig):
+    """float32 and rounded matrices give nearly the same parameters."""
+    d, _ = noisy_poses(rig, 100, 4)
+    T = rig.pose(d)
+    found, residual_mm = rig.encode(T.astype(np.float32))
+    np.testing.assert_allclose(found, d, atol=1e-3)
+    assert residual_mm.max() < 1e-3
+
+
+def test_bounded_encode_stays_inside_and_is_the_best_there(rig):
+    """Inside the bound nothing changes; outside, SLSQP under the same bound finds nothing nearer."""
+    d, T = noisy_poses(rig, 60, 5)
+    free, free_mm = rig.encode(T)
+    bounded, bounded_mm = rig.encode(T, bounds=True)
+    assert (rig.margin(bounded) >= -1e-12).all()
+    inside = rig.margin(free) >= 0
+    assert inside.any() and not inside.all()
+    np.testing.assert_array_equal(bounded[inside], free[inside])
+    assert (bounded_mm >= free_mm - 1e-12).all()
+    for i in np.flatnonzero(~inside)[:15]:
+        oracle = scipy_minimize(
+            lambda x, T=T[i]: (landmark_differences(rig, x, T) ** 2).sum(axis=1).mean(),
+            rig.project(free[i]),
+            constraints={"type": "ineq", "fun": rig.margin, "jac": rig.margin_gradient},
+            method="SLSQP",
+            options={"ftol": 1e-14},
+        )
+        if rig.margin(oracle.x) >= -1e-9:
+            assert bounded_mm[i] <= np.sqrt(oracle.fun) + 1e-4
+
+
+def weighted_cost(rig, d, T, precision):
+    xi = se3_log(T @ np.linalg.inv(rig.pose(d)))
+    return float(xi @ precision @ xi)
+
+
+def test_weighted_encode_minimises_the_mahalanobis_distance(rig):
+    rng = np.random.default_rng(6)
+    _, T = noisy_poses(rig, 20, 6)
+    root = rng.normal(size=(20, 6, 6)) * 0.1 + np.diag([0.01] * 3 + [0.5] * 3)
+    covariance = root @ np.swapaxes(root, 1, 2) + np.diag([1e-6] * 3 + [1e-3] * 3)
+    d, residual_mm = rig.encode(T, covariance=covariance)
+    for i in range(20):
+        precision = np.linalg.inv(covariance[i])
+        oracle = scipy_minimize(
+            lambda x, T=T[i], precision=precision: weighted_cost(rig, x, T, precision),
+            d[i] + 0.05,
+            method="Nelder-Mead",
+            options={"xatol": 1e-7, "fatol": 1e-10, "maxiter": 2000},
+        )
+        assert weighted_cost(rig, d[i], T[i], precision) <= oracle.fun + 1e-6
+    assert (residual_mm >= rig.encode(T)[1] - 1e-12).all()
+
+
+def test_weighted_encode_trusts_what_was_measured_well(rig):
+    """A translation measured poorly along one axis pulls the result less than with equal weights."""
+    d = np.array([20.0, 1.0, 1.0])
+    A = rig.arrays["T_anatomical_skull"]
+    x_skull = A[:3, :3].T @ [1.0, 0.0, 0.0]
+    T = rig.pose(d).copy()
+    T[:3, 3] += 2.0 * x_skull
+    covariance = np.diag([1e-4] * 3 + [0.01] * 3)
+    covariance[3:, 3:] += 25.0 * np.outer(x_skull, x_skull)
+    plain, _ = rig.encode(T)
+    weighted, _ = rig.encode(T, covariance=covariance)
+    assert np.linalg.norm(weighted - d) < 0.3 * np.linalg.norm(plain - d)
+
+
+def test_covariance_rows_with_nan_give_nan_and_bad_ones_are_refused(rig):
+    d, T = noisy_poses(rig, 3, 7)
+    covariance = np.tile(np.eye(6), (3, 1, 1))
+    covariance[1] = np.nan
+    found, residual_mm = rig.encode(T, covariance=covariance)
+    assert np.isnan(found[1]).all() and np.isnan(residual_mm[1])
+    assert np.isfinite(found[[0, 2]]).all()
+    with pytest.raises(ValueError, match="positive definite"):
+        rig.encode(T, covariance=-np.eye(6))
+
+
+def test_weighted_encode_with_bounds_stays_inside(rig):
+    _, T = noisy_poses(rig, 60, 8)
+    d, _ = rig.encode(T, bounds=True, covariance=np.diag([1e-5] * 3 + [0.1] * 3))
+    assert (rig.margin(d) >= -1e-12).all()
+
+
+def test_poses_with_nan_give_nan(rig):
+    _, T = noisy_poses(rig, 4, 9)
+    T[2, 1, 3] = np.nan
+    for bounds in (False, True):
+        d, residual_mm = rig.encode(T, bounds=bounds)
+        assert np.isnan(d[2]).all() and np.isnan(residual_mm[2])
+        assert np.isfinite(d[[0, 1, 3]]).all()
+
+
+def test_any_rigid_pose_gets_an_answer(rig):
+    """Wild poses end somewhere finite, with a residual that says they are off the model."""
+    rng = np.random.default_rng(10)
+    T = se3_exp(rng.normal(size=(200, 6)) * ([1.0] * 3 + [80.0] * 3))
+    d, residual_mm = rig.encode(T)
+    assert np.isfinite(d).all() and np.isfinite(residual_mm).all()
+    assert np.median(residual_mm) > 5.0

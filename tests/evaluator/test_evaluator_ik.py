@@ -1,0 +1,106 @@
+"""Inverse kinematics against the paper's neighbourhood search, while dragging and from nothing."""
+
+import numpy as np
+import pytest
+from brute_force_ik import brute_force_ik
+from example_model import example_arrays, example_meta
+
+from jawusd.evaluator import JawRig
+
+RIGS = {kind: JawRig(example_arrays(kind), example_meta(kind)) for kind in ("anchored", "additive")}
+
+
+@pytest.fixture(params=sorted(RIGS))
+def rig(request):
+    return RIGS[request.param]
+
+
+def valid_d(rig, count, seed):
+    low, high = rig.arrays["d_range"].T
+    return rig.project(np.random.default_rng(seed).uniform(low, high, (count, 3)))
+
+
+def where(rig, d, handles):
+    T = rig.pose(d)
+    return np.einsum("...ij,hj->...hi", T[..., :3, :3], handles) + T[..., None, :3, 3]
+
+
+def test_reachable_targets_are_reached(rig):
+    d = valid_d(rig, 200, 0)
+    chin = rig.arrays["landmarks"][0]
+    found, distance_mm = rig.ik(chin, where(rig, d, chin[None])[:, 0])
+    assert distance_mm.max() < 1e-6
+    np.testing.assert_allclose(found, d, atol=1e-5)
+
+
+@pytest.mark.parametrize("handles", [1, 3])
+def test_never_worse_than_the_papers_search_and_always_valid(rig, handles):
+    """Random drags of up to 8 mm from a valid pose, many beyond reach."""
+    start = valid_d(rig, 100, 1)
+    points = rig.arrays["landmarks"][:handles]
+    targets = where(rig, start, points) + np.random.default_rng(2).normal(size=(100, 1, 3)) * 4.0
+    brute, brute_mm = brute_force_ik(rig, points, targets, start)
+    found, distance_mm = rig.ik(points, targets, start=start)
+    assert (rig.margin(found) >= -1e-12).all()
+    assert (distance_mm <= brute_mm + 1e-9).all()
+    assert (brute_mm > 0.5).any()  # some targets are out of reach: the bound was at work
+    left = where(rig, found, points) - targets
+    np.testing.assert_allclose(distance_mm, np.sqrt((left**2).sum(-1).mean(-1)), atol=1e-12)
+
+
+def test_dragging_does_not_jump(rig):
+    """Along a smooth path of the target, inside and outside reach, the jaw moves at most a few times as far."""
+    chin = rig.arrays["landmarks"][0]
+    time = np.linspace(0.0, 2 * np.pi, 1500)
+    A = rig.arrays["T_anatomical_skull"]
+    path = np.stack([14 * np.sin(2 * time), -18 + 16 * np.cos(time), -5 + 9 * np.sin(time)], axis=1)
+    targets = rig.arrays["T_rest"][:3, :3] @ chin + rig.arrays["T_rest"][:3, 3] + path @ A[:3, :3]
+    d = rig.project([2.0, 0.0, 0.0])
+    drag = []
+    for target in targets:
+        d, _ = rig.ik(chin, target, start=d)
+        drag.append(d)
+    drag = np.array(drag)
+    assert (rig.margin(drag) >= -1e-12).all()
+    hand = np.linalg.norm(np.diff(targets, axis=0), axis=1).max()
+    assert np.linalg.norm(np.diff(drag[1:], axis=0), axis=1).max() < 12 * hand
+    assert (rig.margin(drag) < 1e-6).mean() > 0.1
+
+
+def test_weights_decide_between_handles(rig):
+    points = rig.arrays["landmarks"][[0, 3]]
+    start = rig.project([15.0, 0.0, 1.0])
+    targets = where(rig, start, points) + [[[1.0, -2.0, 0.5]], [[0.0, 3.0, 0.0]]][0]
+    targets[1] += [0.0, 4.0, 0.0]
+    first, _ = rig.ik(points, targets, start=start, weights=[100.0, 1.0])
+    second, _ = rig.ik(points, targets, start=start, weights=[1.0, 100.0])
+    miss_first = np.linalg.norm(where(rig, first, points) - targets, axis=-1)
+    miss_second = np.linalg.norm(where(rig, second, points) - targets, axis=-1)
+    assert miss_first[0] < miss_second[0]
+    assert miss_second[1] < miss_first[1]
+
+
+def test_a_start_outside_is_brought_inside(rig):
+    chin = rig.arrays["landmarks"][0]
+    found, _ = rig.ik(chin, where(rig, [5.0, 0.0, 0.0], chin[None])[0] + 40.0, start=[100.0, 30.0, 30.0])
+    assert rig.margin(found) >= -1e-12
+
+
+def test_targets_and_starts_with_nan_give_nan(rig):
+    chin = rig.arrays["landmarks"][0]
+    targets = np.tile(where(rig, [5.0, 0.0, 0.0], chin[None]), (3, 1))
+    targets[1, 0] = np.nan
+    for start in (None, [1.0, 0.0, 0.0]):
+        found, distance_mm = rig.ik(chin, targets, start=start)
+        assert np.isnan(found[1]).all() and np.isnan(distance_mm[1])
+        assert np.isfinite(found[[0, 2]]).all()
+    assert np.isnan(rig.ik(chin, targets[0], start=[np.nan, 0.0, 0.0])[0]).all()
+
+
+@pytest.mark.parametrize(
+    ("points", "weights", "message"),
+    [([1.0, 2.0], None, "p_mandible"), ([[0.0] * 3] * 2, [1.0], "weights"), ([[0.0] * 3] * 2, [0.0, 0.0], "weights")],
+)
+def test_wrong_handles_are_refused(rig, points, weights, message):
+    with pytest.raises(ValueError, match=message):
+        rig.ik(points, np.zeros((2, 3)), weights=weights)
