@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from jawusd.errors import RigError
 from jawusd.evaluator import JawRig
 from jawusd.geometry.se3 import se3_exp
+from jawusd.rig.knots import sample_knots
 
 Array = NDArray[np.float64]
 
@@ -77,7 +78,7 @@ def build_table(rig: JawRig, vertices: Array, size: int = DEFAULT_SIZE) -> Decod
     """
     if size not in SIZES:
         raise RigError(f"a table of {size} knots per axis is not offered; allowed are {', '.join(map(str, SIZES))}.")
-    axes = tuple(np.linspace(low, high, size) for low, high in valid_box(rig))
+    axes = sample_knots(rig, valid_box(rig), vertices[extreme_vertices(vertices)], size)
     if rig.meta["kind"] == "additive":
         twists = np.concatenate([rig.twist(_on_axis(i, axis)) for i, axis in enumerate(axes)])
         table = DecoderTable("curves", axes, twists.astype(np.float32))
