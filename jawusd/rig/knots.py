@@ -1,4 +1,4 @@
-"""Where to sample a decoder: knots close together where the motion bends, so that straight lines between them err least.
+"""Where to sample a decoder: knots close together where the motion bends, so straight lines between them err least.
 
 The error of linear interpolation over a step h is h^2 / 8 times the second derivative, so knots as dense as the square
 root of the curvature spread it evenly (de Boor, A Practical Guide to Splines, chapter XII).
