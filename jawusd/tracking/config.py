@@ -49,10 +49,12 @@ class TrackingConfig:
     suspect_residual: float = 1.4
     # Uncovered mask above the recent median by more than this makes a row, or a mask, suspect [-].
     suspect_coverage: float = 0.04
-    # A mask matching less than this share of what its best neighbour matches (both relative to before) is left out [-].
-    spoiled_share: float = 0.3
-    # Score gain over the first attempt that makes a frame count as recovered [-].
-    recovery_gain: float = 1.05
+    # Price of a mask pixel left uncovered, in px of contour [1/px]: tells wrong minima apart where few edges show.
+    bare_price: float = 0.5
+    # Gain in worth of the remaining masks, as a share of their score, that proves the one left out wrong [-].
+    conflict_gain: float = 0.15
+    # Gain in worth over the first attempt, as a share of the score, that makes a frame count as recovered [-].
+    recovery_gain: float = 0.05
     # Reach of the multi-start [mm, rad]: the prediction error of a fast chewing stroke.
     search_mm: float = 2.0
     search_rad: float = 0.05
@@ -61,8 +63,8 @@ class TrackingConfig:
     search_finalists: int = 4
     # Matched contour below which a row is lost [px]: 8 mm of tooth edge.
     least_matched_px: float = 60.0
-    # Residual spread above this multiple of the recent median means lost [-].
-    lost_residual: float = 1.8
+    # Residual spread above this multiple of the suspect limit means lost [-]; with a low score the limit itself does.
+    lost_residual: float = 1.3
     # Uncovered share of a mask above which the row is lost [-]: good poses leave about 0.01.
     lost_coverage: float = 0.12
     # Position uncertainty of the crowns above which a row is lost [mm].

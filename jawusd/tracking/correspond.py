@@ -99,7 +99,7 @@ def search_edges(samples, mask, other_mask, other_inverse_depth, reach_px, toler
 
 
 @numba.njit(nogil=True, cache=True)
-def accumulate(samples, distances, gate_px, pull, pose, matrix, centre, system):
+def accumulate(samples, distances, gate_px, score_gate_px, pull, pose, matrix, centre, system):
     """Add the Tukey-weighted normal equations of one row of teeth in one view.
 
     The residual d of a sample shrinks by n . du when the sample moves by du in the picture; du follows from a left
@@ -109,12 +109,14 @@ def accumulate(samples, distances, gate_px, pull, pose, matrix, centre, system):
         samples: contour samples, shape (n, COLUMNS).
         distances: as `search_edges` writes them, shape (n,).
         gate_px: residual beyond which the Tukey weight is zero.
+        score_gate_px: residual beyond which a sample adds nothing to the score.
         pull: weight at the gate of samples deep inside the mask; 0 leaves them out.
         pose: scan to world, shape (4, 4).
         matrix: world [mm] to homogeneous px, shape (3, 4).
         centre: point the twist turns about, world coordinates [mm], shape (3,).
         system: shape (8, 8), added to: rows 0-5 hold [H | g | sum w J], [6, 6] sum w, [6, 7] sum w d,
-            [7, 6] sum w d^2, [7, 7] the matched contour length [px].
+            [7, 6] sum w d^2, [7, 7] the matched contour length [px], [6, 0] the score: contour length, each sample
+            counted by 1 minus Tukey's loss at the score gate [px].
     """
     jacobian = np.empty(6)
     for s in range(len(samples)):
@@ -128,6 +130,9 @@ def accumulate(samples, distances, gate_px, pull, pose, matrix, centre, system):
             d = gate_px
             weight = pull
         else:
+            e = 1.0 - (d / score_gate_px) ** 2
+            if e > 0:
+                system[6, 0] += e * e * e * row[LENGTH]
             e = 1.0 - (d / gate_px) ** 2
             if e <= 0:
                 continue

@@ -11,8 +11,8 @@ from jawusd.errors import TrackingError
 from jawusd.formats.tracks import PARTIAL, TRACKED
 from jawusd.imaging.raster import count_and_not, count_bits, draw_silhouette, pack_bits, project
 from jawusd.tracking.config import TrackingConfig
-from jawusd.tracking.ladder import FrameRecord
-from jawusd.tracking.quality import coverage_error, score_px
+from jawusd.tracking.history import FrameRecord
+from jawusd.tracking.quality import score_px, uncovered_px
 from jawusd.tracking.solver import ContourSolver, Solution, View
 from jawusd.tracking.views import MaskViews
 
@@ -48,13 +48,13 @@ def first_record(
         trial = solver.solve(start, views, gates, use)
         if best is None:
             best = trial
-        elif (score_px(trial) > score_px(best)).any():
-            take = score_px(trial) > score_px(best)
+        elif (take := score_px(trial).sum(1) > score_px(best).sum(1)).any():
             poses = np.where(take[:, None, None], trial.poses, best.poses)
             best = solver.solve(poses, views, config.gates_px[-2:], use)
-    coverage = coverage_error(solver.scans, best, views)
+    bare_px, mask_px = uncovered_px(solver.scans, best, views)
+    coverage = np.where(mask_px > 0, bare_px / np.maximum(mask_px, 1), np.nan)
     for r in _ROWS:
-        share = score_px(best)[r] / max(best.visible_px[r].sum(), 1.0)
+        share = score_px(best)[r].sum() / max(best.visible_px[r].sum(), 1.0)
         bare = np.nanmedian(coverage[r])
         if share < config.first_share or bare > config.lost_coverage:
             raise TrackingError(

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,66 +11,30 @@ from numpy.typing import NDArray
 from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, TRACKED
 from jawusd.geometry import make_transform, se3_exp, transform_points
 from jawusd.tracking.config import TrackingConfig
-from jawusd.tracking.quality import coverage_error, crown_sigma_mm, residual_px, score_px
+from jawusd.tracking.history import FrameRecord, History
+from jawusd.tracking.quality import crown_sigma_mm, matched_px, residual_px, score_px, uncovered_px
 from jawusd.tracking.solver import ContourSolver, Solution, View
 
 _ROWS = (0, 1)
 
 
 @dataclass(frozen=True, eq=False)
-class FrameRecord:
-    """Hold what is known about one instant.
-
-    Attributes:
-        solution: the alignment; its poses of lost rows mean nothing.
-        status: of both rows, as in `Tracks`, shape (2,).
-        used: masks that took part, shape (2, C).
-        coverage: E_SP over mask pixels, shape (2, C); NaN without a mask.
-    """
+class _Trial:
+    """Hold a solution with the mask pixels it leaves uncovered; arrays per row and view, shape (2, C)."""
 
     solution: Solution
-    status: NDArray[np.int8]
-    used: NDArray[np.bool_]
-    coverage: NDArray[np.float64]
+    bare_px: NDArray[np.float64]
+    mask_px: NDArray[np.float64]
+    use: NDArray[np.bool_]
 
+    @property
+    def coverage(self) -> NDArray[np.float64]:
+        """Return E_SP over mask pixels, NaN without a mask."""
+        return np.where(self.mask_px > 0, self.bare_px / np.maximum(self.mask_px, 1), np.nan)
 
-@dataclass(eq=False)
-class History:
-    """Remember what good frames looked like lately, to tell a bad one."""
-
-    length: int
-    scores: deque = field(init=False)
-    residuals: deque = field(init=False)
-    coverages: deque = field(init=False)
-    shares: deque = field(init=False)
-
-    def __post_init__(self) -> None:
-        for name in ("scores", "residuals", "coverages", "shares"):
-            setattr(self, name, deque(maxlen=self.length))
-
-    def add(self, record: FrameRecord) -> None:
-        """Take in a frame; only rows tracked without trouble count."""
-        good = record.status == TRACKED
-        self.scores.append(np.where(good, score_px(record.solution), np.nan))
-        self.residuals.append(np.where(good, residual_px(record.solution), np.nan))
-        seen = good[:, None] & record.used
-        self.coverages.append(np.where(seen, record.coverage, np.nan))
-        self.shares.append(np.where(seen, _shares(record.solution), np.nan))
-
-    def usual(self, name: str, otherwise: float) -> NDArray[np.float64]:
-        """Return the median of the remembered values, or a stand-in where there are none."""
-        stack = np.array(getattr(self, name))
-        if not len(stack):
-            raise ValueError("an empty history knows nothing")
-        known = np.isfinite(stack).any(0)
-        out = np.full(stack.shape[1:], otherwise)
-        out[known] = np.nanmedian(stack[:, known], axis=0)
-        return out
-
-
-def _shares(solution: Solution) -> NDArray[np.float64]:
-    """Return the matched share of the visible contour per row and view, shape (2, C)."""
-    return solution.systems[:, :, 6, 6] / np.maximum(solution.visible_px, 1.0)
+    def worth(self, price: float) -> NDArray[np.float64]:
+        """Return what ranks poses, per row and view: contour that fits less the price of uncovered mask [px]."""
+        return score_px(self.solution) - price * np.where(self.use, self.bare_px, 0.0)
 
 
 class FrameTracker:
@@ -83,109 +46,137 @@ class FrameTracker:
         self.history = history
 
     def track(
-        self, prediction: NDArray[np.float64], views: Sequence[View], gallery: Sequence[NDArray[np.float64]] | None
+        self,
+        starts: Sequence[NDArray[np.float64]],
+        views: Sequence[View],
+        gallery: Sequence[NDArray[np.float64]] | None,
     ) -> FrameRecord:
         """Align one instant.
 
         Args:
-            prediction: T_world_upper, T_world_lower, shape (2, 4, 4).
+            starts: predictions, the likeliest first: T_world_upper, T_world_lower, each shape (2, 4, 4).
             views: one per camera.
             gallery: further starts for the last resort, each shape (2, 4, 4); None forgoes the last resort.
         """
         use = np.array([[v.present[r] for v in views] for r in _ROWS])
-        solution = self._solver.solve(prediction, views, self._config.gates_px, use)
-        coverage = coverage_error(self._solver.scans, solution, views)
-        kept = use & ~self._spoiled(solution, coverage, use)
+        trial = self._try(starts[0], views, self._config.gates_px, use)
+        kept = use & ~self._spoiled(trial)
         if (kept != use).any():
-            use = kept
-            solution = self._solver.solve(prediction, views, self._config.gates_px, use)
-            coverage = coverage_error(self._solver.scans, solution, views)
-        first = solution
-        for attempt in (self._widen,) if gallery is None else (self._widen, self._search):
-            suspect = self._suspect(solution, coverage, use)
+            trial = self._try(starts[0], views, self._config.gates_px, kept)
+        attempts = [self._others, self._leave_out, self._widen, self._search]
+        first = trial
+        for attempt in attempts if gallery is not None else attempts[:-1]:
+            suspect = self._suspect(trial)
             if not suspect.any():
                 break
-            solution = attempt(solution, prediction, views, use, suspect, gallery)
-            coverage = coverage_error(self._solver.scans, solution, views)
-        complete = use.all(1)
-        status = np.where(complete, TRACKED, PARTIAL).astype(np.int8)
-        status[score_px(solution) > self._config.recovery_gain * score_px(first)] = RECOVERED
-        status[self._lost(solution, coverage, use)] = LOST
-        return FrameRecord(solution, status, use, coverage)
+            trial = attempt(trial, suspect, starts, views, gallery)
+        return self._record(first, trial)
 
-    def _suspect(self, solution: Solution, coverage, use) -> NDArray[np.bool_]:
-        """Tell which rows look worse than they lately did."""
-        c, h = self._config, self.history
-        low = score_px(solution) < c.suspect_score * h.usual("scores", 0.0)
-        rough = ~(residual_px(solution) < c.suspect_residual * h.usual("residuals", np.inf))
-        bare = np.where(use, coverage - h.usual("coverages", 0.0), -np.inf).max(1) > c.suspect_coverage
-        return (low | rough | bare) & use.any(1)
+    def _record(self, first: _Trial, trial: _Trial) -> FrameRecord:
+        c = self._config
+        status = np.where(trial.use.all(1), TRACKED, PARTIAL).astype(np.int8)
+        gain = trial.worth(c.bare_price).sum(1) - first.worth(c.bare_price).sum(1)
+        status[(gain > c.recovery_gain * score_px(trial.solution).sum(1)) & (status == TRACKED)] = RECOVERED
+        status[self._lost(trial)] = LOST
+        return FrameRecord(trial.solution, status, trial.use, trial.coverage)
 
-    def _spoiled(self, solution: Solution, coverage, use) -> NDArray[np.bool_]:
-        """Tell which masks disagree with the scan while those of the other cameras do not, shape (2, C)."""
-        c, h = self._config, self.history
-        bare = coverage - h.usual("coverages", 0.0) > c.suspect_coverage
-        share = _shares(solution) / np.maximum(h.usual("shares", 1.0), 1e-6)
-        wrong = np.zeros_like(use)
+    def _try(self, start, views, gates, use) -> _Trial:
+        solution = self._solver.solve(start, views, gates, use)
+        return _Trial(solution, *uncovered_px(self._solver.scans, solution, views), use)
+
+    def _suspect(self, trial: _Trial) -> NDArray[np.bool_]:
+        """Tell which rows look worse than they lately did, shape (2,)."""
+        return (self._scarce(trial) | self._rough(trial) | self._bare(trial).any(1)) & trial.use.any(1)
+
+    def _scarce(self, trial: _Trial) -> NDArray[np.bool_]:
+        usual = self.history.usual_score()
+        return score_px(trial.solution).sum(1) < self._config.suspect_score * usual
+
+    def _rough(self, trial: _Trial, factor: float = 1.0) -> NDArray[np.bool_]:
+        limit = factor * self._config.suspect_residual * self.history.usual_residual()
+        return ~(residual_px(trial.solution) < limit)
+
+    def _bare(self, trial: _Trial) -> NDArray[np.bool_]:
+        """Tell which masks stay uncovered more than they lately did, shape (2, C)."""
+        return trial.use & (trial.coverage - self.history.usual_coverage() > self._config.suspect_coverage)
+
+    def _spoiled(self, trial: _Trial) -> NDArray[np.bool_]:
+        """Tell which masks the scan cannot cover while it covers those of another camera, shape (2, C)."""
+        wrong = self._bare(trial)
         for r in _ROWS:
-            if use[r].sum() < 2:
-                continue
-            ratio = np.where(use[r], share[r], -np.inf)
-            others = np.array([np.delete(ratio, k).max() for k in range(len(ratio))])
-            poor = use[r] & (ratio < c.spoiled_share * np.minimum(others, 1.0))
-            wrong[r] = use[r] & (bare[r] | poor)
-            if wrong[r].all():
+            if (wrong[r] == trial.use[r]).all():
                 wrong[r] = False  # it is the pose that is wrong, not every mask
         return wrong
 
-    def _lost(self, solution: Solution, coverage, use) -> NDArray[np.bool_]:
+    def _lost(self, trial: _Trial) -> NDArray[np.bool_]:
         """Tell which rows cannot be trusted, shape (2,)."""
-        c, h = self._config, self.history
-        few = solution.systems[:, :, 7, 7].sum(1) < c.least_matched_px
-        rough = ~(residual_px(solution) < c.lost_residual * h.usual("residuals", np.inf))
-        bare = np.where(use, coverage, -np.inf).max(1) > c.lost_coverage
-        loose = np.array([crown_sigma_mm(self._solver.scans[r], solution, r, c) > c.lost_sigma_mm for r in _ROWS])
-        return few | rough | bare | loose | ~use.any(1)
+        c = self._config
+        few = matched_px(trial.solution) < c.least_matched_px
+        rough = self._rough(trial, c.lost_residual) | (self._rough(trial) & self._scarce(trial))
+        bare = np.where(trial.use, trial.coverage, 0.0).max(1) > c.lost_coverage
+        loose = np.array([crown_sigma_mm(self._solver.scans[r], trial.solution, r, c) > c.lost_sigma_mm for r in _ROWS])
+        return few | rough | bare | loose | ~trial.use.any(1)
 
-    def _widen(self, solution, prediction, views, use, suspect, gallery) -> Solution:
-        """Try again from the prediction and from the present solution with wide gates."""
-        for start in (prediction, solution.poses):
-            trial = self._solver.solve(start, views, self._config.wide_gates_px, use)
-            solution = self._better(solution, trial, suspect, views, use)
-        return solution
+    def _others(self, trial, suspect, starts, views, gallery) -> _Trial:
+        """Try the other predictions."""
+        for start in starts[1:]:
+            trial = self._better(trial, self._try(start, views, self._config.gates_px, trial.use), suspect, views)
+        return trial
 
-    def _search(self, solution, prediction, views, use, suspect, gallery) -> Solution:
+    def _leave_out(self, trial, suspect, starts, views, gallery) -> _Trial:
+        """Leave a mask out if the others of its row then agree far better among themselves."""
+        c = self._config
+        for r in np.flatnonzero(suspect):
+            for k in np.flatnonzero(trial.use[r]):
+                rest = trial.use.copy()
+                rest[r, k] = False
+                if rest[r].sum() < 2:
+                    continue
+                without = self._try(starts[0], views, c.gates_px, rest)
+                gain = (without.worth(c.bare_price) - trial.worth(c.bare_price))[r, rest[r]].sum()
+                if gain > c.conflict_gain * score_px(without.solution)[r, rest[r]].sum():
+                    trial = without
+                    break
+        return trial
+
+    def _widen(self, trial, suspect, starts, views, gallery) -> _Trial:
+        """Try again with wide gates from the predictions and from where we are."""
+        for start in (*starts, trial.solution.poses):
+            wide = self._try(start, views, self._config.wide_gates_px, trial.use)
+            trial = self._better(trial, wide, suspect, views)
+        return trial
+
+    def _search(self, trial, suspect, starts, views, gallery) -> _Trial:
         """Try many starts around the prediction and earlier poses, the most promising ones to the end."""
         c = self._config
         for r in np.flatnonzero(suspect):
-            starts = [*_around(prediction[r], self._solver.scans[r].centre, c.search_mm, c.search_rad)]
-            starts += [g[r] for g in gallery]
-            trials = []
-            for start in starts:
-                poses = solution.poses.copy()
-                poses[r] = start
-                trials.append((score_px(self._solver.solve(poses, views, c.glance_gates_px, use))[r], start))
-            trials.sort(key=lambda t: -t[0])
             only = np.arange(2) == r
-            for _, start in trials[: c.search_finalists]:
-                poses = solution.poses.copy()
-                poses[r] = start
-                trial = self._solver.solve(poses, views, c.wide_gates_px, use)
-                solution = self._better(solution, trial, only, views, use)
-        return solution
+            candidates = [*_around(starts[0][r], self._solver.scans[r].centre, c.search_mm, c.search_rad)]
+            glances = []
+            for pose in [*candidates, *(g[r] for g in gallery)]:
+                poses = np.where(only[:, None, None], pose, trial.solution.poses)
+                glance = self._try(poses, views, c.glance_gates_px, trial.use)
+                glances.append((glance.worth(c.bare_price)[r].sum(), poses))
+            glances.sort(key=lambda g: -g[0])
+            for _, poses in glances[: c.search_finalists]:
+                trial = self._better(trial, self._try(poses, views, c.wide_gates_px, trial.use), only, views)
+        return trial
 
-    def _better(self, solution: Solution, trial: Solution, rows, views, use) -> Solution:
-        """Return the solution made of the better poses of the given rows."""
-        take = rows & (score_px(trial) > score_px(solution))
+    def _better(self, trial: _Trial, other: _Trial, rows: NDArray[np.bool_], views: Sequence[View]) -> _Trial:
+        """Return the better of two poses of each of the given rows."""
+        price = self._config.bare_price
+        take = rows & (other.worth(price).sum(1) > trial.worth(price).sum(1))
         if not take.any():
-            return solution
-        if take.all():
             return trial
-        poses = np.where(take[:, None, None], trial.poses, solution.poses)
-        return self._solver.solve(poses, views, self._config.gates_px[-2:], use)
+        if take.all():
+            return other
+        poses = np.where(take[:, None, None], other.solution.poses, trial.solution.poses)
+        return self._try(poses, views, self._config.gates_px[-2:], trial.use)
 
 
-def _around(pose: NDArray[np.float64], centre: NDArray[np.float64], mm: float, rad: float):
+def _around(
+    pose: NDArray[np.float64], centre: NDArray[np.float64], mm: float, rad: float
+) -> Iterator[NDArray[np.float64]]:
     """Yield a pose and the poses moved and turned both ways along each axis about a scan point."""
     yield pose
     c = transform_points(pose, centre)

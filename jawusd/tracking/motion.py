@@ -31,6 +31,14 @@ class Motion:
             out[1] = out[0] @ se3_inverse(self._last[0]) @ self._last[1]  # a lost jaw is carried along by the head
         return orthonormalise(out)
 
+    def starts(self) -> list[NDArray[np.float64]]:
+        """Return predictions for the next frame, the likeliest first: going on as before, at rest, and half way."""
+        moving = self.predict()
+        if self._step[0] is None and self._step[1] is None:
+            return [moving]
+        half = orthonormalise(0.5 * (moving + self._last))
+        return [moving, self._last.copy(), half]
+
     def update(self, poses: NDArray[np.float64], found: NDArray[np.bool_]) -> None:
         """Take in the poses of the next frame, shape (2, 4, 4); rows not found keep their predictions."""
         expected = self.predict()

@@ -18,11 +18,8 @@ _TUKEY_VARIANCE = 0.828
 
 
 def score_px(solution: Solution) -> NDArray[np.float64]:
-    """Return the Tukey-weighted matched contour length per row [px], shape (2,).
-
-    It ranks poses: on real anatomy every wrong local optimum matched less than nine tenths of the right one's.
-    """
-    return solution.systems[:, :, 6, 6].sum(1)
+    """Return the contour length that fits its mask edges, closeness counted, per row and view [px], shape (2, C)."""
+    return solution.systems[:, :, 6, 0]
 
 
 def matched_px(solution: Solution) -> NDArray[np.float64]:
@@ -37,29 +34,29 @@ def residual_px(solution: Solution) -> NDArray[np.float64]:
         return np.sqrt(total[:, 7, 6] / total[:, 6, 6] / _TUKEY_VARIANCE)
 
 
-def coverage_error(scans: Sequence[Scan], solution: Solution, views: Sequence[View]) -> NDArray[np.float64]:
-    """Return E_SP of paper eq. 8 over the mask pixels: mask pixels the projected crowns leave uncovered.
+def uncovered_px(
+    scans: Sequence[Scan], solution: Solution, views: Sequence[View]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return E_SP of paper eq. 8, the mask pixels that the projected crowns leave uncovered, and all mask pixels.
 
     Returns:
-        Fractions per row and view, shape (2, C); NaN without a mask.
+        Pixel counts per row and view, shape (2, C) each.
     """
-    out = np.full((2, len(views)), np.nan)
+    bare, total = np.zeros((2, len(views))), np.zeros((2, len(views)))
     for r, scan in enumerate(scans):
         points = np.empty((len(scan.vertices), 3), np.float32)
         for c, view in enumerate(views):
-            mask = pack_bits(view.masks[r] > 127)
-            if not view.present[r] or not count_bits(mask):
+            if not view.present[r]:
                 continue
+            mask = pack_bits(view.masks[r] > 127)
             crowns = np.zeros_like(mask)
             project(scan.vertices_single, (view.matrix @ solution.poses[r]).astype(np.float32), points)
             draw_silhouette(points, scan.crown_faces, 0, 0, view.masks.shape[2], False, crowns)
-            out[r, c] = count_and_not(mask, crowns) / count_bits(mask)
-    return out
+            bare[r, c], total[r, c] = count_and_not(mask, crowns), count_bits(mask)
+    return bare, total
 
 
-def twist_covariance(
-    solution: Solution, row: int, sigma_px: float, correlation_px: float
-) -> NDArray[np.float64]:
+def twist_covariance(solution: Solution, row: int, sigma_px: float, correlation_px: float) -> NDArray[np.float64]:
     """Return the covariance of a row's left twist about the world origin, sigma^2 l H^-1, shape (6, 6).
 
     Args:

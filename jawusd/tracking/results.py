@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from jawusd.formats.tracks import LOST, Tracks
 from jawusd.geometry import relative_pose
 from jawusd.tracking.config import TrackingConfig
-from jawusd.tracking.ladder import FrameRecord
+from jawusd.tracking.history import FrameRecord
 from jawusd.tracking.quality import (
     landmark_sigmas,
     matched_px,

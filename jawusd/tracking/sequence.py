@@ -17,7 +17,8 @@ from jawusd.geometry import Camera, transform_points
 from jawusd.tracking.bootstrap import pose_from_picks
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.first import first_record
-from jawusd.tracking.ladder import FrameRecord, FrameTracker, History
+from jawusd.tracking.history import FrameRecord, History
+from jawusd.tracking.ladder import FrameTracker
 from jawusd.tracking.motion import Motion
 from jawusd.tracking.results import assemble
 from jawusd.tracking.scan import prepare_scan
@@ -163,7 +164,7 @@ class _Take:
         return FrameTracker(self._solver, self._config, history), motion
 
     def _one(self, tracker: FrameTracker, motion: Motion, views: Sequence[View]) -> FrameRecord:
-        record = tracker.track(motion.predict(), views, motion.gallery() if motion.worth_searching() else None)
+        record = tracker.track(motion.starts(), views, motion.gallery() if motion.worth_searching() else None)
         motion.update(record.solution.poses, record.status != LOST)
         tracker.history.add(record)
         return record

@@ -116,7 +116,8 @@ class ContourSolver:
             for c in range(len(views)):
                 if use[r, c]:
                     samples, distances, visible[r, c] = matches[r, c]
-                    accumulate(samples, distances, used, pull, poses[r], views[c].matrix, centres[r], systems[r, c])
+                    gates = (used, config.final_gate_px[1])
+                    accumulate(samples, distances, *gates, pull, poses[r], views[c].matrix, centres[r], systems[r, c])
         return Solution(poses, systems, centres, visible, 0)
 
     def _match(self, pose, view: View, r: int, labels, depths, reach):

@@ -1,0 +1,67 @@
+"""What is known about single frames, and what the good ones lately looked like."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.formats.tracks import TRACKED
+from jawusd.tracking.quality import residual_px, score_px
+from jawusd.tracking.solver import Solution
+
+
+@dataclass(frozen=True, eq=False)
+class FrameRecord:
+    """Hold what is known about one instant.
+
+    Attributes:
+        solution: the alignment; its poses of lost rows mean nothing.
+        status: of both rows, as in `Tracks`, shape (2,).
+        used: masks that took part, shape (2, C).
+        coverage: E_SP over mask pixels, shape (2, C); NaN without a mask.
+    """
+
+    solution: Solution
+    status: NDArray[np.int8]
+    used: NDArray[np.bool_]
+    coverage: NDArray[np.float64]
+
+
+class History:
+    """Remember what good frames looked like lately, to tell a bad one."""
+
+    def __init__(self, length: int) -> None:
+        """Start empty; keep at most `length` frames."""
+        self._scores: deque[NDArray] = deque(maxlen=length)
+        self._residuals: deque[NDArray] = deque(maxlen=length)
+        self._coverages: deque[NDArray] = deque(maxlen=length)
+
+    def add(self, record: FrameRecord) -> None:
+        """Take in a frame; only rows tracked without trouble count."""
+        good = record.status == TRACKED
+        self._scores.append(np.where(good, score_px(record.solution).sum(1), np.nan))
+        self._residuals.append(np.where(good, residual_px(record.solution), np.nan))
+        self._coverages.append(np.where(good[:, None] & record.used, record.coverage, np.nan))
+
+    def usual_score(self) -> NDArray[np.float64]:
+        """Return the median score per row [px], shape (2,); 0 while unknown."""
+        return _median(self._scores, 0.0)
+
+    def usual_residual(self) -> NDArray[np.float64]:
+        """Return the median residual per row [px], shape (2,); infinite while unknown."""
+        return _median(self._residuals, np.inf)
+
+    def usual_coverage(self) -> NDArray[np.float64]:
+        """Return the median coverage error per row and view, shape (2, C); 0 while unknown."""
+        return _median(self._coverages, 0.0)
+
+
+def _median(values: deque[NDArray], otherwise: float) -> NDArray[np.float64]:
+    stack = np.array(values)
+    known = np.isfinite(stack).any(0)
+    out = np.full(stack.shape[1:], otherwise)
+    out[known] = np.nanmedian(stack[:, known], axis=0)
+    return out
