@@ -192,16 +192,18 @@ def _poses_or_parameters(rig: JawRig, path: Path) -> tuple[np.ndarray, np.ndarra
 
 
 def _validate_rig(path: Path, as_json: bool) -> None:
+    from dataclasses import asdict
+
     from jawusd.rig import validate_stage
 
     findings = validate_stage(path)
-    errors = [finding for finding in findings if finding["severity"] == "error"]
-    result = {"file": str(path), "errors": len(errors), "findings": findings}
+    errors = [finding for finding in findings if finding.severity == "error"]
+    result = {"file": str(path), "errors": len(errors), "findings": [asdict(finding) for finding in findings]}
     emit(
         result,
         as_json,
         lambda: [
-            *(f"{f['severity']}: {f['name']} at {f['site']}: {f['message']}" for f in findings),
+            *(f"{finding.severity}: {finding.rule}: {finding.message}" for finding in findings),
             f"{path}: {len(errors)} errors, {len(findings) - len(errors)} warnings",
         ],
     )
@@ -217,17 +219,15 @@ def ik(
     as_json: Json = False,
 ) -> None:
     """Find the valid parameters that bring a point of the mandible nearest to a target."""
-    import numpy as np
-
     import jawusd
     from jawusd.geometry import transform_points
 
     for values, option in ((point, "--point"), (target, "--target"), (start or point, "--start")):
         _check_finite(values, option)
     loaded = jawusd.load(rig)
-    d = np.asarray(loaded.ik(np.array(point), np.array(target), start=start))
-    reached = transform_points(loaded.pose(d), np.array(point))
-    distance_mm = float(np.linalg.norm(reached - np.array(target)))
+    d, distance = loaded.ik(point, target, start=start)
+    distance_mm = float(distance)
+    reached = transform_points(loaded.pose(d), point)
     result = {"d": d, "reached": reached, "distance_mm": distance_mm, "margin_mm": float(loaded.margin(d))}
     emit(result, as_json, lambda: [f"d {d[0]:.3f} {d[1]:.3f} {d[2]:.3f} mm, {distance_mm:.3f} mm from the target"])
 

@@ -148,6 +148,9 @@ class Capture(_Strict):
         unknown = sorted(mentioned - set(names))
         if unknown:
             raise ValueError(f"names camera {unknown[0]}, known are {', '.join(names)}")
+        if self.sync.offsets is not None and set(names) - set(self.sync.offsets):
+            missing = sorted(set(names) - set(self.sync.offsets))
+            raise ValueError(f"[sync] offsets has no entry for {missing[0]}; the reference camera's is 0")
         return self
 
     @property

@@ -34,8 +34,7 @@ def sync_cameras(capture: Capture, progress: Progress) -> dict:
     """
     progress("sync", 0, 1)
     if capture.sync.offsets is not None:
-        offsets = {camera.name: capture.sync.offsets.get(camera.name, 0) for camera in capture.cameras}
-        result = {"offsets": offsets, "method": "given in the capture"}
+        result = {"offsets": dict(capture.sync.offsets), "method": "given in the capture"}
     elif len(capture.cameras) == 1 or any(camera.video is None for camera in capture.cameras):
         # Masks alone carry no flash; numbered alike they are taken as simultaneous, and the report says so.
         result = {"offsets": {camera.name: 0 for camera in capture.cameras}, "method": "taken as simultaneous"}
