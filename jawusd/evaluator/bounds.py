@@ -43,6 +43,8 @@ class SliceHull:
     softness_mm: float
     margin_mm: float
     _gradients: Array = field(init=False, repr=False)
+    _first: float = field(init=False, repr=False)
+    _last: float = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         # d v_j / dd of the K sides (their d1 column is -h_k' and filled in per row), then of v_low and v_high
@@ -50,6 +52,8 @@ class SliceHull:
         gradients[:-2, 1:] = self.directions
         gradients[-2:, 0] = -1.0, 1.0
         object.__setattr__(self, "_gradients", gradients)
+        object.__setattr__(self, "_first", float(self.supports.knots[0]))
+        object.__setattr__(self, "_last", float(self.supports.knots[-1]))
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Array]) -> SliceHull:
@@ -67,16 +71,15 @@ class SliceHull:
 
     def excess(self, d: Array) -> Array:
         """Return how far outside d (n, 3) lies [mm], shape (n,); negative inside."""
-        peak, _, total = self._soft_maximum(d)
-        return peak + self.softness_mm * np.log(total) - self.margin_mm
+        return self._joined(d, self.supports.value(d[:, 0]))[0]
 
     def excess_gradient(self, d: Array) -> tuple[Array, Array]:
         """Return the excess (n,) [mm] and its gradient by d, shape (n, 3)."""
-        peak, powers, total = self._soft_maximum(d)
-        weights = powers / total[:, None]
+        reach, reach_1 = self.supports.value_and_slope(d[:, 0])
+        excess, weights = self._joined(d, reach)
         gradient = weights @ self._gradients
-        gradient[:, 0] -= np.einsum("nk,nk->n", weights[:, :-2], self.supports.slope(d[:, 0]))
-        return peak + self.softness_mm * np.log(total) - self.margin_mm, gradient
+        gradient[:, 0] -= np.einsum("nk,nk->n", weights[:, :-2], reach_1)
+        return excess, gradient
 
     def excess_curvature(self, d: Array) -> tuple[Array, Array, Array]:
         """Return excess (n,), gradient (n, 3) and the rounding's part of the Hessian, shape (n, 3, 3) [1/mm].
@@ -84,14 +87,15 @@ class SliceHull:
         The rest of the Hessian, the bending of the supports along d1, is left out: what is returned is never
         indefinite, which keeps the steps of a solver pointing downhill.
         """
-        peak, powers, total = self._soft_maximum(d)
-        weights = powers / total[:, None]
-        slopes = np.broadcast_to(self._gradients, (len(d), *self._gradients.shape)).copy()
-        slopes[:, :-2, 0] = -self.supports.slope(d[:, 0])
-        gradient = np.einsum("nk,nki->ni", weights, slopes)
-        spread = slopes - gradient[:, None, :]
-        curvature = np.einsum("nk,nki,nkj->nij", weights, spread, spread) / self.softness_mm
-        return peak + self.softness_mm * np.log(total) - self.margin_mm, gradient, curvature
+        reach, reach_1 = self.supports.value_and_slope(d[:, 0])
+        excess, weights = self._joined(d, reach)
+        slopes = np.empty((len(d), *self._gradients.shape))
+        slopes[:] = self._gradients
+        slopes[:, :-2, 0] = -reach_1
+        gradient = (weights[:, None, :] @ slopes)[:, 0]
+        slopes -= gradient[:, None, :]
+        curvature = np.swapaxes(slopes, 1, 2) @ (slopes * (weights / self.softness_mm)[:, :, None])
+        return excess, gradient, curvature
 
     def chord(self, d: Array, axis: int) -> tuple[Array, Array]:
         """Return the ends [mm] of the valid stretch through d (n, 3) along axis 1 or 2; NaN where there is none."""
@@ -150,16 +154,17 @@ class SliceHull:
         from_centre = corners - corners.mean(axis=0) if len(corners) else corners
         return corners[np.argsort(np.arctan2(from_centre[:, 1], from_centre[:, 0]))]
 
-    def _soft_maximum(self, d: Array) -> tuple[Array, Array, Array]:
-        """Return the largest v (n,), exp((v - largest) / softness) (n, K + 2) and the sum of those (n,)."""
-        knots = self.supports.knots
+    def _joined(self, d: Array, reach: Array) -> tuple[Array, Array]:
+        """Return the excess (n,) [mm] and the share (n, K + 2) of each half-space in it, for supports (n, K)."""
         v = np.empty((len(d), len(self.directions) + 2))
         np.matmul(d[:, 1:], self.directions.T, out=v[:, :-2])
-        v[:, :-2] -= self.supports.value(d[:, 0])
-        v[:, -2] = knots[0] - d[:, 0]
-        v[:, -1] = d[:, 0] - knots[-1]
+        v[:, :-2] -= reach
+        np.subtract(self._first, d[:, 0], out=v[:, -2])
+        np.subtract(d[:, 0], self._last, out=v[:, -1])
         peak = v.max(axis=1)
         v -= peak[:, None]
         v /= self.softness_mm
         np.exp(v, out=v)
-        return peak, v, v.sum(axis=1)
+        total = v.sum(axis=1)
+        v /= total[:, None]
+        return peak + self.softness_mm * np.log(total) - self.margin_mm, v

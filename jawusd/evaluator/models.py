@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from jawusd.evaluator.curves import HermiteCurve
 from jawusd.evaluator.gauge import Gauge
+from jawusd.evaluator.single import SingleAdditive, SingleAnchored
 from jawusd.geometry.se3 import se3_exp, se3_left_jacobian, se3_left_jacobian_inverse
 from jawusd.geometry.so3 import so3_exp, so3_left_jacobian, so3_left_jacobian_inverse
 
@@ -39,6 +40,9 @@ class AnchoredModel:
         scales: Lengths dividing the sheared displacement [mm], shape (3,).
         centres: Spline centres, sheared and scaled, shape (m, 3).
         weights: Of the m kernels and the 3 linear terms [rad], shape (m + 3, 3).
+        centres_squared: |c_i|^2, shape (m,).
+        moments: Kernel weights times 1, c_i and |c_i|^2, shape (m, 15); see `_spline`.
+        single: The same model for one row, in floats.
         offset: Value of the bare spline at u = 0 [rad], taken off so that f(0) = 0, shape (3,).
     """
 
@@ -47,9 +51,10 @@ class AnchoredModel:
     scales: Array
     centres: Array
     weights: Array
-    _centres_squared: Array = field(init=False, repr=False)
-    _moments: Array = field(init=False, repr=False)
+    centres_squared: Array = field(init=False, repr=False)
+    moments: Array = field(init=False, repr=False)
     offset: Array = field(init=False, repr=False)
+    single: SingleAnchored = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         # Sum_i W_i r_i^3 and its gradient need only sums of r_i times W_i, W_i c_i and W_i |c_i|^2 (see _spline):
@@ -58,10 +63,11 @@ class AnchoredModel:
         kernel = self.weights[: len(self.centres)]
         by_centre = (kernel[:, :, None] * self.centres[:, None, :]).reshape(len(kernel), 9)
         moments = np.concatenate([kernel, by_centre, kernel * squared[:, None]], axis=1)
-        object.__setattr__(self, "_centres_squared", squared)
-        object.__setattr__(self, "_moments", np.ascontiguousarray(moments))
+        object.__setattr__(self, "centres_squared", squared)
+        object.__setattr__(self, "moments", np.ascontiguousarray(moments))
         object.__setattr__(self, "offset", np.zeros(3))
         object.__setattr__(self, "offset", self._spline(np.zeros((1, 3)))[0][0])
+        object.__setattr__(self, "single", SingleAnchored(self))
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Array]) -> AnchoredModel:
@@ -85,12 +91,16 @@ class AnchoredModel:
 
     def decode_derivative(self, d: Array) -> tuple[Array, Array, Array]:
         """Return rotation, translation [mm] and the spatial derivative S (n, 6, 3) of M(d)."""
+        if len(d) == 1 and np.isfinite(d).all():
+            return self.single.decode_derivative(d)
         u, du = self.gauge.displacement_jacobian(d)
         R, t, by_u = self.motion_derivative_at(u)
         return R, t, by_u @ du
 
     def motion_derivative_at(self, u: Array) -> tuple[Array, Array, Array]:
         """Return rotation, translation [mm] and the spatial derivative (n, 6, 3) by u (n, 3) [mm]."""
+        if len(u) == 1 and np.isfinite(u).all():
+            return self.single.motion_derivative_at(u)
         omega, omega_u = self.rotation_jacobian(u)
         R = so3_exp(omega)
         S = np.empty((len(u), 6, 3))
@@ -142,11 +152,11 @@ class AnchoredModel:
         """
         q_squared = np.einsum("ni,ni->n", q, q)
         r = q @ (-2.0 * self.centres.T)
-        r += self._centres_squared
+        r += self.centres_squared
         r += q_squared[:, None]
         np.maximum(r, 0.0, out=r)  # the expanded square may round to just below zero at a centre
         np.sqrt(r, out=r)
-        sums = r @ self._moments
+        sums = r @ self.moments
         plain, by_centre = sums[:, :3], sums[:, 3:12].reshape(-1, 3, 3)
         linear = self.weights[len(self.centres) :]
         value = q_squared[:, None] * plain + sums[:, 12:] + q @ linear - self.offset
@@ -164,15 +174,18 @@ class AdditiveModel:
         curves: The three curves of twists, about the origin of the anatomical frame.
         incisor: The incisal point at rest [mm], shape (3,).
         d_range: Box of valid d [mm], shape (3, 2); starts for `read_off` are searched in it.
+        single: The same model for one row, in floats.
     """
 
     curves: tuple[HermiteCurve, HermiteCurve, HermiteCurve]
     incisor: Array
     d_range: Array
+    single: SingleAdditive = field(init=False, repr=False)
     _starts: Array = field(init=False, repr=False)
     _start_displacements: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "single", SingleAdditive(self))
         # opening is long and curved, the other two short: 13 x 9 x 9 starts lie within the basin of Gauss-Newton
         axes = [np.linspace(low, high, n) for (low, high), n in zip(self.d_range, (13, 9, 9))]
         starts = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

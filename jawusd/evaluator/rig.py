@@ -20,7 +20,6 @@ from jawusd.evaluator.models import model_from_arrays
 from jawusd.evaluator.polygons import PolygonBound
 from jawusd.evaluator.reach import Reach, nearest_distance
 from jawusd.evaluator.rows import as_keys, as_points, as_rows, in_chunks
-from jawusd.evaluator.single import SinglePose
 from jawusd.evaluator.verdicts import RIGID_TOLERANCE, Limits, Verdicts, judge, too_fast
 from jawusd.geometry.se3 import rigidity_defect, transform_points
 
@@ -65,7 +64,6 @@ class JawRig:
         self._frames = RigFrames(self.arrays["T_anatomical_skull"], self.arrays["T_rest"])
         self._encoder = Encoder(self.model, self._frames, self.bound, self.arrays["landmarks"])
         self._reach = Reach(self.model, self.bound)
-        self._single = SinglePose(self.model, self._frames.from_anatomical, self._frames.closed)
 
     def __reduce__(self) -> tuple:
         return (JawRig, ({name: np.array(value) for name, value in self.arrays.items()}, self.meta))
@@ -83,7 +81,8 @@ class JawRig:
         if d.shape == (3,):
             d1, d2, d3 = d.tolist()
             if abs(d1) + abs(d2) + abs(d3) < _SINGLE_LIMIT_MM:  # False for NaN
-                return self._single.pose(d1, d2, d3)
+                M = np.array(self.model.single.motion(d1, d2, d3))
+                return self._frames.from_anatomical.dot(M).dot(self._frames.closed)
         rows, batch = as_rows(d, (3,), "d")
         return in_chunks(self._poses, rows).reshape(*batch, 4, 4)
 
