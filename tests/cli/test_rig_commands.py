@@ -1,0 +1,154 @@
+"""The commands on a finished rig, run as a user runs them: output, JSON and exit codes."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from example_rig import FPS, example_meshes, example_motion, example_rig, mandible_vertices, moved
+from pxr import Usd, UsdGeom
+
+import jawusd
+from jawusd.formats.poses import read_parameters, write_parameters, write_poses
+from jawusd.geometry import se3_exp, se3_log
+from jawusd.rig.bake import bake_rig
+from jawusd.rig.validate import validate_stage
+
+
+@pytest.fixture(scope="module")
+def actor(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("actor")
+    frames, d = example_motion()
+    bake_rig(folder, example_rig(), example_meshes(), name="someone", fps=FPS, frames=frames, d=d, table_size=17)
+    return folder / "actor.usda"
+
+
+def run(*arguments, code=0):
+    """Run the program in a process of its own and return its standard output."""
+    command = [sys.executable, "-m", "jawusd", *map(str, arguments)]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert result.returncode == code, result.stdout + result.stderr
+    assert "Traceback" not in result.stderr
+    return result.stdout if code in (0, 1) else result.stderr
+
+
+def test_pose_prints_what_the_evaluator_says(actor):
+    found = json.loads(run("pose", actor, "--d", 12, -3, 1.5, "--json"))
+    rig = jawusd.load(actor)
+    np.testing.assert_allclose(found["T_skull_mandible"], rig.pose([12, -3, 1.5]), atol=1e-12)
+    np.testing.assert_allclose(se3_exp(found["twist"]) @ rig.arrays["T_rest"], rig.pose([12, -3, 1.5]), atol=1e-9)
+    assert found["valid"] is True and found["margin_mm"] == pytest.approx(float(rig.margin([12, -3, 1.5])))
+    assert set(found["landmarks_mm"]) == {"incisor", "molar_left", "molar_right", "condyle_left", "condyle_right"}
+    assert "OUTSIDE" in run("pose", actor, "--d", 12, 30, 0)
+
+
+def test_encode_writes_parameters_that_pose_back(actor, tmp_path):
+    rig = jawusd.load(actor)
+    frames, d = example_motion()
+    write_poses(tmp_path / "poses.csv", frames, rig.pose(d))
+    summary = json.loads(run("encode", actor, tmp_path / "poses.csv", "-o", tmp_path / "d.csv", "--json"))
+    assert summary["encoded"] == len(frames) and summary["residual_mm"]["max"] < 1e-6
+    found_frames, found = read_parameters(tmp_path / "d.csv")
+    np.testing.assert_array_equal(found_frames, frames)
+    np.testing.assert_allclose(found, d, atol=1e-6)
+    assert "--force" in run("encode", actor, tmp_path / "poses.csv", "-o", tmp_path / "d.csv", code=10)
+
+
+def test_validate_judges_poses_and_leaves_with_a_no(actor, tmp_path):
+    rig = jawusd.load(actor)
+    frames, d = example_motion(6)
+    T = rig.pose(d)
+    write_poses(tmp_path / "good.csv", frames, T)
+    assert "6 of 6 poses are valid" in run("validate", actor, tmp_path / "good.csv")
+    T[2] = se3_exp([0, 0.3, 0.2, 0, 5, 0]) @ T[2]
+    write_poses(tmp_path / "bad.csv", frames, T)
+    found = json.loads(run("validate", actor, tmp_path / "bad.csv", "--json", code=1))
+    assert found["invalid"] == 1 and found["verdicts"][2]["valid"] is False
+    assert found["verdicts"][2]["reason"] != "valid" and found["verdicts"][1]["reason"] == "valid"
+    write_parameters(tmp_path / "d.csv", frames, d + [0, 40, 0])
+    assert "outside the bound" in run("validate", actor, tmp_path / "d.csv", code=1)
+
+
+def test_validate_without_poses_checks_the_rig(actor):
+    assert json.loads(run("validate", actor, "--json"))["errors"] == 0
+
+
+def test_info_names_actor_ranges_and_meshes(actor):
+    found = json.loads(run("info", actor, "--json"))
+    assert found["actor"] == "someone" and found["model"]["kind"] == "anchored"
+    text = run("info", actor.parent / "anim_capture.usdc")
+    assert "someone" in text and "animation: 40 samples" in text
+
+
+def test_ik_reaches_a_reachable_target(actor):
+    rig = jawusd.load(actor)
+    point = rig.arrays["landmarks"][0]
+    target = (rig.pose([10.0, 2.0, 1.0]) @ np.append(point, 1))[:3]
+    found = json.loads(run("ik", actor, "--point", *point, "--target", *target, "--json"))
+    assert found["distance_mm"] < 1e-3 and found["margin_mm"] >= 0
+
+
+def test_animate_interpolates_keys_linearly_as_in_the_paper(actor, tmp_path):
+    keys = {"fps": 30, "keys": [{"frame": 0, "d": [0, 0, 0]}, {"frame": 10, "d": [20, 2, 1]}]}
+    (tmp_path / "keys.json").write_text(json.dumps(keys))
+    out = actor.parent / "anim_keys.usdc"
+    summary = json.loads(run("animate", actor, tmp_path / "keys.json", "-o", out, "--json"))
+    assert summary["clamped"] == 0 and summary["fps"] == 30
+    assert validate_stage(out) == []
+    stage = Usd.Stage.Open(str(out))
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode(), stage.GetTimeCodesPerSecond()) == (0, 10, 30)
+    prim = stage.GetPrimAtPath("/Actor")
+    assert [prim.GetAttribute(f"jaw:d{i}").Get(4) for i in (1, 2, 3)] == pytest.approx([8, 0.8, 0.4])
+    mandible = UsdGeom.Xformable(stage.GetPrimAtPath("/Actor/geo/Mandible"))
+    T = np.array(mandible.GetLocalTransformation(4)).T
+    expected = moved(jawusd.load(actor).pose([[8, 0.8, 0.4]]), mandible_vertices())
+    np.testing.assert_allclose(moved(T[None], mandible_vertices()), expected, atol=0.01)
+
+
+def test_animate_reports_what_it_clamps(actor, tmp_path):
+    frames, d = example_motion(5)
+    d[2, 1] = 30
+    write_parameters(tmp_path / "d.csv", frames, d)
+    summary = json.loads(run("animate", actor, tmp_path / "d.csv", "-o", actor.parent / "anim_c.usdc", "--json"))
+    assert summary["clamped"] == 1 and summary["largest_clamp_mm"] > 15 and summary["fps"] == FPS
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (("pose", "{actor}", "--d", "1", "2"), 2, "requires 3 arguments"),
+        (("pose", "{actor}", "--d", "1", "2", "nan"), 2, "finite"),
+        (("pose", "{tmp}/none.usda", "--d", "1", "2", "3"), 8, "none.usda"),
+        (("encode", "{actor}", "{tmp}/nan.csv"), 3, 'column "tx" is nan'),
+        (("validate", "{actor}", "{tmp}/empty.csv"), 3, "empty"),
+        (("animate", "{actor}", "{tmp}/bad.json"), 3, "must rise"),
+        (("nonsense",), 2, "No such command"),
+    ],
+)
+def test_bad_input_is_one_clear_error(actor, tmp_path, arguments, code, words):
+    (tmp_path / "nan.csv").write_text("frame,tx,ty,tz,qw,qx,qy,qz\n1,nan,0,0,1,0,0,0\n")
+    (tmp_path / "empty.csv").write_text("")
+    key = {"frame": 3, "d": [0, 0, 0]}
+    (tmp_path / "bad.json").write_text(json.dumps({"fps": 24, "keys": [key, key]}))
+    text = run(*(a.format(actor=actor, tmp=tmp_path) for a in arguments), code=code)
+    assert words in text
+
+
+def test_a_rig_of_a_newer_version_is_refused(actor, tmp_path):
+    for file in actor.parent.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    text = (tmp_path / "actor.usda").read_text()
+    layer = tmp_path / ("actor.usda" if "jaw:formatVersion" in text else "rig.usdc")
+    stage = Usd.Stage.Open(str(tmp_path / "actor.usda"))
+    stage.SetEditTarget(Usd.EditTarget(stage.GetRootLayer()))
+    stage.GetPrimAtPath("/Actor").GetAttribute("jaw:formatVersion").Set(99)
+    stage.GetRootLayer().Export(str(tmp_path / "newer.usda"))
+    assert layer.exists()
+    assert "Update jawusd" in run("pose", tmp_path / "newer.usda", "--d", 1, 0, 0, code=3)
+
+
+def test_the_twist_of_a_pose_is_its_logarithm(actor):
+    rig = jawusd.load(actor)
+    d = np.array([15.0, -2.0, 1.0])
+    np.testing.assert_allclose(rig.twist(d), se3_log(rig.pose(d) @ np.linalg.inv(rig.arrays["T_rest"])), atol=1e-10)
