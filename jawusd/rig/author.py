@@ -28,7 +28,8 @@ from jawusd.rig.layout import (
     RIG_FILE,
     SKULL,
 )
-from jawusd.rig.table import DecoderTable, sample_valid
+from jawusd.rig.sampling import sample_valid
+from jawusd.rig.table import DecoderTable
 
 _TYPES = Sdf.ValueTypeNames
 

@@ -32,7 +32,8 @@ def sample_knots(rig: JawRig, box: Array, points: Array, size: int) -> tuple[Arr
         size: knots per axis.
 
     Returns:
-        Three rising arrays of `size` values [mm], from end to end of the box.
+        Three rising arrays of `size` values [mm], from end to end of the box; 0 is one of them, so that the closed
+        bite is exact.
     """
     points = points[:: max(1, len(points) // _POINTS)]
     return (
@@ -51,7 +52,12 @@ def _spread(rig: JawRig, box: Array, points: Array, axis: int, size: int) -> Arr
     )
     density = np.sqrt(bend + _FLOOR * bend.max() + np.finfo(float).tiny)
     share = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]))])
-    return np.interp(np.linspace(0.0, share[-1], size), share, fine)
+    rest = np.interp(0.0, fine, share)
+    below = int(np.clip(round((size - 1) * rest / share[-1]), 1, size - 2))
+    even = np.concatenate([np.linspace(0.0, rest, below + 1), np.linspace(rest, share[-1], size - below)[1:]])
+    knots = np.interp(even, share, fine)
+    knots[below] = 0.0
+    return knots
 
 
 def _curvature(rig: JawRig, box: Array, points: Array, axis: int) -> Array:

@@ -15,7 +15,7 @@ from jawusd.geometry.se3 import se3_exp, transform_points
 from jawusd.rig import _gf
 from jawusd.rig.layout import PARAMETERS
 from jawusd.rig.read import read_table, rig_of
-from jawusd.rig.table import sample_valid
+from jawusd.rig.sampling import sample_valid
 
 Array = NDArray[np.float64]
 

@@ -21,7 +21,9 @@ from jawusd.formats.mesh import Mesh
 from jawusd.geometry import so3_left_jacobian
 from jawusd.rig.bake import bake_rig
 from jawusd.rig.geo import corner_normals, gum_faces
-from jawusd.rig.table import SIZES, build_table, sample_valid, table_error
+from jawusd.rig.knots import sample_knots
+from jawusd.rig.sampling import sample_valid, valid_box
+from jawusd.rig.table import SIZES, build_table, table_error
 
 FILES = {"actor.usda", "rig.usdc", "geo.usdc", "actor.onnx", "anim_capture.usdc"}
 
@@ -119,6 +121,51 @@ def test_finer_tables_are_better(kind):
     assert errors[0] > 2 * errors[1] > 4 * errors[2] > 0
     with pytest.raises(RigError, match="17, 33, 65"):
         build_table(rig, mandible_vertices(), 20)
+
+
+def test_knots_span_the_valid_box_and_hold_the_closed_bite(kind):
+    rig = example_rig(kind)
+    table = build_table(rig, mandible_vertices())
+    for (low, high), axis in zip(valid_box(rig), table.knots, strict=True):
+        assert (axis[0], axis[-1], len(axis)) == (low, high, 33)
+        assert 0.0 in axis and (np.diff(axis) > 0).all()
+    assert np.abs(table.twist(np.zeros((1, 3)))).max() < 1e-12
+
+
+class BentAtTen:
+    """A motion along x that turns a corner, rounded over 0.5 mm, at d1 = 10 mm."""
+
+    def pose(self, d):
+        T = np.tile(np.eye(4), (*d.shape[:-1], 1, 1))
+        T[..., 0, 3] = self.path(d[..., 0])
+        return T
+
+    def margin(self, d):
+        return np.ones(d.shape[:-1])
+
+    def path(self, d1):
+        return np.sqrt((d1 - 10.0) ** 2 + 0.25)
+
+
+def test_knots_are_dense_where_the_motion_bends():
+    box = np.array([[-1.0, 40.0], [-5.0, 5.0], [-2.0, 6.0]])
+    rig = BentAtTen()
+    d1, d2, _ = sample_knots(rig, box, np.zeros((1, 3)), 33)
+    assert np.diff(d1)[np.searchsorted(d1, 10.0) - 1] < 0.25 * np.diff(d1).max()
+    np.testing.assert_allclose(np.diff(d2), np.diff(d2).mean(), rtol=0.1)
+    x = np.linspace(-1, 40, 5000)
+    even = np.linspace(-1, 40, 33)
+    error, even_error = (np.abs(np.interp(x, k, rig.path(k)) - rig.path(x)).max() for k in (d1, even))
+    assert error < 0.2 * even_error
+
+
+def test_valid_box_holds_all_valid_parameters(kind):
+    rig = example_rig(kind)
+    box = valid_box(rig)
+    d = np.random.default_rng(8).uniform(box[:, 0] - 3, box[:, 1] + 3, (50_000, 3))
+    outside = ((d < box[:, 0]) | (d > box[:, 1])).any(axis=1)
+    assert outside.sum() > 1000
+    assert (rig.margin(d[outside]) < 0).all()
 
 
 def test_measured_error_is_that_of_the_worst_vertex(kind):

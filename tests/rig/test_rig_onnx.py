@@ -10,7 +10,7 @@ from jawusd.errors import FormatError
 from jawusd.rig.arrays import model_hash
 from jawusd.rig.onnx_check import onnx_error_mm
 from jawusd.rig.onnx_sidecar import OPSET, decode_model, write_onnx
-from jawusd.rig.table import sample_valid
+from jawusd.rig.sampling import sample_valid
 
 
 def run(rig, d, dtype, outputs=("pose", "twist", "margin")):
