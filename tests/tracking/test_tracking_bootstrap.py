@@ -1,0 +1,120 @@
+"""First poses from picks."""
+
+import numpy as np
+import pytest
+from bumpy_teeth import arch, jaw_poses, make_cameras, vertex_error_mm
+
+from jawusd.errors import TrackingError
+from jawusd.formats.capture import Pick, PickView
+from jawusd.geometry import transform_points
+from jawusd.tracking.bootstrap import pose_from_picks
+
+MESH = arch(True)
+POSE = jaw_poses(4)[3, 0]
+CAMERAS = {c.name: c for c in make_cameras(distortion=-0.03)}
+
+
+def _picks(count, noise_px=0.0, views=2, seed=0):
+    rng = np.random.default_rng(seed)
+    names = list(CAMERAS)
+    out = []
+    for k, vertex in enumerate(rng.permutation(np.linspace(0, len(MESH.vertices) - 1, count).astype(int))):
+        seen = [names[(k + j) % len(names)] for j in range(views)]
+        place = transform_points(POSE, MESH.vertices[vertex])
+        pixels = [CAMERAS[n].project(place) + noise_px * rng.normal(size=2) for n in seen]
+        spots = tuple(PickView(camera=n, x=float(p[0]), y=float(p[1])) for n, p in zip(seen, pixels))
+        out.append(Pick(vertex=int(vertex), views=spots))
+    return out
+
+
+def _moved(pick, dx):
+    first, *rest = pick.views
+    return Pick(vertex=pick.vertex, views=(PickView(camera=first.camera, x=first.x + dx, y=first.y), *rest))
+
+
+@pytest.mark.parametrize(("count", "views"), [(3, 2), (4, 2), (4, 3), (9, 2)])
+def test_exact_picks_give_the_exact_pose(count, views):
+    pose, wrong = pose_from_picks(_picks(count, views=views), MESH.vertices, CAMERAS, "upper")
+    assert not wrong
+    assert vertex_error_mm(MESH, pose, POSE) < 1e-6
+
+
+def test_noisy_picks_start_within_the_basin():
+    errors = [
+        vertex_error_mm(MESH, pose_from_picks(_picks(4, 1.0, seed=s), MESH.vertices, CAMERAS, "upper")[0], POSE)
+        for s in range(8)
+    ]
+    assert max(errors) < 0.8
+
+
+@pytest.mark.parametrize("bad", [0, 2])
+@pytest.mark.parametrize("count", [4, 6])
+def test_one_wrong_pick_is_left_out_and_named(count, bad):
+    picks = _picks(count, 0.3)
+    vertex = (picks[bad].vertex + len(MESH.vertices) // 2) % len(MESH.vertices)
+    picks[bad] = Pick(vertex=vertex, views=picks[bad].views)
+    pose, wrong = pose_from_picks(picks, MESH.vertices, CAMERAS, "upper")
+    assert wrong == [bad + 1]
+    assert vertex_error_mm(MESH, pose, POSE) < 0.5
+
+
+def test_one_wrong_pixel_is_left_out():
+    picks = _picks(5, 0.2)
+    picks[1] = _moved(picks[1], 60.0)
+    pose, wrong = pose_from_picks(picks, MESH.vertices, CAMERAS, "upper")
+    assert wrong == [2]
+    assert vertex_error_mm(MESH, pose, POSE) < 0.4
+
+
+def test_three_contradicting_picks_are_refused_with_their_misses():
+    picks = _picks(3)
+    picks[0] = _moved(picks[0], 90.0)
+    with pytest.raises(
+        TrackingError, match=r"picks on the upper teeth contradict one another \(pick 1: .* allowed 1.1 mm"
+    ):
+        pose_from_picks(picks, MESH.vertices, CAMERAS, "upper")
+
+
+def test_two_picks_are_too_few():
+    with pytest.raises(TrackingError, match="2 picks on the lower teeth, at least 3"):
+        pose_from_picks(_picks(4)[:2], MESH.vertices, CAMERAS, "lower")
+
+
+def test_picks_on_a_line_are_refused():
+    line = np.column_stack([np.linspace(-20, 20, 5), np.zeros(5), np.zeros(5)])
+    picks = []
+    for k, point in enumerate(line):
+        place = transform_points(POSE, point)
+        spots = [(n, CAMERAS[n].project(place)) for n in ("cam0", "cam1")]
+        picks.append(Pick(vertex=k, views=tuple(PickView(camera=n, x=float(p[0]), y=float(p[1])) for n, p in spots)))
+    with pytest.raises(TrackingError, match="lie on a line"):
+        pose_from_picks(picks, line, CAMERAS, "upper")
+
+
+def test_pick_outside_of_the_picture_is_refused():
+    picks = _picks(4)
+    picks[2] = _moved(picks[2], 5000.0)
+    with pytest.raises(TrackingError, match="pick 3 on the upper teeth lies at .* outside of its 640 x 400 picture"):
+        pose_from_picks(picks, MESH.vertices, CAMERAS, "upper")
+
+
+def test_pick_beyond_the_scan_is_refused():
+    picks = _picks(3)
+    picks[1] = Pick(vertex=len(MESH.vertices), views=picks[1].views)
+    with pytest.raises(TrackingError, match=r"pick 2 .* names vertex \d+, the scan has"):
+        pose_from_picks(picks, MESH.vertices, CAMERAS, "upper")
+
+
+def test_pick_seen_twice_by_one_camera_is_refused():
+    picks = _picks(3)
+    picks[0] = Pick(vertex=picks[0].vertex, views=(picks[0].views[0], picks[0].views[0]))
+    with pytest.raises(TrackingError, match="pick 1 .* seen by camera cam0 alone: its depth is unknown"):
+        pose_from_picks(picks, MESH.vertices, CAMERAS, "upper")
+
+
+def test_pick_in_an_unknown_camera_is_refused():
+    picks = _picks(3)
+    views = (picks[0].views[0], PickView(camera="cam9", x=1.0, y=1.0))
+    picks[0] = Pick(vertex=picks[0].vertex, views=views)
+    with pytest.raises(TrackingError, match="names camera cam9, which is not calibrated"):
+        pose_from_picks(picks, MESH.vertices, CAMERAS, "upper")

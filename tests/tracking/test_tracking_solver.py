@@ -1,0 +1,190 @@
+"""Contour samples, edge search, normal equations and the joint solver."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from bumpy_teeth import arch, disturbed, jaw_poses, make_cameras, render_masks, vertex_error_mm
+
+from jawusd.geometry import make_transform, rigidity_defect, se3_exp, se3_inverse, transform_points
+from jawusd.imaging.raster import draw_depth_labels, project
+from jawusd.tracking.config import TrackingConfig
+from jawusd.tracking.contour import COLUMNS, CROWN, GUM, INVERSE_DEPTH, LENGTH, NX, NY, U, V, contour_samples
+from jawusd.tracking.correspond import accumulate, search_edges
+from jawusd.tracking.scan import prepare_scan
+from jawusd.tracking.solver import ContourSolver, View
+
+CONFIG = TrackingConfig()
+MESHES = (arch(True), arch(False))
+SCANS = tuple(prepare_scan(m, n) for m, n in zip(MESHES, ("upper", "lower")))
+CAMERAS = make_cameras()
+POSES = jaw_poses(8)
+
+
+def _views(k, meshes=MESHES, **noise):
+    present = np.array([True, True])
+    return [
+        View(c.projection_matrix(), c.centre_world(), render_masks(meshes, POSES[k], c, **noise), present)
+        for c in CAMERAS
+    ]
+
+
+def _samples(r, pose, camera):
+    labels = np.zeros(camera.size_px[::-1], np.uint8)
+    depth = np.zeros(camera.size_px[::-1], np.float32)
+    points = np.empty((len(SCANS[r].vertices), 3), np.float32)
+    project(SCANS[r].vertices_single, (camera.projection_matrix() @ pose).astype(np.float32), points)
+    draw_depth_labels(points, SCANS[r].crown_faces, 0, 0, False, depth, labels, CROWN)
+    draw_depth_labels(points, SCANS[r].gum_faces, 0, 0, False, depth, labels, GUM)
+    eye = transform_points(se3_inverse(pose), camera.centre_world())
+    return contour_samples(SCANS[r], camera.projection_matrix() @ pose, eye, labels, depth, 3.0, 1.5), labels
+
+
+def test_samples_lie_on_the_outline_of_the_rendered_crowns():
+    camera, pose = CAMERAS[1], POSES[2, 0]
+    samples, labels = _samples(0, pose, camera)
+    assert samples.shape[1] == COLUMNS and len(samples) > 300
+    pixels = camera.project(transform_points(pose, samples[:, :3]))
+    assert np.abs(pixels - samples[:, [U, V]]).max() < 1e-9
+    depth = camera.depth(transform_points(pose, samples[:, :3]))
+    assert np.allclose(samples[:, INVERSE_DEPTH], 1 / depth)
+    normal = samples[:, [NX, NY]]
+    assert np.allclose(np.linalg.norm(normal, axis=1), 1)
+    inside = np.round(pixels - 1.6 * normal).astype(int)
+    outside = np.round(pixels + 1.6 * normal).astype(int)
+    assert (labels[inside[:, 1], inside[:, 0]] == CROWN).mean() > 0.97
+    assert (labels[outside[:, 1], outside[:, 0]] != CROWN).mean() > 0.97
+    # Part of it is the crown-gum line.
+    assert (labels[outside[:, 1], outside[:, 0]] == GUM).mean() > 0.1
+
+
+def test_edge_search_on_soft_straight_edges():
+    height, width = 40, 60
+    errors = []
+    for edge in 30 + np.linspace(0, 1, 11)[:-1]:  # px: teeth to the left of it
+        cover = np.clip(edge + 0.5 - np.arange(width), 0, 1)
+        mask = np.tile(np.round(255 * cover).astype(np.uint8), (height, 1))
+        rows = np.zeros((5, COLUMNS))
+        rows[:, U] = [28.0, 31.2, 33.5, 20.0, 45.0]
+        rows[:, V], rows[:, NX], rows[:, INVERSE_DEPTH] = 20.0, 1.0, 0.005
+        out = np.empty(5)
+        nothing = np.zeros((height, width), np.float32)
+        search_edges(rows, mask, np.zeros_like(mask), nothing, 5.0, 0.4, 0.7, out)
+        errors.append(out[:3] - (edge - rows[:3, U]))
+        assert np.isposinf(out[3]) and np.isnan(out[4])
+    # Linear interpolation of area averages is off by up to an eighth of a pixel, both ways alike.
+    assert np.abs(errors).max() < 0.125 and np.abs(np.mean(errors)) < 0.02
+
+
+def test_edges_across_the_contour_and_hidden_samples_are_left_out():
+    mask = np.tile((np.arange(60) < 30).astype(np.uint8) * 255, (40, 1))
+    rows = np.zeros((2, COLUMNS))
+    rows[:, U], rows[:, V], rows[:, INVERSE_DEPTH] = 29.0, 20.0, 0.005
+    rows[0, [NX, NY]] = np.cos(1.1), np.sin(1.1)
+    rows[1, NX] = 1.0
+    out = np.empty(2)
+    none, nothing = np.zeros_like(mask), np.zeros(mask.shape, np.float32)
+    search_edges(rows, mask, none, nothing, 5.0, 0.4, 0.7, out)
+    assert np.isnan(out[0]) and np.isfinite(out[1])
+    in_front, behind = np.full(mask.shape, 1 / 198.0, np.float32), np.full(mask.shape, 1 / 202.0, np.float32)
+    search_edges(rows[1:], mask, none, in_front, 5.0, 0.4, 0.7, out)
+    assert np.isnan(out[0])
+    search_edges(rows[1:], mask, none, behind, 5.0, 0.4, 0.7, out)
+    assert np.isfinite(out[0])
+    # The other row's mask begins at the edge, but nothing says that row lies behind: the edge may be its own.
+    other = np.where(mask > 0, 0, 255).astype(np.uint8)
+    search_edges(rows[1:], mask, other, nothing, 5.0, 0.4, 0.7, out)
+    assert np.isnan(out[0])
+    search_edges(rows[1:], mask, other, behind, 5.0, 0.4, 0.7, out)
+    assert np.isfinite(out[0])
+
+
+def test_normal_equations_agree_with_finite_differences():
+    camera, pose = CAMERAS[2], POSES[3, 1]
+    samples, _ = _samples(1, pose, camera)
+    rng = np.random.default_rng(1)
+    distances = rng.normal(size=len(samples)) * 0.5
+    centre = transform_points(pose, SCANS[1].centre)
+    system = np.zeros((8, 8))
+    accumulate(samples, distances, 2.0, 2.5, 0.0, pose, camera.projection_matrix(), centre, system)
+    h, J = 1e-5, np.empty((len(samples), 6))
+    to, back = make_transform(np.eye(3), -centre), make_transform(np.eye(3), centre)
+    for k in range(6):
+        ends = [
+            camera.project(transform_points(back @ se3_exp(s * h * np.eye(6)[k]) @ to @ pose, samples[:, :3]))
+            for s in (1, -1)
+        ]
+        J[:, k] = ((ends[0] - ends[1]) / (2 * h) * samples[:, [NX, NY]]).sum(1)
+    weight = np.clip(1 - (distances / 2.0) ** 2, 0, None) ** 2 * samples[:, LENGTH]
+    scale = np.abs(J).max(0) * weight.sum()
+    assert np.abs(system[:6, :6] - J.T @ (J * weight[:, None])).max() / scale.max() ** 2 < 1e-6
+    assert (np.abs(system[:6, 6] - J.T @ (weight * distances)) / scale < 1e-6).all()
+    assert (np.abs(system[:6, 7] - J.T @ weight) / scale < 1e-6).all()
+    assert system[6, 6] == pytest.approx(weight.sum())
+    assert system[6, 7] == pytest.approx(weight @ distances)
+    assert system[7, 6] == pytest.approx(weight @ distances**2)
+    assert system[7, 7] == pytest.approx(samples[np.abs(distances) < 2.0, LENGTH].sum())
+    tight = np.clip(1 - (distances / 2.5) ** 2, 0, None) ** 3
+    assert system[6, 0] == pytest.approx(tight @ samples[:, LENGTH])
+
+
+@pytest.mark.parametrize("k", [0, 4])
+def test_solver_finds_exact_masks_to_a_hundredth_of_a_millimetre(k):
+    start = disturbed(POSES[k], 0.5, 0.01, np.random.default_rng(k))
+    solution = ContourSolver(SCANS, CONFIG).solve(start, _views(k), CONFIG.gates_px)
+    for r in (0, 1):
+        assert vertex_error_mm(MESHES[r], solution.poses[r], POSES[k, r]) < 0.015
+        assert rigidity_defect(solution.poses[r]) < 1e-12
+
+
+def test_solver_holds_with_noise_and_lips():
+    rng = np.random.default_rng(2)
+    views = _views(1, lips_mm=(6.5, -14.0), noise_px=0.4, rng=rng)
+    start = disturbed(POSES[1], 0.7, 0.012, rng)
+    solution = ContourSolver(SCANS, CONFIG).solve(start, views, CONFIG.gates_px)
+    for r in (0, 1):
+        assert vertex_error_mm(MESHES[r], solution.poses[r], POSES[1, r]) < 0.08
+
+
+def test_wide_gates_reach_farther_than_narrow_ones():
+    rng = np.random.default_rng(7)
+    views = _views(2)
+    solver = ContourSolver(SCANS, CONFIG)
+    found = np.zeros(2)
+    for _ in range(4):
+        start = disturbed(POSES[2], 2.5, 0.05, rng)
+        for g, gates in enumerate((CONFIG.gates_px, CONFIG.wide_gates_px)):
+            poses = solver.solve(start, views, gates).poses
+            found[g] += all(vertex_error_mm(MESHES[r], poses[r], POSES[2, r]) < 0.1 for r in (0, 1))
+    assert found[1] == 4 and found[1] >= found[0]
+
+
+def test_threads_do_not_change_the_result():
+    rng = np.random.default_rng(4)
+    views = _views(5, noise_px=0.3, rng=rng)
+    start = disturbed(POSES[5], 0.5, 0.01, rng)
+    alone = ContourSolver(SCANS, CONFIG).solve(start, views, CONFIG.gates_px)
+    with ThreadPoolExecutor(3) as pool:
+        together = ContourSolver(SCANS, CONFIG, pool).solve(start, views, CONFIG.gates_px)
+    assert (alone.poses == together.poses).all() and (alone.systems == together.systems).all()
+
+
+def test_masks_left_out_do_not_count():
+    views = _views(6)
+    broken = [*views[:2], View(views[2].matrix, views[2].eye, np.roll(views[2].masks, 9, axis=2), views[2].present)]
+    use = np.array([[True, True, False]] * 2)
+    solver = ContourSolver(SCANS, CONFIG)
+    a, b = (solver.solve(POSES[6], v, CONFIG.gates_px, use) for v in (views, broken))
+    assert (a.poses[0] == b.poses[0]).all()
+    assert not b.systems[:, 2].any() and b.systems[:, :2].any()
+
+
+def test_a_row_without_masks_stays_where_it_was():
+    views = [
+        View(v.matrix, v.eye, v.masks * np.array([1, 0], np.uint8)[:, None, None], np.array([True, False]))
+        for v in _views(3)
+    ]
+    start = disturbed(POSES[3], 0.4, 0.01, np.random.default_rng(0))
+    solution = ContourSolver(SCANS, CONFIG).solve(start, views, CONFIG.gates_px)
+    assert vertex_error_mm(MESHES[1], solution.poses[1], start[1]) < 1e-6
+    assert vertex_error_mm(MESHES[0], solution.poses[0], POSES[3, 0]) < 0.02
