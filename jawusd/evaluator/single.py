@@ -201,12 +201,7 @@ class SingleAdditive:
     def motion(self, d1: float, d2: float, d3: float) -> Rows:
         """Return the rows of M(d), 4x4."""
         first, second, third = self._curves
-        wx, wy, wz, vx, vy, vz = (first(d1) + second(d2) + third(d3)).tolist()
-        rows = _rotation_rows(wx, wy, wz)
-        for row, jacobian in zip(rows, _left_jacobian_rows(wx, wy, wz)):
-            row.append(jacobian[0] * vx + jacobian[1] * vy + jacobian[2] * vz)
-        rows.append([0.0, 0.0, 0.0, 1.0])
-        return rows
+        return motion_rows(*(first(d1) + second(d2) + third(d3)).tolist())
 
 
 class _SingleCurve:
@@ -220,6 +215,15 @@ class _SingleCurve:
         interval = bisect_right(self._knots, x)
         s = x - self._knots[max(interval - 1, 0)]
         return self._coefficients[interval].dot(np.array((1.0, s, s * s, s * s * s)))
+
+
+def motion_rows(wx: float, wy: float, wz: float, vx: float, vy: float, vz: float) -> Rows:
+    """Return the rows of the rigid motion of a twist, omega = w [rad] and v [mm], 4x4."""
+    rows = _rotation_rows(wx, wy, wz)
+    for row, jacobian in zip(rows, _left_jacobian_rows(wx, wy, wz)):
+        row.append(jacobian[0] * vx + jacobian[1] * vy + jacobian[2] * vz)
+    rows.append([0.0, 0.0, 0.0, 1.0])
+    return rows
 
 
 def _bent(x: float) -> tuple[float, float]:

@@ -1,0 +1,99 @@
+"""The sampled decoder, as readers that do not know the exact model see it: a grid of twists, interpolated linearly."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jawusd.evaluator.rows import as_rows, in_chunks
+from jawusd.evaluator.single import motion_rows
+from jawusd.geometry.se3 import se3_exp
+
+Array = NDArray[np.float64]
+
+
+class SampledTable:
+    """Twists of a rig sampled on a grid over d: ``pose(d) = exp(trilinear(d)) rest``.
+
+    Parameters outside the grid are clamped to it.
+
+    Attributes:
+        knots: Rising sample positions of d1, d2, d3 [mm], three arrays of length >= 2.
+        T_rest: T_skull_mandible of the closed bite, shape (4, 4).
+    """
+
+    def __init__(self, knots: tuple[ArrayLike, ArrayLike, ArrayLike], twists: ArrayLike, T_rest: ArrayLike) -> None:
+        """Build the table.
+
+        Args:
+            knots: Sample positions of d1, d2, d3 [mm], rising.
+            twists: Twists (omega [rad], v [mm]), skull frame, shape (n1, n2, n3, 6).
+            T_rest: T_skull_mandible of the closed bite, shape (4, 4).
+
+        Raises:
+            ValueError: shapes that do not fit, or knots that do not rise.
+        """
+        self.knots = tuple(np.array(axis, dtype=np.float64) for axis in knots)
+        self.T_rest = np.array(T_rest, dtype=np.float64)
+        twists = np.asarray(twists, dtype=np.float64)
+        counts = tuple(len(axis) for axis in self.knots)
+        if twists.shape != (*counts, 6) or self.T_rest.shape != (4, 4):
+            raise ValueError(f"twists must have shape {(*counts, 6)} and T_rest (4, 4), got {twists.shape}")
+        if len(counts) != 3 or any(len(axis) < 2 or (np.diff(axis) <= 0).any() for axis in self.knots):
+            raise ValueError("knots must be three rising arrays of at least two positions")
+        # neighbours along d3 side by side: half as many places in memory to visit
+        self._pairs = np.concatenate([twists[:, :, :-1], twists[:, :, 1:]], axis=3)
+        self._flat = self._pairs.reshape(-1, 12)
+        self._positions = tuple(axis.tolist() for axis in self.knots)
+
+    def twist(self, d: ArrayLike) -> Array:
+        """Return the interpolated twists (omega [rad], v [mm]), shape (..., 6), at d (..., 3) [mm]."""
+        rows, batch = as_rows(d, (3,), "d")
+        return in_chunks(self._twists, rows).reshape(*batch, 6)
+
+    def pose(self, d: ArrayLike) -> Array:
+        """Return the poses T_skull_mandible, shape (..., 4, 4), at d (..., 3) [mm]."""
+        d = np.asarray(d, dtype=np.float64)
+        if d.shape == (3,):
+            x, y, z = d.tolist()
+            if x == x and y == y and z == z:  # NaN goes the long way
+                return np.array(motion_rows(*self._single_twist(x, y, z))).dot(self.T_rest)
+        rows, batch = as_rows(d, (3,), "d")
+        return in_chunks(self._poses, rows).reshape(*batch, 4, 4)
+
+    def _poses(self, d: Array) -> Array:
+        T = se3_exp(self._twists(d)) @ self.T_rest
+        T[np.isnan(d[:, 0])] = np.nan
+        return T
+
+    def _twists(self, d: Array) -> Array:
+        (i, a), (j, b), (k, c) = (_located(axis, d[:, column]) for column, axis in enumerate(self.knots))
+        _, n2, n3, _ = self._pairs.shape
+        corner = (i * n2 + j) * n3 + k
+        a, b = a[:, None], b[:, None]
+        pair = (1 - a) * (1 - b) * self._flat[corner]
+        pair += (1 - a) * b * self._flat[corner + n3]
+        pair += a * (1 - b) * self._flat[corner + n2 * n3]
+        pair += a * b * self._flat[corner + n2 * n3 + n3]
+        return pair[:, :6] + c[:, None] * (pair[:, 6:] - pair[:, :6])
+
+    def _single_twist(self, x: float, y: float, z: float) -> list[float]:
+        (i, a), (j, b), (k, c) = (_located_one(axis, value) for axis, value in zip(self._positions, (x, y, z)))
+        weights = np.array(((1 - a) * (1 - b), (1 - a) * b, a * (1 - b), a * b))
+        pair = weights.dot(self._pairs[i : i + 2, j : j + 2, k].reshape(4, 12)).tolist()
+        return [low + c * (high - low) for low, high in zip(pair, pair[6:])]
+
+
+def _located(knots: Array, x: Array) -> tuple[NDArray[np.intp], Array]:
+    """Return the cell (n,) of each position x (n,) and the share of the way through it, x clamped to the knots."""
+    cell = np.clip(knots.searchsorted(x, side="right") - 1, 0, len(knots) - 2)
+    start = knots[cell]
+    return cell, np.clip((x - start) / (knots[cell + 1] - start), 0.0, 1.0)
+
+
+def _located_one(knots: list[float], x: float) -> tuple[int, float]:
+    cell = min(max(bisect_right(knots, x) - 1, 0), len(knots) - 2)
+    share = (x - knots[cell]) / (knots[cell + 1] - knots[cell])
+    return cell, min(max(share, 0.0), 1.0)

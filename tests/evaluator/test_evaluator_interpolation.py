@@ -1,0 +1,107 @@
+"""Interpolation between keys: straight, smooth, and never outside the bound."""
+
+import numpy as np
+import pytest
+from example_model import example_arrays, example_meta
+from scipy.interpolate import interp1d
+
+from jawusd.evaluator import JawRig
+
+ARRAYS = example_arrays()
+RIG = JawRig(ARRAYS, example_meta())
+
+
+def keys_inside(count, seed, spread=1.0):
+    rng = np.random.default_rng(seed)
+    d = RIG.project(rng.uniform([-6, -14, -6], [50, 14, 12], (count, 3)) * spread)
+    return np.cumsum(rng.uniform(2.0, 9.0, count)), d
+
+
+def test_linear_is_scipys_and_holds_outside():
+    frames, keys = keys_inside(8, 0)
+    at = np.linspace(frames[0] - 5, frames[-1] + 5, 301)
+    expected = interp1d(frames, keys, axis=0, bounds_error=False, fill_value=(keys[0], keys[-1]))(at)
+    np.testing.assert_allclose(RIG.interpolate(frames, keys, at), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("method", ["linear", "smooth"])
+def test_keys_are_met_exactly(method):
+    frames, keys = keys_inside(9, 1)
+    np.testing.assert_allclose(RIG.interpolate(frames, keys, frames, method), keys, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_smooth_never_leaves_the_bound_between_keys_on_it(seed):
+    """Keys on and inside the bound, among them far corners that a plain cubic overshoots."""
+    frames, keys = keys_inside(12, seed + 10)
+    at = np.linspace(frames[0], frames[-1], 20001)
+    assert RIG.margin(RIG.interpolate(frames, keys, at, "smooth")).min() > -1e-4
+
+
+def test_a_plain_cubic_would_leave_the_bound():
+    """The guard is at work: without it the same keys overshoot by more than a millimetre."""
+    from scipy.interpolate import CubicHermiteSpline
+
+    frames, keys = keys_inside(12, 10)
+    rate = np.diff(keys, axis=0) / np.diff(frames)[:, None]
+    step = np.diff(frames)[:, None]
+    tangents = np.zeros_like(keys)
+    tangents[1:-1] = (rate[:-1] * step[1:] + rate[1:] * step[:-1]) / (step[1:] + step[:-1])
+    plain = CubicHermiteSpline(frames, keys, tangents)(np.linspace(frames[0], frames[-1], 2001))
+    assert RIG.margin(plain).min() < -0.3
+
+
+def test_smooth_survives_a_bound_that_is_hollow_along_d1():
+    """Sections with a waist: the straight line between valid keys is not valid, the smooth curve is."""
+    waist = 1.0 - 0.85 * np.exp(-(((ARRAYS["slice_d1"] - 20.0) / 5.0) ** 2))
+    rig = JawRig(dict(ARRAYS, slice_support=ARRAYS["slice_support"] * waist[:, None]), example_meta())
+    keys = np.array([[8.0, 5.0, 0.5], [32.0, 3.5, 0.5], [33.0, -3.0, 0.0], [6.0, -5.0, 1.0]])
+    frames = np.array([0.0, 10.0, 15.0, 30.0])
+    assert (rig.margin(keys) > 0).all()
+    at = np.linspace(0.0, 30.0, 20001)
+    assert rig.margin(rig.interpolate(frames, keys, at)).min() < -1.0
+    assert rig.margin(rig.interpolate(frames, keys, at, "smooth")).min() > -1e-4
+
+
+def test_smooth_has_a_continuous_velocity():
+    frames, keys = keys_inside(10, 3)
+    at = np.linspace(frames[0] - 1, frames[-1] + 1, 200001)
+    d = RIG.interpolate(frames, keys, at, "smooth")
+    velocity = np.diff(d, axis=0) / np.diff(at)[:, None]
+    linear = np.diff(RIG.interpolate(frames, keys, at), axis=0) / np.diff(at)[:, None]
+    jump, linear_jump = (np.abs(np.diff(v, axis=0)).max() for v in (velocity, linear))
+    assert jump < 0.01 < linear_jump
+
+
+def test_keys_outside_are_still_met_smoothly():
+    """There is nothing to guard when a key itself is outside: the curve goes through it."""
+    frames, keys = np.array([0.0, 5.0, 10.0]), np.array([[5.0, 0, 0], [20.0, 30.0, 0], [5.0, 0, 0]])
+    np.testing.assert_allclose(RIG.interpolate(frames, keys, [5.0], "smooth"), keys[1:2], atol=1e-12)
+
+
+def test_shapes_and_single_keys():
+    frames, keys = keys_inside(4, 4)
+    for method in ("linear", "smooth"):
+        assert RIG.interpolate(frames, keys, 3.0, method).shape == (3,)
+        assert RIG.interpolate(frames, keys, np.zeros((2, 0, 3)), method).shape == (2, 0, 3, 3)
+        assert np.isnan(RIG.interpolate(frames, keys, [np.nan], method)).all()
+        np.testing.assert_array_equal(RIG.interpolate([5.0], keys[:1], [0.0, 9.0], method), np.tile(keys[:1], (2, 1)))
+
+
+@pytest.mark.parametrize(
+    ("frames", "keys", "message"),
+    [
+        ([0.0, 1.0], np.zeros((3, 3)), "shape"),
+        ([], np.zeros((0, 3)), "shape"),
+        ([0.0, 0.0], np.zeros((2, 3)), "rise"),
+        ([0.0, np.nan], np.zeros((2, 3)), "finite"),
+    ],
+)
+def test_wrong_keys_are_refused(frames, keys, message):
+    with pytest.raises(ValueError, match=message):
+        RIG.interpolate(frames, keys, [0.0])
+
+
+def test_unknown_method_is_refused():
+    with pytest.raises(ValueError, match='"linear" or "smooth"'):
+        RIG.interpolate([0.0], np.zeros((1, 3)), [0.0], method="cubic")
