@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +54,7 @@ def _read_arrays(path: Path) -> dict[str, NDArray]:
             return {name: archive[name] for name in archive.files}
     except FileNotFoundError as error:
         raise FormatError("there is no such file.", path=path) from error
-    except (OSError, ValueError, EOFError, KeyError, NotImplementedError, zipfile.BadZipFile, zipfile.error) as error:
+    except (OSError, ValueError, EOFError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
         raise FormatError(f"is not a readable npz file ({error}).", path=path) from error
 
 

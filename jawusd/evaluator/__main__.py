@@ -1,0 +1,175 @@
+"""``python -m jawusd.evaluator``: poses, encoding and verdicts of a model.npz where there is nothing but numpy.
+
+    python -m jawusd.evaluator info MODEL
+    python -m jawusd.evaluator pose MODEL --d 20 0 3
+    python -m jawusd.evaluator encode MODEL poses.csv
+    python -m jawusd.evaluator validate MODEL poses.csv
+
+Poses come as CSV with the columns frame, m00 ... m33 (row-major T_skull_mandible [mm]). Results go to stdout as CSV, or
+JSON with --json. Exit codes: 0, 1 an invalid pose was found, 2 usage, 3 and up an error (see jawusd.errors).
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.errors import FormatError, JawusdError
+from jawusd.evaluator.files import load
+from jawusd.evaluator.rig import JawRig
+
+_MATRIX_COLUMNS = [f"m{row}{column}" for row in range(4) for column in range(4)]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command and return the exit code.
+
+    Args:
+        arguments: Command line without the program's name; that of the process if None.
+    """
+    options = _parser().parse_args(arguments)
+    try:
+        return options.run(load(options.model), options)
+    except JawusdError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return error.exit_code
+    except BrokenPipeError:
+        # the reader (head, less) has what it wanted; keep the interpreter from complaining at exit
+        sys.stderr.close()
+        return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m jawusd.evaluator", description="Evaluate a jaw model with numpy alone."
+    )
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    for name, run, text in (
+        ("info", _info, "what the model is, its ranges and limits"),
+        ("pose", _pose, "pose, twist, landmarks and margin of jaw parameters"),
+        ("encode", _encode, "nearest jaw parameters and residual of each pose"),
+        ("validate", _validate, "a verdict on each pose; exit code 1 if one is invalid"),
+    ):
+        command = commands.add_parser(name, help=text, description=text)
+        command.add_argument("model", type=Path, help="model.npz")
+        if name == "pose":
+            command.add_argument("--d", type=float, nargs=3, required=True, metavar=("D1", "D2", "D3"), help="[mm]")
+        elif name != "info":
+            command.add_argument("poses", type=Path, help="CSV with the columns frame, m00 ... m33")
+        if name == "encode":
+            command.add_argument("--bounds", action="store_true", help="search only inside the bound")
+        command.add_argument("--json", action="store_true", help="print JSON")
+        command.set_defaults(run=run)
+    return parser
+
+
+def _info(rig: JawRig, options: argparse.Namespace) -> int:
+    low, high = rig.arrays["d_range"].T
+    facts = {
+        "actor": rig.meta.get("actor"),
+        "kind": rig.meta["kind"],
+        "method": rig.meta.get("method"),
+        "d_min_mm": low.tolist(),
+        "d_max_mm": high.tolist(),
+        "residual_limit_mm": rig.limits.residual_mm,
+        "margin_limit_mm": rig.limits.margin_mm,
+        "captured_poses": len(rig.arrays["codes"]),
+    }
+    if options.json:
+        print(json.dumps(facts))
+    else:
+        for name, value in facts.items():
+            print(f"{name}: {value}")
+    return 0
+
+
+def _pose(rig: JawRig, options: argparse.Namespace) -> int:
+    d = np.array(options.d)
+    T = rig.pose(d)
+    margin_mm = float(rig.margin(d))
+    if options.json:
+        landmarks = rig.arrays["landmarks"] @ T[:3, :3].T + T[:3, 3]
+        facts = {
+            "d": options.d,
+            "T_skull_mandible": T.tolist(),
+            "twist": rig.twist(d).tolist(),
+            "landmarks_mm": landmarks.tolist(),
+            "margin_mm": margin_mm,
+        }
+        print(json.dumps({name: _plain(value) for name, value in facts.items()}))
+    else:
+        _print_rows(["frame", *_MATRIX_COLUMNS, "margin_mm"], [[0, *T.ravel().tolist(), margin_mm]], as_json=False)
+    return 0
+
+
+def _encode(rig: JawRig, options: argparse.Namespace) -> int:
+    frames, T = _read_poses(options.poses)
+    d, residual_mm = rig.encode(T, bounds=options.bounds)
+    rows = [[frame, *x, r] for frame, x, r in zip(frames, d.tolist(), residual_mm.tolist())]
+    _print_rows(["frame", "d1", "d2", "d3", "residual_mm"], rows, as_json=options.json)
+    return 0
+
+
+def _validate(rig: JawRig, options: argparse.Namespace) -> int:
+    frames, T = _read_poses(options.poses)
+    verdicts = rig.validate(T)
+    columns = (verdicts.valid.tolist(), verdicts.words(), verdicts.residual_mm.tolist(), verdicts.margin_mm.tolist())
+    rows = [[frame, *row] for frame, *row in zip(frames, *columns)]
+    _print_rows(["frame", "valid", "reason", "residual_mm", "margin_mm"], rows, as_json=options.json)
+    return 0 if verdicts.valid.all() else 1
+
+
+def _print_rows(header: list[str], rows: list[list], *, as_json: bool) -> None:
+    if as_json:
+        print(json.dumps([{name: _plain(value) for name, value in zip(header, row)} for row in rows]))
+        return
+    writer = csv.writer(sys.stdout, lineterminator="\n")
+    writer.writerow(header)
+    writer.writerows(rows)
+
+
+def _plain(value: object) -> object:
+    """Return the value with NaN as null, which JSON has no other word for."""
+    if isinstance(value, list):
+        return [_plain(each) for each in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def _read_poses(path: Path) -> tuple[list[int], NDArray[np.float64]]:
+    """Return frame numbers and T_skull_mandible (F, 4, 4) of a CSV table; nan and inf are taken as they stand.
+
+    Raises:
+        FormatError: not such a table, or a cell that is not a number.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError as error:
+        raise FormatError("there is no such file.", path=path) from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise FormatError(f"cannot be read ({error}).", path=path) from error
+    try:
+        table = list(csv.DictReader(text.splitlines(), strict=True))
+    except csv.Error as error:
+        raise FormatError(f"is not a CSV table ({error}).", path=path) from error
+    frames, values = [], []
+    for number, row in enumerate(table, start=1):
+        missing = [name for name in ("frame", *_MATRIX_COLUMNS) if row.get(name) is None]
+        if missing:
+            raise FormatError(f'row {number} has no "{missing[0]}"; needed are frame, m00 ... m33.', path=path)
+        try:
+            frames.append(int(row["frame"]))
+            values.append([float(row[name]) for name in _MATRIX_COLUMNS])
+        except ValueError as error:
+            raise FormatError(f"row {number}: {error}.", path=path) from error
+    return frames, np.array(values, dtype=np.float64).reshape(-1, 4, 4)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
