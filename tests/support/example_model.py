@@ -15,8 +15,8 @@ LANDMARKS_ANATOMICAL = np.array(
 )
 
 
-def example_arrays(kind="anchored"):
-    """Return the arrays of an example model of kind "anchored" or "additive"."""
+def example_arrays(kind="anchored", centres=40):
+    """Return the arrays of an example model of kind "anchored" (with so many spline centres) or "additive"."""
     A = _transform([0.2, -0.1, 0.3], [3.0, -40.0, 20.0])
     rest = _transform([0.01, -0.02, 0.005], [0.2, -0.4, 0.3])
     to_mandible = np.linalg.inv(A @ rest)
@@ -30,7 +30,7 @@ def example_arrays(kind="anchored"):
         "margin_limit_mm": np.array(0.0),
         **_bounds(),
     }
-    arrays |= _anchored() if kind == "anchored" else _additive()
+    arrays |= _anchored(centres) if kind == "anchored" else _additive()
     return arrays
 
 
@@ -46,9 +46,9 @@ def example_meta(kind="anchored"):
     }
 
 
-def _anchored():
+def _anchored(count):
     rng = np.random.default_rng(7)
-    centres = rng.uniform([-0.2, -1.6, -1.2], [3.0, 1.6, 1.6], (40, 3))
+    centres = rng.uniform([-0.2, -1.6, -1.2], [3.0, 1.6, 1.6], (count, 3))
     scales = np.array([15.0, 6.0, 5.0])
     path = np.array([[0.4, -1.1, 0.5, 0.6, -0.3], [-2.0, -14.0, -4.0, 1.0, 0.3]])
     weights = _interpolating_weights(centres, scales, path)
