@@ -43,25 +43,27 @@ def translations(T: ArrayLike) -> list[Gf.Vec3d]:
 
 
 def rotations(T: ArrayLike) -> list[Gf.Quatd]:
-    """Return the rotations of transforms (n, 4, 4) as unit quaternions, each in the half-space of its predecessor.
+    """Return the rotations of transforms (n, 4, 4) as unit quaternions, each in the half-space of its predecessor."""
+    return [Gf.Quatd(w, x, y, z) for w, x, y, z in _continuous_wxyz(T).tolist()]
 
-    USD's slerp takes the short way between two samples, but readers that interpolate the four numbers do not.
-    """
+
+def quatf_arrays(T: ArrayLike) -> list[Vt.QuatfArray]:
+    """Return the same as arrays of one single-precision quaternion each, the values of a one-joint animation."""
+    return [Vt.QuatfArray([Gf.Quatf(w, x, y, z)]) for w, x, y, z in _continuous_wxyz(T).tolist()]
+
+
+def _continuous_wxyz(T: ArrayLike) -> NDArray[np.float64]:
+    # USD's slerp takes the short way between two samples, but readers that interpolate the four numbers do not.
     wxyz = wxyz_from_matrix(np.asarray(T, dtype=np.float64)[:, :3, :3])
     if len(wxyz) > 1:
         turn = np.where(np.einsum("ij,ij->i", wxyz[1:], wxyz[:-1]) < 0, -1.0, 1.0)
         wxyz = wxyz * np.concatenate([[1.0], np.cumprod(turn)])[:, None]
-    return [Gf.Quatd(w, x, y, z) for w, x, y, z in wxyz.tolist()]
+    return wxyz
 
 
 def row_matrix(T: ArrayLike) -> Gf.Matrix4d:
     """Return a transform (4, 4) for column vectors as a Gf.Matrix4d, which acts on row vectors."""
     return Gf.Matrix4d(np.asarray(T, dtype=np.float64).T.tolist())
-
-
-def column_matrix(matrix: Gf.Matrix4d) -> NDArray[np.float64]:
-    """Return a Gf.Matrix4d as a transform (4, 4) for column vectors."""
-    return np.array(matrix, dtype=np.float64).T
 
 
 def transform_from_ops(translation: Gf.Vec3d, rotation: Gf.Quatd) -> NDArray[np.float64]:

@@ -16,8 +16,10 @@ from jawusd.rig.animation import write_animation
 from jawusd.rig.author import decoder_layer, interface_layer
 from jawusd.rig.geo import build_geometry
 from jawusd.rig.layers import write_layer
-from jawusd.rig.layout import ACTOR_FILE, GEO_FILE, ONNX_FILE, RIG_FILE
+from jawusd.rig.layout import ACTOR_FILE, GEO_FILE, ONNX_FILE, PACKAGE_FILE, RIG_FILE, SKEL_FILE
 from jawusd.rig.onnx_sidecar import write_onnx
+from jawusd.rig.package import write_package
+from jawusd.rig.skel import write_skel
 from jawusd.rig.table import DEFAULT_SIZE, build_table
 
 CAPTURED_MOTION = "anim_capture.usdc"
@@ -34,7 +36,7 @@ def bake_rig(
     d: ArrayLike | None = None,
     table_size: int = DEFAULT_SIZE,
 ) -> list[Path]:
-    """Write a rig: interface, decoder, geometry, ONNX graph, and the captured motion if there is one.
+    """Write a rig: interface, decoder, geometry, ONNX graph, captured motion if there is one, skeleton, package.
 
     Every file is written in one step, `actor.usda` after all it refers to.
 
@@ -70,6 +72,10 @@ def bake_rig(
         write_onnx(folder / ONNX_FILE, rig),
         write_layer(interface_layer(rig, name, meshes, fps), folder / ACTOR_FILE),
     ]
+    shown = folder / ACTOR_FILE
     if frames is not None and d is not None:
-        written.append(write_animation(folder / CAPTURED_MOTION, folder / ACTOR_FILE, frames, d, fps, rig=rig))
+        shown = write_animation(folder / CAPTURED_MOTION, folder / ACTOR_FILE, frames, d, fps, rig=rig)
+        written.append(shown)
+    written.append(write_skel(folder / SKEL_FILE, rig, list(meshes), fps, frames, d))
+    written.append(write_package(folder / PACKAGE_FILE, shown))
     return written

@@ -25,7 +25,7 @@ from jawusd.rig.knots import sample_knots
 from jawusd.rig.sampling import sample_valid, valid_box
 from jawusd.rig.table import SIZES, build_table, table_error
 
-FILES = {"actor.usda", "rig.usdc", "geo.usdc", "actor.onnx", "anim_capture.usdc"}
+FILES = {"actor.usda", "rig.usdc", "geo.usdc", "actor.onnx", "anim_capture.usdc", "actor_skel.usdc", "actor.usdz"}
 
 
 def mandible_at(stage, time):

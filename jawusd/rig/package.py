@@ -1,0 +1,56 @@
+"""The package for viewers: one `.usdz` with everything flattened into a text layer."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+
+from pxr import Sdf, Usd, UsdUtils
+
+from jawusd.errors import RigError
+from jawusd.formats.atomic import atomic_path
+from jawusd.rig.layout import ACTOR, ACTOR_FILE
+from jawusd.rig.read import open_stage
+
+
+def write_package(out: str | os.PathLike[str], source: str | os.PathLike[str]) -> Path:
+    """Flatten a stage of one actor into a package.
+
+    The layer inside is text: three.js turns a whole-number translation of a binary layer into NaN. The ONNX file stays
+    outside, packages may hold USD, images and sound only.
+
+    Args:
+        out: the `.usdz` to write.
+        source: `actor.usda` or an animation layer on it.
+
+    Returns:
+        The package.
+
+    Raises:
+        RigError: the source cannot be opened or packed.
+        OutputError: the package cannot be written.
+    """
+    out = Path(out)
+    layer = _flattened(open_stage(source))
+    with tempfile.TemporaryDirectory() as scratch:
+        text = Path(scratch) / ACTOR_FILE
+        if not layer.Export(str(text)):
+            raise RigError("OpenUSD could not flatten the actor.", path=source)
+        with atomic_path(out) as temporary:
+            if not UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(text)), str(temporary)):
+                raise RigError("OpenUSD could not pack the actor.", path=out)
+    return out
+
+
+def _flattened(stage: Usd.Stage) -> Sdf.Layer:
+    layer = stage.Flatten(addSourceFileComment=False)
+    actor = layer.GetPrimAtPath(ACTOR)
+    for prop in actor.properties:
+        # flattening drops `custom` where the schema is known, and Blender imports no other attribute
+        if prop.name.startswith("jaw:"):
+            prop.custom = True
+    actor.RemoveProperty(layer.GetPropertyAtPath(f"{ACTOR}.jaw:onnx"))
+    # the identifier is an asset path too: it would be packed
+    actor.assetInfo = {key: value for key, value in dict(actor.assetInfo).items() if key != "identifier"}
+    return layer

@@ -1,0 +1,130 @@
+"""The UsdSkel variant of an actor: the jaw as a bone with keys, for tools that edit skeletons but not rigs."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pxr import Kind, Sdf, Usd, UsdSkel, Vt
+
+from jawusd.evaluator import JawRig
+from jawusd.geometry.anatomy import LANDMARKS
+from jawusd.geometry.se3 import make_transform, se3_inverse, transform_points
+from jawusd.rig import _gf
+from jawusd.rig.geo import MESH_PATHS
+from jawusd.rig.layers import define_prim, new_layer, stage_of, write_layer
+from jawusd.rig.layout import ACTOR, GEO_FILE
+
+Array = NDArray[np.float64]
+
+JOINTS = ("skull", "skull/jaw")
+SKELETON, MOTION = f"{ACTOR}/Skel", f"{ACTOR}/Skel/Motion"
+
+
+def write_skel(
+    out: str | os.PathLike[str],
+    rig: JawRig,
+    mesh_names: list[str],
+    fps: float,
+    frames: ArrayLike | None = None,
+    d: ArrayLike | None = None,
+) -> Path:
+    """Write the skeleton beside `geo.usdc`, whose meshes it binds rigidly to two joints.
+
+    The joint `skull/jaw` sits midway between the condyles and carries one key per frame; it has no d1, d2, d3 and
+    no bounds.
+
+    Args:
+        out: file to write, in the folder of `geo.usdc`.
+        rig: the exact model.
+        mesh_names: the meshes that `geo.usdc` holds, names as in `MESH_PATHS`.
+        fps: frames per second.
+        frames: frame numbers (F,), increasing; without them the jaw rests.
+        d: parameters (F, 3) [mm]; rows with NaN get no key.
+
+    Returns:
+        The file.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    layer = new_layer(fps)
+    root = define_prim(layer, ACTOR, "SkelRoot")
+    root.kind = Kind.Tokens.component
+    hinge = np.eye(4)
+    hinge[:3, 3] = _hinge(rig)
+    stage = stage_of(layer)
+    _define_skeleton(stage, hinge)
+    keys = _define_motion(stage, rig, hinge, frames, d)
+    if keys is not None:
+        layer.startTimeCode, layer.endTimeCode = float(keys[0]), float(keys[-1])
+    for name in mesh_names:
+        _bind(layer, MESH_PATHS[name], rig.arrays["T_rest"] if _moves(name) else np.eye(4), int(_moves(name)))
+    root.payloadList.prependedItems = [Sdf.Payload(f"./{GEO_FILE}")]
+    return write_layer(layer, Path(out))
+
+
+def _moves(name: str) -> bool:
+    return name in ("mandible", "lower_teeth")
+
+
+def _hinge(rig: JawRig) -> Array:
+    """Return the point midway between the condyles in the closed bite, skull coordinates [mm]."""
+    condyles = [LANDMARKS.index(name) for name in ("condyle_left", "condyle_right")]
+    return transform_points(rig.arrays["T_rest"], rig.arrays["landmarks"][condyles]).mean(axis=0)
+
+
+def _define_skeleton(stage: Usd.Stage, hinge: Array) -> None:
+    skeleton = UsdSkel.Skeleton.Define(stage, SKELETON)
+    rest = Vt.Matrix4dArray([_gf.row_matrix(np.eye(4)), _gf.row_matrix(hinge)])
+    skeleton.CreateJointsAttr(Vt.TokenArray(JOINTS))
+    skeleton.CreateBindTransformsAttr(rest)
+    skeleton.CreateRestTransformsAttr(rest)
+    binding = UsdSkel.BindingAPI.Apply(skeleton.GetPrim())
+    binding.CreateAnimationSourceRel().SetTargets([Sdf.Path(MOTION)])
+
+
+def _define_motion(
+    stage: Usd.Stage, rig: JawRig, hinge: Array, frames: ArrayLike | None, d: ArrayLike | None
+) -> Array | None:
+    """Define the animation of the joint skull/jaw and return its key frames.
+
+    The joint moves as D hinge, D = pose rest^-1: a vertex bound at rest is carried to D rest p = pose p.
+    """
+    motion = UsdSkel.Animation.Define(stage, MOTION)
+    motion.CreateJointsAttr(Vt.TokenArray([JOINTS[1]]))
+    motion.CreateScalesAttr(Vt.Vec3hArray([(1, 1, 1)]))
+    translations, rotations = motion.CreateTranslationsAttr(), motion.CreateRotationsAttr()
+    translations.Set(_gf.vec3f_array(hinge[None, :3, 3]))
+    rotations.Set(_gf.quatf_arrays(np.eye(4)[None])[0])
+    if frames is None or d is None:
+        return None
+    frames, d = np.asarray(frames, dtype=np.float64), np.asarray(d, dtype=np.float64)
+    known = np.isfinite(d).all(axis=1)
+    moved = rig.pose(d[known]) @ se3_inverse(rig.arrays["T_rest"])
+    joint = make_transform(moved[:, :3, :3], (moved @ hinge)[:, :3, 3])
+    for frame, T, rotation in zip(frames[known].tolist(), joint, _gf.quatf_arrays(joint), strict=True):
+        translations.Set(_gf.vec3f_array(T[None, :3, 3]), frame)
+        rotations.Set(rotation, frame)
+    return frames[known] if known.any() else None
+
+
+def _bind(layer: Sdf.Layer, path: str, bind: Array, joint: int) -> None:
+    """Bind a mesh of the payload rigidly to a joint; written as overs, the payload is not loaded here."""
+    mesh = Sdf.CreatePrimInLayer(layer, path)
+    schemas = Sdf.TokenListOp()
+    schemas.prependedItems = ["SkelBindingAPI"]
+    mesh.SetInfo("apiSchemas", schemas)
+    skeleton = Sdf.RelationshipSpec(mesh, "skel:skeleton", custom=False)
+    skeleton.targetPathList.explicitItems = [Sdf.Path(SKELETON)]
+    types = Sdf.ValueTypeNames
+    matrix = Sdf.AttributeSpec(mesh, "primvars:skel:geomBindTransform", types.Matrix4d)
+    matrix.default = _gf.row_matrix(bind)
+    values = (("jointIndices", types.IntArray, Vt.IntArray([joint])), ("jointWeights", types.FloatArray, [1.0]))
+    for name, type_name, value in values:
+        primvar = Sdf.AttributeSpec(mesh, f"primvars:skel:{name}", type_name)
+        primvar.default = value
+        primvar.SetInfo("interpolation", "constant")
+        primvar.SetInfo("elementSize", 1)

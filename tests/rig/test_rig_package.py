@@ -1,0 +1,48 @@
+"""The package for viewers: flat, text, complete but for the ONNX file."""
+
+import numpy as np
+import pytest
+from example_rig import assert_valid_usd, example_motion, example_rig
+from pxr import Sdf, Usd, UsdGeom
+
+from jawusd.errors import RigError
+from jawusd.rig import load_rig
+from jawusd.rig.package import write_package
+
+
+def test_package_holds_one_text_layer(folder):
+    package = folder / "actor.usdz"
+    assert_valid_usd(package)
+    assert Sdf.ZipFile.Open(str(package)).GetFileNames() == ["actor.usda"]
+    layer = Sdf.Layer.FindOrOpen(str(package))
+    assert not layer.GetCompositionAssetDependencies() and not layer.GetExternalAssetDependencies()
+    assert layer.ExportToString().startswith("#usda 1.0")
+    assert str(folder.parent.parent) not in layer.ExportToString()
+
+
+def test_package_moves_and_loads_like_the_rig(folder, kind):
+    rig = load_rig(folder / "actor.usdz")
+    frames, d = example_motion()
+    np.testing.assert_array_equal(rig.pose(d), example_rig(kind).pose(d))
+    stage = Usd.Stage.Open(str(folder / "actor.usdz"))
+    mandible = UsdGeom.Xformable(stage.GetPrimAtPath("/Actor/geo/Mandible"))
+    for k in (0, 11, 39):
+        shown = np.array(mandible.GetLocalTransformation(float(frames[k]))).T
+        assert np.abs(shown - rig.pose(d[k])).max() < 1e-9
+    assert (stage.GetTimeCodesPerSecond(), stage.GetStartTimeCode()) == (24, 30)
+
+
+def test_attributes_stay_custom(anchored_folder):
+    layer = Sdf.Layer.FindOrOpen(str(anchored_folder / "actor.usdz"))
+    actor = layer.GetPrimAtPath("/Actor")
+    names = [prop.name for prop in actor.properties if prop.name.startswith("jaw:")]
+    assert "jaw:d1" in names and "jaw:onnx" not in names
+    assert all(actor.properties[name].custom for name in names)
+
+
+def test_a_source_that_is_no_usd_leaves_the_old_package(anchored_folder):
+    package = anchored_folder / "actor.usdz"
+    before = package.read_bytes()
+    with pytest.raises(RigError, match="no such file"):
+        write_package(package, anchored_folder / "nothing.usda")
+    assert package.read_bytes() == before
