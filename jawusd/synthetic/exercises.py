@@ -82,13 +82,16 @@ def record(person: Person, n_frames: int, seed: int, kind: Kind = "training", no
     return Recording(controls, phase, person.pose(*controls.T), T_true, T_noisy)
 
 
-def schedule(names: tuple[str, ...], n_frames: int, rng: np.random.Generator) -> tuple[Array, NDArray[np.str_]]:
+def schedule(
+    names: tuple[str, ...], n_frames: int, rng: np.random.Generator, tempo: float = 1.0
+) -> tuple[Array, NDArray[np.str_]]:
     """String exercises together until the frames are filled.
 
     Args:
         names: exercises, repeated as needed.
         n_frames: number of frames.
         rng: draws their sizes and speeds.
+        tempo: how much faster than usual the exercises are done; chewing and speech keep their speed.
 
     Returns:
         controls with smoothed seams, shape (F, 3), and the exercise of each frame, shape (F,).
@@ -102,9 +105,10 @@ def schedule(names: tuple[str, ...], n_frames: int, rng: np.random.Generator) ->
     phase: list[str] = []
     while len(phase) < n_frames:
         name = names[len(curves) % len(names)]
-        curves.append(np.stack(_EXERCISES[name](rng), -1))
+        curve = np.stack(_EXERCISES[name](rng), -1)
+        curves.append(curve if name in ("chew", "speech") else _faster(curve, tempo))
         phase += [name] * len(curves[-1])
-    return _smoothed(np.concatenate(curves)[:n_frames]), np.array(phase[:n_frames])
+    return smoothed(np.concatenate(curves)[:n_frames]), np.array(phase[:n_frames])
 
 
 def smooth_noise(rng: np.random.Generator, n_frames: int, frames: float, n: int) -> Array:
@@ -115,11 +119,17 @@ def smooth_noise(rng: np.random.Generator, n_frames: int, frames: float, n: int)
     curve[0] = rng.normal(size=n)
     for i in range(1, n_frames):
         curve[i] = keep * curve[i - 1] + steps[i]
-    return _smoothed(curve)
+    return smoothed(curve)
 
 
-def _smoothed(curves: Array) -> Array:
-    """Seven-frame Hann average along time, shape (F, n): muscles make no corners."""
+def _faster(curve: Array, tempo: float) -> Array:
+    """Resample a control curve (F, 3) to fewer frames."""
+    at = np.arange(0.0, len(curve) - 1.0, tempo)
+    return np.stack([np.interp(at, np.arange(len(curve)), column) for column in curve.T], -1)
+
+
+def smoothed(curves: Array) -> Array:
+    """Return the seven-frame Hann average along time, shape (F, n): muscles make no corners."""
     kernel = np.hanning(9)[1:-1]
     kernel = kernel / kernel.sum()
     padded = np.pad(curves, ((3, 3), (0, 0)), mode="edge")

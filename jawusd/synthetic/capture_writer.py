@@ -1,0 +1,267 @@
+"""Write a whole synthetic capture: scans, videos, masks, boards, calibration, picks and the truth."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.formats.atomic import write_bytes_atomic, write_npz_atomic, write_text_atomic
+from jawusd.formats.calibration import save_calibration
+from jawusd.formats.mesh import Mesh
+from jawusd.geometry import LANDMARKS, Camera
+from jawusd.imaging.video_writer import VideoWriter
+from jawusd.synthetic.anatomy import Anatomy, build_anatomy
+from jawusd.synthetic.masks import Outline, drawn_mask
+from jawusd.synthetic.person import Person
+from jawusd.synthetic.picks import SeenVertex, choose_picks
+from jawusd.synthetic.render import Picture, Renderer
+from jawusd.synthetic.scene import Scene
+from jawusd.synthetic.studio import BOARD_COLUMNS, BOARD_ROWS, SQUARE_MM, board, board_poses, build_cameras
+from jawusd.synthetic.take import FPS, LEAD, OPEN_HOLD, REST_HOLD, TAIL, Take, perform
+
+Array = NDArray[np.float64]
+Progress = Callable[[int, int], None]
+
+# Frame k of a camera shows the instant of frame k + offset of the first one.
+_OFFSETS = (0, 5, -3)
+_PICKS = 4
+_PICK_NOISE_PX = 1.0
+_PICTURES_PER_BOARD = 2
+# Sensor noise [grey levels of 255]; a few patterns are shifted about instead of drawing one per picture.
+_SENSOR_NOISE = 1.3
+_NOISE_PATTERNS = 5
+
+
+@dataclass(frozen=True)
+class DemoConfig:
+    """What to record.
+
+    Attributes:
+        seed: another number is another person and another performance.
+        frames: tracked frames at 24 per second.
+        size_px: width and height of the pictures.
+        boards: poses of the calibration board.
+        quality_crf: H.264 constant rate factor of the videos.
+    """
+
+    seed: int = 0
+    frames: int = 240
+    size_px: tuple[int, int] = (1280, 720)
+    boards: int = 24
+    quality_crf: int = 25
+
+    def __post_init__(self) -> None:
+        if self.frames <= OPEN_HOLD + REST_HOLD:
+            raise ValueError(f"frames must be more than {OPEN_HOLD + REST_HOLD}, got {self.frames}")
+        if min(self.size_px) < 64 or self.size_px[0] % 2 or self.size_px[1] % 2:
+            raise ValueError(f"size_px must be even and at least 64, got {self.size_px}")
+        if self.boards < 1:
+            raise ValueError(f"boards must be at least 1, got {self.boards}")
+
+
+def write_demo(folder: str | os.PathLike[str], config: DemoConfig, progress: Progress | None = None) -> Path:
+    """Record a synthetic person into a capture folder.
+
+    Args:
+        folder: where; files of the same names are replaced.
+        config: what to record.
+        progress: called with pictures done and pictures in all.
+
+    Returns:
+        The path of capture.toml.
+
+    Raises:
+        MissingDependencyError: there is no OpenGL without a display (EGL).
+        OutputError: the folder cannot be written.
+    """
+    folder = Path(folder)
+    person = Person(config.seed)
+    cameras = build_cameras(config.size_px)
+    with Renderer(cameras) as renderer:  # first: without OpenGL there is no point in the rest
+        anatomy = build_anatomy(person)
+        take = perform(person, anatomy.occlusion, config.frames, _OFFSETS, config.seed)
+        recorder = _Recorder(folder, config, cameras, renderer, progress)
+        recorder.performance(Scene(person, anatomy, renderer), take)
+        T_world_board = recorder.boards()
+    for name, mesh in _scans(anatomy).items():
+        write_bytes_atomic(folder / "scans" / f"{name}.ply", _ply(mesh))
+    save_calibration(folder / "calibration.toml", cameras)
+    write_npz_atomic(folder / "truth" / "truth.npz", _truth(person, cameras, take, T_world_board))
+    path = folder / "capture.toml"
+    write_text_atomic(path, _description(config, cameras, take, recorder.picks))
+    return path
+
+
+class _Recorder:
+    """Draws every picture of a capture and writes the video files."""
+
+    def __init__(
+        self, folder: Path, config: DemoConfig, cameras: list[Camera], renderer: Renderer, progress: Progress | None
+    ) -> None:
+        self._folder = folder
+        self._config = config
+        self._cameras = cameras
+        self._renderer = renderer
+        self._progress = progress
+        self._frames = LEAD + config.frames + TAIL
+        self._total = len(cameras) * (self._frames + config.boards)
+        self._done = 0
+        self._rng = [np.random.default_rng([config.seed, 0xCA3, k]) for k in range(len(cameras))]
+        shape = (_NOISE_PATTERNS, config.size_px[1], config.size_px[0], 3)
+        self._grain = np.rint(self._rng[0].normal(0.0, _SENSOR_NOISE, shape)).astype(np.int8)
+        self.picks: dict[str, list[SeenVertex]] = {}
+
+    def performance(self, scene: Scene, take: Take) -> None:
+        """Record the exercises with videos and masks, and the picks of the first tracked frame."""
+        outlines = [[Outline(self._config.size_px, rng) for _ in ("upper", "lower")] for rng in self._rng]
+        black = np.zeros(self._config.size_px[::-1], np.uint8)
+        with contextlib.ExitStack() as stack:
+            videos = [stack.enter_context(self._video("video", camera)) for camera in self._cameras]
+            masks = [[stack.enter_context(self._mask(c, jaw)) for jaw in ("upper", "lower")] for c in self._cameras]
+            for row in range(len(take.phase)):
+                instant = take.first_instant + row
+                poses = scene.pose(take, row)
+                tracked = take.tracked[0] <= instant < take.tracked[1]
+                if instant == take.tracked[0]:
+                    self._pick(scene, take, row)
+                for k in range(len(self._cameras)):
+                    if not 0 <= instant - _OFFSETS[k] < self._frames:
+                        continue
+                    wobble = tuple(outline.next() for outline in outlines[k]) if tracked else None
+                    picture = scene.draw(k, take, row, poses, wobble)
+                    videos[k].write(self._noisy(picture, k))
+                    for writer, coverage in zip(masks[k], (picture.upper, picture.lower), strict=True):
+                        writer.write(drawn_mask(coverage, self._rng[k]) if tracked else black)
+                    self._count()
+
+    def boards(self) -> Array:
+        """Record the calibration board; return T_world_board of each pose, shape (B, 4, 4)."""
+        self._renderer.add("board", board())
+        poses = board_poses(self._config.boards, np.random.default_rng([self._config.seed, 0xB0A2D]))
+        with contextlib.ExitStack() as stack:
+            videos = [stack.enter_context(self._video("boards", camera)) for camera in self._cameras]
+            for T in poses:
+                for k, video in enumerate(videos):
+                    picture = self._renderer.render(k, {"board": T}, T)
+                    for _ in range(_PICTURES_PER_BOARD):
+                        video.write(self._noisy(picture, k))
+                    self._count()
+        return poses
+
+    def _pick(self, scene: Scene, take: Take, row: int) -> None:
+        head = take.T_world_skull[row]
+        hiding = scene.occluders(take, row)
+        rng = np.random.default_rng([self._config.seed, 0x91C])
+        for jaw, arch, T in (
+            ("upper", scene.anatomy.upper, head),
+            ("lower", scene.anatomy.lower, head @ take.T_skull_mandible[row]),
+        ):
+            self.picks[jaw] = choose_picks(arch, T, self._cameras, hiding, _PICKS, _PICK_NOISE_PX, rng)
+
+    def _video(self, kind: str, camera: Camera) -> VideoWriter:
+        path = self._folder / kind / f"{camera.name}.mp4"
+        return VideoWriter(path, self._config.size_px, FPS, quality_crf=self._config.quality_crf)
+
+    def _mask(self, camera: Camera, jaw: str) -> VideoWriter:
+        path = self._folder / "masks" / camera.name / f"{jaw}.mkv"
+        return VideoWriter(path, self._config.size_px, FPS, lossless=True)
+
+    def _noisy(self, picture: Picture, camera: int) -> NDArray[np.uint8]:
+        """Add sensor noise."""
+        rng = self._rng[camera]
+        pattern = self._grain[rng.integers(_NOISE_PATTERNS)]
+        shift = tuple(int(rng.integers(s)) for s in pattern.shape[:2])
+        return np.clip(picture.color + np.roll(pattern, shift, (0, 1)).astype(np.int16), 0, 255).astype(np.uint8)
+
+    def _count(self) -> None:
+        self._done += 1
+        if self._progress is not None:
+            self._progress(self._done, self._total)
+
+
+def _scans(anatomy: Anatomy) -> dict[str, Mesh]:
+    return {
+        "upper_teeth": anatomy.upper.mesh,
+        "lower_teeth": anatomy.lower.mesh,
+        "mandible": anatomy.mandible,
+        "skull": anatomy.skull,
+    }
+
+
+def _ply(mesh: Mesh) -> bytes:
+    """Encode a coloured mesh as binary PLY with float32 positions."""
+    vertices = np.zeros(len(mesh.vertices), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    vertices["xyz"], vertices["rgb"] = mesh.vertices, mesh.colors
+    faces = np.zeros(len(mesh.faces), [("n", "u1"), ("index", "<i4", 3)])
+    faces["n"], faces["index"] = 3, mesh.faces
+    header = (
+        "ply\nformat binary_little_endian 1.0\ncomment lengths in mm\n"
+        f"element vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
+        "property uchar red\nproperty uchar green\nproperty uchar blue\n"
+        f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    return header.encode() + vertices.tobytes() + faces.tobytes()
+
+
+def _truth(person: Person, cameras: list[Camera], take: Take, T_world_board: Array) -> dict[str, Array]:
+    """Everything a tracker should find, for the tracked frames."""
+    frames = np.arange(*take.tracked)
+    rows = frames - take.first_instant
+    upper = take.T_world_skull[rows]
+    return {
+        "frames": frames,
+        "T_world_upper": upper,
+        "T_world_lower": upper @ take.T_skull_mandible[rows],
+        "T_upper_lower": take.T_skull_mandible[rows],
+        "phase": take.phase[rows],
+        "controls": take.controls[rows],
+        "camera_names": np.array([camera.name for camera in cameras]),
+        "offsets": np.array(_OFFSETS),
+        "K": np.stack([camera.K for camera in cameras]),
+        "dist": np.stack([camera.distortion for camera in cameras]),
+        "R": np.stack([camera.T_cam_world[:3, :3] for camera in cameras]),
+        "t": np.stack([camera.T_cam_world[:3, 3] for camera in cameras]),
+        "flash": take.dark,
+        "rest_frame": np.array(take.rest_frame),
+        "landmark_names": np.array(LANDMARKS),
+        "landmarks": person.landmarks,
+        "board_T_world": T_world_board,
+    }
+
+
+def _description(
+    config: DemoConfig, cameras: list[Camera], take: Take, picks: dict[str, list[SeenVertex]]
+) -> str:
+    """Text of capture.toml."""
+    lines = [
+        'format = "jawusd-capture/1"',
+        f'name = "synthetic_{config.seed}"',
+        'units = "mm"',
+        f"fps = {FPS}",
+        'calibration = "calibration.toml"',
+        f"frames = [{take.tracked[0]}, {take.tracked[1]}]",
+        "",
+        "[scans]",
+        *(f'{name} = "scans/{name}.ply"' for name in ("upper_teeth", "lower_teeth", "mandible", "skull")),
+        "",
+    ]
+    for camera in cameras:
+        lines += ["[[camera]]", f'name = "{camera.name}"', f'video = "video/{camera.name}.mp4"']
+        lines += [f'masks.{jaw} = "masks/{camera.name}/{jaw}.mkv"' for jaw in ("upper", "lower")] + [""]
+    videos = ", ".join(f'"boards/{camera.name}.mp4"' for camera in cameras)
+    lines += ["[boards]", 'pattern = "chessboard"', f"cols = {BOARD_COLUMNS}", f"rows = {BOARD_ROWS}"]
+    lines += [f"square_mm = {SQUARE_MM}", f"videos = [{videos}]", ""]
+    lines += ["[sync]", 'method = "flash"', f'reference = "{cameras[0].name}"', ""]
+    lines += ["[bootstrap]", f"frame = {take.tracked[0]}", ""]
+    for jaw in ("upper", "lower"):
+        for pick in picks[jaw]:
+            views = ", ".join(f'{{ camera = "{name}", x = {x:.2f}, y = {y:.2f} }}' for name, x, y in pick.views)
+            lines += [f"[[bootstrap.{jaw}]]", f"vertex = {pick.vertex}", f"views = [{views}]", ""]
+    lines += ["[motion]", f"rest_frame = {take.rest_frame}", ""]
+    return "\n".join(lines)

@@ -1,0 +1,103 @@
+"""The person in the studio: surfaces with colours and labels, posed at an instant of a take, drawn by the renderer."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jawusd.formats.mesh import Mesh
+from jawusd.geometry import transform_points
+from jawusd.synthetic.anatomy import Anatomy
+from jawusd.synthetic.dental_arch import DentalArch
+from jawusd.synthetic.person import Person
+from jawusd.synthetic.render import LOWER_TEETH, UPPER_TEETH, Picture, Renderer
+from jawusd.synthetic.soft_tissue import Face, LipState, Surface, palate, tongue
+from jawusd.synthetic.take import Take
+
+Array = NDArray[np.float64]
+
+_ENAMEL = np.array([0.80, 0.745, 0.63])
+_GUM = np.array([0.56, 0.22, 0.21])
+# Canines are yellower, and enamel darkens towards the gum.
+_CANINE_TINT = np.array([0.95, 0.91, 0.82])
+
+
+class Scene:
+    """All surfaces of one person, ready to be drawn."""
+
+    def __init__(self, person: Person, anatomy: Anatomy, renderer: Renderer) -> None:
+        """Give the renderer the person's surfaces.
+
+        Args:
+            person: who.
+            anatomy: that person's teeth.
+            renderer: draws them.
+        """
+        self._renderer = renderer
+        self.anatomy = anatomy
+        self._face = Face(person.joint.incisor)
+        self._still = LipState(8.2, 8.2, 27.5, 0.0)
+        for name, arch, label in (("upper", anatomy.upper, UPPER_TEETH), ("lower", anatomy.lower, LOWER_TEETH)):
+            crowns, gum = _arch_surfaces(arch)
+            renderer.add(f"{name} teeth", crowns, label)
+            renderer.add(f"{name} gum", gum)
+        face = self._face
+        vertices = face.posed(self._still, np.eye(4))
+        renderer.add("face", Surface(vertices, face.faces, face.colors, face.gloss, face.skin, face.inside))
+        renderer.add("palate", palate())
+        renderer.add("tongue", tongue(0.0, 0.0, 0.0))
+
+    def pose(self, take: Take, row: int) -> dict[str, Array]:
+        """Shape lips and tongue for an instant and return the surfaces' poses T_world_part, (4, 4) each.
+
+        Args:
+            take: the performance.
+            row: instant, counted from the take's first one.
+        """
+        T_jaw, head = take.T_skull_mandible[row], take.T_world_skull[row]
+        self._renderer.move("face", self._face.posed(take.lips[row], T_jaw))
+        self._renderer.move("tongue", tongue(*take.tongue_mm[row]).vertices)
+        jaw = head @ T_jaw
+        return {
+            "upper teeth": head, "upper gum": head, "palate": head, "face": head,
+            "lower teeth": jaw, "lower gum": jaw, "tongue": jaw,
+        }  # fmt: skip
+
+    def draw(
+        self, camera: int, take: Take, row: int, poses: dict[str, Array], wobble_px: tuple[ArrayLike, ArrayLike] | None
+    ) -> Picture:
+        """Draw an instant; `poses` as returned by `pose` for the same row, `wobble_px` as for `Renderer.render`."""
+        return self._renderer.render(camera, poses, take.T_world_skull[row], float(take.light[row]), wobble_px)
+
+    def occluders(self, take: Take, row: int) -> list[Mesh]:
+        """Return everything that can hide a tooth at an instant, in world coordinates [mm]."""
+        T_jaw, head = take.T_skull_mandible[row], take.T_world_skull[row]
+        licking = tongue(*take.tongue_mm[row])
+        parts = (
+            (head, self.anatomy.upper.mesh),
+            (head @ T_jaw, self.anatomy.lower.mesh),
+            (head, Mesh(self._face.posed(take.lips[row], T_jaw), self._face.faces)),
+            (head @ T_jaw, Mesh(licking.vertices, licking.faces)),
+        )
+        return [Mesh(transform_points(T, mesh.vertices), mesh.faces) for T, mesh in parts]
+
+
+def _arch_surfaces(arch: DentalArch) -> tuple[Surface, Surface]:
+    """Crowns and gum of a row of teeth with the colours of life."""
+    tooth = arch.tooth != 0
+    first_gum = int(np.argmin(tooth))
+    vertices, faces = arch.mesh.vertices, arch.mesh.faces
+    crown_faces = faces[faces[:, 0] < first_gum]
+    gum_faces = faces[faces[:, 0] >= first_gum] - first_gum
+    colors = np.tile(_ENAMEL, (first_gum, 1))
+    for k in np.unique(arch.tooth[:first_gum]):
+        own = arch.tooth[:first_gum] == k
+        height = np.abs(vertices[:first_gum][own, 1])
+        share = (height - height.min()) / np.ptp(height)  # 0 at the end towards the other jaw
+        colors[own] *= (1.0 - 0.16 * share[:, None] * np.array([0.6, 0.8, 1.3]))
+        if abs(k) == 3:
+            colors[own] *= _CANINE_TINT
+    n, m = first_gum, len(vertices) - first_gum
+    crowns = Surface(vertices[:n], crown_faces, colors, np.full(n, 0.5), np.zeros(n), np.ones(n))
+    gum = Surface(vertices[n:], gum_faces, np.tile(_GUM, (m, 1)), np.full(m, 0.4), np.full(m, 0.3), np.ones(m))
+    return crowns, gum

@@ -1,0 +1,249 @@
+"""Lips, face, mouth lining, palate and tongue: what surrounds and hides the teeth in pictures.
+
+The face is one grid of rings around the mouth, from the throat over the lining of the cheeks and the lips to the
+edge of the face. It is built in the scan frame for the closed bite and follows the mandible by linear blend skinning.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jawusd.geometry import transform_points
+from jawusd.synthetic.kinematics import smoothstep
+from jawusd.synthetic.surfaces import Faces, grid_faces
+
+Array = NDArray[np.float64]
+
+_COLUMNS = 160
+_SKIN_ROWS = 30
+_SKIN = np.array([0.66, 0.41, 0.31])
+_VERMILION = np.array([0.50, 0.19, 0.175])
+_LINING = np.array([0.45, 0.14, 0.13])
+_THROAT = np.array([0.10, 0.025, 0.025])
+_TONGUE = np.array([0.72, 0.36, 0.35])
+_PALATE = np.array([0.70, 0.40, 0.38])
+
+# Midline profile of the face from the neck up, for lips drawn back: height and depth [mm].
+_PROFILE = np.array(
+    [
+        [-95.0, -58.0], [-75.0, -48.0], [-62.0, -34.0], [-54.0, -18.0], [-48.0, -6.5], [-42.0, 1.5], [-36.0, 5.0],
+        [-29.0, 4.0], [-23.0, 2.2], [-16.0, 4.5], [-9.0, 7.5], [0.0, 8.5], [9.0, 9.0], [17.0, 8.8], [24.0, 8.6],
+        [60.0, 12.0],
+    ]
+)  # fmt: skip
+# Rings of the mouth's lining: depth, half width, height up and down [mm].
+_LINING_RINGS = ((-78.0, 0.05, 0.05, 0.05), (-60.0, 36.0, 16.0, 16.0), (-24.0, 35.5, 18.0, 18.0))
+
+# Cross-section of a lip, from the wet side to the skin: distance from the edge outwards and height over the plane of
+# the edge [mm], and how much of it is red.
+_LIP = np.array(
+    [
+        [4.5, -5.5, 1.0], [2.2, -4.2, 1.0], [0.7, -2.2, 1.0], [0.0, 0.0, 1.0], [0.5, 1.9, 1.0], [1.7, 3.4, 1.0],
+        [3.4, 4.4, 1.0], [5.2, 4.6, 0.98], [6.8, 4.1, 0.8], [8.2, 3.3, 0.42], [9.6, 2.6, 0.12], [11.2, 2.1, 0.0],
+    ]
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class LipState:
+    """How the lips are held.
+
+    Attributes:
+        upper_mm: height of the middle of the upper lip's edge over the upper incisal edge.
+        lower_mm: depth of the middle of the lower lip's edge below the lower incisal edge, moving with the jaw.
+        width_mm: half distance between the corners.
+        slant: one side of the mouth drawn higher: rise per mm to the left.
+    """
+
+    upper_mm: float
+    lower_mm: float
+    width_mm: float
+    slant: float
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A coloured surface for rendering.
+
+    Attributes:
+        vertices: positions [mm], shape (V, 3).
+        faces: shape (F, 3).
+        colors: linear diffuse reflectance, shape (V, 3), 0..1.
+        gloss: strength of the highlight, shape (V,), 0..1.
+        skin: 1 where the surface has the grain of skin, 0 elsewhere, shape (V,).
+        inside: 1 for what lies in the mouth and gets little light at depth, shape (V,).
+    """
+
+    vertices: Array
+    faces: Faces
+    colors: Array
+    gloss: Array
+    skin: Array
+    inside: Array
+
+
+class Face:
+    """Face, lips and mouth lining of one person as a grid of rings around the mouth."""
+
+    def __init__(self, lower_incisor: Array) -> None:
+        """Prepare the grid.
+
+        Args:
+            lower_incisor: lower incisal point in occlusion, scan frame [mm], shape (3,).
+        """
+        self._incisor_y = float(lower_incisor[1])
+        angle = 2 * np.pi * (np.arange(_COLUMNS) + 0.5) / _COLUMNS
+        self._cos, self._sin = np.cos(angle), np.sin(angle)
+        # the lower lip rides on the jaw, the corners go along by a third
+        self._follow = smoothstep((0.35 - self._sin) / 0.95)
+        lining_rows, lip_rows = 4, len(_LIP)
+        self.rows = lining_rows + lip_rows + _SKIN_ROWS
+        self.faces = grid_faces(self.rows, _COLUMNS, closed=True)
+        red = np.concatenate([np.ones(lining_rows), _LIP[:, 2], np.zeros(_SKIN_ROWS)])[:, None, None]
+        depth = np.concatenate([[0.0, 0.3, 0.85, 1.0], np.ones(lip_rows + _SKIN_ROWS)])[:, None, None]
+        wet = np.concatenate([np.zeros(lining_rows), smoothstep((2.0 - _LIP[:, 1]) / 6.0), np.zeros(_SKIN_ROWS)])
+        red_color = _VERMILION + (_LINING - _VERMILION) * wet[:, None, None]
+        color = _SKIN + (red_color - _SKIN) * red
+        color = _THROAT + (np.where(depth < 1.0, _LINING, color) - _THROAT) * depth
+        self.colors = np.broadcast_to(color, (self.rows, _COLUMNS, 3)).reshape(-1, 3).copy()
+        gloss = np.concatenate([np.zeros(lining_rows), 0.30 - 0.17 * (1 - _LIP[:, 2]), np.full(_SKIN_ROWS, 0.13)])
+        self.gloss = np.repeat(gloss, _COLUMNS)
+        grain = np.concatenate([np.zeros(lining_rows), 0.35 + 0.65 * (1 - _LIP[:, 2]), np.ones(_SKIN_ROWS)])
+        self.skin = np.repeat(grain, _COLUMNS)
+        inside = np.concatenate([np.ones(lining_rows), np.where(_LIP[:, 1] < -1.0, 1.0, 0.0), np.zeros(_SKIN_ROWS)])
+        self.inside = np.repeat(inside, _COLUMNS)
+
+    def rest(self, lips: LipState) -> Array:
+        """Return the vertices for the closed bite, scan frame [mm], shape (rows, columns, 3)."""
+        edge = self._edge(lips)
+        outwards = np.stack([self._cos * 0.8, self._sin], -1)
+        outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
+        # at the corners the red is narrow, in the middle of the lower lip widest
+        size = (0.45 + 0.55 * np.abs(self._sin) ** 0.7) * np.where(self._sin < 0, 1.1, 0.95)
+        base = _skin_depth(edge[:, 0], edge[:, 1]) - 4.2 - 1.5 * self._cos**8
+        lip_rows = []
+        for distance, height, _ in _LIP:
+            xy = edge + outwards * distance * (size[:, None] if distance > 0.1 else 1.0)
+            lip_rows.append(np.stack([xy[:, 0], xy[:, 1], base + height * (0.6 + 0.4 * np.abs(self._sin))], -1))
+        lip = np.stack(lip_rows)
+        lip[4:] = _rounded(lip[4:])
+        return np.concatenate([self._lining(lip[0]), lip, _rounded(self._skin_grid(lip[-1]))])
+
+    def posed(self, lips: LipState, T_skull_mandible: ArrayLike) -> Array:
+        """Return the vertices in the skull frame, following the jaw.
+
+        Args:
+            lips: how the lips are held.
+            T_skull_mandible: jaw pose, shape (4, 4).
+
+        Returns:
+            Vertices [mm], shape (rows * columns, 3).
+        """
+        rest = self.rest(lips)
+        reach = np.ones(self.rows)
+        reach[-_SKIN_ROWS:] = np.linspace(1.0, 0.75, _SKIN_ROWS)
+        weight = self._follow * reach[:, None]
+        weight[0] = 0.4  # the throat stays closed
+        weight = weight[..., None]
+        moved = transform_points(np.asarray(T_skull_mandible, dtype=np.float64), rest.reshape(-1, 3))
+        return (rest + weight * (moved.reshape(rest.shape) - rest)).reshape(-1, 3)
+
+    def _edge(self, lips: LipState) -> Array:
+        """Edge of the mouth opening in the closed bite, (columns, 2) in x, y."""
+        middle = -1.0
+        upper, lower = lips.upper_mm - middle, middle - (self._incisor_y - lips.lower_mm)
+        shape = np.abs(self._sin) ** 0.8
+        y = middle + np.where(self._sin > 0, upper, -lower) * shape
+        x = lips.width_mm * np.sign(self._cos) * np.abs(self._cos) ** 0.9
+        # cupid's bow
+        y = y - 0.9 * np.exp(-((x / 4.0) ** 2)) * (self._sin > 0)
+        return np.stack([x, y + lips.slant * x], -1)
+
+    def _lining(self, lip_inner: Array) -> Array:
+        """Rings of the mouth's lining from the throat to the wet side of the lips, (4, columns, 3)."""
+        rings = []
+        for z, half_width, up, down in _LINING_RINGS:
+            x = half_width * np.sign(self._cos) * np.abs(self._cos) ** 0.7
+            y = np.where(self._sin > 0, up, down) * np.sign(self._sin) * np.abs(self._sin) ** 0.7
+            rings.append(np.stack([x, y - 1.0, np.full(_COLUMNS, z)], -1))
+        rings.append(0.5 * (rings[-1] + lip_inner) + [0.0, 0.0, 3.0])
+        return np.stack(rings)
+
+    def _skin_grid(self, border: Array) -> Array:
+        """Rings of skin from the border of the red to the edge of the face, (rows, columns, 3)."""
+        far = np.stack([70.0 * self._cos, np.where(self._sin > 0, 62.0, 72.0) * self._sin - 8.0], -1)
+        share = (np.arange(1, _SKIN_ROWS + 1) / _SKIN_ROWS)[:, None, None] ** 1.35
+        xy = border[None, :, :2] + share * (far - border[:, :2])
+        z = _skin_depth(xy[..., 0], xy[..., 1])
+        # the first rows run smoothly out of the lip's bulge
+        offset = border[:, 2] - _skin_depth(border[:, 0], border[:, 1])
+        z = z + offset * np.exp(-((share[..., 0] / 0.10) ** 1.5))
+        return np.concatenate([xy, z[..., None]], -1)
+
+
+def _rounded(rings: Array) -> Array:
+    """Hann average of rings (R, A, 3) along themselves: no creases at the corners of the mouth."""
+    kernel = np.hanning(13)[1:-1]
+    kernel /= kernel.sum()
+    return sum(k * np.roll(rings, i - 5, axis=1) for i, k in enumerate(kernel))
+
+
+def _skin_depth(x: Array, y: Array) -> Array:
+    """Depth z [mm] of the skin over the frontal plane, any shape."""
+    # an averaged polygon has no visible corners
+    middle = np.mean([np.interp(y + shift, *_PROFILE.T) for shift in (-4.0, -2.0, 0.0, 2.0, 4.0)], axis=0)
+    chin = smoothstep((-22.0 - y) / 20.0)
+    z = middle - (0.0138 + 0.0045 * chin) * x**2 - 1.1e-6 * x**4
+    # groove below the nose with its ridges, wings of the nose, folds from nose to mouth
+    lip = np.exp(-(((y - 17.0) / 7.5) ** 2))
+    z = z + lip * (0.7 * np.exp(-(((np.abs(x) - 5.0) / 2.6) ** 2)) - 0.8 * np.exp(-((x / 3.0) ** 2)))
+    z = z + 15.0 * np.exp(-((x / 12.5) ** 2)) * smoothstep((y - 21.0) / 13.0)
+    fold = np.abs(x) - (19.0 + 0.62 * (24.0 - y))
+    strength = smoothstep((y + 12.0) / 10.0) * smoothstep((40.0 - y) / 14.0)
+    z = z - 1.5 * strength * np.exp(-((fold / 3.2) ** 2)) + 1.6 * strength * np.exp(-(((fold - 9.0) / 8.0) ** 2))
+    return z + 1.6 * chin * np.exp(-((x / 13.0) ** 2)) * np.exp(-(((y + 37.0) / 8.0) ** 2))
+
+
+def palate() -> Surface:
+    """Return the roof of the mouth between the upper teeth, scan frame."""
+    z = np.linspace(-56.0, -6.0, 26)
+    across = np.linspace(-1.0, 1.0, 25)
+    half = 24.0 * np.sqrt(np.clip((-z - 2.0) / 40.0, 0.03, 1.0)) + 0.5
+    x = half[:, None] * across
+    rise = np.sqrt(np.clip((-z - 5.0) / 18.0, 0.0, 1.0))[:, None]
+    y = 7.5 + 11.0 * rise * (1.0 - np.abs(across) ** 2.5)
+    ridges = 0.35 * np.sin(z * 1.5)[:, None] * np.exp(-(((z + 14.0) / 8.0) ** 2))[:, None]
+    vertices = np.stack([x, y + ridges, np.broadcast_to(z[:, None], x.shape)], -1).reshape(-1, 3)
+    faces = grid_faces(26, 25, closed=False)
+    return _plain(vertices, faces, _PALATE, 0.35)
+
+
+def tongue(forward_mm: float, up_mm: float, side_mm: float) -> Surface:
+    """Return the tongue on the floor of the mouth, mandible frame.
+
+    Args:
+        forward_mm: how far it is put forward from rest.
+        up_mm: how far its tip is raised.
+        side_mm: shift of the tip to the left.
+    """
+    around, along = 40, 26
+    u = 2 * np.pi * np.arange(around) / around
+    t = np.linspace(0.0, 1.0, along)
+    width = 17.5 * np.sqrt(np.clip(1.0 - (t * 1.02 - 0.25).clip(0) ** 2 / 0.6, 0.002, 1.0))
+    height = 8.0 * (1.0 - 0.55 * t) * np.sqrt(np.clip(1.0 - t**6, 0.002, 1.0))
+    z = -66.0 + (57.0 + forward_mm) * t
+    lift = up_mm * smoothstep((t - 0.45) / 0.55)
+    x = width[:, None] * np.sign(np.cos(u)) * np.abs(np.cos(u)) ** 0.8 + side_mm * t[:, None] ** 2
+    top = np.sign(np.sin(u)) * np.abs(np.sin(u)) ** 0.8
+    groove = 1.3 * np.exp(-((x / 3.0) ** 2)) * (top > 0) * np.sin(np.pi * t)[:, None]
+    y = -8.0 + lift[:, None] + height[:, None] * top - groove
+    vertices = np.stack([x, y, np.broadcast_to(z[:, None], x.shape)], -1).reshape(-1, 3)
+    return _plain(vertices, grid_faces(along, around, closed=True)[:, ::-1], _TONGUE, 0.45)
+
+
+def _plain(vertices: Array, faces: Faces, color: Array, gloss: float) -> Surface:
+    n = len(vertices)
+    return Surface(vertices, faces, np.tile(color, (n, 1)), np.full(n, gloss), np.full(n, 0.3), np.ones(n))
