@@ -41,10 +41,14 @@ class TrackingConfig:
     typical_noise_px3: float = 1.6
     # Contour length over which outline errors move together [px], until it has been measured on the take.
     correlation_px: float = 10.0
-    # Good frames remembered to judge the next one [frames]: about a second, the time in which lips open or close.
+    # Good frames remembered to judge residuals and coverage [frames]: about a second.
     history_frames: int = 31
-    # Score below this share of the recent median makes a row suspect [-]: lips seldom hide as much in one second.
+    # Good frames remembered to judge scores [frames]: closing lips take longer, a lost pose does not.
+    score_frames: int = 7
+    # Score below this share of the recent median makes a row suspect [-]: lips seldom hide as much in a few frames.
     suspect_score: float = 0.6
+    # Score share below which even closing lips are no excuse [-].
+    alarming_score: float = 0.3
     # Residual spread above this multiple of the recent median makes a row suspect [-].
     suspect_residual: float = 1.4
     # Uncovered mask above the recent median by more than this makes a row, or a mask, suspect [-].

@@ -80,7 +80,7 @@ def _check_not_swapped(
             points = np.empty((len(scan.vertices), 3), np.float32)
             bits = np.zeros_like(pack_bits(view.masks[0]))
             project(scan.vertices_single, (view.matrix @ poses[r]).astype(np.float32), points)
-            draw_silhouette(points, scan.crown_faces, 0, 0, view.masks.shape[2], False, bits)
+            draw_silhouette(points, scan.crown_faces, 0, 0, view.masks.shape[2], scan.painted, bits)
             crowns.append(bits)
         masks = [pack_bits(m > 127) for m in view.masks]
         own = sum(count_and_not(masks[r], crowns[r]) for r in _ROWS)

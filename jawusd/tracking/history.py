@@ -33,9 +33,9 @@ class FrameRecord:
 class History:
     """Remember what good frames looked like lately, to tell a bad one."""
 
-    def __init__(self, length: int) -> None:
-        """Start empty; keep at most `length` frames."""
-        self._scores: deque[NDArray] = deque(maxlen=length)
+    def __init__(self, length: int, score_length: int) -> None:
+        """Start empty; keep at most `length` frames, scores of at most `score_length`."""
+        self._scores: deque[NDArray] = deque(maxlen=score_length)
         self._residuals: deque[NDArray] = deque(maxlen=length)
         self._coverages: deque[NDArray] = deque(maxlen=length)
 

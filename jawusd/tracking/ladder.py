@@ -63,13 +63,16 @@ class FrameTracker:
         kept = use & ~self._spoiled(trial)
         if (kept != use).any():
             trial = self._try(starts[0], views, self._config.gates_px, kept)
-        attempts = [self._others, self._leave_out, self._widen, self._search]
         first = trial
-        for attempt in attempts if gallery is not None else attempts[:-1]:
-            suspect = self._suspect(trial)
-            if not suspect.any():
-                break
-            trial = attempt(trial, suspect, starts, views, gallery)
+        for rows, attempt in (
+            (self._suspect, self._others),
+            (self._alarming, self._leave_out),
+            (self._suspect, self._widen),
+            (self._alarming, self._search),
+        ):
+            bad = rows(trial)
+            if bad.any() and (attempt != self._search or gallery is not None):
+                trial = attempt(trial, bad, starts, views, gallery)
         return self._record(first, trial)
 
     def _record(self, first: _Trial, trial: _Trial) -> FrameRecord:
@@ -88,9 +91,14 @@ class FrameTracker:
         """Tell which rows look worse than they lately did, shape (2,)."""
         return (self._scarce(trial) | self._rough(trial) | self._bare(trial).any(1)) & trial.use.any(1)
 
-    def _scarce(self, trial: _Trial) -> NDArray[np.bool_]:
-        usual = self.history.usual_score()
-        return score_px(trial.solution).sum(1) < self._config.suspect_score * usual
+    def _alarming(self, trial: _Trial) -> NDArray[np.bool_]:
+        """Tell which rows look so bad that closing lips alone do not explain it, shape (2,)."""
+        bad = self._scarce(trial, self._config.alarming_score) | self._rough(trial) | self._bare(trial).any(1)
+        return bad & trial.use.any(1)
+
+    def _scarce(self, trial: _Trial, share: float | None = None) -> NDArray[np.bool_]:
+        share = self._config.suspect_score if share is None else share
+        return score_px(trial.solution).sum(1) < share * self.history.usual_score()
 
     def _rough(self, trial: _Trial, factor: float = 1.0) -> NDArray[np.bool_]:
         limit = factor * self._config.suspect_residual * self.history.usual_residual()

@@ -51,7 +51,7 @@ def uncovered_px(
             mask = pack_bits(view.masks[r] > 127)
             crowns = np.zeros_like(mask)
             project(scan.vertices_single, (view.matrix @ solution.poses[r]).astype(np.float32), points)
-            draw_silhouette(points, scan.crown_faces, 0, 0, view.masks.shape[2], False, crowns)
+            draw_silhouette(points, scan.crown_faces, 0, 0, view.masks.shape[2], scan.painted, crowns)
             bare[r, c], total[r, c] = count_and_not(mask, crowns), count_bits(mask)
     return bare, total
 

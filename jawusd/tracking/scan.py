@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from jawusd.errors import TrackingError
 from jawusd.formats.mesh import Mesh
@@ -33,6 +35,7 @@ class Scan:
         centre: centroid of the crown vertices [mm], shape (3,).
         radius_mm: largest distance of a crown vertex from the centre.
         painted: whether the scan's colours told crown from gum; otherwise the whole scan counts as crown.
+            Painted crowns are wound outwards, so faces turned away need not be drawn.
     """
 
     name: str
@@ -74,6 +77,8 @@ def prepare_scan(mesh: Mesh, name: str) -> Scan:
         crown = paint if painted else crown
     solid = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
     crown_faces = np.ascontiguousarray(faces[crown & solid])
+    if painted:
+        crown_faces = _wound_outwards(vertices, crown_faces)
     gum_faces = np.ascontiguousarray(faces[~crown & solid])
     if len(crown_faces) < _FEWEST_CROWN_FACES:
         raise TrackingError(
@@ -109,6 +114,25 @@ def _weld(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> tuple[NDAr
     """Merge vertices at the same place: triangle soups would otherwise consist of borders only."""
     unique, inverse = np.unique(vertices, axis=0, return_inverse=True)
     return np.ascontiguousarray(unique), np.ascontiguousarray(inverse.reshape(-1)[faces], np.int32)
+
+
+def _wound_outwards(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Return the faces with those connected pieces turned round that enclose a negative volume.
+
+    Volumes are taken about each piece's own centre, so the open base of a crown adds little.
+    """
+    links = coo_array(
+        (np.ones(3 * len(faces)), (faces.ravel(), np.roll(faces, 1, axis=1).ravel())), [len(vertices)] * 2
+    )
+    piece = connected_components(links, directed=False)[1][faces[:, 0]]
+    corners = vertices[faces]
+    count = np.bincount(piece)
+    middle = corners.mean(1)
+    centre = np.stack([np.bincount(piece, middle[:, k]) / np.maximum(count, 1) for k in range(3)], axis=1)
+    corners = corners - centre[piece][:, None]
+    six_volumes = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
+    inside_out = np.bincount(piece, six_volumes)[piece] < 0
+    return np.ascontiguousarray(np.where(inside_out[:, None], faces[:, ::-1], faces), np.int32)
 
 
 def _edge_table(faces: NDArray[np.int32]) -> NDArray[np.int32]:

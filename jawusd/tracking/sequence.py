@@ -154,7 +154,7 @@ class _Take:
 
     def _from(self, frame: int) -> tuple[FrameTracker, Motion]:
         """Return a tracker that knows the frames around a tracked one."""
-        history = History(self._config.history_frames)
+        history = History(self._config.history_frames, self._config.score_frames)
         known = sorted(self.records, key=lambda f: -abs(f - frame))
         for near in known[-self._config.history_frames :]:
             history.add(self.records[near])

@@ -205,7 +205,7 @@ class _Rendering:
         labels, depth = self.labels[c][r], self.depths[c][r]
         labels[:] = 0
         depth[:] = 0
-        draw_depth_labels(points, scan.crown_faces, 0, 0, False, depth, labels, CROWN)
+        draw_depth_labels(points, scan.crown_faces, 0, 0, scan.painted, depth, labels, CROWN)
         draw_depth_labels(points, scan.gum_faces, 0, 0, False, depth, labels, GUM)
         self._drawn[r][c] = pose.copy()
 
