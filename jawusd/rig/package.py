@@ -13,6 +13,9 @@ from jawusd.formats.atomic import atomic_path
 from jawusd.rig.layout import ACTOR, ACTOR_FILE
 from jawusd.rig.read import open_stage
 
+# Archives carry the time of their files. A fixed one makes equal rigs equal: the first a zip can hold in any time zone.
+_ZIP_EPOCH = 315_619_200
+
 
 def write_package(out: str | os.PathLike[str], source: str | os.PathLike[str]) -> Path:
     """Flatten a stage of one actor into a package.
@@ -37,6 +40,7 @@ def write_package(out: str | os.PathLike[str], source: str | os.PathLike[str]) -
         text = Path(scratch) / ACTOR_FILE
         if not layer.Export(str(text)):
             raise RigError("OpenUSD could not flatten the actor.", path=source)
+        os.utime(text, (_ZIP_EPOCH, _ZIP_EPOCH))
         with atomic_path(out) as temporary:
             if not UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(text)), str(temporary)):
                 raise RigError("OpenUSD could not pack the actor.", path=out)

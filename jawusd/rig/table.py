@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jawusd.errors import RigError
 from jawusd.evaluator import JawRig
+from jawusd.evaluator.table import SampledTable
 from jawusd.geometry.se3 import se3_exp
 from jawusd.rig.knots import sample_knots
 from jawusd.rig.sampling import sample_valid, valid_box
@@ -51,15 +52,7 @@ class DecoderTable:
         if self.format == "curves":
             parts = np.split(self.twists.astype(np.float64), np.cumsum([len(axis) for axis in self.knots])[:2])
             return sum(_along(part, axis, x) for part, axis, x in zip(parts, self.knots, d.T, strict=True))
-        located = [_locate(axis, d[:, i]) for i, axis in enumerate(self.knots)]
-        (i, a), (j, b), (k, c) = ((index, share[:, None]) for index, share in located)
-        twists = self.twists
-        total = np.zeros((len(d), 6))
-        for di, wi in ((0, 1 - a), (1, a)):
-            for dj, wj in ((0, 1 - b), (1, b)):
-                for dk, wk in ((0, 1 - c), (1, c)):
-                    total += wi * wj * wk * twists[i + di, j + dj, k + dk]
-        return total
+        return SampledTable(self.knots, self.twists, np.eye(4)).twist(d)
 
 
 def build_table(rig: JawRig, vertices: Array, size: int = DEFAULT_SIZE) -> DecoderTable:
@@ -129,7 +122,7 @@ def extreme_vertices(vertices: Array) -> NDArray[np.int64]:
     height, turn = 1 - 2 * i / len(i), np.pi * (1 + 5**0.5) * i  # Fibonacci sphere
     radius = np.sqrt(1 - height**2)
     directions = np.stack([radius * np.cos(turn), radius * np.sin(turn), height], axis=1)
-    return np.unique(np.argmax(vertices @ directions.T, axis=0))
+    return np.unique(np.argmax(directions @ vertices.T, axis=1))
 
 
 def _on_axis(i: int, values: Array) -> Array:
@@ -138,12 +131,6 @@ def _on_axis(i: int, values: Array) -> Array:
     return d
 
 
-def _locate(knots: Array, x: Array) -> tuple[NDArray[np.int64], Array]:
-    x = np.clip(x, knots[0], knots[-1])
-    index = np.clip(np.searchsorted(knots, x, side="right") - 1, 0, len(knots) - 2)
-    return index, (x - knots[index]) / (knots[index + 1] - knots[index])
-
-
 def _along(values: Array, knots: Array, x: Array) -> Array:
-    index, share = _locate(knots, x)
-    return values[index] * (1 - share[:, None]) + values[index + 1] * share[:, None]
+    """Return values (n, 6) at knots (n,) interpolated linearly at x (m,), clamped to the knots."""
+    return np.stack([np.interp(x, knots, column) for column in values.T], axis=1)

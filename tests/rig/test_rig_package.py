@@ -1,5 +1,7 @@
 """The package for viewers: flat, text, complete but for the ONNX file."""
 
+import zipfile
+
 import numpy as np
 import pytest
 from example_rig import assert_valid_usd, example_motion, example_rig
@@ -38,6 +40,13 @@ def test_attributes_stay_custom(anchored_folder):
     names = [prop.name for prop in actor.properties if prop.name.startswith("jaw:")]
     assert "jaw:d1" in names and "jaw:onnx" not in names
     assert all(actor.properties[name].custom for name in names)
+
+
+def test_packing_later_gives_the_same_bytes(anchored_folder, tmp_path):
+    again = write_package(tmp_path / "again.usdz", anchored_folder / "anim_capture.usdc")
+    assert again.read_bytes() == (anchored_folder / "actor.usdz").read_bytes()
+    with zipfile.ZipFile(again) as archive:
+        assert {entry.date_time[0] for entry in archive.infolist()} == {1980}
 
 
 def test_a_source_that_is_no_usd_leaves_the_old_package(anchored_folder):
