@@ -53,13 +53,13 @@ def distance_residual(derivative: Derivative, vectors: Array, target: Array) -> 
         R, t, S = derivative(x)
         image = carried(R, t, vectors)
         # a vector (b, h) moves by w x image + v h under the spatial velocity (w, v)
-        J = np.empty((len(x), 3, count, 3))
-        px, py, pz = image[:, 0, :, None], image[:, 1, :, None], image[:, 2, :, None]
-        wx, wy, wz = S[:, None, 0], S[:, None, 1], S[:, None, 2]
-        v = S[:, 3:, None] * vectors[3][:, None]
-        J[:, 0] = wy * pz - wz * py + v[:, 0]
-        J[:, 1] = wz * px - wx * pz + v[:, 1]
-        J[:, 2] = wx * py - wy * px + v[:, 2]
-        return (image - target[rows]).reshape(len(x), 3 * count), J.reshape(len(x), 3 * count, 3)
+        by_velocity = np.zeros((len(x), 3, count, 6))
+        by_velocity[:, 0, :, 1], by_velocity[:, 1, :, 0] = image[:, 2], -image[:, 2]
+        by_velocity[:, 1, :, 2], by_velocity[:, 2, :, 1] = image[:, 0], -image[:, 0]
+        by_velocity[:, 2, :, 0], by_velocity[:, 0, :, 2] = image[:, 1], -image[:, 1]
+        for axis in range(3):
+            by_velocity[:, axis, :, 3 + axis] = vectors[3]
+        r = (image - target[rows]).reshape(len(x), 3 * count)
+        return r, by_velocity.reshape(len(x), 3 * count, 6) @ S
 
     return residual

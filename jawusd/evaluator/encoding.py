@@ -77,9 +77,9 @@ class Encoder:
         if isinstance(model, AnchoredModel):
             # the nearest pose does not depend on the chart: searching over the incisal displacement spares the gauge
             residual = distance_residual(model.motion_derivative_at, self._vectors, target)
-            return model.gauge.inverse(minimise(residual, model.displacement_of(R, t))[0])
+            return model.parameters_at(minimise(residual, model.displacement_of(R, t)))
         residual = distance_residual(model.decode_derivative, self._vectors, target)
-        return minimise(residual, model.read_off(R, t))[0]
+        return minimise(residual, model.read_off(R, t))
 
     def _most_likely(self, R: Array, t: Array, whitening: Array, start: Array, bound: SliceHull | None) -> Array:
         measured = make_transform(R, t)
@@ -91,7 +91,7 @@ class Encoder:
             # exp(xi(d + e)) = exp(xi) exp(-S e), and the right Jacobian is the left one at -xi
             return np.einsum("nij,nj->ni", W, xi), -W @ se3_left_jacobian_inverse(-xi) @ S
 
-        return minimise(residual, start, bound)[0]
+        return minimise(residual, start, bound)
 
 
 def whitening_of(covariance: Array) -> Array:

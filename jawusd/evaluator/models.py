@@ -82,6 +82,9 @@ class AnchoredModel:
 
     def decode(self, d: Array) -> tuple[Array, Array]:
         """Return the rotation (n, 3, 3) and translation (n, 3) [mm] of M(d)."""
+        if len(d) == 1 and np.isfinite(d).all():
+            M = np.array([self.single.motion(*d[0].tolist())])
+            return M[:, :3, :3], M[:, :3, 3]
         return self.motion_at(self.gauge.displacement(d))
 
     def motion_at(self, u: Array) -> tuple[Array, Array]:
@@ -122,7 +125,12 @@ class AnchoredModel:
 
     def read_off(self, R: Array, t: Array) -> Array:
         """Return the d (n, 3) [mm] that put the incisal point where the motions (R, t) put it."""
-        return self.gauge.inverse(self.displacement_of(R, t))
+        return self.parameters_at(self.displacement_of(R, t))
+
+    def parameters_at(self, u: Array) -> Array:
+        """Return the d (n, 3) [mm] of incisal displacements u (n, 3) [mm]."""
+        d = self.single.parameters_at(u) if len(u) == 1 and np.isfinite(u).all() else None
+        return self.gauge.inverse(u) if d is None else d
 
     def displacement_of(self, R: Array, t: Array) -> Array:
         """Return the displacement u (n, 3) [mm] of the incisal point under the motions (R, t)."""

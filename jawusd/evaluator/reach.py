@@ -57,7 +57,7 @@ class Reach:
         def residual(x: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]:
             return x - d[out[rows]], np.broadcast_to(identity, (len(x), 3, 3))
 
-        valid[out] = minimise(residual, start, self._bound)[0]
+        valid[out] = minimise(residual, start, self._bound)
         return valid
 
     def best_starts(self, vectors: Array, target: Array) -> Array:
@@ -77,7 +77,7 @@ class Reach:
             target: Where they should go, scaled alike.
             start: First d [mm], inside the bound, shape (n, 3).
         """
-        return minimise(distance_residual(self._model.decode_derivative, vectors, target), start, self._bound)[0]
+        return minimise(distance_residual(self._model.decode_derivative, vectors, target), start, self._bound)
 
 
 def nearest_distance(points: Array, queries: Array) -> Array:

@@ -32,6 +32,9 @@ Vector = tuple[float, float, float]
 Rows = list[list[float]]
 
 _SMALL_ANGLE_SQUARED = 1e-4
+_NEWTON_STEPS = 12
+_NEWTON_SETTLED_MM = 1e-8  # the step after it would be below the last digit
+_LEAST_NEWTON_SLOPE = 0.2
 
 
 class SingleAnchored:
@@ -63,6 +66,11 @@ class SingleAnchored:
     def motion_derivative_at(self, u: Array) -> tuple[Array, Array, Array]:
         """Return R (1, 3, 3), t (1, 3) and S (1, 6, 3) by u for one row u (1, 3)."""
         return self._derivative(tuple(u[0].tolist()), np.eye(3))
+
+    def parameters_at(self, u: Array) -> Array | None:
+        """Return the d (1, 3) of one row u (1, 3), or None where plain Newton does not settle."""
+        found = self._gauge.inverse(tuple(u[0].tolist()))
+        return None if found is None else np.array([found])
 
     def _derivative(self, u: Vector, by_d: Array) -> tuple[Array, Array, Array]:
         ux, uy, uz = u
@@ -190,6 +198,26 @@ class SingleGauge:
         u = gx + d2, -(d1 + drop * fade), gz + rho + d3
         rows = [[gx_1, 1.0, 0.0], [-(1.0 + drop * fade_1), -drop_2 * fade, -drop_3 * fade], [gz_1 + rho_1, rho_2, 1.0]]
         return u, rows
+
+
+    def inverse(self, u: Vector) -> Vector | None:
+        """Return the d [mm] of u [mm] by plain Newton, or None if that does not settle (see `Gauge.inverse`)."""
+        ux, uy, uz = u
+        gx, gz = self.path(-uy)
+        d1, d2, d3 = -uy, ux - gx, uz - gz
+        for _ in range(_NEWTON_STEPS):
+            (x, y, z), ((g, _, _), (a, b, c), (h, k, _)) = self.displacement_jacobian(d1, d2, d3)
+            rx, ry, rz = ux - x, uy - y, uz - z
+            slope = a - b * g - c * (h - k * g)
+            if slope > -_LEAST_NEWTON_SLOPE:  # y falls with opening wherever the gauge is a gauge
+                return None
+            s1 = (ry - b * rx - c * (rz - k * rx)) / slope
+            s2 = rx - g * s1
+            s3 = rz - h * s1 - k * s2
+            d1, d2, d3 = d1 + s1, d2 + s2, d3 + s3
+            if abs(s1) + abs(s2) + abs(s3) < _NEWTON_SETTLED_MM:
+                return d1, d2, d3
+        return None
 
 
 class SingleAdditive:

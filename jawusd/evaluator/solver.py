@@ -22,6 +22,10 @@ _LARGEST_DAMPING = 1e8
 _SMALLEST_DAMPING = 1e-12
 _INSIDE_MM = 1e-10  # depth at which a point pulled back onto the surface is left
 _PULL_BACKS = 12
+_PULL = 1.01  # a little more than the distance, so that one pull mostly does; what is lost vanishes with the steps
+_LEAST_STIFFNESS = 1e-12  # keeps steps finite where nothing depends on a parameter
+_LEAST_SLOPE = 1e-6  # squared; keeps pulls finite where the bound is flat
+_TOUCHING_MM = 1e-3  # depth up to which a start counts as lying on the bound
 _IDENTITY = np.eye(3)
 
 
@@ -44,8 +48,8 @@ def minimise(
     bound: Bound | None = None,
     *,
     iterations: int = 60,
-    tolerance_mm: float = 1e-7,
-) -> tuple[Array, Array]:
+    tolerance_mm: float = 1e-6,
+) -> Array:
     """Minimise half the squared residual of every row.
 
     Args:
@@ -54,10 +58,10 @@ def minimise(
             come back NaN.
         bound: Where the points must stay.
         iterations: Most steps tried per row.
-        tolerance_mm: A row is settled when its step is shorter; near the end steps shrink at least tenfold each time.
+        tolerance_mm: A row is settled when its next step is shorter.
 
     Returns:
-        The points (n, 3) and their squared residuals (n,).
+        The points [mm], shape (n, 3).
     """
     x = start.copy()
     cost = np.full(len(x), np.nan)
@@ -66,41 +70,54 @@ def minimise(
     cost[rows] = np.einsum("nm,nm->n", r, r)
     measured = np.isfinite(cost[rows])
     x[rows[~measured]] = np.nan
-    rows, r, J = rows[measured], r[measured], J[measured]
+    rows, r, J = _picked(measured, rows, r, J)
     damping = np.full(len(rows), _START_DAMPING)
-    pressure = np.zeros(len(rows))
+    pressure = np.zeros(len(rows)) if bound is None else _first_pressure(bound, x[rows], r, J)
     for _ in range(iterations):
-        if not rows.size:
-            break
         if bound is None:
             step = -solve_symmetric(_damped(np.swapaxes(J, 1, 2) @ J, damping), _gradient(J, r))
-            trial = x[rows] + step
-            allowed = np.ones(len(rows), dtype=bool)
         else:
             step, pressure = _bounded_step(bound, x[rows], r, J, damping, pressure)
-            trial, allowed = _pulled_back(bound, x[rows] + step)
+        moving = (np.abs(step) > tolerance_mm).any(axis=1) & (damping < _LARGEST_DAMPING)
+        if bound is None:
+            x[rows] += np.where(moving[:, None], 0.0, step)  # the last step costs nothing and doubles the digits
+        rows, r, J, damping, pressure, step = _picked(moving, rows, r, J, damping, pressure, step)
+        if not rows.size:
+            break
+        trial, allowed = x[rows] + step, True
+        if bound is not None:
+            trial, allowed = _pulled_back(bound, trial)
         r_trial, J_trial = residual(trial, rows)
         cost_trial = np.einsum("nm,nm->n", r_trial, r_trial)
-        better = allowed & (cost_trial <= cost[rows])
-        moved = np.abs(trial - x[rows]).max(axis=1)
-        x[rows[better]], cost[rows[better]] = trial[better], cost_trial[better]
-        r[better], J[better] = r_trial[better], J_trial[better]
+        better = (cost_trial <= cost[rows]) & allowed
         damping = np.where(better, np.maximum(damping * 0.1, _SMALLEST_DAMPING), damping * 10.0)
-        left = (moved > tolerance_mm) & (damping < _LARGEST_DAMPING)
-        rows, r, J, damping, pressure = rows[left], r[left], J[left], damping[left], pressure[left]
-    return x, cost
+        if better.all():
+            x[rows], cost[rows], r, J = trial, cost_trial, r_trial, J_trial
+        else:
+            x[rows[better]], cost[rows[better]] = trial[better], cost_trial[better]
+            r = np.where(better[:, None], r_trial, r)
+            J = np.where(better[:, None, None], J_trial, J)
+    return x
+
+
+def _picked(wanted: NDArray[np.bool_], *arrays: Array) -> tuple[Array, ...]:
+    """Return the wanted rows of each array; the arrays themselves, uncopied, if that is all of them."""
+    return arrays if wanted.all() else tuple(array[wanted] for array in arrays)
 
 
 def solve_symmetric(A: Array, b: Array) -> Array:
     """Solve A x = b for symmetric A (n, 3, 3) and b (n, 3) by cofactors."""
-    a, p, q, c, s, f = A[:, 0, 0], A[:, 0, 1], A[:, 0, 2], A[:, 1, 1], A[:, 1, 2], A[:, 2, 2]
+    if len(A) == 1:
+        (a, p, q), (_, c, s), (_, _, f) = A[0].tolist()
+        x, y, z = b[0].tolist()
+    else:
+        a, p, q, c, s, f = A[:, 0, 0], A[:, 0, 1], A[:, 0, 2], A[:, 1, 1], A[:, 1, 2], A[:, 2, 2]
+        x, y, z = b.T
     c00, c01, c02 = c * f - s * s, q * s - p * f, p * s - q * c
     c11, c12, c22 = a * f - q * q, p * q - a * s, a * c - p * p
     scale = 1.0 / (a * c00 + p * c01 + q * c02)
-    x, y, z = b.T
-    return np.stack([c00 * x + c01 * y + c02 * z, c01 * x + c11 * y + c12 * z, c02 * x + c12 * y + c22 * z], 1) * scale[
-        :, None
-    ]
+    solution = (c00 * x + c01 * y + c02 * z, c01 * x + c11 * y + c12 * z, c02 * x + c12 * y + c22 * z)
+    return (np.array(solution) * scale).T.reshape(len(A), 3)
 
 
 def _gradient(J: Array, r: Array) -> Array:
@@ -109,8 +126,16 @@ def _gradient(J: Array, r: Array) -> Array:
 
 def _damped(A: Array, damping: Array) -> Array:
     # damping relative to the problem's own scale, so that it means the same for mm and for weighted residuals
-    amount = damping * (np.einsum("nii->n", A) / 3.0) + np.finfo(float).tiny
+    amount = damping * (np.einsum("nii->n", A) / 3.0) + _LEAST_STIFFNESS
     return A + amount[:, None, None] * _IDENTITY
+
+
+def _first_pressure(bound: Bound, x: Array, r: Array, J: Array) -> Array:
+    """Return the bound's multiplier at the start: how hard the cost presses against it where x lies on it."""
+    excess, normal = bound.excess_gradient(x)
+    squared = np.maximum(np.einsum("ni,ni->n", normal, normal), _LEAST_SLOPE)
+    press = -np.einsum("ni,ni->n", normal, _gradient(J, r)) / squared
+    return np.where(excess > -_TOUCHING_MM, np.maximum(press, 0.0), 0.0)
 
 
 def _bounded_step(
@@ -128,17 +153,15 @@ def _bounded_step(
 
 def _pulled_back(bound: Bound, x: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Return the points moved down the gradient until just inside, and whether they got there."""
-    x = x.copy()
+    inside = np.zeros(len(x), dtype=bool)
     rows = np.arange(len(x))
     for _ in range(_PULL_BACKS):
         excess, normal = bound.excess_gradient(x[rows])
         out = excess > 0
-        rows, excess, normal = rows[out], excess[out], normal[out]
+        inside[rows[~out]] = True
+        rows, excess, normal = _picked(out, rows, excess, normal)
         if not rows.size:
             break
-        squared = np.maximum(np.einsum("ni,ni->n", normal, normal), 1e-6)
-        x[rows] -= ((excess + _INSIDE_MM) / squared)[:, None] * normal
-    inside = np.ones(len(x), dtype=bool)
-    if rows.size:
-        inside[rows] = bound.excess(x[rows]) <= 0
+        squared = np.maximum(np.einsum("ni,ni->n", normal, normal), _LEAST_SLOPE)
+        x[rows] -= ((_PULL * excess + _INSIDE_MM) / squared)[:, None] * normal
     return x, inside

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from jawusd.evaluator.encoding import carried, distance_residual, landmark_vectors
+from jawusd.evaluator.distances import carried, distance_residual, landmark_vectors
 from jawusd.evaluator.models import AnchoredModel, JawModelForm
 from jawusd.evaluator.solver import minimise
 from jawusd.geometry import make_transform
@@ -63,10 +63,10 @@ class MandibleMetric:
         if isinstance(model, AnchoredModel):
             # As in the evaluator: the nearest pose does not depend on the gauge, so search without it.
             residual = distance_residual(model.motion_derivative_at, self.vectors, carried(R, t, self.vectors))
-            u, _ = minimise(residual, model.displacement_of(R, t))
+            u = minimise(residual, model.displacement_of(R, t))
             return model.gauge.inverse(u), make_transform(*model.motion_at(u))
         residual = distance_residual(model.decode_derivative, self.vectors, carried(R, t, self.vectors))
-        d, _ = minimise(residual, model.read_off(R, t))
+        d = minimise(residual, model.read_off(R, t))
         return d, make_transform(*model.decode(d))
 
     def best_rotation(self, target: Array, incisor: Array, at: Array) -> Array:

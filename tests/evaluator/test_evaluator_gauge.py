@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jawusd.evaluator.gauge import Gauge
+from jawusd.evaluator.models import AnchoredModel
 
 ARRAYS = example_arrays("anchored")
 GAUGE = Gauge.from_arrays(ARRAYS)
@@ -45,6 +46,21 @@ def test_inverse_survives_a_gauge_with_a_steep_glide_surface():
     d = gauge.inverse(u)
     assert np.isfinite(d).all()
     np.testing.assert_allclose(gauge.displacement(d), u, atol=1e-9)
+
+
+def test_one_row_is_inverted_as_many_are():
+    """The float path agrees with the array path, and hands over what plain Newton cannot do."""
+    model = AnchoredModel.from_arrays(ARRAYS)
+    rng = np.random.default_rng(3)
+    u = rng.uniform([-14, -60, -20], [14, 10, 12], (300, 3))
+    expected = GAUGE.inverse(u)
+    np.testing.assert_allclose([model.parameters_at(row[None])[0] for row in u], expected, atol=1e-9)
+    steep = AnchoredModel.from_arrays(
+        dict(ARRAYS, glide_drop=np.array([0.5, 0.5, 0.4, 0.4]), glide_fade_mm=np.array(5.0))
+    )
+    found = np.array([steep.parameters_at(row[None])[0] for row in u])
+    np.testing.assert_allclose(steep.gauge.displacement(found), u, atol=1e-9)
+    assert any(steep.single.parameters_at(row[None]) is None for row in u)
 
 
 def test_inverse_passes_nan_rows_through():
