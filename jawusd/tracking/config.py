@@ -37,10 +37,15 @@ class TrackingConfig:
     redraw_px: float = 0.7
     # Distance a row may plausibly lie from its prediction [mm]: a weak pull that only matters where masks say nothing.
     prediction_mm: float = 0.5
-    # Outline variance times correlation length behind that pull [px^3]: 0.4 px over 10 px, typical masks by hand.
-    typical_noise_px3: float = 1.6
+    # Outline variance times correlation length behind that pull [px^3]: 0.4 px over 18 px, typical masks by hand.
+    typical_noise_px3: float = 3.0
     # Contour length over which outline errors move together [px], until it has been measured on the take.
-    correlation_px: float = 10.0
+    correlation_px: float = 18.0
+    # Side of the tiles within which errors are measured together [px]: estimates change little from 20 to 45.
+    tile_px: int = 30
+    # True over measured correlation length [-]: the fit takes part of the error out of the residuals, and the Tukey
+    # weight costs efficiency. 2.2 to 3.0 over outline errors of 0.25 and 0.6 px, correlated over 2 to 14 px.
+    tile_factor: float = 2.8
     # Good frames remembered to judge residuals and coverage [frames]: about a second.
     history_frames: int = 31
     # Good frames remembered to judge scores [frames]: closing lips take longer, a lost pose does not.

@@ -99,6 +99,24 @@ def search_edges(samples, mask, other_mask, other_inverse_depth, reach_px, toler
 
 
 @numba.njit(nogil=True, cache=True)
+def _slope(row, pose, matrix, centre, jacobian):
+    """Write how far a sample moves along its normal [px] per unit of a left twist about a world point."""
+    a = pose[0, 0] * row[X] + pose[0, 1] * row[Y] + pose[0, 2] * row[Z] + pose[0, 3]
+    b = pose[1, 0] * row[X] + pose[1, 1] * row[Y] + pose[1, 2] * row[Z] + pose[1, 3]
+    c = pose[2, 0] * row[X] + pose[2, 1] * row[Y] + pose[2, 2] * row[Z] + pose[2, 3]
+    w = matrix[2, 0] * a + matrix[2, 1] * b + matrix[2, 2] * c + matrix[2, 3]
+    for k in range(3):
+        along = row[NX] * (matrix[0, k] - row[U] * matrix[2, k]) + row[NY] * (matrix[1, k] - row[V] * matrix[2, k])
+        jacobian[3 + k] = along / w
+    a -= centre[0]
+    b -= centre[1]
+    c -= centre[2]
+    jacobian[0] = b * jacobian[5] - c * jacobian[4]
+    jacobian[1] = c * jacobian[3] - a * jacobian[5]
+    jacobian[2] = a * jacobian[4] - b * jacobian[3]
+
+
+@numba.njit(nogil=True, cache=True)
 def accumulate(samples, distances, gate_px, score_gate_px, pull, pose, matrix, centre, system):
     """Add the Tukey-weighted normal equations of one row of teeth in one view.
 
@@ -139,19 +157,7 @@ def accumulate(samples, distances, gate_px, score_gate_px, pull, pose, matrix, c
             weight = e * e
             system[7, 7] += row[LENGTH]
         weight *= row[LENGTH]
-        a = pose[0, 0] * row[X] + pose[0, 1] * row[Y] + pose[0, 2] * row[Z] + pose[0, 3]
-        b = pose[1, 0] * row[X] + pose[1, 1] * row[Y] + pose[1, 2] * row[Z] + pose[1, 3]
-        c = pose[2, 0] * row[X] + pose[2, 1] * row[Y] + pose[2, 2] * row[Z] + pose[2, 3]
-        w = matrix[2, 0] * a + matrix[2, 1] * b + matrix[2, 2] * c + matrix[2, 3]
-        for k in range(3):
-            along = row[NX] * (matrix[0, k] - row[U] * matrix[2, k]) + row[NY] * (matrix[1, k] - row[V] * matrix[2, k])
-            jacobian[3 + k] = along / w
-        a -= centre[0]
-        b -= centre[1]
-        c -= centre[2]
-        jacobian[0] = b * jacobian[5] - c * jacobian[4]
-        jacobian[1] = c * jacobian[3] - a * jacobian[5]
-        jacobian[2] = a * jacobian[4] - b * jacobian[3]
+        _slope(row, pose, matrix, centre, jacobian)
         for i in range(6):
             for k in range(6):
                 system[i, k] += weight * jacobian[i] * jacobian[k]
@@ -160,3 +166,35 @@ def accumulate(samples, distances, gate_px, score_gate_px, pull, pose, matrix, c
         system[6, 6] += weight
         system[6, 7] += weight * d
         system[7, 6] += weight * d * d
+
+
+@numba.njit(nogil=True, cache=True)
+def scatter_of_tiles(samples, distances, gate_px, pose, matrix, centre, shape, tile_px):
+    """Return the sum over picture tiles of s s^T, s = sum of w J d over the samples in the tile.
+
+    Errors of the outline move together over some length of contour; within a tile they add up before they are
+    squared. Over the normal matrix this tells how much less a pixel of contour says than independent errors would
+    (cluster-robust covariance, Liang & Zeger 1986).
+
+    Args:
+        samples, distances, gate_px, pose, matrix, centre: as for `accumulate`.
+        shape: (h, w) of the picture.
+        tile_px: side of the square tiles, longer than the errors' correlation.
+
+    Returns:
+        Scatter matrix, shape (6, 6).
+    """
+    across = shape[1] // tile_px + 1
+    sums = np.zeros(((shape[0] // tile_px + 1) * across, 6))
+    jacobian = np.empty(6)
+    for s in range(len(samples)):
+        d = distances[s]
+        if not abs(d) < gate_px:
+            continue
+        row = samples[s]
+        weight = (1.0 - (d / gate_px) ** 2) ** 2 * row[LENGTH]
+        _slope(row, pose, matrix, centre, jacobian)
+        tile = int(row[V]) // tile_px * across + int(row[U]) // tile_px
+        for k in range(6):
+            sums[tile, k] += weight * d * jacobian[k]
+    return sums.T @ sums

@@ -77,6 +77,22 @@ def twist_covariance(solution: Solution, row: int, sigma_px: float, correlation_
     return A @ (sigma_px**2 * correlation_px * np.linalg.inv(H)) @ A.T
 
 
+def correlation_px(solution: Solution, config: TrackingConfig) -> NDArray[np.float64]:
+    """Return the contour length over which outline errors move together, as this frame shows it, shape (2,).
+
+    tr(H^-1 S) / (6 sigma^2) with the scatter S of tiles is that length, but for the configured factor; NaN without a
+    match in every direction.
+    """
+    out = np.full(2, np.nan)
+    sigma = residual_px(solution)
+    for r in (0, 1):
+        H = solution.systems[r, :, :6, :6].sum(0)
+        if sigma[r] > 0 and np.linalg.matrix_rank(H, hermitian=True) == 6:
+            measured = np.trace(np.linalg.solve(H, solution.scatters[r])) / (6 * sigma[r] ** 2)
+            out[r] = config.tile_factor * measured
+    return out
+
+
 def crown_sigma_mm(scan: Scan, solution: Solution, row: int, config: TrackingConfig) -> float:
     """Return the rms standard deviation of the position of crown vertices [mm]; infinite if the masks leave it free."""
     sigma = float(residual_px(solution)[row])

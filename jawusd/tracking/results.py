@@ -13,6 +13,7 @@ from jawusd.geometry import relative_pose
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.history import FrameRecord
 from jawusd.tracking.quality import (
+    correlation_px,
     landmark_sigmas,
     matched_px,
     relative_covariance,
@@ -47,11 +48,12 @@ def assemble(
     poses = np.stack([r.solution.poses for r in rows])
     poses[lost] = np.nan
     residual = np.stack([residual_px(r.solution) for r in rows])
+    correlation = _take_correlation_px(rows, lost, config)
     covariance = np.full((len(rows), 2, 6, 6), np.nan)
     for k, record in enumerate(rows):
         for r in (0, 1):
             if not lost[k, r]:
-                covariance[k, r] = twist_covariance(record.solution, r, residual[k, r], config.correlation_px)
+                covariance[k, r] = twist_covariance(record.solution, r, residual[k, r], correlation)
     both = ~lost.any(1)
     relative = np.full((len(rows), 4, 4), np.nan)
     covariance_relative = np.full((len(rows), 6, 6), np.nan)
@@ -77,5 +79,12 @@ def assemble(
         residual_px=residual,
         matched_px=np.stack([matched_px(r.solution) for r in rows]),
         camera_names=camera_names,
-        meta={"tracking": asdict(config), **notes},
+        meta={"tracking": asdict(config), "correlation_px": correlation, **notes},
     )
+
+
+def _take_correlation_px(records: Sequence[FrameRecord], lost: NDArray[np.bool_], config: TrackingConfig) -> float:
+    """Return the correlation length of the outline errors of a take, the median over its frames [px]."""
+    values = np.stack([correlation_px(r.solution, config) for r in records])[~lost]
+    values = values[np.isfinite(values)]
+    return float(np.median(values)) if len(values) else config.correlation_px

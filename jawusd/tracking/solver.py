@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from jawusd.geometry import make_transform, orthonormalise, se3_exp, se3_inverse
 from jawusd.imaging.raster import draw_depth_labels, project
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour import CROWN, GUM, contour_samples
-from jawusd.tracking.correspond import accumulate, search_edges
+from jawusd.tracking.correspond import accumulate, scatter_of_tiles, search_edges
 from jawusd.tracking.scan import Scan
 
 _ROWS = (0, 1)  # upper, lower
@@ -44,6 +44,7 @@ class Solution:
         poses: T_world_upper and T_world_lower, shape (2, 4, 4).
         systems: normal equations per row and view as `accumulate` sums them, shape (2, C, 8, 8).
         centres: points the twists turn about, world coordinates [mm], shape (2, 3).
+        scatters: sums over picture tiles of the squared score of `scatter_of_tiles`, per row, shape (2, 6, 6).
         visible_px: contour length that could have been matched, per row and view [px], shape (2, C).
         iterations: how many linearised steps were taken.
     """
@@ -51,6 +52,7 @@ class Solution:
     poses: NDArray[np.float64]
     systems: NDArray[np.float64]
     centres: NDArray[np.float64]
+    scatters: NDArray[np.float64]
     visible_px: NDArray[np.float64]
     iterations: int
 
@@ -90,10 +92,10 @@ class ContourSolver:
                 poses[r] = _moved(poses[r], step[r], state.centres[r])
             if gate == gates_px[-1] and self._motion_mm(step) < self.config.converged_mm:
                 break
-        state = self._linearise(poses, views, use, gates_px[-1], render)
-        return Solution(poses, state.systems, state.centres, state.visible_px, iterations)
+        state = self._linearise(poses, views, use, gates_px[-1], render, final=True)
+        return replace(state, iterations=iterations)
 
-    def _linearise(self, poses, views, use, gate, render: _Rendering) -> Solution:
+    def _linearise(self, poses, views, use, gate, render: _Rendering, final: bool = False) -> Solution:
         """Find correspondences at the given poses and sum up the normal equations."""
         config = self.config
         render.update(poses)
@@ -107,18 +109,20 @@ class ContourSolver:
 
         matches = dict(zip(tasks, self._map(match, tasks), strict=True))
         systems = np.zeros((2, len(views), 8, 8))
-        visible = np.zeros((2, len(views)))
+        scatters, visible = np.zeros((2, 6, 6)), np.zeros((2, len(views)))
         for r in _ROWS:
             used = gate
             if gate <= config.final_gate_px[1]:
                 used = self._final_gate([matches[t][1] for t in tasks if t[0] == r], gate)
             pull = config.pull if gate > config.pull_above_px else 0.0
-            for c in range(len(views)):
-                if use[r, c]:
-                    samples, distances, visible[r, c] = matches[r, c]
-                    gates = (used, config.final_gate_px[1])
-                    accumulate(samples, distances, *gates, pull, poses[r], views[c].matrix, centres[r], systems[r, c])
-        return Solution(poses, systems, centres, visible, 0)
+            for c in np.flatnonzero(use[r]):
+                samples, distances, visible[r, c] = matches[r, c]
+                where = (poses[r], views[c].matrix, centres[r])
+                accumulate(samples, distances, used, config.final_gate_px[1], pull, *where, systems[r, c])
+                if final:
+                    shape = views[c].masks.shape[1:]
+                    scatters[r] += scatter_of_tiles(samples, distances, used, *where, shape, config.tile_px)
+        return Solution(poses.copy(), systems, centres, scatters, visible, 0)
 
     def _match(self, pose, view: View, r: int, labels, depths, reach):
         config, scan = self.config, self.scans[r]
