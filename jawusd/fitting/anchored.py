@@ -18,6 +18,7 @@ from jawusd.fitting.data import TrainingData
 from jawusd.fitting.gauge_fit import GaugeFit, fit_gauge, path_gauge
 from jawusd.fitting.path import fit_path
 from jawusd.fitting.spline import SplineBasis, choose_smoothing, farthest_points, ridge_solve
+from jawusd.fitting.trimming import within
 from jawusd.geometry import so3_log
 
 Array = NDArray[np.float64]
@@ -32,7 +33,7 @@ _CV_BLOCK, _CV_FOLDS = 25, 5  # frames (about a second of video) that are left o
 _CV_CAP_MM = 1.0
 _TAIL_RIDGE = 1e-6  # keeps the slope finite along a direction without motion
 _FRAMES_PER_CENTRE = 4
-_TRIM_FLOOR_MM = 0.5  # rms residual below which a frame is never trimmed
+_TRIM_FLOOR_MM = 0.5
 
 
 @dataclass(frozen=True)
@@ -100,7 +101,7 @@ def fit_anchored(data: TrainingData, shown: Mask, trim_mad: float) -> AnchoredFi
         model, smoothing = _regress(data, u, fitted, plain, scales)
         d, nearest = data.metric.nearest(model, data.motion)
         u = plain.displacement(d)
-        kept = _within(data.metric.rms(nearest, data.motion), trim_mad)
+        kept = within(data.metric.rms(nearest, data.motion), trim_mad, _TRIM_FLOOR_MM)
     gauge_fit = fit_gauge(u[fitted], data.weights[fitted], path, shown)
     model = AnchoredModel(gauge_fit.gauge, data.incisor, scales, model.centres, model.weights)
     return AnchoredFit(model, gauge_fit, smoothing, fitted)
@@ -130,9 +131,3 @@ def _regress(
     fitted = ridge_solve(weighted.T @ columns, weighted.T @ values, smoothing * basis.energy + tail)
     spline = basis.weights(np.linalg.solve(L.T, fitted.T).T)
     return AnchoredModel(plain, data.incisor, scales, basis.centres, spline), smoothing
-
-
-def _within(residual_mm: Array, trim_mad: float) -> Mask:
-    middle = np.median(residual_mm)
-    spread = 1.4826 * np.median(np.abs(residual_mm - middle))
-    return residual_mm <= max(middle + trim_mad * spread, _TRIM_FLOOR_MM)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Protocol
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from jawusd.errors import EvaluatorError, FittingError
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.models import JawModelForm
+from jawusd.fitting.additive import fit_additive
 from jawusd.fitting.alpha_shape import alpha_shape
 from jawusd.fitting.anatomy_gate import AnatomyWarning, check_anatomy
 from jawusd.fitting.anchored import fit_anchored
@@ -20,6 +21,7 @@ from jawusd.fitting.config import FittingConfig
 from jawusd.fitting.coverage import shown_parameters
 from jawusd.fitting.data import Anatomy, Selection, TrainingData, select_poses, select_tracks
 from jawusd.fitting.error_table import join, pose_errors, summarise
+from jawusd.fitting.pca import fit_pca
 from jawusd.fitting.slice_hull import fit_slice_hull, valid_box
 from jawusd.formats.model import JawModel
 from jawusd.formats.tracks import Tracks
@@ -45,7 +47,7 @@ class FittedForm(Protocol):
     def arrays(self) -> dict[str, Array]:
         """Return the decoder's own arrays."""
 
-    def notes(self) -> dict[str, float]:
+    def notes(self) -> dict:
         """Return what the header says about the fit."""
 
 
@@ -107,7 +109,15 @@ def fit_model(
 
 
 def _fit_form(data: TrainingData, shown: NDArray[np.bool_], config: FittingConfig) -> FittedForm:
-    return fit_anchored(data, shown, config.trim_mad)
+    if config.method == "anchored":
+        return fit_anchored(data, shown, config.trim_mad)
+    if config.method == "additive":
+        return fit_additive(data, shown, config.trim_mad)
+    if config.method == "pca":
+        return fit_pca(data, shown)
+    from jawusd.fitting.paper import fit_paper  # torch: two seconds that the other methods need not wait
+
+    return fit_paper(data, shown, config.literal, config.starts, config.seed)
 
 
 def _error_tables(
@@ -128,10 +138,12 @@ def _error_tables(
         tables["trimmed"] = summarise(errors_of(form, ~form.kept))
     if config.holdout_folds:
         fold = np.arange(len(data)) * config.holdout_folds // len(data)
+        # The networks of "paper" start in the folds where the best of the full fit started, once.
+        again = replace(config, starts=1, seed=form.notes().get("seed", config.seed))
         parts = []
         for k in range(config.holdout_folds):
             tell(k + 1)
-            parts.append(errors_of(_fit_form(data.select(fold != k), shown, config), (fold == k) & form.kept))
+            parts.append(errors_of(_fit_form(data.select(fold != k), shown, again), (fold == k) & form.kept))
         tables["holdout"] = summarise(join(parts))
     return tables
 
