@@ -44,7 +44,7 @@ def info(rig: RigArg, as_json: Json = False) -> None:
 def _info_lines(found: dict[str, Any]) -> list[str]:
     lines = [
         f"actor {found['actor']}, format {found['format_version']}, prim {found['prim']}",
-        f"model: {found['model']['kind']} ({found['model']['method']}), onnx: {found['onnx'] or 'none'}",
+        f"model: {found['model']['kind']} ({found['model']['method']}), onnx: {', '.join(found['onnx']) or 'none'}",
     ]
     for name, (low, high) in found["ranges_mm"].items():
         lines.append(f"  {name}: {low:.2f} .. {high:.2f} mm")

@@ -20,9 +20,11 @@ from jawusd.rig.layers import apply_jaw_api, define_prim, new_layer, set_attribu
 from jawusd.rig.layout import (
     ACTOR,
     ACTOR_FILE,
+    ENCODE_FILE,
     FORMAT_VERSION,
     GEO_FILE,
     MANDIBLE,
+    ONNX_ATTRIBUTES,
     ONNX_FILE,
     PARAMETERS,
     RIG_FILE,
@@ -66,7 +68,8 @@ def interface_layer(rig: JawRig, name: str, meshes: Mapping[str, Mesh], fps: flo
     set_attribute(actor, "jaw:angleUnit", _TYPES.Token, "rad")
     set_attribute(actor, "jaw:twistOrder", _TYPES.TokenArray, Vt.TokenArray(["omega", "v"]))
     set_attribute(actor, "jaw:modelHash", _TYPES.String, model_hash(rig))
-    set_attribute(actor, "jaw:onnx", _TYPES.Asset, Sdf.AssetPath(f"./{ONNX_FILE}"))
+    for attribute, file in zip(ONNX_ATTRIBUTES, (ONNX_FILE, ENCODE_FILE), strict=True):
+        set_attribute(actor, attribute, _TYPES.Asset, Sdf.AssetPath(f"./{file}"))
     set_attribute(actor, "jaw:landmarks:names", _TYPES.TokenArray, Vt.TokenArray(list(LANDMARKS)))
     write_arrays(actor, rig, _INTERFACE_ARRAYS)
     set_relationship(actor, "jaw:skull", [SKULL])

@@ -16,8 +16,8 @@ from jawusd.rig.animation import write_animation
 from jawusd.rig.author import decoder_layer, interface_layer
 from jawusd.rig.geo import build_geometry
 from jawusd.rig.layers import write_layer
-from jawusd.rig.layout import ACTOR_FILE, GEO_FILE, ONNX_FILE, PACKAGE_FILE, RIG_FILE, SKEL_FILE
-from jawusd.rig.onnx_sidecar import write_onnx
+from jawusd.rig.layout import ACTOR_FILE, ENCODE_FILE, GEO_FILE, ONNX_FILE, PACKAGE_FILE, RIG_FILE, SKEL_FILE
+from jawusd.rig.onnx_sidecar import decode_model, encode_model, write_onnx
 from jawusd.rig.package import write_package
 from jawusd.rig.skel import write_skel
 from jawusd.rig.table import DEFAULT_SIZE, build_table
@@ -36,7 +36,7 @@ def bake_rig(
     d: ArrayLike | None = None,
     table_size: int = DEFAULT_SIZE,
 ) -> list[Path]:
-    """Write a rig: interface, decoder, geometry, ONNX graph, captured motion if there is one, skeleton, package.
+    """Write a rig: interface, decoder, geometry, ONNX graphs, captured motion if there is one, skeleton, package.
 
     Every file is written in one step, `actor.usda` after all it refers to.
 
@@ -69,7 +69,8 @@ def bake_rig(
     written = [
         write_layer(geometry, folder / GEO_FILE),
         write_layer(decoder_layer(rig, table), folder / RIG_FILE),
-        write_onnx(folder / ONNX_FILE, rig),
+        write_onnx(folder / ONNX_FILE, decode_model(rig)),
+        write_onnx(folder / ENCODE_FILE, encode_model(rig)),
         write_layer(interface_layer(rig, name, meshes, fps), folder / ACTOR_FILE),
     ]
     shown = folder / ACTOR_FILE

@@ -10,9 +10,11 @@ ACTOR, GEO, MATERIALS = "/Actor", "/Actor/geo", "/Actor/mtl"
 SKULL, MANDIBLE = "/Actor/geo/Skull", "/Actor/geo/Mandible"
 
 ACTOR_FILE, RIG_FILE, GEO_FILE = "actor.usda", "rig.usdc", "geo.usdc"
-ONNX_FILE, SKEL_FILE, PACKAGE_FILE = "actor.onnx", "actor_skel.usdc", "actor.usdz"
+ONNX_FILE, ENCODE_FILE = "actor.onnx", "actor_encode.onnx"
+SKEL_FILE, PACKAGE_FILE = "actor_skel.usdc", "actor.usdz"
 
 PARAMETERS = ("jaw:d1", "jaw:d2", "jaw:d3")
+ONNX_ATTRIBUTES = ("jaw:onnx", "jaw:onnx:encode")
 
 
 @dataclass(frozen=True)

@@ -23,11 +23,13 @@ class Graph:
 
     Attributes:
         dtype: float32 or float64.
+        prefix: start of every name; graphs inside one another must not share names.
         nodes: operators so far.
         initializers: constants so far.
     """
 
     dtype: np.dtype
+    prefix: str = ""
     nodes: list[onnx.NodeProto] = field(default_factory=list)
     initializers: list[onnx.TensorProto] = field(default_factory=list)
     _constants: dict[tuple, str] = field(default_factory=dict)
@@ -43,7 +45,7 @@ class Graph:
         array = array.reshape(np.shape(value))
         key = (array.dtype.str, array.shape, array.tobytes())
         if key not in self._constants:
-            name = f"c{len(self._constants)}"
+            name = f"{self.prefix}c{len(self._constants)}"
             self._constants[key] = name
             self.initializers.append(numpy_helper.from_array(array, name))
         return self._constants[key]
@@ -51,7 +53,7 @@ class Graph:
     def op(self, kind: str, *inputs: str | float, name: str | None = None, **attributes: object) -> str:
         """Add an operator with one output; plain numbers become constants of the graph's type."""
         names = [value if isinstance(value, str) else self.constant(float(value)) for value in inputs]
-        output = name or f"{kind.lower()}{len(self.nodes)}"
+        output = name or f"{self.prefix}{kind.lower()}{len(self.nodes)}"
         self.nodes.append(helper.make_node(kind, names, [output], **attributes))
         return output
 
@@ -87,9 +89,12 @@ class Graph:
 
     def columns(self, a: str, count: int) -> list[str]:
         """Split rows (n, count) into columns (n, 1)."""
-        names = [f"column{len(self.nodes)}_{i}" for i in range(count)]
-        sizes = self.constant(np.ones(count), np.int64)
-        self.nodes.append(helper.make_node("Split", [a, sizes], names, axis=1))
+        return self.split(a, count, axis=1)
+
+    def split(self, a: str, count: int, axis: int) -> list[str]:
+        """Split a value into equal parts along an axis."""
+        names = [f"{self.prefix}part{len(self.nodes)}_{i}" for i in range(count)]
+        self.nodes.append(helper.make_node("Split", [a], names, axis=axis))
         return names
 
     def sum_rows(self, a: str) -> str:

@@ -10,7 +10,7 @@ from pxr import Sdf, Usd, UsdUtils
 
 from jawusd.errors import RigError
 from jawusd.formats.atomic import atomic_path
-from jawusd.rig.layout import ACTOR, ACTOR_FILE
+from jawusd.rig.layout import ACTOR, ACTOR_FILE, ONNX_ATTRIBUTES
 from jawusd.rig.read import open_stage
 
 # Archives carry the time of their files. A fixed one makes equal rigs equal: the first a zip can hold in any time zone.
@@ -20,7 +20,7 @@ _ZIP_EPOCH = 315_619_200
 def write_package(out: str | os.PathLike[str], source: str | os.PathLike[str]) -> Path:
     """Flatten a stage of one actor into a package.
 
-    The layer inside is text: three.js turns a whole-number translation of a binary layer into NaN. The ONNX file stays
+    The layer inside is text: three.js turns a whole-number translation of a binary layer into NaN. The ONNX files stay
     outside, packages may hold USD, images and sound only.
 
     Args:
@@ -54,7 +54,8 @@ def _flattened(stage: Usd.Stage) -> Sdf.Layer:
         # flattening drops `custom` where the schema is known, and Blender imports no other attribute
         if prop.name.startswith("jaw:"):
             prop.custom = True
-    actor.RemoveProperty(layer.GetPropertyAtPath(f"{ACTOR}.jaw:onnx"))
+    for attribute in ONNX_ATTRIBUTES:
+        actor.RemoveProperty(layer.GetPropertyAtPath(f"{ACTOR}.{attribute}"))
     # the identifier is an asset path too: it would be packed
     actor.assetInfo = {key: value for key, value in dict(actor.assetInfo).items() if key != "identifier"}
     return layer

@@ -13,7 +13,7 @@ from pxr import Sdf, Tf, Usd, UsdGeom
 from jawusd.errors import EvaluatorError, FormatError, RigError, UnitsError, VersionError
 from jawusd.evaluator import JawRig
 from jawusd.rig.arrays import read_arrays, read_value
-from jawusd.rig.layout import FORMAT_VERSION, PARAMETERS
+from jawusd.rig.layout import FORMAT_VERSION, ONNX_ATTRIBUTES, PARAMETERS
 from jawusd.rig.schema import has_jaw_api
 from jawusd.rig.table import DecoderTable
 
@@ -152,8 +152,8 @@ def escapes(asset: str) -> bool:
 
 
 def _authored_onnx(layer: Sdf.Layer, prim_path: Sdf.Path) -> list[str]:
-    attribute = layer.GetAttributeAtPath(prim_path.AppendProperty("jaw:onnx"))
-    return [attribute.default.path] if attribute is not None and attribute.default is not None else []
+    attributes = [layer.GetAttributeAtPath(prim_path.AppendProperty(name)) for name in ONNX_ATTRIBUTES]
+    return [attribute.default.path for attribute in attributes if attribute is not None and attribute.default]
 
 
 def read_table(prim: Usd.Prim, where: object) -> DecoderTable:
@@ -192,7 +192,7 @@ def describe(path: PathArg, prim_path: str | None = None) -> dict[str, Any]:
     names = list(read_value(prim, "jaw:landmarks:names", path))
     samples = prim.GetAttribute(PARAMETERS[0]).GetTimeSamples()
     animation = {"samples": len(samples), "first": samples[0], "last": samples[-1]} if samples else None
-    onnx = prim.GetAttribute("jaw:onnx").Get()
+    onnx = [prim.GetAttribute(name).Get() for name in ONNX_ATTRIBUTES]
     return {
         "file": str(path),
         "prim": str(prim.GetPath()),
@@ -213,7 +213,7 @@ def describe(path: PathArg, prim_path: str | None = None) -> dict[str, Any]:
             "shape": [len(axis) for axis in table.knots],
             "max_error_mm": table.max_error_mm,
         },
-        "onnx": onnx.path if onnx is not None else None,
+        "onnx": [asset.path for asset in onnx if asset is not None],
         "fps": stage.GetTimeCodesPerSecond(),
         "animation": animation,
         "meshes": _meshes(prim),

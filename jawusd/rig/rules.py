@@ -13,7 +13,7 @@ from jawusd.errors import JawusdError
 from jawusd.evaluator import JawRig
 from jawusd.geometry.se3 import se3_exp, transform_points
 from jawusd.rig import _gf
-from jawusd.rig.layout import PARAMETERS
+from jawusd.rig.layout import ONNX_ATTRIBUTES, PARAMETERS
 from jawusd.rig.read import read_table, rig_of
 from jawusd.rig.sampling import sample_valid
 
@@ -23,6 +23,7 @@ _TABLE_SLACK_MM = 0.01  # the table states its error over more parameters than a
 _ONNX_MM = 0.01
 _BAKED_MM = 0.01
 _PROBES = 500
+_ONNX_PROBES = 100
 
 
 @dataclass(frozen=True)
@@ -72,27 +73,29 @@ def check_table(prim: Usd.Prim) -> Iterator[Finding]:
 
 
 def check_onnx(prim: Usd.Prim) -> Iterator[Finding]:
-    """The ONNX file named by jaw:onnx was made from this model and gives its poses."""
-    asset = prim.GetAttribute("jaw:onnx").Get()
+    """The ONNX files named by the rig were made from this model and give its poses and parameters."""
     rig = _rig(prim)
-    if asset is None or not asset.path or rig is None:
-        return
-    if not asset.resolvedPath:
-        yield _finding("error", "Onnx", prim, f"{asset.path} is not there.")
+    assets = [prim.GetAttribute(name).Get() for name in ONNX_ATTRIBUTES]
+    if rig is None or not any(assets):
         return
     try:
         from jawusd.rig.onnx_check import onnx_error_mm
     except ImportError:
         yield _finding("info", "Onnx", prim, "not checked: the package onnx is not installed (jawusd[build]).")
         return
-    try:
-        error_mm = onnx_error_mm(asset.resolvedPath, rig, sample_valid(rig, _PROBES))
-    except JawusdError as error:
-        yield _finding("error", "Onnx", prim, error.message)
-        return
-    if not error_mm <= _ONNX_MM:
-        message = f"{asset.path} is {error_mm:.3f} mm from the model, allowed {_ONNX_MM} mm."
-        yield _finding("error", "Onnx", prim, message)
+    d = sample_valid(rig, _ONNX_PROBES)
+    for asset in filter(None, assets):
+        if not asset.resolvedPath:
+            yield _finding("error", "Onnx", prim, f"{asset.path} is not there.")
+            continue
+        try:
+            error_mm = onnx_error_mm(asset.resolvedPath, rig, d)
+        except JawusdError as error:
+            yield _finding("error", "Onnx", prim, f"{asset.path} {error.message}")
+            continue
+        if not error_mm <= _ONNX_MM:
+            message = f"{asset.path} is {error_mm:.3f} mm from the model, allowed {_ONNX_MM} mm."
+            yield _finding("error", "Onnx", prim, message)
 
 
 def check_bounds(prim: Usd.Prim) -> Iterator[Finding]:

@@ -8,7 +8,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdValidation, Vt
 
 from jawusd.evaluator import JawRig
 from jawusd.rig import register_validators, validate_stage
-from jawusd.rig.onnx_sidecar import write_onnx
+from jawusd.rig.onnx_sidecar import decode_model, encode_model, write_onnx
 from jawusd.rig.rules import RULES
 
 
@@ -58,7 +58,13 @@ def break_onnx_presence(folder):
 def break_onnx_identity(folder):
     rig = example_rig()
     arrays = {**rig.arrays, "incisor": rig.arrays["incisor"] + 0.1}
-    write_onnx(folder / "actor.onnx", JawRig(arrays, rig.meta))
+    write_onnx(folder / "actor.onnx", decode_model(JawRig(arrays, rig.meta)))
+
+
+def break_encoder_identity(folder):
+    rig = example_rig()
+    arrays = {**rig.arrays, "incisor": rig.arrays["incisor"] + 0.1}
+    write_onnx(folder / "actor_encode.onnx", encode_model(JawRig(arrays, rig.meta)))
 
 
 def break_onnx_agreement(folder):
@@ -68,6 +74,16 @@ def break_onnx_agreement(folder):
         if values.ndim == 2 and values.dtype == np.float32 and values.size > 30:
             tensor.CopyFrom(onnx.numpy_helper.from_array(values * np.float32(1.02), tensor.name))
     onnx.save(model, folder / "actor.onnx")
+
+
+def break_encoder_agreement(folder):
+    """The right label on the graph of another jaw."""
+    rig = example_rig()
+    model = encode_model(JawRig({**rig.arrays, "incisor": rig.arrays["incisor"] + 0.5}, rig.meta))
+    right = onnx.load(folder / "actor_encode.onnx")
+    del model.metadata_props[:]
+    model.metadata_props.extend(right.metadata_props)
+    onnx.save(model, folder / "actor_encode.onnx")
 
 
 def break_bounds(folder):
@@ -106,6 +122,8 @@ BROKEN = [
     (break_onnx_presence, "actor.usda", "Onnx", "error", "not there"),
     (break_onnx_identity, "actor.usda", "Onnx", "error", "another model"),
     (break_onnx_agreement, "actor.usda", "Onnx", "error", "mm from the model"),
+    (break_encoder_identity, "actor.usda", "Onnx", "error", "actor_encode.onnx was made from another model"),
+    (break_encoder_agreement, "actor.usda", "Onnx", "error", "mm from the model"),
     (break_bounds, "actor.usda", "Bounds", "warning", "are outside"),
     (break_mandible_target, "actor.usda", "Mandible", "error", "/Actor/geo/Chin"),
     (break_mandible_ops, "actor.usda", "Mandible", "error", "expected translate"),
