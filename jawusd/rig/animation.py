@@ -20,7 +20,7 @@ from jawusd.geometry.quaternion import wxyz_from_matrix
 from jawusd.geometry.se3 import make_transform, transform_points
 from jawusd.geometry.so3 import so3_exp
 from jawusd.rig import _gf
-from jawusd.rig.layers import new_layer, write_layer
+from jawusd.rig.layers import new_layer, relative_path, write_layer
 from jawusd.rig.layout import ACTOR, MANDIBLE, PARAMETERS
 from jawusd.rig.read import load_rig
 
@@ -75,7 +75,7 @@ def write_animation(
     if not known.any():
         raise RigError("no frame has parameters; there is nothing to animate.", path=out)
     layer = new_layer(fps)
-    layer.subLayerPaths.append(_relative(actor, out))
+    layer.subLayerPaths.append(relative_path(actor, out))
     layer.startTimeCode, layer.endTimeCode = float(frames[0]), float(frames[-1])
     if not known.all():
         lost = _gf.int_array(np.floor(frames[~known]))
@@ -165,8 +165,3 @@ def _landmark_distance(rig: JawRig, T_a: Array, T_b: Array) -> Array:
     landmarks = rig.arrays["landmarks"]
     difference = T_a - T_b
     return np.linalg.norm(transform_points(difference, landmarks[None]), axis=-1).max(axis=1)
-
-
-def _relative(actor: Path, out: Path) -> str:
-    relative = Path(os.path.relpath(actor.resolve(), out.resolve().parent)).as_posix()
-    return relative if relative.startswith(".") else f"./{relative}"

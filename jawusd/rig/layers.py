@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -14,17 +15,18 @@ from jawusd.rig.layout import ACTOR
 from jawusd.rig.schema import SCHEMA_NAME
 
 
-def new_layer(fps: float | None = None) -> Sdf.Layer:
-    """Return a layer in memory with the units of every jawusd file: Y up, mm, /Actor the default prim.
+def new_layer(fps: float | None = None, default_prim: str = ACTOR) -> Sdf.Layer:
+    """Return a layer in memory with the units of every jawusd file: Y up, mm.
 
     Args:
         fps: time codes per second; None leaves the layer without time.
+        default_prim: path of the default prim.
     """
     layer = Sdf.Layer.CreateAnonymous(".usda")
     root = layer.pseudoRoot
     root.SetInfo(UsdGeom.Tokens.upAxis, UsdGeom.Tokens.y)
     root.SetInfo(UsdGeom.Tokens.metersPerUnit, 0.001)
-    layer.defaultPrim = Sdf.Path(ACTOR).name
+    layer.defaultPrim = Sdf.Path(default_prim).name
     layer.customLayerData = {"creator": f"jawusd {__version__}"}
     if fps is not None:
         layer.timeCodesPerSecond = fps
@@ -78,6 +80,12 @@ def set_relationship(spec: Sdf.PrimSpec, name: str, targets: Iterable[str]) -> N
     """Author a relationship to prims."""
     relationship = Sdf.RelationshipSpec(spec, name, custom=True)
     relationship.targetPathList.explicitItems = [Sdf.Path(target) for target in targets]
+
+
+def relative_path(target: Path, layer: Path) -> str:
+    """Return the path of a file as a layer should name it: relative to the layer's folder, starting with a dot."""
+    relative = Path(os.path.relpath(target.resolve(), layer.resolve().parent)).as_posix()
+    return relative if relative.startswith(".") else f"./{relative}"
 
 
 def write_layer(layer: Sdf.Layer, path: Path) -> Path:

@@ -61,7 +61,7 @@ def _anchored(g: Graph, arrays: Arrays, d: str) -> Motion:
 
 
 def _displacement(g: Graph, arrays: Arrays, d: str) -> str:
-    """Add the gauge: displacement (n, 3) [mm] of the incisal point, anatomical frame (jawusd.evaluator.gauge)."""
+    """Add the gauge: displacement (n, 3) [mm] of the incisal point, anatomical frame."""
     d1, d2, d3 = g.columns(d, 3)
     e = float(arrays["glide_softness_mm"])
     gx, gz = _path(g, arrays, d1)
@@ -107,7 +107,8 @@ def _soft_ramp(g: Graph, x: str, e: float) -> str:
 
 def _bent(g: Graph, x: str) -> str:
     square = g.mul(x, x)
-    return g.div(g.mul(square, shape.DROP_BEND), g.op("Sqrt", g.add(g.mul(square, 1.0 / shape.DROP_SATURATION_MM2), 1.0)))
+    straightening = g.op("Sqrt", g.add(g.mul(square, 1.0 / shape.DROP_SATURATION_MM2), 1.0))
+    return g.div(g.mul(square, shape.DROP_BEND), straightening)
 
 
 def _spline(g: Graph, centres: NDArray, weights: NDArray, q: str) -> str:

@@ -1,0 +1,119 @@
+"""The take as a scene: the calibrated cameras and the actor where the head was, to be laid over the footage."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pxr import Gf, Kind, Sdf, Usd, UsdGeom
+
+from jawusd.errors import RigError
+from jawusd.geometry.camera import Camera
+from jawusd.geometry.se3 import se3_inverse
+from jawusd.rig import _gf
+from jawusd.rig.layers import define_prim, new_layer, relative_path, set_attribute, stage_of, write_layer
+
+TAKE, TAKE_ACTOR, TAKE_CAMERAS = "/Take", "/Take/Actor", "/Take/Cameras"
+
+# Apertures and focal lengths only count relative to one another; tools that read them as mm see a 36 mm sensor.
+_SENSOR_WIDTH = 36.0
+_CLIPPING_MM = (1.0, 10_000.0)
+_LARGEST_SKEW = 1e-6
+# Camera and world axes of OpenCV are x right, y down, z forward; those of USD x right, y up, z backward.
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def write_cameras(
+    out: str | os.PathLike[str],
+    cameras: Sequence[Camera],
+    actor: str | os.PathLike[str],
+    frames: ArrayLike,
+    T_world_skull: ArrayLike,
+    fps: float,
+) -> Path:
+    """Write the take: one `UsdGeom.Camera` per camera, and the actor carried by the tracked head.
+
+    The cameras are pinholes: they match footage without lens distortion. The OpenCV coefficients stand beside them
+    as `jaw:distortion`, the picture size as `jaw:imageSize`.
+
+    Args:
+        out: file to write.
+        cameras: the calibrated cameras.
+        actor: the layer to show, `anim_capture.usdc` or `actor.usda`.
+        frames: frame numbers (F,), increasing.
+        T_world_skull: poses of the skull (F, 4, 4), NaN where it was lost.
+        fps: frames per second.
+
+    Returns:
+        The file.
+
+    Raises:
+        RigError: no cameras, two of one name, a camera with skewed pixels, or no frame with a pose.
+        OutputError: the file cannot be written.
+    """
+    out = Path(out)
+    frames, T_world_skull = np.asarray(frames, dtype=np.float64), np.asarray(T_world_skull, dtype=np.float64)
+    if T_world_skull.shape != (len(frames), 4, 4):
+        raise ValueError(f"T_world_skull must have shape {(len(frames), 4, 4)}, got {T_world_skull.shape}")
+    names = [Sdf.Path(TAKE_CAMERAS).AppendChild(_prim_name(camera.name)) for camera in cameras]
+    if not names or len(set(names)) < len(names):
+        raise RigError("a take needs cameras, each with a name of its own.", path=out)
+    known = np.isfinite(T_world_skull).all(axis=(1, 2))
+    if not known.any():
+        raise RigError("the skull has no pose in any frame.", path=out)
+    layer = new_layer(fps, TAKE)
+    layer.startTimeCode, layer.endTimeCode = float(frames[0]), float(frames[-1])
+    define_prim(layer, TAKE, "Xform").kind = Kind.Tokens.assembly
+    define_prim(layer, TAKE_CAMERAS, "Scope")
+    shown = define_prim(layer, TAKE_ACTOR, "Xform")
+    stage = stage_of(layer)
+    _add_pose(stage, TAKE, _FLIP)
+    _add_motion(stage, frames[known], T_world_skull[known])
+    for name, camera in zip(names, cameras, strict=True):
+        _define_camera(stage, name, camera)
+    shown.referenceList.prependedItems = [Sdf.Reference(relative_path(Path(actor), out))]
+    return write_layer(layer, out)
+
+
+def _prim_name(name: str) -> str:
+    cleaned = "".join(letter if letter.isalnum() and letter.isascii() else "_" for letter in name)
+    return cleaned if cleaned[:1].isalpha() else f"cam_{cleaned}"
+
+
+def _add_pose(stage: Usd.Stage, path: str | Sdf.Path, T: NDArray[np.float64]) -> None:
+    xform = UsdGeom.Xformable(stage.GetPrimAtPath(path))
+    xform.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(_gf.translations(T[None])[0])
+    xform.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(_gf.rotations(T[None])[0])
+
+
+def _add_motion(stage: Usd.Stage, frames: NDArray[np.float64], T_world_skull: NDArray[np.float64]) -> None:
+    _add_pose(stage, TAKE_ACTOR, T_world_skull[0])
+    translate, orient = UsdGeom.Xformable(stage.GetPrimAtPath(TAKE_ACTOR)).GetOrderedXformOps()
+    samples = zip(frames.tolist(), _gf.translations(T_world_skull), _gf.rotations(T_world_skull), strict=True)
+    for frame, translation, rotation in samples:
+        translate.Set(translation, frame)
+        orient.Set(rotation, frame)
+
+
+def _define_camera(stage: Usd.Stage, path: Sdf.Path, camera: Camera) -> None:
+    """Define one camera: the picture spans pixel edges, half a pixel outside the first and last centres."""
+    (fx, skew, cx), (_, fy, cy) = camera.K[:2]
+    width, height = camera.size_px
+    if abs(skew) > _LARGEST_SKEW * fx:
+        raise RigError(f"camera {camera.name} has skewed pixels (K[0, 1] = {skew:g}), which USD cannot express.")
+    prim = UsdGeom.Camera.Define(stage, path)
+    unit = _SENSOR_WIDTH / width
+    aperture_height = height * unit * fx / fy
+    prim.CreateFocalLengthAttr(fx * unit)
+    prim.CreateHorizontalApertureAttr(_SENSOR_WIDTH)
+    prim.CreateVerticalApertureAttr(aperture_height)
+    prim.CreateHorizontalApertureOffsetAttr(_SENSOR_WIDTH * (0.5 - (cx + 0.5) / width))
+    prim.CreateVerticalApertureOffsetAttr(aperture_height * ((cy + 0.5) / height - 0.5))
+    prim.CreateClippingRangeAttr(Gf.Vec2f(*_CLIPPING_MM))
+    _add_pose(stage, path, se3_inverse(camera.T_cam_world) @ _FLIP)
+    spec = stage.GetRootLayer().GetPrimAtPath(path)
+    set_attribute(spec, "jaw:distortion", Sdf.ValueTypeNames.DoubleArray, _gf.double_array(camera.distortion))
+    set_attribute(spec, "jaw:imageSize", Sdf.ValueTypeNames.Int2, Gf.Vec2i(width, height))
