@@ -126,7 +126,8 @@ class SliceHull:
 
     def candidates(self) -> Array:
         """Return points (n, 3) [mm] spread over the valid volume, dense near its surface: starts for searches."""
-        low, high = self.supports.knots[0] - self.margin_mm, self.supports.knots[-1] + self.margin_mm
+        reach = self.margin_mm - self.softness_mm  # at the very ends the rounding leaves no section
+        low, high = self._first - reach, self._last + reach
         points = []
         for d1 in np.linspace(low, high, _CANDIDATE_SLICES):
             outline = self._sharp_outline(d1)

@@ -46,8 +46,7 @@ class Encoder:
         d = self._nearest(R, t)
         out = np.flatnonzero(self._bound.excess(d) > 0) if bounded else ()
         if len(out):
-            target = carried(R[out], t[out], self._vectors)
-            d[out] = self._reach.pull(self._vectors, target, self._reach.nearest(d[out]))
+            d[out] = self._reach.best_pull(self._vectors, carried(R[out], t[out], self._vectors))
         return d, self._residual_mm(d, R, t)
 
     def encode_weighted(self, T: Array, whitening: Array, *, bounded: bool) -> tuple[Array, Array]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,15 +12,19 @@ from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.distances import carried, distance_residual
 from jawusd.evaluator.models import JawModelForm
 from jawusd.evaluator.rows import in_chunks
-from jawusd.evaluator.solver import minimise
+from jawusd.evaluator.solver import Residual, minimise
 
 Array = NDArray[np.float64]
 
+_MOST_VALLEYS = 4
 _SCAN_ROWS = 64  # rows compared with all candidates at once: 64 x 6,000 distances are 3 MB
 
 
 class Reach:
-    """Where the jaw can go, scanned once: the valid volume is not quite convex, so searches start at its best point.
+    """Where the jaw can go, scanned once for the starts of searches.
+
+    Sections at one opening are convex, but the valid volume as a whole is not: along d1 a search may have several
+    valleys, so one is started in each of the deepest.
 
     Args:
         model: The jaw model.
@@ -31,14 +35,13 @@ class Reach:
         self._model, self._bound = model, bound
 
     @cached_property
-    def _scan(self) -> tuple[Array, tuple[Array, Array]]:
-        """Points (p, 3) [mm] all over the valid volume, and their motions."""
+    def _scan(self) -> _Scan:
         points = self._bound.candidates()
         if not len(points):
             raise EvaluatorError(
                 "the bound of this rig leaves no valid jaw parameters.", hint="Fit the model again with a wider margin."
             )
-        return points, in_chunks(self._model.decode, points)
+        return _Scan(points, *in_chunks(self._model.decode, points))
 
     def nearest(self, d: Array) -> Array:
         """Return the nearest points (n, 3) [mm] inside the bound; d (n, 3) itself where it is inside.
@@ -50,34 +53,95 @@ class Reach:
         out = np.flatnonzero(self._bound.excess(d) > 0)
         if not out.size:
             return valid
-        points, _ = self._scan
-        start = points[_nearest_rows(points, d[out])]
-        identity = np.eye(3)
+        wanted, identity = d[out], np.eye(3)
 
         def residual(x: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]:
-            return x - d[out[rows]], np.broadcast_to(identity, (len(x), 3, 3))
+            return x - wanted[rows], np.broadcast_to(identity, (len(x), 3, 3))
 
-        valid[out] = minimise(residual, start, self._bound)
+        valid[out] = self._best(residual, self._scan.points, wanted)
         return valid
 
-    def best_starts(self, vectors: Array, target: Array) -> Array:
-        """Return the scanned points (n, 3) [mm] that bring the vectors (4, m) nearest to the targets (n, 3, m)."""
-        points, motions = self._scan
-        images = carried(*motions, vectors).reshape(len(points), -1)
-        lost = np.isnan(target).any(axis=(1, 2))
-        starts = points[_nearest_rows(images, target.reshape(len(target), images.shape[1]))]
-        starts[lost] = np.nan
-        return starts
-
-    def pull(self, vectors: Array, target: Array, start: Array) -> Array:
-        """Return the valid d (n, 3) [mm] that bring the vectors (4, m) locally nearest to the targets (n, 3, m).
+    def best_pull(self, vectors: Array, target: Array) -> Array:
+        """Return the valid d (n, 3) [mm] that bring the vectors (4, m) nearest to the targets (n, 3, m).
 
         Args:
             vectors: Homogeneous points of the mandible at rest, anatomical frame [mm], scaled by their weights.
             target: Where they should go, scaled alike.
-            start: First d [mm], inside the bound, shape (n, 3).
+
+        Raises:
+            EvaluatorError: the valid volume is empty.
+        """
+        images = carried(self._scan.R, self._scan.t, vectors).reshape(len(self._scan.points), -1)
+        residual = distance_residual(self._model.decode_derivative, vectors, target)
+        return self._best(residual, images, target.reshape(len(target), images.shape[1]))
+
+    def pull(self, vectors: Array, target: Array, start: Array) -> Array:
+        """Return what `best_pull` does, but only the bottom of the valley that start (n, 3) [mm] lies in.
+
+        Short steps keep the search in that valley, which is what makes dragging continuous.
         """
         return minimise(distance_residual(self._model.decode_derivative, vectors, target), start, self._bound)
+
+    def _best(self, residual: Residual, features: Array, wanted: Array) -> Array:
+        """Return the best d (n, 3) over searches from every valley; features (p, k) are of the scanned points."""
+        best, least = np.full((len(wanted), 3), np.nan), np.full(len(wanted), np.inf)
+        for rows, starts in self._scan.valleys(features, wanted):
+            found = minimise(partial(_of_rows, residual, rows), starts, self._bound)
+            r, _ = residual(found, rows)
+            cost = np.einsum("nm,nm->n", r, r)
+            better = cost < least[rows]
+            best[rows[better]], least[rows[better]] = found[better], cost[better]
+        return best
+
+
+class _Scan:
+    """Points spread over the valid volume, slice by slice, and their motions.
+
+    Attributes:
+        points: d of the points [mm], shape (p, 3), in order of d1.
+        R, t: Their motions, shapes (p, 3, 3) and (p, 3).
+    """
+
+    def __init__(self, points: Array, R: Array, t: Array) -> None:
+        self.points, self.R, self.t = points, R, t
+        self._first = np.flatnonzero(np.diff(points[:, 0], prepend=-np.inf) > 0)
+
+    def valleys(self, features: Array, wanted: Array) -> list[tuple[NDArray[np.intp], Array]]:
+        """Return rounds of starts: row numbers (m,) and d (m, 3) [mm], the best first; rows with NaN have none.
+
+        A valley is a slice whose best point is nearer to what is wanted than that of both its neighbours.
+
+        Args:
+            features: What is compared, of the points, shape (p, k).
+            wanted: What it should be, shape (n, k).
+        """
+        found = np.full((len(wanted), _MOST_VALLEYS), -1, dtype=np.intp)
+        squared = np.einsum("pk,pk->p", features, features)
+        for i in range(0, len(wanted), _SCAN_ROWS):
+            distance = squared - 2.0 * wanted[i : i + _SCAN_ROWS] @ features.T
+            found[i : i + _SCAN_ROWS] = self._deepest(distance)
+        found[np.isnan(wanted).any(axis=1)] = -1
+        rounds = [(np.flatnonzero(column >= 0), column) for column in found.T]
+        return [(rows, self.points[column[rows]]) for rows, column in rounds if rows.size]
+
+    def _deepest(self, distance: Array) -> NDArray[np.intp]:
+        """Return the best point in each of the deepest valleys (n, v) of distances (n, p); -1 where there are fewer."""
+        least = np.minimum.reduceat(distance, self._first, axis=1)
+        walls = np.pad(least, ((0, 0), (1, 1)), constant_values=np.inf)
+        valley = (least <= walls[:, :-2]) & (least <= walls[:, 2:])
+        depth = np.where(valley, least, np.inf)
+        order = np.argsort(depth, axis=1)[:, :_MOST_VALLEYS]
+        found = np.full((len(distance), _MOST_VALLEYS), -1, dtype=np.intp)
+        ends = np.append(self._first[1:], distance.shape[1])
+        for row, slices in enumerate(order):
+            for place, each in enumerate(slices[np.isfinite(depth[row, slices])]):
+                first = self._first[each]
+                found[row, place] = first + np.argmin(distance[row, first : ends[each]])
+        return found
+
+
+def _of_rows(residual: Residual, rows: NDArray[np.intp], x: Array, some: NDArray[np.intp]) -> tuple[Array, Array]:
+    return residual(x, rows[some])
 
 
 def nearest_distance(points: Array, queries: Array) -> Array:

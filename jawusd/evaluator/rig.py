@@ -300,11 +300,11 @@ class JawRig:
         targets = targets.reshape(len(targets), vectors.shape[1], 3)
         scaled = np.swapaxes(transform_points(self._frames.to_anatomical, targets), 1, 2) * vectors[3]
         if start is None:
-            d = in_chunks(lambda target: self._reach.best_starts(vectors, target), scaled)
+            d = in_chunks(lambda target: self._reach.best_pull(vectors, target), scaled)
         else:
             given, _ = as_rows(np.broadcast_to(np.asarray(start, float), (*batch, 3)), (3,), "start")
-            d = in_chunks(self._reach.nearest, given)
-        d = in_chunks(lambda target, d: self._reach.pull(vectors, target, d), scaled, d)
+            first = in_chunks(self._reach.nearest, given)
+            d = in_chunks(lambda target, d: self._reach.pull(vectors, target, d), scaled, first)
         left = carried(*self.model.decode(d), vectors) - scaled
         return d.reshape(*batch, 3), np.sqrt(np.einsum("nij,nij->n", left, left)).reshape(batch)
 

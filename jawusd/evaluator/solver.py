@@ -21,6 +21,7 @@ _START_DAMPING = 1e-6
 _LARGEST_DAMPING = 1e8
 _SMALLEST_DAMPING = 1e-12
 _INSIDE_MM = 1e-10  # depth at which a point pulled back onto the surface is left
+_LONGEST_STEP_MM = 1.0  # within a bound, where a longer one may land in another valley
 _PULL_BACKS = 12
 _PULL = 1.01  # a little more than the distance, so that one pull mostly does; what is lost vanishes with the steps
 _LEAST_STIFFNESS = 1e-12  # keeps steps finite where nothing depends on a parameter
@@ -47,7 +48,7 @@ def minimise(
     start: Array,
     bound: Bound | None = None,
     *,
-    iterations: int = 60,
+    iterations: int = 80,
     tolerance_mm: float = 1e-6,
 ) -> Array:
     """Minimise half the squared residual of every row.
@@ -148,7 +149,9 @@ def _bounded_step(
     over = excess + np.einsum("ni,ni->n", normal, step)
     inward = solve_symmetric(A, normal)
     pressure = np.maximum(over, 0.0) / np.einsum("ni,ni->n", normal, inward)
-    return step - pressure[:, None] * inward, pressure
+    step -= pressure[:, None] * inward
+    length = np.sqrt(np.einsum("ni,ni->n", step, step))
+    return step * np.minimum(1.0, _LONGEST_STEP_MM / np.maximum(length, 1e-300))[:, None], pressure
 
 
 def _pulled_back(bound: Bound, x: Array) -> tuple[Array, NDArray[np.bool_]]:

@@ -186,3 +186,17 @@ def test_captured_distance_is_the_distance_to_the_nearest_code():
     np.testing.assert_array_equal(RIG.captured_distance(ARRAYS["codes"]), 0.0)
     none = JawRig(dict(ARRAYS, codes=np.empty((0, 3))), example_meta())
     assert none.captured_distance([1.0, 0.0, 0.0]) == np.inf
+
+
+def test_project_finds_the_nearest_of_several_valleys():
+    """Supports that wave along d1 give several local answers; none of 20,000 inner points is nearer than ours."""
+    wave = 1.0 + 0.25 * np.cos(ARRAYS["slice_d1"] * 0.9)
+    rig = JawRig(dict(ARRAYS, slice_support=ARRAYS["slice_support"] * wave[:, None]), example_meta())
+    rng = np.random.default_rng(11)
+    inner = rng.uniform([-1, -13, -4], [43, 13, 10], (300_000, 3))
+    inner = inner[rig.margin(inner) >= 0]
+    assert len(inner) > 20_000
+    d = rng.uniform([-8, -25, -12], [52, 25, 20], (150, 3))
+    d = d[rig.margin(d) < 0]
+    nearest = np.array([np.linalg.norm(inner - x, axis=1).min() for x in d])
+    assert (np.linalg.norm(rig.project(d) - d, axis=1) <= nearest + 1e-9).all()
