@@ -25,6 +25,24 @@ class Method(StrEnum):
     pca = "pca"
 
 
+class Solver(StrEnum):
+    """Name the trackers."""
+
+    contour = "contour"
+    paper = "paper"
+
+
+class Backend(StrEnum):
+    """Name the places where the paper's solver draws."""
+
+    cpu = "cpu"
+    gl = "gl"
+
+
+SolverOption = Annotated[Solver, typer.Option(help="How to track: paper is slower and less accurate, to compare with.")]
+BackendOption = Annotated[Backend, typer.Option(help="Where --solver paper draws; gl needs OpenGL 4.3 (EGL).")]
+
+
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
     app.command("build")(build)
@@ -39,6 +57,8 @@ def build(
     capture: CaptureArg,
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the rig.", show_default=False)],
     model: Annotated[Method, typer.Option(help="Form of the jaw model.")] = Method.anchored,
+    solver: SolverOption = Solver.contour,
+    backend: BackendOption = Backend.cpu,
     resume: Annotated[bool, typer.Option("--resume", help="Continue an earlier build in this folder.")] = False,
     fresh: Annotated[bool, typer.Option("--fresh", help="Delete an earlier build in this folder first.")] = False,
     jobs: Annotated[int, typer.Option(min=1, max=64, help="Threads that draw and compare.")] = 2,
@@ -49,7 +69,10 @@ def build(
     from jawusd.pipeline.build import BuildOptions, build_rig
     from jawusd.pipeline.summary import build_lines
 
-    options = BuildOptions(model.value, jobs=jobs, resume=resume, fresh=fresh, allow_outside=allow_outside)
+    _check_backend(solver, backend)
+    options = BuildOptions(
+        model.value, solver.value, backend.value, jobs=jobs, resume=resume, fresh=fresh, allow_outside=allow_outside
+    )
     with progress() as report:
         summary = build_rig(capture, out, options, report)
     emit(summary, as_json, lambda: build_lines(summary))
@@ -68,6 +91,11 @@ def sync(capture: CaptureArg, allow_outside: Outside = False, as_json: Json = Fa
 def track(
     capture: CaptureArg,
     out: Annotated[Path, typer.Option("-o", "--out", help="File of the tracks.")] = Path("tracks.npz"),
+    solver: SolverOption = Solver.contour,
+    backend: BackendOption = Backend.cpu,
+    overlay: Annotated[
+        Path | None, typer.Option(help="Folder for videos with the tracked scans over the footage.", show_default=False)
+    ] = None,
     jobs: Annotated[int, typer.Option(min=1, max=64, help="Threads that draw and compare.")] = 2,
     force: Force = False,
     allow_outside: Outside = False,
@@ -75,18 +103,28 @@ def track(
 ) -> None:
     """Track both rows of teeth through the masks."""
     from jawusd.formats.tracks import save_tracks
+    from jawusd.pipeline.overlay import overlay_files, write_overlay
     from jawusd.pipeline.prepare import open_capture
     from jawusd.pipeline.stages import sync_cameras, track_teeth
     from jawusd.pipeline.summary import track_lines, track_summary
 
+    _check_backend(solver, backend)
     refuse_existing(out, force)
     opened = open_capture(capture, allow_outside=allow_outside)
+    for path in overlay_files(opened, overlay) if overlay else ():
+        refuse_existing(path, force)
     with progress() as report:
         offsets = sync_cameras(opened, report)["offsets"]
-        tracks = track_teeth(opened, offsets, jobs, report)
-    save_tracks(out, tracks)
-    summary = {**track_summary(tracks), "file": str(out)}
+        tracks = track_teeth(opened, offsets, jobs, report, solver.value, backend.value)
+        save_tracks(out, tracks)
+        drawn = write_overlay(opened, offsets, tracks, overlay, report) if overlay else []
+    summary = {**track_summary(tracks), "file": str(out), "overlay": [str(path) for path in drawn]}
     emit(summary, as_json, lambda: track_lines(summary))
+
+
+def _check_backend(solver: Solver, backend: Backend) -> None:
+    if backend is Backend.gl and solver is not Solver.paper:
+        raise typer.BadParameter("--backend gl belongs to --solver paper; the contour solver runs on the CPU.")
 
 
 def fit(

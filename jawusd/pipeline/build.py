@@ -34,6 +34,8 @@ class BuildOptions:
 
     Attributes:
         model: "anchored", "additive", "paper" or "pca".
+        solver: "contour" or "paper".
+        backend: where the paper's solver draws, "cpu" or "gl".
         jobs: threads of the tracker; the result does not depend on it.
         resume: continue an earlier build in the folder.
         fresh: delete an earlier build in the folder first.
@@ -41,6 +43,8 @@ class BuildOptions:
     """
 
     model: str = "anchored"
+    solver: str = "contour"
+    backend: str = "cpu"
     jobs: int = 2
     resume: bool = False
     fresh: bool = False
@@ -105,7 +109,12 @@ class _Build:
         described["cameras"] = [camera.name for camera in capture.cameras]
         track = self._stage(
             "track",
-            self._inputs(["scans", "calibration", "masks"], described, sync.result["offsets"]),
+            self._inputs(
+                ["scans", "calibration", "masks"],
+                described,
+                sync.result["offsets"],
+                [options.solver, options.backend],
+            ),
             lambda: self._track(sync.result["offsets"]),
         )
         fit = self._stage("fit", hash_value([track.outputs, track.inputs, options.model, __version__]), self._fit)
@@ -138,7 +147,8 @@ class _Build:
         return [], sync_cameras(self.capture, self.progress)
 
     def _track(self, offsets: dict[str, int]) -> tuple[list[Path], dict]:
-        tracks = track_teeth(self.capture, offsets, self.options.jobs, self.progress)
+        options = self.options
+        tracks = track_teeth(self.capture, offsets, options.jobs, self.progress, options.solver, options.backend)
         path = self.folder / "tracks.npz"
         save_tracks(path, tracks)
         return [path], track_summary(tracks)

@@ -50,7 +50,14 @@ def sync_cameras(capture: Capture, progress: Progress) -> dict:
     return result
 
 
-def track_teeth(capture: Capture, offsets: dict[str, int], jobs: int, progress: Progress) -> Tracks:
+def track_teeth(
+    capture: Capture,
+    offsets: dict[str, int],
+    jobs: int,
+    progress: Progress,
+    solver: str = "contour",
+    backend: str = "cpu",
+) -> Tracks:
     """Track both rows of teeth.
 
     Args:
@@ -58,12 +65,26 @@ def track_teeth(capture: Capture, offsets: dict[str, int], jobs: int, progress: 
         offsets: frame offset by camera.
         jobs: threads.
         progress: told of every frame.
+        solver: "contour", or "paper" for the paper's own method, to compare with.
+        backend: where the paper's method draws, "cpu" or "gl".
 
     Raises:
-        CaptureError, TrackingError: see `tracking.track_capture`.
+        CaptureError, TrackingError: see `tracking.track_capture` and `tracking.paper_sequence`.
+        MissingDependencyError: the GL backend has no OpenGL to work with.
     """
-    tracking = stage("jawusd.tracking")
     cameras, meshes = load_cameras(capture), load_meshes(capture)
+    if solver == "paper":
+        return stage("jawusd.tracking.paper_sequence").track_capture_paper(
+            capture,
+            cameras,
+            offsets,
+            meshes["upper_teeth"],
+            meshes["lower_teeth"],
+            backend=backend,
+            threads=jobs,
+            progress=lambda done, total: progress("track", done, total),
+        )
+    tracking = stage("jawusd.tracking")
     anatomy = find_anatomy(capture, meshes)
     return tracking.track_capture(
         capture,

@@ -41,7 +41,8 @@ def track_lines(summary: dict) -> list[str]:
         more = "" if len(lost) <= _LISTED_FRAMES else f" and {len(lost) - _LISTED_FRAMES} more"
         lines.append(f"  lost: {', '.join(map(str, lost[:_LISTED_FRAMES]))}{more}")
     lines.append(f"  recovered {summary['recovered']}, without one of the cameras {summary['without_a_camera']}")
-    sigma = ", ".join(f"{name} {value}" for name, value in summary["sigma_mm"].items())
+    known = {name: value for name, value in summary["sigma_mm"].items() if value is not None}
+    sigma = ", ".join(f"{name} {value}" for name, value in known.items()) or "not known"
     lines.append(f"  expected error (1 sigma, median) [mm]: {sigma}")
     lines.append(f"  mask left uncovered: {summary['coverage_error_percent']} %")
     return lines

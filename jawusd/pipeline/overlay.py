@@ -1,0 +1,112 @@
+"""Draw the tracked scans over the footage, to be judged by eye (paper figs. 10 and 11)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.errors import CalibrationError, CaptureError, OutputError
+from jawusd.formats.capture import Capture
+from jawusd.formats.mesh import Mesh
+from jawusd.formats.tracks import Tracks
+from jawusd.geometry import Camera
+from jawusd.pipeline.extras import stage
+from jawusd.pipeline.prepare import load_cameras, load_meshes
+from jawusd.pipeline.state import Progress
+
+SHEET = "contact_sheet.png"
+_SHEET_FRAMES = 6
+_GRAY = 60  # where a camera was not recording
+_CRF = 20  # H.264 quality for looking at, half the time of an archive
+
+
+def overlay_files(capture: Capture, folder: Path) -> list[Path]:
+    """Return the files `write_overlay` writes: a video per camera that has one, and the contact sheet."""
+    return [folder / f"{camera.name}.mp4" for camera in capture.cameras if camera.video] + [folder / SHEET]
+
+
+def write_overlay(
+    capture: Capture, offsets: dict[str, int], tracks: Tracks, folder: Path, progress: Progress
+) -> list[Path]:
+    """Write per camera an H.264 video of the tracked frames with both scans drawn over them, and a contact sheet.
+
+    The videos run in step: where a camera was not recording its picture is gray. Lost rows are not drawn.
+
+    Args:
+        capture: gives footage, calibration and scans.
+        offsets: frame offset by camera.
+        tracks: the poses to draw.
+        folder: where the files go; made if need be, files of the same name are overwritten.
+        progress: told of every picture.
+
+    Returns:
+        The files written.
+
+    Raises:
+        CaptureError: no camera has a video, or one cannot be decoded.
+        CalibrationError: a video has another size than its camera's calibration.
+        OutputError: the files cannot be written.
+    """
+    cameras = {camera.name: camera for camera in load_cameras(capture)}
+    sources = {source.name: source.video for source in capture.cameras if source.video}
+    if not sources:
+        raise CaptureError(
+            "no camera has a video, so there is nothing to draw over.",
+            path=capture.folder / "capture.toml",
+            hint="Name the footage there (video = ...).",
+        )
+    meshes = load_meshes(capture)
+    upper, lower = meshes["upper_teeth"], meshes["lower_teeth"]
+    drawing = stage("jawusd.imaging.overlay")
+    videos = {name: stage("jawusd.imaging.video").Video(path) for name, path in sources.items()}
+    for name, video in videos.items():
+        if video.size_px != cameras[name].size_px:
+            raise CalibrationError(
+                f"camera {name} is calibrated for {cameras[name].size_px} px, its video has {video.size_px} px.",
+                path=sources[name],
+                hint="Calibrate at the size of the footage.",
+            )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot write here: {error.strerror}.", path=folder) from error
+    done, total = 0, len(videos) * len(tracks.frames)
+    for name, video in videos.items():
+        width, height = (side // 2 * 2 for side in video.size_px)  # H.264 halves the colours
+        writer = stage("jawusd.imaging.video_writer").VideoWriter(
+            folder / f"{name}.mp4", (width, height), capture.fps, quality_crf=_CRF
+        )
+        with writer as out:
+            for image in _drawn(drawing, tracks, video, offsets[name], cameras[name], upper, lower):
+                out.write(image[:height, :width])
+                done += 1
+                progress("overlay", done, total)
+    shown = np.unique(np.linspace(0, len(tracks.frames) - 1, _SHEET_FRAMES).round().astype(int))
+    sheet = drawing.tracking_sheet(
+        tracks, tracks.frames[shown].tolist(), [cameras[name] for name in videos], videos, offsets, upper, lower
+    )
+    drawing.save_png(folder / SHEET, sheet)
+    return overlay_files(capture, folder)
+
+
+def _drawn(
+    drawing: ModuleType, tracks: Tracks, video, offset: int, camera: Camera, upper: Mesh, lower: Mesh
+) -> Iterator[NDArray[np.uint8]]:
+    """Yield the picture of every tracked frame, (h, w, 3) RGB."""
+    own = tracks.frames - offset
+    recorded = own[(own >= 0) & (own < video.count)]
+    pictures = video.frames(int(recorded[0]), int(recorded[-1]) + 1, colour="rgb") if len(recorded) else iter(())
+    for row, wanted in enumerate(own):
+        if not 0 <= wanted < video.count:
+            yield np.full((camera.size_px[1], camera.size_px[0], 3), _GRAY, np.uint8)
+            continue
+        image = next(picture.image for picture in pictures if picture.index == wanted)
+        scans = [
+            drawing.PlacedScan(upper, tracks.T_world_upper[row], drawing.UPPER_COLOUR),
+            drawing.PlacedScan(lower, tracks.T_world_lower[row], drawing.LOWER_COLOUR),
+        ]
+        yield drawing.draw_overlay(image, camera, scans)
