@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.geometry.se3 import make_transform, se3_adjoint, se3_inverse
+from jawusd.geometry.se3 import se3_adjoint, se3_inverse
 
 Array = NDArray[np.float64]
 
@@ -25,13 +25,15 @@ class RigFrames:
         self.from_anatomical = se3_inverse(T_anatomical_skull)
         self.closed = T_anatomical_skull @ T_rest
         self.adjoint = se3_adjoint(self.from_anatomical)
-        self._opened = se3_inverse(self.closed)
+        # (L M Q) as one matrix product over all motions: rows of 16 times the Kronecker product of L^T and Q
+        self._to_pose = np.kron(self.from_anatomical.T, self.closed)
+        self._to_motion = np.kron(self.to_anatomical.T, se3_inverse(self.closed))
 
-    def poses(self, R: Array, t: Array) -> Array:
-        """Return the poses T_skull_mandible (n, 4, 4) of motions R (n, 3, 3), t (n, 3) [mm]."""
-        return self.from_anatomical @ make_transform(R, t) @ self.closed
+    def poses(self, M: Array) -> Array:
+        """Return the poses T_skull_mandible of motions, both of shape (n, 4, 4)."""
+        return (M.reshape(-1, 16) @ self._to_pose).reshape(-1, 4, 4)
 
     def motions(self, T_skull_mandible: Array) -> tuple[Array, Array]:
         """Return rotation (n, 3, 3) and translation (n, 3) [mm] of the motions of poses (n, 4, 4)."""
-        M = self.to_anatomical @ T_skull_mandible @ self._opened
+        M = (T_skull_mandible.reshape(-1, 16) @ self._to_motion).reshape(-1, 4, 4)
         return M[:, :3, :3], M[:, :3, 3]

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 from jawusd.evaluator.curves import HermiteCurve
 from jawusd.evaluator.gauge import Gauge
+from jawusd.evaluator.motions import anchored_motions, motions_from_twists
 from jawusd.evaluator.single import SingleAdditive, SingleAnchored
-from jawusd.geometry.se3 import se3_exp, se3_left_jacobian, se3_left_jacobian_inverse
-from jawusd.geometry.so3 import so3_exp, so3_left_jacobian, so3_left_jacobian_inverse
+from jawusd.geometry.se3 import se3_left_jacobian, se3_left_jacobian_inverse
+from jawusd.geometry.so3 import so3_left_jacobian, so3_left_jacobian_inverse
 
 Array = NDArray[np.float64]
 
@@ -84,13 +85,19 @@ class AnchoredModel:
         """Return the rotation (n, 3, 3) and translation (n, 3) [mm] of M(d)."""
         if len(d) == 1 and np.isfinite(d).all():
             M = np.array([self.single.motion(*d[0].tolist())])
-            return M[:, :3, :3], M[:, :3, 3]
-        return self.motion_at(self.gauge.displacement(d))
+        else:
+            M = self.motion(d)
+        return M[:, :3, :3], M[:, :3, 3]
 
     def motion_at(self, u: Array) -> tuple[Array, Array]:
         """Return rotation and translation of the motion that carries the incisal point by u (n, 3) [mm]."""
-        R = so3_exp(self.rotation(u))
-        return R, u + self.incisor - R @ self.incisor
+        M = anchored_motions(self.rotation(u), u + self.incisor, self.incisor)
+        return M[:, :3, :3], M[:, :3, 3]
+
+    def motion(self, d: Array) -> Array:
+        """Return M(d) as transforms, shape (n, 4, 4)."""
+        u = self.gauge.displacement(d)
+        return anchored_motions(self.rotation(u), u + self.incisor, self.incisor)
 
     def decode_derivative(self, d: Array) -> tuple[Array, Array, Array]:
         """Return rotation, translation [mm] and the spatial derivative S (n, 6, 3) of M(d)."""
@@ -105,18 +112,18 @@ class AnchoredModel:
         if len(u) == 1 and np.isfinite(u).all():
             return self.single.motion_derivative_at(u)
         omega, omega_u = self.rotation_jacobian(u)
-        R = so3_exp(omega)
+        M = anchored_motions(omega, u + self.incisor, self.incisor)
         S = np.empty((len(u), 6, 3))
         S[:, :3] = so3_left_jacobian(omega) @ omega_u
         # The incisal point itself moves by du: w x (u + p) + v = du.
         S[:, 3:] = np.eye(3) + np.cross((u + self.incisor)[:, :, None], S[:, :3], axis=1)
-        return R, u + self.incisor - R @ self.incisor, S
+        return M[:, :3, :3], M[:, :3, 3], S
 
     def log(self, d: Array) -> Array:
         """Return the twist log M(d), shape (n, 6)."""
         u = self.gauge.displacement(d)
         omega = self.rotation(u)
-        t = u + self.incisor - so3_exp(omega) @ self.incisor
+        t = anchored_motions(omega, u + self.incisor, self.incisor)[:, :3, 3]
         return np.concatenate([omega, np.einsum("nij,nj->ni", so3_left_jacobian_inverse(omega), t)], axis=1)
 
     def log_jacobian(self, d: Array) -> Array:
@@ -215,13 +222,17 @@ class AdditiveModel:
 
     def decode(self, d: Array) -> tuple[Array, Array]:
         """Return the rotation (n, 3, 3) and translation (n, 3) [mm] of M(d)."""
-        M = se3_exp(self.log(d))
+        M = self.motion(d)
         return M[:, :3, :3], M[:, :3, 3]
+
+    def motion(self, d: Array) -> Array:
+        """Return M(d) as transforms, shape (n, 4, 4)."""
+        return motions_from_twists(self.log(d))
 
     def decode_derivative(self, d: Array) -> tuple[Array, Array, Array]:
         """Return rotation, translation [mm] and the spatial derivative S (n, 6, 3) of M(d)."""
         twist = self.log(d)
-        M = se3_exp(twist)
+        M = motions_from_twists(twist)
         return M[:, :3, :3], M[:, :3, 3], se3_left_jacobian(twist) @ self.log_jacobian(d)
 
     def log(self, d: Array) -> Array:

@@ -87,7 +87,7 @@ class JawRig:
         return in_chunks(self._poses, rows).reshape(*batch, 4, 4)
 
     def _poses(self, d: Array) -> Array:
-        return self._frames.poses(*self.model.decode(d))
+        return self._frames.poses(self.model.motion(d))
 
     def twist(self, d: ArrayLike) -> Array:
         """Return the twist log(pose(d) rest^-1) in the skull frame.

@@ -7,9 +7,9 @@ from bisect import bisect_right
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jawusd.evaluator.motions import motions_from_twists
 from jawusd.evaluator.rows import as_rows, in_chunks
 from jawusd.evaluator.single import motion_rows
-from jawusd.geometry.se3 import se3_exp
 
 Array = NDArray[np.float64]
 
@@ -64,7 +64,7 @@ class SampledTable:
         return in_chunks(self._poses, rows).reshape(*batch, 4, 4)
 
     def _poses(self, d: Array) -> Array:
-        T = se3_exp(self._twists(d)) @ self.T_rest
+        T = (motions_from_twists(self._twists(d)).reshape(-1, 4) @ self.T_rest).reshape(-1, 4, 4)
         T[np.isnan(d[:, 0])] = np.nan
         return T
 

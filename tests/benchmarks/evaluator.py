@@ -132,12 +132,12 @@ def timings(rig: evaluator.JawRig) -> dict[str, dict[int, float]]:
 
 
 def drags(rig: evaluator.JawRig) -> tuple[float, float]:
-    """Return the worst excess [mm] of 1,000 drags over the paper's search, and the median milliseconds of one."""
+    """Return the worst excess [mm] of 1,000 drags by about 2 mm over the paper's search, and one's milliseconds."""
     rng = np.random.default_rng(2)
     start = rig.project(rng.uniform(*rig.arrays["d_range"].T, (1000, 3)))
     handles = rig.arrays["landmarks"][:3]
     T = rig.pose(start)
-    targets = np.einsum("nij,hj->nhi", T[:, :3, :3], handles) + T[:, None, :3, 3] + rng.normal(size=(1000, 1, 3)) * 4
+    targets = np.einsum("nij,hj->nhi", T[:, :3, :3], handles) + T[:, None, :3, 3] + rng.normal(size=(1000, 1, 3))
     _, brute_mm = brute_force_ik(rig, handles, targets, start)
     excess, spent = [], []
     for d, target, best in zip(start, targets, brute_mm):
