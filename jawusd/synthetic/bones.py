@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from jawusd.formats.mesh import Mesh
 from jawusd.synthetic.kinematics import Joint, eminence
-from jawusd.synthetic.surfaces import Faces, loft, merged
+from jawusd.synthetic.surfaces import Faces, grid_faces, loft, merged, outward
 
 Array = NDArray[np.float64]
 
@@ -140,16 +140,17 @@ def _ramus(joint: Joint, side: float, centre: Array) -> tuple[Array, Faces]:
             [-44.0, 5.0, 17.0, 5.0, 18.0],
             [-30.0, 3.5, 15.5, 4.5, 17.5],
             [-18.0, 2.0, 13.5, 3.5, 16.5],
-            [-11.0, 1.5, 12.5, 2.0, 14.5],
+            [-12.0, 1.5, 12.5, 2.4, 14.5],
+            [-9.0, 1.5, 12.5, 0.6, 12.0],
         ]
     )
-    rows = _spline(rows[:, 0], rows, np.linspace(-60.0, -11.0, 26))
+    rows = _spline(rows[:, 0], rows, np.linspace(-60.0, -9.0, 27))
     return _column(centre, side, rows)
 
 
 def _condyle(side: float, centre: Array) -> tuple[Array, Faces]:
     """Neck and head of one condyle; the head is an ellipsoid about the centre."""
-    neck = np.array([[-24.0, 2.5, 5.0, 4.0, 8.0], [-15.0, 1.5, 1.5, 4.2, 5.0], [-8.0, 0.5, -0.3, 5.5, 4.0]])
+    neck = np.array([[-24.0, 2.5, 5.5, 2.6, 6.5], [-15.0, 1.5, 1.5, 4.0, 5.0], [-8.0, 0.5, -0.3, 5.5, 4.0]])
     neck = _spline(neck[:, 0], neck, np.linspace(-24.0, -8.0, 9))
     turn = np.linspace(-0.35 * np.pi, 0.499 * np.pi, 13)
     head = np.stack(
@@ -169,7 +170,7 @@ def _coronoid(side: float, centre: Array) -> tuple[Array, Faces]:
     """The process in front of the notch."""
     rows = np.array(
         [
-            [-24.0, 2.5, 21.0, 3.6, 9.0],
+            [-24.0, 2.5, 21.0, 2.6, 7.0],
             [-12.0, 2.5, 23.5, 2.8, 6.0],
             [-3.0, 3.0, 25.5, 2.0, 3.4],
             [1.0, 3.0, 25.0, 0.8, 1.2],
@@ -200,10 +201,23 @@ def _socket(joint: Joint, k: int) -> tuple[Array, Faces]:
         ],
         -1,
     )
-    roof = joint.condyles[k, 1] + JOINT_SPACE_MM + 4.0
-    over = under.copy()
-    over[..., 1] = roof
-    return loft(np.concatenate([under, over[:, ::-1]], 1))
+    # thick in the middle, thin towards the edges, domed over the fossa
+    along = np.linspace(-1.0, 1.0, 40)[:, None]
+    thick = np.sqrt((1.0 - along**6) * (1.0 - (across / 12.0) ** 6) + 0.01)
+    dome = 3.0 * np.exp(-(((slide[:, None] - 2.0) / 9.0) ** 2)) * np.cos(across / 12.0 * np.pi / 2)
+    over = under + np.stack([0.0 * thick, 1.0 + 4.5 * thick + dome, 0.0 * thick], -1)
+    vertices = np.concatenate([under, over[:, ::-1]], 1).reshape(-1, 3)
+    n = 2 * len(across)
+    j = np.arange(len(across) - 1)
+    ends = []
+    for start, turn in ((0, 1), (39 * n, -1)):
+        below, above = start + j, start + n - 1 - j
+        strip = np.concatenate(
+            [np.stack([below, below + 1, above], -1), np.stack([below + 1, above - 1, above], -1)]
+        )
+        ends.append(strip[:, ::turn])
+    faces = np.concatenate([grid_faces(40, n, closed=True), *ends]).astype(np.int32)
+    return vertices, outward(vertices, faces)
 
 
 def _cheekbone(joint: Joint, k: int, side: float) -> tuple[Array, Faces]:

@@ -54,7 +54,7 @@ class DemoConfig:
     frames: int = 240
     size_px: tuple[int, int] = (1280, 720)
     boards: int = 24
-    quality_crf: int = 25
+    quality_crf: int = 23
 
     def __post_init__(self) -> None:
         if self.frames <= OPEN_HOLD + REST_HOLD:

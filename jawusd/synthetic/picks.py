@@ -19,6 +19,7 @@ _BORDER_PX = 10.0
 _FACING = 0.35
 # Another surface this much nearer to the camera hides a point.
 _CLEARANCE_MM = 0.05
+_TIPS_PER_TOOTH = 6
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,8 @@ def _tips(arch: DentalArch) -> NDArray[np.int64]:
     for k in np.unique(arch.tooth[arch.tooth != 0]):
         own = np.flatnonzero(arch.tooth == k)
         height = up * vertices[own, 1]
-        chosen.append(own[height > height.max() - 1.2])
+        tips = own[height > height.max() - 1.2]
+        chosen.append(tips[:: max(1, len(tips) // _TIPS_PER_TOOTH)])
     return np.concatenate(chosen)
 
 
@@ -97,19 +99,24 @@ def _seen(camera: Camera, points: Array, normals: Array, occluders: list[Mesh]) 
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     facing = np.einsum("ni,ni->n", rays, normals)
     pixels = camera.project(points)
-    low, high = _BORDER_PX, np.array(camera.size_px) - 1 - _BORDER_PX
-    facing[((pixels < low) | (pixels > high)).any(1)] = 0.0
+    limit = np.array(camera.size_px) - 1 - _BORDER_PX
+    facing[((pixels < _BORDER_PX) | (pixels > limit)).any(1)] = 0.0
     facing[facing < _FACING] = 0.0
+    corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in occluders])
+    # a triangle can only hide a point if its corners, in the picture, do not all lie to one side of it
+    seen_at = camera.project_pinhole(corners)
+    low, high = seen_at.min(1), seen_at.max(1)
+    at = camera.project_pinhole(points)
     for i in np.flatnonzero(facing):
-        if any(_hits(points[i], eye, mesh) for mesh in occluders):
+        if _hits(points[i], eye, corners[((low <= at[i]) & (at[i] <= high)).all(1)]):
             facing[i] = 0.0
     return facing
 
 
-def _hits(point: Array, eye: Array, mesh: Mesh) -> bool:
-    """Tell whether a mesh lies between a point and the eye (Moeller and Trumbore 1997)."""
+def _hits(point: Array, eye: Array, corners: Array) -> bool:
+    """Tell whether a triangle (N, 3, 3) lies between a point and the eye (Moeller and Trumbore 1997)."""
     direction = eye - point
-    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     e1, e2, s = b - a, c - a, point - a
     h = np.cross(direction, e2)
     det = np.einsum("ij,ij->i", e1, h)

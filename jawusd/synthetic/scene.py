@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 _ENAMEL = np.array([0.80, 0.745, 0.63])
 _GUM = np.array([0.56, 0.22, 0.21])
 # Canines are yellower, and enamel darkens towards the gum.
-_CANINE_TINT = np.array([0.95, 0.91, 0.82])
+_CANINE_TINT = np.array([0.975, 0.955, 0.91])
 
 
 class Scene:

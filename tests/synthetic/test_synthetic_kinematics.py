@@ -143,12 +143,10 @@ def test_noise_scale_scales_the_tracking_noise_only() -> None:
 def test_impossible_poses_are_refused(people: list[Person]) -> None:
     for person in people:
         good = person.pose(0.4, 0.3, 0.2)
-        assert person.is_valid(good)
-        for twist in ([0, 0, 0, 0, 3.0, 0], [0, 0, 0, 6.0, 0, 0], [0, 0.1, 0, 0, 0, 0], [0, 0, 0.06, 0, 0, 0]):
-            assert not person.is_valid(se3_exp(twist) @ good)
-        assert not person.is_valid(person.pose(1.15, 0.0, 0.0))
-        assert not person.is_valid(person.pose(0.0, 1.4, 0.0))
-        assert not person.is_valid(person.pose(0.0, 0.0, 1.4))
+        twists = [[0, 0, 0, 0, 3.0, 0], [0, 0, 0, 6.0, 0, 0], [0, 0.1, 0, 0, 0, 0], [0, 0, 0.06, 0, 0, 0]]
+        beyond = person.pose([1.15, 0.0, 0.0], [0.0, 1.4, 0.0], [0.0, 0.0, 1.4])
+        verdicts = person.is_valid(np.concatenate([good[None], se3_exp(twists) @ good, beyond]))
+        np.testing.assert_array_equal(verdicts, [True] + 7 * [False])
 
 
 def test_nearest_finds_the_controls_again(people: list[Person]) -> None:
