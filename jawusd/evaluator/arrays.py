@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jawusd.errors import EvaluatorError
+from jawusd.evaluator.models import KINDS
 from jawusd.geometry.se3 import rigidity_defect
 
 _RIGID_TOLERANCE = 1e-6
@@ -63,8 +64,8 @@ def checked_arrays(arrays: Mapping[str, ArrayLike], kind: str) -> dict[str, NDAr
     Raises:
         EvaluatorError: an unknown kind, or an array that is missing, of a wrong shape, not finite or out of range.
     """
-    if kind not in ("anchored", "additive"):
-        raise EvaluatorError(f'the model is of kind "{kind}"; this jawusd knows "anchored" and "additive".')
+    if kind not in KINDS:
+        raise EvaluatorError(f'the model is of kind "{kind}"; this jawusd knows {" and ".join(KINDS)}.')
     shapes = _COMMON | (_ANCHORED if kind == "anchored" else _ADDITIVE)
     lengths: dict[str, int] = {}
     checked = {name: _checked(name, arrays, shape, lengths) for name, shape in shapes.items()}

@@ -31,13 +31,15 @@ class Encoder:
     Args:
         model: The jaw model.
         frames: Of the rig.
-        bound: The valid volume, for encoding inside it.
+        bound: The valid volume.
+        reach: Searches inside it.
         landmarks: Landmarks of the mandible [mm], mandible frame, shape (n, 3).
     """
 
-    def __init__(self, model: JawModelForm, frames: RigFrames, bound: SliceHull, landmarks: Array) -> None:
-        self._model, self._frames, self._bound = model, frames, bound
-        self._reach = Reach(model, bound)
+    def __init__(
+        self, model: JawModelForm, frames: RigFrames, bound: SliceHull, reach: Reach, landmarks: Array
+    ) -> None:
+        self._model, self._frames, self._bound, self._reach = model, frames, bound, reach
         self._vectors = landmark_vectors(transform_points(frames.closed, landmarks))
 
     def encode(self, T: Array, *, bounded: bool) -> tuple[Array, Array]:

@@ -43,8 +43,8 @@ class AnchoredModel:
         weights: Of the m kernels and the 3 linear terms [rad], shape (m + 3, 3).
         centres_squared: |c_i|^2, shape (m,).
         moments: Kernel weights times 1, c_i and |c_i|^2, shape (m, 15); see `_spline`.
-        single: The same model for one row, in floats.
         offset: Value of the bare spline at u = 0 [rad], taken off so that f(0) = 0, shape (3,).
+        single: The same model for one row, in floats.
     """
 
     gauge: Gauge
@@ -129,10 +129,6 @@ class AnchoredModel:
     def log_jacobian(self, d: Array) -> Array:
         """Return d log M / dd, shape (n, 6, 3)."""
         return se3_left_jacobian_inverse(self.log(d)) @ self.decode_derivative(d)[2]
-
-    def read_off(self, R: Array, t: Array) -> Array:
-        """Return the d (n, 3) [mm] that put the incisal point where the motions (R, t) put it."""
-        return self.parameters_at(self.displacement_of(R, t))
 
     def parameters_at(self, u: Array) -> Array:
         """Return the d (n, 3) [mm] of incisal displacements u (n, 3) [mm]."""
@@ -268,10 +264,3 @@ def model_from_arrays(arrays: Mapping[str, Array]) -> JawModelForm:
         KeyError: an array of the model is missing.
     """
     return AnchoredModel.from_arrays(arrays) if "spline_weights" in arrays else AdditiveModel.from_arrays(arrays)
-
-
-def decode_anatomical(arrays: Mapping[str, Array], d: Array) -> tuple[Array, Array]:
-    """Return rotation (..., 3, 3) and translation (..., 3) [mm] of M(d), anatomical frame, for d (..., 3) [mm]."""
-    d = np.asarray(d, dtype=float)
-    R, t = model_from_arrays(arrays).decode(d.reshape(-1, 3))
-    return R.reshape(*d.shape[:-1], 3, 3), t.reshape(d.shape)

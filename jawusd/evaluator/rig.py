@@ -62,8 +62,8 @@ class JawRig:
         self._opening_mm = float(self.arrays["d_range"][0, 1])
         self.limits = Limits(float(self.arrays["residual_limit_mm"]), float(self.arrays["margin_limit_mm"]))
         self._frames = RigFrames(self.arrays["T_anatomical_skull"], self.arrays["T_rest"])
-        self._encoder = Encoder(self.model, self._frames, self.bound, self.arrays["landmarks"])
         self._reach = Reach(self.model, self.bound)
+        self._encoder = Encoder(self.model, self._frames, self.bound, self._reach, self.arrays["landmarks"])
 
     def __reduce__(self) -> tuple:
         return (JawRig, ({name: np.array(value) for name, value in self.arrays.items()}, self.meta))
@@ -223,6 +223,9 @@ class JawRig:
             bound: Which bound, see `margin`.
             times_s: Times of the poses along the last batch axis, shape (F,); needed for a speed limit.
             speed_limit_mm_s: Largest speed of a landmark between consecutive poses; None asks no question.
+
+        Returns:
+            Verdicts of the batch shape.
 
         Raises:
             ValueError: wrong shapes, or a speed limit without rising times.

@@ -19,9 +19,9 @@ Residual = Callable[[Array, NDArray[np.intp]], tuple[Array, Array]]
 
 _START_DAMPING = 1e-6
 _LARGEST_DAMPING = 1e8
-_SMALLEST_DAMPING = 1e-12
+_SMALLEST_DAMPING = 1e-9
 _INSIDE_MM = 1e-10  # depth at which a point pulled back onto the surface is left
-_LONGEST_STEP_MM = 2.0  # within a bound, where a longer one may land in another valley
+_LONGEST_STEP_MM = 1.0  # within a bound, where a longer one may land in another valley
 _PULL_BACKS = 12
 _PULL = 1.01  # a little more than the distance, so that one pull mostly does; what is lost vanishes with the steps
 _LEAST_STIFFNESS = 1e-12  # keeps steps finite where nothing depends on a parameter
@@ -116,7 +116,8 @@ def solve_symmetric(A: Array, b: Array) -> Array:
         x, y, z = b.T
     c00, c01, c02 = c * f - s * s, q * s - p * f, p * s - q * c
     c11, c12, c22 = a * f - q * q, p * q - a * s, a * c - p * p
-    scale = 1.0 / (a * c00 + p * c01 + q * c02)
+    determinant = a * c00 + p * c01 + q * c02
+    scale = 1.0 / (determinant + (determinant == 0))  # a finite step even of a singular row; damping mends it
     solution = (c00 * x + c01 * y + c02 * z, c01 * x + c11 * y + c12 * z, c02 * x + c12 * y + c22 * z)
     return (np.array(solution) * scale).T.reshape(len(A), 3)
 

@@ -7,6 +7,7 @@ from scipy.optimize import least_squares
 from scipy.optimize import minimize as scipy_minimize
 
 from jawusd.evaluator import JawRig
+from jawusd.evaluator.solver import solve_symmetric
 from jawusd.geometry.se3 import se3_exp, se3_log
 
 RIGS = {kind: JawRig(example_arrays(kind), example_meta(kind)) for kind in ("anchored", "additive")}
@@ -160,3 +161,17 @@ def test_any_rigid_pose_gets_an_answer(rig):
     d, residual_mm = rig.encode(T)
     assert np.isfinite(d).all() and np.isfinite(residual_mm).all()
     assert np.median(residual_mm) > 5.0
+
+
+def test_a_handle_that_hardly_moves_is_solved_without_dividing_by_zero():
+    """Equations without full rank: rows of zeros give no step, single or in batches."""
+    singular = np.zeros((3, 3, 3))
+    singular[1] = np.outer([1.0, 2.0, 3.0], [1.0, 2.0, 3.0])
+    singular[2] = np.diag([2.0, 4.0, 8.0])
+    b = np.tile([2.0, 4.0, 8.0], (3, 1))
+    x = solve_symmetric(singular, b)
+    np.testing.assert_allclose(x[0], 0.0)
+    np.testing.assert_allclose(x[2], 1.0)
+    assert np.isfinite(x).all()
+    for A, right, expected in zip(singular, b, x):
+        np.testing.assert_allclose(solve_symmetric(A[None], right[None])[0], expected)

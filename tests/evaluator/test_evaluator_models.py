@@ -8,10 +8,9 @@ from example_model import example_arrays
 from scipy.spatial.transform import Rotation
 
 from jawusd.evaluator.curves import HermiteCurve
-from jawusd.evaluator.models import AnchoredModel, decode_anatomical, model_from_arrays
+from jawusd.evaluator.models import KINDS, AnchoredModel, model_from_arrays
 from jawusd.geometry.se3 import se3_exp
 
-KINDS = ("anchored", "additive")
 # inside, on a knot of the curves, past both ends of the path, at rest
 POINTS = np.array(
     [[20.0, 3.0, -1.0], [5.25, -6.0, 4.0], [60.0, 2.0, 1.0], [-5.0, -1.0, 0.5], [0.0, 0.0, 0.0], [41.0, 8.9, 6.9]]
@@ -34,7 +33,7 @@ def random_d(arrays, count, seed=0):
 
 def test_motion_agrees_with_the_reference(arrays):
     """Values agree with the formulas evaluated in 50 digits."""
-    R, t = decode_anatomical(arrays, POINTS)
+    R, t = model_from_arrays(arrays).decode(POINTS)
     for i, d in enumerate(POINTS):
         M = matrix(reference.motion(arrays, [mp.mpf(float(x)) for x in d]))
         np.testing.assert_allclose(R[i], M[:3, :3], atol=1e-12)
@@ -43,14 +42,14 @@ def test_motion_agrees_with_the_reference(arrays):
 
 def test_rest_is_the_identity(arrays):
     """M(0) = I: d = 0 is the closed bite."""
-    R, t = decode_anatomical(arrays, np.zeros(3))
-    np.testing.assert_allclose(R, np.eye(3), atol=1e-14)
+    R, t = model_from_arrays(arrays).decode(np.zeros((2, 3)))
+    np.testing.assert_allclose(R, np.stack([np.eye(3)] * 2), atol=1e-14)
     np.testing.assert_allclose(t, 0.0, atol=1e-12)
 
 
 def test_rotations_are_rotations(arrays):
     """scipy accepts the rotations as they are."""
-    R, _ = decode_anatomical(arrays, random_d(arrays, 200))
+    R, _ = model_from_arrays(arrays).decode(random_d(arrays, 200))
     np.testing.assert_allclose(Rotation.from_matrix(R).as_matrix(), R, atol=1e-12)
 
 
@@ -85,11 +84,11 @@ def test_anchored_model_puts_the_incisor_where_the_gauge_says():
     np.testing.assert_allclose(R @ arrays["incisor"] + t - arrays["incisor"], model.gauge.displacement(d), atol=1e-12)
 
 
-def test_read_off_inverts_an_anchored_model():
+def test_the_incisor_tells_the_parameters_of_an_anchored_model():
     arrays = example_arrays("anchored")
     model = AnchoredModel.from_arrays(arrays)
     d = random_d(arrays, 300)
-    np.testing.assert_allclose(model.read_off(*model.decode(d)), d, atol=1e-9)
+    np.testing.assert_allclose(model.parameters_at(model.displacement_of(*model.decode(d))), d, atol=1e-9)
 
 
 def test_read_off_of_an_additive_model_starts_near():
