@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
+from jawusd.errors import JawusdError
 from jawusd.evaluator import JawRig
 from jawusd.formats.capture import Capture
 from jawusd.formats.model import JawModel
@@ -72,6 +75,24 @@ def track_teeth(
         CaptureError, TrackingError: see `tracking.track_capture` and `tracking.paper_sequence`.
         MissingDependencyError: the GL backend has no OpenGL to work with.
     """
+    with _about(capture):
+        return _track(capture, offsets, jobs, progress, solver, backend)
+
+
+@contextlib.contextmanager
+def _about(capture: Capture) -> Iterator[None]:
+    """Name the capture in errors of stages that know only its content."""
+    try:
+        yield
+    except JawusdError as error:
+        if error.path is None:
+            error.path = str(capture.folder / "capture.toml")
+        raise
+
+
+def _track(
+    capture: Capture, offsets: dict[str, int], jobs: int, progress: Progress, solver: str, backend: str
+) -> Tracks:
     cameras, meshes = load_cameras(capture), load_meshes(capture)
     if solver == "paper":
         return stage("jawusd.tracking.paper_sequence").track_capture_paper(
@@ -126,15 +147,16 @@ def fit_jaw(capture: Capture, motion: Motion, method: str, progress: Progress) -
     meshes = load_meshes(capture)
     anatomy = find_anatomy(capture, meshes)
     bone = meshes.get("mandible", meshes["lower_teeth"])
-    model = fitting.fit_model(
-        motion,
-        T_anatomical_skull=anatomy.T_anatomical_skull,
-        landmarks=anatomy.landmarks,
-        mandible_vertices=bone.vertices,
-        config=fitting.FittingConfig(method=method),
-        actor=capture.name,
-        progress=lambda done, total: progress("fit", done, total),
-    )
+    with _about(capture):
+        model = fitting.fit_model(
+            motion,
+            T_anatomical_skull=anatomy.T_anatomical_skull,
+            landmarks=anatomy.landmarks,
+            mandible_vertices=bone.vertices,
+            config=fitting.FittingConfig(method=method),
+            actor=capture.name,
+            progress=lambda done, total: progress("fit", done, total),
+        )
     model.meta.update(fps=capture.fps, inferred=list(anatomy.inferred))
     return model
 

@@ -1,0 +1,229 @@
+"""The example capture becomes a rig, and each way a capture can be wrong is one clear error that loses nothing."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import onnxruntime
+import pytest
+import trimesh
+from package_copy import ROOT
+from pxr import Usd, UsdGeom
+
+import jawusd
+from jawusd.errors import CalibrationError, CaptureError, JawusdError, OutputError, TrackingError
+from jawusd.formats.tracks import load_tracks
+from jawusd.geometry import transform_points
+from jawusd.pipeline.build import BuildOptions, build_rig
+from jawusd.rig.validate import validate_stage
+
+EXAMPLE = ROOT / "examples" / "capture"
+
+
+def quiet(stage, done, total):
+    """Swallow progress."""
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    out = tmp_path_factory.mktemp("build") / "actor"
+    return out, build_rig(EXAMPLE, out, BuildOptions(), quiet)
+
+
+def points_of_mandible():
+    scans = EXAMPLE / "scans"
+    return np.concatenate([trimesh.load(scans / name).vertices for name in ("mandible.ply", "lower_teeth.ply")])
+
+
+def test_the_example_is_tracked_as_well_as_its_masks_allow(built):
+    out, summary = built
+    tracks = load_tracks(out / "tracks.npz")
+    with np.load(EXAMPLE / "truth" / "truth.npz") as archive:
+        truth = {name: archive[name] for name in archive.files}
+    assert summary["track"]["lost"] == [] and tracks.tracked().all()
+    rows = np.searchsorted(truth["frames"], tracks.frames)
+    scans = {"upper": "upper_teeth.ply", "lower": "lower_teeth.ply"}
+    for name, file in scans.items():
+        vertices = np.asarray(trimesh.load(EXAMPLE / "scans" / file).vertices)[::10]
+        found = getattr(tracks, f"T_world_{name}")
+        error = transform_points(found, vertices) - transform_points(truth[f"T_world_{name}"][rows], vertices)
+        assert np.linalg.norm(error, axis=-1).mean() < 0.15
+    offsets = dict(zip(truth["camera_names"].tolist(), truth["offsets"].tolist(), strict=True))
+    assert summary["sync"]["offsets"] == offsets
+
+
+def test_the_model_reconstructs_what_was_tracked(built):
+    _, summary = built
+    assert summary["fit"]["errors"]["train"]["mandible"]["mean"] < 0.6
+
+
+def test_every_usd_file_passes_every_validator(built):
+    out, _ = built
+    layers = sorted(path for path in out.iterdir() if path.suffix in (".usda", ".usdc", ".usdz"))
+    assert len(layers) >= 4
+    for path in layers:
+        assert [f for f in validate_stage(path) if f.severity == "error"] == [], path.name
+
+
+def test_the_baked_ops_are_the_evaluators_poses_at_every_captured_frame(built):
+    out, _ = built
+    stage = Usd.Stage.Open(str(out / "anim_capture.usdc"))
+    mandible = UsdGeom.Xformable(stage.GetPrimAtPath("/Actor/geo/Mandible"))
+    prim, rig = stage.GetPrimAtPath("/Actor"), jawusd.load(out / "actor.usda")
+    vertices = points_of_mandible()
+    tracks = load_tracks(out / "tracks.npz")
+    for frame in tracks.frames:
+        d = [prim.GetAttribute(f"jaw:d{i}").Get(float(frame)) for i in (1, 2, 3)]
+        baked = np.array(mandible.GetLocalTransformation(float(frame))).T
+        gap = transform_points(baked, vertices) - transform_points(rig.pose(d), vertices)
+        assert np.linalg.norm(gap, axis=1).max() < 0.01
+
+
+def test_exact_model_table_and_onnx_agree_on_random_valid_parameters(built):
+    out, _ = built
+    rig = jawusd.load(out / "actor.usda")
+    rng = np.random.default_rng(0)
+    low, high = rig.arrays["d_range"].T
+    d = rng.uniform(low, high, (60000, 3))
+    d = d[rig.margin(d) >= 0][:1000]
+    assert len(d) == 1000
+    vertices = points_of_mandible()[::7]
+    exact = transform_points(rig.pose(d), vertices)
+    session = onnxruntime.InferenceSession(str(out / "actor.onnx"), providers=["CPUExecutionProvider"])
+    names = [output.name for output in session.get_outputs()]
+    dtype = np.float32 if "float)" in session.get_inputs()[0].type else np.float64
+    outputs = dict(zip(names, session.run(None, {session.get_inputs()[0].name: d.astype(dtype)}), strict=True))
+    T = next(value for value in outputs.values() if value.shape[1:] == (4, 4)).astype(float)
+    assert np.linalg.norm(transform_points(T, vertices) - exact, axis=-1).max() < 0.01
+    from jawusd.rig.read import find_rig_prim, open_stage, read_table
+
+    stage = open_stage(out / "actor.usda")
+    table = read_table(find_rig_prim(stage, out), out)
+    from jawusd.geometry import se3_exp
+
+    read = se3_exp(table.twist(d)) @ rig.arrays["T_rest"]
+    assert np.linalg.norm(transform_points(read, vertices) - exact, axis=-1).max() < 0.06
+
+
+def test_a_second_build_needs_a_word_and_resume_reuses_everything(built):
+    out, _ = built
+    with pytest.raises(OutputError, match="--resume"):
+        build_rig(EXAMPLE, out, BuildOptions(), quiet)
+    again = build_rig(EXAMPLE, out, BuildOptions(resume=True), quiet)
+    assert again["reused"] == ["sync", "track", "fit", "bake"]
+
+
+def test_resume_redoes_only_what_depends_on_a_change(built, tmp_path):
+    out = tmp_path / "copy"
+    shutil.copytree(built[0], out)
+    (out / "model.npz").unlink()
+    again = build_rig(EXAMPLE, out, BuildOptions(resume=True), quiet)
+    assert again["reused"][:2] == ["sync", "track"] and "fit" not in again["reused"]
+    assert (out / "model.npz").read_bytes() == (built[0] / "model.npz").read_bytes()
+
+
+@pytest.fixture
+def capture(tmp_path):
+    """A copy of the example whose files may be broken; large ones are links until a test replaces them."""
+    folder = tmp_path / "capture"
+    for source in EXAMPLE.rglob("*"):
+        target = folder / source.relative_to(EXAMPLE)
+        if source.is_dir():
+            target.mkdir(parents=True, exist_ok=True)
+        elif source.is_file():
+            target.parent.mkdir(parents=True, exist_ok=True)
+            os.link(source, target) if source.stat().st_dev == tmp_path.stat().st_dev else shutil.copy(source, target)
+    return folder
+
+
+def replace(folder, name, change):
+    """Replace a file of the copy by a changed one, never writing through a hard link."""
+    data = (folder / name).read_bytes()
+    (folder / name).unlink()
+    (folder / name).write_bytes(change(data))
+
+
+def missing_mask_folder(folder):
+    shutil.rmtree(folder / "masks")
+
+
+def masks_of_another_size(folder):
+    from jawusd.imaging.video_writer import VideoWriter
+
+    path = next((folder / "masks").rglob("*.mkv"))
+    path.unlink()
+    with VideoWriter(path, (320, 180), 24.0, lossless=True) as writer:
+        for _ in range(40):
+            writer.write(np.full((180, 320), 255, np.uint8))
+
+
+def scan_in_metres(folder):
+    mesh = trimesh.load(folder / "scans" / "lower_teeth.ply", process=False)
+    mesh.apply_scale(0.001)
+    (folder / "scans" / "lower_teeth.ply").unlink()
+    mesh.export(folder / "scans" / "lower_teeth.ply")
+
+
+def calibration_without_rotation(folder):
+    def change(data):
+        lines = data.decode().splitlines()
+        first = next(i for i, line in enumerate(lines) if line.startswith("rotation"))
+        lines[first] = "rotation = [[1.0, 0.0, 0.0], [0.0, 1.2, 0.0], [0.0, 0.0, 1.0]]"
+        return "\n".join(lines).encode()
+
+    replace(folder, "calibration.toml", change)
+
+
+def pick_outside_its_image(folder):
+    import re
+
+    replace(folder, "capture.toml", lambda data: re.sub(rb"\bx = [0-9.]+", b"x = 99999.0", data, count=1))
+
+
+def truncated_video(folder):
+    video = next((folder / "video").glob("*.mp4"))
+    replace(folder, str(video.relative_to(folder)), lambda data: data[: len(data) // 3])
+
+
+@pytest.mark.parametrize(
+    ("damage", "error", "words"),
+    [
+        (missing_mask_folder, CaptureError, "masks"),
+        (masks_of_another_size, CaptureError, "320"),
+        (scan_in_metres, CaptureError, "metres"),
+        (calibration_without_rotation, CalibrationError, "not a rotation"),
+        (pick_outside_its_image, TrackingError, "outside"),
+        (truncated_video, CaptureError, "video"),
+    ],
+)
+def test_each_broken_capture_is_one_clear_error(capture, tmp_path, damage, error, words):
+    damage(capture)
+    with pytest.raises(error, match=words) as caught:
+        build_rig(capture, tmp_path / "out", BuildOptions(), quiet)
+    assert isinstance(caught.value, JawusdError) and str(capture) in str(caught.value)
+    left = {path.name for path in (tmp_path / "out").iterdir()} if (tmp_path / "out").exists() else set()
+    assert left <= {"build.json", ".jawusd-lock"}
+
+
+def test_an_output_folder_with_other_files_is_left_alone(tmp_path):
+    (tmp_path / "mine.txt").write_text("precious")
+    with pytest.raises(OutputError, match="not empty"):
+        build_rig(EXAMPLE, tmp_path, BuildOptions(), quiet)
+    assert os.listdir(tmp_path) == ["mine.txt"]
+
+
+def test_the_program_reports_a_broken_capture_without_a_traceback(capture, tmp_path):
+    calibration_without_rotation(capture)
+    command = [sys.executable, "-m", "jawusd", "build", str(capture), "-o", str(tmp_path / "out")]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert result.returncode == 5 and "not a rotation" in result.stderr and "Traceback" not in result.stderr
+
+
+def test_build_json_names_every_file_with_its_hash(built):
+    out, summary = built
+    record = json.loads((out / "build.json").read_text())["stages"]
+    listed = {name for stage in record.values() for name in stage["outputs"]}
+    assert listed == set(summary["files"]) and {"actor.usda", "tracks.npz", "model.npz", "actor.onnx"} <= listed
