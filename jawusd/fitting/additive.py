@@ -90,9 +90,6 @@ def fit_additive(data: TrainingData, shown: Mask, trim_mad: float) -> AdditiveFi
         shown: which parameters the data show, shape (3,); the curves of the others are translations without rotation.
         trim_mad: frames farther from the model than the median by this many normalised median absolute deviations
             are left out of the fit.
-
-    Raises:
-        FittingError: the opening path folds.
     """
     u = data.displacement()
     t = fit_gauge(u, data.weights, fit_path(u, data.weights), shown).gauge.inverse(u)

@@ -77,15 +77,14 @@ def _unit_mistake(data: TrainingData, anatomy: Anatomy) -> AnatomyWarning | None
     travel = _condyle_travel(data, anatomy, 1.0)
     if travel <= _CONDYLE_MAX_MM:
         return None
-    for name, factor in _UNITS.items():
-        scaled = _condyle_travel(data, anatomy, factor)
-        if scaled <= _CONDYLE_MAX_MM:
-            return AnatomyWarning(
-                "pose_units",
-                f"the condyles travel {travel:.3g} mm (human: up to {_CONDYLE_MAX_MM:g} mm), but {scaled:.1f} mm if "
-                f"the translations of the poses are in {name}.",
-            )
-    return None
+    scaled, name = min((_condyle_travel(data, anatomy, factor), name) for name, factor in _UNITS.items())
+    if scaled > _CONDYLE_MAX_MM:
+        return None
+    return AnatomyWarning(
+        "pose_units",
+        f"the condyles travel {travel:.3g} mm (human: up to {_CONDYLE_MAX_MM:g} mm), but {scaled:.1f} mm if the "
+        f"translations of the poses are in {name}.",
+    )
 
 
 def _condyle_travel(data: TrainingData, anatomy: Anatomy, factor: float) -> float:

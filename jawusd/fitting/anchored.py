@@ -69,7 +69,7 @@ class AnchoredFit:
             "spline_weights": self.model.weights,
         }
 
-    def notes(self) -> dict[str, float]:
+    def notes(self) -> dict[str, float | None]:
         """Return what the header says about the fit."""
         return {
             "centres": len(self.model.centres),
@@ -87,9 +87,6 @@ def fit_anchored(data: TrainingData, shown: Mask, trim_mad: float) -> AnchoredFi
         shown: which of opening, laterotrusion, protrusion the data show, shape (3,); f does not depend on the others.
         trim_mad: frames farther from the model than the median by this many normalised median absolute deviations
             are left out of the fit.
-
-    Raises:
-        FittingError: the gauge cannot be made invertible.
     """
     u = data.displacement()
     path = fit_path(u, data.weights)

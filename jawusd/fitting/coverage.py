@@ -28,7 +28,11 @@ def shown_parameters(data: TrainingData) -> tuple[NDArray[np.bool_], list[str]]:
     """
     u = data.displacement()
     gx, gz, _, _ = path_gauge(fit_path(u, data.weights)).path(-u[:, 1])
-    free = np.stack([-u[:, 1], u[:, 0] - gx, u[:, 2] - gz], axis=-1)
+    side, front = u[:, 0] - gx, u[:, 2] - gz
+    # A lateral excursion carries the jaw forward by itself; only what goes beyond that shows protrusion.
+    arch = np.stack([np.abs(side), side, side**2], axis=-1)
+    front = front - arch @ np.linalg.lstsq(arch, front, rcond=1e-6)[0]
+    free = np.stack([-u[:, 1], side, front], axis=-1)
     spread = np.percentile(free, 99, axis=0) - np.percentile(free, 1, axis=0)
     shown = spread >= _SMALLEST_RANGE_MM
     sentences = [

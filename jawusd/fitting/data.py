@@ -19,7 +19,7 @@ _MODEL_SIGMA_MM = 0.3  # how far real jaws stray from a three-parameter model: s
 _LARGEST_SIGMA_MM = 2.0  # frames less certain than this over the mandible (rms) are left out
 _RIGID = 1e-3
 _FEWEST_POSES = 15
-_SMALLEST_MOTION_MM = 1.0  # between the 2 and 98 % quantiles, in the direction that moves most
+_SMALLEST_MOTION_MM = 1.0  # rms over the mandible from the first pose, 95 % quantile
 
 
 @dataclass(frozen=True)
@@ -226,12 +226,11 @@ def _check(frames: NDArray[np.int64], T: Array) -> None:
 
 
 def _check_motion(data: TrainingData) -> None:
-    moved = data.displacement()
-    spread = np.percentile(moved, 98, axis=0) - np.percentile(moved, 2, axis=0)
-    if np.linalg.norm(spread) < _SMALLEST_MOTION_MM:
+    moved = float(np.percentile(data.metric.rms(data.motion, data.motion[:1]), 95))
+    if moved < _SMALLEST_MOTION_MM:
         raise FittingError(
-            f"the poses are all alike: the lower incisal point moves by {np.linalg.norm(spread):.2g} mm, at least "
-            f"{_SMALLEST_MOTION_MM:g} mm are needed.",
+            f"the poses are all alike: the mandible moves by {moved:.2g} mm, at least {_SMALLEST_MOTION_MM:g} mm are "
+            "needed.",
             hint="If the jaw did move, check that the translations are in mm.",
         )
 

@@ -81,7 +81,7 @@ def fit_model(
         left out and trimmed, warnings, and what the poses do not show.
 
     Raises:
-        FittingError: too few poses, no motion, poses that are not rigid, or a model that cannot be made invertible.
+        FittingError: too few poses, no motion, poses that are not rigid, or parameters outside what a rig allows.
         ValueError: arrays of wrong shapes.
     """
     anatomy = Anatomy.of(T_anatomical_skull, landmarks, mandible_vertices, T_rest)
@@ -101,8 +101,8 @@ def fit_model(
         warnings.append(AnatomyWarning("few_poses", f"only {len(data)} poses: the model interpolates coarsely."))
     form = _fit_form(data, shown, config)
     errors = _error_tables(data, form, shown, config, lambda done: tell(done, steps))
-    arrays = _arrays(data, form, anatomy, config)
-    model = _finish(arrays, form, selection, frames, T, errors, warnings, config)
+    arrays, tolerance_mm = _arrays(data, form, anatomy, config)
+    model = _finish(arrays, tolerance_mm, form, selection, frames, T, errors, warnings, config)
     model.meta["actor"] = actor
     tell(steps, steps)
     return model
@@ -148,16 +148,18 @@ def _error_tables(
     return tables
 
 
-def _arrays(data: TrainingData, form: FittedForm, anatomy: Anatomy, config: FittingConfig) -> dict[str, Array]:
-    """Return all arrays of the model but the limits of the verdicts."""
+def _arrays(
+    data: TrainingData, form: FittedForm, anatomy: Anatomy, config: FittingConfig
+) -> tuple[dict[str, Array], float]:
+    """Return all arrays but the limits of the verdicts, and how far out of bounds measured poses may lie [mm]."""
     d, _ = data.metric.nearest(form.model, data.motion[form.kept])
     if not np.isfinite(d).all():
         raise FittingError("the parameters of some training poses cannot be found.", hint="Check the poses' units.")
-    hull = fit_slice_hull(d)
+    hull, tolerance_mm = fit_slice_hull(d)
     lateral, lateral_counts = alpha_shape(d[:, [0, 1]], config.alpha)
     protrusion, protrusion_counts = alpha_shape(d[:, [0, 2]], config.alpha)
     step = -(-len(d) // _LARGEST_CODES)
-    return {
+    arrays = {
         **form.arrays(),
         **hull,
         "T_anatomical_skull": anatomy.T_anatomical_skull,
@@ -171,10 +173,12 @@ def _arrays(data: TrainingData, form: FittedForm, anatomy: Anatomy, config: Fitt
         "polygon_d1d3_counts": protrusion_counts,
         "codes": d[::step],
     }
+    return arrays, tolerance_mm
 
 
 def _finish(
     arrays: dict[str, Array],
+    tolerance_mm: float,
     form: FittedForm,
     selection: Selection,
     frames: NDArray[np.int64],
@@ -205,6 +209,5 @@ def _finish(
     trained = np.zeros(len(frames), dtype=bool)
     trained[np.flatnonzero(selection.used)[form.kept]] = True
     limit = max(float(np.percentile(residual_mm[trained], _RESIDUAL_QUANTILE)), _SMALLEST_RESIDUAL_LIMIT_MM)
-    margin = min(0.0, float(rig.margin(d[trained]).min()))
-    arrays = {**arrays, "residual_limit_mm": np.array(limit), "margin_limit_mm": np.array(margin)}
+    arrays = {**arrays, "residual_limit_mm": np.array(limit), "margin_limit_mm": np.array(-tolerance_mm)}
     return JawModel(arrays, frames, d, residual_mm, trained, meta)

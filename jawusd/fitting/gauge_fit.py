@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import FittingError
 from jawusd.evaluator.gauge import Gauge
 from jawusd.fitting.path import Path
 
@@ -31,7 +30,8 @@ _FEWEST_FRAMES = 20
 
 #: Smallest principal minor of the gauge's Jacobian that counts as invertible; it is 1 for an undistorted gauge.
 SMALLEST_MINOR = 0.25
-_STIFFER, _ATTEMPTS = 4.0, 8
+_STIFFNESSES = 4.0 ** np.arange(8)
+_WIDER_MM = 3.0  # by which the checked box is wider than the captured poses: the largest margin of a bound
 _GRID = 33
 
 
@@ -42,12 +42,12 @@ class GaugeFit:
     Attributes:
         gauge: the fitted gauge.
         smallest_minor: least principal minor of the Jacobian over the box (see `smallest_minor`).
-        stiffness: factor on the ridge penalties, 1 unless the gauge folded at first.
+        stiffness: factor on the ridge penalties, 1 unless the gauge folded at first; None: no glide surface at all.
     """
 
     gauge: Gauge
     smallest_minor: float
-    stiffness: float
+    stiffness: float | None
 
 
 def path_gauge(path: Path) -> Gauge:
@@ -64,28 +64,23 @@ def fit_gauge(displacement: Array, weights: Array, path: Path, shown: Mask) -> G
         path: the habitual opening path.
         shown: which of opening, laterotrusion, protrusion the data show, shape (3,).
 
-    Raises:
-        FittingError: even the plain opening path folds inside the captured box.
+    Returns:
+        The gauge; if no stiffness makes it invertible, the one of the path alone, which always is.
     """
-    stiffness = 1.0
-    for _ in range(_ATTEMPTS):
+    for stiffness in _STIFFNESSES:
         gauge = _fit(displacement, weights, path_gauge(path), shown, stiffness)
-        d = gauge.inverse(displacement)
-        if np.isfinite(d).all():
-            minor = smallest_minor(gauge, np.stack([d.min(0), d.max(0)], axis=1))
-            if minor >= SMALLEST_MINOR:
-                return GaugeFit(gauge, minor, stiffness)
-        stiffness *= _STIFFER
+        minor = _smallest_minor_around(gauge, displacement)
+        if minor >= SMALLEST_MINOR:
+            return GaugeFit(gauge, minor, float(stiffness))
     gauge = path_gauge(path)
+    return GaugeFit(gauge, _smallest_minor_around(gauge, displacement), None)
+
+
+def _smallest_minor_around(gauge: Gauge, displacement: Array) -> float:
     d = gauge.inverse(displacement)
-    minor = smallest_minor(gauge, np.stack([d.min(0), d.max(0)], axis=1))
-    if minor < SMALLEST_MINOR:
-        raise FittingError(
-            f"the opening path folds: the parameters could not be told apart (smallest Jacobian minor {minor:.2f}, "
-            f"allowed {SMALLEST_MINOR}).",
-            hint="Check the units and the anatomical frame of the poses.",
-        )
-    return GaugeFit(gauge, minor, np.inf)
+    if not np.isfinite(d).all():
+        return -np.inf
+    return smallest_minor(gauge, np.stack([d.min(0) - _WIDER_MM, d.max(0) + _WIDER_MM], axis=1))
 
 
 def smallest_minor(gauge: Gauge, box: Array) -> float:

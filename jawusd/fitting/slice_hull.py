@@ -27,41 +27,41 @@ _FEWEST_IN_WINDOW = 12  # or this many nearest ones where there are fewer
 _TAPER = 0.35  # reach lost, relative to the section's middle, by a frame at the edge of the window
 _KERNEL_KNOTS = 1.0  # sd of the smoothing over the opening, in knots
 _FOLDS, _BLOCK = 5, 50  # left-out blocks of about one exercise each [frames]
-_MARGIN_QUANTILE = 0.995
+_MARGIN_QUANTILE = 0.999
 # The soft maximum of all half-spaces at once is SOFTNESS_MM * log(DIRECTIONS + 2) = 0.29 mm above the largest one: with
-# less margin, a section without extent (a direction the data do not show) would contain nothing.
-_MARGIN_LIMITS_MM = (0.35, 3.0)
+# less margin, a section without extent (a direction the data do not show) would contain nothing. Leaving an exercise
+# out overstates how far the others' hull must be widened where nothing else reaches, hence the upper limit.
+_MARGIN_LIMITS_MM = (0.35, 1.2)
 _CONTACT_TOLERANCE_MM = 0.3  # how far below the captured openings the teeth may be said to close
 _SHORTEST_RANGE_MM = 1.0
 # Retrusion is free only once the teeth have parted, so margins are taken apart and blended between these openings.
 _CLOSED_MM, _OPEN_MM = 3.0, 7.0
 _FEWEST_IN_ZONE = 40
+_TOLERANCE_QUANTILE, _LARGEST_TOLERANCE_MM = 0.95, 0.5
 
 
-def fit_slice_hull(d: Array) -> dict[str, Array]:
+def fit_slice_hull(d: Array) -> tuple[dict[str, Array], float]:
     """Build the bound of captured parameters.
 
     Every side has a margin of its own, since some borders are hard and met by every exercise (retrusion, closing) and
-    others are rarely reached: the 99.5 % quantile of how far left-out frames lie beyond that side of the hull of the
-    others, kept within 0.35 and 3 mm.
+    others are rarely reached: the 99.9 % quantile of how far left-out frames lie beyond that side of the hull of the
+    others, kept within 0.35 and 1.2 mm.
 
     Args:
         d: parameters of the captured poses in the order of time [mm], shape (N, 3).
 
     Returns:
-        The `slice_*` arrays of a model. The supports hold what a side's margin has more than the common one.
+        The `slice_*` arrays of a model, whose supports hold what a side's margin has more than the common one; and how
+        far outside measured poses may lie [mm]: the 95 % quantile of left-out frames.
     """
     blocks = np.arange(len(d)) // min(_BLOCK, max(1, len(d) // _FOLDS)) % _FOLDS
-    beyond = np.concatenate([_beyond(_hull(d[blocks != k]), d[blocks == k]) for k in range(_FOLDS)])
-    d1 = np.concatenate([d[blocks == k, 0] for k in range(_FOLDS)])
-    hull, common = _hull(d), _MARGIN_LIMITS_MM[0]
-    margin = np.stack([_margin(beyond[d1 < _OPEN_MM], beyond), _margin(beyond[d1 > _CLOSED_MM], beyond)])
-    share = np.clip((hull["slice_d1"] - _CLOSED_MM) / (_OPEN_MM - _CLOSED_MM), 0.0, 1.0)[:, None]
-    hull["slice_support"] += (1 - share) * margin[0, :-1] + share * margin[1, :-1] - common
-    low = hull["slice_d1"][0] + common - _CONTACT_TOLERANCE_MM
-    high = max(hull["slice_d1"][-1] + margin[1, -1] - common, low + _SHORTEST_RANGE_MM)
-    hull["slice_d1"] = np.linspace(low, high, KNOTS)
-    return {**hull, "slice_margin_mm": np.array(common)}
+    left_out = [(d[blocks != k], d[blocks == k]) for k in range(_FOLDS)]
+    beyond = np.concatenate([_beyond(_hull(seen), unseen) for seen, unseen in left_out])
+    d1 = np.concatenate([unseen[:, 0] for _, unseen in left_out])
+    margins = np.stack([_margin(beyond[d1 < _OPEN_MM], beyond), _margin(beyond[d1 > _CLOSED_MM], beyond)])
+    excess = [SliceHull.from_arrays(_hull(seen, margins)).excess(unseen) for seen, unseen in left_out]
+    tolerance = np.quantile(np.concatenate(excess), _TOLERANCE_QUANTILE)
+    return _hull(d, margins), float(np.clip(tolerance, 0.0, _LARGEST_TOLERANCE_MM))
 
 
 def valid_box(arrays: Mapping[str, Array]) -> Array:
@@ -88,23 +88,31 @@ def _beyond(hull: dict[str, Array], d: Array) -> Array:
     return np.column_stack([d[:, 1:] @ hull["slice_directions"].T - supports, d[:, 0] - hull["slice_d1"][-1]])
 
 
-def _hull(d: Array) -> dict[str, Array]:
-    """Return the arrays of the bound without margin."""
+def _hull(d: Array, margins: Array | None = None) -> dict[str, Array]:
+    """Return the arrays of the bound, with margins of closed and open jaws (2, K + 1) or none."""
     angle = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     directions = np.stack([np.cos(angle), np.sin(angle) * _PROTRUSION_STRETCH], axis=-1)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     low, high = float(d[:, 0].min()), float(d[:, 0].max())
+    common = 0.0
+    if margins is not None:
+        common = _MARGIN_LIMITS_MM[0]
+        # The common margin widens closing too, which the teeth do not allow: take it back there.
+        low, high = low + common - _CONTACT_TOLERANCE_MM, high + margins[1, -1] - common
     knots = np.linspace(low, max(high, low + _SHORTEST_RANGE_MM), KNOTS)
     reach = d[:, 1:] @ directions.T
     windows = np.clip(_WINDOW_MM[0] + _WINDOW_GROWTH * knots, *_WINDOW_MM)
     sections = [_section(np.abs(d[:, 0] - knot) / window, reach) for knot, window in zip(knots, windows, strict=True)]
     support = _smoothed(np.stack(sections))
+    if margins is not None:
+        share = np.clip((knots - _CLOSED_MM) / (_OPEN_MM - _CLOSED_MM), 0.0, 1.0)[:, None]
+        support += (1 - share) * margins[0, :-1] + share * margins[1, :-1] - common
     return {
         "slice_d1": knots,
         "slice_directions": directions,
         "slice_support": support,
         "slice_softness_mm": np.array(SOFTNESS_MM),
-        "slice_margin_mm": np.array(0.0),
+        "slice_margin_mm": np.array(common),
     }
 
 
