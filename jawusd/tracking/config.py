@@ -58,6 +58,10 @@ class TrackingConfig:
     suspect_residual: float = 1.4
     # Uncovered mask above the recent median by more than this makes a row, or a mask, suspect [-].
     suspect_coverage: float = 0.04
+    # Residual of one view above this multiple of the row's recent median makes its mask suspect [-].
+    uneven_residual: float = 1.6
+    # Score of one view below this share of its recent median means its mask shows something else [-].
+    dead_score: float = 0.03
     # Price of a mask pixel left uncovered, in px of contour [1/px]: tells wrong minima apart where few edges show.
     bare_price: float = 0.5
     # Gain in worth of the remaining masks, as a share of their score, that proves the one left out wrong [-].
@@ -80,3 +84,9 @@ class TrackingConfig:
     lost_sigma_mm: float = 0.5
     # Matched share of the visible contour the first frame must reach [-]: good ones reach 0.15 with lips nearly closed.
     first_share: float = 0.1
+    # Delay between cameras [frames] and mask bias [px] from which all frames are aligned again with them taken out:
+    # below, they cost less than the noise of single frames.
+    refine_delay_frames: float = 0.03
+    refine_bias_px: float = 0.1
+    # Most rounds of that [-]: each leaves a tenth of the delay.
+    refine_rounds: int = 2

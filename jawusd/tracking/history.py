@@ -42,12 +42,12 @@ class History:
     def add(self, record: FrameRecord) -> None:
         """Take in a frame; only rows tracked without trouble count."""
         good = record.status == TRACKED
-        self._scores.append(np.where(good, score_px(record.solution).sum(1), np.nan))
+        self._scores.append(np.where(good[:, None], score_px(record.solution), np.nan))
         self._residuals.append(np.where(good, residual_px(record.solution), np.nan))
         self._coverages.append(np.where(good[:, None] & record.used, record.coverage, np.nan))
 
     def usual_score(self) -> NDArray[np.float64]:
-        """Return the median score per row [px], shape (2,); 0 while unknown."""
+        """Return the median score per row and view [px], shape (2, C); 0 while unknown."""
         return _median(self._scores, 0.0)
 
     def usual_residual(self) -> NDArray[np.float64]:

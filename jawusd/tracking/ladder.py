@@ -12,7 +12,7 @@ from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, TRACKED
 from jawusd.geometry import make_transform, se3_exp, transform_points
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.history import FrameRecord, History
-from jawusd.tracking.quality import crown_sigma_mm, matched_px, residual_px, score_px, uncovered_px
+from jawusd.tracking.quality import crown_sigma_mm, matched_px, residual_px, score_px, uncovered_px, view_residual_px
 from jawusd.tracking.solver import ContourSolver, Solution, View
 
 _ROWS = (0, 1)
@@ -66,7 +66,7 @@ class FrameTracker:
         first = trial
         for rows, attempt in (
             (self._suspect, self._others),
-            (self._alarming, self._leave_out),
+            (self._uneven, self._leave_out),
             (self._suspect, self._widen),
             (self._alarming, self._search),
         ):
@@ -96,9 +96,14 @@ class FrameTracker:
         bad = self._scarce(trial, self._config.alarming_score) | self._rough(trial) | self._bare(trial).any(1)
         return bad & trial.use.any(1)
 
+    def _uneven(self, trial: _Trial) -> NDArray[np.bool_]:
+        """Tell which rows are alarming or fit one view far worse than they usually fit, shape (2,)."""
+        limit = self._config.uneven_residual * self.history.usual_residual()[:, None]
+        return self._alarming(trial) | (trial.use & (view_residual_px(trial.solution) > limit)).any(1)
+
     def _scarce(self, trial: _Trial, share: float | None = None) -> NDArray[np.bool_]:
         share = self._config.suspect_score if share is None else share
-        return score_px(trial.solution).sum(1) < share * self.history.usual_score()
+        return score_px(trial.solution).sum(1) < share * self.history.usual_score().sum(1)
 
     def _rough(self, trial: _Trial, factor: float = 1.0) -> NDArray[np.bool_]:
         limit = factor * self._config.suspect_residual * self.history.usual_residual()
@@ -109,8 +114,10 @@ class FrameTracker:
         return trial.use & (trial.coverage - self.history.usual_coverage() > self._config.suspect_coverage)
 
     def _spoiled(self, trial: _Trial) -> NDArray[np.bool_]:
-        """Tell which masks the scan cannot cover while it covers those of another camera, shape (2, C)."""
-        wrong = self._bare(trial)
+        """Tell which masks the scan neither covers nor fits while it does those of another camera, shape (2, C)."""
+        fit = score_px(trial.solution)
+        dead = trial.use & (fit < self._config.dead_score * self.history.usual_score())
+        wrong = self._bare(trial) | dead
         for r in _ROWS:
             if (wrong[r] == trial.use[r]).all():
                 wrong[r] = False  # it is the pose that is wrong, not every mask

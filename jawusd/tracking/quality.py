@@ -34,6 +34,14 @@ def residual_px(solution: Solution) -> NDArray[np.float64]:
         return np.sqrt(total[:, 7, 6] / total[:, 6, 6] / _TUKEY_VARIANCE)
 
 
+def view_residual_px(solution: Solution) -> NDArray[np.float64]:
+    """Return the standard deviation of the matched residuals per row and view [px], shape (2, C); NaN without any."""
+    weight, square = solution.systems[:, :, 6, 6], solution.systems[:, :, 7, 6]
+    out = np.full(weight.shape, np.nan)
+    np.divide(square, weight * _TUKEY_VARIANCE, out=out, where=weight > 0)
+    return np.sqrt(out)
+
+
 def uncovered_px(
     scans: Sequence[Scan], solution: Solution, views: Sequence[View]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -50,7 +58,7 @@ def uncovered_px(
                 continue
             mask = pack_bits(view.masks[r] > 127)
             crowns = np.zeros_like(mask)
-            project(scan.vertices_single, (view.matrix @ solution.poses[r]).astype(np.float32), points)
+            project(scan.vertices_single, (view.matrix @ view.lead[r] @ solution.poses[r]).astype(np.float32), points)
             draw_silhouette(points, scan.crown_faces, 0, 0, view.masks.shape[2], scan.painted, crowns)
             bare[r, c], total[r, c] = count_and_not(mask, crowns), count_bits(mask)
     return bare, total

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from jawusd.errors import TrackingError
 from jawusd.formats.capture import Capture
 from jawusd.formats.mesh import Mesh
-from jawusd.formats.tracks import LOST, RECOVERED, Tracks
+from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, Tracks
 from jawusd.geometry import Camera, transform_points
 from jawusd.tracking.bootstrap import pose_from_picks
 from jawusd.tracking.config import TrackingConfig
@@ -20,7 +20,8 @@ from jawusd.tracking.first import first_record
 from jawusd.tracking.history import FrameRecord, History
 from jawusd.tracking.ladder import FrameTracker
 from jawusd.tracking.motion import Motion
-from jawusd.tracking.results import assemble
+from jawusd.tracking.nuisance import Nuisances, estimate_nuisances, leads
+from jawusd.tracking.results import assemble, outline_variance
 from jawusd.tracking.scan import prepare_scan
 from jawusd.tracking.solver import ContourSolver, View
 from jawusd.tracking.views import MaskViews
@@ -74,10 +75,11 @@ def track_capture(
         take.run(range(capture.bootstrap.frame + 1, stop))
         take.run(range(capture.bootstrap.frame - 1, first - 1, -1))
         take.re_enter()
+        nuisances = take.refine()
         records = take.records if capture.frames else _trimmed(take.records)
         names = tuple(camera.name for camera in masks.cameras)
     notes = {"picks_left_out": left_out, "painted": [s.painted for s in scans]}
-    return assemble(records, scans, names, np.asarray(landmarks, np.float64), config, notes)
+    return assemble(records, names, np.asarray(landmarks, np.float64), nuisances, config, notes)
 
 
 def _start_poses(
@@ -151,6 +153,30 @@ class _Take:
                 if (lost <= was_lost).all() and (lost != was_lost).any():
                     status = np.where(was_lost & ~lost, RECOVERED, record.status).astype(np.int8)
                     self.records[frame] = replace(record, status=status)
+
+    def refine(self) -> Nuisances:
+        """Estimate delays and biases; where they matter, align all frames again with them taken out."""
+        c = self._config
+        found = estimate_nuisances(self.records, outline_variance(self.records, c))
+        residual, rounds = found, 0
+        while residual.matters(c.refine_delay_frames, c.refine_bias_px) and rounds < c.refine_rounds:
+            self._realign(found)
+            residual = estimate_nuisances(self.records, outline_variance(self.records, c))
+            found, rounds = found.plus(residual), rounds + 1
+        return found
+
+    def _realign(self, nuisances: Nuisances) -> None:
+        """Align every frame again, starting from where it is, with delays and biases taken out."""
+        before = dict(self.records)
+        tracker, _ = self._from(self._first)
+        for frame, views in self._masks.walk(self._first, self._stop):
+            moved = leads(before, frame, nuisances.delays)
+            views = [replace(v, lead=m, bias_px=nuisances.bias_px) for v, m in zip(views, moved, strict=True)]
+            record = tracker.track([before[frame].solution.poses], views, None)
+            was = before[frame].status
+            status = np.where((was == RECOVERED) & (record.status == TRACKED), RECOVERED, record.status).astype(np.int8)
+            self.records[frame] = replace(record, status=np.where(was == LOST, LOST, status).astype(np.int8))
+            tracker.history.add(record)
 
     def _from(self, frame: int) -> tuple[FrameTracker, Motion]:
         """Return a tracker that knows the frames around a tracked one."""

@@ -11,8 +11,9 @@ from jawusd.geometry import make_transform, orthonormalise, se3_adjoint, se3_exp
 
 # Frames on either side over which liveliness is judged: a third of a second at 24 fps.
 _WINDOW = 4
-# Least acceleration variance, as a share of what noise alone would show: noise estimates are not better than that.
-_FLOOR = 0.1
+# Least acceleration variance, as a share of what noise independent from frame to frame would show: the habits of
+# whoever draws masks make part of it the same in neighbouring frames, where it does not show.
+_FLOOR = 0.5
 _SHORTEST = 5  # frames; shorter runs say nothing about their own smoothness
 
 

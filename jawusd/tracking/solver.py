@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from jawusd.geometry import make_transform, orthonormalise, se3_exp, se3_inverse, se3_log, transform_points
 from jawusd.imaging.raster import draw_depth_labels, project
 from jawusd.tracking.config import TrackingConfig
-from jawusd.tracking.contour import CROWN, GUM, contour_samples
+from jawusd.tracking.contour import CROWN, GUM, LENGTH, contour_samples
 from jawusd.tracking.correspond import accumulate, scatter_of_tiles, search_edges
 from jawusd.tracking.scan import Scan
 
@@ -28,12 +28,16 @@ class View:
         eye: camera centre in the world [mm], shape (3,).
         masks: of the upper and the lower row, uint8, 255 = teeth, shape (2, h, w); zeros where there is none.
         present: which of the two masks exist, shape (2,).
+        lead: how the rows move, in the world, from the reference instant to this camera's own, shape (2, 4, 4).
+        bias_px: how far the masks reach beyond the teeth [px], shape (2,).
     """
 
     matrix: NDArray[np.float64]
     eye: NDArray[np.float64]
     masks: NDArray[np.uint8]
     present: NDArray[np.bool_]
+    lead: NDArray[np.float64] = field(default_factory=lambda: np.tile(np.eye(4), (2, 1, 1)))
+    bias_px: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +109,7 @@ class ContourSolver:
 
         def match(task):
             r, c = task
-            return self._match(poses[r], views[c], r, render.labels[c], render.depths[c], reach)
+            return self._match(views[c].lead[r] @ poses[r], views[c], r, render.labels[c], render.depths[c], reach)
 
         matches = dict(zip(tasks, self._map(match, tasks), strict=True))
         systems = np.zeros((2, len(views), 8, 8))
@@ -117,7 +121,7 @@ class ContourSolver:
             pull = config.pull if gate > config.pull_above_px else 0.0
             for c in np.flatnonzero(use[r]):
                 samples, distances, visible[r, c] = matches[r, c]
-                where = (poses[r], views[c].matrix, centres[r])
+                where = (views[c].lead[r] @ poses[r], views[c].matrix, centres[r])
                 accumulate(samples, distances, used, config.final_gate_px[1], pull, *where, systems[r, c])
                 if final:
                     shape = views[c].masks.shape[1:]
@@ -141,7 +145,7 @@ class ContourSolver:
             config.normal_cosine,
             distances,
         )
-        return samples, distances, float(samples[:, 7].sum())
+        return samples, distances - view.bias_px[r], float(samples[:, LENGTH].sum())
 
     def _final_gate(self, distances: list[NDArray], gate: float) -> float:
         """Return the Tukey gate that suits the spread of the residuals (median absolute deviation)."""
@@ -205,7 +209,7 @@ class _Rendering:
     def _draw(self, r: int, c: int, pose: NDArray[np.float64]) -> None:
         scan, view = self._solver.scans[r], self._views[c]
         points = np.empty((len(scan.vertices), 3), np.float32)
-        project(scan.vertices_single, (view.matrix @ pose).astype(np.float32), points)
+        project(scan.vertices_single, (view.matrix @ view.lead[r] @ pose).astype(np.float32), points)
         labels, depth = self.labels[c][r], self.depths[c][r]
         labels[:] = 0
         depth[:] = 0
