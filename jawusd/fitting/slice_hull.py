@@ -21,8 +21,7 @@ KNOTS = 48
 SOFTNESS_MM = 0.1
 
 _PROTRUSION_STRETCH = 1.6  # directions are spread evenly after stretching protrusion, the shorter axis, by this
-_WINDOW_MM = (1.0, 3.5)  # frames within this opening of a section shape it, closed and from 10 mm on,
-_WINDOW_GROWTH = 0.25
+_WINDOW_MM = 3.5  # frames within this opening of a section shape it,
 _FEWEST_IN_WINDOW = 12  # or this many nearest ones where there are fewer
 _TAPER = 0.35  # reach lost, relative to the section's middle, by a frame at the edge of the window
 _KERNEL_KNOTS = 1.0  # sd of the smoothing over the opening, in knots
@@ -101,9 +100,7 @@ def _hull(d: Array, margins: Array | None = None) -> dict[str, Array]:
         low, high = low + common - _CONTACT_TOLERANCE_MM, high + margins[1, -1] - common
     knots = np.linspace(low, max(high, low + _SHORTEST_RANGE_MM), KNOTS)
     reach = d[:, 1:] @ directions.T
-    windows = np.clip(_WINDOW_MM[0] + _WINDOW_GROWTH * knots, *_WINDOW_MM)
-    sections = [_section(np.abs(d[:, 0] - knot) / window, reach) for knot, window in zip(knots, windows, strict=True)]
-    support = _smoothed(np.stack(sections))
+    support = _smoothed(np.stack([_section(np.abs(d[:, 0] - knot) / _WINDOW_MM, reach) for knot in knots]))
     if margins is not None:
         share = np.clip((knots - _CLOSED_MM) / (_OPEN_MM - _CLOSED_MM), 0.0, 1.0)[:, None]
         support += (1 - share) * margins[0, :-1] + share * margins[1, :-1] - common
