@@ -44,7 +44,8 @@ class PaperConfig:
     tolerance_mm: float = 0.01
     # Rounds of rotation and translation; most frames need fewer than ten.
     most_rounds: int = 40
-    # Spacing of the dense samples, three per degree of freedom.
+    # Dense samples: how many per degree of freedom (odd), and how far apart.
+    dense_samples: int = 3
     dense_rad: float = radians(0.2)
     dense_mm: float = 0.1
     # Whether boundary pixels in the mask of the other row go uncounted. The paper counts them, which drags the lower
@@ -95,7 +96,8 @@ def solve_paper(
             best, lowest = _descend(at, best, lowest, block, config)
         improved = lowest < before
     spacing = np.repeat([config.dense_rad, config.dense_mm], 3)
-    around = best + spacing * np.array(list(product((-1, 0, 1), repeat=6)))
+    half = config.dense_samples // 2
+    around = best + spacing * np.array(list(product(range(-half, half + 1), repeat=6)))
     values = at(around)
     # The middle sample is `best` itself; ties stay there.
     if values.min() < lowest:

@@ -11,7 +11,7 @@ from jawusd.errors import MissingDependencyError, TrackingError
 from jawusd.formats.capture import Capture
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import LOST, PARTIAL, TRACKED, load_tracks, save_tracks
-from jawusd.geometry import make_transform, se3_exp, transform_points
+from jawusd.geometry import make_transform, transform_points
 from jawusd.imaging.pixel_counts import RasterCounter
 from jawusd.tracking.paper_energy import PaperEnergy, paper_scan
 from jawusd.tracking.paper_sequence import track_capture_paper
@@ -122,12 +122,12 @@ def test_red_and_green_are_taken_by_majority_and_grey_is_left_out() -> None:
     assert middle.min() >= -8 and mesh.vertices[scan.plain_faces][..., 1].min() == -9
     assert len(scan.plain_faces) == 2 * 40 * 12 + 40  # of the squares with two grey corners one triangle each
     assert len(scan.boundary_faces) == 2 * 40 * 8 and mesh.vertices[scan.boundary_faces][..., 1].min() == 4
-    np.testing.assert_allclose(scan.centre[:2], [0, np.unique(mesh.vertices[mesh.vertices[:, 1] >= -9], axis=0)[:, 1].mean()], atol=0.1)
     assert not scan.cull  # a plate has no inside
 
 
 def test_only_consistent_outward_scans_are_culled() -> None:
     mesh = _painted(arch(True))
+    mesh = Mesh(mesh.vertices, mesh.faces[(mesh.colors[mesh.faces] != GREY).any((1, 2))], mesh.colors)  # no gum
     assert paper_scan(mesh, "upper").cull
     assert not paper_scan(Mesh(mesh.vertices, mesh.faces[:, ::-1], mesh.colors), "upper").cull
     mixed = mesh.faces.copy()
@@ -289,7 +289,7 @@ def track(capture, config=QUICK, **options):
 
 def test_a_take_is_followed_without_claims_of_certainty(masks_folder, tmp_path) -> None:
     told = []
-    tracks = track(take(masks_folder), PaperConfig(), progress=lambda *a: told.append(a))
+    tracks = track(take(masks_folder), PaperConfig(dense_samples=1), progress=lambda *a: told.append(a))
     assert told == [(1, 3), (2, 3), (3, 3)]
     np.testing.assert_array_equal(tracks.frames, [5, 6, 7])
     assert (tracks.status == TRACKED).all()
@@ -309,7 +309,7 @@ def test_a_take_is_followed_without_claims_of_certainty(masks_folder, tmp_path) 
     ):
         assert np.isnan(getattr(tracks, name)).all()
     assert tracks.meta["solver"] == "paper" and tracks.meta["tracking"]["boundary_weight"] == LAMBDA
-    assert tracks.meta["evaluations_per_row_and_frame"] > 3**6
+    assert 50 < tracks.meta["evaluations_per_row_and_frame"] < 1000
     save_tracks(tmp_path / "tracks.npz", tracks)
     loaded = load_tracks(tmp_path / "tracks.npz")
     np.testing.assert_array_equal(loaded.T_upper_lower, tracks.T_upper_lower)
