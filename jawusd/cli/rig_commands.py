@@ -204,7 +204,7 @@ def _validate_rig(path: Path, as_json: bool) -> None:
         as_json,
         lambda: [
             *(f"{finding.severity}: {finding.rule}: {finding.message}" for finding in findings),
-            f"{path}: {len(errors)} errors, {len(findings) - len(errors)} warnings",
+            f"{path}: {len(errors)} errors, {len(findings) - len(errors)} other findings",
         ],
     )
     if errors:
