@@ -46,7 +46,7 @@ def _gum(curve: np.ndarray, radius_mm: float) -> tuple:
     for i in range(len(curve) - 1):
         for j in range(around):
             p, q = i * around + j, i * around + (j + 1) % around
-            faces += [[p, q, p + around], [q, q + around, p + around]]
+            faces += [[p, p + around, q], [q, p + around, q + around]]
     return points, np.array(faces)
 
 
@@ -84,15 +84,21 @@ def make_cameras(yaw_deg: tuple[float, ...] = (0.0, 35.0, -35.0), distortion: fl
     return out
 
 
-def jaw_poses(count: int, seed: int = 3) -> np.ndarray:
-    """Return smooth T_world_upper, T_world_lower of a nodding head that opens its mouth, shape (count, 2, 4, 4)."""
+def jaw_poses(times: int | np.ndarray, seed: int = 3) -> np.ndarray:
+    """Return T_world_upper, T_world_lower of a nodding head that opens its mouth, shape (count, 2, 4, 4).
+
+    Args:
+        times: instants in frames, or how many frames from 0 on.
+        seed: seed of the head's motion.
+    """
     rng = np.random.default_rng(seed)
     wave = rng.normal(size=(6,)) * [0.02, 0.03, 0.02, 0.8, 0.6, 0.8]
-    out = np.empty((count, 2, 4, 4))
-    for k in range(count):
-        head = se3_exp(wave * np.sin(0.25 * k + np.arange(6)))
-        opening = 4.0 + 3.0 * np.sin(0.3 * k)
-        jaw = se3_exp([0.012 * opening, 0.004 * np.sin(k / 3), 0, 0.3 * np.sin(k / 4), -0.6 * opening, 0.1 * opening])
+    times = np.arange(times) if np.ndim(times) == 0 else times
+    out = np.empty((len(times), 2, 4, 4))
+    for k, t in enumerate(times):
+        head = se3_exp(wave * np.sin(0.25 * t + np.arange(6)))
+        opening = 4.0 + 3.0 * np.sin(0.3 * t)
+        jaw = se3_exp([0.012 * opening, 0.004 * np.sin(t / 3), 0, 0.3 * np.sin(t / 4), -0.6 * opening, 0.1 * opening])
         out[k] = head, head @ jaw
     return out
 
@@ -105,6 +111,7 @@ def render_masks(
     noise_px: float = 0.0,
     rng: np.random.Generator | None = None,
     fine: int = 3,
+    grown_px: float = 0.0,
 ) -> np.ndarray:
     """Return the visible crowns of both rows as soft masks, (2, h, w) uint8.
 
@@ -115,7 +122,8 @@ def render_masks(
         lips_mm: heights above and below which lips hide everything, in the head's frame at its front teeth.
         noise_px: standard deviation of a smooth error of the outline.
         rng: source of that error.
-        fine: sub-pixels per side.
+        fine: sub-pixels per side; odd, or thresholding the result at one half would widen it.
+        grown_px: how far the outline lies outside of the teeth.
     """
     width, height = camera.size_px
     big = camera.scaled((width * fine, height * fine))
@@ -135,16 +143,16 @@ def render_masks(
             rows = np.arange(depth.shape[0])
             masks[:, rows < edge if above else rows > edge] = False
     out = np.stack([cv2.resize(m.astype(np.uint8) * 255, (width, height), interpolation=cv2.INTER_AREA) for m in masks])
-    return np.stack([_shaken(m, noise_px, rng) for m in out]) if noise_px else out
+    return np.stack([_shaken(m, noise_px, grown_px, rng) for m in out]) if noise_px else out
 
 
-def _shaken(mask: np.ndarray, sigma_px: float, rng: np.random.Generator) -> np.ndarray:
-    """Move the outline of a mask by a smooth random field."""
+def _shaken(mask: np.ndarray, sigma_px: float, grown_px: float, rng: np.random.Generator) -> np.ndarray:
+    """Move the outline of a mask by a smooth random field, and outwards."""
     inside = (mask > 127).astype(np.uint8)
     signed = cv2.distanceTransform(inside, cv2.DIST_L2, 5) - cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5)
     signed = np.where(inside > 0, signed - 0.5, signed + 0.5)
     field = cv2.GaussianBlur(rng.normal(size=mask.shape), (0, 0), 3.0)
-    signed = signed + field * sigma_px / field.std()
+    signed = signed + grown_px + field * sigma_px / field.std()
     return np.clip(127.5 + 255 * signed, 0, 255).astype(np.uint8)
 
 

@@ -5,41 +5,19 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-from bumpy_teeth import arch, jaw_poses, make_cameras, render_masks, vertex_error_mm
+from small_take import CAMERAS, LANDMARKS, MESHES, ROWS, START, errors_mm, make_capture, png, source, track, write_masks
 
 from jawusd.errors import TrackingError
-from jawusd.formats.capture import Capture
 from jawusd.formats.tracks import load_tracks, save_tracks
-from jawusd.geometry import transform_points
 from jawusd.tracking import track_capture
 
 FRAMES = 10
-START = 3  # the bootstrap frame, reference camera
-OFFSETS = {"cam0": 0, "cam1": 2, "cam2": -1}
-MESHES = (arch(True), arch(False))
-CAMERAS = make_cameras()
-POSES = jaw_poses(FRAMES)
-LANDMARKS = np.array([[0, 0, 1], [20, -3, -20], [-20, -3, -20], [45, 30, -70], [-45, 30, -70.0]])
-ROWS = ("upper", "lower")
-
-
-def _png(folder, camera, row, frame):
-    return folder / camera / row / f"{frame - OFFSETS[camera] + 5:06d}.png"
 
 
 @pytest.fixture(scope="module")
 def pictures(tmp_path_factory):
-    """Render the masks of the take once; reference frames 5 to 5 + FRAMES."""
-    folder = tmp_path_factory.mktemp("take")
-    rng = np.random.default_rng(0)
-    for camera in CAMERAS:
-        for row in ROWS:
-            (folder / camera.name / row).mkdir(parents=True)
-        for k in range(FRAMES):
-            masks = render_masks(MESHES, POSES[k], camera, (7.5, -16.0), 0.3, rng, fine=2)
-            for row, mask in zip(ROWS, masks):
-                cv2.imwrite(str(_png(folder, camera.name, row, k)), (mask > 127).astype(np.uint8) * 255)
-    return folder
+    """Render the masks of the take once."""
+    return write_masks(tmp_path_factory.mktemp("take"), FRAMES)
 
 
 @pytest.fixture
@@ -48,49 +26,14 @@ def take(pictures, tmp_path):
     return shutil.copytree(pictures, tmp_path / "take")
 
 
-def _source(folder, name):
-    return {"name": name, "masks": {row: folder / name / row / "%06d.png" for row in ROWS}}
-
-
-def _capture(folder, start=START, away_mm=0.0, **change):
-    rng = np.random.default_rng(1)
-    picks = {row: [] for row in ROWS}
-    for r, row in enumerate(ROWS):
-        for vertex in rng.choice(len(MESHES[r].vertices), 5, replace=False):
-            place = transform_points(POSES[start, r], MESHES[r].vertices[vertex]) + [0, away_mm, 0]
-            pixels = [(c.name, c.project(place) + rng.normal(size=2) * 0.7) for c in CAMERAS[:2]]
-            views = [{"camera": n, "x": float(p[0]), "y": float(p[1])} for n, p in pixels]
-            picks[row].append({"vertex": int(vertex), "views": views})
-    fields = {
-        "folder": folder,
-        "name": "take",
-        "fps": 25.0,
-        "frames": (5, 5 + FRAMES),
-        "scans": {"upper_teeth": "u.ply", "lower_teeth": "l.ply"},
-        "cameras": [_source(folder, c.name) for c in CAMERAS],
-        "bootstrap": {"frame": 5 + start, **picks},
-    }
-    return Capture(**{**fields, **change})
-
-
-def _track(capture, **options):
-    return track_capture(capture, CAMERAS, OFFSETS, *MESHES, LANDMARKS, **options)
-
-
-def _errors(tracks):
-    poses = np.stack([tracks.T_world_upper, tracks.T_world_lower], 1)
-    return np.array(
-        [
-            [vertex_error_mm(MESHES[r], poses[k, r], POSES[f - 5, r]) for r in (0, 1)]
-            for k, f in enumerate(tracks.frames)
-        ]
-    )
+def _capture(folder, **change):
+    return make_capture(folder, FRAMES, **change)
 
 
 @pytest.fixture(scope="module")
 def tracks(pictures):
     seen = []
-    out = _track(_capture(pictures), progress=lambda done, total: seen.append((done, total)))
+    out = track(_capture(pictures), progress=lambda done, total: seen.append((done, total)))
     assert seen == [(k + 1, FRAMES) for k in range(FRAMES)]
     return out
 
@@ -98,7 +41,7 @@ def tracks(pictures):
 def test_take_is_tracked_both_ways_from_the_bootstrap_frame(tracks):
     assert tracks.frames.tolist() == list(range(5, 5 + FRAMES))
     assert (tracks.status == 1).all() and not tracks.prior_aided.any()
-    assert _errors(tracks).max() < 0.08
+    assert errors_mm(tracks).max() < 0.08
     relative = np.linalg.inv(tracks.T_world_upper) @ tracks.T_world_lower
     assert np.abs(relative - tracks.T_upper_lower).max() < 1e-9
 
@@ -117,59 +60,59 @@ def test_quality_arrays_are_filled(tracks, tmp_path):
 
 
 def test_threads_do_not_change_the_tracks(pictures, tracks):
-    alone = _track(_capture(pictures), threads=1)
+    alone = track(_capture(pictures), threads=1)
     for name in ("T_world_upper", "T_world_lower", "covariance_relative", "coverage_error", "status"):
         assert (getattr(alone, name) == getattr(tracks, name)).all()
 
 
 def test_frame_range_may_be_left_to_the_masks(pictures):
-    tracks = _track(_capture(pictures, frames=None))
+    tracks = track(_capture(pictures, frames=None))
     assert tracks.frames.tolist() == list(range(5, 5 + FRAMES)) and (tracks.status == 1).all()
 
 
 def test_missing_mask_is_made_up_for_by_the_other_cameras(take):
-    _png(take, "cam1", "lower", 6).unlink()
-    tracks = _track(_capture(take))
+    png(take, "cam1", "lower", 6).unlink()
+    tracks = track(_capture(take))
     assert tracks.status[6].tolist() == [1, 3]
     assert np.isnan(tracks.coverage_error[6, 1, 1]) and np.isfinite(tracks.coverage_error[6, 0]).all()
-    assert _errors(tracks).max() < 0.1
+    assert errors_mm(tracks).max() < 0.1
 
 
 @pytest.mark.parametrize("kind", ["blob", "other row", "shifted"])
 def test_spoiled_mask_is_left_out(take, kind):
-    path = _png(take, "cam2", "upper", 7)
+    path = png(take, "cam2", "upper", 7)
     mask = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if kind == "blob":
         cv2.circle(mask, (330, 240), 45, 255, -1)
     elif kind == "other row":
-        mask = cv2.imread(str(_png(take, "cam2", "lower", 7)), cv2.IMREAD_UNCHANGED)
+        mask = cv2.imread(str(png(take, "cam2", "lower", 7)), cv2.IMREAD_UNCHANGED)
     else:
         mask = np.roll(mask, (-6, 7), axis=(0, 1))
     cv2.imwrite(str(path), mask)
-    tracks = _track(_capture(take))
+    tracks = track(_capture(take))
     assert tracks.status[7, 0] == 3
-    assert _errors(tracks).max() < 0.1
+    assert errors_mm(tracks).max() < 0.1
 
 
 def test_hidden_teeth_are_lost_and_found_again(take):
     for k in (5, 6):
         for camera in CAMERAS:
-            path = _png(take, camera.name, "lower", k)
+            path = png(take, camera.name, "lower", k)
             cv2.imwrite(str(path), np.zeros_like(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)))
-    tracks = _track(_capture(take))
+    tracks = track(_capture(take))
     assert tracks.status[5:7].tolist() == [[1, 0], [1, 0]]
     for name in ("T_world_lower", "T_upper_lower", "raw_T_upper_lower", "covariance_lower", "covariance_relative"):
         assert np.isnan(getattr(tracks, name)[5:7]).all()
     assert np.isfinite(tracks.T_world_upper).all() and np.isnan(tracks.sigma_mm[5:7]).all()
     assert (tracks.status[7:] != 0).all()
-    assert np.nanmax(_errors(tracks)) < 0.1
+    assert np.nanmax(errors_mm(tracks)) < 0.1
 
 
 def test_one_camera_is_refused_because_of_its_depth(pictures):
     unmasked = [{"name": c.name, "video": pictures / "video.mp4"} for c in CAMERAS[1:]]
-    capture = _capture(pictures, cameras=[_source(pictures, "cam0"), *unmasked])
+    capture = _capture(pictures, cameras=[source(pictures, "cam0"), *unmasked])
     with pytest.raises(TrackingError, match="1 of 3 cameras have masks; one view leaves the depth"):
-        _track(capture)
+        track(capture)
 
 
 def test_exchanged_masks_are_named(pictures):
@@ -181,30 +124,30 @@ def test_exchanged_masks_are_named(pictures):
     with pytest.raises(
         TrackingError, match="camera cam1, frame 8: the masks of the upper and lower teeth are exchanged"
     ):
-        _track(capture)
+        track(capture)
 
 
 def test_picks_far_from_the_masks_are_refused(pictures):
     capture = _capture(pictures, away_mm=12.0)
     with pytest.raises(TrackingError, match=r"frame 8: the (upper|lower) teeth do not fit their masks"):
-        _track(capture)
+        track(capture)
 
 
 def test_bootstrap_frame_must_lie_in_the_range(pictures):
     with pytest.raises(TrackingError, match="bootstrap.frame is 8, frames run from 10 to 14"):
-        _track(_capture(pictures, frames=(10, 15)))
+        track(_capture(pictures, frames=(10, 15)))
 
 
 def test_first_frame_needs_two_masks_of_each_row(take):
     for camera in CAMERAS[1:]:
-        _png(take, camera.name, "upper", START).unlink()
+        png(take, camera.name, "upper", START).unlink()
     with pytest.raises(TrackingError, match="frame 8: 1 masks of the upper teeth, the first frame needs two"):
-        _track(_capture(take))
+        track(_capture(take))
 
 
 def test_picks_are_needed(pictures):
     with pytest.raises(TrackingError, match=r"no \[bootstrap\] picks"):
-        _track(_capture(pictures, bootstrap=None))
+        track(_capture(pictures, bootstrap=None))
 
 
 def test_camera_without_offset_is_named(pictures):
