@@ -1,0 +1,13 @@
+"""Jaw rigs inside differentiable solvers: a torch module with poses, bounds and a prior on jaw poses."""
+
+from jawusd.errors import MissingDependencyError
+
+try:
+    import torch  # noqa: F401
+except ModuleNotFoundError as error:
+    raise MissingDependencyError("jawusd.solvers needs torch.", hint="pip install 'jawusd[build]'") from error
+
+from jawusd.solvers.face_model import jaw_pose_from_axis_angle
+from jawusd.solvers.layer import JawLayer
+
+__all__ = ["JawLayer", "jaw_pose_from_axis_angle"]

@@ -1,0 +1,132 @@
+"""A jaw rig as a torch module: poses, margins, encoding, and a prior on jaw poses that other solvers can add."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from jawusd.evaluator import JawRig
+from jawusd.evaluator.bounds import SliceHull
+from jawusd.evaluator.distances import landmark_vectors
+from jawusd.evaluator.models import AnchoredModel
+from jawusd.geometry.se3 import se3_inverse
+from jawusd.solvers.motion import AdditiveMotion, AnchoredMotion, Curve
+
+_LEAST_CURVATURE = 1e-9  # relative; keeps encodings differentiable where a parameter hardly moves the landmarks
+
+
+class JawLayer(nn.Module):
+    """Evaluate a rig on torch tensors, with gradients, in float32 or float64, on any device.
+
+    ``layer(d)`` is `JawRig.pose`. Nothing is trained: the rig's arrays are buffers, so ``.to(...)`` moves them.
+
+    Args:
+        rig: The rig. Encoding searches with it on the CPU.
+    """
+
+    def __init__(self, rig: JawRig) -> None:
+        super().__init__()
+        self.rig = rig
+        anchored = isinstance(rig.model, AnchoredModel)
+        self.motion = AnchoredMotion(rig.model) if anchored else AdditiveMotion(rig.model)
+        self.bound = _Bound(rig.bound)
+        A = rig.arrays["T_anatomical_skull"]
+        closed = A @ rig.arrays["T_rest"]
+        self.register_buffer("from_anatomical", torch.tensor(se3_inverse(A)))
+        self.register_buffer("closed", torch.tensor(closed))
+        vectors = landmark_vectors(rig.arrays["landmarks"])
+        self.register_buffer("vectors", torch.tensor(vectors))
+
+    def forward(self, d: Tensor) -> Tensor:
+        """Return the poses T_skull_mandible, shape (..., 4, 4), for jaw parameters d (..., 3) [mm]."""
+        rows = _rows(d, (3,))
+        return self._poses(rows).reshape(*d.shape[:-1], 4, 4)
+
+    def margin(self, d: Tensor) -> Tensor:
+        """Return the signed distance (...) of d (..., 3) to the bound [mm], positive inside."""
+        return self.bound(_rows(d, (3,))).reshape(d.shape[:-1])
+
+    def penalty(self, d: Tensor) -> Tensor:
+        """Return the squared distance (...) by which d (..., 3) lies outside the bound [mm^2]; zero inside."""
+        return torch.relu(-self.margin(d)).square()
+
+    def encode(self, T_skull_mandible: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the nearest jaw parameters and the landmark distance to them, as `JawRig.encode` does.
+
+        The derivatives by the pose are those of the nearest point itself: the implicit function theorem on
+        ``grad_d |pose(d) - T|^2 = 0``, second derivatives of the model included.
+
+        Args:
+            T_skull_mandible: Poses, shape (..., 4, 4).
+
+        Returns:
+            d [mm], shape (..., 3), and the squared residual [mm^2], shape (...): the square, because the distance
+            itself has no gradient where it is zero.
+        """
+        T = _rows(T_skull_mandible, (4, 4))
+        found, _ = self.rig.encode(T.detach().cpu().double().numpy())
+        at = torch.tensor(found, dtype=T.dtype, device=T.device)
+        target = (T @ self.vectors)[:, :3].reshape(-1, 12)
+        image, J, H = self._expansion(at, target.detach())
+        # a Newton step from the minimum: nowhere to go, but its derivative by the target is the minimum's own
+        slope = torch.einsum("nmi,nm->ni", J, image - target)
+        d = at - torch.linalg.solve(H, slope - slope.detach())
+        squared = (self._images(d) - target).square().sum(dim=1)
+        batch = T_skull_mandible.shape[:-2]
+        return d.reshape(*batch, 3), squared.reshape(batch)
+
+    def loss(self, T_skull_mandible: Tensor) -> Tensor:
+        """Return a prior on jaw poses [mm^2], shape (...): squared residual plus `penalty` of the nearest parameters.
+
+        Zero for every pose of this person's jaw, and growing with the millimetres a pose is off the model or outside
+        the bound: a replacement for the usual pull towards the closed mouth.
+
+        Args:
+            T_skull_mandible: Poses, shape (..., 4, 4).
+        """
+        d, squared = self.encode(T_skull_mandible)
+        return squared + self.penalty(d)
+
+    def _poses(self, d: Tensor) -> Tensor:
+        return self.from_anatomical @ self.motion(d) @ self.closed
+
+    def _images(self, d: Tensor) -> Tensor:
+        """Return where the four vectors that stand for the landmarks go (n, 12), see `evaluator.encoding`."""
+        return (self._poses(d) @ self.vectors)[:, :3].reshape(-1, 12)
+
+    def _expansion(self, d: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return images (n, 12), their Jacobian (n, 12, 3) and the Hessian (n, 3, 3) of half the squared distance."""
+
+        def cost(d: Tensor, target: Tensor) -> Tensor:
+            return 0.5 * (self._images(d[None])[0] - target).square().sum()
+
+        with torch.no_grad():
+            J = torch.func.vmap(torch.func.jacrev(lambda d: self._images(d[None])[0]))(d)
+            H = torch.func.vmap(torch.func.jacrev(torch.func.jacrev(cost)))(d, target)
+            floor = _LEAST_CURVATURE * H.diagonal(dim1=1, dim2=2).abs().mean(dim=1)
+            H = H + floor[:, None, None] * torch.eye(3, dtype=d.dtype, device=d.device)
+            return self._images(d), J, H
+
+
+class _Bound(nn.Module):
+    """The margin of a `SliceHull` in torch."""
+
+    def __init__(self, bound: SliceHull) -> None:
+        super().__init__()
+        self.supports = Curve(bound.supports)
+        self.register_buffer("directions", torch.tensor(bound.directions))
+        self._softness_mm, self._margin_mm = bound.softness_mm, bound.margin_mm
+
+    def forward(self, d: Tensor) -> Tensor:
+        """Return the margins (n,) [mm] of d (n, 3) [mm]."""
+        d1 = d[:, :1]
+        knots = self.supports.knots
+        sides = d[:, 1:] @ self.directions.T - self.supports(d[:, 0])
+        v = torch.cat([sides, knots[0] - d1, d1 - knots[-1]], dim=1)
+        return self._margin_mm - self._softness_mm * torch.logsumexp(v / self._softness_mm, dim=1)
+
+
+def _rows(values: Tensor, tail: tuple[int, ...]) -> Tensor:
+    if values.shape[values.ndim - len(tail) :] != tail:
+        raise ValueError(f"the shape must end in {tail}, got {tuple(values.shape)}")
+    return values.reshape(-1, *tail)
