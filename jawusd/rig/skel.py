@@ -15,7 +15,7 @@ from jawusd.geometry.se3 import make_transform, se3_inverse, transform_points
 from jawusd.rig import _gf
 from jawusd.rig.geo import MESH_PATHS
 from jawusd.rig.layers import define_prim, new_layer, stage_of, write_layer
-from jawusd.rig.layout import ACTOR, GEO_FILE
+from jawusd.rig.layout import ACTOR, GEO_FILE, MANDIBLE
 
 Array = NDArray[np.float64]
 
@@ -60,6 +60,10 @@ def write_skel(
     keys = _define_motion(stage, rig, hinge, frames, d)
     if keys is not None:
         layer.startTimeCode, layer.endTimeCode = float(keys[0]), float(keys[-1])
+    # The meshes stand where their bind transforms put them; Blender would apply the op of the payload on top.
+    mandible = Sdf.CreatePrimInLayer(layer, MANDIBLE)
+    order = Sdf.AttributeSpec(mandible, "xformOpOrder", Sdf.ValueTypeNames.TokenArray, Sdf.VariabilityUniform)
+    order.default = Vt.TokenArray()
     for name in mesh_names:
         _bind(layer, MESH_PATHS[name], rig.arrays["T_rest"] if _moves(name) else np.eye(4), int(_moves(name)))
     root.payloadList.prependedItems = [Sdf.Payload(f"./{GEO_FILE}")]

@@ -1,0 +1,24 @@
+// Run by node: parse a .usdz with three.js and print where the mandible's mesh is, as JSON.
+// Usage: node three_read.mjs NODE_MODULES FILE TIME,TIME,... MESH     (times in seconds)
+import { readFileSync } from "node:fs";
+import { pathToFileURL } from "node:url";
+
+const [, , modules, file, times, meshName] = process.argv;
+const THREE = await import(pathToFileURL(`${modules}/three/build/three.module.js`));
+const { USDLoader } = await import(pathToFileURL(`${modules}/three/examples/jsm/loaders/USDLoader.js`));
+
+const bytes = readFileSync(file);
+const scene = new USDLoader().parse(bytes.buffer.slice(bytes.byteOffset, bytes.byteOffset + bytes.byteLength));
+const mesh = scene.getObjectByName(meshName);
+const clips = scene.animations ?? [];
+const mixer = new THREE.AnimationMixer(scene);
+clips.forEach((clip) => mixer.clipAction(clip).play());
+const actor = scene.getObjectByName("Actor");
+const found = {};
+for (const time of times.split(",").map(Number)) {
+  mixer.setTime(time);
+  scene.updateMatrixWorld(true);
+  const relative = actor.matrixWorld.clone().invert().multiply(mesh.matrixWorld);
+  found[time] = relative.clone().transpose().elements; // row by row
+}
+console.log("RESULT " + JSON.stringify({ revision: THREE.REVISION, clips: clips.length, tracks: clips[0]?.tracks.length ?? 0, matrices: found, points: mesh.geometry.attributes.position.count }));

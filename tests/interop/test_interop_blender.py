@@ -1,0 +1,38 @@
+"""Blender imports rigs without any add-on: the baked ops as a cache, the skeleton as bones with editable keys."""
+
+import numpy as np
+import pytest
+from example_rig import FPS, example_meshes, example_motion, example_rig, moved
+from foreign import run_in
+
+from jawusd.rig.bake import bake_rig
+
+MESHES = {"MandibleMesh": "mandible", "LowerTeethMesh": "lower_teeth", "SkullMesh": "skull"}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Return a baked example rig, whose scans are not quite in occlusion."""
+    frames, d = example_motion()
+    made = tmp_path_factory.mktemp("actor")
+    bake_rig(made, example_rig(), example_meshes(), name="example", fps=FPS, frames=frames, d=d)
+    return made
+
+
+@pytest.mark.parametrize("blender", ["blender45", "blender50"])
+@pytest.mark.parametrize("name", ["anim_capture.usdc", "actor.usdz", "actor_skel.usdc"])
+def test_vertices_are_where_the_model_puts_them(folder, blender, name):
+    frames, d = example_motion()
+    shown = np.arange(0, len(frames), 2)
+    found = run_in(blender, "blender_import.py", folder / name, ",".join(map(str, frames[shown])), ",".join(MESHES))
+    for k in shown:
+        pose = example_rig().pose(d[k])
+        for mesh, key in MESHES.items():
+            T = np.eye(4) if key == "skull" else pose
+            expected = moved(T[None], example_meshes()[key].vertices)[0]
+            places = np.array(found["frames"][str(frames[k])][mesh])
+            assert np.linalg.norm(places - expected, axis=1).max() < 0.01
+    if name == "actor_skel.usdc":
+        assert found["bones"] == ["skull", "jaw"] and max(found["actions"].values()) == len(frames)
+    else:
+        assert {"jaw:d1", "jaw:d1:range", "jaw:formatVersion", "jaw:modelHash"} <= set(found["properties"])

@@ -1,0 +1,82 @@
+"""Programs that never heard of jawusd read its rigs: other OpenUSD versions, tinyusdz, three.js, NVIDIA's validator."""
+
+import subprocess
+
+import numpy as np
+import pytest
+from example_rig import FPS, example_meshes, example_motion, example_rig
+from foreign import SCRIPTS, environment, run, run_in
+from scipy.spatial.transform import Rotation
+
+from jawusd.geometry import make_transform
+from jawusd.rig.bake import bake_rig
+
+SHOWN = (0, 9, 17, 30, 39)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Return a baked example rig."""
+    frames, d = example_motion()
+    made = tmp_path_factory.mktemp("actor")
+    bake_rig(made, example_rig(), example_meshes(), name="example", fps=FPS, frames=frames, d=d)
+    return made
+
+
+def expected_poses():
+    """Return the frames tried and the poses the evaluator gives there."""
+    frames, d = example_motion()
+    rows = list(SHOWN)
+    return frames[rows], example_rig().pose(d[rows])
+
+
+def landmark_distance(T_a, T_b):
+    """Return the largest distance [mm] of a landmark under two sets of poses."""
+    landmarks = np.c_[example_rig().arrays["landmarks"], np.ones(5)]
+    return np.linalg.norm(((T_a - T_b) @ landmarks.T)[:, :3], axis=1).max()
+
+
+@pytest.mark.parametrize("name", ["usd2411", "usd255"])
+def test_older_openusd_shows_the_same_poses(folder, name):
+    frames, poses = expected_poses()
+    for file in ("anim_capture.usdc", "actor.usdz"):
+        found = run_in(name, "usd_read.py", folder / file, ",".join(map(str, frames)))
+        assert landmark_distance(np.array(found["poses"]), poses) < 1e-6
+        np.testing.assert_allclose(found["d"], example_motion()[1][list(SHOWN)], atol=1e-12)
+        assert found["table"] == 33**3 * 6 and "JawRigAPI" in found["schemas"]
+
+
+def test_tinyusdz_reads_rig_and_motion(folder):
+    found = run_in("tinyusdz", "tinyusdz_read.py", folder / "actor.usdz")
+    assert found["shape"] == [33, 33, 33] and "JawRigAPI" in found["schemas"] and found["meshes"] == 4
+    frames, poses = expected_poses()
+    translation, rotation = found["channels"]["translation"], found["channels"]["rotation"]
+    at = [translation["times"].index(frame) for frame in frames]
+    xyzw = Rotation.from_quat(np.array(rotation["values"])[at])
+    T = make_transform(xyzw.as_matrix(), np.array(translation["values"])[at])
+    assert landmark_distance(T, poses) < 1e-3
+
+
+def test_tinyusdz_reads_the_interface_layer(folder):
+    """It follows no sublayers, but must not choke on the text."""
+    environment("tinyusdz")
+    code = "import sys, tinyusdz; p = tinyusdz.load(sys.argv[1]).get_prim_at_path('/Actor');"
+    code += "import json; print('RESULT ' + json.dumps([p.api_schemas(), p.get_attribute('jaw:d1').value.as_scalar()]))"
+    found = run([environment("tinyusdz") / "bin" / "python", "-c", code, folder / "actor.usda"])
+    assert "JawRigAPI" in found[0] and found[1] == 0.0
+
+
+def test_three_js_animates_the_mandible(folder):
+    frames, poses = expected_poses()
+    times = ",".join(str(frame / FPS) for frame in frames)
+    modules = environment("threejs") / "node_modules"
+    found = run(["node", SCRIPTS / "three_read.mjs", modules, folder / "actor.usdz", times, "MandibleMesh"])
+    shown = np.array([found["matrices"][str(frame / FPS).removesuffix(".0")] for frame in frames]).reshape(-1, 4, 4)
+    assert landmark_distance(shown, poses) < 0.01
+
+
+@pytest.mark.parametrize("name", ["actor.usda", "anim_capture.usdc", "actor.usdz", "actor_skel.usdc"])
+def test_nvidia_validator_finds_nothing(folder, name):
+    program = environment("nvidia") / "bin" / "nvidia_usd_validate"
+    done = subprocess.run([program, folder / name], capture_output=True, text=True, timeout=240)
+    assert done.returncode == 0, done.stdout + done.stderr
