@@ -25,8 +25,8 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 CENTRES = 80
-_ROUNDS = 5
-_SCALES_MM = np.array([15.0, 6.0, 5.0])  # lengths over which f changes along opening, sideways and forward
+_ROUNDS = 4
+_SCALES_MM = np.array([10.0, 7.0, 5.0])  # lengths over which f changes along opening, sideways and forward
 _HIDDEN_SCALE_MM = 1e9  # f does not depend on a direction the data do not show
 _SMOOTHING = 10.0 ** np.arange(-6.0, 4.0)
 _CV_BLOCK, _CV_FOLDS = 25, 5  # frames (about a second of video) that are left out together

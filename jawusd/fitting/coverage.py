@@ -1,4 +1,4 @@
-"""What the captured poses can show: which of the three parameters they move."""
+"""What the captured poses show and what they lack: which parameters they move, and which parts of the envelope."""
 
 from __future__ import annotations
 
@@ -12,6 +12,14 @@ from jawusd.fitting.path import SMALLEST_OPENING_MM, fit_path
 Array = NDArray[np.float64]
 
 PARAMETERS = ("opening", "laterotrusion", "protrusion")
+
+# Limits below which a take is worth repeating: smaller than nearly all adults' ranges (Hirsch 2006, Zawawi 2003)
+_SMALL_OPENING_MM, _SMALL_LATERAL_MM, _SMALL_PROTRUSION_MM = 30.0, 5.0, 4.0
+_WIDE, _FEW_WIDE_FRAMES = 0.85, 10  # share of the largest opening that counts as wide open
+_HALF_OPEN = (0.25, 0.65)
+_HALF_OPEN_SHARE = 0.35  # of the range with closed teeth that should be reached half open
+# Directions of (laterotrusion, protrusion) that frames should reach half open, as far as this share of the closed range
+_SECTORS, _SECTOR_REACH, _FEWEST_SECTORS = 8, 0.25, 6
 
 # Ranges (1 to 99 %) below which a parameter is noise and habit, not an exercise [mm]
 _SMALLEST_RANGE_MM = np.array([SMALLEST_OPENING_MM, 3.0, 2.5])
@@ -42,3 +50,52 @@ def shown_parameters(data: TrainingData) -> tuple[NDArray[np.bool_], list[str]]:
         if not shown[i]
     ]
     return shown, sentences
+
+
+def missing_movements(d: Array, shown: NDArray[np.bool_]) -> list[str]:
+    """Say what a take lacks, one sentence each with what to record.
+
+    Args:
+        d: parameters of the captured poses [mm], shape (N, 3).
+        shown: which parameters the data show, shape (3,); the others have their own sentences.
+    """
+    widest = float(d[:, 0].max())
+    found = []
+    if shown[0]:
+        if widest < _SMALL_OPENING_MM:
+            found.append(f"The widest opening is {widest:.0f} mm: record opening as wide as possible, three times.")
+        wide = int((d[:, 0] > _WIDE * widest).sum())
+        if wide < _FEW_WIDE_FRAMES:
+            found.append(f"Only {wide} frames are near full opening: hold the widest opening for a second.")
+    for name, side in (("left", d[:, 1]), ("right", -d[:, 1])):
+        if shown[1] and side.max() < _SMALL_LATERAL_MM:
+            found.append(f"The jaw moves {max(side.max(), 0.0):.1f} mm to the {name}: record a full slide that way.")
+    if shown[2] and d[:, 2].max() < _SMALL_PROTRUSION_MM:
+        found.append(f"The jaw moves {max(d[:, 2].max(), 0.0):.1f} mm forward: record a full protrusion.")
+    return found + (_missing_half_open(d) if shown.all() else [])
+
+
+def _missing_half_open(d: Array) -> list[str]:
+    """Say what is missing between a quarter and two thirds of the opening."""
+    low, high = (share * d[:, 0].max() for share in _HALF_OPEN)
+    half = d[(d[:, 0] > low) & (d[:, 0] < high), 1:]
+    where = f"between {low:.0f} and {high:.0f} mm of opening"
+    if not len(half):
+        return [f"There are no frames {where}: record opening and closing slowly."]
+    reach = np.stack([d[:, 1].max(), -d[:, 1].min(), d[:, 2].max()])
+    reached = np.stack([half[:, 0].max(), -half[:, 0].min(), half[:, 1].max()])
+    names = ("slides to the left", "slides to the right", "protrusion")
+    found = [
+        f"There is no {name} {where}: record it with the mouth half open."
+        for name, here, there in zip(names, reached, reach, strict=True)
+        if here < _HALF_OPEN_SHARE * there
+    ]
+    circle = (half - np.median(half, axis=0)) / np.maximum([max(reach[:2]), reach[2]], 1.0)
+    far = circle[np.linalg.norm(circle, axis=1) > _SECTOR_REACH]
+    covered = len(np.unique(np.round(np.arctan2(far[:, 1], far[:, 0]) / (2 * np.pi) * _SECTORS) % _SECTORS))
+    if covered < _FEWEST_SECTORS:
+        found.append(
+            f"Only {covered} of {_SECTORS} directions are covered {where}: record ten seconds of circling with the "
+            "mouth half open."
+        )
+    return found

@@ -18,7 +18,7 @@ from jawusd.fitting.alpha_shape import alpha_shape
 from jawusd.fitting.anatomy_gate import AnatomyWarning, check_anatomy
 from jawusd.fitting.anchored import fit_anchored
 from jawusd.fitting.config import FittingConfig
-from jawusd.fitting.coverage import shown_parameters
+from jawusd.fitting.coverage import missing_movements, shown_parameters
 from jawusd.fitting.data import Anatomy, Selection, TrainingData, select_poses, select_tracks
 from jawusd.fitting.error_table import join, pose_errors, summarise
 from jawusd.fitting.pca import fit_pca
@@ -102,6 +102,7 @@ def fit_model(
     form = _fit_form(data, shown, config)
     errors = _error_tables(data, form, shown, config, lambda done: tell(done, steps))
     arrays, tolerance_mm = _arrays(data, form, anatomy, config)
+    warnings += [AnatomyWarning("take_lacks", sentence) for sentence in missing_movements(arrays["codes"], shown)]
     model = _finish(arrays, tolerance_mm, form, selection, frames, T, errors, warnings, config)
     model.meta["actor"] = actor
     tell(steps, steps)

@@ -7,7 +7,7 @@ from jawusd.errors import FittingError
 from jawusd.evaluator import JawRig
 from jawusd.fitting import FittingConfig, fit_model
 from jawusd.fitting.anatomy_gate import check_anatomy
-from jawusd.fitting.coverage import shown_parameters
+from jawusd.fitting.coverage import missing_movements, shown_parameters
 from jawusd.fitting.data import Anatomy, select_poses, select_tracks
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import make_transform, random_rotation, se3_exp, so3_exp, transform_points
@@ -234,3 +234,26 @@ def test_repeated_takes_change_nothing(person, take):
 def test_shown_parameters_of_a_full_take(take, anatomy):
     shown, sentences = shown_parameters(select_poses(np.arange(len(take)), take, anatomy).data)
     assert shown.all() and sentences == []
+
+
+def test_full_take_lacks_nothing_and_poor_takes_are_told_what_to_record(person):
+    full = fit(person, record(person, 1200, 1, "hidden").T_noisy)  # with wandering through the whole envelope
+    assert [w for w in full.meta["warnings"] if w["code"] == "take_lacks"] == []
+    said = [w["message"] for w in fit(person, record(person, 833, 1).T_noisy).meta["warnings"]]
+    assert len(said) == 1 and "record ten seconds of circling" in said[0]
+    d, shown = full.d[full.trained], np.ones(3, dtype=bool)
+    half = (d[:, 0] > 10) & (d[:, 0] < 33)
+    cases = {
+        "widest opening is": d[d[:, 0] < 25],
+        "near full opening": d[(d[:, 0] < 0.84 * d[:, 0].max()) | (np.arange(len(d)) == d[:, 0].argmax())],
+        "to the right": d[d[:, 1] > -3],
+        "mm forward": d[d[:, 2] < 3],
+        "no protrusion between": d[~half | (d[:, 2] < 1)],
+        "no slides to the left between": d[~half | (d[:, 1] < 1)],
+        "no frames between": d[~half],
+        "directions are covered": d[~half | (np.abs(d[:, 1]) < 0.3)],
+    }
+    assert missing_movements(d, shown) == []
+    for words, poor in cases.items():
+        assert any(words in sentence for sentence in missing_movements(poor, shown)), words
+    assert missing_movements(d[~half], np.array([True, True, False])) == []
