@@ -1,0 +1,65 @@
+"""The sidebar panel: sliders of the rigs in the scene, and whether their pose is valid."""
+
+import bpy
+
+from . import jaw
+
+
+class JAWUSD_OT_key(bpy.types.Operator):
+    """Set a key on all three jaw parameters at the current frame"""
+
+    bl_idname = "jawusd.key"
+    bl_label = "Key Jaw"
+    bl_options = {"REGISTER", "UNDO"}
+
+    actor: bpy.props.StringProperty()
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Insert the keys."""
+        for name in jaw.SLIDERS:
+            bpy.data.objects[self.actor].keyframe_insert(f'["{name}"]')
+        return {"FINISHED"}
+
+
+class JAWUSD_PT_sliders(bpy.types.Panel):
+    """Jaw parameters of every rig in the scene."""
+
+    bl_label = "Jaw"
+    bl_category = "Jaw"
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Show the panel when the scene has a rig."""
+        return bool(jaw.actors())
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw sliders, margin and key button of every rig."""
+        for actor in jaw.actors():
+            box = self.layout.box()
+            box.label(text=actor.name)
+            for name, label in zip(jaw.SLIDERS, jaw.LABELS):
+                box.prop(actor, f'["{name}"]', text=label)
+            margin = jaw.rig_of(actor).margin(*(actor[name] for name in jaw.SLIDERS))
+            word = "inside" if margin >= 0 else "OUTSIDE"
+            box.label(text=f"{word} the bounds by {abs(margin):.1f} mm", icon="INFO" if margin >= 0 else "ERROR")
+            captured, shown = actor.get("jawusd_fps"), context.scene.render.fps / context.scene.render.fps_base
+            if captured and abs(captured - shown) > 0.01:
+                box.label(text=f"captured at {captured:g} fps, the scene has {shown:g}", icon="TIME")
+            box.operator(JAWUSD_OT_key.bl_idname).actor = actor.name
+
+
+_CLASSES = (JAWUSD_OT_key, JAWUSD_PT_sliders)
+
+
+def register() -> None:
+    """Register operator and panel."""
+    for cls in _CLASSES:
+        bpy.utils.register_class(cls)
+
+
+def unregister() -> None:
+    """Unregister them."""
+    for cls in reversed(_CLASSES):
+        bpy.utils.unregister_class(cls)
