@@ -11,7 +11,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom
 
 from jawusd.errors import JawusdError
 from jawusd.evaluator import JawRig
-from jawusd.geometry.se3 import se3_exp, transform_points
+from jawusd.geometry.se3 import transform_points
 from jawusd.rig import _gf
 from jawusd.rig.layout import ONNX_ATTRIBUTES, PARAMETERS
 from jawusd.rig.read import read_table, rig_of
@@ -65,7 +65,7 @@ def check_table(prim: Usd.Prim) -> Iterator[Finding]:
     if rig is None:
         return
     d = sample_valid(rig, _PROBES)
-    read = se3_exp(table.twist(d)) @ rig.arrays["T_rest"]
+    read = table.pose(d, rig.arrays["T_rest"])
     error_mm = _landmark_distance(rig, read, rig.pose(d)).max()
     if error_mm > table.max_error_mm + _TABLE_SLACK_MM:
         message = f"the table is {error_mm:.3f} mm from the model, maxError says {table.max_error_mm:.3f} mm."

@@ -54,6 +54,10 @@ class DecoderTable:
             return sum(_along(part, axis, x) for part, axis, x in zip(parts, self.knots, d.T, strict=True))
         return SampledTable(self.knots, self.twists, np.eye(4)).twist(d)
 
+    def pose(self, d: ArrayLike, T_rest: Array) -> Array:
+        """Return poses T_skull_mandible, shape (n, 4, 4), at d (n, 3) [mm]: exp(twist) times the rest pose."""
+        return se3_exp(self.twist(d)) @ T_rest
+
 
 def build_table(rig: JawRig, vertices: Array, size: int = DEFAULT_SIZE) -> DecoderTable:
     """Sample a rig and measure the table's error.
@@ -94,7 +98,7 @@ def table_error(rig: JawRig, table: DecoderTable, vertices: Array, d: Array) -> 
     parameters; those are then checked at every vertex.
     """
     exact = rig.pose(d)
-    read = se3_exp(table.twist(d)) @ rig.arrays["T_rest"]
+    read = table.pose(d, rig.arrays["T_rest"])
     rough = largest_distance(exact, read, vertices[extreme_vertices(vertices)])
     worst = np.argsort(rough)[-_FULL_CHECKS:]
     return float(largest_distance(exact[worst], read[worst], vertices).max())
