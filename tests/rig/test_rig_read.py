@@ -192,3 +192,30 @@ def test_two_actors_in_a_shot_move_independently(folder, kind, tmp_path):
         mandible = UsdGeom.Xformable(stage.GetPrimAtPath(f"/World/{name}/geo/Mandible"))
         shown = np.array(mandible.GetLocalTransformation(float(frames[20] + offset))).T
         assert np.abs(shown - rig.pose(d[20])).max() < 1e-9
+
+
+def test_instanced_actors_move_as_one_and_load(anchored_folder, tmp_path):
+    """Instances share their children: parameters on the root differ, the baked motion is that of the reference."""
+    shot = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageUpAxis(shot, "Y")
+    UsdGeom.SetStageMetersPerUnit(shot, 0.001)
+    world = UsdGeom.Xform.Define(shot, "/World")
+    shot.SetDefaultPrim(world.GetPrim())
+    Usd.ModelAPI(world).SetKind("assembly")
+    shot.SetTimeCodesPerSecond(24)
+    for i, name in enumerate(("One", "Two")):
+        prim = UsdGeom.Xform.Define(shot, f"/World/{name}")
+        prim.GetPrim().GetReferences().AddReference(str(anchored_folder / "anim_capture.usdc"))
+        prim.GetPrim().SetInstanceable(True)
+        prim.AddTranslateOp().Set(Gf.Vec3d(300 * i, 0, 0))
+    path = tmp_path / "shot.usda"
+    shot.GetRootLayer().Export(str(path))
+    assert_valid_usd(path)
+    frames, d = example_motion()
+    stage = Usd.Stage.Open(str(path))
+    rig = load_rig(path, "/World/Two")
+    for i, name in enumerate(("One", "Two")):
+        cache = UsdGeom.XformCache(float(frames[20]))
+        world_pose = np.array(cache.GetLocalToWorldTransform(stage.GetPrimAtPath(f"/World/{name}/geo/Mandible"))).T
+        expected = rig.pose(d[20]) + np.array([[0, 0, 0, 300 * i], *np.zeros((3, 4))])
+        assert np.abs(world_pose - expected).max() < 1e-9
