@@ -53,7 +53,7 @@ def track_capture_paper(
 
     It knows no failure and no uncertainty: a row with two masks or more counts as tracked however badly it fits, and
     covariances, sigmas, residuals and matched lengths of the result are NaN throughout, which says "not known" and
-    not "certain". `coverage_error` is what there is to judge it by.
+    not "certain"; a fit to such tracks weighs all frames alike. `coverage_error` is what there is to judge them by.
 
     Args:
         capture: the capture; its masks, bootstrap picks and frame range are used.
