@@ -194,9 +194,12 @@ def _poses_or_parameters(rig: JawRig, path: Path) -> tuple[np.ndarray, np.ndarra
 def _validate_rig(path: Path, as_json: bool) -> None:
     from dataclasses import asdict
 
-    from jawusd.rig import validate_stage
+    from jawusd.rig import find_nvidia_validator, nvidia_findings, validate_stage
 
     findings = validate_stage(path)
+    nvidia = find_nvidia_validator()
+    if nvidia is not None:
+        findings += nvidia_findings(path, nvidia)
     errors = [finding for finding in findings if finding.severity == "error"]
     result = {"file": str(path), "errors": len(errors), "findings": [asdict(finding) for finding in findings]}
     emit(

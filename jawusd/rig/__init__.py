@@ -4,6 +4,7 @@
 """
 
 from jawusd.rig.animation import write_animation
+from jawusd.rig.nvidia import find_nvidia_validator, nvidia_findings
 from jawusd.rig.read import describe, load_rig
 from jawusd.rig.schema import register_schema, schema_is_live
 from jawusd.rig.validate import Finding, register_validators, validate_stage
@@ -14,7 +15,9 @@ register_schema()
 __all__ = [
     "Finding",
     "describe",
+    "find_nvidia_validator",
     "load_rig",
+    "nvidia_findings",
     "register_schema",
     "register_validators",
     "schema_is_live",

@@ -1,5 +1,6 @@
 """Programs that never heard of jawusd read its rigs: other OpenUSD versions, tinyusdz, three.js, NVIDIA's validator."""
 
+import shutil
 import subprocess
 
 import numpy as np
@@ -10,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from jawusd.geometry import make_transform
 from jawusd.rig.bake import bake_rig
+from jawusd.rig.nvidia import nvidia_findings
 
 SHOWN = (0, 9, 17, 30, 39)
 
@@ -80,3 +82,11 @@ def test_nvidia_validator_finds_nothing(folder, name):
     program = environment("nvidia") / "bin" / "nvidia_usd_validate"
     done = subprocess.run([program, folder / name], capture_output=True, text=True, timeout=240)
     assert done.returncode == 0, done.stdout + done.stderr
+    assert nvidia_findings(folder / name, program) == []
+
+
+def test_nvidia_validator_finds_a_missing_file(folder, tmp_path):
+    program = environment("nvidia") / "bin" / "nvidia_usd_validate"
+    copied = shutil.copytree(folder, tmp_path / "actor")
+    (copied / "geo.usdc").unlink()
+    assert "error" in {finding.severity for finding in nvidia_findings(copied / "actor.usda", program)}
