@@ -14,7 +14,7 @@ from jawusd.formats.capture import Capture
 from jawusd.formats.model import load_model, save_model
 from jawusd.formats.tracks import load_tracks, save_tracks
 from jawusd.pipeline.prepare import input_files, open_capture
-from jawusd.pipeline.stages import bake_files, fit_jaw, sync_cameras, track_teeth
+from jawusd.pipeline.stages import bake_files, fit_jaw, sync_cameras, track_teeth, write_take
 from jawusd.pipeline.state import (
     BUILD_FILE,
     LOCK_FILE,
@@ -161,4 +161,6 @@ class _Build:
         return [path], fit_summary(model)
 
     def _bake(self) -> tuple[list[Path], dict]:
-        return bake_files(self.capture, load_model(self.folder / "model.npz"), self.folder, self.progress), {}
+        files = bake_files(self.capture, load_model(self.folder / "model.npz"), self.folder, self.progress)
+        take = write_take(self.capture, load_tracks(self.folder / "tracks.npz"), self.folder)
+        return [*files, take], {}

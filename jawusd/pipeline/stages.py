@@ -191,6 +191,27 @@ def bake_files(capture: Capture, model: JawModel, folder: Path, progress: Progre
     return files
 
 
+def write_take(capture: Capture, tracks: Tracks, folder: Path) -> Path:
+    """Write the take beside the rig: its cameras, and the actor where the head was.
+
+    Returns:
+        The file written.
+
+    Raises:
+        CalibrationError: a camera of the capture has no calibration.
+        RigError, OutputError: the take cannot be written.
+    """
+    cameras = stage("jawusd.rig.cameras")
+    return cameras.write_cameras(
+        folder / "cameras.usda",
+        load_cameras(capture),
+        folder / "anim_capture.usdc",
+        tracks.frames,
+        tracks.T_world_upper,
+        capture.fps,
+    )
+
+
 def write_demo_capture(folder: Path, seed: int, frames: int, progress: Progress) -> Path:
     """Render a synthetic capture and return its capture.toml.
 

@@ -226,4 +226,5 @@ def test_build_json_names_every_file_with_its_hash(built):
     out, summary = built
     record = json.loads((out / "build.json").read_text())["stages"]
     listed = {name for stage in record.values() for name in stage["outputs"]}
-    assert listed == set(summary["files"]) and {"actor.usda", "tracks.npz", "model.npz", "actor.onnx"} <= listed
+    expected = {"actor.usda", "tracks.npz", "model.npz", "actor.onnx", "cameras.usda"}
+    assert listed == set(summary["files"]) and expected <= listed
