@@ -15,11 +15,10 @@ from scipy.interpolate import BSpline
 
 from jawusd.evaluator.curves import HermiteCurve
 from jawusd.evaluator.models import AdditiveModel
-from jawusd.fitting.curves import MEASURED, additive_arrays, in_millimetres
+from jawusd.fitting.curves import MEASURED, Curve, additive_arrays, in_millimetres
 from jawusd.fitting.data import TrainingData
 from jawusd.fitting.gauge_fit import fit_gauge
 from jawusd.fitting.path import fit_path
-from jawusd.fitting.pca import metric_root
 from jawusd.fitting.spline import choose_smoothing, ridge_solve
 from jawusd.fitting.trimming import within
 from jawusd.geometry import se3_log
@@ -115,7 +114,7 @@ def _regress(data: TrainingData, t: Array, kept: Mask, shown: Mask) -> tuple[Add
     t, weights = t[kept], data.weights[kept]
     bases = [_Basis(t[:, i], _PIECES[i]) for i in range(3)]
     columns = [basis.columns(t[:, i]) for i, basis in enumerate(bases)]
-    root = metric_root(data)
+    root = data.metric.twist_root()
     # In mm: rotations by their effect on the mandible, translations as they are.
     L = np.linalg.cholesky(data.metric.about(data.incisor))
     turning = twists[:, :3] @ L
@@ -140,7 +139,9 @@ def _regress(data: TrainingData, t: Array, kept: Mask, shown: Mask) -> tuple[Add
     return AdditiveModel((curves[0], curves[1], curves[2]), data.incisor, d_range), smoothing
 
 
-def _assembled(columns: list[Array], bases: list[_Basis], shown: Mask, which: tuple[int, ...]):
+def _assembled(
+    columns: list[Array], bases: list[_Basis], shown: Mask, which: tuple[int, ...]
+) -> tuple[Array, Array, Array]:
     """Return the columns of some parameters side by side, their bending energy and the fixed part of the penalty."""
     sizes = [columns[i].shape[1] for i in which]
     energy = np.zeros((sum(sizes), sum(sizes)))
@@ -161,7 +162,7 @@ def _solve(matrix: Array, values: Array, weights: Array, penalty: Array, columns
     return np.split(solution, np.cumsum([part.shape[1] for part in columns])[:-1])
 
 
-def _curve(basis: _Basis, turn: Array, glide: Array, incisor: Array, axis: int):
+def _curve(basis: _Basis, turn: Array, glide: Array, incisor: Array, axis: int) -> Curve:
     """Return the function t -> twist, rate of one curve from the coefficients of omega and s."""
 
     def curve(t: Array) -> tuple[Array, Array]:

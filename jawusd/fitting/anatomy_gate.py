@@ -55,20 +55,20 @@ def _frame_mistake(data: TrainingData) -> AnatomyWarning | None:
     if not _CONDYLES_APART_MM[0] <= apart <= _CONDYLES_APART_MM[1]:
         return AnatomyWarning(
             "scan_units",
-            f"the condyles are {apart:.4g} mm apart (human: 70-140 mm): the scans are probably not in mm.",
+            f"The condyles are {apart:.4g} mm apart (human: 70-140 mm): the scans are probably not in mm.",
         )
     behind = min(incisor[2] - condyle_left[2], incisor[2] - condyle_right[2])
     if behind < 0:
         return AnatomyWarning(
-            "front_back_flip", f"the condyles lie {-behind:.0f} mm in front of the incisors: z must point forward."
+            "front_back_flip", f"The condyles lie {-behind:.0f} mm in front of the incisors: z must point forward."
         )
     if condyle_left[0] < condyle_right[0] or molar_left[0] < molar_right[0]:
         return AnatomyWarning(
             "left_right_flip",
-            "left and right landmarks are exchanged: in the anatomical frame x must point to the subject's left.",
+            "Left and right landmarks are exchanged: in the anatomical frame x must point to the subject's left.",
         )
     if min(condyle_left[1], condyle_right[1]) < incisor[1]:
-        return AnatomyWarning("upside_down", "the condyles lie below the incisal point: y must point up.")
+        return AnatomyWarning("upside_down", "The condyles lie below the incisal point: y must point up.")
     return None
 
 
@@ -82,7 +82,7 @@ def _unit_mistake(data: TrainingData, anatomy: Anatomy) -> AnatomyWarning | None
         return None
     return AnatomyWarning(
         "pose_units",
-        f"the condyles travel {travel:.3g} mm (human: up to {_CONDYLE_MAX_MM:g} mm), but {scaled:.1f} mm if the "
+        f"The condyles travel {travel:.3g} mm (human: up to {_CONDYLE_MAX_MM:g} mm), but {scaled:.1f} mm if the "
         f"translations of the poses are in {name}.",
     )
 
@@ -102,7 +102,7 @@ def _swap_mistake(data: TrainingData) -> AnatomyWarning | None:
     if rise > _RISE_MAX_MM and swapped_rise < _RISE_MAX_MM:
         return AnatomyWarning(
             "swapped_jaws",
-            f"the lower incisal point rises {rise:.1f} mm above the bite (at most {_RISE_MAX_MM:g} mm is possible) but "
+            f"The lower incisal point rises {rise:.1f} mm above the bite (at most {_RISE_MAX_MM:g} mm is possible) but "
             "not in the inverse poses: upper and lower teeth are probably exchanged (T_lower_upper for T_upper_lower).",
         )
     return None
@@ -124,7 +124,7 @@ def _out_of_range(data: TrainingData) -> list[AnatomyWarning]:
         ("condylar translation", float(np.percentile(travel, _QUANTILE)), _CONDYLE_MAX_MM, "mm"),
     ]
     return [
-        AnatomyWarning(f"{name.replace(' ', '_')}_range", f"{name} is {value:.1f} {unit} (human: up to {limit:g}).")
+        AnatomyWarning(f"{name.replace(' ', '_')}_range", f"{name.capitalize()} is {value:.1f} {unit} (human: up to {limit:g}).")
         for name, value, limit, unit in found
         if value > limit
     ]

@@ -37,11 +37,11 @@ def shown_parameters(data: TrainingData) -> tuple[NDArray[np.bool_], list[str]]:
     u = data.displacement()
     gx, gz, _, _ = path_gauge(fit_path(u, data.weights)).path(-u[:, 1])
     side, front = u[:, 0] - gx, u[:, 2] - gz
-    # A lateral excursion carries the jaw forward by itself; only what goes beyond that shows protrusion.
-    arch = np.stack([np.abs(side), side, side**2], axis=-1)
-    front = front - arch @ np.linalg.lstsq(arch, front, rcond=1e-6)[0]
-    free = np.stack([-u[:, 1], side, front], axis=-1)
-    spread = np.percentile(free, 99, axis=0) - np.percentile(free, 1, axis=0)
+    if _range(side) >= _SMALLEST_RANGE_MM[1]:
+        # A lateral excursion carries the jaw forward by itself; only what goes beyond that shows protrusion.
+        arch = np.stack([np.abs(side), side, side**2], axis=-1)
+        front = front - arch @ np.linalg.lstsq(arch, front, rcond=None)[0]
+    spread = np.array([_range(values) for values in (-u[:, 1], side, front)])
     shown = spread >= _SMALLEST_RANGE_MM
     sentences = [
         f"The poses do not show {name}: it varies by {spread[i]:.1f} mm (at least {_SMALLEST_RANGE_MM[i]:g} mm are "
@@ -50,6 +50,10 @@ def shown_parameters(data: TrainingData) -> tuple[NDArray[np.bool_], list[str]]:
         if not shown[i]
     ]
     return shown, sentences
+
+
+def _range(values: Array) -> float:
+    return float(np.percentile(values, 99) - np.percentile(values, 1))
 
 
 def missing_movements(d: Array, shown: NDArray[np.bool_]) -> list[str]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, replace
-from typing import Protocol
 
 import numpy as np
 import scipy
@@ -12,15 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from jawusd.errors import EvaluatorError, FittingError
 from jawusd.evaluator import JawRig
-from jawusd.evaluator.models import JawModelForm
 from jawusd.fitting.additive import fit_additive
 from jawusd.fitting.alpha_shape import alpha_shape
 from jawusd.fitting.anatomy_gate import AnatomyWarning, check_anatomy
 from jawusd.fitting.anchored import fit_anchored
 from jawusd.fitting.config import FittingConfig
-from jawusd.fitting.coverage import missing_movements, shown_parameters
+from jawusd.fitting.coverage import PARAMETERS, missing_movements, shown_parameters
 from jawusd.fitting.data import Anatomy, Selection, TrainingData, select_poses, select_tracks
-from jawusd.fitting.error_table import join, pose_errors, summarise
+from jawusd.fitting.holdout import FittedForm, seen_errors, unseen_errors
 from jawusd.fitting.pca import fit_pca
 from jawusd.fitting.slice_hull import fit_slice_hull, valid_box
 from jawusd.formats.model import JawModel
@@ -35,20 +33,6 @@ _LARGEST_CODES = 2000
 _RESIDUAL_QUANTILE = 99.5
 _SMALLEST_RESIDUAL_LIMIT_MM = 0.1  # noise-free poses must not make every measured pose "off the model"
 _FEW_POSES = 100
-
-
-class FittedForm(Protocol):
-    """What every fitting method returns."""
-
-    kind: str
-    model: JawModelForm
-    kept: NDArray[np.bool_]
-
-    def arrays(self) -> dict[str, Array]:
-        """Return the decoder's own arrays."""
-
-    def notes(self) -> dict:
-        """Return what the header says about the fit."""
 
 
 def fit_model(
@@ -96,15 +80,31 @@ def fit_model(
     data = selection.data
     warnings = check_anatomy(data, anatomy)
     shown, sentences = shown_parameters(data)
+    if not shown.any():
+        raise FittingError(
+            "the poses show neither opening nor laterotrusion nor protrusion.",
+            hint=" ".join(warning.message for warning in warnings) or "Capture all three movements, about 30 s in all.",
+        )
     warnings += [AnatomyWarning("not_shown", sentence) for sentence in sentences]
     if len(data) < _FEW_POSES:
-        warnings.append(AnatomyWarning("few_poses", f"only {len(data)} poses: the model interpolates coarsely."))
+        warnings.append(AnatomyWarning("few_poses", f"Only {len(data)} poses: the model interpolates coarsely."))
     form = _fit_form(data, shown, config)
-    errors = _error_tables(data, form, shown, config, lambda done: tell(done, steps))
+    errors, uncertainty = seen_errors(data, form), {}
+    if config.holdout_folds:
+        # The networks of "paper" start in the folds where the best of the full fit started, once.
+        again = replace(config, starts=1, seed=form.notes().get("seed", config.seed))
+        unseen, uncertainty = unseen_errors(
+            data,
+            form.kept,
+            config.holdout_folds,
+            lambda part: _fit_form(part, shown, again),
+            lambda fold: tell(fold + 1, steps),
+        )
+        errors |= unseen
     arrays, tolerance_mm = _arrays(data, form, anatomy, config)
     warnings += [AnatomyWarning("take_lacks", sentence) for sentence in missing_movements(arrays["codes"], shown)]
     model = _finish(arrays, tolerance_mm, form, selection, frames, T, errors, warnings, config)
-    model.meta["actor"] = actor
+    model.meta |= {"actor": actor, "uncertainty": uncertainty}
     tell(steps, steps)
     return model
 
@@ -119,34 +119,6 @@ def _fit_form(data: TrainingData, shown: NDArray[np.bool_], config: FittingConfi
     from jawusd.fitting.paper import fit_paper  # torch: two seconds that the other methods need not wait
 
     return fit_paper(data, shown, config.literal, config.starts, config.seed)
-
-
-def _error_tables(
-    data: TrainingData,
-    form: FittedForm,
-    shown: NDArray[np.bool_],
-    config: FittingConfig,
-    tell: Callable[[int], None],
-) -> dict[str, dict[str, dict[str, float]]]:
-    """Return the tables "train", "trimmed" and "holdout"; the first and last over the frames that were not trimmed."""
-
-    def errors_of(fitted: FittedForm, rows: NDArray[np.bool_]) -> dict[str, Array]:
-        part = data.select(rows)
-        return pose_errors(part, part.metric.nearest(fitted.model, part.motion)[1])
-
-    tables = {"train": summarise(errors_of(form, form.kept))}
-    if not form.kept.all():
-        tables["trimmed"] = summarise(errors_of(form, ~form.kept))
-    if config.holdout_folds:
-        fold = np.arange(len(data)) * config.holdout_folds // len(data)
-        # The networks of "paper" start in the folds where the best of the full fit started, once.
-        again = replace(config, starts=1, seed=form.notes().get("seed", config.seed))
-        parts = []
-        for k in range(config.holdout_folds):
-            tell(k + 1)
-            parts.append(errors_of(_fit_form(data.select(fold != k), shown, again), (fold == k) & form.kept))
-        tables["holdout"] = summarise(join(parts))
-    return tables
 
 
 def _arrays(
@@ -210,5 +182,9 @@ def _finish(
     trained = np.zeros(len(frames), dtype=bool)
     trained[np.flatnonzero(selection.used)[form.kept]] = True
     limit = max(float(np.percentile(residual_mm[trained], _RESIDUAL_QUANTILE)), _SMALLEST_RESIDUAL_LIMIT_MM)
+    reached = d[trained]
+    meta["ranges_mm"] = {
+        name: [float(reached[:, i].min()), float(reached[:, i].max())] for i, name in enumerate(PARAMETERS)
+    }
     arrays = {**arrays, "residual_limit_mm": np.array(limit), "margin_limit_mm": np.array(-tolerance_mm)}
     return JawModel(arrays, frames, d, residual_mm, trained, meta)

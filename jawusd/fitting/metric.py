@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull, QhullError
 from jawusd.evaluator.distances import carried, distance_residual, landmark_vectors
 from jawusd.evaluator.models import AnchoredModel, JawModelForm
 from jawusd.evaluator.solver import minimise
-from jawusd.geometry import make_transform
+from jawusd.geometry import hat, make_transform
 
 Array = NDArray[np.float64]
 
@@ -94,6 +94,17 @@ class MandibleMetric:
         offset = self.vectors[:3, 3] - point
         second = self.vectors[:3, :3] @ self.vectors[:3, :3].T + np.outer(offset, offset)
         return np.trace(second) * np.eye(3) - second
+
+    def twist_root(self) -> Array:
+        """Return L (6, 6) with |L^T xi|^2 = mean squared displacement under a small twist xi at rest [mm^2]."""
+        arms = np.concatenate([-hat(self.vectors[:3, :3].T), np.zeros((3, 3, 3))], axis=2)
+        J = np.concatenate([arms, velocity_of(self.vectors[:3, 3])[None]])
+        return np.linalg.cholesky(np.einsum("nij,nik->jk", J, J))
+
+
+def velocity_of(point: Array) -> Array:
+    """Return the matrix (3, 6) that maps a twist (omega, v) to the velocity of a point [mm]."""
+    return np.concatenate([-hat(point), np.eye(3)], axis=1)
 
 
 def _parts(M: Array) -> tuple[Array, Array]:

@@ -25,7 +25,6 @@ from jawusd.fitting.curves import MEASURED, Curve, additive_arrays, in_millimetr
 from jawusd.fitting.data import TrainingData
 from jawusd.fitting.error_table import pose_errors, summarise
 from jawusd.fitting.nlpca import Nlpca, train_nlpca
-from jawusd.fitting.pca import metric_root
 from jawusd.geometry import se3_exp, se3_log
 
 Array = NDArray[np.float64]
@@ -142,7 +141,7 @@ def fit_paper(data: TrainingData, shown: Mask, literal: bool, starts: int, seed:
             "the paper's model needs opening, lateral and protrusive movements in the data.",
             hint="Use the model 'anchored', which fits what the data show.",
         )
-    root = metric_root(data)
+    root = data.metric.twist_root()
     points = se3_log(data.motion) @ root
     sums = [_network_sum(data, points, root, literal, seed + start) for start in range(starts)]
     best = min(sums, key=lambda found: _error(found, data, points, root))

@@ -11,7 +11,8 @@ from jawusd.errors import FittingError
 from jawusd.evaluator.models import AdditiveModel
 from jawusd.fitting.curves import MEASURED, additive_arrays, straight, translation
 from jawusd.fitting.data import TrainingData
-from jawusd.geometry import hat, se3_log
+from jawusd.fitting.metric import velocity_of
+from jawusd.geometry import se3_log
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -43,13 +44,6 @@ class PcaFit:
         return {"singular_values_mm": self.singular_values_mm.tolist()}
 
 
-def metric_root(data: TrainingData) -> Array:
-    """Return L (6, 6) with |L^T xi|^2 = mean squared displacement of the mandible under a small twist xi [mm^2]."""
-    points, offset = data.metric.vectors[:3, :3].T, data.metric.vectors[:3, 3]
-    J = np.concatenate([np.concatenate([-hat(points), np.zeros((3, 3, 3))], axis=2), [_velocity_of(offset)]])
-    return np.linalg.cholesky(np.einsum("nij,nik->jk", J, J))
-
-
 def fit_pca(data: TrainingData, shown: Mask) -> PcaFit:
     """Fit a linear subspace of se(3) through the closed bite.
 
@@ -64,7 +58,7 @@ def fit_pca(data: TrainingData, shown: Mask) -> PcaFit:
     Raises:
         FittingError: the components do not move the incisal point in as many independent directions.
     """
-    L = metric_root(data)
+    L = data.metric.twist_root()
     twists = se3_log(data.motion)
     weights = data.weights / data.weights.sum()
     _, singular, Vt = np.linalg.svd((twists @ L) * np.sqrt(weights)[:, None], full_matrices=False)
@@ -79,7 +73,7 @@ def fit_pca(data: TrainingData, shown: Mask) -> PcaFit:
 
 def _semantic_directions(basis: Array, twists: Array, weights: Array, incisor: Array, shown: Mask) -> Array:
     """Return the twists per mm of d1, d2, d3 as columns, shape (6, 3)."""
-    measure = MEASURED[shown] @ _velocity_of(incisor)
+    measure = MEASURED[shown] @ velocity_of(incisor)
     to_mm = measure @ basis
     if np.linalg.cond(to_mm) > _LARGEST_CONDITION:
         raise FittingError(
@@ -94,8 +88,3 @@ def _semantic_directions(basis: Array, twists: Array, weights: Array, incisor: A
         habit = (d * weights) @ d[0] / ((weights * d[0]) @ d[0])
         directions[:, 0] = directions[:, shown] @ habit
     return directions
-
-
-def _velocity_of(point: Array) -> Array:
-    """Return the matrix (3, 6) that maps a twist to the velocity of a point."""
-    return np.concatenate([-hat(point), np.eye(3)], axis=1)

@@ -162,13 +162,13 @@ def test_inhuman_ranges_are_named(person, take):
     assert {"laterotrusion_range", "condylar_translation_range"} <= set(codes(person, sideways))
 
 
-def fit(person, T):
+def fit(person, T, method="anchored"):
     return fit_model(
         (np.arange(len(T)), T),
         T_anatomical_skull=make_transform(np.eye(3), -person.landmarks[0]),
         landmarks=person.landmarks,
         mandible_vertices=person.mandible_points,
-        config=FittingConfig(holdout_folds=2),
+        config=FittingConfig(method=method, holdout_folds=2),
     )
 
 
@@ -205,6 +205,21 @@ def test_takes_that_lack_an_exercise_give_a_model_of_the_rest(person, controls, 
     for name in hidden:  # the other parameters' slopes include the path, so only the hidden ones must not turn the jaw
         if name != "opening":
             assert np.abs(turning[:, :, slider[name]]).max() < 1e-6
+
+
+@pytest.mark.parametrize("method", ["pca", "additive"])
+def test_other_models_also_do_without_an_exercise(person, method):
+    T = noisy(person.pose(SWING**2, NOTHING, NOTHING), np.random.default_rng(6))
+    model = fit(person, T, method=method)
+    assert model.meta["errors"]["train"]["mandible"]["mean"] < (0.6 if method == "pca" else 0.3)
+    assert len([w for w in model.meta["warnings"] if w["code"] == "not_shown"]) == 2
+
+
+def test_wrong_units_explain_why_nothing_is_shown(person, take):
+    wrong = take.copy()
+    wrong[:, :3, 3] /= 1000
+    with pytest.raises(FittingError, match=r"show neither opening.*are in metres"):
+        fit(person, wrong)
 
 
 def test_pure_hinge_is_fitted(person):

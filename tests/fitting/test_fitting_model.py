@@ -6,8 +6,11 @@ import pytest
 from jawusd.errors import FittingError
 from jawusd.evaluator import JawRig
 from jawusd.fitting import FittingConfig, fit_model
+from jawusd.fitting.data import Anatomy, select_poses
+from jawusd.fitting.holdout import unseen_errors
+from jawusd.fitting.pca import fit_pca
 from jawusd.formats.model import load_model, save_model
-from jawusd.geometry import make_transform, random_rotation, se3_exp, so3_exp
+from jawusd.geometry import LANDMARKS, make_transform, random_rotation, se3_exp, so3_exp, transform_points
 from jawusd.synthetic.exercises import record
 from jawusd.synthetic.person import Person
 
@@ -76,6 +79,36 @@ def test_unseen_exercises_stay_near_the_floor_of_any_three_parameter_model(perso
     floor = person.nearest(hidden, bounded=False)[1]
     assert error.mean() <= 0.45
     assert error.mean() <= 1.35 * floor.mean()
+
+
+def test_predicted_uncertainty_covers_errors_on_unseen_exercises(person, model, rig):
+    hidden = record(person, 600, 2, "hidden").T_noisy
+    d = rig.encode(hidden)[0]
+    distance, near = rig.captured_distance(d), rig.pose(d)
+    inside = []
+    for name, point in zip(LANDMARKS, person.landmarks, strict=True):
+        sure = model.meta["uncertainty"][name]
+        assert sure["per_mm"] > 0
+        error = np.linalg.norm(transform_points(near, point) - transform_points(hidden, point), axis=-1)
+        inside.append((error <= 2 * (sure["base_mm"] + sure["per_mm"] * distance)).mean())
+    assert min(inside) >= 0.9 and np.mean(inside) <= 0.985
+
+
+def test_left_out_frames_are_left_out(person, take):
+    anatomy = Anatomy.of(make_transform(np.eye(3), -person.landmarks[0]), person.landmarks, None, None)
+    data = select_poses(np.arange(300), take[:300], anatomy).data
+    seen = []
+
+    def refit(part):
+        seen.append(part.frames)
+        return fit_pca(part, np.ones(3, bool))
+
+    kept = np.ones(300, bool)
+    kept[10:20] = False
+    tables, _ = unseen_errors(data, kept, 3, refit, lambda fold: None)
+    for fold, frames in enumerate(seen):
+        np.testing.assert_array_equal(frames, np.setdiff1d(np.arange(300), np.arange(100 * fold, 100 * fold + 100)))
+    assert tables["holdout"]["mandible"]["frames"] == 290
 
 
 def test_closed_bite_is_zero(rig):
