@@ -13,10 +13,12 @@ class TrackingConfig:
     working_px_per_mm: float = 7.2
     # Distance of contour samples [px]: mask noise is correlated over more than this, denser sampling gains nothing.
     sample_step_px: float = 3.0
-    # Residual gates per iteration [px]. Narrow: wider ones reach lip and gum edges about half a millimetre away.
-    gates_px: tuple[float, ...] = (6.0, 4.0, 3.0, 2.5, 2.5, 2.5, 2.5)
-    # Gates of the fallback [px], for predictions that are off by a millimetre or more.
+    # Residual gates per iteration [px]. Narrow at the end: wider ones reach lip and gum edges half a millimetre away.
     wide_gates_px: tuple[float, ...] = (14.0, 10.0, 8.0, 6.0, 4.0, 3.0, 2.5, 2.5, 2.5, 2.5)
+    # Gate to start from when motion is easy to predict [px]; the others are for lively motion and the fallback.
+    first_gate_px: float = 6.0
+    # First gate over the recent prediction error [-]: the next one may be larger.
+    gate_per_miss: float = 1.5
     # Bounds of the last gates [px], which follow the spread of the residuals in between.
     final_gate_px: tuple[float, float] = (1.2, 2.5)
     # Tukey gate in standard deviations: 95 % efficiency for normal noise (Huber & Ronchetti 2009).
@@ -71,7 +73,7 @@ class TrackingConfig:
     # Reach of the multi-start [mm, rad]: the prediction error of a fast chewing stroke.
     search_mm: float = 2.0
     search_rad: float = 0.05
-    # Gates of the first look at a start, and how many starts are followed to the end.
+    # Gates of the first look at a start [px], and how many starts are followed to the end.
     glance_gates_px: tuple[float, ...] = (14.0, 8.0)
     search_finalists: int = 4
     # Matched contour below which a row is lost [px]: 8 mm of tooth edge.
@@ -90,3 +92,7 @@ class TrackingConfig:
     refine_bias_px: float = 0.1
     # Most rounds of that [-]: each leaves a tenth of the delay.
     refine_rounds: int = 2
+
+    def gates_from(self, reach_px: float) -> tuple[float, ...]:
+        """Return the gates to go through when the start is off by about reach_px, and no less than the usual."""
+        return tuple(g for g in self.wide_gates_px if g <= max(reach_px, self.first_gate_px))

@@ -44,13 +44,13 @@ def first_record(
             )
     _check_not_swapped(solver, start, views, names, frame)
     best: Solution | None = None
-    for gates in (config.gates_px, config.wide_gates_px):
+    for gates in (config.gates_from(0.0), config.wide_gates_px):
         trial = solver.solve(start, views, gates, use)
         if best is None:
             best = trial
         elif (take := score_px(trial).sum(1) > score_px(best).sum(1)).any():
             poses = np.where(take[:, None, None], trial.poses, best.poses)
-            best = solver.solve(poses, views, config.gates_px[-2:], use)
+            best = solver.solve(poses, views, config.wide_gates_px[-2:], use)
     bare_px, mask_px = uncovered_px(solver.scans, best, views)
     coverage = np.where(mask_px > 0, bare_px / np.maximum(mask_px, 1), np.nan)
     for r in _ROWS:

@@ -50,6 +50,7 @@ class FrameTracker:
         starts: Sequence[NDArray[np.float64]],
         views: Sequence[View],
         gallery: Sequence[NDArray[np.float64]] | None,
+        reach_px: float = 0.0,
     ) -> FrameRecord:
         """Align one instant.
 
@@ -57,12 +58,14 @@ class FrameTracker:
             starts: predictions, the likeliest first: T_world_upper, T_world_lower, each shape (2, 4, 4).
             views: one per camera.
             gallery: further starts for the last resort, each shape (2, 4, 4); None forgoes the last resort.
+            reach_px: how far off the first start may be.
         """
+        gates = self._config.gates_from(reach_px)
         use = np.array([[v.present[r] for v in views] for r in _ROWS])
-        trial = self._try(starts[0], views, self._config.gates_px, use)
+        trial = self._try(starts[0], views, gates, use)
         kept = use & ~self._spoiled(trial)
         if (kept != use).any():
-            trial = self._try(starts[0], views, self._config.gates_px, kept)
+            trial = self._try(starts[0], views, gates, kept)
         first = trial
         for rows, attempt in (
             (self._suspect, self._others),
@@ -135,7 +138,9 @@ class FrameTracker:
     def _others(self, trial, suspect, starts, views, gallery) -> _Trial:
         """Try the other predictions."""
         for start in starts[1:]:
-            trial = self._better(trial, self._try(start, views, self._config.gates_px, trial.use), suspect, views)
+            trial = self._better(
+                trial, self._try(start, views, self._config.gates_from(0.0), trial.use), suspect, views
+            )
         return trial
 
     def _leave_out(self, trial, suspect, starts, views, gallery) -> _Trial:
@@ -147,7 +152,7 @@ class FrameTracker:
                 rest[r, k] = False
                 if rest[r].sum() < 2:
                     continue
-                without = self._try(starts[0], views, c.gates_px, rest)
+                without = self._try(starts[0], views, c.gates_from(0.0), rest)
                 gain = (without.worth(c.bare_price) - trial.worth(c.bare_price))[r, rest[r]].sum()
                 if gain > c.conflict_gain * score_px(without.solution)[r, rest[r]].sum():
                     trial = without
@@ -186,7 +191,7 @@ class FrameTracker:
         if take.all():
             return other
         poses = np.where(take[:, None, None], other.solution.poses, trial.solution.poses)
-        return self._try(poses, views, self._config.gates_px[-2:], trial.use)
+        return self._try(poses, views, self._config.wide_gates_px[-2:], trial.use)
 
 
 def _around(

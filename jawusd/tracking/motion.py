@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.geometry import orthonormalise, se3_inverse
+from jawusd.geometry import orthonormalise, se3_inverse, transform_points
 
 _GALLERY = 16  # earlier poses kept: enough to cover the exercises of a jaw at 2 mm
 _APART_MM = 2.0  # poses nearer than this have the same basin
+_RECENT = 8  # frames over which prediction errors are remembered: a third of a chewing stroke at 24 fps
 
 
 class Motion:
     """Extrapolate with constant velocity; keep a gallery of earlier poses for getting back after a loss."""
 
-    def __init__(self, poses: NDArray[np.float64]) -> None:
-        """Start at rest at T_world_upper, T_world_lower, shape (2, 4, 4)."""
+    def __init__(self, poses: NDArray[np.float64], points: NDArray[np.float64]) -> None:
+        """Start at rest.
+
+        Args:
+            poses: T_world_upper, T_world_lower, shape (2, 4, 4).
+            points: some points of both rows, at which prediction errors are measured, shape (2, N, 3).
+        """
+        self._points = points
+        self._misses: deque[float] = deque(maxlen=2 * _RECENT)  # two rows
         self._last = np.array(poses)
         self._step: list[NDArray[np.float64] | None] = [None, None]
         self._lost_for = np.zeros(2, int)
@@ -44,6 +54,9 @@ class Motion:
         expected = self.predict()
         for r in (0, 1):
             if found[r]:
+                if not self._lost_for[r]:
+                    gap = transform_points(expected[r], self._points[r]) - transform_points(poses[r], self._points[r])
+                    self._misses.append(float(np.linalg.norm(gap, axis=1).max()))
                 # After a loss the last pose is a guess, and a velocity from it would be another.
                 self._step[r] = None if self._lost_for[r] else poses[r] @ se3_inverse(self._last[r])
             else:
@@ -53,6 +66,10 @@ class Motion:
             expected[1] = expected[0] @ se3_inverse(self._last[0]) @ self._last[1]
         self._last = np.where(found[:, None, None], poses, expected)
         self.remember(poses, found)
+
+    def miss_mm(self) -> float:
+        """Return the largest recent error of a prediction at the given points [mm]."""
+        return max(self._misses, default=0.0)
 
     def remember(self, poses: NDArray[np.float64], found: NDArray[np.bool_]) -> None:
         """Keep poses of both rows, shape (2, 4, 4), as later starts if they are unlike those kept."""

@@ -124,6 +124,8 @@ class _Take:
         self._solver, self._config, self._masks = solver, config, masks
         self._first, self._stop = first, stop
         self._progress = progress or (lambda done, total: None)
+        # A dozen points a row show any motion of it.
+        self._probes = np.stack([s.crown_vertices(12)[:12] for s in solver.scans])
         self.records: dict[int, FrameRecord] = {}
 
     def begin(self, frame: int, poses: NDArray[np.float64]) -> None:
@@ -184,13 +186,15 @@ class _Take:
         known = sorted(self.records, key=lambda f: -abs(f - frame))
         for near in known[-self._config.history_frames :]:
             history.add(self.records[near])
-        motion = Motion(self.records[frame].solution.poses)
+        motion = Motion(self.records[frame].solution.poses, self._probes)
         for near in known[::10]:
             motion.remember(self.records[near].solution.poses, self.records[near].status != LOST)
         return FrameTracker(self._solver, self._config, history), motion
 
     def _one(self, tracker: FrameTracker, motion: Motion, views: Sequence[View]) -> FrameRecord:
-        record = tracker.track(motion.starts(), views, motion.gallery() if motion.worth_searching() else None)
+        reach = self._config.gate_per_miss * motion.miss_mm() * self._config.working_px_per_mm
+        gallery = motion.gallery() if motion.worth_searching() else None
+        record = tracker.track(motion.starts(), views, gallery, reach)
         motion.update(record.solution.poses, record.status != LOST)
         tracker.history.add(record)
         return record

@@ -15,6 +15,7 @@ from jawusd.tracking.scan import prepare_scan
 from jawusd.tracking.solver import ContourSolver, View
 
 CONFIG = TrackingConfig()
+USUAL = CONFIG.gates_from(0.0)
 MESHES = (arch(True), arch(False))
 SCANS = tuple(prepare_scan(m, n) for m, n in zip(MESHES, ("upper", "lower")))
 CAMERAS = make_cameras()
@@ -131,7 +132,7 @@ def test_normal_equations_agree_with_finite_differences():
 @pytest.mark.parametrize("k", [0, 4])
 def test_solver_finds_exact_masks_to_a_hundredth_of_a_millimetre(k):
     start = disturbed(POSES[k], 0.5, 0.01, np.random.default_rng(k))
-    solution = ContourSolver(SCANS, CONFIG).solve(start, _views(k), CONFIG.gates_px)
+    solution = ContourSolver(SCANS, CONFIG).solve(start, _views(k), USUAL)
     for r in (0, 1):
         assert vertex_error_mm(MESHES[r], solution.poses[r], POSES[k, r]) < 0.015
         assert rigidity_defect(solution.poses[r]) < 1e-12
@@ -141,7 +142,7 @@ def test_solver_holds_with_noise_and_lips():
     rng = np.random.default_rng(2)
     views = _views(1, lips_mm=(6.5, -14.0), noise_px=0.4, rng=rng)
     start = disturbed(POSES[1], 0.7, 0.012, rng)
-    solution = ContourSolver(SCANS, CONFIG).solve(start, views, CONFIG.gates_px)
+    solution = ContourSolver(SCANS, CONFIG).solve(start, views, USUAL)
     for r in (0, 1):
         assert vertex_error_mm(MESHES[r], solution.poses[r], POSES[1, r]) < 0.08
 
@@ -153,7 +154,7 @@ def test_wide_gates_reach_farther_than_narrow_ones():
     found = np.zeros(2)
     for _ in range(4):
         start = disturbed(POSES[2], 2.5, 0.05, rng)
-        for g, gates in enumerate((CONFIG.gates_px, CONFIG.wide_gates_px)):
+        for g, gates in enumerate((USUAL, CONFIG.wide_gates_px)):
             poses = solver.solve(start, views, gates).poses
             found[g] += all(vertex_error_mm(MESHES[r], poses[r], POSES[2, r]) < 0.1 for r in (0, 1))
     assert found[1] == 4 and found[1] >= found[0]
@@ -163,9 +164,9 @@ def test_threads_do_not_change_the_result():
     rng = np.random.default_rng(4)
     views = _views(5, noise_px=0.3, rng=rng)
     start = disturbed(POSES[5], 0.5, 0.01, rng)
-    alone = ContourSolver(SCANS, CONFIG).solve(start, views, CONFIG.gates_px)
+    alone = ContourSolver(SCANS, CONFIG).solve(start, views, USUAL)
     with ThreadPoolExecutor(3) as pool:
-        together = ContourSolver(SCANS, CONFIG, pool).solve(start, views, CONFIG.gates_px)
+        together = ContourSolver(SCANS, CONFIG, pool).solve(start, views, USUAL)
     assert (alone.poses == together.poses).all() and (alone.systems == together.systems).all()
 
 
@@ -174,7 +175,7 @@ def test_masks_left_out_do_not_count():
     broken = [*views[:2], View(views[2].matrix, views[2].eye, np.roll(views[2].masks, 9, axis=2), views[2].present)]
     use = np.array([[True, True, False]] * 2)
     solver = ContourSolver(SCANS, CONFIG)
-    a, b = (solver.solve(POSES[6], v, CONFIG.gates_px, use) for v in (views, broken))
+    a, b = (solver.solve(POSES[6], v, USUAL, use) for v in (views, broken))
     assert (a.poses[0] == b.poses[0]).all()
     assert not b.systems[:, 2].any() and b.systems[:, :2].any()
 
@@ -185,6 +186,6 @@ def test_a_row_without_masks_stays_where_it_was():
         for v in _views(3)
     ]
     start = disturbed(POSES[3], 0.4, 0.01, np.random.default_rng(0))
-    solution = ContourSolver(SCANS, CONFIG).solve(start, views, CONFIG.gates_px)
+    solution = ContourSolver(SCANS, CONFIG).solve(start, views, USUAL)
     assert vertex_error_mm(MESHES[1], solution.poses[1], start[1]) < 1e-6
     assert vertex_error_mm(MESHES[0], solution.poses[0], POSES[3, 0]) < 0.02
