@@ -124,7 +124,9 @@ def _out_of_range(data: TrainingData) -> list[AnatomyWarning]:
         ("condylar translation", float(np.percentile(travel, _QUANTILE)), _CONDYLE_MAX_MM, "mm"),
     ]
     return [
-        AnatomyWarning(f"{name.replace(' ', '_')}_range", f"{name.capitalize()} is {value:.1f} {unit} (human: up to {limit:g}).")
+        AnatomyWarning(
+            f"{name.replace(' ', '_')}_range", f"{name.capitalize()} is {value:.1f} {unit} (human: up to {limit:g})."
+        )
         for name, value, limit, unit in found
         if value > limit
     ]
