@@ -67,10 +67,11 @@ class JawLayer(nn.Module):
         found, _ = self.rig.encode(T.detach().cpu().double().numpy())
         at = torch.tensor(found, dtype=T.dtype, device=T.device)
         target = (T @ self.vectors)[:, :3].reshape(-1, 12)
-        image, J, H = self._expansion(at, target.detach())
-        # a Newton step from the minimum: nowhere to go, but its derivative by the target is the minimum's own
-        slope = torch.einsum("nmi,nm->ni", J, image - target)
-        d = at - torch.linalg.solve(H, slope - slope.detach())
+        d = at
+        if T.requires_grad and torch.is_grad_enabled():
+            # a Newton step from the minimum: nowhere to go, but its derivative by the target is the minimum's own
+            slope, H = self._slope_and_curvature(at, target)
+            d = at - torch.linalg.solve(H, slope - slope.detach())
         squared = (self._images(d) - target).square().sum(dim=1)
         batch = T_skull_mandible.shape[:-2]
         return d.reshape(*batch, 3), squared.reshape(batch)
@@ -94,18 +95,21 @@ class JawLayer(nn.Module):
         """Return where the four vectors that stand for the landmarks go (n, 12), see `evaluator.encoding`."""
         return (self._poses(d) @ self.vectors)[:, :3].reshape(-1, 12)
 
-    def _expansion(self, d: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return images (n, 12), their Jacobian (n, 12, 3) and the Hessian (n, 3, 3) of half the squared distance."""
+    def _slope_and_curvature(self, d: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+        """Return gradient (n, 3) and Hessian (n, 3, 3) by d of half the squared distance of images and target (n, 12).
 
-        def cost(d: Tensor, target: Tensor) -> Tensor:
-            return 0.5 * (self._images(d[None])[0] - target).square().sum()
-
-        with torch.no_grad():
-            J = torch.func.vmap(torch.func.jacrev(lambda d: self._images(d[None])[0]))(d)
-            H = torch.func.vmap(torch.func.jacrev(torch.func.jacrev(cost)))(d, target)
-            floor = _LEAST_CURVATURE * H.diagonal(dim1=1, dim2=2).abs().mean(dim=1)
-            H = H + floor[:, None, None] * torch.eye(3, dtype=d.dtype, device=d.device)
-            return self._images(d), J, H
+        The gradient is differentiable by the target; the Hessian is a constant.
+        """
+        with torch.enable_grad():
+            x = d.detach().requires_grad_()
+            image = self._images(x)
+            (slope,) = torch.autograd.grad(image, x, image.detach() - target, create_graph=True)
+            half = 0.5 * (image - target.detach()).square().sum()
+            (gradient,) = torch.autograd.grad(half, x, create_graph=True)
+            columns = [torch.autograd.grad(gradient[:, i].sum(), x, retain_graph=True)[0] for i in range(3)]
+        H = torch.stack(columns, dim=2)
+        floor = _LEAST_CURVATURE * H.diagonal(dim1=1, dim2=2).abs().mean(dim=1)
+        return slope, H + floor[:, None, None] * torch.eye(3, dtype=d.dtype, device=d.device)
 
 
 class _Bound(nn.Module):
