@@ -63,7 +63,8 @@ class Motion:
                 self._step[r] = None
         self._lost_for = np.where(found, 0, self._lost_for + 1)
         if not found[1]:
-            expected[1] = expected[0] @ se3_inverse(self._last[0]) @ self._last[1]
+            head = poses[0] if found[0] else expected[0]
+            expected[1] = head @ se3_inverse(self._last[0]) @ self._last[1]
         self._last = np.where(found[:, None, None], poses, expected)
         self.remember(poses, found)
 

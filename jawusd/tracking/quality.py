@@ -107,7 +107,7 @@ def crown_sigma_mm(scan: Scan, solution: Solution, row: int, config: TrackingCon
     covariance = twist_covariance(solution, row, sigma, config.correlation_px)
     if not np.isfinite(covariance).all():
         return np.inf
-    points = transform_points(solution.poses[row], scan.crown_vertices(300))
+    points = transform_points(solution.poses[row], scan.probes)
     return float(np.sqrt(np.trace(mandible_metric(points) @ covariance)))
 
 

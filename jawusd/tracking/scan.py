@@ -11,11 +11,10 @@ from scipy.sparse.csgraph import connected_components
 
 from jawusd.errors import TrackingError
 from jawusd.formats.mesh import Mesh
+from jawusd.imaging.meshio import tooth_labels
 from jawusd.tracking.margin import crown_gum_segments
 
-# How far red or green must stand out from the other channels (of 255) for a vertex to count as painted crown:
-# label colours stand out by more than 100, the pinks and ivories of photographic scan textures by less.
-_PAINT_CONTRAST = 60
+_PROBES = 300  # enough for a mean over the crowns to one per cent
 _FEWEST_CROWN_FACES = 100  # fewer cannot show a contour in several directions
 
 
@@ -32,6 +31,7 @@ class Scan:
         planes: normal and offset (n, n.p) of every crown face, shape (F, 4); only signs of n.x - offset are used.
         edges: vertex, vertex, face, other face or -1 at a border, int32, shape (E, 4).
         margin: segments of the crown-gum line that are no mesh edges [mm], shape (S, 2, 3).
+        probes: some vertices spread over the crowns, at which motion is measured [mm], shape (N <= 300, 3).
         centre: centroid of the crown vertices [mm], shape (3,).
         radius_mm: largest distance of a crown vertex from the centre.
         painted: whether the scan's colours told crown from gum; otherwise the whole scan counts as crown.
@@ -46,14 +46,10 @@ class Scan:
     planes: NDArray[np.float64]
     edges: NDArray[np.int32]
     margin: NDArray[np.float64]
+    probes: NDArray[np.float64]
     centre: NDArray[np.float64]
     radius_mm: float
     painted: bool
-
-    def crown_vertices(self, limit: int | None = None) -> NDArray[np.float64]:
-        """Return the vertices of the crowns [mm], shape (N, 3), at most about `limit` of them."""
-        points = self.vertices[np.unique(self.crown_faces)]
-        return points if limit is None else points[:: max(1, len(points) // limit)]
 
 
 def prepare_scan(mesh: Mesh, name: str) -> Scan:
@@ -68,13 +64,9 @@ def prepare_scan(mesh: Mesh, name: str) -> Scan:
         TrackingError: the scan has too few faces to be tracked.
     """
     vertices, faces = _weld(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int32))
-    crown = np.ones(len(faces), bool)
-    painted = False
-    if mesh.colors is not None:
-        paint = _painted(np.asarray(mesh.colors))[np.asarray(mesh.faces)].sum(1) >= 2
-        # A handful of reddish vertices is no labelling.
-        painted = paint.sum() >= _FEWEST_CROWN_FACES
-        crown = paint if painted else crown
+    tooth = tooth_labels(mesh) > 0
+    painted = not tooth.all()
+    crown = tooth[np.asarray(mesh.faces)].sum(1) >= 2
     solid = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
     crown_faces = np.ascontiguousarray(faces[crown & solid])
     if painted:
@@ -87,7 +79,8 @@ def prepare_scan(mesh: Mesh, name: str) -> Scan:
         )
     corner = vertices[crown_faces]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    centre = vertices[np.unique(crown_faces)].mean(0)
+    crowns = vertices[np.unique(crown_faces)]
+    centre = crowns.mean(0)
     return Scan(
         name=name,
         vertices=vertices,
@@ -97,17 +90,11 @@ def prepare_scan(mesh: Mesh, name: str) -> Scan:
         planes=np.column_stack([normal, np.einsum("ij,ij->i", normal, corner[:, 0])]),
         edges=_edge_table(crown_faces),
         margin=crown_gum_segments(vertices, crown_faces, gum_faces),
+        probes=crowns[np.linspace(0, len(crowns) - 1, min(len(crowns), _PROBES)).astype(int)],
         centre=centre,
         radius_mm=float(np.linalg.norm(corner.reshape(-1, 3) - centre, axis=1).max()),
-        painted=bool(painted),
+        painted=painted,
     )
-
-
-def _painted(colors: NDArray) -> NDArray[np.bool_]:
-    rgb = colors[:, :3].astype(np.int16)
-    red = rgb[:, 0] - np.maximum(rgb[:, 1], rgb[:, 2])
-    green = rgb[:, 1] - np.maximum(rgb[:, 0], rgb[:, 2])
-    return np.maximum(red, green) > _PAINT_CONTRAST
 
 
 def _weld(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> tuple[NDArray, NDArray[np.int32]]:

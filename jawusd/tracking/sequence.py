@@ -124,8 +124,8 @@ class _Take:
         self._solver, self._config, self._masks = solver, config, masks
         self._first, self._stop = first, stop
         self._progress = progress or (lambda done, total: None)
-        # A dozen points a row show any motion of it.
-        self._probes = np.stack([s.crown_vertices(12)[:12] for s in solver.scans])
+        # A dozen points of a row show any motion of it.
+        self._probes = np.stack([s.probes[np.linspace(0, len(s.probes) - 1, 12).astype(int)] for s in solver.scans])
         self.records: dict[int, FrameRecord] = {}
 
     def begin(self, frame: int, poses: NDArray[np.float64]) -> None:
