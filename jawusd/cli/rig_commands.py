@@ -240,6 +240,7 @@ def animate(
     source: Annotated[Path, typer.Argument(help="keys.json, or a CSV of d or of poses.", show_default=False)],
     out: Annotated[Path, typer.Option("-o", "--out", help="Animation layer.")] = Path("anim.usdc"),
     fps: Annotated[float | None, typer.Option(min=0.001, help="Frames per second of a CSV; the rig's else.")] = None,
+    splines: Annotated[Path | None, typer.Option(help="Also write the keys as USD splines, to this layer.")] = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -248,9 +249,10 @@ def animate(
 
     import jawusd
     from jawusd.cli.motion import read_motion
-    from jawusd.rig import describe, write_animation
+    from jawusd.rig import describe, write_animation, write_splines
 
-    refuse_existing(out, force)
+    for path in filter(None, (out, splines)):
+        refuse_existing(path, force)
     loaded = jawusd.load(rig)
     frames, d, source_fps = read_motion(loaded, source)
     inside = loaded.margin(d) >= float(loaded.arrays["margin_limit_mm"])
@@ -258,6 +260,8 @@ def animate(
     moved_mm = np.linalg.norm(kept - d, axis=1)
     rate = fps or source_fps or describe(rig)["fps"]
     write_animation(out, rig, frames, kept, rate)
+    if splines is not None:
+        write_splines(splines, out, frames, kept, rate)
     result = {
         "file": str(out),
         "frames": [float(frames[0]), float(frames[-1])],

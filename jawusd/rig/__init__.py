@@ -7,6 +7,7 @@ from jawusd.rig.animation import write_animation
 from jawusd.rig.nvidia import find_nvidia_validator, nvidia_findings
 from jawusd.rig.read import describe, load_rig
 from jawusd.rig.schema import register_schema, schema_is_live
+from jawusd.rig.splines import write_splines
 from jawusd.rig.validate import Finding, register_validators, validate_stage
 
 # As early as possible: OpenUSD ignores schemas that come after a process has used its first stage.
@@ -23,4 +24,5 @@ __all__ = [
     "schema_is_live",
     "validate_stage",
     "write_animation",
+    "write_splines",
 ]

@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import os
 
-from pxr import Usd, UsdValidation
+from pxr import Usd
 
 from jawusd.rig.read import open_stage
 from jawusd.rig.rules import RULES, Finding, Rule
 from jawusd.rig.schema import has_jaw_api
 
+try:
+    from pxr import UsdValidation
+except ImportError:  # OpenUSD before 25.02 has no such module
+    UsdValidation = None
+
 KEYWORD = "JawUsd"
 _PREFIX = "jawusd:"
 
 # UsdValidation takes validators written in Python from OpenUSD 26.05 on.
-_PLUGGABLE = hasattr(UsdValidation, "ValidatorMetadata")
+_PLUGGABLE = UsdValidation is not None and hasattr(UsdValidation.ValidationRegistry, "RegisterStageValidator")
+_NO_STOCK = "OpenUSD's own validators were not run: usd-core is older than 26.5."
 
 
 def register_validators() -> bool:
@@ -44,7 +50,7 @@ def validate_stage(path: str | os.PathLike[str]) -> list[Finding]:
     """
     stage = open_stage(path)
     if not register_validators():
-        return _apply_rules(stage)
+        return [*_apply_rules(stage), Finding("info", "Stock", "/", _NO_STOCK)]
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
     return [_finding(error) for error in UsdValidation.ValidationContext(validators).Validate(stage)]
 

@@ -106,6 +106,20 @@ def test_animate_interpolates_keys_linearly_as_in_the_paper(actor, tmp_path):
     np.testing.assert_allclose(moved(T[None], mandible_vertices()), expected, atol=0.01)
 
 
+def test_animate_writes_keys_as_splines_when_asked(actor, tmp_path):
+    keys = {"fps": 30, "keys": [{"frame": 0, "d": [0, 0, 0]}, {"frame": 10, "d": [20, 2, 1]}]}
+    (tmp_path / "keys.json").write_text(json.dumps(keys))
+    out, splines = (actor.parent / f"anim_spline_test{name}.usdc" for name in ("", "_keys"))
+    run("animate", actor, tmp_path / "keys.json", "-o", out, "--splines", splines)
+    assert validate_stage(splines) == []
+    stage = Usd.Stage.Open(str(splines))
+    attribute = stage.GetPrimAtPath("/Actor").GetAttribute("jaw:d1")
+    assert attribute.HasSpline() and attribute.Get(4) == pytest.approx(8)
+    other = actor.parent / "anim_spline_other.usdc"
+    refused = run("animate", actor, tmp_path / "keys.json", "-o", other, "--splines", splines, code=10)
+    assert splines.name in refused and not other.exists()
+
+
 def test_animate_reports_what_it_clamps(actor, tmp_path):
     frames, d = example_motion(5)
     d[2, 1] = 30

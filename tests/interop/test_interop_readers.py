@@ -2,6 +2,7 @@
 
 import shutil
 import subprocess
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from example_rig import FPS, example_meshes, example_motion, example_rig
 from foreign import SCRIPTS, environment, run, run_in
 from scipy.spatial.transform import Rotation
 
+import jawusd
 from jawusd.geometry import make_transform
 from jawusd.rig.bake import bake_rig
 from jawusd.rig.nvidia import nvidia_findings
@@ -46,6 +48,15 @@ def test_older_openusd_shows_the_same_poses(folder, name):
         assert landmark_distance(np.array(found["poses"]), poses) < 1e-6
         np.testing.assert_allclose(found["d"], example_motion()[1][list(SHOWN)], atol=1e-12)
         assert found["table"] == 33**3 * 6 and "JawRigAPI" in found["schemas"]
+
+
+@pytest.mark.parametrize("name", ["usd2411", "usd255"])
+def test_jawusd_itself_runs_on_older_openusd(folder, tmp_path, name, monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", str(Path(jawusd.__file__).parents[1]))
+    found = run_in(name, "jawusd_read.py", shutil.copytree(folder, tmp_path / "actor"))
+    np.testing.assert_allclose(found["poses"], example_rig().pose([[10.0, 1.0, 0.5], [0.0, 0.0, 0.0]]), atol=1e-12)
+    assert found["kind"] == "anchored"
+    assert found["findings"] == [["info", "Onnx"], ["info", "Stock"]]
 
 
 def test_tinyusdz_reads_rig_and_motion(folder):
