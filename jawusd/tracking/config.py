@@ -14,13 +14,15 @@ class TrackingConfig:
     # Distance of contour samples [px]: mask noise is correlated over more than this, denser sampling gains nothing.
     sample_step_px: float = 3.0
     # Residual gates per iteration [px]. Narrow at the end: wider ones reach lip and gum edges half a millimetre away.
-    wide_gates_px: tuple[float, ...] = (14.0, 10.0, 8.0, 6.0, 4.0, 3.0, 2.5, 2.5, 2.5, 2.5)
+    wide_gates_px: tuple[float, ...] = (14.0, 10.0, 8.0, 6.0, 4.0, 4.0, 4.0, 4.0, 4.0, 4.0)
     # Gate to start from when motion is easy to predict [px]; the others are for lively motion and the fallback.
     first_gate_px: float = 6.0
     # First gate over the recent prediction error [-]: the next one may be larger.
     gate_per_miss: float = 1.5
-    # Bounds of the last gates [px], which follow the spread of the residuals in between.
-    final_gate_px: tuple[float, float] = (1.2, 2.5)
+    # Bounds of the last gates [px], which follow the spread of the residuals in between: 2 px for good masks by hand.
+    final_gate_px: tuple[float, float] = (1.2, 4.0)
+    # Residual at which a sample adds nothing to the score [px]: the same for all poses, so that scores compare.
+    score_gate_px: float = 2.5
     # Tukey gate in standard deviations: 95 % efficiency for normal noise (Huber & Ronchetti 2009).
     gate_sigmas: float = 4.685
     # Weight of samples deep inside the mask while gates are wide [-]: pulls a model that lies too far inside outwards.
@@ -36,7 +38,7 @@ class TrackingConfig:
     # Update below which iterations stop [mm at the crowns]: a tenth of the accuracy that can be reached.
     converged_mm: float = 0.004
     # Motion after which a scan is drawn again for hidden parts [px]: hidden parts are judged to one pixel.
-    redraw_px: float = 0.7
+    redraw_px: float = 1.0
     # Distance a row may plausibly lie from its prediction [mm]: a weak pull that only matters where masks say nothing.
     prediction_mm: float = 0.5
     # Outline variance times correlation length behind that pull [px^3]: 0.4 px over 18 px, typical masks by hand.

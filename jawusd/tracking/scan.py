@@ -51,6 +51,11 @@ class Scan:
     radius_mm: float
     painted: bool
 
+    def crown_vertices(self, limit: int | None = None) -> NDArray[np.float64]:
+        """Return the vertices of the crowns [mm], shape (N, 3), at most about `limit` of them."""
+        points = self.vertices[np.unique(self.crown_faces)]
+        return points if limit is None else points[:: max(1, len(points) // limit)]
+
 
 def prepare_scan(mesh: Mesh, name: str) -> Scan:
     """Split a teeth scan into crowns and gum and build the tables of the contour search.

@@ -122,7 +122,7 @@ class ContourSolver:
             for c in np.flatnonzero(use[r]):
                 samples, distances, visible[r, c] = matches[r, c]
                 where = (views[c].lead[r] @ poses[r], views[c].matrix, centres[r])
-                accumulate(samples, distances, used, config.final_gate_px[1], pull, *where, systems[r, c])
+                accumulate(samples, distances, used, config.score_gate_px, pull, *where, systems[r, c])
                 if final:
                     shape = views[c].masks.shape[1:]
                     scatters[r] += scatter_of_tiles(samples, distances, used, *where, shape, config.tile_px)
