@@ -8,6 +8,8 @@ deviation of 0.1, weights started in U(-0.1, 0.1), and components reordered whil
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -90,15 +92,27 @@ def train_nlpca(
 
     rng = np.random.default_rng(seed)
     flat = rng.uniform(-_START, _START, sum(int(np.prod(shape)) for shape in shapes))
-    for iterations in _STAGES[:stages]:
-        options = {"maxiter": iterations, "maxcor": _MEMORY, "maxfun": 10 * iterations}
-        options |= {"gtol": _GRADIENT_TOLERANCE, "ftol": _COST_TOLERANCE}
-        found = minimize(cost, flat, jac=True, method="L-BFGS-B", options=options)
-        flat = _ordered(found.x, shapes, scaled.numpy())
-        if found.nit < iterations and np.array_equal(flat, found.x):
-            break
-    value, _ = cost(flat)
+    with _one_thread():
+        for iterations in _STAGES[:stages]:
+            options = {"maxiter": iterations, "maxcor": _MEMORY, "maxfun": 10 * iterations}
+            options |= {"gtol": _GRADIENT_TOLERANCE, "ftol": _COST_TOLERANCE}
+            found = minimize(cost, flat, jac=True, method="L-BFGS-B", options=options)
+            flat = _ordered(found.x, shapes, scaled.numpy())
+            if found.nit < iterations and np.array_equal(flat, found.x):
+                break
+        value, _ = cost(flat)
     return Nlpca(tuple(part.copy() for part in _split(flat, shapes)), scale, mean, value)
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """Keep torch on one thread: networks of a dozen units only wait for each other, and sums keep their order."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _shapes(width: int, components: int) -> list[tuple[int, ...]]:
