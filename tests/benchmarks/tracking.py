@@ -1,106 +1,206 @@
-"""Time the tracker: python tests/benchmarks/tracking.py [CAPTURE.toml]
+"""Compare the paper's solver with the default one: python tests/benchmarks/tracking.py CAPTURE [--windows 3 --length 4]
 
-Without a capture: a made-up mouth of 8000 crown triangles in three views of 640 x 400. With one that has synchronised
-cameras (`sync.offsets`) or a truth folder with offsets: its first 60 frames. One table to stdout, milliseconds of
-processor time per frame: reading masks, one alignment of both rows, and a whole frame with everything; then wall time
-with one and two threads.
+Tracks a few short windows spread over a capture that comes with its truth (truth/truth.npz). Both solvers start every
+window from the same picks, taken from the truth of its first frame; that frame is not scored. Each row of the table
+runs in a process of its own, one after the other:
+
+    solve   wall time of the solver, median per frame, both rows of teeth, all views [ms]
+    core    processor time of the solver, where it runs in one thread [ms]
+    all     wall time with reading, undistorting and judging [ms]
+    CPU     processor time of all that, all threads, mean per frame [ms]
+    error   distance of tooth vertices from the truth, mean over vertices: mean, 95th percentile, largest over frames
+
+"exact" counts boundary pixels as eq. 9 does; "spared" leaves those in the other row's mask uncounted, which helps the
+paper's energy where one row hides the other.
 """
 
 from __future__ import annotations
 
+import argparse
+import json
 import os
+import platform
+import subprocess
+import sys
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
 
-for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ[variable] = "1"
-
-import sys  # noqa: E402
-import tempfile  # noqa: E402
-import time  # noqa: E402
-from dataclasses import dataclass  # noqa: E402
-from pathlib import Path  # noqa: E402
-
-import numpy as np  # noqa: E402
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
-import small_take  # noqa: E402
-
-from jawusd.formats.calibration import load_calibration  # noqa: E402
-from jawusd.formats.capture import Capture, load_capture  # noqa: E402
-from jawusd.formats.mesh import Mesh  # noqa: E402
-from jawusd.geometry import Camera, transform_points  # noqa: E402
-from jawusd.imaging.meshio import load_mesh  # noqa: E402
-from jawusd.tracking import TrackingConfig, track_capture  # noqa: E402
-from jawusd.tracking.scan import prepare_scan  # noqa: E402
-from jawusd.tracking.solver import ContourSolver  # noqa: E402
-from jawusd.tracking.views import MaskViews  # noqa: E402
-
-FRAMES = 60
+ROWS = ("upper", "lower")
 
 
-@dataclass
-class Take:
-    """Hold what the tracker is given."""
+@dataclass(frozen=True)
+class Setup:
+    """Name one row of the table."""
 
-    capture: Capture
-    cameras: list[Camera]
-    offsets: dict[str, int]
-    upper: Mesh
-    lower: Mesh
+    solver: str
+    backend: str
+    threads: int
+    other_row_hides: bool = False
+
+    def label(self) -> str:
+        """Return the row's name."""
+        how = {"paper": "paper, spared" if self.other_row_hides else "paper, exact"}.get(self.solver, "default")
+        return f"{how:<15}{self.backend:<5}{self.threads}"
 
 
-def given(path: str) -> Take:
-    """Return a capture's first frames; offsets from the capture or from a truth file next to it."""
+SETUPS = (
+    Setup("contour", "cpu", 1),
+    Setup("contour", "cpu", 2),
+    Setup("paper", "cpu", 1),
+    Setup("paper", "cpu", 2),
+    Setup("paper", "cpu", 2, other_row_hides=True),
+    Setup("paper", "gl", 1),
+    Setup("paper", "gl", 2),
+)
+
+
+class Watch:
+    """Take wall time, time within the solver, and processor time at every finished frame."""
+
+    def __init__(self, module: object, name: str) -> None:
+        """Time the function or method of that name from now on."""
+        self._solve_s = self._core_s = 0.0
+        self._marks: list[tuple[float, ...]] = []
+        original = getattr(module, name)
+
+        def timed(*arguments: object, **options: object) -> object:
+            start, core = time.perf_counter(), time.thread_time()
+            try:
+                return original(*arguments, **options)
+            finally:
+                self._solve_s += time.perf_counter() - start
+                self._core_s += time.thread_time() - core
+
+        setattr(module, name, timed)
+
+    def mark(self, done: int, total: int) -> None:
+        """Note that a frame is finished."""
+        self._marks.append((time.perf_counter(), self._solve_s, self._core_s, time.process_time()))
+
+    def frames_ms(self) -> list[list[float]]:
+        """Return all, solve, core, CPU [ms] of every frame but the first, and forget them."""
+        marks, self._marks = self._marks, []
+        return [[1e3 * (b - a) for a, b in zip(first, then)] for first, then in zip(marks, marks[1:])]
+
+
+def run_setup(path: Path, setup: Setup, windows: int, length: int) -> dict:
+    """Track all windows with one setup; return times and errors per scored frame."""
+    import numpy as np
+
+    from jawusd.formats.capture import load_capture
+    from jawusd.geometry import transform_points
+    from jawusd.imaging.meshio import tooth_labels
+    from jawusd.pipeline.prepare import find_anatomy, load_cameras, load_meshes
+    from jawusd.tracking import paper_sequence, track_capture
+    from jawusd.tracking.paper_solver import PaperConfig
+    from jawusd.tracking.solver import ContourSolver
+
     capture = load_capture(path)
-    offsets = capture.sync.offsets
-    if offsets is None:
-        with np.load(capture.folder / "truth" / "truth.npz", allow_pickle=False) as truth:
-            offsets = {str(n): int(o) for n, o in zip(truth["camera_names"], truth["offsets"])}
-    first = capture.bootstrap.frame
-    capture = capture.model_copy(update={"frames": (first, first + FRAMES)})
-    scans = [load_mesh(p) for p in (capture.scans.upper_teeth, capture.scans.lower_teeth)]
-    return Take(capture, load_calibration(capture.calibration), offsets, *scans)
+    cameras, meshes = load_cameras(capture), load_meshes(capture)
+    with np.load(capture.folder / "truth" / "truth.npz", allow_pickle=False) as archive:
+        truth = {name: archive[name] for name in archive.files}
+    offsets = dict(zip(truth["camera_names"].tolist(), truth["offsets"].tolist(), strict=True))
+    scans = [meshes[f"{row}_teeth"] for row in ROWS]
+    watch = Watch(*((paper_sequence, "solve_paper") if setup.solver == "paper" else (ContourSolver, "solve")))
+    landmarks = find_anatomy(capture, meshes).landmarks
+    config = replace(PaperConfig(), other_row_hides=setup.other_row_hides)
+    times: list[list[float]] = []
+    errors: dict[str, list[float]] = {row: [] for row in ROWS}
+    for start in np.linspace(0, len(truth["frames"]) - length, windows).round().astype(int):
+        window = cut(capture, cameras, scans, truth, int(start), length)
+        if setup.solver == "paper":
+            options = {"backend": setup.backend, "threads": setup.threads, "progress": watch.mark}
+            tracks = paper_sequence.track_capture_paper(window, cameras, offsets, *scans, config, **options)
+        else:
+            options = {"threads": setup.threads, "progress": watch.mark}
+            tracks = track_capture(window, cameras, offsets, *scans, landmarks, **options)
+        times += watch.frames_ms()
+        for row, scan in zip(ROWS, scans, strict=True):
+            crown = scan.vertices[tooth_labels(scan) > 0][::5]
+            found = getattr(tracks, f"raw_T_world_{row}")[1:]
+            exact = truth[f"T_world_{row}"][start + 1 : start + length]
+            gap = np.linalg.norm(transform_points(found, crown) - transform_points(exact, crown), axis=-1)
+            errors[row] += gap.mean(-1).tolist()
+    return {"times_ms": times, "errors_mm": errors}
 
 
-def made_up(folder: Path) -> Take:
-    """Return the take the tests use, longer."""
-    capture = small_take.make_capture(small_take.write_masks(folder / "take", FRAMES), FRAMES)
-    return Take(capture, small_take.CAMERAS, small_take.OFFSETS, *small_take.MESHES)
+def cut(capture: object, cameras: list, scans: list, truth: dict, start: int, length: int) -> object:
+    """Return the capture limited to a window of the truth, with exact picks on its first frame."""
+    import numpy as np
+
+    from jawusd.formats.capture import Bootstrap, Pick, PickView
+    from jawusd.geometry import transform_points
+    from jawusd.imaging.meshio import tooth_labels
+
+    first = int(truth["frames"][start])
+    picks = {}
+    for row, scan in zip(ROWS, scans, strict=True):
+        teeth = np.flatnonzero(tooth_labels(scan) > 0)
+        spread = np.array([[1, 0, 0], [-1, 0, 0], [0, 0, 1], [0.7, 0, 0.7], [-0.7, 0, 0.7]])
+        chosen = {int(teeth[np.argmax(scan.vertices[teeth] @ direction)]) for direction in spread}
+        picks[row] = []
+        for vertex in sorted(chosen):
+            place = transform_points(truth[f"T_world_{row}"][start], scan.vertices[vertex])
+            pixels = [(camera.name, camera.project(place)) for camera in cameras]
+            views = tuple(PickView(camera=name, x=float(x), y=float(y)) for name, (x, y) in pixels)
+            picks[row].append(Pick(vertex=vertex, views=views))
+    bootstrap = Bootstrap(frame=first, upper=tuple(picks["upper"]), lower=tuple(picks["lower"]))
+    return capture.model_copy(update={"frames": (first, first + length), "bootstrap": bootstrap})
 
 
-def report(take: Take) -> None:
-    """Measure and print."""
-    config = TrackingConfig()
-    arguments = (take.capture, take.cameras, take.offsets, take.upper, take.lower, small_take.LANDMARKS)
-    clock = time.process_time()
-    scans = (prepare_scan(take.upper, "upper"), prepare_scan(take.lower, "lower"))
-    print(f"scan preparation          {1e3 * (time.process_time() - clock):8.1f} ms once")
-    rows = {}
-    for threads in (1, 2):
-        track_capture(*arguments, threads=threads)  # compiled and warm
-        wall, clock = time.perf_counter(), time.process_time()
-        tracks = track_capture(*arguments, threads=threads)
-        rows[threads] = (time.perf_counter() - wall, time.process_time() - clock)
-    poses = np.stack([tracks.raw_T_world_upper, tracks.raw_T_world_lower], 1)
-    centre = np.mean([transform_points(poses[0, r], scans[r].centre) for r in (0, 1)], axis=0)
-    table = {c.name: c for c in take.cameras}
-    solver, gates = ContourSolver(scans, config), config.gates_from(0.0)
-    with MaskViews(take.capture.cameras, table, take.offsets, centre, config.working_px_per_mm) as masks:
-        clock = time.process_time()
-        views = [v for _, v in masks.walk(*take.capture.frames)]
-        reading = time.process_time() - clock
-    clock = time.process_time()
-    for k in range(2, len(views)):
-        solver.solve(poses[k - 1] @ np.linalg.inv(poses[k - 2]) @ poses[k - 1], views[k], gates)
-    solving = time.process_time() - clock
-    per = 1e3 / len(views)
-    print(f"reading masks             {reading * per:8.1f} ms/frame")
-    print(f"one alignment, one thread {solving * 1e3 / (len(views) - 2):8.1f} ms/frame")
-    for threads, (wall, clock) in rows.items():
+def in_a_process(options: argparse.Namespace, setup: Setup) -> dict | str:
+    """Run one setup in a fresh interpreter; return its result, or why there is none."""
+    limits = {name: str(setup.threads) for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "LP_NUM_THREADS")}
+    command = [sys.executable, __file__, str(options.capture), "--row", str(SETUPS.index(setup))]
+    command += ["--windows", str(options.windows), "--length", str(options.length)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env={**os.environ, **limits})
+    if done.returncode:
+        return done.stderr.strip().splitlines()[-1]
+    return json.loads(done.stdout)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("capture", type=Path)
+    parser.add_argument("--windows", type=int, default=3)
+    parser.add_argument("--length", type=int, default=4, help="frames per window")
+    parser.add_argument("--row", type=int, help="run one row of the table only and print it as JSON")
+    options = parser.parse_args()
+    if options.row is not None:
+        print(json.dumps(run_setup(options.capture, SETUPS[options.row], options.windows, options.length)))
+        return
+    import numpy as np
+
+    scored = options.windows * (options.length - 1)
+    print(f"{options.capture}: {options.windows} windows of {options.length} frames, {scored} scored")
+    print(f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")
+    print(f"{'':<22}{'ms per frame':^36} |{'upper error [mm]':^24} |{'lower error [mm]':^24}")
+    heads = "".join(f"{name:>8}" for name in ("mean", "p95", "max"))
+    print(f"{'solver         where thr':<24}{'solve':>7}{'core':>9}{'all':>9}{'CPU':>9} |{heads} |{heads}")
+    found = {}
+    for setup in SETUPS:
+        result = in_a_process(options, setup)
+        if isinstance(result, str):
+            print(f"{setup.label()}      {result}", flush=True)
+            continue
+        everything, solve, core, cpu = np.array(result["times_ms"]).T
+        found[setup] = np.median(core), np.mean([np.mean(result["errors_mm"][row]) for row in ROWS])
+        alone = f"{np.median(core):.0f}" if setup.threads == 1 and setup.backend == "cpu" else "-"
+        line = f"{setup.label():<22}{np.median(solve):9.0f}{alone:>9}{np.median(everything):9.0f}{cpu.mean():9.0f}"
+        for row in ROWS:
+            e = np.array(result["errors_mm"][row])
+            line += f" |{e.mean():8.3f}{np.percentile(e, 95):8.3f}{e.max():8.3f}"
+        print(line, flush=True)
+    default, paper = (found.get(Setup(name, "cpu", 1)) for name in ("contour", "paper"))
+    if default and paper:
         print(
-            f"everything, {threads} thread(s)   {clock * per:8.1f} ms/frame of processor, {wall * per:.1f} of wall time"
+            f"default against paper, one thread: {paper[0] / default[0]:.0f} times faster (at least 40 wanted), ",
+            end="",
         )
+        print(f"{paper[1] / default[1]:.1f} times more accurate (at least 3 wanted)")
 
 
 if __name__ == "__main__":
-    with tempfile.TemporaryDirectory() as folder:
-        report(given(sys.argv[1]) if len(sys.argv) > 1 else made_up(Path(folder)))
+    main()
