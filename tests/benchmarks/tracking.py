@@ -196,7 +196,7 @@ def main() -> None:
     default, paper = (found.get(Setup(name, "cpu", 1)) for name in ("contour", "paper"))
     if default and paper:
         print(
-            f"default against paper, one thread: {paper[0] / default[0]:.0f} times faster (at least 40 wanted), ",
+            f"default against paper, one core: {paper[0] / default[0]:.0f} times faster (at least 40 wanted), ",
             end="",
         )
         print(f"{paper[1] / default[1]:.1f} times more accurate (at least 3 wanted)")
