@@ -72,9 +72,8 @@ class TrackingConfig:
     conflict_gain: float = 0.15
     # Gain in worth over the first attempt, as a share of the score, that makes a frame count as recovered [-].
     recovery_gain: float = 0.05
-    # Reach of the multi-start [mm, rad]: the prediction error of a fast chewing stroke.
-    search_mm: float = 2.0
-    search_rad: float = 0.05
+    # Rings of the multi-start [mm, rad]: the prediction error of a fast chewing stroke, and of teeth back in sight.
+    search_rings: tuple[tuple[float, float], ...] = ((2.0, 0.05), (4.0, 0.12))
     # Gates of the first look at a start [px], and how many starts are followed to the end.
     glance_gates_px: tuple[float, ...] = (14.0, 8.0)
     search_finalists: int = 4

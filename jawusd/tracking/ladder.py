@@ -13,6 +13,7 @@ from jawusd.geometry import make_transform, se3_exp, transform_points
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.history import FrameRecord, History
 from jawusd.tracking.quality import crown_sigma_mm, matched_px, residual_px, score_px, uncovered_px, view_residual_px
+from jawusd.tracking.reacquire import shift_to_masks
 from jawusd.tracking.solver import ContourSolver, Solution, View
 
 _ROWS = (0, 1)
@@ -171,9 +172,10 @@ class FrameTracker:
         c = self._config
         for r in np.flatnonzero(suspect):
             only = np.arange(2) == r
-            candidates = [*_around(starts[0][r], self._solver.scans[r].centre, c.search_mm, c.search_rad)]
+            scan = self._solver.scans[r]
+            bases = [self._brought_near(p[r], r, views, trial.use) for p in (starts[0], *gallery)]
             glances = []
-            for pose in [*candidates, *(g[r] for g in gallery)]:
+            for pose in [*_around(bases[0], scan.centre, c.search_rings), *bases[1:]]:
                 poses = np.where(only[:, None, None], pose, trial.solution.poses)
                 glance = self._try(poses, views, c.glance_gates_px, trial.use)
                 glances.append((glance.worth(c.bare_price)[r].sum(), poses))
@@ -181,6 +183,13 @@ class FrameTracker:
             for _, poses in glances[: c.search_finalists]:
                 trial = self._better(trial, self._try(poses, views, c.wide_gates_px, trial.use), only, views)
         return trial
+
+    def _brought_near(self, pose: NDArray[np.float64], r: int, views: Sequence[View], use: NDArray[np.bool_]):
+        """Return the pose moved onto its masks if they lie farther off than the search reaches."""
+        shift = shift_to_masks(self._solver.scans[r], pose, r, views, use)
+        if np.linalg.norm(shift) <= self._config.search_rings[0][0]:
+            return pose
+        return make_transform(np.eye(3), shift) @ pose
 
     def _better(self, trial: _Trial, other: _Trial, rows: NDArray[np.bool_], views: Sequence[View]) -> _Trial:
         """Return the better of two poses of each of the given rows."""
@@ -195,14 +204,15 @@ class FrameTracker:
 
 
 def _around(
-    pose: NDArray[np.float64], centre: NDArray[np.float64], mm: float, rad: float
+    pose: NDArray[np.float64], centre: NDArray[np.float64], rings: Sequence[tuple[float, float]]
 ) -> Iterator[NDArray[np.float64]]:
-    """Yield a pose and the poses moved and turned both ways along each axis about a scan point."""
+    """Yield a pose and, for each (mm, rad), the poses moved and turned both ways along each axis about a scan point."""
     yield pose
     c = transform_points(pose, centre)
     to, back = make_transform(np.eye(3), -c), make_transform(np.eye(3), c)
-    for k in range(6):
-        for sign in (-1.0, 1.0):
-            twist = np.zeros(6)
-            twist[k] = sign * (rad if k < 3 else mm)
-            yield back @ se3_exp(twist) @ to @ pose
+    for mm, rad in rings:
+        for k in range(6):
+            for sign in (-1.0, 1.0):
+                twist = np.zeros(6)
+                twist[k] = sign * (rad if k < 3 else mm)
+                yield back @ se3_exp(twist) @ to @ pose

@@ -29,6 +29,7 @@ class Motion:
         self._last = np.array(poses)
         self._step: list[NDArray[np.float64] | None] = [None, None]
         self._lost_for = np.zeros(2, int)
+        self._failures = np.zeros(2, int)
         self._seen: list[NDArray[np.float64]] = []
 
     def predict(self) -> NDArray[np.float64]:
@@ -49,8 +50,14 @@ class Motion:
         half = orthonormalise(0.5 * (moving + self._last))
         return [moving, self._last.copy(), half]
 
-    def update(self, poses: NDArray[np.float64], found: NDArray[np.bool_]) -> None:
-        """Take in the poses of the next frame, shape (2, 4, 4); rows not found keep their predictions."""
+    def update(self, poses: NDArray[np.float64], found: NDArray[np.bool_], seen: NDArray[np.bool_]) -> None:
+        """Take in the next frame; rows not found keep their predictions.
+
+        Args:
+            poses: T_world_upper, T_world_lower, shape (2, 4, 4).
+            found: rows whose poses can be trusted, shape (2,).
+            seen: rows that have any mask, shape (2,).
+        """
         expected = self.predict()
         for r in (0, 1):
             if found[r]:
@@ -62,6 +69,7 @@ class Motion:
             else:
                 self._step[r] = None
         self._lost_for = np.where(found, 0, self._lost_for + 1)
+        self._failures = np.where(found, 0, self._failures + seen)
         if not found[1]:
             head = poses[0] if found[0] else expected[0]
             expected[1] = head @ se3_inverse(self._last[0]) @ self._last[1]
@@ -82,9 +90,12 @@ class Motion:
         self._seen = [*self._seen[-_GALLERY + 1 :], np.array(poses)]
 
     def worth_searching(self) -> bool:
-        """Tell whether a search from many starts is due: always at first, then ever less often while lost."""
-        longest = int(self._lost_for.max())
-        return longest & (longest - 1) == 0 or longest % 16 == 0
+        """Tell whether a search from many starts is due: always at first, then ever less often while it fails.
+
+        Frames without masks do not count: teeth that come back are looked for at once.
+        """
+        failures = int(self._failures.max())
+        return failures & (failures - 1) == 0 or failures % 16 == 0
 
     def gallery(self) -> list[NDArray[np.float64]]:
         """Return earlier poses as starts for the next frame: the jaw relative to where the head is now."""

@@ -195,7 +195,7 @@ class _Take:
         reach = self._config.gate_per_miss * motion.miss_mm() * self._config.working_px_per_mm
         gallery = motion.gallery() if motion.worth_searching() else None
         record = tracker.track(motion.starts(), views, gallery, reach)
-        motion.update(record.solution.poses, record.status != LOST)
+        motion.update(record.solution.poses, record.status != LOST, record.used.any(1))
         tracker.history.add(record)
         return record
 

@@ -18,6 +18,7 @@ from jawusd.tracking.quality import (
     twist_covariance,
     uncovered_px,
 )
+from jawusd.tracking.reacquire import shift_to_masks
 from jawusd.tracking.scan import prepare_scan
 from jawusd.tracking.solver import ContourSolver, View
 from jawusd.tracking.views import MaskViews, working_size
@@ -111,6 +112,9 @@ def test_uncovered_pixels_are_those_off_the_crowns():
     assert (bare[0] - [100, 110, 120] >= 0).all() and (bare[0] - [100, 110, 120] < 0.02 * total[0]).all()
 
 
+BOTH, UPPER = np.array([True, True]), np.array([True, False])
+
+
 def _motion(poses):
     return Motion(poses, np.zeros((2, 3, 3)) + np.eye(3) * 10)
 
@@ -120,7 +124,7 @@ def test_prediction_goes_on_and_starts_offer_to_stop():
     poses = jaw_poses(1)[0]
     motion = _motion(poses)
     assert len(motion.starts()) == 1
-    motion.update(step @ poses, np.array([True, True]))
+    motion.update(step @ poses, BOTH, BOTH)
     assert motion.predict() == pytest.approx(step @ step @ poses)
     going, resting, half = motion.starts()
     assert going == pytest.approx(step @ step @ poses) and resting == pytest.approx(step @ poses)
@@ -132,7 +136,7 @@ def test_lost_jaw_is_carried_by_the_head():
     poses = jaw_poses(1)[0]
     motion = _motion(poses)
     head = se3_exp([0, 0.05, 0, 3.0, 0, 0])
-    motion.update(np.stack([head @ poses[0], np.full((4, 4), 7.0)]), np.array([True, False]))
+    motion.update(np.stack([head @ poses[0], np.full((4, 4), 7.0)]), UPPER, BOTH)
     relative = se3_inverse(poses[0]) @ poses[1]
     assert se3_inverse(motion.predict()[0]) @ motion.predict()[1] == pytest.approx(relative, abs=1e-9)
 
@@ -143,7 +147,7 @@ def test_gallery_keeps_unlike_jaw_poses_relative_to_the_head():
     for k in range(30):
         motion.remember(np.stack([poses[0], poses[1] @ se3_exp([0, 0, 0, 0, -0.5 * k, 0])]), np.array([True, True]))
     assert 6 < len(motion.gallery()) <= 16
-    motion.update(se3_exp([0, 0.1, 0, 5, 0, 0]) @ poses, np.array([True, True]))
+    motion.update(se3_exp([0, 0.1, 0, 5, 0, 0]) @ poses, BOTH, BOTH)
     head = motion.predict()[0]
     for entry in motion.gallery():
         jaw = se3_inverse(head) @ entry[1]
@@ -155,8 +159,27 @@ def test_searches_become_rarer_while_lost():
     due = []
     for _ in range(40):
         due.append(motion.worth_searching())
-        motion.update(motion.predict(), np.array([True, False]))
+        motion.update(motion.predict(), UPPER, BOTH)
     assert due[:5] == [True, True, True, False, True] and sum(due) < 10
+
+
+def test_searches_stay_due_while_there_is_nothing_to_see():
+    motion = _motion(jaw_poses(1)[0])
+    for _ in range(7):
+        motion.update(motion.predict(), UPPER, UPPER)
+        assert motion.worth_searching()
+
+
+def test_shift_brings_crowns_back_onto_their_masks():
+    poses = jaw_poses(2)[1]
+    views = [
+        View(c.projection_matrix(), c.centre_world(), render_masks(MESHES, poses, c), BOTH) for c in make_cameras()
+    ]
+    away = np.array([3.0, 9.0, 0.0])
+    moved = make_transform(np.eye(3), away) @ poses[1]
+    use = np.ones((2, 3), bool)
+    assert shift_to_masks(SCANS[1], moved, 1, views, use) == pytest.approx(-away, abs=2.5)
+    assert (shift_to_masks(SCANS[1], moved, 1, views, ~use) == 0).all()
 
 
 def test_walking_backwards_gives_the_same_views(tmp_path):
