@@ -74,6 +74,8 @@ def write_cameras(
     _add_motion(stage, frames[known], T_world_skull[known])
     for name, camera in zip(names, cameras, strict=True):
         _define_camera(stage, name, camera)
+    # A stage still open on the nameless layer would look for the actor beside it, and complain.
+    del stage
     shown.referenceList.prependedItems = [Sdf.Reference(relative_path(Path(actor), out))]
     return write_layer(layer, out)
 
