@@ -237,37 +237,45 @@ def ik(
 
 def animate(
     rig: RigArg,
-    source: Annotated[Path, typer.Argument(help="keys.json, or a CSV of d or of poses.", show_default=False)],
+    source: Annotated[
+        Path | None, typer.Argument(help="keys.json, or a CSV of d or of poses.", show_default=False)
+    ] = None,
+    arkit: Annotated[
+        Path | None, typer.Option(help="Instead: ARKit face capture, the CSV of Live Link Face.", show_default=False)
+    ] = None,
     out: Annotated[Path, typer.Option("-o", "--out", help="Animation layer.")] = Path("anim.usdc"),
-    fps: Annotated[float | None, typer.Option(min=0.001, help="Frames per second of a CSV; the rig's else.")] = None,
+    fps: Annotated[
+        float | None, typer.Option(min=0.001, help="Frames per second; else from the keys or time codes, or the rig's.")
+    ] = None,
     splines: Annotated[Path | None, typer.Option(help="Also write the keys as USD splines, to this layer.")] = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Write an animation layer over a rig from keys, parameters or poses; clamping to the bound is reported."""
+    """Write an animation layer over a rig; clamping to the bound is reported."""
     import numpy as np
 
     import jawusd
-    from jawusd.cli.motion import read_motion
+    from jawusd.cli.motion import kept_inside, read_face, read_motion
     from jawusd.rig import describe, write_animation, write_splines
 
+    if (source is None) == (arkit is None):
+        raise typer.BadParameter("give either a source or --arkit.", param_hint="SOURCE")
     for path in filter(None, (out, splines)):
         refuse_existing(path, force)
     loaded = jawusd.load(rig)
-    frames, d, source_fps = read_motion(loaded, source)
-    inside = loaded.margin(d) >= float(loaded.arrays["margin_limit_mm"])
-    kept = np.where(inside[:, None], d, loaded.project(d))
-    moved_mm = np.linalg.norm(kept - d, axis=1)
-    rate = fps or source_fps or describe(rig)["fps"]
-    write_animation(out, rig, frames, kept, rate)
+    motion = read_motion(loaded, source) if arkit is None else read_face(loaded, arkit, fps)
+    kept, clamping = kept_inside(loaded, motion.d)
+    rate = fps or motion.fps or describe(rig)["fps"]
+    write_animation(out, rig, motion.frames, kept, rate)
+    known = np.isfinite(kept).all(axis=1)
     if splines is not None:
-        write_splines(splines, out, frames, kept, rate)
+        write_splines(splines, out, motion.frames[known], kept[known], rate)
     result = {
         "file": str(out),
-        "frames": [float(frames[0]), float(frames[-1])],
+        "frames": [float(motion.frames[0]), float(motion.frames[-1])],
         "fps": rate,
-        "clamped": int((~inside).sum()),
-        "largest_clamp_mm": float(moved_mm.max()),
+        "lost": int((~known).sum()),
+        **clamping,
     }
     emit(result, as_json, lambda: _animate_lines(result))
 
@@ -275,7 +283,9 @@ def animate(
 def _animate_lines(result: dict[str, Any]) -> list[str]:
     first, last = result["frames"]
     lines = [f"{result['file']}: frames {first:g} .. {last:g} at {result['fps']:g} fps"]
+    if result["lost"]:
+        lines.append(f"{result['lost']} frames say nothing and were bridged")
     if result["clamped"]:
-        moved = f"moved by up to {result['largest_clamp_mm']:.2f} mm"
+        moved = f"moved by {result['mean_clamp_mm']:.2f} mm on average, {result['largest_clamp_mm']:.2f} mm at most"
         lines.append(f"{result['clamped']} frames lay outside the bound, {moved}")
     return lines

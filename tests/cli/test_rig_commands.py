@@ -128,6 +128,45 @@ def test_animate_reports_what_it_clamps(actor, tmp_path):
     assert summary["clamped"] == 1 and summary["largest_clamp_mm"] > 15 and summary["fps"] == FPS
 
 
+def face_csv(path, weights, fps=30):
+    """Write a face capture of rows (open, left, right, forward); None is a moment without a face."""
+    rows = ["Timecode,BlendShapeCount,JawForward,JawRight,JawLeft,JawOpen"]
+    for k, row in enumerate(weights):
+        code = f"10:00:{k // fps:02d}:{k % fps:02d}.000"
+        rows.append(f"{code},0" if row is None else f"{code},52,{row[3]},{row[2]},{row[1]},{row[0]}")
+    path.write_text("\n".join(rows))
+    return path
+
+
+def test_animate_takes_arkit_weights_as_shares_of_the_persons_ranges(actor, tmp_path):
+    """The ends are measured with `ranges`: 1 is the edge of the bound, so opening halfway and then to either side."""
+    rig = jawusd.load(actor)
+    d1 = 0.5 * rig.arrays["d_range"][0, 1]
+    d2_min, d2_max, _, d3_max = rig.ranges(d1)
+    weights = [(0, 0, 0, 0), (0.5, 0, 0, 0), (0.5, 0.5, 0, 0), (0.5, 0.1, 0.6, 0), (0.5, 0, 0, 0.5), None] * 20
+    csv = face_csv(tmp_path / "face.csv", weights)
+    out = actor.parent / "anim_face.usdc"
+    summary = json.loads(run("animate", actor, "--arkit", csv, "-o", out, "--json"))
+    assert summary["fps"] == 30 and summary["frames"] == [0, 119]
+    assert (summary["clamped"], summary["lost"]) == (0, 20)
+    stage = Usd.Stage.Open(str(out))
+    assert (stage.GetTimeCodesPerSecond(), stage.GetEndTimeCode()) == (30, 119)
+    prim = stage.GetPrimAtPath("/Actor")
+    found = np.array([[prim.GetAttribute(f"jaw:d{i}").Get(frame) for i in (1, 2, 3)] for frame in range(5)])
+    expected = [[0, 0, 0], [d1, 0, 0], [d1, 0.5 * d2_max, 0], [d1, 0.5 * d2_min, 0], [d1, 0, 0.5 * d3_max]]
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+    assert [f.rule for f in validate_stage(out)] == []
+
+
+def test_animate_says_how_far_arkit_weights_were_clamped(actor, tmp_path):
+    csv = face_csv(tmp_path / "face.csv", [(0.3, 0, 0, 0)] * 60 + [(1.2, 0, 0, 0), (0.4, 1, 0, 1)] * 15)
+    out = actor.parent / "anim_wide.usdc"
+    summary = json.loads(run("animate", actor, "--arkit", csv, "-o", out, "--json"))
+    assert summary["clamped"] == 30 and summary["largest_clamp_mm"] > 1
+    assert 0 < summary["mean_clamp_mm"] < summary["largest_clamp_mm"]
+    assert "30 frames lay outside" in run("animate", actor, "--arkit", csv, "-o", out, "--force")
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
@@ -137,12 +176,17 @@ def test_animate_reports_what_it_clamps(actor, tmp_path):
         (("encode", "{actor}", "{tmp}/nan.csv"), 3, 'column "tx" is nan'),
         (("validate", "{actor}", "{tmp}/empty.csv"), 3, "empty"),
         (("animate", "{actor}", "{tmp}/bad.json"), 3, "must rise"),
+        (("animate", "{actor}"), 2, "either a source or --arkit"),
+        (("animate", "{actor}", "{tmp}/bad.json", "--arkit", "{tmp}/nan.csv"), 2, "either a source or --arkit"),
+        (("animate", "{actor}", "--arkit", "{tmp}/nan.csv"), 3, "timecode"),
+        (("animate", "{actor}", "--arkit", "{tmp}/faceless.csv"), 3, "no row has a face"),
         (("nonsense",), 2, "No such command"),
     ],
 )
 def test_bad_input_is_one_clear_error(actor, tmp_path, arguments, code, words):
     (tmp_path / "nan.csv").write_text("frame,tx,ty,tz,qw,qx,qy,qz\n1,nan,0,0,1,0,0,0\n")
     (tmp_path / "empty.csv").write_text("")
+    face_csv(tmp_path / "faceless.csv", [None] * 90)
     key = {"frame": 3, "d": [0, 0, 0]}
     (tmp_path / "bad.json").write_text(json.dumps({"fps": 24, "keys": [key, key]}))
     text = run(*(a.format(actor=actor, tmp=tmp_path) for a in arguments), code=code)

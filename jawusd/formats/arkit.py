@@ -1,0 +1,169 @@
+"""Face captures of ARKit as Live Link Face exports them: a CSV table of blend shape weights with time codes.
+
+    Timecode,BlendShapeCount,...,JawForward,JawRight,JawLeft,JawOpen,...
+    14:03:52:28.207,61,...,0.01,0,0.02,0.31,...
+
+A time code is HH:MM:SS:FF.fff, FF counted at the rate of the take. Column names count without regard to case, any other
+column is ignored. A row whose count is 0 is a moment without a face.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.errors import FormatError
+
+__all__ = ["FaceCapture", "read_arkit"]
+
+JAW_COLUMNS = ("jawopen", "jawleft", "jawright", "jawforward")
+_TIME, _COUNT = "timecode", "blendshapecount"
+_TIMECODE = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})[:;](\d{1,3}(?:\.\d+)?)")
+_RATES = (24, 25, 30, 48, 50, 60, 100, 120)
+_DAY_S = 86_400
+_MAX_BYTES = 1 << 30
+
+
+@dataclass(frozen=True, eq=False)
+class FaceCapture:
+    """Hold the jaw's weights of a face capture.
+
+    Attributes:
+        frames: frames after the first row, increasing, fractions kept, shape (F,).
+        weights: JawOpen, JawLeft, JawRight, JawForward, nominally 0 .. 1, NaN without a face, shape (F, 4). Left is
+            the subject's left.
+        fps: frames per second.
+        timecode: that of the first row, as written.
+    """
+
+    frames: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    fps: float
+    timecode: str
+
+
+def read_arkit(path: str | os.PathLike[str], fps: float | None = None) -> FaceCapture:
+    """Read a face capture.
+
+    Args:
+        path: CSV file of Live Link Face.
+        fps: rate at which the time codes count; found from them if None, which takes a capture that passes at least
+            one full second.
+
+    Raises:
+        FormatError: not such a table; a value that is no finite number, a time code that does not follow the one
+            before, or a rate that does not fit. The message names line and column.
+    """
+    path = Path(path)
+    rows = _rows(path)
+    columns = [name.strip().lower() for name in rows[0][1]]
+    for name in (_TIME, *JAW_COLUMNS):
+        if columns.count(name) != 1:
+            raise FormatError(
+                f'names the column "{name}" {columns.count(name)} times, expected once.',
+                path=path,
+                hint="Live Link Face exports Timecode, JawOpen, JawLeft, JawRight and JawForward.",
+            )
+    at = [columns.index(name) for name in (_TIME, *JAW_COLUMNS)]
+    count = columns.index(_COUNT) if _COUNT in columns else None
+    codes, weights, lines = [], [], []
+    for line, row in rows[1:]:
+        face = count is None or len(row) <= count or row[count].strip() != "0"
+        if face and len(row) != len(columns):
+            raise FormatError(f"line {line} has {len(row)} values, the header names {len(columns)}.", path=path)
+        codes.append(_seconds_and_frames(row[at[0]] if len(row) > at[0] else "", line, path))
+        weights.append([_number(row[i], line, rows[0][1][i], path) if face else math.nan for i in at[1:]])
+        lines.append(line)
+    if not codes:
+        raise FormatError("has no rows below the header.", path=path)
+    seconds = np.array([second for second, _ in codes])
+    # Past midnight the time codes start over.
+    seconds += _DAY_S * np.concatenate([[0], np.cumsum(np.diff(seconds) < -_DAY_S // 2)])
+    inside = np.array([frame for _, frame in codes])
+    rate = _rate(seconds, inside, lines, fps, path)
+    return FaceCapture(_frames(seconds, inside, lines, rate, path), np.array(weights), rate, rows[1][1][at[0]].strip())
+
+
+def _rows(path: Path) -> list[tuple[int, list[str]]]:
+    """Return the rows that are not empty with their line numbers, the header first."""
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise FormatError(f"is {path.stat().st_size} bytes, at most {_MAX_BYTES} are read.", path=path)
+        with path.open(encoding="utf-8-sig", newline="") as opened:
+            reader = csv.reader(opened, strict=True)
+            rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
+    except FileNotFoundError as error:
+        raise FormatError("there is no such file.", path=path) from error
+    except UnicodeDecodeError as error:
+        raise FormatError(f"is not UTF-8 text ({error}).", path=path) from error
+    except csv.Error as error:
+        raise FormatError(f"is not a CSV table ({error}).", path=path) from error
+    except OSError as error:
+        raise FormatError(f"cannot be read: {error.strerror}.", path=path) from error
+    if not rows:
+        raise FormatError("is empty; the first line must name the columns.", path=path)
+    return rows
+
+
+def _number(text: str, line: int, column: str, path: Path) -> float:
+    try:
+        value = float(text)
+    except ValueError as error:
+        raise FormatError(f'line {line}, column "{column}": "{text}" is not a number.', path=path) from error
+    if not math.isfinite(value):
+        raise FormatError(f'line {line}, column "{column}" is {text}; all weights must be finite.', path=path)
+    return value
+
+
+def _seconds_and_frames(text: str, line: int, path: Path) -> tuple[int, float]:
+    found = _TIMECODE.fullmatch(text.strip())
+    if found is None:
+        raise FormatError(f'line {line}, column "Timecode": "{text}" is not HH:MM:SS:FF.fff.', path=path)
+    hours, minutes, seconds = (int(part) for part in found.groups()[:3])
+    return 3600 * hours + 60 * minutes + seconds, float(found[4])
+
+
+def _rate(
+    seconds: NDArray[np.int64], inside: NDArray[np.float64], lines: list[int], fps: float | None, path: Path
+) -> float:
+    """Return the given rate, or the lowest usual one above every frame number once a full second was counted."""
+    top = int(np.argmax(inside))
+    highest = math.floor(inside[top])
+    if fps is None:
+        # The first and the last second are cut: where counting starts over only those between them tell.
+        whole = (seconds > seconds[0]) & (seconds < seconds[-1])
+        rates = [rate for rate in _RATES if rate > highest]
+        if not whole.any() or not rates:
+            raise FormatError(
+                "the time codes do not tell the frame rate: they pass no full second, or count above "
+                f"{_RATES[-1]} frames per second.",
+                path=path,
+                hint="Give the rate with --fps.",
+            )
+        return float(rates[0])
+    if highest >= math.ceil(fps):
+        raise FormatError(
+            f'line {lines[top]}, column "Timecode" counts frame {highest} of a second, at {fps:g} frames per second '
+            f"allowed are 0 .. {math.ceil(fps) - 1}.",
+            path=path,
+        )
+    return float(fps)
+
+
+def _frames(
+    seconds: NDArray[np.int64], inside: NDArray[np.float64], lines: list[int], rate: float, path: Path
+) -> NDArray[np.float64]:
+    # A rate like 29.97 counts whole frames: 30 numbers per second of time code.
+    frames = seconds * math.ceil(rate) + inside
+    steps = np.diff(frames)
+    if (steps <= 0).any():
+        line = lines[int(np.argmax(steps <= 0)) + 1]
+        raise FormatError(f'line {line}, column "Timecode" does not come after the row before.', path=path)
+    return np.round(frames - frames[0], 6)

@@ -1,0 +1,95 @@
+"""ARKit face captures: time codes, the rate found from them, moments without a face, and every fault by its line."""
+
+import numpy as np
+import pytest
+
+from jawusd.errors import FormatError
+from jawusd.formats.arkit import read_arkit
+
+HEADER = "Timecode,BlendShapeCount,EyeBlinkLeft,JawForward,JawRight,JawLeft,JawOpen,HeadYaw"
+
+
+def timecode(frame, rate, start_s=14 * 3600, sub=".207"):
+    """Return HH:MM:SS:FF.fff of a frame."""
+    second = (start_s + frame // rate) % 86400
+    return f"{second // 3600:02d}:{second // 60 % 60:02d}:{second % 60:02d}:{frame % rate:02d}{sub}"
+
+
+def take(path, frames, rate, header=HEADER, **more):
+    """Write a capture whose JawOpen is a hundredth of the frame number."""
+    rows = [f"{timecode(k, rate, **more)},61,0.5,0.1,0.2,0.3,{k / 100},-3.5" for k in frames]
+    path.write_text("\n".join([header, *rows, ""]))
+    return path
+
+
+@pytest.mark.parametrize("rate", [24, 25, 30, 60])
+def test_frames_weights_and_rate_come_from_the_file(tmp_path, rate):
+    frames = np.array([k for k in range(17, 17 + 4 * rate) if k % 11])  # with dropped frames
+    found = read_arkit(take(tmp_path / "face.csv", frames, rate))
+    assert found.fps == rate and found.timecode == timecode(int(frames[0]), rate)
+    np.testing.assert_allclose(found.frames, frames - frames[0], atol=1e-6)
+    np.testing.assert_allclose(found.weights[:, 0], frames / 100)
+    np.testing.assert_allclose(found.weights[0, 1:], [0.3, 0.2, 0.1])
+
+
+def test_column_names_count_without_case_and_a_byte_order_mark_is_skipped(tmp_path):
+    path = take(tmp_path / "face.csv", range(90), 30, header=HEADER.upper())
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert len(read_arkit(path).frames) == 90
+
+
+def test_midnight_and_subframes(tmp_path):
+    path = take(tmp_path / "face.csv", range(180), 60, start_s=86398)
+    np.testing.assert_allclose(read_arkit(path).frames, np.arange(180), atol=1e-6)
+    path.write_text(f"{HEADER}\n01:00:00:10.25,61,0,0,0,0,0,0\n01:00:00:11.75,61,0,0,0,0,0,0\n")
+    np.testing.assert_allclose(read_arkit(path, fps=60).frames, [0, 1.5])
+
+
+def test_rows_without_a_face_are_lost_not_closed(tmp_path):
+    path = take(tmp_path / "face.csv", range(90), 30)
+    lines = path.read_text().splitlines()
+    lines[5] = f"{timecode(4, 30)},0"
+    lines[6] = f"{timecode(5, 30)},0,,,,,,"
+    path.write_text("\n".join(lines))
+    weights = read_arkit(path).weights
+    assert np.isnan(weights[4:6]).all() and np.isfinite(np.delete(weights, [4, 5], axis=0)).all()
+
+
+def test_a_short_take_does_not_tell_its_rate(tmp_path):
+    path = take(tmp_path / "face.csv", range(20), 60)
+    with pytest.raises(FormatError, match="--fps"):
+        read_arkit(path)
+    assert read_arkit(path, fps=59.94).fps == 59.94
+
+
+@pytest.mark.parametrize(
+    ("row", "words"),
+    [
+        ("01:00:00:02,61,0,0,0,0,x,0", 'line 3, column "JawOpen": "x"'),
+        ("01:00:00:02,61,0,0,0,nan,0,0", 'line 3, column "JawLeft" is nan'),
+        ("01:00:00:02,61,0,0,0,0,0", "line 3 has 7 values"),
+        ("1.5,61,0,0,0,0,0,0", 'line 3, column "Timecode": "1.5"'),
+        ("01:00:00:01,61,0,0,0,0,0,0", 'line 3, column "Timecode" does not come after'),
+        ("01:00:00:30,61,0,0,0,0,0,0", 'line 3, column "Timecode" counts frame 30'),
+    ],
+)
+def test_each_fault_is_named_by_line_and_column(tmp_path, row, words):
+    path = tmp_path / "face.csv"
+    path.write_text(f"{HEADER}\n01:00:00:01,61,0,0,0,0,0,0\n{row}\n")
+    with pytest.raises(FormatError, match=words):
+        read_arkit(path, fps=30)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "empty"),
+        (HEADER, "no rows"),
+        (HEADER.replace("JawOpen", "MouthOpen"), '"jawopen" 0 times'),
+        (HEADER + ",jawopen", '"jawopen" 2 times'),
+    ],
+)
+def test_tables_that_are_none(tmp_path, text, words):
+    (tmp_path / "face.csv").write_text(text)
+    with pytest.raises(FormatError, match=words):
+        read_arkit(tmp_path / "face.csv")
