@@ -88,7 +88,7 @@ def fit_model(
     warnings += [AnatomyWarning("not_shown", sentence) for sentence in sentences]
     if len(data) < _FEW_POSES:
         warnings.append(AnatomyWarning("few_poses", f"Only {len(data)} poses: the model interpolates coarsely."))
-    form = _fit_form(data, shown, config)
+    form = fit_form(data, shown, config)
     errors, uncertainty = seen_errors(data, form), {}
     if config.holdout_folds:
         # The networks of "paper" start in the folds where the best of the full fit started, once.
@@ -97,7 +97,7 @@ def fit_model(
             data,
             form.kept,
             config.holdout_folds,
-            lambda part: _fit_form(part, shown, again),
+            lambda part: fit_form(part, shown, again),
             lambda fold: tell(fold + 1, steps),
         )
         errors |= unseen
@@ -109,7 +109,17 @@ def fit_model(
     return model
 
 
-def _fit_form(data: TrainingData, shown: NDArray[np.bool_], config: FittingConfig) -> FittedForm:
+def fit_form(data: TrainingData, shown: NDArray[np.bool_], config: FittingConfig) -> FittedForm:
+    """Fit the decoder of `config.method` alone, without bounds, checks and hold-out.
+
+    Args:
+        data: the training data.
+        shown: which parameters the data show, shape (3,).
+        config: the method.
+
+    Raises:
+        FittingError: the method cannot be fitted to these data.
+    """
     if config.method == "anchored":
         return fit_anchored(data, shown, config.trim_mad)
     if config.method == "additive":
