@@ -47,11 +47,11 @@ _MODEL = {
 _LENGTHS = ("path_scale", "glide_softness", "glide_fade")  # single numbers, named with their unit
 
 # constants of the gauge and of the bound
-_FADE_SOFTNESS_MM = 1.0
-_LIMIT_SOFTNESS_MM = 4.0
-_ARCH_BOW_MM = 10.0
-_DROP_BEND = 0.15
-_DROP_SATURATION_MM2 = 16.0
+FADE_SOFTNESS_MM = 1.0
+LIMIT_SOFTNESS_MM = 4.0
+ARCH_BOW_MM = 10.0
+DROP_BEND = 0.15
+DROP_SATURATION_MM2 = 16.0
 _SEARCH_STEPS = 60
 _SERIES_BELOW_RAD2 = 1e-4
 
@@ -179,6 +179,7 @@ class Rig:
         kind: "anchored" or "additive".
         arrays: the model's numbers by name, each a flat list, row by row.
         d_range: ((min, max), (min, max), (min, max)) of d1, d2, d3 [mm].
+        matrices: T_skull_anatomical, and T_anatomical_mandible of the closed bite, rows; the motion stands between.
     """
 
     def __init__(self, kind: str, arrays: dict[str, list[float]]) -> None:
@@ -188,8 +189,8 @@ class Rig:
         limits = arrays["d_range"]
         self.d_range = tuple((limits[i], limits[i + 1]) for i in (0, 2, 4))
         A = _rows(arrays["T_anatomical_skull"], 4)
-        self._left = _rigid_inverse(A)
-        self._right = _product(A, _rows(arrays["T_rest"], 4))
+        # what stands left and right of the motion: T_skull_anatomical, and T_anatomical_mandible of the closed bite
+        self.matrices = (_rigid_inverse(A), _product(A, _rows(arrays["T_rest"], 4)))
         self._motion = _Anchored(arrays) if kind == "anchored" else _Additive(arrays)
         knots = arrays["slice_d1"]
         supports = _rows(arrays["slice_support"], len(arrays["slice_directions"]) // 2)
@@ -202,7 +203,7 @@ class Rig:
 
     def pose(self, d1: float, d2: float, d3: float) -> Rows:
         """Return T_skull_mandible [mm] of jaw parameters [mm]: four rows, for column vectors."""
-        return _product(_product(self._left, self._motion.at(d1, d2, d3)), self._right)
+        return _product(_product(self.matrices[0], self._motion.at(d1, d2, d3)), self.matrices[1])
 
     def margin(self, d1: float, d2: float, d3: float) -> float:
         """Return the signed distance to the bound [mm], positive inside."""
@@ -280,14 +281,14 @@ class _Anchored:
         e = self._a["glide_softness_mm"][0]
         low, high = self._a["path_limits"]
         gx, gz = self._path(d1)
-        s = low + _soft_ramp(d1 - low, _LIMIT_SOFTNESS_MM) - _soft_ramp(d1 - high, _LIMIT_SOFTNESS_MM)
+        s = low + _soft_ramp(d1 - low, LIMIT_SOFTNESS_MM) - _soft_ramp(d1 - high, LIMIT_SOFTNESS_MM)
         s /= self._scale
         side, front = math.sqrt(d2 * d2 + e * e) - e, _soft_ramp(d3, e)
         c, w = self._a["glide_arch"], self._a["glide_drop"]
         rho = side * (c[0] + s * (c[1] + s * c[2])) + d2 * (c[3] + s * c[4])
-        rho += d2 * d2 / _ARCH_BOW_MM * (c[5] + s * c[6])
+        rho += d2 * d2 / ARCH_BOW_MM * (c[5] + s * c[6])
         drop = w[0] * side + w[1] * front + w[2] * _bent(side) + w[3] * _bent(front)
-        share = _soft_ramp(d1, _FADE_SOFTNESS_MM) / self._a["glide_fade_mm"][0]
+        share = _soft_ramp(d1, FADE_SOFTNESS_MM) / self._a["glide_fade_mm"][0]
         return (gx + d2, -(d1 + drop * math.exp(-share * share)), gz + rho + d3)
 
 
@@ -341,7 +342,7 @@ def _soft_ramp(x: float, e: float) -> float:
 
 
 def _bent(x: float) -> float:
-    return _DROP_BEND * x * x / math.sqrt(1.0 + x * x / _DROP_SATURATION_MM2)
+    return DROP_BEND * x * x / math.sqrt(1.0 + x * x / DROP_SATURATION_MM2)
 
 
 def _rotate(omega: Sequence[float], v: Sequence[float], shift: int) -> list[float]:
