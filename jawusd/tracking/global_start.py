@@ -1,0 +1,222 @@
+"""Start a take without picks: choose a frame that shows the teeth well and search their poses there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.errors import TrackingError
+from jawusd.formats.capture import CameraSource
+from jawusd.formats.mesh import Mesh
+from jawusd.geometry import Camera, make_transform, so3_log, transform_points
+from jawusd.tracking.config import TrackingConfig
+from jawusd.tracking.first import first_record
+from jawusd.tracking.mask_geometry import MaskSurvey, survey_masks
+from jawusd.tracking.pose_search import Candidate, Grid, RowSearch, coarse_scan, hinge_at_front
+from jawusd.tracking.quality import score_px, uncovered_px
+from jawusd.tracking.scan import Scan
+from jawusd.tracking.solver import ContourSolver, Solution, View
+from jawusd.tracking.views import MaskViews
+
+_ROWS = (0, 1)
+_NAMES = ("upper", "lower")
+_SURVEYED = 24  # frames looked at: two seconds of reading, and every exercise of a usual take is met
+_FRAMES_TRIED = 5
+_PX_PER_MM = 2.0  # of the search: one pixel is a third of the step between orientations at the canines
+_FINALISTS = 5  # poses per row that are refined
+_DISTINCT_MM = 2.0  # poses closer than this lead to the same minimum
+# Turns about the guess: the teeth face the cameras, the upper ones are above the lower ones. Masks one beside the other
+# in a lateral movement, or half hidden by lips, mislead the roll most.
+_GRID = Grid(
+    yaw_rad=np.radians(np.arange(-56, 57, 8.0)),
+    pitch_rad=np.radians(np.arange(-40, 41, 8.0)),
+    roll_rad=np.radians(np.arange(-48, 49, 8.0)),
+    reach_mm=(13.0, 9.0, 15.0),
+)
+_MARGIN_MM = float(np.linalg.norm(_GRID.reach_mm))
+_WIDEST_JAW_RAD = 0.8  # turn between the rows beyond which a jaw does not open
+_FARTHEST_JAW_MM = 75.0  # distance of the rows' front teeth beyond which it does not either
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Say where tracking begins.
+
+    Attributes:
+        frame: reference camera frame.
+        poses: T_world_upper, T_world_lower, shape (2, 4, 4).
+        notes: how it was found, for the meta data of the tracks.
+    """
+
+    frame: int
+    poses: NDArray[np.float64]
+    notes: dict
+
+
+@dataclass(frozen=True, eq=False)
+class Footage:
+    """Name the masks to be searched.
+
+    Attributes:
+        sources: cameras with masks.
+        cameras: calibrated cameras by name.
+        offsets: reference frame minus own frame number, by camera name.
+        frames: first frame and one past the last, or None for all that have masks.
+    """
+
+    sources: Sequence[CameraSource]
+    cameras: Mapping[str, Camera]
+    offsets: Mapping[str, int]
+    frames: tuple[int, int] | None
+
+    def survey(self, frames: tuple[int, int] | None = None, count: int = _SURVEYED) -> MaskSurvey:
+        """Look at evenly spread frames, of the whole footage unless a range is given."""
+        return survey_masks(self.sources, self.cameras, self.offsets, frames or self.frames, count)
+
+    def views(self, centre: NDArray[np.float64], px_per_mm: float) -> MaskViews:
+        """Open the masks at a resolution at the teeth."""
+        return MaskViews(self.sources, self.cameras, self.offsets, centre, px_per_mm)
+
+
+class StartSearch:
+    """Search the poses of both rows of teeth on single frames."""
+
+    def __init__(
+        self,
+        meshes: Sequence[Mesh],
+        scans: Sequence[Scan],
+        T_anatomical_scan: NDArray[np.float64],
+        config: TrackingConfig,
+        map_: Callable[..., Iterable] = map,
+    ) -> None:
+        """Prepare coarse scans.
+
+        Args:
+            meshes: upper and lower teeth scans in one frame, in occlusion [mm].
+            scans: the same, prepared.
+            T_anatomical_scan: scan frame to (left, up, front) axes, shape (4, 4).
+            config: the tracker's numbers.
+            map_: runs the parts of the search, in threads if it likes.
+        """
+        self._config, self._map = config, map_
+        self._coarse = tuple(coarse_scan(m, n) for m, n in zip(meshes, _NAMES, strict=True))
+        self._hinges = [hinge_at_front(s.crown_vertices(), T_anatomical_scan) for s in self._coarse]
+        self._solver = ContourSolver(scans, config)
+        self._coarse_solver = ContourSolver(self._coarse, config)
+
+    def at(self, footage: Footage, frame: int) -> tuple[NDArray[np.float64], float]:
+        """Return the best poses on a frame, T_world_upper and T_world_lower (2, 4, 4), and their worth [px].
+
+        Raises:
+            TrackingError: too few masks, or no pair of poses that a jaw can take.
+        """
+        survey = footage.survey((frame, frame + 1), 1)
+        places = survey.places()[0]
+        with footage.views(places.mean(0), _PX_PER_MM) as masks:
+            views = masks.at(frame)
+        axes = _guessed_axes(places, survey.eyes)
+        finalists = []
+        for r in _ROWS:
+            search = RowSearch(self._coarse[r], r, views, _PX_PER_MM, _MARGIN_MM)
+            base = make_transform(axes, places[r])
+            found = search.best(base, self._hinges[r], _GRID, self._map)
+            finalists.append(self._distinct(found, r))
+        pairs = self._refined_pairs(finalists, views)
+        if not pairs:
+            raise TrackingError(f"frame {frame}: the best poses of the two rows of teeth are none a jaw can take")
+        with footage.views(places.mean(0), self._config.working_px_per_mm) as masks:
+            views = masks.at(frame)
+        solve = partial(self._solver.solve, views=views, gates_px=self._config.wide_gates_px)
+        ends = [solve(poses) for poses in pairs]
+        worth = [self._worth(self._solver, s, views).sum() for s in ends]
+        best = int(np.argmax(worth))
+        return ends[best].poses, float(worth[best])
+
+    def _distinct(self, found: Sequence[Candidate], r: int) -> list[NDArray[np.float64]]:
+        """Return the best poses that differ from one another."""
+        probes = self._coarse[r].probes
+        kept: list[NDArray[np.float64]] = []
+        for candidate in found:
+            here = transform_points(candidate.pose, probes)
+            if all(np.linalg.norm(here - transform_points(k, probes), axis=1).mean() > _DISTINCT_MM for k in kept):
+                kept.append(candidate.pose)
+                if len(kept) == _FINALISTS:
+                    break
+        return kept
+
+    def _refined_pairs(
+        self, finalists: Sequence[Sequence[NDArray[np.float64]]], views: Sequence[View]
+    ) -> list[NDArray[np.float64]]:
+        """Refine the finalists coarsely and return the best pairs a jaw can take, at most four, shape (2, 4, 4) each."""
+        ranked = []
+        for r in _ROWS:
+            ends = []
+            for pose in finalists[r]:
+                start = np.stack([finalists[q][0] if q != r else pose for q in _ROWS])
+                end = self._coarse_solver.solve(start, views, self._config.wide_gates_px)
+                ends.append((self._worth(self._coarse_solver, end, views)[r], end.poses[r]))
+            ranked.append(sorted(ends, key=lambda e: -e[0]))
+        pairs = [(u[0] + v[0], np.stack([u[1], v[1]])) for u in ranked[0] for v in ranked[1]]
+        pairs = [p for p in pairs if self._possible(p[1])]
+        return [poses for _, poses in sorted(pairs, key=lambda p: -p[0])[:4]]
+
+    def _possible(self, poses: NDArray[np.float64]) -> bool:
+        """Tell whether a jaw can bring the rows into these poses."""
+        turn = so3_log(poses[0, :3, :3].T @ poses[1, :3, :3])
+        fronts = [(poses[r] @ np.linalg.inv(self._hinges[r]))[:3, 3] for r in _ROWS]
+        return np.linalg.norm(turn) < _WIDEST_JAW_RAD and np.linalg.norm(fronts[1] - fronts[0]) < _FARTHEST_JAW_MM
+
+    def _worth(self, solver: ContourSolver, solution: Solution, views: Sequence[View]) -> NDArray[np.float64]:
+        """Return the fitting contour less the price of uncovered mask per row [px], shape (2,)."""
+        bare, _ = uncovered_px(solver.scans, solution, views)
+        # A price per area: the coarse pictures' pixels are larger.
+        price = self._config.bare_price
+        if solver is self._coarse_solver:
+            price *= self._config.working_px_per_mm / _PX_PER_MM
+        return (score_px(solution) - price * bare).sum(1)
+
+
+def search_start(search: StartSearch, footage: Footage, solver: ContourSolver, config: TrackingConfig) -> Start:
+    """Find a frame on which both rows of teeth can be aligned, and their poses there.
+
+    Raises:
+        TrackingError: no frame of those tried could be aligned.
+    """
+    survey = footage.survey()
+    tried: list[tuple[int, str]] = []
+    for frame in survey.promising(_FRAMES_TRIED).tolist():
+        try:
+            poses, worth = search.at(footage, frame)
+            centre = np.mean([transform_points(poses[r], solver.scans[r].centre) for r in _ROWS], axis=0)
+            with footage.views(centre, config.working_px_per_mm) as masks:
+                first_record(solver, config, poses, masks, frame)
+        except TrackingError as error:
+            tried.append((frame, error.message))
+            continue
+        return Start(frame, poses, {"by": "search", "frame": frame, "worth_px": worth, "frames_failed": tried})
+    raise TrackingError(
+        f"no [bootstrap] picks, and the search for the teeth failed on all {len(tried)} frames tried: "
+        + "; ".join(message if f"frame {frame}" in message else f"frame {frame}: {message}" for frame, message in tried),
+        hint="Give [bootstrap] picks: three or more per row of teeth, each seen by two cameras; or check the masks, the "
+        "calibration and the time offsets.",
+    )
+
+
+def _guessed_axes(places: NDArray[np.float64], eyes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return left, up and front of the teeth in the world as far as the masks tell, shape (3, 3), axes in columns.
+
+    Args:
+        places: middles of the upper and the lower masks [mm], shape (2, 3).
+        eyes: camera centres [mm], shape (C, 3).
+    """
+    rays = eyes - places.mean(0)
+    front = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).mean(0)
+    front /= np.linalg.norm(front)
+    up = places[0] - places[1]
+    up -= front * (front @ up)
+    up /= np.linalg.norm(up)
+    return np.stack([np.cross(up, front), up, front], axis=1)
