@@ -50,7 +50,9 @@ def _info_lines(found: dict[str, Any]) -> list[str]:
         lines.append(f"  {name}: {low:.2f} .. {high:.2f} mm")
     table = found["table"]
     lines.append(f"table: {table['format']} {table['shape']}, worst error {table['max_error_mm']:.4f} mm")
-    lines += [f"mesh {name}: {count} points" for name, count in found["meshes"].items()]
+    for name, count in found["meshes"].items():
+        mark = ", a placeholder, no anatomy" if name in found["placeholders"] else ""
+        lines.append(f"mesh {name}: {count} points{mark}")
     if found["animation"]:
         shown = found["animation"]
         lines.append(f"animation: {shown['samples']} samples, frames {shown['first']:g} .. {shown['last']:g}")

@@ -14,11 +14,12 @@ from jawusd.evaluator import JawRig
 from jawusd.formats.mesh import Mesh
 from jawusd.rig.animation import write_animation
 from jawusd.rig.author import decoder_layer, interface_layer
-from jawusd.rig.geo import build_geometry
+from jawusd.rig.geo import build_geometry, check_meshes
 from jawusd.rig.layers import write_layer
 from jawusd.rig.layout import ACTOR_FILE, ENCODE_FILE, GEO_FILE, ONNX_FILE, PACKAGE_FILE, RIG_FILE, SKEL_FILE
 from jawusd.rig.onnx_sidecar import decode_model, encode_model, write_onnx
 from jawusd.rig.package import write_package
+from jawusd.rig.placeholder import grow_placeholder
 from jawusd.rig.skel import write_skel
 from jawusd.rig.table import DEFAULT_SIZE, build_table
 
@@ -38,7 +39,7 @@ def bake_rig(
 ) -> list[Path]:
     """Write a rig: interface, decoder, geometry, ONNX graphs, captured motion if there is one, skeleton, package.
 
-    Every file is written in one step, `actor.usda` after all it refers to.
+    Without a mandible mesh a placeholder is grown from the lower scan, and marked as such. Every file is written in one step, `actor.usda` after all it refers to.
 
     Args:
         folder: where the files go; made if missing.
@@ -63,8 +64,13 @@ def bake_rig(
         raise ValueError("frames and d belong together: give both or neither")
     if not fps > 0:
         raise RigError(f"{fps} frames per second; it must be more than 0.", path=folder)
-    geometry = build_geometry(meshes, rig.arrays["T_rest"])
-    moving = np.concatenate([meshes[key].vertices for key in ("mandible", "lower_teeth") if key in meshes])
+    check_meshes(meshes)
+    placeholder = None
+    if "mandible" not in meshes:
+        grown = grow_placeholder(rig, meshes["lower_teeth"])
+        meshes, placeholder = {**meshes, "mandible": grown.mesh}, grown.source
+    geometry = build_geometry(meshes, rig.arrays["T_rest"], placeholder)
+    moving = np.concatenate([meshes[key].vertices for key in ("mandible", "lower_teeth")])
     table = build_table(rig, moving, table_size)
     written = [
         write_layer(geometry, folder / GEO_FILE),

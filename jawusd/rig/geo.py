@@ -11,7 +11,7 @@ from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdShade
 from jawusd.errors import RigError
 from jawusd.formats.mesh import Mesh
 from jawusd.rig import _gf
-from jawusd.rig.layers import define_prim, new_layer, stage_of
+from jawusd.rig.layers import define_prim, new_layer, set_attribute, stage_of
 from jawusd.rig.layout import ACTOR, GEO, MANDIBLE, MATERIALS, SKULL
 
 # Every mesh name is unique: Blender merges an Xform with an only child and keeps the child's name.
@@ -28,23 +28,27 @@ _MATERIALS = {
     "Enamel": ((0.85, 0.80, 0.70), 0.25),
     "Gum": ((0.55, 0.16, 0.15), 0.45),
     "Bone": ((0.75, 0.68, 0.54), 0.70),
+    "Placeholder": ((0.35, 0.45, 0.60), 0.90),
 }
 # A vertex counts as crown when red or green stands out by this much of 255; grey is gum.
 _PAINT_CONTRAST = 60
 
 
-def build_geometry(meshes: Mapping[str, Mesh], T_rest: NDArray[np.float64]) -> Sdf.Layer:
+def build_geometry(
+    meshes: Mapping[str, Mesh], T_rest: NDArray[np.float64], placeholder: str | None = None
+) -> Sdf.Layer:
     """Build the layer with all meshes under /Actor.
 
     Args:
         meshes: `upper_teeth` and `skull` in skull coordinates, `lower_teeth` and `mandible` in mandible coordinates
             [mm]; `skull` and `mandible` may be missing.
         T_rest: T_skull_mandible of the closed bite, shape (4, 4); the mandible stands there by default.
+        placeholder: where the condyles of the mandible come from, if its mesh is a stand-in; it is then marked so.
 
     Raises:
         RigError: an unknown or missing mesh, or a mesh without faces or with values that are not finite.
     """
-    _check_meshes(meshes)
+    check_meshes(meshes)
     layer = new_layer()
     define_prim(layer, ACTOR, "Xform")
     define_prim(layer, MATERIALS, "Scope")
@@ -55,11 +59,26 @@ def build_geometry(meshes: Mapping[str, Mesh], T_rest: NDArray[np.float64]) -> S
     for path in (SKULL, MANDIBLE):
         Usd.ModelAPI(stage.GetPrimAtPath(path)).SetKind(Kind.Tokens.subcomponent)
     place_mandible(UsdGeom.Xformable(stage.GetPrimAtPath(MANDIBLE)), T_rest)
-    materials = {name: _material(stage, name) for name in _MATERIALS}
+    stand_in = "mandible" if placeholder is not None else None
+    used = [name for name in _MATERIALS if name != "Placeholder" or stand_in]
+    materials = {name: _material(stage, name) for name in used}
     for name, path in MESH_PATHS.items():
         if name in meshes:
-            _define_mesh(stage, path, meshes[name], materials, teeth=name.endswith("teeth"))
+            base = "Enamel" if name.endswith("teeth") else "Placeholder" if name == stand_in else "Bone"
+            _define_mesh(stage, path, meshes[name], materials, base)
+    if placeholder is not None:
+        _mark_placeholder(layer.GetPrimAtPath(MESH_PATHS["mandible"]), placeholder)
     return layer
+
+
+def _mark_placeholder(mesh: Sdf.PrimSpec, condyles: str) -> None:
+    """Say on a mesh, in every way readers show, that it is a stand-in."""
+    text = f"Not anatomy: a placeholder grown from the lower scan, there was no mandible mesh. Condyles: {condyles}."
+    mesh.SetInfo("displayName", "Mandible (placeholder)")
+    mesh.SetInfo("documentation", text)
+    mesh.customData = {"placeholder": True}
+    set_attribute(mesh, "jaw:placeholder", Sdf.ValueTypeNames.Bool, True)
+    set_attribute(mesh, "jaw:placeholder:condyles", Sdf.ValueTypeNames.String, condyles)
 
 
 def place_mandible(mandible: UsdGeom.Xformable, T: NDArray[np.float64]) -> None:
@@ -76,7 +95,12 @@ def extent(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([vertices.min(axis=0), vertices.max(axis=0)])
 
 
-def _check_meshes(meshes: Mapping[str, Mesh]) -> None:
+def check_meshes(meshes: Mapping[str, Mesh]) -> None:
+    """Check that meshes make a rig.
+
+    Raises:
+        RigError: an unknown or missing mesh, or a mesh without faces or with values that are not finite.
+    """
     unknown = sorted(set(meshes) - set(MESH_PATHS))
     if unknown:
         raise RigError(f"there is no mesh called {unknown[0]!r}; allowed are {', '.join(MESH_PATHS)}.")
@@ -101,7 +125,7 @@ def _material(stage: Usd.Stage, name: str) -> UsdShade.Material:
 
 
 def _define_mesh(
-    stage: Usd.Stage, path: str, mesh: Mesh, materials: Mapping[str, UsdShade.Material], *, teeth: bool
+    stage: Usd.Stage, path: str, mesh: Mesh, materials: Mapping[str, UsdShade.Material], base: str
 ) -> None:
     prim = UsdGeom.Mesh.Define(stage, path)
     prim.CreatePointsAttr(_gf.vec3f_array(mesh.vertices))
@@ -112,8 +136,7 @@ def _define_mesh(
     prim.CreateDoubleSidedAttr(True)  # scans are open surfaces
     prim.CreateNormalsAttr(_gf.vec3f_array(corner_normals(mesh)))
     prim.SetNormalsInterpolation(UsdGeom.Tokens.faceVarying)
-    gum = gum_faces(mesh) if teeth else np.zeros(len(mesh.faces), dtype=bool)
-    base = "Enamel" if teeth else "Bone"
+    gum = gum_faces(mesh) if base == "Enamel" else np.zeros(len(mesh.faces), dtype=bool)
     prim.CreateDisplayColorAttr([Gf.Vec3f(*_MATERIALS[base][0])])
     binding = UsdShade.MaterialBindingAPI.Apply(prim.GetPrim())
     binding.Bind(materials[base])

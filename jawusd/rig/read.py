@@ -217,6 +217,7 @@ def describe(path: PathArg, prim_path: str | None = None) -> dict[str, Any]:
         "fps": stage.GetTimeCodesPerSecond(),
         "animation": animation,
         "meshes": _meshes(prim),
+        "placeholders": [p.GetName() for p in Usd.PrimRange(prim) if p.GetAttribute("jaw:placeholder").Get()],
         "errors": rig.meta.get("errors"),
     }
 

@@ -1,0 +1,42 @@
+"""Read the meshes of a rig back from its geometry layer."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+from pxr import UsdGeom
+
+from jawusd.errors import RigError
+from jawusd.formats.mesh import Mesh
+from jawusd.rig.geo import MESH_PATHS
+from jawusd.rig.read import open_stage
+
+
+def read_geometry(path: str | os.PathLike[str]) -> dict[str, Mesh]:
+    """Read the meshes of `geo.usdc`.
+
+    Args:
+        path: the layer.
+
+    Returns:
+        Meshes by the names of `geo.MESH_PATHS`, skull ones in the skull frame, mandible ones in the mandible frame
+        [mm], with the layer's single precision; those the rig does not have are missing.
+
+    Raises:
+        RigError: not a USD file, or a mesh that is not made of triangles.
+    """
+    stage = open_stage(path)
+    found = {}
+    for name, prim_path in MESH_PATHS.items():
+        mesh = UsdGeom.Mesh(stage.GetPrimAtPath(prim_path))
+        if not mesh:
+            continue
+        counts = np.array(mesh.GetFaceVertexCountsAttr().Get() or [])
+        if not counts.size or (counts != 3).any():
+            raise RigError(f"{prim_path} must be made of triangles.", path=Path(path))
+        vertices = np.array(mesh.GetPointsAttr().Get(), dtype=np.float64)
+        faces = np.array(mesh.GetFaceVertexIndicesAttr().Get(), dtype=np.int32).reshape(-1, 3)
+        found[name] = Mesh(vertices, faces)
+    return found

@@ -1,0 +1,119 @@
+"""The stand-in for a missing mandible: closed, where the jaw is, condyles from the motion, and marked everywhere."""
+
+import types
+
+import numpy as np
+import pytest
+import trimesh
+from example_rig import FPS, assert_valid_usd, example_meshes, example_motion, example_rig
+from pxr import Usd, UsdGeom, UsdShade
+
+from jawusd.formats.mesh import Mesh
+from jawusd.geometry import LANDMARKS, make_transform, so3_exp
+from jawusd.rig import describe
+from jawusd.rig.bake import bake_rig
+from jawusd.rig.placeholder import find_condyles, grow_placeholder
+
+MEAN = np.array([[50.0, 36.0, -80.0], [-50.0, 36.0, -80.0]])  # the mean adult places
+INFERRED = {"inferred": ["condyle_left, at mean adult places", "condyle_right, at mean adult places"]}
+
+
+def sliding_jaw(condyles, meta=INFERRED, travel_mm=9.0, noise_mm=0.05):
+    """Return what a jaw of known condyles would be as a rig: they ride an arc, while the jaw opens to any angle.
+
+    Both condyles slide alike along a circle of 12 mm about a crest below and in front of them.
+    """
+    rng = np.random.default_rng(4)
+    slide, angle = rng.uniform(0, travel_mm, 300), rng.uniform(0, 0.5, 300)
+    centre = np.mean(condyles, axis=0) * [0, 1, 1]
+    path = np.stack([np.zeros(300), 12 * np.cos(slide / 12) - 12, 12 * np.sin(slide / 12)], axis=1)
+    path += rng.normal(0, noise_mm, path.shape) * [0, 1, 1]
+    R = so3_exp(angle[:, None] * [1.0, 0, 0])
+    poses = make_transform(R, centre + path - np.einsum("nij,j->ni", R, centre))
+    landmarks = np.array([[0, 0, 0], [21, -1, -26], [-21, -1, -26], *MEAN])
+    arrays = {"landmarks": landmarks, "codes": np.zeros((300, 3)), "T_anatomical_skull": np.eye(4), "T_rest": np.eye(4)}
+    return types.SimpleNamespace(arrays=arrays, meta=meta, pose=lambda d: poses[: len(d)])
+
+
+@pytest.mark.parametrize("offset", [(0.0, -10.0, -4.0), (0.0, 6.0, 5.0)])
+def test_condyles_come_from_the_motion(offset):
+    truth = MEAN + offset
+    found, source = find_condyles(sliding_jaw(truth))
+    assert source == "estimated from the motion"
+    assert np.linalg.norm(found - truth, axis=1).max() < 2.5
+    assert np.linalg.norm(MEAN - truth, axis=1).min() > 7
+
+
+def test_a_motion_that_cannot_tell_leaves_the_mean_places():
+    for rig in (sliding_jaw(MEAN + [0, -10, -4], travel_mm=2.0), sliding_jaw(MEAN + [0, -10, -4], noise_mm=2.0)):
+        found, source = find_condyles(rig)
+        assert source == "mean adult places"
+        np.testing.assert_array_equal(found, MEAN)
+
+
+def test_given_condyles_stay():
+    found, source = find_condyles(sliding_jaw(MEAN + [0, -10, -4], meta={"inferred": ["molar_left, from the scans"]}))
+    assert source == "landmarks given with the capture"
+    np.testing.assert_array_equal(found, MEAN)
+
+
+def closed(mesh):
+    """Return the mesh in trimesh, which says whether it is closed and turned outward."""
+    made = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    assert made.is_watertight and made.is_winding_consistent and made.volume > 20_000
+    return made
+
+
+def winding(mesh, point):
+    """Return how often a surface goes round a point: its solid angle over 4 pi (van Oosterom & Strackee 1983)."""
+    a, b, c = np.moveaxis(mesh.triangles - point, 1, 0)
+    la, lb, lc = (np.linalg.norm(x, axis=1) for x in (a, b, c))
+    dots = (np.einsum("ij,ij->i", x, y) for x, y in ((b, c), (a, c), (a, b)))
+    below = la * lb * lc + sum(dot * length for dot, length in zip(dots, (la, lb, lc)))
+    return 2 * np.arctan2(np.einsum("ij,ij->i", a, np.cross(b, c)), below).sum() / (4 * np.pi)
+
+
+def test_it_is_a_closed_body_below_the_scan_with_heads_at_the_condyles(kind):
+    rig, lower = example_rig(kind), example_meshes()["lower_teeth"]
+    grown = grow_placeholder(rig, lower)
+    made = closed(grown.mesh)
+    condyles = rig.arrays["landmarks"][[LANDMARKS.index(name) for name in ("condyle_left", "condyle_right")]]
+    np.testing.assert_allclose(grown.condyles, condyles)
+    assert all(winding(made, point) == pytest.approx(1) for point in condyles)
+    A = (rig.arrays["T_anatomical_skull"] @ rig.arrays["T_rest"])[:3, :3]
+    height = grown.mesh.vertices @ A[1]
+    assert height.min() < (lower.vertices @ A[1]).min() - 10
+    assert height.max() < (condyles @ A[1]).max() + 8
+
+
+def test_a_scan_of_few_teeth_gives_a_body_too():
+    rig, lower = example_rig(), example_meshes()["lower_teeth"]
+    near = np.linalg.norm(lower.vertices - rig.arrays["landmarks"][0], axis=1) < 8
+    faces = lower.faces[near[lower.faces].all(axis=1)]
+    used, renamed = np.unique(faces, return_inverse=True)
+    closed(grow_placeholder(rig, Mesh(lower.vertices[used], renamed.reshape(-1, 3))).mesh)
+
+
+def test_it_is_marked_wherever_it_goes(tmp_path, kind):
+    meshes = {name: mesh for name, mesh in example_meshes().items() if name != "mandible"}
+    frames, d = example_motion()
+    bake_rig(tmp_path, example_rig(kind), meshes, name="x", fps=FPS, frames=frames, d=d, table_size=17)
+    for file in ("actor.usda", "anim_capture.usdc", "actor.usdz", "actor_skel.usdc"):
+        assert_valid_usd(tmp_path / file)
+        stage = Usd.Stage.Open(str(tmp_path / file))
+        prim = stage.GetPrimAtPath("/Actor/geo/Mandible/MandibleMesh")
+        assert "placeholder" in prim.GetDisplayName() and "Not anatomy" in prim.GetDocumentation()
+        assert prim.GetCustomDataByKey("placeholder") is True
+        attribute = prim.GetAttribute("jaw:placeholder")
+        assert attribute.Get() is True and attribute.IsCustom()
+        assert prim.GetAttribute("jaw:placeholder:condyles").Get() == "landmarks given with the capture"
+        material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
+        assert material.GetPrim().GetName() == "Placeholder"
+    assert describe(tmp_path / "actor.usda")["placeholders"] == ["MandibleMesh"]
+
+
+def test_a_given_mandible_bears_no_mark(anchored_folder):
+    assert describe(anchored_folder / "actor.usda")["placeholders"] == []
+    stage = Usd.Stage.Open(str(anchored_folder / "actor.usda"))
+    assert UsdGeom.Mesh(stage.GetPrimAtPath("/Actor/geo/Mandible/MandibleMesh"))
+    assert not stage.GetPrimAtPath("/Actor/mtl/Placeholder")
