@@ -9,6 +9,21 @@ from typing import Annotated
 import typer
 
 from jawusd.cli.output import emit, progress, refuse_existing
+from jawusd.cli.subject_options import (
+    CaptureOption,
+    ColumnsOption,
+    GroupOption,
+    InvertOption,
+    LandmarksOption,
+    LengthUnit,
+    LowerOption,
+    MandibleOption,
+    RestOption,
+    UnitOption,
+    UpperOption,
+    subject_given,
+    trajectory_options,
+)
 
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 Force = Annotated[bool, typer.Option("--force", help="Overwrite an existing output.")]
@@ -128,8 +143,20 @@ def _check_backend(solver: Solver, backend: Backend) -> None:
 
 
 def fit(
-    poses: Annotated[Path, typer.Argument(help="tracks.npz, or a CSV of poses.", show_default=False)],
-    capture: Annotated[Path, typer.Option(help="The capture: gives scans and landmarks.", show_default=False)],
+    poses: Annotated[
+        Path,
+        typer.Argument(help="tracks.npz, a CSV of poses, or HDF5 of jaw-tracking-system.", show_default=False),
+    ],
+    capture: CaptureOption = None,
+    upper_teeth: UpperOption = None,
+    lower_teeth: LowerOption = None,
+    mandible: MandibleOption = None,
+    landmarks: LandmarksOption = None,
+    columns: ColumnsOption = None,
+    length_unit: UnitOption = LengthUnit.mm,
+    invert: InvertOption = False,
+    rest_frame: RestOption = None,
+    group: GroupOption = None,
     out: Annotated[Path, typer.Option("-o", "--out", help="File of the model.")] = Path("model.npz"),
     model: Annotated[Method, typer.Option(help="Form of the jaw model.")] = Method.anchored,
     force: Force = False,
@@ -138,15 +165,14 @@ def fit(
 ) -> None:
     """Fit a three-parameter jaw model to tracked or given poses."""
     from jawusd.formats.model import save_model
-    from jawusd.pipeline.prepare import open_capture
-    from jawusd.pipeline.stages import fit_jaw, read_motion
+    from jawusd.pipeline.stages import fit_subject, read_motion
     from jawusd.pipeline.summary import fit_lines, fit_summary
 
     refuse_existing(out, force)
-    motion = read_motion(poses)
-    opened = open_capture(capture, allow_outside=allow_outside)
+    motion = read_motion(poses, trajectory_options(columns, length_unit, invert, rest_frame, group))
+    subject = subject_given(poses.stem, capture, upper_teeth, lower_teeth, mandible, landmarks, allow_outside)
     with progress() as report:
-        fitted = fit_jaw(opened, motion, model.value, report)
+        fitted = fit_subject(subject, motion, model.value, report)
     save_model(out, fitted)
     summary = {**fit_summary(fitted), "file": str(out)}
     emit(summary, as_json, lambda: fit_lines(summary))

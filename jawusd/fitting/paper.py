@@ -123,7 +123,9 @@ class PaperFit:
         return _motions(self.network_sum.value(self.network_sum.encode(points)), self.root)
 
 
-def fit_paper(data: TrainingData, shown: Mask, literal: bool, starts: int, seed: int) -> PaperFit:
+def fit_paper(
+    data: TrainingData, shown: Mask, literal: bool, starts: int, seed: int, nets: dict[int, Nlpca] | None = None
+) -> PaperFit:
     """Fit the paper's model.
 
     Args:
@@ -132,6 +134,7 @@ def fit_paper(data: TrainingData, shown: Mask, literal: bool, starts: int, seed:
         literal: keep the paper's groups (1), (2, 3), (4, 5) whatever the components turn out to mean.
         starts: networks trained from different starts; the sum with the smallest training error is kept.
         seed: of the first start.
+        nets: trained networks of five components by seed; used where there is one, completed by this call.
 
     Raises:
         FittingError: a parameter is not in the data, or no component moves the incisal point that way.
@@ -143,7 +146,11 @@ def fit_paper(data: TrainingData, shown: Mask, literal: bool, starts: int, seed:
         )
     root = data.metric.twist_root()
     points = se3_log(data.motion) @ root
-    sums = [_network_sum(data, points, root, literal, seed + start) for start in range(starts)]
+    nets = {} if nets is None else nets
+    for start in range(starts):
+        if seed + start not in nets:
+            nets[seed + start] = train_nlpca(points, COMPONENTS, seed + start)
+    sums = [_network_sum(data, points, root, literal, seed + start, nets[seed + start]) for start in range(starts)]
     best = min(sums, key=lambda found: _error(found, data, points, root))
     if not literal:
         best = _with_leftovers(best, data, points, root)
@@ -154,8 +161,7 @@ def fit_paper(data: TrainingData, shown: Mask, literal: bool, starts: int, seed:
     return fit
 
 
-def _network_sum(data: TrainingData, points: Array, root: Array, literal: bool, seed: int) -> _Sum:
-    net = train_nlpca(points, COMPONENTS, seed)
+def _network_sum(data: TrainingData, points: Array, root: Array, literal: bool, seed: int, net: Nlpca) -> _Sum:
     groups = _LITERAL_GROUPS if literal else _groups_by_incisal_motion(net, points, root, data.incisor)
     components = net.encode(points)
     parts = [_part(net, components, group, seed, _ALL_STAGES) for group in groups]

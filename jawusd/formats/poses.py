@@ -1,7 +1,7 @@
 """Poses and parameters as tables: CSV with a header, or JSON with the same columns.
 
 Poses:      frame, m00, m01, ... m33   (row-major T_skull_mandible [mm])
-        or  frame, tx, ty, tz, qw, qx, qy, qz
+        or  frame, tx, ty, tz, qw, qx, qy, qz   (scalar-first quaternion)
 Parameters: frame, d1, d2, d3   [mm]
 """
 
@@ -11,6 +11,7 @@ import csv
 import io
 import json
 import os
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,7 @@ PARAMETER_COLUMNS = ("d1", "d2", "d3")
 _MAX_BYTES = 1 << 30
 # A matrix written with 5 decimals is rigid to about this.
 _RIGID_TOLERANCE = 1e-3
+_ZERO_QUATERNION = 1e-6
 
 
 def _read_table(path: Path) -> dict[str, list[str]]:
@@ -94,20 +96,27 @@ def _numbers(columns: dict[str, list[str]], names: tuple[str, ...], path: Path) 
     return out
 
 
-def _frames(columns: dict[str, list[str]], path: Path) -> NDArray[np.int64]:
-    if "frame" not in columns:
-        raise FormatError(f'has no column "frame"; it has {", ".join(columns) or "none"}.', path=path)
-    values = _numbers(columns, ("frame",), path)[:, 0]
-    if (values != np.round(values)).any() or np.abs(values).max(initial=0) > 2**53:
-        raise FormatError('column "frame" must hold whole numbers.', path=path)
+def _frames(columns: dict[str, list[str]], name: str, path: Path) -> NDArray[np.int64]:
+    if name not in columns:
+        raise FormatError(f'has no column "{name}"; it has {", ".join(columns) or "none"}.', path=path)
+    values = _numbers(columns, (name,), path)[:, 0]
+    uneven = np.flatnonzero((values != np.round(values)) | (np.abs(values) > 2**53))
+    if uneven.size:
+        row = int(uneven[0])
+        raise FormatError(
+            f'row {row + 1}, column "{name}" is {columns[name][row]}; frames must be whole numbers.', path=path
+        )
     return values.astype(np.int64)
 
 
-def read_poses(path: str | os.PathLike[str]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def read_poses(
+    path: str | os.PathLike[str], columns: Mapping[str, str] | None = None
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Read jaw poses from CSV or JSON.
 
     Args:
-        path: table with matrix or quaternion columns, see the module.
+        path: table with matrix or quaternion columns, see the module; the last matrix row may be left out.
+        columns: how the file calls columns that are not named as in the module, e.g. {"tx": "X"}.
 
     Returns:
         Frame numbers (F,) and T_skull_mandible (F, 4, 4).
@@ -116,20 +125,31 @@ def read_poses(path: str | os.PathLike[str]) -> tuple[NDArray[np.int64], NDArray
         FormatError: columns missing, a value that is not a finite number, or a matrix that is not rigid.
     """
     path = Path(path)
-    columns = _read_table(path)
-    frames = _frames(columns, path)
-    if all(name in columns for name in MATRIX_COLUMNS):
-        T = _numbers(columns, MATRIX_COLUMNS, path).reshape(-1, 4, 4)
-    elif all(name in columns for name in QUATERNION_COLUMNS):
-        values = _numbers(columns, QUATERNION_COLUMNS, path)
+    table = _read_table(path)
+    called = {name: name for name in ("frame", *MATRIX_COLUMNS, *QUATERNION_COLUMNS)} | dict(columns or {})
+    for name, theirs in (columns or {}).items():
+        if theirs not in table:
+            raise FormatError(
+                f'has no column "{theirs}" to be read as "{name}"; it has {", ".join(table)}.', path=path
+            )
+    frames = _frames(table, called["frame"], path)
+    matrix, quaternion = (tuple(called[name] for name in names) for names in (MATRIX_COLUMNS, QUATERNION_COLUMNS))
+    if all(name in table for name in matrix[:12]):
+        T = np.tile(np.eye(4), (len(frames), 1, 1))
+        rows = 4 if all(name in table for name in matrix) else 3
+        T[:, :rows] = _numbers(table, matrix[: 4 * rows], path).reshape(-1, rows, 4)
+    elif all(name in table for name in quaternion):
+        values = _numbers(table, quaternion, path)
         norm = np.linalg.norm(values[:, 3:], axis=1)
-        if (norm < 1e-6).any():
+        if (norm < _ZERO_QUATERNION).any():
             raise FormatError(f"row {int(norm.argmin()) + 1}: the quaternion is zero.", path=path)
         T = make_transform(matrix_from_wxyz(values[:, 3:]), values[:, :3])
     else:
         raise FormatError(
-            f"has neither the columns m00 ... m33 nor {', '.join(QUATERNION_COLUMNS)}; it has {', '.join(columns)}.",
+            f"has neither the columns {matrix[0]} ... {matrix[11]} nor {', '.join(quaternion)}; "
+            f"it has {', '.join(table)}.",
             path=path,
+            hint=None if columns else "`jawusd fit` takes other names with --columns, e.g. tx=X,ty=Y,...",
         )
     return frames, _checked_rigid(T, path)
 
@@ -157,7 +177,7 @@ def read_parameters(path: str | os.PathLike[str]) -> tuple[NDArray[np.int64], ND
     """
     path = Path(path)
     columns = _read_table(path)
-    frames = _frames(columns, path)
+    frames = _frames(columns, "frame", path)
     missing = [name for name in PARAMETER_COLUMNS if name not in columns]
     if missing:
         raise FormatError(f'has no column "{missing[0]}"; it has {", ".join(columns)}.', path=path)

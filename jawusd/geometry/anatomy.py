@@ -158,6 +158,24 @@ def find_landmarks(
     return transform_points(np.linalg.inv(A), out)
 
 
+def landmark_frame(landmarks: ArrayLike) -> NDArray[np.float64]:
+    """Find the anatomical frame from landmarks alone: occlusal plane through incisal point and molars.
+
+    Args:
+        landmarks: in the order of `LANDMARKS`, teeth in occlusion [mm], shape (5, 3).
+
+    Returns:
+        The landmarks' frame to the anatomical frame, origin at the lower incisal point, shape (4, 4).
+    """
+    incisor, molar_left, molar_right = np.asarray(landmarks, dtype=np.float64)[:3]
+    forward = incisor - 0.5 * (molar_left + molar_right)
+    up = np.cross(forward, molar_left - molar_right)
+    up /= np.linalg.norm(up)
+    forward /= np.linalg.norm(forward)
+    R = np.stack([np.cross(up, forward), up, forward])
+    return make_transform(R, -R @ incisor)
+
+
 def _condyle(mandible: NDArray[np.float64], side: float) -> NDArray[np.float64]:
     """Return the centre of one condylar head in anatomical coordinates, shape (3,)."""
     half = mandible[mandible[:, 0] * side > 0]

@@ -13,6 +13,7 @@ _EXTRA_OF = {
     "jawusd.tracking": "build",
     "jawusd.fitting": "build",
     "jawusd.rig": "build",
+    "jawusd.report": "report",
     "jawusd.synthetic": "demo",
 }
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from jawusd.errors import CalibrationError, CaptureError
 from jawusd.formats.calibration import load_calibration
@@ -81,22 +81,11 @@ def load_meshes(capture: Capture) -> dict[str, Mesh]:
 
 
 def find_anatomy(capture: Capture, meshes: dict[str, Mesh]) -> Anatomy:
-    """Return the anatomical frame and the landmarks, given ones before derived ones.
+    """Return the anatomical frame and the landmarks of a capture, given ones before derived ones.
 
     Raises:
         CaptureError: a landmark has an unknown name, or the scans are swapped or not in occlusion.
     """
-    imaging = stage("jawusd.imaging.meshio")
-    crowns = {name: mesh.vertices[imaging.tooth_labels(mesh) > 0] for name, mesh in meshes.items() if "teeth" in name}
-    inferred = []
-    given = capture.anatomy.T_anatomical_skull
-    if given is None:
-        T_anatomical_skull = anatomical_frame(crowns["upper_teeth"], crowns["lower_teeth"])
-        inferred.append("anatomical axes, from the scans")
-    else:
-        T_anatomical_skull = np.array(given, dtype=np.float64)
-    bone = meshes.get("mandible")
-    landmarks = find_landmarks(crowns["lower_teeth"], None if bone is None else bone.vertices, T_anatomical_skull)
     named = capture.anatomy.landmarks or {}
     unknown = sorted(set(named) - set(LANDMARKS))
     if unknown:
@@ -104,6 +93,30 @@ def find_anatomy(capture: Capture, meshes: dict[str, Mesh]) -> Anatomy:
             f'[anatomy.landmarks] names "{unknown[0]}", known are {", ".join(LANDMARKS)}.',
             path=capture.folder / "capture.toml",
         )
+    return measure_anatomy(meshes, capture.anatomy.T_anatomical_skull, named)
+
+
+def measure_anatomy(meshes: Mapping[str, Mesh], given: ArrayLike | None, named: Mapping[str, ArrayLike]) -> Anatomy:
+    """Derive from the scans what is not given.
+
+    Args:
+        meshes: by the names of `MESHES`, both rows of teeth among them.
+        given: T_anatomical_skull, shape (4, 4), or None.
+        named: landmarks in the mandible frame [mm] by the names of `geometry.LANDMARKS`, shape (3,) each.
+
+    Raises:
+        CaptureError: the scans are swapped or not in occlusion.
+    """
+    imaging = stage("jawusd.imaging.meshio")
+    crowns = {name: mesh.vertices[imaging.tooth_labels(mesh) > 0] for name, mesh in meshes.items() if "teeth" in name}
+    inferred = []
+    if given is None:
+        T_anatomical_skull = anatomical_frame(crowns["upper_teeth"], crowns["lower_teeth"])
+        inferred.append("anatomical axes, from the scans")
+    else:
+        T_anatomical_skull = np.array(given, dtype=np.float64)
+    bone = meshes.get("mandible")
+    landmarks = find_landmarks(crowns["lower_teeth"], None if bone is None else bone.vertices, T_anatomical_skull)
     for index, name in enumerate(LANDMARKS):
         if name in named:
             landmarks[index] = named[name]

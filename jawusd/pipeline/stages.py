@@ -9,15 +9,16 @@ from pathlib import Path
 
 import numpy as np
 
-from jawusd.errors import JawusdError
+from jawusd.errors import FormatError, JawusdError
 from jawusd.evaluator import JawRig
 from jawusd.formats.capture import Capture
 from jawusd.formats.model import JawModel
-from jawusd.formats.poses import read_poses
 from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.pipeline.extras import stage
 from jawusd.pipeline.prepare import find_anatomy, load_cameras, load_meshes
 from jawusd.pipeline.state import Progress
+from jawusd.pipeline.subject import Subject, subject_of_capture
+from jawusd.pipeline.trajectories import TrajectoryOptions, read_trajectory
 
 Motion = Tracks | tuple[np.ndarray, np.ndarray]
 
@@ -119,23 +120,38 @@ def _track(
     )
 
 
-def read_motion(path: str | os.PathLike[str]) -> Motion:
-    """Read tracks, or a table of poses from elsewhere.
+def read_motion(path: str | os.PathLike[str], options: TrajectoryOptions | None = None) -> Motion:
+    """Read tracks, or poses from elsewhere.
+
+    Args:
+        path: tracks.npz, a CSV or JSON table, or HDF5 of jaw-tracking-system.
+        options: how a file from elsewhere is written; not for tracks.
 
     Returns:
         `Tracks` of an npz file; of any other file frame numbers (F,) and T_skull_mandible (F, 4, 4).
 
     Raises:
-        FormatError: not such a file.
+        FormatError: not such a file, or options given for tracks.
+        MissingDependencyError: HDF5 without h5py.
     """
-    return load_tracks(path) if Path(path).suffix == ".npz" else read_poses(path)
+    if Path(path).suffix != ".npz":
+        return read_trajectory(path, options or TrajectoryOptions())
+    if options not in (None, TrajectoryOptions()):
+        raise FormatError("are tracks; columns, units and rest frame are for poses from elsewhere.", path=path)
+    return load_tracks(path)
 
 
 def fit_jaw(capture: Capture, motion: Motion, method: str, progress: Progress) -> JawModel:
+    """Fit the jaw model of the person of a capture; see `fit_subject`."""
+    with _about(capture):
+        return fit_subject(subject_of_capture(capture), motion, method, progress)
+
+
+def fit_subject(subject: Subject, motion: Motion, method: str, progress: Progress) -> JawModel:
     """Fit the jaw model.
 
     Args:
-        capture: gives scans, landmarks and mandible.
+        subject: gives landmarks and mandible.
         motion: what `read_motion` gives.
         method: "anchored", "additive", "paper" or "pca".
         progress: told of the work.
@@ -144,20 +160,19 @@ def fit_jaw(capture: Capture, motion: Motion, method: str, progress: Progress) -
         FittingError: the poses cannot carry a model.
     """
     fitting = stage("jawusd.fitting")
-    meshes = load_meshes(capture)
-    anatomy = find_anatomy(capture, meshes)
-    bone = meshes.get("mandible", meshes["lower_teeth"])
-    with _about(capture):
-        model = fitting.fit_model(
-            motion,
-            T_anatomical_skull=anatomy.T_anatomical_skull,
-            landmarks=anatomy.landmarks,
-            mandible_vertices=bone.vertices,
-            config=fitting.FittingConfig(method=method),
-            actor=capture.name,
-            progress=lambda done, total: progress("fit", done, total),
-        )
-    model.meta.update(fps=capture.fps, inferred=list(anatomy.inferred))
+    model = fitting.fit_model(
+        motion,
+        T_anatomical_skull=subject.T_anatomical_skull,
+        landmarks=subject.landmarks,
+        mandible_vertices=subject.measured_points(),
+        T_rest=subject.T_rest,
+        config=fitting.FittingConfig(method=method),
+        actor=subject.name,
+        progress=lambda done, total: progress("fit", done, total),
+    )
+    model.meta["inferred"] = list(subject.inferred)
+    if subject.fps is not None:
+        model.meta["fps"] = subject.fps
     return model
 
 

@@ -35,6 +35,9 @@ def test_imports_follow_the_layers():
         ("pipeline/__init__.py", "import torch", "torch and shapely"),
         ("tracking/__init__.py", "import cv2", "Video and image"),
         ("fitting/__init__.py", "import rich", "typer and rich"),
+        ("fitting/__init__.py", "import matplotlib", "matplotlib and jinja2"),
+        ("report/__init__.py", "import jawusd.fitting", "Layers"),
+        ("formats/poses.py", "import h5py", "h5py belongs"),
         ("newlayer/__init__.py", "x = 1", "newlayer"),
     ],
 )

@@ -1,0 +1,117 @@
+"""Options that say whose jaw it is and how a file of poses is written: shared by `fit` and `report`."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from jawusd.pipeline.subject import Subject
+    from jawusd.pipeline.trajectories import TrajectoryOptions
+
+
+class LengthUnit(StrEnum):
+    """Name the units of length that a table may have."""
+
+    mm = "mm"
+    cm = "cm"
+    m = "m"
+
+
+CaptureOption = Annotated[Path | None, typer.Option(help="The capture: gives scans and landmarks.", show_default=False)]
+UpperOption = Annotated[
+    Path | None, typer.Option(help="Scan of the upper teeth, instead of a capture.", show_default=False)
+]
+LowerOption = Annotated[
+    Path | None, typer.Option(help="Scan of the lower teeth, in the same frame, in occlusion.", show_default=False)
+]
+MandibleOption = Annotated[Path | None, typer.Option(help="Mesh of the mandible, same frame.", show_default=False)]
+LandmarksOption = Annotated[
+    Path | None, typer.Option(help="Landmarks (JSON), instead of a capture or scans.", show_default=False)
+]
+ColumnsOption = Annotated[
+    str | None,
+    typer.Option(
+        help="How a table calls its columns: frame=Frame,tx=X,ty=Y,tz=Z,qw=W,... or m00=...,m01=...",
+        show_default=False,
+    ),
+]
+UnitOption = Annotated[LengthUnit, typer.Option(help="Unit of a table's translations.")]
+InvertOption = Annotated[bool, typer.Option("--invert", help="The poses map skull to mandible.")]
+RestOption = Annotated[
+    int | None,
+    typer.Option(help="A frame with the teeth in occlusion: poses are taken relative to it.", show_default=False),
+]
+GroupOption = Annotated[str | None, typer.Option(help="Trajectory of an HDF5 file.", show_default=False)]
+
+
+def trajectory_options(
+    columns: str | None, length_unit: LengthUnit, invert: bool, rest_frame: int | None, group: str | None
+) -> TrajectoryOptions:
+    """Return the options of a file of poses.
+
+    Raises:
+        typer.BadParameter: a column map that cannot be read.
+    """
+    from jawusd.pipeline.trajectories import TrajectoryOptions
+
+    return TrajectoryOptions(_column_map(columns), length_unit.value, invert, rest_frame, group)
+
+
+def _column_map(text: str | None) -> dict[str, str]:
+    from jawusd.formats.poses import MATRIX_COLUMNS, QUATERNION_COLUMNS
+
+    known = ("frame", *QUATERNION_COLUMNS, *MATRIX_COLUMNS)
+    found: dict[str, str] = {}
+    for part in (text or "").split(",") if text else ():
+        ours, sign, theirs = (piece.strip() for piece in part.partition("="))
+        if not sign or not theirs:
+            raise typer.BadParameter(f'"{part}" is not of the form name=column.', param_hint="--columns")
+        if ours not in known:
+            raise typer.BadParameter(
+                f'"{ours}" is not a column of poses; known are frame, {", ".join(QUATERNION_COLUMNS)}, m00 ... m33.',
+                param_hint="--columns",
+            )
+        if ours in found:
+            raise typer.BadParameter(f'"{ours}" is named twice.', param_hint="--columns")
+        found[ours] = theirs
+    return found
+
+
+def subject_given(
+    name: str,
+    capture: Path | None,
+    upper_teeth: Path | None,
+    lower_teeth: Path | None,
+    mandible: Path | None,
+    landmarks: Path | None,
+    allow_outside: bool,
+) -> Subject:
+    """Return the person that the options describe.
+
+    Args:
+        name: of a person without a capture.
+        capture, upper_teeth, lower_teeth, mandible, landmarks: one of capture, both scans, or landmarks.
+        allow_outside: let paths in the capture leave its folder.
+
+    Raises:
+        typer.BadParameter: none or several of them.
+        JawusdError: what the files raise.
+    """
+    from jawusd.pipeline.prepare import open_capture
+    from jawusd.pipeline.subject import subject_of_capture, subject_of_landmarks, subject_of_scans
+
+    scans = {"upper_teeth": upper_teeth, "lower_teeth": lower_teeth, "mandible": mandible}
+    scans = {key: path for key, path in scans.items() if path is not None}
+    if sum((capture is not None, bool(scans), landmarks is not None)) != 1:
+        raise typer.BadParameter("give either --capture, or --upper-teeth and --lower-teeth, or --landmarks.")
+    if capture is not None:
+        return subject_of_capture(open_capture(capture, allow_outside=allow_outside))
+    if landmarks is not None:
+        return subject_of_landmarks(landmarks, name)
+    if not {"upper_teeth", "lower_teeth"} <= set(scans):
+        raise typer.BadParameter("scans mean both --upper-teeth and --lower-teeth; --mandible may be added.")
+    return subject_of_scans(scans, name)

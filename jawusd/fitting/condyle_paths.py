@@ -1,0 +1,139 @@
+"""Paper Fig. 5: where the condyles go when the jaw opens, in the principal component and in the models."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.evaluator.models import JawModelForm
+from jawusd.fitting.data import Anatomy, TrainingData
+from jawusd.formats.experiments import CondylePath, Distances
+from jawusd.formats.mesh import Mesh
+from jawusd.geometry import se3_exp, se3_log, transform_points
+
+Array = NDArray[np.float64]
+
+EXPERIMENT = "condyle path"
+PRINCIPAL = "principal component 1"
+
+_STEPS = 121
+_SHOWN_OPENINGS = (0.0, 1 / 3, 2 / 3, 1.0)  # of the path at which the condyle's outline is drawn: four, as the paper
+_AROUND_MM = 24.0  # of the outlines about the closed condyle
+_HABITUAL_MM = 1.5  # captured poses with |d2| and |d3| below this belong to plain opening
+_BESIDE_MM = 0.75  # captured condyles this near in z say how high the eminence lets a condyle go
+_FEWEST_BESIDE = 3
+
+
+def condyle_paths(
+    data: TrainingData, models: dict[str, JawModelForm], widest_mm: float, mandible: Mesh | None, anatomy: Anatomy
+) -> list[CondylePath]:
+    """Sweep the first principal component, and the opening of each model.
+
+    Args:
+        data: the captured poses.
+        models: decoders by name; d1 alone is swept.
+        widest_mm: opening at which the sweeps of models end.
+        mandible: for outlines of the condyle, mandible frame.
+        anatomy: where the jaw lies.
+    """
+    sweeps = {PRINCIPAL: principal_opening(data)}
+    d = np.zeros((_STEPS, 3))
+    d[:, 0] = np.linspace(0.0, widest_mm, _STEPS)
+    sweeps |= {name: model.motion(d) for name, model in models.items()}
+    bone = None if mandible is None else Mesh(anatomy.at_rest(mandible.vertices), mandible.faces)
+    return [_path(name, motion, data, bone) for name, motion in sweeps.items()]
+
+
+def principal_opening(data: TrainingData) -> Array:
+    """Return the motions log M = w p1 for w between the captured extremes, shape (K, 4, 4), ordered to open.
+
+    p1 is the first principal component of the captured twists under the mandible metric, not centred, so that the
+    sweep passes the closed bite as the models' do (the paper's w1 p1).
+    """
+    root = data.metric.twist_root()
+    points = se3_log(data.motion) @ root * np.sqrt(data.weights)[:, None]
+    first = np.linalg.svd(points, full_matrices=False)[2][0]
+    scores = se3_log(data.motion) @ root @ first
+    if np.median(scores) < 0:
+        first, scores = -first, -scores
+    weights = np.linspace(min(np.percentile(scores, 0.5), 0.0), np.percentile(scores, 99.5), _STEPS)
+    return se3_exp(weights[:, None] * np.linalg.solve(root.T, first))
+
+
+def _path(name: str, motion: Array, data: TrainingData, bone: Mesh | None) -> CondylePath:
+    points = np.stack([transform_points(motion, centre) for centre in data.landmarks[3:]])
+    opening = -(transform_points(motion, data.incisor) - data.incisor)[:, 1]
+    heads = []
+    if bone is not None:
+        near = Mesh(bone.vertices, _faces_near(bone, data.landmarks[3]))
+        for share in _SHOWN_OPENINGS:
+            k = round(share * (len(motion) - 1))
+            moved = Mesh(transform_points(motion[k], near.vertices), near.faces)
+            heads.append(sagittal_section(moved, points[0, k], _AROUND_MM))
+    return CondylePath(name, opening, points, tuple(heads))
+
+
+def _faces_near(mesh: Mesh, centre: Array) -> NDArray[np.int32]:
+    near = np.linalg.norm(mesh.vertices - centre, axis=1) < 2 * _AROUND_MM
+    return mesh.faces[near[mesh.faces].all(axis=1)]
+
+
+def sagittal_section(mesh: Mesh, centre: Array, around_mm: float) -> Array:
+    """Cut a mesh with the plane x = centre[0].
+
+    Args:
+        mesh: anatomical frame.
+        centre: a point of the plane [mm], shape (3,).
+        around_mm: segments farther from the centre than this are left out.
+
+    Returns:
+        Segments of the cut, end points (z, y) [mm], shape (S, 2, 2).
+    """
+    side = mesh.vertices[:, 0] > centre[0]
+    cut = mesh.vertices[mesh.faces[side[mesh.faces].sum(axis=1) % 3 > 0]]
+    if not len(cut):
+        return np.empty((0, 2, 2))
+    height = cut[:, :, 0] - centre[0]
+    above = height > 0
+    # Of three corners one lies alone on its side of the plane: the cut runs between its two edges.
+    alone = np.where(above.sum(1) == 1, above.argmax(1), (~above).argmax(1))
+    rows = np.arange(len(cut))
+    ends = []
+    for other in (1, 2):
+        far = (alone + other) % 3
+        share = height[rows, alone] / (height[rows, alone] - height[rows, far])
+        ends.append(cut[rows, alone] + share[:, None] * (cut[rows, far] - cut[rows, alone]))
+    segments = np.stack(ends, axis=1)[:, :, [2, 1]]
+    near = (np.abs(segments - centre[[2, 1]]) < around_mm).all(axis=(1, 2))
+    return segments[near]
+
+
+def path_distances(paths: list[CondylePath], captured: Array, d: Array) -> list[Distances]:
+    """Measure the paths against the captured condyles.
+
+    Args:
+        paths: of the models.
+        captured: condyle centres of the captured poses [mm], shape (2, N, 3).
+        d: parameters of the captured poses in the default model [mm], shape (N, 3).
+
+    Returns:
+        For each path how far its points lie from the nearest captured condyle of plain opening, and how far above
+        the highest captured condyle beside them, where there is any: the eminence lets no condyle go there.
+    """
+    habitual = captured[:, (np.abs(d[:, 1:]) < _HABITUAL_MM).all(axis=1)]
+    found = []
+    for path in paths:
+        above = np.concatenate([_above(path.points[side], captured[side]) for side in (0, 1)])
+        found.append(Distances(EXPERIMENT, path.model, "above every captured condyle", above))
+        if habitual.shape[1]:
+            away = np.linalg.norm(path.points[:, :, None] - habitual[:, None], axis=-1).min(2).ravel()
+            found.append(Distances(EXPERIMENT, path.model, "from the captured opening path", away))
+    return found
+
+
+def _above(path: Array, captured: Array) -> Array:
+    """Return how far path points (K, 3) lie above the highest captured ones (N, 3) at the same z [mm], 0 if below."""
+    beside = np.abs(path[:, None, 2] - captured[None, :, 2]) < _BESIDE_MM
+    highest = np.where(beside, captured[None, :, 1], -np.inf).max(1)
+    known = beside.sum(1) >= _FEWEST_BESIDE
+    return np.maximum(path[known, 1] - highest[known], 0.0)

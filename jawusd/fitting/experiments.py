@@ -1,0 +1,218 @@
+"""The experiments of Yang et al. (2019) on any take: paper Figs. 5, 12 and 13, and which poses the take lacks."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jawusd.errors import FittingError
+from jawusd.fitting.condyle_paths import condyle_paths, path_distances, sagittal_section
+from jawusd.fitting.config import FittingConfig
+from jawusd.fitting.coverage import missing_movements, shown_parameters
+from jawusd.fitting.data import Anatomy, TrainingData, select_poses, select_tracks
+from jawusd.fitting.fit import fit_form
+from jawusd.fitting.holdout import FittedForm
+from jawusd.fitting.nlpca import Nlpca, train_nlpca
+from jawusd.fitting.paper import COMPONENTS, PaperFit, fit_paper
+from jawusd.fitting.synthesis import Bounds, captured_reference, distance_to_nearest
+from jawusd.formats.experiments import Coverage, Distances, Experiments
+from jawusd.formats.mesh import Mesh
+from jawusd.formats.tracks import Tracks
+from jawusd.geometry import se3_exp, se3_log, transform_points
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+#: Models of the experiments: label and how `FittingConfig` asks for them.
+MODELS: dict[str, dict] = {
+    "paper, literal": {"method": "paper", "literal": True},
+    "paper": {"method": "paper"},
+    "additive": {"method": "additive"},
+    "anchored": {"method": "anchored"},
+    "pca": {"method": "pca"},
+}
+DEFAULT = "anchored"
+RECONSTRUCTION, SYNTHESIS = "reconstruction", "synthesis"
+
+_LARGEST = "largest vertex distance"
+_OPENING_QUANTILE = 0.995  # the sweep of Fig. 5 ends here, not at the one widest frame
+_SKULL_AROUND_MM = 30.0
+_GRID_MM = 0.5
+_FAR_MM = np.array([3.0, 2.0, 2.0])  # a pose farther than this from all captured ones lies in a gap
+_SLICES = 60
+
+#: Called with the steps done and the steps in all.
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    """The models of one take, with the captured poses in their parameters."""
+
+    forms: dict[str, FittedForm]
+    d: dict[str, Array]
+    nearest: dict[str, Array]
+    notes: tuple[str, ...]
+
+
+def run_experiments(
+    source: Tracks | tuple[ArrayLike, ArrayLike],
+    anatomy: Anatomy,
+    *,
+    bones: Mapping[str, Mesh] | None = None,
+    config: FittingConfig = FittingConfig(),  # noqa: B008 - frozen
+    actor: str = "",
+    progress: Progress | None = None,
+) -> Experiments:
+    """Do the paper's experiments on a take.
+
+    Args:
+        source: tracks (their raw poses are used, those a prior helped with are not), or frame numbers (F,) and poses
+            T_skull_mandible (F, 4, 4) with NaN where there is none.
+        anatomy: where the jaw lies and which points are measured.
+        bones: meshes "mandible" and "skull" for outlines, scan frame [mm]; either may be missing.
+        config: starts and seed of the networks, trimming, alpha, folds; the method is not looked at.
+        actor: whose jaw.
+        progress: told of the steps done.
+
+    Returns:
+        The results. Models that cannot be fitted to the take are left out and named in `notes`.
+
+    Raises:
+        FittingError: too few poses or no motion.
+    """
+    tell, steps = progress or (lambda done, total: None), len(MODELS) + COMPONENTS
+    selection = select_tracks(source, anatomy) if isinstance(source, Tracks) else select_poses(*source, anatomy)
+    data, bones = selection.data, bones or {}
+    shown, sentences = shown_parameters(data)
+    fitted = _fit_all(data, shown, config, lambda done: tell(done, steps))
+    paper = fitted.forms.get("paper")
+    nets = _networks(data, config, paper, lambda done: tell(len(MODELS) + done, steps))
+    captured = np.stack([transform_points(data.motion, centre) for centre in data.landmarks[3:]])
+    d = fitted.d[DEFAULT]
+    swept = {name: fitted.forms[name].model for name in ("paper", DEFAULT) if name in fitted.forms}
+    widest = float(np.quantile(d[:, 0], _OPENING_QUANTILE))
+    paths = condyle_paths(data, swept, widest, bones.get("mandible"), anatomy)
+    bounds = {name: Bounds.of(d[fitted.forms[name].kept], config.alpha) for name, d in fitted.d.items()}
+    distances = path_distances(paths, captured, d)
+    distances += _reconstruction(data, fitted, nets) + _synthesis(data, fitted, bounds, config)
+    kept = d[fitted.forms[DEFAULT].kept]
+    lacking = (*sentences, *missing_movements(kept, shown))
+    return Experiments(
+        actor=actor,
+        frames=len(data),
+        captured_condyles=captured,
+        skull=_skull_outline(bones.get("skull"), data, anatomy),
+        condyle_paths=tuple(paths),
+        distances=tuple(distances),
+        coverage=_coverage(kept, bounds[DEFAULT], lacking),
+        notes=fitted.notes,
+    )
+
+
+def _fit_all(data: TrainingData, shown: Mask, config: FittingConfig, tell: Callable[[int], None]) -> _Fitted:
+    forms, codes, nearest, notes, nets = {}, {}, {}, [], {}
+    for step, (name, choice) in enumerate(MODELS.items()):
+        tell(step)
+        start = time.perf_counter()
+        try:
+            form = _fit(data, shown, replace(config, **choice), nets)
+        except FittingError as error:
+            if name == DEFAULT:
+                raise
+            notes.append(f"{name}: {error}")
+            continue
+        seconds = time.perf_counter() - start
+        d, motion = data.metric.nearest(form.model, data.motion)
+        usable = np.isfinite(d).all(1)
+        if not usable[form.kept].all():
+            notes.append(f"{name}: the parameters of {int((~usable[form.kept]).sum())} poses cannot be found.")
+            continue
+        forms[name], codes[name], nearest[name] = form, d, motion
+        notes.append(f"{name}: fitted in {seconds:.1f} s; {int((~form.kept).sum())} frames left out as outliers.")
+    return _Fitted(forms, codes, nearest, tuple(notes))
+
+
+def _fit(data: TrainingData, shown: Mask, config: FittingConfig, nets: dict[int, Nlpca]) -> FittedForm:
+    """Fit one model; the two variants of the paper's share their networks."""
+    if config.method == "paper":
+        return fit_paper(data, shown, config.literal, config.starts, config.seed, nets)
+    return fit_form(data, shown, config)
+
+
+def _networks(
+    data: TrainingData, config: FittingConfig, paper: FittedForm | None, tell: Callable[[int], None]
+) -> list[Nlpca]:
+    """Return networks of 1..5 components; the last is the one behind the paper's model, if there is one."""
+    points = se3_log(data.motion) @ data.metric.twist_root()
+    nets = []
+    for count in range(1, COMPONENTS + 1):
+        tell(count - 1)
+        known = count == COMPONENTS and isinstance(paper, PaperFit)
+        nets.append(paper.network_sum.net if known else train_nlpca(points, count, config.seed))
+    tell(COMPONENTS)
+    return nets
+
+
+def _reconstruction(data: TrainingData, fitted: _Fitted, nets: list[Nlpca]) -> list[Distances]:
+    """Paper Fig. 12: every captured pose against what each model makes of it, trimmed frames included."""
+    root = data.metric.twist_root()
+    points = se3_log(data.motion) @ root
+    rebuilt = {
+        f"NLPCA {net.components}": se3_exp(np.linalg.solve(root.T, net.decode(net.encode(points)).T).T)
+        for net in nets
+    }
+    for name, form in fitted.forms.items():
+        if isinstance(form, PaperFit):
+            rebuilt[f"{name}, as published"] = form.reconstruct_as_published(data.motion)
+    rebuilt |= fitted.nearest
+    return [
+        Distances(RECONSTRUCTION, name, _LARGEST, data.metric.largest(motion, data.motion))
+        for name, motion in rebuilt.items()
+    ]
+
+
+def _synthesis(
+    data: TrainingData, fitted: _Fitted, bounds: dict[str, Bounds], config: FittingConfig
+) -> list[Distances]:
+    """Paper Fig. 13: random poses of each model against the nearest captured pose."""
+    folds = max(config.holdout_folds, 2)
+    reference = captured_reference(data.metric, data.motion, folds)
+    found = [Distances(SYNTHESIS, "captured hold-out poses", f"{folds} contiguous parts", reference)]
+    for name, form in fitted.forms.items():
+        for bound, d in bounds[name].draw(np.random.default_rng(config.seed)).items():
+            if len(d):
+                distance = distance_to_nearest(data.metric, form.model.motion(d), data.motion)
+                found.append(Distances(SYNTHESIS, name, bound, distance))
+    return found
+
+
+def _skull_outline(skull: Mesh | None, data: TrainingData, anatomy: Anatomy) -> Array:
+    if skull is None:
+        return np.empty((0, 2, 2))
+    placed = Mesh(transform_points(anatomy.T_anatomical_skull, skull.vertices), skull.faces)
+    return sagittal_section(placed, data.landmarks[3], _SKULL_AROUND_MM)
+
+
+def _coverage(d: Array, bounds: Bounds, sentences: tuple[str, ...]) -> Coverage:
+    openings = np.linspace(*bounds.slices_box[0], _SLICES)
+    at = np.zeros((_SLICES, 3))
+    at[:, 0] = openings
+    slices = np.stack([np.stack(bounds.slices.chord(at, axis), axis=1) for axis in (1, 2)])
+    gaps = _gaps(d, bounds, 1), _gaps(d, bounds, 2)
+    return Coverage(d, bounds.rings, openings, slices, gaps, sentences)
+
+
+def _gaps(d: Array, bounds: Bounds, axis: int) -> Array:
+    """Return points (d1, d_axis) of the slice hull, the other parameter zero, that lie far from every captured pose."""
+    first, second = (np.arange(low, high, _GRID_MM) for low, high in bounds.slices_box[[0, axis]])
+    grid = np.zeros((len(first) * len(second), 3))
+    grid[:, 0], grid[:, axis] = (part.ravel() for part in np.meshgrid(first, second))
+    grid = grid[bounds.slices.excess(grid) <= 0][:, [0, axis]]
+    scale = _FAR_MM[[0, axis]]
+    far = np.array([((((d[:, [0, axis]] - point) / scale) ** 2).sum(1) > 1).all() for point in grid], dtype=bool)
+    return grid[far]

@@ -1,0 +1,132 @@
+"""Results of the paper's experiments on one take: what was computed, ready to be drawn and tabulated."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.formats.atomic import write_text_atomic
+
+Array = NDArray[np.float64]
+
+TABLE_COLUMNS = ("experiment", "model", "quantity", "count", "mean_mm", "median_mm", "p95_mm", "max_mm")
+
+
+@dataclass(frozen=True, eq=False)
+class Distances:
+    """Name a set of distances.
+
+    Attributes:
+        experiment: "condyle path", "reconstruction" or "synthesis": paper Figs. 5, 12 and 13.
+        model: whose.
+        quantity: what was measured.
+        values_mm: one distance per pose or point of a path [mm], shape (N,).
+    """
+
+    experiment: str
+    model: str
+    quantity: str
+    values_mm: Array
+
+    def row(self) -> dict[str, str | int | float]:
+        """Return the distances as one row of the table, keys `TABLE_COLUMNS`."""
+        v = self.values_mm
+        figures = (len(v), v.mean(), np.median(v), np.percentile(v, 95), v.max()) if len(v) else (0, *[np.nan] * 4)
+        count, *rest = figures
+        labels = (self.experiment, self.model, self.quantity)
+        return dict(zip(TABLE_COLUMNS, (*labels, int(count), *map(float, rest)), strict=True))
+
+
+@dataclass(frozen=True, eq=False)
+class CondylePath:
+    """Hold the opening movement of one model at the condyles, anatomical frame.
+
+    Attributes:
+        model: whose.
+        opening_mm: vertical opening at the incisal point [mm], shape (K,).
+        points: centres of the left and right condyle [mm], shape (2, K, 3).
+        heads: outline of the left condyle in the sagittal plane through its centre at some openings: segments
+            (z, y) [mm], each of shape (S, 2, 2); empty without a mandible mesh.
+    """
+
+    model: str
+    opening_mm: Array
+    points: Array
+    heads: tuple[Array, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Coverage:
+    """Show which part of the envelope was captured, in the parameters d of the default model.
+
+    Attributes:
+        d: captured poses [mm], shape (N, 3).
+        outlines: rings of the paper's bounds in (d1, d2) and (d1, d3) [mm], each ring (n, 2).
+        slices_d1: openings [mm], shape (K,).
+        slices: valid d2 and d3 [mm] of the slice hull on the habitual path there, lowest and highest, shape (2, K, 2).
+        gaps: points (d1, d2) and (d1, d3) [mm] inside the slice hull far from every captured pose, each (G, 2).
+        sentences: what to record next.
+    """
+
+    d: Array
+    outlines: tuple[tuple[Array, ...], tuple[Array, ...]]
+    slices_d1: Array
+    slices: Array
+    gaps: tuple[Array, Array]
+    sentences: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Experiments:
+    """Hold the results.
+
+    Attributes:
+        actor: whose jaw.
+        frames: number of captured poses that were used.
+        captured_condyles: centres of the left and right condyle in all captured poses, anatomical frame [mm], shape
+            (2, N, 3).
+        skull: outline of the skull beside the left condyle: segments (z, y) [mm], shape (S, 2, 2).
+        condyle_paths: one per model.
+        distances: everything measured, in the order of the table.
+        coverage: captured part of the envelope.
+        notes: what could not be done and why.
+    """
+
+    actor: str
+    frames: int
+    captured_condyles: Array
+    skull: Array
+    condyle_paths: tuple[CondylePath, ...]
+    distances: tuple[Distances, ...]
+    coverage: Coverage
+    notes: tuple[str, ...]
+
+    def of(self, experiment: str) -> list[Distances]:
+        """Return the distances of one experiment."""
+        return [found for found in self.distances if found.experiment == experiment]
+
+    def table(self) -> list[dict[str, str | int | float]]:
+        """Return the table, one dictionary per row with the keys `TABLE_COLUMNS`."""
+        return [found.row() for found in self.distances]
+
+
+def save_table(path: str | os.PathLike[str], rows: list[dict[str, str | int | float]]) -> None:
+    """Write a table of experiments as CSV, atomically.
+
+    Args:
+        path: the file.
+        rows: what `Experiments.table` gives.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    text = io.StringIO()
+    writer = csv.DictWriter(text, TABLE_COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_text_atomic(path, text.getvalue())

@@ -1,0 +1,85 @@
+"""Landmarks of a jaw without scans: JSON, format jawusd-landmarks/1.
+
+    {"format": "jawusd-landmarks/1", "units": "mm",
+     "landmarks": {"incisor": [x, y, z], "molar_left": [...], "molar_right": [...],
+                   "condyle_left": [...], "condyle_right": [...]},
+     "T_anatomical_skull": [[...], [...], [...], [...]]}
+
+All five points lie in one frame with the teeth in occlusion, on the mandible; the transform to the anatomical frame is
+optional.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.errors import FormatError, UnitsError
+from jawusd.formats.npz import check_format
+from jawusd.geometry import LANDMARKS, rigidity_defect
+
+FAMILY, VERSION = "jawusd-landmarks", 1
+_RIGID_TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkFile:
+    """Hold the file.
+
+    Attributes:
+        landmarks: in the order of `geometry.LANDMARKS` [mm], shape (5, 3).
+        T_anatomical_skull: the file's frame to the anatomical frame, shape (4, 4), or None.
+    """
+
+    landmarks: NDArray[np.float64]
+    T_anatomical_skull: NDArray[np.float64] | None
+
+
+def load_landmarks(path: str | os.PathLike[str]) -> LandmarkFile:
+    """Read landmarks.
+
+    Raises:
+        FormatError: not such a file; the message names the key.
+        VersionError: written for a newer version.
+        UnitsError: lengths not in mm.
+    """
+    path = Path(path)
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise FormatError("there is no such file.", path=path) from error
+    except (OSError, ValueError, RecursionError) as error:
+        raise FormatError(f"is not JSON ({error}).", path=path) from error
+    if not isinstance(data, dict):
+        raise FormatError("must be a JSON object.", path=path)
+    check_format(data.get("format"), FAMILY, VERSION, path)
+    if data.get("units") != "mm":
+        raise UnitsError(f'units are "{data.get("units")}", allowed is "mm".', path=path)
+    unknown = sorted(set(data) - {"format", "units", "landmarks", "T_anatomical_skull"})
+    if unknown:
+        raise FormatError(f'"{unknown[0]}" is not a key of this format.', path=path)
+    named = data.get("landmarks")
+    if not isinstance(named, dict) or set(named) != set(LANDMARKS):
+        raise FormatError(f'"landmarks" must name exactly {", ".join(LANDMARKS)}.', path=path)
+    landmarks = np.stack([_numbers(named[name], (3,), f'landmark "{name}"', path) for name in LANDMARKS])
+    T = data.get("T_anatomical_skull")
+    if T is not None:
+        T = _numbers(T, (4, 4), '"T_anatomical_skull"', path)
+        if rigidity_defect(T) > _RIGID_TOLERANCE:
+            raise FormatError('"T_anatomical_skull" must be a rigid 4 x 4 matrix.', path=path)
+    return LandmarkFile(landmarks, T)
+
+
+def _numbers(value: object, shape: tuple[int, ...], name: str, path: Path) -> NDArray[np.float64]:
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise FormatError(f"{name} is not an array of numbers.", path=path) from error
+    if array.shape != shape or not np.isfinite(array).all():
+        raise FormatError(f"{name} must be finite numbers of shape {shape}, found shape {array.shape}.", path=path)
+    return array

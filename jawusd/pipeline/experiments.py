@@ -1,0 +1,77 @@
+"""The paper's experiments on a take: read it, compute, draw, and write the table."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from jawusd.formats.experiments import save_table
+from jawusd.pipeline.extras import stage
+from jawusd.pipeline.stages import Motion
+from jawusd.pipeline.state import Progress
+from jawusd.pipeline.subject import Subject
+
+TABLE_FILE = "experiments.csv"
+
+
+def report_experiments(subject: Subject, motion: Motion, folder: Path, starts: int, progress: Progress) -> dict:
+    """Do the paper's experiments and write figures and table.
+
+    Args:
+        subject: whose jaw.
+        motion: tracks or poses.
+        folder: where the files go; made if missing.
+        starts: random starts of the paper's networks.
+        progress: told of the work.
+
+    Returns:
+        `actor`, `frames`, `table` (rows), `coverage` (sentences), `notes` and `files`.
+
+    Raises:
+        FittingError: the poses cannot carry a model.
+        MissingDependencyError: matplotlib is not installed.
+        OutputError: a file cannot be written.
+    """
+    figures = stage("jawusd.report.figures")  # before minutes of computing: it may not be installed
+    experiments, fitting = stage("jawusd.fitting.experiments"), stage("jawusd.fitting")
+    data = stage("jawusd.fitting.data")
+    anatomy = data.Anatomy.of(
+        subject.T_anatomical_skull, subject.landmarks, subject.measured_points(), subject.T_rest
+    )
+    found = experiments.run_experiments(
+        motion,
+        anatomy,
+        bones=subject.bones,
+        config=fitting.FittingConfig(starts=starts),
+        actor=subject.name,
+        progress=lambda done, total: progress("experiments", done, total),
+    )
+    files = figures.draw_experiments(found, folder)
+    table = found.table()
+    save_table(folder / TABLE_FILE, table)
+    return {
+        "actor": found.actor,
+        "frames": found.frames,
+        "table": table,
+        "coverage": list(found.coverage.sentences),
+        "notes": list(found.notes),
+        "files": [*files, folder / TABLE_FILE],
+    }
+
+
+def experiment_files(folder: Path) -> list[Path]:
+    """Return the files that `report_experiments` writes into a folder."""
+    names = stage("jawusd.report.figures").FIGURES
+    return [folder / f"{name}.{suffix}" for name in names for suffix in ("png", "svg")] + [folder / TABLE_FILE]
+
+
+def experiment_lines(summary: dict) -> list[str]:
+    """Return the result of `report_experiments` as text."""
+    heads = ("mean", "median", "p95", "max")
+    lines = [f"{summary['actor']}: {summary['frames']} captured poses; distances [mm]"]
+    lines.append(f"{'experiment':<16}{'model':<30}{'quantity':<32}{'count':>6}" + "".join(f"{h:>9}" for h in heads))
+    for row in summary["table"]:
+        figures = "".join(f"{row[f'{head}_mm']:9.3f}" for head in heads)
+        lines.append(f"{row['experiment']:<16}{row['model']:<30}{row['quantity']:<32}{row['count']:>6}{figures}")
+    lines += [f"note: {note}" for note in summary["notes"]]
+    lines += [f"coverage: {sentence}" for sentence in summary["coverage"] or ["nothing is missing."]]
+    return lines + [str(path) for path in summary["files"]]
