@@ -93,6 +93,16 @@ class TrackingConfig:
     refine_bias_px: float = 0.1
     # Most rounds of that [-]: each leaves a tenth of the delay.
     refine_rounds: int = 2
+    # Shift of contours by wrong camera poses [px] from which those are corrected: below, what looks like it is the
+    # habits of whoever drew the masks.
+    refine_shift_px: float = 0.15
+    # How far calibrated cameras turn and move until the take, standard deviation per axis [rad, mm]: a knock.
+    refine_turn_rad: float = 0.0035
+    refine_move_mm: float = 0.5
+    # Frames on which camera poses are found [-], most rounds of that, and the change that ends it [px].
+    settle_frames: int = 40
+    settle_rounds: int = 8
+    settled_px: float = 0.02
 
     def gates_from(self, reach_px: float) -> tuple[float, ...]:
         """Return the gates to go through when the start is off by about reach_px, and no less than the usual."""

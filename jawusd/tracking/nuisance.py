@@ -1,15 +1,17 @@
-"""What a whole take tells about its cameras and masks: time offsets below a frame, and masks drawn too wide."""
+"""What a whole take tells: time offsets below a frame, masks drawn too wide, wrong camera poses."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.formats.tracks import LOST
 from jawusd.geometry import make_transform, se3_exp, se3_inverse, se3_log
+from jawusd.tracking.config import TrackingConfig
+from jawusd.tracking.extrinsics import Extrinsics, lever
 from jawusd.tracking.history import FrameRecord
 
 
@@ -21,22 +23,32 @@ class Nuisances:
         delays: camera c shows the instant of frame + delays[c], in frames, the first camera's is 0, shape (C,).
         bias_px: how far the masks of each row reach beyond the teeth at the working size, shape (2,).
         sigma_delays, sigma_bias_px: their standard deviations, shapes (C,) and (2,).
+        twists, sigma_twists: corrections of the camera poses as in `Extrinsics`, shape (C, 6).
+        shift_px: rms distance by which the twists shift contours beyond what poses of the teeth make up for.
     """
 
     delays: NDArray[np.float64]
     bias_px: NDArray[np.float64]
     sigma_delays: NDArray[np.float64]
     sigma_bias_px: NDArray[np.float64]
+    twists: NDArray[np.float64]
+    sigma_twists: NDArray[np.float64]
+    shift_px: float = 0.0
 
     def plus(self, more: Nuisances) -> Nuisances:
-        """Return the sum with what was estimated on top of this."""
-        return Nuisances(self.delays + more.delays, self.bias_px + more.bias_px, more.sigma_delays, more.sigma_bias_px)
+        """Return the sum with delays and biases that were estimated on top of these."""
+        return replace(more, delays=self.delays + more.delays, bias_px=self.bias_px + more.bias_px)
 
-    def matters(self, delay_frames: float, bias_px: float) -> bool:
+    def matters(self, config: TrackingConfig) -> bool:
         """Tell whether anything exceeds its limit, and clearly so."""
-        late = np.abs(self.delays) > np.maximum(delay_frames, 4 * self.sigma_delays)
-        wide = np.abs(self.bias_px) > np.maximum(bias_px, 4 * self.sigma_bias_px)
-        return bool(late.any() or wide.any())
+        late = np.abs(self.delays) > np.maximum(config.refine_delay_frames, 4 * self.sigma_delays)
+        wide = np.abs(self.bias_px) > np.maximum(config.refine_bias_px, 4 * self.sigma_bias_px)
+        return bool(late.any() or wide.any() or self.cameras_moved(config))
+
+    def cameras_moved(self, config: TrackingConfig) -> bool:
+        """Tell whether the camera poses are off by more than the limit, and clearly so."""
+        clear = (np.abs(self.twists) > 4 * self.sigma_twists).any()
+        return bool(clear and self.shift_px > config.refine_shift_px)
 
 
 # Spread expected before looking, which keeps them finite where a take says nothing: cameras synchronised to whole
@@ -45,34 +57,76 @@ _PRIOR_DELAY_FRAMES = 0.5
 _PRIOR_BIAS_PX = 0.5
 
 
-def estimate_nuisances(records: Mapping[int, FrameRecord], variance_px3: NDArray[np.float64]) -> Nuisances:
-    """Estimate delays and biases from the normal equations of all frames, the poses eliminated frame by frame.
+class TakeEquations:
+    """Sum up the normal equations of what all frames share, the poses eliminated frame by frame.
 
-    The residual of a sample is d = J (x + delay_c v) + bias with the pose correction x of its frame and the row's
-    velocity v, so all frames share delays and biases: a bordered block-diagonal system, solved by its Schur
-    complement (as in bundle adjustment, Triggs et al. 1999).
-
-    Args:
-        records: by frame; rows lost, and frames without both neighbours, are left out.
-        variance_px3: outline variance times correlation length per row [px^3], shape (2,).
+    The residual of a sample is d = J (x + delay_c v + A y_c) + bias with the pose correction x of its frame, the row's
+    velocity v, and the camera's twist y_c brought to the row's centre by A, so all frames share delays, biases and
+    twists: a bordered block-diagonal system, solved by its Schur complement (as in bundle adjustment, Triggs et al.
+    1999).
     """
-    cameras = next(iter(records.values())).used.shape[1]
-    size = cameras + 2
-    S, r = np.zeros((size, size)), np.zeros(size)
-    for frame in sorted(records):
-        for row in (0, 1):
-            velocity = velocity_twist(records, frame, row)
-            if velocity is not None:
-                block, right = _reduced(records[frame].solution.systems[row], velocity, row)
-                S += block / variance_px3[row]
-                r += right / variance_px3[row]
-    prior = np.r_[np.full(cameras, _PRIOR_DELAY_FRAMES), np.full(2, _PRIOR_BIAS_PX)]
-    S += np.diag(prior**-2.0)
-    keep = np.arange(1, size)  # a delay common to all cameras cannot be told from motion
-    covariance = np.zeros((size, size))
-    covariance[np.ix_(keep, keep)] = np.linalg.inv(S[np.ix_(keep, keep)])
-    x, sigma = covariance @ r, np.sqrt(np.diag(covariance))
-    return Nuisances(x[:cameras], x[cameras:], sigma[:cameras], sigma[cameras:])
+
+    def __init__(
+        self,
+        records: Mapping[int, FrameRecord],
+        variance_px3: NDArray[np.float64],
+        extrinsics: Extrinsics,
+        frames: Iterable[int] | None = None,
+    ) -> None:
+        """Sum up.
+
+        Args:
+            records: by frame; rows lost, and frames without both neighbours, are left out.
+            variance_px3: outline variance times correlation length per row [px^3], shape (2,).
+            extrinsics: the camera poses the records were aligned with.
+            frames: the frames to use, by default all.
+        """
+        self._extrinsics = extrinsics
+        self._cameras = len(extrinsics.twists)
+        size = 7 * self._cameras + 2
+        self._S, self._r, self._weight = np.zeros((size, size)), np.zeros(size), 0.0
+        for frame in sorted(records if frames is None else frames):
+            for row in (0, 1):
+                velocity = velocity_twist(records, frame, row)
+                if velocity is not None:
+                    block, right, weight = _reduced(records[frame].solution, velocity, row, extrinsics.pivot)
+                    self._S += block / variance_px3[row]
+                    self._r += right / variance_px3[row]
+                    self._weight += weight / variance_px3[row]
+
+    def solve(self, config: TrackingConfig, cameras_move: bool) -> Nuisances:
+        """Return the nuisances the frames show.
+
+        Args:
+            config: gives the spread of camera poses expected before looking.
+            cameras_move: estimate the camera poses too; else they are taken as they are.
+        """
+        C, size = self._cameras, len(self._r)
+        S = self._S.copy()
+        prior = np.r_[np.full(C, _PRIOR_DELAY_FRAMES), np.full(2, _PRIOR_BIAS_PX)]
+        S[: C + 2, : C + 2] += np.diag(prior**-2.0)
+        for c, precision in enumerate(self._extrinsics.precision(config.refine_turn_rad, config.refine_move_mm)):
+            block = slice(C + 2 + 6 * c, C + 8 + 6 * c)
+            S[block, block] += precision
+        keep = np.arange(1, size if cameras_move else C + 2)  # a delay common to all cameras is part of the motion
+        covariance = np.zeros((size, size))
+        covariance[np.ix_(keep, keep)] = np.linalg.inv(S[np.ix_(keep, keep)])
+        x = covariance @ self._r
+        # A motion common to all cameras is one of the world, of which the masks tell nothing.
+        centred = np.eye(6 * C) - np.kron(np.full((C, C), 1 / C), np.eye(6))
+        twists = centred @ x[C + 2 :]
+        sigma = np.sqrt(np.diag(covariance))
+        sigma_twists = np.sqrt(np.diag(centred @ covariance[C + 2 :, C + 2 :] @ centred))
+        square = twists @ self._S[C + 2 :, C + 2 :] @ twists / max(self._weight, 1e-300)
+        return Nuisances(
+            delays=x[:C],
+            bias_px=x[C : C + 2],
+            sigma_delays=sigma[:C],
+            sigma_bias_px=sigma[C : C + 2],
+            twists=twists.reshape(C, 6),
+            sigma_twists=sigma_twists.reshape(C, 6),
+            shift_px=float(np.sqrt(max(square, 0.0))),
+        )
 
 
 def leads(records: Mapping[int, FrameRecord], frame: int, delays: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -86,24 +140,25 @@ def leads(records: Mapping[int, FrameRecord], frame: int, delays: NDArray[np.flo
     return out
 
 
-def _reduced(systems: NDArray[np.float64], velocity: NDArray[np.float64], row: int) -> tuple[NDArray, NDArray]:
-    """Return one frame's part of the normal equations of delays and biases, the pose eliminated."""
-    cameras = len(systems)
-    size = cameras + 2
-    b = cameras + row
+def _reduced(solution, velocity, row: int, pivot) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Return one frame's part of the normal equations, the pose eliminated, and the weight of its samples."""
+    systems = solution.systems[row]
+    C = len(systems)
+    size = 7 * C + 2
+    to_centre = lever(pivot, solution.centres[row])
     S, r, B = np.zeros((size, size)), np.zeros(size), np.zeros((6, size))
+    bias = np.eye(size)[C + row]
     for c, system in enumerate(systems):
         H, g, s = system[:6, :6], system[:6, 6], system[:6, 7]
-        B[:, c] = H @ velocity
-        B[:, b] += s
-        S[c, c] = velocity @ H @ velocity
-        S[c, b] = S[b, c] = velocity @ s
-        S[b, b] += system[6, 6]
-        r[c] = velocity @ g
-        r[b] += system[6, 7]
+        D = np.zeros((6, size))  # how the nuisances move the row in this camera
+        D[:, c] = velocity
+        D[:, C + 2 + 6 * c : C + 8 + 6 * c] = to_centre
+        B += H @ D + np.outer(s, bias)
+        S += D.T @ H @ D + np.outer(D.T @ s, bias) + np.outer(bias, s @ D) + system[6, 6] * np.outer(bias, bias)
+        r += D.T @ g + system[6, 7] * bias
     H, g = systems[:, :6, :6].sum(0), systems[:, :6, 6].sum(0)
     eliminated = np.linalg.lstsq(H, np.column_stack([B, g]), rcond=1e-10)[0]
-    return S - B.T @ eliminated[:, :-1], r - B.T @ eliminated[:, -1]
+    return S - B.T @ eliminated[:, :-1], r - B.T @ eliminated[:, -1], float(systems[:, 6, 6].sum())
 
 
 def velocity_twist(records: Mapping[int, FrameRecord], frame: int, row: int) -> NDArray[np.float64] | None:

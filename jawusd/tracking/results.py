@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from jawusd.formats.tracks import LOST, Tracks
 from jawusd.geometry import relative_pose
 from jawusd.tracking.config import TrackingConfig
+from jawusd.tracking.extrinsics import Extrinsics
 from jawusd.tracking.history import FrameRecord
 from jawusd.tracking.nuisance import Nuisances
 from jawusd.tracking.quality import (
@@ -29,6 +30,7 @@ def assemble(
     camera_names: tuple[str, ...],
     landmarks: NDArray[np.float64],
     nuisances: Nuisances,
+    extrinsics: Extrinsics,
     config: TrackingConfig,
     notes: dict,
 ) -> Tracks:
@@ -42,6 +44,7 @@ def assemble(
         camera_names: the cameras that have masks.
         landmarks: mandible coordinates [mm], shape (5, 3).
         nuisances: delays and biases, reported in the meta data.
+        extrinsics: the camera poses the records were aligned with, reported too.
         config: the tracker's numbers, kept in the meta data.
         notes: more meta data.
     """
@@ -65,6 +68,7 @@ def assemble(
         "delays_sigma_frames": dict(zip(camera_names, nuisances.sigma_delays.tolist(), strict=True)),
         "mask_bias_px": nuisances.bias_px.tolist(),
         "mask_bias_sigma_px": nuisances.sigma_bias_px.tolist(),
+        "extrinsics": extrinsics.report(camera_names),
         **notes,
     }
     return Tracks(

@@ -16,11 +16,12 @@ from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, Tracks
 from jawusd.geometry import Camera, transform_points
 from jawusd.tracking.bootstrap import pose_from_picks
 from jawusd.tracking.config import TrackingConfig
+from jawusd.tracking.extrinsics import Extrinsics
 from jawusd.tracking.first import first_record
 from jawusd.tracking.history import FrameRecord, History
 from jawusd.tracking.ladder import FrameTracker
 from jawusd.tracking.motion import Motion
-from jawusd.tracking.nuisance import Nuisances, estimate_nuisances, leads
+from jawusd.tracking.nuisance import Nuisances, TakeEquations, leads
 from jawusd.tracking.results import assemble, outline_variance
 from jawusd.tracking.scan import prepare_scan
 from jawusd.tracking.solver import ContourSolver, View
@@ -75,11 +76,11 @@ def track_capture(
         take.run(range(capture.bootstrap.frame + 1, stop))
         take.run(range(capture.bootstrap.frame - 1, first - 1, -1))
         take.re_enter()
-        nuisances = take.refine()
+        nuisances, extrinsics = take.refine()
         records = take.records if capture.frames else _trimmed(take.records)
         names = tuple(camera.name for camera in masks.cameras)
     notes = {"picks_left_out": left_out, "painted": [s.painted for s in scans]}
-    return assemble(records, names, np.asarray(landmarks, np.float64), nuisances, config, notes)
+    return assemble(records, names, np.asarray(landmarks, np.float64), nuisances, extrinsics, config, notes)
 
 
 def _start_poses(
@@ -156,24 +157,58 @@ class _Take:
                     status = np.where(was_lost & ~lost, RECOVERED, record.status).astype(np.int8)
                     self.records[frame] = replace(record, status=status)
 
-    def refine(self) -> Nuisances:
-        """Estimate delays and biases; where they matter, align all frames again with them taken out."""
+    def refine(self) -> tuple[Nuisances, Extrinsics]:
+        """Estimate delays, biases and camera poses; where they matter, align all frames again with them put right."""
         c = self._config
-        found = estimate_nuisances(self.records, outline_variance(self.records, c))
-        residual, rounds = found, 0
-        while residual.matters(c.refine_delay_frames, c.refine_bias_px) and rounds < c.refine_rounds:
-            self._realign(found)
-            residual = estimate_nuisances(self.records, outline_variance(self.records, c))
-            found, rounds = found.plus(residual), rounds + 1
-        return found
+        extrinsics = Extrinsics.calibrated(self._masks.cameras, self._middle())
+        found = self._equations(extrinsics).solve(c, True)
+        cameras_moved = found.cameras_moved(c) and c.refine_rounds > 0
+        if cameras_moved:
+            found, extrinsics = self._settle(found, extrinsics)
+        else:
+            extrinsics = extrinsics.then(np.zeros_like(found.twists), found.sigma_twists)
+            found = self._equations(extrinsics).solve(c, False)
+        pending, rounds = cameras_moved or found.matters(c), 0
+        while pending and rounds < c.refine_rounds:
+            if cameras_moved:
+                extrinsics = extrinsics.then(found.twists, found.sigma_twists)
+            self._realign(found, extrinsics)
+            residual = self._equations(extrinsics).solve(c, cameras_moved)
+            found, pending, rounds = found.plus(residual), residual.matters(c), rounds + 1
+        return found, extrinsics
 
-    def _realign(self, nuisances: Nuisances) -> None:
-        """Align every frame again, starting from where it is, with delays and biases taken out."""
+    def _equations(self, extrinsics: Extrinsics) -> TakeEquations:
+        return TakeEquations(self.records, outline_variance(self.records, self._config), extrinsics)
+
+    def _middle(self) -> NDArray[np.float64]:
+        """Return a point amid the teeth, world coordinates [mm], shape (3,)."""
+        return np.median([r.solution.centres for r in self.records.values()], axis=(0, 1))
+
+    def _settle(self, found: Nuisances, extrinsics: Extrinsics) -> tuple[Nuisances, Extrinsics]:
+        """Align some frames again and again until the camera poses stay: matches follow them only step by step."""
+        c, records = self._config, dict(self.records)
+        whole = [f for f, r in sorted(records.items()) if (r.status != LOST).all()]
+        sample = [whole[k] for k in np.unique(np.linspace(0, len(whole) - 1, c.settle_frames).astype(int))]
+        variance = outline_variance(records, c)
+        for _ in range(c.settle_rounds):
+            extrinsics = extrinsics.then(found.twists, found.sigma_twists)
+            for frame in sample:
+                views = _put_right(self._masks.at(frame), self.records, frame, found, extrinsics)
+                start, used = records[frame].solution.poses, records[frame].used
+                solution = self._solver.solve(start, views, c.gates_from(0.0), used)
+                records[frame] = replace(records[frame], solution=solution)
+            more = TakeEquations(records, variance, extrinsics, sample).solve(c, True)
+            found = found.plus(more)
+            if more.shift_px < c.settled_px:
+                break
+        return found, extrinsics
+
+    def _realign(self, nuisances: Nuisances, extrinsics: Extrinsics) -> None:
+        """Align every frame again, starting from where it is, with all that the take tells put right."""
         before = dict(self.records)
         tracker, _ = self._from(self._first)
         for frame, views in self._masks.walk(self._first, self._stop):
-            moved = leads(before, frame, nuisances.delays)
-            views = [replace(v, lead=m, bias_px=nuisances.bias_px) for v, m in zip(views, moved, strict=True)]
+            views = _put_right(views, before, frame, nuisances, extrinsics)
             record = tracker.track([before[frame].solution.poses], views, None)
             was = before[frame].status
             status = np.where((was == RECOVERED) & (record.status == TRACKED), RECOVERED, record.status).astype(np.int8)
@@ -198,6 +233,19 @@ class _Take:
         motion.update(record.solution.poses, record.status != LOST, record.used.any(1))
         tracker.history.add(record)
         return record
+
+
+def _put_right(
+    views: Sequence[View],
+    records: Mapping[int, FrameRecord],
+    frame: int,
+    nuisances: Nuisances,
+    extrinsics: Extrinsics,
+) -> list[View]:
+    """Return the views of a frame with delays, biases and camera poses put right."""
+    moved = leads(records, frame, nuisances.delays)
+    views = extrinsics.put_right(views)
+    return [replace(v, lead=m, bias_px=nuisances.bias_px) for v, m in zip(views, moved, strict=True)]
 
 
 def _gaps(records: Mapping[int, FrameRecord]) -> Iterable[tuple[int, int]]:

@@ -1,10 +1,15 @@
-"""Delays between cameras and masks drawn too wide."""
+"""Delays between cameras, masks drawn too wide, and cameras that were moved after their calibration."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_take import errors_mm, make_capture, track, write_masks
+from small_take import CAMERAS, LANDMARKS, MESHES, OFFSETS, errors_mm, make_capture, track, write_masks
 
-from jawusd.tracking import TrackingConfig
+from jawusd.formats.tracks import load_tracks, save_tracks
+from jawusd.geometry import rigidity_defect, se3_exp, se3_inverse, se3_log
+from jawusd.tracking import TrackingConfig, track_capture
+from jawusd.tracking.extrinsics import Extrinsics, corrected_cameras
 from jawusd.tracking.nuisance import Nuisances
 
 FRAMES = 16
@@ -53,5 +58,117 @@ def test_nothing_is_found_where_nothing_is(tmp_path):
     [(0.05, 0.0, 0.001, True), (0.02, 0.0, 0.001, False), (0.05, 0.0, 0.02, False), (0.0, -0.2, 0.001, True)],
 )
 def test_only_clear_and_large_nuisances_matter(delay, bias, sigma, expected):
-    n = Nuisances(np.array([0, delay]), np.array([bias, 0.0]), np.full(2, sigma), np.full(2, sigma))
-    assert n.matters(0.03, 0.1) is expected
+    still = np.zeros((2, 6))
+    n = Nuisances(np.array([0, delay]), np.array([bias, 0.0]), np.full(2, sigma), np.full(2, sigma), still, still + 1)
+    assert n.matters(TrackingConfig()) is expected
+
+
+@pytest.mark.parametrize(("move", "shift", "expected"), [(0.1, 0.5, True), (0.1, 0.05, False), (0.03, 0.5, False)])
+def test_only_clear_and_large_camera_motions_matter(move, shift, expected):
+    twists, none = np.zeros((2, 6)), np.zeros(2)
+    twists[1, 4] = move
+    n = Nuisances(none, none, none + 1, none + 1, twists, np.full((2, 6), 0.01), shift)
+    assert n.matters(TrackingConfig()) is expected and n.cameras_moved(TrackingConfig()) is expected
+
+
+# What happened to each camera after its calibration, seen from itself [rad, mm].
+KNOCKS = np.array([[2, -1, 1, 0.1, -0.2, 0.1], [-1, 2, -2, 0.2, 0.1, -0.2], [1, 1, 2, -0.1, 0.2, 0.1]])
+KNOCKS[:, :3] *= 1e-3
+KNOCKED = [replace(c, T_cam_world=se3_exp(k) @ c.T_cam_world) for c, k in zip(CAMERAS, KNOCKS)]
+
+
+def _track_knocked(capture, **options):
+    return track_capture(capture, KNOCKED, OFFSETS, *MESHES, LANDMARKS, **options)
+
+
+def _landmarks_mm(tracks, truth):
+    """Return the mean error of the landmarks in the skull frame: no motion of the world changes it."""
+    return np.mean(
+        [
+            np.linalg.norm(LANDMARKS @ (a - b)[:3, :3].T + (a - b)[:3, 3], axis=1)
+            for a, b in zip(tracks.raw_T_upper_lower, truth.raw_T_upper_lower)
+        ]
+    )
+
+
+@pytest.fixture(scope="module")
+def takes(tmp_path_factory):
+    """The same masks with the true cameras, with knocked ones, and with these taken as they are."""
+    capture = make_capture(write_masks(tmp_path_factory.mktemp("knocked"), FRAMES), FRAMES)
+    return track(capture), _track_knocked(capture), _track_knocked(capture, config=WITHOUT)
+
+
+def test_knocked_cameras_are_put_right(takes):
+    good, corrected, without = takes
+    assert corrected.meta["extrinsics"]["corrected"] and not without.meta["extrinsics"]["corrected"]
+    assert _landmarks_mm(corrected, good) < 0.3 * _landmarks_mm(without, good)
+    assert (corrected.status == 1).all()
+    # What the cameras were off by must not pass for something else.
+    assert np.abs(list(corrected.meta["delays_frames"].values())).max() < 0.03
+    assert np.abs(corrected.meta["mask_bias_px"]).max() < 0.15
+
+
+def test_corrected_cameras_see_the_teeth_where_the_true_ones_do(takes):
+    good, corrected, _ = takes
+    then = corrected_cameras(KNOCKED, corrected.meta)
+    points = MESHES[0].vertices[::50]
+
+    def misses(cameras):
+        T, exact = corrected.raw_T_world_upper[8], good.raw_T_world_upper[8]
+        return max(
+            np.linalg.norm(
+                c.project(points @ T[:3, :3].T + T[:3, 3]) - true.project(points @ exact[:3, :3].T + exact[:3, 3]),
+                axis=1,
+            ).mean()
+            for c, true in zip(cameras, CAMERAS)
+        )
+
+    assert misses(then) < 0.25  # px; outlines are good to 0.3
+    assert misses(KNOCKED) > 4 * misses(then)
+
+
+def test_corrections_fit_their_uncertainty(takes):
+    """Compare with the knocks themselves, but for the motion of the world that brings the two sets closest."""
+    report = takes[1].meta["extrinsics"]
+    pivot = np.eye(4)
+    pivot[:3, 3] = report["pivot_mm"]
+    found = np.hstack([np.radians(list(report["turns_deg"].values())), list(report["moves_mm"].values())])
+    sigma = np.hstack([np.radians(list(report["turns_sigma_deg"].values())), list(report["moves_sigma_mm"].values())])
+    undone = [
+        se3_log(se3_inverse(pivot) @ se3_inverse(k.T_cam_world) @ c.T_cam_world @ pivot)
+        for k, c in zip(KNOCKED, CAMERAS)
+    ]
+    undone = np.array(undone) - np.mean(undone, axis=0)
+    assert (np.abs(found - undone) < 5 * sigma).all()
+    assert np.abs(undone / sigma).max() > 10  # the test has something to find
+
+
+def test_corrections_cancel_and_survive_the_file(takes, tmp_path):
+    save_tracks(tmp_path / "tracks.npz", takes[1])
+    meta = load_tracks(tmp_path / "tracks.npz").meta
+    assert np.sum(list(meta["extrinsics"]["moves_mm"].values()), axis=0) == pytest.approx(np.zeros(3), abs=1e-9)
+    assert max(rigidity_defect(c.T_cam_world) for c in corrected_cameras(KNOCKED, meta)) < 1e-9
+
+
+def test_true_cameras_are_left_alone(takes):
+    report = takes[0].meta["extrinsics"]
+    assert not report["corrected"] and not np.any(list(report["moves_mm"].values()))
+    assert all(0 < s < 0.2 for row in report["moves_sigma_mm"].values() for s in row)
+    for before, after in zip(CAMERAS, corrected_cameras(CAMERAS, takes[0].meta)):
+        assert np.abs(before.T_cam_world - after.T_cam_world).max() < 1e-12
+    assert corrected_cameras(CAMERAS, {})[1].T_cam_world.tolist() == CAMERAS[1].T_cam_world.tolist()
+
+
+def test_what_is_known_of_a_camera_is_said_about_the_teeth():
+    """Draw knocks of a camera about itself; about the teeth they scatter as the precision says."""
+    pivot = np.array([3.0, -5.0, 2.0])
+    extrinsics = Extrinsics.calibrated(CAMERAS, pivot)
+    precision = extrinsics.precision(0.002, 0.5)[1]
+    rng = np.random.default_rng(0)
+    knocks = rng.normal(size=(4000, 6)) * [0.002, 0.002, 0.002, 0.5, 0.5, 0.5]
+    T = CAMERAS[1].T_cam_world
+    at = np.eye(4)
+    at[:3, 3] = pivot
+    about = se3_log(se3_inverse(at) @ se3_inverse(T) @ se3_exp(knocks) @ T @ at)
+    chi2 = np.einsum("ni,ij,nj->n", about, precision, about)
+    assert chi2.mean() == pytest.approx(6, rel=0.05)
