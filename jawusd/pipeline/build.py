@@ -163,4 +163,4 @@ class _Build:
     def _bake(self) -> tuple[list[Path], dict]:
         files = bake_files(self.capture, load_model(self.folder / "model.npz"), self.folder, self.progress)
         take = write_take(self.capture, load_tracks(self.folder / "tracks.npz"), self.folder)
-        return [*files, take], {}
+        return [*files, *take], {}

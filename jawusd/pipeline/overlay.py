@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,25 +52,10 @@ def write_overlay(
         CalibrationError: a video has another size than its camera's calibration.
         OutputError: the files cannot be written.
     """
-    cameras = {camera.name: camera for camera in load_cameras(capture)}
-    sources = {source.name: source.video for source in capture.cameras if source.video}
-    if not sources:
-        raise CaptureError(
-            "no camera has a video, so there is nothing to draw over.",
-            path=capture.folder / "capture.toml",
-            hint="Name the footage there (video = ...).",
-        )
+    cameras, videos = open_footage(capture)
     meshes = load_meshes(capture)
     upper, lower = meshes["upper_teeth"], meshes["lower_teeth"]
     drawing = stage("jawusd.imaging.overlay")
-    videos = {name: stage("jawusd.imaging.video").Video(path) for name, path in sources.items()}
-    for name, video in videos.items():
-        if video.size_px != cameras[name].size_px:
-            raise CalibrationError(
-                f"camera {name} is calibrated for {cameras[name].size_px} px, its video has {video.size_px} px.",
-                path=sources[name],
-                hint="Calibrate at the size of the footage.",
-            )
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -91,6 +77,32 @@ def write_overlay(
     )
     drawing.save_png(folder / SHEET, sheet)
     return overlay_files(capture, folder)
+
+
+def open_footage(capture: Capture) -> tuple[dict[str, Camera], dict[str, Any]]:
+    """Return the calibrated cameras of a capture, and the videos of those that have one, by name.
+
+    Raises:
+        CaptureError: no camera has a video, or one cannot be decoded.
+        CalibrationError: a video has another size than its camera's calibration.
+    """
+    cameras = {camera.name: camera for camera in load_cameras(capture)}
+    sources = {source.name: source.video for source in capture.cameras if source.video}
+    if not sources:
+        raise CaptureError(
+            "no camera has a video, so there is no footage.",
+            path=capture.folder / "capture.toml",
+            hint="Name the footage there (video = ...).",
+        )
+    videos = {name: stage("jawusd.imaging.video").Video(path) for name, path in sources.items()}
+    for name, video in videos.items():
+        if video.size_px != cameras[name].size_px:
+            raise CalibrationError(
+                f"camera {name} is calibrated for {cameras[name].size_px} px, its video has {video.size_px} px.",
+                path=sources[name],
+                hint="Calibrate at the size of the footage.",
+            )
+    return cameras, videos
 
 
 def _drawn(

@@ -206,11 +206,11 @@ def bake_files(capture: Capture, model: JawModel, folder: Path, progress: Progre
     return files
 
 
-def write_take(capture: Capture, tracks: Tracks, folder: Path) -> Path:
+def write_take(capture: Capture, tracks: Tracks, folder: Path) -> list[Path]:
     """Write the take beside the rig: its cameras, and the actor where the head was.
 
     Returns:
-        The file written.
+        The files written.
 
     Raises:
         CalibrationError: a camera of the capture has no calibration.

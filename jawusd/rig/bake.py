@@ -39,7 +39,8 @@ def bake_rig(
 ) -> list[Path]:
     """Write a rig: interface, decoder, geometry, ONNX graphs, captured motion if there is one, skeleton, package.
 
-    Without a mandible mesh a placeholder is grown from the lower scan, and marked as such. Every file is written in one step, `actor.usda` after all it refers to.
+    Without a mandible mesh a placeholder is grown from the lower scan, and marked as such. Every file is written in one
+    step, `actor.usda` after all it refers to.
 
     Args:
         folder: where the files go; made if missing.

@@ -18,6 +18,9 @@ from jawusd.rig.layers import define_prim, new_layer, relative_path, set_attribu
 
 TAKE, TAKE_ACTOR, TAKE_CAMERAS = "/Take", "/Take/Actor", "/Take/Cameras"
 
+#: Where the undistorted pictures of a camera lie beside the take, numbered by time code.
+PLATE = "plates/{name}/{name}.%06d.jpg"
+
 # Apertures and focal lengths only count relative to one another; tools that read them as mm see a 36 mm sensor.
 _SENSOR_WIDTH = 36.0
 _CLIPPING_MM = (1.0, 10_000.0)
@@ -33,14 +36,16 @@ def write_cameras(
     frames: ArrayLike,
     T_world_skull: ArrayLike,
     fps: float,
-) -> Path:
+) -> list[Path]:
     """Write the take: one `UsdGeom.Camera` per camera, and the actor carried by the tracked head.
 
-    The cameras are pinholes: they match footage without lens distortion. The OpenCV coefficients stand beside them
-    as `jaw:distortion`, the picture size as `jaw:imageSize`.
+    The cameras are pinholes: they match footage without lens distortion. Where such plates of a camera are to be found
+    says its `jaw:plate`, a printf pattern for the time code, relative to the take; the OpenCV coefficients of the
+    footage itself stand in `jaw:distortion`, the picture size in `jaw:imageSize`. The head's motion lies in a binary
+    layer of its own beside the take, which sublayers it: text is no place for a sample per frame.
 
     Args:
-        out: file to write.
+        out: file to write, `.usda`; the motion goes to `<name>_motion.usdc` beside it.
         cameras: the calibrated cameras.
         actor: the layer to show, `anim_capture.usdc` or `actor.usda`.
         frames: frame numbers (F,), increasing.
@@ -48,7 +53,7 @@ def write_cameras(
         fps: frames per second.
 
     Returns:
-        The file.
+        The motion's file and the take's, in the order written.
 
     Raises:
         RigError: no cameras, two of one name, a camera with skewed pixels, or no frame with a pose.
@@ -64,6 +69,7 @@ def write_cameras(
     known = np.isfinite(T_world_skull).all(axis=(1, 2))
     if not known.any():
         raise RigError("the skull has no pose in any frame.", path=out)
+    motion = out.with_name(f"{out.stem}_motion.usdc")
     layer = new_layer(fps, TAKE)
     layer.startTimeCode, layer.endTimeCode = float(frames[0]), float(frames[-1])
     define_prim(layer, TAKE, "Xform").kind = Kind.Tokens.assembly
@@ -71,13 +77,14 @@ def write_cameras(
     shown = define_prim(layer, TAKE_ACTOR, "Xform")
     stage = stage_of(layer)
     _add_pose(stage, TAKE, _FLIP)
-    _add_motion(stage, frames[known], T_world_skull[known])
     for name, camera in zip(names, cameras, strict=True):
         _define_camera(stage, name, camera)
-    # A stage still open on the nameless layer would look for the actor beside it, and complain.
+    # A stage still open on the nameless layer would look for the files beside it, and complain.
     del stage
+    layer.subLayerPaths.append(relative_path(motion, out))
     shown.referenceList.prependedItems = [Sdf.Reference(relative_path(Path(actor), out))]
-    return write_layer(layer, out)
+    moving = _motion_layer(frames[known], T_world_skull[known], fps)
+    return [write_layer(moving, motion), write_layer(layer, out)]
 
 
 def _prim_name(name: str) -> str:
@@ -91,13 +98,21 @@ def _add_pose(stage: Usd.Stage, path: str | Sdf.Path, T: NDArray[np.float64]) ->
     xform.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(_gf.rotations(T[None])[0])
 
 
-def _add_motion(stage: Usd.Stage, frames: NDArray[np.float64], T_world_skull: NDArray[np.float64]) -> None:
+def _motion_layer(frames: NDArray[np.float64], T_world_skull: NDArray[np.float64], fps: float) -> Sdf.Layer:
+    """Return the layer that moves the actor with the head."""
+    layer = new_layer(fps, TAKE)
+    define_prim(layer, TAKE_ACTOR, "Xform")
+    stage = stage_of(layer)
     _add_pose(stage, TAKE_ACTOR, T_world_skull[0])
     translate, orient = UsdGeom.Xformable(stage.GetPrimAtPath(TAKE_ACTOR)).GetOrderedXformOps()
     samples = zip(frames.tolist(), _gf.translations(T_world_skull), _gf.rotations(T_world_skull), strict=True)
     for frame, translation, rotation in samples:
         translate.Set(translation, frame)
         orient.Set(rotation, frame)
+    for path in (TAKE, TAKE_ACTOR):  # the take defines them
+        spec = layer.GetPrimAtPath(path)
+        spec.specifier, spec.typeName = Sdf.SpecifierOver, ""
+    return layer
 
 
 def _define_camera(stage: Usd.Stage, path: Sdf.Path, camera: Camera) -> None:
@@ -119,3 +134,4 @@ def _define_camera(stage: Usd.Stage, path: Sdf.Path, camera: Camera) -> None:
     spec = stage.GetRootLayer().GetPrimAtPath(path)
     set_attribute(spec, "jaw:distortion", Sdf.ValueTypeNames.DoubleArray, _gf.double_array(camera.distortion))
     set_attribute(spec, "jaw:imageSize", Sdf.ValueTypeNames.Int2, Gf.Vec2i(width, height))
+    set_attribute(spec, "jaw:plate", Sdf.ValueTypeNames.String, "./" + PLATE.format(name=camera.name))

@@ -22,7 +22,7 @@ def read_geometry(path: str | os.PathLike[str]) -> dict[str, Mesh]:
 
     Returns:
         Meshes by the names of `geo.MESH_PATHS`, skull ones in the skull frame, mandible ones in the mandible frame
-        [mm], with the layer's single precision; those the rig does not have are missing.
+        [mm], with the layer's single precision; those the rig does not have are missing, and so is a placeholder.
 
     Raises:
         RigError: not a USD file, or a mesh that is not made of triangles.
@@ -31,7 +31,7 @@ def read_geometry(path: str | os.PathLike[str]) -> dict[str, Mesh]:
     found = {}
     for name, prim_path in MESH_PATHS.items():
         mesh = UsdGeom.Mesh(stage.GetPrimAtPath(prim_path))
-        if not mesh:
+        if not mesh or mesh.GetPrim().GetAttribute("jaw:placeholder").Get():
             continue
         counts = np.array(mesh.GetFaceVertexCountsAttr().Get() or [])
         if not counts.size or (counts != 3).any():

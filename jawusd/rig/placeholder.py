@@ -79,8 +79,9 @@ def find_condyles(rig: JawRig) -> tuple[Array, str]:
     The motion tells height and depth of a condyle; its distance from the midline stays that of the landmark.
     """
     landmarks = rig.arrays["landmarks"][_CONDYLES]
-    if not any(text.startswith("condyle") for text in rig.meta.get("inferred", ())):
-        return landmarks, "landmarks given with the capture"
+    inferred = [text for text in rig.meta.get("inferred", ()) if text.startswith("condyle")]
+    if not any("mean adult places" in text for text in inferred):
+        return landmarks, "landmarks of the model"
     T_anatomical_mandible = rig.arrays["T_anatomical_skull"] @ rig.arrays["T_rest"]
     back = se3_inverse(T_anatomical_mandible)
     poses = rig.arrays["T_anatomical_skull"] @ rig.pose(rig.arrays["codes"]) @ back
@@ -148,8 +149,9 @@ def _body(scan: Array) -> tuple[Array, Array, Array]:
             found.append([*near[:, [0, 2]].mean(axis=0), np.percentile(near[:, 1], 5)])
     if len(known) < 2:  # a scan of a few teeth: a body of its own size around them
         known, found = [0.0], [[*scan[:, [0, 2]].mean(axis=0), scan[:, 1].min()]]
-    order = np.argsort(known)
-    x, z, low = (np.interp(_STATIONS, np.array(known)[order], np.array(column)[order]) for column in np.transpose(found))
+    # stations run from left to right, np.interp wants them rising
+    known, found = np.array(known)[::-1], np.array(found)[::-1]
+    x, z, low = (np.interp(_STATIONS, known, column) for column in found.T)
     centres = np.stack([x, low - _BODY_BELOW_SCAN_MM, z], axis=1)
     outward = np.stack([np.sin(_STATIONS), np.zeros(len(_STATIONS)), np.cos(_STATIONS)], axis=1)
     return centres, _BODY_MM[0] * outward, np.tile([0.0, _BODY_MM[1], 0.0], (len(_STATIONS), 1))

@@ -41,7 +41,7 @@ def test_usd_cameras_see_the_jaw_where_the_calibration_does(anchored_folder):
     frames, d = example_motion()
     head = head_motion(len(frames))
     actor = anchored_folder / "anim_capture.usdc"
-    out = write_cameras(anchored_folder / "cameras.usda", cameras(), actor, frames, head, 24)
+    _, out = write_cameras(anchored_folder / "cameras.usda", cameras(), actor, frames, head, 24)
     assert_valid_usd(out)
     stage = Usd.Stage.Open(str(out))
     assert (UsdGeom.GetStageUpAxis(stage), UsdGeom.GetStageMetersPerUnit(stage)) == ("Y", 0.001)
@@ -61,7 +61,8 @@ def test_usd_cameras_see_the_jaw_where_the_calibration_does(anchored_folder):
 
 def test_the_actor_stands_upright_and_distortion_is_kept(anchored_folder):
     head = head_motion(2)
-    out = write_cameras(anchored_folder / "cameras.usda", cameras(), anchored_folder / "actor.usda", [1, 2], head, 24)
+    actor = anchored_folder / "actor.usda"
+    _, out = write_cameras(anchored_folder / "cameras.usda", cameras(), actor, [1, 2], head, 24)
     assert_valid_usd(out)
     stage = Usd.Stage.Open(str(out))
     world = UsdGeom.XformCache(1.0).GetLocalToWorldTransform(stage.GetPrimAtPath("/Take/Actor"))
@@ -69,13 +70,28 @@ def test_the_actor_stands_upright_and_distortion_is_kept(anchored_folder):
     camera = stage.GetPrimAtPath("/Take/Cameras/cam_1")
     assert list(camera.GetAttribute("jaw:distortion").Get()) == [-0.1, 0.02, 0, 0, 0]
     assert tuple(camera.GetAttribute("jaw:imageSize").Get()) == (1920, 1080)
+    assert camera.GetAttribute("jaw:plate").Get() == "./plates/cam 1/cam 1.%06d.jpg"
+
+
+def test_no_samples_lie_in_text(anchored_folder):
+    """NVIDIA's validator flags them; and the binary layer must not outlive its rewriting."""
+    actor = anchored_folder / "actor.usda"
+    for count in (40, 12):
+        motion, out = write_cameras(
+            anchored_folder / "cameras.usda", cameras(), actor, np.arange(count), head_motion(count), 24
+        )
+        assert "timeSamples" not in out.read_text() and motion.suffix == ".usdc"
+        stage = Usd.Stage.Open(str(out))
+        translate = stage.GetPrimAtPath("/Take/Actor").GetAttribute("xformOp:translate")
+        assert translate.GetNumTimeSamples() == count
+        np.testing.assert_allclose(translate.Get(count - 1), [4, 0, 0])
 
 
 def test_lost_frames_get_no_sample(anchored_folder):
     head = head_motion(4)
     head[2] = np.nan
     actor = anchored_folder / "actor.usda"
-    out = write_cameras(anchored_folder / "cameras.usda", cameras(), actor, [1, 2, 3, 4], head, 24)
+    _, out = write_cameras(anchored_folder / "cameras.usda", cameras(), actor, [1, 2, 3, 4], head, 24)
     assert_valid_usd(out)
     stage = Usd.Stage.Open(str(out))
     assert stage.GetPrimAtPath("/Take/Actor").GetAttribute("xformOp:orient").GetTimeSamples() == [1, 2, 4]

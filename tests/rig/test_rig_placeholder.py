@@ -53,7 +53,7 @@ def test_a_motion_that_cannot_tell_leaves_the_mean_places():
 
 def test_given_condyles_stay():
     found, source = find_condyles(sliding_jaw(MEAN + [0, -10, -4], meta={"inferred": ["molar_left, from the scans"]}))
-    assert source == "landmarks given with the capture"
+    assert source == "landmarks of the model"
     np.testing.assert_array_equal(found, MEAN)
 
 
@@ -106,7 +106,7 @@ def test_it_is_marked_wherever_it_goes(tmp_path, kind):
         assert prim.GetCustomDataByKey("placeholder") is True
         attribute = prim.GetAttribute("jaw:placeholder")
         assert attribute.Get() is True and attribute.IsCustom()
-        assert prim.GetAttribute("jaw:placeholder:condyles").Get() == "landmarks given with the capture"
+        assert prim.GetAttribute("jaw:placeholder:condyles").Get() == "landmarks of the model"
         material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
         assert material.GetPrim().GetName() == "Placeholder"
     assert describe(tmp_path / "actor.usda")["placeholders"] == ["MandibleMesh"]

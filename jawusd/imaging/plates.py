@@ -1,0 +1,38 @@
+"""Write pictures without lens distortion, as the camera of a scene sees them."""
+
+from __future__ import annotations
+
+import os
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.formats.atomic import write_bytes_atomic
+from jawusd.geometry import Camera
+from jawusd.imaging.working_view import WorkingView
+
+__all__ = ["PlateWriter"]
+
+_QUALITY = 95
+
+
+class PlateWriter:
+    """Undistort the pictures of one camera at full size and write them as JPEG.
+
+    A plate has the intrinsics K and the size of the recorded picture, so that the same pinhole camera fits it; the
+    corners that the lens did not record are black.
+    """
+
+    def __init__(self, camera: Camera) -> None:
+        """Take the calibrated camera."""
+        self._view = WorkingView(camera, camera.size_px)
+
+    def write(self, path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
+        """Write the plate of a recorded picture (h, w, 3) RGB.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        plate = self._view.picture(image)[..., ::-1]
+        write_bytes_atomic(path, cv2.imencode(".jpg", plate, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes())

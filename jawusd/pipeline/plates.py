@@ -1,0 +1,57 @@
+"""Write the footage without lens distortion beside a take, to be seen behind the rig in a DCC."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.errors import OutputError
+from jawusd.formats.capture import Capture
+from jawusd.pipeline.extras import stage
+from jawusd.pipeline.overlay import open_footage
+from jawusd.pipeline.state import Progress
+
+
+def write_plates(
+    capture: Capture, offsets: dict[str, int], frames: NDArray[np.int64], folder: Path, progress: Progress
+) -> list[str]:
+    """Write one JPEG per frame and camera, where `cameras.usda` says they are, numbered by its time codes.
+
+    Args:
+        capture: gives footage and calibration.
+        offsets: frame offset by camera.
+        frames: frames of the reference camera, increasing, shape (F,). Where a camera was not recording there is no
+            plate.
+        folder: the rig's folder.
+        progress: told of every picture.
+
+    Returns:
+        The file pattern of every camera, below the folder.
+
+    Raises:
+        CaptureError: no camera has a video, or one cannot be decoded.
+        CalibrationError: a video has another size than its camera's calibration.
+        OutputError: the files cannot be written.
+    """
+    cameras, videos = open_footage(capture)
+    pattern = stage("jawusd.rig.cameras").PLATE
+    done, total = 0, len(videos) * len(frames)
+    for name, video in videos.items():
+        plates = stage("jawusd.imaging.plates").PlateWriter(cameras[name])
+        files = str(folder / pattern.format(name=name))
+        try:
+            Path(files).parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"cannot write here: {error.strerror}.", path=Path(files).parent) from error
+        own = frames - offsets[name]
+        wanted = set(own[(own >= 0) & (own < video.count)].tolist())
+        pictures = video.frames(min(wanted), max(wanted) + 1, colour="rgb") if wanted else iter(())
+        for picture in pictures:
+            if picture.index in wanted:
+                plates.write(files % (picture.index + offsets[name]), picture.image)
+                done += 1
+                progress("plates", done, total)
+    progress("plates", total, total)
+    return [pattern.format(name=name) for name in videos]

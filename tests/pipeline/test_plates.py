@@ -1,0 +1,84 @@
+"""Undistorted plates: a point of the world is in the plate where a pinhole camera sees it, at the frame it names."""
+
+import shutil
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from jawusd.formats.calibration import save_calibration
+from jawusd.geometry import Camera, make_transform
+from jawusd.imaging.video_writer import VideoWriter
+from jawusd.pipeline.plates import write_plates
+from jawusd.pipeline.prepare import open_capture
+from jawusd.rig.cameras import PLATE
+
+SIZE = (320, 240)
+K = np.array([[300.0, 0, 155], [0, 290, 118], [0, 0, 1]])
+CAMERAS = [
+    Camera("left", SIZE, K, np.array([-0.25, 0.08, 0.002, -0.001, 0]), make_transform(np.eye(3), [-6, 0, 150.0])),
+    Camera("right", SIZE, K, np.zeros(5), make_transform(np.eye(3), [6, 0, 150.0])),
+]
+OFFSETS = {"left": 0, "right": 4}
+FRAMES = np.arange(3, 9)
+
+
+def point(frame):
+    """Return where a bright ball is at a reference frame, in a corner of the picture: world [mm]."""
+    return np.array([48.0 - 2 * frame, 38.0, 4.0])
+
+
+@pytest.fixture
+def capture(tmp_path):
+    folder = tmp_path / "capture"
+    folder.mkdir()
+    for name in ("upper.ply", "lower.ply"):
+        (folder / name).write_text("ply\n")
+    save_calibration(folder / "calibration.toml", CAMERAS)
+    for camera in CAMERAS:
+        with VideoWriter(folder / f"{camera.name}.mp4", SIZE, 25.0, quality_crf=2) as out:
+            for own in range(12):
+                picture = np.full((SIZE[1], SIZE[0], 3), 40, np.uint8)
+                centre = camera.project(point(own + OFFSETS[camera.name])[None])[0]
+                cv2.circle(picture, np.round(centre * 16).astype(int).tolist(), 5 * 16, (250,) * 3, -1, shift=4)
+                out.write(picture)
+    cameras = "".join(f'[[camera]]\nname = "{c.name}"\nvideo = "{c.name}.mp4"\n' for c in CAMERAS)
+    (folder / "capture.toml").write_text(
+        'format = "jawusd-capture/1"\nname = "ball"\nunits = "mm"\nfps = 25.0\ncalibration = "calibration.toml"\n'
+        '[scans]\nupper_teeth = "upper.ply"\nlower_teeth = "lower.ply"\n' + cameras
+    )
+    return folder
+
+
+def ball_px(path):
+    """Return the centre of the bright ball of a picture [px]."""
+    weight = np.clip(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE).astype(float) - 100, 0, None)
+    y, x = np.mgrid[: weight.shape[0], : weight.shape[1]]
+    return np.array([(weight * x).sum(), (weight * y).sum()]) / weight.sum()
+
+
+def test_plates_show_what_a_pinhole_camera_sees(capture, tmp_path):
+    told = []
+    patterns = write_plates(
+        open_capture(capture), OFFSETS, FRAMES, tmp_path / "rig", lambda name, done, total: told.append((done, total))
+    )
+    assert patterns == ["plates/left/left.%06d.jpg", "plates/right/right.%06d.jpg"] and told[-1] == (12, 12)
+    for camera in CAMERAS:
+        for frame in FRAMES:
+            path = tmp_path / "rig" / (PLATE.format(name=camera.name) % frame)
+            if frame < OFFSETS[camera.name]:
+                assert not path.exists()  # the camera was not recording yet
+                continue
+            expected = camera.project_pinhole(point(frame)[None])[0]
+            assert np.abs(ball_px(path) - expected).max() < 0.25
+    bent = np.abs(CAMERAS[0].project(point(5)[None]) - CAMERAS[0].project_pinhole(point(5)[None])).max()
+    assert bent > 1  # so that the test would notice footage as it was
+
+
+def test_the_command_needs_a_built_rig(capture, tmp_path):
+    shutil.copytree(capture, tmp_path / "copy")
+    command = [sys.executable, "-m", "jawusd", "plates", str(tmp_path / "copy"), str(tmp_path / "no_rig")]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 3 and "tracks.npz" in done.stderr
