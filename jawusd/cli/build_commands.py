@@ -80,7 +80,7 @@ def build(
     allow_outside: Outside = False,
     as_json: Json = False,
 ) -> None:
-    """Turn a capture into a rig: sync, track, fit, bake."""
+    """Turn a capture into a rig: sync, track, fit, track again where the model helps, bake."""
     from jawusd.pipeline.build import BuildOptions, build_rig
     from jawusd.pipeline.summary import build_lines
 
@@ -108,6 +108,12 @@ def track(
     out: Annotated[Path, typer.Option("-o", "--out", help="File of the tracks.")] = Path("tracks.npz"),
     solver: SolverOption = Solver.contour,
     backend: BackendOption = Backend.cpu,
+    prior: Annotated[
+        Path | None,
+        typer.Option(
+            help="model.npz of this person: a second pass with its help.", show_default=False
+        ),
+    ] = None,
     overlay: Annotated[
         Path | None, typer.Option(help="Folder for videos with the tracked scans over the footage.", show_default=False)
     ] = None,
@@ -117,20 +123,24 @@ def track(
     as_json: Json = False,
 ) -> None:
     """Track both rows of teeth through the masks."""
+    from jawusd.formats.model import load_model
     from jawusd.formats.tracks import save_tracks
     from jawusd.pipeline.overlay import overlay_files, write_overlay
     from jawusd.pipeline.prepare import open_capture
-    from jawusd.pipeline.stages import sync_cameras, track_teeth
+    from jawusd.pipeline.stages import aid_teeth, sync_cameras, track_teeth
     from jawusd.pipeline.summary import track_lines, track_summary
 
     _check_backend(solver, backend)
     refuse_existing(out, force)
+    model = load_model(prior) if prior else None
     opened = open_capture(capture, allow_outside=allow_outside)
     for path in overlay_files(opened, overlay) if overlay else ():
         refuse_existing(path, force)
     with progress() as report:
         offsets = sync_cameras(opened, report)["offsets"]
         tracks = track_teeth(opened, offsets, jobs, report, solver.value, backend.value)
+        if model is not None:
+            tracks = aid_teeth(opened, offsets, tracks, model, jobs, report)
         save_tracks(out, tracks)
         drawn = write_overlay(opened, offsets, tracks, overlay, report) if overlay else []
     summary = {**track_summary(tracks), "file": str(out), "overlay": [str(path) for path in drawn]}

@@ -36,6 +36,7 @@ class Tracks:
         prior_aided: a kinematic prior took part in the final pose, shape (F,).
         coverage_error: mask pixels the projected scan leaves uncovered, as a fraction of the mask (E_SP of paper
             eq. 8 over segmented pixels), shape (F, 2, C); NaN without a mask.
+        masks_used: the masks that took part in the raw poses, shape (F, 2, C); the others are missing or spoiled.
         covariance_upper, covariance_lower: covariance of the left twist xi [rad, mm] with T_true = exp(xi) T, world
             frame, about the world origin, shape (F, 6, 6).
         covariance_relative: the same of T_upper_lower in the skull frame, shape (F, 6, 6).
@@ -56,6 +57,7 @@ class Tracks:
     status: NDArray[np.int8]
     prior_aided: NDArray[np.bool_]
     coverage_error: NDArray[np.float64]
+    masks_used: NDArray[np.bool_]
     covariance_upper: NDArray[np.float64]
     covariance_lower: NDArray[np.float64]
     covariance_relative: NDArray[np.float64]
@@ -83,6 +85,7 @@ def _shapes(count: int, cameras: int) -> dict[str, tuple[int, ...]]:
         "status": (count, 2),
         "prior_aided": (count,),
         "coverage_error": (count, 2, cameras),
+        "masks_used": (count, 2, cameras),
         **covariances,
         "sigma_mm": (count, len(LANDMARKS)),
         "residual_px": (count, 2),
@@ -128,6 +131,8 @@ def load_tracks(path: str | os.PathLike[str]) -> Tracks:
     if not isinstance(names, list) or not all(isinstance(n, str) for n in names):
         raise FormatError('"meta" has no list "camera_names".', path=path)
     count = len(take(arrays, "frames", (None,), path))
+    if "masks_used" not in arrays and "coverage_error" in arrays:  # trackers other than ours need not say
+        arrays["masks_used"] = np.isfinite(arrays["coverage_error"])
     values = {
         # NaN is how a lost frame is written, so only the frame numbers must be finite.
         name: take(arrays, name, shape, path, finite=name == "frames")

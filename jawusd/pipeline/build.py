@@ -14,7 +14,7 @@ from jawusd.formats.capture import Capture
 from jawusd.formats.model import load_model, save_model
 from jawusd.formats.tracks import load_tracks, save_tracks
 from jawusd.pipeline.prepare import input_files, open_capture
-from jawusd.pipeline.stages import bake_files, fit_jaw, sync_cameras, track_teeth, write_take
+from jawusd.pipeline.stages import aid_teeth, bake_files, fit_jaw, sync_cameras, track_teeth, write_take
 from jawusd.pipeline.state import (
     BUILD_FILE,
     LOCK_FILE,
@@ -26,6 +26,8 @@ from jawusd.pipeline.state import (
     locked,
 )
 from jawusd.pipeline.summary import fit_summary, track_summary
+
+FIRST_PASS = "first_pass.npz"  # tracks without the model's help: what the model is fitted to
 
 
 @dataclass(frozen=True)
@@ -118,15 +120,20 @@ class _Build:
             lambda: self._track(sync.result["offsets"]),
         )
         fit = self._stage("fit", hash_value([track.outputs, track.inputs, options.model, __version__]), self._fit)
-        bake = self._stage("bake", hash_value([fit.outputs, track.inputs, __version__]), self._bake)
+        aid = self._stage(
+            "aid",
+            hash_value([track.outputs, track.inputs, fit.outputs, __version__]),
+            lambda: self._aid(sync.result["offsets"]),
+        )
+        bake = self._stage("bake", hash_value([fit.outputs, aid.outputs, track.inputs, __version__]), self._bake)
         return {
             "capture": capture.name,
             "folder": str(self.folder),
-            "files": sorted({*track.outputs, *fit.outputs, *bake.outputs}),
+            "files": sorted({*track.outputs, *fit.outputs, *aid.outputs, *bake.outputs}),
             "seconds": {name: record.seconds for name, record in self.state.stages.items()},
             "reused": self.reused,
             "sync": sync.result,
-            "track": track.result,
+            "track": aid.result,
             "fit": fit.result,
         }
 
@@ -149,16 +156,23 @@ class _Build:
     def _track(self, offsets: dict[str, int]) -> tuple[list[Path], dict]:
         options = self.options
         tracks = track_teeth(self.capture, offsets, options.jobs, self.progress, options.solver, options.backend)
-        path = self.folder / "tracks.npz"
+        path = self.folder / FIRST_PASS
         save_tracks(path, tracks)
         return [path], track_summary(tracks)
 
     def _fit(self) -> tuple[list[Path], dict]:
-        tracks = load_tracks(self.folder / "tracks.npz")
+        tracks = load_tracks(self.folder / FIRST_PASS)
         model = fit_jaw(self.capture, tracks, self.options.model, self.progress)
         path = self.folder / "model.npz"
         save_model(path, model)
         return [path], fit_summary(model)
+
+    def _aid(self, offsets: dict[str, int]) -> tuple[list[Path], dict]:
+        first, model = load_tracks(self.folder / FIRST_PASS), load_model(self.folder / "model.npz")
+        tracks = aid_teeth(self.capture, offsets, first, model, self.options.jobs, self.progress)
+        path = self.folder / "tracks.npz"
+        save_tracks(path, tracks)
+        return [path], track_summary(tracks)
 
     def _bake(self) -> tuple[list[Path], dict]:
         files = bake_files(self.capture, load_model(self.folder / "model.npz"), self.folder, self.progress)

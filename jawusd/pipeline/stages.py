@@ -120,6 +120,37 @@ def _track(
     )
 
 
+def aid_teeth(
+    capture: Capture, offsets: dict[str, int], tracks: Tracks, model: JawModel, jobs: int, progress: Progress
+) -> Tracks:
+    """Track the hard frames again with the fitted model as a prior.
+
+    Args:
+        capture: the capture.
+        offsets: frame offset by camera.
+        tracks: the first pass.
+        model: the model fitted to it.
+        jobs: threads.
+        progress: told of every frame.
+
+    Raises:
+        CaptureError: a mask cannot be read.
+    """
+    with _about(capture):
+        meshes = load_meshes(capture)
+        return stage("jawusd.tracking.aided").aid_tracks(
+            tracks,
+            JawRig(model.arrays, model.meta),
+            capture,
+            load_cameras(capture),
+            offsets,
+            meshes["upper_teeth"],
+            meshes["lower_teeth"],
+            threads=jobs,
+            progress=lambda done, total: progress("aid", done, total),
+        )
+
+
 def read_motion(path: str | os.PathLike[str], options: TrajectoryOptions | None = None) -> Motion:
     """Read tracks, or poses from elsewhere.
 

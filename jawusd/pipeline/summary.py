@@ -24,6 +24,7 @@ def track_summary(tracks: Tracks) -> dict:
         "lost": [int(frame) for frame in lost],
         "recovered": int((tracks.status == RECOVERED).any(1).sum()),
         "without_a_camera": int((tracks.status == PARTIAL).any(1).sum()),
+        "prior_aided": int(tracks.prior_aided.sum()),
         "sigma_mm": {name: _rounded(value) for name, value in zip(LANDMARKS, sigma, strict=True)},
         "coverage_error_percent": _rounded(100 * np.nanmean(coverage)) if np.isfinite(coverage).any() else None,
     }
@@ -41,6 +42,8 @@ def track_lines(summary: dict) -> list[str]:
         more = "" if len(lost) <= _LISTED_FRAMES else f" and {len(lost) - _LISTED_FRAMES} more"
         lines.append(f"  lost: {', '.join(map(str, lost[:_LISTED_FRAMES]))}{more}")
     lines.append(f"  recovered {summary['recovered']}, without one of the cameras {summary['without_a_camera']}")
+    if summary["prior_aided"]:
+        lines.append(f"  {summary['prior_aided']} uncertain frames tracked again with the fitted model's help")
     known = {name: value for name, value in summary["sigma_mm"].items() if value is not None}
     sigma = ", ".join(f"{name} {value}" for name, value in known.items()) or "not known"
     lines.append(f"  expected error (1 sigma, median) [mm]: {sigma}")

@@ -177,6 +177,7 @@ def _assembled(records: Mapping[int, _Record], camera_names: tuple[str, ...], me
         status=status,
         prior_aided=np.zeros(count, bool),
         coverage_error=np.stack([records[f].coverage for f in frames]),
+        masks_used=np.stack([np.isfinite(records[f].coverage) for f in frames]),
         covariance_upper=unknown,
         covariance_lower=unknown.copy(),
         covariance_relative=unknown.copy(),

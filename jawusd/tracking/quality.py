@@ -11,7 +11,7 @@ from jawusd.geometry import hat, make_transform, mandible_metric, se3_adjoint, s
 from jawusd.imaging.raster import count_and_not, count_bits, draw_silhouette, pack_bits, project
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.scan import Scan
-from jawusd.tracking.solver import Solution, View
+from jawusd.tracking.solver import Solution, View, WeighedPrior
 
 # E[w d^2] / E[w] of a unit normal residual under the Tukey weight at 4.685 standard deviations, by quadrature.
 _TUKEY_VARIANCE = 0.828
@@ -83,6 +83,34 @@ def twist_covariance(solution: Solution, row: int, sigma_px: float, correlation_
         return free
     A = se3_adjoint(make_transform(np.eye(3), solution.centres[row]))
     return A @ (sigma_px**2 * correlation_px * np.linalg.inv(H)) @ A.T
+
+
+def joint_covariance(
+    solution: Solution, prior: WeighedPrior, sigma_px: NDArray[np.float64], correlation_px: float
+) -> NDArray[np.float64] | None:
+    """Return the covariance of both rows' left twists about the world origin given masks and prior, shape (12, 12).
+
+    Args:
+        solution: an alignment with the prior.
+        prior: what else is known of the two poses.
+        sigma_px, correlation_px: as for `twist_covariance`, the former per row, shape (2,).
+
+    Returns:
+        Covariance (rad, mm), rows (upper, lower); None where masks and prior leave a motion free.
+    """
+    precision, _ = prior.terms(solution.poses, np.zeros((2, 3)))
+    for r in (0, 1):
+        to_centre = se3_adjoint(make_transform(np.eye(3), -solution.centres[r]))
+        block = slice(6 * r, 6 * r + 6)
+        H = solution.systems[r, :, :6, :6].sum(0) / (sigma_px[r] ** 2 * correlation_px)
+        precision[block, block] += to_centre.T @ H @ to_centre
+    if not np.isfinite(precision).all():
+        return None
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(precision), 1e-300))
+    scaled = scale[:, None] * precision * scale
+    if np.linalg.matrix_rank(scaled, hermitian=True) < 12:
+        return None
+    return scale[:, None] * np.linalg.inv(scaled) * scale
 
 
 def correlation_px(solution: Solution, config: TrackingConfig) -> NDArray[np.float64]:

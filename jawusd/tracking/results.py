@@ -82,6 +82,7 @@ def assemble(
         status=status,
         prior_aided=np.zeros(len(frames), bool),
         coverage_error=np.stack([r.coverage for r in ordered]),
+        masks_used=np.stack([r.used for r in ordered]),
         covariance_upper=covariance[:, 0],
         covariance_lower=covariance[:, 1],
         covariance_relative=covariance_relative,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +62,22 @@ class Solution:
     iterations: int
 
 
+class WeighedPrior(Protocol):
+    """Know something of both poses, and how much a pixel of contour is worth against it.
+
+    Attributes:
+        variance_px3: outline variance times correlation length per row [px^3], shape (2,).
+    """
+
+    variance_px3: NDArray[np.float64]
+
+    def terms(
+        self, poses: NDArray[np.float64], centres: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return precision (12, 12) and right side (12,) of left twists about the centres, rows (upper, lower)."""
+        ...
+
+
 class ContourSolver:
     """Align two scans with masks; keeps buffers, so one solver serves one thread of control."""
 
@@ -75,6 +92,7 @@ class ContourSolver:
         views: Sequence[View],
         gates_px: Sequence[float],
         use: NDArray[np.bool_] | None = None,
+        prior: WeighedPrior | None = None,
     ) -> Solution:
         """Align both rows, starting from given poses.
 
@@ -83,6 +101,7 @@ class ContourSolver:
             views: one picture per camera.
             gates_px: residual gate of every iteration.
             use: masks that take part, shape (2, C); by default all present ones.
+            prior: what else is known of the two poses; by default nothing.
         """
         start, poses = poses, np.array(poses, np.float64)
         use = np.array([[v.present[r] for v in views] for r in _ROWS]) if use is None else use
@@ -91,7 +110,7 @@ class ContourSolver:
         for gate in gates_px:
             iterations += 1
             state = self._linearise(poses, views, use, gate, render)
-            step = self._step(state, start)
+            step = self._step(state, start, prior)
             for r in _ROWS:
                 poses[r] = _moved(poses[r], step[r], state.centres[r])
             if gate == gates_px[-1] and self._motion_mm(step) < self.config.converged_mm:
@@ -156,7 +175,7 @@ class ContourSolver:
             return gate
         return float(np.clip(self.config.gate_sigmas * 1.4826 * np.median(d), *self.config.final_gate_px))
 
-    def _step(self, state: Solution, start: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _step(self, state: Solution, start: NDArray[np.float64], prior: WeighedPrior | None) -> NDArray[np.float64]:
         """Solve the joint 12x12 normal equations; twists about the centres, shape (2, 6).
 
         A weak pull towards the start keeps motions finite that the masks leave free.
@@ -170,6 +189,10 @@ class ContourSolver:
             block = slice(6 * r, 6 * r + 6)
             H[block, block] = total[:6, :6] + np.diag(pull)
             g[block] = total[:6, 6] - pull * away
+        if prior is not None:
+            weight = np.repeat(1.0 / prior.variance_px3, 6)
+            known, towards = prior.terms(state.poses, state.centres)
+            H, g = weight[:, None] * H + known, weight * g + towards
         return np.linalg.solve(H, g).reshape(2, 6)
 
     def _motion_mm(self, step: NDArray[np.float64]) -> float:

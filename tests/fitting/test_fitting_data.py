@@ -45,6 +45,7 @@ def tracks_of(T, covariance=None):
         status=np.ones((count, 2), dtype=np.int8),
         prior_aided=np.zeros(count, dtype=bool),
         coverage_error=np.zeros((count, 2, 3)),
+        masks_used=np.ones((count, 2, 3), bool),
         covariance_upper=small,
         covariance_lower=small,
         covariance_relative=small if covariance is None else covariance,

@@ -22,7 +22,8 @@ def make_tracks(count=5, cameras=("a", "b")):
     cov[2] = np.nan
     return Tracks(
         np.arange(30, 30 + count), *poses, np.ones((count, 2), np.int8), np.zeros(count, bool),
-        np.full((count, 2, len(cameras)), 0.01), cov, cov.copy(), cov.copy(), np.full((count, 5), 0.05),
+        np.full((count, 2, len(cameras)), 0.01), np.ones((count, 2, len(cameras)), bool),
+        cov, cov.copy(), cov.copy(), np.full((count, 5), 0.05),
         np.full((count, 2), 0.5), np.full((count, 2), 800.0), cameras, {"config": {"gate_px": 2.5}},
     )  # fmt: skip
 
@@ -39,6 +40,15 @@ def test_tracks_round_trip_bit_for_bit(tmp_path):
     first = (tmp_path / "t.npz").read_bytes()
     save_tracks(tmp_path / "t.npz", tracks)
     assert (tmp_path / "t.npz").read_bytes() == first
+
+
+def test_trackers_that_do_not_say_which_masks_they_used_used_all(tmp_path):
+    tracks = make_tracks()
+    tracks.coverage_error[3, 1, 0] = np.nan
+    save_tracks(tmp_path / "t.npz", tracks)
+    rewrite(tmp_path / "t.npz", lambda arrays: arrays.pop("masks_used"))
+    used = load_tracks(tmp_path / "t.npz").masks_used
+    assert not used[3, 1, 0] and used.sum() == used.size - 1
 
 
 def rewrite(path, change):

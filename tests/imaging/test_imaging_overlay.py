@@ -94,7 +94,8 @@ def tracks(count: int) -> Tracks:
     zeros = {
         name: np.zeros(shape)
         for name, shape in {
-            "status": (count, 2), "coverage_error": (count, 2, 1), "covariance_upper": (count, 6, 6),
+            "status": (count, 2), "coverage_error": (count, 2, 1), "masks_used": (count, 2, 1),
+            "covariance_upper": (count, 6, 6),
             "covariance_lower": (count, 6, 6), "covariance_relative": (count, 6, 6), "sigma_mm": (count, 5),
             "residual_px": (count, 2), "matched_px": (count, 2),
         }.items()

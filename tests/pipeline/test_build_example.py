@@ -113,7 +113,7 @@ def test_a_second_build_needs_a_word_and_resume_reuses_everything(built):
     with pytest.raises(OutputError, match="--resume"):
         build_rig(EXAMPLE, out, BuildOptions(), quiet)
     again = build_rig(EXAMPLE, out, BuildOptions(resume=True), quiet)
-    assert again["reused"] == ["sync", "track", "fit", "bake"]
+    assert again["reused"] == ["sync", "track", "fit", "aid", "bake"]
 
 
 def test_resume_redoes_only_what_depends_on_a_change(built, tmp_path):

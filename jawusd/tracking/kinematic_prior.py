@@ -1,0 +1,73 @@
+"""The person's own jaw model as a prior on where the lower teeth are relative to the upper ones."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.evaluator import JawRig
+from jawusd.geometry import (
+    make_transform,
+    mandible_metric,
+    relative_pose,
+    se3_adjoint,
+    se3_inverse,
+    se3_left_jacobian,
+    se3_log,
+    transform_points,
+)
+
+_NORMAL_DIRECTIONS = 3  # six motions of a rigid body less the three the model allows
+
+
+@dataclass(frozen=True, eq=False)
+class KinematicPrior:
+    """Pull relative poses towards the poses of a jaw model, and leave motion along the model free.
+
+    The deviation of a pose from the model, the left twist xi with T_upper_lower = exp(xi) pose(d), costs
+    xi^T P xi after the best change of d: P = 3 / s^2 (M - M J (J^T M J)^-1 J^T M) with the landmark metric M
+    (xi^T M xi = mean squared displacement), the model's Jacobian J, and the rms distance s of captured poses from the
+    model, spread over three directions. The prior of Zoss et al. 2018 (an empirical rig), with the width taken from
+    the capture.
+
+    Attributes:
+        jaw: the person's model.
+        spread_mm: rms landmark distance s of good tracked poses from the model [mm].
+        variance_px3: outline variance times correlation length per row [px^3], shape (2,): what the masks weigh.
+    """
+
+    jaw: JawRig
+    spread_mm: float
+    variance_px3: NDArray[np.float64]
+
+    def terms(self, poses: NDArray[np.float64], centres: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
+        """Return the normal equations of the prior.
+
+        Args:
+            poses: T_world_upper, T_world_lower, shape (2, 4, 4).
+            centres: world points that the rows' left twists turn about [mm], shape (2, 3).
+
+        Returns:
+            Precision matrix (12, 12) and right side (12,) of the twists (upper, lower).
+        """
+        relative = relative_pose(poses[0], poses[1])
+        d = self.jaw.encode(relative)[0]
+        pose = self.jaw.pose(d)
+        deviation = se3_log(relative @ se3_inverse(pose))
+        precision = self._precision(d, pose)
+        to_skull = se3_adjoint(se3_inverse(poses[0]))
+        about = [se3_adjoint(make_transform(np.eye(3), centre)) for centre in centres]
+        # To first order exp(xi') = exp(Ad(T_u^-1) (x_l - x_u)) exp(xi).
+        slope = np.hstack([-to_skull @ about[0], to_skull @ about[1]])
+        return slope.T @ precision @ slope, -slope.T @ precision @ deviation
+
+    def _precision(self, d: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return P at a model pose, shape (6, 6)."""
+        M = mandible_metric(transform_points(pose, self.jaw.arrays["landmarks"]))
+        # The derivative of the logarithm becomes that of the pose by the left Jacobian (Barfoot 2017, eq. 7.85).
+        J = se3_left_jacobian(self.jaw.twist(d)) @ self.jaw.jacobian(d)
+        along = M @ J
+        normal = M - along @ np.linalg.solve(J.T @ along, along.T)
+        return _NORMAL_DIRECTIONS / self.spread_mm**2 * normal
