@@ -94,7 +94,7 @@ class Experiments:
         condyle_paths: one per model.
         distances: everything measured, in the order of the table.
         coverage: captured part of the envelope.
-        notes: what could not be done and why.
+        notes: how long each model took and how many frames it left out; models that could not be fitted, and why.
     """
 
     actor: str
