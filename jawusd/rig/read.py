@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 from pxr import Sdf, Tf, Usd, UsdGeom
 
-from jawusd.errors import EvaluatorError, FormatError, RigError, UnitsError, VersionError
+from jawusd.errors import EvaluatorError, FormatError, RigError, UnitsError
 from jawusd.evaluator import JawRig
 from jawusd.rig.arrays import read_arrays, read_value
-from jawusd.rig.layout import FORMAT_VERSION, ONNX_ATTRIBUTES, PARAMETERS
+from jawusd.rig.layout import ONNX_ATTRIBUTES, PARAMETERS
 from jawusd.rig.schema import has_jaw_api
 from jawusd.rig.table import DecoderTable
+from jawusd.rig.versions import bring_up_to_date
 
 PathArg = str | os.PathLike[str]
 
@@ -74,7 +75,7 @@ def find_rig_prim(stage: Usd.Stage, where: object, prim_path: str | None = None)
 
 def rig_of(prim: Usd.Prim, where: object) -> JawRig:
     """Build the evaluator from a rig prim; see `load_rig` for what it raises."""
-    check_version(prim, where)
+    bring_up_to_date(prim, where)
     check_units(prim, where)
     check_assets(prim, where)
     kind = read_value(prim, "jaw:model:kind", where)
@@ -91,24 +92,6 @@ def rig_of(prim: Usd.Prim, where: object) -> JawRig:
         return JawRig(arrays, meta)
     except EvaluatorError as error:
         raise FormatError(error.message, path=str(where)) from error
-
-
-def check_version(prim: Usd.Prim, where: object) -> None:
-    """Check that this version can read the rig.
-
-    Raises:
-        FormatError: the version is not a positive whole number.
-        VersionError: it is newer.
-    """
-    version = read_value(prim, "jaw:formatVersion", where)
-    if not isinstance(version, int) or version < 1:
-        raise FormatError(f"jaw:formatVersion is {version!r}, expected a whole number from 1.", path=str(where))
-    if version > FORMAT_VERSION:
-        raise VersionError(
-            f"the rig has format version {version}, this jawusd reads up to {FORMAT_VERSION}.",
-            path=str(where),
-            hint="Update jawusd.",
-        )
 
 
 def check_units(prim: Usd.Prim, where: object) -> None:
@@ -161,7 +144,9 @@ def read_table(prim: Usd.Prim, where: object) -> DecoderTable:
 
     Raises:
         FormatError: values are missing, or do not fit one another.
+        VersionError: written by a newer version.
     """
+    bring_up_to_date(prim, where)
     names = ("shape", "d1Knots", "d2Knots", "d3Knots", "twists", "format", "maxError", "errorSamples")
     values = {name: read_value(prim, f"jaw:decoder:{name}", where) for name in names}
     knots = tuple(np.array(values[f"d{i}Knots"], dtype=np.float64) for i in (1, 2, 3))

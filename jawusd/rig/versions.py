@@ -1,0 +1,46 @@
+"""Format versions: what is read, what is refused, and the one place where an older rig becomes a present one.
+
+A new version of the format takes four steps: raise `layout.FORMAT_VERSION`; write here the step from the version before
+it, `STEPS[1]` from 1 to 2, which gives a prim the attributes of the next version out of its own; let
+`tests/golden/make_golden_rig.py` write the golden rigs of the new version beside the old ones, which stay for ever and
+go through the steps in the tests; do the same in `plugins/jawusd_reader.py`, which stands alone. Files are never
+rewritten: `jawusd bake` on the model gives a rig of the present version.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from pxr import Usd
+
+from jawusd.errors import FormatError, VersionError
+from jawusd.rig.arrays import read_value
+from jawusd.rig.layout import FORMAT_VERSION
+
+STEPS: dict[int, Callable[[Usd.Prim], None]] = {}
+
+
+def bring_up_to_date(prim: Usd.Prim, where: object) -> None:
+    """Check the version of a rig prim and carry an older one to the present version.
+
+    The new attributes are authored in the session layer of the prim's stage: in memory, stronger than the files, never
+    in them.
+
+    Raises:
+        FormatError: the version is not a positive whole number.
+        VersionError: it is newer than this jawusd.
+    """
+    version = read_value(prim, "jaw:formatVersion", where)
+    if not isinstance(version, int) or version < 1:
+        raise FormatError(f"jaw:formatVersion is {version!r}, expected a whole number from 1.", path=str(where))
+    if version > FORMAT_VERSION:
+        raise VersionError(
+            f"the rig has format version {version}, this jawusd reads up to {FORMAT_VERSION}.",
+            path=str(where),
+            hint="Update jawusd.",
+        )
+    stage = prim.GetStage()
+    with Usd.EditContext(stage, stage.GetSessionLayer()):
+        for step in range(version, FORMAT_VERSION):
+            STEPS[step](prim)
+            prim.GetAttribute("jaw:formatVersion").Set(step + 1)

@@ -1,0 +1,78 @@
+"""Rigs of older versions: read through the steps, in memory, by everything that reads rigs; the files stay."""
+
+import numpy as np
+import pytest
+from example_rig import example_rig
+from pxr import Sdf, Usd
+
+from jawusd.errors import VersionError
+from jawusd.rig import describe, load_rig, validate_stage, versions
+
+OLD_NAME, NEW_NAME = "jaw:decoder:error", "jaw:decoder:maxError"
+
+
+@pytest.fixture
+def older(anchored_folder, monkeypatch):
+    """Return a rig as a version before the present one would have been: another name, inches in the incisal point.
+
+    What is present becomes version 2, and STEPS gets the step from 1 to 2.
+    """
+    for file, change in (("rig.usdc", _rename), ("rig.usdc", _to_inches)):
+        layer = Sdf.Layer.OpenAsAnonymous(str(anchored_folder / file))
+        change(layer)
+        layer.Export(str(anchored_folder / file))
+
+    def step(prim):
+        error = prim.CreateAttribute(NEW_NAME, Sdf.ValueTypeNames.Double)
+        error.Set(prim.GetAttribute(OLD_NAME).Get())
+        incisor = prim.GetAttribute("jaw:model:incisor")
+        incisor.Set(np.array(incisor.Get()) * 25.4)
+
+    monkeypatch.setattr(versions, "FORMAT_VERSION", 2)
+    monkeypatch.setitem(versions.STEPS, 1, step)
+    return anchored_folder
+
+
+def _rename(layer):
+    attribute = layer.GetAttributeAtPath(f"/Actor.{NEW_NAME}")
+    attribute.name = OLD_NAME
+
+
+def _to_inches(layer):
+    incisor = layer.GetAttributeAtPath("/Actor.jaw:model:incisor")
+    incisor.default = np.array(incisor.default) / 25.4
+
+
+def test_an_older_rig_gives_the_same_poses(older):
+    before = {path.name: path.read_bytes() for path in older.iterdir()}
+    d = [[10.0, 2.0, 1.0], [0, 0, 0]]
+    for file in ("actor.usda", "anim_capture.usdc"):
+        np.testing.assert_allclose(load_rig(older / file).pose(d), example_rig().pose(d), atol=1e-12)
+        assert describe(older / file)["table"]["max_error_mm"] > 0
+    assert {path.name: path.read_bytes() for path in older.iterdir()} == before
+
+
+def test_an_older_rig_is_validated_as_it_is_read(older):
+    findings = validate_stage(older / "actor.usda")
+    assert {finding.rule for finding in findings} <= {"Onnx"}  # the sidecar was hashed with the present arrays
+
+
+def test_reading_twice_on_one_stage_upgrades_once(older):
+    stage = Usd.Stage.Open(str(older / "actor.usda"))
+    prim = stage.GetPrimAtPath("/Actor")
+    for _ in range(2):
+        versions.bring_up_to_date(prim, older)
+        assert prim.GetAttribute("jaw:formatVersion").Get() == 2
+    np.testing.assert_allclose(prim.GetAttribute("jaw:model:incisor").Get(), example_rig().arrays["incisor"])
+
+
+def test_a_version_after_the_present_one_is_refused(older):
+    layer = Sdf.Layer.OpenAsAnonymous(str(older / "actor.usda"))
+    layer.GetAttributeAtPath("/Actor.jaw:formatVersion").default = 3
+    layer.Export(str(older / "actor.usda"))
+    with pytest.raises(VersionError, match="version 3, this jawusd reads up to 2"):
+        load_rig(older / "actor.usda")
+
+
+def test_every_older_version_has_a_step():
+    assert sorted(versions.STEPS) == list(range(1, versions.FORMAT_VERSION))
