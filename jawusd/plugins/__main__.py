@@ -1,10 +1,18 @@
-"""Write the Blender extension: `python -m jawusd.plugins jawusd_blender.zip`."""
+"""Hand out what runs inside other programs.
+
+    python -m jawusd.plugins jawusd_blender.zip    the Blender extension
+    python -m jawusd.plugins FOLDER                reader, recipes for Maya, Houdini and Unreal, Geometry Nodes maker
+"""
 
 import sys
 from pathlib import Path
 
-from jawusd.plugins.extension import build_extension
+from jawusd.plugins.extension import build_extension, copy_scripts
 
-if len(sys.argv) != 2 or not sys.argv[1].endswith(".zip"):
-    sys.exit("usage: python -m jawusd.plugins FILE.zip")
-print(build_extension(Path(sys.argv[1])))
+if len(sys.argv) != 2 or sys.argv[1].startswith("-"):
+    sys.exit("usage: python -m jawusd.plugins FILE.zip|FOLDER")
+target = Path(sys.argv[1])
+if target.suffix == ".zip":
+    print(build_extension(target))
+else:
+    print(*copy_scripts(target), sep="\n")

@@ -1,11 +1,13 @@
-"""Build the Blender extension: the add-on and the reader in one zip."""
+"""Hand out what runs inside other programs: the Blender extension as one zip, the scripts as files."""
 
 from __future__ import annotations
 
+import shutil
 import zipfile
 from pathlib import Path
 
 _HERE = Path(__file__).parent
+_SCRIPTS = ("jawusd_reader.py", "jawusd_recipes.py", "blender_nodes.py")
 # one fixed time: equal sources give equal bytes
 _ZIP_TIME = (1980, 1, 1, 0, 0, 0)
 
@@ -24,3 +26,16 @@ def build_extension(out: Path) -> Path:
         for source in [*sources, _HERE / "jawusd_reader.py"]:
             archive.writestr(zipfile.ZipInfo(source.name, _ZIP_TIME), source.read_bytes(), zipfile.ZIP_DEFLATED)
     return out
+
+
+def copy_scripts(folder: Path) -> list[Path]:
+    """Copy the reader, and the scripts that need nothing but it, into a folder; made if missing.
+
+    Returns:
+        The files.
+
+    Raises:
+        OSError: they cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    return [Path(shutil.copyfile(_HERE / name, folder / name)) for name in _SCRIPTS]
