@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from jawusd.errors import CaptureError
 from jawusd.imaging.video import Video
 
-__all__ = ["MaskReader"]
+__all__ = ["MaskReader", "mask_size_px"]
 
 _AHEAD = 4  # pictures waiting at most: 8 MB of full HD per reader
 _NUMBER = re.compile(r"%(0(\d+))?d")
@@ -115,10 +115,22 @@ class MaskReader:
             yield mask if mask is None or self._prepare is None else self._prepare(mask)
 
 
-class _PngMasks:
-    """Masks as numbered PNG files."""
+def mask_size_px(path: str | os.PathLike[str]) -> tuple[int, int]:
+    """Return the (width, height) of the first mask of a PNG pattern or video.
 
-    def __init__(self, pattern: Path, size_px: tuple[int, int]) -> None:
+    Raises:
+        CaptureError: the folder or file is missing, holds no masks, or cannot be decoded.
+    """
+    path = Path(path)
+    if "%" not in path.name:
+        return Video(path).size_px
+    return _PngMasks(path, None).first_size_px()
+
+
+class _PngMasks:
+    """Masks as numbered PNG files; of any size where none is named."""
+
+    def __init__(self, pattern: Path, size_px: tuple[int, int] | None) -> None:
         self._pattern, self._size_px = pattern, size_px
         number = _NUMBER.search(pattern.name)
         if number is None or pattern.name.count("%") != 1:
@@ -145,13 +157,18 @@ class _PngMasks:
             path = self._files.get(frame)
             yield None if path is None else self._load(path)
 
+    def first_size_px(self) -> tuple[int, int]:
+        height, width = self._load(self._files[min(self._files)]).shape
+        return width, height
+
     def _load(self, path: Path) -> Mask:
         image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         if image is None:
             raise CaptureError(
                 "the mask cannot be decoded.", path=path, hint="Export it again, or delete it: that frame is skipped."
             )
-        _check_size(path, image.shape[1::-1], self._size_px)
+        if self._size_px is not None:
+            _check_size(path, image.shape[1::-1], self._size_px)
         return _single_channel(image)
 
 

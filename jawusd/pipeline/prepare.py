@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jawusd.errors import CalibrationError, CaptureError
 from jawusd.formats.calibration import load_calibration
-from jawusd.formats.capture import Capture, load_capture
+from jawusd.formats.capture import CameraSource, Capture, load_capture
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import LANDMARKS, Camera, anatomical_frame, find_landmarks
 from jawusd.pipeline.extras import stage
@@ -45,11 +45,30 @@ def open_capture(path: str | os.PathLike[str], *, allow_outside: bool = False) -
 
 
 def load_cameras(capture: Capture) -> list[Camera]:
-    """Return the calibrated cameras in the capture's order.
+    """Return the calibrated cameras in the capture's order, at the size the pictures were recorded in.
+
+    A calibration made at another size of the same shape is scaled; `rescaled_cameras` says of which cameras.
 
     Raises:
-        CalibrationError: there is no calibration, or it does not know a camera of the capture.
+        CalibrationError: there is no calibration, it does not know a camera of the capture, or the pictures have
+            another shape than those it was made from.
+        CaptureError: a video or mask cannot be read.
     """
+    return [_at_recorded_size(camera, capture, source) for camera, source in _calibrated(capture)]
+
+
+def rescaled_cameras(capture: Capture) -> dict[str, tuple[tuple[int, int], tuple[int, int]]]:
+    """Return the sizes (width, height) [px] calibrated and recorded, by the name of each camera where they differ.
+
+    Raises:
+        CalibrationError, CaptureError: as `load_cameras`.
+    """
+    pairs = [(camera, _at_recorded_size(camera, capture, source)) for camera, source in _calibrated(capture)]
+    return {a.name: (tuple(a.size_px), tuple(b.size_px)) for a, b in pairs if tuple(a.size_px) != tuple(b.size_px)}
+
+
+def _calibrated(capture: Capture) -> list[tuple[Camera, CameraSource]]:
+    """Return the cameras as calibrated, each with its source."""
     if capture.calibration is None:
         raise CalibrationError(
             'has no "calibration".',
@@ -62,7 +81,29 @@ def load_cameras(capture: Capture) -> list[Camera]:
         raise CalibrationError(
             f"does not know camera {missing[0]} of the capture; it names {', '.join(known)}.", path=capture.calibration
         )
-    return [known[source.name] for source in capture.cameras]
+    return [(known[source.name], source) for source in capture.cameras]
+
+
+def _at_recorded_size(camera: Camera, capture: Capture, source: CameraSource) -> Camera:
+    if source.video is not None:
+        recorded, path = stage("jawusd.imaging.video").Video(source.video).size_px, source.video
+    elif source.masks is not None:
+        path = source.masks.upper
+        recorded = stage("jawusd.imaging.masks").mask_size_px(path)
+    else:
+        return camera
+    width, height = camera.size_px
+    if tuple(recorded) == (width, height):
+        return camera
+    # One pixel is what rounding of a scaled height makes.
+    if abs(recorded[0] * height / width - recorded[1]) > 1.0:
+        raise CalibrationError(
+            f"camera {camera.name}: calibrated for pictures of {width} x {height} px, but {path.name} has "
+            f"{recorded[0]} x {recorded[1]} px, another shape.",
+            path=capture.calibration,
+            hint="Calibrate in the recording's own mode: a crop cannot be told from the sizes alone.",
+        )
+    return camera.scaled(recorded)
 
 
 def load_meshes(capture: Capture) -> dict[str, Mesh]:

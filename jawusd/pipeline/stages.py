@@ -15,7 +15,7 @@ from jawusd.formats.capture import Capture
 from jawusd.formats.model import JawModel
 from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.pipeline.extras import stage
-from jawusd.pipeline.prepare import find_anatomy, load_cameras, load_meshes
+from jawusd.pipeline.prepare import find_anatomy, load_cameras, load_meshes, rescaled_cameras
 from jawusd.pipeline.state import Progress
 from jawusd.pipeline.subject import Subject, subject_of_capture
 from jawusd.pipeline.trajectories import TrajectoryOptions, read_trajectory
@@ -77,7 +77,9 @@ def track_teeth(
         MissingDependencyError: the GL backend has no OpenGL to work with.
     """
     with _about(capture):
-        return _track(capture, offsets, jobs, progress, solver, backend)
+        tracks = _track(capture, offsets, jobs, progress, solver, backend)
+    tracks.meta["calibration_rescaled_px"] = rescaled_cameras(capture)
+    return tracks
 
 
 @contextlib.contextmanager

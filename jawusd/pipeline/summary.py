@@ -25,6 +25,7 @@ def track_summary(tracks: Tracks) -> dict:
         "recovered": int((tracks.status == RECOVERED).any(1).sum()),
         "without_a_camera": int((tracks.status == PARTIAL).any(1).sum()),
         "prior_aided": int(tracks.prior_aided.sum()),
+        "calibration_rescaled_px": tracks.meta.get("calibration_rescaled_px", {}),
         "sigma_mm": {name: _rounded(value) for name, value in zip(LANDMARKS, sigma, strict=True)},
         "coverage_error_percent": _rounded(100 * np.nanmean(coverage)) if np.isfinite(coverage).any() else None,
     }
@@ -42,6 +43,11 @@ def track_lines(summary: dict) -> list[str]:
         more = "" if len(lost) <= _LISTED_FRAMES else f" and {len(lost) - _LISTED_FRAMES} more"
         lines.append(f"  lost: {', '.join(map(str, lost[:_LISTED_FRAMES]))}{more}")
     lines.append(f"  recovered {summary['recovered']}, without one of the cameras {summary['without_a_camera']}")
+    for name, (was, now) in summary["calibration_rescaled_px"].items():
+        lines.append(
+            f"  {name} is calibrated at {was[0]} x {was[1]} px and recorded at {now[0]} x {now[1]}: taken as the same "
+            "picture, scaled"
+        )
     if summary["prior_aided"]:
         lines.append(f"  {summary['prior_aided']} uncertain frames tracked again with the fitted model's help")
     known = {name: value for name, value in summary["sigma_mm"].items() if value is not None}

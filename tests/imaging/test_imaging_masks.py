@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from jawusd.errors import CaptureError
-from jawusd.imaging.masks import MaskReader
+from jawusd.imaging.masks import MaskReader, mask_size_px
 from jawusd.imaging.video_writer import VideoWriter
 
 SIZE = (64, 40)
@@ -166,3 +166,8 @@ def test_all_png_encodings(tmp_path: Path) -> None:
     assert np.array_equal(MaskReader(tmp_path / "soft_%d.png", SIZE).read(4), soft)
     write_png(tmp_path / "clear_4.png", np.dstack([full, 0 * full]), 8, 4)
     assert MaskReader(tmp_path / "clear_%d.png", SIZE).read(4) is None
+
+
+@pytest.mark.parametrize("kind", ["pattern", "video"])
+def test_size_of_masks_is_read_from_the_files(request, kind):
+    assert mask_size_px(request.getfixturevalue(kind)) == SIZE

@@ -15,9 +15,11 @@ from pxr import Usd, UsdGeom
 
 import jawusd
 from jawusd.errors import CalibrationError, CaptureError, JawusdError, OutputError, TrackingError
+from jawusd.formats.calibration import load_calibration
 from jawusd.formats.tracks import load_tracks
 from jawusd.geometry import transform_points
 from jawusd.pipeline.build import BuildOptions, build_rig
+from jawusd.pipeline.prepare import load_cameras, open_capture, rescaled_cameras
 from jawusd.rig.validate import validate_stage
 
 EXAMPLE = ROOT / "examples" / "capture"
@@ -177,6 +179,30 @@ def calibration_without_rotation(folder):
     replace(folder, "calibration.toml", change)
 
 
+def calibration_at(width, height):
+    """Return what gives the calibration of a copy another picture size, the intrinsics scaled by hand."""
+
+    def change(data):
+        import tomllib
+
+        out = []
+        for name, entry in tomllib.loads(data.decode()).items():
+            if "matrix" not in entry:
+                continue
+            sx, sy = width / entry["size"][0], height / entry["size"][1]
+            K = entry["matrix"]
+            K = [[K[0][0] * sx, 0.0, (K[0][2] + 0.5) * sx - 0.5], [0.0, K[1][1] * sy, (K[1][2] + 0.5) * sy - 0.5], K[2]]
+            values = {**entry, "size": [width, height], "matrix": K}
+            out += [f"[{name}]", *(f"{key} = {json.dumps(value)}" for key, value in values.items())]
+        return "\n".join(out).encode()
+
+    return change
+
+
+def calibration_of_another_shape(folder):
+    replace(folder, "calibration.toml", calibration_at(1280, 960))
+
+
 def pick_outside_its_image(folder):
     import re
 
@@ -193,6 +219,7 @@ def truncated_video(folder):
     [
         (missing_mask_folder, CaptureError, "masks"),
         (masks_of_another_size, CaptureError, "320"),
+        (calibration_of_another_shape, CalibrationError, "another shape"),
         (scan_in_metres, CaptureError, "metres"),
         (calibration_without_rotation, CalibrationError, "not a rotation"),
         (pick_outside_its_image, TrackingError, "outside"),
@@ -206,6 +233,18 @@ def test_each_broken_capture_is_one_clear_error(capture, tmp_path, damage, error
     assert isinstance(caught.value, JawusdError) and str(capture) in str(caught.value)
     left = {path.name for path in (tmp_path / "out").iterdir()} if (tmp_path / "out").exists() else set()
     assert left <= {"build.json", ".jawusd-lock"}
+
+
+def test_calibration_at_another_size_of_the_same_shape_is_scaled(capture):
+    exact = load_cameras(open_capture(capture))
+    assert rescaled_cameras(open_capture(capture)) == {}
+    replace(capture, "calibration.toml", calibration_at(2560, 1440))
+    assert load_calibration(capture / "calibration.toml")[0].size_px == (2560, 1440)
+    opened = open_capture(capture)
+    assert set(rescaled_cameras(opened)) == {camera.name for camera in exact}
+    for found, wanted in zip(load_cameras(opened), exact, strict=True):
+        assert found.size_px == wanted.size_px
+        np.testing.assert_allclose(found.K, wanted.K, atol=1e-9)
 
 
 def test_an_output_folder_with_other_files_is_left_alone(tmp_path):
