@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.errors import TrackingError
 from jawusd.formats.tracks import PARTIAL, TRACKED
-from jawusd.imaging.raster import count_and_not, count_bits, draw_silhouette, pack_bits, project
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.history import FrameRecord
 from jawusd.tracking.quality import score_px, uncovered_px
-from jawusd.tracking.solver import ContourSolver, Solution, View
+from jawusd.tracking.solver import ContourSolver, Solution
 from jawusd.tracking.views import MaskViews
 
 _ROWS = (0, 1)
@@ -31,10 +28,9 @@ def first_record(
         frame: the bootstrap frame.
 
     Raises:
-        TrackingError: too few masks on this frame, masks of the two rows exchanged, or no alignment.
+        TrackingError: too few masks on this frame, or no alignment.
     """
     views = masks.at(frame)
-    names = [camera.name for camera in masks.cameras]
     use = np.array([[v.present[r] for v in views] for r in _ROWS])
     for r in _ROWS:
         if use[r].sum() < 2:
@@ -42,7 +38,6 @@ def first_record(
                 f"frame {frame}: {use[r].sum()} masks of the {_NAMES[r]} teeth, the first frame needs two",
                 hint="Choose a bootstrap frame that is segmented in every camera.",
             )
-    _check_not_swapped(solver, start, views, names, frame)
     best: Solution | None = None
     for gates in (config.gates_from(0.0), config.wide_gates_px):
         trial = solver.solve(start, views, gates, use)
@@ -65,31 +60,3 @@ def first_record(
             )
     status = np.where(use.all(1), TRACKED, PARTIAL).astype(np.int8)
     return FrameRecord(best, status, use, coverage)
-
-
-def _check_not_swapped(
-    solver: ContourSolver, poses: NDArray, views: Sequence[View], names: Sequence[str], frame: int
-) -> None:
-    """Refuse masks that lie on the other row of teeth."""
-    for view, name in zip(views, names, strict=True):
-        if not view.present.all():
-            continue
-        crowns = []
-        for r in _ROWS:
-            scan = solver.scans[r]
-            points = np.empty((len(scan.vertices), 3), np.float32)
-            bits = np.zeros_like(pack_bits(view.masks[0]))
-            project(scan.vertices_single, (view.matrix @ poses[r]).astype(np.float32), points)
-            draw_silhouette(points, scan.crown_faces, 0, 0, view.masks.shape[2], scan.painted, bits)
-            crowns.append(bits)
-        masks = [pack_bits(m > 127) for m in view.masks]
-        own = sum(count_and_not(masks[r], crowns[r]) for r in _ROWS)
-        crossed = sum(count_and_not(masks[r], crowns[1 - r]) for r in _ROWS)
-        total = sum(count_bits(m) for m in masks)
-        # The rows overlap in closed bites, so only a clear case counts.
-        if own > 0.5 * total and crossed < 0.5 * own:
-            raise TrackingError(
-                f"camera {name}, frame {frame}: the masks of the upper and lower teeth are exchanged "
-                f"({own / total:.0%} of them lies off its own scan, {crossed / total:.0%} off the other one)",
-                hint="Exchange masks.upper and masks.lower of this camera, or the picks of the two rows.",
-            )

@@ -2,30 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import TrackingError
-from jawusd.formats.capture import CameraSource
+from jawusd.errors import CaptureError, TrackingError
 from jawusd.formats.mesh import Mesh
-from jawusd.geometry import Camera, make_transform, so3_log, transform_points
-from jawusd.tracking.config import TrackingConfig
+from jawusd.geometry import make_transform, so3_log, transform_points
 from jawusd.tracking.first import first_record
-from jawusd.tracking.mask_geometry import MaskSurvey, survey_masks
+from jawusd.tracking.footage import Footage, Start
+from jawusd.tracking.mixups import check_mixups, possible_mixups
 from jawusd.tracking.pose_search import Candidate, Grid, RowSearch, coarse_scan, hinge_at_front
 from jawusd.tracking.quality import score_px, uncovered_px
-from jawusd.tracking.scan import Scan
 from jawusd.tracking.solver import ContourSolver, Solution, View
-from jawusd.tracking.views import MaskViews
 
 _ROWS = (0, 1)
 _NAMES = ("upper", "lower")
 _SURVEYED = 24  # frames looked at: two seconds of reading, and every exercise of a usual take is met
 _FRAMES_TRIED = 5
+_MIXUPS_TRIED = 12  # all of them with four cameras; every one costs a search
 _PX_PER_MM = 2.0  # of the search: one pixel is a third of the step between orientations at the canines
 _FINALISTS = 5  # poses per row that are refined
 _DISTINCT_MM = 2.0  # poses closer than this lead to the same minimum
@@ -42,71 +40,28 @@ _WIDEST_JAW_RAD = 0.8  # turn between the rows beyond which a jaw does not open
 _FARTHEST_JAW_MM = 75.0  # distance of the rows' front teeth beyond which it does not either
 
 
-@dataclass(frozen=True, eq=False)
-class Start:
-    """Say where tracking begins.
-
-    Attributes:
-        frame: reference camera frame.
-        poses: T_world_upper, T_world_lower, shape (2, 4, 4).
-        notes: how it was found, for the meta data of the tracks.
-    """
-
-    frame: int
-    poses: NDArray[np.float64]
-    notes: dict
-
-
-@dataclass(frozen=True, eq=False)
-class Footage:
-    """Name the masks to be searched.
-
-    Attributes:
-        sources: cameras with masks.
-        cameras: calibrated cameras by name.
-        offsets: reference frame minus own frame number, by camera name.
-        frames: first frame and one past the last, or None for all that have masks.
-    """
-
-    sources: Sequence[CameraSource]
-    cameras: Mapping[str, Camera]
-    offsets: Mapping[str, int]
-    frames: tuple[int, int] | None
-
-    def survey(self, frames: tuple[int, int] | None = None, count: int = _SURVEYED) -> MaskSurvey:
-        """Look at evenly spread frames, of the whole footage unless a range is given."""
-        return survey_masks(self.sources, self.cameras, self.offsets, frames or self.frames, count)
-
-    def views(self, centre: NDArray[np.float64], px_per_mm: float) -> MaskViews:
-        """Open the masks at a resolution at the teeth."""
-        return MaskViews(self.sources, self.cameras, self.offsets, centre, px_per_mm)
-
-
 class StartSearch:
     """Search the poses of both rows of teeth on single frames."""
 
     def __init__(
         self,
         meshes: Sequence[Mesh],
-        scans: Sequence[Scan],
+        solver: ContourSolver,
         T_anatomical_scan: NDArray[np.float64],
-        config: TrackingConfig,
         map_: Callable[..., Iterable] = map,
     ) -> None:
         """Prepare coarse scans.
 
         Args:
             meshes: upper and lower teeth scans in one frame, in occlusion [mm].
-            scans: the same, prepared.
+            solver: holds the same scans, prepared.
             T_anatomical_scan: scan frame to (left, up, front) axes, shape (4, 4).
-            config: the tracker's numbers.
             map_: runs the parts of the search, in threads if it likes.
         """
-        self._config, self._map = config, map_
+        self.solver, self._config, self._map = solver, solver.config, map_
         self._coarse = tuple(coarse_scan(m, n) for m, n in zip(meshes, _NAMES, strict=True))
         self._hinges = [hinge_at_front(s.crown_vertices(), T_anatomical_scan) for s in self._coarse]
-        self._solver = ContourSolver(scans, config)
-        self._coarse_solver = ContourSolver(self._coarse, config)
+        self._coarse_solver = ContourSolver(self._coarse, solver.config)
 
     def at(self, footage: Footage, frame: int) -> tuple[NDArray[np.float64], float]:
         """Return the best poses on a frame, T_world_upper and T_world_lower (2, 4, 4), and their worth [px].
@@ -130,9 +85,9 @@ class StartSearch:
             raise TrackingError(f"frame {frame}: the best poses of the two rows of teeth are none a jaw can take")
         with footage.views(places.mean(0), self._config.working_px_per_mm) as masks:
             views = masks.at(frame)
-        solve = partial(self._solver.solve, views=views, gates_px=self._config.wide_gates_px)
+        solve = partial(self.solver.solve, views=views, gates_px=self._config.wide_gates_px)
         ends = [solve(poses) for poses in pairs]
-        worth = [self._worth(self._solver, s, views).sum() for s in ends]
+        worth = [self._worth(self.solver, s, views).sum() for s in ends]
         best = int(np.argmax(worth))
         return ends[best].poses, float(worth[best])
 
@@ -151,7 +106,7 @@ class StartSearch:
     def _refined_pairs(
         self, finalists: Sequence[Sequence[NDArray[np.float64]]], views: Sequence[View]
     ) -> list[NDArray[np.float64]]:
-        """Refine the finalists coarsely and return the best pairs a jaw can take, at most four, shape (2, 4, 4) each."""
+        """Refine the finalists coarsely and return up to four pairs a jaw can take, shape (2, 4, 4) each."""
         ranked = []
         for r in _ROWS:
             ends = []
@@ -180,30 +135,63 @@ class StartSearch:
         return (score_px(solution) - price * bare).sum(1)
 
 
-def search_start(search: StartSearch, footage: Footage, solver: ContourSolver, config: TrackingConfig) -> Start:
+def search_start(search: StartSearch, footage: Footage) -> Start:
     """Find a frame on which both rows of teeth can be aligned, and their poses there.
 
     Raises:
-        TrackingError: no frame of those tried could be aligned.
+        TrackingError: no frame of those tried could be aligned; the message says what happened on each, or which
+            exchange of masks would let it succeed.
     """
-    survey = footage.survey()
-    tried: list[tuple[int, str]] = []
-    for frame in survey.promising(_FRAMES_TRIED).tolist():
+    frames = footage.survey(None, _SURVEYED).promising(_FRAMES_TRIED).tolist()
+    failed: dict[int, str] = {}
+    for frame in frames:
         try:
             poses, worth = search.at(footage, frame)
-            centre = np.mean([transform_points(poses[r], solver.scans[r].centre) for r in _ROWS], axis=0)
-            with footage.views(centre, config.working_px_per_mm) as masks:
-                first_record(solver, config, poses, masks, frame)
         except TrackingError as error:
-            tried.append((frame, error.message))
+            failed[frame] = error.message.removeprefix(f"frame {frame}: ")
             continue
-        return Start(frame, poses, {"by": "search", "frame": frame, "worth_px": worth, "frames_failed": tried})
+        # Most masks being right, the poses are, and show which ones are not.
+        check_mixups(footage, search.solver, poses, frame)
+        try:
+            poses = _aligned(search, footage, poses, frame)
+        except TrackingError as error:
+            failed[frame] = error.message.removeprefix(f"frame {frame}: ")
+            continue
+        notes = {"by": "search", "frame": frame, "worth_px": worth, "failed": {str(f): m for f, m in failed.items()}}
+        return Start(frame, poses, notes)
+    _name_mixup(search, footage, frames[0])
     raise TrackingError(
-        f"no [bootstrap] picks, and the search for the teeth failed on all {len(tried)} frames tried: "
-        + "; ".join(message if f"frame {frame}" in message else f"frame {frame}: {message}" for frame, message in tried),
-        hint="Give [bootstrap] picks: three or more per row of teeth, each seen by two cameras; or check the masks, the "
-        "calibration and the time offsets.",
+        f"there are no [bootstrap] picks, and searching the teeth failed on all {len(frames)} frames tried. "
+        + " ".join(f"Frame {frame}: {message}." for frame, message in failed.items()),
+        hint="Give [bootstrap] picks, three or more per row of teeth, each seen by two cameras; and check the masks, "
+        "the calibration and the time offsets.",
     )
+
+
+def _aligned(search: StartSearch, footage: Footage, poses: NDArray[np.float64], frame: int) -> NDArray[np.float64]:
+    """Return the poses as aligned by the solver if they pass the checks of a first frame, shape (2, 4, 4)."""
+    solver = search.solver
+    centre = np.mean([transform_points(poses[r], solver.scans[r].centre) for r in _ROWS], axis=0)
+    with footage.views(centre, solver.config.working_px_per_mm) as masks:
+        return first_record(solver, solver.config, poses, masks, frame).solution.poses
+
+
+def _name_mixup(search: StartSearch, footage: Footage, frame: int) -> None:
+    """Refuse masks with which the search succeeds after an exchange."""
+    found = []
+    for mixup in possible_mixups(footage.sources)[:_MIXUPS_TRIED]:
+        try:
+            righted = replace(footage, sources=mixup.sources)
+            poses, worth = search.at(righted, frame)
+            _aligned(search, righted, poses, frame)
+        except (TrackingError, CaptureError):
+            continue  # this exchange explains nothing
+        found.append((worth, mixup))
+    if found:
+        _, mixup = max(found, key=lambda f: f[0])
+        raise TrackingError(
+            f"frame {frame}: {mixup.finding}: the teeth are found only after exchanging them", hint=mixup.hint
+        )
 
 
 def _guessed_axes(places: NDArray[np.float64], eyes: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -9,12 +9,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import TrackingError
 from jawusd.formats.capture import Capture
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, Tracks
 from jawusd.geometry import Camera, transform_points
-from jawusd.tracking.bootstrap import pose_from_picks
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.extrinsics import Extrinsics
 from jawusd.tracking.first import first_record
@@ -25,6 +23,7 @@ from jawusd.tracking.nuisance import Nuisances, TakeEquations, leads
 from jawusd.tracking.results import assemble, outline_variance
 from jawusd.tracking.scan import prepare_scan
 from jawusd.tracking.solver import ContourSolver, View
+from jawusd.tracking.start import find_start
 from jawusd.tracking.views import MaskViews
 
 Progress = Callable[[int, int], None]
@@ -45,7 +44,8 @@ def track_capture(
     """Track both rows of teeth through a capture.
 
     Args:
-        capture: the capture; its masks, bootstrap picks and frame range are used.
+        capture: the capture; its masks, frame range and bootstrap picks are used; without picks the teeth are
+            searched.
         cameras: calibrated cameras; world lengths in mm.
         offsets: reference frame minus own frame number, per camera name.
         upper, lower: teeth scans in one frame, in occlusion [mm].
@@ -55,53 +55,28 @@ def track_capture(
         progress: called with frames done and frames in all, once per frame.
 
     Raises:
-        TrackingError: no picks, one camera only, or a first frame that cannot be aligned.
+        TrackingError: one camera only, masks or scans mixed up, or no frame on which the teeth can be aligned.
         CaptureError: a mask cannot be read.
     """
     config = config or TrackingConfig()
     table = {camera.name: camera for camera in cameras}
-    start, left_out = _start_poses(capture, table, upper, lower)
     scans = (prepare_scan(upper, "upper"), prepare_scan(lower, "lower"))
-    centre = np.mean([transform_points(start[r], scans[r].centre) for r in (0, 1)], axis=0)
-    with (
-        MaskViews(capture.cameras, table, offsets, centre, config.working_px_per_mm) as masks,
-        ThreadPoolExecutor(threads) as pool,
-    ):
-        first, stop = capture.frames or masks.frames
-        if not first <= capture.bootstrap.frame < stop:
-            raise TrackingError(f"bootstrap.frame is {capture.bootstrap.frame}, frames run from {first} to {stop - 1}")
+    with ThreadPoolExecutor(threads) as pool:
         solver = ContourSolver(scans, config, pool if threads > 1 else None)
-        take = _Take(solver, config, masks, first, stop, progress)
-        take.begin(capture.bootstrap.frame, start)
-        take.run(range(capture.bootstrap.frame + 1, stop))
-        take.run(range(capture.bootstrap.frame - 1, first - 1, -1))
-        take.re_enter()
-        nuisances, extrinsics = take.refine()
-        records = take.records if capture.frames else _trimmed(take.records)
-        names = tuple(camera.name for camera in masks.cameras)
-    notes = {"picks_left_out": left_out, "painted": [s.painted for s in scans]}
+        start = find_start(capture, table, offsets, (upper, lower), solver, pool.map)
+        centre = np.mean([transform_points(start.poses[r], scans[r].centre) for r in (0, 1)], axis=0)
+        with MaskViews(capture.cameras, table, offsets, centre, config.working_px_per_mm) as masks:
+            first, stop = capture.frames or masks.frames
+            take = _Take(solver, config, masks, first, stop, progress)
+            take.begin(start.frame, start.poses)
+            take.run(range(start.frame + 1, stop))
+            take.run(range(start.frame - 1, first - 1, -1))
+            take.re_enter()
+            nuisances, extrinsics = take.refine()
+            records = take.records if capture.frames else _trimmed(take.records)
+            names = tuple(camera.name for camera in masks.cameras)
+    notes = {"start": start.notes, "painted": [s.painted for s in scans]}
     return assemble(records, names, np.asarray(landmarks, np.float64), nuisances, extrinsics, config, notes)
-
-
-def _start_poses(
-    capture: Capture, cameras: Mapping[str, Camera], upper: Mesh, lower: Mesh
-) -> tuple[NDArray[np.float64], dict[str, list[int]]]:
-    """Return T_world_upper, T_world_lower from the picks, shape (2, 4, 4), and the picks left out."""
-    if capture.bootstrap is None:
-        raise TrackingError(
-            "the capture has no [bootstrap] picks, so nothing tells where the teeth are at first",
-            path=capture.folder / "capture.toml",
-            hint="Add three or more picks per row of teeth, each seen by two cameras.",
-        )
-    poses, left_out = [], {}
-    for row, mesh, picks in (
-        ("upper", upper, capture.bootstrap.upper),
-        ("lower", lower, capture.bootstrap.lower),
-    ):
-        pose, wrong = pose_from_picks(picks, np.asarray(mesh.vertices, np.float64), cameras, row)
-        poses.append(pose)
-        left_out[row] = wrong
-    return np.stack(poses), left_out
 
 
 def _trimmed(records: dict[int, FrameRecord]) -> dict[int, FrameRecord]:

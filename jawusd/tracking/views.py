@@ -48,16 +48,7 @@ class MaskViews:
             TrackingError: fewer than two cameras have masks, or a camera is not calibrated or not synchronised.
         """
         self._stack = ExitStack()
-        masked = [s for s in sources if s.masks is not None]
-        if len(masked) < 2:
-            raise TrackingError(
-                f"{len(masked)} of {len(sources)} cameras have masks; one view leaves the depth of the teeth unknown",
-                hint="Give masks for two cameras at least, some 30 degrees apart or more.",
-            )
-        for source in masked:
-            for table, what in ((cameras, "calibration"), (offsets, "time offset")):
-                if source.name not in table:
-                    raise TrackingError(f"camera {source.name} has no {what}", hint="Calibrate and synchronise first.")
+        masked = masked_sources(sources, cameras, offsets)
         self.cameras = tuple(cameras[s.name] for s in masked)
         self._offsets = [offsets[s.name] for s in masked]
         self._working, self._readers = [], []
@@ -105,6 +96,27 @@ class MaskViews:
             held = [(frame, self.at(frame)) for frame in range(begin, end)]
             while held:
                 yield held.pop()
+
+
+def masked_sources(
+    sources: Sequence[CameraSource], cameras: Mapping[str, Camera], offsets: Mapping[str, int]
+) -> tuple[CameraSource, ...]:
+    """Return the cameras that have masks.
+
+    Raises:
+        TrackingError: fewer than two have, or one of them is not calibrated or not synchronised.
+    """
+    masked = tuple(s for s in sources if s.masks is not None)
+    if len(masked) < 2:
+        raise TrackingError(
+            f"{len(masked)} of {len(sources)} cameras have masks; one view leaves the depth of the teeth unknown",
+            hint="Give masks for two cameras at least, some 30 degrees apart or more.",
+        )
+    for source in masked:
+        for table, what in ((cameras, "calibration"), (offsets, "time offset")):
+            if source.name not in table:
+                raise TrackingError(f"camera {source.name} has no {what}", hint="Calibrate and synchronise first.")
+    return masked
 
 
 def working_size(camera: Camera, centre_world: NDArray[np.float64], px_per_mm: float) -> tuple[int, int]:

@@ -1,0 +1,118 @@
+"""Checks on the two teeth scans together: are they in occlusion, and is the upper one the upper one?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from jawusd.errors import TrackingError
+from jawusd.geometry import anatomical_frame, transform_points
+from jawusd.tracking.scan import Scan
+
+# Teeth in occlusion touch. Scans taken slightly open, or a bite registered carelessly, stay within the first limit;
+# beyond the second one the scans are not in one frame [mm].
+_LOOSE_MM, _APART_MM = 1.0, 4.0
+# Depth to which crowns may run into one another: registrations overlap by some tenths of a millimetre [mm].
+_TIGHT_MM, _THROUGH_MM = 1.0, 3.0
+# Distance of the middles of both arches along the bite plane: a severe malocclusion stays below [mm].
+_ASIDE_MM = 15.0
+_MIDLINES_MM = 4.0
+# Height of the middle of the upper crowns above that of the lower ones: 5 mm or more in any bite [mm].
+_LEAST_HEIGHT_MM = 2.5
+_SHARE = 0.005  # of the crown vertices that may be exceptions
+
+
+def check_occlusion(
+    scans: Sequence[Scan], T_anatomical_scan: ArrayLike | None
+) -> tuple[NDArray[np.float64], list[str]]:
+    """Check that both rows of teeth lie in one frame, in occlusion.
+
+    Args:
+        scans: upper and lower, prepared.
+        T_anatomical_scan: scan frame to (left, up, front) axes, shape (4, 4), or None to derive it.
+
+    Returns:
+        T_anatomical_scan, shape (4, 4), and what is odd but may be, one sentence each.
+
+    Raises:
+        TrackingError: the rows are far apart, beside one another, or inside one another.
+    """
+    crowns = [scan.crown_vertices(6000) for scan in scans]
+    near, depth = _gap_mm(crowns), _overlap_mm(scans)
+    hint = "Export both scans in one coordinate frame with the teeth in occlusion (closed bite)."
+    if near > _APART_MM:
+        raise TrackingError(
+            f"the upper and lower teeth scans are not in occlusion: they are {near:.1f} mm apart where they are "
+            f"closest, at most {_APART_MM:g} mm are allowed",
+            hint=hint,
+        )
+    if depth > _THROUGH_MM:
+        raise TrackingError(
+            f"the upper and lower teeth scans are not in occlusion: their crowns run {depth:.1f} mm into one another, "
+            f"at most {_THROUGH_MM:g} mm are allowed",
+            hint=hint,
+        )
+    given = T_anatomical_scan is not None
+    T = np.array(T_anatomical_scan, np.float64) if given else anatomical_frame(*crowns)
+    upper, lower = (transform_points(T, c) for c in crowns)
+    height = abs(float(upper[:, 1].mean() - lower[:, 1].mean()))
+    if height < _LEAST_HEIGHT_MM:
+        raise TrackingError(
+            f"the upper and lower teeth scans are not in occlusion: the middle of the upper crowns lies {height:.1f} "
+            f"mm above that of the lower ones, at least {_LEAST_HEIGHT_MM:g} mm are needed",
+            hint=hint,
+        )
+    middles = _middle(upper) - _middle(lower)
+    aside = float(np.linalg.norm(middles))
+    if aside > _ASIDE_MM:
+        raise TrackingError(
+            f"the upper and lower teeth scans are not in occlusion: their arches lie {aside:.0f} mm beside one "
+            f"another, at most {_ASIDE_MM:g} mm are allowed",
+            hint=hint,
+        )
+    findings = []
+    if near > _LOOSE_MM:
+        findings.append(f"the scans do not touch: {near:.1f} mm apart where they are closest")
+    if depth > _TIGHT_MM:
+        findings.append(f"the crowns of the scans run {depth:.1f} mm into one another")
+    if abs(middles[0]) > _MIDLINES_MM:
+        findings.append(f"the middles of the two arches lie {abs(middles[0]):.1f} mm apart sideways")
+    if _width(lower) > _width(upper) and lower[:, 2].max() > upper[:, 2].max():
+        findings.append("the lower arch encloses the upper one: an underbite, or exchanged scan files")
+    return T, findings
+
+
+def _gap_mm(crowns: Sequence[NDArray[np.float64]]) -> float:
+    """Return the distance of the vertices that are closest to the other row [mm]."""
+    distance = cKDTree(crowns[0]).query(crowns[1])[0]
+    return float(np.quantile(distance, _SHARE))
+
+
+def _overlap_mm(scans: Sequence[Scan]) -> float:
+    """Return how deep the lower crowns run into the upper ones, which must be wound outwards [mm]."""
+    if not scans[0].painted:
+        return 0.0  # without paint nothing says which side of the surface is inside
+    faces, vertices = scans[0].crown_faces, scans[0].vertices
+    corners = vertices[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    points = scans[1].crown_vertices(6000)
+    distance, nearest = cKDTree(corners.mean(1)).query(points)
+    behind = np.einsum("ij,ij->i", points - corners.mean(1)[nearest], normals[nearest])
+    # Behind the surface and not merely past its border.
+    inside = np.where(behind < -0.7 * distance, distance, 0.0)
+    return float(np.quantile(inside, 1.0 - _SHARE))
+
+
+def _middle(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the middle of an arch along the bite plane (left, front) [mm], shape (2,)."""
+    low, high = np.percentile(points[:, [0, 2]], [1, 99], axis=0)
+    return 0.5 * (low + high)
+
+
+def _width(points: NDArray[np.float64]) -> float:
+    low, high = np.percentile(points[:, 0], [1, 99])
+    return float(high - low)
