@@ -6,6 +6,7 @@ import pytest
 from jawusd.geometry import (
     anatomical_frame,
     find_landmarks,
+    landmark_frame,
     make_transform,
     mandible_metric,
     random_rotation,
@@ -68,6 +69,13 @@ def test_without_a_mandible_the_condyles_stand_at_mean_adult_places():
     found = transform_points(A, find_landmarks(LOWER, None, A))
     assert np.linalg.norm(found[3] - found[4]) == pytest.approx(100, abs=1e-9)
     assert np.linalg.norm(found[3] - found[0]) == pytest.approx(101, abs=3)
+
+
+def test_landmarks_alone_give_the_frame_wherever_they_lie():
+    at_home = np.array([[0.0, 0, 0], [22, 0, -26], [-22, 0, -26], [50, 36, -80], [-50, 36, -80]])
+    np.testing.assert_allclose(landmark_frame(at_home), np.eye(4), atol=1e-12)
+    moved = se3_exp([0.5, -1.2, 2.0, 30, -80, 15.0])
+    np.testing.assert_allclose(landmark_frame(transform_points(moved, at_home)) @ moved, np.eye(4), atol=1e-9)
 
 
 def test_metric_measures_mean_squared_displacement():
