@@ -11,8 +11,9 @@ from foreign import SCRIPTS, environment, run, run_in
 from scipy.spatial.transform import Rotation
 
 import jawusd
-from jawusd.geometry import make_transform
+from jawusd.geometry import Camera, make_transform
 from jawusd.rig.bake import bake_rig
+from jawusd.rig.cameras import write_cameras
 from jawusd.rig.nvidia import nvidia_findings
 
 SHOWN = (0, 9, 17, 30, 39)
@@ -24,6 +25,10 @@ def folder(tmp_path_factory):
     frames, d = example_motion()
     made = tmp_path_factory.mktemp("actor")
     bake_rig(made, example_rig(), example_meshes(), name="example", fps=FPS, frames=frames, d=d)
+    K = np.array([[2000.0, 0, 959.5], [0, 2000, 539.5], [0, 0, 1]])
+    camera = Camera("cam0", (1920, 1080), K, np.array([-0.1, 0.02, 0, 0, 0]), make_transform(np.eye(3), [0, 0, 250]))
+    heads = make_transform(np.eye(3), np.outer(np.arange(len(frames)), [0.1, 0, 0.05]))
+    write_cameras(made / "cameras.usda", [camera], made / "anim_capture.usdc", frames, heads, FPS)
     return made
 
 
@@ -40,8 +45,8 @@ def landmark_distance(T_a, T_b):
     return np.linalg.norm(((T_a - T_b) @ landmarks.T)[:, :3], axis=1).max()
 
 
-@pytest.mark.parametrize("name", ["usd2411", "usd255"])
-def test_older_openusd_shows_the_same_poses(folder, name):
+@pytest.mark.parametrize("name", ["usd2411", "usd255", "usd2611"])
+def test_every_openusd_shows_the_same_poses(folder, name):
     frames, poses = expected_poses()
     for file in ("anim_capture.usdc", "actor.usdz"):
         found = run_in(name, "usd_read.py", folder / file, ",".join(map(str, frames)))
@@ -88,7 +93,9 @@ def test_three_js_animates_the_mandible(folder):
     assert landmark_distance(shown, poses) < 0.01
 
 
-@pytest.mark.parametrize("name", ["actor.usda", "anim_capture.usdc", "actor.usdz", "actor_skel.usdc"])
+@pytest.mark.parametrize(
+    "name", ["actor.usda", "anim_capture.usdc", "actor.usdz", "actor_skel.usdc", "cameras.usda"]
+)
 def test_nvidia_validator_finds_nothing(folder, name):
     program = environment("nvidia") / "bin" / "nvidia_usd_validate"
     done = subprocess.run([program, folder / name], capture_output=True, text=True, timeout=240)
