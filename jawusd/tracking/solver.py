@@ -99,7 +99,7 @@ class ContourSolver:
         Args:
             poses: start T_world_upper, T_world_lower, shape (2, 4, 4).
             views: one picture per camera.
-            gates_px: residual gate of every iteration.
+            gates_px: residual gate of every iteration; without any, the poses are judged where they are.
             use: masks that take part, shape (2, C); by default all present ones.
             prior: what else is known of the two poses; by default nothing.
         """
@@ -115,7 +115,8 @@ class ContourSolver:
                 poses[r] = _moved(poses[r], step[r], state.centres[r])
             if gate == gates_px[-1] and self._motion_mm(step) < self.config.converged_mm:
                 break
-        state = self._linearise(poses, views, use, gates_px[-1], render, final=True)
+        gate = gates_px[-1] if gates_px else self.config.final_gate_px[1]
+        state = self._linearise(poses, views, use, gate, render, final=True)
         return replace(state, iterations=iterations)
 
     def _linearise(self, poses, views, use, gate, render: _Rendering, final: bool = False) -> Solution:
