@@ -73,5 +73,5 @@ def experiment_lines(summary: dict) -> list[str]:
         figures = "".join(f"{row[f'{head}_mm']:9.3f}" for head in heads)
         lines.append(f"{row['experiment']:<16}{row['model']:<30}{row['quantity']:<32}{row['count']:>6}{figures}")
     lines += [f"note: {note}" for note in summary["notes"]]
-    lines += [f"coverage: {sentence}" for sentence in summary["coverage"] or ["nothing is missing."]]
+    lines += [f"coverage: {sentence}" for sentence in summary["coverage"] or ["no exercise is missing."]]
     return lines + [str(path) for path in summary["files"]]

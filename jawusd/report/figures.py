@@ -89,6 +89,7 @@ def _frame(axis: Axes, found: Experiments, around_mm: float) -> None:
     axis.set_xlim(middle[0] - half, middle[0] + half)
     axis.set_ylim(middle[1] - half, middle[1] + half)
     axis.set_box_aspect(1)
+    axis.locator_params(nbins=6)
 
 
 def reconstruction_figure(found: Experiments) -> Figure:
@@ -153,11 +154,11 @@ def coverage_figure(coverage: Coverage, actor: str) -> Figure:
         axis.plot(coverage.slices_d1, edges[:, 0], color=BLACK, lw=1.2, label="slice hull, on the habitual path")
         axis.plot(coverage.slices_d1, edges[:, 1], color=BLACK, lw=1.2)
         gaps = coverage.gaps[index]
-        axis.plot(gaps[:, 0], gaps[:, 1], "x", ms=3, color=VERMILION, label="inside the bound, never captured")
+        axis.plot(gaps[:, 0], gaps[:, 1], "x", ms=3, color=VERMILION, label="inside the bound, nothing captured near")
         axis.set_xlabel("opening d1 [mm]")
         axis.set_ylabel(names[index])
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
-    advice = "\n".join(coverage.sentences) or "The take covers opening, laterotrusion and protrusion."
+    advice = "\n".join(coverage.sentences) or "No exercise is missing."
     figure.suptitle(f"{actor}: captured part of the envelope\n{advice}", fontsize=9)
     return figure

@@ -2,8 +2,9 @@
 
 Five persons whose joints share nothing with the models: 833 training poses, 5,000 hidden poses of other exercises, both
 with tracking noise. Errors are the largest distance of a mandible point per pose [mm]. Tables to stdout: the models
-with the floor (projection onto the person's own manifold), then the default model with fewer poses, other noise, gross
-outliers, no mandible mesh and turned scan frames, then its bounds and single sliders against the person's truth.
+and, in the same run, methods of others, with the floor (projection onto the person's own manifold), the numbers stored
+and processor seconds per fit; then the default model with fewer poses, other noise, gross outliers, no mandible mesh
+and turned scan frames; then its bounds and single sliders against the person's truth.
 """
 
 from __future__ import annotations
@@ -17,10 +18,11 @@ import argparse  # noqa: E402
 import time  # noqa: E402
 
 import numpy as np  # noqa: E402
+from model_peers import PEERS  # noqa: E402
 
 from jawusd.evaluator import JawRig  # noqa: E402
 from jawusd.fitting import FittingConfig, fit_model  # noqa: E402
-from jawusd.fitting.data import Anatomy, select_poses  # noqa: E402
+from jawusd.fitting.data import Anatomy, TrainingData, select_poses  # noqa: E402
 from jawusd.fitting.paper import fit_paper  # noqa: E402
 from jawusd.geometry import make_transform, random_rotation, se3_exp, transform_points  # noqa: E402
 from jawusd.synthetic.exercises import record  # noqa: E402
@@ -29,6 +31,7 @@ from jawusd.synthetic.person import Person  # noqa: E402
 TRAINING, HIDDEN, SEED_TRAINING, SEED_HIDDEN = 833, 5000, 1, 2
 SWEEPS = ((0, 0.0), (1, 0.0), (2, 0.0), (1, 15.0), (2, 15.0))  # axis, opening [mm]
 ALL_SHOWN = np.ones(3, dtype=bool)
+DECODER = ("path_", "glide_", "spline_", "curve")  # arrays that a model is decoded from
 
 
 class Subject:
@@ -56,6 +59,11 @@ class Subject:
         )
         return JawRig(model.arrays, model.meta), model, time.process_time() - start
 
+    def training(self) -> tuple[Anatomy, TrainingData]:
+        """Return the training take as fitting sees it."""
+        anatomy = Anatomy.of(self.T_anatomical_skull, self.person.landmarks, self.person.mandible_points, None)
+        return anatomy, select_poses(np.arange(TRAINING), self.take(), anatomy).data
+
     def error(self, rig: JawRig, T: np.ndarray) -> np.ndarray:
         """Return the largest distance per pose [mm] between poses and the nearest ones of the rig."""
         points = self.person.mandible_points
@@ -68,12 +76,17 @@ def row(label: str, *columns: np.ndarray) -> None:
     cells = [
         f"{e.mean():6.3f} {np.median(e):6.3f} {np.percentile(e, 95):6.3f} {e.max():6.2f}" for e in columns
     ]
-    print(f"{label:<34}" + "  | ".join(cells), flush=True)
+    print(f"{label:<52}" + "  | ".join(cells), flush=True)
+
+
+def described(label: str, numbers: list[int], seconds: list[float]) -> str:
+    """Return a row's label with the mean count of stored numbers and processor seconds."""
+    return f"{label:<34}{np.mean(numbers):8.0f}{np.mean(seconds):8.1f}"
 
 
 def models(subjects: list[Subject], starts: int) -> None:
-    """Print the table of models: training and hidden errors, numbers stored and seconds."""
-    print(f"{'model':<34}train: mean median p95 max         | hidden")
+    """Print the table of models and peers: training and hidden errors, numbers stored and seconds."""
+    print(f"{'model':<34}{'numbers':>8}{'s':>8}  train: mean median p95 max         | hidden")
     row("floor", np.zeros(1), np.concatenate([s.floor for s in subjects]))
     for label, config in {
         "pca": {"method": "pca"},
@@ -82,30 +95,45 @@ def models(subjects: list[Subject], starts: int) -> None:
         "paper": {"method": "paper", "starts": starts},
         "paper --literal": {"method": "paper", "literal": True, "starts": starts},
     }.items():
-        train, hidden, seconds = [], [], []
+        train, hidden, numbers, seconds = [], [], [], []
         for subject in subjects:
             T = subject.take()
-            rig, _, took = subject.fit(T, **config)
+            rig, model, took = subject.fit(T, **config)
             train.append(subject.error(rig, T))
             hidden.append(subject.error(rig, subject.hidden))
             seconds.append(took)
-        row(f"{label} ({np.mean(seconds):.1f} s)", np.concatenate(train), np.concatenate(hidden))
+            numbers.append(sum(array.size for name, array in model.arrays.items() if name.startswith(DECODER)))
+        row(described(label, numbers, seconds), np.concatenate(train), np.concatenate(hidden))
     published(subjects, starts)
+    peers(subjects)
 
 
 def published(subjects: list[Subject], starts: int) -> None:
     """Print the literal model encoded by its networks, as the paper does, instead of projected."""
     train, hidden = [], []
     for subject in subjects:
-        anatomy = Anatomy.of(
-            subject.T_anatomical_skull, subject.person.landmarks, subject.person.mandible_points, None
-        )
-        data = select_poses(np.arange(TRAINING), subject.take(), anatomy).data
+        anatomy, data = subject.training()
         fit = fit_paper(data, ALL_SHOWN, True, starts, 0)
         for T, errors in ((subject.take(), train), (subject.hidden, hidden)):
             M = anatomy.motion(T)
             errors.append(data.metric.largest(fit.reconstruct_as_published(M), M))
     row("paper --literal, as published", np.concatenate(train), np.concatenate(hidden))
+
+
+def peers(subjects: list[Subject]) -> None:
+    """Print the same errors of methods of others."""
+    for label, fit in PEERS.items():
+        train, hidden, numbers, seconds = [], [], [], []
+        for subject in subjects:
+            anatomy, data = subject.training()
+            start = time.process_time()
+            peer = fit(data)
+            seconds.append(time.process_time() - start)
+            numbers.append(peer.numbers)
+            for T, errors in ((subject.take(), train), (subject.hidden, hidden)):
+                M = anatomy.motion(T)
+                errors.append(data.metric.largest(peer.rebuild(M), M))
+        row(described(label, numbers, seconds), np.concatenate(train), np.concatenate(hidden))
 
 
 def robustness(subjects: list[Subject]) -> None:
@@ -196,8 +224,12 @@ if __name__ == "__main__":
     parser.add_argument("--persons", type=int, default=5)
     parser.add_argument("--starts", type=int, default=4, help="random starts of the paper's networks")
     parser.add_argument("--skip-models", action="store_true")
+    parser.add_argument("--only-peers", action="store_true", help="the methods of others alone")
     options = parser.parse_args()
     people = [Subject(seed) for seed in range(options.persons)]
+    if options.only_peers:
+        peers(people)
+        raise SystemExit
     if not options.skip_models:
         models(people, options.starts)
     robustness(people)
