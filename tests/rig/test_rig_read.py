@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
-from example_rig import assert_valid_usd, example_motion, example_rig
+from example_rig import assert_valid_usd, example_motion, example_rig, moved
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
+from scipy.spatial.transform import Rotation
 
 import jawusd
 from jawusd.errors import FormatError, RigError, UnitsError, VersionError
-from jawusd.rig import describe, load_rig
+from jawusd.geometry import make_transform
+from jawusd.rig import describe, load_rig, write_animation
 from jawusd.rig.arrays import model_hash
 from jawusd.rig.read import escapes
 
@@ -219,3 +221,44 @@ def test_instanced_actors_move_as_one_and_load(anchored_folder, tmp_path):
         world_pose = np.array(cache.GetLocalToWorldTransform(stage.GetPrimAtPath(f"/World/{name}/geo/Mandible"))).T
         expected = rig.pose(d[20]) + np.array([[0, 0, 0, 300 * i], *np.zeros((3, 4))])
         assert np.abs(world_pose - expected).max() < 1e-9
+
+
+@pytest.mark.parametrize("instanced", [False, True])
+def test_two_animations_in_one_shot_moved_scaled_and_instanced(anchored_folder, tmp_path, instanced):
+    """Each actor has its own motion file, place and turn; the shot is in centimetres."""
+    rig, (frames, d) = example_rig(), example_motion()
+    motions = {"One": d, "Two": d[::-1] * [0.8, -1, 0.5]}
+    shot = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageUpAxis(shot, "Y")
+    UsdGeom.SetStageMetersPerUnit(shot, 0.01)
+    world = UsdGeom.Xform.Define(shot, "/World")
+    shot.SetDefaultPrim(world.GetPrim())
+    Usd.ModelAPI(world).SetKind("assembly")
+    shot.SetTimeCodesPerSecond(24)
+    placed = {}
+    for i, (name, values) in enumerate(motions.items()):
+        actor = anchored_folder / "actor.usda"
+        layer = write_animation(anchored_folder / f"anim_{name}.usdc", actor, frames, values, 24)
+        prim = UsdGeom.Xform.Define(shot, f"/World/{name}")
+        prim.GetPrim().GetReferences().AddReference(str(layer))
+        prim.GetPrim().SetInstanceable(instanced)
+        prim.AddTranslateOp().Set(Gf.Vec3d(30 * i, 160, -5))
+        prim.AddRotateYOp().Set(40.0 * i)
+        prim.AddScaleOp().Set(Gf.Vec3f(0.1))
+        placed[name] = make_transform(Rotation.from_euler("y", 40 * i, degrees=True).as_matrix(), [30 * i, 160, -5])
+    path = tmp_path / "shot.usda"
+    shot.GetRootLayer().Export(str(path))
+    assert_valid_usd(path)
+    stage = Usd.Stage.Open(str(path))
+    for name, values in motions.items():
+        prim = stage.GetPrimAtPath(f"/World/{name}")
+        assert prim.IsInstance() == instanced
+        mesh = stage.GetPrimAtPath(f"/World/{name}/geo/Mandible/MandibleMesh")
+        points = np.array(UsdGeom.Mesh(mesh).GetPointsAttr().Get(), dtype=float)
+        for k in (0, 13, 30):
+            to_world = np.array(UsdGeom.XformCache(float(frames[k])).GetLocalToWorldTransform(mesh))
+            in_actor = moved(rig.pose(values[k])[None], points)[0]
+            expected = moved(placed[name][None], 0.1 * in_actor)[0]
+            np.testing.assert_allclose((np.c_[points, np.ones(len(points))] @ to_world)[:, :3], expected, atol=1e-6)
+            shown = [prim.GetAttribute(f"jaw:d{j}").Get(float(frames[k])) for j in (1, 2, 3)]
+            np.testing.assert_allclose(shown, values[k], atol=1e-12)
