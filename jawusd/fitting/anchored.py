@@ -3,6 +3,7 @@
 On the three-dimensional set of reachable poses the displacement u of the incisal point is itself a coordinate system,
 so omega = f(u), t = u + p - R(omega) p with f(0) = 0 describes any smooth three-parameter jaw. f is a smoothing
 polyharmonic spline; it is refitted while the captured poses are projected onto it, so that noise in u does not bias f.
+Where no poses were captured the spline follows, weakly, what the condyles' paths say of them (see `condylar`).
 """
 
 from __future__ import annotations
@@ -11,15 +12,17 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from jawusd.evaluator.gauge import Gauge
 from jawusd.evaluator.models import AnchoredModel
-from jawusd.fitting.data import TrainingData
+from jawusd.fitting.condylar import CondylarGuidance
+from jawusd.fitting.data import MODEL_SIGMA_MM, TrainingData
 from jawusd.fitting.gauge_fit import GaugeFit, fit_gauge, path_gauge
 from jawusd.fitting.path import fit_path
 from jawusd.fitting.spline import SplineBasis, choose_smoothing, farthest_points, ridge_solve
 from jawusd.fitting.trimming import within
-from jawusd.geometry import so3_log
+from jawusd.geometry import make_transform, so3_log
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -34,6 +37,8 @@ _CV_CAP_MM = 1.0
 _TAIL_RIDGE = 1e-6  # keeps the slope finite along a direction without motion
 _FRAMES_PER_CENTRE = 4
 _TRIM_FLOOR_MM = 0.5
+_GUIDED_GRID = (9, 7, 7)  # points along opening, sideways and forward at which the condyles' paths are consulted
+_GUIDED_SHARE = 0.08  # weight of all of them together, relative to the frames, if the paths fitted perfectly
 
 
 @dataclass(frozen=True)
@@ -90,41 +95,77 @@ def fit_anchored(data: TrainingData, shown: Mask, trim_mad: float) -> AnchoredFi
     """
     u = data.displacement()
     path = fit_path(u, data.weights)
-    plain = path_gauge(path)
-    scales = np.where(shown, _SCALES_MM, _HIDDEN_SCALE_MM)
+    chart = _Chart(path_gauge(path), np.where(shown, _SCALES_MM, _HIDDEN_SCALE_MM))
     kept = np.ones(len(data), dtype=bool)
     for _ in range(_ROUNDS):
         fitted = kept
-        model, smoothing = _regress(data, u, fitted, plain, scales)
+        model, smoothing = _regress(data, u, fitted, chart, guided=bool(shown.all()))
         d, nearest = data.metric.nearest(model, data.motion)
-        u = plain.displacement(d)
+        u = chart.path.displacement(d)
         kept = within(data.metric.rms(nearest, data.motion), trim_mad, _TRIM_FLOOR_MM)
     gauge_fit = fit_gauge(u[fitted], data.weights[fitted], path, shown)
-    model = AnchoredModel(gauge_fit.gauge, data.incisor, scales, model.centres, model.weights)
+    model = AnchoredModel(gauge_fit.gauge, data.incisor, chart.scales, model.centres, model.weights)
     return AnchoredFit(model, gauge_fit, smoothing, fitted)
 
 
-def _regress(
-    data: TrainingData, u: Array, kept: Mask, plain: Gauge, scales: Array
-) -> tuple[AnchoredModel, float]:
+@dataclass(frozen=True)
+class _Chart:
+    """Map incisal displacements u (N, 3) [mm] to the sheared and scaled arguments q (N, 3) of the spline."""
+
+    path: Gauge
+    scales: Array
+
+    def of(self, u: Array) -> Array:
+        gx, gz, _, _ = self.path.path(-u[:, 1])
+        return np.stack([-u[:, 1], u[:, 0] - gx, u[:, 2] - gz], axis=1) / self.scales
+
+    def displacement(self, q: Array) -> Array:
+        opening, side, front = (q * self.scales).T
+        gx, gz, _, _ = self.path.path(opening)
+        return np.stack([side + gx, -opening, front + gz], axis=1)
+
+
+def _regress(data: TrainingData, u: Array, kept: Mask, chart: _Chart, guided: bool) -> tuple[AnchoredModel, float]:
     """Fit f to the rotations that suit the frames best while their incisal points stay at u.
 
     The smoothing is chosen anew each time: gross outliers, once trimmed, no longer ask for a stiffer f.
     """
-    gx, gz, _, _ = plain.path(-u[:, 1])
-    q = np.stack([-u[:, 1], u[:, 0] - gx, u[:, 2] - gz], axis=1) / scales
-    rotation = data.metric.best_rotation(data.motion, data.incisor, u + data.incisor)
+    rotation = data.metric.best_rotation(data.motion, data.incisor, u + data.incisor)[kept]
+    omega, q, weights = so3_log(rotation), chart.of(u[kept]), data.weights[kept]
+    folds = (np.arange(len(data)) // _CV_BLOCK % _CV_FOLDS)[kept]
+    if guided:
+        more = _guided_rows(
+            data, make_transform(rotation, u[kept] + data.incisor - rotation @ data.incisor), weights, chart
+        )
+        omega, q, weights = (np.concatenate(pair) for pair in zip((omega, q, weights), more, strict=True))
+        folds = np.append(folds, np.full(len(q) - len(folds), -1))
     # In units of mm: |L^T domega|^2 is the mean squared displacement of the mandible about the incisal point.
     L = np.linalg.cholesky(data.metric.about(data.incisor))
-    values = so3_log(rotation[kept]) @ L
+    values = omega @ L
     count = min(CENTRES, max(4, int(kept.sum()) // _FRAMES_PER_CENTRE))
-    basis = SplineBasis.on_centres(farthest_points(q[kept], count))
-    columns, weights = basis.columns(q[kept]), data.weights[kept]
+    basis = SplineBasis.on_centres(farthest_points(q, count))
+    columns = basis.columns(q)
     tail = np.zeros_like(basis.energy)
     tail[-3:, -3:] = _TAIL_RIDGE * np.eye(3)
-    folds = (np.arange(len(data)) // _CV_BLOCK % _CV_FOLDS)[kept]
     smoothing = choose_smoothing(columns, values, weights, basis.energy, tail, _SMOOTHING, folds, _CV_CAP_MM)
     weighted = columns * weights[:, None]
     fitted = ridge_solve(weighted.T @ columns, weighted.T @ values, smoothing * basis.energy + tail)
     spline = basis.weights(np.linalg.solve(L.T, fitted.T).T)
-    return AnchoredModel(plain, data.incisor, scales, basis.centres, spline), smoothing
+    return AnchoredModel(chart.path, data.incisor, chart.scales, basis.centres, spline), smoothing
+
+
+def _guided_rows(data: TrainingData, motion: Array, weights: Array, chart: _Chart) -> tuple[Array, Array, Array]:
+    """Return rotation vectors (G, 3), spline arguments (G, 3) and weights (G,) where the condyles' paths lead.
+
+    They fill the box around the captured poses, and weigh together a few percent of what those weigh: where there are
+    poses, these decide.
+    """
+    guidance = CondylarGuidance.of_motion(motion, weights, data.incisor, data.landmarks[-2:])
+    q = chart.of(motion[:, :3, :3] @ data.incisor + motion[:, :3, 3] - data.incisor)
+    axes = [np.linspace(low, high, n) for low, high, n in zip(q.min(0), q.max(0), _GUIDED_GRID, strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    nearest = cKDTree(q).query(grid)[1]
+    omega, found = guidance.rotation(chart.displacement(grid), so3_log(motion[nearest, :3, :3]))
+    trust = MODEL_SIGMA_MM**2 / (MODEL_SIGMA_MM**2 + guidance.misfit_mm**2)
+    weight = _GUIDED_SHARE * trust * weights.sum() / max(int(found.sum()), 1)
+    return omega[found], grid[found], np.full(int(found.sum()), weight)

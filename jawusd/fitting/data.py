@@ -15,7 +15,8 @@ from jawusd.geometry import LANDMARKS, hat, orthonormalise, rigidity_defect, se3
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_MODEL_SIGMA_MM = 0.3  # how far real jaws stray from a three-parameter model: smaller tracking errors hardly matter
+#: How far real jaws stray from a three-parameter model: smaller errors of tracking hardly matter [mm].
+MODEL_SIGMA_MM = 0.3
 _LARGEST_SIGMA_MM = 2.0  # frames less certain than this over the mandible (rms) are left out
 _RIGID = 1e-3
 _FEWEST_POSES = 15
@@ -138,7 +139,7 @@ def select_tracks(tracks: Tracks, anatomy: Anatomy) -> Selection:
         "prior aided": tracks.prior_aided,
         f"uncertain (sd over the mandible above {_LARGEST_SIGMA_MM} mm)": sigma > _LARGEST_SIGMA_MM,
     }
-    weights = _MODEL_SIGMA_MM**2 / (_MODEL_SIGMA_MM**2 + sigma**2)
+    weights = MODEL_SIGMA_MM**2 / (MODEL_SIGMA_MM**2 + sigma**2)
     return _select(tracks.frames, T, weights, reasons, anatomy)
 
 

@@ -30,7 +30,9 @@ Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
 _LARGEST_CODES = 2000
-_RESIDUAL_QUANTILE = 99.5
+# A measured pose is off the model beyond what nearly all trained poses and nearly all left-out ones keep: of the poses
+# of the take itself 99.5 % have to pass this limit and the bound together.
+_TRAINED_QUANTILE, _UNSEEN_QUANTILE = 99.8, 99.5
 _SMALLEST_RESIDUAL_LIMIT_MM = 0.1  # noise-free poses must not make every measured pose "off the model"
 _FEW_POSES = 100
 
@@ -89,11 +91,11 @@ def fit_model(
     if len(data) < _FEW_POSES:
         warnings.append(AnatomyWarning("few_poses", f"Only {len(data)} poses: the model interpolates coarsely."))
     form = fit_form(data, shown, config)
-    errors, uncertainty = seen_errors(data, form), {}
+    errors, uncertainty, unseen_mm = seen_errors(data, form), {}, np.zeros(0)
     if config.holdout_folds:
         # The networks of "paper" start in the folds where the best of the full fit started, once.
         again = replace(config, starts=1, seed=form.notes().get("seed", config.seed))
-        unseen, uncertainty = unseen_errors(
+        unseen, uncertainty, unseen_mm = unseen_errors(
             data,
             form.kept,
             config.holdout_folds,
@@ -103,7 +105,7 @@ def fit_model(
         errors |= unseen
     arrays, tolerance_mm = _arrays(data, form, anatomy, config)
     warnings += [AnatomyWarning("take_lacks", sentence) for sentence in missing_movements(arrays["codes"], shown)]
-    model = _finish(arrays, tolerance_mm, form, selection, frames, T, errors, warnings, config)
+    model = _finish(arrays, tolerance_mm, unseen_mm, form, selection, frames, T, errors, warnings, config)
     model.meta |= {"actor": actor, "uncertainty": uncertainty}
     tell(steps, steps)
     return model
@@ -162,6 +164,7 @@ def _arrays(
 def _finish(
     arrays: dict[str, Array],
     tolerance_mm: float,
+    unseen_mm: Array,
     form: FittedForm,
     selection: Selection,
     frames: NDArray[np.int64],
@@ -191,7 +194,9 @@ def _finish(
     d, residual_mm = rig.encode(T)
     trained = np.zeros(len(frames), dtype=bool)
     trained[np.flatnonzero(selection.used)[form.kept]] = True
-    limit = max(float(np.percentile(residual_mm[trained], _RESIDUAL_QUANTILE)), _SMALLEST_RESIDUAL_LIMIT_MM)
+    limit = max(float(np.percentile(residual_mm[trained], _TRAINED_QUANTILE)), _SMALLEST_RESIDUAL_LIMIT_MM)
+    if len(unseen_mm):
+        limit = max(limit, float(np.percentile(unseen_mm, _UNSEEN_QUANTILE)))
     reached = d[trained]
     meta["ranges_mm"] = {
         name: [float(reached[:, i].min()), float(reached[:, i].max())] for i, name in enumerate(PARAMETERS)

@@ -15,6 +15,7 @@ from scipy.linalg import cho_factor, cho_solve
 Array = NDArray[np.float64]
 
 _RANK = 1e-9  # singular values below this share of the largest count as zero
+_TIE_DIGITS = 9
 _SAME_CENTRE = 1e-6  # normalised distance below which two points are one centre
 
 
@@ -28,7 +29,8 @@ def farthest_points(points: Array, count: int) -> Array:
     chosen = [int(np.argmin((points**2).sum(1)))]
     distance = ((points - points[chosen[0]]) ** 2).sum(1)
     while len(chosen) < min(count, len(points)):
-        farthest = int(np.argmax(distance))
+        # Rounded, so that of points equally far, as on a grid, the same one is taken whatever frame they come from.
+        farthest = int(np.argmax(np.round(distance, _TIE_DIGITS)))
         if distance[farthest] < _SAME_CENTRE**2:
             break
         chosen.append(farthest)
@@ -92,12 +94,13 @@ def choose_smoothing(
         tail: fixed part of the penalty, shape (k, k).
         grid: smoothing factors to try, ascending.
         folds: fold number of each frame, shape (N,); contiguous blocks, since neighbours in time are nearly equal.
+            Rows with a negative one are never left out.
         cap: errors above this [mm] count as this, so that outliers do not choose the smoothness.
     """
     weighted = columns * weights[:, None]
     total, right = weighted.T @ columns, weighted.T @ values
     cost = np.zeros(len(grid))
-    for fold in np.unique(folds):
+    for fold in np.unique(folds[folds >= 0]):
         left = folds == fold
         normal, target = total - weighted[left].T @ columns[left], right - weighted[left].T @ values[left]
         for index, factor in enumerate(grid):

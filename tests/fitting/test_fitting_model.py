@@ -105,7 +105,7 @@ def test_left_out_frames_are_left_out(person, take):
 
     kept = np.ones(300, bool)
     kept[10:20] = False
-    tables, _ = unseen_errors(data, kept, 3, refit, lambda fold: None)
+    tables, _, _ = unseen_errors(data, kept, 3, refit, lambda fold: None)
     for fold, frames in enumerate(seen):
         np.testing.assert_array_equal(frames, np.setdiff1d(np.arange(300), np.arange(100 * fold, 100 * fold + 100)))
     assert tables["holdout"]["mandible"]["frames"] == 290
@@ -192,7 +192,7 @@ def test_dental_arch_alone_is_enough(person, take):
 
 
 def test_limits_accept_what_was_captured_and_refuse_what_was_not(person, take, rig):
-    assert rig.validate(take).valid.mean() > 0.98
+    assert rig.validate(take).valid.mean() >= 0.995
     astray = make_transform(so3_exp(np.array([0.0, 0.0, 0.2])), np.zeros(3)) @ take
     assert not rig.validate(astray).valid.any()
 

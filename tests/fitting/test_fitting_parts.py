@@ -118,7 +118,7 @@ def test_farthest_points_spread_and_skip_repeats():
     cloud = np.repeat(rng.normal(size=(30, 3)), 2, axis=0)
     assert len(farthest_points(cloud, 50)) == 30
     few = farthest_points(cloud, 8)
-    assert np.linalg.norm(few[0]) == np.linalg.norm(cloud, axis=1).min()
+    assert np.linalg.norm(few[0]) == pytest.approx(np.linalg.norm(cloud, axis=1).min())
     gap = np.linalg.norm(few[:, None] - few[None], axis=-1)[np.triu_indices(8, 1)].min()
     cover = np.linalg.norm(cloud[:, None] - few[None], axis=-1).min(1).max()
     assert cover <= gap  # Gonzalez: no point is farther from the chosen ones than those are from each other
@@ -277,16 +277,14 @@ def test_box_contains_everything_within_the_bound():
     assert (d >= box[:, 0]).all() and (d <= box[:, 1]).all()
 
 
-def test_hard_borders_get_a_smaller_margin_than_rarely_reached_ones():
+def test_tolerance_grows_with_what_a_left_out_exercise_adds():
     rng = np.random.default_rng(21)
-    d = envelope(rng, 1000)
-    d[:, 0] = np.sort(d[:, 0]) * 0 + rng.uniform(10, 40, 1000)
-    d[:, 2] = np.where(rng.random(1000) < 0.5, -1.0, rng.exponential(1.2, 1000))
-    arrays, _ = fit_slice_hull(d)
-    back, front = arrays["slice_directions"] @ [0, -1], arrays["slice_directions"] @ [0, 1]
-    reach = arrays["slice_support"] + arrays["slice_margin_mm"]
-    assert reach[:, np.argmax(back)].mean() - 1.0 < 0.6
-    assert reach[:, np.argmax(front)].max() > d[:, 2].max()
+    alike = envelope(rng, 1000)
+    farther = alike.copy()
+    block = np.arange(1000) // 50 % 5 == 4  # frames that are left out together
+    farther[block, 1:] = [0.0, 2.0] + 1.3 * (alike[block, 1:] - [0.0, 2.0])
+    (_, small), (_, large) = fit_slice_hull(alike), fit_slice_hull(farther)
+    assert 0.0 <= small < large <= 1.0
 
 
 def test_flat_section_still_contains_its_frames():
