@@ -18,6 +18,7 @@ from jawusd.tracking.correspond import accumulate, scatter_of_tiles, search_edge
 from jawusd.tracking.scan import Scan
 
 _ROWS = (0, 1)  # upper, lower
+_DENSE_STEPS = 2  # with all faces of a dense scan, after the thinned one has settled
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +86,8 @@ class ContourSolver:
         self.scans = tuple(scans)
         self.config = config
         self._map: Callable[..., Iterable] = executor.map if executor else map
+        thin = [scan.thin or scan for scan in self.scans]
+        self._thin = ContourSolver(thin, config, executor) if any(scan.thin for scan in self.scans) else None
 
     def solve(
         self,
@@ -103,8 +106,16 @@ class ContourSolver:
             use: masks that take part, shape (2, C); by default all present ones.
             prior: what else is known of the two poses; by default nothing.
         """
-        start, poses = poses, np.array(poses, np.float64)
         use = np.array([[v.present[r] for v in views] for r in _ROWS]) if use is None else use
+        if self._thin is None or not gates_px:
+            return self._descend(poses, poses, views, gates_px, use, prior)
+        rough = self._thin.solve(poses, views, gates_px, use, prior)
+        last = self._descend(poses, rough.poses, views, tuple(gates_px[-1:]) * _DENSE_STEPS, use, prior)
+        return replace(last, iterations=rough.iterations + last.iterations)
+
+    def _descend(self, start, poses, views, gates_px, use, prior) -> Solution:
+        """Take one step per gate from the given poses, pulled weakly towards the start."""
+        poses = np.array(poses, np.float64)
         render = _Rendering(self, views)
         iterations = 0
         for gate in gates_px:

@@ -3,12 +3,15 @@
 import numpy as np
 import pytest
 import trimesh
-from bumpy_teeth import GREY, RED, arch
+from bumpy_teeth import GREY, RED, arch, jaw_poses, make_cameras, render_masks, vertex_error_mm
+from scipy.spatial import cKDTree
 
 from jawusd.errors import TrackingError
 from jawusd.formats.mesh import Mesh
+from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.margin import crown_gum_segments
 from jawusd.tracking.scan import prepare_scan
+from jawusd.tracking.solver import ContourSolver, View
 
 
 def _painted(parts):
@@ -39,8 +42,9 @@ def test_crown_gum_line_of_ball_and_plate_is_a_circle():
 
 def test_crown_gum_line_agrees_with_a_brute_force_search():
     rng = np.random.default_rng(5)
-    vertices = rng.normal(size=(60, 3)) * 3
-    crown, gum = rng.integers(0, 60, (25, 3)).astype(np.int32), rng.integers(0, 60, (30, 3)).astype(np.int32)
+    # No two triangles share a corner: whether those that touch count as crossing is up to rounding.
+    vertices = rng.normal(size=(165, 3)) * 3
+    crown, gum = np.split(np.arange(165, dtype=np.int32).reshape(-1, 3), [25])
     segments = crown_gum_segments(vertices, crown, gum)
     count = 0
     for a in vertices[crown]:
@@ -121,3 +125,41 @@ def test_scan_with_too_few_faces_is_refused():
     box = trimesh.creation.box((1.0, 1.0, 1.0))
     with pytest.raises(TrackingError, match="upper teeth scan: 12 tooth faces, at least 100"):
         prepare_scan(Mesh(box.vertices, box.faces), "upper")
+
+
+@pytest.fixture(scope="module")
+def dense():
+    """A row of teeth with faces as small as intra-oral scanners make them, of the same shape."""
+    mesh = arch(True)
+    vertices, faces, colors = np.asarray(mesh.vertices), np.asarray(mesh.faces), np.asarray(mesh.colors, float)
+    for _ in range(3):
+        vertices, faces, attributes = trimesh.remesh.subdivide(vertices, faces, vertex_attributes={"c": colors})
+        colors = attributes["c"]
+    red = np.linalg.norm(colors - RED, axis=1) < np.linalg.norm(colors - GREY, axis=1)
+    return Mesh(vertices, faces, np.where(red[:, None], RED, GREY).astype(np.uint8))
+
+
+def test_dense_scans_are_thinned_without_changing_shape_or_centre(dense):
+    scan = prepare_scan(dense, "upper")
+    thin = scan.thin
+    assert len(scan.crown_faces) > 60_000 and 0.8 * 20_000 < len(thin.crown_faces) < 1.2 * 20_000
+    np.testing.assert_array_equal(thin.centre, scan.centre)
+    spacing_mm = np.linalg.norm(scan.vertices[scan.crown_faces[:, 0]] - scan.vertices[scan.crown_faces[:, 1]], axis=1)
+    away_mm = cKDTree(scan.vertices).query(thin.vertices)[0]
+    assert np.percentile(away_mm, 99) < spacing_mm.max() / 2
+    assert thin.thin is None and prepare_scan(arch(True), "upper").thin is None
+
+
+def test_a_dense_scan_lands_where_the_plain_one_does(dense):
+    config, poses, camera = TrackingConfig(), jaw_poses(2), make_cameras()
+    meshes = (arch(True), arch(False))
+    plain = [prepare_scan(mesh, name) for mesh, name in zip(meshes, ("upper", "lower"))]
+    views = [
+        View(c.projection_matrix(), c.centre_world(), render_masks(meshes, poses[1], c, (7.5, -16.0)), np.ones(2, bool))
+        for c in camera
+    ]
+    gates = config.gates_from(0.0)
+    first = ContourSolver(plain, config).solve(poses[0], views, gates)
+    second = ContourSolver([prepare_scan(dense, "upper"), plain[1]], config).solve(poses[0], views, gates)
+    assert vertex_error_mm(meshes[0], second.poses[0], first.poses[0]) < 0.01
+    assert vertex_error_mm(meshes[1], second.poses[1], first.poses[1]) < 0.01
