@@ -99,10 +99,11 @@ class TrackingConfig:
     # How far calibrated cameras turn and move until the take, standard deviation per axis [rad, mm]: a knock.
     refine_turn_rad: float = 0.0035
     refine_move_mm: float = 0.5
-    # Frames on which camera poses are found [-], most rounds of that, and the change that ends it [px].
+    # Frames on which these are settled before all are aligned again [-], most rounds of that, and the share of the
+    # limits above below which a round changes too little for another.
     settle_frames: int = 40
-    settle_rounds: int = 8
-    settled_px: float = 0.02
+    settle_rounds: int = 6
+    settled_share: float = 0.2
 
     def gates_from(self, reach_px: float) -> tuple[float, ...]:
         """Return the gates to go through when the start is off by about reach_px, and no less than the usual."""

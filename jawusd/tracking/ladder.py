@@ -77,6 +77,9 @@ class FrameTracker:
             bad = rows(trial)
             if bad.any() and (attempt != self._search or gallery is not None):
                 trial = attempt(trial, bad, starts, views, gallery)
+        kept = trial.use & ~self._spoiled(trial)
+        if (kept != trial.use).any():  # a mask that had drawn the first attempt away from all others
+            trial = self._try(trial.solution.poses, views, gates, kept)
         return self._record(first, trial)
 
     def _record(self, first: _Trial, trial: _Trial) -> FrameRecord:

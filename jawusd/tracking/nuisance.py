@@ -45,6 +45,12 @@ class Nuisances:
         wide = np.abs(self.bias_px) > np.maximum(config.refine_bias_px, 4 * self.sigma_bias_px)
         return bool(late.any() or wide.any() or self.cameras_moved(config))
 
+    def settled(self, config: TrackingConfig) -> bool:
+        """Tell whether all are so small that estimating them once more is not worth it."""
+        late = np.abs(self.delays).max() / config.refine_delay_frames
+        wide = np.abs(self.bias_px).max() / config.refine_bias_px
+        return max(late, wide, self.shift_px / config.refine_shift_px) < config.settled_share
+
     def cameras_moved(self, config: TrackingConfig) -> bool:
         """Tell whether the camera poses are off by more than the limit, and clearly so."""
         clear = (np.abs(self.twists) > 4 * self.sigma_twists).any()
@@ -134,6 +140,9 @@ def leads(records: Mapping[int, FrameRecord], frame: int, delays: NDArray[np.flo
     out = np.tile(np.eye(4), (len(delays), 2, 1, 1))
     for row in (0, 1):
         velocity = velocity_twist(records, frame, row)
+        if velocity is None:
+            across = bridge(records, frame, row)
+            velocity = None if across is None else across[1]
         if velocity is not None:
             to = make_transform(np.eye(3), -records[frame].solution.centres[row])
             out[:, row] = se3_inverse(to) @ se3_exp(delays[:, None] * velocity) @ to
@@ -170,3 +179,28 @@ def velocity_twist(records: Mapping[int, FrameRecord], frame: int, row: int) -> 
     to = make_transform(np.eye(3), -now.centres[row])
     step = to @ after.poses[row] @ se3_inverse(before.poses[row]) @ se3_inverse(to)
     return 0.5 * se3_log(step)
+
+
+_BRIDGE_FRAMES = 6  # a quarter of a second at 24 fps: jaws turn round in less than two of these
+
+
+def bridge(
+    records: Mapping[int, FrameRecord], frame: int, row: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Return a row's pose (4, 4) and twist per frame about its centre (6,), going evenly between tracked frames.
+
+    None without tracked frames close by on both sides.
+    """
+    reach = range(1, _BRIDGE_FRAMES + 1)
+
+    def known(f: int) -> bool:
+        return f in records and records[f].status[row] != LOST
+
+    before = next((frame - k for k in reach if known(frame - k)), None)
+    after = next((frame + k for k in reach if known(frame + k)), None)
+    if before is None or after is None:
+        return None
+    to = make_transform(np.eye(3), -records[frame].solution.centres[row])
+    start, end = (records[f].solution.poses[row] for f in (before, after))
+    twist = se3_log(to @ end @ se3_inverse(start) @ se3_inverse(to)) / (after - before)
+    return se3_inverse(to) @ se3_exp((frame - before) * twist) @ to @ start, twist

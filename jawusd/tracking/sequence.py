@@ -19,7 +19,7 @@ from jawusd.tracking.first import first_record
 from jawusd.tracking.history import FrameRecord, History
 from jawusd.tracking.ladder import FrameTracker
 from jawusd.tracking.motion import Motion
-from jawusd.tracking.nuisance import Nuisances, TakeEquations, leads
+from jawusd.tracking.nuisance import Nuisances, TakeEquations, bridge, leads
 from jawusd.tracking.results import assemble, outline_variance
 from jawusd.tracking.scan import prepare_scan
 from jawusd.tracking.solver import ContourSolver, View
@@ -138,12 +138,12 @@ class _Take:
         extrinsics = Extrinsics.calibrated(self._masks.cameras, self._middle())
         found = self._equations(extrinsics).solve(c, True)
         cameras_moved = found.cameras_moved(c) and c.refine_rounds > 0
-        if cameras_moved:
-            found, extrinsics = self._settle(found, extrinsics)
-        else:
+        if not cameras_moved:
             extrinsics = extrinsics.then(np.zeros_like(found.twists), found.sigma_twists)
             found = self._equations(extrinsics).solve(c, False)
-        pending, rounds = cameras_moved or found.matters(c), 0
+        pending, rounds = found.matters(c), 0
+        if pending and c.refine_rounds:
+            found, extrinsics = self._settle(found, extrinsics, cameras_moved)
         while pending and rounds < c.refine_rounds:
             if cameras_moved:
                 extrinsics = extrinsics.then(found.twists, found.sigma_twists)
@@ -159,22 +159,25 @@ class _Take:
         """Return a point amid the teeth, world coordinates [mm], shape (3,)."""
         return np.median([r.solution.centres for r in self.records.values()], axis=(0, 1))
 
-    def _settle(self, found: Nuisances, extrinsics: Extrinsics) -> tuple[Nuisances, Extrinsics]:
-        """Align some frames again and again until the camera poses stay: matches follow them only step by step."""
+    def _settle(self, found: Nuisances, extrinsics: Extrinsics, cameras_moved: bool) -> tuple[Nuisances, Extrinsics]:
+        """Align some frames again and again until the nuisances stay: matches follow them only step by step."""
         c, records = self._config, dict(self.records)
         whole = [f for f, r in sorted(records.items()) if (r.status != LOST).all()]
-        sample = [whole[k] for k in np.unique(np.linspace(0, len(whole) - 1, c.settle_frames).astype(int))]
+        sample = {
+            whole[k]: self._masks.at(whole[k]) for k in np.linspace(0, len(whole) - 1, c.settle_frames).astype(int)
+        }
         variance = outline_variance(records, c)
         for _ in range(c.settle_rounds):
-            extrinsics = extrinsics.then(found.twists, found.sigma_twists)
-            for frame in sample:
-                views = _put_right(self._masks.at(frame), self.records, frame, found, extrinsics)
+            if cameras_moved:
+                extrinsics = extrinsics.then(found.twists, found.sigma_twists)
+            for frame, views in sample.items():
                 start, used = records[frame].solution.poses, records[frame].used
+                views = _put_right(views, self.records, frame, found, extrinsics)
                 solution = self._solver.solve(start, views, c.gates_from(0.0), used)
                 records[frame] = replace(records[frame], solution=solution)
-            more = TakeEquations(records, variance, extrinsics, sample).solve(c, True)
+            more = TakeEquations(records, variance, extrinsics, sample).solve(c, cameras_moved)
             found = found.plus(more)
-            if more.shift_px < c.settled_px:
+            if more.settled(c):
                 break
         return found, extrinsics
 
@@ -184,10 +187,11 @@ class _Take:
         tracker, _ = self._from(self._first)
         for frame, views in self._masks.walk(self._first, self._stop):
             views = _put_right(views, before, frame, nuisances, extrinsics)
-            record = tracker.track([before[frame].solution.poses], views, None)
-            was = before[frame].status
-            status = np.where((was == RECOVERED) & (record.status == TRACKED), RECOVERED, record.status).astype(np.int8)
-            self.records[frame] = replace(record, status=np.where(was == LOST, LOST, status).astype(np.int8))
+            record = tracker.track(_starts_again(before, frame), views, None)
+            found = record.status == TRACKED
+            doubted = np.isin(before[frame].status, (RECOVERED, LOST))
+            status = np.where(found & doubted, RECOVERED, record.status).astype(np.int8)
+            self.records[frame] = replace(record, status=status)
             tracker.history.add(record)
 
     def _from(self, frame: int) -> tuple[FrameTracker, Motion]:
@@ -221,6 +225,18 @@ def _put_right(
     moved = leads(records, frame, nuisances.delays)
     views = extrinsics.put_right(views)
     return [replace(v, lead=m, bias_px=nuisances.bias_px) for v, m in zip(views, moved, strict=True)]
+
+
+def _starts_again(records: Mapping[int, FrameRecord], frame: int) -> list[NDArray[np.float64]]:
+    """Return the poses from which to align a frame again: where it is; where a row is lost, from even motion first."""
+    own = records[frame].solution.poses
+    lost = np.flatnonzero(records[frame].status == LOST)
+    even = own.copy()
+    for row in lost:
+        across = bridge(records, frame, row)
+        if across is not None:
+            even[row] = across[0]
+    return [even, own] if len(lost) else [own]
 
 
 def _gaps(records: Mapping[int, FrameRecord]) -> Iterable[tuple[int, int]]:

@@ -122,11 +122,19 @@ class Scorer:
         return text, float(np.nanmean(final, axis=0).max()), float(plain.max())
 
 
+def written(folder: Path, frames: tuple[int, int]) -> bool:
+    """Tell whether a copy of these frames is there already."""
+    return (folder / "capture.toml").exists() and load_capture(folder, allow_outside=True).frames == frames
+
+
 def nuisances(tracks: Tracks) -> str:
     """Return what was found out about cameras and masks."""
     delays = ", ".join(f"{v:+.3f}" for v in tracks.meta["delays_frames"].values())
     bias = ", ".join(f"{v:+.2f}" for v in tracks.meta["mask_bias_px"])
-    return f"{'':<13}delays [frames] {delays}; mask bias [px] {bias}"
+    report = tracks.meta["extrinsics"]
+    moves = f"corrected by up to {np.abs(list(report['moves_mm'].values())).max():.2f} mm"
+    cameras = moves if report["corrected"] else "left alone"
+    return f"{'':<13}delays [frames] {delays}; mask bias [px] {bias}; cameras {cameras}"
 
 
 def main() -> None:
@@ -135,7 +143,7 @@ def main() -> None:
     parser.add_argument("capture", type=Path)
     parser.add_argument("--kinds", nargs="+", choices=list(KINDS), default=list(KINDS))
     parser.add_argument("--frames", type=int, nargs=2, metavar=("A", "B"), help="first frame, one past the last")
-    parser.add_argument("--keep", type=Path, help="keep copies and tracks in this folder")
+    parser.add_argument("--keep", type=Path, help="keep copies and tracks there, use copies that are there")
     parser.add_argument("--scored", action="store_true", help="score the tracks kept there")
     options = parser.parse_args()
     scorer = Scorer(options.capture)
@@ -151,7 +159,9 @@ def main() -> None:
             folder = (options.keep or Path(scratch)) / kind
             start = time.process_time()
             if not options.scored:
-                save_tracks(degrade(scorer.capture, kind, folder, frames) / "tracks.npz", scorer.track(folder))
+                if not written(folder, frames):
+                    degrade(scorer.capture, kind, folder, frames)
+                save_tracks(folder / "tracks.npz", scorer.track(folder))
             tracks = load_tracks(folder / "tracks.npz")
             text, mean, worst = scorer.line(kind, tracks)
             clean = mean if kind == "clean" else clean

@@ -76,3 +76,16 @@ def test_absent_masks_lose_only_their_row(tracker):
     views = [View(v.matrix, v.eye, v.masks, np.array([True, False])) for v in _views(1)]
     record = tracker.track([POSES[1]], views, [])
     assert record.status.tolist() == [TRACKED, LOST] and np.isnan(record.coverage[1]).all()
+
+
+def test_a_mask_that_draws_the_pose_away_is_left_out_in_the_end(tracker):
+    """Start where only the spoiled mask is: all masks look wrong there, and the one that is so shows only later."""
+    views, far = _views(1), _views(2)
+    moved = np.roll(views[2].masks[0], (30, 45), axis=(0, 1))
+    spoiled = np.stack([moved, views[2].masks[1]])
+    views[2] = View(far[2].matrix, far[2].eye, spoiled, np.ones(2, bool))
+    away = POSES[1].copy()
+    away[0] = make_transform(np.eye(3), [5.0, 4.0, 2.0]) @ away[0]
+    record = tracker.track([away], views, [])
+    assert record.used[0].tolist() == [True, True, False] and record.status[0] == PARTIAL
+    assert max(_errors(record)) < 0.15

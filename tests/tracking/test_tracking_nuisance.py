@@ -4,13 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from bumpy_teeth import jaw_poses
 from small_take import CAMERAS, LANDMARKS, MESHES, OFFSETS, errors_mm, make_capture, track, write_masks
 
-from jawusd.formats.tracks import load_tracks, save_tracks
+from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, load_tracks, save_tracks
 from jawusd.geometry import rigidity_defect, se3_exp, se3_inverse, se3_log
 from jawusd.tracking import TrackingConfig, track_capture
 from jawusd.tracking.extrinsics import Extrinsics, corrected_cameras
-from jawusd.tracking.nuisance import Nuisances
+from jawusd.tracking.history import FrameRecord
+from jawusd.tracking.ladder import FrameTracker
+from jawusd.tracking.nuisance import Nuisances, bridge, leads
+from jawusd.tracking.solver import Solution
 
 FRAMES = 16
 WITHOUT = TrackingConfig(refine_rounds=0)
@@ -172,3 +176,53 @@ def test_what_is_known_of_a_camera_is_said_about_the_teeth():
     about = se3_log(se3_inverse(at) @ se3_inverse(T) @ se3_exp(knocks) @ T @ at)
     chi2 = np.einsum("ni,ij,nj->n", about, precision, about)
     assert chi2.mean() == pytest.approx(6, rel=0.05)
+
+
+def _records(count, lost=()):
+    """Return records of a jaw that turns and moves evenly, some of them lost and far away."""
+    step = np.array([0.01, 0.02, -0.01, 0.4, -0.6, 0.2])
+    start = se3_exp([0.2, -0.1, 0.3, 5.0, -12.0, 3.0])
+    records = {}
+    for f in range(count):
+        poses = np.tile(se3_exp(f * step) @ start, (2, 1, 1))
+        status = np.full(2, TRACKED, np.int8)
+        if f in lost:
+            poses[1], status[1] = se3_exp([0, 0, 0, 30.0, 0, 0]) @ poses[1], LOST
+        nothing = np.zeros((2, 2, 8, 8)), np.ones((2, 3)), np.zeros((2, 6, 6)), np.zeros((2, 2)), 1
+        records[f] = FrameRecord(Solution(poses, *nothing), status, np.ones((2, 2), bool), np.zeros((2, 2)))
+    return records, step
+
+
+def test_a_lost_row_is_bridged_by_even_motion():
+    records, step = _records(12, lost=(4, 5, 6))
+    pose, _ = bridge(records, 5, 1)
+    assert pose == pytest.approx(records[5].solution.poses[0], abs=1e-6)
+    moved = leads(records, 5, np.array([0.0, 0.25]))
+    assert moved[0] == pytest.approx(np.tile(np.eye(4), (2, 1, 1)))
+    assert moved[1, 1] == pytest.approx(se3_exp(0.25 * step), abs=1e-6)
+    assert moved[1, 0] == pytest.approx(moved[1, 1], abs=1e-6)
+
+
+def test_long_gaps_and_ends_are_not_bridged():
+    assert bridge(_records(20, lost=range(4, 18))[0], 10, 1) is None
+    assert bridge(_records(6, lost=(0, 1))[0], 0, 1) is None
+    assert leads(_records(6, lost=(0, 1))[0], 0, np.array([0.0, 0.3]))[1, 1].tolist() == np.eye(4).tolist()
+
+
+def test_frames_lost_to_a_late_camera_are_found_once_it_is_known(tmp_path):
+    """Call a row lost without reason, as a late camera may: aligned again with the delay taken out it comes back."""
+    capture = make_capture(write_masks(tmp_path / "late", FRAMES, delays=(0.0, 0.3, -0.2)), FRAMES)
+    original = FrameTracker.track
+
+    def distrustful(self, starts, views, gallery, reach_px=0.0):
+        record = original(self, starts, views, gallery, reach_px)
+        shaky = max(np.abs(v.lead - np.eye(4)).max() for v in views) == 0 and self.history.usual_score().any()
+        seen = abs(record.solution.poses[1, 1, 3] - AT[1, 1, 3]) < 0.3
+        return replace(record, status=np.array([record.status[0], LOST], np.int8)) if shaky and seen else record
+
+    AT = jaw_poses(11)[10]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(FrameTracker, "track", distrustful)
+        tracks = track(capture)
+    assert tracks.status[10].tolist() == [TRACKED, RECOVERED]
+    assert errors_mm(tracks, raw=True)[10].max() < 0.1
