@@ -15,7 +15,7 @@ from jawusd.geometry import make_transform, so3_log, transform_points
 from jawusd.tracking.first import first_record
 from jawusd.tracking.footage import Footage, Start
 from jawusd.tracking.mixups import check_mixups, possible_mixups
-from jawusd.tracking.pose_search import Candidate, Grid, RowSearch, coarse_scan, hinge_at_front
+from jawusd.tracking.pose_search import Candidate, Grid, coarse_scan, hinge_at_front, search_row
 from jawusd.tracking.quality import score_px, uncovered_px
 from jawusd.tracking.solver import ContourSolver, Solution, View
 
@@ -30,12 +30,11 @@ _DISTINCT_MM = 2.0  # poses closer than this lead to the same minimum
 # Turns about the guess: the teeth face the cameras, the upper ones are above the lower ones. Masks one beside the other
 # in a lateral movement, or half hidden by lips, mislead the roll most.
 _GRID = Grid(
-    yaw_rad=np.radians(np.arange(-56, 57, 8.0)),
-    pitch_rad=np.radians(np.arange(-40, 41, 8.0)),
-    roll_rad=np.radians(np.arange(-48, 49, 8.0)),
+    yaw_rad=np.radians(np.arange(-50, 51, 10.0)),
+    pitch_rad=np.radians(np.arange(-40, 41, 10.0)),
+    roll_rad=np.radians(np.arange(-50, 51, 10.0)),
     reach_mm=(13.0, 9.0, 15.0),
 )
-_MARGIN_MM = float(np.linalg.norm(_GRID.reach_mm))
 _WIDEST_JAW_RAD = 0.8  # turn between the rows beyond which a jaw does not open
 _FARTHEST_JAW_MM = 75.0  # distance of the rows' front teeth beyond which it does not either
 
@@ -76,9 +75,8 @@ class StartSearch:
         axes = _guessed_axes(places, survey.eyes)
         finalists = []
         for r in _ROWS:
-            search = RowSearch(self._coarse[r], r, views, _PX_PER_MM, _MARGIN_MM)
             base = make_transform(axes, places[r])
-            found = search.best(base, self._hinges[r], _GRID, self._map)
+            found = search_row(self._coarse[r], r, views, _PX_PER_MM, base, self._hinges[r], _GRID, self._map)
             finalists.append(self._distinct(found, r))
         pairs = self._refined_pairs(finalists, views)
         if not pairs:

@@ -75,75 +75,78 @@ def coarse_scan(mesh: Mesh, name: str) -> Scan:
     return prepare_scan(Mesh(mesh.vertices[chosen], faces, colors), name)
 
 
-class RowSearch:
-    """Search the pose of one row of teeth in the pictures of one instant."""
+class _Screen:
+    """Tell what the drawn row is worth in one picture at every shift."""
 
-    def __init__(self, scan: Scan, row: int, views: Sequence[View], px_per_mm: float, margin_mm: float) -> None:
-        """Prepare the correlation templates.
+    def __init__(self, view: View, row: int, px_per_mm: float, shifts: NDArray[np.float64], at: NDArray) -> None:
+        """Prepare the correlation.
 
         Args:
-            scan: the row of teeth, coarse.
+            view: the picture, with a mask of the row.
             row: 0 upper, 1 lower.
-            views: pictures of about the given resolution; those without a mask of the row are left out.
-            px_per_mm: resolution at the teeth.
-            margin_mm: farthest shift that will be asked for.
+            px_per_mm: its resolution at the teeth.
+            shifts: world translations that will be asked for [mm], shape (N, 3).
+            at: world point that is shifted [mm], shape (3,).
         """
-        self._scan = scan
-        self._margin = int(np.ceil(margin_mm * px_per_mm))
-        self._shapes, self._matrices, self._templates, self._full = [], [], [], []
-        for view in views:
-            if not view.present[row]:
-                continue
-            picture = _template(view.masks[row], view.masks[1 - row], px_per_mm)
-            padded = np.pad(picture, self._margin)
-            self._shapes.append(padded.shape)
-            full = tuple(fft.next_fast_len(n, real=True) for n in padded.shape)
-            self._full.append(full)
-            self._templates.append(fft.rfft2(padded.astype(np.float32), full))
-            shift = np.array([[1, 0, self._margin], [0, 1, self._margin], [0, 0, 1.0]])
-            self._matrices.append(shift @ view.matrix)
+        # Rounded: sub-pixel shifts gain nothing on blurred outlines.
+        pixels = np.rint(shifts @ _slope(view.matrix, at).T).astype(np.int64)
+        picture = _template(view.masks[row], view.masks[1 - row], px_per_mm)
+        some = np.abs(picture) > 1e-3
+        y, x = np.flatnonzero(some.any(1)), np.flatnonzero(some.any(0))
+        picture = picture[y[0] : y[-1] + 1, x[0] : x[-1] + 1]
+        # With as much border as the farthest shift nothing that wraps around meets the template.
+        right, down = np.abs(pixels).max(0)
+        picture = np.pad(picture, ((down, down), (right, right))).astype(np.float32)
+        self._shape = picture.shape
+        self._full = tuple(fft.next_fast_len(n, real=True) for n in picture.shape)
+        self._template = fft.rfft2(picture, self._full)
+        self._matrix = np.array([[1, 0, right - x[0]], [0, 1, down - y[0]], [0, 0, 1.0]]) @ view.matrix
+        self._columns, self._rows = (pixels % self._full[::-1]).T
 
-    def best(
-        self, base: NDArray[np.float64], hinge: NDArray[np.float64], grid: Grid, map_: Callable = map
-    ) -> list[Candidate]:
-        """Return the best translation of every orientation of a grid, the best orientations first.
-
-        Args:
-            base: pose of the row's anatomical axes and the point to turn about: world <- (left, up, front), shape
-                (4, 4); its origin is where the hinge is expected.
-            hinge: T_anatomical_scan with the origin at the point to turn about, shape (4, 4).
-            grid: what to try.
-            map_: runs orientations, in threads if it likes.
-        """
-        shifts = grid.shifts() @ base[:3, :3].T
-        slopes = [_slope(M, base[:3, 3]) for M in self._matrices]
-        # Sub-pixel shifts gain nothing on blurred outlines.
-        pixels = [np.rint(shifts @ s.T).astype(np.int64) for s in slopes]
-        for p, full in zip(pixels, self._full, strict=True):
-            np.clip(p, -self._margin, self._margin, out=p)
-            p %= np.array(full)[::-1]
-
-        def look(turn: NDArray[np.float64]) -> Candidate:
-            pose = base @ make_transform(turn, np.zeros(3)) @ hinge
-            worth = np.zeros(len(shifts), np.float32)
-            for k, p in enumerate(pixels):
-                worth += self._correlation(k, pose)[p[:, 1], p[:, 0]]
-            best = int(worth.argmax())
-            return Candidate(float(worth[best]), make_transform(np.eye(3), shifts[best]) @ pose)
-
-        return sorted(map_(look, grid.turns()), key=lambda c: -c.worth)
-
-    def _correlation(self, k: int, pose: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Return the worth of the row's picture at every shift, indexed (dy, dx) modulo the transform's size."""
-        scan = self._scan
+    def worth(self, scan: Scan, pose: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Return the worth of a pose under all shifts [px], shape (N,)."""
         points = np.empty((len(scan.vertices), 3), np.float32)
-        project(scan.vertices_single, (self._matrices[k] @ pose).astype(np.float32), points)
-        depth = np.zeros(self._shapes[k], np.float32)
-        labels = np.zeros(self._shapes[k], np.uint8)
+        project(scan.vertices_single, (self._matrix @ pose).astype(np.float32), points)
+        depth, labels = np.zeros(self._shape, np.float32), np.zeros(self._shape, np.uint8)
         draw_depth_labels(points, scan.crown_faces, 0, 0, scan.painted, depth, labels, CROWN)
         draw_depth_labels(points, scan.gum_faces, 0, 0, False, depth, labels, GUM)
-        drawn = fft.rfft2((labels == CROWN).astype(np.float32), self._full[k])
-        return fft.irfft2(np.conj(drawn) * self._templates[k], self._full[k])
+        drawn = fft.rfft2((labels == CROWN).astype(np.float32), self._full)
+        return fft.irfft2(np.conj(drawn) * self._template, self._full)[self._rows, self._columns]
+
+
+def search_row(
+    scan: Scan,
+    row: int,
+    views: Sequence[View],
+    px_per_mm: float,
+    base: NDArray[np.float64],
+    hinge: NDArray[np.float64],
+    grid: Grid,
+    map_: Callable[..., Iterable] = map,
+) -> list[Candidate]:
+    """Return the best translation of every orientation of a grid, the best orientations first.
+
+    Args:
+        scan: the row of teeth, coarse.
+        row: 0 upper, 1 lower.
+        views: pictures of one instant; those without a mask of the row are left out.
+        px_per_mm: their resolution at the teeth.
+        base: guessed pose of the row's (left, up, front) axes about the point to turn about, world <- axes, shape
+            (4, 4).
+        hinge: scan frame to (left, up, front) axes about that point, shape (4, 4).
+        grid: what to try.
+        map_: runs orientations, in threads if it likes.
+    """
+    shifts = grid.shifts() @ base[:3, :3].T
+    screens = [_Screen(view, row, px_per_mm, shifts, base[:3, 3]) for view in views if view.present[row]]
+
+    def look(turn: NDArray[np.float64]) -> Candidate:
+        pose = base @ make_transform(turn, np.zeros(3)) @ hinge
+        worth = sum(screen.worth(scan, pose) for screen in screens)
+        best = int(worth.argmax())
+        return Candidate(float(worth[best]), make_transform(np.eye(3), shifts[best]) @ pose)
+
+    return sorted(map_(look, grid.turns()), key=lambda c: -c.worth)
 
 
 def _template(mask: NDArray[np.uint8], other: NDArray[np.uint8], px_per_mm: float) -> NDArray[np.float64]:
