@@ -29,8 +29,9 @@ from jawusd.rig.onnx_sidecar import decode_model  # noqa: E402
 from jawusd.rig.sampling import sample_valid  # noqa: E402
 
 MESHES = {"geo.usdc", "actor.usdz"}  # files that hold meshes
-OURS = {"actor.usda", "rig.usdc", "actor.onnx", "actor_encode.onnx", "actor_skel.usdc", "anim_capture.usdc"}
-OURS |= {"cameras.usda", "cameras_motion.usdc", "model.npz", "tracks.npz", "first_pass.npz", "build.json"}
+RIG = {"actor.usda", "rig.usdc", "actor.onnx", "actor_encode.onnx", "actor_skel.usdc", "anim_capture.usdc"}
+RIG |= {"cameras.usda", "cameras_motion.usdc"}
+RECORDS = {"tracks.npz", "first_pass.npz", "model.npz", "build.json"}  # of the build; they grow with the capture
 TAKE_FRAMES = 10_000
 
 
@@ -42,8 +43,9 @@ def row(name, value, bar, good):
 def sizes(folder):
     """Sum the files of the rig that hold no meshes."""
     files = {path.name: path.stat().st_size for path in folder.iterdir() if path.is_file()}
-    total = sum(size for name, size in files.items() if name in OURS)
-    row("files without meshes", f"{total / 1e6:.2f} MB", "<= 2 MB", total <= 2e6)
+    rig, records = (sum(size for name, size in files.items() if name in group) for group in (RIG, RECORDS))
+    row("rig without meshes and without the build's records", f"{rig / 1e6:.2f} MB", "<= 2 MB", rig <= 2e6)
+    row("rig without meshes, with the records", f"{(rig + records) / 1e6:.2f} MB", "<= 2 MB", rig + records <= 2e6)
     for name in sorted(MESHES & set(files)):
         print(f"    {name}: {files[name] / 1e6:.2f} MB")
 
