@@ -175,13 +175,13 @@ def fit(
 ) -> None:
     """Fit a three-parameter jaw model to tracked or given poses."""
     from jawusd.formats.model import save_model
-    from jawusd.pipeline.stages import fit_subject, read_motion
+    from jawusd.pipeline.stages import about, fit_subject, read_motion
     from jawusd.pipeline.summary import fit_lines, fit_summary
 
     refuse_existing(out, force)
     motion = read_motion(poses, trajectory_options(columns, length_unit, invert, rest_frame, group))
     subject = subject_given(poses.stem, capture, upper_teeth, lower_teeth, mandible, landmarks, allow_outside)
-    with progress() as report:
+    with progress() as report, about(poses):
         fitted = fit_subject(subject, motion, model.value, report)
     save_model(out, fitted)
     summary = {**fit_summary(fitted), "file": str(out)}

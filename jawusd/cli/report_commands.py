@@ -59,7 +59,7 @@ def report(
 ) -> None:
     """Repeat the paper's experiments on a take: figures (PNG, SVG) and a table (CSV)."""
     from jawusd.pipeline.experiments import experiment_files, experiment_lines, report_experiments
-    from jawusd.pipeline.stages import read_motion
+    from jawusd.pipeline.stages import about, read_motion
     from jawusd.pipeline.subject import subject_of_build
 
     if not experiments:
@@ -71,11 +71,12 @@ def report(
         refuse_existing(path, force)
     options = trajectory_options(columns, length_unit, invert, rest_frame, group)
     given = (capture, upper_teeth, lower_teeth, mandible, landmarks)
-    motion = read_motion(source / "tracks.npz" if source.is_dir() else source, options)
+    poses = source / "tracks.npz" if source.is_dir() else source
+    motion = read_motion(poses, options)
     if source.is_dir() and not any(given):
         subject = subject_of_build(source)
     else:
         subject = subject_given(source.stem, *given, allow_outside)
-    with progress() as tell:
+    with progress() as tell, about(poses):
         summary = report_experiments(subject, motion, folder, starts, tell)
     emit(summary, as_json, lambda: experiment_lines(summary))

@@ -163,8 +163,7 @@ def _reconstruction(data: TrainingData, fitted: _Fitted, nets: list[Nlpca]) -> l
     root = data.metric.twist_root()
     points = se3_log(data.motion) @ root
     rebuilt = {
-        f"NLPCA {net.components}": se3_exp(np.linalg.solve(root.T, net.decode(net.encode(points)).T).T)
-        for net in nets
+        f"NLPCA {net.components}": se3_exp(np.linalg.solve(root.T, net.decode(net.encode(points)).T).T) for net in nets
     }
     for name, form in fitted.forms.items():
         if isinstance(form, PaperFit):

@@ -34,9 +34,7 @@ def report_experiments(subject: Subject, motion: Motion, folder: Path, starts: i
     figures = stage("jawusd.report.figures")  # before minutes of computing: it may not be installed
     experiments, fitting = stage("jawusd.fitting.experiments"), stage("jawusd.fitting")
     data = stage("jawusd.fitting.data")
-    anatomy = data.Anatomy.of(
-        subject.T_anatomical_skull, subject.landmarks, subject.measured_points(), subject.T_rest
-    )
+    anatomy = data.Anatomy.of(subject.T_anatomical_skull, subject.landmarks, subject.measured_points(), subject.T_rest)
     found = experiments.run_experiments(
         motion,
         anatomy,

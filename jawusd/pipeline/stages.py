@@ -76,20 +76,20 @@ def track_teeth(
         CaptureError, TrackingError: see `tracking.track_capture` and `tracking.paper_sequence`.
         MissingDependencyError: the GL backend has no OpenGL to work with.
     """
-    with _about(capture):
+    with about(capture.folder / "capture.toml"):
         tracks = _track(capture, offsets, jobs, progress, solver, backend)
     tracks.meta["calibration_rescaled_px"] = rescaled_cameras(capture)
     return tracks
 
 
 @contextlib.contextmanager
-def _about(capture: Capture) -> Iterator[None]:
-    """Name the capture in errors of stages that know only its content."""
+def about(path: Path) -> Iterator[None]:
+    """Name a file in errors of stages that know only its content."""
     try:
         yield
     except JawusdError as error:
         if error.path is None:
-            error.path = str(capture.folder / "capture.toml")
+            error.path = str(path)
         raise
 
 
@@ -138,7 +138,7 @@ def aid_teeth(
     Raises:
         CaptureError: a mask cannot be read.
     """
-    with _about(capture):
+    with about(capture.folder / "capture.toml"):
         meshes = load_meshes(capture)
         return stage("jawusd.tracking.aided").aid_tracks(
             tracks,
@@ -176,7 +176,7 @@ def read_motion(path: str | os.PathLike[str], options: TrajectoryOptions | None 
 
 def fit_jaw(capture: Capture, motion: Motion, method: str, progress: Progress) -> JawModel:
     """Fit the jaw model of the person of a capture; see `fit_subject`."""
-    with _about(capture):
+    with about(capture.folder / "capture.toml"):
         return fit_subject(subject_of_capture(capture), motion, method, progress)
 
 

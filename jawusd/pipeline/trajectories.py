@@ -70,9 +70,7 @@ def read_trajectory(
     return frames, T
 
 
-def _pose_at(
-    frames: NDArray[np.int64], T: NDArray[np.float64], wanted: int, path: Path
-) -> NDArray[np.float64]:
+def _pose_at(frames: NDArray[np.int64], T: NDArray[np.float64], wanted: int, path: Path) -> NDArray[np.float64]:
     rows = np.flatnonzero(frames == wanted)
     if not rows.size:
         between = f"; it has {frames.min()} to {frames.max()}" if len(frames) else ""

@@ -76,7 +76,8 @@ def test_help_loads_nothing_heavy():
         "from typer.testing import CliRunner\n"
         "from jawusd.cli.main import app\n"
         "result = CliRunner().invoke(app, ['--help'])\n"
-        "heavy = {'torch','cv2','av','numba','scipy','shapely','trimesh','moderngl','pxr','onnx','pydantic','numpy'}\n"
+        "heavy = {'torch','cv2','av','numba','scipy','shapely','trimesh','moderngl','pxr','onnx','pydantic','numpy',"
+        "'matplotlib','h5py'}\n"
         "print(result.exit_code, sorted(heavy & set(sys.modules)))\n"
     )
     result = run_python(ROOT, code)

@@ -73,9 +73,7 @@ class Subject:
 
 def row(label: str, *columns: np.ndarray) -> None:
     """Print mean/median/p95/max of pooled errors."""
-    cells = [
-        f"{e.mean():6.3f} {np.median(e):6.3f} {np.percentile(e, 95):6.3f} {e.max():6.2f}" for e in columns
-    ]
+    cells = [f"{e.mean():6.3f} {np.median(e):6.3f} {np.percentile(e, 95):6.3f} {e.max():6.2f}" for e in columns]
     print(f"{label:<52}" + "  | ".join(cells), flush=True)
 
 

@@ -1,0 +1,75 @@
+"""Whose jaw it is, from each kind of file that can say so."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from example_model import example_arrays, example_meta
+from example_rig import FPS, example_meshes, example_motion, example_rig
+from package_copy import ROOT
+
+from jawusd.errors import CaptureError, FormatError, RigError
+from jawusd.formats.model import JawModel, save_model
+from jawusd.geometry import LANDMARKS, landmark_frame
+from jawusd.pipeline.prepare import open_capture
+from jawusd.pipeline.subject import subject_of_build, subject_of_capture, subject_of_landmarks, subject_of_scans
+from jawusd.rig.bake import bake_rig
+
+SCANS = {name: ROOT / "examples" / "capture" / "scans" / f"{name}.ply" for name in ("upper_teeth", "lower_teeth")}
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """A folder with what a build leaves behind for the report: model and geometry."""
+    folder = tmp_path_factory.mktemp("built")
+    frames, d = example_motion()
+    bake_rig(folder, example_rig(), example_meshes(), name="someone", fps=FPS, frames=frames, d=d, table_size=17)
+    meta = {**example_meta(), "actor": "someone", "fps": 24.0}
+    zeros = np.zeros(len(frames))
+    save_model(folder / "model.npz", JawModel(example_arrays(), np.array(frames), d, zeros, zeros == 0, meta))
+    return folder
+
+
+def test_a_build_is_enough_to_report_on_it(built):
+    found, arrays = subject_of_build(built), example_arrays()
+    assert (found.name, found.fps) == ("someone", 24.0)
+    np.testing.assert_array_equal(found.landmarks, arrays["landmarks"])
+    np.testing.assert_array_equal(found.T_anatomical_skull, arrays["T_anatomical_skull"])
+    np.testing.assert_array_equal(found.T_rest, arrays["T_rest"])
+    np.testing.assert_allclose(found.measured_points(), example_meshes()["mandible"].vertices, atol=1e-4)
+
+
+def test_a_folder_without_model_or_geometry_is_one_clear_error(built, tmp_path):
+    with pytest.raises(FormatError, match="no such file"):
+        subject_of_build(tmp_path)
+    (tmp_path / "model.npz").write_bytes((built / "model.npz").read_bytes())
+    with pytest.raises(RigError, match="no such file"):
+        subject_of_build(tmp_path)
+
+
+def test_loose_scans_say_the_same_as_the_capture_they_belong_to():
+    capture = subject_of_capture(open_capture(ROOT / "examples" / "capture"))
+    mandible = ROOT / "examples" / "capture" / "scans" / "mandible.ply"
+    loose = subject_of_scans({**SCANS, "mandible": mandible}, "someone")
+    np.testing.assert_array_equal(loose.landmarks, capture.landmarks)
+    np.testing.assert_array_equal(loose.T_anatomical_skull, capture.T_anatomical_skull)
+    np.testing.assert_array_equal(loose.T_rest, np.eye(4))
+    assert len(loose.measured_points()) == len(capture.measured_points())
+    without = subject_of_scans(SCANS, "someone")
+    np.testing.assert_array_equal(without.measured_points(), without.bones["lower_teeth"].vertices)
+    assert any("mean adult places" in text for text in without.inferred)
+
+
+def test_a_scan_that_is_none_is_named():
+    with pytest.raises(CaptureError, match="nothing.ply"):
+        subject_of_scans({**SCANS, "mandible": Path("nothing.ply")}, "someone")
+
+
+def test_landmarks_alone_measure_at_the_landmarks(tmp_path):
+    at = np.array([[1.0, -30, 5], [23, -30, -21], [-21, -30, -21], [51, 6, -75], [-49, 6, -75]])
+    data = {"format": "jawusd-landmarks/1", "units": "mm", "landmarks": dict(zip(LANDMARKS, at.tolist(), strict=True))}
+    (tmp_path / "l.json").write_text(json.dumps(data))
+    found = subject_of_landmarks(tmp_path / "l.json", "someone")
+    assert found.measured_points() is None and found.inferred == ("anatomical axes, from the landmarks",)
+    np.testing.assert_array_equal(found.T_anatomical_skull, landmark_frame(at))
