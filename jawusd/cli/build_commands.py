@@ -192,6 +192,7 @@ def bake(
     model: Annotated[Path, typer.Argument(help="model.npz.", show_default=False)],
     capture: Annotated[Path, typer.Option(help="The capture: gives the meshes.", show_default=False)],
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the rig.", show_default=False)],
+    table: Annotated[int, typer.Option(help="Knots per axis of the sampled decoder: 17, 33 or 65.")] = 33,
     force: Force = False,
     allow_outside: Outside = False,
     as_json: Json = False,
@@ -205,7 +206,7 @@ def bake(
     loaded = load_model(model)
     opened = open_capture(capture, allow_outside=allow_outside)
     with progress() as report:
-        files = bake_files(opened, loaded, out, report)
+        files = bake_files(opened, loaded, out, report, table)
     emit({"files": files}, as_json, lambda: [str(path) for path in files])
 
 

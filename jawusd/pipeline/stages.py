@@ -209,7 +209,9 @@ def fit_subject(subject: Subject, motion: Motion, method: str, progress: Progres
     return model
 
 
-def bake_files(capture: Capture, model: JawModel, folder: Path, progress: Progress) -> list[Path]:
+def bake_files(
+    capture: Capture, model: JawModel, folder: Path, progress: Progress, table_size: int = 33
+) -> list[Path]:
     """Write the rig.
 
     Args:
@@ -217,6 +219,7 @@ def bake_files(capture: Capture, model: JawModel, folder: Path, progress: Progre
         model: the fitted model with the captured parameters.
         folder: where the rig goes.
         progress: told of the work.
+        table_size: knots per axis of the sampled decoder, 17, 33 or 65.
 
     Returns:
         The files written.
@@ -234,6 +237,7 @@ def bake_files(capture: Capture, model: JawModel, folder: Path, progress: Progre
         fps=capture.fps,
         frames=model.frames,
         d=model.d,
+        table_size=table_size,
     )
     progress("bake", 1, 1)
     return files
