@@ -229,10 +229,13 @@ def test_pure_hinge_is_fitted(person):
     T[:, :3, 3] = centre - T[:, :3, :3] @ centre
     model = fit(person, noisy(T, np.random.default_rng(5)))
     assert model.meta["errors"]["train"]["mandible"]["mean"] < 0.35
+    said = " ".join(w["message"] for w in model.meta["warnings"] if w["code"] == "not_shown")
+    assert "do not show laterotrusion" in said and "do not show protrusion" in said
 
 
 def test_twenty_poses_and_gaps_are_enough_for_a_coarse_model(person, take):
-    model = fit(person, take[::20])
+    model = fit(person, take[:: len(take) // 20][:20])
+    assert len(model.frames) == 20 and model.trained.all()
     assert "few_poses" in [w["code"] for w in model.meta["warnings"]]
     gappy = take.copy()
     gappy[::5] = np.nan
