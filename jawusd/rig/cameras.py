@@ -101,7 +101,8 @@ def _add_pose(stage: Usd.Stage, path: str | Sdf.Path, T: NDArray[np.float64]) ->
 def _motion_layer(frames: NDArray[np.float64], T_world_skull: NDArray[np.float64], fps: float) -> Sdf.Layer:
     """Return the layer that moves the actor with the head."""
     layer = new_layer(fps, TAKE)
-    define_prim(layer, TAKE_ACTOR, "Xform")
+    for path in (TAKE, TAKE_ACTOR):
+        define_prim(layer, path, "Xform")
     stage = stage_of(layer)
     _add_pose(stage, TAKE_ACTOR, T_world_skull[0])
     translate, orient = UsdGeom.Xformable(stage.GetPrimAtPath(TAKE_ACTOR)).GetOrderedXformOps()
@@ -109,9 +110,6 @@ def _motion_layer(frames: NDArray[np.float64], T_world_skull: NDArray[np.float64
     for frame, translation, rotation in samples:
         translate.Set(translation, frame)
         orient.Set(rotation, frame)
-    for path in (TAKE, TAKE_ACTOR):  # the take defines them
-        spec = layer.GetPrimAtPath(path)
-        spec.specifier, spec.typeName = Sdf.SpecifierOver, ""
     return layer
 
 

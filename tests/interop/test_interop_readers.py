@@ -94,7 +94,7 @@ def test_three_js_animates_the_mandible(folder):
 
 
 @pytest.mark.parametrize(
-    "name", ["actor.usda", "anim_capture.usdc", "actor.usdz", "actor_skel.usdc", "cameras.usda"]
+    "name", ["actor.usda", "anim_capture.usdc", "actor.usdz", "actor_skel.usdc", "cameras.usda", "cameras_motion.usdc"]
 )
 def test_nvidia_validator_finds_nothing(folder, name):
     program = environment("nvidia") / "bin" / "nvidia_usd_validate"
