@@ -21,6 +21,7 @@ Triple = tuple[float, float, float]
 
 #: Exit code of a "no": an invalid pose, a rig with errors.
 NO = 1
+_USD = (".usd", ".usda", ".usdc", ".usdz")
 
 
 def register(app: typer.Typer) -> None:
@@ -151,7 +152,9 @@ def encode(
 
 def validate(
     rig: RigArg,
-    poses: Annotated[Path | None, typer.Argument(help="CSV or JSON of poses or of d, or tracks.npz.")] = None,
+    poses: Annotated[
+        Path | None, typer.Argument(help="CSV or JSON of poses or of d, tracks.npz, or an animated USD stage.")
+    ] = None,
     residual_mm: Annotated[float | None, typer.Option(help="Largest distance to the model; the rig's else.")] = None,
     margin_mm: Annotated[float | None, typer.Option(help="Smallest margin to the bound; the rig's else.")] = None,
     as_json: Json = False,
@@ -187,6 +190,10 @@ def _verdict_lines(rows: list[dict[str, Any]], invalid: int) -> list[str]:
 def _poses_or_parameters(rig: JawRig, path: Path) -> tuple[np.ndarray, np.ndarray]:
     from jawusd.formats.poses import read_parameters, table_columns
 
+    if path.suffix.lower() in _USD:
+        from jawusd.rig.motion_read import read_poses_of_stage
+
+        return read_poses_of_stage(path)
     if path.suffix != ".npz" and "d1" in table_columns(path):
         frames, d = read_parameters(path)
         return frames, rig.pose(d)

@@ -1,0 +1,79 @@
+"""Read how the mandible moves in a stage: by its transforms alone, whoever made them."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+from numpy.typing import NDArray
+from pxr import Usd, UsdGeom
+
+from jawusd.errors import FormatError
+from jawusd.geometry.se3 import rigidity_defect
+from jawusd.rig.layout import ACTOR, MANDIBLE
+from jawusd.rig.read import find_rig_prim, open_stage
+
+Array = NDArray[np.float64]
+
+_MOST_FRAMES = 1_000_000
+_RIGID = 1e-5  # single-precision quaternions, as DCCs write them, stay below
+
+
+def read_poses_of_stage(path: str | os.PathLike[str], prim_path: str | None = None) -> tuple[NDArray[np.int64], Array]:
+    """Read the poses of the mandible at every whole frame of a stage.
+
+    Args:
+        path: an animation layer of a rig, or a shot that references one.
+        prim_path: which rig, where the stage has several.
+
+    Returns:
+        Frame numbers (F,) and T_skull_mandible (F, 4, 4), mm: relative to the actor, wherever it stands.
+
+    Raises:
+        RigError: not a stage.
+        FormatError: no rig or several, no mandible, no motion, or one that is not rigid.
+    """
+    stage = open_stage(path)
+    actor = find_rig_prim(stage, path, prim_path)
+    mandible = _mandible(stage, actor, path)
+    times = _whole_frames(stage, path)
+    poses = np.empty((len(times), 4, 4))
+    for k, time in enumerate(times):
+        cache = UsdGeom.XformCache(Usd.TimeCode(float(time)))
+        moved, _ = cache.ComputeRelativeTransform(mandible, actor)
+        poses[k] = np.array(moved).T  # USD multiplies rows from the left
+    defect = rigidity_defect(poses)
+    if not defect.max() <= _RIGID:
+        worst = int(np.argmax(np.where(np.isfinite(defect), defect, np.inf)))
+        raise FormatError(
+            f"the mandible is not rigid at frame {times[worst]} (off by {defect[worst]:.2g}, allowed {_RIGID:g}).",
+            path=str(path),
+            hint="Samples of matrices shear in between: key translate and orient.",
+        )
+    return times, poses
+
+
+def _mandible(stage: Usd.Stage, actor: Usd.Prim, path: object) -> Usd.Prim:
+    targets = actor.GetRelationship("jaw:mandible").GetTargets() if actor.HasRelationship("jaw:mandible") else []
+    default = actor.GetPath().AppendPath(MANDIBLE.removeprefix(f"{ACTOR}/"))
+    prim = stage.GetPrimAtPath(targets[0] if targets else default)
+    if not prim or not prim.IsA(UsdGeom.Xformable):
+        raise FormatError(f"{actor.GetPath()} has no mandible that could move.", path=str(path))
+    return prim
+
+
+def _whole_frames(stage: Usd.Stage, path: object) -> NDArray[np.int64]:
+    if not stage.HasAuthoredTimeCodeRange():
+        raise FormatError(
+            "has no start and end time code: nothing says which frames to read.",
+            path=str(path),
+            hint="Name an animation layer, or set both in the shot.",
+        )
+    first, last = int(np.ceil(stage.GetStartTimeCode())), int(np.floor(stage.GetEndTimeCode()))
+    if not 0 < last - first + 1 <= _MOST_FRAMES:
+        raise FormatError(
+            f"its time codes run from {stage.GetStartTimeCode():g} to {stage.GetEndTimeCode():g}: no whole frame, or "
+            f"more than {_MOST_FRAMES}.",
+            path=str(path),
+        )
+    return np.arange(first, last + 1)
