@@ -31,6 +31,7 @@ _FOLDS, _BLOCK = 5, 50  # left-out blocks of about one exercise each [frames]
 # less margin, a section without extent (a direction the data do not show) would contain nothing.
 _MARGIN_MM = 0.38
 _CONTACT_TOLERANCE_MM = 0.05  # how far below the captured openings the teeth may be said to close
+_FRAMES_PER_SLIP = 400  # one frame in so many may close farther than the teeth allow, by noise
 _SHORTEST_RANGE_MM = 1.0
 _TOLERANCE_QUANTILE, _LARGEST_TOLERANCE_MM = 0.95, 1.0
 
@@ -69,7 +70,8 @@ def _hull(d: Array) -> dict[str, Array]:
     directions = np.stack([np.cos(angle), np.sin(angle) * _PROTRUSION_STRETCH], axis=-1)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     # The margin widens closing too, which the teeth do not allow: take it back there.
-    low, high = float(d[:, 0].min()) + _MARGIN_MM - _CONTACT_TOLERANCE_MM, float(d[:, 0].max())
+    closed = float(np.sort(d[:, 0])[len(d) // _FRAMES_PER_SLIP])
+    low, high = closed + _MARGIN_MM - _CONTACT_TOLERANCE_MM, float(d[:, 0].max())
     knots = np.linspace(low, max(high, low + _SHORTEST_RANGE_MM), KNOTS)
     reach = d[:, 1:] @ directions.T
     support = _smoothed(np.stack([_section(np.abs(d[:, 0] - knot) / _WINDOW_MM, reach) for knot in knots]))
