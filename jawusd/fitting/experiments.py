@@ -93,14 +93,13 @@ def run_experiments(
     paper = fitted.forms.get("paper")
     nets = _networks(data, config, paper, lambda done: tell(len(MODELS) + done, steps))
     captured = np.stack([transform_points(data.motion, centre) for centre in data.landmarks[3:]])
-    d = fitted.d[DEFAULT]
+    d, kept = fitted.d[DEFAULT], fitted.d[DEFAULT][fitted.forms[DEFAULT].kept]
     swept = {name: fitted.forms[name].model for name in ("paper", DEFAULT) if name in fitted.forms}
-    widest = float(np.quantile(d[:, 0], _OPENING_QUANTILE))
+    widest = float(np.quantile(kept[:, 0], _OPENING_QUANTILE))
     paths = condyle_paths(data, swept, widest, bones.get("mandible"), anatomy)
     bounds = {name: Bounds.of(d[fitted.forms[name].kept], config.alpha) for name, d in fitted.d.items()}
     distances = path_distances(paths, captured, d)
     distances += _reconstruction(data, fitted, nets) + _synthesis(data, fitted, bounds, config)
-    kept = d[fitted.forms[DEFAULT].kept]
     lacking = (*sentences, *missing_movements(kept, shown))
     return Experiments(
         actor=actor,
@@ -131,6 +130,8 @@ def _fit_all(data: TrainingData, shown: Mask, config: FittingConfig, tell: Calla
         usable = np.isfinite(d).all(1)
         if not usable[form.kept].all():
             notes.append(f"{name}: the parameters of {int((~usable[form.kept]).sum())} poses cannot be found.")
+            if name == DEFAULT:
+                raise FittingError(notes[-1], hint="Check the poses' units.")
             continue
         forms[name], codes[name], nearest[name] = form, d, motion
         notes.append(f"{name}: fitted in {seconds:.1f} s; {int((~form.kept).sum())} frames left out as outliers.")
@@ -169,10 +170,12 @@ def _reconstruction(data: TrainingData, fitted: _Fitted, nets: list[Nlpca]) -> l
         if isinstance(form, PaperFit):
             rebuilt[f"{name}, as published"] = form.reconstruct_as_published(data.motion)
     rebuilt |= fitted.nearest
-    return [
-        Distances(RECONSTRUCTION, name, _LARGEST, data.metric.largest(motion, data.motion))
-        for name, motion in rebuilt.items()
-    ]
+    found = []
+    for name, motion in rebuilt.items():
+        known = np.isfinite(motion).all((1, 2))  # a gross outlier may have no nearest pose on a model
+        errors = data.metric.largest(motion[known], data.motion[known])
+        found.append(Distances(RECONSTRUCTION, name, _LARGEST, errors))
+    return found
 
 
 def _synthesis(

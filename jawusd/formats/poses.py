@@ -1,4 +1,4 @@
-"""Poses and parameters as tables: CSV with a header, or JSON with the same columns.
+"""Poses and parameters as tables: CSV (comma, semicolon or tab) with a header, or JSON with the same columns.
 
 Poses:      frame, m00, m01, ... m33   (row-major T_skull_mandible [mm])
         or  frame, tx, ty, tz, qw, qx, qy, qz   (scalar-first quaternion)
@@ -45,7 +45,7 @@ def _read_table(path: Path) -> dict[str, list[str]]:
     if path.suffix.lower() == ".json":
         return _json_columns(text, path)
     try:
-        rows = list(csv.reader(io.StringIO(text), strict=True))
+        rows = list(csv.reader(io.StringIO(text), strict=True, delimiter=_delimiter(text)))
     except csv.Error as error:
         raise FormatError(f"is not a CSV table ({error}).", path=path) from error
     rows = [row for row in rows if row and not row[0].lstrip().startswith("#")]
@@ -58,6 +58,12 @@ def _read_table(path: Path) -> dict[str, list[str]]:
         if len(row) != len(header):
             raise FormatError(f"line {number} has {len(row)} values, the header names {len(header)}.", path=path)
     return {name: [row[i] for row in rows[1:]] for i, name in enumerate(header)}
+
+
+def _delimiter(text: str) -> str:
+    """Return what separates the column names: comma, semicolon or tab, whichever is most frequent among them."""
+    header = next((line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")), "")
+    return max(",;\t", key=header.count)
 
 
 def _json_columns(text: str, path: Path) -> dict[str, list[str]]:
@@ -116,7 +122,8 @@ def read_poses(
 
     Args:
         path: table with matrix or quaternion columns, see the module; the last matrix row may be left out.
-        columns: how the file calls columns that are not named as in the module, e.g. {"tx": "X"}.
+        columns: how the file calls columns that are not named as in the module, e.g. {"tx": "X"}; without a frame
+            column its rows are then numbered from 0.
 
     Returns:
         Frame numbers (F,) and T_skull_mandible (F, 4, 4).
@@ -129,10 +136,11 @@ def read_poses(
     called = {name: name for name in ("frame", *MATRIX_COLUMNS, *QUATERNION_COLUMNS)} | dict(columns or {})
     for name, theirs in (columns or {}).items():
         if theirs not in table:
-            raise FormatError(
-                f'has no column "{theirs}" to be read as "{name}"; it has {", ".join(table)}.', path=path
-            )
-    frames = _frames(table, called["frame"], path)
+            raise FormatError(f'has no column "{theirs}" to be read as "{name}"; it has {", ".join(table)}.', path=path)
+    if columns and called["frame"] not in table:
+        frames = np.arange(len(next(iter(table.values()))))
+    else:
+        frames = _frames(table, called["frame"], path)
     matrix, quaternion = (tuple(called[name] for name in names) for names in (MATRIX_COLUMNS, QUATERNION_COLUMNS))
     if all(name in table for name in matrix[:12]):
         T = np.tile(np.eye(4), (len(frames), 1, 1))

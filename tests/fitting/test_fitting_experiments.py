@@ -193,6 +193,20 @@ def test_opening_alone_leaves_the_papers_model_out_and_says_so(quick, person, an
     assert any("laterotrusion" in sentence for sentence in found.coverage.sentences)
 
 
+def test_gross_outliers_are_counted_but_do_not_spoil_the_rest(quick, poses, anatomy):
+    rng = np.random.default_rng(5)
+    struck = rng.choice(FRAMES, 6, replace=False)
+    wrong = poses.copy()
+    centre = make_transform(np.eye(3), anatomy.landmarks[0])
+    twisted = centre @ se3_exp(rng.choice([-1, 1], (6, 6)) * [0, 0.15, 0.15, 0, 0, 0]) @ np.linalg.inv(centre)
+    wrong[struck] = wrong[struck] @ twisted
+    found = run_experiments((np.arange(FRAMES), wrong), anatomy, config=FittingConfig(starts=1))
+    errors = next(one for one in found.of("reconstruction") if one.model == "anchored").values_mm
+    assert len(errors) == FRAMES and (errors > 5).sum() == 6 and np.median(errors) < 0.6
+    assert all(np.isfinite(one.values_mm).all() for one in found.distances)
+    assert max(path.opening_mm.max() for path in found.condyle_paths if path.model == "anchored") < 60
+
+
 def test_frames_a_prior_helped_with_are_never_used(quick, poses, anatomy):
     nan = np.full((FRAMES, 4, 4), np.nan)
     aided = np.zeros(FRAMES, dtype=bool)

@@ -42,6 +42,21 @@ def test_a_map_need_only_name_what_differs(tmp_path, motion):
     np.testing.assert_allclose(T[:, :3, 3], t, atol=1e-9)
 
 
+@pytest.mark.parametrize("separator", [";", "\t"])
+def test_other_separators_are_recognised(tmp_path, motion, separator):
+    path = quaternion_table(tmp_path / "p.csv", *motion)
+    path.write_text("# exported, by hand\n" + path.read_text().replace(",", separator))
+    np.testing.assert_allclose(read_poses(path, MAP)[1][:, :3, 3], motion[1], atol=1e-9)
+
+
+def test_rows_of_a_foreign_table_without_frames_are_numbered(tmp_path, motion):
+    path = quaternion_table(tmp_path / "p.csv", *motion, "seconds,X,Y,Z,I,J,K,W")
+    frames, _ = read_poses(path, {name: theirs for name, theirs in MAP.items() if name != "frame"})
+    np.testing.assert_array_equal(frames, range(6))
+    with pytest.raises(FormatError, match='no column "frame"'):
+        read_poses(path)
+
+
 def test_the_last_matrix_row_may_be_left_out(tmp_path, motion):
     rotation, t = motion
     rows = np.concatenate([rotation.as_matrix(), t[:, :, None]], axis=2).reshape(6, 12)
