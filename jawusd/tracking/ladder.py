@@ -64,7 +64,7 @@ class FrameTracker:
         gates = self._config.gates_from(reach_px)
         use = np.array([[v.present[r] for v in views] for r in _ROWS])
         trial = self._try(starts[0], views, gates, use)
-        kept = use & ~self._spoiled(trial)
+        kept = use & ~self._spoiled(trial, 2)
         if (kept != use).any():
             trial = self._try(starts[0], views, gates, kept)
         first = trial
@@ -77,7 +77,7 @@ class FrameTracker:
             bad = rows(trial)
             if bad.any() and (attempt != self._search or gallery is not None):
                 trial = attempt(trial, bad, starts, views, gallery)
-        kept = trial.use & ~self._spoiled(trial)
+        kept = trial.use & ~self._spoiled(trial, 1)
         if (kept != trial.use).any():  # a mask that had drawn the first attempt away from all others
             trial = self._try(trial.solution.poses, views, gates, kept)
         return self._record(first, trial)
@@ -120,14 +120,14 @@ class FrameTracker:
         """Tell which masks stay uncovered more than they lately did, shape (2, C)."""
         return trial.use & (trial.coverage - self.history.usual_coverage() > self._config.suspect_coverage)
 
-    def _spoiled(self, trial: _Trial) -> NDArray[np.bool_]:
-        """Tell which masks the scan neither covers nor fits while it does those of another camera, shape (2, C)."""
+    def _spoiled(self, trial: _Trial, fewest: int) -> NDArray[np.bool_]:
+        """Tell which masks the scan neither covers nor fits while it does at least so many others, shape (2, C)."""
         fit = score_px(trial.solution)
         dead = trial.use & (fit < self._config.dead_score * self.history.usual_score())
         wrong = self._bare(trial) | dead
         for r in _ROWS:
-            if (wrong[r] == trial.use[r]).all():
-                wrong[r] = False  # it is the pose that is wrong, not every mask
+            if (trial.use[r] & ~wrong[r]).sum() < fewest:
+                wrong[r] = False  # it is the pose that is wrong, not so many masks
         return wrong
 
     def _lost(self, trial: _Trial) -> NDArray[np.bool_]:

@@ -89,3 +89,15 @@ def test_a_mask_that_draws_the_pose_away_is_left_out_in_the_end(tracker):
     record = tracker.track([away], views, [])
     assert record.used[0].tolist() == [True, True, False] and record.status[0] == PARTIAL
     assert max(_errors(record)) < 0.15
+
+
+def test_one_mask_does_not_outvote_two(tracker):
+    """Start where the spoiled mask says: it fits there to the pixel, and the two good ones do not."""
+    views = _views(1)
+    away = POSES[1].copy()
+    away[0] = make_transform(np.eye(3), [3.0, 2.5, 1.0]) @ away[0]
+    spoiled = render_masks(MESHES, away, make_cameras()[2], (7.5, -16.0))[0]
+    views[2] = View(views[2].matrix, views[2].eye, np.stack([spoiled, views[2].masks[1]]), np.ones(2, bool))
+    record = tracker.track([away], views, [])
+    assert record.used[0].tolist() == [True, True, False] and record.status[0] == PARTIAL
+    assert max(_errors(record)) < 0.15
