@@ -11,12 +11,22 @@ from numpy.typing import NDArray
 
 from jawusd.errors import TrackingError
 from jawusd.formats.capture import Pick
-from jawusd.geometry import Camera, make_transform, orthonormalise, rigid_fit, se3_exp, transform_points, triangulate
+from jawusd.geometry import (
+    Camera,
+    make_transform,
+    mandible_metric,
+    orthonormalise,
+    rigid_fit,
+    se3_exp,
+    transform_points,
+    triangulate,
+)
 
 _FEWEST = 3
 # A pick whose vertex projects farther than this from its pixel counts as wrong [mm at the teeth]: three times the
 # error of a careless click (5 px where a pixel is 0.07 mm).
 _TOLERANCE_MM = 1.1
+_CLICK_MM = _TOLERANCE_MM / 3  # standard deviation of a careless click along each axis
 _MOST_TRIPLES = 500  # consensus over more start triples adds nothing but time
 
 
@@ -81,6 +91,35 @@ def pose_from_picks(
             )
         best = _refined(good, best)
     return best, [s.number for s in sightings if s not in good]
+
+
+def picked_sigma_mm(
+    picks: Sequence[Pick],
+    vertices: NDArray[np.float64],
+    cameras: Mapping[str, Camera],
+    pose: NDArray[np.float64],
+    probes: NDArray[np.float64],
+) -> float:
+    """Return how far careless clicks let a row stray, the rms standard deviation over its crowns [mm].
+
+    Args:
+        picks: the picks behind the pose, without those left out.
+        vertices: vertices of the scan file [mm], shape (V, 3).
+        cameras: calibrated cameras by name.
+        pose: T_world_row, shape (4, 4).
+        probes: points spread over the crowns, scan coordinates [mm], shape (N, 3).
+    """
+    H = np.zeros((6, 6))
+    for k, pick in enumerate(picks, start=1):
+        s = _sighting(k, pick, vertices, cameras, "picked")
+        _, _, slope = _residuals_px(s, pose)
+        px_per_mm = np.linalg.norm(slope, axis=(1, 2)) / np.sqrt(2)
+        slope = (slope / (px_per_mm * _CLICK_MM)[:, None, None]).reshape(-1, 3)
+        p = transform_points(pose, s.point)
+        J = np.hstack([np.cross(p, slope), slope])
+        H += J.T @ J
+    M = mandible_metric(transform_points(pose, probes))
+    return float(np.sqrt(np.trace(M @ np.linalg.pinv(H, hermitian=True))))
 
 
 def _sighting(number: int, pick: Pick, vertices: NDArray, cameras: Mapping[str, Camera], row: str) -> _Sighting:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.errors import TrackingError
 from jawusd.formats.capture import CameraSource
 from jawusd.geometry import Camera
 from jawusd.tracking.mask_geometry import MaskSurvey, survey_masks
@@ -52,3 +53,11 @@ class Footage:
     def views(self, centre: NDArray[np.float64], px_per_mm: float) -> MaskViews:
         """Open the masks at a resolution at the teeth, which are near a world point [mm], shape (3,)."""
         return MaskViews(self.sources, self.cameras, self.offsets, centre, px_per_mm)
+
+    def has_masks(self, frame: int) -> bool:
+        """Tell whether both rows have masks in two cameras on a frame."""
+        try:
+            self.survey((frame, frame + 1), 1)
+        except TrackingError:
+            return False
+        return True

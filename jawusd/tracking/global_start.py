@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +13,7 @@ from jawusd.formats.mesh import Mesh
 from jawusd.geometry import make_transform, so3_log, transform_points
 from jawusd.tracking.first import first_record
 from jawusd.tracking.footage import Footage, Start
-from jawusd.tracking.mixups import check_mixups, possible_mixups
+from jawusd.tracking.mixups import all_rows_exchanged, check_mixups, possible_mixups
 from jawusd.tracking.pose_search import Candidate, Grid, coarse_scan, hinge_at_front, search_row
 from jawusd.tracking.quality import score_px, uncovered_px
 from jawusd.tracking.solver import ContourSolver, Solution, View
@@ -34,6 +33,13 @@ _GRID = Grid(
     pitch_rad=np.radians(np.arange(-40, 41, 10.0)),
     roll_rad=np.radians(np.arange(-50, 51, 10.0)),
     reach_mm=(13.0, 9.0, 15.0),
+)
+# Turns and translations about poses from picks: four careless clicks close together leave as much.
+_NEAR_GRID = Grid(
+    yaw_rad=np.radians(np.arange(-20, 21, 10.0)),
+    pitch_rad=np.radians(np.arange(-20, 21, 10.0)),
+    roll_rad=np.radians(np.arange(-20, 21, 10.0)),
+    reach_mm=(6.0, 6.0, 6.0),
 )
 _WIDEST_JAW_RAD = 0.8  # turn between the rows beyond which a jaw does not open
 _FARTHEST_JAW_MM = 75.0  # distance of the rows' front teeth beyond which it does not either
@@ -73,18 +79,42 @@ class StartSearch:
         with footage.views(places.mean(0), _PX_PER_MM) as masks:
             views = masks.at(frame)
         axes = _guessed_axes(places, survey.eyes)
+        bases = [make_transform(axes, place) for place in places]
+        finalists = [self._searched(r, views, bases[r], _GRID) for r in _ROWS]
+        return self._settled(finalists, views, footage, frame)
+
+    def near(self, footage: Footage, frame: int, poses: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+        """Return the best poses on a frame near given ones, T_world_upper and T_world_lower (2, 4, 4), and their worth.
+
+        Raises:
+            TrackingError: no pair of poses that a jaw can take.
+        """
+        with footage.views(transform_points(poses[0], self._coarse[0].centre), _PX_PER_MM) as masks:
+            views = masks.at(frame)
         finalists = []
         for r in _ROWS:
-            base = make_transform(axes, places[r])
-            found = search_row(self._coarse[r], r, views, _PX_PER_MM, base, self._hinges[r], _GRID, self._map)
-            finalists.append(self._distinct(found, r))
+            base = poses[r] @ np.linalg.inv(self._hinges[r])
+            finalists.append([poses[r], *self._searched(r, views, base, _NEAR_GRID)])
+        return self._settled(finalists, views, footage, frame)
+
+    def _searched(
+        self, r: int, views: Sequence[View], base: NDArray[np.float64], grid: Grid
+    ) -> list[NDArray[np.float64]]:
+        """Return the best poses of a row that differ from one another."""
+        found = search_row(self._coarse[r], r, views, _PX_PER_MM, base, self._hinges[r], grid, self._map)
+        return self._distinct(found, r)
+
+    def _settled(
+        self, finalists: Sequence[Sequence[NDArray[np.float64]]], views: Sequence[View], footage: Footage, frame: int
+    ) -> tuple[NDArray[np.float64], float]:
+        """Return the best pair of finalists, refined at the working size, and its worth [px]."""
         pairs = self._refined_pairs(finalists, views)
         if not pairs:
             raise TrackingError(f"frame {frame}: the best poses of the two rows of teeth are none a jaw can take")
-        with footage.views(places.mean(0), self._config.working_px_per_mm) as masks:
+        centre = np.mean([transform_points(pairs[0][r], self._coarse[r].centre) for r in _ROWS], axis=0)
+        with footage.views(centre, self._config.working_px_per_mm) as masks:
             views = masks.at(frame)
-        solve = partial(self.solver.solve, views=views, gates_px=self._config.wide_gates_px)
-        ends = [solve(poses) for poses in pairs]
+        ends = [self.solver.solve(poses, views, self._config.wide_gates_px) for poses in pairs]
         worth = [self._worth(self.solver, s, views).sum() for s in ends]
         best = int(np.argmax(worth))
         return ends[best].poses, float(worth[best])
@@ -155,6 +185,7 @@ def search_start(search: StartSearch, footage: Footage) -> Start:
         except TrackingError as error:
             failed[frame] = error.message.removeprefix(f"frame {frame}: ")
             continue
+        _check_upright(search, footage, frame, worth)
         notes = {"by": "search", "frame": frame, "worth_px": worth, "failed": {str(f): m for f, m in failed.items()}}
         return Start(frame, poses, notes)
     _name_mixup(search, footage, frames[0])
@@ -172,6 +203,21 @@ def _aligned(search: StartSearch, footage: Footage, poses: NDArray[np.float64], 
     centre = np.mean([transform_points(poses[r], solver.scans[r].centre) for r in _ROWS], axis=0)
     with footage.views(centre, solver.config.working_px_per_mm) as masks:
         return first_record(solver, solver.config, poses, masks, frame).solution.poses
+
+
+def _check_upright(search: StartSearch, footage: Footage, frame: int, worth: float) -> None:
+    """Refuse masks that fit better with the rows exchanged everywhere: turned over, an upper row resembles a lower."""
+    mixup = all_rows_exchanged(footage.sources)
+    try:
+        _, other = search.at(replace(footage, sources=mixup.sources), frame)
+    except TrackingError:
+        return
+    if other > worth:
+        raise TrackingError(
+            f"frame {frame}: {mixup.finding}: {other:.0f} px of contour fit after exchanging them, {worth:.0f} px as "
+            "they are named",
+            hint=mixup.hint,
+        )
 
 
 def _name_mixup(search: StartSearch, footage: Footage, frame: int) -> None:

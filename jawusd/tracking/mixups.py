@@ -39,25 +39,27 @@ class Mixup:
     sources: tuple[CameraSource, ...]
 
 
+def all_rows_exchanged(sources: Sequence[CameraSource]) -> Mixup:
+    """Return the exchange of rows in all cameras, which exchanged scan files look like as well."""
+    return Mixup(
+        "the masks of the upper and lower teeth are exchanged in every camera",
+        "Exchange masks.upper and masks.lower, or upper_teeth and lower_teeth in [scans].",
+        _with_masks(sources, {k: _turned(s.masks) for k, s in enumerate(sources)}),
+    )
+
+
 def possible_mixups(sources: Sequence[CameraSource]) -> list[Mixup]:
     """Return every exchange of rows in one camera or in all, and of masks between two cameras of one picture size."""
     out = []
-    for which in ([k] for k in range(len(sources))):
-        name = sources[which[0]].name
+    for k, source in enumerate(sources):
         out.append(
             Mixup(
-                f"the masks of the upper and lower teeth are exchanged in camera {name}",
-                f"Exchange masks.upper and masks.lower of camera {name}.",
-                _with_masks(sources, {k: _turned(sources[k].masks) for k in which}),
+                f"the masks of the upper and lower teeth are exchanged in camera {source.name}",
+                f"Exchange masks.upper and masks.lower of camera {source.name}.",
+                _with_masks(sources, {k: _turned(source.masks)}),
             )
         )
-    out.append(
-        Mixup(
-            "the masks of the upper and lower teeth are exchanged in every camera",
-            "Exchange masks.upper and masks.lower, or upper_teeth and lower_teeth in [scans].",
-            _with_masks(sources, {k: _turned(s.masks) for k, s in enumerate(sources)}),
-        )
-    )
+    out.append(all_rows_exchanged(sources))
     for a, b in combinations(range(len(sources)), 2):
         first, second = sources[a].name, sources[b].name
         out.append(

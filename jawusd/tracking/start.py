@@ -7,16 +7,19 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 import numpy as np
 
 from jawusd.errors import TrackingError
-from jawusd.formats.capture import Bootstrap, Capture
+from jawusd.formats.capture import Capture
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera
-from jawusd.tracking.bootstrap import pose_from_picks
+from jawusd.tracking.bootstrap import picked_sigma_mm, pose_from_picks
 from jawusd.tracking.footage import Footage, Start
 from jawusd.tracking.global_start import StartSearch, search_start
 from jawusd.tracking.mixups import check_mixups
 from jawusd.tracking.scan_checks import check_occlusion
 from jawusd.tracking.solver import ContourSolver
 from jawusd.tracking.views import masked_sources
+
+# Poses as sure as this [mm] lie within the basin of the contour solver.
+_SURE_MM = 0.8
 
 
 def find_start(
@@ -44,23 +47,31 @@ def find_start(
     """
     footage = Footage(masked_sources(capture.cameras, cameras, offsets), cameras, offsets, capture.frames)
     T_anatomical_scan, findings = check_occlusion(solver.scans, capture.anatomy.T_anatomical_skull)
+    search = StartSearch(meshes, solver, T_anatomical_scan, map_)
     if capture.bootstrap is not None:
-        first, stop = capture.frames or (0, capture.bootstrap.frame + 1)
-        if not first <= capture.bootstrap.frame < stop:
-            raise TrackingError(f"bootstrap.frame is {capture.bootstrap.frame}, frames run from {first} to {stop - 1}")
-        start = _picked(capture.bootstrap, cameras, meshes)
-        check_mixups(footage, solver, start.poses, start.frame)
+        start = _picked(capture, footage, meshes, search)
     else:
-        start = search_start(StartSearch(meshes, solver, T_anatomical_scan, map_), footage)
+        start = search_start(search, footage)
     return Start(start.frame, start.poses, {**start.notes, "scan_findings": findings})
 
 
-def _picked(bootstrap: Bootstrap, cameras: Mapping[str, Camera], meshes: Sequence[Mesh]) -> Start:
-    """Return the poses that agree with the picks."""
-    poses, left_out = [], {}
-    for row, mesh, picks in zip(("upper", "lower"), meshes, (bootstrap.upper, bootstrap.lower), strict=True):
-        pose, wrong = pose_from_picks(picks, np.asarray(mesh.vertices, np.float64), cameras, row)
+def _picked(capture: Capture, footage: Footage, meshes: Sequence[Mesh], search: StartSearch) -> Start:
+    """Return the poses that agree with the picks; where picks leave much open, the best ones for the masks nearby."""
+    bootstrap = capture.bootstrap
+    first, stop = capture.frames or (0, bootstrap.frame + 1)
+    if not first <= bootstrap.frame < stop:
+        raise TrackingError(f"bootstrap.frame is {bootstrap.frame}, frames run from {first} to {stop - 1}")
+    poses, left_out, sigma_mm = [], {}, {}
+    for scan, mesh, picks in zip(search.solver.scans, meshes, (bootstrap.upper, bootstrap.lower), strict=True):
+        pose, wrong = pose_from_picks(picks, mesh.vertices, footage.cameras, scan.name)
         poses.append(pose)
-        left_out[row] = wrong
-    notes = {"by": "picks", "frame": bootstrap.frame, "picks_left_out": left_out}
-    return Start(bootstrap.frame, np.stack(poses), notes)
+        left_out[scan.name] = wrong
+        good = [pick for k, pick in enumerate(picks, start=1) if k not in wrong]
+        sigma_mm[scan.name] = picked_sigma_mm(good, mesh.vertices, footage.cameras, pose, scan.probes)
+    notes = {"by": "picks", "frame": bootstrap.frame, "picks_left_out": left_out, "picks_sigma_mm": sigma_mm}
+    start = Start(bootstrap.frame, np.stack(poses), notes)
+    check_mixups(footage, search.solver, start.poses, start.frame)
+    if max(sigma_mm.values()) <= _SURE_MM or not footage.has_masks(start.frame):
+        return start
+    poses, worth = search.near(footage, start.frame, start.poses)
+    return Start(start.frame, poses, {**notes, "by": "picks, then search nearby", "worth_px": worth})

@@ -30,10 +30,10 @@ from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.first import first_record
 from jawusd.tracking.footage import Footage
 from jawusd.tracking.global_start import StartSearch
-from jawusd.tracking.mixups import check_mixups
 from jawusd.tracking.scan import prepare_scan
 from jawusd.tracking.scan_checks import check_occlusion
 from jawusd.tracking.solver import ContourSolver, View
+from jawusd.tracking.start import find_start
 from jawusd.tracking.views import masked_sources
 
 ROWS = ("upper", "lower")
@@ -45,7 +45,7 @@ class Bench:
 
     def __init__(self, folder: Path) -> None:
         """Load everything."""
-        capture = load_capture(folder, allow_outside=True)
+        self.capture = capture = load_capture(folder, allow_outside=True)
         with np.load(capture.folder / "truth" / "truth.npz", allow_pickle=False) as archive:
             self.frames = archive["frames"]
             self.truth = np.stack([archive[f"T_world_{row}"] for row in ROWS], axis=1)
@@ -127,20 +127,25 @@ def score_clicks(bench: Bench, count: int, noise_px: float) -> None:
         if bootstrap is None:
             continue
         done += 1
+        capture = bench.capture.model_copy(update={"bootstrap": bootstrap})
         try:
             poses = [
                 pose_from_picks(getattr(bootstrap, row), mesh.vertices, bench.cameras, row)[0]
                 for row, mesh in zip(ROWS, bench.meshes, strict=True)
             ]
             first = bench.errors_mm(np.stack(poses), frame)
-            check_mixups(bench.footage, bench.solver, np.stack(poses), frame)
-            end = bench.errors_mm(bench.aligned(np.stack(poses), frame), frame)
+            start = find_start(capture, bench.cameras, bench.footage.offsets, bench.meshes, bench.solver)
+            end = bench.errors_mm(bench.aligned(start.poses, frame), frame)
         except TrackingError as error:
             print(f"{frame:5}  {error}", flush=True)
             continue
         good += int(end.max() <= CLICK_LIMIT_MM)
-        print(f"{frame:5} {first[0]:8.2f}{first[1]:7.2f} {end[0]:8.3f}{end[1]:7.3f}", flush=True)
-    print(f"{good} of {done} within {CLICK_LIMIT_MM} mm for both rows")
+        line = f"{frame:5} {first[0]:8.2f}{first[1]:7.2f} {end[0]:8.3f}{end[1]:7.3f}  {start.notes['by']}"
+        if end.max() > CLICK_LIMIT_MM:
+            same = bench.errors_mm(bench.aligned(bench.truth[np.flatnonzero(bench.frames == frame)[0]], frame), frame)
+            line += f", {same[0]:.3f} {same[1]:.3f} when started from the truth"
+        print(line, flush=True)
+    print(f"{good} of {done} within {CLICK_LIMIT_MM} mm of the truth for both rows")
 
 
 def score_search(bench: Bench, count: int, threads: int) -> None:
