@@ -19,7 +19,8 @@ def test_sliders_ranges_and_keys_survive_saving(tmp_path, blender, kind):
     frames, d = example_motion()
     bake_rig(tmp_path / "actor", rig, example_meshes(), name="x", fps=FPS, frames=frames, d=d)
     archive = build_extension(tmp_path / "jawusd_blender.zip")
-    poses = sample_valid(rig, 50, seed=5)
+    # near the closed bite as well: its quaternions are nearly whole numbers
+    poses = np.concatenate([sample_valid(rig, 50, seed=5), 0.1 * sample_valid(rig, 20, seed=6)])
     (tmp_path / "poses.json").write_text(json.dumps(poses.tolist()))
     (tmp_path / "work").mkdir()
     for arguments in (["import", tmp_path / "actor" / "anim_capture.usdc"], ["reopen"]):
@@ -27,7 +28,7 @@ def test_sliders_ranges_and_keys_survive_saving(tmp_path, blender, kind):
             blender, "blender_addon.py", archive, tmp_path / "work", *arguments, tmp_path / "poses.json"
         )
         distance = np.linalg.norm(np.array(found["poses"]) - moved(rig.pose(poses), vertices), axis=-1)
-        assert distance.max() < 0.01
+        assert distance.max() < 0.001
         expected = np.array([rig.ranges(*row) for row in poses])
         np.testing.assert_allclose(np.array(found["ranges"]).reshape(-1, 4), expected, atol=1e-6)
         for frame, shown in found["frames"].items():

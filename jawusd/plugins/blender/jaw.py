@@ -13,6 +13,9 @@ LABELS = ("Opening [mm]", "Laterotrusion [mm], + left", "Protrusion [mm], + forw
 _STORE, _ACTOR, _FPS = "jawusd_rig", "jawusd_actor", "jawusd_fps"
 _FUNCTION = "jawusd_channel"
 _CHANNELS = (("location", 3), ("rotation_quaternion", 4))
+# Blender 5.0 snaps driven values within 1e-4 of a whole number to it, in a unit quaternion up to 0.02 mm at the chin.
+# It normalises quaternions before use, so longer ones lose nothing.
+_QUATERNION_LENGTH = 1024.0
 
 _rigs = {}
 _poses = {}
@@ -146,7 +149,7 @@ def _channel(mandible: bpy.types.Object, d1: float, d2: float, d3: float, channe
     if key not in _poses:
         _poses.clear()  # the seven channels of one pose follow one another
         translation, wxyz = jawusd_reader.decompose(rig_of(actor).pose(d1, d2, d3))
-        _poses[key] = (*translation, *wxyz)
+        _poses[key] = (*translation, *(_QUATERNION_LENGTH * x for x in wxyz))
     return _poses[key][channel]
 
 
