@@ -169,6 +169,8 @@ def main() -> None:
             missed += [f"unflagged over {WORST_MM} mm"] * (worst > WORST_MM)
             print(text, "; ".join(missed) or "ok", flush=True)
             print(f"{nuisances(tracks)}; {time.process_time() - start:.0f} s of processor", flush=True)
+    if "extrinsics" in options.kinds:
+        print("extrinsics: vertex errors after the best rigid motion of the world over the take")
 
 
 if __name__ == "__main__":
