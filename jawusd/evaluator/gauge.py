@@ -27,10 +27,11 @@ LIMIT_SOFTNESS_MM = 4.0  # rounding of the kinks where the gothic arch stops cha
 ARCH_BOW_MM = 10.0  # the quadratic arch features are d2^2 / 10 mm, to keep all coefficients of one order
 DROP_BEND = 0.15  # slope gained by the bent drop features per mm, saturating at 4 mm (below)
 DROP_SATURATION_MM2 = 16.0
-_INVERSE_TOLERANCE_MM = 1e-13
-_INVERSE_ITERATIONS = 120
-_PATIENCE = 8  # steps after which Newton is taken to crawl: steps double until there is a bracket, then it is halved
-_INVERSE_STEP_MM = 20.0
+INVERSE_TOLERANCE_MM = 1e-13
+INVERSE_ITERATIONS = 120
+PATIENCE = 8  # steps after which Newton is taken to crawl: steps double until there is a bracket, then it is halved
+INVERSE_STEP_MM = 20.0
+LEAST_INVERSE_SLOPE = 0.2
 
 
 @dataclass(frozen=True)
@@ -148,11 +149,11 @@ class Gauge:
         low, high = np.full(len(u), -np.inf), np.full(len(u), np.inf)
         d = np.full(u.shape, np.nan)
         active = np.flatnonzero(np.isfinite(u).all(axis=1))
-        for iteration in range(_INVERSE_ITERATIONS):
+        for iteration in range(INVERSE_ITERATIONS):
             x = d1[active]
             d2, d3, excess, slope = self._opening_equation(u[active], x)
             step = _newton_step(excess, slope)
-            done = np.abs(step) <= _INVERSE_TOLERANCE_MM * (1.0 + np.abs(x))
+            done = np.abs(step) <= INVERSE_TOLERANCE_MM * (1.0 + np.abs(x))
             d[active[done]] = np.stack([x, d2, d3], axis=-1)[done]
             low[active] = np.where(excess < 0, x, low[active])
             high[active] = np.where(excess > 0, x, high[active])
@@ -206,14 +207,14 @@ def _bent(x: Array) -> tuple[Array, Array]:
 
 def _newton_step(excess: Array, slope: Array) -> Array:
     # the excess rises with d1 wherever the gauge is a gauge; a slope near or below zero can only mislead
-    return np.clip(-excess / np.where(slope > 0.2, slope, 1.0), -_INVERSE_STEP_MM, _INVERSE_STEP_MM)
+    return np.clip(-excess / np.where(slope > LEAST_INVERSE_SLOPE, slope, 1.0), -INVERSE_STEP_MM, INVERSE_STEP_MM)
 
 
 def _next_opening(x: Array, step: Array, low: Array, high: Array, iteration: int) -> Array:
     """Return the next d1 to try: a Newton step, or the middle of the bracket where that leads out of it or crawls."""
     bounded = np.isfinite(low) & np.isfinite(high)
-    late = max(iteration - _PATIENCE, 0)
-    stride = np.clip(step * 2.0 ** min(late, 64), -_INVERSE_STEP_MM, _INVERSE_STEP_MM)
+    late = max(iteration - PATIENCE, 0)
+    stride = np.clip(step * 2.0 ** min(late, 64), -INVERSE_STEP_MM, INVERSE_STEP_MM)
     newton = x + np.where(bounded, step, stride)
     halve = bounded & ((newton <= low) | (newton >= high) | (late % 2 == 1))
     middle = 0.5 * (np.where(bounded, low, 0.0) + np.where(bounded, high, 0.0))

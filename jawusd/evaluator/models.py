@@ -186,22 +186,24 @@ class AdditiveModel:
         incisor: The incisal point at rest [mm], shape (3,).
         d_range: Box of valid d [mm], shape (3, 2); starts for `read_off` are searched in it.
         single: The same model for one row, in floats.
+        starts: Those starts, d [mm], shape (s, 3).
+        start_displacements: Displacements of the incisal point there [mm], shape (s, 3).
     """
 
     curves: tuple[HermiteCurve, HermiteCurve, HermiteCurve]
     incisor: Array
     d_range: Array
     single: SingleAdditive = field(init=False, repr=False)
-    _starts: Array = field(init=False, repr=False)
-    _start_displacements: Array = field(init=False, repr=False)
+    starts: Array = field(init=False, repr=False)
+    start_displacements: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "single", SingleAdditive(self))
         # opening is long and curved, the other two short: 13 x 9 x 9 starts lie within the basin of Gauss-Newton
         axes = [np.linspace(low, high, n) for (low, high), n in zip(self.d_range, (13, 9, 9))]
         starts = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-        object.__setattr__(self, "_starts", starts)
-        object.__setattr__(self, "_start_displacements", self.displacement_of(*self.decode(starts)))
+        object.__setattr__(self, "starts", starts)
+        object.__setattr__(self, "start_displacements", self.displacement_of(*self.decode(starts)))
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Array]) -> AdditiveModel:
@@ -249,9 +251,9 @@ class AdditiveModel:
         Good enough to start Gauss-Newton from; the curves have no closed-form inverse.
         """
         u = self.displacement_of(R, t)
-        grid = self._start_displacements
+        grid = self.start_displacements
         distance = np.einsum("ij,ij->i", grid, grid) - 2.0 * u @ grid.T
-        return np.where(np.isfinite(u).all(axis=1)[:, None], self._starts[np.argmin(distance, axis=1)], np.nan)
+        return np.where(np.isfinite(u).all(axis=1)[:, None], self.starts[np.argmin(distance, axis=1)], np.nan)
 
 
 JawModelForm = AnchoredModel | AdditiveModel

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from functools import cached_property, partial
+from collections.abc import Callable
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,8 @@ from jawusd.evaluator.rows import in_chunks
 from jawusd.evaluator.solver import Residual, minimise
 
 Array = NDArray[np.float64]
+# (row numbers (k,), starts (k, 3)) -> bottoms (k, 3) and squared residuals (k,)
+Search = Callable[[NDArray[np.intp], Array], tuple[Array, Array]]
 
 _MOST_VALLEYS = 4
 _SCAN_ROWS = 64  # rows compared with all candidates at once: 64 x 6,000 distances are 3 MB
@@ -53,12 +56,8 @@ class Reach:
         out = np.flatnonzero(self._bound.excess(d) > 0)
         if not out.size:
             return valid
-        wanted, identity = d[out], np.eye(3)
-
-        def residual(x: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]:
-            return x - wanted[rows], np.broadcast_to(identity, (len(x), 3, 3))
-
-        valid[out] = self._best(residual, self._scan.points, wanted)
+        wanted = d[out]
+        valid[out] = self._best(lambda rows, first: self._approach(wanted[rows], first), self._scan.points, wanted)
         return valid
 
     def best_pull(self, vectors: Array, target: Array) -> Array:
@@ -72,23 +71,39 @@ class Reach:
             EvaluatorError: the valid volume is empty.
         """
         images = carried(self._scan.R, self._scan.t, vectors).reshape(len(self._scan.points), -1)
-        residual = distance_residual(self._model.decode_derivative, vectors, target)
-        return self._best(residual, images, target.reshape(len(target), images.shape[1]))
+        wanted = target.reshape(len(target), images.shape[1])
+        return self._best(lambda rows, first: self._pull(vectors, target[rows], first), images, wanted)
 
     def pull(self, vectors: Array, target: Array, start: Array) -> Array:
         """Return what `best_pull` does, but only the bottom of the valley that start (n, 3) [mm] lies in.
 
         Short steps keep the search in that valley, which is what makes dragging continuous.
         """
-        return minimise(distance_residual(self._model.decode_derivative, vectors, target), start, self._bound)
+        return self._pull(vectors, target, start)[0]
 
-    def _best(self, residual: Residual, features: Array, wanted: Array) -> Array:
+    def _pull(self, vectors: Array, target: Array, start: Array) -> tuple[Array, Array]:
+        """Return the bottoms (n, 3) [mm] of the valleys the starts lie in, and the squared distances left (n,)."""
+        return self._bottom(distance_residual(self._model.decode_derivative, vectors, target), start)
+
+    def _approach(self, wanted: Array, start: Array) -> tuple[Array, Array]:
+        """Return the points (n, 3) [mm] nearest to those wanted (n, 3), and their squared distances (n,)."""
+        identity = np.eye(3)
+
+        def residual(x: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]:
+            return x - wanted[rows], np.broadcast_to(identity, (len(x), 3, 3))
+
+        return self._bottom(residual, start)
+
+    def _bottom(self, residual: Residual, start: Array) -> tuple[Array, Array]:
+        found = minimise(residual, start, self._bound)
+        r, _ = residual(found, np.arange(len(found)))
+        return found, np.einsum("nm,nm->n", r, r)
+
+    def _best(self, search: Search, features: Array, wanted: Array) -> Array:
         """Return the best d (n, 3) over searches from every valley; features (p, k) are of the scanned points."""
         best, least = np.full((len(wanted), 3), np.nan), np.full(len(wanted), np.inf)
         for rows, starts in self._scan.valleys(features, wanted):
-            found = minimise(partial(_of_rows, residual, rows), starts, self._bound)
-            r, _ = residual(found, rows)
-            cost = np.einsum("nm,nm->n", r, r)
+            found, cost = search(rows, starts)
             better = cost < least[rows]
             best[rows[better]], least[rows[better]] = found[better], cost[better]
         return best
@@ -138,10 +153,6 @@ class _Scan:
                 first = self._first[each]
                 found[row, place] = first + np.argmin(distance[row, first : ends[each]])
         return found
-
-
-def _of_rows(residual: Residual, rows: NDArray[np.intp], x: Array, some: NDArray[np.intp]) -> tuple[Array, Array]:
-    return residual(x, rows[some])
 
 
 def nearest_distance(points: Array, queries: Array) -> Array:

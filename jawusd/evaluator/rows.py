@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 CHUNK_ROWS = 2048
-_LARGEST = 1e9  # 1,000 km: no jaw, and squares and cubes of it still fit a float
+LARGEST = 1e9  # 1,000 km: no jaw, and squares and cubes of it still fit a float
 
 
 def as_rows(values: ArrayLike, tail: tuple[int, ...], name: str) -> tuple[Array, tuple[int, ...]]:
@@ -27,7 +27,7 @@ def as_rows(values: ArrayLike, tail: tuple[int, ...], name: str) -> tuple[Array,
     if values.ndim < len(tail) or values.shape[len(batch) :] != tail:
         raise ValueError(f"{name} must have shape (..., {', '.join(map(str, tail))}), got {values.shape}")
     rows = values.reshape(-1, *tail) if values.size else np.empty((int(np.prod(batch)), *tail))
-    finite = (np.abs(rows) < _LARGEST).all(axis=tuple(range(1, rows.ndim)))  # False for NaN
+    finite = (np.abs(rows) < LARGEST).all(axis=tuple(range(1, rows.ndim)))  # False for NaN
     if not finite.all():
         rows = np.where(finite.reshape(-1, *(1,) * len(tail)), rows, np.nan)
     return rows, batch

@@ -17,16 +17,18 @@ Array = NDArray[np.float64]
 # (x (k, 3), row numbers (k,)) -> residuals (k, m) and their derivatives by x (k, m, 3)
 Residual = Callable[[Array, NDArray[np.intp]], tuple[Array, Array]]
 
-_START_DAMPING = 1e-6
-_LARGEST_DAMPING = 1e8
-_SMALLEST_DAMPING = 1e-9
-_INSIDE_MM = 1e-10  # depth at which a point pulled back onto the surface is left
-_LONGEST_STEP_MM = 1.0  # within a bound, where a longer one may land in another valley
-_PULL_BACKS = 12
-_PULL = 1.01  # a little more than the distance, so that one pull mostly does; what is lost vanishes with the steps
-_LEAST_STIFFNESS = 1e-12  # keeps steps finite where nothing depends on a parameter
-_LEAST_SLOPE = 1e-6  # squared; keeps pulls finite where the bound is flat
-_TOUCHING_MM = 1e-3  # depth up to which a start counts as lying on the bound
+ITERATIONS = 80
+TOLERANCE_MM = 1e-6
+START_DAMPING = 1e-6
+LARGEST_DAMPING = 1e8
+SMALLEST_DAMPING = 1e-9
+INSIDE_MM = 1e-10  # depth at which a point pulled back onto the surface is left
+LONGEST_STEP_MM = 1.0  # within a bound, where a longer one may land in another valley
+PULL_BACKS = 12
+PULL = 1.01  # a little more than the distance, so that one pull mostly does; what is lost vanishes with the steps
+LEAST_STIFFNESS = 1e-12  # keeps steps finite where nothing depends on a parameter
+LEAST_SLOPE = 1e-6  # squared; keeps pulls finite where the bound is flat
+TOUCHING_MM = 1e-3  # depth up to which a start counts as lying on the bound
 _IDENTITY = np.eye(3)
 
 
@@ -48,8 +50,8 @@ def minimise(
     start: Array,
     bound: Bound | None = None,
     *,
-    iterations: int = 80,
-    tolerance_mm: float = 1e-6,
+    iterations: int = ITERATIONS,
+    tolerance_mm: float = TOLERANCE_MM,
 ) -> Array:
     """Minimise half the squared residual of every row.
 
@@ -72,14 +74,14 @@ def minimise(
     measured = np.isfinite(cost[rows])
     x[rows[~measured]] = np.nan
     rows, r, J = _picked(measured, rows, r, J)
-    damping = np.full(len(rows), _START_DAMPING)
+    damping = np.full(len(rows), START_DAMPING)
     pressure = np.zeros(len(rows)) if bound is None else _first_pressure(bound, x[rows], r, J)
     for _ in range(iterations):
         if bound is None:
             step = -solve_symmetric(_damped(np.swapaxes(J, 1, 2) @ J, damping), _gradient(J, r))
         else:
             step, pressure = _bounded_step(bound, x[rows], r, J, damping, pressure)
-        moving = (np.abs(step) > tolerance_mm).any(axis=1) & (damping < _LARGEST_DAMPING)
+        moving = (np.abs(step) > tolerance_mm).any(axis=1) & (damping < LARGEST_DAMPING)
         if bound is None:
             x[rows] += np.where(moving[:, None], 0.0, step)  # the last step costs nothing and doubles the digits
         rows, r, J, damping, pressure, step = _picked(moving, rows, r, J, damping, pressure, step)
@@ -91,7 +93,7 @@ def minimise(
         r_trial, J_trial = residual(trial, rows)
         cost_trial = np.einsum("nm,nm->n", r_trial, r_trial)
         better = (cost_trial <= cost[rows]) & allowed
-        damping = np.where(better, np.maximum(damping * 0.1, _SMALLEST_DAMPING), damping * 10.0)
+        damping = np.where(better, np.maximum(damping * 0.1, SMALLEST_DAMPING), damping * 10.0)
         if better.all():
             x[rows], cost[rows], r, J = trial, cost_trial, r_trial, J_trial
         else:
@@ -128,16 +130,16 @@ def _gradient(J: Array, r: Array) -> Array:
 
 def _damped(A: Array, damping: Array) -> Array:
     # damping relative to the problem's own scale, so that it means the same for mm and for weighted residuals
-    amount = damping * (np.einsum("nii->n", A) / 3.0) + _LEAST_STIFFNESS
+    amount = damping * (np.einsum("nii->n", A) / 3.0) + LEAST_STIFFNESS
     return A + amount[:, None, None] * _IDENTITY
 
 
 def _first_pressure(bound: Bound, x: Array, r: Array, J: Array) -> Array:
     """Return the bound's multiplier at the start: how hard the cost presses against it where x lies on it."""
     excess, normal = bound.excess_gradient(x)
-    squared = np.maximum(np.einsum("ni,ni->n", normal, normal), _LEAST_SLOPE)
+    squared = np.maximum(np.einsum("ni,ni->n", normal, normal), LEAST_SLOPE)
     press = -np.einsum("ni,ni->n", normal, _gradient(J, r)) / squared
-    return np.where(excess > -_TOUCHING_MM, np.maximum(press, 0.0), 0.0)
+    return np.where(excess > -TOUCHING_MM, np.maximum(press, 0.0), 0.0)
 
 
 def _bounded_step(
@@ -152,20 +154,20 @@ def _bounded_step(
     pressure = np.maximum(over, 0.0) / np.einsum("ni,ni->n", normal, inward)
     step -= pressure[:, None] * inward
     length = np.sqrt(np.einsum("ni,ni->n", step, step))
-    return step * np.minimum(1.0, _LONGEST_STEP_MM / np.maximum(length, 1e-300))[:, None], pressure
+    return step * np.minimum(1.0, LONGEST_STEP_MM / np.maximum(length, 1e-300))[:, None], pressure
 
 
 def _pulled_back(bound: Bound, x: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Return the points moved down the gradient until just inside, and whether they got there."""
     inside = np.zeros(len(x), dtype=bool)
     rows = np.arange(len(x))
-    for _ in range(_PULL_BACKS):
+    for _ in range(PULL_BACKS):
         excess, normal = bound.excess_gradient(x[rows])
         out = excess > 0
         inside[rows[~out]] = True
         rows, excess, normal = _picked(out, rows, excess, normal)
         if not rows.size:
             break
-        squared = np.maximum(np.einsum("ni,ni->n", normal, normal), _LEAST_SLOPE)
-        x[rows] -= ((_PULL * excess + _INSIDE_MM) / squared)[:, None] * normal
+        squared = np.maximum(np.einsum("ni,ni->n", normal, normal), LEAST_SLOPE)
+        x[rows] -= ((PULL * excess + INSIDE_MM) / squared)[:, None] * normal
     return x, inside

@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 RIGID_TOLERANCE = 1e-3
 
 # Parameters on the bound itself, read back from a pose, may round to just outside.
-_ROUNDING_MM = 1e-6
+ROUNDING_MM = 1e-6
 
 
 class Reason(IntFlag):
@@ -102,7 +102,7 @@ def judge(finite: Array, rigid: Array, residual_mm: Array, margin_mm: Array, d: 
     measured = finite & rigid
     # `not <=` so that a pose the model cannot measure (NaN) is refused
     reason[measured & ~(residual_mm <= limits.residual_mm)] |= Reason.OFF_MODEL.value
-    reason[measured & ~(margin_mm >= limits.margin_mm - _ROUNDING_MM)] |= Reason.OUTSIDE_BOUNDS.value
+    reason[measured & ~(margin_mm >= limits.margin_mm - ROUNDING_MM)] |= Reason.OUTSIDE_BOUNDS.value
     return Verdicts(reason == 0, reason, residual_mm, margin_mm, d)
 
 

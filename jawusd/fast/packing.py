@@ -1,0 +1,112 @@
+"""A rig's numbers laid out for the compiled code: one flat array for the model, one for the bound.
+
+Passing an array to compiled code costs about as long as the arithmetic of one pose, so everything a function needs
+comes in one. The names below are places in those arrays; a slice of the model holds what its comment says.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.evaluator.bounds import SliceHull
+from jawusd.evaluator.curves import HermiteCurve
+from jawusd.evaluator.frames import RigFrames
+from jawusd.evaluator.models import AdditiveModel, AnchoredModel, JawModelForm
+from jawusd.geometry.se3 import se3_inverse
+
+Array = NDArray[np.float64]
+
+# the model, both kinds
+COUNT = 0  # spline centres of an anchored model; 0 says additive
+INCISOR = 1  # (3,) [mm]
+FROM_ANATOMICAL = 4  # (4, 4) row by row: L, Q of pose = L M Q
+CLOSED = 20  # (4, 4): Q
+TO_ANATOMICAL = 36  # (4, 4): L^-1
+FROM_CLOSED = 52  # (4, 4): Q^-1
+ADJOINT = 68  # (6, 6): twists from the anatomical to the skull frame
+VECTORS = 104  # (4, 4): what stands for the landmarks, see `evaluator.distances`
+REST = 120  # where the part of the kind begins
+
+# anchored
+SCALES = REST  # (3,) [mm]
+OFFSET = REST + 3  # (3,) [rad]
+LINEAR = REST + 6  # (3 inputs, 3 outputs) [rad]
+PATH = REST + 15  # scale, low, high [mm], then 5 coefficients of gx and 5 of gz
+ARCH = REST + 28  # (7,)
+DROP = REST + 35  # (4,)
+SOFTNESS = REST + 39  # [mm]
+FADE = REST + 40  # [mm]
+SPLINE = REST + 41  # centres column by column (3, m), then kernel weights (m, 3)
+
+# additive
+CURVES = REST  # where each of the three curves begins
+STARTS = REST + 3  # number n of the starts of searches
+GRID = REST + 4  # d (n, 3) and incisal displacements (n, 3) of the starts [mm], then the curves
+# a curve, from where it begins: number of knots n, knots (n,), starts (n + 1,), coefficients (n + 1, 4, k)
+
+# the bound
+ROUNDING = 0  # [mm]
+MARGIN = 1  # [mm]
+SIDES = 2  # number k of half-planes
+HULL = 3  # their normals column by column (2, k), then the curve of the supports
+
+
+def packed_model(model: JawModelForm, frames: RigFrames, vectors: Array) -> Array:
+    """Return the numbers of a model.
+
+    Args:
+        model: The jaw model.
+        frames: Of its rig.
+        vectors: Homogeneous vectors (4, 4) that stand for the landmarks, anatomical frame [mm].
+    """
+    anchored = isinstance(model, AnchoredModel)
+    both = [
+        [len(model.centres) if anchored else 0],
+        model.incisor,
+        frames.from_anatomical,
+        frames.closed,
+        frames.to_anatomical,
+        se3_inverse(frames.closed),
+        frames.adjoint,
+        vectors,
+    ]
+    return _joined(both + (_anchored(model) if anchored else _additive(model)))
+
+
+def packed_bound(bound: SliceHull) -> Array:
+    """Return the numbers of a bound."""
+    head = [[bound.softness_mm, bound.margin_mm, len(bound.directions)], bound.directions.T]
+    return _joined([*head, _curve(bound.supports)])
+
+
+def _anchored(model: AnchoredModel) -> list:
+    gauge = model.gauge
+    count = len(model.centres)
+    return [
+        model.scales,
+        model.offset,
+        model.weights[count:],
+        [gauge.path_scale_mm, *gauge.path_limits],
+        gauge.path_coefficients,
+        gauge.glide_arch,
+        gauge.glide_drop,
+        [gauge.glide_softness_mm, gauge.glide_fade_mm],
+        model.centres.T,
+        model.weights[:count],
+    ]
+
+
+def _additive(model: AdditiveModel) -> list:
+    curves = [_curve(curve) for curve in model.curves]
+    first = GRID + 2 * model.starts.size
+    begins = first + np.cumsum([0, len(curves[0]), len(curves[1])])
+    return [begins, [len(model.starts)], model.starts, model.start_displacements, *curves]
+
+
+def _curve(curve: HermiteCurve) -> Array:
+    return _joined([[len(curve.knots)], curve.knots, curve.starts, curve.coefficients])
+
+
+def _joined(parts: list) -> Array:
+    return np.concatenate([np.asarray(part, dtype=np.float64).ravel() for part in parts])

@@ -1,0 +1,140 @@
+"""Compiled: the rig's functions over rows, as Python calls them.
+
+Everything here releases the GIL and keeps no state, so any number of threads may call it at once. The argument types
+are fixed (C-contiguous, writable float64 arrays): a call with others is a TypeError and never a second compilation.
+The compiled code is cached on disk by this file's date; after a change in another module of this package alone, the
+cache has to go (``rm -r jawusd/fast/__pycache__``).
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from jawusd.evaluator.rows import LARGEST
+from jawusd.fast.descent import Problem, descend_inside, edge_scratch, normal_scratch
+from jawusd.fast.hull import excess, excess_gradient
+from jawusd.fast.motion import logarithm, logarithm_derivative, pose, scratch
+from jawusd.fast.packing import ADJOINT
+from jawusd.fast.rigid import device
+from jawusd.fast.searches import encode, encoding_scratch, finite, hull_scratch, judge
+
+
+def compiled(signature: str):
+    """Return a decorator that compiles for these argument types and keeps the code on disk."""
+    return numba.njit(signature, nogil=True, cache=True, error_model="numpy")
+
+
+@device
+def usable(d1, d2, d3):
+    """Tell whether d can be computed with; others give NaN."""
+    return abs(d1) < LARGEST and abs(d2) < LARGEST and abs(d3) < LARGEST
+
+
+@compiled("f8[:,::1](f8[::1], f8, f8, f8)")
+def single_pose(model, d1, d2, d3):
+    """Return T_skull_mandible (4, 4) of one d [mm]."""
+    out = np.empty((4, 4))
+    pose(model, d1, d2, d3, scratch(model), out)
+    return out
+
+
+@compiled("void(f8[::1], f8[:,::1], f8[:,:,::1])")
+def poses(model, d, out):
+    """Write the poses (n, 4, 4) of d (n, 3) [mm] to out."""
+    w = scratch(model)
+    for row in range(len(d)):
+        if usable(d[row, 0], d[row, 1], d[row, 2]):
+            pose(model, d[row, 0], d[row, 1], d[row, 2], w, out[row])
+        else:
+            out[row] = np.nan
+
+
+@compiled("void(f8[::1], f8[:,::1], f8[:,::1])")
+def twists(model, d, out):
+    """Write the twists (n, 6), skull frame, of d (n, 3) [mm] to out."""
+    w = scratch(model)
+    for row in range(len(d)):
+        out[row] = np.nan
+        if not usable(d[row, 0], d[row, 1], d[row, 2]):
+            continue
+        logarithm(model, d[row, 0], d[row, 1], d[row, 2], w)
+        for i in range(6):
+            total = 0.0
+            for k in range(6):
+                total += model[ADJOINT + 6 * i + k] * w.twist[k]
+            out[row, i] = total
+
+
+@compiled("void(f8[::1], f8[:,::1], f8[:,:,::1])")
+def jacobians(model, d, out):
+    """Write the derivatives (n, 6, 3) of the twists by d (n, 3) [mm] to out."""
+    w = scratch(model)
+    for row in range(len(d)):
+        out[row] = np.nan
+        if not usable(d[row, 0], d[row, 1], d[row, 2]):
+            continue
+        logarithm_derivative(model, d[row, 0], d[row, 1], d[row, 2], w)
+        for i in range(6):
+            for axis in range(3):
+                total = 0.0
+                for k in range(6):
+                    total += model[ADJOINT + 6 * i + k] * w.twist_d[k, axis]
+                out[row, i, axis] = total
+
+
+@compiled("f8(f8[::1], f8, f8, f8)")
+def single_margin(bound, d1, d2, d3):
+    """Return the margin [mm] of one d [mm]."""
+    return -excess(bound, d1, d2, d3, hull_scratch(bound))[0]
+
+
+@compiled("void(f8[::1], f8[:,::1], f8[::1])")
+def margins(bound, d, out):
+    """Write the margins (n,) [mm] of d (n, 3) [mm] to out."""
+    v = hull_scratch(bound)
+    for row in range(len(d)):
+        out[row] = np.nan
+        if usable(d[row, 0], d[row, 1], d[row, 2]):
+            out[row] = -excess(bound, d[row, 0], d[row, 1], d[row, 2], v)[0]
+
+
+@compiled("void(f8[::1], f8[:,::1], f8[:,::1])")
+def margin_gradients(bound, d, out):
+    """Write the derivatives (n, 3) of the margins by d (n, 3) [mm] to out."""
+    v = hull_scratch(bound)
+    for row in range(len(d)):
+        if usable(d[row, 0], d[row, 1], d[row, 2]):
+            excess_gradient(bound, d[row, 0], d[row, 1], d[row, 2], v, out[row])
+            for i in range(3):
+                out[row, i] = -out[row, i]
+        else:
+            out[row] = np.nan
+
+
+@compiled("void(f8[::1], f8[:,:,::1], f8[:,::1], f8[::1])")
+def encodings(model, T, d, residual_mm):
+    """Write the d (n, 3) [mm] nearest to poses T (n, 4, 4), and the residuals (n,) [mm]."""
+    e = encoding_scratch(model)
+    for row in range(len(T)):
+        d[row], residual_mm[row] = np.nan, np.nan
+        if finite(T[row]):
+            residual_mm[row] = encode(model, T[row], e)
+            d[row] = e.x
+
+
+@compiled("void(f8[::1], f8[::1], f8[:,:,::1], f8, f8, f8[:,::1], f8[::1], f8[::1], u1[::1])")
+def judgements(model, bound, T, residual_limit_mm, margin_limit_mm, d, residual_mm, margin_mm, reason):
+    """Write d (n, 3), residuals and margins (n,) [mm] and reasons (n,) of poses T (n, 4, 4)."""
+    e, v = encoding_scratch(model), hull_scratch(bound)
+    for row in range(len(T)):
+        why, residual, margin = judge(model, bound, T[row], residual_limit_mm, margin_limit_mm, e, v)
+        d[row], residual_mm[row], margin_mm[row], reason[row] = e.x, residual, margin, why
+
+
+@compiled("void(f8[::1], f8[::1], i8, f8[:,::1], f8[:,:,::1], f8[:,::1], f8[::1])")
+def descents(model, bound, chart, vectors, targets, x, cost):
+    """Move x (n, 3) [mm] to the bottoms of their valleys inside the bound; write what is left squared (n,)."""
+    w, n, edge = scratch(model), normal_scratch(), edge_scratch(bound)
+    for row in range(len(x)):
+        cost[row] = descend_inside(model, bound, Problem(chart, vectors, targets[row]), x[row], w, n, edge)

@@ -1,0 +1,143 @@
+"""Compiled: poses to the nearest parameters, and verdicts on them, for one row."""
+
+from __future__ import annotations
+
+from collections import namedtuple
+from math import sqrt
+
+import numpy as np
+
+from jawusd.evaluator.rows import LARGEST
+from jawusd.evaluator.verdicts import RIGID_TOLERANCE, ROUNDING_MM, Reason
+from jawusd.fast.descent import DISPLACEMENT, PARAMETERS, Problem, descend, normal_scratch
+from jawusd.fast.hull import excess
+from jawusd.fast.motion import motion, parameters_at, scratch
+from jawusd.fast.packing import COUNT, FROM_CLOSED, GRID, INCISOR, SIDES, STARTS, TO_ANATOMICAL, VECTORS
+from jawusd.fast.rigid import device
+
+_NOT_FINITE, _NOT_RIGID = Reason.NOT_FINITE.value, Reason.NOT_RIGID.value
+_OFF_MODEL, _OUTSIDE_BOUNDS = Reason.OFF_MODEL.value, Reason.OUTSIDE_BOUNDS.value
+
+Encoding = namedtuple("Encoding", "w n target x product")
+
+
+@device
+def encoding_scratch(model):
+    """Return the memory of one call that encodes."""
+    return Encoding(scratch(model), normal_scratch(), np.empty((3, 4)), np.empty(3), np.empty((4, 4)))
+
+
+@device
+def encode(model, T, e):
+    """Write to e.x the d [mm] whose pose is nearest to T (4, 4), and return the residual [mm]."""
+    vectors = model[VECTORS : VECTORS + 16].reshape(4, 4)
+    M = e.w.M
+    _measured(model, T, e.product, M)
+    for i in range(3):
+        for j in range(4):
+            total = 0.0
+            for k in range(4):
+                total += M[i, k] * vectors[k, j]
+            e.target[i, j] = total
+    p0, p1, p2 = model[INCISOR], model[INCISOR + 1], model[INCISOR + 2]
+    for i in range(3):
+        e.x[i] = M[i, 0] * p0 + M[i, 1] * p1 + M[i, 2] * p2 + M[i, 3] - model[INCISOR + i]
+    if model[COUNT] != 0:
+        # the nearest pose does not depend on the chart: searching over the displacement spares the gauge
+        descend(model, Problem(DISPLACEMENT, vectors, e.target), e.x, e.w, e.n)
+        e.x[0], e.x[1], e.x[2] = parameters_at(model, e.x[0], e.x[1], e.x[2])
+    else:
+        _read_off(model, e.x)
+        descend(model, Problem(PARAMETERS, vectors, e.target), e.x, e.w, e.n)
+    return _residual_mm(model, vectors, e)
+
+
+@device
+def _measured(model, T, half, M):
+    """Write the first three rows of L^-1 T Q^-1 to M."""
+    for i in range(4):
+        for k in range(4):
+            total = 0.0
+            for j in range(4):
+                total += T[i, j] * model[FROM_CLOSED + 4 * j + k]
+            half[i, k] = total
+    for i in range(3):
+        for k in range(4):
+            total = 0.0
+            for j in range(4):
+                total += model[TO_ANATOMICAL + 4 * i + j] * half[j, k]
+            M[i, k] = total
+
+
+@device
+def _read_off(model, x):
+    """Replace the incisal displacement x by the d of the start whose displacement is nearest."""
+    count = int(model[STARTS])
+    at = model[GRID + 3 * count :]
+    best, least = 0, np.inf
+    for i in range(count):
+        a, b, c = at[3 * i] - x[0], at[3 * i + 1] - x[1], at[3 * i + 2] - x[2]
+        square = a * a + b * b + c * c
+        if square < least:
+            best, least = i, square
+    for i in range(3):
+        x[i] = model[GRID + 3 * best + i]
+
+
+@device
+def _residual_mm(model, vectors, e):
+    motion(model, e.x[0], e.x[1], e.x[2], e.w)
+    total = 0.0
+    for i in range(3):
+        for j in range(4):
+            image = e.w.M[i, 3] * vectors[3, j]
+            for k in range(3):
+                image += e.w.M[i, k] * vectors[k, j]
+            total += (image - e.target[i, j]) ** 2
+    return sqrt(total)
+
+
+@device
+def finite(T):
+    """Tell whether all of T (4, 4) are numbers a jaw can have."""
+    for i in range(4):
+        for k in range(4):
+            if not abs(T[i, k]) < LARGEST:  # also false for NaN
+                return False
+    return True
+
+
+@device
+def rigid(T):
+    """Tell whether T (4, 4) is rigid to the evaluator's tolerance: `geometry.rigidity_defect`."""
+    defect = max(abs(T[3, 0]), abs(T[3, 1]), abs(T[3, 2]), abs(T[3, 3] - 1.0))
+    for i in range(3):
+        for k in range(i, 3):
+            total = T[i, 0] * T[k, 0] + T[i, 1] * T[k, 1] + T[i, 2] * T[k, 2] - (1.0 if i == k else 0.0)
+            defect = max(defect, abs(total))
+    x = T[1, 1] * T[2, 2] - T[1, 2] * T[2, 1]
+    y = T[1, 2] * T[2, 0] - T[1, 0] * T[2, 2]
+    z = T[1, 0] * T[2, 1] - T[1, 1] * T[2, 0]
+    return defect <= RIGID_TOLERANCE and T[0, 0] * x + T[0, 1] * y + T[0, 2] * z >= 0.0
+
+
+@device
+def judge(model, bound, T, residual_limit, margin_limit, e, v):
+    """Return reason, residual and margin [mm] of a pose T (4, 4), its d in e.x: `evaluator.verdicts.judge`."""
+    e.x[:] = np.nan
+    if not finite(T):
+        return _NOT_FINITE, np.nan, np.nan
+    if not rigid(T):
+        return _NOT_RIGID, np.nan, np.nan
+    residual = encode(model, T, e)
+    out, _, _ = excess(bound, e.x[0], e.x[1], e.x[2], v)
+    reason = 0 if residual <= residual_limit else _OFF_MODEL
+    if not -out >= margin_limit - ROUNDING_MM:
+        reason |= _OUTSIDE_BOUNDS
+    return reason, residual, -out
+
+
+@device
+def hull_scratch(bound):
+    """Return the memory of one call for the hull."""
+    return np.empty(int(bound[SIDES]))
