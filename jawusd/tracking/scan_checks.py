@@ -56,30 +56,32 @@ def check_occlusion(
             hint=hint,
         )
     given = T_anatomical_scan is not None
-    T = np.array(T_anatomical_scan, np.float64) if given else anatomical_frame(*crowns)
-    upper, lower = (transform_points(T, c) for c in crowns)
-    height = abs(float(upper[:, 1].mean() - lower[:, 1].mean()))
+    # The thin direction of the upper row alone: that of both rows means little while they are not known to meet.
+    up = np.array(T_anatomical_scan, np.float64)[1, :3] if given else _thin_direction(crowns[0])
+    between = crowns[0].mean(0) - crowns[1].mean(0)
+    height, aside = abs(float(up @ between)), float(np.linalg.norm(between - up * (up @ between)))
     if height < _LEAST_HEIGHT_MM:
         raise TrackingError(
             f"the upper and lower teeth scans are not in occlusion: the middle of the upper crowns lies {height:.1f} "
             f"mm above that of the lower ones, at least {_LEAST_HEIGHT_MM:g} mm are needed",
             hint=hint,
         )
-    middles = _middle(upper) - _middle(lower)
-    aside = float(np.linalg.norm(middles))
     if aside > _ASIDE_MM:
         raise TrackingError(
             f"the upper and lower teeth scans are not in occlusion: their arches lie {aside:.0f} mm beside one "
             f"another, at most {_ASIDE_MM:g} mm are allowed",
             hint=hint,
         )
+    T = np.array(T_anatomical_scan, np.float64) if given else anatomical_frame(*crowns)
+    upper, lower = (transform_points(T, c) for c in crowns)
+    sideways = abs(_midline(upper) - _midline(lower))
     findings = []
     if near > _LOOSE_MM:
         findings.append(f"the scans do not touch: {near:.1f} mm apart where they are closest")
     if depth > _TIGHT_MM:
         findings.append(f"the crowns of the scans run {depth:.1f} mm into one another")
-    if abs(middles[0]) > _MIDLINES_MM:
-        findings.append(f"the middles of the two arches lie {abs(middles[0]):.1f} mm apart sideways")
+    if sideways > _MIDLINES_MM:
+        findings.append(f"the middles of the two arches lie {sideways:.1f} mm apart sideways")
     if _width(lower) > _width(upper) and lower[:, 2].max() > upper[:, 2].max():
         findings.append("the lower arch encloses the upper one: an underbite, or exchanged scan files")
     return T, findings
@@ -107,10 +109,14 @@ def _overlap_mm(scans: Sequence[Scan]) -> float:
     return float(np.quantile(inside, 1.0 - _SHARE))
 
 
-def _middle(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the middle of an arch along the bite plane (left, front) [mm], shape (2,)."""
-    low, high = np.percentile(points[:, [0, 2]], [1, 99], axis=0)
-    return 0.5 * (low + high)
+def _thin_direction(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the direction in which a row of teeth extends least, shape (3,)."""
+    return np.linalg.svd(points - points.mean(0), full_matrices=False)[2][2]
+
+
+def _midline(points: NDArray[np.float64]) -> float:
+    """Return the middle of an arch from side to side [mm]."""
+    return float(np.percentile(points[:, 0], [1, 99]).mean())
 
 
 def _width(points: NDArray[np.float64]) -> float:
