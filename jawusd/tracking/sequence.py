@@ -136,11 +136,12 @@ class _Take:
         """Estimate delays, biases and camera poses; where they matter, align all frames again with them put right."""
         c = self._config
         extrinsics = Extrinsics.calibrated(self._masks.cameras, self._middle())
-        found = self._equations(extrinsics).solve(c, True)
+        equations = self._equations(extrinsics)
+        found = equations.solve(c, True)
         cameras_moved = found.cameras_moved(c) and c.refine_rounds > 0
         if not cameras_moved:
             extrinsics = extrinsics.then(np.zeros_like(found.twists), found.sigma_twists)
-            found = self._equations(extrinsics).solve(c, False)
+            found = equations.solve(c, False)
         pending, rounds = found.matters(c), 0
         if pending and c.refine_rounds:
             found, extrinsics = self._settle(found, extrinsics, cameras_moved)
