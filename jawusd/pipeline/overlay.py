@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import CalibrationError, CaptureError, OutputError
+from jawusd.errors import CaptureError, OutputError
 from jawusd.formats.capture import Capture
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import Tracks
@@ -49,7 +49,7 @@ def write_overlay(
 
     Raises:
         CaptureError: no camera has a video, or one cannot be decoded.
-        CalibrationError: a video has another size than its camera's calibration.
+        CalibrationError: a video has another shape than its camera's calibration.
         OutputError: the files cannot be written.
     """
     cameras, videos = open_footage(capture)
@@ -84,7 +84,7 @@ def open_footage(capture: Capture) -> tuple[dict[str, Camera], dict[str, Any]]:
 
     Raises:
         CaptureError: no camera has a video, or one cannot be decoded.
-        CalibrationError: a video has another size than its camera's calibration.
+        CalibrationError: a video has another shape than its camera's calibration.
     """
     cameras = {camera.name: camera for camera in load_cameras(capture)}
     sources = {source.name: source.video for source in capture.cameras if source.video}
@@ -95,13 +95,6 @@ def open_footage(capture: Capture) -> tuple[dict[str, Camera], dict[str, Any]]:
             hint="Name the footage there (video = ...).",
         )
     videos = {name: stage("jawusd.imaging.video").Video(path) for name, path in sources.items()}
-    for name, video in videos.items():
-        if video.size_px != cameras[name].size_px:
-            raise CalibrationError(
-                f"camera {name} is calibrated for {cameras[name].size_px} px, its video has {video.size_px} px.",
-                path=sources[name],
-                hint="Calibrate at the size of the footage.",
-            )
     return cameras, videos
 
 

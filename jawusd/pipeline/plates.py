@@ -32,7 +32,7 @@ def write_plates(
 
     Raises:
         CaptureError: no camera has a video, or one cannot be decoded.
-        CalibrationError: a video has another size than its camera's calibration.
+        CalibrationError: a video has another shape than its camera's calibration.
         OutputError: the files cannot be written.
     """
     cameras, videos = open_footage(capture)
