@@ -20,8 +20,9 @@ from jawusd.tracking.solver import ContourSolver, View
 _ROWS = (0, 1)
 # An exchange is believed if it leaves less than this share of what is uncovered as the masks are named.
 _PROOF = 0.5
-# Uncovered share of all masks of a camera from which an exchange is thought of: picks by hand leave up to 0.1.
-_ODD_SHARE = 0.2
+# Uncovered share of all masks of a camera from which an exchange is looked for: good poses leave 0.01, and two cameras'
+# masks may resemble one another up to 0.1.
+_ODD_SHARE = 0.05
 
 
 @dataclass(frozen=True, eq=False)
