@@ -1,0 +1,27 @@
+"""The face-solver example runs; its full comparison takes minutes."""
+
+import importlib.util
+import sys
+
+import pytest
+from package_copy import ROOT
+
+
+@pytest.fixture
+def example(monkeypatch):
+    spec = importlib.util.spec_from_file_location("face_solver", ROOT / "examples" / "face_solver.py")
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "face_solver", module)
+    spec.loader.exec_module(module)
+    monkeypatch.setattr(module, "STEP", 70)
+    monkeypatch.setattr(module, "WEIGHTS", (0.1,))
+    return module
+
+
+def test_a_rig_beats_the_pull_to_the_closed_mouth(example, monkeypatch, tmp_path, capsys):
+    picture = tmp_path / "errors.png"
+    monkeypatch.setattr(sys, "argv", ["face_solver.py", "-o", str(picture)])
+    example.main()
+    rows = {line.split()[0]: line.split() for line in capsys.readouterr().out.splitlines() if len(line.split()) == 7}
+    assert float(rows["rig"][4]) < float(rows["neutral"][4]) < float(rows["turning"][4])
+    assert picture.read_bytes()[:4] == b"\x89PNG"
