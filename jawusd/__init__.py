@@ -16,11 +16,13 @@ __all__ = ["__version__", "load"]
 __version__ = "0.1.0.dev0"
 
 
-def load(path: str | PathLike[str]) -> JawRig:
+def load(path: str | PathLike[str], *, fast: bool = False) -> JawRig:
     """Load a rig for posing, validation and inverse kinematics.
 
     Args:
         path: `actor.usda` (or any layer or package that carries the rig), or a `model.npz`.
+        fast: Compile the most used functions with numba: the same results to 1e-10, several times faster. Needs
+            `pip install 'jawusd[fast]'`; the first use after an installation compiles for about a minute.
 
     Returns:
         The evaluator of the rig.
@@ -28,11 +30,18 @@ def load(path: str | PathLike[str]) -> JawRig:
     Raises:
         FormatError: the file is not a rig, is incomplete, or was written by a newer version.
         RigError: the stage cannot be opened.
+        MissingDependencyError: ``fast`` without numba.
     """
     if str(path).endswith(".npz"):
         from jawusd import evaluator
 
-        return evaluator.load(path)
-    from jawusd.rig import load_rig
+        rig = evaluator.load(path)
+    else:
+        from jawusd.rig import load_rig
 
-    return load_rig(path)
+        rig = load_rig(path)
+    if not fast:
+        return rig
+    from jawusd.fast import accelerate
+
+    return accelerate(rig)

@@ -13,6 +13,8 @@ from jawusd.evaluator.single import motion_rows
 
 Array = NDArray[np.float64]
 
+_SINGLE_LIMIT_MM = 1e4
+
 
 class SampledTable:
     """Twists of a rig sampled on a grid over d: ``pose(d) = exp(trilinear(d)) rest``.
@@ -58,7 +60,7 @@ class SampledTable:
         d = np.asarray(d, dtype=np.float64)
         if d.shape == (3,):
             x, y, z = d.tolist()
-            if x == x and y == y and z == z:  # NaN goes the long way
+            if abs(x) + abs(y) + abs(z) < _SINGLE_LIMIT_MM:  # NaN and infinities go the long way
                 return np.array(motion_rows(*self._single_twist(x, y, z))).dot(self.T_rest)
         rows, batch = as_rows(d, (3,), "d")
         return in_chunks(self._poses, rows).reshape(*batch, 4, 4)

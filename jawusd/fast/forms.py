@@ -13,7 +13,6 @@ from jawusd.fast.packing import ARCH, COUNT, CURVES, DROP, FADE, LINEAR, OFFSET,
 from jawusd.fast.rigid import device
 
 
-
 @device
 def gauge_path(model, d1):
     """Return gx, gz [mm] and their slopes at opening d1 [mm]."""

@@ -133,5 +133,29 @@ class FastRig(JawRig):
         compiled.judgements(
             self._numbers, self._hull, rows, limits.residual_mm, limits.margin_mm, d, residual_mm, margin_mm, reason
         )
-        reason, shape = reason.reshape(batch), (*batch, 3)
-        return Verdicts(reason == 0, reason, residual_mm.reshape(batch), margin_mm.reshape(batch), d.reshape(shape))
+        return _verdicts(d, residual_mm, margin_mm, reason, batch)
+
+    def validate_parameters(
+        self,
+        d: ArrayLike,
+        *,
+        margin_limit_mm: float | None = None,
+        bound: BoundName = "slices",
+        times_s: ArrayLike | None = None,
+        speed_limit_mm_s: float | None = None,
+    ) -> Verdicts:
+        """Judge jaw parameters d (..., 3) [mm] as `validate` does poses; see `JawRig.validate_parameters`."""
+        if bound != "slices" or speed_limit_mm_s is not None:
+            return super().validate_parameters(
+                d, margin_limit_mm=margin_limit_mm, bound=bound, times_s=times_s, speed_limit_mm_s=speed_limit_mm_s
+            )
+        rows, batch = rows_of(d, (3,), "d")
+        limits = self.limits.replaced(None, margin_limit_mm, None)
+        residual_mm, margin_mm, reason = np.empty(len(rows)), np.empty(len(rows)), np.empty(len(rows), dtype=np.uint8)
+        compiled.parameter_judgements(self._hull, rows, limits.margin_mm, residual_mm, margin_mm, reason)
+        return _verdicts(rows, residual_mm, margin_mm, reason, batch)
+
+
+def _verdicts(d: Array, residual_mm: Array, margin_mm: Array, reason: NDArray[np.uint8], batch: tuple) -> Verdicts:
+    reason = reason.reshape(batch)
+    return Verdicts(reason == 0, reason, residual_mm.reshape(batch), margin_mm.reshape(batch), d.reshape(*batch, 3))

@@ -17,7 +17,7 @@ from jawusd.fast.hull import excess, excess_gradient
 from jawusd.fast.motion import logarithm, logarithm_derivative, pose, scratch
 from jawusd.fast.packing import ADJOINT
 from jawusd.fast.rigid import device
-from jawusd.fast.searches import encode, encoding_scratch, finite, hull_scratch, judge
+from jawusd.fast.searches import NOT_FINITE, encode, encoding_scratch, finite, hull_scratch, judge, outside
 
 
 def compiled(signature: str):
@@ -130,6 +130,17 @@ def judgements(model, bound, T, residual_limit_mm, margin_limit_mm, d, residual_
     for row in range(len(T)):
         why, residual, margin = judge(model, bound, T[row], residual_limit_mm, margin_limit_mm, e, v)
         d[row], residual_mm[row], margin_mm[row], reason[row] = e.x, residual, margin, why
+
+
+@compiled("void(f8[::1], f8[:,::1], f8, f8[::1], f8[::1], u1[::1])")
+def parameter_judgements(bound, d, margin_limit_mm, residual_mm, margin_mm, reason):
+    """Write residuals (0 or NaN), margins (n,) [mm] and reasons (n,) of parameters d (n, 3) [mm]."""
+    v = hull_scratch(bound)
+    for row in range(len(d)):
+        residual_mm[row], margin_mm[row], reason[row] = np.nan, np.nan, NOT_FINITE
+        if usable(d[row, 0], d[row, 1], d[row, 2]):
+            margin = -excess(bound, d[row, 0], d[row, 1], d[row, 2], v)[0]
+            residual_mm[row], margin_mm[row], reason[row] = 0.0, margin, outside(margin, margin_limit_mm)
 
 
 @compiled("void(f8[::1], f8[::1], i8, f8[:,::1], f8[:,:,::1], f8[:,::1], f8[::1])")

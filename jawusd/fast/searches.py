@@ -15,7 +15,7 @@ from jawusd.fast.motion import motion, parameters_at, scratch
 from jawusd.fast.packing import COUNT, FROM_CLOSED, GRID, INCISOR, SIDES, STARTS, TO_ANATOMICAL, VECTORS
 from jawusd.fast.rigid import device
 
-_NOT_FINITE, _NOT_RIGID = Reason.NOT_FINITE.value, Reason.NOT_RIGID.value
+NOT_FINITE, _NOT_RIGID = Reason.NOT_FINITE.value, Reason.NOT_RIGID.value
 _OFF_MODEL, _OUTSIDE_BOUNDS = Reason.OFF_MODEL.value, Reason.OUTSIDE_BOUNDS.value
 
 Encoding = namedtuple("Encoding", "w n target x product")
@@ -126,15 +126,19 @@ def judge(model, bound, T, residual_limit, margin_limit, e, v):
     """Return reason, residual and margin [mm] of a pose T (4, 4), its d in e.x: `evaluator.verdicts.judge`."""
     e.x[:] = np.nan
     if not finite(T):
-        return _NOT_FINITE, np.nan, np.nan
+        return NOT_FINITE, np.nan, np.nan
     if not rigid(T):
         return _NOT_RIGID, np.nan, np.nan
     residual = encode(model, T, e)
     out, _, _ = excess(bound, e.x[0], e.x[1], e.x[2], v)
     reason = 0 if residual <= residual_limit else _OFF_MODEL
-    if not -out >= margin_limit - ROUNDING_MM:
-        reason |= _OUTSIDE_BOUNDS
-    return reason, residual, -out
+    return reason | outside(-out, margin_limit), residual, -out
+
+
+@device
+def outside(margin, margin_limit):
+    """Return the reason against a margin [mm], 0 if there is none."""
+    return 0 if margin >= margin_limit - ROUNDING_MM else _OUTSIDE_BOUNDS
 
 
 @device
