@@ -20,6 +20,7 @@ from jawusd.fitting.coverage import PARAMETERS, missing_movements, shown_paramet
 from jawusd.fitting.data import Anatomy, Selection, TrainingData, select_poses, select_tracks
 from jawusd.fitting.holdout import FittedForm, seen_errors, unseen_errors
 from jawusd.fitting.pca import fit_pca
+from jawusd.fitting.screening import screened
 from jawusd.fitting.slice_hull import fit_slice_hull, valid_box
 from jawusd.formats.model import JawModel
 from jawusd.formats.tracks import Tracks
@@ -79,6 +80,7 @@ def fit_model(
     else:
         frames, T = np.asarray(source[0], dtype=np.int64), np.asarray(source[1], dtype=np.float64)
         selection = select_poses(frames, T, anatomy)
+    selection = screened(selection)
     data = selection.data
     warnings = check_anatomy(data, anatomy)
     shown, sentences = shown_parameters(data)
