@@ -17,6 +17,7 @@ from jawusd.tracking.reacquire import shift_to_masks
 from jawusd.tracking.solver import ContourSolver, Solution, View
 
 _ROWS = (0, 1)
+_FEWEST_MASKS = 2  # one view leaves the depth to the outline's width, which a wrong mask shares
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +138,7 @@ class FrameTracker:
         rough = self._rough(trial, c.lost_residual) | (self._rough(trial) & self._scarce(trial))
         bare = np.where(trial.use, trial.coverage, 0.0).max(1) > c.lost_coverage
         loose = np.array([crown_sigma_mm(self._solver.scans[r], trial.solution, r, c) > c.lost_sigma_mm for r in _ROWS])
-        return few | rough | bare | loose | ~trial.use.any(1)
+        return few | rough | bare | loose | (trial.use.sum(1) < _FEWEST_MASKS)
 
     def _others(self, trial, suspect, starts, views, gallery) -> _Trial:
         """Try the other predictions."""
