@@ -6,7 +6,7 @@ import sys
 
 import typer
 
-from jawusd.cli import build_commands, plate_commands, report_commands, rig_commands
+from jawusd.cli import build_commands, plate_commands, report_commands, rig_commands, view_commands
 from jawusd.errors import JawusdError
 
 app = typer.Typer(
@@ -21,6 +21,7 @@ build_commands.register(app)
 rig_commands.register(app)
 plate_commands.register(app)
 report_commands.register(app)
+view_commands.register(app)
 
 #: Exit code of a run stopped with Ctrl+C, as shells report it.
 INTERRUPTED = 130

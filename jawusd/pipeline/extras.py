@@ -15,6 +15,7 @@ _EXTRA_OF = {
     "jawusd.rig": "build",
     "jawusd.report": "report",
     "jawusd.synthetic": "demo",
+    "jawusd.viewer": "view",
 }
 
 

@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from pxr import UsdGeom
 
 from jawusd.errors import RigError
@@ -39,4 +40,28 @@ def read_geometry(path: str | os.PathLike[str]) -> dict[str, Mesh]:
         vertices = np.array(mesh.GetPointsAttr().Get(), dtype=np.float64)
         faces = np.array(mesh.GetFaceVertexIndicesAttr().Get(), dtype=np.int32).reshape(-1, 3)
         found[name] = Mesh(vertices, faces)
+    return found
+
+
+def read_gum(path: str | os.PathLike[str]) -> dict[str, NDArray[np.bool_]]:
+    """Read which faces of the teeth meshes are gum.
+
+    Args:
+        path: the layer.
+
+    Returns:
+        Per face, shape (F,), by the names of `geo.MESH_PATHS`; meshes without such a subset are missing.
+
+    Raises:
+        RigError: not a USD file.
+    """
+    stage = open_stage(path)
+    found = {}
+    for name, prim_path in MESH_PATHS.items():
+        mesh = UsdGeom.Mesh(stage.GetPrimAtPath(prim_path))
+        subset = UsdGeom.Subset(stage.GetPrimAtPath(f"{prim_path}/{prim_path.rsplit('/', 1)[1]}Gum"))
+        if mesh and subset:
+            gum = np.zeros(len(mesh.GetFaceVertexCountsAttr().Get()), dtype=bool)
+            gum[np.array(subset.GetIndicesAttr().Get())] = True
+            found[name] = gum
     return found

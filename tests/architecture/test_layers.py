@@ -43,6 +43,10 @@ def test_imports_follow_the_layers():
         ("fitting/__init__.py", "import matplotlib", "matplotlib and jinja2"),
         ("report/__init__.py", "import jawusd.fitting", "Layers"),
         ("formats/poses.py", "import h5py", "h5py belongs"),
+        ("pipeline/view.py", "import viser", "viser belongs"),
+        ("viewer/page.py", "import jawusd.rig", "Layers"),
+        ("viewer/plots.py", "import matplotlib", "matplotlib and jinja2"),
+        ("viewer/decimate.py", "import trimesh", "Video and image"),
         ("newlayer/__init__.py", "x = 1", "newlayer"),
     ],
 )
@@ -82,7 +86,7 @@ def test_help_loads_nothing_heavy():
         "from jawusd.cli.main import app\n"
         "result = CliRunner().invoke(app, ['--help'])\n"
         "heavy = {'torch','cv2','av','numba','scipy','shapely','trimesh','moderngl','pxr','onnx','pydantic','numpy',"
-        "'matplotlib','h5py'}\n"
+        "'matplotlib','h5py','viser'}\n"
         "print(result.exit_code, sorted(heavy & set(sys.modules)))\n"
     )
     result = run_python(ROOT, code)

@@ -1,0 +1,156 @@
+"""Give the viewer an actor: its evaluator, meshes for a screen, and its motions."""
+
+from __future__ import annotations
+
+import os
+import re
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.errors import FormatError, OutputError, RigError
+from jawusd.evaluator import JawRig
+from jawusd.formats.mesh import Mesh
+from jawusd.formats.tracks import load_tracks
+from jawusd.pipeline.extras import stage
+
+if TYPE_CHECKING:
+    from jawusd.viewer.actor import ViewedActor
+    from jawusd.viewer.clip import Clip
+    from jawusd.viewer.server import Viewer
+
+#: What the motion that was captured is called among the motions of an actor.
+CAPTURED = "captured take"
+
+_TRACKS = "tracks.npz"
+_ANIMATION = re.compile(r"anim[A-Za-z0-9_-]{0,100}\.usd[ac]?")
+_MOST_FACES = 20_000  # per mesh: what a browser without a graphics card still turns fluently
+_DEFAULT_FPS = 24.0
+
+
+def open_viewer(path: str | os.PathLike[str], host: str, port: int) -> Viewer:
+    """Serve the rig at a path to browsers; see `viewed_actor` and `Viewer` for what it raises.
+
+    Args:
+        path: `actor.usda`, another layer or package that carries the rig, or the folder of a build.
+        host: address to listen on.
+        port: port to listen on.
+
+    Raises:
+        MissingDependencyError: the viewer is not installed.
+    """
+    server = stage("jawusd.viewer.server")
+    return server.Viewer(viewed_actor(path), host, port)
+
+
+def viewed_actor(path: str | os.PathLike[str]) -> ViewedActor:
+    """Read what the viewer shows of a rig.
+
+    Args:
+        path: as for `open_viewer`.
+
+    Raises:
+        FormatError: not a rig, or one without geometry.
+        RigError: not a USD file.
+    """
+    path = Path(path)
+    path = path / "actor.usda" if path.is_dir() else path
+    if path.suffix == ".npz":
+        raise FormatError("holds a model without meshes; nothing to see.", path=path, hint="Name the actor.usda.")
+    rig_read = stage("jawusd.rig.read")
+    rig, about = rig_read.load_rig(path), rig_read.describe(path)
+    return stage("jawusd.viewer.actor").ViewedActor(
+        name=str(about["actor"] or path.stem),
+        rig=rig,
+        meshes=screen_meshes(path),
+        fps=float(about["fps"] or _DEFAULT_FPS),
+        folder=path.parent,
+        clip_names=partial(motion_names, path.parent),
+        load_clip=partial(load_motion, path.parent, rig, float(about["fps"] or _DEFAULT_FPS)),
+        save_layer=partial(save_motion, path, rig),
+    )
+
+
+def screen_meshes(path: Path) -> dict[str, Mesh]:
+    """Return the meshes of a rig by the viewer's names, teeth and gum apart, coarse enough for a screen.
+
+    Raises:
+        RigError: there is nothing to take hold of.
+    """
+    geometry = stage("jawusd.rig.geo_read")
+    meshes, gum = geometry.read_geometry(path), geometry.read_gum(path)
+    if not {"mandible", "lower_teeth"} & set(meshes):
+        raise RigError("has no mandible to look at.", path=path)
+    parted: dict[str, Mesh] = {}
+    for name, mesh in meshes.items():
+        if name in gum:
+            parted[name] = part_of(mesh, ~gum[name])
+            parted[name.replace("teeth", "gum")] = part_of(mesh, gum[name])
+        else:
+            parted[name] = mesh
+    for_view = stage("jawusd.viewer.decimate").for_view
+    return {name: for_view(mesh, _MOST_FACES) for name, mesh in parted.items() if len(mesh.faces)}
+
+
+def part_of(mesh: Mesh, chosen: NDArray[np.bool_]) -> Mesh:
+    """Return some faces (F,) of a mesh, with the vertices they use."""
+    used, faces = np.unique(mesh.faces[chosen], return_inverse=True)
+    return Mesh(mesh.vertices[used], faces.reshape(-1, 3), None if mesh.colors is None else mesh.colors[used])
+
+
+def motion_names(folder: Path) -> tuple[str, ...]:
+    """Return the motions there are in the folder of an actor: the take, and layers called anim..."""
+    layers = sorted(path.name for path in folder.iterdir() if _ANIMATION.fullmatch(path.name) and path.is_file())
+    return ((CAPTURED,) if (folder / _TRACKS).is_file() else ()) + tuple(layers)
+
+
+def load_motion(folder: Path, rig: JawRig, fps: float, name: str) -> Clip:
+    """Read one of `motion_names`, as the nearest parameters of its poses.
+
+    Args:
+        folder: of the actor.
+        rig: its evaluator.
+        fps: frames per second of the take.
+        name: of the motion.
+
+    Raises:
+        FormatError: there is no such motion, or it cannot be read.
+        RigError: it is not USD.
+    """
+    if name not in motion_names(folder):
+        raise FormatError(f'there is no motion called "{name}" here.', path=folder)
+    if name == CAPTURED:
+        tracks = load_tracks(folder / _TRACKS)
+        frames, poses = tracks.frames, tracks.T_upper_lower
+    else:
+        frames, poses = stage("jawusd.rig.motion_read").read_poses_of_stage(folder / name)
+        fps = float(stage("jawusd.rig.read").describe(folder / name)["fps"])
+    d, _ = rig.encode(poses)
+    return stage("jawusd.viewer.clip").Clip.of(name, frames, d, fps)
+
+
+def save_motion(actor: Path, rig: JawRig, name: str, clip: Clip, overwrite: bool) -> Path:
+    """Write a motion as an animation layer beside an actor.
+
+    Args:
+        actor: the layer it animates.
+        rig: its evaluator.
+        name: of the file, anim... .usda or .usdc, without a folder.
+        clip: the motion.
+        overwrite: replace a file that is there.
+
+    Raises:
+        OutputError: the name is not allowed or taken, or the file cannot be written.
+    """
+    if not _ANIMATION.fullmatch(name):
+        raise OutputError(
+            f'"{name}" is no name for an animation: anim, then letters, digits, _ or -, then .usdc or .usda.'
+        )
+    target = actor.parent / name
+    if target.exists() and not overwrite:
+        raise OutputError("exists already.", path=target, hint="Choose another name, or tick overwrite.")
+    stage("jawusd.rig.animation").write_animation(target, actor, clip.frames, clip.d, clip.fps, rig=rig)
+    return target

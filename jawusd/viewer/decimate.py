@@ -1,0 +1,56 @@
+"""Fewer triangles for the screen: vertices of one cell of a grid become one."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jawusd.formats.mesh import Mesh
+
+_STEPS = 18
+
+
+def for_view(mesh: Mesh, most_faces: int) -> Mesh:
+    """Return a mesh with at most about so many faces, made for looking at only.
+
+    Vertex clustering (Rossignac and Borrel, "Multi-resolution 3D approximations for rendering complex scenes", 1993):
+    the finest grid that is coarse enough is found by bisection.
+
+    Args:
+        mesh: the mesh [mm].
+        most_faces: how many faces may stay.
+
+    Returns:
+        The mesh itself when it is small enough.
+    """
+    if len(mesh.faces) <= most_faces:
+        return mesh
+    fine, coarse = 0.0, float(np.ptp(mesh.vertices, axis=0).max())
+    best = None
+    for _ in range(_STEPS):
+        cell = 0.5 * (fine + coarse)
+        clustered = _clustered(mesh, cell)
+        if len(clustered.faces) > most_faces:
+            fine = cell
+        else:
+            coarse, best = cell, clustered
+    return best if best is not None and len(best.faces) else mesh
+
+
+def _clustered(mesh: Mesh, cell_mm: float) -> Mesh:
+    """Return the mesh with one vertex, the mean, per occupied cell."""
+    cells = np.floor((mesh.vertices - mesh.vertices.min(axis=0)) / cell_mm).astype(np.int64)
+    sizes = cells.max(axis=0) + 1
+    flat = (cells[:, 0] * sizes[1] + cells[:, 1]) * sizes[2] + cells[:, 2]
+    _, owner, count = np.unique(flat, return_inverse=True, return_counts=True)
+    means = np.stack([np.bincount(owner, column) / count for column in mesh.vertices.T], axis=1)
+    colors = None
+    if mesh.colors is not None:
+        sums = [np.bincount(owner, column) / count for column in mesh.colors.T.astype(float)]
+        colors = np.stack(sums, axis=1).round().astype(np.uint8)
+    faces = owner[mesh.faces]
+    a, b, c = faces.T
+    faces = faces[(a != b) & (b != c) & (c != a)]
+    # The same three vertices in another order of rotation are the same face; flipped ones are its other side.
+    first = faces.argmin(axis=1)[:, None]
+    turned = np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1)
+    return Mesh(means, np.unique(turned, axis=0), colors)

@@ -1,0 +1,200 @@
+"""The panel of the timeline: keys, curves, playing and scrubbing."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+
+import viser
+
+from jawusd.errors import FormatError
+from jawusd.viewer import keytrack
+from jawusd.viewer.actor import ViewedActor
+from jawusd.viewer.clip import Clip
+from jawusd.viewer.notices import guarded
+from jawusd.viewer.player import Player
+from jawusd.viewer.plots import Plot, curve_plot, with_playhead
+from jawusd.viewer.session import Session
+
+KEYS = "keys"
+_LENGTH = 100
+_MOST_THUMBS = 40  # more keys than this are moved with the buttons alone
+
+
+class MotionPanel:
+    """Hold the timeline of one page.
+
+    Attributes:
+        frame: the frame shown.
+        player: plays.
+    """
+
+    def __init__(
+        self, client: viser.ClientHandle, session: Session, actor: ViewedActor, changed: Callable[[], None]
+    ) -> None:
+        """Make the widgets in the present container.
+
+        Args:
+            client: the page.
+            session: whose keys these are.
+            actor: has motions to load.
+            changed: called after every change of the pose or the keys.
+        """
+        self._client, self._session, self._actor, self._changed = client, session, actor, changed
+        self._loaded: dict[str, Clip] = {}
+        self._copied: tuple[float, float, float] | None = None
+        self._drawn: tuple[object, ...] = ()
+        self.player = Player(self.show, self._stopped)
+        gui = client.gui
+        self.source = gui.add_dropdown("motion", (KEYS, *actor.clip_names()))
+        self.source.on_update(guarded(client, self._choose))
+        self.frame_slider = gui.add_slider("frame", 0.0, float(_LENGTH), 1.0, 0.0)
+        self.frame_slider.on_update(guarded(client, self._scrub))
+        self.play = gui.add_button("play", icon=viser.Icon.PLAYER_PLAY)
+        self.play.on_click(guarded(client, self._toggle))
+        self.loop = gui.add_checkbox("loop", True)
+        gui.add_button_group("keys", ("set", "delete", "copy", "paste")).on_click(guarded(client, self._edit))
+        gui.add_button_group("go to", ("previous", "next")).on_click(guarded(client, self._jump))
+        self._curves = gui.add_html("")
+        self._playhead = gui.add_html("")
+        self.thumbs = gui.add_multi_slider("move keys", 0, _LENGTH, 1, (0,), visible=False)
+        self.thumbs.on_update(guarded(client, self._drag_keys))
+        self.between = gui.add_dropdown("between keys", ("linear", "smooth"))
+        self.between.on_update(guarded(client, self._interpolate))
+        self.fps = gui.add_number("frames per second", session.work.fps, min=1.0, max=1000.0, step=1.0)
+        self.fps.on_update(guarded(client, self._rate))
+        self._plot: Plot = curve_plot(None, ())
+        self.frame = 0.0
+
+    def clip(self) -> Clip | None:
+        """Return the motion chosen, None while there are no keys."""
+        return self._session.key_clip() if self.source.value == KEYS else self._loaded[self.source.value]
+
+    def add_clip(self, clip: Clip) -> None:
+        """Offer a motion that came from a file of the visitor, and choose it."""
+        self._loaded[clip.name] = clip
+        self.source.options = tuple(dict.fromkeys((*self.source.options, clip.name)))
+        self.source.value = clip.name
+        self._begin(clip)
+
+    def offer_clips(self) -> None:
+        """Offer motions that came to lie beside the rig."""
+        self.source.options = tuple(dict.fromkeys((*self.source.options, *self._actor.clip_names())))
+
+    def show(self, frame: float) -> None:
+        """Show the chosen motion at a frame."""
+        self.frame = frame
+        clip = self.clip()
+        if clip is not None:
+            self._session.show(clip.at(frame))
+        self._changed()
+
+    def refresh(self) -> None:
+        """Bring the widgets in line with session and frame."""
+        work = self._session.work
+        chosen = self.source.value
+        drawn = (chosen, id(self._loaded.get(chosen)), work.keys, work.interpolation, work.fps)
+        if drawn != self._drawn:
+            self._drawn = drawn
+            clip = self.clip()
+            self._plot = curve_plot(clip, work.keys if chosen == KEYS else ())
+            self._curves.content = self._plot.definition()
+            self._set_ends(clip)
+            self._set_thumbs()
+            self.between.value, self.fps.value = work.interpolation, work.fps
+        self._playhead.content = f'<div style="padding:0 6px">{with_playhead(self._plot, self.frame)}</div>'
+        if self.frame_slider.value != round(self.frame):
+            self.frame_slider.value = round(self.frame)
+
+    def _set_ends(self, clip: Clip | None) -> None:
+        first, last = (0.0, 0.0) if clip is None else clip.span
+        if self.source.value == KEYS:
+            first, last = min(first, 0.0), max(last + 25.0, float(_LENGTH))
+        self.frame_slider.min, self.frame_slider.max = first, last
+        self.frame = min(max(self.frame, first), last)
+
+    def _set_thumbs(self) -> None:
+        frames = tuple(key.frame for key in self._session.work.keys)
+        whole = all(frame == int(frame) for frame in frames)
+        visible = 0 < len(frames) <= _MOST_THUMBS and whole and self.source.value == KEYS
+        if visible:
+            self.thumbs.min, self.thumbs.max = int(self.frame_slider.min), int(self.frame_slider.max)
+            self.thumbs.value = tuple(int(frame) for frame in frames)
+        self.thumbs.visible = visible
+
+    async def _choose(self, _: object) -> None:
+        self.player.stop()
+        name = self.source.value
+        if name != KEYS and name not in self._loaded:
+            try:
+                self._loaded[name] = await asyncio.to_thread(self._actor.load_clip, name)
+            except Exception:
+                self.source.value = KEYS
+                raise
+        if self.source.value == name:  # the visitor may have gone on while the file was read
+            self._begin(self.clip())
+
+    def _begin(self, clip: Clip | None) -> None:
+        self._drawn = ()
+        if clip is None:
+            self._changed()
+        else:
+            self.show(clip.span[0])
+
+    async def _scrub(self, _: object) -> None:
+        self.player.stop()
+        self.show(float(self.frame_slider.value))
+
+    async def _toggle(self, _: object) -> None:
+        if self.player.playing:
+            self.player.stop()
+            return
+        clip = self.clip()
+        if clip is None:
+            raise FormatError("there is nothing to play.", hint="Set keys, or choose another motion.")
+        self.play.label, self.play.icon = "stop", viser.Icon.PLAYER_STOP
+        fps = self._session.work.fps if self.source.value == KEYS else clip.fps
+        self.player.start(self.frame, fps, clip.span, lambda: bool(self.loop.value))
+
+    def _stopped(self) -> None:
+        self.play.label, self.play.icon = "play", viser.Icon.PLAYER_PLAY
+
+    async def _edit(self, event: viser.GuiEvent) -> None:
+        session, frame = self._session, float(round(self.frame))
+        self.player.stop()
+        if event.target.value == "set":
+            session.add_key(frame)
+        elif event.target.value == "delete":
+            session.set_keys(keytrack.without_key(session.work.keys, frame))
+        elif event.target.value == "copy":
+            self._copied = session.work.d
+        elif self._copied is None:
+            raise FormatError("nothing was copied yet.", hint='Go to a frame and press "copy".')
+        else:
+            session.set_keys(keytrack.with_key(session.work.keys, frame, self._copied))
+            session.show(self._copied)
+        self.source.value = KEYS
+        self.frame = frame
+        self._changed()
+
+    async def _jump(self, event: viser.GuiEvent) -> None:
+        self.player.stop()
+        frames = [key.frame for key in self._session.work.keys]
+        if event.target.value == "next":
+            reached = min((frame for frame in frames if frame > self.frame), default=None)
+        else:
+            reached = max((frame for frame in frames if frame < self.frame), default=None)
+        if reached is not None:
+            self.show(reached)
+
+    async def _drag_keys(self, _: object) -> None:
+        self._session.set_keys(keytrack.at_frames(self._session.work.keys, self.thumbs.value))
+        self.show(self.frame)
+
+    async def _interpolate(self, _: object) -> None:
+        self._session.set_interpolation(self.between.value)
+        self.show(self.frame)
+
+    async def _rate(self, _: object) -> None:
+        self._session.set_fps(float(self.fps.value))
+        self._changed()

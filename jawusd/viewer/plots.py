@@ -1,0 +1,197 @@
+"""Plots as SVG text: the bounds, Posselt's figures and the curves of an animation.
+
+The still part of a plot is sent once and has an id; what moves refers to it (`<use>`), so that following the jaw costs
+a few hundred bytes. Text takes the page's colour and reads on light and dark.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.evaluator import JawRig
+from jawusd.viewer.clip import Clip
+from jawusd.viewer.keytrack import KeyTrack
+from jawusd.viewer.readouts import INCISOR, border_path, landmark_places, rest_places
+
+Array = NDArray[np.float64]
+
+# Okabe and Ito's colours, told apart by everybody; those of the jaw in 3-D too.
+BLUE, ORANGE, GREEN, VERMILION, GREY = "#0072b2", "#e69f00", "#009e73", "#d55e00", "#888888"
+CURVE_COLORS = (BLUE, VERMILION, GREEN)
+
+_WIDTH, _HEIGHT = 300, 210
+_LEFT, _RIGHT, _TOP, _BOTTOM = 36, 8, 22, 32
+_MOST_POINTS = 300
+_MOST_SAMPLES = 400
+_TEXT = 'font-family="sans-serif" font-size="11" fill="currentColor"'
+
+
+@dataclass(frozen=True)
+class Plot:
+    """Hold a plot whose still part is drawn.
+
+    Attributes:
+        name: id of the still part in the page.
+        still: SVG of axes, outlines and points.
+        low, high: corners of the plotted area in data.
+    """
+
+    name: str
+    still: str
+    low: tuple[float, float]
+    high: tuple[float, float]
+
+    def definition(self) -> str:
+        """Return the HTML that puts the still part, unseen, into the page; once."""
+        hidden = 'width="0" height="0" style="position:absolute"'
+        return f'<svg {hidden}><defs><g id="{self.name}">{self.still}</g></defs></svg>'
+
+    def with_point(self, x: float, y: float, inside: bool) -> str:
+        """Return the SVG of the plot with the present pose marked."""
+        px, py = _place(self, np.array([[x, y]]))[0]
+        mark = f'<circle cx="{px:.1f}" cy="{py:.1f}" r="5" fill="{GREEN if inside else VERMILION}" stroke="white"/>'
+        return _svg(f'<use href="#{self.name}"/>{mark}')
+
+
+def bound_plot(rig: JawRig, axis: int) -> Plot:
+    """Draw the paper's outline and the slice bound in the plane of d1 and another parameter, with captured poses.
+
+    Args:
+        rig: the rig.
+        axis: 1 for d2, 2 for d3.
+    """
+    name = ("", "d1d2", "d1d3")[axis]
+    corners = rig.arrays[f"polygon_{name}"]
+    rings = np.split(corners, np.cumsum(rig.arrays[f"polygon_{name}_counts"])[:-1].astype(int))
+    border = border_path(rig, axis)[:, [0, axis]]
+    captured = _thinned(rig.arrays["codes"][:, [0, axis]])
+    title = ("", "lateral d2 over opening d1", "protrusion d3 over opening d1")[axis]
+    plot = _framed(f"jaw-{name}", np.vstack([corners, border, captured]), title, "opening d1 [mm]", "mm")
+    parts = [_dots(plot, captured), *(_ring(plot, ring, GREY, "4 3") for ring in rings), _ring(plot, border, BLUE)]
+    return _drawn(plot, parts)
+
+
+def posselt_plot(rig: JawRig, axis: int) -> Plot:
+    """Draw Posselt's figure: where the lower incisal point can go, seen from the side or the front.
+
+    Args:
+        rig: the rig.
+        axis: 1 frontal (x is lateral, d3 = 0), 2 sagittal (x is forward, d2 = 0).
+    """
+    origin = rest_places(rig)[INCISOR]
+    columns = [0, 1] if axis == 1 else [2, 1]
+    border = (landmark_places(rig, border_path(rig, axis))[:, INCISOR] - origin)[:, columns]
+    captured = (landmark_places(rig, _thinned(rig.arrays["codes"]))[:, INCISOR] - origin)[:, columns]
+    name, title, label = (
+        ("jaw-frontal", "Posselt, frontal", "to the subject's left [mm]"),
+        ("jaw-sagittal", "Posselt, sagittal", "forward [mm]"),
+    )[axis - 1]
+    plot = _framed(name, np.vstack([border, captured]), title, label, "up mm")
+    return _drawn(plot, [_dots(plot, captured), _ring(plot, border, BLUE)])
+
+
+def posselt_point(places: Array, rest: Array, axis: int) -> tuple[float, float]:
+    """Return where landmark places (5, 3) lie in Posselt's figure `axis`, given those at rest [mm]."""
+    moved = places[INCISOR] - rest[INCISOR]
+    return float(moved[0 if axis == 1 else 2]), float(moved[1])
+
+
+def curve_plot(clip: Clip | None, keys: KeyTrack, name: str = "jaw-curves") -> Plot:
+    """Draw d1, d2 and d3 of a motion over its frames, keys as dots."""
+    if clip is None:
+        empty = f'<text x="{_WIDTH / 2}" y="{_HEIGHT / 2}" text-anchor="middle" {_TEXT}>no keys yet</text>'
+        return Plot(name, empty, (0.0, 0.0), (1.0, 1.0))
+    first, last = clip.span
+    frames = np.union1d(np.linspace(first, last, _MOST_SAMPLES), [key.frame for key in keys])
+    values = clip.at(frames)
+    corners = np.stack([np.repeat([first, max(last, first + 1)], 2), np.tile([values.min(), values.max()], 2)], axis=1)
+    plot = _framed(name, corners, f"{clip.name}: d1, d2, d3 [mm]", "frame", "mm", pad_x=False)
+    parts = []
+    for axis, color in enumerate(CURVE_COLORS):
+        line = _path(_place(plot, np.stack([frames, values[:, axis]], axis=1)))
+        parts.append(f'<path d="{line}" fill="none" stroke="{color}" stroke-width="1.5"/>')
+        label = f'<text x="{_WIDTH - 70 + 24 * axis}" y="14" font-size="11" fill="{color}" font-weight="bold">'
+        parts.append(f"{label}d{axis + 1}</text>")
+        for key in keys:
+            px, py = _place(plot, np.array([[key.frame, key.d[axis]]]))[0]
+            parts.append(f'<circle cx="{px:.1f}" cy="{py:.1f}" r="3" fill="{color}"/>')
+    return _drawn(plot, parts)
+
+
+def with_playhead(plot: Plot, frame: float) -> str:
+    """Return the SVG of a curve plot with a line at the frame shown."""
+    frame = min(max(frame, plot.low[0]), plot.high[0])
+    px = _place(plot, np.array([[frame, plot.low[1]]]))[0, 0]
+    line = (
+        f'<line x1="{px:.1f}" x2="{px:.1f}" y1="{_TOP}" y2="{_HEIGHT - _BOTTOM}" stroke="{ORANGE}" stroke-width="2"/>'
+    )
+    return _svg(f'<use href="#{plot.name}"/>{line}')
+
+
+def _svg(content: str) -> str:
+    return f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" width="100%" style="display:block">{content}</svg>'
+
+
+def _thinned(points: Array) -> Array:
+    return points[:: max(1, -(-len(points) // _MOST_POINTS))]
+
+
+def _place(plot: Plot, points: Array) -> Array:
+    """Return pixels (n, 2) of data points (n, 2), kept inside the frame."""
+    low, high = np.array(plot.low), np.array(plot.high)
+    share = np.clip((points - low) / (high - low), 0.0, 1.0)
+    x = _LEFT + share[:, 0] * (_WIDTH - _LEFT - _RIGHT)
+    y = _HEIGHT - _BOTTOM - share[:, 1] * (_HEIGHT - _TOP - _BOTTOM)
+    return np.stack([x, y], axis=1)
+
+
+def _framed(name: str, data: Array, title: str, x_label: str, y_label: str, pad_x: bool = True) -> Plot:
+    """Return a plot of axes, ticks and labels that holds data (n, 2)."""
+    low, high = data.min(axis=0), data.max(axis=0)
+    pad = np.maximum(0.06 * (high - low), 0.5) * (float(pad_x), 1.0)
+    low, high = low - pad, high + pad
+    plot = Plot(name, "", (float(low[0]), float(low[1])), (float(high[0]), float(high[1])))
+    area = (_WIDTH - _LEFT - _RIGHT, _HEIGHT - _TOP - _BOTTOM)
+    parts = [
+        f'<rect x="{_LEFT}" y="{_TOP}" width="{area[0]}" height="{area[1]}" fill="none" stroke="{GREY}"/>',
+        f'<text x="{_LEFT}" y="14" {_TEXT} font-weight="bold">{title}</text>',
+        f'<text x="{_LEFT + area[0] / 2}" y="{_HEIGHT - 4}" text-anchor="middle" {_TEXT}>{x_label}</text>',
+        f'<text x="4" y="{_TOP - 8}" {_TEXT}>{y_label}</text>',
+    ]
+    for tick in _ticks(low[0], high[0]):
+        px = _place(plot, np.array([[tick, low[1]]]))[0, 0]
+        parts.append(f'<text x="{px:.1f}" y="{_HEIGHT - _BOTTOM + 13}" text-anchor="middle" {_TEXT}>{tick:g}</text>')
+    for tick in _ticks(low[1], high[1]):
+        py = _place(plot, np.array([[low[0], tick]]))[0, 1]
+        parts.append(f'<text x="{_LEFT - 4}" y="{py + 4:.1f}" text-anchor="end" {_TEXT}>{tick:g}</text>')
+        parts.append(f'<path d="M{_LEFT} {py:.1f}h{area[0]}" stroke="{GREY}" stroke-opacity=".25"/>')
+    return Plot(name, "".join(parts), plot.low, plot.high)
+
+
+def _drawn(plot: Plot, parts: list[str]) -> Plot:
+    return Plot(plot.name, plot.still + "".join(parts), plot.low, plot.high)
+
+
+def _ticks(low: float, high: float) -> list[float]:
+    """Return about five round numbers between two values."""
+    rough = (high - low) / 5
+    power = 10.0 ** np.floor(np.log10(rough))
+    step = power * next(factor for factor in (1, 2, 5, 10) if factor * power >= rough)
+    return [round(step * k, 9) + 0.0 for k in range(int(np.ceil(low / step)), int(np.floor(high / step)) + 1)]
+
+
+def _path(pixels: Array) -> str:
+    return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in pixels)
+
+
+def _ring(plot: Plot, points: Array, color: str, dash: str = "") -> str:
+    dashed = f' stroke-dasharray="{dash}"' if dash else ""
+    return f'<path d="{_path(_place(plot, points))}Z" fill="none" stroke="{color}" stroke-width="1.5"{dashed}/>'
+
+
+def _dots(plot: Plot, points: Array) -> str:
+    steps = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in _place(plot, points))
+    return f'<path d="{steps}" stroke="{GREY}" stroke-width="2.5" stroke-linecap="round" stroke-opacity=".7"/>'

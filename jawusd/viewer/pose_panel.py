@@ -1,0 +1,169 @@
+"""The panel that poses the jaw: sliders with live ends, read-outs, pins, undo, views."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import viser
+
+from jawusd.geometry import LANDMARKS
+from jawusd.viewer.notices import guarded
+from jawusd.viewer.plots import GREEN, VERMILION
+from jawusd.viewer.readouts import Readout
+from jawusd.viewer.scene import PRESETS, JawScene
+from jawusd.viewer.session import Session
+
+STEP_MM = 0.01
+LABELS = ("d1 opening", "d2 lateral (+ left)", "d3 protrusion (+ forward)")
+# How far sliders reach beyond the ranges of the rig while poses outside are allowed.
+_BEYOND = 0.25
+_PINNABLE = tuple(name for name in LANDMARKS if not name.startswith("molar"))
+
+
+class PosePanel:
+    """Hold the widgets that pose the jaw.
+
+    Attributes:
+        sliders: of d1, d2, d3 [mm].
+    """
+
+    def __init__(
+        self, client: viser.ClientHandle, session: Session, scene: JawScene, changed: Callable[[], None]
+    ) -> None:
+        """Make the widgets in the present container.
+
+        Args:
+            client: the page.
+            session: what the widgets change.
+            scene: where the camera is.
+            changed: called after every change.
+        """
+        self._client, self._session, self._scene, self._changed = client, session, scene, changed
+        gui = client.gui
+        self.sliders = [self._add_slider(index, label) for index, label in enumerate(LABELS)]
+        self.keep_valid = gui.add_checkbox("keep valid", True, hint="Stop sliders at the bound of this person.")
+        self.keep_valid.on_update(guarded(client, self._keep))
+        self.reading = gui.add_html("")
+        steps = gui.add_button_group("history", ("undo", "redo", "close jaw"))
+        steps.on_click(guarded(client, self._step))
+        with gui.add_folder("Hold while dragging"):
+            self.pins = {name: self._add_pin(name) for name in _PINNABLE}
+        with gui.add_folder("View"):
+            views = gui.add_button_group("look from", tuple(PRESETS))
+            views.on_click(guarded(client, self._look))
+            paths = gui.add_checkbox("paths and captured places", True)
+            paths.on_update(guarded(client, self._show_paths))
+            dark = gui.add_checkbox("dark page", False)
+            dark.on_update(guarded(client, self._darken))
+        undo = gui.add_command("Undo", hotkey="Z", modifier="cmd/ctrl")
+        undo.on_trigger(guarded(client, self._undo))
+
+    def _add_slider(self, index: int, label: str) -> viser.GuiSliderHandle[float]:
+        slider = self._client.gui.add_slider(f"{label} [mm]", -1.0, 1.0, STEP_MM, 0.0)
+
+        async def moved(_: object) -> None:
+            self._session.set_parameter(index, float(slider.value))
+            self._changed()
+
+        slider.on_update(guarded(self._client, moved))
+        return slider
+
+    def _add_pin(self, name: str) -> viser.GuiCheckboxHandle:
+        box = self._client.gui.add_checkbox(name.replace("_", " "), False)
+
+        async def pinned(_: object) -> None:
+            self._session.set_pin(name, bool(box.value))
+            self._changed()
+
+        box.on_update(guarded(self._client, pinned))
+        return box
+
+    async def _keep(self, _: object) -> None:
+        self._session.set_keep_valid(self.keep_valid.value)
+        self._changed()
+
+    async def _step(self, event: viser.GuiEvent) -> None:
+        if event.target.value == "undo":
+            self._session.undo()
+        elif event.target.value == "redo":
+            self._session.redo()
+        else:
+            self._session.set_pose([0.0, 0.0, 0.0])
+        self._changed()
+
+    async def _undo(self, _: object) -> None:
+        self._session.undo()
+        self._changed()
+
+    async def _look(self, event: viser.GuiEvent) -> None:
+        self._scene.look(event.target.value)
+
+    async def _show_paths(self, event: viser.GuiEvent) -> None:
+        self._scene.show_paths(event.target.value)
+
+    async def _darken(self, event: viser.GuiEvent) -> None:
+        self._client.gui.configure_theme(dark_mode=event.target.value, show_logo=False, show_share_button=False)
+
+    def refresh(self, readout: Readout) -> None:
+        """Bring sliders, pins and numbers in line with the session."""
+        session = self._session
+        limits = session.limits()
+        ends = slider_ends(limits, session.rig.arrays["d_range"], session.keep_valid)
+        for slider, (low, high), value in zip(self.sliders, ends, session.work.d, strict=True):
+            low, high = min(low, value), max(high, value)
+            if (slider.min, slider.max) != (low, high):
+                slider.min, slider.max = low, high
+            if abs(slider.value - value) > 0.5 * STEP_MM:
+                slider.value = value
+        for name, box in self.pins.items():
+            box.value = any(pin.name == name for pin in session.work.pins)
+        self.reading.content = reading_html(readout, session.work.d, limits)
+
+
+def slider_ends(limits: object, d_range: object, keep_valid: bool) -> list[tuple[float, float]]:
+    """Return low and high end of the three sliders [mm].
+
+    Args:
+        limits: valid ends at the present pose, shape (3, 2) [mm].
+        d_range: ends of the rig as a whole, shape (3, 2) [mm].
+        keep_valid: whether sliders stay inside; their ends are then rounded inwards to the step of the sliders.
+    """
+    if keep_valid:
+        return [
+            (math.ceil(low / STEP_MM - 1e-6) * STEP_MM, math.floor(high / STEP_MM + 1e-6) * STEP_MM)
+            for low, high in limits
+        ]
+    return [(float(low - _BEYOND * (high - low)), float(high + _BEYOND * (high - low))) for low, high in d_range]
+
+
+def reading_html(readout: Readout, d: tuple[float, float, float], limits: object) -> str:
+    """Return the numbers of a pose as HTML; the verdict in colour and in words."""
+    color, verdict = (GREEN, "valid") if readout.inside else (VERMILION, "OUTSIDE the bound")
+    captured = f"{readout.captured_mm:.2f} mm" if math.isfinite(readout.captured_mm) else "nothing captured"
+    rows = [
+        ("incisal point", f"down {readout.opening_mm:.2f}, left {readout.lateral_mm:.2f}, "
+                          f"forward {readout.protrusion_mm:.2f} mm"),
+        ("left condyle", _moved(readout.condyle_left_mm)),
+        ("right condyle", _moved(readout.condyle_right_mm)),
+        ("margin", f"{readout.margin_mm:.2f} mm"),
+        ("nearest captured", captured),
+        *((f"valid d{i + 1}", _span(d[i], *limits[i])) for i in range(3)),
+    ]  # fmt: skip
+    cells = "".join(
+        f'<tr><td style="opacity:.7;padding-right:8px;white-space:nowrap">{name}</td><td>{text}</td></tr>'
+        for name, text in rows
+    )
+    head = f'<div style="color:{color};font-weight:bold">&#9679; {verdict}</div>'
+    return f'<div style="font-size:12px;padding:2px 12px;line-height:1.35">{head}<table>{cells}</table></div>'
+
+
+def _span(value: float, low: float, high: float) -> str:
+    text = f"{low:.2f} to {high:.2f} mm"
+    inside = low - STEP_MM <= value <= high + STEP_MM
+    return text if inside else f'<b style="color:{VERMILION}">{text}</b>'
+
+
+def _moved(moved_mm: tuple[float, float, float]) -> str:
+    left, up, forward = moved_mm
+    return f"left {left:.2f}, down {-up:.2f}, forward {forward:.2f} mm"

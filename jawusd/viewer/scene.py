@@ -1,0 +1,175 @@
+"""The jaw in 3-D: meshes, paths, markers and where the camera stands. World of the page: anatomical frame, mm."""
+
+from __future__ import annotations
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from jawusd.formats.mesh import Mesh
+from jawusd.geometry import LANDMARKS
+from jawusd.geometry.quaternion import wxyz_from_matrix
+from jawusd.geometry.se3 import se3_inverse, transform_points
+from jawusd.viewer.actor import MOVING, STILL, ViewedActor
+from jawusd.viewer.readouts import CONDYLES, INCISOR, habitual_path, landmark_places, rest_places
+
+Array = NDArray[np.float64]
+Color = tuple[int, int, int]
+
+_ENAMEL, _GUM, _BONE = (236, 229, 212), (196, 112, 108), (222, 207, 178)
+_COLORS = {"upper_teeth": _ENAMEL, "lower_teeth": _ENAMEL, "upper_gum": _GUM, "lower_gum": _GUM}
+_OUTSIDE: Color = (222, 120, 90)
+_INCISOR, _CONDYLE, _PIN, _HELD = (0, 114, 178), (0, 158, 115), (230, 159, 0), (213, 94, 0)
+_SKULL_OPACITY = 0.28
+_MARKER_MM, _PIN_MM = 1.2, 2.2
+_CAPTURED_MM, _MOST_CAPTURED = 0.5, 400
+
+#: Views by name: where the camera stands from what it looks at, in anatomical axes [mm].
+PRESETS = {
+    "front": (0.0, 10.0, 330.0),
+    "left": (330.0, 10.0, 0.0),
+    "right": (-330.0, 10.0, 0.0),
+    "condyle left": (105.0, 12.0, 40.0),
+    "condyle right": (-105.0, 12.0, 40.0),
+}
+_FOV_RAD, _NEAR_MM, _FAR_MM = 0.6, 1.0, 5000.0
+
+
+class JawScene:
+    """Draw the jaw for one page.
+
+    Attributes:
+        grips: the meshes that can be taken hold of.
+    """
+
+    def __init__(self, client: viser.ClientHandle, actor: ViewedActor) -> None:
+        """Draw everything that stands still and the jaw in the closed bite."""
+        self._client, self._scene = client, client.scene
+        rig = actor.rig
+        self._T_world_skull = np.array(rig.arrays["T_anatomical_skull"])
+        self._rest = rest_places(rig)
+        self._scene.configure_default_lights(cast_shadow=False)
+        for name in STILL:
+            if name in actor.meshes:
+                self._add_still(name, actor.meshes[name])
+        self._jaw = self._scene.add_frame("/jaw", show_axes=False)
+        moving = [name for name in MOVING if name in actor.meshes]
+        self.grips = [self._add_moving(name, actor.meshes[name]) for name in moving]
+        self._mandible = self.grips[moving.index("mandible")] if "mandible" in moving else None
+        self._inside = True
+        self._add_landmarks(rig.arrays["landmarks"])
+        self._paths = self._add_paths(actor)
+        self._pins = {name: self._ball(f"/pin/{name}", _PIN_MM, _PIN, opacity=0.6) for name in LANDMARKS}
+        self._held = self._ball("/held", _MARKER_MM, _HELD)
+        self._line = self._scene.add_line_segments(
+            "/pull", np.zeros((1, 2, 3)), colors=_HELD, thickness=2.5, thickness_units="screen"
+        )
+        self.show_hold(None, None)
+        self.show_pins({})
+
+    def _add_still(self, name: str, mesh: Mesh) -> None:
+        vertices = transform_points(self._T_world_skull, mesh.vertices)
+        clear = _SKULL_OPACITY if name == "skull" else None
+        self._scene.add_mesh_simple(
+            f"/{name}", vertices, mesh.faces, color=_COLORS.get(name, _BONE), opacity=clear, side="double"
+        )
+
+    def _add_moving(self, name: str, mesh: Mesh) -> viser.MeshHandle:
+        color = _COLORS.get(name, _BONE)
+        return self._scene.add_mesh_simple(f"/jaw/{name}", mesh.vertices, mesh.faces, color=color, side="double")
+
+    def _add_landmarks(self, landmarks: Array) -> None:
+        for name, place in zip(LANDMARKS, landmarks, strict=True):
+            color = _CONDYLE if name.startswith("condyle") else _INCISOR
+            if not name.startswith("molar"):
+                self._ball(f"/jaw/{name}", _MARKER_MM, color, position=tuple(place))
+
+    def _ball(self, name: str, radius_mm: float, color: Color, **more: object) -> viser.IcosphereHandle:
+        return self._scene.add_icosphere(name, radius=radius_mm, color=color, **more)
+
+    def _lines(self, name: str, ends: Array, color: Color) -> viser.LineSegmentsHandle:
+        return self._scene.add_line_segments(name, ends, colors=color, thickness=2.5, thickness_units="screen")
+
+    def _add_paths(self, actor: ViewedActor) -> list[viser.SceneNodeHandle]:
+        """Draw the paths of incisal point and condyles in plain opening, and where they were in the capture."""
+        codes = actor.rig.arrays["codes"]
+        captured = landmark_places(actor.rig, codes[:: max(1, -(-len(codes) // _MOST_CAPTURED))])
+        path = habitual_path(actor.rig)
+        handles: list[viser.SceneNodeHandle] = []
+        for index in (INCISOR, *CONDYLES):
+            color, line = _INCISOR if index == INCISOR else _CONDYLE, path[:, index]
+            segments = np.stack([line[:-1], line[1:]], axis=1)
+            name = f"/paths/{LANDMARKS[index]}"
+            handles.append(self._lines(name, segments, color))
+            handles.append(
+                self._scene.add_point_cloud(
+                    f"{name}_captured",
+                    captured[:, index],
+                    colors=color,
+                    point_size=_CAPTURED_MM,
+                    point_shape="circle",
+                    precision="float32",
+                )
+            )
+        return handles
+
+    def show_paths(self, visible: bool) -> None:
+        """Show or hide paths and captured places."""
+        for handle in self._paths:
+            handle.visible = visible
+
+    def move(self, T_skull_mandible: Array, inside: bool) -> None:
+        """Put the mandible where it belongs, in another colour when the pose is not valid."""
+        T = self._T_world_skull @ T_skull_mandible
+        with self._client.atomic():
+            self._jaw.position = tuple(T[:3, 3])
+            self._jaw.wxyz = tuple(wxyz_from_matrix(T[:3, :3]))
+        if inside != self._inside and self._mandible is not None:
+            self._mandible.color = _BONE if inside else _OUTSIDE
+        self._inside = inside
+
+    def show_hold(self, held_skull: Array | None, pointer_skull: Array | None) -> None:
+        """Mark the held point and a line to the pointer, both (3,) [mm] in the skull frame; None hides them."""
+        visible = held_skull is not None and pointer_skull is not None
+        if held_skull is not None and pointer_skull is not None:
+            ends = transform_points(self._T_world_skull, np.stack([held_skull, pointer_skull]))
+            self._held.position = tuple(ends[0])
+            self._line.points = ends[None].astype(np.float32)
+        if self._held.visible != visible:
+            self._held.visible = self._line.visible = visible
+
+    def show_pins(self, places_skull: dict[str, Array]) -> None:
+        """Mark pinned landmarks at their places (3,) [mm], skull frame."""
+        for name, ball in self._pins.items():
+            if name in places_skull:
+                ball.position = tuple(transform_points(self._T_world_skull, places_skull[name]))
+            if ball.visible != (name in places_skull):
+                ball.visible = name in places_skull
+
+    def skull_from_page(self, position: tuple[float, float, float]) -> Array:
+        """Return a place of the page's world in the skull frame [mm], shape (3,)."""
+        return transform_points(se3_inverse(self._T_world_skull), np.array(position))
+
+    def look(self, preset: str) -> None:
+        """Put the camera where a preset says."""
+        target, eye = preset_view(self._rest, preset)
+        camera = self._client.camera
+        with self._client.atomic():
+            camera.position, camera.look_at, camera.up_direction = tuple(eye), tuple(target), (0.0, 1.0, 0.0)
+
+
+def preset_view(rest: Array, preset: str) -> tuple[Array, Array]:
+    """Return what a preset looks at and from where, shape (3,) each [mm], given the landmarks (5, 3) at rest."""
+    target = rest[list(CONDYLES) + [INCISOR]].mean(axis=0)
+    if preset.startswith("condyle"):
+        target = rest[CONDYLES[0] if preset.endswith("left") else CONDYLES[1]]
+    return target, target + np.array(PRESETS[preset])
+
+
+def set_first_view(server: viser.ViserServer, rest: Array, preset: str = "front") -> None:
+    """Let every page begin with a preset, given the landmarks (5, 3) at rest [mm]."""
+    target, eye = preset_view(rest, preset)
+    server.scene.set_up_direction("+y")
+    first = server.initial_camera
+    first.position, first.look_at, first.up = tuple(eye), tuple(target), (0.0, 1.0, 0.0)
+    first.fov, first.near, first.far = _FOV_RAD, _NEAR_MM, _FAR_MM

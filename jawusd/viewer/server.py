@@ -1,0 +1,126 @@
+"""Serve the viewer to browsers on this machine."""
+
+from __future__ import annotations
+
+import contextlib
+import ipaddress
+import logging
+import socket
+import sys
+from urllib.parse import urlsplit
+
+import viser
+
+from jawusd.errors import OutputError
+from jawusd.viewer.actor import ViewedActor
+from jawusd.viewer.page import Page
+from jawusd.viewer.plot_panel import StillPlots
+from jawusd.viewer.scene import set_first_view
+
+log = logging.getLogger(__name__)
+
+
+class _LocalServer(viser.ViserServer):
+    """A viser server that asks nobody else: any page could order it to open a tunnel to the internet."""
+
+    def request_share_url(self, verbose: bool = True) -> str | None:
+        """Refuse to share through viser's relay."""
+        log.warning("a page asked for a public address; the viewer gives none")
+        return None
+
+
+class Viewer:
+    """Serve an actor; every page has a session of its own.
+
+    Attributes:
+        pages: the open pages by client number.
+        url: where to look.
+    """
+
+    def __init__(self, actor: ViewedActor, host: str, port: int) -> None:
+        """Start serving.
+
+        Args:
+            actor: what is shown.
+            host: address to listen on.
+            port: port to listen on; 0 takes any free one, a taken one the next that is free.
+
+        Raises:
+            OutputError: the address is not this machine's.
+        """
+        self._actor, self._host = actor, host
+        self._still = StillPlots(actor.rig)
+        self.pages: dict[int, Page] = {}
+        _check_address(host)
+        with contextlib.redirect_stdout(sys.stderr):  # viser greets there; results go on stdout
+            self._server = _LocalServer(host=host, port=port, label=actor.name, verbose=False)
+        set_first_view(self._server, self._still.rest)
+        self._server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
+        self._server.on_client_connect(self._welcome)
+        self._server.on_client_disconnect(self._farewell)
+        self.url = f"http://{'localhost' if is_loopback(host) else host}:{self._server.get_port()}"
+
+    async def _welcome(self, client: viser.ClientHandle) -> None:
+        if not self._trusted(client):
+            log.warning("refused a page that belongs to another site")
+            return
+        self.pages[client.client_id] = Page(client, self._actor, self._still)
+
+    async def _farewell(self, client: viser.ClientHandle) -> None:
+        page = self.pages.pop(client.client_id, None)
+        if page is not None:
+            page.close()
+
+    def _trusted(self, client: viser.ClientHandle) -> bool:
+        """Return whether the page came from this server: browsers let pages of any site connect to localhost."""
+        headers = self._server._websock_server._live_connections[client.client_id].request.headers
+        return is_own_page(headers.get("Host", ""), headers.get("Origin"), local=is_loopback(self._host))
+
+    def wait(self) -> None:
+        """Serve until interrupted."""
+        self._server.sleep_forever()
+
+    def stop(self) -> None:
+        """Stop serving."""
+        with contextlib.redirect_stdout(sys.stderr):
+            self._server.stop()
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether an address is reached from this machine alone."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return False
+
+
+def is_own_page(host: str, origin: str | None, *, local: bool) -> bool:
+    """Return whether a connection comes from a page that this server sent.
+
+    Args:
+        host: the Host header, name and port.
+        origin: the Origin header; programs that are no browser send none.
+        local: the server listens on this machine alone; another name in `host` is then a trick with DNS.
+    """
+    name = urlsplit(f"//{host}").hostname or ""
+    if local and not is_loopback(name):
+        return False
+    return origin is None or urlsplit(origin).netloc == host
+
+
+def _check_address(host: str) -> None:
+    """Try to listen on an address: viser would look for a free port for ever.
+
+    Raises:
+        OutputError: nobody can.
+    """
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as probe:
+            probe.bind(address)
+    except OSError as error:
+        raise OutputError(
+            f"cannot listen on {host}: {error.strerror}.", hint="The default, 127.0.0.1, is reached from this machine."
+        ) from error

@@ -1,0 +1,277 @@
+"""What one visitor does with a rig: sliders, dragging with pins, keys, undo. Knows nothing of the page."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jawusd.evaluator import JawRig
+from jawusd.formats.keys import Keys
+from jawusd.geometry import LANDMARKS
+from jawusd.geometry.se3 import se3_inverse, transform_points
+from jawusd.viewer import keytrack
+from jawusd.viewer.clip import Clip
+from jawusd.viewer.keytrack import KeyTrack
+from jawusd.viewer.readouts import ON_BOUND_MM, Readout, read_out
+
+Array = NDArray[np.float64]
+Interpolation = Literal["linear", "smooth"]
+
+# A pinned landmark counts this much more than the point under the pointer (squared distances): 5 mm of pull move it
+# by a fraction of a millimetre where the jaw could follow either.
+_PIN_WEIGHT = 100.0
+_MOST_UNDO = 200
+_SHARES = np.linspace(1.0, 0.0, 65)
+
+
+@dataclass(frozen=True)
+class Pin:
+    """Hold a landmark where it was when it was pinned: mandible and skull frame [mm]."""
+
+    name: str
+    p_mandible: tuple[float, float, float]
+    p_skull: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Work:
+    """Hold everything that undo brings back."""
+
+    d: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    pins: tuple[Pin, ...] = ()
+    keys: KeyTrack = ()
+    fps: float = 24.0
+    interpolation: Interpolation = "linear"
+
+
+class Session:
+    """Let one visitor pose, drag and key a rig.
+
+    Attributes:
+        rig: the rig.
+        work: pose, pins and keys now.
+        keep_valid: whether sliders stay inside the bound.
+    """
+
+    def __init__(self, rig: JawRig, fps: float) -> None:
+        """Start at the closed bite, without keys.
+
+        Args:
+            rig: the rig.
+            fps: frames per second of new animations.
+        """
+        self.rig = rig
+        self.work = Work(d=_triple(rig.project(np.zeros(3))), fps=fps)
+        self.keep_valid = True
+        self._undo: list[Work] = []
+        self._redo: list[Work] = []
+        self._gesture: str | None = None
+        self._handle: Array | None = None
+
+    @property
+    def d(self) -> Array:
+        """Return the parameters now [mm], shape (3,)."""
+        return np.array(self.work.d)
+
+    @property
+    def dragging(self) -> bool:
+        """Return whether a point of the mandible is held."""
+        return self._handle is not None
+
+    def pose(self) -> Array:
+        """Return T_skull_mandible now, shape (4, 4)."""
+        return self.rig.pose(self.d)
+
+    def readout(self) -> Readout:
+        """Return what is measured of the pose now."""
+        return read_out(self.rig, self.d)
+
+    def limits(self) -> Array:
+        """Return how far each parameter may go [mm], shape (3, 2): low and high.
+
+        The opening may use its whole range. d2 and d3 have the ends that are valid at the opening now and with the
+        other one where it is; if no value is, with the other one at 0, else none at all: both ends are then the value
+        itself.
+        """
+        d = self.d
+        found = np.array(self.rig.ranges(*d)).reshape(2, 2)
+        alone = np.array(self.rig.ranges(d[0])).reshape(2, 2)
+        found = np.where(np.isfinite(found).all(axis=1, keepdims=True), found, alone)
+        found = np.where(np.isfinite(found).all(axis=1, keepdims=True), found, d[1:, None])
+        return np.vstack([self.rig.arrays["d_range"][0], found])
+
+    def set_parameter(self, index: int, value: float) -> None:
+        """Move one parameter, as a slider does; a run of moves of the same one is one step for undo.
+
+        Args:
+            index: 0, 1 or 2 for d1, d2, d3.
+            value: its new value [mm]. With `keep_valid` the opening wins, d2 and d3 shrink with it; d2 and d3 stop at
+                the bound.
+
+        Raises:
+            ValueError: the value is not finite.
+        """
+        if not np.isfinite(value):
+            raise ValueError(f"d{index + 1} must be finite, got {value}")
+        d = self.d
+        d[index] = value
+        self._change(f"d{index + 1}", d=_triple(self._kept(d, index) if self.keep_valid else d))
+
+    def set_pose(self, d: ArrayLike) -> None:
+        """Move all parameters [mm] (3,) at once, inside the bound if `keep_valid`."""
+        d = np.asarray(d, dtype=np.float64)
+        self._change(None, d=_triple(self._inside(d) if self.keep_valid else d))
+
+    def show(self, d: ArrayLike) -> None:
+        """Show parameters [mm] (3,) of a motion as they are: nothing to undo, nothing kept inside."""
+        self.work = replace(self.work, d=_triple(np.asarray(d, dtype=np.float64)))
+        self._gesture = None
+
+    def set_keep_valid(self, keep: bool) -> None:
+        """Switch whether sliders stay inside; switching it on brings the pose inside."""
+        self.keep_valid = bool(keep)
+        if keep and float(self.rig.margin(self.d)) < -ON_BOUND_MM:
+            self.set_pose(self.d)
+
+    def _inside(self, d: Array) -> Array:
+        return d if float(self.rig.margin(d)) >= -ON_BOUND_MM else self.rig.project(d)
+
+    def _kept(self, d: Array, index: int) -> Array:
+        """Return d (3,) brought inside, moving the parameter `index` as little as the bound allows."""
+        if float(self.rig.margin(d)) >= 0.0:
+            return d
+        d = d.copy()
+        if index == 0:
+            d[0] = np.clip(d[0], *self.rig.arrays["d_range"][0])
+            tried = d * np.stack([np.ones_like(_SHARES), _SHARES, _SHARES], axis=1)
+            valid = np.flatnonzero(self.rig.margin(tried) >= 0.0)
+            return tried[valid[0]] if valid.size else self.rig.project(d)
+        ends = np.array(self.rig.ranges(*d))[2 * (index - 1) : 2 * index]
+        if np.isfinite(ends).all():
+            d[index] = np.clip(d[index], *ends)
+        return self._inside(d)
+
+    def grab(self, p_skull: ArrayLike) -> None:
+        """Take hold of the point of the mandible that is now at p_skull [mm] (3,), skull frame."""
+        self._handle = transform_points(se3_inverse(self.pose()), np.asarray(p_skull, dtype=np.float64))
+        self._gesture = None
+
+    def drag_to(self, p_skull: ArrayLike) -> float:
+        """Let the jaw follow the pointer: inverse kinematics from the last pose, pins held.
+
+        Args:
+            p_skull: where the held point should go [mm], skull frame, shape (3,).
+
+        Returns:
+            Distance left between the held point and the pointer [mm].
+
+        Raises:
+            RuntimeError: nothing is held.
+        """
+        if self._handle is None:
+            raise RuntimeError("drag_to before grab")
+        target = np.asarray(p_skull, dtype=np.float64)
+        handles = np.array([self._handle, *(pin.p_mandible for pin in self.work.pins)])
+        targets = np.array([target, *(pin.p_skull for pin in self.work.pins)])
+        weights = [1.0] + [_PIN_WEIGHT] * len(self.work.pins)
+        d, _ = self.rig.ik(handles, targets, start=self.d, weights=weights)
+        self._change("drag", d=_triple(d))
+        return float(np.linalg.norm(transform_points(self.rig.pose(d), self._handle) - target))
+
+    def release(self) -> None:
+        """Let go of the held point."""
+        self._handle = None
+        self._gesture = None
+
+    def held_place(self) -> Array | None:
+        """Return where the held point is now [mm], skull frame, shape (3,); None when nothing is held."""
+        return None if self._handle is None else transform_points(self.pose(), self._handle)
+
+    def set_pin(self, name: str, on: bool) -> None:
+        """Pin a landmark where it is now, or let it go. Pins hold while dragging; sliders and keys move them along.
+
+        Args:
+            name: one of `geometry.LANDMARKS`.
+            on: pin it.
+        """
+        pins = tuple(pin for pin in self.work.pins if pin.name != name)
+        if on:
+            place = self.rig.arrays["landmarks"][LANDMARKS.index(name)]
+            pins += (Pin(name, _triple(place), _triple(transform_points(self.pose(), place))),)
+        self._change(None, pins=pins)
+
+    def set_keys(self, keys: KeyTrack) -> None:
+        """Replace the keys."""
+        self._change(None, keys=keys)
+
+    def add_key(self, frame: float) -> None:
+        """Set a key of the pose now at a frame; a key that was there is replaced."""
+        self.set_keys(keytrack.with_key(self.work.keys, frame, self.work.d))
+
+    def load_keys(self, loaded: Keys) -> None:
+        """Replace keys, frame rate and interpolation by those of a file."""
+        self._change(None, keys=loaded.keys, fps=loaded.fps, interpolation=loaded.interpolation)
+
+    def set_interpolation(self, interpolation: Interpolation) -> None:
+        """Choose how the jaw moves between keys."""
+        self._change(None, interpolation=interpolation)
+
+    def set_fps(self, fps: float) -> None:
+        """Set the frames per second.
+
+        Raises:
+            ValueError: not more than 0.
+        """
+        if not 0 < fps <= 1000:
+            raise ValueError(f"fps must be above 0 and at most 1000, got {fps}")
+        self._change("fps", fps=float(fps))
+
+    def saved_keys(self) -> Keys | None:
+        """Return the keys as they are saved, None without any."""
+        work = self.work
+        return Keys(fps=work.fps, interpolation=work.interpolation, keys=work.keys) if work.keys else None
+
+    def key_clip(self) -> Clip | None:
+        """Return the animation of the keys, None without any: the keys, or every whole frame of a smooth one too."""
+        saved = self.saved_keys()
+        if saved is None:
+            return None
+        frames, d_keys = saved.arrays()
+        if saved.interpolation == "linear":
+            return Clip("keys", frames, d_keys, saved.fps)
+        times = np.union1d(np.arange(np.ceil(frames[0]), np.floor(frames[-1]) + 1), frames)
+        d = self.rig.interpolate(frames, d_keys, times, saved.interpolation)
+        return Clip("keys", times, d, saved.fps)
+
+    def undo(self) -> bool:
+        """Take the last change back; return whether there was one."""
+        return self._step(self._undo, self._redo)
+
+    def redo(self) -> bool:
+        """Make the last change that was taken back again; return whether there was one."""
+        return self._step(self._redo, self._undo)
+
+    def _step(self, source: list[Work], other: list[Work]) -> bool:
+        if not source:
+            return False
+        other.append(self.work)
+        self.work = source.pop()
+        self._gesture = None
+        return True
+
+    def _change(self, gesture: str | None, **values: object) -> None:
+        """Change the work; changes of one gesture in a row are one step."""
+        if gesture is None or gesture != self._gesture:
+            self._undo.append(self.work)
+            del self._undo[:-_MOST_UNDO]
+        self._redo.clear()
+        self._gesture = gesture
+        self.work = replace(self.work, **values)
+
+
+def _triple(values: Array) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
