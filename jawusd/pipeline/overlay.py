@@ -16,7 +16,7 @@ from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import Camera
 from jawusd.pipeline.extras import stage
-from jawusd.pipeline.prepare import load_cameras, load_meshes
+from jawusd.pipeline.prepare import load_cameras, load_meshes, tracked_cameras
 from jawusd.pipeline.state import Progress
 
 SHEET = "contact_sheet.png"
@@ -53,6 +53,7 @@ def write_overlay(
         OutputError: the files cannot be written.
     """
     cameras, videos = open_footage(capture)
+    cameras = {camera.name: camera for camera in tracked_cameras(list(cameras.values()), tracks)}
     meshes = load_meshes(capture)
     upper, lower = meshes["upper_teeth"], meshes["lower_teeth"]
     drawing = stage("jawusd.imaging.overlay")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from jawusd.errors import CalibrationError, CaptureError
 from jawusd.formats.calibration import load_calibration
 from jawusd.formats.capture import CameraSource, Capture, load_capture
 from jawusd.formats.mesh import Mesh
+from jawusd.formats.tracks import Tracks
 from jawusd.geometry import LANDMARKS, Camera, anatomical_frame, find_landmarks
 from jawusd.pipeline.extras import stage
 
@@ -65,6 +66,11 @@ def rescaled_cameras(capture: Capture) -> dict[str, tuple[tuple[int, int], tuple
     """
     pairs = [(camera, _at_recorded_size(camera, capture, source)) for camera, source in _calibrated(capture)]
     return {a.name: (tuple(a.size_px), tuple(b.size_px)) for a, b in pairs if tuple(a.size_px) != tuple(b.size_px)}
+
+
+def tracked_cameras(cameras: Sequence[Camera], tracks: Tracks) -> list[Camera]:
+    """Return the cameras the poses of tracks belong to: as loaded but for what the take itself corrected."""
+    return stage("jawusd.tracking.extrinsics").corrected_cameras(cameras, tracks.meta)
 
 
 def _calibrated(capture: Capture) -> list[tuple[Camera, CameraSource]]:

@@ -15,7 +15,7 @@ from jawusd.formats.capture import Capture
 from jawusd.formats.model import JawModel
 from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.pipeline.extras import stage
-from jawusd.pipeline.prepare import find_anatomy, load_cameras, load_meshes, rescaled_cameras
+from jawusd.pipeline.prepare import find_anatomy, load_cameras, load_meshes, rescaled_cameras, tracked_cameras
 from jawusd.pipeline.state import Progress
 from jawusd.pipeline.subject import Subject, subject_of_capture
 from jawusd.pipeline.trajectories import TrajectoryOptions, read_trajectory
@@ -256,7 +256,7 @@ def write_take(capture: Capture, tracks: Tracks, folder: Path) -> list[Path]:
     cameras = stage("jawusd.rig.cameras")
     return cameras.write_cameras(
         folder / "cameras.usda",
-        load_cameras(capture),
+        tracked_cameras(load_cameras(capture), tracks),
         folder / "anim_capture.usdc",
         tracks.frames,
         tracks.T_world_upper,

@@ -120,6 +120,20 @@ def test_each_camera_gets_a_video_with_the_scans_where_they_are_seen(capture, tm
     assert sheet.shape[1] == 2 * 480 and sheet.std() > 10
 
 
+def test_scans_are_drawn_as_the_corrected_cameras_see_them(capture, tmp_path):
+    """The take says that the left camera stands 8 mm to the side of where it was calibrated."""
+    tracks, moved = some_tracks(), CAMERAS[0].T_cam_world.copy()
+    moved[0, 3] += 8.0
+    tracks.meta["extrinsics"] = {"T_cam_world": {"left": moved.tolist()}}
+    drawn = []
+    for name, given in (("plain", some_tracks()), ("corrected", tracks)):
+        drawn.append(decoded(write_overlay(open_capture(capture), OFFSETS, given, tmp_path / name, quiet)[0])[0])
+    shift = round(8.0 * K[0, 0] / (150.0 - 3.0))
+    row = pixel(CAMERAS[0], [0, -9, -3.0])[0]
+    warm = [np.flatnonzero(p[row, :, 0].astype(int) - p[row, :, 2] > 20) for p in drawn]
+    assert warm[1].min() - warm[0].min() == pytest.approx(shift, abs=2)
+
+
 def test_odd_sides_lose_a_line(capture, tmp_path):
     """H.264 as everybody plays it needs even sides; footage in other formats may have odd ones."""
     size = (SIZE[0] + 1, SIZE[1] + 1)
