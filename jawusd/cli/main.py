@@ -6,7 +6,7 @@ import sys
 
 import typer
 
-from jawusd.cli import build_commands, plate_commands, report_commands, rig_commands, view_commands
+from jawusd.cli import build_commands, capture_commands, plate_commands, report_commands, rig_commands, view_commands
 from jawusd.errors import JawusdError
 
 app = typer.Typer(
@@ -18,6 +18,7 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 build_commands.register(app)
+capture_commands.register(app)
 rig_commands.register(app)
 plate_commands.register(app)
 report_commands.register(app)

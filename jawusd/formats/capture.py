@@ -52,23 +52,38 @@ class CameraSource(_Strict):
 
 
 class Boards(_Strict):
-    """Describe the calibration boards; counts are inner corners."""
+    """Describe the calibration boards; counts are inner corners.
+
+    `videos` names, per camera in camera order, a video or a pattern of numbered pictures (`%04d`); pictures of one
+    number are taken as simultaneous. A ChArUco board also needs OpenCV's name of its dictionary and its marker size.
+    """
 
     pattern: Literal["chessboard", "charuco"] = "chessboard"
     cols: Annotated[int, Field(ge=3, le=50)]
     rows: Annotated[int, Field(ge=3, le=50)]
     square_mm: Annotated[float, Field(gt=0, le=200)]
     videos: tuple[Path, ...]
+    dictionary: Annotated[str, Field(pattern=r"^DICT_[4-7]X[4-7]_(50|100|250|1000)$")] | None = None
+    marker_mm: Annotated[float, Field(gt=0, le=200)] | None = None
+
+    @model_validator(mode="after")
+    def _describes_markers(self) -> Boards:
+        if self.pattern == "charuco" and (self.dictionary is None or self.marker_mm is None):
+            raise ValueError('a "charuco" board needs dictionary (as "DICT_5X5_100") and marker_mm')
+        if self.marker_mm is not None and self.marker_mm >= self.square_mm:
+            raise ValueError(f"marker_mm = {self.marker_mm:g} must be smaller than square_mm = {self.square_mm:g}")
+        return self
 
 
 class Sync(_Strict):
     """Say how the cameras are aligned in time.
 
+    `flash` looks for light flashes and, where a clip shows none, listens to the sound; `audio` only listens.
     `offsets` gives, per camera, the whole number with: frame k of the camera shows the instant of frame k + offset of
     the reference camera.
     """
 
-    method: Literal["flash", "offsets"] = "flash"
+    method: Literal["flash", "audio", "offsets"] = "flash"
     reference: str | None = None
     offsets: dict[str, int] | None = None
 
@@ -126,6 +141,8 @@ class Capture(_Strict):
     fps: Annotated[float, Field(gt=0, le=10000)]
     frames: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]] | None = None
     calibration: Path | None = None
+    #: Length of the calibration file's unit [mm]; others write metres or, from pictures alone, any unit.
+    calibration_unit_mm: Annotated[float, Field(gt=0, le=1e6)] = 1.0
     scans: Scans
     cameras: Annotated[tuple[CameraSource, ...], Field(min_length=1, max_length=64)]
     boards: Boards | None = None
@@ -141,6 +158,8 @@ class Capture(_Strict):
             raise ValueError(f"camera names must differ, found {', '.join(names)}")
         if self.frames is not None and self.frames[0] >= self.frames[1]:
             raise ValueError(f"frames = {list(self.frames)} is empty; the second number is one past the last frame")
+        if self.boards is not None and len(self.boards.videos) != len(names):
+            raise ValueError(f"[boards] names {len(self.boards.videos)} videos for {len(names)} cameras")
         mentioned = {self.sync.reference} if self.sync.reference else set()
         mentioned |= set(self.sync.offsets or {})
         for pick in (*self.bootstrap.upper, *self.bootstrap.lower) if self.bootstrap else ():

@@ -1,0 +1,227 @@
+"""Bundle adjustment of fixed cameras over views of a planar board.
+
+Minimises the robust reprojection error over intrinsics (fx, fy, cx, cy, k1, k2; the other coefficients stay 0: few
+pictures of a small board cannot tell them apart), camera poses (the first camera is the world) and board poses. The
+Jacobian is analytic: OpenCV's for the lens, Solà et al. 2018 (eq. 143) for the rotations; most of it is 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse import csr_matrix
+
+from jawusd.capture.first_guess import FirstGuess
+from jawusd.errors import CalibrationError
+from jawusd.geometry import hat, make_transform, so3_exp, so3_left_jacobian, so3_log
+
+__all__ = ["Bundle", "adjust"]
+
+Array = NDArray[np.float64]
+
+_LENS = 6  # fx, fy, cx, cy, k1, k2
+_POSE = 6  # rotation vector [rad], translation [mm]
+_HUBER_SIGMAS, _LEAST_SIGMA_PX = 3.0, 0.02
+_MOST_STEPS = 100
+_OUTLIER_SIGMAS, _OUTLIER_PX = 8.0, 1.0  # a corner further off than both is not that corner
+_FEWEST_CORNERS = 6  # left of a view; else the view is dropped
+
+
+@dataclass(frozen=True, eq=False)
+class Bundle:
+    """Hold the result of the adjustment.
+
+    Attributes:
+        K: intrinsic matrices [px], shape (C, 3, 3).
+        distortion: k1 and k2, shape (C, 2).
+        T_cam_world: world (the first camera) to camera [mm], shape (C, 4, 4).
+        T_world_board: board to world [mm], shape (V, 4, 4).
+        corners_px: the corners used, NaN where not, shape (C, V, N, 2).
+        residuals_px: projected minus seen, NaN where not seen, shape (C, V, N, 2).
+        parameters: the cameras' share of the unknowns, see `camera_from`, shape (12 C - 6,).
+        covariance: of these parameters, shape (12 C - 6, 12 C - 6).
+    """
+
+    K: Array
+    distortion: Array
+    T_cam_world: Array
+    T_world_board: Array
+    corners_px: Array
+    residuals_px: Array
+    parameters: Array
+    covariance: Array
+
+
+def adjust(start: FirstGuess, points_mm: Array) -> Bundle:
+    """Adjust, drop corners that fit far worse than the others, and adjust again.
+
+    Args:
+        start: cameras, board poses and corners in one order.
+        points_mm: corners on the board, shape (N, 3).
+
+    Raises:
+        CalibrationError: the adjustment does not settle.
+    """
+    corners = start.corners_px.copy()
+    corners[:, ~np.isfinite(start.T_world_board[:, 0, 0])] = np.nan
+    problem = _Problem(corners, points_mm)
+    solution = problem.solve(problem.pack(start))
+    off = np.linalg.norm(problem.spread(solution), axis=-1)
+    outlier = off > max(_OUTLIER_SIGMAS * float(np.nanmedian(off)), _OUTLIER_PX)
+    if outlier.any():
+        corners = problem.corners_px.copy()
+        corners[outlier] = np.nan
+        corners[np.isfinite(corners[..., 0]).sum(-1) < _FEWEST_CORNERS] = np.nan
+        again = _Problem(corners, points_mm)
+        cameras, boards = problem.split(solution)
+        problem, solution = again, again.solve(np.concatenate([cameras, boards[again.views].ravel()]))
+    cameras, boards = problem.split(solution)
+    K, distortion, T_cam_world = camera_from(cameras)
+    return Bundle(
+        K,
+        distortion,
+        T_cam_world,
+        make_transform(so3_exp(boards[:, :3]), boards[:, 3:]),
+        problem.corners_px,
+        problem.spread(solution),
+        cameras,
+        problem.covariance(solution),
+    )
+
+
+def camera_from(parameters: Array) -> tuple[Array, Array, Array]:
+    """Return K (C, 3, 3), k1 and k2 (C, 2) and T_cam_world (C, 4, 4) of the cameras' parameters, shape (12 C - 6,)."""
+    count = (len(parameters) + _POSE) // (_LENS + _POSE)
+    lens = parameters[: count * _LENS].reshape(count, _LENS)
+    K = np.zeros((count, 3, 3))
+    K[:, 0, 0], K[:, 1, 1], K[:, 0, 2], K[:, 1, 2], K[:, 2, 2] = *lens[:, :4].T, np.ones(count)
+    poses = np.concatenate([np.zeros((1, _POSE)), parameters[count * _LENS :].reshape(count - 1, _POSE)])
+    return K, lens[:, 4:], make_transform(so3_exp(poses[:, :3]), poses[:, 3:])
+
+
+class _Problem:
+    """Residuals and Jacobian over the views that are seen by any camera."""
+
+    def __init__(self, corners_px: Array, points_mm: Array) -> None:
+        self.views = np.flatnonzero(np.isfinite(corners_px[..., 0]).any((0, 2)))
+        self.corners_px, self.points_mm = corners_px[:, self.views], points_mm
+        self.cameras = len(corners_px)
+        self.seen = np.isfinite(self.corners_px[..., 0])
+        # Where each camera's view stands among the residuals.
+        self.blocks = [(c, v) for c in range(self.cameras) for v in range(len(self.views)) if self.seen[c, v].any()]
+
+    def pack(self, start: FirstGuess) -> Array:
+        """Return all unknowns of a start: lenses, poses of cameras 1.., poses of boards."""
+        lens = np.stack([start.K[:, 0, 0], start.K[:, 1, 1], start.K[:, 0, 2], start.K[:, 1, 2]], axis=1)
+        T = np.concatenate([start.T_cam_world[1:], start.T_world_board[self.views]])
+        poses = np.concatenate([so3_log(T[:, :3, :3]), T[:, :3, 3]], axis=1)
+        return np.concatenate([np.hstack([lens, start.distortion]).ravel(), poses.ravel()])
+
+    def split(self, x: Array) -> tuple[Array, Array]:
+        """Return the cameras' parameters and the boards' (V, 6)."""
+        own = self.cameras * (_LENS + _POSE) - _POSE
+        return x[:own], x[own:].reshape(-1, _POSE)
+
+    def solve(self, x: Array) -> Array:
+        """Return the unknowns with the least robust error (Levenberg-Marquardt, reweighted; Triggs et al. 2000).
+
+        The normal equations are formed from the sparse Jacobian and solved densely: exact, where iterative solvers
+        crawl because focal length and distance nearly exchange for each other.
+        """
+        for _ in range(2):  # the second time with the spread that the first one reached
+            scale = _HUBER_SIGMAS * max(_LEAST_SIGMA_PX, 1.4826 * float(np.median(np.abs(self.residuals(x)))))
+            x = self._descend(x, scale)
+        return x
+
+    def _descend(self, x: Array, scale_px: float) -> Array:
+        damping, cost = 1e-4, _huber(self.residuals(x), scale_px)
+        for _ in range(_MOST_STEPS):
+            residual, J = self.residuals(x), self.jacobian(x)
+            weights = np.minimum(1.0, scale_px / np.maximum(np.abs(residual), 1e-300))
+            normal = (J.T @ J.multiply(weights[:, None])).toarray()
+            gradient = J.T @ (weights * residual)
+            before = cost
+            while damping < 1e10:
+                damped = normal + damping * np.diag(np.diag(normal))
+                candidate = x - cho_solve(cho_factor(damped), gradient)
+                cost = _huber(self.residuals(candidate), scale_px)
+                if cost <= before:
+                    x, damping = candidate, damping / 10
+                    break
+                damping *= 10
+            else:
+                return x  # no step lowers the error any more
+            if before - cost <= 1e-10 * before:
+                return x
+        raise CalibrationError(f"the bundle adjustment did not settle in {_MOST_STEPS} steps.")
+
+    def residuals(self, x: Array) -> Array:
+        """Return projected minus seen pixels, shape (R,)."""
+        return np.concatenate([self._block(x, c, v, False)[0] for c, v in self.blocks])
+
+    def spread(self, x: Array) -> Array:
+        """Return the residuals as (C, V, N, 2), NaN where not seen."""
+        out = np.full(self.corners_px.shape, np.nan)
+        for c, v in self.blocks:
+            out[c, v, self.seen[c, v]] = self._block(x, c, v, False)[0].reshape(-1, 2)
+        return out
+
+    def jacobian(self, x: Array) -> csr_matrix:
+        """Return d residual / d unknown, sparse, shape (R, U)."""
+        data, rows, columns, row = [], [], [], 0
+        for c, v in self.blocks:
+            residual, parts = self._block(x, c, v, True)
+            for column, part in parts:
+                r, k = np.indices(part.shape)
+                data.append(part.ravel())
+                rows.append((row + r).ravel())
+                columns.append((column + k).ravel())
+            row += len(residual)
+        entries = (np.concatenate(data), (np.concatenate(rows), np.concatenate(columns)))
+        return csr_matrix(entries, shape=(row, len(x)))
+
+    def covariance(self, x: Array) -> Array:
+        """Return the covariance of the cameras' parameters, the boards' poses marginalised."""
+        J, residual = self.jacobian(x), self.residuals(x)
+        sigma = 1.4826 * np.median(np.abs(residual))
+        normal = (J.T @ J).toarray()
+        scale = 1 / np.sqrt(np.diag(normal))  # px, rad and mm: bring them to one size before inverting
+        inverse = np.linalg.pinv(normal * scale[:, None] * scale, hermitian=True) * scale[:, None] * scale
+        own = len(self.split(x)[0])
+        return sigma**2 * inverse[:own, :own]
+
+    def _block(self, x: Array, c: int, v: int, derive: bool) -> tuple[Array, list[tuple[int, Array]]]:
+        """Return residuals (2n,) of one view by one camera and its Jacobian parts with their first column."""
+        cameras, boards = self.split(x)
+        lens, column = cameras[c * _LENS : (c + 1) * _LENS], self.cameras * _LENS + (c - 1) * _POSE
+        pose = cameras[column : column + _POSE] if c else np.zeros(_POSE)
+        K = np.array([[lens[0], 0, lens[2]], [0, lens[1], lens[3]], [0, 0, 1.0]])
+        points = self.points_mm[self.seen[c, v]]
+        turned = points @ so3_exp(boards[v, :3]).T
+        world = turned + boards[v, 3:]
+        R = so3_exp(pose[:3])
+        carried = world @ R.T
+        pixels, J = cv2.projectPoints(carried + pose[3:], np.zeros(3), np.zeros(3), K, np.array([*lens[4:], 0.0, 0.0]))
+        residual = (pixels.reshape(-1, 2) - self.corners_px[c, v, self.seen[c, v]]).ravel()
+        if not derive:
+            return residual, []
+        # Columns of OpenCV: rotation 0-2, translation 3-5, f 6-7, c 8-9, distortion from 10.
+        by_point = J[:, 3:6].reshape(-1, 2, 3)
+        parts = [(c * _LENS, J[:, 6:12])]
+        if c:
+            by_turn = by_point @ (-hat(carried)) @ so3_left_jacobian(pose[:3])
+            parts.append((column, np.concatenate([by_turn, by_point], axis=-1).reshape(-1, _POSE)))
+        by_world = by_point @ R
+        by_turn = by_world @ (-hat(turned)) @ so3_left_jacobian(boards[v, :3])
+        board = np.concatenate([by_turn, by_world], axis=-1).reshape(-1, _POSE)
+        parts.append((len(cameras) + v * _POSE, board))
+        return residual, parts
+
+
+def _huber(residual: Array, scale_px: float) -> float:
+    size = np.abs(residual)
+    return float(np.where(size <= scale_px, 0.5 * size**2, scale_px * (size - 0.5 * scale_px)).sum())

@@ -1,0 +1,189 @@
+"""Calibrate the cameras of a capture from its boards, and say how far the result can be trusted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.capture.boards import Sightings, board_points, board_symmetries, find_boards
+from jawusd.capture.bundle import Bundle, adjust
+from jawusd.capture.first_guess import guess_cameras
+from jawusd.capture.scale import ScaleCheck, check_scale
+from jawusd.capture.shape import ShapeError, board_shape_error, expected_shape_error, mouth_centre
+from jawusd.errors import CalibrationError
+from jawusd.formats.capture import Capture
+from jawusd.geometry import Camera
+
+__all__ = ["CalibrationReport", "calibrate_capture", "calibrate_sightings"]
+
+Array = NDArray[np.float64]
+
+_ENOUGH_VIEWS = 40  # a quarter of the shape error of 20
+_GOOD_RMS_PX = 0.5
+_FAR_MM = 30.0  # the board's nearest corner from the middle of the mouth
+_GRID = (8, 5)  # cells of the picture whose coverage is counted
+_LITTLE_COVERAGE = 0.5
+_LARGE_EXPECTED_MM = 0.05  # a share of the tracking error of about 0.1 mm
+
+
+@dataclass(frozen=True)
+class CalibrationReport:
+    """Say how good a calibration is.
+
+    Attributes:
+        cameras: per camera `views`, `rms_px`, `coverage` (share of the picture's cells with corners), `blurred` and
+            `missed` picture numbers.
+        views: board poses used.
+        board_shape: error of distances between triangulated corners near the mouth, on the very pictures used.
+        expected_shape_mm: mean error of distances in the mouth volume expected from the corners' scatter.
+        mouth_mm: middle of the mouth in the world, and from what it is known.
+        scale: what the teeth say of the board's square size.
+        advice: what to do better, one sentence each.
+        notes: what was assumed.
+    """
+
+    cameras: dict[str, dict]
+    views: int
+    board_shape: ShapeError
+    expected_shape_mm: float
+    mouth_mm: tuple[float, float, float]
+    mouth_from: str
+    scale: ScaleCheck
+    advice: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    def as_dict(self) -> dict:
+        """Return the report as plain data."""
+        return asdict(self)
+
+
+def calibrate_capture(
+    capture: Capture, scans: Mapping[str, Array], progress: Callable[[int, int], None]
+) -> tuple[list[Camera], CalibrationReport]:
+    """Calibrate from the boards of a capture.
+
+    Args:
+        capture: names boards, cameras and picks.
+        scans: vertices of the teeth scans [mm] by "upper" and "lower", shape (n, 3); picks refer to them.
+        progress: told of every picture searched (done, total).
+
+    Returns:
+        The cameras, the first one being the world, and the report.
+
+    Raises:
+        CalibrationError: there are no boards, or they do not carry a calibration.
+        CaptureError: a clip cannot be read.
+    """
+    if capture.boards is None:
+        raise CalibrationError(
+            "has no [boards].",
+            path=capture.folder / "capture.toml",
+            hint="Film a chessboard where the teeth will be and name the clips there, or give a calibration file.",
+        )
+    names = tuple(camera.name for camera in capture.cameras)
+    return calibrate_sightings(find_boards(names, capture.boards, progress), capture, scans)
+
+
+def calibrate_sightings(
+    sightings: Sightings, capture: Capture, scans: Mapping[str, Array]
+) -> tuple[list[Camera], CalibrationReport]:
+    """Calibrate from corners already found; see `calibrate_capture`."""
+    boards = capture.boards
+    if boards is None:
+        raise CalibrationError("has no [boards].", path=capture.folder / "capture.toml")
+    points = board_points(boards)
+    start = guess_cameras(sightings.names, sightings.sizes_px, sightings.corners_px, points, board_symmetries(boards))
+    bundle = adjust(start, points)
+    lenses = np.hstack([bundle.distortion, np.zeros((len(bundle.K), 3))])
+    cameras = [
+        Camera(name, size, K, lens, T)
+        for name, size, K, lens, T in zip(sightings.names, sightings.sizes_px, bundle.K, lenses, bundle.T_cam_world)
+    ]
+    scale = check_scale(cameras, capture.bootstrap, scans, boards.square_mm)
+    centre, source = mouth_centre(cameras, capture.bootstrap, bundle.T_world_board)
+    expected = expected_shape_error(cameras, bundle, centre) if len(cameras) > 1 else float("nan")
+    figures = {camera.name: _camera_figures(c, camera, bundle, sightings) for c, camera in enumerate(cameras)}
+    shape = board_shape_error(cameras, bundle, points, centre)
+    report = CalibrationReport(
+        figures,
+        len(bundle.T_world_board),
+        shape,
+        expected,
+        tuple(float(value) for value in centre),
+        source,
+        scale,
+        tuple(_advice(figures, bundle, points, centre, expected)),
+        (*sightings.notes, *_notes(sightings, bundle, scale)),
+    )
+    return cameras, report
+
+
+def _camera_figures(c: int, camera: Camera, bundle: Bundle, sightings: Sightings) -> dict:
+    seen = np.isfinite(bundle.corners_px[c, ..., 0])
+    pixels = bundle.corners_px[c][seen]
+    cells = np.floor(pixels / camera.size_px * _GRID).astype(int)
+    covered = {(x, y) for x, y in cells.tolist()}
+    corners = {"top left": (0, 0), "top right": (1, 0), "bottom left": (0, 1), "bottom right": (1, 1)}
+    # A quarter of the picture in either direction counts as its corner.
+    share = pixels / camera.size_px
+    empty = [name for name, (right, low) in corners.items() if not ((np.abs(share - [right, low]) < 0.25).all(1)).any()]
+    return {
+        "views": int(seen.any(1).sum()),
+        "rms_px": float(np.sqrt(np.nansum(bundle.residuals_px[c] ** 2) / max(1, seen.sum()))),
+        "coverage": len(covered) / (_GRID[0] * _GRID[1]),
+        "empty_corners": empty,
+        "blurred": sightings.blurred[camera.name],
+        "missed": sightings.missed[camera.name],
+    }
+
+
+def _advice(figures: dict[str, dict], bundle: Bundle, points_mm: Array, centre_mm: Array, expected_mm: float) -> list:
+    advice = []
+    fewest = min(figures, key=lambda name: figures[name]["views"])
+    if figures[fewest]["views"] < _ENOUGH_VIEWS:
+        advice.append(
+            f"camera {fewest} uses {figures[fewest]['views']} views of the board; {_ENOUGH_VIEWS} and more make the "
+            "result steadier."
+        )
+    corners = np.einsum("vij,nj->vni", bundle.T_world_board[:, :3, :3], points_mm)
+    corners += bundle.T_world_board[:, None, :3, 3]
+    distance = float(np.median(np.linalg.norm(corners - centre_mm, axis=-1).min(1)))
+    if distance > _FAR_MM:
+        advice.append(
+            f"the board was held {distance:.0f} mm from the mouth (median of its nearest corner); hold it where the "
+            f"teeth will be, within {_FAR_MM:.0f} mm."
+        )
+    for name, figure in figures.items():
+        if figure["rms_px"] > _GOOD_RMS_PX:
+            advice.append(
+                f"camera {name} misses the corners by {figure['rms_px']:.2f} px rms (good is below {_GOOD_RMS_PX:g}): "
+                "look for blur, a bent board, a zoom or a camera that moved."
+            )
+        if figure["coverage"] < _LITTLE_COVERAGE or figure["empty_corners"]:
+            empty = ", ".join(figure["empty_corners"]) or "parts"
+            advice.append(
+                f"camera {name}: the board covered {figure['coverage']:.0%} of the picture and left {empty} empty; "
+                "the lens is extrapolated there, keep the teeth out of it."
+            )
+    if expected_mm > _LARGE_EXPECTED_MM:
+        advice.append(
+            f"distances in the mouth are expected to be wrong by {expected_mm:.3f} mm: add views, tilted up to 30 "
+            "degrees, with all of the board in all cameras."
+        )
+    return advice
+
+
+def _notes(sightings: Sightings, bundle: Bundle, scale: ScaleCheck) -> list[str]:
+    notes = []
+    lost = int(np.isfinite(sightings.corners_px[..., 0]).sum() - np.isfinite(bundle.corners_px[..., 0]).sum())
+    if lost:
+        notes.append(
+            f"{lost} of {int(np.isfinite(sightings.corners_px[..., 0]).sum())} corners disagree with the rest and were "
+            "left out."
+        )
+    if scale.ratio is None:
+        notes.append(f"nothing but [boards] square_mm tells the scale: {scale.reason}.")
+    return notes

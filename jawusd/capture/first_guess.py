@@ -1,0 +1,178 @@
+"""Start the calibration: intrinsics per camera, then where the cameras stand, from single views of the board.
+
+A detector may list a symmetric board's corners in another order in every picture. Each order is a board turned in its
+plane; the relative pose of two fixed cameras is the same in all views only where both list the same corner first, so
+the pose that most views agree on settles orders and finds views that were not simultaneous.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.errors import CalibrationError
+from jawusd.geometry import make_transform, se3_inverse, so3_exp, so3_log
+
+__all__ = ["FirstGuess", "guess_cameras"]
+
+Array = NDArray[np.float64]
+
+FEWEST_VIEWS = 6  # per camera; fewer leave focal length and distance exchangeable
+_SAME_ANGLE_RAD, _SAME_SHARE = np.deg2rad(4.0), 0.04  # relative poses this close (share of the distance) agree
+_LEAST_AGREEMENT = 0.5  # of the views shared by two cameras
+_INTRINSIC_FLAGS = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
+
+
+@dataclass(frozen=True, eq=False)
+class FirstGuess:
+    """Hold a start for the bundle adjustment.
+
+    Attributes:
+        K: intrinsic matrices [px], shape (C, 3, 3).
+        distortion: k1 and k2 per camera, shape (C, 2).
+        T_cam_world: world (the first camera) to camera [mm], shape (C, 4, 4).
+        T_world_board: board to world [mm], NaN for views that fit nothing, shape (V, 4, 4).
+        corners_px: corners in one common order, NaN where unseen or inconsistent, shape (C, V, N, 2).
+    """
+
+    K: Array
+    distortion: Array
+    T_cam_world: Array
+    T_world_board: Array
+    corners_px: Array
+
+
+def guess_cameras(
+    names: tuple[str, ...],
+    sizes_px: tuple[tuple[int, int], ...],
+    corners_px: Array,
+    points_mm: Array,
+    symmetries: list[NDArray[np.int64]],
+) -> FirstGuess:
+    """Calibrate each camera alone, then place the cameras by the views they share.
+
+    Args:
+        names: camera names.
+        sizes_px: picture (width, height) per camera.
+        corners_px: seen corners, NaN where unseen, shape (C, V, N, 2).
+        points_mm: corners on the board, shape (N, 3).
+        symmetries: orders in which the same corners may be listed, permutations of (N,); the first is the identity.
+
+    Raises:
+        CalibrationError: too few views, or cameras that share too few views or contradict themselves.
+    """
+    count, views = corners_px.shape[:2]
+    K, distortion, T_cam_board = np.empty((count, 3, 3)), np.empty((count, 2)), np.full((count, views, 4, 4), np.nan)
+    for c, name in enumerate(names):
+        K[c], distortion[c], T_cam_board[c] = _single_camera(name, sizes_px[c], corners_px[c], points_mm)
+    # Listing the corners in another order is turning the board: T_cam_board of order s = T_cam_board @ turns[s].
+    turns = [_turn(points_mm, order) for order in symmetries]
+    T_cam_world = _place_cameras(names, T_cam_board, turns)
+    corners, T_world_board = corners_px.copy(), np.full((views, 4, 4), np.nan)
+    for v in range(views):
+        seen = [c for c in range(count) if np.isfinite(T_cam_board[c, v, 0, 0])]
+        agreed: list[tuple[int, int]] = []
+        for first in seen:  # the camera that most others agree with tells the board's pose
+            T = se3_inverse(T_cam_world[first]) @ T_cam_board[first, v]
+            found = [
+                (c, s)
+                for c in seen
+                for s, turn in enumerate(turns)
+                if _alike(T_cam_world[c] @ T, T_cam_board[c, v] @ turn)
+            ]
+            if len(found) > len(agreed):
+                agreed, T_world_board[v] = found, T
+        orders = dict(agreed)
+        for c in seen:
+            corners[c, v] = corners_px[c, v, symmetries[orders[c]]] if c in orders else np.nan
+    return FirstGuess(K, distortion, T_cam_world, T_world_board, corners)
+
+
+def _single_camera(name: str, size_px: tuple[int, int], corners_px: Array, points_mm: Array) -> tuple:
+    """Return K (3, 3), k1 and k2 and T_cam_board (V, 4, 4) of one camera (Zhang 2000, by OpenCV)."""
+    seen = np.isfinite(corners_px[..., 0])
+    used = np.flatnonzero(seen.any(1))
+    if len(used) < FEWEST_VIEWS:
+        raise CalibrationError(
+            f"camera {name}: the board is seen sharply in {len(used)} pictures, at least {FEWEST_VIEWS} are needed.",
+            hint="Film the board again: 40 poses where the teeth will be, tilted up to 30 degrees, held still.",
+        )
+    objects = [points_mm[seen[v]].astype(np.float32) for v in used]
+    pixels = [corners_px[v, seen[v]].astype(np.float32) for v in used]
+    try:
+        _, K, d, rotations, translations = cv2.calibrateCamera(
+            objects, pixels, size_px, None, None, flags=_INTRINSIC_FLAGS
+        )
+    except cv2.error as error:
+        raise CalibrationError(
+            f"camera {name}: the board's views do not fix the lens ({error.err}).",
+            hint="Tilt the board by up to 30 degrees in all directions; views facing the camera tell nothing.",
+        ) from error
+    T = np.full((len(corners_px), 4, 4), np.nan)
+    T[used] = make_transform(
+        so3_exp(np.reshape(rotations, (-1, 3)).astype(np.float64)), np.reshape(translations, (-1, 3))
+    )
+    return K, np.ravel(d)[:2], T
+
+
+def _turn(points_mm: Array, order: NDArray[np.int64]) -> Array:
+    """Return the transform of the board with points[order] = R points, about its middle."""
+    # Planar: the two in-plane axes by least squares, the normal stays.
+    plane = np.linalg.lstsq(points_mm[:, :2], points_mm[order, :2], rcond=None)[0].T
+    R = np.eye(3)
+    R[:2, :2] = np.round(plane)
+    return make_transform(R, np.zeros(3))
+
+
+def _alike(a: Array, b: Array) -> NDArray[np.bool_]:
+    """Say whether poses agree, shape (...)."""
+    angle = np.linalg.norm(so3_log(a[..., :3, :3] @ np.swapaxes(b[..., :3, :3], -1, -2)), axis=-1)
+    apart = np.linalg.norm(a[..., :3, 3] - b[..., :3, 3], axis=-1)
+    return (angle < _SAME_ANGLE_RAD) & (apart < _SAME_SHARE * np.linalg.norm(b[..., :3, 3], axis=-1))
+
+
+def _place_cameras(names: tuple[str, ...], T_cam_board: Array, turns: list[Array]) -> Array:
+    """Return T_cam_world (C, 4, 4), walking from the first camera over the pairs that share most views."""
+    seen = np.isfinite(T_cam_board[..., 0, 0])
+    T_cam_world = np.full((len(names), 4, 4), np.nan)
+    T_cam_world[0] = np.eye(4)
+    placed, waiting = [0], list(range(1, len(names)))
+    while waiting:
+        shared = [((seen[a] & seen[b]).sum(), a, b) for a in placed for b in waiting]
+        views, a, b = max(shared, key=lambda item: item[0])
+        if views < FEWEST_VIEWS:
+            raise CalibrationError(
+                f"camera {names[b]} shares {views} sharp board views with {names[a]}, at least {FEWEST_VIEWS} are "
+                "needed.",
+                hint="Hold the board so that both cameras see all of it, and start the board clips together.",
+            )
+        T_cam_world[b] = _relative_pose(names[a], names[b], T_cam_board[[a, b]], turns) @ T_cam_world[a]
+        placed.append(b)
+        waiting.remove(b)
+    return T_cam_world
+
+
+def _relative_pose(name_a: str, name_b: str, T_cam_board: Array, turns: list[Array]) -> Array:
+    """Return the T_b_a that most shared views agree on in one of the orders."""
+    both = np.isfinite(T_cam_board[..., 0, 0]).all(0)
+    T_a, T_b = T_cam_board[0, both], T_cam_board[1, both]
+    # (orders, views, 4, 4): the pose of b in a's coordinates if b lists the corners in that order.
+    candidates = np.stack([T_b @ turn @ se3_inverse(T_a) for turn in turns])
+    flat = candidates.reshape(-1, 4, 4)
+    votes = _alike(flat[:, None, None], candidates[None]).any(1)  # (candidates, views)
+    support = votes.sum(1)
+    best = int(np.argmax(support))
+    if support[best] < _LEAST_AGREEMENT * both.sum():
+        raise CalibrationError(
+            f"the views of the board by {name_a} and {name_b} contradict each other: at most {support[best]} of "
+            f"{both.sum()} agree on where the cameras stand.",
+            hint="The board clips must be simultaneous picture by picture, and the cameras must not move.",
+        )
+    # Of those with much support, the one in the middle.
+    strong = flat[support >= 0.8 * support[best]]
+    near = strong[_alike(strong, flat[best])]
+    gap = np.linalg.norm(near[:, None, :3] - near[None, :, :3], axis=(-1, -2)).sum(1)
+    return near[int(np.argmin(gap))]

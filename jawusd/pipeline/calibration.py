@@ -1,0 +1,68 @@
+"""Calibrate a capture from its boards: wires scans, boards and the report together."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from jawusd.formats.calibration import save_calibration
+from jawusd.formats.capture import Capture
+from jawusd.pipeline.extras import stage
+from jawusd.pipeline.prepare import load_meshes
+from jawusd.pipeline.stages import about
+from jawusd.pipeline.state import Progress
+
+_LISTED = 10
+
+
+def calibrate_boards(capture: Capture, out: Path, progress: Progress) -> dict:
+    """Calibrate the cameras from the boards of a capture and write the calibration.
+
+    Args:
+        capture: names the boards.
+        out: aniposelib TOML to write.
+        progress: told of every picture searched.
+
+    Returns:
+        The report as plain data; see `capture.calibrate.CalibrationReport`.
+
+    Raises:
+        CalibrationError: the boards do not carry a calibration.
+        CaptureError: a clip or scan cannot be read.
+        OutputError: the file cannot be written.
+    """
+    calibrate = stage("jawusd.capture.calibrate")
+    with about(capture.folder / "capture.toml"):
+        meshes = load_meshes(capture)
+        scans = {jaw: meshes[f"{jaw}_teeth"].vertices for jaw in ("upper", "lower")}
+        cameras, report = calibrate.calibrate_capture(
+            capture, scans, lambda done, total: progress("calibrate", done, total)
+        )
+    save_calibration(out, cameras)
+    return report.as_dict()
+
+
+def calibration_lines(report: dict) -> list[str]:
+    """Return a calibration report as text."""
+    lines = [f"calibrated from {report['views']} views of the board"]
+    for name, camera in report["cameras"].items():
+        line = (
+            f"  {name}: {camera['rms_px']:.3f} px rms, {camera['views']} views, {camera['coverage']:.0%} of the picture"
+        )
+        for word in ("blurred", "missed"):
+            if numbers := camera[word]:
+                more = f" and {len(numbers) - _LISTED} more" if len(numbers) > _LISTED else ""
+                line += f"; {word}: {', '.join(map(str, numbers[:_LISTED]))}{more}"
+        lines.append(line)
+    shape = report["board_shape"]
+    if shape["distances"]:
+        lines.append(
+            f"  distances on the boards near the mouth: wrong by {shape['mean']:.4f} mm (mean), {shape['p95']:.4f} "
+            f"(p95), {shape['max']:.4f} (max)"
+        )
+    lines.append(
+        f"  distances in the mouth, expected from the scatter of the corners: {report['expected_shape_mm']:.4f} mm "
+        f"(mean); middle of the mouth from {report['mouth_from']}"
+    )
+    if (ratio := report["scale"]["ratio"]) is not None:
+        lines.append(f"  the teeth confirm the board's size: seen {ratio:.4f} times (+-{report['scale']['sigma']:.4f})")
+    return lines + [f"  note: {note}" for note in report["notes"]] + [f"  advice: {text}" for text in report["advice"]]
