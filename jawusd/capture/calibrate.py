@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 _ENOUGH_VIEWS = 40  # a quarter of the shape error of 20
 _GOOD_RMS_PX = 0.5
-_FAR_MM = 30.0  # the board's nearest corner from the middle of the mouth
+_FAR_MM = 40.0  # the board's nearest corner from the middle of the mouth
 _GRID = (8, 5)  # cells of the picture whose coverage is counted
 _LITTLE_COVERAGE = 0.5
 _LARGE_EXPECTED_MM = 0.05  # a share of the tracking error of about 0.1 mm

@@ -1,14 +1,12 @@
-"""Align cameras in time by the light going off and on.
+"""Align cameras in time by the light going off and on, else by their sound.
 
-The mean brightness of a picture falls and rises with the room light in all cameras at once. The times of these steps,
-matched between two cameras, give their offset in whole frames; a step that falls into an exposure leaves a picture of
-intermediate brightness, which tells the fraction of a frame (if the shutter is open all the time; with a shorter
-exposure only when the step happens to fall into it).
+Pictures are placed by their presentation times: in a video of variable rate, frame k is the picture shown k nominal
+frame durations after the first one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,52 +14,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.capture.light import Offset, Step, find_flashes, match_steps, mean_brightness
+from jawusd.capture.sound import RATE_HZ, match_sounds
 from jawusd.errors import SyncError
 from jawusd.formats.capture import Capture
+from jawusd.imaging.audio import Sound, read_sound
 from jawusd.imaging.video import Video
 
-__all__ = ["Alignment", "Offset", "Step", "align_videos", "estimate_offsets", "find_steps", "match_steps"]
+__all__ = ["Alignment", "align_videos", "estimate_offsets", "frame_grid", "light_curve"]
 
-_FIRST_WINDOW_S = 4.0  # searched at either end; doubled until a flash is found
-_SPARSE = 8  # every 8th pixel in both directions tells the mean brightness
-_CONTRAST = 0.3  # share of the brightness a flash must change; moving people change a few per cent
-_ABRUPT_FRAMES = 3  # a lamp is off or on within this many frames
-_TOLERANCE_FRAMES = 1.0  # steps this close are the same step
-_DROPPED_S = 0.5  # steps that fit with an offset this different tell of lost frames
-_FEWEST_STEPS = 2
 _RATE_TOLERANCE = 1e-3
-
-
-@dataclass(frozen=True)
-class Step:
-    """Mark one sudden change of brightness.
-
-    Attributes:
-        time_frames: when, in frames of the camera's video; k = as the exposure of frame k begins.
-        rising: the light goes on; else off.
-    """
-
-    time_frames: float
-    rising: bool
-
-
-@dataclass(frozen=True)
-class Offset:
-    """Say how one camera lies in time: its frame k shows the instant of frame k + frames of the reference camera.
-
-    Attributes:
-        frames: the offset in whole frames.
-        exact_frames: the same with its estimated fraction.
-        spread_frames: largest deviation of a matched step from exact_frames.
-        matched_steps: number of steps found in both cameras.
-        confidence: share of the steps of both cameras that have a partner, 0 .. 1.
-    """
-
-    frames: int
-    exact_frames: float
-    spread_frames: float
-    matched_steps: int
-    confidence: float
 
 
 @dataclass(frozen=True)
@@ -71,10 +33,14 @@ class Alignment:
     Attributes:
         reference: the camera that counts the frames.
         cameras: the offset per camera, in the order of the capture.
+        method: "light flash" or "sound".
+        notes: what a person should know of the clips.
     """
 
     reference: str
     cameras: dict[str, Offset]
+    method: str = "light flash"
+    notes: tuple[str, ...] = ()
 
     @property
     def offsets(self) -> dict[str, int]:
@@ -88,10 +54,10 @@ class Alignment:
 
 
 def estimate_offsets(capture: Capture) -> Alignment:
-    """Align the cameras of a capture by the light flashes in their videos; see `align_videos`.
+    """Align the cameras of a capture by the light flashes or the sound of their videos; see `align_videos`.
 
     Raises:
-        SyncError: a camera has no video, or the flashes do not tell.
+        SyncError: a camera has no video, or neither flashes nor sound tell.
         CaptureError: a video cannot be read.
     """
     videos = {camera.name: camera.video for camera in capture.cameras if camera.video is not None}
@@ -102,171 +68,135 @@ def estimate_offsets(capture: Capture) -> Alignment:
                 path=capture.folder / "capture.toml",
                 hint=_offsets_hint([camera.name for camera in capture.cameras]),
             )
-    return align_videos(videos, capture.reference)
+    return align_videos(videos, capture.reference, by_light=capture.sync.method != "audio")
 
 
-def align_videos(videos: Mapping[str, Path], reference: str) -> Alignment:
+def align_videos(videos: Mapping[str, Path], reference: str, *, by_light: bool = True) -> Alignment:
     """Find the light flashes in all videos and align them with those of the reference camera.
 
-    Only the beginning and the end of each video are decoded, more of it only while no flash is found.
+    Only the beginning and the end of each video are decoded, more of it only while no flash is found. If a video shows
+    no flash and all have sound, the sound aligns them.
 
     Args:
         videos: video file per camera name.
         reference: the camera that counts the frames.
+        by_light: look for flashes at all.
 
     Raises:
-        SyncError: no flash in a video, rates that differ, or steps that do not fit together.
+        SyncError: neither flash nor sound, rates that differ, or steps that do not fit together.
         CaptureError: a video cannot be read.
     """
     opened = {name: Video(path) for name, path in videos.items()}
     hint = _offsets_hint(videos)
-    rate = opened[reference].fps
+    grids = {name: frame_grid(video.times_s, video.fps) for name, video in opened.items()}
+    rate = grids[reference][1]
     for name, video in opened.items():
-        if abs(video.fps / rate - 1) > _RATE_TOLERANCE:
+        if abs(grids[name][1] / rate - 1) > _RATE_TOLERANCE:
             raise SyncError(
-                f"camera {name} runs at {video.fps:g} frames per second, camera {reference} at {rate:g}.",
+                f"camera {name} runs at {grids[name][1]:.6g} frames per second, camera {reference} at {rate:.6g}.",
                 path=video.path,
                 hint="Offsets in whole frames need equal rates: convert the videos to one rate.",
             )
+    notes = _missing_pictures({name: numbers for name, (numbers, _) in grids.items()})
     with ThreadPoolExecutor(max_workers=len(opened)) as pool:
-        steps = dict(zip(opened, pool.map(lambda item: _video_steps(*item, hint), opened.items())))
-    offsets = {}
-    for name, video in opened.items():
-        try:
-            offsets[name] = match_steps(steps[name], steps[reference], rate)
-        except SyncError as error:
-            raise SyncError(
-                f"camera {name}, against {reference}: {error.message}", path=video.path, hint=hint
-            ) from error
-    return Alignment(reference, offsets)
+        dark = None
+        if by_light:
+            found = dict(zip(opened, pool.map(find_flashes, opened.values())))
+            dark = next((name for name in opened if found[name].reason), None)
+        if by_light and dark is None:
+            steps = {name: _on_grid(found[name].steps, grids[name][0]) for name in opened}
+            offsets = {
+                name: _against(
+                    name, reference, video, hint, lambda n=name: match_steps(steps[n], steps[reference], rate)
+                )
+                for name, video in opened.items()
+            }
+            return Alignment(reference, offsets, "light flash", notes)
+        sounds = dict(zip(opened, pool.map(lambda video: read_sound(video.path, RATE_HZ), opened.values())))
+    why = "" if dark is None else f"camera {dark} {found[dark].reason}; "
+    silent = [name for name, sound in sounds.items() if sound is None]
+    if silent:
+        whose = "no clip has" if len(silent) == len(opened) else f"camera {silent[0]} has no"
+        raise SyncError(f"{why}{whose} sound to go by.", path=opened[dark or silent[0]].path, hint=hint)
+    offsets = {
+        name: _against(name, reference, video, hint, lambda n=name: _by_sound(n, reference, sounds, opened, rate), why)
+        for name, video in opened.items()
+    }
+    return Alignment(reference, offsets, "sound", (*((f"{why}the sound aligns the cameras",) if why else ()), *notes))
 
 
-def find_steps(brightness: NDArray[np.float64], first_frame: int = 0) -> list[Step]:
-    """Find the frames at which the light goes off or on.
-
-    Args:
-        brightness: mean brightness of successive pictures, 0..255, shape (n,).
-        first_frame: frame number of the first one.
-
-    Returns:
-        The steps in order of time; none if the brightness changes by less than a flash does.
-    """
-    if len(brightness) < 2 or brightness.max() - brightness.min() < _CONTRAST * brightness.max():
-        return []
-    contrast = brightness.max() - brightness.min()
-    bright = brightness >= brightness.min() + contrast / 2
-    crossings = np.flatnonzero(bright[1:] != bright[:-1]) + 1
-    limits = [0, *crossings.tolist(), len(brightness)]
-    steps = []
-    for before, at, after in zip(limits[:-2], limits[1:-1], limits[2:]):
-        first, last = max(before, at - _ABRUPT_FRAMES), min(after, at + _ABRUPT_FRAMES)
-        around = brightness[first:last]
-        low, high = around.min(), around.max()
-        if high - low < contrast / 2:
-            continue  # it fades: clouds, a dimmer, an automatic exposure
-        lit = float(((around - low) / (high - low)).sum())
-        rising = bool(bright[at])
-        steps.append(Step(first_frame + (last - lit if rising else first + lit), rising))
-    return steps
-
-
-def match_steps(steps: list[Step], reference: list[Step], fps: float) -> Offset:
-    """Align the steps of one camera with those of the reference camera.
-
-    Args:
-        steps: of the camera.
-        reference: of the reference camera.
-        fps: frames per second of both.
+def light_curve(path: Path) -> list[tuple[int, float, float]]:
+    """Return picture number, time [s] and mean brightness (0..255) of every picture of a video.
 
     Raises:
-        SyncError: fewer than two steps fit, two alignments fit equally well, or frames were lost in between.
+        CaptureError: the video cannot be read.
     """
-    candidates = {round(r.time_frames - s.time_frames) for s in steps for r in reference if s.rising == r.rising}
-    ranked = sorted((_aligned(steps, reference, offset) for offset in candidates), key=lambda a: (-len(a[0]), a[1]))
-    if not ranked or len(ranked[0][0]) < _FEWEST_STEPS:
-        raise SyncError(
-            f"the light steps at {_listed(steps)} do not fit those at {_listed(reference)} of the reference."
-        )
-    pairs, spread, exact = ranked[0]
-    _refuse_lost_frames(steps, reference, pairs, exact, _DROPPED_S * fps)
-    for other_pairs, other_spread, other in ranked[1:]:
-        if len(other_pairs) == len(pairs) and other_spread < spread + 0.5 and abs(other - exact) > _TOLERANCE_FRAMES:
-            raise SyncError(
-                f"the light flashes fit equally well with an offset of {exact:.0f} and of {other:.0f} frames."
-            )
-    confidence = 2 * len(pairs) / (len(steps) + len(reference))
-    return Offset(round(exact), exact, spread, len(pairs), confidence)
+    return [(frame.index, frame.time_s, mean_brightness(frame.image)) for frame in Video(path).frames(threads=1)]
 
 
-def _refuse_lost_frames(
-    steps: list[Step], reference: list[Step], pairs: list[tuple[int, int]], exact: float, reach_frames: float
-) -> None:
-    """Raise if steps that found no partner would find one with a slightly different offset."""
-    lone_steps, lone_partners = (
-        [step for k, step in enumerate(own) if k not in {pair[side] for pair in pairs}]
-        for side, own in enumerate((steps, reference))
+def frame_grid(times_s: NDArray[np.float64], fps: float) -> tuple[NDArray[np.int64], float]:
+    """Place pictures on an even grid of frames; pictures that a variable rate left out leave gaps.
+
+    Args:
+        times_s: presentation times after the first picture, increasing, shape (n,).
+        fps: the file's own average rate, taken where two pictures do not tell more.
+
+    Returns:
+        Frame number of each picture, shape (n,), and frames per second.
+    """
+    if len(times_s) < 3:
+        return np.arange(len(times_s)), fps
+    period = float(np.median(np.diff(times_s)))
+    last = 16
+    # The median of rounded time stamps is off by up to 3 %: fit longer and longer stretches.
+    while True:
+        stretch = times_s[:last]
+        numbers = np.round(stretch / period)
+        period = float((numbers @ stretch) / (numbers @ numbers))
+        if last >= len(times_s):
+            return np.round(times_s / period).astype(np.int64), 1 / period
+        last *= 2
+
+
+def _on_grid(steps: list[Step], numbers: NDArray[np.int64]) -> list[Step]:
+    """Return steps counted in pictures with their time on the grid of frames."""
+    out = []
+    for step in steps:
+        picture = min(int(step.time_frames), len(numbers) - 1)
+        out.append(Step(float(numbers[picture]) + step.time_frames - picture, step.rising))
+    return out
+
+
+def _missing_pictures(numbers: Mapping[str, NDArray[np.int64]]) -> tuple[str, ...]:
+    return tuple(
+        f"camera {name} has a variable rate: {missing} of {frames[-1] + 1} frames have no picture of their own. Its "
+        "pictures are not numbered evenly; convert it to a constant rate before masks are made."
+        for name, frames in numbers.items()
+        if (missing := int(frames[-1] + 1 - len(np.unique(frames)))) > 0
     )
-    for step in lone_steps:
-        for partner in lone_partners:
-            other = partner.time_frames - step.time_frames
-            if step.rising == partner.rising and abs(other - exact) < reach_frames:
-                matched = steps[pairs[0][0]].time_frames
-                (early, before), (late, after) = sorted([(matched, exact), (step.time_frames, other)])
-                raise SyncError(
-                    f"the offset is {before:.1f} frames at frame {early:.0f} and {after:.1f} at frame {late:.0f}: "
-                    "frames were lost while recording."
-                )
 
 
-def _aligned(steps: list[Step], reference: list[Step], offset: int) -> tuple[list[tuple[int, int]], float, float]:
-    """Return the pairs of step numbers that meet under an offset, their spread and their exact offset [frames]."""
-    pairs, differences = [], []
-    for i, step in enumerate(steps):
-        for j, partner in enumerate(reference):
-            difference = partner.time_frames - step.time_frames
-            if step.rising == partner.rising and abs(difference - offset) <= _TOLERANCE_FRAMES:
-                pairs.append((i, j))
-                differences.append(difference)
-                break
-    if not pairs:
-        return [], 0.0, float(offset)
-    exact = float(np.median(differences))
-    return pairs, float(np.abs(np.array(differences) - exact).max()), exact
+def _by_sound(
+    name: str, reference: str, sounds: Mapping[str, Sound], videos: Mapping[str, Video], fps: float
+) -> Offset:
+    if name == reference:
+        return Offset(0, 0.0, 0.0, 0, 1.0)
+    match = match_sounds(sounds[name], sounds[reference])
+    exact = (match.delay_s - videos[reference].start_s + videos[name].start_s) * fps
+    return Offset(round(exact), exact, 0.0, 0, match.confidence)
 
 
-def _video_steps(name: str, video: Video, hint: str) -> list[Step]:
-    """Find the steps near both ends of a video, looking further in until there are some."""
-    window = max(2, round(_FIRST_WINDOW_S * video.fps))
-    head: list[Step] = []
-    tail: list[Step] = []
-    while 2 * window < video.count:
-        if len(head) < _FEWEST_STEPS:
-            head = find_steps(_brightness(video, 0, window))
-        if len(tail) < _FEWEST_STEPS:
-            tail = find_steps(_brightness(video, video.count - window, video.count), video.count - window)
-        if min(len(head), len(tail)) >= _FEWEST_STEPS:
-            return head + tail
-        window *= 2
-    brightness = _brightness(video, 0, video.count)
-    steps = find_steps(brightness)
-    if len(steps) < _FEWEST_STEPS:
+def _against(
+    name: str, reference: str, video: Video, hint: str, work: Callable[[], Offset], before: str = ""
+) -> Offset:
+    """Name the cameras in errors of comparing them."""
+    try:
+        return work()
+    except SyncError as error:
         raise SyncError(
-            f"camera {name} shows no light flash: {len(steps)} sudden changes, brightness {brightness.min():.0f} to "
-            f"{brightness.max():.0f} of 255 over all {video.count} frames; a flash changes it by more than "
-            f"{_CONTRAST:.0%} and back.",
-            path=video.path,
-            hint=hint,
-        )
-    return steps
-
-
-def _brightness(video: Video, first: int, last: int) -> NDArray[np.float64]:
-    return np.array([frame.image[::_SPARSE, ::_SPARSE].mean() for frame in video.frames(first, last, threads=1)])
+            f"{before}camera {name}, against {reference}: {error.message}", path=video.path, hint=hint
+        ) from error
 
 
 def _offsets_hint(names: Iterable[str]) -> str:
     return f"Give whole-frame offsets instead, in capture.toml: [sync] offsets = {{ {' = .., '.join(names)} = .. }}."
-
-
-def _listed(steps: list[Step]) -> str:
-    return ", ".join(f"{step.time_frames:.1f} ({'on' if step.rising else 'off'})" for step in steps)

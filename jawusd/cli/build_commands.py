@@ -61,7 +61,6 @@ BackendOption = Annotated[Backend, typer.Option(help="Where --solver paper draws
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
     app.command("build")(build)
-    app.command("sync")(sync)
     app.command("track")(track)
     app.command("fit")(fit)
     app.command("bake")(bake)
@@ -93,16 +92,6 @@ def build(
     emit(summary, as_json, lambda: build_lines(summary))
 
 
-def sync(capture: CaptureArg, allow_outside: Outside = False, as_json: Json = False) -> None:
-    """Find the frame offsets between the cameras from light flashes."""
-    from jawusd.pipeline.prepare import open_capture
-    from jawusd.pipeline.stages import sync_cameras
-
-    with progress() as report:
-        result = sync_cameras(open_capture(capture, allow_outside=allow_outside), report)
-    emit(result, as_json, lambda: [f"{name}: {offset:+d} frames" for name, offset in result["offsets"].items()])
-
-
 def track(
     capture: CaptureArg,
     out: Annotated[Path, typer.Option("-o", "--out", help="File of the tracks.")] = Path("tracks.npz"),
@@ -110,9 +99,7 @@ def track(
     backend: BackendOption = Backend.cpu,
     prior: Annotated[
         Path | None,
-        typer.Option(
-            help="model.npz of this person: a second pass with its help.", show_default=False
-        ),
+        typer.Option(help="model.npz of this person: a second pass with its help.", show_default=False),
     ] = None,
     overlay: Annotated[
         Path | None, typer.Option(help="Folder for videos with the tracked scans over the footage.", show_default=False)

@@ -15,6 +15,7 @@ from jawusd.cli.output import emit, plain, progress, refuse_existing
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
     app.command("calibrate")(calibrate)
+    app.command("sync")(sync)
 
 
 def calibrate(
@@ -41,3 +42,59 @@ def calibrate(
     if report_file is not None:
         write_text_atomic(report_file, json.dumps(plain(summary), indent=1) + "\n")
     emit(summary, as_json, lambda: [*calibration_lines(summary), str(out)])
+
+
+def sync(
+    clips: Annotated[
+        list[Path], typer.Argument(help="A capture (capture.toml or its folder), or two and more videos.")
+    ],
+    reference: Annotated[
+        str | None, typer.Option(help="Clip that counts the frames, by its name; the first.", show_default=False)
+    ] = None,
+    curves: Annotated[
+        Path | None,
+        typer.Option(help="Also write the brightness of every picture of every clip as CSV.", show_default=False),
+    ] = None,
+    force: Force = False,
+    allow_outside: Outside = False,
+    as_json: Json = False,
+) -> None:
+    """Find the frame offsets between cameras from light flashes, else from their sound."""
+    from jawusd.pipeline.prepare import open_capture
+    from jawusd.pipeline.stages import sync_cameras, sync_videos, write_light_curves
+
+    if curves is not None:
+        refuse_existing(curves, force)
+    single = len(clips) == 1
+    if single and reference is not None:
+        raise typer.BadParameter("--reference is for clips; a capture names its own in [sync].")
+    capture = open_capture(clips[0], allow_outside=allow_outside) if single else None
+    videos = {c.name: c.video for c in capture.cameras if c.video} if capture else _named(clips)
+    if reference is not None and reference not in videos:
+        raise typer.BadParameter(f"--reference {reference} is none of {', '.join(videos)}.")
+    with progress() as report:
+        if capture is not None:
+            result = sync_cameras(capture, report)
+        else:
+            result = sync_videos(videos, reference or next(iter(videos)), report)
+        if curves is not None:
+            write_light_curves(curves, videos)
+    emit(result, as_json, lambda: _sync_lines(result))
+
+
+def _named(clips: list[Path]) -> dict[str, Path]:
+    """Return the clips by their names, with folders where names alone are not enough."""
+    short = {clip.stem: clip for clip in clips}
+    named = short if len(short) == len(clips) else {str(clip): clip for clip in clips}
+    if len(named) < len(clips):
+        raise typer.BadParameter("a clip is given twice.")
+    return named
+
+
+def _sync_lines(result: dict) -> list[str]:
+    exact, sure = result.get("exact_frames", {}), result.get("confidence", {})
+    lines = [f"by {result['method']}:"]
+    for name, offset in result["offsets"].items():
+        more = f" (exactly {exact[name]:+.2f}, confidence {sure[name]:.2f})" if name in exact else ""
+        lines.append(f"  {name}: {offset:+d} frames{more}")
+    return lines + [f"  note: {note}" for note in result.get("notes", [])]

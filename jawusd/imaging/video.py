@@ -50,6 +50,7 @@ class Video:
         path: the file.
         count: number of pictures.
         times_s: presentation times after the first picture [s], shape (count,), increasing.
+        start_s: presentation time of the first picture in the file, where its sound counts from too [s].
         fps: average pictures per second.
         rotation_deg: counter-clockwise turn the file asks for: 0, 90, 180 or 270. It is applied to every picture.
         size_px: (width, height) after rotation.
@@ -84,6 +85,7 @@ class Video:
                 path=path,
                 hint="Copy it again from the camera, or cut it to the part that is whole.",
             )
+        self.start_s = float(self._pts[0] * self._time_base)
         self.times_s = (self._pts - self._pts[0]) * self._time_base
         self.rotation_deg = 0
         first = next(self._decode(0, 1, threads=1))[1]

@@ -13,6 +13,7 @@ from jawusd.errors import OutputError
 from jawusd.formats.capture import Capture
 from jawusd.formats.model import load_model, save_model
 from jawusd.formats.tracks import load_tracks, save_tracks
+from jawusd.pipeline.calibration import calibrate_boards
 from jawusd.pipeline.prepare import input_files, open_capture
 from jawusd.pipeline.stages import aid_teeth, bake_files, fit_jaw, sync_cameras, track_teeth, write_take
 from jawusd.pipeline.state import (
@@ -27,6 +28,7 @@ from jawusd.pipeline.state import (
 )
 from jawusd.pipeline.summary import fit_summary, track_summary
 
+CALIBRATION = "calibration.toml"  # made from the boards when the capture names none
 FIRST_PASS = "first_pass.npz"  # tracks without the model's help: what the model is fitted to
 
 
@@ -104,6 +106,7 @@ class _Build:
         self.reused: list[str] = []
 
     def run(self) -> dict:
+        calibrate = self._calibrated()
         capture, options = self.capture, self.options
         sync = self._stage("sync", self._inputs(["videos"], capture.sync.model_dump()), self._sync)
         # Paths stay out: the contents count, not where the capture lies.
@@ -129,9 +132,12 @@ class _Build:
         return {
             "capture": capture.name,
             "folder": str(self.folder),
-            "files": sorted({*track.outputs, *fit.outputs, *aid.outputs, *bake.outputs}),
+            "files": sorted(
+                {*(calibrate.outputs if calibrate else ()), *track.outputs, *fit.outputs, *aid.outputs, *bake.outputs}
+            ),
             "seconds": {name: record.seconds for name, record in self.state.stages.items()},
             "reused": self.reused,
+            "calibrate": calibrate.result if calibrate else None,
             "sync": sync.result,
             "track": aid.result,
             "fit": fit.result,
@@ -149,6 +155,23 @@ class _Build:
         start = time.perf_counter()
         outputs, result = work()
         return self.state.finish(name, inputs, outputs, time.perf_counter() - start, result)
+
+    def _calibrated(self) -> StageRecord | None:
+        """Calibrate from the boards if the capture names no calibration but has boards."""
+        capture = self.capture
+        if capture.calibration is not None or capture.boards is None:
+            return None
+        described = capture.boards.model_dump(mode="json", exclude={"videos"})
+        picks = capture.bootstrap.model_dump(mode="json") if capture.bootstrap else None
+        names = [camera.name for camera in capture.cameras]
+        path = self.folder / CALIBRATION
+        record = self._stage(
+            "calibrate",
+            self._inputs(["boards", "scans"], described, picks, names),
+            lambda: ([path], calibrate_boards(capture, path, self.progress)),
+        )
+        self.capture = capture.model_copy(update={"calibration": path, "calibration_unit_mm": 1.0})
+        return record
 
     def _sync(self) -> tuple[list[Path], dict]:
         return [], sync_cameras(self.capture, self.progress)

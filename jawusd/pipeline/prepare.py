@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jawusd.errors import CalibrationError, CaptureError
-from jawusd.formats.calibration import load_calibration
+from jawusd.formats.camera_files import calibration_files, load_cameras_file
 from jawusd.formats.capture import CameraSource, Capture, load_capture
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import Tracks
@@ -79,9 +79,10 @@ def _calibrated(capture: Capture) -> list[tuple[Camera, CameraSource]]:
         raise CalibrationError(
             'has no "calibration".',
             path=capture.folder / "capture.toml",
-            hint="Name a calibration file (aniposelib TOML) there.",
+            hint="Name a calibration file there; jawusd calibrate makes one from [boards].",
         )
-    known = {camera.name: camera for camera in load_calibration(capture.calibration)}
+    found = load_cameras_file(capture.calibration, capture.calibration_unit_mm)
+    known = {camera.name: camera for camera in found}
     missing = [source.name for source in capture.cameras if source.name not in known]
     if missing:
         raise CalibrationError(
@@ -180,18 +181,24 @@ def input_files(capture: Capture, names: Iterable[str]) -> list[Path]:
 
     Args:
         capture: the capture.
-        names: any of "scans", "calibration", "masks", "videos".
+        names: any of "scans", "boards", "calibration", "masks", "videos".
     """
     files: list[Path] = []
     for name in names:
         if name == "scans":
             files += [path for key in MESHES if (path := getattr(capture.scans, key)) is not None]
         elif name == "calibration" and capture.calibration is not None:
-            files.append(capture.calibration)
+            files += calibration_files(capture.calibration)
+        elif name == "boards" and capture.boards is not None:
+            files += _sequence_files(capture.boards.videos)
         elif name == "videos":
             files += [camera.video for camera in capture.cameras if camera.video is not None]
         elif name == "masks":
             for camera in capture.cameras:
-                for pattern in (camera.masks.upper, camera.masks.lower) if camera.masks else ():
-                    files += sorted(pattern.parent.iterdir()) if "%" in pattern.name else [pattern]
+                files += _sequence_files((camera.masks.upper, camera.masks.lower) if camera.masks else ())
     return [path for path in files if path.is_file()]
+
+
+def _sequence_files(paths: Iterable[Path]) -> list[Path]:
+    """Return videos as they are and all files beside each picture pattern."""
+    return [file for path in paths for file in (sorted(path.parent.iterdir()) if "%" in path.name else [path])]

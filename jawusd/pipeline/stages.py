@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from jawusd.errors import FormatError, JawusdError
 from jawusd.evaluator import JawRig
+from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.capture import Capture
 from jawusd.formats.model import JawModel
 from jawusd.formats.tracks import Tracks, load_tracks
@@ -43,15 +45,48 @@ def sync_cameras(capture: Capture, progress: Progress) -> dict:
         # Masks alone carry no flash; numbered alike they are taken as simultaneous, and the report says so.
         result = {"offsets": {camera.name: 0 for camera in capture.cameras}, "method": "taken as simultaneous"}
     else:
-        found = stage("jawusd.capture.sync").estimate_offsets(capture).cameras
-        result = {
-            "offsets": {name: offset.frames for name, offset in found.items()},
-            "method": "light flash",
-            "exact_frames": {name: offset.exact_frames for name, offset in found.items()},
-            "confidence": {name: offset.confidence for name, offset in found.items()},
-        }
+        with about(capture.folder / "capture.toml"):
+            result = alignment_result(stage("jawusd.capture.sync").estimate_offsets(capture))
     progress("sync", 1, 1)
     return result
+
+
+def sync_videos(videos: Mapping[str, Path], reference: str, progress: Progress) -> dict:
+    """Return the frame offset of every clip to the reference, as `sync_cameras` does for a capture.
+
+    Raises:
+        SyncError, CaptureError: see `capture.sync.align_videos`.
+    """
+    progress("sync", 0, 1)
+    result = alignment_result(stage("jawusd.capture.sync").align_videos(videos, reference))
+    progress("sync", 1, 1)
+    return result
+
+
+def alignment_result(alignment: Any) -> dict:
+    """Return a `capture.sync.Alignment` as plain data."""
+    found = alignment.cameras
+    return {
+        "offsets": alignment.offsets,
+        "reference": alignment.reference,
+        "method": alignment.method,
+        "exact_frames": {name: offset.exact_frames for name, offset in found.items()},
+        "confidence": alignment.confidence,
+        "notes": list(alignment.notes),
+    }
+
+
+def write_light_curves(path: Path, videos: Mapping[str, Path]) -> None:
+    """Write the mean brightness of every picture as CSV: camera, picture, time_s, brightness.
+
+    Raises:
+        CaptureError: a video cannot be read.
+        OutputError: the file cannot be written.
+    """
+    sync, lines = stage("jawusd.capture.sync"), ["camera,picture,time_s,brightness"]
+    for name, video in videos.items():
+        lines += [f"{name},{index},{time_s:.6f},{mean:.3f}" for index, time_s, mean in sync.light_curve(video)]
+    write_text_atomic(path, "\n".join([*lines, ""]))
 
 
 def track_teeth(
@@ -209,9 +244,7 @@ def fit_subject(subject: Subject, motion: Motion, method: str, progress: Progres
     return model
 
 
-def bake_files(
-    capture: Capture, model: JawModel, folder: Path, progress: Progress, table_size: int = 33
-) -> list[Path]:
+def bake_files(capture: Capture, model: JawModel, folder: Path, progress: Progress, table_size: int = 33) -> list[Path]:
     """Write the rig.
 
     Args:

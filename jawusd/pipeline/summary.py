@@ -7,6 +7,7 @@ import numpy as np
 from jawusd.formats.model import JawModel
 from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, Tracks
 from jawusd.geometry import LANDMARKS
+from jawusd.pipeline.calibration import calibration_lines
 
 _LISTED_FRAMES = 20
 
@@ -78,7 +79,13 @@ def fit_lines(summary: dict) -> list[str]:
 def build_lines(summary: dict) -> list[str]:
     """Return the summary of a build as text."""
     offsets = ", ".join(f"{name} {offset:+d}" for name, offset in summary["sync"]["offsets"].items())
-    lines = [f"sync ({summary['sync']['method']}): {offsets} frames"]
+    lines = []
+    if summary["calibrate"]:
+        lines += [
+            "the capture names no calibration: made one from its boards",
+            *calibration_lines(summary["calibrate"]),
+        ]
+    lines += [f"sync ({summary['sync']['method']}): {offsets} frames"]
     lines += track_lines(summary["track"])
     lines += fit_lines(summary["fit"])
     seconds = ", ".join(

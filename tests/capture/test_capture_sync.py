@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jawusd.capture.sync import Step, align_videos, estimate_offsets, find_steps, match_steps
+from jawusd.capture.light import Step, find_steps, match_steps
+from jawusd.capture.sync import align_videos, estimate_offsets
 from jawusd.errors import SyncError
 from jawusd.formats.capture import Capture
 from jawusd.imaging.video_writer import VideoWriter

@@ -1,0 +1,210 @@
+"""Find light flashes in videos: the light goes off and on in all cameras at once.
+
+The mean brightness of a picture falls and rises with the room light. The times of these steps, matched between two
+cameras, give their offset in whole frames; a step that falls into an exposure leaves a picture of intermediate
+brightness, which tells the fraction of a frame (if the shutter is open all the time; with a shorter exposure only when
+the step happens to fall into it).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.errors import SyncError
+from jawusd.imaging.video import Video
+
+__all__ = ["Flashes", "Offset", "Step", "find_flashes", "find_steps", "match_steps", "mean_brightness"]
+
+_FIRST_WINDOW_S = 4.0  # searched at either end; doubled until a flash is found
+_SPARSE = 8  # every 8th pixel in both directions tells the mean brightness
+_CONTRAST = 0.3  # share of the brightness a flash must change; moving people change a few per cent
+_ABRUPT_FRAMES = 3  # a lamp is off or on within this many frames
+_TOLERANCE_FRAMES = 1.0  # steps this close are the same step
+_DROPPED_S = 0.5  # steps that fit with an offset this different tell of lost frames
+_FEWEST_STEPS = 2
+
+
+@dataclass(frozen=True)
+class Step:
+    """Mark one sudden change of brightness.
+
+    Attributes:
+        time_frames: when, in frames of the camera's video; k = as the exposure of frame k begins.
+        rising: the light goes on; else off.
+    """
+
+    time_frames: float
+    rising: bool
+
+
+@dataclass(frozen=True)
+class Offset:
+    """Say how one camera lies in time: its frame k shows the instant of frame k + frames of the reference camera.
+
+    Attributes:
+        frames: the offset in whole frames.
+        exact_frames: the same with its estimated fraction.
+        spread_frames: largest deviation of a matched step from exact_frames; 0 by sound.
+        matched_steps: number of steps found in both cameras; 0 by sound.
+        confidence: share of the steps of both cameras that have a partner, or what `SoundMatch` says; 0 .. 1.
+    """
+
+    frames: int
+    exact_frames: float
+    spread_frames: float
+    matched_steps: int
+    confidence: float
+
+
+@dataclass(frozen=True)
+class Flashes:
+    """Hold the steps of one video.
+
+    Attributes:
+        steps: in order of time.
+        reason: why they are too few to align by, else "".
+    """
+
+    steps: list[Step]
+    reason: str = ""
+
+
+def find_steps(brightness: NDArray[np.float64], first_frame: int = 0) -> list[Step]:
+    """Find the frames at which the light goes off or on.
+
+    Args:
+        brightness: mean brightness of successive pictures, 0..255, shape (n,).
+        first_frame: frame number of the first one.
+
+    Returns:
+        The steps in order of time; none if the brightness changes by less than a flash does.
+    """
+    if len(brightness) < 2 or brightness.max() - brightness.min() < _CONTRAST * brightness.max():
+        return []
+    contrast = brightness.max() - brightness.min()
+    bright = brightness >= brightness.min() + contrast / 2
+    crossings = np.flatnonzero(bright[1:] != bright[:-1]) + 1
+    limits = [0, *crossings.tolist(), len(brightness)]
+    steps = []
+    for before, at, after in zip(limits[:-2], limits[1:-1], limits[2:]):
+        first, last = max(before, at - _ABRUPT_FRAMES), min(after, at + _ABRUPT_FRAMES)
+        around = brightness[first:last]
+        low, high = around.min(), around.max()
+        if high - low < contrast / 2:
+            continue  # it fades: clouds, a dimmer, an automatic exposure
+        lit = float(((around - low) / (high - low)).sum())
+        rising = bool(bright[at])
+        steps.append(Step(first_frame + (last - lit if rising else first + lit), rising))
+    return steps
+
+
+def match_steps(steps: list[Step], reference: list[Step], fps: float) -> Offset:
+    """Align the steps of one camera with those of the reference camera.
+
+    Args:
+        steps: of the camera.
+        reference: of the reference camera.
+        fps: frames per second of both.
+
+    Raises:
+        SyncError: fewer than two steps fit, two alignments fit equally well, or frames were lost in between.
+    """
+    candidates = {round(r.time_frames - s.time_frames) for s in steps for r in reference if s.rising == r.rising}
+    ranked = sorted((_aligned(steps, reference, offset) for offset in candidates), key=lambda a: (-len(a[0]), a[1]))
+    if not ranked or len(ranked[0][0]) < _FEWEST_STEPS:
+        raise SyncError(
+            f"the light steps at {_listed(steps)} do not fit those at {_listed(reference)} of the reference."
+        )
+    pairs, spread, exact = ranked[0]
+    _refuse_lost_frames(steps, reference, pairs, exact, _DROPPED_S * fps)
+    for other_pairs, other_spread, other in ranked[1:]:
+        if len(other_pairs) == len(pairs) and other_spread < spread + 0.5 and abs(other - exact) > _TOLERANCE_FRAMES:
+            raise SyncError(
+                f"the light flashes fit equally well with an offset of {exact:.0f} and of {other:.0f} frames."
+            )
+    confidence = 2 * len(pairs) / (len(steps) + len(reference))
+    return Offset(round(exact), exact, spread, len(pairs), confidence)
+
+
+def _refuse_lost_frames(
+    steps: list[Step], reference: list[Step], pairs: list[tuple[int, int]], exact: float, reach_frames: float
+) -> None:
+    """Raise if steps that found no partner would find one with a slightly different offset."""
+    lone_steps, lone_partners = (
+        [step for k, step in enumerate(own) if k not in {pair[side] for pair in pairs}]
+        for side, own in enumerate((steps, reference))
+    )
+    for step in lone_steps:
+        for partner in lone_partners:
+            other = partner.time_frames - step.time_frames
+            if step.rising == partner.rising and abs(other - exact) < reach_frames:
+                matched = steps[pairs[0][0]].time_frames
+                (early, before), (late, after) = sorted([(matched, exact), (step.time_frames, other)])
+                raise SyncError(
+                    f"the offset is {before:.1f} frames at frame {early:.0f} and {after:.1f} at frame {late:.0f}: "
+                    "frames were lost while recording."
+                )
+
+
+def _aligned(steps: list[Step], reference: list[Step], offset: int) -> tuple[list[tuple[int, int]], float, float]:
+    """Return the pairs of step numbers that meet under an offset, their spread and their exact offset [frames]."""
+    pairs, differences = [], []
+    for i, step in enumerate(steps):
+        for j, partner in enumerate(reference):
+            difference = partner.time_frames - step.time_frames
+            if step.rising == partner.rising and abs(difference - offset) <= _TOLERANCE_FRAMES:
+                pairs.append((i, j))
+                differences.append(difference)
+                break
+    if not pairs:
+        return [], 0.0, float(offset)
+    exact = float(np.median(differences))
+    return pairs, float(np.abs(np.array(differences) - exact).max()), exact
+
+
+def find_flashes(video: Video) -> Flashes:
+    """Find the steps near both ends of a video, looking further in until there are some.
+
+    Returns:
+        The steps, their times in pictures of the video.
+
+    Raises:
+        CaptureError: the video cannot be decoded.
+    """
+    window = max(2, round(_FIRST_WINDOW_S * video.fps))
+    head: list[Step] = []
+    tail: list[Step] = []
+    while 2 * window < video.count:
+        if len(head) < _FEWEST_STEPS:
+            head = find_steps(_brightness(video, 0, window))
+        if len(tail) < _FEWEST_STEPS:
+            tail = find_steps(_brightness(video, video.count - window, video.count), video.count - window)
+        if min(len(head), len(tail)) >= _FEWEST_STEPS:
+            return Flashes(head + tail)
+        window *= 2
+    brightness = _brightness(video, 0, video.count)
+    steps = find_steps(brightness)
+    if len(steps) >= _FEWEST_STEPS:
+        return Flashes(steps)
+    return Flashes(
+        steps,
+        f"shows no light flash: {len(steps)} sudden changes, brightness {brightness.min():.0f} to "
+        f"{brightness.max():.0f} of 255 over all {video.count} frames; a flash changes it by more than "
+        f"{_CONTRAST:.0%} and back",
+    )
+
+
+def _brightness(video: Video, first: int, last: int) -> NDArray[np.float64]:
+    return np.array([mean_brightness(frame.image) for frame in video.frames(first, last, threads=1)])
+
+
+def mean_brightness(image: NDArray[np.uint8]) -> float:
+    """Return the mean brightness of a picture from every 8th pixel in both directions."""
+    return float(image[::_SPARSE, ::_SPARSE].mean())
+
+
+def _listed(steps: list[Step]) -> str:
+    return ", ".join(f"{step.time_frames:.1f} ({'on' if step.rising else 'off'})" for step in steps)

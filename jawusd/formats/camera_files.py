@@ -1,0 +1,262 @@
+"""Calibrations of other programs, told apart by their names: aniposelib TOML, COLMAP text, nerfstudio JSON.
+
+COLMAP: `cameras.txt` and `images.txt` (https://colmap.github.io/format.html); rotation (w, x, y, z) and translation
+take world to camera. nerfstudio: `transforms.json` (https://docs.nerf.studio/quickstart/data_conventions.html);
+camera-to-world with OpenGL axes (x right, y up, z backward). Both put the centre of the top-left pixel at (0.5, 0.5),
+OpenCV and jawusd at (0, 0).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.errors import CalibrationError
+from jawusd.formats.calibration import load_calibration
+from jawusd.geometry import Camera, make_transform, matrix_from_wxyz, rigidity_defect, se3_inverse
+
+__all__ = ["calibration_files", "load_cameras_file", "load_colmap", "load_nerfstudio"]
+
+Array = NDArray[np.float64]
+
+_COLMAP = ("cameras.txt", "images.txt")
+_HALF_PX = 0.5
+# Per COLMAP model: which parameters are fx, fy, cx, cy and, from there on, OpenCV's distortion; SIMPLE ones share f.
+_MODELS = {
+    "SIMPLE_PINHOLE": ("f", 0),
+    "PINHOLE": ("fxfy", 0),
+    "SIMPLE_RADIAL": ("f", 1),
+    "RADIAL": ("f", 2),
+    "OPENCV": ("fxfy", 4),
+    "FULL_OPENCV": ("fxfy", 8),
+}
+# Images of one camera may differ this much before they count as a moving camera.
+_MOVED_RAD, _MOVED_SHARE = 1e-3, 1e-3
+_MAX_BYTES = 64 << 20
+_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def load_cameras_file(path: str | os.PathLike[str], unit_mm: float = 1.0) -> list[Camera]:
+    """Read cameras of any known kind of calibration.
+
+    Args:
+        path: aniposelib TOML, a COLMAP text model (its folder or one of its files) or nerfstudio's transforms.json.
+        unit_mm: length of the file's unit [mm].
+
+    Returns:
+        Cameras in the file's order, lengths in mm, OpenCV axes and pixels.
+
+    Raises:
+        CalibrationError: a value is missing or wrong, or the camera model is not supported.
+        FormatError: the file is damaged.
+    """
+    path = Path(path)
+    if path.is_dir() or path.name in _COLMAP:
+        cameras = load_colmap(path if path.is_dir() else path.parent)
+    elif path.suffix == ".json":
+        cameras = load_nerfstudio(path)
+    else:
+        cameras = load_calibration(path)
+    return [replace(camera, T_cam_world=_in_mm(camera.T_cam_world, unit_mm)) for camera in cameras]
+
+
+def calibration_files(path: Path) -> list[Path]:
+    """Return the files that make up a calibration."""
+    if path.is_dir() or path.name in _COLMAP:
+        return [(path if path.is_dir() else path.parent) / name for name in _COLMAP]
+    return [path]
+
+
+def load_colmap(folder: str | os.PathLike[str]) -> list[Camera]:
+    """Read a COLMAP text model.
+
+    An image in a folder is named after it (`cam0/0001.png` is cam0), else after its file (`cam0.png`). Several images
+    of one camera must share its pose: the cameras of a capture stand still.
+
+    Args:
+        folder: holds cameras.txt and images.txt.
+
+    Returns:
+        Cameras by name, in the model's unit.
+
+    Raises:
+        CalibrationError: see `load_cameras_file`.
+    """
+    folder = Path(folder)
+    path = folder / "images.txt"
+    lenses = {}
+    for row in _rows(folder / "cameras.txt"):
+        lenses[row[0]] = _colmap_lens(folder / "cameras.txt", row)
+    cameras: dict[str, Camera] = {}
+    for row in _rows(path, every=2):
+        if len(row) < 10:
+            raise CalibrationError(
+                f'"{" ".join(row)}" is not an image: an id, 4 + 3 pose values, a camera id and a name are needed.',
+                path=path,
+            )
+        if row[8] not in lenses:
+            raise CalibrationError(f"image {row[9]} names camera {row[8]}, which cameras.txt does not hold.", path=path)
+        q, t = np.split(_floats(path, row[1:8]), [4])
+        if not np.linalg.norm(q) > 0:
+            raise CalibrationError(f"image {row[9]} has a quaternion of length 0.", path=path)
+        size, K, distortion = lenses[row[8]]
+        name = _camera_name(" ".join(row[9:]))
+        _add(cameras, Camera(name, size, K, distortion, make_transform(matrix_from_wxyz(q), t)), path)
+    if not cameras:
+        raise CalibrationError("holds no images.", path=path)
+    return [cameras[name] for name in sorted(cameras)]
+
+
+def load_nerfstudio(path: str | os.PathLike[str]) -> list[Camera]:
+    """Read nerfstudio's transforms.json; names as in `load_colmap`.
+
+    Args:
+        path: transforms.json.
+
+    Returns:
+        Cameras by name, in the file's unit before its `applied_scale`.
+
+    Raises:
+        CalibrationError: see `load_cameras_file`.
+    """
+    path = Path(path)
+    data = _json(path)
+    frames = data.get("frames")
+    if not isinstance(frames, list) or not frames:
+        raise CalibrationError('has no "frames".', path=path)
+    scale = float(data.get("applied_scale", 1.0))
+    cameras: dict[str, Camera] = {}
+    for index, frame in enumerate(frames):
+        where = f"frames[{index}]"
+        if not isinstance(frame, dict) or "file_path" not in frame:
+            raise CalibrationError(f'{where} has no "file_path".', path=path)
+        size, K, distortion = _nerfstudio_lens(path, {**data, **frame}, where)
+        try:
+            T_world_gl = np.array(frame["transform_matrix"], dtype=np.float64)
+        except (KeyError, ValueError, TypeError) as error:
+            raise CalibrationError(f'{where} has no "transform_matrix" of 4 x 4 numbers.', path=path) from error
+        T_world_gl = np.vstack([T_world_gl, [0, 0, 0, 1]]) if T_world_gl.shape == (3, 4) else T_world_gl
+        if T_world_gl.shape != (4, 4) or not np.isfinite(T_world_gl).all() or rigidity_defect(T_world_gl) > 1e-4:
+            raise CalibrationError(f"{where} transform_matrix is not a rigid 4 x 4 matrix.", path=path)
+        T_world_gl[:3, 3] /= scale
+        T_cam_world = se3_inverse(T_world_gl @ _OPENGL)
+        _add(cameras, Camera(_camera_name(frame["file_path"]), size, K, distortion, T_cam_world), path)
+    return [cameras[name] for name in sorted(cameras)]
+
+
+def _in_mm(T: Array, unit_mm: float) -> Array:
+    T = T.copy()
+    T[:3, 3] *= unit_mm
+    return T
+
+
+def _rows(path: Path, every: int = 1) -> list[list[str]]:
+    """Return the words of every n-th line; an image's second line lists its points and may be empty."""
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise CalibrationError(f"is {path.stat().st_size} bytes, at most {_MAX_BYTES} are read.", path=path)
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise CalibrationError(
+            f"cannot be read ({error}).", path=path, hint="A COLMAP text model has cameras.txt and images.txt."
+        ) from error
+    lines = [line for line in text.splitlines() if not line.startswith("#")]
+    if every == 1:
+        lines = [line for line in lines if line.strip()]
+    return [line.split() for line in lines[::every] if line.strip()]
+
+
+def _floats(path: Path, words: Iterable[str]) -> Array:
+    try:
+        values = np.array([float(word) for word in words])
+    except ValueError as error:
+        raise CalibrationError(f'"{" ".join(words)}" are not numbers.', path=path) from error
+    if not np.isfinite(values).all():
+        raise CalibrationError(f'"{" ".join(words)}" holds a value that is not finite.', path=path)
+    return values
+
+
+def _colmap_lens(path: Path, row: list[str]) -> tuple[tuple[int, int], Array, Array]:
+    if len(row) < 5 or row[1] not in _MODELS:
+        found = row[1] if len(row) > 1 else "nothing"
+        raise CalibrationError(
+            f"camera {row[0]} has the model {found}, allowed are {', '.join(_MODELS)}.",
+            path=path,
+            hint="Undistort the footage first, or solve again with --ImageReader.camera_model OPENCV.",
+        )
+    focal, terms = _MODELS[row[1]]
+    values = _floats(path, row[2:])
+    expected = 2 + (3 if focal == "f" else 4) + terms
+    if len(values) != expected:
+        raise CalibrationError(f"camera {row[0]} has {len(values)} values, {row[1]} needs {expected}.", path=path)
+    size = (int(values[0]), int(values[1]))
+    fx, fy, cx, cy = (values[2], *values[2:5]) if focal == "f" else values[2:6]
+    distortion = values[expected - terms :]
+    if 0 < terms < 4:  # radial terms only
+        distortion = np.concatenate([distortion, np.zeros(4 - terms)])
+    return size, _matrix(path, f"camera {row[0]}", fx, fy, cx, cy), distortion
+
+
+def _nerfstudio_lens(path: Path, values: dict, where: str) -> tuple[tuple[int, int], Array, Array]:
+    model = values.get("camera_model", "OPENCV")
+    if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL") or values.get("is_fisheye"):
+        raise CalibrationError(
+            f'{where} has the camera model "{model}"; only perspective models are read.',
+            path=path,
+            hint="Undistort the footage first, or calibrate with the OPENCV model.",
+        )
+    found = {}
+    for key in ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4"):
+        value = values.get(key, values.get("fl_x") if key == "fl_y" else 0.0 if key[0] in "kp" else None)
+        if not isinstance(value, int | float) or not np.isfinite(value):
+            raise CalibrationError(f'{where} has no number "{key}".', path=path)
+        found[key] = float(value)
+    if found["k4"] != 0:
+        # nerfstudio's k4 is a fourth power of r^2; OpenCV's fourth coefficient stands in a denominator.
+        raise CalibrationError(f"{where} has k4 = {found['k4']:g}, allowed is 0.", path=path)
+    K = _matrix(path, where, found["fl_x"], found["fl_y"], found["cx"], found["cy"])
+    lens = np.array([found[key] for key in ("k1", "k2", "p1", "p2", "k3")])
+    return (int(found["w"]), int(found["h"])), K, lens
+
+
+def _matrix(path: Path, where: str, fx: float, fy: float, cx: float, cy: float) -> Array:
+    if not (fx > 0 and fy > 0):
+        raise CalibrationError(f"{where} has the focal lengths {fx:g} and {fy:g} px, allowed are > 0 px.", path=path)
+    return np.array([[fx, 0.0, cx - _HALF_PX], [0.0, fy, cy - _HALF_PX], [0.0, 0.0, 1.0]])
+
+
+def _camera_name(file: str) -> str:
+    image = PurePosixPath(file.replace("\\", "/"))
+    folder = image.parent.name
+    return image.stem if folder in ("", ".", "images") else folder
+
+
+def _add(cameras: dict[str, Camera], camera: Camera, path: Path) -> None:
+    """Add a camera, or check that it stands where an earlier image of it stood."""
+    known = cameras.setdefault(camera.name, camera)
+    turned = np.abs(known.T_cam_world[:3, :3] - camera.T_cam_world[:3, :3]).max()
+    moved = np.linalg.norm(known.centre_world() - camera.centre_world())
+    if turned > _MOVED_RAD or moved > _MOVED_SHARE * np.linalg.norm(known.centre_world()) + 1e-12:
+        raise CalibrationError(
+            f"camera {camera.name} stands in different places in its images.",
+            path=path,
+            hint="Name the images after the cameras, one per camera (cam0.png) or one folder each (cam0/0001.png).",
+        )
+
+
+def _json(path: Path) -> dict:
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise CalibrationError(f"is {path.stat().st_size} bytes, at most {_MAX_BYTES} are read.", path=path)
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise CalibrationError(f"is not JSON that can be read ({error}).", path=path) from error
+    if not isinstance(data, dict):
+        raise CalibrationError("is not a JSON object.", path=path)
+    return data

@@ -1,0 +1,59 @@
+"""Read the sound of a video with PyAV, as one channel."""
+
+from __future__ import annotations
+
+import os
+from typing import NamedTuple
+
+import av
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.errors import CaptureError
+
+__all__ = ["Sound", "read_sound"]
+
+
+class Sound(NamedTuple):
+    """Hold the sound of a file.
+
+    Attributes:
+        samples: one channel, shape (n,).
+        rate_hz: samples per second.
+        start_s: presentation time of the first sample in the file [s].
+    """
+
+    samples: NDArray[np.float32]
+    rate_hz: int
+    start_s: float
+
+
+def read_sound(path: str | os.PathLike[str], rate_hz: int) -> Sound | None:
+    """Read the first sound track of a file.
+
+    Args:
+        path: a video or sound file.
+        rate_hz: samples per second to return.
+
+    Returns:
+        The sound, or None if the file carries none.
+
+    Raises:
+        CaptureError: the file or its sound cannot be decoded.
+    """
+    parts, start_s = [], 0.0
+    try:
+        with av.open(os.fspath(path)) as container:
+            if not container.streams.audio:
+                return None
+            resampler = av.AudioResampler(format="flt", layout="mono", rate=rate_hz)
+            for frame in container.decode(container.streams.audio[0]):
+                if not parts and frame.pts is not None:
+                    start_s = float(frame.pts * frame.time_base)
+                parts += [piece.to_ndarray()[0] for piece in resampler.resample(frame)]
+            parts += [piece.to_ndarray()[0] for piece in resampler.resample(None)]
+    except (av.FFmpegError, OSError) as error:
+        raise CaptureError(
+            f"its sound cannot be decoded ({error.strerror}).", path=path, hint="Copy it again from the camera."
+        ) from error
+    return Sound(np.concatenate(parts), rate_hz, start_s) if parts else None
