@@ -10,16 +10,18 @@ from numpy.typing import NDArray
 
 from jawusd.errors import EvaluatorError
 from jawusd.evaluator.bounds import SliceHull
-from jawusd.evaluator.distances import carried, distance_residual
+from jawusd.evaluator.distances import distance_residual
 from jawusd.evaluator.models import JawModelForm
 from jawusd.evaluator.rows import in_chunks
-from jawusd.evaluator.solver import Residual, minimise
+from jawusd.evaluator.solver import Residual, minimise, pulled_inside
 
 Array = NDArray[np.float64]
 # (row numbers (k,), starts (k, 3)) -> bottoms (k, 3) and squared residuals (k,)
 Search = Callable[[NDArray[np.intp], Array], tuple[Array, Array]]
 
 _MOST_VALLEYS = 4
+_RIPPLE_STEPS = (-2.0, -1.0, 1.0, 2.0)
+_LONGEST_DRAG_MM = 3.0  # movement in d between two events of a drag; what goes further may as well change valleys
 _SCAN_ROWS = 64  # rows compared with all candidates at once: 64 x 6,000 distances are 3 MB
 
 
@@ -57,7 +59,7 @@ class Reach:
         if not out.size:
             return valid
         wanted = d[out]
-        valid[out] = self._best(lambda rows, first: self._approach(wanted[rows], first), self._scan.points, wanted)
+        valid[out], _ = self._best(lambda rows, first: self._approach(wanted[rows], first), self._scan.points, wanted)
         return valid
 
     def best_pull(self, vectors: Array, target: Array) -> Array:
@@ -70,16 +72,42 @@ class Reach:
         Raises:
             EvaluatorError: the valid volume is empty.
         """
-        images = carried(self._scan.R, self._scan.t, vectors).reshape(len(self._scan.points), -1)
-        wanted = target.reshape(len(target), images.shape[1])
-        return self._best(lambda rows, first: self._pull(vectors, target[rows], first), images, wanted)
+        return self._best_pull(vectors, target)[0]
 
     def pull(self, vectors: Array, target: Array, start: Array) -> Array:
         """Return what `best_pull` does, but only the bottom of the valley that start (n, 3) [mm] lies in.
 
-        Short steps keep the search in that valley, which is what makes dragging continuous.
+        Short steps keep the search in that valley, which is what makes dragging continuous. A start from which they
+        lead far away is no drag: there the better of that bottom and of `best_pull` is returned.
         """
-        return self._pull(vectors, target, start)[0]
+        found, left = self._pull(vectors, target, start)
+        far = np.flatnonzero(np.linalg.norm(found - start, axis=1) > _LONGEST_DRAG_MM)
+        if far.size:
+            best, least = self._best_pull(vectors, target[far])
+            better = least < left[far]
+            found[far[better]] = best[better]
+        return found
+
+    def _best_pull(self, vectors: Array, target: Array) -> tuple[Array, Array]:
+        """Return the bottoms (n, 3) [mm] of the deepest valleys, and the squared distances left (n,)."""
+        images = self._scan.images(vectors)
+        wanted = target.reshape(len(target), images.shape[1])
+        best, least = self._best(lambda rows, first: self._pull(vectors, target[rows], first), images, wanted)
+        first, inside = pulled_inside(self._bound, (best[:, None] + self._ripples).reshape(-1, 3))
+        first[~inside] = np.nan
+        found, left = self._pull(vectors, np.repeat(target, len(self._ripples), axis=0), first)
+        left = np.where(np.isnan(left), np.inf, left).reshape(len(best), -1)
+        choice = left.argmin(axis=1)
+        each = np.arange(len(best))
+        better = left[each, choice] < least
+        best[better] = found.reshape(len(best), -1, 3)[each, choice][better]
+        return best, np.minimum(least, left[each, choice])
+
+    @cached_property
+    def _ripples(self) -> Array:
+        """Steps (r, 3) [mm] to either side across ripples of the bound, which are as long as its knots lie apart."""
+        spacing_mm = np.diff(self._bound.supports.knots).mean()
+        return np.array([[step * spacing_mm, 0.0, 0.0] for step in _RIPPLE_STEPS])
 
     def _pull(self, vectors: Array, target: Array, start: Array) -> tuple[Array, Array]:
         """Return the bottoms (n, 3) [mm] of the valleys the starts lie in, and the squared distances left (n,)."""
@@ -99,14 +127,21 @@ class Reach:
         r, _ = residual(found, np.arange(len(found)))
         return found, np.einsum("nm,nm->n", r, r)
 
-    def _best(self, search: Search, features: Array, wanted: Array) -> Array:
-        """Return the best d (n, 3) over searches from every valley; features (p, k) are of the scanned points."""
+    def _best(self, search: Search, features: Array, wanted: Array) -> tuple[Array, Array]:
+        """Return the best d (n, 3) [mm] over searches from every valley, and the squared residuals (n,).
+
+        Args:
+            search: From starts to bottoms.
+            features: What is compared, of the scanned points, shape (p, k).
+            wanted: What it should be, shape (n, k).
+        """
         best, least = np.full((len(wanted), 3), np.nan), np.full(len(wanted), np.inf)
-        for rows, starts in self._scan.valleys(features, wanted):
-            found, cost = search(rows, starts)
-            better = cost < least[rows]
-            best[rows[better]], least[rows[better]] = found[better], cost[better]
-        return best
+        rows, starts = self._scan.valleys(features, wanted)
+        found, cost = search(rows, starts)
+        order = np.lexsort((cost, rows))  # by row, then by cost, NaN last
+        each, first = np.unique(rows[order], return_index=True)
+        best[each], least[each] = found[order[first]], cost[order[first]]
+        return best, least
 
 
 class _Scan:
@@ -114,15 +149,20 @@ class _Scan:
 
     Attributes:
         points: d of the points [mm], shape (p, 3), in order of d1.
-        R, t: Their motions, shapes (p, 3, 3) and (p, 3).
     """
 
     def __init__(self, points: Array, R: Array, t: Array) -> None:
-        self.points, self.R, self.t = points, R, t
+        """Keep the points and their motions R (p, 3, 3), t (p, 3) [mm]."""
+        self.points = points
+        self._motions = np.concatenate([R, t[:, :, None]], axis=2).reshape(-1, 4)
         self._first = np.flatnonzero(np.diff(points[:, 0], prepend=-np.inf) > 0)
 
-    def valleys(self, features: Array, wanted: Array) -> list[tuple[NDArray[np.intp], Array]]:
-        """Return rounds of starts: row numbers (m,) and d (m, 3) [mm], the best first; rows with NaN have none.
+    def images(self, vectors: Array) -> Array:
+        """Return where the motions carry homogeneous vectors (4, m) [mm], flat: shape (p, 3 m)."""
+        return (self._motions @ vectors).reshape(len(self.points), -1)
+
+    def valleys(self, features: Array, wanted: Array) -> tuple[NDArray[np.intp], Array]:
+        """Return starts: row numbers (m,), several for a row, and d (m, 3) [mm]; rows with NaN have none.
 
         A valley is a slice whose best point is nearer to what is wanted than that of both its neighbours.
 
@@ -136,8 +176,8 @@ class _Scan:
             distance = squared - 2.0 * wanted[i : i + _SCAN_ROWS] @ features.T
             found[i : i + _SCAN_ROWS] = self._deepest(distance)
         found[np.isnan(wanted).any(axis=1)] = -1
-        rounds = [(np.flatnonzero(column >= 0), column) for column in found.T]
-        return [(rows, self.points[column[rows]]) for rows, column in rounds if rows.size]
+        rows, places = np.nonzero(found >= 0)
+        return rows, self.points[found[rows, places]]
 
     def _deepest(self, distance: Array) -> NDArray[np.intp]:
         """Return the best point in each of the deepest valleys (n, v) of distances (n, p); -1 where there are fewer."""

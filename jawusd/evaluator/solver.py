@@ -89,7 +89,7 @@ def minimise(
             break
         trial, allowed = x[rows] + step, True
         if bound is not None:
-            trial, allowed = _pulled_back(bound, trial)
+            trial, allowed = pulled_inside(bound, trial)
         r_trial, J_trial = residual(trial, rows)
         cost_trial = np.einsum("nm,nm->n", r_trial, r_trial)
         better = (cost_trial <= cost[rows]) & allowed
@@ -142,9 +142,7 @@ def _first_pressure(bound: Bound, x: Array, r: Array, J: Array) -> Array:
     return np.where(excess > -TOUCHING_MM, np.maximum(press, 0.0), 0.0)
 
 
-def _bounded_step(
-    bound: Bound, x: Array, r: Array, J: Array, damping: Array, pressure: Array
-) -> tuple[Array, Array]:
+def _bounded_step(bound: Bound, x: Array, r: Array, J: Array, damping: Array, pressure: Array) -> tuple[Array, Array]:
     """Return the step of the quadratic model under the linearised bound, and the bound's multiplier."""
     excess, normal, curvature = bound.excess_curvature(x)
     A = _damped(np.swapaxes(J, 1, 2) @ J + pressure[:, None, None] * curvature, damping)
@@ -157,8 +155,8 @@ def _bounded_step(
     return step * np.minimum(1.0, LONGEST_STEP_MM / np.maximum(length, 1e-300))[:, None], pressure
 
 
-def _pulled_back(bound: Bound, x: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the points moved down the gradient until just inside, and whether they got there."""
+def pulled_inside(bound: Bound, x: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Move the points x (n, 3) [mm] down the gradient until just inside, in place; return them and which got there."""
     inside = np.zeros(len(x), dtype=bool)
     rows = np.arange(len(x))
     for _ in range(PULL_BACKS):

@@ -5,7 +5,7 @@ import pytest
 from brute_force_ik import brute_force_ik
 from example_model import example_arrays, example_meta
 
-from jawusd.evaluator import JawRig
+from jawusd.evaluator import JawRig, reach
 
 RIGS = {kind: JawRig(example_arrays(kind), example_meta(kind)) for kind in ("anchored", "additive")}
 
@@ -46,6 +46,24 @@ def test_never_worse_than_the_papers_search_and_always_valid(rig, handles):
     assert (brute_mm > 0.5).any()  # some targets are out of reach: the bound was at work
     left = where(rig, found, points) - targets
     np.testing.assert_allclose(distance_mm, np.sqrt((left**2).sum(-1).mean(-1)), atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", sorted(RIGS))
+def test_a_far_throw_finds_the_better_side_of_a_ripple(kind, monkeypatch):
+    """A bound that ripples with opening is full of valleys; the search from the start alone ends in wrong ones."""
+    arrays = example_arrays(kind)
+    arrays["slice_support"] += 0.3 * np.sin(np.arange(len(arrays["slice_support"])) * np.pi / 2)[:, None]
+    rig = JawRig(arrays, example_meta(kind))
+    start = valid_d(rig, 300, 0)
+    points = rig.arrays["landmarks"][:1]
+    targets = where(rig, start, points) + np.random.default_rng(0).normal(size=(300, 1, 3)) * 6.0
+    _, brute_mm = brute_force_ik(rig, points, targets, start)
+    found, distance_mm = rig.ik(points, targets, start=start)
+    assert (rig.margin(found) >= -1e-12).all()
+    assert (distance_mm <= brute_mm + 1e-9).all()
+    monkeypatch.setattr(reach, "_LONGEST_DRAG_MM", np.inf)
+    _, distance_mm = rig.ik(points, targets, start=start)
+    assert (distance_mm > brute_mm + 0.01).any()
 
 
 def test_dragging_does_not_jump(rig):
