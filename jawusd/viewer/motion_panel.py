@@ -63,7 +63,7 @@ class MotionPanel:
         self.between.on_update(guarded(client, self._interpolate))
         self.fps = gui.add_number("frames per second", session.work.fps, min=1.0, max=1000.0, step=1.0)
         self.fps.on_update(guarded(client, self._rate))
-        self._plot: Plot = curve_plot(None, ())
+        self._plot: Plot = curve_plot(None, (), (0.0, float(_LENGTH)))
         self.frame = 0.0
 
     def clip(self) -> Clip | None:
@@ -97,21 +97,23 @@ class MotionPanel:
         if drawn != self._drawn:
             self._drawn = drawn
             clip = self.clip()
-            self._plot = curve_plot(clip, work.keys if chosen == KEYS else ())
+            span = self._set_ends(clip)
+            self._plot = curve_plot(clip, work.keys if chosen == KEYS else (), span)
             self._curves.content = self._plot.definition()
-            self._set_ends(clip)
             self._set_thumbs()
             self.between.value, self.fps.value = work.interpolation, work.fps
         self._playhead.content = f'<div style="padding:0 6px">{with_playhead(self._plot, self.frame)}</div>'
         if self.frame_slider.value != round(self.frame):
             self.frame_slider.value = round(self.frame)
 
-    def _set_ends(self, clip: Clip | None) -> None:
+    def _set_ends(self, clip: Clip | None) -> tuple[float, float]:
+        """Let the timeline reach over a motion; return its first and last frame."""
         first, last = (0.0, 0.0) if clip is None else clip.span
         if self.source.value == KEYS:
             first, last = min(first, 0.0), max(last + 25.0, float(_LENGTH))
         self.frame_slider.min, self.frame_slider.max = first, last
         self.frame = min(max(self.frame, first), last)
+        return first, last
 
     def _set_thumbs(self) -> None:
         frames = tuple(key.frame for key in self._session.work.keys)

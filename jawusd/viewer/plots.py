@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 BLUE, ORANGE, GREEN, VERMILION, GREY = "#0072b2", "#e69f00", "#009e73", "#d55e00", "#888888"
 CURVE_COLORS = (BLUE, VERMILION, GREEN)
 
-_WIDTH, _HEIGHT = 300, 210
+_WIDTH, _HEIGHT = 300, 192
 _LEFT, _RIGHT, _TOP, _BOTTOM = 36, 8, 22, 32
 _MOST_POINTS = 300
 _MOST_SAMPLES = 400
@@ -86,10 +86,10 @@ def posselt_plot(rig: JawRig, axis: int) -> Plot:
     border = (landmark_places(rig, border_path(rig, axis))[:, INCISOR] - origin)[:, columns]
     captured = (landmark_places(rig, _thinned(rig.arrays["codes"]))[:, INCISOR] - origin)[:, columns]
     name, title, label = (
-        ("jaw-frontal", "Posselt, frontal", "to the subject's left [mm]"),
-        ("jaw-sagittal", "Posselt, sagittal", "forward [mm]"),
+        ("jaw-frontal", "Posselt, frontal: up over left", "to the subject's left [mm]"),
+        ("jaw-sagittal", "Posselt, sagittal: up over forward", "forward [mm]"),
     )[axis - 1]
-    plot = _framed(name, np.vstack([border, captured]), title, label, "up mm")
+    plot = _framed(name, np.vstack([border, captured]), title, label, "mm")
     return _drawn(plot, [_dots(plot, captured), _ring(plot, border, BLUE)])
 
 
@@ -99,15 +99,16 @@ def posselt_point(places: Array, rest: Array, axis: int) -> tuple[float, float]:
     return float(moved[0 if axis == 1 else 2]), float(moved[1])
 
 
-def curve_plot(clip: Clip | None, keys: KeyTrack, name: str = "jaw-curves") -> Plot:
-    """Draw d1, d2 and d3 of a motion over its frames, keys as dots."""
+def curve_plot(clip: Clip | None, keys: KeyTrack, span: tuple[float, float]) -> Plot:
+    """Draw d1, d2 and d3 of a motion over the frames of a span, keys as dots."""
+    name = "jaw-curves"
     if clip is None:
         empty = f'<text x="{_WIDTH / 2}" y="{_HEIGHT / 2}" text-anchor="middle" {_TEXT}>no keys yet</text>'
-        return Plot(name, empty, (0.0, 0.0), (1.0, 1.0))
-    first, last = clip.span
+        return Plot(name, empty, (span[0], 0.0), (max(span[1], span[0] + 1.0), 1.0))
+    first, last = span[0], max(span[1], span[0] + 1.0)
     frames = np.union1d(np.linspace(first, last, _MOST_SAMPLES), [key.frame for key in keys])
     values = clip.at(frames)
-    corners = np.stack([np.repeat([first, max(last, first + 1)], 2), np.tile([values.min(), values.max()], 2)], axis=1)
+    corners = np.stack([np.repeat([first, last], 2), np.tile([values.min(), values.max()], 2)], axis=1)
     plot = _framed(name, corners, f"{clip.name}: d1, d2, d3 [mm]", "frame", "mm", pad_x=False)
     parts = []
     for axis, color in enumerate(CURVE_COLORS):
@@ -125,9 +126,7 @@ def with_playhead(plot: Plot, frame: float) -> str:
     """Return the SVG of a curve plot with a line at the frame shown."""
     frame = min(max(frame, plot.low[0]), plot.high[0])
     px = _place(plot, np.array([[frame, plot.low[1]]]))[0, 0]
-    line = (
-        f'<line x1="{px:.1f}" x2="{px:.1f}" y1="{_TOP}" y2="{_HEIGHT - _BOTTOM}" stroke="{ORANGE}" stroke-width="2"/>'
-    )
+    line = f'<path d="M{px:.1f} {_TOP}V{_HEIGHT - _BOTTOM}" stroke="{ORANGE}" stroke-width="2"/>'
     return _svg(f'<use href="#{plot.name}"/>{line}')
 
 

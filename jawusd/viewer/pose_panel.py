@@ -15,7 +15,12 @@ from jawusd.viewer.scene import PRESETS, JawScene
 from jawusd.viewer.session import Session
 
 STEP_MM = 0.01
-LABELS = ("d1 opening", "d2 lateral (+ left)", "d3 protrusion (+ forward)")
+LABELS = ("d1 opening", "d2 to the left", "d3 forward")
+_HINTS = (
+    "Opening [mm] along this person's own path.",
+    "Laterotrusion [mm] at the incisal point, + to the subject's left.",
+    "Protrusion [mm] relative to the path of opening, + forward.",
+)
 # How far sliders reach beyond the ranges of the rig while poses outside are allowed.
 _BEYOND = 0.25
 _PINNABLE = tuple(name for name in LANDMARKS if not name.startswith("molar"))
@@ -60,7 +65,7 @@ class PosePanel:
         undo.on_trigger(guarded(client, self._undo))
 
     def _add_slider(self, index: int, label: str) -> viser.GuiSliderHandle[float]:
-        slider = self._client.gui.add_slider(f"{label} [mm]", -1.0, 1.0, STEP_MM, 0.0)
+        slider = self._client.gui.add_slider(label, -1.0, 1.0, STEP_MM, 0.0, hint=_HINTS[index])
 
         async def moved(_: object) -> None:
             self._session.set_parameter(index, float(slider.value))
@@ -111,7 +116,7 @@ class PosePanel:
         limits = session.limits()
         ends = slider_ends(limits, session.rig.arrays["d_range"], session.keep_valid)
         for slider, (low, high), value in zip(self.sliders, ends, session.work.d, strict=True):
-            low, high = min(low, value), max(high, value)
+            low, high = min(low, _outwards(value, -1)), max(high, _outwards(value, 1))
             if (slider.min, slider.max) != (low, high):
                 slider.min, slider.max = low, high
             if abs(slider.value - value) > 0.5 * STEP_MM:
@@ -131,10 +136,15 @@ def slider_ends(limits: object, d_range: object, keep_valid: bool) -> list[tuple
     """
     if keep_valid:
         return [
-            (math.ceil(low / STEP_MM - 1e-6) * STEP_MM, math.floor(high / STEP_MM + 1e-6) * STEP_MM)
+            (_outwards(low, 1), _outwards(high, -1))  # towards each other
             for low, high in limits
         ]
     return [(float(low - _BEYOND * (high - low)), float(high + _BEYOND * (high - low))) for low, high in d_range]
+
+
+def _outwards(value: float, sign: int) -> float:
+    """Return a value rounded down or up to the step of the sliders, but for the noise of computing."""
+    return round(sign * math.ceil(sign * value / STEP_MM - 1e-6) * STEP_MM, 6)
 
 
 def reading_html(readout: Readout, d: tuple[float, float, float], limits: object) -> str:
@@ -142,28 +152,35 @@ def reading_html(readout: Readout, d: tuple[float, float, float], limits: object
     color, verdict = (GREEN, "valid") if readout.inside else (VERMILION, "OUTSIDE the bound")
     captured = f"{readout.captured_mm:.2f} mm" if math.isfinite(readout.captured_mm) else "nothing captured"
     rows = [
-        ("incisal point", f"down {readout.opening_mm:.2f}, left {readout.lateral_mm:.2f}, "
-                          f"forward {readout.protrusion_mm:.2f} mm"),
-        ("left condyle", _moved(readout.condyle_left_mm)),
-        ("right condyle", _moved(readout.condyle_right_mm)),
-        ("margin", f"{readout.margin_mm:.2f} mm"),
+        ("opening", f"{_plain(readout.opening_mm)} mm"),
+        ("lateral, + left", f"{_plain(readout.lateral_mm)} mm"),
+        ("forward", f"{_plain(readout.protrusion_mm)} mm"),
+        ("left condyle moved", _moved(readout.condyle_left_mm)),
+        ("right condyle moved", _moved(readout.condyle_right_mm)),
+        ("margin", f"{_plain(readout.margin_mm)} mm"),
         ("nearest captured", captured),
         *((f"valid d{i + 1}", _span(d[i], *limits[i])) for i in range(3)),
-    ]  # fmt: skip
+    ]
     cells = "".join(
         f'<tr><td style="opacity:.7;padding-right:8px;white-space:nowrap">{name}</td><td>{text}</td></tr>'
         for name, text in rows
     )
     head = f'<div style="color:{color};font-weight:bold">&#9679; {verdict}</div>'
-    return f'<div style="font-size:12px;padding:2px 12px;line-height:1.35">{head}<table>{cells}</table></div>'
+    foot = '<div style="opacity:.6">L, D, F: to the left, down, forward [mm]</div>'
+    return f'<div style="font-size:12px;padding:2px 12px;line-height:1.35">{head}<table>{cells}</table>{foot}</div>'
+
+
+def _plain(value: float) -> str:
+    """Return a number of mm with two decimals and no minus in front of zero."""
+    return f"{round(value, 2) + 0.0:.2f}"
 
 
 def _span(value: float, low: float, high: float) -> str:
-    text = f"{low:.2f} to {high:.2f} mm"
+    text = f"{_plain(low)} to {_plain(high)} mm"
     inside = low - STEP_MM <= value <= high + STEP_MM
     return text if inside else f'<b style="color:{VERMILION}">{text}</b>'
 
 
 def _moved(moved_mm: tuple[float, float, float]) -> str:
     left, up, forward = moved_mm
-    return f"left {left:.2f}, down {-up:.2f}, forward {forward:.2f} mm"
+    return " ".join(f"{word} {_plain(value)}" for word, value in (("L", left), ("D", -up), ("F", forward)))

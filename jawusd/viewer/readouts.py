@@ -79,11 +79,13 @@ def border_path(rig: JawRig, axis: int, samples: int = 40) -> Array:
     Returns:
         Shape (n, 3), down one side and up the other.
     """
-    opening = np.linspace(*rig.arrays["d_range"][0], samples)
+    # denser at both ends, where the bound closes
+    low, high = rig.arrays["d_range"][0]
+    opening = low + (high - low) * 0.5 * (1.0 - np.cos(np.linspace(0.0, np.pi, samples)))
     ends = rig.ranges(opening)
-    low, high = ends[2 * (axis - 1)], ends[2 * (axis - 1) + 1]
-    known = np.isfinite(low) & np.isfinite(high)
+    least, most = ends[2 * (axis - 1)], ends[2 * (axis - 1) + 1]
+    known = np.isfinite(least) & np.isfinite(most)
     sides = np.zeros((2, int(known.sum()), 3))
     sides[..., 0] = opening[known]
-    sides[0, :, axis], sides[1, :, axis] = low[known], high[known]
+    sides[0, :, axis], sides[1, :, axis] = least[known], most[known]
     return np.concatenate([sides[0], sides[1, ::-1]])

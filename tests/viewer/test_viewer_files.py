@@ -1,0 +1,98 @@
+"""What the viewer is given of an actor, and what it may write: read back by readers that know nothing of it."""
+
+import numpy as np
+import pytest
+from example_rig import FPS, assert_valid_usd, example_motion, example_rig
+from pxr import Usd
+
+from jawusd.errors import FormatError, OutputError, RigError
+from jawusd.formats.mesh import Mesh
+from jawusd.pipeline.view import motion_names, part_of, viewed_actor
+from jawusd.rig.geo_read import read_geometry, read_gum
+from jawusd.rig.motion_read import read_poses_of_stage
+from jawusd.viewer.clip import Clip
+
+
+def test_an_actor_brings_its_meshes_with_teeth_and_gum_apart(folder):
+    actor = viewed_actor(folder)
+    assert actor.name == "someone" and actor.fps == FPS and actor.folder == folder
+    whole = read_geometry(folder / "geo.usdc")
+    for row in ("upper", "lower"):
+        parts = len(actor.meshes[f"{row}_teeth"].faces), len(actor.meshes[f"{row}_gum"].faces)
+        assert min(parts) > 0 and sum(parts) == len(whole[f"{row}_teeth"].faces)
+    assert set(actor.meshes) == {"skull", "mandible", "upper_teeth", "upper_gum", "lower_teeth", "lower_gum"}
+    np.testing.assert_allclose(actor.rig.pose([9, 1, 0]), example_rig().pose([9, 1, 0]), atol=1e-9)
+
+
+def test_gum_is_where_the_paint_is_grey(folder):
+    from example_rig import example_meshes
+
+    from jawusd.rig.geo import gum_faces
+
+    gum = read_gum(folder / "geo.usdc")
+    assert set(gum) == {"upper_teeth", "lower_teeth"}
+    for name, faces in gum.items():
+        np.testing.assert_array_equal(faces, gum_faces(example_meshes()[name]))
+
+
+def test_a_part_of_a_mesh_has_only_the_vertices_it_uses():
+    mesh = Mesh(np.arange(15.0).reshape(5, 3), np.array([[0, 1, 2], [2, 3, 4]]), np.arange(15).reshape(5, 3))
+    part = part_of(mesh, np.array([False, True]))
+    np.testing.assert_array_equal(part.vertices[part.faces[0]], mesh.vertices[[2, 3, 4]])
+    assert len(part.vertices) == 3 and (part.colors == mesh.colors[2:]).all()
+
+
+def test_what_is_no_rig_is_refused(tmp_path):
+    with pytest.raises(FormatError, match="without meshes"):
+        viewed_actor(tmp_path / "model.npz")
+    with pytest.raises(RigError, match="no such file"):
+        viewed_actor(tmp_path)
+
+
+def test_the_baked_motion_is_offered_and_read_back(folder):
+    actor = viewed_actor(folder / "actor.usda")
+    frames, d = example_motion()
+    (name,) = actor.clip_names()
+    clip = actor.load_clip(name)
+    np.testing.assert_array_equal(clip.frames, frames)
+    np.testing.assert_allclose(clip.d, d, atol=1e-4)
+    assert clip.fps == FPS
+
+
+@pytest.mark.parametrize("name", ["anim_other.usdc", "../actor.usda", "/etc/passwd", "actor.usda", "captured take"])
+def test_only_motions_that_are_offered_are_read(folder, name):
+    with pytest.raises(FormatError, match="no motion"):
+        viewed_actor(folder).load_clip(name)
+
+
+def test_a_motion_file_that_is_broken_is_refused(folder):
+    (folder / "anim_broken.usdc").write_bytes(b"PXR-USDC" + bytes(80))
+    actor = viewed_actor(folder)
+    with pytest.raises(RigError, match="not a USD file"):
+        actor.load_clip("anim_broken.usdc")
+
+
+def test_a_written_animation_is_valid_and_moves_as_the_clip(folder):
+    actor = viewed_actor(folder)
+    clip = Clip("keys", np.array([0.0, 12.0, 30.0]), np.array([[2.0, 0, 0], [18, 2, 0.5], [5, -1, 1]]), 30.0)
+    path = actor.save_layer("anim_mine.usdc", clip, False)
+    assert_valid_usd(path)
+    assert Usd.Stage.Open(str(path)).GetTimeCodesPerSecond() == 30.0
+    frames, T = read_poses_of_stage(path)
+    expected = actor.rig.pose(actor.rig.interpolate(clip.frames, clip.d, frames))
+    np.testing.assert_allclose(T, expected, atol=1e-6)
+    assert "anim_mine.usdc" in motion_names(folder)
+    with pytest.raises(OutputError, match="exists already"):
+        actor.save_layer("anim_mine.usdc", clip, False)
+    actor.save_layer("anim_mine.usdc", clip, True)
+
+
+@pytest.mark.parametrize(
+    "name", ["actor.usda", "../anim.usdc", "anim/x.usdc", "anim.txt", "", "anim\n.usdc", "rig.usdc"]
+)
+def test_only_animations_beside_the_rig_are_written(folder, name):
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    clip = Clip("keys", np.array([0.0]), np.zeros((1, 3)), 24.0)
+    with pytest.raises(OutputError, match="no name for an animation"):
+        viewed_actor(folder).save_layer(name, clip, True)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
