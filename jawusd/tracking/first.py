@@ -9,12 +9,15 @@ from jawusd.errors import TrackingError
 from jawusd.formats.tracks import PARTIAL, TRACKED
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.history import FrameRecord
-from jawusd.tracking.quality import score_px, uncovered_px
+from jawusd.tracking.quality import row_fit, score_px, uncovered_px
 from jawusd.tracking.solver import ContourSolver, Solution
 from jawusd.tracking.views import MaskViews
 
 _ROWS = (0, 1)
 _NAMES = ("upper", "lower")
+# Least `row_fit` of a first frame [-]: teeth that slid along by one reach 0 in one of the rows, right poses 0.1 even
+# with lips nearly closed.
+_LEAST_FIT = 0.05
 
 
 def first_record(
@@ -48,14 +51,16 @@ def first_record(
             best = solver.solve(poses, views, config.wide_gates_px[-2:], use)
     bare_px, mask_px = uncovered_px(solver.scans, best, views)
     coverage = np.where(mask_px > 0, bare_px / np.maximum(mask_px, 1), np.nan)
+    fit = row_fit(solver.scans, best, views, config.bare_price)
     for r in _ROWS:
         share = score_px(best)[r].sum() / max(best.visible_px[r].sum(), 1.0)
         bare = np.nanmedian(coverage[r])
-        if share < config.first_share or bare > config.lost_coverage:
+        if share < config.first_share or bare > config.lost_coverage or fit[r] < _LEAST_FIT:
             raise TrackingError(
                 f"frame {frame}: the {_NAMES[r]} teeth do not fit their masks: {share:.0%} of the visible contour "
-                f"matches (at least {config.first_share:.0%} is needed) and {bare:.1%} of the masks stays uncovered "
-                f"(at most {config.lost_coverage:.0%} is allowed)",
+                f"matches (at least {config.first_share:.0%} is needed), {bare:.1%} of the masks stays uncovered "
+                f"(at most {config.lost_coverage:.0%} is allowed), and the first less the price of the second is "
+                f"{fit[r]:.2f} (at least {_LEAST_FIT} is needed)",
                 hint="Check the picks, the calibration, the time offsets and the masks of this frame.",
             )
     status = np.where(use.all(1), TRACKED, PARTIAL).astype(np.int8)

@@ -1,170 +1,32 @@
-"""Start a take without picks: choose a frame that shows the teeth well and search their poses there."""
+"""Start a take without picks: choose frames that show the teeth well and search their poses there."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.errors import CaptureError, TrackingError
-from jawusd.formats.mesh import Mesh
-from jawusd.geometry import make_transform, so3_log, transform_points
+from jawusd.geometry import transform_points
 from jawusd.tracking.first import first_record
 from jawusd.tracking.footage import Footage, Start
-from jawusd.tracking.mixups import all_rows_exchanged, check_mixups, possible_mixups
-from jawusd.tracking.pose_search import Candidate, Grid, coarse_scan, hinge_at_front, search_row
-from jawusd.tracking.quality import score_px, uncovered_px
-from jawusd.tracking.solver import ContourSolver, Solution, View
+from jawusd.tracking.mixups import all_rows_exchanged, likely_mixup, possible_mixups
+from jawusd.tracking.start_search import Found, StartSearch
 
 _ROWS = (0, 1)
-_NAMES = ("upper", "lower")
 _SURVEYED = 24  # frames looked at: two seconds of reading, and every exercise of a usual take is met
 _FRAMES_TRIED = 5
 _MIXUPS_TRIED = 12  # all of them with four cameras; every one costs a search
-_PX_PER_MM = 2.0  # of the search: one pixel is a third of the step between orientations at the canines
-_FINALISTS = 5  # poses per row that are refined
-_DISTINCT_MM = 2.0  # poses closer than this lead to the same minimum
-# Turns about the guess: the teeth face the cameras, the upper ones are above the lower ones. Masks one beside the other
-# in a lateral movement, or half hidden by lips, mislead the roll most.
-_GRID = Grid(
-    yaw_rad=np.radians(np.arange(-50, 51, 10.0)),
-    pitch_rad=np.radians(np.arange(-40, 41, 10.0)),
-    roll_rad=np.radians(np.arange(-50, 51, 10.0)),
-    reach_mm=(13.0, 9.0, 15.0),
-)
-# Turns and translations about poses from picks: four careless clicks close together leave as much.
-_NEAR_GRID = Grid(
-    yaw_rad=np.radians(np.arange(-20, 21, 10.0)),
-    pitch_rad=np.radians(np.arange(-20, 21, 10.0)),
-    roll_rad=np.radians(np.arange(-20, 21, 10.0)),
-    reach_mm=(6.0, 6.0, 6.0),
-)
-_WIDEST_JAW_RAD = 0.8  # turn between the rows beyond which a jaw does not open
-_FARTHEST_JAW_MM = 75.0  # distance of the rows' front teeth beyond which it does not either
-
-
-class StartSearch:
-    """Search the poses of both rows of teeth on single frames."""
-
-    def __init__(
-        self,
-        meshes: Sequence[Mesh],
-        solver: ContourSolver,
-        T_anatomical_scan: NDArray[np.float64],
-        map_: Callable[..., Iterable] = map,
-    ) -> None:
-        """Prepare coarse scans.
-
-        Args:
-            meshes: upper and lower teeth scans in one frame, in occlusion [mm].
-            solver: holds the same scans, prepared.
-            T_anatomical_scan: scan frame to (left, up, front) axes, shape (4, 4).
-            map_: runs the parts of the search, in threads if it likes.
-        """
-        self.solver, self._config, self._map = solver, solver.config, map_
-        self._coarse = tuple(coarse_scan(m, n) for m, n in zip(meshes, _NAMES, strict=True))
-        self._hinges = [hinge_at_front(s.crown_vertices(), T_anatomical_scan) for s in self._coarse]
-        self._coarse_solver = ContourSolver(self._coarse, solver.config)
-
-    def at(self, footage: Footage, frame: int) -> tuple[NDArray[np.float64], float]:
-        """Return the best poses on a frame, T_world_upper and T_world_lower (2, 4, 4), and their worth [px].
-
-        Raises:
-            TrackingError: too few masks, or no pair of poses that a jaw can take.
-        """
-        survey = footage.survey((frame, frame + 1), 1)
-        places = survey.places()[0]
-        with footage.views(places.mean(0), _PX_PER_MM) as masks:
-            views = masks.at(frame)
-        axes = _guessed_axes(places, survey.eyes)
-        bases = [make_transform(axes, place) for place in places]
-        finalists = [self._searched(r, views, bases[r], _GRID) for r in _ROWS]
-        return self._settled(finalists, views, footage, frame)
-
-    def near(self, footage: Footage, frame: int, poses: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-        """Return the best poses on a frame near given ones, T_world_upper and T_world_lower (2, 4, 4), and their worth.
-
-        Raises:
-            TrackingError: no pair of poses that a jaw can take.
-        """
-        with footage.views(transform_points(poses[0], self._coarse[0].centre), _PX_PER_MM) as masks:
-            views = masks.at(frame)
-        finalists = []
-        for r in _ROWS:
-            base = poses[r] @ np.linalg.inv(self._hinges[r])
-            finalists.append([poses[r], *self._searched(r, views, base, _NEAR_GRID)])
-        return self._settled(finalists, views, footage, frame)
-
-    def _searched(
-        self, r: int, views: Sequence[View], base: NDArray[np.float64], grid: Grid
-    ) -> list[NDArray[np.float64]]:
-        """Return the best poses of a row that differ from one another."""
-        found = search_row(self._coarse[r], r, views, _PX_PER_MM, base, self._hinges[r], grid, self._map)
-        return self._distinct(found, r)
-
-    def _settled(
-        self, finalists: Sequence[Sequence[NDArray[np.float64]]], views: Sequence[View], footage: Footage, frame: int
-    ) -> tuple[NDArray[np.float64], float]:
-        """Return the best pair of finalists, refined at the working size, and its worth [px]."""
-        pairs = self._refined_pairs(finalists, views)
-        if not pairs:
-            raise TrackingError(f"frame {frame}: the best poses of the two rows of teeth are none a jaw can take")
-        centre = np.mean([transform_points(pairs[0][r], self._coarse[r].centre) for r in _ROWS], axis=0)
-        with footage.views(centre, self._config.working_px_per_mm) as masks:
-            views = masks.at(frame)
-        ends = [self.solver.solve(poses, views, self._config.wide_gates_px) for poses in pairs]
-        worth = [self._worth(self.solver, s, views).sum() for s in ends]
-        best = int(np.argmax(worth))
-        return ends[best].poses, float(worth[best])
-
-    def _distinct(self, found: Sequence[Candidate], r: int) -> list[NDArray[np.float64]]:
-        """Return the best poses that differ from one another."""
-        probes = self._coarse[r].probes
-        kept: list[NDArray[np.float64]] = []
-        for candidate in found:
-            here = transform_points(candidate.pose, probes)
-            if all(np.linalg.norm(here - transform_points(k, probes), axis=1).mean() > _DISTINCT_MM for k in kept):
-                kept.append(candidate.pose)
-                if len(kept) == _FINALISTS:
-                    break
-        return kept
-
-    def _refined_pairs(
-        self, finalists: Sequence[Sequence[NDArray[np.float64]]], views: Sequence[View]
-    ) -> list[NDArray[np.float64]]:
-        """Refine the finalists coarsely and return up to four pairs a jaw can take, shape (2, 4, 4) each."""
-        ranked = []
-        for r in _ROWS:
-            ends = []
-            for pose in finalists[r]:
-                start = np.stack([finalists[q][0] if q != r else pose for q in _ROWS])
-                end = self._coarse_solver.solve(start, views, self._config.wide_gates_px)
-                ends.append((self._worth(self._coarse_solver, end, views)[r], end.poses[r]))
-            ranked.append(sorted(ends, key=lambda e: -e[0]))
-        pairs = [(u[0] + v[0], np.stack([u[1], v[1]])) for u in ranked[0] for v in ranked[1]]
-        pairs = [p for p in pairs if self._possible(p[1])]
-        return [poses for _, poses in sorted(pairs, key=lambda p: -p[0])[:4]]
-
-    def _possible(self, poses: NDArray[np.float64]) -> bool:
-        """Tell whether a jaw can bring the rows into these poses."""
-        turn = so3_log(poses[0, :3, :3].T @ poses[1, :3, :3])
-        fronts = [(poses[r] @ np.linalg.inv(self._hinges[r]))[:3, 3] for r in _ROWS]
-        return np.linalg.norm(turn) < _WIDEST_JAW_RAD and np.linalg.norm(fronts[1] - fronts[0]) < _FARTHEST_JAW_MM
-
-    def _worth(self, solver: ContourSolver, solution: Solution, views: Sequence[View]) -> NDArray[np.float64]:
-        """Return the fitting contour less the price of uncovered mask per row [px], shape (2,)."""
-        bare, _ = uncovered_px(solver.scans, solution, views)
-        # A price per area: the coarse pictures' pixels are larger.
-        price = self._config.bare_price
-        if solver is self._coarse_solver:
-            price *= self._config.working_px_per_mm / _PX_PER_MM
-        return (score_px(solution) - price * bare).sum(1)
+# Fit that leaves no doubt [-]. Wrong poses of a hundred searches stayed below 0.1 in one of the rows, right ones
+# exceed 0.35 where much of the teeth shows, and 0.1 with lips nearly closed or cameras 0.1 degrees off.
+_CLEAR_FIT = 0.3
 
 
 def search_start(search: StartSearch, footage: Footage) -> Start:
     """Find a frame on which both rows of teeth can be aligned, and their poses there.
+
+    The first frame that fits beyond doubt is taken, or else the one that fits best.
 
     Raises:
         TrackingError: no frame of those tried could be aligned; the message says what happened on each, or which
@@ -172,29 +34,56 @@ def search_start(search: StartSearch, footage: Footage) -> Start:
     """
     frames = footage.survey(None, _SURVEYED).promising(_FRAMES_TRIED).tolist()
     failed: dict[int, str] = {}
+    accused: set[str] = set()
+    best: tuple[int, Found] | None = None
     for frame in frames:
         try:
-            poses, worth = search.at(footage, frame)
+            found = search.at(footage, frame)
+            # Most masks being right, the poses are, and show which ones are not. Poor poses may accuse any.
+            mixup = likely_mixup(footage, search.solver, found.poses, frame)
+            if mixup is None:
+                found = replace(found, poses=_aligned(search, footage, found.poses, frame))
         except TrackingError as error:
             failed[frame] = error.message.removeprefix(f"frame {frame}: ")
             continue
-        # Most masks being right, the poses are, and show which ones are not.
-        check_mixups(footage, search.solver, poses, frame)
-        try:
-            poses = _aligned(search, footage, poses, frame)
-        except TrackingError as error:
-            failed[frame] = error.message.removeprefix(f"frame {frame}: ")
+        if mixup is not None:
+            if found.fit >= _CLEAR_FIT:
+                raise mixup.refusal(frame)
+            failed[frame] = mixup.finding
+            accused.add(mixup.hint)
             continue
-        _check_upright(search, footage, frame, worth)
-        notes = {"by": "search", "frame": frame, "worth_px": worth, "failed": {str(f): m for f, m in failed.items()}}
-        return Start(frame, poses, notes)
-    _name_mixup(search, footage, frames[0])
-    raise TrackingError(
-        f"there are no [bootstrap] picks, and searching the teeth failed on all {len(frames)} frames tried. "
-        + " ".join(f"Frame {frame}: {message}." for frame, message in failed.items()),
-        hint="Give [bootstrap] picks, three or more per row of teeth, each seen by two cameras; and check the masks, "
-        "the calibration and the time offsets.",
-    )
+        if best is None or found.fit > best[1].fit:
+            best = frame, found
+        if found.fit >= _CLEAR_FIT:
+            break
+    if best is None:
+        _name_mixup(search, footage, frames[0], accused)
+        raise TrackingError(
+            f"there are no [bootstrap] picks, and searching the teeth failed on all {len(frames)} frames tried. "
+            + " ".join(f"Frame {frame}: {message}." for frame, message in failed.items()),
+            hint="Give [bootstrap] picks, three or more per row of teeth, each seen by two cameras; and check the "
+            "masks, the calibration and the time offsets.",
+        )
+    frame, found = best
+    _check_upright(search, footage, frame, found)
+    notes = {"by": "search", "frame": frame, "worth_px": found.worth_px, "fit": found.fit}
+    return Start(frame, found.poses, {**notes, "failed": {str(f): m for f, m in failed.items()}})
+
+
+def search_around(search: StartSearch, footage: Footage, frame: int, poses: NDArray[np.float64]) -> Found:
+    """Find the poses near given ones; if none fits beyond doubt, the best ones of all.
+
+    Raises:
+        TrackingError: no pair of poses that a jaw can take.
+    """
+    near = search.near(footage, frame, poses)
+    if near.fit >= _CLEAR_FIT:
+        return near
+    try:
+        anywhere = search.at(footage, frame)
+    except TrackingError:
+        return near
+    return max(near, anywhere, key=lambda found: found.worth_px)
 
 
 def _aligned(search: StartSearch, footage: Footage, poses: NDArray[np.float64], frame: int) -> NDArray[np.float64]:
@@ -205,50 +94,35 @@ def _aligned(search: StartSearch, footage: Footage, poses: NDArray[np.float64], 
         return first_record(solver, solver.config, poses, masks, frame).solution.poses
 
 
-def _check_upright(search: StartSearch, footage: Footage, frame: int, worth: float) -> None:
+def _check_upright(search: StartSearch, footage: Footage, frame: int, found: Found) -> None:
     """Refuse masks that fit better with the rows exchanged everywhere: turned over, an upper row resembles a lower."""
     mixup = all_rows_exchanged(footage.sources)
     try:
-        _, other = search.at(replace(footage, sources=mixup.sources), frame)
+        other = search.at(replace(footage, sources=mixup.sources), frame)
     except TrackingError:
         return
-    if other > worth:
+    if other.worth_px > found.worth_px:
         raise TrackingError(
-            f"frame {frame}: {mixup.finding}: {other:.0f} px of contour fit after exchanging them, {worth:.0f} px as "
-            "they are named",
+            f"frame {frame}: {mixup.finding}: {other.worth_px:.0f} px of contour fit after exchanging them, "
+            f"{found.worth_px:.0f} px as they are named",
             hint=mixup.hint,
         )
 
 
-def _name_mixup(search: StartSearch, footage: Footage, frame: int) -> None:
-    """Refuse masks with which the search succeeds after an exchange."""
-    found = []
-    for mixup in possible_mixups(footage.sources)[:_MIXUPS_TRIED]:
+def _name_mixup(search: StartSearch, footage: Footage, frame: int, accused: set[str]) -> None:
+    """Refuse masks with which the search succeeds after an exchange, those first that were accused by their hints."""
+    explained: list[tuple[float, TrackingError]] = []
+    mixups = sorted(possible_mixups(footage.sources), key=lambda m: m.hint not in accused)
+    for mixup in mixups[:_MIXUPS_TRIED]:
         try:
             righted = replace(footage, sources=mixup.sources)
-            poses, worth = search.at(righted, frame)
-            _aligned(search, righted, poses, frame)
+            found = search.at(righted, frame)
+            _aligned(search, righted, found.poses, frame)
         except (TrackingError, CaptureError):
             continue  # this exchange explains nothing
-        found.append((worth, mixup))
-    if found:
-        _, mixup = max(found, key=lambda f: f[0])
-        raise TrackingError(
-            f"frame {frame}: {mixup.finding}: the teeth are found only after exchanging them", hint=mixup.hint
-        )
-
-
-def _guessed_axes(places: NDArray[np.float64], eyes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return left, up and front of the teeth in the world as far as the masks tell, shape (3, 3), axes in columns.
-
-    Args:
-        places: middles of the upper and the lower masks [mm], shape (2, 3).
-        eyes: camera centres [mm], shape (C, 3).
-    """
-    rays = eyes - places.mean(0)
-    front = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).mean(0)
-    front /= np.linalg.norm(front)
-    up = places[0] - places[1]
-    up -= front * (front @ up)
-    up /= np.linalg.norm(up)
-    return np.stack([np.cross(up, front), up, front], axis=1)
+        why = f"{mixup.finding}: the teeth are found only after exchanging them"
+        explained.append((found.fit, replace(mixup, finding=why).refusal(frame)))
+        if found.fit >= _CLEAR_FIT:
+            break
+    if explained:
+        raise max(explained, key=lambda e: e[0])[1]

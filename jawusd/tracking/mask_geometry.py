@@ -15,6 +15,7 @@ from jawusd.geometry import Camera, triangulate
 from jawusd.imaging.masks import MaskReader
 from jawusd.imaging.working_view import WorkingView
 
+_BESIDE = 2  # surveyed frames to either side that show much the same
 _WIDTH_PX = 320  # of the surveyed pictures: their middles are good to a tenth of a millimetre
 
 
@@ -47,15 +48,19 @@ class MaskSurvey:
         return out
 
     def promising(self, count: int) -> NDArray[np.int64]:
-        """Return the frames that show most of both rows in all cameras, the best first, at most `count`.
+        """Return frames that show much of both rows in all cameras, the best first, at most `count`.
 
         Beyond what a tenth of the frames reach more area counts for nothing: a mask that large may be a wrong one.
+        Frames next to one another resemble each other: neighbours come after all others.
         """
         full = np.maximum(np.quantile(self.areas_px, 0.9, axis=0), 1.0)
         shown = np.sqrt(np.minimum(self.areas_px / full, 1.0)).sum(-1).min(-1)
         usable = ((self.areas_px > 0).sum(-1) >= 2).all(-1)
-        order = [f for f in np.argsort(-shown, kind="stable") if usable[f]]
-        return self.frames[order[:count]]
+        apart, beside = [], []
+        for f in np.argsort(-shown, kind="stable"):
+            if usable[f]:
+                (beside if any(abs(f - g) <= _BESIDE for g in apart) else apart).append(f)
+        return self.frames[[*apart, *beside][:count]]
 
 
 def survey_masks(

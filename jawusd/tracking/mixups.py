@@ -39,6 +39,10 @@ class Mixup:
     hint: str
     sources: tuple[CameraSource, ...]
 
+    def refusal(self, frame: int) -> TrackingError:
+        """Return the error that names the exchange."""
+        return TrackingError(f"frame {frame}: {self.finding}", hint=self.hint)
+
 
 def all_rows_exchanged(sources: Sequence[CameraSource]) -> Mixup:
     """Return the exchange of rows in all cameras, which exchanged scan files look like as well."""
@@ -73,21 +77,18 @@ def possible_mixups(sources: Sequence[CameraSource]) -> list[Mixup]:
     return out
 
 
-def check_mixups(footage: Footage, solver: ContourSolver, poses: NDArray[np.float64], frame: int) -> None:
-    """Refuse masks that lie off their scans unless two cameras, or two rows, are exchanged.
+def likely_mixup(footage: Footage, solver: ContourSolver, poses: NDArray[np.float64], frame: int) -> Mixup | None:
+    """Return the exchange that explains masks far better which lie off their scans, with the evidence; None without.
 
     Args:
         footage: the masks as they are named.
         solver: holds the scans.
         poses: T_world_upper, T_world_lower, good to a millimetre or so, shape (2, 4, 4).
         frame: the frame of these poses.
-
-    Raises:
-        TrackingError: an exchange explains the masks far better.
     """
     given = _bare_shares(footage, solver, poses, frame)
     if not (given >= _ODD_SHARE).any():
-        return
+        return None
     found = []
     for mixup in possible_mixups(footage.sources):
         if _sizes_differ(footage, mixup.sources):
@@ -95,12 +96,10 @@ def check_mixups(footage: Footage, solver: ContourSolver, poses: NDArray[np.floa
         shares = _bare_shares(replace(footage, sources=mixup.sources), solver, poses, frame)
         found.append((float(np.nanmean(shares)), mixup))
     share, mixup = min(found, key=lambda f: f[0])
-    if share < _PROOF * np.nanmean(given):
-        raise TrackingError(
-            f"frame {frame}: {mixup.finding}: {np.nanmean(given):.0%} of the masks lie off their scans at the first "
-            f"pose, {share:.0%} would after exchanging them",
-            hint=mixup.hint,
-        )
+    if share >= _PROOF * np.nanmean(given):
+        return None
+    evidence = f"{np.nanmean(given):.0%} of the masks lie off their scans, {share:.0%} would after exchanging them"
+    return replace(mixup, finding=f"{mixup.finding}: {evidence}")
 
 
 def _bare_shares(

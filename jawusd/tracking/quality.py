@@ -64,6 +64,27 @@ def uncovered_px(
     return bare, total
 
 
+def row_fit(scans: Sequence[Scan], solution: Solution, views: Sequence[View], bare_price: float) -> NDArray[np.float64]:
+    """Return how much of a row's visible contour fits its masks, less the price of uncovered mask, shape (2,) [-].
+
+    The median over the views, so that one spoiled mask of three does not count; -inf where nothing is visible.
+
+    Args:
+        scans: upper and lower, prepared.
+        solution: an alignment.
+        views: the pictures it was made with.
+        bare_price: price of an uncovered pixel in px of contour [1/px].
+    """
+    bare, _ = uncovered_px(scans, solution, views)
+    shares = (score_px(solution) - bare_price * bare) / np.maximum(solution.visible_px, 1.0)
+    out = np.full(2, -np.inf)
+    for r in (0, 1):
+        seen = shares[r, solution.visible_px[r] > 0]
+        if len(seen):
+            out[r] = np.median(seen)
+    return out
+
+
 def twist_covariance(solution: Solution, row: int, sigma_px: float, correlation_px: float) -> NDArray[np.float64]:
     """Return the covariance of a row's left twist about the world origin, sigma^2 l H^-1, shape (6, 6).
 

@@ -59,7 +59,9 @@ def check_occlusion(
     # The thin direction of the upper row alone: that of both rows means little while they are not known to meet.
     up = np.array(T_anatomical_scan, np.float64)[1, :3] if given else _thin_direction(crowns[0])
     between = crowns[0].mean(0) - crowns[1].mean(0)
-    height, aside = abs(float(up @ between)), float(np.linalg.norm(between - up * (up @ between)))
+    height, aside = float(up @ between), float(np.linalg.norm(between - up * (up @ between)))
+    # The side of its gum tells a lower row above the upper one from scans whose axes are turned over.
+    height = abs(height) if (side := _gum_side(scans[0], up)) == 0 else height * side
     if height < _LEAST_HEIGHT_MM:
         raise TrackingError(
             f"the upper and lower teeth scans are not in occlusion: the middle of the upper crowns lies {height:.1f} "
@@ -85,6 +87,14 @@ def check_occlusion(
     if _width(lower) > _width(upper) and lower[:, 2].max() > upper[:, 2].max():
         findings.append("the lower arch encloses the upper one: an underbite, or exchanged scan files")
     return T, findings
+
+
+def _gum_side(scan: Scan, up: NDArray[np.float64]) -> float:
+    """Return on which side of its crowns a row has its gum: 1 towards `up`, -1 away from it, 0 if it has none."""
+    if not scan.painted or not len(scan.gum_faces):
+        return 0.0
+    gum, crowns = (scan.vertices[np.unique(faces)].mean(0) for faces in (scan.gum_faces, scan.crown_faces))
+    return float(np.sign(up @ (gum - crowns)))
 
 
 def _gap_mm(crowns: Sequence[NDArray[np.float64]]) -> float:

@@ -12,10 +12,11 @@ from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera
 from jawusd.tracking.bootstrap import picked_sigma_mm, pose_from_picks
 from jawusd.tracking.footage import Footage, Start
-from jawusd.tracking.global_start import StartSearch, search_start
-from jawusd.tracking.mixups import check_mixups
+from jawusd.tracking.global_start import search_around, search_start
+from jawusd.tracking.mixups import likely_mixup
 from jawusd.tracking.scan_checks import check_occlusion
 from jawusd.tracking.solver import ContourSolver
+from jawusd.tracking.start_search import StartSearch
 from jawusd.tracking.views import masked_sources
 
 # Poses as sure as this [mm] lie within the basin of the contour solver.
@@ -70,8 +71,10 @@ def _picked(capture: Capture, footage: Footage, meshes: Sequence[Mesh], search: 
         sigma_mm[scan.name] = picked_sigma_mm(good, mesh.vertices, footage.cameras, pose, scan.probes)
     notes = {"by": "picks", "frame": bootstrap.frame, "picks_left_out": left_out, "picks_sigma_mm": sigma_mm}
     start = Start(bootstrap.frame, np.stack(poses), notes)
-    check_mixups(footage, search.solver, start.poses, start.frame)
+    if (mixup := likely_mixup(footage, search.solver, start.poses, start.frame)) is not None:
+        raise mixup.refusal(start.frame)
     if max(sigma_mm.values()) <= _SURE_MM or not footage.has_masks(start.frame):
         return start
-    poses, worth = search.near(footage, start.frame, start.poses)
-    return Start(start.frame, poses, {**notes, "by": "picks, then search nearby", "worth_px": worth})
+    found = search_around(search, footage, start.frame, start.poses)
+    notes |= {"by": "picks, then search", "worth_px": found.worth_px, "fit": found.fit}
+    return Start(start.frame, found.poses, notes)

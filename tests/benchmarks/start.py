@@ -1,4 +1,4 @@
-"""Score how tracking starts: python tests/benchmarks/start.py CAPTURE [--clicks 50] [--frames 10] [--threads 2]
+"""Score how tracking starts: python tests/benchmarks/start.py CAPTURE [--clicks 50] [--skip 0] [--frames 10]
 
 For captures that come with their truth (truth/truth.npz), which serves to score, and to make clicks where a person
 would see the vertex.
@@ -29,11 +29,11 @@ from jawusd.tracking.bootstrap import pose_from_picks
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.first import first_record
 from jawusd.tracking.footage import Footage
-from jawusd.tracking.global_start import StartSearch
 from jawusd.tracking.scan import prepare_scan
 from jawusd.tracking.scan_checks import check_occlusion
 from jawusd.tracking.solver import ContourSolver, View
 from jawusd.tracking.start import find_start
+from jawusd.tracking.start_search import StartSearch
 from jawusd.tracking.views import masked_sources
 
 ROWS = ("upper", "lower")
@@ -116,17 +116,19 @@ def clicks(bench: Bench, frame: int, noise_px: float, rng: np.random.Generator) 
     return Bootstrap(frame=frame, **picks)
 
 
-def score_clicks(bench: Bench, count: int, noise_px: float) -> None:
+def score_clicks(bench: Bench, trials: range, noise_px: float) -> None:
     """Print the outcome of starts from careless clicks."""
     rng = np.random.default_rng(5)
     print(f"clicks with {noise_px:g} px error per axis, four per row\nframe    from clicks       aligned         [mm]")
-    good = done = 0
-    while done < count:
+    good = drawn = 0
+    while drawn < trials.stop:
         frame = int(rng.choice(bench.frames))
         bootstrap = clicks(bench, frame, noise_px, rng)
         if bootstrap is None:
             continue
-        done += 1
+        drawn += 1
+        if drawn <= trials.start:
+            continue
         capture = bench.capture.model_copy(update={"bootstrap": bootstrap})
         try:
             poses = [
@@ -145,12 +147,12 @@ def score_clicks(bench: Bench, count: int, noise_px: float) -> None:
             same = bench.errors_mm(bench.aligned(bench.truth[np.flatnonzero(bench.frames == frame)[0]], frame), frame)
             line += f", {same[0]:.3f} {same[1]:.3f} when started from the truth"
         print(line, flush=True)
-    print(f"{good} of {done} within {CLICK_LIMIT_MM} mm of the truth for both rows")
+    print(f"{good} of {len(trials)} within {CLICK_LIMIT_MM} mm of the truth for both rows")
 
 
 def score_search(bench: Bench, count: int, threads: int) -> None:
     """Print the outcome of starts without clicks."""
-    print(f"no clicks, {threads} threads\nframe    upper  lower [mm]   worth   CPU [s]")
+    print(f"no clicks, {threads} threads\nframe    upper  lower [mm]   worth    fit   CPU [s]")
     good = 0
     frames = bench.frames[np.linspace(0, len(bench.frames) - 1, count).round().astype(int)]
     with ThreadPoolExecutor(threads) as pool:
@@ -159,11 +161,15 @@ def score_search(bench: Bench, count: int, threads: int) -> None:
         for frame in frames.tolist():
             begin = time.process_time()
             try:
-                poses, worth = search.at(bench.footage, frame)
+                found = search.at(bench.footage, frame)
                 spent = time.process_time() - begin
-                error = bench.errors_mm(poses, frame)
-                print(f"{frame:5} {error[0]:8.3f}{error[1]:7.3f} {worth:12.0f} {spent:9.1f}", end="", flush=True)
-                bench.aligned(poses, frame)
+                error = bench.errors_mm(found.poses, frame)
+                print(
+                    f"{frame:5} {error[0]:8.3f}{error[1]:7.3f} {found.worth_px:8.0f} {found.fit:6.2f} {spent:9.1f}",
+                    end="",
+                    flush=True,
+                )
+                bench.aligned(found.poses, frame)
             except TrackingError as refusal:
                 print(f"  refused: frame {frame}: {refusal.message}", flush=True)
                 continue
@@ -177,13 +183,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("capture", type=Path)
     parser.add_argument("--clicks", type=int, default=50, help="trials, 0 for none")
+    parser.add_argument("--skip", type=int, default=0, help="trials drawn but not run, to run all in parts")
     parser.add_argument("--noise-px", type=float, default=5.0, help="standard deviation of clicks along each axis")
     parser.add_argument("--frames", type=int, default=10, help="frames searched, 0 for none")
     parser.add_argument("--threads", type=int, default=2)
     options = parser.parse_args()
     bench = Bench(options.capture)
     if options.clicks:
-        score_clicks(bench, options.clicks, options.noise_px)
+        score_clicks(bench, range(options.skip, options.skip + options.clicks), options.noise_px)
     if options.frames:
         score_search(bench, options.frames, options.threads)
 

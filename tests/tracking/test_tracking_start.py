@@ -1,5 +1,6 @@
 """Starts without picks, from poor picks, and from footage or scans that were mixed up."""
 
+import re
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -26,16 +27,18 @@ from jawusd.errors import TrackingError
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import make_transform, random_rotation, se3_exp, se3_inverse, transform_points
 from jawusd.imaging.raster import draw_silhouette, project, unpack_bits, words_for
-from jawusd.tracking import global_start, track_capture
+from jawusd.tracking import global_start, start_search, track_capture
 from jawusd.tracking.config import TrackingConfig
+from jawusd.tracking.first import first_record
 from jawusd.tracking.footage import Footage
-from jawusd.tracking.global_start import StartSearch
-from jawusd.tracking.mask_geometry import survey_masks
+from jawusd.tracking.mask_geometry import MaskSurvey, survey_masks
+from jawusd.tracking.mixups import possible_mixups
 from jawusd.tracking.pose_search import Grid, _Screen, _template, coarse_scan
 from jawusd.tracking.scan import prepare_scan
 from jawusd.tracking.scan_checks import check_occlusion
 from jawusd.tracking.solver import ContourSolver
 from jawusd.tracking.start import find_start
+from jawusd.tracking.start_search import Found, StartSearch
 from jawusd.tracking.views import masked_sources
 
 FRAMES = 5
@@ -53,9 +56,9 @@ def pictures(tmp_path_factory):
 def short_search(monkeypatch):
     """Search few orientations, on one frame."""
     turns = np.radians([-18.0, 0.0, 18.0])
-    monkeypatch.setattr(global_start, "_GRID", Grid(turns, turns, turns, (10.0, 8.0, 12.0)))
+    monkeypatch.setattr(start_search, "_GRID", Grid(turns, turns, turns, (10.0, 8.0, 12.0)))
     monkeypatch.setattr(global_start, "_FRAMES_TRIED", 1)
-    monkeypatch.setattr(global_start, "_FINALISTS", 2)
+    monkeypatch.setattr(start_search, "_FINALISTS", 2)
 
 
 def _capture(folder, **change):
@@ -179,7 +182,7 @@ def test_picks_close_together_are_helped_by_the_masks(pictures):
             views = [{"camera": n, "x": float(p[0]), "y": float(p[1])} for n, p in views]
             picks[row].append({"vertex": int(vertex), "views": views})
     start = _start(_capture(pictures, bootstrap={"frame": capture.bootstrap.frame, **picks}))
-    assert start.notes["by"] == "picks, then search nearby"
+    assert start.notes["by"] == "picks, then search"
     assert max(start.notes["picks_sigma_mm"].values()) > 1.0
     assert max(_error_mm(start, r) for r in (0, 1)) < 0.1
 
@@ -217,6 +220,7 @@ def test_scans_in_occlusion_are_accepted():
         ([0, 7, 0], r"the middle of the upper crowns lies 2\.\d mm above"),
         ([0, 0, -17], r"they are \d.\d mm apart"),
         ([30, -1, 0], "their arches lie 30 mm beside one another, at most 15 mm"),
+        ([0, 20, 0], r"the middle of the upper crowns lies -10\.\d mm above"),
     ],
 )
 def test_scans_out_of_occlusion_are_refused(by_mm, message, axes):
@@ -276,6 +280,104 @@ def test_all_shifts_at_once_agree_with_drawing_each(pictures):
         assert worth == pytest.approx(template[unpack_bits(bits, template.shape[1])].sum(), rel=0.02, abs=3.0)
 
 
+def _footage(folder):
+    capture = _capture(folder)
+    return Footage(masked_sources(capture.cameras, TABLE, OFFSETS), TABLE, OFFSETS, capture.frames)
+
+
+def _misplaced(poses):
+    """Return the poses with the upper row turned into a wrong minimum, where it covers nearly all of its masks."""
+    middle = make_transform(np.eye(3), [0, 0, -11])
+    out = poses.copy()
+    out[0] = poses[0] @ middle @ se3_exp([0, 0.35, 0, 0, 0, 0]) @ se3_inverse(middle)
+    return out
+
+
+class _FoundBefore:
+    """Answer searches with fits and poses that were made up."""
+
+    def __init__(self, fits, misplaced=()):
+        self.solver = ContourSolver(SCANS, TrackingConfig())
+        self.fits, self.misplaced, self.asked = list(fits), misplaced, []
+
+    def at(self, footage, frame):
+        if list(footage.sources) != list(self.sources):
+            raise TrackingError("nothing found after exchanging masks")
+        poses = jaw_poses(FRAMES)[frame - FIRST]
+        if len(self.asked) in self.misplaced:
+            poses = _misplaced(poses)
+        fit = self.fits[len(self.asked)]
+        self.asked.append(frame)
+        return Found(poses, 1000.0 * fit, fit)
+
+
+def _searched(folder, search):
+    footage = _footage(folder)
+    search.sources = footage.sources
+    return global_start.search_start(search, footage)
+
+
+def test_first_frame_that_fits_beyond_doubt_is_taken(pictures):
+    search = _FoundBefore([0.1, 0.5, 0.9])
+    assert _searched(pictures, search).frame == search.asked[1] and len(search.asked) == 2
+
+
+def test_without_one_the_frame_that_fits_best_is_taken(pictures):
+    search = _FoundBefore([0.1, 0.15, 0.25, 0.2, 0.1])
+    start = _searched(pictures, search)
+    assert start.frame == search.asked[2] and len(search.asked) == 5 and start.notes["fit"] == 0.25
+
+
+def test_wrong_minimum_that_covers_the_masks_is_refused(pictures):
+    solver, poses = ContourSolver(SCANS, TrackingConfig()), jaw_poses(FRAMES)[0]
+    with _footage(pictures).views(poses[0, :3, 3], 7.2) as masks:
+        assert first_record(solver, solver.config, poses, masks, FIRST).solution.poses.shape == (2, 4, 4)
+        with pytest.raises(TrackingError, match="upper teeth do not fit their masks") as refusal:
+            first_record(solver, solver.config, _misplaced(poses), masks, FIRST)
+    share, bare, fit = re.findall(
+        r"(-?[\d.]+)%? (?:of the visible|of the masks stays|\(at least 0.05)", str(refusal.value)
+    )
+    assert float(share) > 15 and float(bare) < 8 and float(fit) < 0  # neither of the first two alone would tell
+
+
+def test_frame_with_wrong_poses_is_passed_over(pictures):
+    search = _FoundBefore([0.2] * 5, misplaced=(0, 1))
+    start = _searched(pictures, search)
+    assert start.frame == search.asked[2]
+    assert list(start.notes["failed"]) == [str(f) for f in search.asked[:2]]
+
+
+def test_poor_poses_accuse_no_masks(pictures, monkeypatch):
+    def accuse(footage, solver, poses, frame):
+        return possible_mixups(footage.sources)[0] if frame == search.asked[0] else None
+
+    monkeypatch.setattr(global_start, "likely_mixup", accuse)
+    search = _FoundBefore([0.1, 0.5])
+    assert _searched(pictures, search).frame == search.asked[1]
+    search = _FoundBefore([0.5])
+    with pytest.raises(TrackingError, match="exchanged in camera cam0"):
+        _searched(pictures, search)
+
+
+def test_picks_far_off_are_helped_by_a_search_everywhere(pictures, short_search):
+    footage, truth = _footage(pictures), jaw_poses(FRAMES)[START]
+    search = StartSearch(MESHES, ContourSolver(SCANS, TrackingConfig()), np.eye(4))
+    off = make_transform(np.eye(3), [14.0, 0, -14.0]) @ truth
+    assert search.near(footage, FIRST + START, off).fit < 0.1
+    found = global_start.search_around(search, footage, FIRST + START, off)
+    assert max(vertex_error_mm(MESHES[r], found.poses[r], truth[r]) for r in (0, 1)) < 0.1 and found.fit > 0.3
+
+
+def test_frames_tried_lie_apart():
+    areas = np.full((9, 2, 3), 100.0)
+    areas[3:6] += 50.0  # the best ones side by side
+    areas[4, :, 1:] += 50.0
+    areas[8, 0] = [100.0, 0.0, 0.0]
+    survey = MaskSurvey(np.arange(9) * 10, np.zeros((9, 2, 3, 2)), areas, np.zeros((3, 3, 4)), np.zeros((3, 3)))
+    assert survey.promising(3).tolist() == [40, 0, 70]
+    assert sorted(survey.promising(99)) == [0, 10, 20, 30, 40, 50, 60, 70]
+
+
 def test_search_is_the_same_in_threads(pictures, short_search):
     capture = _capture(pictures)
     footage = Footage(masked_sources(capture.cameras, TABLE, OFFSETS), TABLE, OFFSETS, capture.frames)
@@ -283,4 +385,4 @@ def test_search_is_the_same_in_threads(pictures, short_search):
     T = check_occlusion(SCANS, None)[0]
     with ThreadPoolExecutor(2) as pool:
         both = [StartSearch(MESHES, solver, T, m).at(footage, FIRST + 1) for m in (map, pool.map)]
-    assert (both[0][0] == both[1][0]).all() and both[0][1] == both[1][1]
+    assert (both[0].poses == both[1].poses).all() and both[0].worth_px == both[1].worth_px
