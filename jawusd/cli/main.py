@@ -6,7 +6,15 @@ import sys
 
 import typer
 
-from jawusd.cli import build_commands, capture_commands, plate_commands, report_commands, rig_commands, view_commands
+from jawusd.cli import (
+    build_commands,
+    capture_commands,
+    library_commands,
+    plate_commands,
+    report_commands,
+    rig_commands,
+    view_commands,
+)
 from jawusd.errors import JawusdError
 
 app = typer.Typer(
@@ -20,6 +28,7 @@ app = typer.Typer(
 build_commands.register(app)
 capture_commands.register(app)
 rig_commands.register(app)
+library_commands.register(app)
 plate_commands.register(app)
 report_commands.register(app)
 view_commands.register(app)

@@ -31,7 +31,8 @@ _BETWEEN_MM = 0.02
 _SHARES = (0.25, 0.5, 0.75)
 _MAX_HALVINGS = 5
 _USD_LERP_BELOW = 1e-5
-_LOST = "lostFrames"
+#: Key of the lost frames in an animation layer's `customLayerData`.
+LOST = "lostFrames"
 
 
 def write_animation(
@@ -79,7 +80,7 @@ def write_animation(
     layer.startTimeCode, layer.endTimeCode = float(frames[0]), float(frames[-1])
     if not known.all():
         lost = _gf.int_array(np.floor(frames[~known]))
-        layer.customLayerData = {**layer.customLayerData, _LOST: lost}
+        layer.customLayerData = {**layer.customLayerData, LOST: lost}
     _author(layer, rig, frames[known], d[known], frames[[0, -1]])
     return write_layer(layer, out)
 

@@ -10,7 +10,8 @@ from pxr import Usd, UsdGeom
 
 from jawusd.errors import FormatError
 from jawusd.geometry.se3 import rigidity_defect
-from jawusd.rig.layout import ACTOR, MANDIBLE
+from jawusd.rig.animation import LOST
+from jawusd.rig.layout import ACTOR, MANDIBLE, PARAMETERS
 from jawusd.rig.read import find_rig_prim, open_stage
 
 Array = NDArray[np.float64]
@@ -51,6 +52,42 @@ def read_poses_of_stage(path: str | os.PathLike[str], prim_path: str | None = No
             hint="Samples of matrices shear in between: key translate and orient.",
         )
     return times, poses
+
+
+def read_parameters_of_stage(
+    path: str | os.PathLike[str], prim_path: str | None = None
+) -> tuple[Array, Array, float] | None:
+    """Read the samples of d that an animation layer holds.
+
+    Args:
+        path: an animation layer of a rig, or a shot that references one.
+        prim_path: which rig, where the stage has several.
+
+    Returns:
+        Times (F,), d (F, 3) [mm] with NaN in the frames the layer lists as lost, and frames per second; None when the
+        motion is not given by d, only by transforms.
+
+    Raises:
+        RigError: not a stage.
+        FormatError: no rig or several, or parameters that are not finite.
+    """
+    stage = open_stage(path)
+    actor = find_rig_prim(stage, path, prim_path)
+    attributes = [actor.GetAttribute(name) for name in PARAMETERS]
+    sampled = [attribute.GetTimeSamples() for attribute in attributes if attribute]
+    times = np.unique(np.concatenate([np.zeros(0), *sampled]))
+    if len(sampled) < len(PARAMETERS) or not len(times):
+        return None
+    if len(times) > _MOST_FRAMES:
+        raise FormatError(f"has {len(times)} samples of d, at most {_MOST_FRAMES} are read.", path=str(path))
+    d = np.array([[attribute.Get(time) for attribute in attributes] for time in times], dtype=np.float64)
+    if not np.isfinite(d).all():
+        raise FormatError("its samples of d hold values that are not finite.", path=str(path))
+    listed = stage.GetRootLayer().customLayerData.get(LOST, [])
+    lost = np.setdiff1d(np.array(list(listed), dtype=np.float64), times)
+    order = np.argsort(np.concatenate([times, lost]))
+    all_d = np.concatenate([d, np.full((len(lost), 3), np.nan)])
+    return np.concatenate([times, lost])[order], all_d[order], float(stage.GetTimeCodesPerSecond())
 
 
 def _mandible(stage: Usd.Stage, actor: Usd.Prim, path: object) -> Usd.Prim:

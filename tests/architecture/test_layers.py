@@ -47,6 +47,8 @@ def test_imports_follow_the_layers():
         ("viewer/page.py", "import jawusd.rig", "Layers"),
         ("viewer/plots.py", "import matplotlib", "matplotlib and jinja2"),
         ("viewer/decimate.py", "import trimesh", "Video and image"),
+        ("library/index.py", "import jawusd.rig", "Layers"),
+        ("library/transport.py", "import scipy", "numba and scipy"),
         ("newlayer/__init__.py", "x = 1", "newlayer"),
     ],
 )

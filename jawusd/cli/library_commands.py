@@ -1,0 +1,251 @@
+"""Commands on many actors: library, and retarget, from one rig to another or to somebody who has none."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from jawusd.cli.output import emit, progress, refuse_existing
+
+if TYPE_CHECKING:
+    from jawusd.cli.motion import Motion
+    from jawusd.evaluator import JawRig
+    from jawusd.library.index import Entry, Library
+
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+Force = Annotated[bool, typer.Option("--force", help="Overwrite an existing output.")]
+
+
+class Use(StrEnum):
+    """Name the ways to use a library."""
+
+    average = "average"
+    closest = "closest"
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this module."""
+    app.command("retarget")(retarget)
+    app.command("library")(library)
+
+
+def retarget(
+    anim: Annotated[
+        Path | None,
+        typer.Argument(help="Motion of --from: an animation layer, keys.json, or a CSV of d or poses."),
+    ] = None,
+    source: Annotated[Path | None, typer.Option("--from", help="Rig the motion was made for.")] = None,
+    target: Annotated[Path | None, typer.Option("--to", help="Rig that shall move.")] = None,
+    landmarks: Annotated[
+        Path | None, typer.Option(help="Instead of a motion: landmarks (JSON) of a person without a capture.")
+    ] = None,
+    library_folder: Annotated[
+        Path | None, typer.Option("--library", help="With --landmarks: folder of rigs to learn from.")
+    ] = None,
+    use: Annotated[Use, typer.Option(help="With --landmarks: average the library, or take the closest.")] = Use.average,
+    fps: Annotated[float | None, typer.Option(min=0.001, help="Frames per second; the motion's own else.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="anim.usdc of the motion, model.npz of a person.")
+    ] = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Carry a motion to another rig, or make a rig for a person from landmarks and a library."""
+    if out is None:
+        raise typer.BadParameter("give the file to write.", param_hint="--out")
+    moving, person = (anim, source, target), (landmarks, library_folder)
+    if all(moving) and not any(person):
+        _retarget_motion(anim, source, target, fps, out, force, as_json)
+    elif all(person) and not any((*moving, fps)):
+        _personal(landmarks, library_folder, use, out, force, as_json)
+    else:
+        raise typer.BadParameter("give either ANIM, --from and --to, or --landmarks and --library.")
+
+
+def _retarget_motion(
+    anim: Path, source: Path, target: Path, fps: float | None, out: Path, force: bool, as_json: bool
+) -> None:
+    import numpy as np
+
+    from jawusd.cli.motion import kept_inside
+    from jawusd.pipeline.library import load_any_rig, retarget
+    from jawusd.rig import write_animation
+    from jawusd.rig.read import describe
+
+    refuse_existing(out, force)
+    for place, option in ((out, "--out"), (target, "--to")):
+        if place.suffix not in (".usd", ".usda", ".usdc"):
+            raise typer.BadParameter("must be a USD layer: .usda, .usdc or .usd.", param_hint=option)
+    giver, taker = load_any_rig(source), load_any_rig(target)
+    motion = _motion_of(giver, anim)
+    frames, d = retarget(giver, taker, motion.frames, motion.d)
+    kept, clamping = kept_inside(taker, d)
+    rate = fps or motion.fps or describe(target)["fps"]
+    write_animation(out, target, frames, kept, rate, rig=taker)
+    known = np.isfinite(kept).all(axis=1)
+    valid = taker.validate_parameters(kept[known]).valid
+    result = {
+        "file": str(out),
+        "frames": [float(frames[0]), float(frames[-1])],
+        "samples": len(frames),
+        "fps": rate,
+        "lost": int((~known).sum()),
+        "valid": int(valid.sum()),
+        **clamping,
+    }
+    emit(result, as_json, lambda: _retarget_lines(result))
+
+
+def _motion_of(rig: JawRig, path: Path) -> Motion:
+    """Return a motion of a rig: samples of d of a stage, its transforms where it has none, or a table."""
+    import numpy as np
+
+    from jawusd.cli.motion import Motion, read_motion
+    from jawusd.rig.motion_read import read_parameters_of_stage, read_poses_of_stage
+    from jawusd.rig.read import open_stage
+
+    if path.suffix.lower() not in (".usd", ".usda", ".usdc", ".usdz"):
+        return read_motion(rig, path)
+    sampled = read_parameters_of_stage(path)
+    if sampled is not None:
+        return Motion(*sampled)
+    frames, poses = read_poses_of_stage(path)
+    rate = float(open_stage(path).GetTimeCodesPerSecond())
+    return Motion(frames.astype(np.float64), rig.encode(poses)[0], rate)
+
+
+def _retarget_lines(result: dict[str, Any]) -> list[str]:
+    first, last = result["frames"]
+    known = result["samples"] - result["lost"]
+    lines = [
+        f"{result['file']}: frames {first:g} .. {last:g} at {result['fps']:g} fps, "
+        f"{result['valid']} of {known} samples valid"
+    ]
+    if result["lost"]:
+        lines.append(f"{result['lost']} frames say nothing and were bridged")
+    if result["clamped"]:
+        moved = f"moved by {result['mean_clamp_mm']:.2f} mm on average, {result['largest_clamp_mm']:.2f} mm at most"
+        lines.append(f"{result['clamped']} samples lay outside the bound, {moved}")
+    return lines
+
+
+def _personal(landmarks: Path, folder: Path, use: Use, out: Path, force: bool, as_json: bool) -> None:
+    from jawusd.formats.model import save_model
+    from jawusd.pipeline.library import open_library, personal_rig
+
+    refuse_existing(out, force)
+    opened = open_library(folder)
+    with progress() as report:
+        made = personal_rig(landmarks, opened, closest=use is Use.closest, name=landmarks.stem, progress=report)
+    save_model(out, made.model)
+    meta = made.model.meta
+    result = {
+        "file": str(out),
+        "use": use.value,
+        **meta["personal"],
+        "ranges_mm": meta["ranges_mm"],
+        "not_used": [*made.left_out, *opened.skipped],
+        "warnings": meta["warnings"],
+    }
+    emit(result, as_json, lambda: _personal_lines(result))
+
+
+def _personal_lines(result: dict[str, Any]) -> list[str]:
+    lines = [str(result["file"])]
+    lines += [f"  {name}: {low:.1f} .. {high:.1f} mm" for name, (low, high) in result["ranges_mm"].items()]
+    heaviest = sorted(result["weights"].items(), key=lambda item: -item[1])
+    lines += [f"  from {name}: {weight:.0%}" for name, weight in heaviest]
+    lines += [f"  not used: {name}" for name in result["not_used"]]
+    return lines + [f"  {warning['code']}: {warning['message']}" for warning in result["warnings"]]
+
+
+def library(
+    folder: Annotated[Path, typer.Argument(help="Folder with a subfolder per person.", show_default=False)],
+    search: Annotated[str | None, typer.Option(help="List only names and paths with this in them.")] = None,
+    like: Annotated[Path | None, typer.Option(help="Sort by likeness to these landmarks (JSON).")] = None,
+    compare: Annotated[tuple[str, str] | None, typer.Option(help="Two persons, side by side.")] = None,
+    add: Annotated[Path | None, typer.Option(help="Copy this rig (actor.usda or model.npz) in first.")] = None,
+    name: Annotated[str | None, typer.Option(help="With --add: name of the person; else as the rig says.")] = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Keep many actors: bring the index library.json up to date, list, search and compare."""
+    from jawusd.pipeline.library import add_rig, open_library
+
+    if compare is not None and (search is not None or like is not None):
+        raise typer.BadParameter("--compare stands alone; --search and --like go together.")
+    if name is not None and add is None:
+        raise typer.BadParameter("belongs to --add.", param_hint="--name")
+    if add is not None:
+        add_rig(folder, add, name, force)
+    opened = open_library(folder)
+    if compare is not None:
+        first, second = (opened.find(who) for who in compare)
+        compared = _compared(first, second)
+        emit(compared, as_json, lambda: _compare_lines(compared))
+        return
+    listed = _listed(opened, search, like)
+    emit(listed, as_json, lambda: _library_lines(listed))
+
+
+def _listed(opened: Library, search: str | None, like: Path | None) -> dict[str, Any]:
+    from dataclasses import asdict
+
+    rigs = [asdict(entry) for entry in (opened.entries if search is None else opened.search(search))]
+    if like is not None:
+        from jawusd.formats.landmarks import load_landmarks
+        from jawusd.library.transport import landmark_distance_mm
+
+        wanted, marks = load_landmarks(like).landmarks, {entry.path: entry.landmarks() for entry in opened.entries}
+        for rig in rigs:
+            rig["landmark_distance_mm"] = landmark_distance_mm(marks[rig["path"]], wanted)
+        rigs.sort(key=lambda rig: rig["landmark_distance_mm"])
+    return {"folder": str(opened.folder), "reread": opened.reread, "rigs": rigs, "skipped": opened.skipped}
+
+
+def _library_lines(listed: dict[str, Any]) -> list[str]:
+    from jawusd.library.index import PARAMETERS
+
+    lines = [f"{'actor':<20}{'opening':>9}{'right':>8}{'left':>7}{'back':>7}{'forward':>9}{'condyles':>10}  file [mm]"]
+    for rig in listed["rigs"]:
+        (_, opening), (right, left), (back, forward) = (rig["ranges_mm"][name] for name in PARAMETERS)
+        row = f"{rig['actor'][:19]:<20}{opening:9.1f}{right:8.1f}{left:7.1f}{back:7.1f}{forward:9.1f}"
+        alike = f"  unlike by {rig['landmark_distance_mm']:.1f} mm" if "landmark_distance_mm" in rig else ""
+        partial = "  lacks a movement" if rig["not_shown"] else ""
+        lines.append(f"{row}{rig['condylar_distance_mm']:10.1f}  {rig['path']}{alike}{partial}")
+    lines.append(f"{len(listed['rigs'])} rigs, {listed['reread']} of the folder's new or changed")
+    return lines + [f"skipped {path}: {why}" for path, why in listed["skipped"].items()]
+
+
+def _compared(first: Entry, second: Entry) -> dict[str, Any]:
+    from jawusd.library.index import PARAMETERS
+    from jawusd.library.transport import landmark_distance_mm
+
+    def numbers(entry: Entry) -> dict[str, float]:
+        ends = {f"{key}_{end}": entry.ranges_mm[key][i] for key in PARAMETERS for i, end in enumerate(("min", "max"))}
+        return {
+            **ends,
+            "condylar_distance": entry.condylar_distance_mm,
+            "condyle_incisor": entry.condyle_incisor_mm,
+        }
+
+    a, b = numbers(first), numbers(second)
+    rows = {key: {"first": a[key], "second": b[key], "difference": b[key] - a[key]} for key in a}
+    return {
+        "first": first.path,
+        "second": second.path,
+        "actors": [first.actor, second.actor],
+        "landmark_distance_mm": landmark_distance_mm(first.landmarks(), second.landmarks()),
+        "measures_mm": rows,
+    }
+
+
+def _compare_lines(compared: dict[str, Any]) -> list[str]:
+    first, second = compared["actors"]
+    lines = [f"{'[mm]':<22}{first[:15]:>16}{second[:15]:>16}{'difference':>12}"]
+    for name, row in compared["measures_mm"].items():
+        lines.append(f"{name:<22}{row['first']:16.2f}{row['second']:16.2f}{row['difference']:+12.2f}")
+    return [*lines, f"landmarks differ by {compared['landmark_distance_mm']:.2f} mm rms after the best rigid fit"]

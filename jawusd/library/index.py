@@ -1,0 +1,233 @@
+"""The index of a folder of rigs: `library.json`, format jawusd-library/1.
+
+The index is only a memory of what the scan found: a path in it is never opened. Rigs are looked for below the folder
+and nowhere else, and read again when their content has changed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from jawusd.errors import FormatError, JawusdError
+from jawusd.evaluator import JawRig
+from jawusd.formats.atomic import write_text_atomic
+from jawusd.formats.npz import check_format
+from jawusd.geometry import LANDMARKS, landmark_frame, transform_points
+from jawusd.library.transport import Donor, condylar_distance_mm, condyle_incisor_mm
+
+FAMILY, VERSION = "jawusd-library", 1
+INDEX_FILE = "library.json"
+MODEL_FILE, ACTOR_FILE = "model.npz", "actor.usda"
+PARAMETERS = ("opening", "laterotrusion", "protrusion")
+
+_MOST_FOLDERS = 20_000
+_MOST_INDEX_BYTES = 64 << 20
+_CHUNK_BYTES = 1 << 20
+
+#: Reads the rig of a file.
+Loader = Callable[[Path], JawRig]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What the index knows of one rig.
+
+    Attributes:
+        path: of the rig's file, relative to the folder, with slashes.
+        actor: name of the person.
+        kind: form of the model.
+        content: SHA-256 of the rig's files.
+        ranges_mm: lowest and highest value of each parameter.
+        landmarks_mm: in the person's own landmark frame (occlusal plane, origin at the lower incisal point).
+        condylar_distance_mm: between the condyle centres.
+        condyle_incisor_mm: from the middle between the condyles to the incisal point.
+        errors_mm: the model's error tables, as its header has them.
+        not_shown: the person's capture lacks a movement: of no use for others.
+    """
+
+    path: str
+    actor: str
+    kind: str
+    content: str
+    ranges_mm: dict[str, list[float]]
+    landmarks_mm: dict[str, list[float]]
+    condylar_distance_mm: float
+    condyle_incisor_mm: float
+    errors_mm: dict
+    not_shown: bool
+
+    def landmarks(self) -> np.ndarray:
+        """Return the landmarks in the order of `LANDMARKS` [mm], shape (5, 3)."""
+        return np.array([self.landmarks_mm[name] for name in LANDMARKS])
+
+
+@dataclass(frozen=True)
+class Library:
+    """A scanned folder.
+
+    Attributes:
+        folder: the folder, resolved.
+        entries: its rigs, by path.
+        skipped: files that could not be read, by path, and why.
+        reread: how many rigs were new or had changed.
+    """
+
+    folder: Path
+    entries: tuple[Entry, ...]
+    skipped: dict[str, str]
+    reread: int
+
+    def find(self, name: str) -> Entry:
+        """Return the rig of a person, by name or by path.
+
+        Raises:
+            FormatError: there is none, or there are several.
+        """
+        found = [entry for entry in self.entries if name in (entry.path, entry.actor, str(Path(entry.path).parent))]
+        if not found:
+            known = ", ".join(entry.actor for entry in self.entries) or "nobody"
+            raise FormatError(f'has no rig of "{name}"; it holds {known}.', path=self.folder)
+        if len(found) > 1:
+            paths = ", ".join(entry.path for entry in found)
+            raise FormatError(f'has several rigs of "{name}": {paths}.', path=self.folder, hint="Name the path.")
+        return found[0]
+
+    def search(self, text: str) -> tuple[Entry, ...]:
+        """Return the rigs whose name or path contains a text, whatever its case."""
+        return tuple(e for e in self.entries if text.lower() in e.actor.lower() or text.lower() in e.path.lower())
+
+
+def scan_library(folder: str | os.PathLike[str], load: Loader) -> Library:
+    """Bring the index of a folder up to date.
+
+    Every subfolder counts as one person: its `model.npz`, else its `actor.usda`. Links that leave the folder are not
+    followed.
+
+    Args:
+        folder: the library.
+        load: reads a rig.
+
+    Raises:
+        FormatError: no such folder, too many folders, or an index that is damaged.
+        VersionError: an index written by a newer version.
+        OutputError: the index has changed and cannot be written.
+    """
+    root = Path(folder).resolve()
+    if not root.is_dir():
+        raise FormatError("there is no such folder.", path=folder)
+    known = _read_index(root / INDEX_FILE)
+    entries, skipped, reread = [], {}, 0
+    for path in sorted(_rig_files(root)):
+        name = path.relative_to(root).as_posix()
+        try:
+            content = _content(path, root)
+            entry = known.get(name)
+            if entry is None or entry.content != content:
+                entry, reread = _entry(name, content, load(path)), reread + 1
+            entries.append(entry)
+        except JawusdError as error:
+            skipped[name] = f"{error.message} {error.hint or ''}".strip()
+    if {entry.path: entry for entry in entries} != known:
+        data = {"format": f"{FAMILY}/{VERSION}", "units": "mm", "rigs": [asdict(entry) for entry in entries]}
+        write_text_atomic(root / INDEX_FILE, json.dumps(data, indent=1, sort_keys=True) + "\n")
+    return Library(root, tuple(entries), skipped, reread)
+
+
+def load_donors(library: Library, load: Loader) -> list[Donor]:
+    """Read the rigs of all persons whose captures show every movement, named by their paths.
+
+    Raises:
+        JawusdError: a rig has become unreadable since the scan.
+    """
+    return [Donor(e.path, load(library.folder / e.path)) for e in library.entries if not e.not_shown]
+
+
+def _rig_files(root: Path) -> Iterator[Path]:
+    for count, (where, folders, files) in enumerate(os.walk(root, followlinks=False)):
+        if count >= _MOST_FOLDERS:
+            raise FormatError(f"has more than {_MOST_FOLDERS} folders below it; that is no library.", path=root)
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        for name in (MODEL_FILE, ACTOR_FILE):
+            if name in files:
+                yield Path(where) / name
+                break
+
+
+def _content(path: Path, root: Path) -> str:
+    """Return the SHA-256 of the files a rig is read from.
+
+    Raises:
+        FormatError: one of them is not a plain file inside the library, or cannot be read.
+    """
+    total = hashlib.sha256()
+    parts = [path]
+    if path.name == ACTOR_FILE:  # OpenUSD opens what the interface refers to, in its folder: no link may lead it away
+        parts += sorted(p for p in path.parent.iterdir() if p.suffix.startswith(".usd") and p != path)
+    for part in parts:
+        if not part.resolve().is_relative_to(root):
+            raise FormatError(f"{part.name} is a link out of the library; it is not followed.", path=path)
+        if not part.is_file():
+            raise FormatError(f"{part.name} is not a file.", path=path)
+        total.update(part.name.encode() + b"\0")
+        try:
+            with open(part, "rb") as handle:
+                while chunk := handle.read(_CHUNK_BYTES):
+                    total.update(chunk)
+        except OSError as error:
+            raise FormatError(f"{part.name} cannot be read: {error.strerror}.", path=path) from error
+    return total.hexdigest()
+
+
+def _entry(name: str, content: str, rig: JawRig) -> Entry:
+    landmarks = rig.arrays["landmarks"]
+    shown = transform_points(landmark_frame(landmarks), landmarks)
+    warnings = rig.meta.get("warnings") or []
+    return Entry(
+        path=name,
+        actor=str(rig.meta.get("actor") or Path(name).parent.name or "unnamed"),
+        kind=str(rig.meta["kind"]),
+        content=content,
+        ranges_mm={key: row.tolist() for key, row in zip(PARAMETERS, rig.arrays["d_range"], strict=True)},
+        landmarks_mm={key: row.tolist() for key, row in zip(LANDMARKS, shown, strict=True)},
+        condylar_distance_mm=condylar_distance_mm(landmarks),
+        condyle_incisor_mm=condyle_incisor_mm(landmarks),
+        errors_mm=dict(rig.meta.get("errors") or {}),
+        not_shown=any(isinstance(w, dict) and w.get("code") == "not_shown" for w in warnings),
+    )
+
+
+def _read_index(path: Path) -> dict[str, Entry]:
+    """Return the entries of an index by path; none if there is no index yet."""
+    if path.is_symlink():
+        raise FormatError("is a link; an index is a file of the library.", path=path)
+    if not path.exists():
+        return {}
+    try:
+        if path.stat().st_size > _MOST_INDEX_BYTES:
+            raise ValueError(f"{path.stat().st_size} bytes")
+        data = json.loads(path.read_text(encoding="utf-8"))
+        check_format(data.get("format"), FAMILY, VERSION, path)
+        return {entry.path: entry for entry in map(_entry_of, data["rigs"])}
+    except (OSError, ValueError, TypeError, AttributeError, KeyError, RecursionError) as error:
+        raise FormatError(f"is damaged ({error}).", path=path, hint="Delete it; it is made anew.") from error
+
+
+def _entry_of(record: dict) -> Entry:
+    entry = Entry(**record)
+    text = [field.name for field in fields(Entry) if field.type == "str"]
+    if not all(isinstance(getattr(entry, name), str) for name in text):
+        raise ValueError("a text is none")
+    numbers = [*entry.ranges_mm[PARAMETERS[0]], entry.condylar_distance_mm, entry.condyle_incisor_mm]
+    numbers += [*entry.ranges_mm[PARAMETERS[1]], *entry.ranges_mm[PARAMETERS[2]]]
+    if len(numbers) != 8 or not np.isfinite(np.array(numbers, dtype=np.float64)).all():
+        raise ValueError("ranges are not three pairs of numbers")
+    if entry.landmarks().shape != (5, 3) or not np.isfinite(entry.landmarks().astype(np.float64)).all():
+        raise ValueError("landmarks are not five points")
+    return entry

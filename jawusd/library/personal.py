@@ -1,0 +1,146 @@
+"""The motion of somebody without a capture: that of the persons of a library, carried over and averaged.
+
+How much a library person counts falls with the distance between the landmarks; how fast, and how wrong the result is to
+be expected, the library itself says: every person in turn is predicted from the others and compared.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.errors import FittingError
+from jawusd.geometry import LANDMARKS, transform_points
+from jawusd.library.transport import Donor, displacements, landmark_distance_mm, poses_of_landmarks
+
+Array = NDArray[np.float64]
+
+# Landmark distances [mm] at which a person counts exp(-1/2) as much as one with the same landmarks; inf: all alike.
+BANDWIDTHS_MM = (math.inf, 4.0, 2.0, 1.0)
+_POSES = 1600
+_POSES_LEFT_OUT = 120  # poses per person that leaving-one-out looks at
+_FEWEST_DONORS = 2  # with two persons each can be predicted from the other
+
+
+@dataclass(frozen=True, eq=False)
+class Expected:
+    """What leaving one person out says of the error.
+
+    Attributes:
+        errors_mm: by name of the person left out, the landmark errors [mm], shape (K, 5), at equal shares of the
+            ranges: both the shape of the motion and the ranges count.
+    """
+
+    errors_mm: dict[str, Array]
+
+    def pooled(self) -> Array:
+        """Return the errors of all persons [mm], shape (N, 5)."""
+        return np.concatenate(list(self.errors_mm.values()))
+
+    def summary(self) -> dict:
+        """Return mean, 95 % quantile and largest error over landmarks [mm], and the mean by person."""
+        errors = self.pooled()
+        return {
+            "measured": "leave-one-out over the library, at the landmarks, at equal shares of the ranges",
+            "mean": float(errors.mean()),
+            "p95": float(np.percentile(errors, 95)),
+            "max": float(errors.max()),
+            "mean_by_person": {name: float(values.mean()) for name, values in self.errors_mm.items()},
+        }
+
+    def table(self) -> dict[str, dict[str, float]]:
+        """Return mean, median, p95 and max by landmark [mm], as the error tables of models have them."""
+        return {
+            name: {
+                "mean": float(column.mean()),
+                "median": float(np.median(column)),
+                "p95": float(np.percentile(column, 95)),
+                "max": float(column.max()),
+                "frames": len(column),
+            }
+            for name, column in zip(LANDMARKS, self.pooled().T, strict=True)
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class PersonalMotion:
+    """Hold the motion made for a person.
+
+    Attributes:
+        poses: T_skull_mandible in the frame of the landmarks, the identity with the teeth together, shape (N, 4, 4).
+        weights: how much each library person counts; they sum to 1.
+        bandwidth_mm: landmark distance over which the weights fall, inf when all count alike; None with one person.
+        expected: error to be expected; None when the library has a single person.
+    """
+
+    poses: Array
+    weights: dict[str, float]
+    bandwidth_mm: float | None
+    expected: Expected | None
+
+
+def personal_motion(donors: Sequence[Donor], target: Array, *, closest: bool = False) -> PersonalMotion:
+    """Make the motion of a person from landmarks and a library.
+
+    Args:
+        donors: the persons of the library, each showing all three movements.
+        target: the person's landmarks with the teeth together [mm], shape (5, 3), in the order of `LANDMARKS`.
+        closest: take the person with the most similar landmarks instead of an average.
+
+    Raises:
+        FittingError: no donors.
+    """
+    if not donors:
+        raise FittingError("the library has no person whose motion could be carried over.")
+    bandwidth, expected = _leave_one_out(donors, closest)
+    weights = _weights(donors, target, bandwidth)
+    used = [(donor, weight) for donor, weight in zip(donors, weights, strict=True) if weight > 0]
+    shares = np.concatenate([_captured_shares(donor, _POSES // len(used)) for donor, _ in used])
+    moved = sum(weight * displacements(donor, target, shares) for donor, weight in used)
+    return PersonalMotion(
+        poses_of_landmarks(target, target + moved),
+        {donor.name: float(weight) for donor, weight in used},
+        bandwidth,
+        expected,
+    )
+
+
+def _captured_shares(donor: Donor, count: int) -> Array:
+    """Return about so many of a person's captured poses, in the order of time, as shares of the ranges."""
+    codes = donor.rig.arrays["codes"]
+    step = -(-len(codes) // max(count, 1))
+    return donor.rig.normalized(codes[::step])
+
+
+def _weights(donors: Sequence[Donor], target: Array, bandwidth_mm: float | None) -> Array:
+    """Return the weights (n,), which sum to 1; without a bandwidth, of the closest person alone."""
+    distance = np.array([landmark_distance_mm(donor.landmarks, target) for donor in donors])
+    if bandwidth_mm is None:
+        return (np.arange(len(donors)) == distance.argmin()).astype(np.float64)
+    nearness = -0.5 * (distance / bandwidth_mm) ** 2
+    weights = np.exp(nearness - nearness.max())
+    return weights / weights.sum()
+
+
+def _leave_one_out(donors: Sequence[Donor], closest: bool) -> tuple[float | None, Expected | None]:
+    """Return the bandwidth that predicts the library's persons from each other best, and those errors."""
+    if len(donors) < _FEWEST_DONORS:
+        return None, None
+    choices: tuple[float | None, ...] = (None,) if closest else BANDWIDTHS_MM
+    errors: list[dict[str, Array]] = [{} for _ in choices]
+    for i, left_out in enumerate(donors):
+        others = [*donors[:i], *donors[i + 1 :]]
+        shares, rest = _captured_shares(left_out, _POSES_LEFT_OUT), left_out.landmarks
+        truth = transform_points(left_out.rig.pose(left_out.rig.denormalized(shares)), left_out.rig.arrays["landmarks"])
+        moved = np.stack([displacements(donor, rest, shares) for donor in others])
+        for found, bandwidth in zip(errors, choices, strict=True):
+            average = np.einsum("j,jkpi->kpi", _weights(others, rest, bandwidth), moved)
+            predicted = transform_points(poses_of_landmarks(rest, rest + average), rest)
+            found[left_out.name] = np.linalg.norm(predicted - truth, axis=-1)
+    expected = [Expected(found) for found in errors]
+    best = int(np.argmin([found.pooled().mean() for found in expected]))
+    return choices[best], expected[best]

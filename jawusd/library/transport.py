@@ -1,0 +1,97 @@
+"""Carry one person's jaw motion to another's bones, by the five landmarks both have.
+
+How a jaw moves is decided by its joints and teeth, how far its landmarks travel also by its size. What is carried over
+is therefore the displacement of each landmark, scaled sideways by the ratio of the distances between the condyles and
+in the sagittal plane by that of the distances from the condyles to the incisal point; the pose is the rigid motion
+nearest to the displaced landmarks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.evaluator import JawRig
+from jawusd.geometry import landmark_frame, make_transform, rigid_fit, transform_points
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Donor:
+    """One person of a library.
+
+    Attributes:
+        name: of the person, for reports.
+        rig: the person's rig.
+    """
+
+    name: str
+    rig: JawRig
+
+    @property
+    def landmarks(self) -> Array:
+        """The landmarks with the teeth together, skull frame [mm], shape (5, 3), in the order of `LANDMARKS`."""
+        return transform_points(self.rig.arrays["T_rest"], self.rig.arrays["landmarks"])
+
+
+def condylar_distance_mm(landmarks: Array) -> float:
+    """Return the distance [mm] between the condyle centres of landmarks (5, 3)."""
+    return float(np.linalg.norm(landmarks[3] - landmarks[4]))
+
+
+def condyle_incisor_mm(landmarks: Array) -> float:
+    """Return the distance [mm] from the middle between the condyles to the incisal point of landmarks (5, 3)."""
+    return float(np.linalg.norm(landmarks[0] - landmarks[3:5].mean(axis=0)))
+
+
+def landmark_distance_mm(a: Array, b: Array) -> float:
+    """Return how unlike two persons' landmarks are: the rms distance [mm] left by the best rigid fit.
+
+    Args:
+        a: landmarks of one person [mm], shape (5, 3), in any frame.
+        b: landmarks of the other [mm], shape (5, 3).
+    """
+    left = transform_points(rigid_fit(a, b), a) - b
+    return float(np.sqrt((left**2).sum(axis=1).mean()))
+
+
+def displacements(donor: Donor, target: Array, shares: Array) -> Array:
+    """Return how the target's landmarks move when a donor's motion is carried over.
+
+    Args:
+        donor: whose motion it is.
+        target: the other person's landmarks with the teeth together [mm], shape (5, 3).
+        shares: parameters as shares of the ranges, see `JawRig.normalized`, shape (K, 3).
+
+    Returns:
+        Displacements in the target's frame [mm], shape (K, 5, 3).
+    """
+    rest = donor.landmarks
+    d = donor.rig.denormalized(shares)
+    moved = transform_points(donor.rig.pose(d), donor.rig.arrays["landmarks"]) - rest
+    width = condylar_distance_mm(target) / condylar_distance_mm(rest)
+    reach = condyle_incisor_mm(target) / condyle_incisor_mm(rest)
+    axes = landmark_frame(target)[:3, :3]  # rows: left, up and anterior in the target's frame
+    to_target = axes.T @ np.diag([width, reach, reach]) @ axes @ rigid_fit(rest, target)[:3, :3]
+    return moved @ to_target.T
+
+
+def poses_of_landmarks(rest: Array, moved: Array) -> Array:
+    """Return the rigid motions that bring landmarks nearest to displaced ones (Kabsch 1976).
+
+    Args:
+        rest: landmarks with the teeth together [mm], shape (P, 3).
+        moved: where they should go [mm], shape (K, P, 3).
+
+    Returns:
+        Motions, shape (K, 4, 4).
+    """
+    p, q = rest.mean(axis=0), moved.mean(axis=1)
+    U, _, Vt = np.linalg.svd(np.swapaxes(moved - q[:, None], 1, 2) @ (rest - p))
+    sign = np.ones((len(moved), 3))
+    sign[:, 2] = np.linalg.det(U @ Vt)
+    R = U * sign[:, None, :] @ Vt
+    return make_transform(R, q - R @ p)

@@ -1,0 +1,191 @@
+"""A folder of actors, and the two ways to give a jaw another's motion: retargeting, and a rig from landmarks alone."""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.errors import EvaluatorError, FormatError, OutputError
+from jawusd.evaluator import JawRig, load
+from jawusd.formats.landmarks import load_landmarks
+from jawusd.formats.model import JawModel, load_model, save_model
+from jawusd.library.index import MODEL_FILE, Library, load_donors, scan_library
+from jawusd.library.personal import PersonalMotion, personal_motion
+from jawusd.pipeline.extras import stage
+from jawusd.pipeline.stages import Progress, fit_subject
+from jawusd.pipeline.subject import Subject, subject_of_landmarks
+
+Array = NDArray[np.float64]
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
+
+
+def load_any_rig(path: Path) -> JawRig:
+    """Read a rig from `model.npz` with numpy alone, or from USD.
+
+    Raises:
+        JawusdError: it is no rig.
+        MissingDependencyError: USD without OpenUSD.
+    """
+    return load(path) if path.suffix == ".npz" else stage("jawusd.rig").load_rig(path)
+
+
+def open_library(folder: str | os.PathLike[str]) -> Library:
+    """Scan a library and bring its index up to date; see `library.index.scan_library`."""
+    return scan_library(folder, load_any_rig)
+
+
+def add_rig(folder: str | os.PathLike[str], source: Path, name: str | None, force: bool) -> Path:
+    """Copy a rig into a library, as the model file `NAME/model.npz`.
+
+    Args:
+        folder: the library; made if missing.
+        source: a rig or a model file.
+        name: of the person and the subfolder; None: as the rig says.
+        force: overwrite a person of that name.
+
+    Returns:
+        The file written.
+
+    Raises:
+        FormatError: not a rig, or a name that makes no folder.
+        OutputError: there is such a person already, or the file cannot be written.
+    """
+    rig = load_any_rig(source)
+    called = name or str(rig.meta.get("actor") or "")
+    if not _NAME.fullmatch(called):
+        raise FormatError(
+            f'"{called}" makes no folder; letters, digits, ".", "_" and "-" do.', path=source, hint="Give --name."
+        )
+    place = Path(folder) / called
+    # The place is inside the library by its name; a link lying there could still lead out of it.
+    if place.is_symlink() or (place / MODEL_FILE).is_symlink():
+        raise OutputError("is a link; rigs are written into the library itself.", path=place)
+    if (place / MODEL_FILE).exists() and not force:
+        raise OutputError("exists already.", path=place, hint="Give another --name, or overwrite it with --force.")
+    save_model(place / MODEL_FILE, _as_model(rig, source, called))
+    return place / MODEL_FILE
+
+
+def _as_model(rig: JawRig, source: Path, name: str) -> JawModel:
+    if source.suffix == ".npz":
+        model = load_model(source)
+        model.meta["actor"] = name
+        return model
+    none = np.zeros(0)
+    arrays = {key: np.array(value) for key, value in rig.arrays.items()}
+    return JawModel(
+        arrays, none.astype(np.int64), np.zeros((0, 3)), none, none.astype(bool), {**rig.meta, "actor": name}
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class PersonalRig:
+    """A rig made from landmarks.
+
+    Attributes:
+        model: the fitted model.
+        motion: what it was fitted to.
+        left_out: library persons not used, their captures lack a movement.
+    """
+
+    model: JawModel
+    motion: PersonalMotion
+    left_out: tuple[str, ...]
+
+
+def personal_rig(landmarks: Path, library: Library, *, closest: bool, name: str, progress: Progress) -> PersonalRig:
+    """Make a rig for somebody without a capture, from landmarks and a library.
+
+    The motion of the library's persons is carried over to the landmarks and averaged (see `library.personal`), and the
+    anchored model is fitted to it. Its header says what the leave-one-out over the library lets expect; measured poses
+    may lie as far from the model as that.
+
+    Args:
+        landmarks: file of format jawusd-landmarks/1.
+        library: the library.
+        closest: take the motion of the person with the most similar landmarks instead of the average.
+        name: of the new person.
+        progress: told of the work.
+
+    Raises:
+        FormatError: not such a file.
+        FittingError: the library has no usable person, or the landmarks are not those of a jaw.
+    """
+    subject = subject_of_landmarks(landmarks, name)
+    progress("carry", 0, 1)
+    motion = personal_motion(load_donors(library, load_any_rig), load_landmarks(landmarks).landmarks, closest=closest)
+    progress("carry", 1, 1)
+    model = fit_personal(subject, motion, progress)
+    return PersonalRig(model, motion, tuple(entry.path for entry in library.entries if entry.not_shown))
+
+
+def fit_personal(subject: Subject, motion: PersonalMotion, progress: Progress) -> JawModel:
+    """Fit the anchored model to a motion carried over, and say in its header what it is worth.
+
+    Raises:
+        FittingError: see `fitting.fit_model`.
+    """
+    frames = np.arange(len(motion.poses))
+    model = fit_subject(subject, (frames, motion.poses), "anchored", progress)
+    expected = motion.expected
+    model.meta["personal"] = {
+        "weights": motion.weights,
+        "landmark_distance_scale_mm": _finite(motion.bandwidth_mm),
+        "expected_error_mm": None if expected is None else expected.summary(),
+        "fit_to_carried_motion_mm": model.meta["errors"],
+    }
+    # How well the model follows the motion it was given says nothing of the person: nobody measured that one.
+    model.meta["errors"] = {} if expected is None else {"expected": expected.table()}
+    model.meta["warnings"].append({"code": "personal", "message": _caution(motion)})
+    if expected is not None:
+        limit = np.maximum(model.arrays["residual_limit_mm"], expected.summary()["mean"])
+        model.arrays["residual_limit_mm"] = limit
+    return model
+
+
+def _caution(motion: PersonalMotion) -> str:
+    persons = f"{len(motion.weights)} library person{'s' if len(motion.weights) > 1 else ''}"
+    start = f"Made from landmarks and {persons}, not from a capture;"
+    if motion.expected is None:
+        return f"{start} with a single person in the library the error to be expected cannot be stated."
+    found = motion.expected.summary()
+    return f"{start} expected error {found['mean']:.2f} mm, 95 % below {found['p95']:.2f} mm (leave-one-out)."
+
+
+def _finite(value: float | None) -> float | None:
+    return None if value is None or not np.isfinite(value) else value
+
+
+def retarget(source: JawRig, target: JawRig, frames: Array, d: Array) -> tuple[Array, Array]:
+    """Carry a motion to another person as shares of the ranges of both.
+
+    Between two samples a motion is linear in d, and shares are not: whole frames in between become samples too.
+
+    Args:
+        source: whose motion it is.
+        target: who shall move.
+        frames: increasing frame numbers (F,).
+        d: parameters of the source (F, 3) [mm], NaN where lost.
+
+    Returns:
+        Frame numbers (G,), and parameters of the target (G, 3) [mm], NaN where lost; not yet kept inside its bound.
+
+    Raises:
+        EvaluatorError: no frame has parameters.
+    """
+    known = np.isfinite(d).all(axis=1)
+    if not known.any():
+        raise EvaluatorError("no frame of the motion has parameters; there is nothing to carry over.")
+    first, last = frames[known][[0, -1]]
+    lost = frames[~known]
+    whole = np.setdiff1d(np.arange(np.ceil(first), np.floor(last) + 1), lost)
+    times = np.union1d(frames, whole)
+    at = np.stack([np.interp(times, frames[known], column) for column in d[known].T], axis=1)
+    at[np.isin(times, lost)] = np.nan
+    return times, target.denormalized(source.normalized(at))
