@@ -126,7 +126,7 @@ def edge_width_px(image: NDArray[np.uint8], corners_px: Array, cols: int) -> flo
     """Return the 10 to 90 % width of a chessboard's edges from its gradient energy.
 
     A step of contrast C blurred by a Gaussian of sigma has the gradient energy C^2 / (2 sigma sqrt(pi)) per length of
-    edge; a chessboard has the variance C^2 / 4 and, with cell sides a and b, (|a| + |b|) / |a x b| of edge per area.
+    edge; a chessboard with cell sides a and b has (|a| + |b|) / |a x b| of edge per area.
 
     Args:
         image: gray picture, shape (h, w).
@@ -147,7 +147,8 @@ def edge_width_px(image: NDArray[np.uint8], corners_px: Array, cols: int) -> flo
     cv2.fillConvexPoly(inside, np.round(hull - [x, y]).astype(np.int32), 1)
     gy, gx = np.gradient(part)
     energy = float((gx * gx + gy * gy)[inside > 0].mean())
-    sigma = 2 * float(part[inside > 0].var()) * density / (np.sqrt(np.pi) * energy)
+    black, white = np.percentile(part[inside > 0], (5, 95))
+    sigma = float(white - black) ** 2 * density / (2 * np.sqrt(np.pi) * energy)
     return 2 * 1.2816 * float(sigma)
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from jawusd.errors import SyncError
 from jawusd.imaging.video import Video
 
-__all__ = ["Flashes", "Offset", "Step", "find_flashes", "find_steps", "match_steps", "mean_brightness"]
+__all__ = ["Flashes", "Offset", "Step", "find_flashes", "find_steps", "match_steps", "mean_brightness", "on_grid"]
 
 _FIRST_WINDOW_S = 4.0  # searched at either end; doubled until a flash is found
 _SPARSE = 8  # every 8th pixel in both directions tells the mean brightness
@@ -25,6 +25,7 @@ _ABRUPT_FRAMES = 3  # a lamp is off or on within this many frames
 _TOLERANCE_FRAMES = 1.0  # steps this close are the same step
 _DROPPED_S = 0.5  # steps that fit with an offset this different tell of lost frames
 _FEWEST_STEPS = 2
+_BETWEEN_FRAMES = 0.15  # a fraction of a frame this small is noise
 
 
 @dataclass(frozen=True)
@@ -34,10 +35,12 @@ class Step:
     Attributes:
         time_frames: when, in frames of the camera's video; k = as the exposure of frame k begins.
         rising: the light goes on; else off.
+        slack_frames: how much earlier it may have been, because the pictures before it are missing.
     """
 
     time_frames: float
     rising: bool
+    slack_frames: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -151,18 +154,40 @@ def _refuse_lost_frames(
 
 def _aligned(steps: list[Step], reference: list[Step], offset: int) -> tuple[list[tuple[int, int]], float, float]:
     """Return the pairs of step numbers that meet under an offset, their spread and their exact offset [frames]."""
-    pairs, differences = [], []
+    pairs, differences, slacks = [], [], []
     for i, step in enumerate(steps):
         for j, partner in enumerate(reference):
             difference = partner.time_frames - step.time_frames
-            if step.rising == partner.rising and abs(difference - offset) <= _TOLERANCE_FRAMES:
+            low, high = difference - partner.slack_frames, difference + step.slack_frames
+            if step.rising == partner.rising and low - _TOLERANCE_FRAMES <= offset <= high + _TOLERANCE_FRAMES:
                 pairs.append((i, j))
                 differences.append(difference)
+                slacks.append(step.slack_frames + partner.slack_frames)
                 break
     if not pairs:
         return [], 0.0, float(offset)
-    exact = float(np.median(differences))
-    return pairs, float(np.abs(np.array(differences) - exact).max()), exact
+    # Only the pairs that know best tell the offset.
+    best = np.array(differences)[np.array(slacks) == min(slacks)]
+    exact = float(np.median(best))
+    return pairs, float(np.abs(best - exact).max()), exact
+
+
+def on_grid(steps: list[Step], numbers: NDArray[np.int64]) -> list[Step]:
+    """Return steps counted in pictures with their time on the grid of frames.
+
+    Args:
+        steps: of a video, their times in pictures.
+        numbers: frame number of each picture, shape (n,).
+    """
+    out = []
+    for step in steps:
+        nearest = round(step.time_frames)
+        between = abs(step.time_frames - nearest) < _BETWEEN_FRAMES and 0 < nearest < len(numbers)
+        picture = nearest if between else min(int(step.time_frames), len(numbers) - 1)
+        # Between two pictures the step is anywhere in the gap; within one, that picture's brightness tells.
+        gap = float(numbers[picture] - numbers[picture - 1] - 1) if between else 0.0
+        out.append(Step(float(numbers[picture]) + step.time_frames - picture, step.rising, max(0.0, gap)))
+    return out
 
 
 def find_flashes(video: Video) -> Flashes:

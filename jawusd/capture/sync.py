@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.capture.light import Offset, Step, find_flashes, match_steps, mean_brightness
+from jawusd.capture.light import Offset, find_flashes, match_steps, mean_brightness, on_grid
 from jawusd.capture.sound import RATE_HZ, match_sounds
 from jawusd.errors import SyncError
 from jawusd.formats.capture import Capture
@@ -104,7 +104,7 @@ def align_videos(videos: Mapping[str, Path], reference: str, *, by_light: bool =
             found = dict(zip(opened, pool.map(find_flashes, opened.values())))
             dark = next((name for name in opened if found[name].reason), None)
         if by_light and dark is None:
-            steps = {name: _on_grid(found[name].steps, grids[name][0]) for name in opened}
+            steps = {name: on_grid(found[name].steps, grids[name][0]) for name in opened}
             offsets = {
                 name: _against(
                     name, reference, video, hint, lambda n=name: match_steps(steps[n], steps[reference], rate)
@@ -146,9 +146,11 @@ def frame_grid(times_s: NDArray[np.float64], fps: float) -> tuple[NDArray[np.int
     """
     if len(times_s) < 3:
         return np.arange(len(times_s)), fps
-    period = float(np.median(np.diff(times_s)))
-    last = 16
-    # The median of rounded time stamps is off by up to 3 %: fit longer and longer stretches.
+    steps = np.diff(times_s)
+    median = np.median(steps)
+    # Frames next to each other; gaps would bias the mean, rounded time stamps the median.
+    period = float(steps[(steps > 0.5 * median) & (steps < 1.5 * median)].mean())
+    last = 16  # jitter still leaves it off by some per mille: fit longer and longer stretches
     while True:
         stretch = times_s[:last]
         numbers = np.round(stretch / period)
@@ -156,15 +158,6 @@ def frame_grid(times_s: NDArray[np.float64], fps: float) -> tuple[NDArray[np.int
         if last >= len(times_s):
             return np.round(times_s / period).astype(np.int64), 1 / period
         last *= 2
-
-
-def _on_grid(steps: list[Step], numbers: NDArray[np.int64]) -> list[Step]:
-    """Return steps counted in pictures with their time on the grid of frames."""
-    out = []
-    for step in steps:
-        picture = min(int(step.time_frames), len(numbers) - 1)
-        out.append(Step(float(numbers[picture]) + step.time_frames - picture, step.rising))
-    return out
 
 
 def _missing_pictures(numbers: Mapping[str, NDArray[np.int64]]) -> tuple[str, ...]:

@@ -1,0 +1,159 @@
+"""Finding boards in drawn pictures whose corners are known."""
+
+import cv2
+import numpy as np
+import pytest
+from boards import board, charuco, chessboard, corner_grid, opencv_pixels, photograph, poses, studio
+
+from jawusd.capture.boards import edge_width_px, find_boards
+from jawusd.errors import CalibrationError, CaptureError
+from jawusd.formats.capture import Boards
+from jawusd.imaging.video_writer import VideoWriter
+
+CAMERAS = studio(lens=(0.0, 0.0))[:2]
+NAMES = ("c0", "c1")
+RNG = np.random.default_rng(0)
+POSES = poses(6, RNG, tilt=0.3)
+
+
+def pictures(boards, draw=chessboard, T_world_board=POSES):
+    """Return the pictures of every camera."""
+    texture, to_texture = draw(boards)
+    return [[photograph(camera, T, texture, to_texture) for T in T_world_board] for camera in CAMERAS]
+
+
+def write_clips(folder, images):
+    """Write each picture twice, as a pose held for two frames."""
+    paths = []
+    for c, camera in enumerate(images):
+        path = folder / f"c{c}.mp4"
+        with VideoWriter(path, camera[0].shape[::-1], 24.0, quality_crf=10) as writer:
+            for image in camera:
+                writer.write(image)
+                writer.write(image)
+        paths.append(path)
+    return tuple(paths)
+
+
+def write_pictures(folder, images):
+    """Write numbered PNG files."""
+    for c, camera in enumerate(images):
+        (folder / f"c{c}").mkdir()
+        for k, image in enumerate(camera):
+            cv2.imwrite(str(folder / f"c{c}" / f"board_{3 * k:04d}.png"), image)
+    return tuple(folder / f"c{c}" / "board_%04d.png" for c in range(len(images)))
+
+
+def quiet(done, total):
+    """Swallow progress."""
+
+
+def test_chessboard_corners_in_video_are_those_projected(tmp_path):
+    boards = board(videos=write_clips(tmp_path, pictures(board())))
+    told = []
+    found = find_boards(NAMES, boards, lambda done, total: told.append((done, total)))
+    assert told[0] == (0, 12) and told[-1] == (12, 12)
+    assert found.corners_px.shape == (2, 6, 54, 2) and found.sizes_px == ((640, 480),) * 2 and found.notes == ()
+    grid = corner_grid(boards)
+    for c, camera in enumerate(CAMERAS):
+        for v, T in enumerate(POSES):
+            exact = opencv_pixels(camera, grid @ T[:3, :3].T + T[:3, 3])
+            miss = min(np.abs(found.corners_px[c, v] - order).max() for order in (exact, exact[::-1]))
+            assert miss < 0.25
+
+
+def test_charuco_in_numbered_pictures_keeps_the_numbers_of_its_corners(tmp_path):
+    about = {"pattern": "charuco", "dictionary": "DICT_4X4_50", "marker_mm": 6.5, "cols": 7, "rows": 5, "square_mm": 9}
+    boards = board(**about)
+    images = pictures(boards, charuco)
+    images[0][2][:, :330] = 110  # half of the board is hidden
+    boards = board(**about, videos=write_pictures(tmp_path, images))
+    found = find_boards(NAMES, boards, quiet)
+    assert found.numbers.tolist() == [0, 3, 6, 9, 12, 15]
+    hidden = np.isnan(found.corners_px[0, 2, :, 0])
+    assert 5 < hidden.sum() < 30 and np.isfinite(found.corners_px[1, 2]).all()
+    grid = corner_grid(boards)
+    for c, camera in enumerate(CAMERAS):
+        for v, T in enumerate(POSES):
+            exact = opencv_pixels(camera, grid @ T[:3, :3].T + T[:3, 3])
+            assert np.nanmax(np.abs(found.corners_px[c, v] - exact)) < 0.5
+
+
+@pytest.mark.parametrize("sigma", [1.0, 2.0, 3.0])
+def test_the_width_of_edges_is_that_of_the_blur(sigma):
+    boards = board(square_mm=8.0)
+    texture, to_texture = chessboard(boards)
+    T = np.eye(4)
+    T[2, 3] = 200
+    image = cv2.GaussianBlur(photograph(CAMERAS[0], T, texture, to_texture), (0, 0), sigma)
+    corners = opencv_pixels(CAMERAS[0], corner_grid(boards) + [0, 0, 200])
+    # Drawing and differencing add half a pixel in squares; where edges cross, blur hides some of them.
+    assert 0.95 < edge_width_px(image, corners, 9) / (2.563 * np.hypot(sigma, 0.5)) < 1.25
+
+
+def test_blurred_pictures_are_refused_and_named(tmp_path):
+    images = pictures(board())
+    images[1][2] = cv2.GaussianBlur(images[1][2], (0, 0), 4.0)
+    found = find_boards(NAMES, board(videos=write_pictures(tmp_path, images)), quiet)
+    assert 6 in found.blurred["c1"] + found.missed["c1"] and found.blurred["c0"] == []
+    assert np.isnan(found.corners_px[1, 2]).all() and np.isfinite(found.corners_px[0, 2]).all()
+
+
+def test_the_sharper_of_two_frames_is_taken(tmp_path):
+    images = pictures(board(), T_world_board=POSES[:3])
+    path = tmp_path / "c0.mp4"
+    with VideoWriter(path, (640, 480), 24.0, quality_crf=10) as writer:
+        for image in images[0]:
+            writer.write(cv2.blur(image, (9, 1)))
+            writer.write(image)
+    found = find_boards(("c0",), board(videos=(path,)), quiet)
+    assert found.numbers.tolist() == [1, 3, 5]
+
+
+@pytest.mark.parametrize(("cols", "rows"), [(8, 6), (9, 7), (10, 7), (5, 4)])
+def test_a_wrong_corner_count_is_named_with_the_right_one(tmp_path, cols, rows):
+    videos = write_pictures(tmp_path, pictures(board(), T_world_board=POSES[:3]))
+    with pytest.raises(
+        CalibrationError, match=rf"c0: the board has 9 x 6 inner corners, \[boards\] says {cols} x {rows}"
+    ):
+        find_boards(NAMES, board(cols=cols, rows=rows, videos=videos), quiet)
+
+
+def test_pictures_without_a_board_are_refused(tmp_path):
+    rng = np.random.default_rng(1)
+    images = [[rng.integers(80, 120, (480, 640)).astype(np.uint8) for _ in range(2)] for _ in CAMERAS]
+    videos = write_pictures(tmp_path, images)
+    with pytest.raises(CalibrationError, match="camera c0: no chessboard with 9 x 6 inner corners in any of 2"):
+        find_boards(NAMES, board(videos=videos), quiet)
+    about = {"pattern": "charuco", "dictionary": "DICT_4X4_50", "marker_mm": 3.0}
+    with pytest.raises(CalibrationError, match="no charuco of DICT_4X4_50"):
+        find_boards(NAMES, board(**about, videos=videos), quiet)
+
+
+def test_a_clip_cut_short_is_used_and_said(tmp_path):
+    images = pictures(board())
+    images[1] = images[1][:4]
+    found = find_boards(NAMES, board(videos=write_clips(tmp_path, images)), quiet)
+    assert len(found.numbers) == 4
+    assert "different numbers of pictures (c0 12, c1 8)" in found.notes[0]
+
+
+def test_pictures_that_cannot_be_read_are_named(tmp_path):
+    videos = write_pictures(tmp_path, pictures(board(), T_world_board=POSES[:2]))
+    (tmp_path / "c0" / "board_0003.png").write_bytes(b"no picture")
+    with pytest.raises(CaptureError, match=r"board_0003\.png: is not a picture"):
+        find_boards(NAMES, board(videos=videos), quiet)
+    with pytest.raises(CaptureError, match="no picture matches"):
+        find_boards(("c0",), board(videos=(tmp_path / "c1" / "bord_%04d.png",)), quiet)
+    cv2.imwrite(str(tmp_path / "c0" / "board_0003.png"), np.zeros((100, 100), np.uint8))
+    with pytest.raises(CalibrationError, match="is 100 x 100 px, the first picture 640 x 480"):
+        find_boards(NAMES, board(videos=videos), quiet)
+
+
+def test_a_charuco_board_must_be_described():
+    with pytest.raises(ValueError, match="needs dictionary"):
+        Boards(pattern="charuco", cols=9, rows=6, square_mm=5, videos=("a",))
+    with pytest.raises(ValueError, match="must be smaller than square_mm"):
+        board(pattern="charuco", dictionary="DICT_4X4_50", marker_mm=5.0)
+    with pytest.raises(ValueError, match="dictionary"):
+        board(pattern="charuco", dictionary="DICT_9X9_50", marker_mm=3.0)
