@@ -177,23 +177,27 @@ def fit(
 
 def bake(
     model: Annotated[Path, typer.Argument(help="model.npz.", show_default=False)],
-    capture: Annotated[Path, typer.Option(help="The capture: gives the meshes.", show_default=False)],
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the rig.", show_default=False)],
+    capture: CaptureOption = None,
+    upper_teeth: UpperOption = None,
+    lower_teeth: LowerOption = None,
+    mandible: MandibleOption = None,
+    fps: Annotated[float, typer.Option(min=0.001, help="Frames per second of a person without a capture.")] = 24.0,
     table: Annotated[int, typer.Option(help="Knots per axis of the sampled decoder: 17, 33 or 65.")] = 33,
     force: Force = False,
     allow_outside: Outside = False,
     as_json: Json = False,
 ) -> None:
-    """Write the OpenUSD rig of a model."""
+    """Write the OpenUSD rig of a model, with the meshes of a capture or loose scans."""
     from jawusd.formats.model import load_model
-    from jawusd.pipeline.prepare import open_capture
-    from jawusd.pipeline.stages import bake_files
+    from jawusd.pipeline.stages import bake_meshes
 
     refuse_existing(out / "actor.usda", force)
     loaded = load_model(model)
-    opened = open_capture(capture, allow_outside=allow_outside)
+    name = str(loaded.meta.get("actor") or model.stem)
+    subject = subject_given(name, capture, upper_teeth, lower_teeth, mandible, None, allow_outside)
     with progress() as report:
-        files = bake_files(opened, loaded, out, report, table)
+        files = bake_meshes(subject.bones, subject.name, subject.fps or fps, loaded, out, report, table)
     emit({"files": files}, as_json, lambda: [str(path) for path in files])
 
 

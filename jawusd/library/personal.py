@@ -67,45 +67,79 @@ class Expected:
 
 
 @dataclass(frozen=True, eq=False)
+class Learned:
+    """What a library says of itself.
+
+    Attributes:
+        bandwidth_mm: landmark distance over which a person's weight falls by exp(-1/2), inf when all count alike; None
+            when the closest person alone counts.
+        expected: error to be expected; None when the library has a single person.
+    """
+
+    bandwidth_mm: float | None
+    expected: Expected | None
+
+
+@dataclass(frozen=True, eq=False)
 class PersonalMotion:
     """Hold the motion made for a person.
 
     Attributes:
         poses: T_skull_mandible in the frame of the landmarks, the identity with the teeth together, shape (N, 4, 4).
         weights: how much each library person counts; they sum to 1.
-        bandwidth_mm: landmark distance over which the weights fall, inf when all count alike; None with one person.
-        expected: error to be expected; None when the library has a single person.
+        learned: what the weights and the expected error come from.
     """
 
     poses: Array
     weights: dict[str, float]
-    bandwidth_mm: float | None
-    expected: Expected | None
+    learned: Learned
 
 
-def personal_motion(donors: Sequence[Donor], target: Array, *, closest: bool = False) -> PersonalMotion:
-    """Make the motion of a person from landmarks and a library.
+def leave_one_out(donors: Sequence[Donor], *, closest: bool = False) -> Learned:
+    """Predict every person of a library from the others, and choose how fast likeness counts.
 
     Args:
-        donors: the persons of the library, each showing all three movements.
-        target: the person's landmarks with the teeth together [mm], shape (5, 3), in the order of `LANDMARKS`.
-        closest: take the person with the most similar landmarks instead of an average.
+        donors: the persons, by different names.
+        closest: use the person with the most similar landmarks instead of an average.
 
     Raises:
         FittingError: no donors.
     """
     if not donors:
         raise FittingError("the library has no person whose motion could be carried over.")
-    bandwidth, expected = _leave_one_out(donors, closest)
-    weights = _weights(donors, target, bandwidth)
+    if len(donors) < _FEWEST_DONORS:
+        return Learned(None, None)
+    choices: tuple[float | None, ...] = (None,) if closest else BANDWIDTHS_MM
+    errors: list[dict[str, Array]] = [{} for _ in choices]
+    for i, left_out in enumerate(donors):
+        others = [*donors[:i], *donors[i + 1 :]]
+        shares, rest = _captured_shares(left_out, _POSES_LEFT_OUT), left_out.landmarks
+        own = left_out.rig.arrays["landmarks"]
+        truth = transform_points(left_out.rig.pose(left_out.rig.denormalized(shares)), own[None])
+        moved = np.stack([displacements(donor, rest, shares) for donor in others])
+        for found, bandwidth in zip(errors, choices, strict=True):
+            average = np.einsum("j,jkpi->kpi", _weights(others, rest, bandwidth), moved)
+            predicted = transform_points(poses_of_landmarks(rest, rest + average), rest[None])
+            found[left_out.name] = np.linalg.norm(predicted - truth, axis=-1)
+    expected = [Expected(found) for found in errors]
+    best = int(np.argmin([found.pooled().mean() for found in expected]))
+    return Learned(choices[best], expected[best])
+
+
+def personal_motion(donors: Sequence[Donor], target: Array, learned: Learned) -> PersonalMotion:
+    """Make the motion of a person from landmarks and a library.
+
+    Args:
+        donors: the persons of the library, each showing all three movements.
+        target: the person's landmarks with the teeth together [mm], shape (5, 3), in the order of `LANDMARKS`.
+        learned: what `leave_one_out` says of these donors.
+    """
+    weights = _weights(donors, target, learned.bandwidth_mm)
     used = [(donor, weight) for donor, weight in zip(donors, weights, strict=True) if weight > 0]
     shares = np.concatenate([_captured_shares(donor, _POSES // len(used)) for donor, _ in used])
     moved = sum(weight * displacements(donor, target, shares) for donor, weight in used)
     return PersonalMotion(
-        poses_of_landmarks(target, target + moved),
-        {donor.name: float(weight) for donor, weight in used},
-        bandwidth,
-        expected,
+        poses_of_landmarks(target, target + moved), {donor.name: float(weight) for donor, weight in used}, learned
     )
 
 
@@ -124,23 +158,3 @@ def _weights(donors: Sequence[Donor], target: Array, bandwidth_mm: float | None)
     nearness = -0.5 * (distance / bandwidth_mm) ** 2
     weights = np.exp(nearness - nearness.max())
     return weights / weights.sum()
-
-
-def _leave_one_out(donors: Sequence[Donor], closest: bool) -> tuple[float | None, Expected | None]:
-    """Return the bandwidth that predicts the library's persons from each other best, and those errors."""
-    if len(donors) < _FEWEST_DONORS:
-        return None, None
-    choices: tuple[float | None, ...] = (None,) if closest else BANDWIDTHS_MM
-    errors: list[dict[str, Array]] = [{} for _ in choices]
-    for i, left_out in enumerate(donors):
-        others = [*donors[:i], *donors[i + 1 :]]
-        shares, rest = _captured_shares(left_out, _POSES_LEFT_OUT), left_out.landmarks
-        truth = transform_points(left_out.rig.pose(left_out.rig.denormalized(shares)), left_out.rig.arrays["landmarks"])
-        moved = np.stack([displacements(donor, rest, shares) for donor in others])
-        for found, bandwidth in zip(errors, choices, strict=True):
-            average = np.einsum("j,jkpi->kpi", _weights(others, rest, bandwidth), moved)
-            predicted = transform_points(poses_of_landmarks(rest, rest + average), rest)
-            found[left_out.name] = np.linalg.norm(predicted - truth, axis=-1)
-    expected = [Expected(found) for found in errors]
-    best = int(np.argmin([found.pooled().mean() for found in expected]))
-    return choices[best], expected[best]

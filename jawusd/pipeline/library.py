@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 
 from jawusd.errors import EvaluatorError, FormatError, OutputError
 from jawusd.evaluator import JawRig, load
-from jawusd.formats.landmarks import load_landmarks
 from jawusd.formats.model import JawModel, load_model, save_model
 from jawusd.library.index import MODEL_FILE, Library, load_donors, scan_library
-from jawusd.library.personal import PersonalMotion, personal_motion
+from jawusd.library.personal import PersonalMotion, leave_one_out, personal_motion
 from jawusd.pipeline.extras import stage
-from jawusd.pipeline.stages import Progress, fit_subject
+from jawusd.pipeline.stages import Progress
 from jawusd.pipeline.subject import Subject, subject_of_landmarks
 
 Array = NDArray[np.float64]
@@ -119,7 +118,8 @@ def personal_rig(landmarks: Path, library: Library, *, closest: bool, name: str,
     """
     subject = subject_of_landmarks(landmarks, name)
     progress("carry", 0, 1)
-    motion = personal_motion(load_donors(library, load_any_rig), load_landmarks(landmarks).landmarks, closest=closest)
+    donors = load_donors(library, load_any_rig)
+    motion = personal_motion(donors, subject.landmarks, leave_one_out(donors, closest=closest))
     progress("carry", 1, 1)
     model = fit_personal(subject, motion, progress)
     return PersonalRig(model, motion, tuple(entry.path for entry in library.entries if entry.not_shown))
@@ -131,12 +131,20 @@ def fit_personal(subject: Subject, motion: PersonalMotion, progress: Progress) -
     Raises:
         FittingError: see `fitting.fit_model`.
     """
-    frames = np.arange(len(motion.poses))
-    model = fit_subject(subject, (frames, motion.poses), "anchored", progress)
-    expected = motion.expected
+    fitting = stage("jawusd.fitting")
+    model = fitting.fit_model(
+        (np.arange(len(motion.poses)), motion.poses),
+        T_anatomical_skull=subject.T_anatomical_skull,
+        landmarks=subject.landmarks,
+        config=fitting.FittingConfig(holdout_folds=0),  # frames left out are poses of the library, not of this person
+        actor=subject.name,
+        progress=lambda done, total: progress("fit", done, total),
+    )
+    model.meta["inferred"] = list(subject.inferred)
+    expected = motion.learned.expected
     model.meta["personal"] = {
         "weights": motion.weights,
-        "landmark_distance_scale_mm": _finite(motion.bandwidth_mm),
+        "landmark_distance_scale_mm": _finite(motion.learned.bandwidth_mm),
         "expected_error_mm": None if expected is None else expected.summary(),
         "fit_to_carried_motion_mm": model.meta["errors"],
     }
@@ -146,15 +154,17 @@ def fit_personal(subject: Subject, motion: PersonalMotion, progress: Progress) -
     if expected is not None:
         limit = np.maximum(model.arrays["residual_limit_mm"], expected.summary()["mean"])
         model.arrays["residual_limit_mm"] = limit
-    return model
+    # The poses carried over are no take of this person: nothing captured goes into the file.
+    none = np.zeros(0)
+    return replace(model, frames=none.astype(np.int64), d=np.zeros((0, 3)), residual_mm=none, trained=none.astype(bool))
 
 
 def _caution(motion: PersonalMotion) -> str:
     persons = f"{len(motion.weights)} library person{'s' if len(motion.weights) > 1 else ''}"
     start = f"Made from landmarks and {persons}, not from a capture;"
-    if motion.expected is None:
+    if motion.learned.expected is None:
         return f"{start} with a single person in the library the error to be expected cannot be stated."
-    found = motion.expected.summary()
+    found = motion.learned.expected.summary()
     return f"{start} expected error {found['mean']:.2f} mm, 95 % below {found['p95']:.2f} mm (leave-one-out)."
 
 

@@ -14,6 +14,7 @@ from jawusd.errors import FormatError, JawusdError
 from jawusd.evaluator import JawRig
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.capture import Capture
+from jawusd.formats.mesh import Mesh
 from jawusd.formats.model import JawModel
 from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.pipeline.extras import stage
@@ -260,17 +261,37 @@ def bake_files(capture: Capture, model: JawModel, folder: Path, progress: Progre
     Raises:
         RigError, OutputError: the rig cannot be written.
     """
+    return bake_meshes(load_meshes(capture), capture.name, capture.fps, model, folder, progress, table_size)
+
+
+def bake_meshes(
+    meshes: Mapping[str, Mesh],
+    name: str,
+    fps: float,
+    model: JawModel,
+    folder: Path,
+    progress: Progress,
+    table_size: int = 33,
+) -> list[Path]:
+    """Write the rig of a person whose meshes are at hand, with the captured motion if the model has any.
+
+    Args:
+        meshes: by the names of `prepare.MESHES` [mm].
+        name: of the person.
+        fps: frames per second.
+        model, folder, progress, table_size: see `bake_files`.
+
+    Returns:
+        The files written.
+
+    Raises:
+        RigError, OutputError: the rig cannot be written.
+    """
     bake = stage("jawusd.rig.bake")
+    motion = {"frames": model.frames, "d": model.d} if len(model.frames) else {}
     progress("bake", 0, 1)
     files = bake.bake_rig(
-        folder,
-        JawRig(model.arrays, model.meta),
-        load_meshes(capture),
-        name=capture.name,
-        fps=capture.fps,
-        frames=model.frames,
-        d=model.d,
-        table_size=table_size,
+        folder, JawRig(model.arrays, model.meta), meshes, name=name, fps=fps, table_size=table_size, **motion
     )
     progress("bake", 1, 1)
     return files

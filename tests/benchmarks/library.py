@@ -29,7 +29,7 @@ from scipy.signal import find_peaks  # noqa: E402
 from jawusd.evaluator import JawRig  # noqa: E402
 from jawusd.fitting import FittingConfig, fit_model  # noqa: E402
 from jawusd.geometry import landmark_frame, make_transform, rigid_fit, transform_points  # noqa: E402
-from jawusd.library.personal import personal_motion  # noqa: E402
+from jawusd.library.personal import Learned, leave_one_out, personal_motion  # noqa: E402
 from jawusd.library.transport import Donor, landmark_distance_mm  # noqa: E402
 from jawusd.pipeline.library import fit_personal, retarget  # noqa: E402
 from jawusd.pipeline.subject import Subject  # noqa: E402
@@ -63,7 +63,9 @@ class Captured:
     def error(self, poses: np.ndarray) -> np.ndarray:
         """Return the mean vertex distance of poses from the captured ones [mm], shape (FRAMES,)."""
         points = self.person.mandible_points
-        return np.linalg.norm(transform_points(poses, points) - transform_points(self.poses, points), axis=-1).mean(1)
+        return np.linalg.norm(
+            transform_points(poses, points[None]) - transform_points(self.poses, points[None]), axis=-1
+        ).mean(1)
 
     def errors(self, rig: JawRig) -> tuple[np.ndarray, np.ndarray]:
         """Return the errors of a rig made for this person: at equal shares, and of the nearest poses [mm]."""
@@ -85,11 +87,11 @@ class Captured:
         undo = np.linalg.inv(rest)
         return tuple(self.error(to_here @ T @ undo @ back) for T in (at_shares, nearest))
 
-    def rig_from(self, donors: list[Donor], landmarks: np.ndarray, closest: bool = False) -> tuple[JawRig, float]:
-        """Return the rig made from landmarks and other persons, and the mean error it expects [mm]."""
-        motion = personal_motion(donors, landmarks, closest=closest)
+    def rig_from(self, donors: list[Donor], landmarks: np.ndarray, learned: Learned) -> JawRig:
+        """Return the rig made from landmarks and other persons."""
+        motion = personal_motion(donors, landmarks, learned)
         model = fit_personal(Subject("made", landmark_frame(landmarks), landmarks, {}), motion, lambda *_: None)
-        return JawRig(model.arrays, model.meta), motion.expected.summary()["mean"]
+        return JawRig(model.arrays, model.meta)
 
 
 def row(label: str, *columns: np.ndarray) -> None:
@@ -107,13 +109,15 @@ def tabulate(persons: list[Captured], generic: Donor) -> None:
         others = [other.donor for other in persons[:i] + persons[i + 1 :]]
         target = person.donor.landmarks
         alike = min(others, key=lambda donor: landmark_distance_mm(donor.landmarks, target))
-        rig, promised = person.rig_from(others, target)
+        learned, learned_closest = leave_one_out(others), leave_one_out(others, closest=True)
+        promised = learned.expected.summary()["mean"]
+        rig = person.rig_from(others, target, learned)
         picked = target + rng.normal(scale=PICKING_SD_MM, size=target.shape)
         rows = {
             "own rig (floor)": person.errors(person.donor.rig),
             "landmarks, average": person.errors(rig),
-            "landmarks, average, picked 1 mm wrong": person.errors(person.rig_from(others, picked)[0]),
-            "landmarks, closest": person.errors(person.rig_from(others, target, closest=True)[0]),
+            "landmarks, average, picked 1 mm wrong": person.errors(person.rig_from(others, picked, learned)),
+            "landmarks, closest": person.errors(person.rig_from(others, target, learned_closest)),
             "nearest neighbour, rigidly": person.errors_of_other(alike, scaled=False),
             "generic, scaled": person.errors_of_other(generic, scaled=True),
         }
@@ -142,7 +146,8 @@ def sizes(persons: list[Captured]) -> None:
         errors = []
         for i, person in enumerate(persons):
             others = [persons[(i + 1 + k) % len(persons)].donor for k in range(count)]
-            errors.append(person.errors(person.rig_from(others, person.donor.landmarks)[0])[0])
+            rig = person.rig_from(others, person.donor.landmarks, leave_one_out(others))
+            errors.append(person.error(rig.pose(rig.denormalized(person.shares))))
         print(f"  {count:2d}: {np.concatenate(errors).mean():.3f}", flush=True)
 
 
