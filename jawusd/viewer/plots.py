@@ -23,7 +23,7 @@ BLUE, ORANGE, GREEN, VERMILION, GREY = "#0072b2", "#e69f00", "#009e73", "#d55e00
 CURVE_COLORS = (BLUE, VERMILION, GREEN)
 
 _WIDTH, _HEIGHT = 300, 192
-_LEFT, _RIGHT, _TOP, _BOTTOM = 36, 8, 22, 32
+_LEFT, _RIGHT, _TOP, _BOTTOM = 36, 12, 22, 32
 _MOST_POINTS = 300
 _MOST_SAMPLES = 400
 _TEXT = 'font-family="sans-serif" font-size="11" fill="currentColor"'

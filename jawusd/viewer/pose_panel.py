@@ -139,7 +139,8 @@ def slider_ends(limits: object, d_range: object, keep_valid: bool) -> list[tuple
             (_outwards(low, 1), _outwards(high, -1))  # towards each other
             for low, high in limits
         ]
-    return [(float(low - _BEYOND * (high - low)), float(high + _BEYOND * (high - low))) for low, high in d_range]
+    beyond = [(low - _BEYOND * (high - low), high + _BEYOND * (high - low)) for low, high in d_range]
+    return [(_outwards(low, -1), _outwards(high, 1)) for low, high in beyond]
 
 
 def _outwards(value: float, sign: int) -> float:

@@ -133,6 +133,7 @@ class Session:
     def set_keep_valid(self, keep: bool) -> None:
         """Switch whether sliders stay inside; switching it on brings the pose inside."""
         self.keep_valid = bool(keep)
+        self._gesture = None
         if keep and float(self.rig.margin(self.d)) < -ON_BOUND_MM:
             self.set_pose(self.d)
 

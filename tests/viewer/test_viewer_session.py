@@ -43,6 +43,9 @@ def test_sliders_stop_at_the_bound_only_where_asked_to(session):
     session.set_keep_valid(False)
     session.set_parameter(1, 50.0)
     assert session.d[1] == 50.0 and not session.readout().inside
+    session.undo()
+    assert session.d[1] == pytest.approx(high)  # what the switch allows is a step of its own
+    session.redo()
     session.set_keep_valid(True)
     assert session.readout().inside
     np.testing.assert_allclose(session.d, RIG.project([15.0, 50.0, 0.0]), atol=1e-9)

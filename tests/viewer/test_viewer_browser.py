@@ -1,0 +1,245 @@
+"""The real page in headless Chromium: sliders, drag, keys, files; page errors and requests elsewhere fail a test."""
+
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from example_rig import assert_valid_usd
+
+from jawusd.formats.keys import load_keys
+from jawusd.formats.poses import read_parameters
+from jawusd.geometry import matrix_from_wxyz
+from jawusd.rig.motion_read import read_poses_of_stage
+from jawusd.viewer.readouts import landmark_places
+from jawusd.viewer.uploads import MOST_BYTES
+
+# What viser's own page says on its console; nothing here comes from jawusd.
+KNOWN = ("THREE.Clock: This module has been deprecated", "Unable to preventDefault inside passive event listener")
+PATIENCE_S = 120.0  # software GL on a busy machine
+
+
+class Tab:
+    """Drive one open page of a viewer, and keep what its browser complained about."""
+
+    def __init__(self, chromium, viewer):
+        self.viewer, self.complaints, self.elsewhere = viewer, [], []
+        before = set(viewer.pages)
+        self.web = chromium.new_page(viewport={"width": 1200, "height": 720}, accept_downloads=True)
+        self.web.set_default_timeout(1000 * PATIENCE_S)
+        self.web.on("console", self._heard)
+        self.web.on("pageerror", lambda error: self.complaints.append(str(error)))
+        self.web.on("request", self._asked)
+        self.web.goto(viewer.url)
+        self.web.wait_for_selector("text=nearest captured")
+        self.page = viewer.pages[(set(viewer.pages) - before).pop()]
+        self.session = self.page.session
+        until(lambda: self.web.locator(".mantine-Notification-closeButton").count())
+        self.web.locator(".mantine-Notification-closeButton").first.click()  # "Software WebGL" lies over the jaw
+
+    def _heard(self, message):
+        if message.type == "error" and not message.text.startswith(KNOWN):
+            self.complaints.append(message.text)
+
+    def _asked(self, request):
+        if not request.url.startswith((self.viewer.url + "/", "blob:", "data:")):
+            self.elsewhere.append(request.url)
+
+    def type_slider(self, index, value):
+        box = self.web.locator("input.mantine-NumberInput-input:visible").nth(index)
+        box.fill(str(value))
+        box.press("Enter")
+
+    def tab(self, name):
+        self.web.get_by_role("tab", name=name).click()
+
+    def press(self, name):
+        self.web.get_by_role("button", name=name, exact=True).click()
+
+    def said(self, text):
+        self.web.wait_for_selector(f"text={text}")
+
+    def download(self, button, path):
+        self.press(button)
+        with self.web.expect_download() as found:
+            self.web.get_by_role("link").last.click()
+        found.value.save_as(path)
+
+    def pixel(self, place):
+        """Return where a place in anatomical axes [mm] is on the screen."""
+        camera = self.page.client.camera
+        x = matrix_from_wxyz(camera.wxyz).T @ (np.asarray(place) - camera.position)
+        box = self.web.locator("canvas").first.bounding_box()
+        scale = 0.5 * camera.image_height / np.tan(0.5 * camera.fov) / x[2]
+        return box["x"] + 0.5 * box["width"] + scale * x[0], box["y"] + 0.5 * box["height"] + scale * x[1]
+
+    def picture(self, name):
+        """Keep a screenshot where SCREENSHOTS says, as continuous integration does."""
+        if "SCREENSHOTS" in os.environ:
+            self.web.screenshot(path=Path(os.environ["SCREENSHOTS"]) / f"viewer_{name}.png")
+
+
+def until(condition):
+    """Wait until a condition holds."""
+    end = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.05)
+
+
+@pytest.fixture
+def tab(chromium, viewer):
+    opened = Tab(chromium, viewer)
+    yield opened
+    opened.web.close()
+    assert opened.complaints == []
+    assert opened.elsewhere == []
+
+
+def close_to(session, d):
+    return np.allclose(session.d, d, atol=1e-3)
+
+
+def test_sliders_pose_the_jaw_and_their_ends_follow(tab):
+    tab.type_slider(0, 20)
+    until(lambda: close_to(tab.session, [20, 0, 0]))
+    ends = np.ravel([(slider.min, slider.max) for slider in tab.page.pose.sliders[1:]])
+    np.testing.assert_allclose(ends, tab.session.rig.ranges(20.0), atol=0.01)
+    for end in ends:
+        shown = f"{end:.2f}".rstrip("0").rstrip(".")
+        until(lambda shown=shown: tab.web.get_by_text(shown, exact=True).count() > 0)
+    tab.type_slider(1, 100)
+    until(lambda: np.isclose(tab.session.d[1], ends[1], atol=0.011))
+    tab.picture("slider")
+    tab.web.get_by_label("keep valid").click()
+    until(lambda: not tab.session.keep_valid)
+    tab.type_slider(1, 9)
+    tab.said("OUTSIDE the bound")
+    tab.picture("outside")
+    tab.press("undo")
+    until(lambda: np.isclose(tab.session.d[1], ends[1], atol=0.011))
+
+
+def test_dragging_the_incisor_is_inverse_kinematics(tab):
+    tab.type_slider(0, 15)
+    until(lambda: close_to(tab.session, [15, 0, 0]))
+    time.sleep(0.5)  # the page draws the pose
+    rig, start = tab.session.rig, tab.session.d
+    incisor = landmark_places(rig, start)[0]
+    here, there = tab.pixel(incisor), tab.pixel(incisor + [5.0, 0.0, 0.0])
+    held = []
+    drag_to = tab.session.drag_to
+    tab.session.drag_to = lambda p: held.append((tab.session._handle, p)) or drag_to(p)
+    tab.web.mouse.move(*here)
+    tab.web.mouse.down()
+    for share in np.linspace(0.1, 1.0, 10):
+        tab.web.mouse.move(here[0] + share * (there[0] - here[0]), here[1] + share * (there[1] - here[1]))
+        time.sleep(0.06)
+    until(lambda: len(held) > 3)
+    time.sleep(0.3)
+    tab.picture("drag")
+    tab.web.mouse.up()
+    until(lambda: not tab.session.dragging)
+    handle, pointer = held[-1]
+    T = rig.pose(start)
+    asked = rig.arrays["T_anatomical_skull"][:3, :3] @ (pointer - T[:3, :3] @ handle - T[:3, 3])
+    np.testing.assert_allclose(asked, [5.0, 0.0, 0.0], atol=0.6)  # the surface lies nearer to the eye than the incisor
+    found, _ = rig.ik(handle, pointer, start=start)
+    moved = [T[:3, :3] @ handle + T[:3, 3] for T in rig.pose(np.stack([found, tab.session.d]))]
+    assert np.linalg.norm(moved[0] - moved[1]) < 0.1
+    assert tab.session.d[1] > 2.0
+
+
+def test_three_keys_are_exported_saved_and_loaded_again(tab, folder, tmp_path):
+    poses = {0: (2.0, 0.0, 0.0), 12: (16.0, 1.5, 0.0), 30: (6.0, -1.0, 0.5)}
+    for frame, d in poses.items():
+        tab.tab("Pose")
+        for index in (2, 1, 0, 1, 2):
+            tab.type_slider(index, d[index])
+            time.sleep(0.3)
+        until(lambda d=d: close_to(tab.session, d))
+        tab.tab("Animate")
+        tab.page.motion.frame = float(frame)
+        tab.press("set")
+        until(lambda frame=frame: any(key.frame == frame for key in tab.session.work.keys))
+    tab.picture("keys")
+    tab.tab("Files")
+    tab.press("write animation")
+    tab.said("Written")
+    assert_valid_usd(folder / "anim_view.usdc")
+    frames, T = read_poses_of_stage(folder / "anim_view.usdc")
+    rig, at = tab.session.rig, np.linspace(0, 30, 11).astype(int)
+    expected = rig.pose(rig.interpolate(list(poses), list(poses.values()), at))
+    np.testing.assert_allclose(T[np.searchsorted(frames, at)], expected, atol=2e-3)
+    tab.download("save keys.json", tmp_path / "keys.json")
+    saved = load_keys(tmp_path / "keys.json")
+    assert [key.frame for key in saved.keys] == list(poses)
+    np.testing.assert_allclose([key.d for key in saved.keys], list(poses.values()), atol=1e-3)
+    tab.session.set_keys(())
+    tab.page.refresh()
+    tab.web.locator("input[type=file]").set_input_files(tmp_path / "keys.json")
+    until(lambda: tab.session.work.keys == saved.keys)
+
+
+def test_the_baked_motion_plays_goes_round_and_stops(tab):
+    tab.tab("Animate")
+    tab.press("play")
+    tab.said("there is nothing to play")
+    tab.web.locator("input.mantine-Select-input, input.mantine-NativeSelect-input").first.click()
+    tab.web.get_by_role("option").nth(1).click()
+    motion = tab.page.motion
+    until(lambda: motion.clip() is not None and motion.frame == motion.clip().span[0])
+    clip = motion.clip()
+    np.testing.assert_allclose(tab.session.d, clip.d[0], atol=1e-9)
+    shown = []
+    show = motion.player._show
+    motion.player._show = lambda frame: shown.append(frame) or show(frame)
+    tab.press("play")
+    until(lambda: any(after < before for before, after in zip(shown, shown[1:], strict=False)))
+    tab.press("stop")
+    until(lambda: not motion.player.playing)
+    tab.picture("play")
+    first, last = clip.span
+    assert first <= min(shown) and max(shown) <= last
+    np.testing.assert_allclose(tab.session.d, clip.at(motion.frame), atol=1e-9)
+
+
+def test_a_bad_file_is_a_message_and_the_page_lives_on(tab, tmp_path):
+    tab.tab("Files")
+    chooser = tab.web.locator("input[type=file]")
+    bad = tmp_path / "bad.json"
+    bad.write_text('{"fps": 24, "keys": [{"frame": 0}]}')
+    chooser.set_input_files(bad)
+    tab.said("bad.json: keys.0.d")
+    worse = tmp_path / "worse.json"
+    worse.write_bytes(b"\xff\xfe\x00rubbish")
+    chooser.set_input_files(worse)
+    tab.said("not UTF-8")
+    huge = tmp_path / "huge.csv"
+    huge.write_bytes(b"0" * (MOST_BYTES + 1))
+    chooser.set_input_files(huge)
+    tab.said(f"at most {MOST_BYTES} are read")
+    assert tab.page.client.gui._current_file_upload_states == {}
+    good = tmp_path / "walk.csv"
+    good.write_text("frame,d1,d2,d3\n0,1,0,0\n10,9,0,0\n")
+    chooser.set_input_files(good)
+    until(lambda: tab.page.motion.source.value == "walk.csv")
+    tab.download("save CSV of d", tmp_path / "d.csv")
+    frames, d = read_parameters(tmp_path / "d.csv")
+    np.testing.assert_allclose(d[:, 0], 1 + 0.8 * frames)
+
+
+def test_two_pages_do_not_mix(chromium, viewer, tab):
+    other = Tab(chromium, viewer)
+    tab.type_slider(0, 18)
+    until(lambda: close_to(tab.session, [18, 0, 0]))
+    other.type_slider(0, 6)
+    until(lambda: close_to(other.session, [6, 0, 0]))
+    time.sleep(0.5)
+    assert close_to(tab.session, [18, 0, 0]) and tab.page.pose.sliders[0].value == 18
+    boxes = [page.web.locator("input.mantine-NumberInput-input").first.input_value() for page in (tab, other)]
+    assert boxes == ["18", "6"]
+    other.web.close()
+    until(lambda: len(viewer.pages) == 1)
+    assert other.complaints == []
