@@ -157,6 +157,9 @@ class Video:
         if not container.streams.video:
             container.close()
             raise CaptureError("the file holds no video stream.", path=self.path, hint="Check capture.toml.")
+        if container.streams.video[0].codec_context is None:
+            container.close()
+            raise CaptureError("the pictures are in a codec that is not known here.", path=self.path, hint=_REENCODE)
         return container
 
     def _packet_table(

@@ -1,0 +1,148 @@
+"""A capture with boards and no calibration: the build makes one, says so, and keeps it."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from package_copy import ROOT
+from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
+
+from jawusd.cli.main import app
+from jawusd.errors import CalibrationError
+from jawusd.formats.calibration import load_calibration
+from jawusd.geometry import triangulate
+from jawusd.pipeline.build import BuildOptions, build_rig
+from jawusd.pipeline.calibration import calibration_lines
+from jawusd.pipeline.prepare import input_files, load_cameras, open_capture
+from jawusd.pipeline.summary import build_lines
+
+EXAMPLE = ROOT / "examples" / "capture"
+
+
+class Reached(Exception):
+    """Raised to stop a build at a stage."""
+
+
+def stop_at(stage_name, told):
+    """Return a progress function that ends the build when a stage begins."""
+
+    def progress(stage, done, total):
+        told.append((stage, done, total))
+        if stage == stage_name:
+            raise Reached
+
+    return progress
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("example") / "capture"
+    shutil.copytree(EXAMPLE, folder)
+    text = (folder / "capture.toml").read_text()
+    assert 'calibration = "calibration.toml"\n' in text
+    (folder / "capture.toml").write_text(text.replace('calibration = "calibration.toml"\n', ""))
+    (folder / "calibration.toml").unlink()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def calibrated(capture, tmp_path_factory):
+    out = tmp_path_factory.mktemp("build") / "actor"
+    told = []
+    with pytest.raises(Reached):
+        build_rig(capture, out, BuildOptions(), stop_at("track", told))
+    return out, told
+
+
+def test_the_build_calibrates_from_the_boards(calibrated):
+    out, told = calibrated
+    assert ("calibrate", 72, 72) in told
+    record = json.loads((out / "build.json").read_text())["stages"]
+    assert list(record) == ["calibrate", "sync"] and list(record["calibrate"]["outputs"]) == ["calibration.toml"]
+    report = record["calibrate"]["result"]
+    assert all(camera["rms_px"] < 0.3 for camera in report["cameras"].values())
+    assert report["board_shape"]["mean"] < 0.03 and report["scale"]["ratio"] == pytest.approx(1.0, abs=0.015)
+    lines = "\n".join(calibration_lines(report))
+    assert "24 views" in lines and "the teeth confirm" in lines and "advice: camera cam0 uses 24 views" in lines
+
+
+def test_lengths_in_the_mouth_are_those_of_the_true_cameras(calibrated):
+    out, _ = calibrated
+    found, truth = load_calibration(out / "calibration.toml"), load_calibration(EXAMPLE / "calibration.toml")
+    with np.load(EXAMPLE / "truth" / "truth.npz", allow_pickle=False) as archive:
+        centre = archive["T_world_upper"][0][:3, 3]
+    points = centre + np.random.default_rng(0).uniform(-1, 1, (80, 3)) * [28, 14, 20]
+    pixels = np.stack([f.undistort_pixels(t.project(points)) for f, t in zip(found, truth, strict=True)], axis=1)
+    seen = np.array([triangulate([c.projection_matrix() for c in found], views) for views in pixels])
+    i, j = np.triu_indices(len(points), 1)
+    error = np.linalg.norm(seen[i] - seen[j], axis=1) - np.linalg.norm(points[i] - points[j], axis=1)
+    assert np.abs(error).mean() < 0.03
+
+
+def test_a_resumed_build_keeps_the_calibration_until_the_boards_change(capture, calibrated, tmp_path):
+    out = tmp_path / "actor"
+    shutil.copytree(calibrated[0], out)
+    told = []
+    with pytest.raises(Reached):
+        build_rig(capture, out, BuildOptions(resume=True), stop_at("track", told))
+    assert [entry for entry in told if entry[0] == "calibrate"] == [("calibrate", 1, 1)]
+    changed = tmp_path / "changed"
+    shutil.copytree(capture, changed)
+    text = (changed / "capture.toml").read_text()
+    (changed / "capture.toml").write_text(text.replace("square_mm = 8.0", "square_mm = 8.1"))
+    with pytest.raises(Reached):
+        build_rig(changed, out, BuildOptions(resume=True), stop_at("calibrate", []))
+
+
+def test_the_summary_of_a_build_says_what_was_made(calibrated):
+    out, _ = calibrated
+    record = json.loads((out / "build.json").read_text())["stages"]
+    summary = {
+        "calibrate": record["calibrate"]["result"], "sync": record["sync"]["result"], "fit": {}, "reused": [],
+        "seconds": {}, "folder": str(out),
+        "track": {"tracked": 1, "frames": 1, "lost": [], "recovered": 0, "without_a_camera": 0, "prior_aided": 0,
+                  "calibration_rescaled_px": {}, "sigma_mm": {}, "coverage_error_percent": 0.1},
+    }  # fmt: skip
+    assert build_lines(summary)[0] == "the capture names no calibration: made one from its boards"
+    assert not any("calibration" in line for line in build_lines(summary | {"calibrate": None}))
+
+
+def test_a_calibration_of_colmap_is_read_where_the_capture_names_it(capture, tmp_path):
+    folder = tmp_path / "capture"
+    shutil.copytree(capture, folder)
+    truth = load_calibration(EXAMPLE / "calibration.toml")
+    (folder / "model").mkdir()
+    lenses, images = [], []
+    for k, camera in enumerate(truth):
+        K, T = camera.K, camera.T_cam_world
+        x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
+        lens = [K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5, *camera.distortion[:4]]
+        lenses.append(f"{k} OPENCV 1280 720 {' '.join(map(repr, map(float, lens)))}")
+        place = [w, x, y, z, *(T[:3, 3] / 1000)]
+        images += [f"{k} {' '.join(map(repr, map(float, place)))} {k} {camera.name}.png", ""]
+    (folder / "model" / "cameras.txt").write_text("\n".join(lenses))
+    (folder / "model" / "images.txt").write_text("\n".join(images))
+    text = (folder / "capture.toml").read_text()
+    named = 'fps = 24.0\ncalibration = "model"\ncalibration_unit_mm = 1000.0\n'
+    (folder / "capture.toml").write_text(text.replace("fps = 24.0\n", named))
+    opened = open_capture(folder)
+    for found, wanted in zip(load_cameras(opened), truth, strict=True):
+        np.testing.assert_allclose(found.K, wanted.K, atol=1e-9)
+        np.testing.assert_allclose(found.T_cam_world, wanted.T_cam_world, atol=1e-7)
+    assert [path.name for path in input_files(opened, ["calibration"])] == ["cameras.txt", "images.txt"]
+
+
+def test_the_command_refuses_to_overwrite_and_asks_for_boards(capture, tmp_path):
+    (tmp_path / "c.toml").write_text("precious")
+    result = CliRunner().invoke(app, ["calibrate", str(capture), "-o", str(tmp_path / "c.toml")])
+    assert result.exit_code != 0 and (tmp_path / "c.toml").read_text() == "precious"
+    folder = tmp_path / "capture"
+    shutil.copytree(capture, folder)
+    text = (folder / "capture.toml").read_text()
+    first, last = text.index("[boards]"), text.index("[sync]")
+    (folder / "capture.toml").write_text(text[:first] + text[last:])
+    result = CliRunner().invoke(app, ["calibrate", str(folder), "-o", str(tmp_path / "new.toml")])
+    assert isinstance(result.exception, CalibrationError) and "has no [boards]" in str(result.exception)
+    assert not (tmp_path / "new.toml").exists()
