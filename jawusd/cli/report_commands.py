@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -23,6 +23,9 @@ from jawusd.cli.subject_options import (
     subject_given,
     trajectory_options,
 )
+
+if TYPE_CHECKING:
+    from jawusd.pipeline.trajectories import TrajectoryOptions
 
 
 def register(app: typer.Typer) -> None:
@@ -57,26 +60,55 @@ def report(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
-    """Repeat the paper's experiments on a take: figures (PNG, SVG) and a table (CSV)."""
-    from jawusd.pipeline.experiments import experiment_files, experiment_lines, report_experiments
+    """Write report.html of a finished build anew; or repeat the paper's experiments on a take (figures and table)."""
+    options = trajectory_options(columns, length_unit, invert, rest_frame, group)
+    given = (capture, upper_teeth, lower_teeth, mandible, landmarks)
+    if not experiments:
+        if not source.is_dir():
+            raise typer.BadParameter("poses have no report: add --experiments for the paper's experiments on them.")
+        _report_build(source, capture, None, allow_outside, as_json)
+        return
+    if out is None and not source.is_dir():
+        raise typer.BadParameter("name the folder of the figures with -o.", param_hint="--out")
+    _report_experiments(source, out, given, options, starts, force, allow_outside, as_json)
+
+
+def _report_build(folder: Path, capture: Path | None, found: Any, allow_outside: bool, as_json: bool) -> None:
+    from jawusd.pipeline.report import report_build
+
+    with progress() as tell:
+        summary = report_build(folder, capture, tell, found, allow_outside=allow_outside)
+    emit(summary, as_json, lambda: [summary["file"]])
+
+
+def _report_experiments(
+    source: Path,
+    out: Path | None,
+    given: tuple[Path | None, ...],
+    options: TrajectoryOptions,
+    starts: int,
+    force: bool,
+    allow_outside: bool,
+    as_json: bool,
+) -> None:
+    from jawusd.pipeline.experiments import do_experiments, draw_experiments, experiment_files, experiment_lines
+    from jawusd.pipeline.report import fitted_poses, is_build, report_build
     from jawusd.pipeline.stages import about, read_motion
     from jawusd.pipeline.subject import subject_of_build
 
-    if not experiments:
-        raise typer.BadParameter("add --experiments: figures and table of the paper's experiments.")
-    if out is None and not source.is_dir():
-        raise typer.BadParameter("name the folder of the figures with -o.", param_hint="--out")
     folder = out or source / "experiments"
     for path in experiment_files(folder):
         refuse_existing(path, force)
-    options = trajectory_options(columns, length_unit, invert, rest_frame, group)
-    given = (capture, upper_teeth, lower_teeth, mandible, landmarks)
-    poses = source / "tracks.npz" if source.is_dir() else source
+    poses = fitted_poses(source) if source.is_dir() else source
     motion = read_motion(poses, options)
     if source.is_dir() and not any(given):
         subject = subject_of_build(source)
     else:
         subject = subject_given(source.stem, *given, allow_outside)
     with progress() as tell, about(poses):
-        summary = report_experiments(subject, motion, folder, starts, tell)
+        found = do_experiments(subject, motion, starts, tell)
+        summary = draw_experiments(found, folder)
+        if is_build(source):
+            page = report_build(source, given[0], tell, found, allow_outside=allow_outside)
+            summary["files"].append(Path(page["file"]))
     emit(summary, as_json, lambda: experiment_lines(summary))

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from jawusd.evaluator.models import JawModelForm
 from jawusd.fitting.data import Anatomy, TrainingData
-from jawusd.formats.experiments import CondylePath, Distances
+from jawusd.formats.experiments import CondylePath, Distances, ParameterPath
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import se3_exp, se3_log, transform_points
 
@@ -19,6 +19,7 @@ PRINCIPAL = "principal component 1"
 _STEPS = 121
 _SHOWN_OPENINGS = (0.0, 1 / 3, 2 / 3, 1.0)  # of the path at which the condyle's outline is drawn: four, as the paper
 _AROUND_MM = 24.0  # of the outlines about the closed condyle
+_NEAR_CLOSED_MM = 5.0
 _HABITUAL_MM = 1.5  # captured poses with |d2| and |d3| below this belong to plain opening
 _BESIDE_MM = 0.75  # captured condyles this near in z say how high the eminence lets a condyle go
 _FEWEST_BESIDE = 3
@@ -42,6 +43,28 @@ def condyle_paths(
     sweeps |= {name: model.motion(d) for name, model in models.items()}
     bone = None if mandible is None else Mesh(anatomy.at_rest(mandible.vertices), mandible.faces)
     return [_path(name, motion, data, bone) for name, motion in sweeps.items()]
+
+
+def parameter_paths(data: TrainingData, models: dict[str, JawModelForm], captured: Array) -> tuple[ParameterPath, ...]:
+    """Sweep each parameter of each model alone, from the closed bite through what was captured.
+
+    Args:
+        data: the captured poses.
+        models: decoders by name.
+        captured: parameters of the captured poses in the default model [mm], shape (N, 3).
+    """
+    found = []
+    # The other parameters stay zero: only what was captured with the teeth nearly together can be reached so.
+    near = captured[captured[:, 0] < _NEAR_CLOSED_MM]
+    for name, model in models.items():
+        for axis in range(3):
+            d = np.zeros((_STEPS, 3))
+            shown = near if axis and len(near) else captured
+            low, high = np.percentile(shown[:, axis], [0.5, 99.5])
+            d[:, axis] = np.linspace(min(low, 0.0) if axis else 0.0, max(high, 0.0), _STEPS)
+            points = transform_points(model.motion(d), data.landmarks[3])
+            found.append(ParameterPath(name, axis, d[:, axis], points))
+    return tuple(found)
 
 
 def principal_opening(data: TrainingData) -> Array:

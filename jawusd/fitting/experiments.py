@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jawusd.errors import FittingError
-from jawusd.fitting.condyle_paths import condyle_paths, path_distances, sagittal_section
+from jawusd.fitting.condyle_paths import condyle_paths, parameter_paths, path_distances, sagittal_section
 from jawusd.fitting.config import FittingConfig
 from jawusd.fitting.coverage import missing_movements, shown_parameters
 from jawusd.fitting.data import Anatomy, TrainingData, select_poses, select_tracks
@@ -35,7 +35,9 @@ MODELS: dict[str, dict] = {
     "anchored": {"method": "anchored"},
     "pca": {"method": "pca"},
 }
-DEFAULT = "anchored"
+DEFAULT, LINEAR = "anchored", "pca"
+#: Models that take seconds, for `quick`.
+QUICK = ("additive", DEFAULT, LINEAR)
 RECONSTRUCTION, SYNTHESIS = "reconstruction", "synthesis"
 
 _LARGEST = "largest vertex distance"
@@ -66,6 +68,7 @@ def run_experiments(
     bones: Mapping[str, Mesh] | None = None,
     config: FittingConfig = FittingConfig(),  # noqa: B008 - frozen
     actor: str = "",
+    quick: bool = False,
     progress: Progress | None = None,
 ) -> Experiments:
     """Do the paper's experiments on a take.
@@ -77,6 +80,7 @@ def run_experiments(
         bones: meshes "mandible" and "skull" for outlines, scan frame [mm]; either may be missing.
         config: starts and seed of the networks, trimming, alpha, folds; the method is not looked at.
         actor: whose jaw.
+        quick: leave out the networks and the paper's model, and draw random poses of the default model alone.
         progress: told of the steps done.
 
     Returns:
@@ -85,13 +89,13 @@ def run_experiments(
     Raises:
         FittingError: too few poses or no motion.
     """
-    tell, steps = progress or (lambda done, total: None), len(MODELS) + COMPONENTS
+    wanted = QUICK if quick else tuple(MODELS)
+    tell, steps = progress or (lambda done, total: None), len(wanted) + (0 if quick else COMPONENTS)
     selection = select_tracks(source, anatomy) if isinstance(source, Tracks) else select_poses(*source, anatomy)
     data, bones = selection.data, bones or {}
     shown, sentences = shown_parameters(data)
-    fitted = _fit_all(data, shown, config, lambda done: tell(done, steps))
-    paper = fitted.forms.get("paper")
-    nets = _networks(data, config, paper, lambda done: tell(len(MODELS) + done, steps))
+    fitted = _fit_all(data, shown, wanted, config, lambda done: tell(done, steps))
+    nets = [] if quick else _networks(data, config, fitted.forms.get("paper"), lambda d: tell(len(wanted) + d, steps))
     captured = np.stack([transform_points(data.motion, centre) for centre in data.landmarks[3:]])
     d, kept = fitted.d[DEFAULT], fitted.d[DEFAULT][fitted.forms[DEFAULT].kept]
     swept = {name: fitted.forms[name].model for name in ("paper", DEFAULT) if name in fitted.forms}
@@ -99,7 +103,10 @@ def run_experiments(
     paths = condyle_paths(data, swept, widest, bones.get("mandible"), anatomy)
     bounds = {name: Bounds.of(d[fitted.forms[name].kept], config.alpha) for name, d in fitted.d.items()}
     distances = path_distances(paths, captured, d)
-    distances += _reconstruction(data, fitted, nets) + _synthesis(data, fitted, bounds, config)
+    drawn = {name: bounds[name] for name in bounds if name == DEFAULT or not quick}
+    distances += _reconstruction(data, fitted, nets) + _synthesis(data, fitted, drawn, config)
+    compared = {name: fitted.forms[name].model for name in (LINEAR, DEFAULT) if name in fitted.forms}
+    tell(steps, steps)
     lacking = (*sentences, *missing_movements(kept, shown))
     return Experiments(
         actor=actor,
@@ -110,16 +117,19 @@ def run_experiments(
         distances=tuple(distances),
         coverage=_coverage(kept, bounds[DEFAULT], lacking),
         notes=fitted.notes,
+        parameter_paths=parameter_paths(data, compared, kept),
     )
 
 
-def _fit_all(data: TrainingData, shown: Mask, config: FittingConfig, tell: Callable[[int], None]) -> _Fitted:
+def _fit_all(
+    data: TrainingData, shown: Mask, wanted: tuple[str, ...], config: FittingConfig, tell: Callable[[int], None]
+) -> _Fitted:
     forms, codes, nearest, notes, nets = {}, {}, {}, [], {}
-    for step, (name, choice) in enumerate(MODELS.items()):
+    for step, name in enumerate(wanted):
         tell(step)
         start = time.perf_counter()
         try:
-            form = _fit(data, shown, replace(config, **choice), nets)
+            form = _fit(data, shown, replace(config, **MODELS[name]), nets)
         except FittingError as error:
             if name == DEFAULT:
                 raise
@@ -185,7 +195,8 @@ def _synthesis(
     folds = max(config.holdout_folds, 2)
     reference = captured_reference(data.metric, data.motion, folds)
     found = [Distances(SYNTHESIS, "captured hold-out poses", f"{folds} contiguous parts", reference)]
-    for name, form in fitted.forms.items():
+    for name in bounds:
+        form = fitted.forms[name]
         for bound, d in bounds[name].draw(np.random.default_rng(config.seed)).items():
             if len(d):
                 distance = distance_to_nearest(data.metric, form.model.motion(d), data.motion)

@@ -61,6 +61,23 @@ class CondylePath:
 
 
 @dataclass(frozen=True, eq=False)
+class ParameterPath:
+    """Hold where the left condyle goes when one parameter of a model moves alone, anatomical frame.
+
+    Attributes:
+        model: whose.
+        parameter: 0 opening, 1 laterotrusion, 2 protrusion.
+        values_mm: of the parameter [mm], shape (K,).
+        points: centre of the left condyle [mm], shape (K, 3).
+    """
+
+    model: str
+    parameter: int
+    values_mm: Array
+    points: Array
+
+
+@dataclass(frozen=True, eq=False)
 class Coverage:
     """Show which part of the envelope was captured, in the parameters d of the default model.
 
@@ -94,7 +111,8 @@ class Experiments:
         condyle_paths: one per model.
         distances: everything measured, in the order of the table.
         coverage: captured part of the envelope.
-        notes: how long each model took and how many frames it left out; models that could not be fitted, and why.
+        notes: how many frames each model left out; models that could not be fitted, and why; what was not asked for.
+        parameter_paths: of the linear and the default model, for each parameter.
     """
 
     actor: str
@@ -105,6 +123,7 @@ class Experiments:
     distances: tuple[Distances, ...]
     coverage: Coverage
     notes: tuple[str, ...]
+    parameter_paths: tuple[ParameterPath, ...] = ()
 
     def of(self, experiment: str) -> list[Distances]:
         """Return the distances of one experiment."""

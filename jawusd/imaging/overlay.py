@@ -19,7 +19,7 @@ from jawusd.imaging.meshio import GUM, tooth_labels
 from jawusd.imaging.raster import draw_depth_labels
 from jawusd.imaging.video import Video
 
-__all__ = ["PlacedScan", "contact_sheet", "draw_overlay", "save_png", "tracking_sheet"]
+__all__ = ["PlacedScan", "contact_sheet", "draw_overlay", "encode_jpeg", "save_png", "tracking_sheet"]
 
 UPPER_COLOUR = (255, 170, 0)
 LOWER_COLOUR = (0, 200, 255)
@@ -147,6 +147,11 @@ def save_png(path: str | os.PathLike[str], image: NDArray[np.uint8]) -> None:
         OutputError: the file cannot be written.
     """
     write_bytes_atomic(path, cv2.imencode(".png", image[..., ::-1])[1].tobytes())
+
+
+def encode_jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
+    """Return an RGB picture (h, w, 3) as a JPEG file; quality 0 .. 100."""
+    return cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
 
 
 def _points(camera: Camera, scan: PlacedScan) -> NDArray[np.float32]:

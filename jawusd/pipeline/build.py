@@ -15,9 +15,12 @@ from jawusd.formats.model import load_model, save_model
 from jawusd.formats.tracks import load_tracks, save_tracks
 from jawusd.pipeline.calibration import calibrate_boards
 from jawusd.pipeline.prepare import input_files, open_capture
+from jawusd.pipeline.report import BuildFacts, missing_packages, where, write_build_report
 from jawusd.pipeline.stages import aid_teeth, bake_files, fit_jaw, sync_cameras, track_teeth, write_take
 from jawusd.pipeline.state import (
     BUILD_FILE,
+    CALIBRATION,
+    FIRST_PASS,
     LOCK_FILE,
     BuildState,
     Progress,
@@ -27,9 +30,6 @@ from jawusd.pipeline.state import (
     locked,
 )
 from jawusd.pipeline.summary import fit_summary, track_summary
-
-CALIBRATION = "calibration.toml"  # made from the boards when the capture names none
-FIRST_PASS = "first_pass.npz"  # tracks without the model's help: what the model is fitted to
 
 
 @dataclass(frozen=True)
@@ -129,18 +129,21 @@ class _Build:
             lambda: self._aid(sync.result["offsets"]),
         )
         bake = self._stage("bake", hash_value([fit.outputs, aid.outputs, track.inputs, __version__]), self._bake)
+        missing = missing_packages()
+        inputs = hash_value([bake.outputs, bake.inputs, missing, __version__])
+        report = self._stage("report", inputs, lambda: self._report(missing))
+        finished = [*([calibrate] if calibrate else []), track, fit, aid, bake, report]
         return {
             "capture": capture.name,
             "folder": str(self.folder),
-            "files": sorted(
-                {*(calibrate.outputs if calibrate else ()), *track.outputs, *fit.outputs, *aid.outputs, *bake.outputs}
-            ),
+            "files": sorted({name for record in finished for name in record.outputs}),
             "seconds": {name: record.seconds for name, record in self.state.stages.items()},
             "reused": self.reused,
             "calibrate": calibrate.result if calibrate else None,
             "sync": sync.result,
             "track": aid.result,
             "fit": fit.result,
+            "report": report.result,
         }
 
     def _inputs(self, parts: Iterable[str], *values: object) -> str:
@@ -201,3 +204,11 @@ class _Build:
         files = bake_files(self.capture, load_model(self.folder / "model.npz"), self.folder, self.progress)
         take = write_take(self.capture, load_tracks(self.folder / "tracks.npz"), self.folder)
         return [*files, *take], {}
+
+    def _report(self, missing: str | None) -> tuple[list[Path], dict]:
+        place = where(self.capture, self.folder)
+        if missing is not None:
+            # The rig is complete without; the summary says what is missing and how to get it.
+            return [], {"capture": place, "missing": missing}
+        path = write_build_report(self.folder, BuildFacts(self.state.stages, self.capture), self.progress)
+        return [path], {"capture": place, "file": path.name}

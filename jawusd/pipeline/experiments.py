@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from jawusd.formats.experiments import save_table
+from jawusd.formats.experiments import Experiments, save_table
 from jawusd.pipeline.extras import stage
 from jawusd.pipeline.stages import Motion
 from jawusd.pipeline.state import Progress
@@ -31,18 +31,46 @@ def report_experiments(subject: Subject, motion: Motion, folder: Path, starts: i
         MissingDependencyError: matplotlib is not installed.
         OutputError: a file cannot be written.
     """
-    figures = stage("jawusd.report.figures")  # before minutes of computing: it may not be installed
+    stage("jawusd.report.figures")  # before minutes of computing: it may not be installed
+    return draw_experiments(do_experiments(subject, motion, starts, progress), folder)
+
+
+def do_experiments(
+    subject: Subject, motion: Motion, starts: int, progress: Progress, *, quick: bool = False
+) -> Experiments:
+    """Do the paper's experiments.
+
+    Args:
+        subject: whose jaw.
+        motion: tracks or poses.
+        starts: random starts of the paper's networks.
+        progress: told of the work.
+        quick: leave out what takes minutes: the networks and the paper's model.
+
+    Raises:
+        FittingError: the poses cannot carry a model.
+    """
     experiments, fitting = stage("jawusd.fitting.experiments"), stage("jawusd.fitting")
     data = stage("jawusd.fitting.data")
     anatomy = data.Anatomy.of(subject.T_anatomical_skull, subject.landmarks, subject.measured_points(), subject.T_rest)
-    found = experiments.run_experiments(
+    return experiments.run_experiments(
         motion,
         anatomy,
         bones=subject.bones,
         config=fitting.FittingConfig(starts=starts),
         actor=subject.name,
+        quick=quick,
         progress=lambda done, total: progress("experiments", done, total),
     )
+
+
+def draw_experiments(found: Experiments, folder: Path) -> dict:
+    """Write the figures and the table of the experiments; returns what `report_experiments` does.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    figures = stage("jawusd.report.figures")
     files = figures.draw_experiments(found, folder)
     table = found.table()
     save_table(folder / TABLE_FILE, table)

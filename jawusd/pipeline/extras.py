@@ -10,10 +10,11 @@ from jawusd.errors import MissingDependencyError
 _EXTRA_OF = {
     "jawusd.imaging": "build",
     "jawusd.capture": "build",
+    "jawusd.segmentation": "build",
     "jawusd.tracking": "build",
     "jawusd.fitting": "build",
     "jawusd.rig": "build",
-    "jawusd.report": "report",
+    "jawusd.report": "build",
     "jawusd.synthetic": "demo",
     "jawusd.viewer": "view",
 }

@@ -17,6 +17,8 @@ from jawusd.formats.npz import check_format
 FAMILY, VERSION = "jawusd-build", 1
 BUILD_FILE = "build.json"
 LOCK_FILE = ".jawusd-lock"
+CALIBRATION = "calibration.toml"  # made from the boards when the capture names none
+FIRST_PASS = "first_pass.npz"  # tracks without the model's help: what the model is fitted to
 _CHUNK_BYTES = 1 << 20
 
 #: Called with (stage, done, total) as work proceeds; total is 0 when unknown.

@@ -92,4 +92,6 @@ def build_lines(summary: dict) -> list[str]:
         f"{name} {'kept' if name in summary['reused'] else f'{value:.1f} s'}"
         for name, value in summary["seconds"].items()
     )
-    return [*lines, f"time: {seconds}", f"rig: {summary['folder']}/actor.usda"]
+    report = summary["report"]
+    shown = f"{summary['folder']}/{report['file']}" if "file" in report else f"none: {report['missing']}"
+    return [*lines, f"time: {seconds}", f"rig: {summary['folder']}/actor.usda", f"report: {shown}"]

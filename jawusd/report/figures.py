@@ -10,7 +10,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from jawusd.formats.experiments import CondylePath, Coverage, Distances, Experiments
+from jawusd.formats.experiments import CondylePath, Coverage, Distances, Experiments, ParameterPath
 from jawusd.report.style import BLACK, BLUE, GREEN, GREY, ORANGE, PALE, SKY, VERMILION, new_figure, save_figure
 
 Array = NDArray[np.float64]
@@ -22,6 +22,8 @@ _BINS = 40
 _SCALE_QUANTILE = 0.8  # of the models' 95 % quantiles: where the axis of all histograms ends
 _BONES_MM, _CLOSE_MM = 12.0, 1.5  # shown around the paths
 _FEW_MM = 1.0  # the smallest range of a histogram
+_MANY = 2500  # points; more of them are drawn as a picture, or the drawing grows to megabytes
+_MOVES = ("opening d1", "laterotrusion d2", "protrusion d3")
 
 
 def draw_experiments(found: Experiments, folder: Path) -> list[Path]:
@@ -68,12 +70,12 @@ def condyle_figure(found: Experiments) -> Figure:
         axes[row * len(paths)].set_ylabel("up [mm]")
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
-    figure.suptitle(f"{found.actor}: path of the left condyle when the jaw opens, sagittal plane, front on the right")
+    figure.suptitle(f"{found.actor}: path of the left condyle when the jaw opens\nsagittal plane, front on the right")
     return figure
 
 
 def _draw_path(axis: Axes, path: CondylePath, captured: Array) -> None:
-    axis.plot(captured[:, 2], captured[:, 1], ".", ms=3, color=GREY, alpha=0.5, label="captured condyle centres")
+    _draw_points(axis, captured[:, [2, 1]], GREY, "captured condyle centres")
     axis.plot(path.points[0, :, 2], path.points[0, :, 1], color=VERMILION, lw=2, label="opening of the model")
     marks = np.linspace(0, len(path.opening_mm) - 1, len(_HEADS)).round().astype(int)
     for color, k in zip(_HEADS, marks, strict=True):
@@ -90,6 +92,47 @@ def _frame(axis: Axes, found: Experiments, around_mm: float) -> None:
     axis.set_ylim(middle[1] - half, middle[1] + half)
     axis.set_box_aspect(1)
     axis.locator_params(nbins=6)
+
+
+def parameter_figure(found: Experiments) -> Figure:
+    """Draw where the left condyle goes when each parameter moves alone: the linear model against the default one.
+
+    After paper Figs. 5 and 6; above seen from the side, below from above, one column per parameter.
+    """
+    figure, axes = new_figure(11.0, 7.6, 2, 3)
+    captured = found.captured_condyles[0]
+    # (horizontal, vertical) coordinate of each row, and what the axes are called
+    views = (((2, 1), "forward [mm]", "up [mm]"), ((0, 2), "to the left [mm]", "forward [mm]"))
+    for row, ((h, v), across, along) in enumerate(views):
+        for column in range(3):
+            axis = axes[3 * row + column]
+            _draw_points(axis, captured[:, [h, v]], GREY, "captured condyle centres")
+            for path in found.parameter_paths:
+                if path.parameter == column:
+                    _draw_parameter(axis, path, h, v)
+            axis.set_aspect("equal", adjustable="datalim")
+            axis.set_xlabel(across)
+        axes[3 * row].set_ylabel(along)
+    for column, name in enumerate(_MOVES):
+        swept = [path.values_mm for path in found.parameter_paths if path.parameter == column]
+        if swept:
+            axes[column].set_title(f"{name}, {swept[0].min():.0f} to {swept[0].max():.0f} mm")
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
+    figure.suptitle("left condyle while one parameter moves alone; above: from the side, below: from above")
+    return figure
+
+
+def _draw_parameter(axis: Axes, path: ParameterPath, h: int, v: int) -> None:
+    linear = path.model == "pca"
+    label = "linear model (PCA)" if linear else f"{path.model} model"
+    color, style = (BLUE, "--") if linear else (VERMILION, "-")
+    axis.plot(path.points[:, h], path.points[:, v], style, color=color, lw=2, label=label)
+    axis.plot(path.points[-1, h], path.points[-1, v], "o", ms=5, color=color)
+
+
+def _draw_points(axis: Axes, points: Array, color: str, label: str) -> None:
+    axis.plot(*points.T, ".", ms=3, color=color, alpha=0.5, label=label, rasterized=len(points) > _MANY)
 
 
 def reconstruction_figure(found: Experiments) -> Figure:
@@ -110,6 +153,7 @@ def synthesis_figure(found: Experiments) -> Figure:
 def _histograms(
     samples: list[Distances], title: str, labels: list[str], columns: int, reference: Distances | None
 ) -> Figure:
+    columns = min(columns, len(samples))
     rows = -(-len(samples) // columns)
     figure, axes = new_figure(11.0, 1.9 * rows + 0.6, rows, columns, sharex=True, sharey=True)
     # One scale for all; the long tail of one model must not squeeze the others, so what lies beyond is counted.
@@ -146,7 +190,7 @@ def coverage_figure(coverage: Coverage, actor: str) -> Figure:
     figure, axes = new_figure(10.0, 5.0, 1, 2)
     names = ("laterotrusion d2 [mm], + to the left", "protrusion d3 [mm], + forward")
     for index, axis in enumerate(axes):
-        axis.plot(coverage.d[:, 0], coverage.d[:, index + 1], ".", ms=3, color=BLUE, alpha=0.5, label="captured")
+        _draw_points(axis, coverage.d[:, [0, index + 1]], BLUE, "captured")
         for number, ring in enumerate(coverage.outlines[index]):
             closed = np.concatenate([ring, ring[:1]])
             axis.plot(*closed.T, color=GREEN, lw=1.2, ls="--", label="alpha shape" if number == 0 else None)

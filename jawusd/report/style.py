@@ -15,7 +15,8 @@ from jawusd.formats.atomic import write_bytes_atomic
 BLACK, ORANGE, SKY, GREEN, BLUE, VERMILION = "#000000", "#E69F00", "#56B4E9", "#009E73", "#0072B2", "#D55E00"
 GREY, PALE = "#777777", "#C8C8C8"
 
-_SETTINGS = {
+#: What figures are made and saved with.
+SETTINGS = {
     "font.size": 9,
     "axes.titlesize": 9,
     "axes.spines.top": False,
@@ -36,7 +37,7 @@ def new_figure(
         rows, columns: of axes.
         options: of `Figure.subplots`.
     """
-    with matplotlib.rc_context(_SETTINGS):
+    with matplotlib.rc_context(SETTINGS):
         figure = Figure(figsize=(width_in, height_in), layout="constrained")
         axes = figure.subplots(rows, columns, squeeze=False, **options)
     return figure, list(axes.ravel())
@@ -49,7 +50,7 @@ def save_figure(figure: Figure, folder: Path, name: str) -> list[Path]:
         OutputError: a file cannot be written.
     """
     files = []
-    with matplotlib.rc_context(_SETTINGS):
+    with matplotlib.rc_context(SETTINGS):
         for suffix, metadata in (("png", {"Software": None}), ("svg", {"Date": None})):
             drawn = io.BytesIO()
             figure.savefig(drawn, format=suffix, dpi=_DPI, metadata=metadata)

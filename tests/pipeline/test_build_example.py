@@ -115,7 +115,7 @@ def test_a_second_build_needs_a_word_and_resume_reuses_everything(built):
     with pytest.raises(OutputError, match="--resume"):
         build_rig(EXAMPLE, out, BuildOptions(), quiet)
     again = build_rig(EXAMPLE, out, BuildOptions(resume=True), quiet)
-    assert again["reused"] == ["sync", "track", "fit", "aid", "bake"]
+    assert again["reused"] == ["sync", "track", "fit", "aid", "bake", "report"]
 
 
 def test_resume_redoes_only_what_depends_on_a_change(built, tmp_path):
@@ -265,5 +265,5 @@ def test_build_json_names_every_file_with_its_hash(built):
     out, summary = built
     record = json.loads((out / "build.json").read_text())["stages"]
     listed = {name for stage in record.values() for name in stage["outputs"]}
-    expected = {"actor.usda", "tracks.npz", "model.npz", "actor.onnx", "cameras.usda"}
+    expected = {"actor.usda", "tracks.npz", "model.npz", "actor.onnx", "cameras.usda", "report.html"}
     assert listed == set(summary["files"]) and expected <= listed

@@ -1,0 +1,252 @@
+"""Gather what a build found, and write its report."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import TypeVar
+
+from jawusd import __version__
+from jawusd.errors import FormatError, JawusdError, MissingDependencyError
+from jawusd.formats.capture import Capture
+from jawusd.formats.experiments import Experiments
+from jawusd.formats.model import load_model
+from jawusd.formats.report import CameraFacts, Overlay, ReportData, RigFacts
+from jawusd.formats.tracks import Tracks, load_tracks
+from jawusd.pipeline.experiments import do_experiments
+from jawusd.pipeline.extras import stage
+from jawusd.pipeline.prepare import load_cameras, open_capture
+from jawusd.pipeline.report_media import draw_worst_frames, replay_parts
+from jawusd.pipeline.state import BUILD_FILE, CALIBRATION, FIRST_PASS, BuildState, Progress, StageRecord, locked
+from jawusd.pipeline.subject import subject_of_build
+
+T = TypeVar("T")
+
+REPORT_FILE = "report.html"
+_PACKAGES = ("numpy", "scipy", "numba", "usd-core", "opencv-contrib-python-headless")
+_NETWORKS = (
+    "The paper's own models (NLPCA) take about a minute to train: `jawusd report DIR --experiments` adds them to the "
+    "figures."
+)
+
+
+@dataclass(frozen=True)
+class BuildFacts:
+    """Say what a finished build left behind.
+
+    Attributes:
+        stages: record of each stage.
+        capture: the capture it was made from, None where it is not at hand.
+        why_not: why there is no capture.
+    """
+
+    stages: Mapping[str, StageRecord]
+    capture: Capture | None
+    why_not: str = ""
+
+
+def write_build_report(
+    folder: Path, facts: BuildFacts, progress: Progress, experiments: Experiments | None = None
+) -> Path:
+    """Write report.html of a finished build.
+
+    Args:
+        folder: of the rig.
+        facts: what the build left behind.
+        progress: told of the work.
+        experiments: already done in full; without them those that take seconds are done.
+
+    Returns:
+        The file.
+
+    Raises:
+        MissingDependencyError: matplotlib or jinja2 is not installed.
+        FormatError, RigError: a file of the build is damaged.
+        OutputError: the file cannot be written.
+    """
+    document = stage("jawusd.report.document")  # before the work: it may not be installed
+    progress("report", 0, 4)
+    left_out: list[str] = []
+    tracks, model = load_tracks(folder / "tracks.npz"), load_model(folder / "model.npz")
+    subject = subject_of_build(folder)
+    if experiments is None:
+        experiments = _attempt(
+            "experiments",
+            left_out,
+            lambda: do_experiments(subject, load_tracks(fitted_poses(folder)), 1, lambda *_: None, quick=True),
+        )
+        left_out.append(_NETWORKS)
+    progress("report", 1, 4)
+    overlays = _attempt("pictures of the footage", left_out, lambda: _overlays(facts, tracks)) or ()
+    progress("report", 2, 4)
+    sync = facts.stages["sync"].result if "sync" in facts.stages else {}
+    data = ReportData(
+        actor=subject.name,
+        tracks=tracks,
+        model=model,
+        sync=sync,
+        cameras=_attempt("cameras", left_out, lambda: _cameras(facts)) or (),
+        inferred=tuple(model.meta.get("inferred", ())),
+        seconds={name: record.seconds for name, record in facts.stages.items() if name != "report"},
+        hashes=_hashes(facts.stages),
+        versions=_versions(),
+        rig=_rig_facts(folder),
+        experiments=experiments,
+        overlays=overlays,
+        parts=_attempt("3-D replay", left_out, lambda: replay_parts(folder, model)) or (),
+        left_out=tuple(dict.fromkeys(left_out)),
+    )
+    progress("report", 3, 4)
+    document.write_document(folder / REPORT_FILE, data)
+    progress("report", 4, 4)
+    return folder / REPORT_FILE
+
+
+def report_build(
+    folder: Path,
+    capture: str | os.PathLike[str] | None,
+    progress: Progress,
+    experiments: Experiments | None = None,
+    *,
+    allow_outside: bool = False,
+) -> dict:
+    """Write the report of a finished build anew.
+
+    Args:
+        folder: of the rig.
+        capture: capture.toml or its folder; without it, where the build says it was.
+        progress: told of the work.
+        experiments: as for `write_build_report`.
+        allow_outside: let paths in the capture leave its folder.
+
+    Returns:
+        `file` and its size, `bytes`.
+
+    Raises:
+        FormatError: not the folder of a build, or a damaged one.
+        MissingDependencyError, RigError, OutputError: see `write_build_report`.
+        CaptureError: the capture named cannot be read.
+    """
+    if not is_build(folder):
+        raise FormatError(
+            f"is not the folder of a build: there is no {BUILD_FILE}.",
+            path=folder,
+            hint="Name the folder that `jawusd build` wrote, or add --experiments for poses.",
+        )
+    with locked(folder):
+        state = BuildState(folder)
+        given = open_capture(capture, allow_outside=allow_outside) if capture is not None else None
+        facts = build_facts(folder, state, given, allow_outside=allow_outside)
+        path = write_build_report(folder, facts, progress, experiments)
+        # The next --resume must find the file as recorded, or it would write the report again.
+        known = state.stages.get("report")
+        result = {"capture": where(facts.capture, folder)} if facts.capture else dict(known.result if known else {})
+        state.finish("report", known.inputs if known else "", [path], known.seconds if known else 0.0, result)
+    return {"file": str(path), "bytes": path.stat().st_size}
+
+
+def is_build(folder: Path) -> bool:
+    """Tell whether a path is the folder of a build."""
+    return (folder / BUILD_FILE).is_file()
+
+
+def fitted_poses(folder: Path) -> Path:
+    """Return the tracks of a build that its model was fitted to: the first pass, without the model's help."""
+    first = folder / FIRST_PASS
+    return first if first.is_file() else folder / "tracks.npz"
+
+
+def missing_packages() -> str | None:
+    """Return what keeps a report from being written, None if nothing does."""
+    try:
+        stage("jawusd.report.document")
+    except MissingDependencyError as error:
+        return str(error)
+    return None
+
+
+def build_facts(folder: Path, state: BuildState, capture: Capture | None, *, allow_outside: bool = False) -> BuildFacts:
+    """Return what a build left behind, with the capture it came from if that is where it was."""
+    if capture is not None:
+        return BuildFacts(state.stages, _calibrated(capture, folder))
+    record = state.stages.get("report")
+    place = record.result.get("capture") if record else None
+    if not place:
+        return BuildFacts(state.stages, None, "the build does not say where its capture is: name it with --capture.")
+    path = folder / str(place)
+    try:
+        return BuildFacts(state.stages, _calibrated(open_capture(path, allow_outside=allow_outside), folder))
+    except JawusdError as error:
+        return BuildFacts(state.stages, None, f"the capture is not at hand ({error}): name it with --capture.")
+
+
+def _calibrated(capture: Capture, folder: Path) -> Capture:
+    """Return the capture with the calibration that the build made from its boards, if it names none."""
+    made = folder / CALIBRATION
+    if capture.calibration is not None or not made.is_file():
+        return capture
+    return capture.model_copy(update={"calibration": made, "calibration_unit_mm": 1.0})
+
+
+def where(capture: Capture, folder: Path) -> str:
+    """Return the path of a capture seen from the rig's folder; absolute where there is no way between them."""
+    try:
+        return os.path.relpath(capture.folder, folder.resolve())
+    except ValueError:  # another drive
+        return str(capture.folder)
+
+
+def _attempt(what: str, left_out: list[str], work: Callable[[], T]) -> T | None:
+    """Do a part of the report; what cannot be done is named in the report instead of stopping it."""
+    try:
+        return work()
+    except JawusdError as error:
+        left_out.append(f"{what}: {error}")
+        return None
+
+
+def _overlays(facts: BuildFacts, tracks: Tracks) -> tuple[Overlay, ...]:
+    if facts.capture is None:
+        raise FormatError(facts.why_not)
+    offsets = facts.stages["sync"].result["offsets"]
+    return draw_worst_frames(facts.capture, offsets, tracks)
+
+
+def _cameras(facts: BuildFacts) -> tuple[CameraFacts, ...]:
+    if facts.capture is None:
+        raise FormatError(facts.why_not)
+    sizes = {camera.name: camera.size_px for camera in load_cameras(facts.capture)}
+    return tuple(
+        CameraFacts(
+            source.name,
+            source.video.name if source.video else "",
+            f"{source.masks.upper.name}, {source.masks.lower.name}" if source.masks else "",
+            (int(sizes[source.name][0]), int(sizes[source.name][1])),
+        )
+        for source in facts.capture.cameras
+    )
+
+
+def _rig_facts(folder: Path) -> RigFacts:
+    rig = stage("jawusd.rig")
+    found = stage("jawusd.rig.validate").validate_stage(folder / "actor.usda")
+    error_mm = float(rig.describe(folder / "actor.usda")["table"]["max_error_mm"])
+    return RigFacts(error_mm, tuple(f"{finding.severity}: {finding.message}" for finding in found))
+
+
+def _hashes(stages: Mapping[str, StageRecord]) -> dict[str, str]:
+    found = {name: value for key, record in stages.items() if key != "report" for name, value in record.outputs.items()}
+    return dict(sorted(found.items()))
+
+
+def _versions() -> dict[str, str]:
+    found = {"jawusd": __version__}
+    for name in _PACKAGES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    return found

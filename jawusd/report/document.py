@@ -1,0 +1,187 @@
+"""Write the report of a build as one HTML file that needs nothing else: no network, no other file."""
+
+from __future__ import annotations
+
+import base64
+import os
+from importlib import resources
+
+import jinja2
+import numpy as np
+from markupsafe import Markup
+
+from jawusd.formats.atomic import write_text_atomic
+from jawusd.formats.experiments import Experiments
+from jawusd.formats.report import ReportData
+from jawusd.formats.tracks import LOST
+from jawusd.report.figures import (
+    condyle_figure,
+    coverage_figure,
+    parameter_figure,
+    reconstruction_figure,
+    synthesis_figure,
+)
+from jawusd.report.inline import inline_svg
+from jawusd.report.ranges import human_ranges
+from jawusd.report.replay import replay_data
+from jawusd.report.timeline import model_figure, tracking_figure
+from jawusd.report.verdicts import MARKS, WORDS, judge, overall
+
+_LISTED = 60  # frames named one by one
+_PLACES = ("mandible", "incisor", "molar_left", "molar_right", "condyle_left", "condyle_right")
+
+
+def write_document(path: str | os.PathLike[str], data: ReportData) -> None:
+    """Write the report.
+
+    Args:
+        path: the HTML file.
+        data: what it shows.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    write_text_atomic(path, document(data))
+
+
+def document(data: ReportData) -> str:
+    """Return the report as HTML; everything that comes from files is escaped."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("jawusd.report", "page"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    verdicts = judge(data)
+    return environment.get_template("report.html.j2").render(
+        data=data,
+        verdicts=verdicts,
+        overall=overall(verdicts),
+        words=WORDS,
+        marks=MARKS,
+        style=_own("report.css"),
+        script=_own("replay.js"),
+        replay=replay_data(data),
+        figures=_figures(data),
+        pictures=[(one, base64.b64encode(one.jpeg).decode("ascii")) for one in data.overlays],
+        ranges=human_ranges(data.tracks, data.model),
+        errors=_error_tables(data),
+        frames=_frame_lists(data),
+        uncertainty=data.model.meta.get("uncertainty", {}),
+        start=_start(data),
+        cameras=_cameras(data),
+    )
+
+
+def _own(name: str) -> Markup:
+    """Return a file of the package as it is; only our own text may pass unescaped."""
+    return Markup(resources.files("jawusd.report").joinpath("page", name).read_text(encoding="utf-8"))
+
+
+def _figures(data: ReportData) -> dict[str, Markup]:
+    drawn = {
+        "tracking": inline_svg(tracking_figure(data.tracks), "tracking", "How every frame was tracked."),
+        "model": inline_svg(model_figure(data.model), "model", "Parameters, model error and margin of every frame."),
+    }
+    found = data.experiments
+    if found is None:
+        return drawn
+    return drawn | _experiment_figures(found)
+
+
+def _experiment_figures(found: Experiments) -> dict[str, Markup]:
+    figures = {
+        "coverage": (coverage_figure(found.coverage, found.actor), "Captured poses, the bounds and the gaps."),
+        "reconstruction": (reconstruction_figure(found), "Histograms of the reconstruction error of each model."),
+        "synthesis": (synthesis_figure(found), "Histograms of the distance of random poses to captured ones."),
+        "condyle": (condyle_figure(found), "Path of the left condyle when the jaw opens."),
+        "parameters": (parameter_figure(found), "Path of the left condyle for each parameter."),
+    }
+    return {key: inline_svg(figure, key, words) for key, (figure, words) in figures.items()}
+
+
+def _error_tables(data: ReportData) -> list[tuple[str, str, list[tuple[str, dict]]]]:
+    """Return (short name, what it is, rows (place, figures)) per table."""
+    names = {
+        "train": ("fit", "poses the model was fitted to"),
+        "holdout": ("held out", "poses in parts of the take left out of the fit, each in turn"),
+        "trimmed": ("outliers", "poses that the fit left out as outliers"),
+    }
+    tables = data.model.meta.get("errors", {})
+    return [
+        (*names[key], [(place, tables[key][place]) for place in _PLACES if place in tables[key]])
+        for key in names
+        if key in tables
+    ]
+
+
+def _frame_lists(data: ReportData) -> list[tuple[str, int, str]]:
+    """Return (reason, count, frames as text) of frames that were lost, helped, or kept out of the model."""
+    tracks, meta = data.tracks, data.model.meta
+    lists = {"lost by the tracker": tracks.frames[(tracks.status == LOST).any(1)]}
+    lists["tracked with the model's help"] = tracks.frames[tracks.prior_aided]
+    for reason, frames in meta.get("excluded_frames", {}).items():
+        lists[f"kept out of the fit: {reason}"] = frames
+    lists["left out of the fit as outliers"] = meta.get("trimmed_frames", [])
+    return [(reason, len(frames), _spans(np.asarray(frames, dtype=np.int64))) for reason, frames in lists.items()]
+
+
+def _spans(frames: np.ndarray) -> str:
+    """Return frame numbers with neighbours joined: 3-7, 9."""
+    if not len(frames):
+        return ""
+    frames = np.unique(frames)
+    parts = np.split(frames, np.flatnonzero(np.diff(frames) > 1) + 1)
+    texts = [str(part[0]) if len(part) == 1 else f"{part[0]}\u2013{part[-1]}" for part in parts]
+    more = "" if len(texts) <= _LISTED else f" and {len(texts) - _LISTED} more spans"
+    return ", ".join(texts[:_LISTED]) + more
+
+
+def _start(data: ReportData) -> str:
+    """Say how the tracking began."""
+    start = data.tracks.meta.get("start", {})
+    if not start:
+        return "not recorded"
+    text = f"by {start.get('by')}, on frame {start.get('frame')}"
+    left_out = [
+        f"{row}: {', '.join(map(str, numbers))}" for row, numbers in start.get("picks_left_out", {}).items() if numbers
+    ]
+    if left_out:
+        text += f"; picks that did not fit were left out ({'; '.join(left_out)})"
+    return text + "".join(f"; {finding}" for finding in start.get("scan_findings", []))
+
+
+def _cameras(data: ReportData) -> list[dict[str, str]]:
+    """Return a row per camera: what it gave, and what the take corrected."""
+    meta = data.tracks.meta
+    known = {camera.name: camera for camera in data.cameras}
+    extrinsics = meta.get("extrinsics", {})
+    rows = []
+    for index, name in enumerate(data.tracks.camera_names):
+        facts = known.get(name)
+        masks = data.tracks.masks_used[:, :, index]
+        turn = np.linalg.norm(extrinsics.get("turns_deg", {}).get(name, [np.nan]))
+        move = np.linalg.norm(extrinsics.get("moves_mm", {}).get(name, [np.nan]))
+        notes = []
+        if np.isfinite(turn):
+            notes.append(f"turned {turn:.3f} deg and moved {move:.2f} mm" if extrinsics["corrected"] else "unchanged")
+        if name in meta.get("calibration_rescaled_px", {}):
+            was, now = meta["calibration_rescaled_px"][name]
+            notes.append(f"calibrated at {was[0]} \u00d7 {was[1]} px, recorded at {now[0]} \u00d7 {now[1]} px: scaled")
+        rows.append(
+            {
+                "name": name,
+                "video": facts.video if facts else "",
+                "size": f"{facts.size_px[0]} \u00d7 {facts.size_px[1]}" if facts else "",
+                "offset": _signed(data.sync.get("offsets", {}).get(name), "d"),
+                "delay": _signed(meta.get("delays_frames", {}).get(name), ".3f"),
+                "masks": f"{100 * masks.mean():.1f} %",
+                "calibration": "; ".join(notes),
+            }
+        )
+    return rows
+
+
+def _signed(value: float | None, digits: str) -> str:
+    return "" if value is None else f"{value:+{digits}}"

@@ -1,0 +1,88 @@
+"""The data of the page's 3-D replay: small meshes and the poses of the take, packed as text."""
+
+from __future__ import annotations
+
+import base64
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.evaluator import JawRig
+from jawusd.formats.mesh import Mesh
+from jawusd.formats.report import ReplayPart, ReportData
+from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, Tracks
+from jawusd.report.ranges import anatomical_motion, rest_points
+
+Array = NDArray[np.float64]
+
+#: What the page calls the states of a frame.
+STATES = ("tracked", "recovered after a loss", "tracked without a camera", "lost", "tracked with the model's help")
+_MOST_FRAMES = 6000  # longer takes are replayed with every second, third ... frame
+_DEFAULT_FPS = 24.0
+
+
+def replay_data(data: ReportData) -> dict | None:
+    """Return what replay.js reads, JSON-able; None without meshes or frames.
+
+    Poses are motions away from the closed bite in the anatomical frame, the upper 3 x 4 part row by row; meshes are
+    16-bit steps from their lowest corner.
+    """
+    tracks, model = data.tracks, data.model
+    if not data.parts or not len(tracks.frames):
+        return None
+    step = -(-len(tracks.frames) // _MOST_FRAMES)
+    rows = np.arange(0, len(tracks.frames), step)
+    d = _parameters_at(tracks.frames[rows], data)
+    fitted = np.full((len(rows), 4, 4), np.nan)
+    known = np.isfinite(d).all(1)
+    fitted[known] = JawRig(model.arrays, model.meta).pose(d[known])
+    everything = np.concatenate([part.mesh.vertices for part in data.parts])
+    low, high = everything.min(0), everything.max(0)
+    landmarks = rest_points(model, model.arrays["landmarks"])
+    return {
+        "parts": [_packed(part) for part in data.parts],
+        "captured": _poses(anatomical_motion(tracks.T_upper_lower[rows], model)),
+        "fitted": _poses(anatomical_motion(fitted, model)),
+        "d": _text(d.astype("<f4")),
+        "frames": _text(tracks.frames[rows].astype("<i4")),
+        "state": _text(_states(tracks)[rows]),
+        "states": list(STATES),
+        "fps": float(model.meta.get("fps") or _DEFAULT_FPS) / step,
+        "centre": (0.5 * (low + high)).round(2).tolist(),
+        "radius": round(float(np.linalg.norm(high - low)) / 2, 2),
+        "traced": landmarks[[0, 3, 4]].round(3).tolist(),
+    }
+
+
+def _parameters_at(frames: NDArray[np.int64], data: ReportData) -> Array:
+    """Return the parameters of frames [mm], shape (F, 3); NaN where the model has none."""
+    rows = {int(frame): row for row, frame in enumerate(data.model.frames)}
+    missing = np.full(3, np.nan)
+    return np.array([data.model.d[rows[int(f)]] if int(f) in rows else missing for f in frames])
+
+
+def _states(tracks: Tracks) -> NDArray[np.uint8]:
+    state = np.zeros(len(tracks.frames), np.uint8)
+    for value, code in ((RECOVERED, 1), (PARTIAL, 2), (LOST, 3)):
+        state[(tracks.status == value).any(1)] = code
+    state[tracks.prior_aided & (state != 3)] = 4
+    return state
+
+
+def _poses(motion: Array) -> str:
+    return _text(motion[:, :3].reshape(len(motion), 12).astype("<f4"))
+
+
+def _packed(part: ReplayPart) -> dict:
+    mesh: Mesh = part.mesh
+    if len(mesh.vertices) > np.iinfo(np.uint16).max:
+        raise ValueError(f"a mesh of the replay has {len(mesh.vertices)} vertices, at most 65535 are allowed")
+    low = mesh.vertices.min(0)
+    step = float(np.ptp(mesh.vertices, axis=0).max()) / np.iinfo(np.uint16).max or 1.0
+    vertices = np.round((mesh.vertices - low) / step).astype("<u2")
+    packed = {"vertices": _text(vertices), "faces": _text(mesh.faces.astype("<u2"))}
+    return {"name": part.name, "kind": part.kind, "moves": part.moves, "low": low.tolist(), "step": step, **packed}
+
+
+def _text(values: NDArray) -> str:
+    return base64.b64encode(np.ascontiguousarray(values).tobytes()).decode("ascii")

@@ -1,0 +1,235 @@
+"""Judge a build, stage by stage, in plain words and with the thresholds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.evaluator import JawRig
+from jawusd.formats.report import ReportData
+from jawusd.formats.tracks import LOST, RECOVERED, Tracks
+
+Array = NDArray[np.float64]
+
+#: Grades, the best first; "open" is what cannot be judged.
+GOOD, LOOK, BAD, OPEN = "good", "look", "bad", "open"
+WORDS = {GOOD: "good", LOOK: "have a look", BAD: "not good", OPEN: "not judged"}
+MARKS = {GOOD: "\u2714", LOOK: "!", BAD: "\u2716", OPEN: "?"}
+
+# Yang et al. (2019): mask left uncovered on average, and the mean and worst reconstruction error of their Fig. 12.
+_PAPER_COVERAGE_PERCENT, _PAPER_MEAN_MM, _PAPER_WORST_MM = 0.754, 1.73, 7.22
+_MISTAKES = {"scan_units", "pose_units", "front_back_flip", "left_right_flip", "upside_down", "swapped_jaws"}
+
+
+@dataclass(frozen=True)
+class Check:
+    """Judge one figure.
+
+    Attributes:
+        name: what was looked at.
+        found: the figure with its unit.
+        limit: what is good, and what is just acceptable.
+        grade: one of `WORDS`.
+    """
+
+    name: str
+    found: str
+    limit: str
+    grade: str
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Judge one stage.
+
+    Attributes:
+        stage: its name.
+        sentence: the verdict in plain words.
+        checks: what it rests on.
+        grade: the worst grade of the checks; what is not judged does not count.
+    """
+
+    stage: str
+    sentence: str
+    checks: tuple[Check, ...]
+    grade: str
+
+
+def judge(data: ReportData) -> list[Verdict]:
+    """Return the verdicts on sync, track, fit, bounds and rig."""
+    return [_sync(data), _track(data.tracks), _fit(data), _bounds(data), _rig(data)]
+
+
+def overall(verdicts: Iterable[Verdict]) -> str:
+    """Return the worst grade of verdicts."""
+    return _worst([verdict.grade for verdict in verdicts])
+
+
+def _worst(grades: list[str]) -> str:
+    return next((grade for grade in (BAD, LOOK, GOOD) if grade in grades), OPEN)
+
+
+def _below(name: str, value: float, good: float, fair: float, unit: str, digits: int = 2) -> Check:
+    """Judge a figure that should be small."""
+    limit = f"good up to {good:g} {unit}, acceptable up to {fair:g} {unit}"
+    if not np.isfinite(value):
+        return Check(name, "not known", limit, OPEN)
+    grade = GOOD if value <= good else LOOK if value <= fair else BAD
+    return Check(name, f"{value:.{digits}f} {unit}", limit, grade)
+
+
+def _share(name: str, share: float, good: float, fair: float) -> Check:
+    """Judge a share, 0 .. 1, that should be large."""
+    limit = f"good from {100 * good:g} %, acceptable from {100 * fair:g} %"
+    return Check(name, f"{100 * share:.1f} %", limit, GOOD if share >= good else LOOK if share >= fair else BAD)
+
+
+def _verdict(stage: str, checks: list[Check], sentences: dict[str, str]) -> Verdict:
+    grade = _worst([check.grade for check in checks])
+    return Verdict(stage, sentences.get(grade, "There is nothing to judge it by."), tuple(checks), grade)
+
+
+def _sync(data: ReportData) -> Verdict:
+    delays = data.tracks.meta.get("delays_frames", {})
+    rest = max((abs(float(value)) for value in delays.values()), default=np.nan)
+    if len(data.tracks.camera_names) == 1:
+        return Verdict("sync", "There is one camera: nothing to align in time.", (), GOOD)
+    checks = [_below("offset that the teeth themselves show beyond the whole frames", rest, 0.6, 1.0, "frames")]
+    if "confidence" in data.sync:
+        least = min(float(value) for value in data.sync["confidence"].values())
+        checks.append(_share("flashes or sounds that both cameras show", least, 0.8, 0.5))
+    method = str(data.sync.get("method", "not known"))
+    if method == "taken as simultaneous":
+        checks.append(Check("how the cameras were aligned", method, "flash, sound or given offsets", LOOK))
+    return _verdict(
+        "sync",
+        checks,
+        {
+            GOOD: "The cameras agree in time; what is left below a frame was measured and taken into account.",
+            LOOK: "The cameras may be off by a frame: play the footage side by side.",
+            BAD: "The cameras do not agree in time: give the offsets by hand ([sync] offsets) and build again.",
+        },
+    )
+
+
+def _track(tracks: Tracks) -> Verdict:
+    tracked = tracks.tracked()
+    coverage = tracks.coverage_error
+    sigma = np.full(5, np.nan)
+    if tracked.any():
+        sigma = np.median(tracks.sigma_mm[tracked], axis=0)
+    helped = (tracks.status == RECOVERED).any(1) | tracks.prior_aided
+    residual = tracks.residual_px[(tracks.status != LOST) & np.isfinite(tracks.residual_px)]
+    checks = [
+        _share("frames tracked", float(tracked.mean()), 0.98, 0.9),
+        _share("frames sure enough without the model's help or a new search", float((~helped).mean()), 0.6, 0.3),
+        _below(
+            f"mask left uncovered, mean (the paper: {_PAPER_COVERAGE_PERCENT} %)",
+            100 * float(np.nanmean(coverage)) if np.isfinite(coverage).any() else np.nan,
+            1.0,
+            2.0,
+            "%",
+        ),
+        _below("distance of outlines, median", float(np.median(residual)) if residual.size else np.nan, 1.0, 2.0, "px"),
+        _below("expected error at the incisor (1 sigma, median)", float(sigma[0]), 0.15, 0.5, "mm", 3),
+        _below("expected error at the worse condyle (1 sigma, median)", float(sigma[3:].max()), 0.5, 1.0, "mm", 3),
+    ]
+    return _verdict(
+        "track",
+        checks,
+        {
+            GOOD: "The teeth were followed through the take, as exactly as the masks allow.",
+            LOOK: "Most of the take is tracked; look at the worst frames below before relying on it.",
+            BAD: "Much of the take is lost or uncertain: check masks and calibration at the worst frames below.",
+        },
+    )
+
+
+def _fit(data: ReportData) -> Verdict:
+    meta = data.model.meta
+    errors = meta.get("errors", {})
+    table = errors.get("holdout") or errors.get("train") or {}
+    kind = "poses held out of the fit" if errors.get("holdout") else "poses of the fit"
+    row = table.get("mandible", {})
+    out = sum(map(len, meta.get("excluded_frames", {}).values())) + len(meta.get("trimmed_frames", []))
+    count = max(len(data.model.frames), 1)
+    checks = [
+        _below(
+            f"error of {kind}, mean of the largest vertex distance (the paper, its own poses: {_PAPER_MEAN_MM} mm)",
+            float(row.get("mean", np.nan)),
+            0.6,
+            _PAPER_MEAN_MM,
+            "mm",
+        ),
+        _below(
+            f"error of {kind}, worst frame (the paper, its own poses: {_PAPER_WORST_MM} mm)",
+            float(row.get("max", np.nan)),
+            3.0,
+            _PAPER_WORST_MM,
+            "mm",
+        ),
+        _share("frames that shaped the model", 1 - out / count, 0.9, 0.7),
+    ]
+    for warning in meta.get("warnings", []):
+        if warning["code"] != "take_lacks":
+            grade = BAD if warning["code"] in _MISTAKES else LOOK
+            checks.append(Check("human range", warning["message"], "see the table of human ranges", grade))
+    return _verdict(
+        "fit",
+        checks,
+        {
+            GOOD: "Three parameters reproduce this person's poses to a fraction of a millimetre.",
+            LOOK: "The model is usable, but look at the figures marked below.",
+            BAD: "The model does not describe this take: see which figure is out of range.",
+        },
+    )
+
+
+def _bounds(data: ReportData) -> Verdict:
+    model = data.model
+    rig = JawRig(model.arrays, model.meta)
+    used = model.trained & np.isfinite(model.d).all(1)
+    inside = rig.margin(model.d[used]) >= rig.limits.margin_mm if used.any() else np.zeros(1, bool)
+    checks = [_share("captured poses that the bounds call valid", float(inside.mean()), 0.97, 0.9)]
+    synthesis = data.experiments.of("synthesis") if data.experiments else []
+    known = next((one for one in synthesis if one.model.startswith("captured")), None)
+    drawn = next((one for one in synthesis if one.model == model.meta.get("method") and "slice" in one.quantity), None)
+    if known is not None and drawn is not None and len(known.values_mm):
+        ratio = float(np.median(drawn.values_mm) / max(np.median(known.values_mm), 1e-9))
+        checks.append(
+            _below("random valid poses: distance to the take, against captured ones left out", ratio, 3.0, 6.0, "times")
+        )
+    # What the fit found missing is in its warnings; the experiments of the default model may add to it.
+    lacks = [w["message"] for w in model.meta.get("warnings", []) if w["code"] == "take_lacks"]
+    checks += [Check("captured movements", sentence, "nothing missing", LOOK) for sentence in lacks]
+    if not lacks:
+        checks.append(Check("captured movements", "nothing missing", "nothing missing", GOOD))
+    return _verdict(
+        "bounds",
+        checks,
+        {
+            GOOD: "The limits enclose what was captured, and the take covers the envelope.",
+            LOOK: "The limits hold what was captured, but parts of the envelope were not recorded (see below).",
+            BAD: "The limits leave out poses that were captured: do not rely on them.",
+        },
+    )
+
+
+def _rig(data: ReportData) -> Verdict:
+    errors = [finding for finding in data.rig.findings if finding.startswith("error")]
+    checks = [
+        Check("validators", f"{len(errors)} errors", "no errors", BAD if errors else GOOD),
+        _below("sampled decoder against the exact model, worst vertex", data.rig.table_error_mm, 0.06, 0.2, "mm", 3),
+    ]
+    return _verdict(
+        "rig",
+        checks,
+        {
+            GOOD: "The files are valid, and readers of the table get the model's poses.",
+            LOOK: "The files are valid; the table is a coarse copy of the model.",
+            BAD: "The rig has errors: run `jawusd validate` on it.",
+        },
+    )
