@@ -96,11 +96,11 @@ class Reach:
         first, inside = pulled_inside(self._bound, (best[:, None] + self._ripples).reshape(-1, 3))
         first[~inside] = np.nan
         found, left = self._pull(vectors, np.repeat(target, len(self._ripples), axis=0), first)
-        left = np.where(np.isnan(left), np.inf, left).reshape(len(best), -1)
+        left = np.where(np.isnan(left), np.inf, left).reshape(len(best), len(self._ripples))
         choice = left.argmin(axis=1)
         each = np.arange(len(best))
         better = left[each, choice] < least
-        best[better] = found.reshape(len(best), -1, 3)[each, choice][better]
+        best[better] = found.reshape(*left.shape, 3)[each, choice][better]
         return best, np.minimum(least, left[each, choice])
 
     @cached_property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -22,14 +23,20 @@ def as_rows(values: ArrayLike, tail: tuple[int, ...], name: str) -> tuple[Array,
     Raises:
         ValueError: the trailing axes are not ``tail``.
     """
+    rows, batch = in_rows(values, tail, name)
+    finite = (np.abs(rows) < LARGEST).all(axis=tuple(range(1, rows.ndim)))  # False for NaN
+    if not finite.all():
+        rows = np.where(finite.reshape(-1, *(1,) * len(tail)), rows, np.nan)
+    return rows, batch
+
+
+def in_rows(values: ArrayLike, tail: tuple[int, ...], name: str) -> tuple[Array, tuple[int, ...]]:
+    """Return what `as_rows` does, rows that are not finite as they are."""
     values = np.asarray(values, dtype=np.float64)
     batch = values.shape[: values.ndim - len(tail)]
     if values.ndim < len(tail) or values.shape[len(batch) :] != tail:
         raise ValueError(f"{name} must have shape (..., {', '.join(map(str, tail))}), got {values.shape}")
-    rows = values.reshape(-1, *tail) if values.size else np.empty((int(np.prod(batch)), *tail))
-    finite = (np.abs(rows) < LARGEST).all(axis=tuple(range(1, rows.ndim)))  # False for NaN
-    if not finite.all():
-        rows = np.where(finite.reshape(-1, *(1,) * len(tail)), rows, np.nan)
+    rows = values.reshape(-1, *tail) if values.size else np.empty((math.prod(batch), *tail))
     return rows, batch
 
 

@@ -5,18 +5,21 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jawusd.evaluator.rows import as_rows
+from jawusd.evaluator.rows import in_rows
 
 Array = NDArray[np.float64]
 
 
 def rows_of(values: ArrayLike, tail: tuple[int, ...], name: str) -> tuple[Array, tuple[int, ...]]:
-    """Return values as contiguous, writable float64 rows (n, *tail) and the batch shape.
-
-    Rows with a value that is not finite, or above 1e9, become all NaN.
+    """Return values as float64 rows (n, *tail) that the compiled code takes, and the batch shape.
 
     Raises:
         ValueError: the trailing axes are not ``tail``.
     """
-    rows, batch = as_rows(values, tail, name)
-    return np.require(rows, requirements=("C", "W")), batch
+    rows, batch = in_rows(values, tail, name)
+    return owned(rows), batch
+
+
+def owned(rows: Array) -> Array:
+    """Return the rows, copied unless they are contiguous, aligned and writable."""
+    return rows if rows.flags.carray else np.array(rows, order="C")

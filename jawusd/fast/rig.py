@@ -8,9 +8,10 @@ from numpy.typing import ArrayLike, NDArray
 from jawusd.evaluator.distances import landmark_vectors
 from jawusd.evaluator.encoding import Encoder
 from jawusd.evaluator.rig import BoundName, JawRig
+from jawusd.evaluator.rows import as_rows
 from jawusd.evaluator.verdicts import Verdicts
 from jawusd.fast import rows as compiled
-from jawusd.fast.arrays import rows_of
+from jawusd.fast.arrays import owned, rows_of
 from jawusd.fast.packing import packed_bound, packed_model
 from jawusd.fast.search import FastReach
 from jawusd.geometry.se3 import transform_points
@@ -50,7 +51,7 @@ class FastRig(JawRig):
 
     def _poses(self, d: Array) -> Array:
         out = np.empty((len(d), 4, 4))
-        compiled.poses(self._numbers, np.require(d, requirements=("C", "W")), out)
+        compiled.poses(self._numbers, owned(d), out)
         return out
 
     def twist(self, d: ArrayLike) -> Array:
@@ -149,10 +150,10 @@ class FastRig(JawRig):
             return super().validate_parameters(
                 d, margin_limit_mm=margin_limit_mm, bound=bound, times_s=times_s, speed_limit_mm_s=speed_limit_mm_s
             )
-        rows, batch = rows_of(d, (3,), "d")
+        rows, batch = as_rows(d, (3,), "d")  # NaN where not finite: they are part of the verdicts
         limits = self.limits.replaced(None, margin_limit_mm, None)
         residual_mm, margin_mm, reason = np.empty(len(rows)), np.empty(len(rows)), np.empty(len(rows), dtype=np.uint8)
-        compiled.parameter_judgements(self._hull, rows, limits.margin_mm, residual_mm, margin_mm, reason)
+        compiled.parameter_judgements(self._hull, owned(rows), limits.margin_mm, residual_mm, margin_mm, reason)
         return _verdicts(rows, residual_mm, margin_mm, reason, batch)
 
 

@@ -9,6 +9,7 @@ from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.models import JawModelForm
 from jawusd.evaluator.reach import Reach
 from jawusd.fast import rows
+from jawusd.fast.arrays import owned
 from jawusd.fast.descent import PARAMETERS, POINT
 
 Array = NDArray[np.float64]
@@ -36,6 +37,5 @@ class FastReach(Reach):
 
     def _descended(self, chart: int, vectors: Array, target: Array, start: Array) -> tuple[Array, Array]:
         found, cost = np.array(start, order="C"), np.empty(len(start))
-        target = np.require(target, requirements=("C", "W"))
-        rows.descents(*self._numbers, chart, vectors, target, found, cost)
+        rows.descents(*self._numbers, chart, vectors, owned(target), found, cost)
         return found, cost

@@ -274,3 +274,13 @@ def test_rig_works_in_a_forked_process():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=SUPPORT)
     assert done.stdout.strip() == "same", done.stderr
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("started", [True, False])
+def test_inverse_kinematics_takes_any_batch_shape(rig, fast, shape, started):
+    T = rig.pose(rig.project(random_d(rig, shape, 0.0)))
+    start = np.array([5.0, 0.0, 0.5]) if started else None
+    (found, left_mm), (expected, expected_mm) = (each.ik([0.0] * 3, T[..., :3, 3], start=start) for each in (fast, rig))
+    assert found.shape == expected.shape and left_mm.shape == expected_mm.shape
+    np.testing.assert_allclose(left_mm, expected_mm, rtol=0, atol=1e-5)
