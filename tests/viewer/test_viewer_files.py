@@ -1,13 +1,16 @@
 """What the viewer is given of an actor, and what it may write: read back by readers that know nothing of it."""
 
+import sys
+
 import numpy as np
 import pytest
 from example_rig import FPS, assert_valid_usd, example_motion, example_rig
 from pxr import Usd
 
-from jawusd.errors import FormatError, OutputError, RigError
+from jawusd.errors import FormatError, MissingDependencyError, OutputError, RigError
 from jawusd.formats.mesh import Mesh
-from jawusd.pipeline.view import motion_names, part_of, viewed_actor
+from jawusd.formats.tracks import Tracks, save_tracks
+from jawusd.pipeline.view import motion_names, open_viewer, part_of, viewed_actor
 from jawusd.rig.geo_read import read_geometry, read_gum
 from jawusd.rig.motion_read import read_poses_of_stage
 from jawusd.viewer.clip import Clip
@@ -96,3 +99,28 @@ def test_only_animations_beside_the_rig_are_written(folder, name):
     with pytest.raises(OutputError, match="no name for an animation"):
         viewed_actor(folder).save_layer(name, clip, True)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_the_captured_take_is_the_tracks_beside_the_rig(folder):
+    frames, d = example_motion(12)
+    T = example_rig().pose(d)
+    T[4] = np.nan
+    pose = np.tile(np.eye(4), (12, 1, 1))
+    pair, spread = np.ones((12, 2)), np.tile(np.eye(6), (12, 1, 1))
+    tracks = Tracks(
+        frames, pose, pose, T, pose, pose, T, pair.astype(np.int8), np.zeros(12, bool), np.zeros((12, 2, 1)),
+        np.ones((12, 2, 1), bool), spread, spread, spread, np.ones((12, 5)), pair, pair, ("a",), {},
+    )  # fmt: skip
+    save_tracks(folder / "tracks.npz", tracks)
+    actor = viewed_actor(folder)
+    assert actor.clip_names()[0] == "captured take"
+    clip = actor.load_clip("captured take")
+    np.testing.assert_array_equal(clip.frames, np.delete(frames, 4))
+    np.testing.assert_allclose(clip.d, np.delete(d, 4, axis=0), atol=1e-5)
+
+
+def test_without_viser_the_extra_is_named(folder, monkeypatch):
+    monkeypatch.delitem(sys.modules, "jawusd.viewer.server", raising=False)
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(MissingDependencyError, match=r"jawusd\[view\]"):
+        open_viewer(folder, "127.0.0.1", 0)

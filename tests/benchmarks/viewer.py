@@ -1,0 +1,130 @@
+"""Print how fast the viewer answers: server time of sliders and drags, and the page in a browser.
+
+    python tests/benchmarks/viewer.py actor/actor.usda
+    python tests/benchmarks/viewer.py actor/actor.usda --browser /usr/bin/chromium
+
+The server's figures are the median and the 95 % quantile of the time from a visitor's event to the last message put
+into the queue, viser's own included; with --browser, also from opening the page to the jaw, and from a slider's event
+to the number on the screen.
+"""
+
+import argparse
+import asyncio
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from jawusd.geometry.se3 import transform_points
+from jawusd.pipeline.view import open_viewer
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
+from quiet_page import QuietPage
+
+ROUNDS = 200
+
+
+def timed(loop, actions):
+    """Return the milliseconds each action takes in the event loop, as events of a visitor do."""
+
+    async def run(action):
+        began = time.perf_counter()
+        action()
+        return 1e3 * (time.perf_counter() - began)
+
+    return [asyncio.run_coroutine_threadsafe(run(action), loop).result() for action in actions]
+
+
+def drags(page, rng):
+    """Return drag events: the pointer wanders by millimetres from the incisal point."""
+    session = page.session
+    session.set_pose([12.0, 0.0, 0.0])
+    place = transform_points(session.pose(), session.rig.arrays["landmarks"][0])
+    session.grab(place)
+    path = place + np.cumsum(rng.normal(0, 0.6, (ROUNDS, 3)), axis=0) * np.exp(-np.arange(ROUNDS) / 300)[:, None]
+
+    def one(pointer):
+        session.drag_to(pointer)
+        page.scene.show_hold(session.held_place(), pointer)
+        page.refresh()
+
+    return [lambda pointer=pointer: session.drag_to(pointer) for pointer in path], [
+        lambda pointer=pointer: one(pointer) for pointer in path
+    ]
+
+
+def slides(page, rng):
+    """Return slider events: the opening goes up and down, the others wander."""
+    session = page.session
+    values = rng.uniform(0, float(session.rig.arrays["d_range"][0, 1]), ROUNDS)
+
+    def one(index, value):
+        session.set_parameter(index, value)
+        page.refresh()
+
+    return [lambda k=k, value=value: one(k % 3, value if k % 3 == 0 else value / 10) for k, value in enumerate(values)]
+
+
+def in_browser(viewer, path):
+    """Print the seconds from opening the page to the jaw, and the milliseconds from slider to screen."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(
+            executable_path=path, args=["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        )
+        tab = browser.new_page(viewport={"width": 1200, "height": 720})
+        began = time.monotonic()
+        tab.goto(viewer.url)
+        tab.wait_for_selector("text=nearest captured")
+        print(f"page opened to jaw and panels sent  {time.monotonic() - began:8.2f} s")
+        box = tab.locator("input.mantine-NumberInput-input").first
+        box.fill("10")
+        time.sleep(1.0)
+        waits = tab.evaluate(_KEY_TO_NUMBER)
+        print(f"slider key to number on the screen  {np.median(waits):8.1f} ms median of {len(waits)}")
+        browser.close()
+
+
+_KEY_TO_NUMBER = """async () => {
+  const thumb = document.querySelector('[role=slider]'), waits = [];
+  thumb.focus();
+  const shown = () => [...document.querySelectorAll('td')].map(cell => cell.textContent).join();
+  for (let k = 0; k < 30; k++) {
+    const before = shown(), began = performance.now();
+    thumb.dispatchEvent(new KeyboardEvent('keydown', {key: 'ArrowRight', code: 'ArrowRight', bubbles: true}));
+    while (shown() === before && performance.now() - began < 3000) await new Promise(requestAnimationFrame);
+    waits.push(performance.now() - began);
+  }
+  return waits;
+}"""
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("rig")
+    parser.add_argument("--browser", help="a Chromium")
+    given = parser.parse_args()
+    began = time.perf_counter()
+    viewer = open_viewer(given.rig, "127.0.0.1", 0)
+    print(f"rig read, meshes made, server up    {time.perf_counter() - began:8.2f} s")
+    quiet = QuietPage(viewer)
+    page = quiet.page
+    print(f"page made on the server             {1e3 * quiet.made_s:8.1f} ms")
+    rng = np.random.default_rng(0)
+    poses, whole = drags(page, rng)
+    for name, actions in (
+        ("drag event to pose", poses),
+        ("drag event to messages", whole),
+        ("slider to messages", slides(page, rng)),
+    ):
+        ms = timed(quiet.loop, actions)
+        print(f"{name:35s} {np.median(ms):8.2f} ms median, {np.quantile(ms, 0.95):.2f} ms 95 %")
+    if given.browser:
+        in_browser(viewer, given.browser)
+    viewer.stop()
+
+
+if __name__ == "__main__":
+    main()

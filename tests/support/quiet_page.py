@@ -1,0 +1,66 @@
+"""A page of the viewer whose browser takes every message and says nothing: for tests and timings without a browser."""
+
+import asyncio
+import time
+
+import viser
+from viser.infra._infra import AsyncMessageBuffer, WebsockClientConnection, _ClientHandleState
+
+from jawusd.viewer.page import Page
+
+
+class QuietPage:
+    """Hold a page that no browser shows.
+
+    Attributes:
+        page: the page.
+        made_s: how long making it took.
+        notices: titles and bodies of the messages shown.
+    """
+
+    def __init__(self, viewer, number=0):
+        self.loop = viewer._server.get_event_loop()
+        state = _ClientHandleState(AsyncMessageBuffer(self.loop, persistent_messages=False), self.loop)
+        self.client = viser.ClientHandle(WebsockClientConnection(number, state), viewer._server)
+        self.notices = []
+        self.downloads = {}
+        self.client.add_notification = lambda title, body, **_: self.notices.append((title, body))
+        self.client.send_file_download = lambda name, content, **_: self.downloads.update({name: content})
+
+        def make():
+            began = time.perf_counter()
+            return Page(self.client, viewer._actor, viewer._still), time.perf_counter() - began
+
+        self.page, self.made_s = self.call(make)
+
+    def call(self, action):
+        """Run a function where events of visitors run, and return what it returns."""
+
+        async def run():
+            return action()
+
+        return asyncio.run_coroutine_threadsafe(run(), self.loop).result(60)
+
+    def enter(self, handle, value):
+        """Do what a visitor's change of a widget does: set its value, then call its callbacks in order."""
+
+        async def run():
+            handle._impl.value = value
+            event = viser.GuiEvent(client=self.client, client_id=self.client.client_id, target=handle)
+            for callback in handle._impl.update_cb:
+                await callback(event)
+
+        asyncio.run_coroutine_threadsafe(run(), self.loop).result(60)
+
+    def drag(self, grip, phase, start, end):
+        """Do what a visitor's pointer does to a mesh: places in the page's world [mm]."""
+        event = viser.SceneNodeDragEvent(
+            self.client, self.client.client_id, grip, phase, None, tuple(start), (0.5, 0.5), tuple(end), (0.5, 0.5),
+            "left", None,
+        )  # fmt: skip
+
+        async def run():
+            for entry in grip._impl.drag_cb:
+                await entry.callback(event)
+
+        asyncio.run_coroutine_threadsafe(run(), self.loop).result(60)

@@ -1,0 +1,174 @@
+"""Widgets and session together, as events of a visitor reach them, without a browser."""
+
+import time
+
+import numpy as np
+import pytest
+from quiet_page import QuietPage
+from viser import UploadedFile
+
+from jawusd.formats.keys import load_keys
+from jawusd.formats.poses import read_parameters
+from jawusd.rig.motion_read import read_poses_of_stage
+from jawusd.viewer.readouts import landmark_places
+
+
+@pytest.fixture
+def quiet(viewer):
+    return QuietPage(viewer)
+
+
+def button(quiet, label):
+    """Return the widget with a label."""
+    handles = quiet.client.gui._gui_input_handle_from_uuid.values()
+    return next(handle for handle in handles if handle.label == label)
+
+
+def until(condition):
+    end = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.01)
+
+
+def test_sliders_take_their_ends_from_the_rig(quiet):
+    pose, session = quiet.page.pose, quiet.page.session
+    quiet.enter(pose.sliders[0], 20.0)
+    ends = np.ravel([(slider.min, slider.max) for slider in pose.sliders[1:]])
+    np.testing.assert_allclose(ends, session.rig.ranges(20.0), atol=0.01)
+    assert pose.sliders[0].value == 20.0 and session.d[0] == 20.0
+    quiet.enter(pose.sliders[1], 100.0)
+    assert pose.sliders[1].value == pytest.approx(session.d[1], abs=0.006) and "OUTSIDE" not in pose.reading.content
+    quiet.enter(pose.keep_valid, False)
+    quiet.enter(pose.sliders[1], 9.0)
+    assert "OUTSIDE" in pose.reading.content and pose.sliders[1].max > 9.0
+    quiet.enter(button(quiet, "history"), "undo")
+    assert "OUTSIDE" not in pose.reading.content
+    quiet.enter(button(quiet, "history"), "close jaw")
+    np.testing.assert_allclose(session.d, 0, atol=0.01)
+    assert quiet.notices == []
+
+
+def test_the_mandible_on_the_page_stands_where_the_rig_says(quiet):
+    from jawusd.geometry import matrix_from_wxyz
+
+    rig = quiet.page.session.rig
+    quiet.enter(quiet.page.pose.sliders[0], 17.0)
+    jaw = quiet.page.scene._jaw
+    expected = rig.arrays["T_anatomical_skull"] @ rig.pose(quiet.page.session.d)
+    np.testing.assert_allclose(matrix_from_wxyz(jaw.wxyz), expected[:3, :3], atol=1e-9)
+    np.testing.assert_allclose(jaw.position, expected[:3, 3], atol=1e-9)
+
+
+def test_a_drag_of_the_mesh_is_inverse_kinematics_and_pins_are_shown(quiet):
+    page, rig = quiet.page, quiet.page.session.rig
+    quiet.enter(page.pose.sliders[0], 15.0)
+    start = page.session.d
+    incisor = landmark_places(rig, start)[0]
+    grip = page.scene.grips[-1]
+    for phase, share in (("start", 0.1), ("update", 0.5), ("update", 1.0)):
+        quiet.drag(grip, phase, incisor, incisor + share * np.array([5.0, 0, 0]))
+    assert page.scene._held.visible and page.session.dragging
+    quiet.drag(grip, "end", incisor, incisor + [5.0, 0, 0])
+    assert not page.scene._held.visible and not page.session.dragging
+    A = rig.arrays["T_anatomical_skull"]
+    found, _ = rig.ik(rig.arrays["landmarks"][0], np.linalg.solve(A, [*(incisor + [5.0, 0, 0]), 1])[:3], start=start)
+    moved = landmark_places(rig, np.stack([found, page.session.d]))[:, 0]
+    assert np.linalg.norm(moved[0] - moved[1]) < 0.1 and page.session.d[1] > 2
+    quiet.enter(page.pose.pins["condyle_left"], True)
+    assert page.scene._pins["condyle_left"].visible and not page.scene._pins["condyle_right"].visible
+    quiet.drag(grip, "update", incisor, incisor)  # nothing is held: nothing happens
+    assert quiet.notices == []
+
+
+def test_keys_are_set_moved_exported_saved_and_loaded(quiet, folder, tmp_path):
+    page, motion = quiet.page, quiet.page.motion
+    poses = {0: (2.0, 0.0, 0.0), 12: (16.0, 1.5, 0.0), 30: (6.0, -1.0, 0.5)}
+    for frame, d in poses.items():
+        quiet.enter(motion.frame_slider, float(frame))
+        quiet.call(lambda d=d: (page.session.set_pose(d), page.refresh()))
+        quiet.enter(button(quiet, "keys"), "set")
+    assert motion.thumbs.value == (0, 12, 30) and motion.thumbs.visible
+    quiet.enter(button(quiet, "write animation"), True)
+    frames, T = read_poses_of_stage(folder / "anim_view.usdc")
+    rig = page.session.rig
+    np.testing.assert_allclose(T, rig.pose(rig.interpolate(list(poses), list(poses.values()), frames)), atol=1e-5)
+    assert quiet.notices[-1][0] == "Written" and "anim_view.usdc" in motion.source.options
+    quiet.enter(button(quiet, "write animation"), True)
+    assert "exists already" in quiet.notices[-1][1]
+    quiet.enter(button(quiet, "save keys.json"), True)
+    quiet.enter(button(quiet, "save CSV of d"), True)
+    for name, content in quiet.downloads.items():
+        (tmp_path / name).write_bytes(content)
+    at, d = read_parameters(tmp_path / "d.csv")
+    np.testing.assert_allclose(d, rig.interpolate(list(poses), list(poses.values()), at), atol=1e-9)
+    quiet.enter(motion.thumbs, (0, 20, 25))
+    assert [key.frame for key in page.session.work.keys] == [0, 20, 25]
+    quiet.enter(page.files.load, UploadedFile("keys.json", quiet.downloads["keys.json"]))
+    assert page.session.work.keys == load_keys(tmp_path / "keys.json").keys and motion.thumbs.value == (0, 12, 30)
+    quiet.enter(motion.between, "smooth")
+    assert "smooth" in page.session.saved_keys().interpolation
+    quiet.enter(button(quiet, "go to"), "next")
+    quiet.enter(button(quiet, "keys"), "copy")
+    quiet.enter(motion.frame_slider, 50.0)
+    quiet.enter(button(quiet, "keys"), "paste")
+    quiet.enter(motion.frame_slider, 12.0)
+    quiet.enter(button(quiet, "keys"), "delete")
+    assert [key.frame for key in page.session.work.keys] == [0, 30, 50]
+
+
+def test_a_baked_motion_is_chosen_played_round_and_stopped(quiet):
+    motion, session = quiet.page.motion, quiet.page.session
+    quiet.enter(motion.play, True)
+    assert "nothing to play" in quiet.notices.pop()[1]
+    quiet.enter(motion.source, motion.source.options[1])
+    clip = motion.clip()
+    np.testing.assert_allclose(session.d, clip.d[0], atol=1e-9)
+    shown = []
+    motion.player._show = lambda frame: shown.append(frame) or motion.show(frame)
+    quiet.enter(motion.play, True)
+    assert motion.play.label == "stop"
+    until(lambda: any(after < before for before, after in zip(shown, shown[1:], strict=False)))
+    quiet.enter(motion.play, True)
+    assert motion.play.label == "play" and not motion.player.playing
+    np.testing.assert_allclose(session.d, clip.at(motion.frame), atol=1e-9)
+    quiet.enter(motion.frame_slider, clip.span[0] + 4)
+    np.testing.assert_allclose(session.d, clip.at(clip.span[0] + 4), atol=1e-9)
+    assert quiet.notices == []
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("bad.json", b'{"fps": 24, "keys": [{"frame": 0}]}', "bad.json: keys.0.d"),
+        ("bad.json", b"\xff\xfe\x00", "not UTF-8"),
+        ("bad.csv", b"frame,d1\n0,1\n", 'no column "d2"'),
+        ("bad.csv", b"frame,d1,d2,d3\n4,1,0,0\n4,1,0,0\n", "do not rise"),
+        ("empty.csv", b"", "is empty"),
+        ("../../x.usdc", b"PXR-USDC", "x.usdc"),
+    ],
+)
+def test_bad_files_are_messages_and_the_page_lives_on(quiet, name, content, words):
+    quiet.enter(quiet.page.files.load, UploadedFile(name, content))
+    title, body = quiet.notices[-1]
+    assert title == "That did not work" and words in body and "/tmp" not in body
+    quiet.enter(quiet.page.files.load, UploadedFile("good.csv", b"frame,d1,d2,d3\n0,1,0,0\n9,9,0,0\n"))
+    assert quiet.page.motion.source.value == "good.csv" and quiet.page.session.d[0] == 1.0
+
+
+def test_errors_nobody_thought_of_are_messages_too(quiet):
+    def broken(index, value):
+        raise ZeroDivisionError("by nothing")
+
+    quiet.page.session.set_parameter = broken
+    quiet.enter(quiet.page.pose.sliders[0], 3.0)
+    assert quiet.notices[-1] == ("Unexpected error", "ZeroDivisionError: by nothing")
+
+
+def test_two_pages_do_not_mix(viewer):
+    one, other = QuietPage(viewer, 0), QuietPage(viewer, 1)
+    one.enter(one.page.pose.sliders[0], 18.0)
+    one.enter(button(one, "keys"), "set")
+    assert other.page.pose.sliders[0].value == 0.0 and other.page.session.work.keys == ()
+    other.enter(other.page.pose.sliders[0], 6.0)
+    assert one.page.pose.sliders[0].value == 18.0
