@@ -82,6 +82,16 @@ def test_speed_is_asked_for_between_consecutive_poses():
     assert not (RIG.validate(RIG.pose(d), times_s=2 * times, speed_limit_mm_s=150.0).reason & Reason.TOO_FAST).any()
 
 
+def test_as_many_poses_as_landmarks_are_no_pairs():
+    d = np.zeros((5, 3))
+    d[4, 0] = 10.0
+    for verdicts in (
+        RIG.validate(RIG.pose(d), times_s=np.arange(5.0), speed_limit_mm_s=5.0),
+        RIG.validate_parameters(d, times_s=np.arange(5.0), speed_limit_mm_s=5.0),
+    ):
+        assert [bool(r & Reason.TOO_FAST) for r in reasons(verdicts)] == [False] * 4 + [True]
+
+
 def test_speed_across_a_lost_frame_is_not_judged():
     d = np.zeros((3, 3))
     d[:, 0] = [0.0, np.nan, 30.0]
