@@ -277,6 +277,12 @@ def _refined(image: NDArray[np.uint8], corners_px: Array, boards: Boards) -> Arr
 def _charuco(boards: Boards) -> Callable[[NDArray[np.uint8]], Array | None]:
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, str(boards.dictionary)))
     size = (boards.cols + 1, boards.rows + 1)
+    markers, known = size[0] * size[1] // 2, len(dictionary.bytesList)
+    if markers > known:
+        raise CalibrationError(
+            f"[boards] a ChArUco board of {boards.cols} x {boards.rows} inner corners needs {markers} markers, "
+            f"{boards.dictionary} has {known}."
+        )
     board = cv2.aruco.CharucoBoard(size, boards.square_mm, float(boards.marker_mm or 0), dictionary)
     detector = cv2.aruco.CharucoDetector(board)
 

@@ -127,6 +127,9 @@ def test_a_wrong_square_size_is_told_by_the_teeth(tmp_path):
         calibrate_sightings(found, capture_of(CAMERAS, wrong, tmp_path, picks), scans)
     _, unchecked = calibrate_sightings(found, capture_of(CAMERAS, wrong, tmp_path), scans)
     assert any("square_mm tells the scale" in note for note in unchecked.notes)
+    scans, careless = picked(rng, noise_px=60.0)
+    _, unsure = calibrate_sightings(found, capture_of(CAMERAS, board(), tmp_path, careless), scans)
+    assert unsure.scale.ratio is None and "scatter too much" in unsure.scale.reason
 
 
 def test_advice_names_what_was_done_badly(tmp_path):
