@@ -79,7 +79,7 @@ def build(
     allow_outside: Outside = False,
     as_json: Json = False,
 ) -> None:
-    """Turn a capture into a rig: sync, track, fit, track again where the model helps, bake."""
+    """Turn a capture into a rig: calibrate if need be, sync, track, fit, track again where the model helps, bake."""
     from jawusd.pipeline.build import BuildOptions, build_rig
     from jawusd.pipeline.summary import build_lines
 
@@ -191,11 +191,13 @@ def bake(
     """Write the OpenUSD rig of a model, with the meshes of a capture or loose scans."""
     from jawusd.formats.model import load_model
     from jawusd.pipeline.stages import bake_meshes
+    from jawusd.pipeline.subject import check_same_jaw
 
     refuse_existing(out / "actor.usda", force)
     loaded = load_model(model)
     name = str(loaded.meta.get("actor") or model.stem)
     subject = subject_given(name, capture, upper_teeth, lower_teeth, mandible, None, allow_outside)
+    check_same_jaw(subject, loaded)
     with progress() as report:
         files = bake_meshes(subject.bones, subject.name, subject.fps or fps, loaded, out, report, table)
     emit({"files": files}, as_json, lambda: [str(path) for path in files])

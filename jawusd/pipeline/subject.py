@@ -10,15 +10,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.errors import RigError
 from jawusd.formats.capture import Capture
 from jawusd.formats.landmarks import load_landmarks
 from jawusd.formats.mesh import Mesh
-from jawusd.formats.model import load_model
-from jawusd.geometry import landmark_frame
+from jawusd.formats.model import JawModel, load_model
+from jawusd.geometry import LANDMARKS, landmark_frame
 from jawusd.pipeline.extras import stage
 from jawusd.pipeline.prepare import find_anatomy, load_meshes, measure_anatomy
 
 Array = NDArray[np.float64]
+
+_TEETH_APART_MM = 15.0  # molars are picked by hand here, found by rule there
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +96,21 @@ def subject_of_landmarks(path: str | os.PathLike[str], name: str) -> Subject:
     if T is None:
         T, inferred = landmark_frame(given.landmarks), ("anatomical axes, from the landmarks",)
     return Subject(name, T, given.landmarks, {}, inferred=inferred)
+
+
+def check_same_jaw(subject: Subject, model: JawModel) -> None:
+    """Check that a model and a person's scans are in one frame: their teeth must lie in one place.
+
+    Raises:
+        RigError: naming the distance.
+    """
+    apart = np.linalg.norm(model.arrays["landmarks"][:3] - subject.landmarks[:3], axis=1)
+    if apart.max() > _TEETH_APART_MM:
+        raise RigError(
+            f"the {LANDMARKS[int(apart.argmax())]} of the model is {apart.max():.1f} mm from that of the scans "
+            f"(allowed: {_TEETH_APART_MM:g} mm).",
+            hint="Scans and the landmarks or poses of the model must be given in one frame.",
+        )
 
 
 def subject_of_build(folder: Path) -> Subject:

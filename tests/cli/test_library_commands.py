@@ -6,15 +6,17 @@ import numpy as np
 import pytest
 from example_people import person, save
 from example_rig import example_meshes, example_motion
+from package_copy import ROOT
 from pxr import Sdf, Usd
 from typer.testing import CliRunner
 
 import jawusd
 from jawusd.cli.main import app
-from jawusd.errors import FittingError, FormatError, OutputError
+from jawusd.errors import FittingError, FormatError, OutputError, RigError
 from jawusd.formats.model import load_model
 from jawusd.formats.poses import write_parameters
 from jawusd.geometry import LANDMARKS
+from jawusd.pipeline.subject import subject_of_scans
 from jawusd.rig import write_animation
 from jawusd.rig.bake import bake_rig
 from jawusd.rig.layout import PARAMETERS
@@ -220,6 +222,25 @@ def test_landmarks_and_a_library_make_a_rig(people, tmp_path):
         "retarget", "--landmarks", tmp_path / "face.json", "--library", people, "--use", "closest", "-o", closest
     )
     assert list(said["weights"].values()) == [1.0]
+
+
+SCANS = ROOT / "examples" / "capture" / "scans"
+
+
+def test_somebody_without_a_capture_gets_a_rig_on_loose_scans(people, tmp_path):
+    files = {name: SCANS / f"{name}.ply" for name in ("upper_teeth", "lower_teeth", "mandible")}
+    named = dict(zip(LANDMARKS, subject_of_scans(files, "me").landmarks.tolist(), strict=True))
+    (tmp_path / "me.json").write_text(json.dumps({"format": "jawusd-landmarks/1", "units": "mm", "landmarks": named}))
+    run("retarget", "--landmarks", tmp_path / "me.json", "--library", people, "-o", tmp_path / "me.npz")
+    scans = [word for name, path in files.items() for word in (f"--{name.replace('_', '-')}", path)]
+    run("bake", tmp_path / "me.npz", *scans, "-o", tmp_path / "me", "--table", 17)
+    d = [20.0, 1, 0]
+    np.testing.assert_allclose(
+        jawusd.load(tmp_path / "me" / "actor.usda").pose(d), jawusd.load(tmp_path / "me.npz").pose(d), atol=1e-9
+    )
+    assert not (tmp_path / "me" / "anim_capture.usdc").exists()
+    with pytest.raises(RigError, match="in one frame"):
+        run("bake", people / "anna" / "model.npz", *scans, "-o", tmp_path / "other", "--table", 17)
 
 
 def test_an_empty_library_is_said_to_be_empty(tmp_path):
