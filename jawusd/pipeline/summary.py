@@ -86,6 +86,7 @@ def build_lines(summary: dict) -> list[str]:
             *calibration_lines(summary["calibrate"]),
         ]
     lines += [f"sync ({summary['sync']['method']}): {offsets} frames"]
+    lines += [f"  note: {note}" for note in summary["sync"].get("notes", [])]
     lines += track_lines(summary["track"])
     lines += fit_lines(summary["fit"])
     seconds = ", ".join(

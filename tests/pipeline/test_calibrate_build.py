@@ -101,12 +101,14 @@ def test_the_summary_of_a_build_says_what_was_made(calibrated):
     record = json.loads((out / "build.json").read_text())["stages"]
     summary = {
         "calibrate": record["calibrate"]["result"], "sync": record["sync"]["result"], "fit": {}, "reused": [],
-        "seconds": {}, "folder": str(out),
+        "seconds": {}, "folder": str(out), "report": {"file": "report.html"},
         "track": {"tracked": 1, "frames": 1, "lost": [], "recovered": 0, "without_a_camera": 0, "prior_aided": 0,
                   "calibration_rescaled_px": {}, "sigma_mm": {}, "coverage_error_percent": 0.1},
     }  # fmt: skip
     assert build_lines(summary)[0] == "the capture names no calibration: made one from its boards"
     assert not any("calibration" in line for line in build_lines(summary | {"calibrate": None}))
+    summary["sync"]["notes"] = ["camera b has a variable rate"]
+    assert "  note: camera b has a variable rate" in build_lines(summary)
 
 
 def test_a_calibration_of_colmap_is_read_where_the_capture_names_it(capture, tmp_path):
