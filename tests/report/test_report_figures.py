@@ -6,34 +6,22 @@ import numpy as np
 import pytest
 from matplotlib.patches import Rectangle
 from PIL import Image
+from report_data import experiments
 
 from jawusd.errors import OutputError
-from jawusd.formats.experiments import CondylePath, Coverage, Distances, Experiments
-from jawusd.report.figures import FIGURES, coverage_figure, draw_experiments, reconstruction_figure, synthesis_figure
-
-
-def results(bones=True, gaps=True):
-    rng = np.random.default_rng(0)
-    opening = np.linspace(0, 40, 30)
-    points = np.stack([np.stack([np.full(30, side), 30 - 0.2 * opening, -80 + 0.3 * opening], 1) for side in (50, -50)])
-    lines = rng.normal(size=(5, 2, 2)) + [-80, 30]
-    heads = (lines,) * 4 if bones else ()
-    paths = tuple(CondylePath(name, opening, points, heads) for name in ("principal component 1", "anchored"))
-    distances = [Distances("reconstruction", name, "x", rng.gamma(2, 0.2, 300)) for name in ("NLPCA 1", "anchored")]
-    distances += [Distances("synthesis", name, "static: box", rng.gamma(2, 1, 200)) for name in ("captured", "paper")]
-    d = rng.uniform([0, -9, -1], [40, 9, 7], (300, 3))
-    square = np.array([[0.0, -9], [40, -9], [40, 9], [0, 9]])
-    holes = rng.uniform([0, -3], [40, 3], (20, 2)) if gaps else np.empty((0, 2))
-    slices = np.stack([np.stack([np.full(30, -9.0), np.full(30, 9.0)], 1)] * 2)
-    coverage = Coverage(d, ((square,), (square, square / 2)), opening, slices, (holes, holes), ("Record protrusion.",))
-    skull = lines if bones else np.empty((0, 2, 2))
-    captured = points + rng.normal(size=points.shape) * 0.1
-    return Experiments("someone", 300, captured, skull, paths, tuple(distances), coverage, ())
+from jawusd.report.figures import (
+    FIGURES,
+    coverage_figure,
+    draw_experiments,
+    parameter_figure,
+    reconstruction_figure,
+    synthesis_figure,
+)
 
 
 @pytest.mark.parametrize(("bones", "gaps"), [(True, True), (False, False)])
 def test_every_figure_is_a_picture_and_a_drawing(tmp_path, bones, gaps):
-    files = draw_experiments(results(bones, gaps), tmp_path / "figures")
+    files = draw_experiments(experiments(bones, gaps), tmp_path / "figures")
     assert {path.name for path in files} == {f"{name}.{kind}" for name in FIGURES for kind in ("png", "svg")}
     for path in files:
         if path.suffix == ".png":
@@ -47,13 +35,13 @@ def test_every_figure_is_a_picture_and_a_drawing(tmp_path, bones, gaps):
 
 
 def test_equal_results_give_equal_files(tmp_path):
-    first, second = (draw_experiments(results(), tmp_path / name) for name in ("a", "b"))
+    first, second = (draw_experiments(experiments(), tmp_path / name) for name in ("a", "b"))
     for a, b in zip(first, second, strict=True):
         assert a.read_bytes() == b.read_bytes(), a.name
 
 
 def test_histograms_count_every_pose_and_say_what_lies_beyond():
-    found = results()
+    found = experiments()
     for figure, samples in (
         (reconstruction_figure(found), found.of("reconstruction")),
         (synthesis_figure(found), found.of("synthesis")[1:]),
@@ -69,7 +57,7 @@ def test_histograms_count_every_pose_and_say_what_lies_beyond():
 
 
 def test_coverage_shows_every_pose_and_the_advice():
-    found = results()
+    found = experiments()
     figure = coverage_figure(found.coverage, "someone")
     for index, axis in enumerate(figure.axes):
         captured = axis.lines[0].get_xydata()
@@ -81,4 +69,15 @@ def test_coverage_shows_every_pose_and_the_advice():
 def test_a_folder_that_is_a_file_is_one_clear_error(tmp_path):
     (tmp_path / "figures").write_text("")
     with pytest.raises(OutputError, match="figures"):
-        draw_experiments(results(), tmp_path / "figures")
+        draw_experiments(experiments(), tmp_path / "figures")
+
+
+def test_every_parameter_is_drawn_for_both_models_from_both_sides():
+    found = experiments()
+    axes = parameter_figure(found).axes
+    for k, axis in enumerate(axes[:6]):
+        drawn = {tuple(map(tuple, line.get_xydata().round(9))) for line in axis.lines}
+        h, v = ((2, 1), (0, 2))[k // 3]
+        for path in found.parameter_paths:
+            expected = tuple(map(tuple, path.points[:, [h, v]].round(9)))
+            assert (expected in drawn) == (path.parameter == k % 3)

@@ -1,0 +1,117 @@
+"""The verdicts: a good build is called good, and each planted fault is found at its stage."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from report_data import report_data
+
+from jawusd.formats.report import RigFacts
+from jawusd.report.ranges import human_ranges
+from jawusd.report.timeline import tracking_figure
+from jawusd.report.verdicts import BAD, GOOD, LOOK, judge, overall
+
+
+def grades(data):
+    return {verdict.stage: verdict.grade for verdict in judge(data)}
+
+
+def test_a_good_build_is_good():
+    verdicts = judge(report_data())
+    assert [verdict.stage for verdict in verdicts] == ["sync", "track", "fit", "bounds", "rig"]
+    assert overall(verdicts) == GOOD, [c for v in verdicts for c in v.checks if c.grade != GOOD]
+
+
+def late_camera(data):
+    data.tracks.meta["delays_frames"]["cam1"] = -1.4
+    return data
+
+
+def uncovered(data):
+    data.tracks.coverage_error[:] = 0.03
+    return data
+
+
+def blurred(data):
+    data.tracks.residual_px[:] = 3.0
+    return data
+
+
+def unsure(data):
+    data.tracks.sigma_mm[:, 4] = 2.0
+    return data
+
+
+def misfit(data):
+    data.model.meta["errors"]["holdout"]["mandible"] = {"mean": 2.0, "max": 4.0}
+    return data
+
+
+def swapped(data):
+    data.model.meta["warnings"] = [{"code": "swapped_jaws", "message": "Exchanged."}]
+    return data
+
+
+def beyond(data):
+    data.model.d[:30, 1] = 30.0
+    return data
+
+
+def broken(data):
+    return replace(data, rig=RigFacts(0.02, ("error: no mandible",)))
+
+
+def coarse(data):
+    return replace(data, rig=RigFacts(0.5, ()))
+
+
+@pytest.mark.parametrize(
+    ("fault", "stage"),
+    [
+        (late_camera, "sync"),
+        (lambda data: report_data(lost=range(20)), "track"),
+        (uncovered, "track"),
+        (blurred, "track"),
+        (unsure, "track"),
+        (misfit, "fit"),
+        (swapped, "fit"),
+        (beyond, "bounds"),
+        (broken, "rig"),
+        (coarse, "rig"),
+    ],
+)
+def test_each_fault_is_found_where_it_is(fault, stage):
+    found = grades(fault(report_data()))
+    assert found.pop(stage) == BAD and BAD not in found.values()
+
+
+def test_missing_movements_and_unproven_times_ask_for_a_look():
+    data = report_data(sync={"offsets": {}, "method": "taken as simultaneous"})
+    data.model.meta["warnings"] = [{"code": "take_lacks", "message": "Record protrusion."}]
+    assert grades(data) == {"sync": LOOK, "track": GOOD, "fit": GOOD, "bounds": LOOK, "rig": GOOD}
+
+
+def test_ranges_are_those_of_the_motion():
+    data = report_data()
+    A, rest = data.model.arrays["T_anatomical_skull"], data.model.arrays["T_rest"]
+    shifts = np.zeros((60, 3))
+    shifts[:30, 1] = np.linspace(0, -45, 30)
+    shifts[30:45, 0], shifts[45:, 0] = 9.0, -3.0
+    motion = np.tile(np.eye(4), (60, 1, 1))
+    motion[:, :3, 3] = shifts
+    data.tracks.raw_T_upper_lower[:] = np.linalg.inv(A) @ motion @ A @ rest
+    rows = {row.name: row for row in human_ranges(data.tracks, data.model)}
+    opening, left, right = (rows[n] for n in rows if n.startswith(("opening", "laterotrusion")))
+    assert float(opening.found.split()[0]) == pytest.approx(45, abs=0.7) and opening.grade == GOOD
+    assert left.found == "9.0 mm" and left.grade == GOOD
+    assert right.found == "3.0 mm" and right.grade == LOOK and "less" in right.remark
+    assert rows["rotation"].found == "0.0 deg"
+    assert rows["travel of the left condyle"].grade == LOOK and "more" in rows["travel of the left condyle"].remark
+
+
+def test_a_long_take_keeps_its_worst_frame_in_the_drawing():
+    data = report_data(count=5000)
+    data.tracks.residual_px[3333, 1] = 7.0
+    lines = tracking_figure(data.tracks).axes[1].lines
+    assert max(line.get_ydata().max() for line in lines) == 7.0
+    assert all(len(line.get_xdata()) <= 1250 for line in lines)
