@@ -13,6 +13,7 @@ from jawusd.cli import (
     plate_commands,
     report_commands,
     rig_commands,
+    segment_commands,
     view_commands,
 )
 from jawusd.errors import JawusdError
@@ -27,6 +28,7 @@ app = typer.Typer(
 )
 build_commands.register(app)
 capture_commands.register(app)
+segment_commands.register(app)
 rig_commands.register(app)
 library_commands.register(app)
 plate_commands.register(app)

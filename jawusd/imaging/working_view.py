@@ -89,6 +89,22 @@ class WorkingView:
         width, height = self.camera.size_px
         return self._averaged(image, (slice(0, height), slice(0, width)))
 
+    def part(self, image: NDArray[np.uint8], window: tuple[slice, slice]) -> NDArray[np.uint8]:
+        """Bring a part of a picture to the working size.
+
+        Args:
+            image: (H, W) or (H, W, 3) uint8 as recorded.
+            window: rows and columns of the working picture, with start and stop inside it.
+
+        Returns:
+            That part of what `picture` returns.
+
+        Raises:
+            ValueError: the picture has not the size of the recorded ones.
+        """
+        self._check(image)
+        return self._averaged(image, window)
+
     def _check(self, image: NDArray[np.uint8]) -> None:
         if image.shape[1::-1] != self.source.size_px or image.dtype != np.uint8:
             raise ValueError(f"picture must be uint8 of {self.source.size_px} px, got {image.dtype} {image.shape}")

@@ -1,0 +1,193 @@
+"""Make masks from footage: segmentation and tracking take turns, frame by frame, both ways from the picks."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.errors import CaptureError, TrackingError
+from jawusd.formats.capture import Capture, Masks
+from jawusd.pipeline.extras import stage
+from jawusd.pipeline.journal import Journal
+from jawusd.pipeline.overlay import open_footage
+from jawusd.pipeline.prepare import input_files, load_meshes
+from jawusd.pipeline.state import Progress, hash_files, hash_value
+
+_WARM_UP = 6  # finished frames gone through again when work is taken up: colours and motion are known from few
+ROWS = ("upper", "lower")
+
+
+@dataclass(frozen=True)
+class SegmentOptions:
+    """Choose how to segment.
+
+    Attributes:
+        keys: folder with masks a person drew for some frames, or None.
+        resume: keep the frames that were finished before.
+        jobs: threads.
+    """
+
+    keys: Path | None = None
+    resume: bool = False
+    jobs: int = 2
+
+
+def segment_teeth(
+    capture: Capture, offsets: dict[str, int], folder: Path, options: SegmentOptions, progress: Progress
+) -> dict[str, Any]:
+    """Write masks of both rows of teeth for every frame and camera of a capture.
+
+    Args:
+        capture: the capture; its videos, calibration, scans, picks and frame range are used, its masks are not.
+        offsets: frame offset by camera.
+        folder: where the masks go, as CAMERA/upper/000123.png numbered by the camera's own frames.
+        options: how to segment.
+        progress: told of every frame.
+
+    Returns:
+        Per-frame confidences and what is to be looked at, as written to segment.json.
+
+    Raises:
+        CaptureError: fewer than two cameras have a video, or one cannot be decoded.
+        TrackingError: no picks, or the teeth are not found where they say.
+        OutputError: a file cannot be written.
+    """
+    with ThreadPoolExecutor(options.jobs) as pool:
+        return _Segmenting(capture, offsets, folder, options, progress, pool).run()
+
+
+def with_masks(capture: Capture, folder: Path) -> Capture:
+    """Return the capture with the masks that `segment_teeth` wrote to a folder."""
+    pattern = stage("jawusd.segmentation.files").mask_pattern
+    cameras = tuple(
+        camera
+        if camera.video is None
+        else camera.model_copy(update={"masks": Masks(**{row: pattern(folder, camera.name, row) for row in ROWS})})
+        for camera in capture.cameras
+    )
+    return capture.model_copy(update={"cameras": cameras})
+
+
+class _Segmenting:
+    """One run over the frames of a capture."""
+
+    def __init__(self, capture, offsets, folder, options, progress, pool) -> None:
+        self._capture, self._folder, self._progress, self._pool = capture, folder, progress, pool
+        cameras, videos = open_footage(capture)
+        if len(videos) < 2:
+            raise CaptureError(
+                f"{len(videos)} of {len(capture.cameras)} cameras have a video; masks are made from two at least.",
+                path=capture.folder / "capture.toml",
+            )
+        self._names = [name for name in cameras if name in videos]
+        self._cameras = {name: cameras[name] for name in self._names}
+        self._meshes = [load_meshes(capture)[name] for name in ("upper_teeth", "lower_teeth")]
+        self._footage = stage("jawusd.segmentation.footage").ColourFootage(videos, offsets)
+        self._files = stage("jawusd.segmentation.files")
+        self._keys = self._files.KeyMasks(options.keys, {n: self._cameras[n].size_px for n in self._names})
+        guided = stage("jawusd.tracking.guided")
+        self._config = stage("jawusd.segmentation.config").SegmentationConfig()
+        self._tracker = guided.GuidedTracker(*self._meshes, self._see, len(self._config.reach_mm), None, pool)
+        self._first, self._stop = capture.frames or self._footage.range()
+        self._journal = Journal(folder, self._inputs(offsets, options), options.resume)
+        self._pictures: dict = {}
+        self._segments: dict = {}
+        self._segmenters: dict = {}
+
+    def _inputs(self, offsets, options) -> str:
+        keys = sorted(options.keys.rglob("*.png")) if options.keys else []
+        described = self._capture.model_dump(mode="json", include={"bootstrap", "frames"})
+        files = hash_files([*input_files(self._capture, ["videos", "scans", "calibration"]), *keys])
+        return hash_value([files, described, offsets])
+
+    def run(self) -> dict[str, Any]:
+        bootstrap = self._capture.bootstrap
+        poses = self._tracker.picked(bootstrap, self._cameras)
+        start = bootstrap.frame
+        if not self._first <= start < self._stop:
+            raise TrackingError(f"bootstrap.frame is {start}, frames run from {self._first} to {self._stop - 1}")
+        self._new_segmenters(poses)
+        self._pictures = self._footage.at(start)
+        begun = self._tracker.begin(start, poses)
+        self._write(start, begun)
+        self._progress("segment", len(self._journal.entries), self._stop - self._first)
+        for step, end in ((1, self._stop), (-1, self._first - 1)):
+            self._new_segmenters(begun.solution.poses)
+            self._go(start, end, step)
+        return self._journal.entries
+
+    def _new_segmenters(self, poses: NDArray[np.float64]) -> None:
+        module = stage("jawusd.segmentation.camera")
+        self._segmenters = {
+            name: module.CameraSegmenter(camera, self._meshes, poses, self._config)
+            for name, camera in self._cameras.items()
+        }
+
+    def _go(self, start: int, end: int, step: int) -> None:
+        """Go from the frame of the picks to one end of the take, past what was finished before."""
+        done = start
+        while done + step != end and done + step in self._journal.entries:
+            done += step
+        # Even a fresh run judges the first frame once more: its colours come from the poses found there.
+        known = {}
+        warm = range(start, done + step, step)[-_WARM_UP:]
+        for frame, pictures in self._footage.walk(warm):
+            self._pictures = pictures
+            known[frame] = self._tracker.judge(frame, self._journal.poses(frame))
+        frames = range(done + step, end, step)
+        walk = self._footage.walk(frames)
+        follow = self._tracker.follow(frames, known)
+        for _ in frames:
+            _, self._pictures = next(walk)
+            frame, record = next(follow)
+            self._write(frame, record)
+            self._progress("segment", len(self._journal.entries), self._stop - self._first)
+
+    def _see(self, frame: int, poses: NDArray[np.float64], turn: int) -> list:
+        """Segment all cameras' pictures of a frame and return them as the tracker's views."""
+        view = stage("jawusd.tracking.solver").View
+
+        def one(name: str):
+            image, own = self._pictures[name], self._footage.own(name, frame)
+            if image is None:
+                return None
+            return self._segmenters[name].segment(image, poses, turn, self._keys.of(name, own))
+
+        self._segments = dict(zip(self._names, self._pool.map(one, self._names), strict=True))
+        views = []
+        for name, found in self._segments.items():
+            camera = self._cameras[name] if found is None else found.camera
+            masks = np.zeros((2, 1, 1), np.uint8) if found is None else found.masks
+            present = np.zeros(2, bool) if found is None else found.present
+            views.append(view(camera.projection_matrix(), camera.centre_world(), masks, present))
+        return views
+
+    def _write(self, frame: int, record) -> None:
+        """Write the masks of a frame and what is known about it."""
+        residual = stage("jawusd.tracking.quality").view_residual_px(record.solution)
+        cameras = {}
+        for k, name in enumerate(self._names):
+            found = self._segments[name]
+            if found is not None:
+                cameras[name] = {
+                    "frame": self._footage.own(name, frame),
+                    "contrast": found.contrast.tolist(),
+                    "pixels": [int((m > 127).sum()) for m in found.masks],
+                    "unexpected": found.unexpected.tolist(),
+                    "residual_px": residual[:, k].tolist(),
+                    "uncovered": record.coverage[:, k].tolist(),
+                    "used": record.used[:, k].tolist(),
+                }
+        list(self._pool.map(lambda name: self._write_masks(name, cameras[name]["frame"]), cameras))
+        poses = record.solution.poses
+        self._journal.add(frame, {"poses": poses.tolist(), "status": record.status.tolist(), "cameras": cameras})
+
+    def _write_masks(self, name: str, own: int) -> None:
+        masks = self._segmenters[name].recorded(self._segments[name])
+        for row, mask in zip(ROWS, masks, strict=True):
+            self._files.write_mask(self._files.mask_path(self._folder, name, row, own), mask)

@@ -1,0 +1,123 @@
+"""Which masks can be trusted: a confidence per frame and camera, and the frames to be looked at, worst first."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.formats.atomic import write_text_atomic
+from jawusd.formats.capture import Capture
+from jawusd.formats.tracks import LOST
+from jawusd.pipeline.extras import stage
+
+FILE, SHEET = "segment.json", "look_at_these.png"
+FORMAT = "jawusd-segment/1"
+# Below this confidence a mask is to be looked at: a symptom at twice its usual spread.
+_DOUBTFUL = 0.5
+# Symptoms of a bad mask and whether more is worse; each is judged by how far it is off what the take's masks are like.
+_SYMPTOMS = {"contrast": -1.0, "unexpected": 1.0, "residual_px": 1.0, "uncovered": 1.0}
+_LEAST_SPREAD = {"contrast": 0.03, "unexpected": 0.01, "residual_px": 0.05, "uncovered": 0.01}
+_USUAL_OFF = 3.0  # spreads at which a symptom alone brings the confidence to one half
+_SHEET_FRAMES = 12
+
+
+def summarise(entries: dict[int, dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return a row per frame and camera, in order: confidence 0 .. 1 of the worse row of teeth, and the reason.
+
+    Args:
+        entries: what is known about every frame, as `segment_teeth` returns it.
+    """
+    keys = [(frame, name) for frame in sorted(entries) for name in entries[frame]["cameras"]]
+    found = [entries[frame]["cameras"][name] for frame, name in keys]
+    cameras = np.array([name for _, name in keys])
+    off = np.stack([_off(found, cameras, symptom) for symptom in _SYMPTOMS], axis=-1)  # (N, 2, S)
+    lost = np.array([[state == LOST for state in entries[frame]["status"]] for frame, _ in keys])
+    doubt = np.where(lost, np.inf, np.maximum(off, 0).max(-1) / _USUAL_OFF)
+    rows = []
+    for k, (frame, name) in enumerate(keys):
+        worse = int(doubt[k].argmax())
+        reason = "lost" if lost[k, worse] else list(_SYMPTOMS)[int(off[k, worse].argmax())]
+        confidence = float(1 / (1 + doubt[k, worse] ** 2))
+        rows.append(
+            {
+                "frame": frame,
+                "camera": name,
+                "own_frame": found[k]["frame"],
+                "confidence": round(confidence, 3),
+                "row": ("upper", "lower")[worse],
+                "reason": reason,
+            }
+        )
+    return rows
+
+
+def _off(found: list[dict], cameras: NDArray, symptom: str) -> NDArray[np.float64]:
+    """Return how many spreads a symptom is worse than the take's median, per camera, shape (N, 2)."""
+    values = _SYMPTOMS[symptom] * np.array(
+        [[np.nan if v is None else v for v in entry[symptom]] for entry in found], np.float64
+    )
+    out = np.zeros_like(values)
+    for camera in np.unique(cameras):
+        of = cameras == camera
+        for r in (0, 1):
+            seen = values[of, r][np.isfinite(values[of, r])]
+            if len(seen):
+                middle = np.median(seen)
+                spread = max(1.4826 * np.median(np.abs(seen - middle)), _LEAST_SPREAD[symptom])
+                out[of, r] = np.nan_to_num((values[of, r] - middle) / spread)
+    return out
+
+
+def write_summary(capture: Capture, entries: dict[int, dict[str, Any]], folder: Path) -> dict[str, Any]:
+    """Write segment.json, and thumbnails of the worst masks if any are to be looked at.
+
+    Args:
+        capture: gives the videos.
+        entries: as for `summarise`.
+        folder: holds the masks.
+
+    Returns:
+        What segment.json holds.
+
+    Raises:
+        CaptureError: a picture or mask cannot be read.
+        OutputError: a file cannot be written.
+    """
+    rows = summarise(entries)
+    doubtful = sorted((row for row in rows if row["confidence"] < _DOUBTFUL), key=lambda row: row["confidence"])
+    summary = {
+        "format": FORMAT,
+        "capture": capture.name,
+        "masks": {
+            camera.name: {row: f"{camera.name}/{row}/%06d.png" for row in ("upper", "lower")}
+            for camera in capture.cameras
+            if camera.video is not None
+        },
+        "frames": len(entries),
+        "look_at": doubtful,
+        "sheet": SHEET if doubtful else None,
+        "confidence": rows,
+    }
+    write_text_atomic(folder / FILE, json.dumps(summary, indent=1) + "\n")
+    if doubtful:
+        sheet = stage("jawusd.segmentation.sheet")
+        videos = {camera.name: camera.video for camera in capture.cameras}
+        worst = [(row["camera"], row["own_frame"], row["reason"]) for row in doubtful[:_SHEET_FRAMES]]
+        sheet.write_sheet(folder / SHEET, worst, videos, folder)
+    return summary
+
+
+def segment_lines(summary: dict[str, Any]) -> list[str]:
+    """Return the summary for people."""
+    doubtful = summary["look_at"]
+    lines = [f"{summary['frames']} frames segmented in {len(summary['masks'])} cameras"]
+    if doubtful:
+        lines.append(f"{len(doubtful)} masks to look at, worst first (thumbnails in {summary['sheet']}):")
+    for row in doubtful[:_SHEET_FRAMES]:
+        where = f"  {row['camera']} frame {row['own_frame']:>5}  {row['row']:<5}"
+        lines.append(f"{where}  confidence {row['confidence']:.2f}  {row['reason']}")
+    return lines

@@ -1,0 +1,43 @@
+"""The numbers of the segmentation, each with its unit and reason."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class SegmentationConfig:
+    """Set up the segmentation; px are pixels of the working picture."""
+
+    # Working resolution at the teeth [px/mm]: that of the tracker.
+    working_px_per_mm: float = 7.2
+    # Surroundings looked at around the projected crowns [mm]: lips, gum and tongue, not the room behind.
+    margin_mm: float = 4.0
+    # Distance inside projected crowns from which colours are learned as crowns [mm]: above the error of the poses.
+    inner_mm: float = 0.4
+    # Distance outside all projected crowns from which colours are learned as surroundings [mm].
+    outer_mm: float = 1.0
+    # How far teeth may reach beyond their projection [mm]: in the first round, and once the poses have been aligned.
+    reach_mm: tuple[float, ...] = (1.6, 1.0)
+    # Frames over which colours are remembered [-]: light changes with the head, not from frame to frame.
+    memory_frames: float = 24.0
+    # Share of the surroundings below whose log-odds a colour cannot be tooth [-], and how much more [-] it must speak
+    # for teeth where place says nothing: how well colours tell the two apart differs from person to person.
+    surroundings_share: float = 0.95
+    doubt: float = 1.0
+    # Bounds of the log-odds demanded in all [-].
+    doubt_range: tuple[float, float] = (-1.0, 1.0)
+    # Log-odds of being tooth per mm inside the projected outline [1/mm], and what place alone may say against and for.
+    place_per_mm: float = 2.0
+    place_most: tuple[float, float] = (1.5, 1.0)
+    # Price of a border in log-odds per pixel of its length [-], and the share left of it on the strongest edges.
+    border: float = 2.0
+    border_on_edge: float = 0.15
+    # Log-odds between the rows per mm from their projected common border [1/mm].
+    rows_per_mm: float = 4.0
+    # Iterations of the cut [-].
+    steps: int = 24
+    # What a person's mask counts for the colours [frames].
+    key_weight: float = 12.0
+    # Fewest pixels that make a mask [px]: 4 square millimetres.
+    least_px: int = 200

@@ -1,0 +1,86 @@
+"""Where the scans say that crowns, and what hides them, are to be seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.formats.mesh import Mesh
+from jawusd.geometry import Camera, transform_points
+from jawusd.imaging.meshio import GUM, tooth_labels
+from jawusd.imaging.raster import draw_depth_labels
+
+OTHER, UPPER, LOWER = 0, 1, 2
+
+
+@dataclass(frozen=True, eq=False)
+class ScanSurface:
+    """Hold one row of teeth ready to be drawn.
+
+    Attributes:
+        vertices: scan coordinates [mm], shape (V, 3).
+        crown_faces: faces of the teeth, int32, shape (F, 3).
+        gum_faces: faces that only hide what lies behind them, int32, shape (G, 3).
+    """
+
+    vertices: NDArray[np.float64]
+    crown_faces: NDArray[np.int32]
+    gum_faces: NDArray[np.int32]
+
+    @classmethod
+    def of(cls, mesh: Mesh) -> ScanSurface:
+        """Split a teeth scan at the line where most corners of a face are tooth."""
+        faces = np.asarray(mesh.faces, np.int32)
+        crown = (tooth_labels(mesh) != GUM)[faces].sum(1) >= 2
+        return cls(
+            np.asarray(mesh.vertices, np.float64),
+            np.ascontiguousarray(faces[crown]),
+            np.ascontiguousarray(faces[~crown]),
+        )
+
+    def crown_points(self) -> NDArray[np.float64]:
+        """Return the vertices of the crowns [mm], shape (N, 3)."""
+        return self.vertices[np.unique(self.crown_faces)]
+
+
+@dataclass(frozen=True, eq=False)
+class Expectation:
+    """Say what is expected where in a picture; px are pixels of that picture.
+
+    Attributes:
+        labels: OTHER, UPPER or LOWER where that row's crowns are nearest, shape (h, w).
+        inside_px: signed distance to the outline of each row's visible crowns, positive inside, shape (2, h, w).
+    """
+
+    labels: NDArray[np.uint8]
+    inside_px: NDArray[np.float32]
+
+
+def expect_crowns(scans: tuple[ScanSurface, ScanSurface], poses: NDArray[np.float64], camera: Camera) -> Expectation:
+    """Draw both rows as a pinhole camera sees them.
+
+    Args:
+        scans: upper and lower row.
+        poses: T_world_upper, T_world_lower, shape (2, 4, 4).
+        camera: camera of the working picture, without distortion.
+    """
+    width, height = camera.size_px
+    inverse_depth, labels = np.zeros((height, width), np.float32), np.zeros((height, width), np.uint8)
+    for scan, pose, label in zip(scans, poses, (UPPER, LOWER), strict=True):
+        world = transform_points(pose, scan.vertices)
+        points = np.column_stack([camera.project_pinhole(world), camera.depth(world)]).astype(np.float32)
+        draw_depth_labels(points, scan.gum_faces, 0, 0, False, inverse_depth, labels, OTHER)
+        draw_depth_labels(points, scan.crown_faces, 0, 0, False, inverse_depth, labels, label)
+    return Expectation(labels, np.stack([_signed_distance(labels == label) for label in (UPPER, LOWER)]))
+
+
+def _signed_distance(region: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Return the distance to the outline of a region, positive inside [px]; far outside where there is none."""
+    if not region.any():
+        return np.full(region.shape, -1e3, np.float32)
+    inner = cv2.distanceTransform(region.astype(np.uint8), cv2.DIST_L2, 5)
+    outer = cv2.distanceTransform((~region).astype(np.uint8), cv2.DIST_L2, 5)
+    return np.where(region, inner - 0.5, 0.5 - outer)

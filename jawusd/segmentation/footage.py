@@ -1,0 +1,64 @@
+"""The colour pictures of all cameras, instant after instant."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.imaging.video import Video
+
+_CHUNK = 16  # instants held at once when going backwards: 100 MB per full HD camera
+
+Pictures = dict[str, NDArray[np.uint8] | None]
+
+
+class ColourFootage:
+    """Read the pictures of one instant in all cameras, in either direction."""
+
+    def __init__(self, videos: Mapping[str, Video], offsets: Mapping[str, int]) -> None:
+        """Take the videos and, by the same names, reference frame minus own frame number."""
+        self._videos, self._offsets = dict(videos), dict(offsets)
+
+    def own(self, name: str, frame: int) -> int | None:
+        """Return a camera's own number of a frame of the reference camera; None while it was not recording."""
+        own = frame - self._offsets[name]
+        return own if 0 <= own < self._videos[name].count else None
+
+    def range(self) -> tuple[int, int]:
+        """Return the first frame that two cameras show, and one past the last."""
+        starts = sorted(self._offsets[name] for name in self._videos)
+        stops = sorted(self._offsets[name] + video.count for name, video in self._videos.items())
+        return max(0, starts[min(1, len(starts) - 1)]), stops[-min(2, len(stops))]
+
+    def at(self, frame: int) -> Pictures:
+        """Return the RGB pictures (H, W, 3) of one frame of the reference camera, None where there is none."""
+        return next(self.walk(range(frame, frame + 1)))[1]
+
+    def walk(self, frames: range) -> Iterator[tuple[int, Pictures]]:
+        """Yield frames with their pictures; a range that runs backwards is read forwards in parts.
+
+        Raises:
+            CaptureError: a picture cannot be decoded.
+        """
+        if frames.step > 0:
+            yield from self._forwards(frames)
+            return
+        for start in range(0, len(frames), _CHUNK):
+            part = frames[start : start + _CHUNK]
+            held = list(self._forwards(part[::-1]))
+            while held:
+                yield held.pop()
+
+    def _forwards(self, frames: range) -> Iterator[tuple[int, Pictures]]:
+        readers = {}
+        for frame in frames:
+            pictures: Pictures = {}
+            for name, video in self._videos.items():
+                own = self.own(name, frame)
+                if own is not None and name not in readers:
+                    last = min(video.count, frames[-1] - self._offsets[name] + 1)
+                    readers[name] = video.frames(own, last, colour="rgb")
+                pictures[name] = next(readers[name]).image if own is not None else None
+            yield frame, pictures

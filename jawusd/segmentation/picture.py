@@ -1,0 +1,102 @@
+"""One camera's pictures around the teeth: undistorted and reduced for work, masks brought back to recorded pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.geometry import Camera
+from jawusd.imaging.working_view import WorkingView
+from jawusd.segmentation.colours import to_lab
+
+_NODE_PX = 8  # spacing of undistorted positions; the lens is smooth in between
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """Hold a part of a working picture.
+
+    Attributes:
+        camera: the pinhole camera of the part.
+        lab: CIE Lab, 8 bit, shape (h, w, 3).
+        corner: its first column and row in the working picture [px].
+    """
+
+    camera: Camera
+    lab: NDArray[np.uint8]
+    corner: tuple[int, int]
+
+
+class PictureFrame:
+    """Cut windows around the teeth out of one camera's pictures."""
+
+    def __init__(self, source: Camera, centre_world: NDArray[np.float64], px_per_mm: float) -> None:
+        """Choose the working size.
+
+        Args:
+            source: the calibrated camera.
+            centre_world: where the teeth are [mm], shape (3,).
+            px_per_mm: resolution there; pictures are never enlarged.
+        """
+        recorded = float(np.sqrt(source.K[0, 0] * source.K[1, 1]) / source.depth(centre_world))
+        scale = min(1.0, px_per_mm / recorded)
+        self.px_per_mm = recorded * scale
+        self.source = source
+        self._working = WorkingView(source, tuple(max(1, round(s * scale)) for s in source.size_px))
+        self._back = _positions(source, self._working.camera)
+
+    def window(self, image: NDArray[np.uint8], points_world: NDArray[np.float64], margin_mm: float) -> Window | None:
+        """Return what surrounds some world points [mm], shape (N, 3), in a recorded RGB picture; None if out of sight.
+
+        Args:
+            image: (H, W, 3) RGB as recorded.
+            points_world: the points to be in the window.
+            margin_mm: what to leave around them.
+        """
+        camera = self._working.camera
+        seen = camera.project_pinhole(points_world[camera.depth(points_world) > 0])
+        if not len(seen):
+            return None
+        margin = margin_mm * self.px_per_mm
+        limit = np.array(camera.size_px)
+        low = np.clip(np.floor(seen.min(0) - margin), 0, limit).astype(int)
+        high = np.clip(np.ceil(seen.max(0) + margin) + 1, 0, limit).astype(int)
+        if (high - low < 8).any():
+            return None
+        part = self._working.part(image, (slice(low[1], high[1]), slice(low[0], high[0])))
+        size = (int(high[0] - low[0]), int(high[1] - low[1]))
+        cropped = camera.cropped(int(low[0]), int(low[1]), size)
+        return Window(cropped, to_lab(part), (int(low[0]), int(low[1])))
+
+    def given(self, mask: NDArray[np.uint8], window: Window) -> NDArray[np.uint8]:
+        """Return what a recorded mask, (H, W) uint8, shows in a window, shape (h, w)."""
+        (x, y), (width, height) = window.corner, window.camera.size_px
+        return self._working.part(mask, (slice(y, y + height), slice(x, x + width)))
+
+    def recorded(self, shares: NDArray[np.float32], window: Window) -> NDArray[np.uint8]:
+        """Return the mask at recorded size, 0 or 255, of a window's shares of teeth, shape (h, w)."""
+        nodes = self._back[::_NODE_PX, ::_NODE_PX] - np.array(window.corner, np.float32)
+        inside = ((nodes > -_NODE_PX) & (nodes < np.array(shares.shape[::-1], np.float32) + _NODE_PX)).all(2)
+        rows, columns = (np.flatnonzero(inside.any(axis)) * _NODE_PX for axis in (1, 0))
+        out = np.zeros(self._back.shape[:2], np.uint8)
+        if len(rows):
+            box = (slice(rows[0], rows[-1] + _NODE_PX), slice(columns[0], columns[-1] + _NODE_PX))
+            local = self._back[box] - np.array(window.corner, np.float32)
+            part = cv2.remap(shares, local, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+            out[box] = np.where(part > 0.5, 255, 0)
+        return out
+
+
+def _positions(source: Camera, working: Camera) -> NDArray[np.float32]:
+    """Return the working pixel under each recorded pixel, shape (H, W, 2)."""
+    width, height = source.size_px
+    columns, rows = (np.arange(0, size + _NODE_PX, _NODE_PX) for size in (width, height))
+    grid = np.stack(np.meshgrid(columns, rows), axis=-1).astype(np.float64)
+    pinhole = source.undistort_pixels(grid)
+    scale = np.array(working.size_px) / np.array(source.size_px)
+    nodes = ((pinhole + 0.5) * scale - 0.5).astype(np.float32)
+    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    return cv2.remap(nodes, x / _NODE_PX, y / _NODE_PX, cv2.INTER_LINEAR)

@@ -1,0 +1,140 @@
+"""Track through masks that are made on the way, each from where the teeth are expected."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.errors import TrackingError
+from jawusd.formats.capture import Bootstrap
+from jawusd.formats.mesh import Mesh
+from jawusd.formats.tracks import LOST
+from jawusd.geometry import Camera
+from jawusd.tracking.bootstrap import pose_from_picks
+from jawusd.tracking.config import TrackingConfig
+from jawusd.tracking.first import first_record
+from jawusd.tracking.history import FrameRecord, History
+from jawusd.tracking.ladder import FrameTracker
+from jawusd.tracking.motion import Motion
+from jawusd.tracking.scan import prepare_scan
+from jawusd.tracking.solver import ContourSolver, View
+
+#: Makes the views of a frame of the reference camera: called with the frame, T_world_upper and T_world_lower as
+#: expected, shape (2, 4, 4), and the round, 0 for poses that are only predicted.
+See = Callable[[int, NDArray[np.float64], int], Sequence[View]]
+
+_FIRST_ROUNDS = 3  # picks are a few tenths of a millimetre off; each round takes most of the rest
+
+
+@dataclass(frozen=True, eq=False)
+class _OneFrame:
+    """Show the views of a single frame in the way `MaskViews` does."""
+
+    views: Sequence[View]
+
+    def at(self, frame: int) -> Sequence[View]:
+        return self.views
+
+
+class GuidedTracker:
+    """Follow the teeth frame by frame, asking for masks where they are expected."""
+
+    def __init__(
+        self,
+        upper: Mesh,
+        lower: Mesh,
+        see: See,
+        rounds: int,
+        config: TrackingConfig | None = None,
+        executor: Executor | None = None,
+    ) -> None:
+        """Prepare the scans.
+
+        Args:
+            upper, lower: teeth scans in one frame, in occlusion [mm].
+            see: makes the masks.
+            rounds: how often masks and poses take turns on a frame.
+            config: the tracker's numbers.
+            executor: runs parts of the work.
+
+        Raises:
+            TrackingError: a scan cannot be tracked.
+        """
+        self._config = config or TrackingConfig()
+        self._meshes = {"upper": upper, "lower": lower}
+        scans = [prepare_scan(mesh, row) for row, mesh in self._meshes.items()]
+        self._solver = ContourSolver(scans, self._config, executor)
+        self._see, self._rounds = see, rounds
+        # A dozen points of a row show any motion of it.
+        self._probes = np.stack([s.probes[np.linspace(0, len(s.probes) - 1, 12).astype(int)] for s in scans])
+
+    def picked(self, bootstrap: Bootstrap | None, cameras: Mapping[str, Camera]) -> NDArray[np.float64]:
+        """Return T_world_upper and T_world_lower that agree with the picks, shape (2, 4, 4).
+
+        Raises:
+            TrackingError: no picks, too few, or picks that contradict one another.
+        """
+        if bootstrap is None:
+            raise TrackingError(
+                "without masks the tracking starts from picks, and the capture has none",
+                hint="Add [bootstrap]: three or more vertices of each scan with their pixels in two cameras.",
+            )
+        picks = {"upper": bootstrap.upper, "lower": bootstrap.lower}
+        return np.stack(
+            [pose_from_picks(picks[row], mesh.vertices, cameras, row)[0] for row, mesh in self._meshes.items()]
+        )
+
+    def begin(self, frame: int, poses: NDArray[np.float64]) -> FrameRecord:
+        """Align the first frame from picked poses.
+
+        Raises:
+            TrackingError: the teeth do not fit what is seen.
+        """
+        for turn in range(_FIRST_ROUNDS):
+            views = _OneFrame(self._see(frame, poses, min(turn, self._rounds - 1)))
+            record = first_record(self._solver, self._config, poses, views, frame)
+            poses = record.solution.poses
+        return record
+
+    def follow(self, frames: range, known: Mapping[int, FrameRecord]) -> Iterator[tuple[int, FrameRecord]]:
+        """Yield frames and what is known about them, one after the other away from known ones.
+
+        Args:
+            frames: the frames, in either direction; the one before the first must be known.
+            known: records of frames near the first one.
+        """
+        if not len(frames):
+            return
+        history = History(self._config.history_frames, self._config.score_frames)
+        before = frames.start - frames.step
+        near = sorted(known, key=lambda f: -abs(f - before))
+        for frame in near[-self._config.history_frames :]:
+            history.add(known[frame])
+        motion = Motion(known[before].solution.poses, self._probes)
+        tracker = FrameTracker(self._solver, self._config, history)
+        for frame in frames:
+            record = self._one(tracker, motion, frame)
+            motion.update(record.solution.poses, record.status != LOST, record.used.any(1))
+            history.add(record)
+            yield frame, record
+
+    def judge(self, frame: int, poses: NDArray[np.float64]) -> FrameRecord:
+        """Return the record of a frame whose poses are known already, shape (2, 4, 4)."""
+        views = self._see(frame, poses, self._rounds - 1)
+        return first_record(self._solver, self._config, poses, _OneFrame(views), frame)
+
+    def _one(self, tracker: FrameTracker, motion: Motion, frame: int) -> FrameRecord:
+        c = self._config
+        starts = motion.starts()
+        gallery = motion.gallery() if motion.worth_searching() else None
+        reach = c.gate_per_miss * motion.miss_mm() * c.working_px_per_mm
+        record = tracker.track(starts, self._see(frame, starts[0], 0), gallery, reach)
+        for turn in range(1, self._rounds):
+            lost = (record.status == LOST)[:, None, None]
+            poses = np.where(lost, starts[0], record.solution.poses)
+            record = tracker.track([poses], self._see(frame, poses, turn), None)
+        return record
