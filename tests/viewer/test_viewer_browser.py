@@ -186,8 +186,8 @@ def test_the_baked_motion_plays_goes_round_and_stops(tab):
     tab.tab("Animate")
     tab.press("play")
     tab.said("there is nothing to play")
-    tab.web.locator("input.mantine-Select-input, input.mantine-NativeSelect-input").first.click()
-    tab.web.get_by_role("option").nth(1).click()
+    tab.web.locator("input[role=combobox]:visible").first.click()
+    tab.web.get_by_role("option", name=tab.page.motion.source.options[1]).click()
     motion = tab.page.motion
     until(lambda: motion.clip() is not None and motion.frame == motion.clip().span[0])
     clip = motion.clip()
