@@ -1,0 +1,112 @@
+"""The report in a real browser, opened from disk: light and dark, no request, no console error, the replay moves."""
+
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from report_data import report_data
+
+from jawusd.report.document import write_document
+
+CHROMIUM = ("chromium", "chromium-browser", "google-chrome", "chrome")
+# Software GL, so that machines without a graphics card show the replay too.
+ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+PATIENCE_MS = 120_000
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    """Return a running headless Chromium; skips where there is none."""
+    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    path = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, CHROMIUM)), None)
+    if path is None or not Path(path).is_file():
+        pytest.skip("there is no Chromium; install one or name it in the variable CHROMIUM")
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=path, args=ARGUMENTS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(params=["light", "dark"])
+def opened(request, chromium, tmp_path):
+    """Open the report of an example; what went wrong and what was asked for is checked afterwards."""
+    data, path = report_data(lost=(20, 21)), tmp_path / "report.html"
+    write_document(path, data)
+    context = chromium.new_context(color_scheme=request.param, viewport={"width": 1200, "height": 900})
+    context.set_default_timeout(PATIENCE_MS)
+    page, trouble, requests = context.new_page(), [], []
+    page.on("console", lambda message: trouble.append(message.text) if message.type == "error" else None)
+    page.on("pageerror", lambda error: trouble.append(str(error)))
+    page.on("request", lambda request: requests.append(request.url))
+    page.goto(path.as_uri())
+    yield page, data, request.param
+    if "SCREENSHOTS" in os.environ:
+        page.screenshot(path=Path(os.environ["SCREENSHOTS"]) / f"report_{request.param}.png", full_page=True)
+    context.close()
+    assert trouble == []
+    assert [url for url in requests if not url.startswith("data:")] == [path.as_uri()]
+
+
+def part(page, name):
+    return page.locator(f'[data-replay="{name}"]')
+
+
+def picture(page):
+    """Return the replay as drawn, (h, w, 3)."""
+    import io
+
+    from PIL import Image
+
+    with Image.open(io.BytesIO(part(page, "canvas").screenshot())) as image:
+        return np.asarray(image.convert("RGB")).astype(int)
+
+
+def move_to(page, row):
+    part(page, "slider").evaluate("(e, v) => { e.value = v; e.dispatchEvent(new Event('input')); }", row)
+
+
+def luminance(color):
+    """Return the relative luminance of "rgb(r, g, b)" (WCAG 2.2)."""
+    share = np.array([float(v) for v in color[color.index("(") + 1 : -1].split(",")[:3]]) / 255
+    linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    return float(linear @ [0.2126, 0.7152, 0.0722])
+
+
+def test_the_replay_shows_the_frame_that_is_asked_for(opened):
+    page, data, _ = opened
+    for row in (0, 30):
+        move_to(page, row)
+        d = " ".join(part(page, "d").inner_text().split())
+        assert d == "d1 {:.1f} d2 {:.1f} d3 {:.1f} mm".format(*(data.model.d[row] + 0.0))
+        assert part(page, "frame").inner_text() == f"frame {data.model.frames[row]}, tracked"
+    wide = picture(page)
+    assert len(np.unique(wide.reshape(-1, 3), axis=0)) > 50  # shaded meshes, not an empty canvas
+    move_to(page, 0)
+    assert np.abs(picture(page) - wide).max() > 50
+    move_to(page, 20)
+    assert part(page, "frame").inner_text() == f"frame {data.model.frames[20]}, lost"
+    page.locator("[data-frame]").first.click()
+    assert part(page, "frame").inner_text().startswith(f"frame {data.overlays[0].frame},")
+
+
+def test_it_plays_turns_and_is_readable(opened):
+    page, _, scheme = opened
+    before = part(page, "frame").inner_text()
+    part(page, "play").click()
+    page.wait_for_function("text => document.querySelector('[data-replay=frame]').textContent !== text", arg=before)
+    part(page, "play").click()
+    assert part(page, "play").inner_text() == "Play"
+    seen = picture(page)
+    page.get_by_role("button", name="left").click()
+    assert np.abs(picture(page) - seen).max() > 50
+    colors = "e => [getComputedStyle(e).color, getComputedStyle(e).backgroundColor]"
+    ink, paper = map(luminance, page.locator("#verdicts").evaluate(colors))
+    assert (ink > paper) == (scheme == "dark")
+    light, dark = max(ink, paper), min(ink, paper)
+    assert (light + 0.05) / (dark + 0.05) > 7
+    for element in page.locator(".grade").all()[:8]:
+        grade = luminance(element.evaluate("e => getComputedStyle(e).color"))
+        light, dark = max(grade, paper), min(grade, paper)
+        assert (light + 0.05) / (dark + 0.05) > 4.5
