@@ -16,6 +16,8 @@ from jawusd.formats.tracks import load_tracks, save_tracks
 from jawusd.pipeline.calibration import calibrate_boards
 from jawusd.pipeline.prepare import input_files, open_capture
 from jawusd.pipeline.report import BuildFacts, missing_packages, where, write_build_report
+from jawusd.pipeline.segment import SegmentOptions, with_masks
+from jawusd.pipeline.segment_summary import segment_capture
 from jawusd.pipeline.stages import aid_teeth, bake_files, fit_jaw, sync_cameras, track_teeth, write_take
 from jawusd.pipeline.state import (
     BUILD_FILE,
@@ -30,6 +32,8 @@ from jawusd.pipeline.state import (
     locked,
 )
 from jawusd.pipeline.summary import fit_summary, track_summary
+
+MASKS = "masks"  # folder of the masks made when the capture names none
 
 
 @dataclass(frozen=True)
@@ -109,6 +113,7 @@ class _Build:
         calibrate = self._calibrated()
         capture, options = self.capture, self.options
         sync = self._stage("sync", self._inputs(["videos"], capture.sync.model_dump()), self._sync)
+        segment = self._segmented(sync.result["offsets"])
         # Paths stay out: the contents count, not where the capture lies.
         described = capture.model_dump(mode="json", include={"frames", "bootstrap", "motion", "anatomy"})
         described["cameras"] = [camera.name for camera in capture.cameras]
@@ -132,7 +137,7 @@ class _Build:
         missing = missing_packages()
         inputs = hash_value([bake.outputs, bake.inputs, missing, __version__])
         report = self._stage("report", inputs, lambda: self._report(missing))
-        finished = [*([calibrate] if calibrate else []), track, fit, aid, bake, report]
+        finished = [made for made in (calibrate, segment, track, fit, aid, bake, report) if made]
         return {
             "capture": capture.name,
             "folder": str(self.folder),
@@ -141,6 +146,7 @@ class _Build:
             "reused": self.reused,
             "calibrate": calibrate.result if calibrate else None,
             "sync": sync.result,
+            "segment": segment.result if segment else None,
             "track": aid.result,
             "fit": fit.result,
             "report": report.result,
@@ -174,6 +180,26 @@ class _Build:
             lambda: ([path], calibrate_boards(capture, path, self.progress)),
         )
         self.capture = capture.model_copy(update={"calibration": path, "calibration_unit_mm": 1.0})
+        return record
+
+    def _segmented(self, offsets: dict[str, int]) -> StageRecord | None:
+        """Make masks from the videos if the capture names none.
+
+        The masks themselves are no outputs of the record: they may be edited, and tracking starts over if they are.
+        """
+        capture = self.capture
+        if any(camera.masks for camera in capture.cameras):
+            return None
+        folder = self.folder / MASKS
+        described = capture.model_dump(mode="json", include={"frames", "bootstrap"})
+        record = self._stage(
+            "segment",
+            self._inputs(["videos", "scans", "calibration"], described, offsets),
+            lambda: segment_capture(
+                capture, offsets, folder, SegmentOptions(None, True, self.options.jobs), self.progress
+            ),
+        )
+        self.capture = with_masks(capture, folder)
         return record
 
     def _sync(self) -> tuple[list[Path], dict]:

@@ -13,6 +13,8 @@ from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.capture import Capture
 from jawusd.formats.tracks import LOST
 from jawusd.pipeline.extras import stage
+from jawusd.pipeline.segment import SegmentOptions, segment_teeth
+from jawusd.pipeline.state import Progress
 
 FILE, SHEET = "segment.json", "look_at_these.png"
 FORMAT = "jawusd-segment/1"
@@ -109,6 +111,18 @@ def write_summary(capture: Capture, entries: dict[int, dict[str, Any]], folder: 
         worst = [(row["camera"], row["own_frame"], row["reason"]) for row in doubtful[:_SHEET_FRAMES]]
         sheet.write_sheet(folder / SHEET, worst, videos, folder)
     return summary
+
+
+def segment_capture(
+    capture: Capture, offsets: dict[str, int], folder: Path, options: SegmentOptions, progress: Progress
+) -> tuple[list[Path], dict[str, Any]]:
+    """Segment a capture and sum it up; see `segment_teeth`.
+
+    Returns:
+        segment.json, and what it holds but for the confidences.
+    """
+    summary = write_summary(capture, segment_teeth(capture, offsets, folder, options, progress), folder)
+    return [folder / FILE], {key: value for key, value in summary.items() if key != "confidence"}
 
 
 def segment_lines(summary: dict[str, Any]) -> list[str]:

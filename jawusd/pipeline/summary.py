@@ -8,6 +8,7 @@ from jawusd.formats.model import JawModel
 from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, Tracks
 from jawusd.geometry import LANDMARKS
 from jawusd.pipeline.calibration import calibration_lines
+from jawusd.pipeline.segment_summary import segment_lines
 
 _LISTED_FRAMES = 20
 
@@ -87,6 +88,8 @@ def build_lines(summary: dict) -> list[str]:
         ]
     lines += [f"sync ({summary['sync']['method']}): {offsets} frames"]
     lines += [f"  note: {note}" for note in summary["sync"].get("notes", [])]
+    if summary["segment"]:
+        lines += ["the capture names no masks: made them from its videos", *segment_lines(summary["segment"])]
     lines += track_lines(summary["track"])
     lines += fit_lines(summary["fit"])
     seconds = ", ".join(

@@ -31,7 +31,7 @@ class SegmentationConfig:
     place_per_mm: float = 2.0
     place_most: tuple[float, float] = (1.5, 1.0)
     # Price of a border in log-odds per pixel of its length [-], and the share left of it on the strongest edges.
-    border: float = 2.0
+    border: float = 4.0
     border_on_edge: float = 0.15
     # Log-odds between the rows per mm from their projected common border [1/mm].
     rows_per_mm: float = 4.0

@@ -94,5 +94,7 @@ def cut_three_ways(
     for y in np.flatnonzero(free.any(1)):
         columns = np.flatnonzero(free[y])
         spans[y] = columns[0], columns[-1] + 1
-    _iterate(np.ascontiguousarray(cost, np.float32), np.ascontiguousarray(edge, np.float32), u, spans, steps)
+    # Each border is one of two labels, and counts once.
+    half = np.ascontiguousarray(0.5 * edge, np.float32)
+    _iterate(np.ascontiguousarray(cost, np.float32), half, u, spans, steps)
     return u

@@ -1,0 +1,126 @@
+"""The parts of the segmentation against what is known otherwise: exact cuts, painted colours, drawn masks."""
+
+import cv2
+import numpy as np
+import pytest
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import breadth_first_order, maximum_flow
+
+from jawusd.errors import CaptureError
+from jawusd.geometry import Camera
+from jawusd.segmentation.colours import ColourModel
+from jawusd.segmentation.cut import cut_three_ways
+from jawusd.segmentation.files import KeyMasks, mask_path, write_mask
+from jawusd.segmentation.picture import PictureFrame
+
+
+def exact_two_way_cut(cost, edge):
+    """Return where label 1 is cheaper, by SciPy's maximum flow; cost (2, h, w), edge (2, h, w), multiples of 1/100."""
+    h, w = cost.shape[1:]
+    node = np.arange(h * w).reshape(h, w)
+    source, sink = h * w, h * w + 1
+    links = []
+    for y in range(h):
+        for x in range(w):
+            links.append((source, node[y, x], cost[0, y, x]))  # cut if the pixel takes label 0
+            links.append((node[y, x], sink, cost[1, y, x]))
+            for dy, dx, k in ((0, 1, 0), (1, 0, 1)):
+                if y + dy < h and x + dx < w:
+                    other = node[y + dy, x + dx]
+                    links += [(node[y, x], other, edge[k, y, x]), (other, node[y, x], edge[k, y, x])]
+    a, b, c = zip(*links)
+    graph = coo_array((np.round(100 * np.array(c)).astype(np.int32), (a, b)), [h * w + 2] * 2).tocsr()
+    rest = graph - maximum_flow(graph, source, sink).flow
+    rest.data[rest.data < 0] = 0
+    rest.eliminate_zeros()
+    reached = breadth_first_order(rest, source, return_predecessors=False)
+    return np.isin(node, reached)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_cut_is_the_minimal_one(seed):
+    rng = np.random.default_rng(seed)
+    cost = np.round(rng.uniform(0, 2, (2, 9, 11)), 2)
+    edge = np.round(rng.uniform(0.1, 1.0, (2, 9, 11)), 2)
+    three = np.concatenate([cost, np.full((1, 9, 11), 50.0)]).astype(np.float32)
+    start = np.zeros((3, 9, 11), np.float32)
+    start[0] = 1
+    shares = cut_three_ways(three, edge.astype(np.float32), start, np.ones((9, 11), bool), 4000)
+    assert np.array_equal(shares[1] > 0.5, exact_two_way_cut(cost, edge))
+    assert np.allclose(shares.sum(0), 1, atol=1e-5)
+
+
+def test_pixels_that_are_not_free_keep_their_label():
+    cost = np.zeros((3, 6, 8), np.float32)
+    cost[0] = 5
+    start = np.zeros((3, 6, 8), np.float32)
+    start[0] = 1
+    free = np.zeros((6, 8), bool)
+    free[2:4, 3:6] = True
+    shares = cut_three_ways(cost, np.full((2, 6, 8), 0.01, np.float32), start, free, 200)
+    assert np.array_equal(shares[0] < 0.5, free)
+
+
+def painted(rng, shape, colour, spread=6):
+    return np.clip(np.array(colour) + rng.normal(0, spread, (*shape, 3)), 0, 255).astype(np.uint8)
+
+
+def test_lips_over_crowns_are_not_teeth():
+    rng = np.random.default_rng(1)
+    lab = painted(rng, (100, 100), (120, 155, 145))  # lips
+    lab[40:60] = painted(rng, (20, 100), (200, 127, 137))  # teeth
+    lab[52:60] = painted(rng, (8, 100), (110, 128, 138))  # teeth in shadow
+    under = np.zeros((100, 100), bool)
+    under[20:60] = True  # half of the crowns lie under the lip
+    beyond = np.zeros((100, 100), bool)
+    beyond[70:] = beyond[:10] = True
+    model = ColourModel(10.0)
+    assert not model.knows()
+    model.learn(lab, under, beyond)
+    odds = model.weigh(lab)
+    assert model.knows()
+    assert (odds[40:60] > 0).mean() > 0.98
+    assert (odds[20:40] < 0).mean() > 0.98
+    reach = model.surroundings_reach(0.9)
+    assert (odds[beyond] <= reach).mean() == pytest.approx(0.9, abs=0.05)
+
+
+def test_masks_come_back_to_the_recorded_picture():
+    camera = Camera(
+        "cam", (640, 480), [[900, 0, 320], [0, 900, 240], [0, 0, 1]], [-0.25, 0.08, 0.001, -0.001, 0.0], np.eye(4)
+    )
+    frame = PictureFrame(camera, np.array([0, 0, 200.0]), 3.0)
+    mask = np.zeros((480, 640), np.uint8)
+    cv2.ellipse(mask, (400, 300), (110, 60), 20, 0, 360, 255, -1)
+    corners = np.array([[x, y, 200.0] for x in (-20, 50) for y in (-15, 35)])
+    window = frame.window(np.zeros((480, 640, 3), np.uint8), corners, 2.0)
+    back = frame.recorded(frame.given(mask, window).astype(np.float32) / 255, window)
+    both, either = ((back > 0) & (mask > 0)).sum(), ((back > 0) | (mask > 0)).sum()
+    assert set(np.unique(back)) == {0, 255}
+    assert both / either > 0.985
+    assert frame.window(np.zeros((480, 640, 3), np.uint8), np.array([[0, 0, -5.0]]), 2.0) is None
+
+
+def test_key_masks_are_found_by_the_cameras_own_frames(tmp_path):
+    drawn = np.zeros((20, 30), np.uint8)
+    drawn[5:9, 5:20] = 255
+    path = mask_path(tmp_path, "cam1", "lower", 12)
+    path.parent.mkdir(parents=True)
+    write_mask(path, drawn)
+    keys = KeyMasks(tmp_path, {"cam0": (30, 20), "cam1": (30, 20)})
+    upper, lower = keys.of("cam1", 12)
+    assert upper is None
+    assert np.array_equal(lower, drawn)
+    assert keys.of("cam1", 11) == [None, None]
+    assert keys.of("cam0", 12) == [None, None]
+    assert KeyMasks(None, {"cam0": (30, 20)}).of("cam0", 12) == [None, None]
+
+
+def test_a_folder_without_key_masks_is_refused(tmp_path):
+    with pytest.raises(CaptureError, match="no masks of cam0"):
+        KeyMasks(tmp_path, {"cam0": (30, 20)})
+    path = mask_path(tmp_path, "cam0", "upper", 3)
+    path.parent.mkdir(parents=True)
+    write_mask(path, np.full((10, 10), 255, np.uint8))
+    with pytest.raises(CaptureError, match="10 x 10 px"):
+        KeyMasks(tmp_path, {"cam0": (30, 20)}).of("cam0", 3)
