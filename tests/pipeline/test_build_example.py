@@ -110,6 +110,16 @@ def test_exact_model_table_and_onnx_agree_on_random_valid_parameters(built):
     assert np.linalg.norm(transform_points(read, vertices) - exact, axis=-1).max() < 0.06
 
 
+def test_the_report_shows_the_take_and_stays_small(built):
+    out, summary = built
+    text = (out / "report.html").read_text()
+    assert len(text.encode()) < 6e6 and summary["report"]["file"] == "report.html"
+    assert text.count("data:image/jpeg;base64,") == 6 and text.count("video/cam") == 0
+    for words in ("jaw rig report", "light flash", "cam0.mp4", "replay-data", "Paper Fig. 13"):
+        assert words in text
+    assert "<li>pictures" not in text and "<li>experiments" not in text
+
+
 def test_a_second_build_needs_a_word_and_resume_reuses_everything(built):
     out, _ = built
     with pytest.raises(OutputError, match="--resume"):

@@ -1,0 +1,104 @@
+"""The report of a finished build: written anew, with what is not at hand named, and kept by --resume."""
+
+import json
+
+import numpy as np
+import pytest
+from example_rig import FPS, example_meshes
+from report_data import report_data
+
+from jawusd.errors import FormatError, MissingDependencyError
+from jawusd.evaluator import JawRig
+from jawusd.formats.model import save_model
+from jawusd.formats.tracks import save_tracks
+from jawusd.pipeline import report
+from jawusd.pipeline.report import missing_packages, report_build
+from jawusd.pipeline.report_media import chosen_frames
+from jawusd.pipeline.state import BuildState
+from jawusd.pipeline.summary import build_lines
+from jawusd.rig.bake import bake_rig
+
+
+def quiet(stage, done, total):
+    """Swallow progress."""
+
+
+@pytest.fixture
+def built(tmp_path):
+    """Return a folder as a build leaves it; its capture is gone."""
+    data = report_data(count=90)
+    model = data.model
+    rig = JawRig(model.arrays, model.meta)
+    files = bake_rig(
+        tmp_path, rig, example_meshes(), name="someone", fps=FPS, frames=model.frames, d=model.d, table_size=17
+    )
+    save_model(tmp_path / "model.npz", model)
+    save_tracks(tmp_path / "tracks.npz", data.tracks)
+    state = BuildState(tmp_path)
+    state.finish("sync", "", [], 1.0, dict(data.sync))
+    state.finish("bake", "", files, 1.0, {})
+    state.finish("report", "as built", [], 1.0, {"capture": "../gone"})
+    return tmp_path
+
+
+def test_a_report_without_its_capture_says_what_it_lacks(built):
+    result = report_build(built, None, quiet)
+    text = (built / "report.html").read_text()
+    assert result["bytes"] == len(text.encode()) < 6e6
+    assert "example: jaw rig report" in text and "the capture is not at hand" in text
+    assert "report DIR --experiments" in text and "replay-data" in text
+    record = BuildState(built).valid("report", "as built")  # what --resume asks
+    assert record is not None and list(record.outputs) == ["report.html"] and record.result == {"capture": "../gone"}
+
+
+def test_a_folder_that_is_no_build_is_one_clear_error(tmp_path):
+    with pytest.raises(FormatError, match="not the folder of a build"):
+        report_build(tmp_path, None, quiet)
+
+
+def test_missing_packages_are_named_with_the_cure(monkeypatch):
+    assert missing_packages() is None
+
+    def absent(module):
+        raise MissingDependencyError("needs matplotlib.", hint="Install it with: pip install 'jawusd[build]'")
+
+    monkeypatch.setattr(report, "stage", absent)
+    missing = missing_packages()
+    assert "matplotlib" in missing and "jawusd[build]" in missing
+    track = {
+        "tracked": 1,
+        "frames": 1,
+        "lost": [],
+        "recovered": 0,
+        "without_a_camera": 0,
+        "calibration_rescaled_px": {},
+    }
+    summary = {
+        "sync": {"method": "given", "offsets": {}},
+        "track": {
+            **track,
+            "calibration_rescaled_px": {},
+            "prior_aided": 0,
+            "sigma_mm": {},
+            "coverage_error_percent": None,
+        },
+        "fit": {},
+        "seconds": {},
+        "reused": [],
+        "calibrate": None,
+        "folder": "out",
+        "report": {"capture": "..", "missing": missing},
+    }
+    assert build_lines(summary)[-1].startswith("report: none: ") and json.dumps(summary)
+
+
+def test_the_worst_frames_are_chosen_apart_and_one_usual_one():
+    tracks = report_data(count=90, lost=(40,)).tracks
+    tracks.coverage_error[:] = 0.005 + 1e-5 * np.arange(90)[::-1, None, None]
+    tracks.coverage_error[[10, 11, 60]] = np.array([0.05, 0.06, 0.04])[:, None, None]
+    tracks.coverage_error[40] = 0.5  # lost: nothing to draw there
+    tracks.sigma_mm[75, 4] = 3.0
+    rows = [row for row, _ in chosen_frames(tracks, fps=24.0)]
+    assert rows[:2] == [11, 60] and 75 in rows and 40 not in rows and 10 not in rows
+    assert all(abs(a - b) >= 12 for k, a in enumerate(rows[:-1]) for b in rows[:k])
+    assert len(rows) == 6
