@@ -51,9 +51,10 @@ class Journal:
         except OSError as error:
             raise OutputError(f"cannot be written: {error.strerror}.", path=self._path) from error
 
-    def poses(self, frame: int) -> NDArray[np.float64]:
-        """Return T_world_upper and T_world_lower of a finished frame, shape (2, 4, 4)."""
-        return np.array(self.entries[frame]["poses"], np.float64)
+    def known(self, frame: int) -> tuple[NDArray[np.float64], NDArray[np.int8]]:
+        """Return T_world_upper and T_world_lower, shape (2, 4, 4), and their status, shape (2,), of a finished frame."""
+        entry = self.entries[frame]
+        return np.array(entry["poses"], np.float64), np.array(entry["status"], np.int8)
 
 
 def _line(frame: int, entry: dict[str, Any]) -> str:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from jawusd.errors import CaptureError, TrackingError
 from jawusd.formats.capture import Capture, Masks
+from jawusd.formats.tracks import LOST
 from jawusd.pipeline.extras import stage
 from jawusd.pipeline.journal import Journal
 from jawusd.pipeline.overlay import open_footage
@@ -133,12 +134,14 @@ class _Segmenting:
         done = start
         while done + step != end and done + step in self._journal.entries:
             done += step
+        while done != start and LOST in self._journal.entries[done]["status"]:
+            done -= step  # nothing can be told from poses that were lost
         # Even a fresh run judges the first frame once more: its colours come from the poses found there.
         known = {}
         warm = range(start, done + step, step)[-_WARM_UP:]
         for frame, pictures in self._footage.walk(warm):
             self._pictures = pictures
-            known[frame] = self._tracker.judge(frame, self._journal.poses(frame))
+            known[frame] = self._tracker.judge(frame, *self._journal.known(frame))
         frames = range(done + step, end, step)
         walk = self._footage.walk(frames)
         follow = self._tracker.follow(frames, known)

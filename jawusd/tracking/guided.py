@@ -20,6 +20,7 @@ from jawusd.tracking.first import first_record
 from jawusd.tracking.history import FrameRecord, History
 from jawusd.tracking.ladder import FrameTracker
 from jawusd.tracking.motion import Motion
+from jawusd.tracking.quality import uncovered_px
 from jawusd.tracking.scan import prepare_scan
 from jawusd.tracking.solver import ContourSolver, View
 
@@ -122,10 +123,14 @@ class GuidedTracker:
             history.add(record)
             yield frame, record
 
-    def judge(self, frame: int, poses: NDArray[np.float64]) -> FrameRecord:
-        """Return the record of a frame whose poses are known already, shape (2, 4, 4)."""
-        views = self._see(frame, poses, self._rounds - 1)
-        return first_record(self._solver, self._config, poses, _OneFrame(views), frame)
+    def judge(self, frame: int, poses: NDArray[np.float64], status: NDArray[np.int8]) -> FrameRecord:
+        """Return the record of a frame whose poses, shape (2, 4, 4), and status, shape (2,), are known already."""
+        views = self._see(frame, poses, 0)
+        use = np.array([[view.present[r] for view in views] for r in (0, 1)])
+        solution = self._solver.solve(poses, views, (), use)
+        bare_px, mask_px = uncovered_px(self._solver.scans, solution, views)
+        coverage = np.where(mask_px > 0, bare_px / np.maximum(mask_px, 1), np.nan)
+        return FrameRecord(solution, status, use, coverage)
 
     def _one(self, tracker: FrameTracker, motion: Motion, frame: int) -> FrameRecord:
         c = self._config

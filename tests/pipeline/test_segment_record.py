@@ -1,0 +1,87 @@
+"""What is kept of a segmentation: finished frames, confidences, and the masks to be looked at."""
+
+import json
+
+import numpy as np
+import pytest
+
+from jawusd.formats.tracks import LOST, TRACKED
+from jawusd.pipeline.journal import FILE, Journal
+from jawusd.pipeline.segment_summary import segment_lines, summarise
+
+POSES = np.stack([np.eye(4)] * 2).tolist()
+
+
+def entries(count=40):
+    """Return the records of a take with two cameras in which nothing is wrong."""
+    rng = np.random.default_rng(0)
+    out = {}
+    for frame in range(count):
+        cameras = {
+            name: {
+                "frame": frame + 2,
+                "contrast": (0.8 + 0.02 * rng.normal(size=2)).tolist(),
+                "unexpected": (0.02 + 0.005 * rng.normal(size=2)).tolist(),
+                "residual_px": (0.7 + 0.03 * rng.normal(size=2)).tolist(),
+                "uncovered": (0.01 + 0.002 * rng.normal(size=2)).tolist(),
+            }
+            for name in ("cam0", "cam1")
+        }
+        out[frame] = {"poses": POSES, "status": [TRACKED, TRACKED], "cameras": cameras}
+    return out
+
+
+def test_a_record_is_taken_up_again_only_from_the_same_inputs(tmp_path):
+    journal = Journal(tmp_path, "a", resume=False)
+    journal.add(7, {"poses": POSES, "x": float("nan")})
+    journal.add(8, {"poses": POSES, "status": [1, 3]})
+    again = Journal(tmp_path, "a", resume=True)
+    assert sorted(again.entries) == [7, 8]
+    assert again.entries[7]["x"] is None
+    poses, status = again.known(8)
+    assert np.array_equal(poses, np.stack([np.eye(4)] * 2))
+    assert status.tolist() == [1, 3]
+    assert Journal(tmp_path, "b", resume=True).entries == {}
+
+
+def test_a_record_without_resume_starts_anew(tmp_path):
+    Journal(tmp_path, "a", resume=False).add(7, {"poses": POSES})
+    assert Journal(tmp_path, "a", resume=False).entries == {}
+
+
+def test_a_line_cut_short_is_forgotten(tmp_path):
+    journal = Journal(tmp_path, "a", resume=False)
+    journal.add(7, {"poses": POSES})
+    journal.add(8, {"poses": POSES})
+    path = tmp_path / FILE
+    path.write_text(path.read_text()[:-20])
+    assert sorted(Journal(tmp_path, "a", resume=True).entries) == [7]
+    assert all(json.loads(line) for line in path.read_text().splitlines())
+
+
+def test_nothing_is_to_be_looked_at_in_an_even_take():
+    assert min(row["confidence"] for row in summarise(entries())) > 0.5
+
+
+@pytest.mark.parametrize(
+    ("symptom", "value"), [("contrast", 0.3), ("unexpected", 0.3), ("residual_px", 1.6), ("uncovered", 0.2)]
+)
+def test_every_symptom_of_a_bad_mask_counts(symptom, value):
+    take = entries()
+    take[11]["cameras"]["cam1"][symptom][1] = value
+    rows = summarise(take)
+    worst = min(rows, key=lambda row: row["confidence"])
+    assert (worst["frame"], worst["camera"], worst["own_frame"], worst["row"]) == (11, "cam1", 13, "lower")
+    assert worst["reason"] == symptom
+    assert worst["confidence"] < 0.5
+    summary = {"look_at": [worst], "sheet": "sheet.png", "frames": 40, "masks": {"cam0": {}, "cam1": {}}}
+    assert any("cam1 frame    13" in line for line in segment_lines(summary))
+
+
+def test_lost_rows_have_no_confidence():
+    take = entries()
+    take[5]["status"] = [TRACKED, LOST]
+    take[5]["cameras"]["cam0"]["residual_px"] = [0.7, None]
+    rows = {(row["frame"], row["camera"]): row for row in summarise(take)}
+    assert rows[5, "cam0"]["confidence"] == 0
+    assert rows[5, "cam0"]["reason"] == "lost"
