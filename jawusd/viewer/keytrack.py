@@ -1,4 +1,4 @@
-"""Keys of an animation as a tuple that is replaced, never changed: add, move, delete, copy."""
+"""Keys of an animation as a tuple that is replaced, never changed: add, move, delete."""
 
 from __future__ import annotations
 
@@ -26,25 +26,6 @@ def without_key(keys: KeyTrack, frame: float) -> KeyTrack:
     return tuple(key for key in keys if key.frame != frame)
 
 
-def with_copy(keys: KeyTrack, source: float, target: float) -> KeyTrack:
-    """Return the keys with the one at `source` copied to `target`, replacing one that was there.
-
-    Raises:
-        FormatError: there is no key at `source`.
-    """
-    return with_key(keys, target, _key_at(keys, source).d)
-
-
-def with_moved(keys: KeyTrack, source: float, target: float) -> KeyTrack:
-    """Return the keys with the one at `source` moved to `target`, replacing one that was there.
-
-    Raises:
-        FormatError: there is no key at `source`.
-    """
-    moved = _key_at(keys, source)
-    return with_key(without_key(keys, source), target, moved.d)
-
-
 def at_frames(keys: KeyTrack, frames: Sequence[float]) -> KeyTrack:
     """Return the keys, in their order, at other frames.
 
@@ -54,11 +35,6 @@ def at_frames(keys: KeyTrack, frames: Sequence[float]) -> KeyTrack:
     if len(frames) != len(keys) or len(set(frames)) != len(keys):
         raise FormatError(f"{len(set(frames))} frames for {len(keys)} keys; each key needs a frame of its own.")
     return tuple(Key(frame=float(frame), d=key.d) for key, frame in zip(keys, sorted(frames), strict=True))
-
-
-def nearest_key(keys: KeyTrack, frame: float) -> Key | None:
-    """Return the key nearest to a frame, None without keys."""
-    return min(keys, key=lambda key: abs(key.frame - frame), default=None)
 
 
 def _key_at(keys: KeyTrack, frame: float) -> Key:

@@ -109,7 +109,7 @@ def curve_plot(clip: Clip | None, keys: KeyTrack, span: tuple[float, float]) -> 
     frames = np.union1d(np.linspace(first, last, _MOST_SAMPLES), [key.frame for key in keys])
     values = clip.at(frames)
     corners = np.stack([np.repeat([first, last], 2), np.tile([values.min(), values.max()], 2)], axis=1)
-    plot = _framed(name, corners, f"{clip.name}: d1, d2, d3 [mm]", "frame", "mm", pad_x=False)
+    plot = _framed(name, corners, "parameters over frames", "frame", "mm", pad_x=False)
     parts = []
     for axis, color in enumerate(CURVE_COLORS):
         line = _path(_place(plot, np.stack([frames, values[:, axis]], axis=1)))

@@ -18,16 +18,12 @@ def frames_of(keys):
     return [key.frame for key in keys]
 
 
-def test_keys_are_added_replaced_deleted_copied_and_moved():
+def test_keys_are_added_replaced_deleted_and_moved():
     added = keytrack.with_key(KEYS, 5, [7, 8, 9])
     assert frames_of(added) == [0, 5, 10, 20] and added[1].d == (7, 8, 9)
     replaced = keytrack.with_key(KEYS, 10, [7, 8, 9])
     assert frames_of(replaced) == [0, 10, 20] and replaced[1].d == (7, 8, 9)
     assert frames_of(keytrack.without_key(KEYS, 10)) == [0, 20]
-    copied = keytrack.with_copy(KEYS, 10, 40)
-    assert frames_of(copied) == [0, 10, 20, 40] and copied[3].d == (1, 2, 3)
-    moved = keytrack.with_moved(KEYS, 0, 20)
-    assert frames_of(moved) == [10, 20] and moved[1].d == (0, 0, 0)
     shifted = keytrack.at_frames(KEYS, (3, 11, 90))
     assert frames_of(shifted) == [3, 11, 90] and [key.d for key in shifted] == [key.d for key in KEYS]
     assert frames_of(KEYS) == [0, 10, 20]  # nothing was changed in place
@@ -37,8 +33,6 @@ def test_keys_are_added_replaced_deleted_copied_and_moved():
     "action",
     [
         lambda: keytrack.without_key(KEYS, 5),
-        lambda: keytrack.with_copy(KEYS, 5, 6),
-        lambda: keytrack.with_moved((), 5, 6),
         lambda: keytrack.at_frames(KEYS, (1, 2)),
         lambda: keytrack.at_frames(KEYS, (1, 2, 2)),
     ],
@@ -46,10 +40,6 @@ def test_keys_are_added_replaced_deleted_copied_and_moved():
 def test_what_cannot_be_done_to_keys_is_said(action):
     with pytest.raises(FormatError):
         action()
-
-
-def test_the_nearest_key():
-    assert keytrack.nearest_key(KEYS, 14.0).frame == 10 and keytrack.nearest_key((), 3.0) is None
 
 
 def test_a_clip_bridges_lost_frames_and_holds_its_ends():
