@@ -36,8 +36,9 @@ def replay_data(data: ReportData) -> dict | None:
     fitted = np.full((len(rows), 4, 4), np.nan)
     known = np.isfinite(d).all(1)
     fitted[known] = JawRig(model.arrays, model.meta).pose(d[known])
-    everything = np.concatenate([part.mesh.vertices for part in data.parts])
-    low, high = everything.min(0), everything.max(0)
+    # The view holds the jaw; a braincase may reach beyond it.
+    jaw = [part.mesh.vertices for part in data.parts if part.name != "skull"] or [data.parts[0].mesh.vertices]
+    low, high = np.concatenate(jaw).min(0), np.concatenate(jaw).max(0)
     landmarks = rest_points(model, model.arrays["landmarks"])
     return {
         "parts": [_packed(part) for part in data.parts],

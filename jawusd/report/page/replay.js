@@ -167,7 +167,7 @@
     now = Math.min(Math.max(Math.round(index), 0), count - 1);
     slider.value = now;
     const values = [0, 1, 2].map((i) => d[3 * now + i]);
-    const mm = (value) => (Number.isFinite(value) ? value.toFixed(1) : "\u2013");
+    const mm = (value) => (Number.isFinite(value) ? (Math.round(value * 10) / 10 || 0).toFixed(1) : "\u2013");
     find("d").textContent = values.map((value, i) => `d${i + 1} ${mm(value)}`).join("   ") + "   mm";
     find("frame").textContent = `frame ${frames[now]}, ${data.states[state[now]]}`;
     draw();
