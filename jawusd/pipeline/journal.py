@@ -52,7 +52,7 @@ class Journal:
             raise OutputError(f"cannot be written: {error.strerror}.", path=self._path) from error
 
     def known(self, frame: int) -> tuple[NDArray[np.float64], NDArray[np.int8]]:
-        """Return T_world_upper and T_world_lower, shape (2, 4, 4), and their status, shape (2,), of a finished frame."""
+        """Return T_world_upper and T_world_lower, shape (2, 4, 4), and status, shape (2,), of a frame."""
         entry = self.entries[frame]
         return np.array(entry["poses"], np.float64), np.array(entry["status"], np.int8)
 
