@@ -34,9 +34,9 @@ class SegmentationConfig:
     border: float = 4.0
     border_on_edge: float = 0.15
     # Log-odds between the rows per mm from their projected common border [1/mm].
-    rows_per_mm: float = 4.0
+    rows_per_mm: float = 2.0
     # Iterations of the cut [-].
-    steps: int = 24
+    steps: int = 40
     # What a person's mask counts for the colours [frames].
     key_weight: float = 12.0
     # Fewest pixels that make a mask [px]: 4 square millimetres.
