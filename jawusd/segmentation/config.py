@@ -24,7 +24,7 @@ class SegmentationConfig:
     # Share of the surroundings below whose log-odds a colour cannot be tooth [-], and how much more [-] it must speak
     # for teeth where place says nothing: how well colours tell the two apart differs from person to person.
     surroundings_share: float = 0.95
-    doubt: float = 1.0
+    doubt: float = 1.5
     # Bounds of the log-odds demanded in all [-].
     doubt_range: tuple[float, float] = (-1.0, 1.0)
     # Log-odds of being tooth per mm inside the projected outline [1/mm], and what place alone may say against and for.
