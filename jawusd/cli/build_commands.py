@@ -79,7 +79,7 @@ def build(
     allow_outside: Outside = False,
     as_json: Json = False,
 ) -> None:
-    """Turn a capture into a rig: calibrate and segment if need be, sync, track, fit, track again where the model helps, bake."""
+    """Turn a capture into a rig: calibrate and segment if need be, sync, track, fit, track hard frames again, bake."""
     from jawusd.pipeline.build import BuildOptions, build_rig
     from jawusd.pipeline.summary import build_lines
 

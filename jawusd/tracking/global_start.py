@@ -122,7 +122,5 @@ def _name_mixup(search: StartSearch, footage: Footage, frame: int, accused: set[
             continue  # this exchange explains nothing
         why = f"{mixup.finding}: the teeth are found only after exchanging them"
         explained.append((found.fit, replace(mixup, finding=why).refusal(frame)))
-        if found.fit >= _CLEAR_FIT:
-            break
     if explained:
         raise max(explained, key=lambda e: e[0])[1]

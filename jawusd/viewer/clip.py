@@ -80,4 +80,4 @@ def frame_after(frame: float, elapsed_s: float, fps: float, span: tuple[float, f
     if frame <= last:
         return frame
     # The last frame is shown for its own duration before the first one follows.
-    return first + (frame - first) % (last - first + 1) if loop else None
+    return min(first + (frame - first) % (last - first + 1), last) if loop else None

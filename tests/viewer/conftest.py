@@ -37,7 +37,7 @@ def viewer(folder):
     running.stop()
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")  # while it runs, playwright's event loop is in the way of others
 def chromium():
     """Return a running headless Chromium; skips where there is none."""
     sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")

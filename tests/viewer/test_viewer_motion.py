@@ -64,7 +64,8 @@ def test_playing_keeps_time_stops_at_the_end_or_goes_round():
     assert frame_after(90, 1.0, 24, (0, 100), loop=True) == pytest.approx(13)  # 101 frames go round
     assert frame_after(100, 0.0, 24, (0, 100), loop=False) == 0  # at the end it begins again
     assert frame_after(-40, 0.25, 24, (0, 100), loop=False) == 6
-    assert frame_after(0, 100.0, 24, (0, 0), loop=True) < 1
+    assert frame_after(0, 100.0, 24, (0, 0), loop=True) == 0
+    assert frame_after(90, 10.5 / 24, 24, (0, 100), loop=True) == 100  # the last frame for its own duration
 
 
 def test_the_player_shows_rising_frames_ends_by_itself_and_can_be_stopped():

@@ -1,5 +1,6 @@
 """Who may look: addresses, foreign pages, and a warning when the world is let in."""
 
+import signal
 import subprocess
 import sys
 
@@ -44,14 +45,21 @@ def test_an_address_of_another_machine_is_refused(folder):
         Viewer(viewed_actor(folder), "192.0.2.1", 0)
 
 
+def heed_interrupts():
+    """Undo what a shell does that starts the tests in the background: they, and their children, ignore interrupts."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def run_view(folder, *options):
     """Run `jawusd view` until it says where to look; return stdout's first line and stderr."""
     command = [sys.executable, "-m", "jawusd", "view", str(folder), "--no-browser", "--port", "0", *options]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=heed_interrupts
+    )
     try:
         line = process.stdout.readline()
     finally:
-        process.send_signal(2)
+        process.send_signal(signal.SIGINT)
         rest, errors = process.communicate(timeout=60)
     return line, rest, errors, process.returncode
 
