@@ -18,7 +18,8 @@ from jawusd.formats.tracks import Tracks
 from jawusd.geometry import LANDMARKS, Camera, anatomical_frame, find_landmarks
 from jawusd.pipeline.extras import stage
 
-MESHES = ("upper_teeth", "lower_teeth", "mandible", "skull")
+BONES = ("mandible", "skull")
+MESHES = ("upper_teeth", "lower_teeth", *BONES)
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from jawusd.formats.mesh import Mesh
 from jawusd.formats.model import JawModel
 from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.pipeline.extras import stage
-from jawusd.pipeline.prepare import find_anatomy, load_cameras, load_meshes, rescaled_cameras, tracked_cameras
+from jawusd.pipeline.prepare import BONES, find_anatomy, load_cameras, load_meshes, rescaled_cameras, tracked_cameras
 from jawusd.pipeline.state import Progress
 from jawusd.pipeline.subject import Subject, subject_of_capture
 from jawusd.pipeline.trajectories import TrajectoryOptions, read_trajectory
@@ -287,7 +287,9 @@ def bake_meshes(
     Raises:
         RigError, OutputError: the rig cannot be written.
     """
-    bake = stage("jawusd.rig.bake")
+    bake, cleaning = stage("jawusd.rig.bake"), stage("jawusd.imaging.mesh_cleaning")
+    # Bones come from segmented scans with all their faults; teeth scans stay as they are, vertex for vertex.
+    meshes = {key: cleaning.manifold(mesh) if key in BONES else mesh for key, mesh in meshes.items()}
     motion = {"frames": model.frames, "d": model.d} if len(model.frames) else {}
     progress("bake", 0, 1)
     files = bake.bake_rig(
