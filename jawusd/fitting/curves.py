@@ -7,8 +7,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.errors import FittingError
 from jawusd.evaluator.curves import HermiteCurve
 from jawusd.evaluator.models import AdditiveModel
+from jawusd.fitting.coverage import PARAMETERS
 from jawusd.geometry import se3_exp, se3_left_jacobian
 
 Array = NDArray[np.float64]
@@ -22,6 +24,7 @@ MEASURED = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 # Share of the mandible's rms speed below which the incisal point counts as standing still or turning back
 _SLOWEST = 0.2
+_SHORTEST_MM = 0.01  # a curve shorter than this is a network that collapsed
 
 
 def in_millimetres(
@@ -41,6 +44,9 @@ def in_millimetres(
 
     Returns:
         The curve over d [mm], through zero at d = 0, and at which of its knots the incisal point advances steadily.
+
+    Raises:
+        FittingError: the curve does not move at all.
     """
     t = np.unique(np.append(np.linspace(*limits, KNOTS), 0.0))
     twist, rate = curve(t)
@@ -54,6 +60,12 @@ def in_millimetres(
     step = np.where(steady[1:] & steady[:-1], sense * np.diff(advance), walked)
     d = np.concatenate([[0.0], np.cumsum(step)])
     d = sense * (d - d[zero])
+    if np.ptp(d) < _SHORTEST_MM:
+        raise FittingError(
+            f"what was learned of the {PARAMETERS[axis]} moves nothing: {np.ptp(d):.2g} mm along its whole range, at "
+            f"least {_SHORTEST_MM:g} mm are needed.",
+            hint="The networks of this start collapsed. Try another seed or more starts, or the model 'anchored'.",
+        )
     order = np.argsort(d)
     slopes = sense * rate / pace[:, None]
     return HermiteCurve(d[order], twist[order], slopes[order]), steady[order]
