@@ -67,8 +67,8 @@ class MotionPanel:
         self.frame = 0.0
 
     def clip(self) -> Clip | None:
-        """Return the motion chosen, None while there are no keys."""
-        return self._session.key_clip() if self.source.value == KEYS else self._loaded[self.source.value]
+        """Return the motion chosen, None while there are no keys or its file is still being read."""
+        return self._session.key_clip() if self.source.value == KEYS else self._loaded.get(self.source.value)
 
     def add_clip(self, clip: Clip) -> None:
         """Offer a motion that came from a file of the visitor, and choose it."""
