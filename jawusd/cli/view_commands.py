@@ -34,10 +34,10 @@ def view(
             err=True,
         )
     viewer = open_viewer(rig, host, port)
-    typer.echo(f"{viewer.url}  (Ctrl+C stops)")
-    if browser:
-        webbrowser.open(viewer.url)
     try:
+        typer.echo(f"{viewer.url}  (Ctrl+C stops)")
+        if browser:
+            webbrowser.open(viewer.url)
         viewer.wait()
     except KeyboardInterrupt:
         viewer.stop()
