@@ -1,32 +1,19 @@
 """The report in a real browser, opened from disk: light and dark, no request, no console error, the replay moves."""
 
 import os
-import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+from browser import headless_chromium
 from report_data import report_data
 
 from jawusd.report.document import write_document
 
-CHROMIUM = ("chromium", "chromium-browser", "google-chrome", "chrome")
-# Software GL, so that machines without a graphics card show the replay too.
-ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 PATIENCE_MS = 120_000
 
 
-@pytest.fixture(scope="module")
-def chromium():
-    """Return a running headless Chromium; skips where there is none."""
-    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    path = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, CHROMIUM)), None)
-    if path is None or not Path(path).is_file():
-        pytest.skip("there is no Chromium; install one or name it in the variable CHROMIUM")
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=path, args=ARGUMENTS)
-        yield browser
-        browser.close()
+chromium = pytest.fixture(headless_chromium, scope="module")
 
 
 @pytest.fixture(params=["light", "dark"])

@@ -1,18 +1,13 @@
 """A served example actor, and a browser that looks at it."""
 
-import os
 import shutil
-from pathlib import Path
 
 import pytest
+from browser import headless_chromium
 from example_rig import FPS, example_meshes, example_motion, example_rig
 
 from jawusd.pipeline.view import open_viewer
 from jawusd.rig.bake import bake_rig
-
-CHROMIUM = ("chromium", "chromium-browser", "google-chrome", "chrome")
-# Software GL, so that machines without a graphics card show the page too.
-ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 
 @pytest.fixture(scope="session")
@@ -37,14 +32,4 @@ def viewer(folder):
     running.stop()
 
 
-@pytest.fixture(scope="module")  # while it runs, playwright's event loop is in the way of others
-def chromium():
-    """Return a running headless Chromium; skips where there is none."""
-    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    path = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, CHROMIUM)), None)
-    if path is None or not Path(path).is_file():
-        pytest.skip("there is no Chromium; install one or name it in the variable CHROMIUM")
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=path, args=ARGUMENTS)
-        yield browser
-        browser.close()
+chromium = pytest.fixture(headless_chromium, scope="module")
