@@ -11,8 +11,6 @@ import typer
 from jawusd.cli.output import emit, progress, refuse_existing
 
 if TYPE_CHECKING:
-    from jawusd.cli.motion import Motion
-    from jawusd.evaluator import JawRig
     from jawusd.library.index import Entry, Library
 
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
@@ -68,10 +66,8 @@ def retarget(
 def _retarget_motion(
     anim: Path, source: Path, target: Path, fps: float | None, out: Path, force: bool, as_json: bool
 ) -> None:
-    import numpy as np
-
-    from jawusd.cli.motion import kept_inside
-    from jawusd.pipeline.library import load_any_rig, retarget
+    from jawusd.cli.motion import carried_over, carried_over_lines
+    from jawusd.pipeline.library import load_any_rig
     from jawusd.rig import write_animation
     from jawusd.rig.read import describe
 
@@ -79,57 +75,12 @@ def _retarget_motion(
     for place, option in ((out, "--out"), (target, "--to")):
         if place.suffix not in (".usd", ".usda", ".usdc"):
             raise typer.BadParameter("must be a USD layer: .usda, .usdc or .usd.", param_hint=option)
-    giver, taker = load_any_rig(source), load_any_rig(target)
-    motion = _motion_of(giver, anim)
-    frames, d = retarget(giver, taker, motion.frames, motion.d)
-    kept, clamping = kept_inside(taker, d)
+    taker = load_any_rig(target)
+    motion, report = carried_over(source, anim, taker)
     rate = fps or motion.fps or describe(target)["fps"]
-    write_animation(out, target, frames, kept, rate, rig=taker)
-    known = np.isfinite(kept).all(axis=1)
-    valid = taker.validate_parameters(kept[known]).valid
-    result = {
-        "file": str(out),
-        "frames": [float(frames[0]), float(frames[-1])],
-        "samples": len(frames),
-        "fps": rate,
-        "lost": int((~known).sum()),
-        "valid": int(valid.sum()),
-        **clamping,
-    }
-    emit(result, as_json, lambda: _retarget_lines(result))
-
-
-def _motion_of(rig: JawRig, path: Path) -> Motion:
-    """Return a motion of a rig: samples of d of a stage, its transforms where it has none, or a table."""
-    import numpy as np
-
-    from jawusd.cli.motion import Motion, read_motion
-    from jawusd.rig.motion_read import read_parameters_of_stage, read_poses_of_stage
-    from jawusd.rig.read import open_stage
-
-    if path.suffix.lower() not in (".usd", ".usda", ".usdc", ".usdz"):
-        return read_motion(rig, path)
-    sampled = read_parameters_of_stage(path)
-    if sampled is not None:
-        return Motion(*sampled)
-    frames, poses = read_poses_of_stage(path)
-    rate = float(open_stage(path).GetTimeCodesPerSecond())
-    return Motion(frames.astype(np.float64), rig.encode(poses)[0], rate)
-
-
-def _retarget_lines(result: dict[str, Any]) -> list[str]:
-    first, last = result["frames"]
-    known = result["samples"] - result["lost"]
-    lines = [
-        f"{result['file']}: frames {first:g} .. {last:g} at {result['fps']:g} fps, "
-        f"{result['valid']} of {known} samples valid"
-    ]
-    if result["lost"]:
-        lines.append(f"{result['lost']} frames say nothing and were bridged")
-    if result["clamped"]:
-        moved = f"moved by {result['mean_clamp_mm']:.2f} mm on average, {result['largest_clamp_mm']:.2f} mm at most"
-        lines.append(f"{result['clamped']} samples lay outside the bound, {moved}")
-    return lines
+    write_animation(out, target, motion.frames, motion.d, rate, rig=taker)
+    result = {"file": str(out), "fps": rate, **report}
+    emit(result, as_json, lambda: carried_over_lines(result))
 
 
 def _personal(landmarks: Path, folder: Path, use: Use, out: Path, force: bool, as_json: bool) -> None:

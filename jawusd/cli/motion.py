@@ -1,10 +1,10 @@
-"""Read what `jawusd animate` takes, keys, parameters, poses or a face capture, and keep it inside the bound."""
+"""Read what `jawusd animate` and `jawusd retarget` take, and keep it inside the bound."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -77,23 +77,93 @@ def read_face(rig: JawRig, source: Path, fps: float | None) -> Motion:
     return Motion(capture.frames, d, capture.fps)
 
 
-def kept_inside(rig: JawRig, d: np.ndarray) -> tuple[np.ndarray, dict[str, float]]:
-    """Return parameters moved to the nearest valid ones where they lie outside the bound, and how much was moved.
+def kept_inside(rig: JawRig, motion: Motion) -> tuple[Motion, dict[str, Any]]:
+    """Move parameters to the nearest valid ones where they lie outside the bound.
 
     Args:
         rig: the rig.
-        d: parameters (F, 3) [mm]; rows with NaN stay.
+        motion: a motion of it.
 
     Returns:
-        Valid parameters (F, 3) [mm], and `clamped` frames, `largest_clamp_mm`, `mean_clamp_mm` over those frames.
+        The valid motion, and what is to be said of it: `frames`, `lost`, `clamped`, and over the clamped frames
+        `largest_clamp_mm` and `mean_clamp_mm`.
     """
-    outside = rig.margin(d) < float(rig.arrays["margin_limit_mm"])
-    kept = d.copy()
-    kept[outside] = rig.project(d[outside])
-    moved_mm = np.linalg.norm(kept - d, axis=1)[outside]
+    outside = rig.margin(motion.d) < float(rig.arrays["margin_limit_mm"])
+    kept = motion.d.copy()
+    kept[outside] = rig.project(motion.d[outside])
+    moved_mm = np.linalg.norm(kept - motion.d, axis=1)[outside]
     report = {
+        "frames": [float(motion.frames[0]), float(motion.frames[-1])],
+        "lost": int(np.isnan(kept).any(axis=1).sum()),
         "clamped": int(outside.sum()),
         "largest_clamp_mm": float(moved_mm.max(initial=0.0)),
         "mean_clamp_mm": float(moved_mm.mean()) if moved_mm.size else 0.0,
     }
-    return kept, report
+    return Motion(motion.frames, kept, motion.fps), report
+
+
+def carried_over(giver: Path, source: Path, taker: JawRig) -> tuple[Motion, dict[str, Any]]:
+    """Read a motion of one rig and carry it to another, see `pipeline.library.retarget`.
+
+    Args:
+        giver: rig the motion was made for.
+        source: an animation layer, keys, or a table of d or of poses.
+        taker: the rig that shall move.
+
+    Returns:
+        The motion of the taker, and what is to be said of it.
+
+    Raises:
+        FormatError: no such motion or rig.
+        EvaluatorError: no frame of the motion has parameters.
+    """
+    from jawusd.pipeline.library import load_any_rig, retarget
+
+    rig = load_any_rig(giver)
+    motion = _motion_of(rig, source)
+    carried = retarget(rig, taker, motion.frames, motion.d)
+    known = np.isfinite(carried.d).all(axis=1)
+    moved_mm = carried.moved_mm[known]
+    report = {
+        "frames": [float(carried.frames[0]), float(carried.frames[-1])],
+        "samples": len(known),
+        "lost": int((~known).sum()),
+        "valid": int(taker.validate_parameters(carried.d[known]).valid.sum()),
+        "clamped": int(carried.outside.sum()),
+        "mean_move_mm": float(moved_mm.mean()),
+        "largest_move_mm": float(moved_mm.max()),
+    }
+    return Motion(carried.frames, carried.d, motion.fps), report
+
+
+def _motion_of(rig: JawRig, path: Path) -> Motion:
+    """Return a motion of a rig: samples of d of a stage, its transforms where it has none, or a table."""
+    from jawusd.rig.motion_read import read_parameters_of_stage, read_poses_of_stage
+    from jawusd.rig.read import open_stage
+
+    if path.suffix.lower() not in (".usd", ".usda", ".usdc", ".usdz"):
+        return read_motion(rig, path)
+    sampled = read_parameters_of_stage(path)
+    if sampled is not None:
+        return Motion(*sampled)
+    frames, poses = read_poses_of_stage(path)
+    rate = float(open_stage(path).GetTimeCodesPerSecond())
+    return Motion(frames.astype(np.float64), rig.encode(poses)[0], rate)
+
+
+def carried_over_lines(result: dict[str, Any]) -> list[str]:
+    """Return what to print of a motion carried over: the report of `carried_over`, with `file` and `fps`."""
+    first, last = result["frames"]
+    known = result["samples"] - result["lost"]
+    lines = [
+        f"{result['file']}: frames {first:g} .. {last:g} at {result['fps']:g} fps, "
+        f"{result['valid']} of {known} samples valid"
+    ]
+    if result["lost"]:
+        lines.append(f"{result['lost']} frames say nothing and were bridged")
+    if result["clamped"]:
+        lines.append(f"{result['clamped']} samples lay outside the bound at equal shares of the ranges")
+    if result["largest_move_mm"] > 0.005:
+        moved = f"{result['mean_move_mm']:.2f} mm on average, {result['largest_move_mm']:.2f} mm at most"
+        lines.append(f"moved from equal shares by {moved}, to turn where the source turns and stay inside")
+    return lines

@@ -249,6 +249,9 @@ def animate(
     source: Annotated[
         Path | None, typer.Argument(help="keys.json, or a CSV of d or of poses.", show_default=False)
     ] = None,
+    retarget_from: Annotated[
+        Path | None, typer.Option(help="Rig the source was made for; also animation layers then.", show_default=False)
+    ] = None,
     arkit: Annotated[
         Path | None, typer.Option(help="Instead: ARKit face capture, the CSV of Live Link Face.", show_default=False)
     ] = None,
@@ -264,29 +267,29 @@ def animate(
     import numpy as np
 
     import jawusd
-    from jawusd.cli.motion import kept_inside, read_face, read_motion
+    from jawusd.cli.motion import carried_over, carried_over_lines, kept_inside, read_face, read_motion
     from jawusd.rig import describe, write_animation, write_splines
 
     if (source is None) == (arkit is None):
         raise typer.BadParameter("give either a source or --arkit.", param_hint="SOURCE")
+    if arkit is not None and retarget_from is not None:
+        raise typer.BadParameter("goes with a source; weights of --arkit are nobody's.", param_hint="--retarget-from")
     for path in filter(None, (out, splines)):
         refuse_existing(path, force)
     loaded = jawusd.load(rig)
-    motion = read_motion(loaded, source) if arkit is None else read_face(loaded, arkit, fps)
-    kept, clamping = kept_inside(loaded, motion.d)
+    if retarget_from is not None:
+        motion, report = carried_over(retarget_from, source, loaded)
+    else:
+        motion, report = kept_inside(
+            loaded, read_motion(loaded, source) if arkit is None else read_face(loaded, arkit, fps)
+        )
     rate = fps or motion.fps or describe(rig)["fps"]
-    write_animation(out, rig, motion.frames, kept, rate)
-    known = np.isfinite(kept).all(axis=1)
+    write_animation(out, rig, motion.frames, motion.d, rate)
     if splines is not None:
-        write_splines(splines, out, motion.frames[known], kept[known], rate)
-    result = {
-        "file": str(out),
-        "frames": [float(motion.frames[0]), float(motion.frames[-1])],
-        "fps": rate,
-        "lost": int((~known).sum()),
-        **clamping,
-    }
-    emit(result, as_json, lambda: _animate_lines(result))
+        known = np.isfinite(motion.d).all(axis=1)
+        write_splines(splines, out, motion.frames[known], motion.d[known], rate)
+    result = {"file": str(out), "fps": rate, **report}
+    emit(result, as_json, lambda: (_animate_lines if retarget_from is None else carried_over_lines)(result))
 
 
 def _animate_lines(result: dict[str, Any]) -> list[str]:

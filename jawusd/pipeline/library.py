@@ -12,14 +12,20 @@ from numpy.typing import NDArray
 
 from jawusd.errors import EvaluatorError, FormatError, OutputError
 from jawusd.evaluator import JawRig, load
+from jawusd.evaluator.sections import SMALLEST_REACH_MM
 from jawusd.formats.model import JawModel, load_model, save_model
 from jawusd.library.index import MODEL_FILE, Library, load_donors, scan_library
 from jawusd.library.personal import PersonalMotion, leave_one_out, personal_motion
+from jawusd.library.timing import follow
 from jawusd.pipeline.extras import stage
 from jawusd.pipeline.stages import Progress
 from jawusd.pipeline.subject import Subject, subject_of_landmarks
 
 Array = NDArray[np.float64]
+
+# A step of a motion carried over is at least so much of the source's, by the ratio of the ranges.
+_SLOWEST = 0.1
+_ROUNDS = 10  # of timing and bound in turns; most motions need one or two
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
@@ -172,19 +178,35 @@ def _finite(value: float | None) -> float | None:
     return None if value is None or not np.isfinite(value) else value
 
 
-def retarget(source: JawRig, target: JawRig, frames: Array, d: Array) -> tuple[Array, Array]:
-    """Carry a motion to another person as shares of the ranges of both.
+@dataclass(frozen=True, eq=False)
+class Retargeted:
+    """Hold a motion carried to another person, and what had to be changed for it.
 
-    Between two samples a motion is linear in d, and shares are not: whole frames in between become samples too.
+    Attributes:
+        frames: frame numbers, shape (G,).
+        d: parameters of the target [mm], inside its bound, NaN where the motion is lost, shape (G, 3).
+        outside: samples at which equal shares would leave the bound, shape (G,).
+        moved_mm: how far each sample is from equal shares, in d, NaN where lost, shape (G,).
+    """
+
+    frames: Array
+    d: Array
+    outside: NDArray[np.bool_]
+    moved_mm: Array
+
+
+def retarget(source: JawRig, target: JawRig, frames: Array, d: Array) -> Retargeted:
+    """Carry a motion to another person as shares of the ranges of both, in time and inside the bound.
+
+    Between two samples a motion is linear in d, and shares are not: whole frames in between become samples too. Equal
+    shares alone would move peaks by some frames and may leave the bound: the motion is made to rise and fall with the
+    source (see `library.timing`) and brought inside, in turns.
 
     Args:
         source: whose motion it is.
         target: who shall move.
         frames: increasing frame numbers (F,).
         d: parameters of the source (F, 3) [mm], NaN where lost.
-
-    Returns:
-        Frame numbers (G,), and parameters of the target (G, 3) [mm], NaN where lost; not yet kept inside its bound.
 
     Raises:
         EvaluatorError: no frame has parameters.
@@ -198,4 +220,23 @@ def retarget(source: JawRig, target: JawRig, frames: Array, d: Array) -> tuple[A
     times = np.union1d(frames, whole)
     at = np.stack([np.interp(times, frames[known], column) for column in d[known].T], axis=1)
     at[np.isin(times, lost)] = np.nan
-    return times, target.denormalized(source.normalized(at))
+    carried = target.denormalized(source.normalized(at))
+    kept, here = carried.copy(), np.isfinite(at[:, 0])
+    kept[here] = _in_time(source, target, at[here], carried[here])
+    outside = target.margin(carried) < float(target.arrays["margin_limit_mm"])
+    return Retargeted(times, kept, outside, np.linalg.norm(kept - carried, axis=1))
+
+
+def _in_time(source: JawRig, target: JawRig, original: Array, carried: Array) -> Array:
+    """Return d (F, 3) [mm] near those carried, inside the bound, rising and falling where the original does."""
+    sizes = [np.ptp(rig.arrays["d_range"], axis=1) for rig in (source, target)]
+    least = _SLOWEST * sizes[1] / np.maximum(sizes[0], SMALLEST_REACH_MM)
+    kept, limit = carried.copy(), float(target.arrays["margin_limit_mm"])
+    for _ in range(_ROUNDS):
+        for axis in range(3):
+            kept[:, axis] = follow(original[:, axis], kept[:, axis], least[axis])
+        outside = target.margin(kept) < limit
+        if not outside.any():
+            break
+        kept[outside] = target.project(kept[outside])
+    return kept

@@ -91,7 +91,7 @@ def test_what_leaves_the_bound_is_reported_and_valid(actors, tmp_path):
     write_parameters(tmp_path / "d.csv", frames, d)
     out = tmp_path / "out.usdc"
     result = run("retarget", tmp_path / "d.csv", "--from", actors[0], "--to", actors[1], "-o", out, "--fps", 25)
-    assert result["clamped"] > 0 and result["largest_clamp_mm"] > 0.5 and result["valid"] == 10
+    assert result["clamped"] > 0 and result["largest_move_mm"] > 0.5 and result["valid"] == 10
     b = jawusd.load(actors[1])
     assert b.validate(read_poses_of_stage(out)[1]).valid.all()
     said = CliRunner().invoke(
@@ -127,6 +127,17 @@ def test_lost_frames_stay_lost(actors, tmp_path):
     result = run("retarget", path, "--from", actors[0], "--to", actors[1], "-o", out)
     assert result["lost"] == 2
     assert np.isnan(read_parameters_of_stage(out)[1][4:6]).all()
+
+
+def test_animate_takes_motion_of_another_rig(actors, animation, tmp_path):
+    path, frames, _ = animation
+    run("retarget", path, "--from", actors[0], "--to", actors[1], "-o", tmp_path / "retargeted.usdc")
+    said = run("animate", actors[1], path, "--retarget-from", actors[0], "-o", tmp_path / "animated.usdc")
+    assert said["valid"] == said["samples"] == len(frames) and said["fps"] == FPS
+    _, expected, _ = read_parameters_of_stage(tmp_path / "retargeted.usdc")
+    np.testing.assert_array_equal(read_parameters_of_stage(tmp_path / "animated.usdc")[1], expected)
+    arguments = ["animate", actors[1], "--arkit", path, "--retarget-from", actors[0], "-o", tmp_path / "x.usdc"]
+    assert CliRunner().invoke(app, [str(word) for word in arguments]).exit_code == 2
 
 
 def test_retarget_asks_for_one_thing_and_overwrites_nothing(actors, animation, tmp_path):
