@@ -11,9 +11,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from jawusd.capture.light import Offset, find_flashes, match_steps, mean_brightness, on_grid
 from jawusd.capture.sound import RATE_HZ, match_sounds
 from jawusd.errors import SyncError
@@ -21,7 +18,7 @@ from jawusd.formats.capture import Capture
 from jawusd.imaging.audio import Sound, read_sound
 from jawusd.imaging.video import Video
 
-__all__ = ["Alignment", "align_videos", "estimate_offsets", "frame_grid", "light_curve"]
+__all__ = ["Alignment", "align_videos", "estimate_offsets", "light_curve"]
 
 _RATE_TOLERANCE = 1e-3
 
@@ -88,23 +85,22 @@ def align_videos(videos: Mapping[str, Path], reference: str, *, by_light: bool =
     """
     opened = {name: Video(path) for name, path in videos.items()}
     hint = _offsets_hint(videos)
-    grids = {name: frame_grid(video.times_s, video.fps) for name, video in opened.items()}
-    rate = grids[reference][1]
+    rate = opened[reference].timeline.rate
     for name, video in opened.items():
-        if abs(grids[name][1] / rate - 1) > _RATE_TOLERANCE:
+        if abs(video.timeline.rate / rate - 1) > _RATE_TOLERANCE:
             raise SyncError(
-                f"camera {name} runs at {grids[name][1]:.6g} frames per second, camera {reference} at {rate:.6g}.",
+                f"camera {name} runs at {video.timeline.rate:.6g} frames per second, camera {reference} at {rate:.6g}.",
                 path=video.path,
                 hint="Offsets in whole frames need equal rates: convert the videos to one rate.",
             )
-    notes = _missing_pictures({name: numbers for name, (numbers, _) in grids.items()})
+    notes = _missing_pictures(opened)
     with ThreadPoolExecutor(max_workers=len(opened)) as pool:
         dark = None
         if by_light:
             found = dict(zip(opened, pool.map(find_flashes, opened.values())))
             dark = next((name for name in opened if found[name].reason), None)
         if by_light and dark is None:
-            steps = {name: on_grid(found[name].steps, grids[name][0]) for name in opened}
+            steps = {name: on_grid(found[name].steps, video.timeline.numbers) for name, video in opened.items()}
             offsets = {
                 name: _against(
                     name, reference, video, hint, lambda n=name: match_steps(steps[n], steps[reference], rate)
@@ -134,38 +130,12 @@ def light_curve(path: Path) -> list[tuple[int, float, float]]:
     return [(frame.index, frame.time_s, mean_brightness(frame.image)) for frame in Video(path).frames(threads=1)]
 
 
-def frame_grid(times_s: NDArray[np.float64], fps: float) -> tuple[NDArray[np.int64], float]:
-    """Place pictures on an even grid of frames; pictures that a variable rate left out leave gaps.
-
-    Args:
-        times_s: presentation times after the first picture, increasing, shape (n,).
-        fps: the file's own average rate, taken where two pictures do not tell more.
-
-    Returns:
-        Frame number of each picture, shape (n,), and frames per second.
-    """
-    if len(times_s) < 3:
-        return np.arange(len(times_s)), fps
-    steps = np.diff(times_s)
-    median = np.median(steps)
-    # Frames next to each other; gaps would bias the mean, rounded time stamps the median.
-    period = float(steps[(steps > 0.5 * median) & (steps < 1.5 * median)].mean())
-    last = 16  # jitter still leaves it off by some per mille: fit longer and longer stretches
-    while True:
-        stretch = times_s[:last]
-        numbers = np.round(stretch / period)
-        period = float((numbers @ stretch) / (numbers @ numbers))
-        if last >= len(times_s):
-            return np.round(times_s / period).astype(np.int64), 1 / period
-        last *= 2
-
-
-def _missing_pictures(numbers: Mapping[str, NDArray[np.int64]]) -> tuple[str, ...]:
+def _missing_pictures(videos: Mapping[str, Video]) -> tuple[str, ...]:
     return tuple(
-        f"camera {name} has a variable rate: {missing} of {frames[-1] + 1} frames have no picture of their own. Its "
-        "pictures are not numbered evenly; convert it to a constant rate before masks are made."
-        for name, frames in numbers.items()
-        if (missing := int(frames[-1] + 1 - len(np.unique(frames)))) > 0
+        f"camera {name} has a variable rate: {video.timeline.missing} of {video.timeline.count} frames have no picture "
+        "of their own. Frames are counted by time; masks as PNG files are numbered by the pictures of their video."
+        for name, video in videos.items()
+        if video.timeline.missing
     )
 
 

@@ -31,10 +31,52 @@ class Scans(_Strict):
 
 
 class Masks(_Strict):
-    """Name the teeth masks of one camera: a PNG pattern with %06d, or a lossless video."""
+    """Name the teeth masks of one camera: a PNG pattern with %06d, or a video.
+
+    A mask is white on black, or the transparency of a picture with an alpha channel. Instead of `upper` and `lower`,
+    `labels` names one pattern or lossless video in which the gray value `upper_value` means upper teeth, `lower_value`
+    lower teeth and 0 neither.
+    """
 
     upper: Path
     lower: Path
+    upper_value: Annotated[int, Field(ge=1, le=65535)] | None = None
+    lower_value: Annotated[int, Field(ge=1, le=65535)] | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _one_file_for_both(cls, data: object) -> object:
+        if not isinstance(data, dict) or "labels" not in data:
+            return data
+        rest = {key: value for key, value in data.items() if key != "labels"}
+        if rest.keys() & {"upper", "lower"}:
+            raise ValueError("give either labels, or upper and lower")
+        return rest | {"upper": data["labels"], "lower": data["labels"]}
+
+    @model_validator(mode="after")
+    def _values_tell_the_rows(self) -> Masks:
+        values = (self.upper_value, self.lower_value)
+        if self.upper == self.lower and None in values:
+            raise ValueError("one file for both rows needs upper_value and lower_value, their gray values")
+        if self.upper != self.lower and values != (None, None):
+            raise ValueError("upper_value and lower_value are for labels, one file for both rows")
+        if self.upper_value is not None and self.upper_value == self.lower_value:
+            raise ValueError(f"upper_value and lower_value are both {self.upper_value}")
+        return self
+
+    @property
+    def labels(self) -> tuple[int, int] | None:
+        """Return the gray values of upper and lower teeth in label images, None where each row has its own file."""
+        if self.upper_value is None or self.lower_value is None:
+            return None
+        return self.upper_value, self.lower_value
+
+    @property
+    def exchanged(self) -> Masks:
+        """Return the masks with upper and lower exchanged."""
+        return Masks(
+            upper=self.lower, lower=self.upper, upper_value=self.lower_value, lower_value=self.upper_value
+        )
 
 
 class CameraSource(_Strict):

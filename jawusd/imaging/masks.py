@@ -5,26 +5,22 @@ from __future__ import annotations
 import contextlib
 import os
 import queue
-import re
 import threading
 from collections.abc import Callable, Iterator
+from functools import lru_cache
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-import cv2
-import numpy as np
-from numpy.typing import NDArray
-
 from jawusd.errors import CaptureError
+from jawusd.formats.capture import CameraSource
+from jawusd.imaging.mask_files import LabelValues, Mask, PngMasks, VideoMasks
+from jawusd.imaging.timeline import Timeline
 from jawusd.imaging.video import Video
 
-__all__ = ["MaskReader", "mask_size_px"]
+__all__ = ["MaskReader", "mask_size_px", "open_masks"]
 
 _AHEAD = 4  # pictures waiting at most: 8 MB of full HD per reader
-_NUMBER = re.compile(r"%(0(\d+))?d")
-
-Mask = NDArray[np.uint8]
 
 
 class MaskReader:
@@ -32,6 +28,9 @@ class MaskReader:
 
     Reading frame after frame decodes the next few in a background thread; any other order works and decodes on
     demand. One reader serves one thread; use it as a context manager or close it, or its thread waits for ever.
+
+    Frames are those of the camera's clock: frame k is shown k nominal frame durations after its first picture. In a
+    video of variable rate some have no picture, and no mask.
 
     Attributes:
         path: PNG pattern or video.
@@ -43,16 +42,18 @@ class MaskReader:
         path: str | os.PathLike[str],
         size_px: tuple[int, int],
         *,
-        video_count: int | None = None,
+        timeline: Timeline | None = None,
+        labels: LabelValues | None = None,
         prepare: Callable[[Mask], Any] | None = None,
     ) -> None:
-        """Find the masks; decodes nothing yet, except the first picture of a video.
+        """Find the masks; decodes nothing yet, except first pictures of videos and of files with transparency.
 
         Args:
-            path: a PNG pattern with one `%d` or `%06d` (the frame of the camera's video), or a video with one picture
-                per frame of the camera's video.
+            path: a PNG pattern with one `%d` or `%06d` (the number of the picture in the camera's video), or a video
+                with one picture per picture, or per frame, of the camera's video.
             size_px: (width, height) of the camera's pictures.
-            video_count: frames of the camera's video; a mask video of another length is refused.
+            timeline: of the camera's video; without one, PNG files are numbered by frames.
+            labels: for label images, the gray values of the wanted row of teeth and of the other one.
             prepare: applied to each mask in the background thread, such as `WorkingView.mask`; its result is returned
                 instead of the mask.
 
@@ -61,14 +62,16 @@ class MaskReader:
         """
         self.path = Path(path)
         is_pattern = "%" in self.path.name
-        self._source = _PngMasks(self.path, size_px) if is_pattern else _VideoMasks(self.path, size_px, video_count)
-        self.count = self._source.count
+        self._source = (PngMasks if is_pattern else VideoMasks)(self.path, size_px, labels)
+        find_timeline = _timeline_of_pngs if is_pattern else _timeline_of_video
+        self._timeline = find_timeline(self.path, self._source, timeline)
+        self.count = self._source.count if self._timeline is None else self._timeline.count
         self._prepare = prepare
         self._previous: int | None = None
         self._ahead: _Ahead | None = None
 
     def read(self, frame: int) -> Any:
-        """Return the mask of a frame of the camera's video.
+        """Return the mask of a frame of the camera.
 
         Args:
             frame: frame number; numbers outside the video are allowed.
@@ -78,7 +81,7 @@ class MaskReader:
             the frame is not segmented: no picture, or a black one.
 
         Raises:
-            CaptureError: the picture cannot be decoded, or has the wrong size.
+            CaptureError: the picture cannot be decoded, has the wrong size, or is no mask.
         """
         if not 0 <= frame < self.count:
             self._previous = frame
@@ -109,10 +112,82 @@ class MaskReader:
         self.close()
 
     def _results(self, first: int) -> Iterator[Any]:
-        for mask in self._source.masks(first):
+        for mask in self._masks(first):
             if mask is not None and not mask.any():
                 mask = None
             yield mask if mask is None or self._prepare is None else self._prepare(mask)
+
+    def _masks(self, first: int) -> Iterator[Mask | None]:
+        """Yield the mask of every frame from the first on."""
+        if self._timeline is None:
+            yield from self._source.masks(first)
+            return
+        pictures, at = None, 0
+        for frame in range(first, self.count):
+            picture = self._timeline.picture(frame)
+            if picture is None or picture >= self._source.count:
+                yield None
+                continue
+            if pictures is None:
+                pictures, at = self._source.masks(picture), picture
+            while at < picture:  # two pictures in one frame: the first counts
+                next(pictures)
+                at += 1
+            yield next(pictures)
+            at += 1
+
+
+def _timeline_of_pngs(path: Path, source: PngMasks, video: Timeline | None) -> Timeline | None:
+    """Return what tells the number of a file by the frame; None where they are the same."""
+    if video is None or not video.missing:
+        return None
+    if source.count > len(video.numbers):
+        raise CaptureError(
+            f"the masks are numbered up to {source.count - 1}, but the camera's video, of variable rate, has only "
+            f"pictures 0 to {len(video.numbers) - 1} (in {video.count} frames).",
+            path=path,
+            hint="Number masks by the pictures of the video, or convert it to a constant rate before making masks.",
+        )
+    return video
+
+
+def _timeline_of_video(path: Path, source: VideoMasks, video: Timeline | None) -> Timeline:
+    """Return what tells the picture of a mask video by the camera's frame."""
+    if video is None or source.timeline.count == video.count != len(video.numbers) != source.count:
+        return source.timeline  # a constant rate was made of the variable one
+    if source.count != len(video.numbers):
+        frames = f" in {video.count} frames" if video.missing else ""
+        raise CaptureError(
+            f"the mask video has {source.count} pictures, the camera's video {len(video.numbers)}{frames}.",
+            path=path,
+            hint="Export the masks again, one picture per picture of the video, from its first one on.",
+        )
+    return video
+
+
+def open_masks(
+    source: CameraSource, size_px: tuple[int, int], *, prepare: Callable[[Mask], Any] | None = None
+) -> tuple[MaskReader, MaskReader]:
+    """Return readers of the masks of the upper and the lower teeth of a camera that has some; see `MaskReader`.
+
+    Raises:
+        CaptureError: masks or video are missing, damaged or do not belong together.
+        ValueError: the camera has no masks.
+    """
+    masks = source.masks
+    if masks is None:
+        raise ValueError(f"camera {source.name} has no masks")
+    timeline = None if source.video is None else _timeline(source.video, source.video.stat().st_mtime_ns)
+    labels = masks.labels
+    upper = MaskReader(masks.upper, size_px, timeline=timeline, labels=labels, prepare=prepare)
+    lower = MaskReader(masks.lower, size_px, timeline=timeline, labels=labels and labels[::-1], prepare=prepare)
+    return upper, lower
+
+
+@lru_cache(maxsize=64)
+def _timeline(video: Path, changed_ns: int) -> Timeline:
+    """Return the timeline of a video; the time of its last change tells it from an earlier one of that name."""
+    return Video(video).timeline
 
 
 def mask_size_px(path: str | os.PathLike[str]) -> tuple[int, int]:
@@ -124,90 +199,7 @@ def mask_size_px(path: str | os.PathLike[str]) -> tuple[int, int]:
     path = Path(path)
     if "%" not in path.name:
         return Video(path).size_px
-    return _PngMasks(path, None).first_size_px()
-
-
-class _PngMasks:
-    """Masks as numbered PNG files; of any size where none is named."""
-
-    def __init__(self, pattern: Path, size_px: tuple[int, int] | None) -> None:
-        self._pattern, self._size_px = pattern, size_px
-        number = _NUMBER.search(pattern.name)
-        if number is None or pattern.name.count("%") != 1:
-            raise CaptureError(
-                "the mask pattern needs one number such as %06d.", path=pattern, hint="Correct it in capture.toml."
-            )
-        if not pattern.parent.is_dir():
-            raise CaptureError(
-                f"there is no folder {pattern.parent}.", path=pattern, hint="Correct it in capture.toml."
-            )
-        digits = rf"\d{{{number[2]},}}" if number[2] else r"\d+"
-        before, after = (re.escape(part) for part in (pattern.name[: number.start()], pattern.name[number.end() :]))
-        name = re.compile(f"{before}({digits}){after}")
-        found = (name.fullmatch(entry.name) for entry in os.scandir(pattern.parent))
-        self._files = {int(match[1]): pattern.parent / match[0] for match in found if match}
-        if not self._files:
-            raise CaptureError(
-                "no file of the folder has such a name.", path=pattern, hint="Correct `masks` in capture.toml."
-            )
-        self.count = max(self._files) + 1
-
-    def masks(self, first: int) -> Iterator[Mask | None]:
-        for frame in range(first, self.count):
-            path = self._files.get(frame)
-            yield None if path is None else self._load(path)
-
-    def first_size_px(self) -> tuple[int, int]:
-        height, width = self._load(self._files[min(self._files)]).shape
-        return width, height
-
-    def _load(self, path: Path) -> Mask:
-        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        if image is None:
-            raise CaptureError(
-                "the mask cannot be decoded.", path=path, hint="Export it again, or delete it: that frame is skipped."
-            )
-        if self._size_px is not None:
-            _check_size(path, image.shape[1::-1], self._size_px)
-        return _single_channel(image)
-
-
-class _VideoMasks:
-    """Masks as a video with one picture per frame of the camera's video."""
-
-    def __init__(self, path: Path, size_px: tuple[int, int], video_count: int | None) -> None:
-        self._video = Video(path)
-        _check_size(path, self._video.size_px, size_px)
-        self.count = self._video.count
-        if video_count is not None and self.count != video_count:
-            raise CaptureError(
-                f"the mask video has {self.count} pictures, the camera's video {video_count}.",
-                path=path,
-                hint="Export the masks again, one picture per frame of the video, from its first frame on.",
-            )
-
-    def masks(self, first: int) -> Iterator[Mask | None]:
-        for frame in self._video.frames(first, threads=1):
-            yield frame.image
-
-
-def _check_size(path: Path, found: tuple[int, int], allowed: tuple[int, int]) -> None:
-    if tuple(found) != tuple(allowed):
-        raise CaptureError(
-            f"the mask is {found[0]} x {found[1]} px, the camera's pictures are {allowed[0]} x {allowed[1]} px.",
-            path=path,
-            hint="Export the masks at the size of the video.",
-        )
-
-
-def _single_channel(image: NDArray) -> Mask:
-    """Turn any PNG into 8-bit coverage: alpha where it is used, else the brightest colour; 0/1 becomes 0/255."""
-    if image.dtype == np.uint16:
-        image = (image >> 8).astype(np.uint8)
-    if image.ndim == 3:
-        has_alpha = image.shape[2] == 4 and image[..., 3].min() < 255
-        image = np.ascontiguousarray(image[..., 3]) if has_alpha else image[..., :3].max(axis=2)
-    return image * np.uint8(255) if image.max() == 1 else image
+    return PngMasks(path, None).first_size_px()
 
 
 class _Ahead:

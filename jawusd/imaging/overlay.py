@@ -94,7 +94,7 @@ def tracking_sheet(
         tile_px: (width, height) of a tile.
 
     Returns:
-        RGB, (rows, columns, 3) uint8. A tile is gray where the camera was not recording, without tint where the jaw
+        RGB, (rows, columns, 3) uint8. A tile is gray where the camera has no picture, without tint where the jaw
         was lost.
 
     Raises:
@@ -113,11 +113,10 @@ def tracking_sheet(
             PlacedScan(lower, tracks.T_world_lower[row], LOWER_COLOUR),
         ]
         for camera in cameras:
-            own = frame - offsets[camera.name]
+            own = videos[camera.name].timeline.picture(frame - offsets[camera.name])
             tile = np.full((tile_px[1], tile_px[0], 3), 60, np.uint8)
-            video = videos[camera.name]
-            if 0 <= own < video.count:
-                picture = next(video.frames(own, own + 1, colour="rgb")).image
+            if own is not None:
+                picture = next(videos[camera.name].frames(own, own + 1, colour="rgb")).image
                 tile = _cut_to_teeth(draw_overlay(picture, camera, scans), camera, scans, tile_px)
             tiles.append(_captioned(tile, f"{camera.name}  frame {frame}"))
     return contact_sheet(tiles, len(cameras))

@@ -8,25 +8,23 @@ decoded picture is placed by its time stamp, so that B-frames, edit lists and va
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import av
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.errors import CaptureError
+from jawusd.imaging.pixels import CONVERSIONS, Colour
+from jawusd.imaging.timeline import Timeline
 
 __all__ = ["Video", "VideoFrame"]
 
 _REENCODE = "Re-encode it, for example: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp4."
-# ITU-R BT.709 / BT.601 video range: 16 is black, 235 is white.
-_STRETCH = np.clip(np.round((np.arange(256) - 16.0) * 255 / 219), 0, 255).astype(np.uint8)
-_FULL_RANGE = 2  # AVCOL_RANGE_JPEG
-_PLANAR_VIDEO_RANGE = ("yuv420p", "yuv422p", "yuv444p", "nv12", "nv21")
-_PLANAR_FULL_RANGE = ("gray", "yuvj420p", "yuvj422p", "yuvj444p")
+# WebM keeps transparency in a second stream, which only these decoders read; the file's meta data tell of it.
+_ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
 
 
 class VideoFrame(NamedTuple):
@@ -35,7 +33,7 @@ class VideoFrame(NamedTuple):
     Attributes:
         index: number in order of presentation, the first is 0.
         time_s: presentation time after the first picture [s].
-        image: (h, w) gray or (h, w, 3) RGB, uint8, 0..255, read-only.
+        image: (h, w) gray, (h, w, 3) RGB or (h, w, 4) RGBA, uint8, 0..255, read-only.
     """
 
     index: int
@@ -50,10 +48,14 @@ class Video:
         path: the file.
         count: number of pictures.
         times_s: presentation times after the first picture [s], shape (count,), increasing.
+        timeline: which picture is shown at which frame.
         start_s: presentation time of the first picture in the file, where its sound counts from too [s].
         fps: average pictures per second.
         rotation_deg: counter-clockwise turn the file asks for: 0, 90, 180 or 270. It is applied to every picture.
         size_px: (width, height) after rotation.
+        has_alpha: the pictures carry transparency.
+        is_gray: they are stored as one channel.
+        is_rgb: they are stored as red, green and blue.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -76,6 +78,8 @@ class Video:
             self._time_base = float(stream.time_base)
             self._pts, self._seek_dts, stored = self._packet_table(container, stream)
             self.fps = float(stream.average_rate or 0)
+            hidden = {key.lower(): value for key, value in stream.metadata.items()}.get("alpha_mode") == "1"
+            self._alpha_decoder = _ALPHA_DECODERS.get(stream.codec_context.name) if hidden else None
         self.count = len(self._pts)
         if self.count == 0:
             raise CaptureError("the video holds no pictures.", path=path, hint="Copy it again from the camera.")
@@ -87,6 +91,7 @@ class Video:
             )
         self.start_s = float(self._pts[0] * self._time_base)
         self.times_s = (self._pts - self._pts[0]) * self._time_base
+        self.timeline = Timeline(self.times_s, self.fps)
         self.rotation_deg = 0
         first = next(self._decode(0, 1, threads=1))[1]
         if first.rotation % 90:
@@ -98,13 +103,17 @@ class Video:
         self.rotation_deg = first.rotation % 360
         turned = self.rotation_deg in (90, 270)
         self.size_px = (first.height, first.width) if turned else (first.width, first.height)
+        stored_as = first.format
+        self.has_alpha = self._alpha_decoder is not None or any(part.is_alpha for part in stored_as.components)
+        self.is_rgb = stored_as.is_rgb or stored_as.has_palette
+        self.is_gray = not self.is_rgb and len(stored_as.components) == 1
 
     def frames(
         self,
         first: int = 0,
         last: int | None = None,
         *,
-        colour: Literal["gray", "rgb"] = "gray",
+        colour: Colour = "gray",
         region: tuple[int, int, int, int] | None = None,
         threads: int = 0,
     ) -> Iterator[VideoFrame]:
@@ -136,12 +145,22 @@ class Video:
         if not (0 <= x0 < x1 <= width and 0 <= y0 < y1 <= height):
             raise ValueError(f"region {region} is not inside the picture of {width} x {height} px")
         window = (slice(y0, y1), slice(x0, x1))
-        return self._pictures(first, last, colour, window, threads)
+        return self._converted(first, last, colour, window, threads)
 
-    def _pictures(self, first: int, last: int, colour: str, window: tuple, threads: int) -> Iterator[VideoFrame]:
-        convert = _rgb if colour == "rgb" else _gray
-        for index, frame in self._decode(first, last, threads):
-            image = convert(frame, self.rotation_deg, window)
+    def pictures(self, wanted: Sequence[int | None], *, colour: Colour = "gray") -> Iterator[NDArray[np.uint8] | None]:
+        """Yield a picture for each of increasing numbers, None for None, decoding what lies between only once.
+
+        Raises:
+            CaptureError: a picture lies outside the file or cannot be decoded.
+        """
+        known = [number for number in wanted if number is not None]
+        decoded = self.frames(known[0], known[-1] + 1, colour=colour) if known else iter(())
+        for number in wanted:
+            yield None if number is None else next(frame.image for frame in decoded if frame.index == number)
+
+    def _converted(self, first: int, last: int, colour: Colour, window: tuple, threads: int) -> Iterator[VideoFrame]:
+        for index, frame in self._decode(first, last, threads, alpha=colour == "rgba"):
+            image = CONVERSIONS[colour](frame, self.rotation_deg, window)
             image.flags.writeable = False  # the gray buffer may be a reference the decoder still needs
             yield VideoFrame(index, float(self.times_s[index]), image)
 
@@ -188,7 +207,9 @@ class Video:
         latest = np.maximum.accumulate(np.where(is_key, np.arange(len(order)), 0)) if len(order) else order
         return times, np.array(dts, np.int64)[order][latest], stored
 
-    def _decode(self, first: int, last: int, threads: int) -> Iterator[tuple[int, av.VideoFrame]]:
+    def _decode(
+        self, first: int, last: int, threads: int, alpha: bool = False
+    ) -> Iterator[tuple[int, av.VideoFrame]]:
         """Yield (index, decoded frame) for every index of [first, last), or raise naming the one that is missing."""
         wanted = first
         with self._open() as container:
@@ -198,7 +219,7 @@ class Video:
             if first > 0:
                 container.seek(int(self._seek_dts[first]), stream=stream, backward=True)
             try:
-                for frame in container.decode(stream):
+                for frame in self._decoded(container, stream, alpha):
                     if wanted == last:
                         return
                     if frame.pts is None or frame.pts < self._pts[wanted]:
@@ -212,26 +233,19 @@ class Video:
         if wanted < last:
             raise self._undecodable(wanted)
 
+    def _decoded(
+        self, container: av.container.InputContainer, stream: av.VideoStream, alpha: bool
+    ) -> Iterator[av.VideoFrame]:
+        if not (alpha and self._alpha_decoder):
+            yield from container.decode(stream)
+            return
+        decoder = av.CodecContext.create(self._alpha_decoder, "r")
+        for packet in container.demux(stream):
+            yield from decoder.decode(packet if packet.size else None)
+
     def _undecodable(self, index: int) -> CaptureError:
         return CaptureError(
             f"frame {index} of {self.count} (at {self.times_s[index]:.3f} s) cannot be decoded.",
             path=self.path,
             hint="Copy the video again from the camera, or cut it to the part that is whole.",
         )
-
-
-def _gray(frame: av.VideoFrame, rotation_deg: int, window: tuple[slice, slice]) -> NDArray[np.uint8]:
-    name = frame.format.name
-    full = name in _PLANAR_FULL_RANGE or (name in _PLANAR_VIDEO_RANGE and frame.color_range == _FULL_RANGE)
-    if not full and name not in _PLANAR_VIDEO_RANGE:
-        frame = frame.reformat(format="gray")
-    plane = frame.planes[0]
-    stored = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: frame.height, : frame.width]
-    image = np.rot90(stored, rotation_deg // 90)[window]
-    if name in _PLANAR_VIDEO_RANGE and not full:
-        return cv2.LUT(np.ascontiguousarray(image), _STRETCH)
-    return image
-
-
-def _rgb(frame: av.VideoFrame, rotation_deg: int, window: tuple[slice, slice]) -> NDArray[np.uint8]:
-    return np.ascontiguousarray(np.rot90(frame.to_ndarray(format="rgb24"), rotation_deg // 90)[window])

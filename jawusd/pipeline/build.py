@@ -116,7 +116,7 @@ class _Build:
         segment = self._segmented(sync.result["offsets"])
         # Paths stay out: the contents count, not where the capture lies.
         described = capture.model_dump(mode="json", include={"frames", "bootstrap", "motion", "anatomy"})
-        described["cameras"] = [camera.name for camera in capture.cameras]
+        described["cameras"] = [(camera.name, camera.masks and camera.masks.labels) for camera in capture.cameras]
         track = self._stage(
             "track",
             self._inputs(

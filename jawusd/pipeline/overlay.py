@@ -21,7 +21,7 @@ from jawusd.pipeline.state import Progress
 
 SHEET = "contact_sheet.png"
 _SHEET_FRAMES = 6
-_GRAY = 60  # where a camera was not recording
+_GRAY = 60  # where a camera has no picture
 _CRF = 20  # H.264 quality for looking at, half the time of an archive
 
 
@@ -35,7 +35,7 @@ def write_overlay(
 ) -> list[Path]:
     """Write per camera an H.264 video of the tracked frames with both scans drawn over them, and a contact sheet.
 
-    The videos run in step: where a camera was not recording its picture is gray. Lost rows are not drawn.
+    The videos run in step: where a camera has no picture it is gray. Lost rows are not drawn.
 
     Args:
         capture: gives footage, calibration and scans.
@@ -103,14 +103,11 @@ def _drawn(
     drawing: ModuleType, tracks: Tracks, video, offset: int, camera: Camera, upper: Mesh, lower: Mesh
 ) -> Iterator[NDArray[np.uint8]]:
     """Yield the picture of every tracked frame, (h, w, 3) RGB."""
-    own = tracks.frames - offset
-    recorded = own[(own >= 0) & (own < video.count)]
-    pictures = video.frames(int(recorded[0]), int(recorded[-1]) + 1, colour="rgb") if len(recorded) else iter(())
-    for row, wanted in enumerate(own):
-        if not 0 <= wanted < video.count:
+    wanted = [video.timeline.picture(frame - offset) for frame in tracks.frames.tolist()]
+    for row, image in enumerate(video.pictures(wanted, colour="rgb")):
+        if image is None:
             yield np.full((camera.size_px[1], camera.size_px[0], 3), _GRAY, np.uint8)
             continue
-        image = next(picture.image for picture in pictures if picture.index == wanted)
         scans = [
             drawing.PlacedScan(upper, tracks.T_world_upper[row], drawing.UPPER_COLOUR),
             drawing.PlacedScan(lower, tracks.T_world_lower[row], drawing.LOWER_COLOUR),

@@ -22,8 +22,8 @@ def write_plates(
     Args:
         capture: gives footage and calibration.
         offsets: frame offset by camera.
-        frames: frames of the reference camera, increasing, shape (F,). Where a camera was not recording there is no
-            plate.
+        frames: frames of the reference camera, increasing, shape (F,). Where a camera has no picture there is
+            no plate.
         folder: the rig's folder.
         progress: told of every picture.
 
@@ -45,13 +45,10 @@ def write_plates(
             Path(files).parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise OutputError(f"cannot write here: {error.strerror}.", path=Path(files).parent) from error
-        own = frames - offsets[name]
-        wanted = set(own[(own >= 0) & (own < video.count)].tolist())
-        pictures = video.frames(min(wanted), max(wanted) + 1, colour="rgb") if wanted else iter(())
-        for picture in pictures:
-            if picture.index in wanted:
-                plates.write(files % (picture.index + offsets[name]), picture.image)
-                done += 1
-                progress("plates", done, total)
-    progress("plates", total, total)
+        wanted = [video.timeline.picture(frame - offsets[name]) for frame in frames.tolist()]
+        for frame, image in zip(frames.tolist(), video.pictures(wanted, colour="rgb")):
+            if image is not None:
+                plates.write(files % frame, image)
+            done += 1
+            progress("plates", done, total)
     return [pattern.format(name=name) for name in videos]

@@ -196,7 +196,8 @@ def input_files(capture: Capture, names: Iterable[str]) -> list[Path]:
             files += [camera.video for camera in capture.cameras if camera.video is not None]
         elif name == "masks":
             for camera in capture.cameras:
-                files += _sequence_files((camera.masks.upper, camera.masks.lower) if camera.masks else ())
+                masks = camera.masks
+                files += _sequence_files(dict.fromkeys((masks.upper, masks.lower)) if masks else ())
     return [path for path in files if path.is_file()]
 
 

@@ -22,14 +22,13 @@ class ColourFootage:
         self._videos, self._offsets = dict(videos), dict(offsets)
 
     def own(self, name: str, frame: int) -> int | None:
-        """Return a camera's own number of a frame of the reference camera; None while it was not recording."""
-        own = frame - self._offsets[name]
-        return own if 0 <= own < self._videos[name].count else None
+        """Return the picture of a camera at a frame of the reference camera; None where it has none."""
+        return self._videos[name].timeline.picture(frame - self._offsets[name])
 
     def range(self) -> tuple[int, int]:
         """Return the first frame that two cameras show, and one past the last."""
         starts = sorted(self._offsets[name] for name in self._videos)
-        stops = sorted(self._offsets[name] + video.count for name, video in self._videos.items())
+        stops = sorted(self._offsets[name] + video.timeline.count for name, video in self._videos.items())
         return max(0, starts[min(1, len(starts) - 1)]), stops[-min(2, len(stops))]
 
     def at(self, frame: int) -> Pictures:
@@ -52,13 +51,7 @@ class ColourFootage:
                 yield held.pop()
 
     def _forwards(self, frames: range) -> Iterator[tuple[int, Pictures]]:
-        readers = {}
+        wanted = {name: [self.own(name, frame) for frame in frames] for name in self._videos}
+        readers = {name: self._videos[name].pictures(own, colour="rgb") for name, own in wanted.items()}
         for frame in frames:
-            pictures: Pictures = {}
-            for name, video in self._videos.items():
-                own = self.own(name, frame)
-                if own is not None and name not in readers:
-                    last = min(video.count, frames[-1] - self._offsets[name] + 1)
-                    readers[name] = video.frames(own, last, colour="rgb")
-                pictures[name] = next(readers[name]).image if own is not None else None
-            yield frame, pictures
+            yield frame, {name: next(reader) for name, reader in readers.items()}

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from jawusd.errors import TrackingError
 from jawusd.formats.capture import CameraSource
 from jawusd.geometry import Camera, triangulate
-from jawusd.imaging.masks import MaskReader
+from jawusd.imaging.masks import open_masks
 from jawusd.imaging.working_view import WorkingView
 
 _BESIDE = 2  # surveyed frames to either side that show much the same
@@ -91,8 +91,8 @@ def survey_masks(
             scale = min(1.0, _WIDTH_PX / max(width, height))
             view = WorkingView(camera, (max(1, round(width * scale)), max(1, round(height * scale))))
             working.append(view)
-            paths = (source.masks.upper, source.masks.lower)
-            readers.append([stack.enter_context(MaskReader(p, camera.size_px, prepare=view.mask)) for p in paths])
+            opened = open_masks(source, camera.size_px, prepare=view.mask)
+            readers.append([stack.enter_context(reader) for reader in opened])
         shifts = [offsets[source.name] for source in sources]
         first, stop = frames or (
             min(shifts),

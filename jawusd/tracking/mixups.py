@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import TrackingError
+from jawusd.errors import CaptureError, TrackingError
 from jawusd.formats.capture import CameraSource, Masks
 from jawusd.geometry import transform_points
 from jawusd.imaging.raster import count_and_not, count_bits, draw_silhouette, pack_bits, project
@@ -49,7 +49,7 @@ def all_rows_exchanged(sources: Sequence[CameraSource]) -> Mixup:
     return Mixup(
         "the masks of the upper and lower teeth are exchanged in every camera",
         "Exchange masks.upper and masks.lower, or upper_teeth and lower_teeth in [scans].",
-        _with_masks(sources, {k: _turned(s.masks) for k, s in enumerate(sources)}),
+        _with_masks(sources, {k: s.masks.exchanged for k, s in enumerate(sources)}),
     )
 
 
@@ -61,7 +61,7 @@ def possible_mixups(sources: Sequence[CameraSource]) -> list[Mixup]:
             Mixup(
                 f"the masks of the upper and lower teeth are exchanged in camera {source.name}",
                 f"Exchange masks.upper and masks.lower of camera {source.name}.",
-                _with_masks(sources, {k: _turned(source.masks)}),
+                _with_masks(sources, {k: source.masks.exchanged}),
             )
         )
     out.append(all_rows_exchanged(sources))
@@ -93,7 +93,10 @@ def likely_mixup(footage: Footage, solver: ContourSolver, poses: NDArray[np.floa
     for mixup in possible_mixups(footage.sources):
         if _sizes_differ(footage, mixup.sources):
             continue
-        shares = _bare_shares(replace(footage, sources=mixup.sources), solver, poses, frame)
+        try:
+            shares = _bare_shares(replace(footage, sources=mixup.sources), solver, poses, frame)
+        except CaptureError:
+            continue  # mask videos of other lengths than those cameras' clips
         found.append((float(np.nanmean(shares)), mixup))
     share, mixup = min(found, key=lambda f: f[0])
     if share >= _PROOF * np.nanmean(given):
@@ -127,10 +130,6 @@ def _crown_bits(view: View, scan: Scan, pose: NDArray[np.float64]) -> NDArray[np
     project(scan.vertices_single, (view.matrix @ pose).astype(np.float32), points)
     draw_silhouette(points, scan.crown_faces, 0, 0, view.masks.shape[2], scan.painted, bits)
     return bits
-
-
-def _turned(masks: Masks) -> Masks:
-    return Masks(upper=masks.lower, lower=masks.upper)
 
 
 def _with_masks(sources: Sequence[CameraSource], masks: dict[int, Masks]) -> tuple[CameraSource, ...]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from jawusd.errors import TrackingError
 from jawusd.formats.capture import CameraSource
 from jawusd.geometry import Camera
-from jawusd.imaging.masks import MaskReader
+from jawusd.imaging.masks import open_masks
 from jawusd.imaging.working_view import WorkingView
 from jawusd.tracking.solver import View
 
@@ -54,11 +54,9 @@ class MaskViews:
         self._working, self._readers = [], []
         for source, camera in zip(masked, self.cameras, strict=True):
             working = WorkingView(camera, working_size(camera, centre_world, working_px_per_mm))
-            paths = (source.masks.upper, source.masks.lower)
             self._working.append(working)
-            self._readers.append(
-                [self._stack.enter_context(MaskReader(p, camera.size_px, prepare=working.mask)) for p in paths]
-            )
+            readers = open_masks(source, camera.size_px, prepare=working.mask)
+            self._readers.append([self._stack.enter_context(reader) for reader in readers])
         self.frames = (
             min(self._offsets),
             max(o + r.count for o, pair in zip(self._offsets, self._readers, strict=True) for r in pair),

@@ -10,9 +10,10 @@ from scipy.signal import fftconvolve, resample_poly
 
 from jawusd.capture.light import Step, match_steps, on_grid
 from jawusd.capture.sound import RATE_HZ, match_sounds
-from jawusd.capture.sync import align_videos, frame_grid, light_curve
+from jawusd.capture.sync import align_videos, light_curve
 from jawusd.errors import CaptureError, SyncError
 from jawusd.imaging.audio import Sound, read_sound
+from jawusd.imaging.timeline import Timeline
 from jawusd.imaging.video import Video
 
 FPS = 24
@@ -184,8 +185,8 @@ def test_pictures_fall_on_the_frames_they_were_taken_at(tick_s: float, fps: floa
     rng = np.random.default_rng(int(fps))
     numbers = np.sort(np.append(0, 1 + rng.permutation(3000)[:2200]))
     times = np.round(numbers / fps / tick_s) * tick_s
-    found, rate = frame_grid(times, 1.0)
-    assert np.array_equal(found, numbers) and rate == pytest.approx(fps, rel=1e-4)
+    timeline = Timeline(times, 1.0)
+    assert np.array_equal(timeline.numbers, numbers) and timeline.rate == pytest.approx(fps, rel=1e-4)
 
 
 def test_a_step_in_a_gap_does_not_mislead() -> None:

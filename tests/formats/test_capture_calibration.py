@@ -21,7 +21,7 @@ lower_teeth = "lower.ply"
 [[camera]]
 name = "cam0"
 masks.upper = "masks/%06d.png"
-masks.lower = "masks/%06d.png"
+masks.lower = "masks/l%06d.png"
 [[camera]]
 name = "cam1"
 video = "cam1.mp4"

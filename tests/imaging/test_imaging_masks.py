@@ -12,6 +12,7 @@ import pytest
 
 from jawusd.errors import CaptureError
 from jawusd.imaging.masks import MaskReader, mask_size_px
+from jawusd.imaging.timeline import Timeline
 from jawusd.imaging.video_writer import VideoWriter
 
 SIZE = (64, 40)
@@ -115,9 +116,9 @@ def test_sources_that_are_not_there(tmp_path: Path, pattern: Path, video: Path) 
     }.items():
         with pytest.raises(CaptureError, match=message):
             MaskReader(path, SIZE)
-    assert MaskReader(video, SIZE, video_count=COUNT).count == COUNT
+    assert MaskReader(video, SIZE, timeline=Timeline(np.arange(COUNT) / 24, 24)).count == COUNT
     with pytest.raises(CaptureError, match=r"has 14 pictures, the camera's video 15"):
-        MaskReader(video, SIZE, video_count=15)
+        MaskReader(video, SIZE, timeline=Timeline(np.arange(15) / 24, 24))
 
 
 def test_numbers_without_padding(tmp_path: Path) -> None:

@@ -1,0 +1,51 @@
+"""Decoded pictures as arrays: gray at full range, RGB, RGB with transparency; turned as the file asks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal
+
+import av
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["CONVERSIONS", "Colour"]
+
+Colour = Literal["gray", "rgb", "rgba"]
+Window = tuple[slice, slice]
+
+# ITU-R BT.709 / BT.601 video range: 16 is black, 235 is white.
+_STRETCH = np.clip(np.round((np.arange(256) - 16.0) * 255 / 219), 0, 255).astype(np.uint8)
+_FULL_RANGE = 2  # AVCOL_RANGE_JPEG
+_PLANAR_VIDEO_RANGE = ("yuv420p", "yuv422p", "yuv444p", "nv12", "nv21")
+_PLANAR_FULL_RANGE = ("gray", "yuvj420p", "yuvj422p", "yuvj444p")
+
+
+def _gray(frame: av.VideoFrame, rotation_deg: int, window: Window) -> NDArray[np.uint8]:
+    name = frame.format.name
+    full = name in _PLANAR_FULL_RANGE or (name in _PLANAR_VIDEO_RANGE and frame.color_range == _FULL_RANGE)
+    if not full and name not in _PLANAR_VIDEO_RANGE:
+        frame = frame.reformat(format="gray")
+    plane = frame.planes[0]
+    stored = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)[: frame.height, : frame.width]
+    image = np.rot90(stored, rotation_deg // 90)[window]
+    if name in _PLANAR_VIDEO_RANGE and not full:
+        return cv2.LUT(np.ascontiguousarray(image), _STRETCH)
+    return image
+
+
+def _rgb(frame: av.VideoFrame, rotation_deg: int, window: Window) -> NDArray[np.uint8]:
+    return np.ascontiguousarray(np.rot90(frame.to_ndarray(format="rgb24"), rotation_deg // 90)[window])
+
+
+def _rgba(frame: av.VideoFrame, rotation_deg: int, window: Window) -> NDArray[np.uint8]:
+    return np.ascontiguousarray(np.rot90(frame.to_ndarray(format="rgba"), rotation_deg // 90)[window])
+
+
+#: What makes (h, w), (h, w, 3) or (h, w, 4) uint8 of a decoded picture, a quarter turn and a window in the turned one.
+CONVERSIONS: dict[Colour, Callable[[av.VideoFrame, int, Window], NDArray[np.uint8]]] = {
+    "gray": _gray,
+    "rgb": _rgb,
+    "rgba": _rgba,
+}
