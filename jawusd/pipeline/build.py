@@ -17,7 +17,7 @@ from jawusd.pipeline.calibration import calibrate_boards
 from jawusd.pipeline.prepare import input_files, open_capture
 from jawusd.pipeline.report import BuildFacts, missing_packages, where, write_build_report
 from jawusd.pipeline.segment import SegmentOptions, with_masks
-from jawusd.pipeline.segment_summary import segment_capture
+from jawusd.pipeline.segment_summary import delete_masks, segment_capture
 from jawusd.pipeline.stages import aid_teeth, bake_files, fit_jaw, sync_cameras, track_teeth, write_take
 from jawusd.pipeline.state import (
     BUILD_FILE,
@@ -83,6 +83,7 @@ def build_rig(
         state = BuildState(folder)
         if options.fresh:
             state.clear()
+            delete_masks(folder / MASKS)
         return _Build(capture, folder, options, state, progress).run()
 
 

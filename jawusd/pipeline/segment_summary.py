@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.capture import Capture
 from jawusd.formats.tracks import LOST
+from jawusd.pipeline import journal
 from jawusd.pipeline.extras import stage
 from jawusd.pipeline.segment import SegmentOptions, segment_teeth
 from jawusd.pipeline.state import Progress
@@ -123,6 +125,24 @@ def segment_capture(
     """
     summary = write_summary(capture, segment_teeth(capture, offsets, folder, options, progress), folder)
     return [folder / FILE], {key: value for key, value in summary.items() if key != "confidence"}
+
+
+def delete_masks(folder: Path) -> None:
+    """Delete the masks that were made in a folder, what was said of them, and folders left empty.
+
+    Files of other names stay, and so does everything in a folder that segmentation did not write to.
+    """
+    if not (folder / journal.FILE).is_file():
+        return
+    for name in (journal.FILE, FILE, SHEET):
+        (folder / name).unlink(missing_ok=True)
+    for path in [*folder.glob("*/upper/*.png"), *folder.glob("*/lower/*.png")]:
+        # A link may lead out of the folder.
+        if path.stem.isdigit() and path.resolve().is_relative_to(folder.resolve()):
+            path.unlink()
+    for path in [*folder.glob("*/upper"), *folder.glob("*/lower"), *folder.glob("*"), folder]:
+        with contextlib.suppress(OSError):  # not empty, or no folder
+            path.rmdir()
 
 
 def segment_lines(summary: dict[str, Any]) -> list[str]:

@@ -96,6 +96,16 @@ def test_a_resumed_build_keeps_the_calibration_until_the_boards_change(capture, 
         build_rig(changed, out, BuildOptions(resume=True), stop_at("calibrate", []))
 
 
+def test_a_fresh_build_deletes_the_masks_an_earlier_one_made(capture, tmp_path):
+    made = tmp_path / "actor" / "masks" / "cam0" / "upper" / "000031.png"
+    made.parent.mkdir(parents=True)
+    made.touch()
+    (tmp_path / "actor" / "masks" / "segment.jsonl").write_text("{}\n")
+    with pytest.raises(Reached):
+        build_rig(capture, tmp_path / "actor", BuildOptions(fresh=True), stop_at("calibrate", []))
+    assert not (tmp_path / "actor" / "masks").exists()
+
+
 def test_the_summary_of_a_build_says_what_was_made(calibrated):
     out, _ = calibrated
     record = json.loads((out / "build.json").read_text())["stages"]

@@ -7,7 +7,7 @@ import pytest
 
 from jawusd.formats.tracks import LOST, TRACKED
 from jawusd.pipeline.journal import FILE, Journal
-from jawusd.pipeline.segment_summary import segment_lines, summarise
+from jawusd.pipeline.segment_summary import delete_masks, segment_lines, summarise
 
 POSES = np.stack([np.eye(4)] * 2).tolist()
 
@@ -85,3 +85,28 @@ def test_lost_rows_have_no_confidence():
     rows = {(row["frame"], row["camera"]): row for row in summarise(take)}
     assert rows[5, "cam0"]["confidence"] == 0
     assert rows[5, "cam0"]["reason"] == "lost"
+
+
+def test_masks_of_an_earlier_build_are_deleted_and_nothing_else(tmp_path):
+    folder, outside = tmp_path / "masks", tmp_path / "outside" / "upper"
+    outside.mkdir(parents=True)
+    (outside / "000001.png").touch()
+    made = [folder / camera / row / "000012.png" for camera in ("cam0", "cam1") for row in ("upper", "lower")]
+    for path in (*made, folder / "look_at_these.png", folder / "segment.json"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    (folder / "cam2").symlink_to(outside.parent)
+    mine = folder / "cam1" / "lower" / "notes.png"
+    mine.touch()
+    delete_masks(folder)
+    assert all(path.exists() for path in made)  # no record: others may have drawn them
+    Journal(folder, "a", resume=False).add(7, {"poses": POSES})
+    delete_masks(folder)
+    assert sorted(path.name for path in folder.rglob("*")) == ["cam1", "cam2", "lower", "notes.png"]
+    assert (outside / "000001.png").exists() and mine.exists()
+    mine.unlink()
+    (folder / "cam2").unlink()
+    Journal(folder, "a", resume=False)
+    delete_masks(folder)
+    assert not folder.exists()
+    delete_masks(folder)
