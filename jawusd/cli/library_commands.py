@@ -120,14 +120,17 @@ def library(
     compare: Annotated[tuple[str, str] | None, typer.Option(help="Two persons, side by side.")] = None,
     add: Annotated[Path | None, typer.Option(help="Copy this rig (actor.usda or model.npz) in first.")] = None,
     name: Annotated[str | None, typer.Option(help="With --add: name of the person; else as the rig says.")] = None,
+    plot: Annotated[
+        Path | None, typer.Option(help="Folder for ranges.png and ranges.svg: those listed, side by side.")
+    ] = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Keep many actors: bring the index library.json up to date, list, search and compare."""
-    from jawusd.pipeline.library import add_rig, open_library
+    """Keep many actors: bring the index library.json up to date, list, search, compare and plot."""
+    from jawusd.pipeline.library import add_rig, open_library, plot_ranges
 
-    if compare is not None and (search is not None or like is not None):
-        raise typer.BadParameter("--compare stands alone; --search and --like go together.")
+    if compare is not None and (search, like, plot) != (None, None, None):
+        raise typer.BadParameter("--compare stands alone; --search, --like and --plot go together.")
     if name is not None and add is None:
         raise typer.BadParameter("belongs to --add.", param_hint="--name")
     if add is not None:
@@ -139,6 +142,7 @@ def library(
         emit(compared, as_json, lambda: _compare_lines(compared))
         return
     listed = _listed(opened, search, like)
+    listed["plots"] = [] if plot is None else [str(path) for path in plot_ranges(listed["rigs"], plot, force)]
     emit(listed, as_json, lambda: _library_lines(listed))
 
 
@@ -168,7 +172,8 @@ def _library_lines(listed: dict[str, Any]) -> list[str]:
         partial = "  lacks a movement" if rig["not_shown"] else ""
         lines.append(f"{row}{rig['condylar_distance_mm']:10.1f}  {rig['path']}{alike}{partial}")
     lines.append(f"{len(listed['rigs'])} rigs, {listed['reread']} of the folder's new or changed")
-    return lines + [f"skipped {path}: {why}" for path, why in listed["skipped"].items()]
+    lines += [f"skipped {path}: {why}" for path, why in listed["skipped"].items()]
+    return lines + listed["plots"]
 
 
 def _compared(first: Entry, second: Entry) -> dict[str, Any]:

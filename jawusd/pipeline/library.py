@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,6 +89,28 @@ def _as_model(rig: JawRig, source: Path, name: str) -> JawModel:
     return JawModel(
         arrays, none.astype(np.int64), np.zeros((0, 3)), none, none.astype(bool), {**rig.meta, "actor": name}
     )
+
+
+def plot_ranges(entries: Sequence[Mapping[str, Any]], folder: Path, force: bool) -> list[Path]:
+    """Draw the ranges of persons of a library side by side, as PNG and SVG.
+
+    Args:
+        entries: their entries in the index, as `library.index.Entry` names the fields.
+        folder: where the files go; made if missing.
+        force: overwrite them.
+
+    Returns:
+        The files written.
+
+    Raises:
+        MissingDependencyError: matplotlib is not installed.
+        OutputError: a file exists already, or cannot be written.
+    """
+    people = stage("jawusd.report.people")
+    for suffix in (".png", ".svg"):
+        if (folder / (people.RANGES + suffix)).exists() and not force:
+            raise OutputError("exists already.", path=folder / (people.RANGES + suffix), hint="Overwrite with --force.")
+    return people.draw_ranges([(entry["actor"], entry["ranges_mm"]) for entry in entries], folder)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,6 +1,7 @@
 """The commands on many actors: retarget and library, from the shell's side."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -187,6 +188,21 @@ def test_a_library_is_listed_searched_and_compared(people, tmp_path):
     text = CliRunner().invoke(app, ["library", str(people)]).stdout
     assert "42.0" in text and "37.8" in text and "2 rigs" in text
     assert "-4.20" in CliRunner().invoke(app, ["library", str(people), "--compare", "Anna", "Bert"]).stdout
+
+
+def test_the_ranges_of_those_listed_are_drawn(people, tmp_path):
+    save(person("C$osts_$", ranges=0.5), people / "c" / "model.npz")
+    said = run("library", people, "--plot", tmp_path / "figures")
+    assert [Path(name).name for name in said["plots"]] == ["ranges.png", "ranges.svg"]
+    assert (tmp_path / "figures" / "ranges.png").read_bytes()[:4] == b"\x89PNG"
+    drawn = (tmp_path / "figures" / "ranges.svg").read_text()
+    assert all(f">{name}<" in drawn for name in ("Anna", "Bert", "C$osts_$"))
+    with pytest.raises(OutputError, match="exists"):
+        run("library", people, "--plot", tmp_path / "figures")
+    run("library", people, "--search", "bert", "--plot", tmp_path / "figures", "--force")
+    drawn = (tmp_path / "figures" / "ranges.svg").read_text()
+    assert ">Bert<" in drawn and ">Anna<" not in drawn
+    assert CliRunner().invoke(app, ["library", str(people), "--compare", "a", "b", "--plot", "x"]).exit_code == 2
 
 
 def test_rigs_are_added_as_models(people, actors):
