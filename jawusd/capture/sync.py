@@ -11,10 +11,13 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from jawusd.capture.light import Offset, find_flashes, match_steps, mean_brightness, on_grid
+import numpy as np
+
+from jawusd.capture.light import Offset, find_flashes, find_steps, match_steps, mean_brightness, on_grid
 from jawusd.capture.sound import RATE_HZ, match_sounds
 from jawusd.errors import SyncError
 from jawusd.formats.capture import Capture
+from jawusd.formats.light_curve import LightCurve
 from jawusd.imaging.audio import Sound, read_sound
 from jawusd.imaging.video import Video
 
@@ -121,13 +124,18 @@ def align_videos(videos: Mapping[str, Path], reference: str, *, by_light: bool =
     return Alignment(reference, offsets, "sound", (*((f"{why}the sound aligns the cameras",) if why else ()), *notes))
 
 
-def light_curve(path: Path) -> list[tuple[int, float, float]]:
-    """Return picture number, time [s] and mean brightness (0..255) of every picture of a video.
+def light_curve(path: Path) -> LightCurve:
+    """Return the mean brightness of every picture of a video, and the sudden changes in it.
 
     Raises:
         CaptureError: the video cannot be read.
     """
-    return [(frame.index, frame.time_s, mean_brightness(frame.image)) for frame in Video(path).frames(threads=1)]
+    video = Video(path)
+    brightness = np.array([mean_brightness(frame.image) for frame in video.frames(threads=1)])
+    numbers = video.timeline.numbers
+    steps = on_grid(find_steps(brightness), numbers)
+    off, on = (np.array([step.time_frames for step in steps if step.rising == rising]) for rising in (False, True))
+    return LightCurve(video.times_s, numbers, brightness, off, on)
 
 
 def _missing_pictures(videos: Mapping[str, Video]) -> tuple[str, ...]:

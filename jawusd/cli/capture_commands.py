@@ -55,16 +55,25 @@ def sync(
         Path | None,
         typer.Option(help="Also write the brightness of every picture of every clip as CSV.", show_default=False),
     ] = None,
+    plot: Annotated[
+        Path | None,
+        typer.Option(help="Also draw the brightness before and after alignment, as PNG or SVG.", show_default=False),
+    ] = None,
     force: Force = False,
     allow_outside: Outside = False,
     as_json: Json = False,
 ) -> None:
     """Find the frame offsets between cameras from light flashes, else from their sound."""
+    from jawusd.errors import SyncError
     from jawusd.pipeline.prepare import open_capture
-    from jawusd.pipeline.stages import sync_cameras, sync_videos, write_light_curves
+    from jawusd.pipeline.stages import sync_cameras, sync_videos
+    from jawusd.pipeline.sync_files import PLOT_SUFFIXES, light_curves, write_light_curves, write_sync_plot
 
-    if curves is not None:
-        refuse_existing(curves, force)
+    if plot is not None and plot.suffix.lower() not in PLOT_SUFFIXES:
+        raise typer.BadParameter(f"--plot {plot} must end in {' or '.join(PLOT_SUFFIXES)}.")
+    for path in (curves, plot):
+        if path is not None:
+            refuse_existing(path, force)
     single = len(clips) == 1
     if single and reference is not None:
         raise typer.BadParameter("--reference is for clips; a capture names its own in [sync].")
@@ -72,13 +81,22 @@ def sync(
     videos = {c.name: c.video for c in capture.cameras if c.video} if capture else _named(clips)
     if reference is not None and reference not in videos:
         raise typer.BadParameter(f"--reference {reference} is none of {', '.join(videos)}.")
+    result, failure = None, None
     with progress() as report:
-        if capture is not None:
-            result = sync_cameras(capture, report)
-        else:
-            result = sync_videos(videos, reference or next(iter(videos)), report)
+        try:
+            if capture is not None:
+                result = sync_cameras(capture, report)
+            else:
+                result = sync_videos(videos, reference or next(iter(videos)), report)
+        except SyncError as error:
+            failure = error  # the curves show best why
+        found = light_curves(videos, report) if curves is not None or plot is not None else {}
         if curves is not None:
-            write_light_curves(curves, videos)
+            write_light_curves(curves, found)
+        if plot is not None:
+            write_sync_plot(plot, found, result)
+    if failure is not None:
+        raise failure
     emit(result, as_json, lambda: _sync_lines(result))
 
 

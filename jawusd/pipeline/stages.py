@@ -12,7 +12,6 @@ import numpy as np
 
 from jawusd.errors import FormatError, JawusdError
 from jawusd.evaluator import JawRig
-from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.capture import Capture
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.model import JawModel
@@ -75,19 +74,6 @@ def alignment_result(alignment: Any) -> dict:
         "confidence": alignment.confidence,
         "notes": list(alignment.notes),
     }
-
-
-def write_light_curves(path: Path, videos: Mapping[str, Path]) -> None:
-    """Write the mean brightness of every picture as CSV: camera, picture, time_s, brightness.
-
-    Raises:
-        CaptureError: a video cannot be read.
-        OutputError: the file cannot be written.
-    """
-    sync, lines = stage("jawusd.capture.sync"), ["camera,picture,time_s,brightness"]
-    for name, video in videos.items():
-        lines += [f"{name},{index},{time_s:.6f},{mean:.3f}" for index, time_s, mean in sync.light_curve(video)]
-    write_text_atomic(path, "\n".join([*lines, ""]))
 
 
 def track_teeth(

@@ -200,5 +200,6 @@ def test_a_step_in_a_gap_does_not_mislead() -> None:
 
 def test_the_light_curve_has_every_picture(tmp_path: Path) -> None:
     curve = light_curve(film(tmp_path / "a.mp4", np.arange(30) / FPS, lit(30, 0)))
-    assert [row[0] for row in curve] == list(range(30)) and curve[24][1] == pytest.approx(1.0)
-    assert curve[5][2] > 100 and curve[12][2] < 30
+    assert curve.frames.tolist() == list(range(30)) and curve.times_s[24] == pytest.approx(1.0)
+    assert curve.brightness[5] > 100 and curve.brightness[12] < 30
+    assert len(curve.off_frames) == len(curve.on_frames) == 1 and 5 < curve.off_frames[0] <= 12 < curve.on_frames[0]

@@ -9,7 +9,7 @@ from boards import board, chessboard, photograph, poses, studio
 from typer.testing import CliRunner
 
 from jawusd.cli.main import app
-from jawusd.errors import CaptureError
+from jawusd.errors import CaptureError, SyncError
 from jawusd.formats.calibration import load_calibration
 from jawusd.imaging.video_writer import VideoWriter
 
@@ -40,6 +40,22 @@ def test_sync_aligns_any_clips(tmp_path):
     lines = run("sync", *clips).stdout.splitlines()
     assert lines[0] == "by light flash:" and lines[2].startswith("  B: +5 frames (exactly +5.0")
     assert run("sync", *clips, "--curves", tmp_path / "c.csv").exit_code != 0
+
+
+def test_sync_draws_the_clips_before_and_after(tmp_path):
+    clips = [film(tmp_path / f"{name}.mp4", start) for name, start in {"A": 0, "B": 5}.items()]
+    assert run("sync", *clips, "--plot", tmp_path / "sync.svg").exit_code == 0
+    drawn = (tmp_path / "sync.svg").read_text()
+    for words in ("A +0, B +5 frames", "as recorded, first flash", "aligned, last flash", "light off"):
+        assert words in drawn
+    assert run("sync", *clips, "--plot", tmp_path / "sync.svg").exit_code != 0  # exists
+    assert run("sync", *clips, "--plot", tmp_path / "sync.pdf").exit_code == 2
+    # A clip that cannot be aligned is drawn all the same.
+    dim = [film(tmp_path / "dim" / name, start=200) for name in ("C.mp4", "D.mp4")]
+    result = run("sync", *dim, "--plot", tmp_path / "dim.png")
+    assert isinstance(result.exception, SyncError) and "shows no light flash" in str(result.exception)
+    assert "no clip has sound" in str(result.exception)
+    assert (tmp_path / "dim.png").read_bytes()[:4] == b"\x89PNG"
 
 
 def test_clips_of_one_name_are_told_apart_by_their_folders(tmp_path):

@@ -1,0 +1,28 @@
+"""How bright a clip was from picture to picture, and when the light went off and on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class LightCurve:
+    """Hold the brightness of one clip.
+
+    Attributes:
+        times_s: presentation time of every picture after the first one [s], shape (n,).
+        frames: its frame on the clip's even grid, shape (n,).
+        brightness: its mean brightness, 0 .. 255, shape (n,).
+        off_frames, on_frames: when the light suddenly went off, and on [frames], shapes (a,), (b,).
+    """
+
+    times_s: Array
+    frames: NDArray[np.int64]
+    brightness: Array
+    off_frames: Array
+    on_frames: Array
