@@ -13,6 +13,7 @@
       RigError             exit 8
       EvaluatorError       exit 9
       OutputError          exit 10  the output cannot be written, or must not be
+      ClusterError         exit 11  the workers of a cluster cannot be used
 
 A message says where (file, frame, camera), what was found, what is allowed with its unit, and what to do.
 """
@@ -24,6 +25,7 @@ from os import PathLike
 __all__ = [
     "CalibrationError",
     "CaptureError",
+    "ClusterError",
     "EvaluatorError",
     "FittingError",
     "FormatError",
@@ -131,3 +133,9 @@ class OutputError(JawusdError):
     """Report an output that cannot, or must not, be written."""
 
     exit_code = 10
+
+
+class ClusterError(JawusdError):
+    """Report a cluster that does not answer, or whose workers cannot build."""
+
+    exit_code = 11

@@ -10,6 +10,7 @@ from jawusd.cli import (
     build_commands,
     capture_commands,
     library_commands,
+    many_commands,
     plate_commands,
     report_commands,
     rig_commands,
@@ -27,6 +28,7 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 build_commands.register(app)
+many_commands.register(app)
 capture_commands.register(app)
 segment_commands.register(app)
 rig_commands.register(app)

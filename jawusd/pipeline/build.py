@@ -78,7 +78,7 @@ def build_rig(
     """
     capture = open_capture(capture_path, allow_outside=options.allow_outside)
     folder = Path(out)
-    _check_folder(folder, options)
+    check_folder(folder, options)
     with locked(folder):
         state = BuildState(folder)
         if options.fresh:
@@ -87,7 +87,12 @@ def build_rig(
         return _Build(capture, folder, options, state, progress).run()
 
 
-def _check_folder(folder: Path, options: BuildOptions) -> None:
+def check_folder(folder: Path, options: BuildOptions) -> None:
+    """Check that a build may go to a folder.
+
+    Raises:
+        OutputError: it is a file, or holds other files, or a build that is neither to be continued nor deleted.
+    """
     if folder.is_file():
         raise OutputError("is a file; the rig needs a folder.", path=folder)
     if not folder.is_dir() or options.resume or options.fresh:

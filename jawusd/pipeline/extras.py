@@ -17,6 +17,7 @@ _EXTRA_OF = {
     "jawusd.report": "build",
     "jawusd.synthetic": "demo",
     "jawusd.viewer": "view",
+    "jawusd.pipeline": "many",
 }
 
 

@@ -47,6 +47,7 @@ def test_imports_follow_the_layers():
         ("fitting/__init__.py", "import matplotlib", "matplotlib and jinja2"),
         ("report/__init__.py", "import jawusd.fitting", "Layers"),
         ("formats/poses.py", "import h5py", "h5py belongs"),
+        ("cli/many_commands.py", "import distributed", "dask and distributed"),
         ("pipeline/view.py", "import viser", "viser belongs"),
         ("viewer/page.py", "import jawusd.rig", "Layers"),
         ("viewer/plots.py", "import matplotlib", "matplotlib and jinja2"),
@@ -92,7 +93,7 @@ def test_help_loads_nothing_heavy():
         "from jawusd.cli.main import app\n"
         "result = CliRunner().invoke(app, ['--help'])\n"
         "heavy = {'torch','cv2','av','numba','scipy','shapely','trimesh','moderngl','pxr','onnx','pydantic','numpy',"
-        "'matplotlib','h5py','viser'}\n"
+        "'matplotlib','h5py','viser','dask','distributed'}\n"
         "print(result.exit_code, sorted(heavy & set(sys.modules)))\n"
     )
     result = run_python(ROOT, code)

@@ -1,0 +1,100 @@
+"""A list of captures: a text file with one capture a line, and optionally a name for its output.
+
+    # comments and empty lines are skipped; paths are relative to the folder of this file
+    day_1/anna/capture.toml
+    day_1/ben
+    day_2/ben, ben_again
+    "day_2/ben, late", ben_late
+
+It is CSV: a path with a comma goes in double quotes.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from jawusd.errors import FormatError
+
+_MAX_BYTES = 16 << 20
+_NAME = re.compile(r"[A-Za-z0-9_\-][A-Za-z0-9_\-. ]*")
+
+
+@dataclass(frozen=True)
+class ListedCapture:
+    """Name one capture of a list.
+
+    Attributes:
+        path: capture.toml or its folder, absolute; it need not exist.
+        name: of the folder that its results go to, unlike all others of the list.
+    """
+
+    path: Path
+    name: str
+
+
+def load_capture_list(path: str | os.PathLike[str]) -> list[ListedCapture]:
+    """Read a list of captures.
+
+    Raises:
+        FormatError: missing, not text, empty, a line that cannot be read, or two captures of one name.
+    """
+    path = Path(path)
+    folder, found, lines = path.resolve().parent, [], {}
+    for number, line in enumerate(_text(path).splitlines(), start=1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        item = _listed(line, folder, path, number)
+        # Some file systems do not tell upper from lower case.
+        earlier = lines.setdefault(item.name.casefold(), number)
+        if earlier != number:
+            raise FormatError(
+                f'lines {earlier} and {number} would both go to the folder "{item.name}".',
+                path=path,
+                hint="Give one of them a name of its own: PATH, NAME.",
+            )
+        found.append(item)
+    if not found:
+        raise FormatError("names no capture; one path a line is expected.", path=path)
+    return found
+
+
+def _text(path: Path) -> str:
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise FormatError(f"is {path.stat().st_size} bytes, at most {_MAX_BYTES} are read.", path=path)
+        return path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError as error:
+        raise FormatError("there is no such file.", path=path) from error
+    except UnicodeDecodeError as error:
+        raise FormatError(f"is not UTF-8 text ({error}).", path=path) from error
+    except OSError as error:
+        raise FormatError(f"cannot be read: {error.strerror}.", path=path) from error
+
+
+def _listed(line: str, folder: Path, path: Path, number: int) -> ListedCapture:
+    try:
+        (cells,) = csv.reader([line], strict=True, skipinitialspace=True)
+    except (csv.Error, ValueError) as error:
+        raise FormatError(f"line {number} is not CSV ({error}).", path=path) from error
+    cells = [cell.strip() for cell in cells]
+    if len(cells) > 2 or not cells[0] or "\0" in cells[0]:
+        raise FormatError(f"line {number} must be a path, or a path, a comma and a name.", path=path)
+    capture = Path(os.path.normpath(folder / cells[0]))
+    name = cells[1] if len(cells) == 2 else _default_name(capture)
+    if not _NAME.fullmatch(name) or name.endswith((".", " ")):
+        raise FormatError(
+            f'line {number}: "{name}" is no name for a folder; letters, digits, "_", "-", "." and blanks are allowed.',
+            path=path,
+            hint="Give it a name after a comma: PATH, NAME.",
+        )
+    return ListedCapture(capture, name)
+
+
+def _default_name(capture: Path) -> str:
+    if capture.suffix != ".toml":
+        return capture.name
+    return capture.parent.name if capture.name == "capture.toml" else capture.stem

@@ -1,0 +1,247 @@
+"""Many captures: one build each on the workers of a cluster, and one table of how they went."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import io
+import json
+import time
+import traceback
+import uuid
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+
+from dask.system import CPU_COUNT
+from distributed import Client, Future, as_completed, get_worker, wait
+
+from jawusd.errors import JawusdError, OutputError
+from jawusd.formats.atomic import write_text_atomic
+from jawusd.formats.capture_list import ListedCapture
+from jawusd.pipeline.build import BuildOptions, build_rig, check_folder
+from jawusd.pipeline.cluster import check_workers, existing_cluster, local_cluster
+from jawusd.pipeline.state import Progress
+
+SUMMARY_JSON, SUMMARY_CSV = "builds.json", "builds.csv"
+BUILT, KEPT, FAILED, STOPPED = "built", "kept", "failed", "stopped"
+
+#: Told one line of text whenever there is something to tell.
+Tell = Callable[[str], None]
+
+_TELL_SECONDS = 10.0  # between two lines about one stage of one capture
+_STOP_SECONDS = 15.0  # that builds have to end by themselves
+
+# Runs that were called off; a worker may serve several.
+_called_off: set[str] = set()
+
+
+class _CalledOffError(Exception):
+    """End a build from within."""
+
+
+@dataclass(frozen=True)
+class ManyOptions:
+    """Choose how to build many captures.
+
+    Attributes:
+        build: how to build each.
+        cluster: address of a Dask scheduler; None: processes of this machine.
+        workers: how many processes of this machine; None: one per core, but no more than captures.
+        retries: how often a capture is given to another process when one died over it; a scheduler that is already
+            there uses its own number.
+    """
+
+    build: BuildOptions
+    cluster: str | None = None
+    workers: int | None = None
+    retries: int = 3
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Say how the build of one capture went.
+
+    Attributes:
+        name: of its folder.
+        capture: its path.
+        status: "built", "kept" (nothing had changed since an earlier build), "failed" or "stopped".
+        frames, tracked: how many, and how many of them with both rows.
+        model_mm: mean over the frames of the largest distance of a mandible vertex from the model.
+        holdout_mm: the same for frames that were left out of the fit.
+        sigma_incisor_mm: expected error of tracking at the incisal point, median.
+        seconds: that its stages took.
+        error: why it failed.
+    """
+
+    name: str
+    capture: str
+    status: str
+    frames: int | None = None
+    tracked: int | None = None
+    model_mm: float | None = None
+    holdout_mm: float | None = None
+    sigma_incisor_mm: float | None = None
+    seconds: float | None = None
+    error: str | None = None
+
+
+def build_many(captures: Sequence[ListedCapture], root: Path, options: ManyOptions, tell: Tell) -> list[Outcome]:
+    """Build the rig of every capture in a folder of its own; one that fails does not stop the rest.
+
+    The table of outcomes is written to builds.json and builds.csv, also when the work is interrupted.
+
+    Args:
+        captures: what to build.
+        root: gets a folder for each, by its name; every worker must see it by the same path.
+        options: how.
+        tell: told of what happens.
+
+    Returns:
+        The outcomes in the order of the captures.
+
+    Raises:
+        OutputError: the folder of a capture holds a build and neither resume nor fresh is asked for, or cannot be made.
+        ClusterError: the cluster cannot be used.
+    """
+    root = root.resolve()
+    for item in captures:
+        check_folder(root / item.name, options.build)
+    _make(root)
+    if options.cluster is None:
+        cluster = local_cluster(options.workers or min(CPU_COUNT, len(captures)), options.retries)
+    else:
+        cluster = existing_cluster(options.cluster)
+    found: dict[str, Outcome] = {}
+    with cluster as client:
+        check_workers(client, root)
+        try:
+            for outcome in _run(client, captures, root, options.build, tell):
+                found[outcome.name] = outcome
+                tell(f"[{len(found)}/{len(captures)}] {outcome.name}: {outcome.error or outcome.status}")
+        finally:
+            outcomes = [found.get(c.name, Outcome(c.name, str(c.path), STOPPED)) for c in captures]
+            _write(root, outcomes)
+    return outcomes
+
+
+def outcome_lines(outcomes: Sequence[Outcome]) -> list[str]:
+    """Return outcomes as a table for people."""
+    width = max(len("capture"), *(len(o.name) for o in outcomes))
+    lines = [f"{'capture':<{width}}  status   frames  tracked  model mm  holdout mm  incisor mm  seconds"]
+    for o in outcomes:
+        figures = [(o.frames, 6, "d"), (o.tracked, 7, "d"), (o.model_mm, 8, ".3f"), (o.holdout_mm, 10, ".3f")]
+        figures += [(o.sigma_incisor_mm, 10, ".3f"), (o.seconds, 7, ".1f")]
+        cells = "  ".join(f"{'-' if value is None else format(value, form):>{w}}" for value, w, form in figures)
+        lines.append(f"{o.name:<{width}}  {o.status:<7}  {cells}")
+    return lines + [f"{o.name}: {o.error}" for o in outcomes if o.error]
+
+
+def _make(root: Path) -> None:
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot write here: {error.strerror}.", path=root) from error
+
+
+def _run(
+    client: Client, captures: Sequence[ListedCapture], root: Path, options: BuildOptions, tell: Tell
+) -> Iterator[Outcome]:
+    """Yield outcomes as builds end; when the caller is interrupted, end those under way."""
+    run = uuid.uuid4().hex
+    # A worker that takes over from one that died meets what that one had finished.
+    options = options if options.fresh else replace(options, resume=True)
+    with _listening(client, run, tell):
+        items = {
+            client.submit(_build_one, run, item, str(root / item.name), options, key=f"{run}-{item.name}"): item
+            for item in captures
+        }
+        try:
+            for future in as_completed(items):
+                yield _outcome(future, items[future])
+        except BaseException:
+            tell("stopping; what is finished is kept")
+            client.run(_call_off, run, on_error="ignore")
+            with contextlib.suppress(TimeoutError):
+                wait(list(items), timeout=_STOP_SECONDS)
+            raise
+
+
+@contextlib.contextmanager
+def _listening(client: Client, run: str, tell: Tell) -> Iterator[None]:
+    """Pass on what workers tell of a run."""
+    client.subscribe_topic(run, lambda event: tell(event[1]))
+    try:
+        yield
+    finally:
+        client.unsubscribe_topic(run)
+
+
+def _call_off(run: str) -> None:
+    _called_off.add(run)
+
+
+def _outcome(future: Future, item: ListedCapture) -> Outcome:
+    if future.status == "finished":
+        return future.result()
+    error = future.exception() if future.status == "error" else None
+    reason = f"{type(error).__name__}: {error}" if error else "the cluster went away"
+    if type(error).__name__ == "KilledWorker":
+        reason = "every process that worked on it died; did the memory last?"
+    return Outcome(item.name, str(item.path), FAILED, error=reason)
+
+
+def _build_one(run: str, item: ListedCapture, folder: str, options: BuildOptions) -> Outcome:
+    """Build one capture; runs on a worker."""
+    outcome = Outcome(item.name, str(item.path), FAILED)
+    try:
+        summary = build_rig(item.path, folder, options, _progress(run, item.name))
+    except _CalledOffError:
+        return replace(outcome, status=STOPPED)
+    except JawusdError as error:
+        return replace(outcome, error=str(error))
+    except Exception as error:  # a fault of jawusd in one build is no reason to lose the others
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        where = f"{Path(place.filename).name}, line {place.lineno}"
+        return replace(outcome, error=f"unexpected {type(error).__name__} in {where}: {error}")
+    track, errors = summary["track"], summary["fit"].get("errors", {})
+    return replace(
+        outcome,
+        status=KEPT if set(summary["seconds"]) <= set(summary["reused"]) else BUILT,
+        frames=track["frames"],
+        tracked=track["tracked"],
+        model_mm=_mean_mm(errors, "train"),
+        holdout_mm=_mean_mm(errors, "holdout"),
+        sigma_incisor_mm=track["sigma_mm"].get("incisor"),
+        seconds=round(sum(summary["seconds"].values()), 1),
+    )
+
+
+def _mean_mm(errors: dict, table: str) -> float | None:
+    return errors.get(table, {}).get("mandible", {}).get("mean")
+
+
+def _progress(run: str, name: str) -> Progress:
+    """Return a reporter for one build on a worker, which also ends the build of a run that was called off."""
+    worker, told, last = get_worker(), "", 0.0
+
+    def report(stage: str, done: int, total: int) -> None:
+        nonlocal told, last
+        if run in _called_off:
+            raise _CalledOffError
+        now = time.monotonic()
+        if stage != told or now - last > _TELL_SECONDS:
+            told, last = stage, now
+            worker.log_event(run, f"{name}: {stage} {done}/{total}" if total > 1 else f"{name}: {stage}")
+
+    return report
+
+
+def _write(root: Path, outcomes: Sequence[Outcome]) -> None:
+    rows = [asdict(outcome) for outcome in outcomes]
+    write_text_atomic(root / SUMMARY_JSON, json.dumps({"format": "jawusd-builds/1", "builds": rows}, indent=1) + "\n")
+    text = io.StringIO()
+    table = csv.DictWriter(text, [field.name for field in fields(Outcome)], lineterminator="\n")
+    table.writeheader()
+    table.writerows(rows)
+    write_text_atomic(root / SUMMARY_CSV, text.getvalue())
