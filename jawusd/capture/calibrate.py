@@ -20,6 +20,8 @@ from jawusd.geometry import Camera
 __all__ = ["CalibrationReport", "calibrate_capture", "calibrate_sightings"]
 
 Array = NDArray[np.float64]
+#: Called with the cameras and why picks do not tell the scale.
+MeasureScale = Callable[[list[Camera], ScaleCheck], ScaleCheck]
 
 _ENOUGH_VIEWS = 40  # a quarter of the shape error of 20
 _GOOD_RMS_PX = 0.5
@@ -61,7 +63,10 @@ class CalibrationReport:
 
 
 def calibrate_capture(
-    capture: Capture, scans: Mapping[str, Array], progress: Callable[[int, int], None]
+    capture: Capture,
+    scans: Mapping[str, Array],
+    progress: Callable[[int, int], None],
+    scale_without_picks: MeasureScale | None = None,
 ) -> tuple[list[Camera], CalibrationReport]:
     """Calibrate from the boards of a capture.
 
@@ -69,6 +74,7 @@ def calibrate_capture(
         capture: names boards, cameras and picks.
         scans: vertices of the teeth scans [mm] by "upper" and "lower", shape (n, 3); picks refer to them.
         progress: told of every picture searched (done, total).
+        scale_without_picks: measures the size of the teeth with the cameras found, where picks do not tell.
 
     Returns:
         The cameras, the first one being the world, and the report.
@@ -84,11 +90,14 @@ def calibrate_capture(
             hint="Film a chessboard where the teeth will be and name the clips there, or give a calibration file.",
         )
     names = tuple(camera.name for camera in capture.cameras)
-    return calibrate_sightings(find_boards(names, capture.boards, progress), capture, scans)
+    return calibrate_sightings(find_boards(names, capture.boards, progress), capture, scans, scale_without_picks)
 
 
 def calibrate_sightings(
-    sightings: Sightings, capture: Capture, scans: Mapping[str, Array]
+    sightings: Sightings,
+    capture: Capture,
+    scans: Mapping[str, Array],
+    scale_without_picks: MeasureScale | None = None,
 ) -> tuple[list[Camera], CalibrationReport]:
     """Calibrate from corners already found; see `calibrate_capture`."""
     boards = capture.boards
@@ -103,6 +112,8 @@ def calibrate_sightings(
         for name, size, K, lens, T in zip(sightings.names, sightings.sizes_px, bundle.K, lenses, bundle.T_cam_world)
     ]
     scale = check_scale(cameras, capture.bootstrap, scans, boards.square_mm)
+    if scale.ratio is None and scale_without_picks is not None:
+        scale = scale_without_picks(cameras, scale)
     centre, source = mouth_centre(cameras, capture.bootstrap, bundle.T_world_board)
     expected = expected_shape_error(cameras, bundle, centre) if len(cameras) > 1 else float("nan")
     figures = {camera.name: _camera_figures(c, camera, bundle, sightings) for c, camera in enumerate(cameras)}

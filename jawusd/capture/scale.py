@@ -1,4 +1,4 @@
-"""Check the board's square size against the teeth: picked vertices have known distances on the scan."""
+"""Check the board's square size against the teeth: picked vertices have known distances on the scan, or masks tell."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from jawusd.errors import CalibrationError
 from jawusd.formats.capture import Bootstrap
 from jawusd.geometry import Camera, triangulate
 
-__all__ = ["ScaleCheck", "check_scale", "triangulated_picks"]
+__all__ = ["ScaleCheck", "check_scale", "judged_scale", "triangulated_picks"]
 
 Array = NDArray[np.float64]
 
@@ -87,6 +87,20 @@ def check_scale(
     off = np.concatenate(residuals)
     freedom = max(1, len(off) - 7 * len(squares))
     sigma = float(np.sqrt((off @ off) / freedom / sum(weights)))
+    return judged_scale(ratio, sigma, square_mm)
+
+
+def judged_scale(ratio: float, sigma: float, square_mm: float) -> ScaleCheck:
+    """Return a measured size of the teeth if it confirms the squares, or tells too little.
+
+    Args:
+        ratio: seen / scanned.
+        sigma: its standard error.
+        square_mm: the square size taken.
+
+    Raises:
+        CalibrationError: the teeth come out with another size than the scan's.
+    """
     if abs(ratio - 1) > max(_TOLERANCE, _SIGMAS * sigma):
         raise CalibrationError(
             f"seen with these boards the teeth are {ratio:.3f} times as large as their scan (+-{sigma:.3f}): squares "

@@ -182,7 +182,8 @@ class _Build:
         path = self.folder / CALIBRATION
         record = self._stage(
             "calibrate",
-            self._inputs(["boards", "scans"], described, picks, names),
+            # Without picks, masks tell whether the squares have the size they are said to have.
+            self._inputs(["boards", "scans", *([] if picks else ["masks", "videos"])], described, picks, names),
             lambda: ([path], calibrate_boards(capture, path, self.progress)),
         )
         self.capture = capture.model_copy(update={"calibration": path, "calibration_unit_mm": 1.0})

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+from jawusd.errors import SyncError, TrackingError
 from jawusd.formats.calibration import save_calibration
 from jawusd.formats.capture import Capture
+from jawusd.formats.mesh import Mesh
+from jawusd.geometry import Camera
 from jawusd.pipeline.extras import stage
 from jawusd.pipeline.prepare import load_meshes
-from jawusd.pipeline.stages import about
+from jawusd.pipeline.stages import about, sync_cameras
 from jawusd.pipeline.state import Progress
 
 _LISTED = 10
+_SIZE_SIGMA = 0.005  # of the teeth's size as masks tell it
 
 
 def calibrate_boards(capture: Capture, out: Path, progress: Progress) -> dict:
@@ -35,10 +41,36 @@ def calibrate_boards(capture: Capture, out: Path, progress: Progress) -> dict:
         meshes = load_meshes(capture)
         scans = {jaw: meshes[f"{jaw}_teeth"].vertices for jaw in ("upper", "lower")}
         cameras, report = calibrate.calibrate_capture(
-            capture, scans, lambda done, total: progress("calibrate", done, total)
+            capture,
+            scans,
+            lambda done, total: progress("calibrate", done, total),
+            lambda cameras, by_picks: _scale_by_masks(capture, meshes, cameras, by_picks, progress),
         )
     save_calibration(out, cameras)
     return report.as_dict()
+
+
+def _scale_by_masks(
+    capture: Capture, meshes: Mapping[str, Mesh], cameras: list[Camera], by_picks: Any, progress: Progress
+) -> Any:
+    """Return what the masks tell of the size of the teeth, as a `capture.scale.ScaleCheck`.
+
+    Raises:
+        CalibrationError: the teeth come out with another size than their scans.
+    """
+    scale = stage("jawusd.capture.scale")
+    if sum(camera.masks is not None for camera in capture.cameras) < 2:
+        return scale.ScaleCheck(None, None, f"{by_picks.reason}, nor masks of two cameras to search the teeth in")
+    scans = [meshes[f"{jaw}_teeth"] for jaw in ("upper", "lower")]
+    progress("size of the teeth", 0, 1)
+    try:
+        offsets = sync_cameras(capture, progress)["offsets"]
+        ratio = stage("jawusd.tracking.scale_search").seen_size(capture, cameras, offsets, scans)
+    except (SyncError, TrackingError) as error:
+        why = f"{by_picks.reason}, and the teeth could not be searched in the masks ({error.message.rstrip('.')})"
+        return scale.ScaleCheck(None, None, why)
+    progress("size of the teeth", 1, 1)
+    return scale.judged_scale(ratio, _SIZE_SIGMA, capture.boards.square_mm)
 
 
 def calibration_lines(report: dict) -> list[str]:

@@ -9,12 +9,13 @@ from package_copy import ROOT
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
+from jawusd.capture.boards import find_boards
 from jawusd.cli.main import app
 from jawusd.errors import CalibrationError
 from jawusd.formats.calibration import load_calibration
 from jawusd.geometry import triangulate
 from jawusd.pipeline.build import BuildOptions, build_rig
-from jawusd.pipeline.calibration import calibration_lines
+from jawusd.pipeline.calibration import calibrate_boards, calibration_lines
 from jawusd.pipeline.prepare import input_files, load_cameras, open_capture
 from jawusd.pipeline.summary import build_lines
 
@@ -144,6 +145,43 @@ def test_a_calibration_of_colmap_is_read_where_the_capture_names_it(capture, tmp
         np.testing.assert_allclose(found.K, wanted.K, atol=1e-9)
         np.testing.assert_allclose(found.T_cam_world, wanted.T_cam_world, atol=1e-7)
     assert [path.name for path in input_files(opened, ["calibration"])] == ["cameras.txt", "images.txt"]
+
+
+@pytest.fixture(scope="module")
+def corners_found_once(capture):
+    """The corners on the boards, which no size of the squares changes."""
+    opened = open_capture(capture)
+    return find_boards(tuple(camera.name for camera in opened.cameras), opened.boards, lambda done, total: None)
+
+
+def unpicked(capture, tmp_path, **boards):
+    """Return the capture without picks, its boards described otherwise."""
+    opened = open_capture(capture)
+    changed = opened.boards.model_copy(update=boards)
+    return opened.model_copy(update={"bootstrap": None, "boards": changed}), tmp_path / "calibration.toml"
+
+
+def test_without_picks_masks_tell_the_size_of_the_squares(capture, corners_found_once, tmp_path, monkeypatch):
+    monkeypatch.setattr("jawusd.capture.calibrate.find_boards", lambda *arguments: corners_found_once)
+    report = calibrate_boards(*unpicked(capture, tmp_path), lambda *told: None)
+    assert report["scale"]["ratio"] == pytest.approx(1.0, abs=0.01)
+    assert any("the teeth confirm the board's size" in line for line in calibration_lines(report))
+    with pytest.raises(CalibrationError, match=r"squares of 9 mm would have to be (7\.9|8\.0)\d mm"):
+        calibrate_boards(*unpicked(capture, tmp_path, square_mm=9.0), lambda *told: None)
+
+
+def test_without_picks_and_masks_the_size_is_said_to_be_unknown(capture, corners_found_once, tmp_path, monkeypatch):
+    monkeypatch.setattr("jawusd.capture.calibrate.find_boards", lambda *arguments: corners_found_once)
+    opened, out = unpicked(capture, tmp_path, square_mm=9.0)
+    bare = tuple(camera.model_copy(update={"masks": None}) for camera in opened.cameras)
+    report = calibrate_boards(opened.model_copy(update={"cameras": bare}), out, lambda *told: None)
+    assert report["scale"]["ratio"] is None
+    note = "nothing but [boards] square_mm tells the scale: there are no picks in two cameras"
+    assert any(note in line for line in calibration_lines(report))
+    # Clips that cannot be aligned are no reason to fail: the boards are aligned already.
+    unaligned = opened.model_copy(update={"sync": opened.sync.model_copy(update={"method": "audio"})})
+    report = calibrate_boards(unaligned, out, lambda *told: None)
+    assert report["scale"]["ratio"] is None and "sound" in report["scale"]["reason"]
 
 
 def test_the_command_refuses_to_overwrite_and_asks_for_boards(capture, tmp_path):

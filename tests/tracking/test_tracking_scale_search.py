@@ -1,0 +1,41 @@
+"""The size of the teeth as cameras see them, told by masks alone: cameras moved apart by known factors."""
+
+from dataclasses import replace
+
+import pytest
+from small_take import CAMERAS, MESHES, OFFSETS, make_capture, write_masks
+
+from jawusd.errors import TrackingError
+from jawusd.tracking.scale_search import seen_size
+
+COUNT = 3
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    folder = write_masks(tmp_path_factory.mktemp("size"), COUNT)
+    return make_capture(folder, COUNT, bootstrap=None)
+
+
+def farther_apart(factor):
+    """Return the cameras as squares given that much too large would make them."""
+    cameras = []
+    for camera in CAMERAS:
+        T = camera.T_cam_world.copy()
+        T[:3, 3] *= factor
+        cameras.append(replace(camera, T_cam_world=T))
+    return cameras
+
+
+@pytest.mark.parametrize("factor", [1.0, 0.9, 1.2])
+def test_the_size_is_that_of_the_world(capture, factor):
+    assert seen_size(capture, farther_apart(factor), OFFSETS, MESHES) == pytest.approx(factor, rel=0.01)
+
+
+def test_masks_of_something_else_tell_no_size(capture, monkeypatch):
+    monkeypatch.setattr("jawusd.tracking.scale_search._STARTS", (1.0,))
+    turned = [replace(m, vertices=m.vertices * [0.6, 1.0, 1.3]) for m in MESHES]
+    with pytest.raises(TrackingError, match=r"fit the masks of frames \d+, \d+ at no size from 0\.5 to 2"):
+        seen_size(capture, CAMERAS, OFFSETS, turned)
+    with pytest.raises(TrackingError, match="has masks of both rows"):
+        seen_size(make_capture(capture.folder, COUNT, frames=(400, 402)), CAMERAS, OFFSETS, MESHES)
