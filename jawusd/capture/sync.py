@@ -24,6 +24,7 @@ from jawusd.imaging.video import Video
 __all__ = ["Alignment", "align_videos", "estimate_offsets", "light_curve"]
 
 _RATE_TOLERANCE = 1e-3
+_EARLY_S = 2.0  # people stop their cameras one after the other
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ def align_videos(videos: Mapping[str, Path], reference: str, *, by_light: bool =
                 )
                 for name, video in opened.items()
             }
-            return Alignment(reference, offsets, "light flash", notes)
+            return Alignment(reference, offsets, "light flash", (*notes, *_stopped_early(opened, offsets, rate)))
         sounds = dict(zip(opened, pool.map(lambda video: read_sound(video.path, RATE_HZ), opened.values())))
     why = "" if dark is None else f"camera {dark} {found[dark].reason}; "
     silent = [name for name, sound in sounds.items() if sound is None]
@@ -121,7 +122,8 @@ def align_videos(videos: Mapping[str, Path], reference: str, *, by_light: bool =
         name: _against(name, reference, video, hint, lambda n=name: _by_sound(n, reference, sounds, opened, rate), why)
         for name, video in opened.items()
     }
-    return Alignment(reference, offsets, "sound", (*((f"{why}the sound aligns the cameras",) if why else ()), *notes))
+    by_sound = (f"{why}the sound aligns the cameras",) if why else ()
+    return Alignment(reference, offsets, "sound", (*by_sound, *notes, *_stopped_early(opened, offsets, rate)))
 
 
 def light_curve(path: Path) -> LightCurve:
@@ -144,6 +146,18 @@ def _missing_pictures(videos: Mapping[str, Video]) -> tuple[str, ...]:
         "of their own. Frames are counted by time; masks as PNG files are numbered by the pictures of their video."
         for name, video in videos.items()
         if video.timeline.missing
+    )
+
+
+def _stopped_early(videos: Mapping[str, Video], offsets: Mapping[str, Offset], rate: float) -> tuple[str, ...]:
+    """Return a note for every clip that ends long before the last one."""
+    ends = {name: offsets[name].frames + video.timeline.count for name, video in videos.items()}
+    last = max(ends, key=lambda name: ends[name])
+    return tuple(
+        f"camera {name} ends at frame {end - 1} of the reference camera, {ends[last] - end} frames before camera "
+        f"{last}: it was stopped early or its clip was cut short."
+        for name, end in ends.items()
+        if ends[last] - end > _EARLY_S * rate
     )
 
 

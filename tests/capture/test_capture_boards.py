@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from boards import board, charuco, chessboard, corner_grid, opencv_pixels, photograph, poses, studio
 
-from jawusd.capture.boards import edge_width_px, find_boards
+from jawusd.capture.board_detection import edge_width_px
+from jawusd.capture.boards import find_boards
 from jawusd.errors import CalibrationError, CaptureError
 from jawusd.formats.capture import Boards
 from jawusd.imaging.video_writer import VideoWriter
@@ -117,6 +118,38 @@ def test_a_wrong_corner_count_is_named_with_the_right_one(tmp_path, cols, rows):
         CalibrationError, match=rf"c0: the board has 9 x 6 inner corners, \[boards\] says {cols} x {rows}"
     ):
         find_boards(NAMES, board(cols=cols, rows=rows, videos=videos), quiet)
+
+
+ABOUT_CHARUCO = {"pattern": "charuco", "dictionary": "DICT_4X4_50", "marker_mm": 6.5, "square_mm": 9.0}
+
+
+@pytest.mark.parametrize(("cols", "rows", "last"), [(8, 5, 26), (6, 5, 20), (9, 5, 29), (7, 4, 19)])
+def test_a_charuco_board_of_another_size_is_told_by_its_markers(tmp_path, cols, rows, last):
+    shown = board(**ABOUT_CHARUCO, cols=7, rows=5)
+    videos = write_pictures(tmp_path, pictures(shown, charuco, T_world_board=POSES[:3]))
+    message = rf"c0: the board has markers 0 to 23, one of {cols} x {rows} inner corners has 0 to {last}\."
+    with pytest.raises(CalibrationError, match=message):
+        find_boards(NAMES, board(**ABOUT_CHARUCO, cols=cols, rows=rows, videos=videos), quiet)
+    assert len(find_boards(NAMES, board(**ABOUT_CHARUCO, cols=7, rows=5, videos=videos), quiet).numbers) == 3
+
+
+def test_a_chessboard_named_charuco_is_told(tmp_path):
+    videos = write_pictures(tmp_path, pictures(board(), T_world_board=POSES[:3]))
+    with pytest.raises(CalibrationError, match="show a chessboard of 9 x 6 inner corners without markers of"):
+        find_boards(NAMES, board(**ABOUT_CHARUCO, cols=9, rows=6, videos=videos), quiet)
+
+
+@pytest.mark.parametrize("sigma", [4.0, 9.0])
+def test_boards_that_are_blurred_throughout_are_refused(tmp_path, sigma):
+    images = pictures(board(), T_world_board=POSES[:3])
+    images[1] = [cv2.GaussianBlur(image, (0, 0), sigma) for image in images[1]]
+    message = (
+        r"c1: all \d pictures of the board are blurred: its edges are \d+\.\d px wide .* at most 8\.0 px.*in focus"
+        if sigma == 4.0
+        else "c1: no chessboard with 9 x 6 inner corners in any of 3 pictures.*sharp"
+    )
+    with pytest.raises(CalibrationError, match=message):
+        find_boards(NAMES, board(videos=write_pictures(tmp_path, images)), quiet)
 
 
 def test_pictures_without_a_board_are_refused(tmp_path):

@@ -116,6 +116,18 @@ def test_lost_frames_are_noticed(tmp_path: Path) -> None:
         align_videos(videos, "a")
 
 
+def test_a_clip_cut_short_is_aligned_and_named(tmp_path: Path) -> None:
+    videos = {
+        "a": film(tmp_path / "a.mp4", exposures(400, 0)),
+        "b": film(tmp_path / "b.mp4", exposures(200, 5)),
+        "c": film(tmp_path / "c.mp4", exposures(390, 3)),
+    }
+    found = align_videos(videos, "a")
+    assert found.offsets == {"a": 0, "b": 5, "c": 3} and found.confidence["b"] < 1.0
+    assert len(found.notes) == 1
+    assert found.notes[0].startswith("camera b ends at frame 204 of the reference camera, 195 frames before camera a:")
+
+
 def steps(*times: float) -> list[Step]:
     return [Step(time, bool(k % 2)) for k, time in enumerate(times)]
 

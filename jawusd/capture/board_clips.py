@@ -1,0 +1,95 @@
+"""The clips of calibration boards: videos, or numbered pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.errors import CalibrationError, CaptureError
+from jawusd.imaging.video import Video
+
+__all__ = ["BoardClip", "sharpness"]
+
+
+class BoardClip:
+    """Hold the board pictures of one camera: a video, or numbered pictures (a pattern with %d).
+
+    Attributes:
+        path: video or pattern.
+        numbers: of the pictures there are, increasing.
+        size_px: (width, height) of every picture.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Find the pictures.
+
+        Raises:
+            CaptureError: there are none, or the first cannot be read.
+        """
+        self.path = path
+        if "%" in path.name:
+            self._video = None
+            self.numbers = _numbered(path)
+            self.size_px = _read(Path(str(path) % self.numbers[0])).shape[::-1]
+        else:
+            self._video = Video(path)
+            self.numbers = list(range(self._video.count))
+            self.size_px = self._video.size_px
+
+    @property
+    def is_video(self) -> bool:
+        """Tell whether successive pictures are moments of one motion."""
+        return self._video is not None
+
+    def pictures(self, wanted: list[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+        """Yield (number, gray picture) of the wanted ones, in order.
+
+        Raises:
+            CalibrationError: a picture has another size than the first.
+            CaptureError: a picture cannot be read.
+        """
+        if self._video is None:
+            for number in wanted:
+                path = Path(str(self.path) % number)
+                image = _read(path)
+                if image.shape[::-1] != self.size_px:
+                    raise CalibrationError(
+                        f"is {image.shape[1]} x {image.shape[0]} px, the first picture {self.size_px[0]} x "
+                        f"{self.size_px[1]} px.",
+                        path=path,
+                    )
+                yield number, image
+            return
+        needed = set(wanted)
+        for frame in self._video.frames(min(wanted), max(wanted) + 1, threads=1):
+            if frame.index in needed:
+                yield frame.index, frame.image
+
+
+def _numbered(pattern: Path) -> list[int]:
+    numbers = []
+    head, _, tail = pattern.name.partition("%")
+    tail = tail[tail.find("d") + 1 :]
+    for file in pattern.parent.iterdir():
+        digits = file.name[len(head) : len(file.name) - len(tail)]
+        if digits.isdigit() and file.name == pattern.name % int(digits):
+            numbers.append(int(digits))
+    if not numbers:
+        raise CaptureError("no picture matches.", path=pattern, hint="Check [boards] videos in capture.toml.")
+    return sorted(numbers)
+
+
+def _read(path: Path) -> NDArray[np.uint8]:
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        raise CaptureError("is not a picture that can be read.", path=path, hint="Use PNG, JPEG or TIFF.")
+    return image
+
+
+def sharpness(image: NDArray[np.uint8]) -> float:
+    """Return the variance of the Laplacian (Pech-Pacheco et al. 2000), of use between pictures of one camera."""
+    return float(cv2.Laplacian(image, cv2.CV_16S).var()) + 1e-9
