@@ -181,6 +181,7 @@ class _Segmenting:
                     "frame": self._footage.own(name, frame),
                     "contrast": found.contrast.tolist(),
                     "pixels": [int((m > 127).sum()) for m in found.masks],
+                    "outline": found.outline.tolist(),
                     "unexpected": found.unexpected.tolist(),
                     "residual_px": residual[:, k].tolist(),
                     "uncovered": record.coverage[:, k].tolist(),

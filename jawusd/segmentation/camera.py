@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera, transform_points
+from jawusd.segmentation.border import settle_borders
 from jawusd.segmentation.colours import ColourModel
 from jawusd.segmentation.config import SegmentationConfig
 from jawusd.segmentation.crowns import Expectation, ScanSurface, expect_crowns
@@ -31,6 +32,8 @@ class Segment:
         present: which rows are to be seen at all, shape (2,).
         contrast: how far colours change for the better at the outline, per row, -1 .. 1; NaN where there is none.
         unexpected: how much of each row's mask is not where the crowns were expected, as a share; NaN without a mask.
+        outline: pixels of each row's outline that show in the picture, that do not, and that border the other row,
+            shape (2, 3).
         window, expected: what was segmented, and what was expected there.
     """
 
@@ -39,6 +42,7 @@ class Segment:
     present: NDArray[np.bool_]
     contrast: NDArray[np.float64]
     unexpected: NDArray[np.float64]
+    outline: NDArray[np.int64]
     window: Window
     expected: Expectation
 
@@ -91,16 +95,19 @@ class CameraSegmenter:
         if all(mask is not None for mask in drawn):
             self._learn_from(window, np.maximum(*drawn), turn)
         elif turn == 0 or not self._colours.knows():
-            learn_colours(self._colours, window.lab, expected, c, scale)
+            learn_colours(self._colours, window.rgb, expected, c, scale)
         reach = c.reach_mm[min(turn, len(c.reach_mm) - 1)]
-        shares = cut_rows(window.lab, expected, self._colours, c, scale, reach)
+        shares = cut_rows(window.rgb, expected, self._colours, c, scale, reach)
+        clear = np.zeros(shares.shape[1:], bool)
+        if turn > 0:  # predicted poses call for a look only
+            shares, clear = settle_borders(shares, window.rgb, c, scale)
         masks = np.round(255 * shares).astype(np.uint8)
         for r, mask in enumerate(drawn):
             if mask is not None:
                 masks[r] = mask
         present = np.array([(mask > 127).sum() >= c.least_px for mask in masks])
         contrast, unexpected = self._contrast(window, masks), _unexpected(masks, expected)
-        return Segment(window.camera, masks, present, contrast, unexpected, window, expected)
+        return Segment(window.camera, masks, present, contrast, unexpected, _outline(masks, clear), window, expected)
 
     def recorded(self, segment: Segment) -> list[NDArray[np.uint8]]:
         """Return the masks of both rows as recorded, (H, W) uint8, 0 or 255."""
@@ -116,11 +123,11 @@ class CameraSegmenter:
         kernel = np.ones((3, 3), np.uint8)
         inner = cv2.erode(teeth, kernel) > 127
         outer = cv2.dilate(teeth, kernel, iterations=2) < 128
-        self._colours.learn(window.lab, inner, outer, self._config.key_weight)
+        self._colours.learn(window.rgb, inner, outer, self._config.key_weight)
 
     def _contrast(self, window: Window, masks: NDArray[np.uint8]) -> NDArray[np.float64]:
         """Return how much likelier teeth are just inside the outline of a row than just outside of both rows."""
-        odds = self._colours.weigh(window.lab)
+        odds = self._colours.weigh(window.rgb)
         share = 1 / (1 + np.exp(-odds))
         teeth = (masks.max(0) > 127).astype(np.uint8)
         kernel = np.ones((5, 5), np.uint8)
@@ -133,6 +140,17 @@ class CameraSegmenter:
             if inner.any() and outer.any():
                 out[r] = share[inner].mean() - share[outer].mean()
         return out
+
+
+def _outline(masks: NDArray[np.uint8], clear: NDArray[np.bool_]) -> NDArray[np.int64]:
+    kernel = np.ones((3, 3), np.uint8)
+    out = np.zeros((2, 3), np.int64)
+    for r, mask in enumerate(masks):
+        row = (mask > 127).astype(np.uint8)
+        outline = (row > 0) & (cv2.erode(row, kernel) == 0)
+        other = cv2.dilate((masks[1 - r] > 127).astype(np.uint8), kernel) > 0
+        out[r] = (outline & clear & ~other).sum(), (outline & ~clear & ~other).sum(), (outline & other).sum()
+    return out
 
 
 def _unexpected(masks: NDArray[np.uint8], expected: Expectation) -> NDArray[np.float64]:

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from functools import cache
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-_BINS = 32  # per channel: 8 steps of lightness, 4 of each chroma channel
-_CHROMA = (64, 4)  # first step and width of a chroma bin, of 8-bit Lab
+_BINS = 32  # per channel
+_FLOOR = 12.0  # added to every channel before ratios [8-bit steps]: noise of dark pixels has no colour
+_RATIO_STEP = 0.03  # width of a bin of the log ratios [-]: from red over green 0.6 to 1.6 and beyond
 _MOST = 6.0  # no colour alone is surer than this
 _ROUNDS, _STEPS = 5, 8  # times covered crowns are told apart, and Newton steps each time
+_LIGHT = 1  # the term of lightness
 _RIDGE = 0.01  # keeps weights finite where colours do not overlap
 
 
@@ -22,6 +23,9 @@ class ColourModel:
     beyond them is surroundings. A logistic regression on the colours, their squares and products tells the two apart;
     what it finds to be surroundings under the crowns changes sides, and it is fitted again. So few terms cannot follow
     colours of lips that happen to lie under crowns only.
+
+    Colours are lightness and the logs of red and blue over green: shade scales the channels alike and leaves those
+    (Finlayson et al. 2006), so that back teeth in the shade of the mouth look like the lit ones in front.
     """
 
     def __init__(self, memory: float) -> None:
@@ -35,16 +39,16 @@ class ColourModel:
         self._beyond = np.zeros((_BINS,) * 3)
         self._table: NDArray[np.float32] | None = None
 
-    def learn(self, lab: NDArray[np.uint8], under: NDArray[np.bool_], beyond: NDArray[np.bool_], weight=1.0) -> None:
+    def learn(self, rgb: NDArray[np.uint8], under: NDArray[np.bool_], beyond: NDArray[np.bool_], weight=1.0) -> None:
         """Take in a picture.
 
         Args:
-            lab: (h, w, 3) 8-bit CIE Lab.
+            rgb: (h, w, 3) 8-bit RGB.
             under: pixels well inside projected crowns, shape (h, w).
             beyond: pixels well outside all of them, shape (h, w).
             weight: what the picture counts, in frames.
         """
-        index = _bins(lab)
+        index = _bins(rgb)
         for counts, where in ((self._under, under), (self._beyond, beyond)):
             new = np.bincount(index[where], minlength=_BINS**3).reshape(counts.shape)
             counts *= self._keep**weight
@@ -55,9 +59,9 @@ class ColourModel:
         """Tell whether any picture was seen."""
         return bool(self._under.any() and self._beyond.any())
 
-    def weigh(self, lab: NDArray[np.uint8]) -> NDArray[np.float32]:
+    def weigh(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Return the log of how many times likelier each pixel is tooth than surroundings, shape (h, w)."""
-        return self._odds()[_bins(lab)]
+        return self._odds()[_bins(rgb)]
 
     def surroundings_reach(self, share: float) -> float:
         """Return the log-odds that the given share of the surroundings stays below."""
@@ -72,37 +76,56 @@ class ColourModel:
         return self._table
 
 
-def to_lab(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return an RGB picture as 8-bit CIE Lab, shape (h, w, 3)."""
-    return cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB)
+def shadeless(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return the log of lightness and of red and blue over green of an 8-bit picture, shape (h, w, 3)."""
+    red, green, blue = (_LOGS[rgb[..., k]] for k in range(3))
+    return np.stack([(red + green + blue) / 3, red - green, blue - green], axis=-1)
 
 
-def _bins(lab: NDArray[np.uint8]) -> NDArray[np.intp]:
-    first, width = _CHROMA
-    light = lab[..., 0].astype(np.intp) * _BINS // 256
-    a, b = (np.clip((lab[..., k].astype(np.intp) - first) // width, 0, _BINS - 1) for k in (1, 2))
+_LOGS = np.log(np.arange(256, dtype=np.float32) + np.float32(_FLOOR))
+
+
+def _bins(rgb: NDArray[np.uint8]) -> NDArray[np.intp]:
+    red, green, blue = (_LOGS[rgb[..., k]] for k in range(3))
+    light = (rgb[..., 1].astype(np.intp) * _BINS) >> 8
+    a, b = (
+        np.clip((ratio * np.float32(1 / _RATIO_STEP)).astype(np.int32) + _BINS // 2, 0, _BINS - 1)
+        for ratio in (red - green, blue - green)
+    )
     return (light * _BINS + a) * _BINS + b
 
 
 @cache
 def _terms() -> NDArray[np.float64]:
-    """Return the terms of the regression for the centre of every bin, shape (bins, 10)."""
-    first, width = _CHROMA
-    centre = np.arange(_BINS) + 0.5
-    light, a, b = np.meshgrid(centre * 256 / _BINS, *[first + width * centre] * 2, indexing="ij")
-    # Brought to about unit spread: mid grey, and the chroma of skin.
-    light, a, b = (light.ravel() - 128) / 60, (a.ravel() - 138) / 10, (b.ravel() - 138) / 10
-    return np.stack([np.ones_like(a), light, a, b, light**2, a**2, b**2, light * a, light * b, a * b], axis=1)
+    """Return the terms of the regression for the centre of every bin, shape (bins, 7).
+
+    Lightness enters once: dark lips that happen to lie under crowns only must not teach that what is dark is tooth.
+    """
+    step = np.arange(_BINS) + 0.5
+    light, ratio = np.log(step * 256 / _BINS + _FLOOR), (step - _BINS // 2) * _RATIO_STEP
+    light, a, b = np.meshgrid(light, ratio, ratio, indexing="ij")
+    # Brought to about unit spread.
+    light, a, b = (light.ravel() - 4.6) / 0.5, (a.ravel() - 0.15) / 0.1, b.ravel() / 0.1
+    return np.stack([np.ones_like(a), light, a, b, a**2, b**2, a * b], axis=1)
 
 
 def _tell_apart(under: NDArray[np.float64], beyond: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the weights of the terms from the counts of every bin, shape (10,)."""
+    """Return the weights of the terms from the counts of every bin, shape (7,); darkness never speaks for teeth."""
     seen = np.flatnonzero(under + beyond)
     x = _terms()[seen]
     under, beyond = (c[seen] / max(c.sum(), 1e-12) for c in (under, beyond))
+    weights = _regress(x, under, beyond)
+    if weights[_LIGHT] < 0:
+        x[:, _LIGHT] = 0
+        weights = _regress(x, under, beyond)
+    return weights
+
+
+def _regress(x: NDArray[np.float64], under: NDArray[np.float64], beyond: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the weights of terms (N, 7) that tell shares of two kinds (N,) apart, the first of them a mixture."""
     weights, ridge = np.zeros(x.shape[1]), _RIDGE * np.eye(x.shape[1])
     ridge[0, 0] = 1e-9
-    tooth = np.ones(len(seen))
+    tooth = np.ones(len(x))
     for _ in range(_ROUNDS):
         positive, negative = under * tooth, beyond + under * (1 - tooth)
         positive, negative = positive / max(positive.sum(), 1e-12), negative / max(negative.sum(), 1e-12)

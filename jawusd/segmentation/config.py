@@ -35,8 +35,17 @@ class SegmentationConfig:
     border_on_edge: float = 0.15
     # Log-odds between the rows per mm from their projected common border [1/mm].
     rows_per_mm: float = 2.0
+    # How far borders may move to where the picture changes [mm] and how far to either side colours are compared [mm].
+    border_band_mm: float = 0.4
+    border_side_mm: float = 0.8
+    # Blur of the colours compared [px], and standard deviations the sides must differ by [-].
+    border_blur_px: float = 0.7
+    border_contrast: float = 2.0
+    # Share of its outline that must show in the picture for a part to be tooth [-], and pixels below which it is none.
+    founded_share: float = 0.5
+    speck_px: int = 25
     # Iterations of the cut [-].
-    steps: int = 40
+    steps: int = 25
     # What a person's mask counts for the colours [frames].
     key_weight: float = 12.0
     # Fewest pixels that make a mask [px]: 4 square millimetres.

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from jawusd.geometry import Camera
 from jawusd.imaging.working_view import WorkingView
-from jawusd.segmentation.colours import to_lab
 
 _NODE_PX = 8  # spacing of undistorted positions; the lens is smooth in between
 
@@ -21,12 +20,12 @@ class Window:
 
     Attributes:
         camera: the pinhole camera of the part.
-        lab: CIE Lab, 8 bit, shape (h, w, 3).
+        rgb: its pixels, 8 bit, shape (h, w, 3).
         corner: its first column and row in the working picture [px].
     """
 
     camera: Camera
-    lab: NDArray[np.uint8]
+    rgb: NDArray[np.uint8]
     corner: tuple[int, int]
 
 
@@ -69,7 +68,7 @@ class PictureFrame:
         part = self._working.part(image, (slice(low[1], high[1]), slice(low[0], high[0])))
         size = (int(high[0] - low[0]), int(high[1] - low[1]))
         cropped = camera.cropped(int(low[0]), int(low[1]), size)
-        return Window(cropped, to_lab(part), (int(low[0]), int(low[1])))
+        return Window(cropped, part, (int(low[0]), int(low[1])))
 
     def given(self, mask: NDArray[np.uint8], window: Window) -> NDArray[np.uint8]:
         """Return what a recorded mask, (H, W) uint8, shows in a window, shape (h, w)."""

@@ -16,7 +16,7 @@ _NEVER = 30.0  # log-odds that no colour overcomes
 
 def learn_colours(
     model: ColourModel,
-    lab: NDArray[np.uint8],
+    rgb: NDArray[np.uint8],
     expected: Expectation,
     config: SegmentationConfig,
     px_per_mm: float,
@@ -24,11 +24,11 @@ def learn_colours(
 ) -> None:
     """Let a colour model see a picture, shape (h, w, 3), with the crowns where they are expected."""
     nearest = expected.inside_px.max(0) / px_per_mm
-    model.learn(lab, nearest > config.inner_mm, nearest < -config.outer_mm, weight)
+    model.learn(rgb, nearest > config.inner_mm, nearest < -config.outer_mm, weight)
 
 
 def cut_rows(
-    lab: NDArray[np.uint8],
+    rgb: NDArray[np.uint8],
     expected: Expectation,
     model: ColourModel,
     config: SegmentationConfig,
@@ -38,7 +38,7 @@ def cut_rows(
     """Segment a picture.
 
     Args:
-        lab: the picture, shape (h, w, 3).
+        rgb: the picture, shape (h, w, 3).
         expected: where the crowns are expected in it.
         model: the colours of this camera.
         config: the segmentation's numbers.
@@ -49,10 +49,10 @@ def cut_rows(
         Shares of both rows, 0 .. 1, shape (2, h, w).
     """
     inside = expected.inside_px / px_per_mm
-    odds = model.weigh(lab) - np.clip(
+    odds = model.weigh(rgb) - np.clip(
         model.surroundings_reach(config.surroundings_share) + config.doubt, *config.doubt_range
     )
-    cost = np.zeros((3, *lab.shape[:2]), np.float32)
+    cost = np.zeros((3, *rgb.shape[:2]), np.float32)
     apart = np.clip(config.rows_per_mm * (inside[0] - inside[1]) / 2, -3, 3)
     for label, row, sign in ((UPPER, 0, 1.0), (LOWER, 1, -1.0)):
         place = np.clip(config.place_per_mm * inside[row], -config.place_most[0], config.place_most[1])
@@ -60,17 +60,17 @@ def cut_rows(
         cost[label][inside[row] < -reach_mm] = _NEVER
     start = np.stack([expected.labels == label for label in (OTHER, UPPER, LOWER)]).astype(np.float32)
     free = (inside >= -reach_mm).any(0)
-    shares = cut_three_ways(cost, _edge_prices(lab, config), start, free, config.steps)
+    shares = cut_three_ways(cost, _edge_prices(rgb, config), start, free, config.steps)
     return shares[1:]
 
 
-def _edge_prices(lab: NDArray[np.uint8], config: SegmentationConfig) -> NDArray[np.float32]:
+def _edge_prices(rgb: NDArray[np.uint8], config: SegmentationConfig) -> NDArray[np.float32]:
     """Return what a border costs between each pixel and its right and lower neighbour, shape (2, h, w).
 
     The contrast that counts as an edge follows the picture's own (Boykov and Jolly 2001).
     """
-    smooth = cv2.GaussianBlur(lab, (0, 0), 0.8).astype(np.float32)
-    out = np.full((2, *lab.shape[:2]), config.border, np.float32)
+    smooth = cv2.GaussianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB), (0, 0), 0.8).astype(np.float32)
+    out = np.full((2, *rgb.shape[:2]), config.border, np.float32)
     squares = [((smooth[:, 1:] - smooth[:, :-1]) ** 2).sum(2), ((smooth[1:] - smooth[:-1]) ** 2).sum(2)]
     scale = 2 * (squares[0].mean() + squares[1].mean()) / 2 + 1e-6
     low = config.border_on_edge

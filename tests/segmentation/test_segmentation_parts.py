@@ -8,7 +8,9 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from jawusd.errors import CaptureError
 from jawusd.geometry import Camera
+from jawusd.segmentation.border import settle_borders
 from jawusd.segmentation.colours import ColourModel
+from jawusd.segmentation.config import SegmentationConfig
 from jawusd.segmentation.cut import cut_three_ways
 from jawusd.segmentation.files import KeyMasks, mask_path, write_mask
 from jawusd.segmentation.picture import PictureFrame
@@ -67,22 +69,63 @@ def painted(rng, shape, colour, spread=6):
 
 def test_lips_over_crowns_are_not_teeth():
     rng = np.random.default_rng(1)
-    lab = painted(rng, (100, 100), (120, 155, 145))  # lips
-    lab[40:60] = painted(rng, (20, 100), (200, 127, 137))  # teeth
-    lab[52:60] = painted(rng, (8, 100), (110, 128, 138))  # teeth in shadow
+    rgb = painted(rng, (100, 100), (160, 98, 90))  # lips
+    rgb[40:60] = painted(rng, (20, 100), (205, 196, 176))  # teeth
+    rgb[52:60] = painted(rng, (8, 100), (113, 108, 97))  # teeth in shadow
     under = np.zeros((100, 100), bool)
     under[20:60] = True  # half of the crowns lie under the lip
     beyond = np.zeros((100, 100), bool)
     beyond[70:] = beyond[:10] = True
     model = ColourModel(10.0)
     assert not model.knows()
-    model.learn(lab, under, beyond)
-    odds = model.weigh(lab)
+    model.learn(rgb, under, beyond)
+    odds = model.weigh(rgb)
     assert model.knows()
     assert (odds[40:60] > 0).mean() > 0.98
     assert (odds[20:40] < 0).mean() > 0.98
     reach = model.surroundings_reach(0.9)
     assert (odds[beyond] <= reach).mean() == pytest.approx(0.9, abs=0.05)
+
+
+def test_dark_lips_under_crowns_do_not_make_darkness_teeth():
+    rng = np.random.default_rng(4)
+    rgb = painted(rng, (100, 100), (170, 104, 96))  # lips
+    rgb[40:60] = painted(rng, (20, 100), (205, 196, 176))  # teeth
+    rgb[30:40] = painted(rng, (10, 100), (64, 42, 38), 3)  # lips in shadow, nowhere but under crowns
+    under = np.zeros((100, 100), bool)
+    under[30:60] = True
+    model = ColourModel(10.0)
+    model.learn(rgb, under, ~under)
+    assert np.median(model.weigh(rgb)[30:40]) < 0
+    assert (model.weigh(rgb)[40:60] > 0).mean() > 0.95
+
+
+def test_borders_settle_where_the_picture_changes():
+    rng = np.random.default_rng(2)
+    y, x = np.mgrid[:80, :120]
+    away = np.hypot((x - 60.3) / 1.5, y - 40.2) - 24.0  # an ellipse of teeth amid gum
+    tooth = np.clip(0.5 - away, 0, 1)[..., None]
+    shade = (1.0 - 0.4 * x / 120)[..., None]
+    clean = shade * (tooth * (205, 196, 176) + (1 - tooth) * (176, 112, 108))
+    rgb = np.clip(clean + rng.normal(0, 4, clean.shape), 0, 255).astype(np.uint8)
+    small = (away < -2).astype(np.float32)
+    small[4:14, 100:112] = 1.0  # a part without any border in the picture
+    shares, clear = settle_borders(np.stack([small, np.zeros_like(small)]), rgb, SegmentationConfig(), 7.2)
+    assert shares[1].max() == 0
+    assert not (shares[0][:16, 98:] > 0.5).any()
+    found = np.abs(shares[0].sum() - tooth.sum()) / tooth.sum()
+    assert found < 0.05  # began 16 % too small
+    assert clear[np.abs(away) < 1].mean() > 0.95
+    assert (np.abs(away)[(shares[0] > 0.5) != (tooth[..., 0] > 0.5)] < 1.5).all()
+
+
+def test_what_has_no_border_in_the_picture_is_no_tooth():
+    rgb = painted(np.random.default_rng(3), (60, 80), (150, 140, 130), 2)
+    shares = np.zeros((2, 60, 80), np.float32)
+    shares[0, 20:40, 20:60] = 1.0
+    settled, clear = settle_borders(shares, rgb, SegmentationConfig(), 7.2)
+    assert not (settled > 0.5).any()
+    assert not clear[15:45].any()
 
 
 def test_masks_come_back_to_the_recorded_picture():

@@ -1,0 +1,108 @@
+"""Borders between teeth and surroundings, moved to where the picture changes, to fractions of a pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.segmentation.colours import shadeless
+from jawusd.segmentation.config import SegmentationConfig
+
+_EVEN = 1e-4  # variance of the logs that is added [-]: half an 8-bit step
+_FEWEST = 100  # pixels that tell how much colours spread
+_ROW_BLUR_PX = 0.8  # softens the border between the rows to fractions of a pixel
+_FAR_BLUR_PX = 2.0  # finds the nearer row for pixels that have become teeth
+
+
+@dataclass(frozen=True, eq=False)
+class _Sides:
+    """Hold what the colours on both sides of the border say about every pixel.
+
+    Attributes:
+        share: of tooth, half way between the sides 0.5, shape (h, w).
+        contrast: standard deviations between the sides, 0 where one of them is not near, shape (h, w).
+    """
+
+    share: NDArray[np.float32]
+    contrast: NDArray[np.float32]
+
+
+def settle_borders(
+    shares: NDArray[np.float32], rgb: NDArray[np.uint8], config: SegmentationConfig, px_per_mm: float
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Tell teeth from surroundings once more, along their border, by the colours on either side right there.
+
+    Colours learned over the take decide what is tooth; where exactly it ends they decide badly, as the middle between
+    two colours differs from place to place. Fisher's discriminant between the means on both sides, weighed by how much
+    colours spread on one side, finds it (the local region statistics of Lankton & Tannenbaum 2008). Where the sides do
+    not differ the border stays, and what has such a border most of the way round is no tooth.
+
+    Args:
+        shares: of the upper and lower row, shape (2, h, w).
+        rgb: the picture, shape (h, w, 3).
+        config: the segmentation's numbers.
+        px_per_mm: resolution of the picture.
+
+    Returns:
+        Shares with soft borders, half at the outline, shape (2, h, w); and where a border would show, shape (h, w).
+    """
+    colours = cv2.GaussianBlur(shadeless(rgb), (0, 0), config.border_blur_px)
+    band, window = config.border_band_mm * px_per_mm, 2 * round(config.border_side_mm * px_per_mm) + 1
+    inside = _signed_distance(shares.sum(0) > 0.5)
+    sides = _compare_sides(inside, colours, window)
+    if sides is None:
+        return shares, np.zeros(rgb.shape[:2], bool)
+    clear = sides.contrast > config.border_contrast
+    moved = clear & (np.abs(inside) < band)
+    teeth = np.where(moved, np.clip(sides.share, 0, 1), inside > 0).astype(np.float32)
+    teeth[_unfounded(teeth > 0.5, clear, config)] = 0.0
+    rows = [cv2.GaussianBlur(share, (0, 0), _ROW_BLUR_PX) for share in shares]
+    far = [cv2.GaussianBlur(share, (0, 0), _FAR_BLUR_PX) for share in shares]
+    upper, lower = np.where(rows[0] + rows[1] > 0.2, rows, far)
+    teeth = cv2.GaussianBlur(teeth, (0, 0), config.border_blur_px)
+    return teeth * np.stack([upper, lower]) / np.maximum(upper + lower, 1e-6), clear
+
+
+def _signed_distance(region: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Return the distance to the other kind of pixel, positive inside the region [px]."""
+    inner = cv2.distanceTransform(region.astype(np.uint8), cv2.DIST_L2, 5)
+    return inner - cv2.distanceTransform((~region).astype(np.uint8), cv2.DIST_L2, 5)
+
+
+def _compare_sides(inside: NDArray[np.float32], colours: NDArray[np.float32], window: int) -> _Sides | None:
+    """Weigh every pixel between the mean colours on both sides of the border; None where there are not both."""
+    near = np.abs(inside) < window / 2
+    sides = ((inside > 1) & near, (inside < -1) & near)
+    means = [_mean_near(side, colours, window) for side in sides]
+    rest = [(colours - mean)[side] for (mean, _), side in zip(means, sides, strict=True)]
+    if min(map(len, rest)) < _FEWEST:
+        return None
+    precision = np.linalg.inv(np.cov(np.concatenate(rest).T) + _EVEN * np.eye(3)).astype(np.float32)
+    (tooth, has_tooth), (other, has_other) = means
+    apart = tooth - other
+    direction = apart @ precision
+    contrast = (direction * apart).sum(2)
+    share = 0.5 + (direction * (colours - (tooth + other) / 2)).sum(2) / np.maximum(contrast, 1e-6)
+    return _Sides(share, np.where(has_tooth & has_other, np.sqrt(np.maximum(contrast, 0)), 0))
+
+
+def _mean_near(side: NDArray[np.bool_], colours: NDArray[np.float32], window: int):
+    """Return the mean colour of one side around every pixel, and where enough of that side is near."""
+    weight = side.astype(np.float32)
+    count = cv2.boxFilter(weight, -1, (window, window), normalize=False)
+    total = cv2.boxFilter(colours * weight[..., None], -1, (window, window), normalize=False)
+    return total / np.maximum(count, 1)[..., None], count >= window
+
+
+def _unfounded(teeth: NDArray[np.bool_], clear: NDArray[np.bool_], config: SegmentationConfig) -> NDArray[np.bool_]:
+    """Tell which pixels belong to specks, and to parts with hardly a border in the picture, shape (h, w)."""
+    count, parts, stats, _ = cv2.connectedComponentsWithStats(teeth.astype(np.uint8))
+    outline = teeth & (cv2.erode(teeth.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)
+    length = np.bincount(parts[outline], minlength=count)
+    founded = np.bincount(parts[outline & clear], minlength=count)
+    bad = (founded < config.founded_share * length) | (stats[:, cv2.CC_STAT_AREA] < config.speck_px)
+    bad[0] = False
+    return bad[parts]
