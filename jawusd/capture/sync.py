@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +24,7 @@ from jawusd.imaging.video import Video
 __all__ = ["Alignment", "align_videos", "estimate_offsets", "light_curve"]
 
 _RATE_TOLERANCE = 1e-3
+_FPS_TOLERANCE = 5e-3  # people write 24 for 23.976
 _EARLY_S = 2.0  # people stop their cameras one after the other
 
 
@@ -69,7 +70,13 @@ def estimate_offsets(capture: Capture) -> Alignment:
                 path=capture.folder / "capture.toml",
                 hint=_offsets_hint([camera.name for camera in capture.cameras]),
             )
-    return align_videos(videos, capture.reference, by_light=capture.sync.method != "audio")
+    found = align_videos(videos, capture.reference, by_light=capture.sync.method != "audio")
+    rate = Video(videos[capture.reference]).timeline.rate
+    if abs(rate / capture.fps - 1) < _FPS_TOLERANCE:
+        return found
+    said = f"capture.toml says fps = {capture.fps:g}: motion is timed by it"
+    note = f"the clips run at {rate:.6g} frames per second, {said}"
+    return replace(found, notes=(*found.notes, note))
 
 
 def align_videos(videos: Mapping[str, Path], reference: str, *, by_light: bool = True) -> Alignment:

@@ -180,6 +180,11 @@ def test_a_capture_is_aligned_to_its_reference(tmp_path: Path) -> None:
     found = estimate_offsets(capture(tmp_path, videos, reference="b"))
     assert found.reference == "b"
     assert found.offsets == {"a": 2, "b": 0} and found.confidence == {"a": 1.0, "b": 1.0}
+    assert found.notes == ()
+    faster = capture(tmp_path, videos, reference="b").model_copy(update={"fps": 48.0})
+    assert estimate_offsets(faster).notes == (
+        "the clips run at 24 frames per second, capture.toml says fps = 48: motion is timed by it",
+    )
     message = r"capture\.toml: camera c has no video.*offsets = \{ a = \.\., b = \.\., c = \.\. \}"
     with pytest.raises(SyncError, match=message):
         estimate_offsets(capture(tmp_path, videos | {"c": None}))
