@@ -66,6 +66,7 @@ def viewed_actor(path: str | os.PathLike[str]) -> ViewedActor:
         name=str(about["actor"] or path.stem),
         rig=rig,
         meshes=screen_meshes(path),
+        placeholders=frozenset(stage("jawusd.rig.geo_read").read_placeholders(path)),
         fps=float(about["fps"] or _DEFAULT_FPS),
         folder=path.parent,
         clip_names=partial(motion_names, path.parent),
@@ -75,13 +76,13 @@ def viewed_actor(path: str | os.PathLike[str]) -> ViewedActor:
 
 
 def screen_meshes(path: Path) -> dict[str, Mesh]:
-    """Return the meshes of a rig by the viewer's names, teeth and gum apart, coarse enough for a screen.
+    """Return the meshes of a rig by the viewer's names, teeth and gum apart, coarse enough; placeholders too.
 
     Raises:
         RigError: there is nothing to take hold of.
     """
     geometry = stage("jawusd.rig.geo_read")
-    meshes, gum = geometry.read_geometry(path), geometry.read_gum(path)
+    meshes, gum = geometry.read_geometry(path) | geometry.read_placeholders(path), geometry.read_gum(path)
     if not {"mandible", "lower_teeth"} & set(meshes):
         raise RigError("has no mandible to look at.", path=path)
     parted: dict[str, Mesh] = {}

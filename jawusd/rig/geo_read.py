@@ -28,11 +28,20 @@ def read_geometry(path: str | os.PathLike[str]) -> dict[str, Mesh]:
     Raises:
         RigError: not a USD file, or a mesh that is not made of triangles.
     """
+    return _read(path, placeholders=False)
+
+
+def read_placeholders(path: str | os.PathLike[str]) -> dict[str, Mesh]:
+    """Read the meshes that only stand in for anatomy; else as `read_geometry`."""
+    return _read(path, placeholders=True)
+
+
+def _read(path: str | os.PathLike[str], *, placeholders: bool) -> dict[str, Mesh]:
     stage = open_stage(path)
     found = {}
     for name, prim_path in MESH_PATHS.items():
         mesh = UsdGeom.Mesh(stage.GetPrimAtPath(prim_path))
-        if not mesh or mesh.GetPrim().GetAttribute("jaw:placeholder").Get():
+        if not mesh or bool(mesh.GetPrim().GetAttribute("jaw:placeholder").Get()) != placeholders:
             continue
         counts = np.array(mesh.GetFaceVertexCountsAttr().Get() or [])
         if not counts.size or (counts != 3).any():

@@ -22,6 +22,7 @@ class ViewedActor:
         name: of the actor.
         rig: its evaluator.
         meshes: by the names of `STILL` and `MOVING` [mm], already coarse enough for a screen; any may be missing.
+        placeholders: names of meshes that only stand in for anatomy.
         fps: frames per second of new animations.
         folder: where it lies; animations are written there.
         clip_names: says which motions there are now, the captured take and the animation layers beside the rig.
@@ -33,6 +34,7 @@ class ViewedActor:
     name: str
     rig: JawRig
     meshes: Mapping[str, Mesh]
+    placeholders: frozenset[str]
     fps: float
     folder: Path
     clip_names: Callable[[], tuple[str, ...]]

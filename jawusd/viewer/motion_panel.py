@@ -13,7 +13,7 @@ from jawusd.viewer.actor import ViewedActor
 from jawusd.viewer.clip import Clip
 from jawusd.viewer.notices import guarded
 from jawusd.viewer.player import Player
-from jawusd.viewer.plots import Plot, curve_plot, with_playhead
+from jawusd.viewer.plots import Plot, curve_plot, scrubbed_by_pointer, with_playhead
 from jawusd.viewer.session import Session
 
 KEYS = "keys"
@@ -102,7 +102,9 @@ class MotionPanel:
             self._curves.content = self._plot.definition()
             self._set_thumbs()
             self.between.value, self.fps.value = work.interpolation, work.fps
-        self._playhead.content = f'<div style="padding:0 6px">{with_playhead(self._plot, self.frame)}</div>'
+        self._playhead.content = scrubbed_by_pointer(
+            with_playhead(self._plot, self.frame), self._plot, self.frame_slider._impl.uuid
+        )
         if self.frame_slider.value != round(self.frame):
             self.frame_slider.value = round(self.frame)
 
@@ -190,8 +192,8 @@ class MotionPanel:
             self.show(reached)
 
     async def _drag_keys(self, _: object) -> None:
-        self._session.set_keys(keytrack.at_frames(self._session.work.keys, self.thumbs.value))
-        self.show(self.frame)
+        self._session.move_keys(self.thumbs.value, self.frame)
+        self._changed()
 
     async def _interpolate(self, _: object) -> None:
         self._session.set_interpolation(self.between.value)

@@ -10,11 +10,16 @@ from jawusd.viewer.file_panel import FilePanel
 from jawusd.viewer.motion_panel import MotionPanel
 from jawusd.viewer.notices import guarded
 from jawusd.viewer.plot_panel import PlotPanel, StillPlots
+from jawusd.viewer.plots import VERMILION
 from jawusd.viewer.pose_panel import PosePanel
 from jawusd.viewer.scene import JawScene
 from jawusd.viewer.session import Session
 
 _PANEL_PX = 350
+_PLACEHOLDER = (
+    f'<div style="font-size:12px;padding:2px 12px;color:{VERMILION}"><b>The mandible is a placeholder, no anatomy:</b> '
+    "the rig was built without its mesh. It shows where the teeth and condyles go, not the bone.</div>"
+)
 
 
 class Page:
@@ -36,6 +41,8 @@ class Page:
         self.scene = JawScene(client, actor)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Pose"):
+            if "mandible" in actor.placeholders:
+                gui.add_html(_PLACEHOLDER)
             self.pose = PosePanel(client, self.session, self.scene, self.refresh)
         with tabs.add_tab("Animate"):
             self.motion = MotionPanel(client, self.session, actor, self.refresh)

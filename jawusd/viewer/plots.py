@@ -130,6 +130,29 @@ def with_playhead(plot: Plot, frame: float) -> str:
     return _svg(f'<use href="#{plot.name}"/>{line}')
 
 
+def scrubbed_by_pointer(drawn: str, plot: Plot, slider: str) -> str:
+    """Return the HTML of a drawn curve plot in which a click or a drag moves a slider to the frame under the pointer.
+
+    viser tells the server of no click in a plot, so the page does what a visitor's typing in the slider's box does.
+
+    Args:
+        drawn: SVG of the plot.
+        plot: whose frames these are.
+        slider: id of the slider in the page.
+    """
+    share = f"((event.clientX-r.left)/r.width*{_WIDTH}-{_LEFT})/{_WIDTH - _LEFT - _RIGHT}"
+    box = f"document.getElementById('{slider}').parentElement.querySelector('input:not([type=hidden])')"
+    script = (
+        f"if(event.buttons&1){{const b={box},"
+        f"r=this.firstElementChild.getBoundingClientRect(),s=Math.min(1,Math.max(0,{share}));"
+        "Object.getOwnPropertyDescriptor(HTMLInputElement.prototype,'value').set.call(b,"
+        f"Math.round({plot.low[0]:g}+s*{plot.high[0] - plot.low[0]:g}));"
+        "b.dispatchEvent(new Event('input',{bubbles:true}))}"
+    )
+    style = "padding:0 6px;cursor:col-resize;touch-action:none;user-select:none"
+    return f'<div style="{style}" onpointerdown="{script}" onpointermove="{script}">{drawn}</div>'
+
+
 def _svg(content: str) -> str:
     return f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" width="100%" style="display:block">{content}</svg>'
 

@@ -19,8 +19,12 @@ Color = tuple[int, int, int]
 _ENAMEL, _GUM, _BONE = (236, 229, 212), (196, 112, 108), (222, 207, 178)
 _COLORS = {"upper_teeth": _ENAMEL, "lower_teeth": _ENAMEL, "upper_gum": _GUM, "lower_gum": _GUM}
 _OUTSIDE: Color = (222, 120, 90)
+_PLACEHOLDER: Color = (150, 158, 168)  # no anatomy: not the colour of bone, and seen through
+_CLEAR = 0.45  # opacity of a mandible that is seen through
 _INCISOR, _CONDYLE, _PIN, _HELD = (0, 114, 178), (0, 158, 115), (230, 159, 0), (213, 94, 0)
 _SKULL_OPACITY = 0.28
+_GROUND: Color = (196, 190, 186)
+_AMBIENT = 1.6
 _MARKER_MM, _PIN_MM = 1.2, 2.2
 _CAPTURED_MM, _MOST_CAPTURED = 0.5, 400
 
@@ -49,12 +53,16 @@ class JawScene:
         self._T_world_skull = np.array(rig.arrays["T_anatomical_skull"])
         self._rest = rest_places(rig)
         self._scene.configure_default_lights(cast_shadow=False)
+        # Lit from everywhere: pictures of surroundings take half the time of a frame where no graphics card draws.
+        self._scene.configure_environment_map(None)
+        self._scene.add_light_hemisphere("/light", ground_color=_GROUND, intensity=_AMBIENT)
         for name in STILL:
             if name in actor.meshes:
                 self._add_still(name, actor.meshes[name])
         self._jaw = self._scene.add_frame("/jaw", show_axes=False)
         moving = [name for name in MOVING if name in actor.meshes]
-        self.grips = [self._add_moving(name, actor.meshes[name]) for name in moving]
+        self._bone = _PLACEHOLDER if "mandible" in actor.placeholders else _BONE
+        self.grips = [self._add_moving(name, actor) for name in moving]
         self._mandible = self.grips[moving.index("mandible")] if "mandible" in moving else None
         self._inside = True
         self._add_landmarks(rig.arrays["landmarks"])
@@ -74,9 +82,12 @@ class JawScene:
             f"/{name}", vertices, mesh.faces, color=_COLORS.get(name, _BONE), opacity=clear, side="double"
         )
 
-    def _add_moving(self, name: str, mesh: Mesh) -> viser.MeshHandle:
-        color = _COLORS.get(name, _BONE)
-        return self._scene.add_mesh_simple(f"/jaw/{name}", mesh.vertices, mesh.faces, color=color, side="double")
+    def _add_moving(self, name: str, actor: ViewedActor) -> viser.MeshHandle:
+        mesh, color = actor.meshes[name], _COLORS.get(name, self._bone)
+        clear = _CLEAR if name in actor.placeholders else None
+        return self._scene.add_mesh_simple(
+            f"/jaw/{name}", mesh.vertices, mesh.faces, color=color, opacity=clear, side="double"
+        )
 
     def _add_landmarks(self, landmarks: Array) -> None:
         for name, place in zip(LANDMARKS, landmarks, strict=True):
@@ -125,7 +136,7 @@ class JawScene:
             self._jaw.position = tuple(T[:3, 3])
             self._jaw.wxyz = tuple(wxyz_from_matrix(T[:3, :3]))
         if inside != self._inside and self._mandible is not None:
-            self._mandible.color = _BONE if inside else _OUTSIDE
+            self._mandible.color = self._bone if inside else _OUTSIDE
         self._inside = inside
 
     def show_hold(self, held_skull: Array | None, pointer_skull: Array | None) -> None:
@@ -151,9 +162,11 @@ class JawScene:
         return transform_points(se3_inverse(self._T_world_skull), np.array(position))
 
     def look(self, preset: str) -> None:
-        """Put the camera where a preset says."""
+        """Put the camera where a preset says; in a close-up the condyle's path shows through the mandible."""
         target, eye = preset_view(self._rest, preset)
         camera = self._client.camera
+        if self._mandible is not None and self._bone != _PLACEHOLDER:
+            self._mandible.opacity = _CLEAR if preset.startswith("condyle") else None
         with self._client.atomic():
             camera.position, camera.look_at, camera.up_direction = tuple(eye), tuple(target), (0.0, 1.0, 0.0)
 

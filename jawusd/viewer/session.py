@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -207,6 +208,17 @@ class Session:
     def set_keys(self, keys: KeyTrack) -> None:
         """Replace the keys."""
         self._change(None, keys=keys)
+
+    def move_keys(self, frames: Sequence[float], shown: float) -> None:
+        """Move the keys to other frames and show the frame `shown`; a run of moves is one step for undo.
+
+        Raises:
+            FormatError: not one frame per key, or two keys would share a frame.
+        """
+        self._change("move keys", keys=keytrack.at_frames(self.work.keys, frames))
+        clip = self.key_clip()
+        if clip is not None:
+            self.work = replace(self.work, d=_triple(clip.at(shown)))
 
     def add_key(self, frame: float) -> None:
         """Set a key of the pose now at a frame; a key that was there is replaced."""

@@ -1,16 +1,20 @@
 """The report of a finished build: written anew, with what is not at hand named, and kept by --resume."""
 
 import json
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from example_rig import FPS, example_meshes
 from report_data import report_data
+from typer.testing import CliRunner
 
+from jawusd.cli.main import app
 from jawusd.errors import FormatError, MissingDependencyError
 from jawusd.evaluator import JawRig
 from jawusd.formats.model import save_model
-from jawusd.formats.tracks import save_tracks
+from jawusd.formats.tracks import load_tracks, save_tracks
 from jawusd.pipeline import report
 from jawusd.pipeline.report import missing_packages, report_build
 from jawusd.pipeline.report_media import chosen_frames
@@ -49,6 +53,26 @@ def test_a_report_without_its_capture_says_what_it_lacks(built):
     assert "report DIR --experiments" in text and "replay-data" in text
     record = BuildState(built).valid("report", "as built")  # what --resume asks
     assert record is not None and list(record.outputs) == ["report.html"] and record.result == {"capture": "../gone"}
+
+
+def test_the_experiments_of_a_build_go_into_its_report(built):
+    """With the paper's networks, which a build leaves out."""
+    tracks = load_tracks(built / "tracks.npz")
+    sure = {name: 1e-6 * getattr(tracks, f"covariance_{name}") for name in ("upper", "lower", "relative")}
+    save_tracks(built / "tracks.npz", replace(tracks, **{f"covariance_{name}": value for name, value in sure.items()}))
+    report_build(built, None, quiet)
+    without = (built / "report.html").read_text()
+    result = CliRunner().invoke(app, ["report", str(built), "--experiments", "--starts", "1", "--json"])
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout)
+    names = {Path(file).name for file in found["files"]}
+    assert {"fig5_condyle_path.png", "fig12_reconstruction.svg", "fig13_synthesis.png", "experiments.csv"} < names
+    assert {Path(file).parent for file in found["files"]} == {built / "experiments", built}
+    text = (built / "report.html").read_text()
+    networks = {row["model"] for row in found["table"] if "nlpca" in row["model"].lower()}
+    assert networks and all(name in text and name not in without for name in networks)
+    assert "adds them to the" in without and "adds them to the" not in text
+    assert len(text.encode()) < 6e6
 
 
 def test_a_folder_that_is_no_build_is_one_clear_error(tmp_path):

@@ -1,11 +1,8 @@
 """The report in a real browser, opened from disk: light and dark, no request, no console error, the replay moves."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
-from browser import headless_chromium
+from browser import headless_chromium, keep_picture
 from report_data import report_data
 
 from jawusd.report.document import write_document
@@ -29,8 +26,7 @@ def opened(request, chromium, tmp_path):
     page.on("request", lambda request: requests.append(request.url))
     page.goto(path.as_uri())
     yield page, data, request.param
-    if "SCREENSHOTS" in os.environ:
-        page.screenshot(path=Path(os.environ["SCREENSHOTS"]) / f"report_{request.param}.png", full_page=True)
+    keep_picture(page, f"report_{request.param}", full_page=True)
     context.close()
     assert trouble == []
     assert [url for url in requests if not url.startswith("data:")] == [path.as_uri()]

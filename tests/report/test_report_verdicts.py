@@ -85,10 +85,13 @@ def test_each_fault_is_found_where_it_is(fault, stage):
     assert found.pop(stage) == BAD and BAD not in found.values()
 
 
-def test_missing_movements_and_unproven_times_ask_for_a_look():
+@pytest.mark.parametrize("code", ["take_lacks", "not_shown"])
+def test_missing_movements_and_unproven_times_ask_for_a_look(code):
     data = report_data(sync={"offsets": {}, "method": "taken as simultaneous"})
-    data.model.meta["warnings"] = [{"code": "take_lacks", "message": "Record protrusion."}]
+    data.model.meta["warnings"] = [{"code": code, "message": "Record protrusion."}]
     assert grades(data) == {"sync": LOOK, "track": GOOD, "fit": GOOD, "bounds": LOOK, "rig": GOOD}
+    bounds = next(verdict for verdict in judge(data) if verdict.stage == "bounds")
+    assert [c.found for c in bounds.checks if c.name == "captured movements"] == ["Record protrusion."]
 
 
 def test_ranges_are_those_of_the_motion():

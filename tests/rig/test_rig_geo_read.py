@@ -6,7 +6,7 @@ from example_rig import FPS, example_meshes, example_motion, example_rig
 
 from jawusd.errors import RigError
 from jawusd.rig.bake import bake_rig
-from jawusd.rig.geo_read import read_geometry
+from jawusd.rig.geo_read import read_geometry, read_placeholders
 
 
 def bake(folder, meshes):
@@ -26,7 +26,8 @@ def test_meshes_come_back_in_single_precision(tmp_path):
 
 def test_a_placeholder_is_no_bone(tmp_path):
     meshes = {name: mesh for name, mesh in example_meshes().items() if name != "mandible"}
-    assert "mandible" not in read_geometry(bake(tmp_path, meshes))
+    path = bake(tmp_path, meshes)
+    assert "mandible" not in read_geometry(path) and set(read_placeholders(path)) == {"mandible"}
 
 
 def test_what_is_no_geometry_is_refused(tmp_path):

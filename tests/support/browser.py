@@ -14,6 +14,12 @@ _NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 _ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 
+def keep_picture(page, name: str, **how: bool) -> None:
+    """Save a screenshot in the folder that SCREENSHOTS names, as continuous integration does; else do nothing."""
+    if "SCREENSHOTS" in os.environ:
+        page.screenshot(path=Path(os.environ["SCREENSHOTS"]) / f"{name}.png", **how)
+
+
 def headless_chromium() -> Iterator:
     """Yield a running headless Chromium and close it afterwards; skips where there is none.
 

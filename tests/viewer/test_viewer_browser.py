@@ -1,18 +1,20 @@
 """The real page in headless Chromium: sliders, drag, keys, files; page errors and requests elsewhere fail a test."""
 
-import os
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
-from example_rig import assert_valid_usd
+from browser import keep_picture
+from example_rig import FPS, assert_valid_usd, example_meshes, example_motion, example_rig
 
 from jawusd.formats.keys import load_keys
 from jawusd.formats.poses import read_parameters
 from jawusd.geometry import matrix_from_wxyz
+from jawusd.pipeline.view import open_viewer
+from jawusd.rig.bake import bake_rig
 from jawusd.rig.motion_read import read_poses_of_stage
-from jawusd.viewer.readouts import landmark_places
+from jawusd.viewer.readouts import CONDYLES, INCISOR, landmark_places, rest_places
+from jawusd.viewer.scene import PRESETS, preset_view
 from jawusd.viewer.uploads import MOST_BYTES
 
 # What viser's own page says on its console; nothing here comes from jawusd.
@@ -75,9 +77,7 @@ class Tab:
         return box["x"] + 0.5 * box["width"] + scale * x[0], box["y"] + 0.5 * box["height"] + scale * x[1]
 
     def picture(self, name):
-        """Keep a screenshot where SCREENSHOTS says, as continuous integration does."""
-        if "SCREENSHOTS" in os.environ:
-            self.web.screenshot(path=Path(os.environ["SCREENSHOTS"]) / f"viewer_{name}.png")
+        keep_picture(self.web, f"viewer_{name}")
 
 
 def until(condition):
@@ -151,6 +151,76 @@ def test_dragging_the_incisor_is_inverse_kinematics(tab):
     assert tab.session.d[1] > 2.0
 
 
+def pull(tab, landmark, offset):
+    """Drag a landmark of the jaw with the mouse by an offset in anatomical axes [mm]."""
+    place = landmark_places(tab.session.rig, tab.session.d)[landmark]
+    here, there = tab.pixel(place), tab.pixel(place + offset)
+    tab.web.mouse.move(*here)
+    tab.web.mouse.down()
+    for share in np.linspace(0.2, 1.0, 5):
+        tab.web.mouse.move(here[0] + share * (there[0] - here[0]), here[1] + share * (there[1] - here[1]))
+        time.sleep(0.06)
+    until(lambda: tab.session.dragging)
+    time.sleep(0.3)
+    tab.web.mouse.up()
+    until(lambda: not tab.session.dragging)
+
+
+def test_a_pinned_condyle_stays_and_undo_takes_the_drag_back(tab):
+    tab.type_slider(0, 15)
+    until(lambda: close_to(tab.session, [15, 0, 0]))
+    time.sleep(0.5)  # the page draws the pose
+    before = landmark_places(tab.session.rig, tab.session.d)
+    pull(tab, INCISOR, [0.0, -5.0, 0.0])
+    free = landmark_places(tab.session.rig, tab.session.d)
+    tab.web.keyboard.press("Control+z")
+    until(lambda: close_to(tab.session, [15, 0, 0]))
+    tab.web.get_by_label("condyle right").click()
+    until(lambda: tab.session.work.pins)
+    time.sleep(0.5)
+    pull(tab, INCISOR, [0.0, -5.0, 0.0])
+    tab.picture("pin")
+    held = landmark_places(tab.session.rig, tab.session.d)
+    travel = [np.linalg.norm((places - before)[CONDYLES[1]]) for places in (free, held)]
+    assert travel[1] < 0.5 < travel[0]
+    assert before[INCISOR, 1] - held[INCISOR, 1] > 0.2  # about the condyle that is held
+    tab.press("undo")
+    tab.press("undo")
+    until(lambda: not tab.session.work.pins and close_to(tab.session, [15, 0, 0]))
+
+
+def test_every_view_is_drawn_in_light_and_dark(tab):
+    camera, rest = tab.page.client.camera, rest_places(tab.session.rig)
+    for name in PRESETS:
+        tab.press(name)
+        target, eye = preset_view(rest, name)
+        until(lambda eye=eye: np.allclose(camera.position, eye, atol=0.1))
+        np.testing.assert_allclose(camera.look_at, target, atol=0.1)
+        assert (tab.page.scene.grips[0].opacity is None) == (not name.startswith("condyle"))
+        time.sleep(0.5)  # the page draws the view
+        tab.picture(f"view_{name.replace(' ', '_')}")
+    corner = {"x": 400, "y": 30, "width": 8, "height": 8}
+    light = tab.web.screenshot(clip=corner)
+    tab.web.get_by_label("dark page").click()
+    until(lambda: tab.web.screenshot(clip=corner) != light)
+    tab.picture("dark")
+
+
+def test_a_placeholder_of_the_mandible_is_shown_as_one(chromium, tmp_path):
+    meshes = {name: mesh for name, mesh in example_meshes().items() if name != "mandible"}
+    frames, d = example_motion()
+    bake_rig(tmp_path, example_rig(), meshes, name="toothless", fps=FPS, frames=frames, d=d, table_size=17)
+    viewer = open_viewer(tmp_path, "127.0.0.1", 0)
+    tab = Tab(chromium, viewer)
+    tab.said("The mandible is a placeholder, no anatomy")
+    mandible = tab.page.scene.grips[0]
+    assert mandible.name == "/jaw/mandible" and mandible.opacity < 0.6
+    tab.picture("placeholder")
+    tab.web.close()
+    viewer.stop()
+    assert tab.complaints == [] and tab.elsewhere == []
+
+
 def test_three_keys_are_exported_saved_and_loaded_again(tab, folder, tmp_path):
     poses = {0: (2.0, 0.0, 0.0), 12: (16.0, 1.5, 0.0), 30: (6.0, -1.0, 0.5)}
     for frame, d in poses.items():
@@ -176,10 +246,37 @@ def test_three_keys_are_exported_saved_and_loaded_again(tab, folder, tmp_path):
     saved = load_keys(tmp_path / "keys.json")
     assert [key.frame for key in saved.keys] == list(poses)
     np.testing.assert_allclose([key.d for key in saved.keys], list(poses.values()), atol=1e-3)
-    tab.session.set_keys(())
-    tab.page.refresh()
+    tab.tab("Animate")
+    tab.type_slider(0, 12)
+    until(lambda: close_to(tab.session, poses[12]))
+    tab.press("copy")
+    tab.type_slider(0, 40)
+    until(lambda: tab.page.motion.frame == 40)
+    tab.press("paste")
+    until(lambda: [key.frame for key in tab.session.work.keys] == [0, 12, 30, 40])
+    np.testing.assert_allclose(tab.session.work.keys[-1].d, tab.session.work.keys[1].d)
+    time.sleep(0.5)  # the page draws the thumbs
+    thumb = tab.web.locator(".multi-slider-thumb").last.bounding_box()
+    x, y = thumb["x"] + 0.5 * thumb["width"], thumb["y"] + 0.5 * thumb["height"]
+    tab.web.mouse.move(x, y)
+    tab.web.mouse.down()
+    for step in (5, 10, 15):
+        tab.web.mouse.move(x + step, y)
+    tab.web.mouse.up()
+    until(lambda: tab.session.work.keys[-1].frame > 42)
+    assert [key.frame for key in tab.session.work.keys[:3]] == [0, 12, 30]
+    tab.web.locator("input[role=combobox]:visible").last.click()
+    tab.web.get_by_role("option", name="smooth").click()
+    until(lambda: tab.session.work.interpolation == "smooth")
+    tab.picture("smooth")
+    for frame in [key.frame for key in tab.session.work.keys]:
+        tab.type_slider(0, f"{frame:g}")
+        until(lambda frame=frame: tab.page.motion.frame == frame)
+        tab.press("delete")
+        until(lambda frame=frame: all(key.frame != frame for key in tab.session.work.keys))
+    tab.tab("Files")
     tab.web.locator("input[type=file]").set_input_files(tmp_path / "keys.json")
-    until(lambda: tab.session.work.keys == saved.keys)
+    until(lambda: tab.session.work.keys == saved.keys and tab.session.work.interpolation == "linear")
 
 
 def test_the_baked_motion_plays_goes_round_and_stops(tab):
@@ -199,8 +296,22 @@ def test_the_baked_motion_plays_goes_round_and_stops(tab):
     until(lambda: any(after < before for before, after in zip(shown, shown[1:], strict=False)))
     tab.press("stop")
     until(lambda: not motion.player.playing)
-    tab.picture("play")
     first, last = clip.span
+    tab.web.get_by_label("loop").click()
+    until(lambda: not motion.loop.value)
+    tab.press("play")
+    until(lambda: not motion.player.playing and motion.frame == last)
+    plot = tab.web.locator("svg:visible", has=tab.web.locator("use[href='#jaw-curves']")).bounding_box()
+    left, right = plot["x"] + plot["width"] * 36 / 300, plot["x"] + plot["width"] * 288 / 300
+    tab.web.mouse.click(left + 0.25 * (right - left), plot["y"] + 0.5 * plot["height"])
+    until(lambda: abs(motion.frame - (first + 0.25 * (last - first))) <= 1)
+    tab.web.mouse.down()
+    for share in (0.5, 0.7, 0.9):
+        tab.web.mouse.move(left + share * (right - left), plot["y"] + 0.5 * plot["height"])
+        until(lambda share=share: abs(motion.frame - (first + share * (last - first))) <= 1)
+    tab.web.mouse.up()
+    until(lambda: tab.web.locator("input.mantine-NumberInput-input:visible").first.input_value() == f"{motion.frame:g}")
+    tab.picture("play")
     assert first <= min(shown) and max(shown) <= last
     np.testing.assert_allclose(tab.session.d, clip.at(motion.frame), atol=1e-9)
 

@@ -35,6 +35,14 @@ def test_the_numbers_of_a_pose_are_displacements_in_anatomical_axes():
     assert not read_out(RIG, [14.0, 40.0, 0.0]).inside
 
 
+def test_the_places_of_five_poses_are_those_of_each():
+    d = np.array([[0.0, 0, 0], [4, 1, 0], [9, -1, 0.5], [14, 2, 0], [20, 0, 0]])
+    points = np.column_stack([RIG.arrays["landmarks"], np.ones(5)])
+    expected = [(RIG.arrays["T_anatomical_skull"] @ RIG.pose(one) @ points.T).T[:, :3] for one in d]
+    np.testing.assert_allclose(landmark_places(RIG, d), expected, atol=1e-9)
+    np.testing.assert_allclose(landmark_places(RIG, d[:4]), expected[:4], atol=1e-9)
+
+
 def test_paths_begin_closed_and_borders_lie_on_the_bound():
     path = habitual_path(RIG, 20)
     np.testing.assert_allclose(path[0], landmark_places(RIG, [0.0, 0.0, 0.0]))

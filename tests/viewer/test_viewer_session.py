@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from example_rig import FPS, example_rig
 
+from jawusd.errors import FormatError
 from jawusd.formats.keys import Key, Keys
 from jawusd.geometry import LANDMARKS
 from jawusd.viewer.session import Session
@@ -151,6 +152,18 @@ def test_a_run_of_slider_moves_is_one_step_and_playing_is_none(session):
     session.show([9.0, 1.0, 0.0])
     session.undo()
     np.testing.assert_allclose(session.d, 0, atol=0.3)
+
+
+def test_dragging_keys_along_the_timeline_is_one_step(session):
+    keys = (Key(frame=0, d=(0, 0, 0)), Key(frame=10, d=(10, 0, 0)))
+    session.load_keys(Keys(fps=24, interpolation="linear", keys=keys))
+    before = session.work
+    for last in (12, 16, 20):
+        session.move_keys([0, last], 5)
+        np.testing.assert_allclose(session.d, [50 / last, 0, 0])
+    with pytest.raises(FormatError, match="frame of its own"):
+        session.move_keys([20, 20], 5)
+    assert session.undo() and session.work == before
 
 
 @pytest.mark.parametrize("interpolation", ["linear", "smooth"])
