@@ -20,7 +20,7 @@ class BoardClip:
 
     Attributes:
         path: video or pattern.
-        numbers: of the pictures there are, increasing.
+        numbers: of the pictures there are, increasing; in a video those of the frames at which they are shown.
         size_px: (width, height) of every picture.
     """
 
@@ -37,7 +37,7 @@ class BoardClip:
             self.size_px = _read(Path(str(path) % self.numbers[0])).shape[::-1]
         else:
             self._video = Video(path)
-            self.numbers = list(range(self._video.count))
+            self.numbers = sorted(set(self._video.timeline.numbers.tolist()))
             self.size_px = self._video.size_px
 
     @property
@@ -64,10 +64,10 @@ class BoardClip:
                     )
                 yield number, image
             return
-        needed = set(wanted)
-        for frame in self._video.frames(min(wanted), max(wanted) + 1, threads=1):
+        needed = {self._video.timeline.picture(number): number for number in wanted}
+        for frame in self._video.frames(min(needed), max(needed) + 1, threads=1):
             if frame.index in needed:
-                yield frame.index, frame.image
+                yield needed[frame.index], frame.image
 
 
 def _numbered(pattern: Path) -> list[int]:

@@ -127,8 +127,8 @@ def _choose(names: tuple[str, ...], clips: list[BoardClip]) -> tuple[list[int], 
     if len(set(counts)) > 1:
         listed = ", ".join(f"{name} {count}" for name, count in zip(names, counts))
         notes.append(
-            f"the board clips hold different numbers of pictures ({listed}): the first {len(shared)} are taken as "
-            "simultaneous; a clip that was cut at its beginning would spoil the result."
+            f"the board clips hold different numbers of pictures ({listed}): {len(shared)} of like number or time are "
+            "taken as simultaneous; a clip that was cut at its beginning would spoil the result."
         )
     if not all(clip.is_video for clip in clips):
         step = max(1, -(-len(shared) // MOST_VIEWS))

@@ -1,5 +1,8 @@
 """Finding boards in drawn pictures whose corners are known."""
 
+from fractions import Fraction
+
+import av
 import cv2
 import numpy as np
 import pytest
@@ -171,6 +174,32 @@ def test_a_clip_cut_short_is_used_and_said(tmp_path):
     found = find_boards(NAMES, board(videos=write_clips(tmp_path, images)), quiet)
     assert len(found.numbers) == 4
     assert "different numbers of pictures (c0 12, c1 8)" in found.notes[0]
+
+
+def test_clips_of_variable_rate_are_matched_by_time(tmp_path):
+    images = pictures(board())
+    paths = []
+    for c, dropped in enumerate(((), (2, 3))):  # the second camera lost a pose
+        path = tmp_path / f"c{c}.mp4"
+        with av.open(str(path), "w") as container:
+            stream = container.add_stream("libx264", rate=1000)
+            stream.width, stream.height, stream.pix_fmt = 640, 480, "yuv420p"
+            stream.codec_context.time_base = Fraction(1, 1000)
+            stream.options = {"crf": "10"}
+            for k in (k for k in range(12) if k not in dropped):
+                frame = av.VideoFrame.from_ndarray(images[c][k // 2], format="gray")
+                frame.pts, frame.time_base = 40 * k, Fraction(1, 1000)
+                container.mux(stream.encode(frame))
+            container.mux(stream.encode(None))
+        paths.append(path)
+    found = find_boards(NAMES, board(videos=tuple(paths)), quiet)
+    assert len(found.numbers) == 5 and "(c0 12, c1 10): 10 of like number or time" in found.notes[0]
+    grid = corner_grid(board())
+    for c, camera in enumerate(CAMERAS):
+        for v, number in enumerate(found.numbers):
+            T = POSES[number // 2]
+            exact = opencv_pixels(camera, grid @ T[:3, :3].T + T[:3, 3])
+            assert min(np.abs(found.corners_px[c, v] - order).max() for order in (exact, exact[::-1])) < 0.25
 
 
 def test_pictures_that_cannot_be_read_are_named(tmp_path):
