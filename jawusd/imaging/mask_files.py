@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -117,7 +118,7 @@ class VideoMasks:
         else:
             self._colour = "gray" if self._video.is_gray else "rgba" if self._video.has_alpha else "rgb"
         if self._colour == "rgba":
-            _refuse_opaque((frame.image for frame in self._video.frames(colour="rgba", threads=1)), path)
+            _refuse_opaque_video(path, path.stat().st_mtime_ns)
 
     def masks(self, first: int) -> Iterator[Mask | None]:
         """Yield the masks from a picture on, (h, w) uint8, None where nothing is segmented.
@@ -156,6 +157,12 @@ def _refuse_opaque(images: Iterator[NDArray], path: Path) -> None:
         path=path,
         hint="Export the matte itself, in black and white, or colour with its alpha (in After Effects: RGB + Alpha).",
     )
+
+
+@lru_cache(maxsize=256)
+def _refuse_opaque_video(path: Path, changed_ns: int) -> None:
+    """Raise as `_refuse_opaque`, looking once at a video; the time of its last change tells it from an earlier one."""
+    _refuse_opaque((frame.image for frame in Video(path).frames(colour="rgba", threads=1)), path)
 
 
 def _is_opaque_photograph(image: NDArray) -> bool:
