@@ -9,7 +9,7 @@ from package_copy import ROOT
 
 @pytest.fixture
 def example(monkeypatch):
-    spec = importlib.util.spec_from_file_location("face_solver", ROOT / "examples" / "face_solver.py")
+    spec = importlib.util.spec_from_file_location("face_solver", ROOT / "examples" / "03_face_solver.py")
     module = importlib.util.module_from_spec(spec)
     monkeypatch.setitem(sys.modules, "face_solver", module)
     spec.loader.exec_module(module)

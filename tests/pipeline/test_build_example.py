@@ -30,9 +30,8 @@ def quiet(stage, done, total):
 
 
 @pytest.fixture(scope="module")
-def built(tmp_path_factory):
-    out = tmp_path_factory.mktemp("build") / "actor"
-    return out, build_rig(EXAMPLE, out, BuildOptions(), quiet)
+def built(example_build):
+    return example_build
 
 
 def points_of_mandible():

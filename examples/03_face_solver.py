@@ -1,4 +1,4 @@
-"""Fit the jaw in a face solver with the usual prior and with a jaw rig: python examples/face_solver.py [-o PICTURE.png]
+"""Fit the jaw in a face solver with the usual prior and with a jaw rig: python examples/03_face_solver.py [-o PNG]
 
 A helmet camera sees noisy points of the chin and, once the mouth is open, the lower incisors. A face solver looks for
 the jaw pose of every frame: an axis-angle turn about the jaw joint, as in FLAME and SMPL-X, and a translation. One
