@@ -99,7 +99,14 @@ def calibrate_sightings(
     scans: Mapping[str, Array],
     scale_without_picks: MeasureScale | None = None,
 ) -> tuple[list[Camera], CalibrationReport]:
-    """Calibrate from corners already found; see `calibrate_capture`."""
+    """Calibrate from corners already found; see `calibrate_capture`.
+
+    Returns:
+        The cameras, and what is known of their accuracy.
+
+    Raises:
+        CalibrationError: the corners do not carry a calibration.
+    """
     boards = capture.boards
     if boards is None:
         raise CalibrationError("has no [boards].", path=capture.folder / "capture.toml")

@@ -250,6 +250,13 @@ class JawRig:
     ) -> Verdicts:
         """Judge jaw parameters d (..., 3) [mm] as `validate` does poses; the residual is 0.
 
+        Args:
+            d: Jaw parameters [mm], shape (..., 3).
+            margin_limit_mm: Smallest margin; the rig's own if None.
+            bound: Which bound, see `margin`.
+            times_s: Times along the last batch axis, shape (F,); needed for a speed limit.
+            speed_limit_mm_s: Largest speed of a landmark; None asks no question.
+
         Raises:
             ValueError: wrong shapes, or a speed limit without rising times.
         """

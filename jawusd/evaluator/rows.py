@@ -31,7 +31,11 @@ def as_rows(values: ArrayLike, tail: tuple[int, ...], name: str) -> tuple[Array,
 
 
 def in_rows(values: ArrayLike, tail: tuple[int, ...], name: str) -> tuple[Array, tuple[int, ...]]:
-    """Return what `as_rows` does, rows that are not finite as they are."""
+    """Return what `as_rows` does, rows that are not finite as they are.
+
+    Raises:
+        ValueError: values of another shape.
+    """
     values = np.asarray(values, dtype=np.float64)
     batch = values.shape[: values.ndim - len(tail)]
     if values.ndim < len(tail) or values.shape[len(batch) :] != tail:

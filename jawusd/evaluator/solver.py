@@ -109,7 +109,11 @@ def _picked(wanted: NDArray[np.bool_], *arrays: Array) -> tuple[Array, ...]:
 
 
 def solve_symmetric(A: Array, b: Array) -> Array:
-    """Solve A x = b for symmetric A (n, 3, 3) and b (n, 3) by cofactors."""
+    """Solve A x = b for symmetric A (n, 3, 3) and b (n, 3) by cofactors.
+
+    Returns:
+        x, shape (n, 3).
+    """
     if len(A) == 1:
         (a, p, q), (_, c, s), (_, _, f) = A[0].tolist()
         x, y, z = b[0].tolist()

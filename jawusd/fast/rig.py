@@ -71,7 +71,13 @@ class FastRig(JawRig):
     def encode(
         self, T_skull_mandible: ArrayLike, *, bounds: bool = False, covariance: ArrayLike | None = None
     ) -> tuple[Array, Array]:
-        """Return the nearest d (..., 3) [mm] to poses (..., 4, 4), and residual_mm (...); see `JawRig.encode`."""
+        """Return the nearest d (..., 3) [mm] to poses (..., 4, 4), and residual_mm (...); see `JawRig.encode`.
+
+        Args:
+            T_skull_mandible: Poses, shape (..., 4, 4).
+            bounds: Search only inside the bound.
+            covariance: See `JawRig.encode`.
+        """
         if covariance is not None:
             return super().encode(T_skull_mandible, bounds=bounds, covariance=covariance)
         rows, batch = rows_of(T_skull_mandible, (4, 4), "T_skull_mandible")
@@ -116,7 +122,16 @@ class FastRig(JawRig):
         times_s: ArrayLike | None = None,
         speed_limit_mm_s: float | None = None,
     ) -> Verdicts:
-        """Judge poses (..., 4, 4): finite, rigid, on the model, inside, reachable in time; see `JawRig.validate`."""
+        """Judge poses (..., 4, 4): finite, rigid, on the model, inside, reachable in time; see `JawRig.validate`.
+
+        Args:
+            T_skull_mandible: Poses, shape (..., 4, 4).
+            residual_limit_mm: Largest landmark distance to the model; the rig's own if None.
+            margin_limit_mm: Smallest margin; the rig's own if None.
+            bound: Which bound, see `margin`.
+            times_s: Times along the last batch axis, shape (F,); needed for a speed limit.
+            speed_limit_mm_s: Largest speed of a landmark; None asks no question.
+        """
         if bound != "slices" or speed_limit_mm_s is not None:
             return super().validate(
                 T_skull_mandible,
@@ -145,7 +160,15 @@ class FastRig(JawRig):
         times_s: ArrayLike | None = None,
         speed_limit_mm_s: float | None = None,
     ) -> Verdicts:
-        """Judge jaw parameters d (..., 3) [mm] as `validate` does poses; see `JawRig.validate_parameters`."""
+        """Judge jaw parameters d (..., 3) [mm] as `validate` does poses; see `JawRig.validate_parameters`.
+
+        Args:
+            d: Jaw parameters [mm], shape (..., 3).
+            margin_limit_mm: Smallest margin; the rig's own if None.
+            bound: Which bound, see `margin`.
+            times_s: Times along the last batch axis, shape (F,); needed for a speed limit.
+            speed_limit_mm_s: Largest speed of a landmark; None asks no question.
+        """
         if bound != "slices" or speed_limit_mm_s is not None:
             return super().validate_parameters(
                 d, margin_limit_mm=margin_limit_mm, bound=bound, times_s=times_s, speed_limit_mm_s=speed_limit_mm_s

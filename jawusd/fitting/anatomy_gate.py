@@ -44,7 +44,11 @@ class AnatomyWarning:
 
 
 def check_anatomy(data: TrainingData, anatomy: Anatomy) -> list[AnatomyWarning]:
-    """Compare landmarks and motions with human ranges; a recognised mistake is reported alone."""
+    """Compare landmarks and motions with human ranges; a recognised mistake is reported alone.
+
+    Returns:
+        What is not human, or nothing.
+    """
     mistake = _frame_mistake(data) or _unit_mistake(data, anatomy) or _swap_mistake(data)
     return [mistake] if mistake else _out_of_range(data)
 

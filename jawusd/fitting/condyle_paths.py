@@ -36,6 +36,9 @@ def condyle_paths(
         widest_mm: opening at which the sweeps of models end.
         mandible: for outlines of the condyle, mandible frame.
         anatomy: where the jaw lies.
+
+    Returns:
+        The path of the captured component, then one per model.
     """
     sweeps = {PRINCIPAL: principal_opening(data)}
     d = np.zeros((_STEPS, 3))
@@ -52,6 +55,9 @@ def parameter_paths(data: TrainingData, models: dict[str, JawModelForm], capture
         data: the captured poses.
         models: decoders by name.
         captured: parameters of the captured poses in the default model [mm], shape (N, 3).
+
+    Returns:
+        One path per model and parameter.
     """
     found = []
     # The other parameters stay zero: only what was captured with the teeth nearly together can be reached so.

@@ -62,6 +62,9 @@ def missing_movements(d: Array, shown: NDArray[np.bool_]) -> list[str]:
     Args:
         d: parameters of the captured poses [mm], shape (N, 3).
         shown: which parameters the data show, shape (3,); the others have their own sentences.
+
+    Returns:
+        The sentences; none when nothing is missing.
     """
     widest = float(d[:, 0].max())
     found = []

@@ -77,7 +77,11 @@ class SplineBasis:
 
 
 def ridge_solve(normal: Array, right: Array, penalty: Array) -> Array:
-    """Solve (normal + penalty) x = right for symmetric positive definite sums."""
+    """Solve (normal + penalty) x = right for symmetric positive definite sums.
+
+    Returns:
+        x, of the shape of ``right``.
+    """
     return cho_solve(cho_factor(normal + penalty, lower=True), right)
 
 

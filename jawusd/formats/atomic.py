@@ -71,6 +71,10 @@ def _sync_folder(folder: Path) -> None:
 def write_bytes_atomic(path: str | os.PathLike[str], data: bytes) -> None:
     """Write bytes to a file atomically.
 
+    Args:
+        path: where to; its folder is made if missing.
+        data: the whole content.
+
     Raises:
         OutputError: the file cannot be written.
     """
@@ -80,6 +84,10 @@ def write_bytes_atomic(path: str | os.PathLike[str], data: bytes) -> None:
 
 def write_text_atomic(path: str | os.PathLike[str], text: str) -> None:
     """Write UTF-8 text to a file atomically.
+
+    Args:
+        path: where to; its folder is made if missing.
+        text: the whole content.
 
     Raises:
         OutputError: the file cannot be written.

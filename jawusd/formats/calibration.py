@@ -100,6 +100,10 @@ def _camera(path: Path, table: str, values: object) -> Camera:
 def save_calibration(path: str | os.PathLike[str], cameras: list[Camera]) -> None:
     """Write cameras as aniposelib TOML, atomically.
 
+    Args:
+        path: where to.
+        cameras: calibrated cameras, in the order written.
+
     Raises:
         OutputError: the file cannot be written.
     """

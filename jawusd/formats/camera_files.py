@@ -67,7 +67,11 @@ def load_cameras_file(path: str | os.PathLike[str], unit_mm: float = 1.0) -> lis
 
 
 def calibration_files(path: Path) -> list[Path]:
-    """Return the files that make up a calibration."""
+    """Return the files that make up a calibration.
+
+    Args:
+        path: the file or folder that a capture names.
+    """
     if path.is_dir() or path.name in _COLMAP:
         return [(path if path.is_dir() else path.parent) / name for name in _COLMAP]
     return [path]

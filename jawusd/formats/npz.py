@@ -65,6 +65,12 @@ def read_npz(path: str | os.PathLike[str], family: str, version: int) -> tuple[d
 def check_format(found: object, family: str, version: int, path: str | os.PathLike[str]) -> int:
     """Check a format label such as ``"jawusd-tracks/1"`` and return its version.
 
+    Args:
+        found: the label as it was read.
+        family: the name wanted, as "jawusd-tracks".
+        version: the newest version known.
+        path: the file, for errors.
+
     Raises:
         FormatError: another format, or no label.
         VersionError: a newer version.
@@ -81,6 +87,10 @@ def check_format(found: object, family: str, version: int, path: str | os.PathLi
 
 def check_units(meta: dict, path: str | os.PathLike[str]) -> None:
     """Check the units and the twist order written in a file's meta data.
+
+    Args:
+        meta: the file's header.
+        path: the file, for errors.
 
     Raises:
         UnitsError: they differ from mm, rad and (omega, v), or are missing.

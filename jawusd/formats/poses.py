@@ -177,6 +177,9 @@ def _checked_rigid(T: NDArray[np.float64], path: Path) -> NDArray[np.float64]:
 def read_parameters(path: str | os.PathLike[str]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Read parameters d from CSV or JSON.
 
+    Args:
+        path: table with the columns frame, d1, d2, d3 [mm].
+
     Returns:
         Frame numbers (F,) and d [mm] (F, 3).
 
@@ -194,6 +197,9 @@ def read_parameters(path: str | os.PathLike[str]) -> tuple[NDArray[np.int64], ND
 
 def table_columns(path: str | os.PathLike[str]) -> tuple[str, ...]:
     """Return the column names of a CSV or JSON table.
+
+    Args:
+        path: the table.
 
     Raises:
         FormatError: the file is not such a table.
@@ -217,6 +223,11 @@ def write_poses(path: str | os.PathLike[str], frames: NDArray[np.int64], T: NDAr
 
 def write_parameters(path: str | os.PathLike[str], frames: NDArray[np.int64], d: NDArray[np.float64]) -> None:
     """Write parameters d [mm] (F, 3) as CSV, atomically and with all digits.
+
+    Args:
+        path: where to.
+        frames: frame numbers, shape (F,).
+        d: parameters [mm], shape (F, 3).
 
     Raises:
         OutputError: the file cannot be written.

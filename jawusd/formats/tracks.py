@@ -96,6 +96,10 @@ def _shapes(count: int, cameras: int) -> dict[str, tuple[int, ...]]:
 def save_tracks(path: str | os.PathLike[str], tracks: Tracks) -> None:
     """Write tracks atomically.
 
+    Args:
+        path: where to, `.npz`.
+        tracks: what to write.
+
     Raises:
         OutputError: the file cannot be written.
         ValueError: an array has the wrong shape.
@@ -120,6 +124,9 @@ def save_tracks(path: str | os.PathLike[str], tracks: Tracks) -> None:
 
 def load_tracks(path: str | os.PathLike[str]) -> Tracks:
     """Read tracks and check them.
+
+    Args:
+        path: `tracks.npz` of format jawusd-tracks/1.
 
     Raises:
         FormatError: not a tracks file, wrong shapes, or poses that are not rigid.

@@ -151,7 +151,11 @@ class Camera:
         return replace(self, size_px=(int(size_px[0]), int(size_px[1])), K=K)
 
     def depth(self, points_world: ArrayLike) -> NDArray[np.float64]:
-        """Return the depth of world points along the optical axis [mm], shape (...)."""
+        """Return the depth of world points along the optical axis [mm], shape (...).
+
+        Args:
+            points_world: points [mm], shape (..., 3).
+        """
         return transform_points(self.T_cam_world, np.atleast_2d(points_world))[..., 2].reshape(
             np.shape(points_world)[:-1]
         )

@@ -14,6 +14,9 @@ def wxyz_from_matrix(R: ArrayLike) -> NDArray[np.float64]:
 
     Returns:
         Quaternions (w, x, y, z), shape (..., 4).
+
+    Raises:
+        ValueError: another shape.
     """
     R = np.asarray(R, dtype=np.float64)
     if R.shape[-2:] != (3, 3):
@@ -42,6 +45,9 @@ def matrix_from_wxyz(q: ArrayLike) -> NDArray[np.float64]:
 
     Returns:
         Rotation matrices, shape (..., 3, 3).
+
+    Raises:
+        ValueError: another shape.
     """
     q = np.asarray(q, dtype=np.float64)
     if q.shape[-1:] != (4,):

@@ -162,6 +162,9 @@ def se3_exp(twist: ArrayLike) -> NDArray[np.float64]:
 
     Returns:
         Transforms, shape (..., 4, 4).
+
+    Raises:
+        ValueError: another shape.
     """
     twist = np.asarray(twist, dtype=np.float64)
     if twist.shape[-1:] != (6,):
@@ -178,6 +181,9 @@ def se3_log(T: ArrayLike) -> NDArray[np.float64]:
 
     Returns:
         Twists (omega [rad], v [mm]), shape (..., 6).
+
+    Raises:
+        ValueError: another shape.
     """
     T = np.asarray(T, dtype=np.float64)
     if T.shape[-2:] != (4, 4):

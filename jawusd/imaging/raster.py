@@ -264,7 +264,11 @@ def _popcount(x):
 
 @numba.njit(_INT(_BITS), nogil=True, cache=True)
 def count_bits(bits: np.ndarray) -> int:
-    """Count the set pixels of a (h, words) uint64 bit-row picture."""
+    """Count the set pixels of a (h, words) uint64 bit-row picture.
+
+    Returns:
+        How many pixels are set.
+    """
     total = np.uint64(0)
     for y in range(bits.shape[0]):
         for k in range(bits.shape[1]):
@@ -275,6 +279,9 @@ def count_bits(bits: np.ndarray) -> int:
 @numba.njit(_INT(_BITS, _BITS), nogil=True, cache=True)
 def count_and_not(first: np.ndarray, second: np.ndarray) -> int:
     """Count the pixels set in first and not in second; both (h, words) uint64.
+
+    Returns:
+        How many pixels they are.
 
     Raises:
         ValueError: the two pictures differ in shape.

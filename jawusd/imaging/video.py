@@ -117,7 +117,7 @@ class Video:
         region: tuple[int, int, int, int] | None = None,
         threads: int = 0,
     ) -> Iterator[VideoFrame]:
-        """Yield the pictures first, first + 1, .. last - 1.
+        """Return an iterator over the pictures first, first + 1, .. last - 1.
 
         Gray is the luma at full range (black 0, white 255); for gray and full-range files it is the decoder's own
         buffer, without a copy.

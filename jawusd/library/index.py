@@ -143,6 +143,13 @@ def scan_library(folder: str | os.PathLike[str], load: Loader) -> Library:
 def load_donors(library: Library, load: Loader) -> list[Donor]:
     """Read the rigs of all persons whose captures show every movement, named by their paths.
 
+    Args:
+        library: a scanned folder.
+        load: reads a rig.
+
+    Returns:
+        The persons, in the order of the entries.
+
     Raises:
         JawusdError: a rig has become unreadable since the scan.
     """

@@ -90,6 +90,10 @@ def build_rig(
 def check_folder(folder: Path, options: BuildOptions) -> None:
     """Check that a build may go to a folder.
 
+    Args:
+        folder: where the build shall go.
+        options: says whether to resume or to start afresh.
+
     Raises:
         OutputError: it is a file, or holds other files, or a build that is neither to be continued nor deleted.
     """

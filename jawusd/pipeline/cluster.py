@@ -102,6 +102,10 @@ async def _greet(address: str) -> None:
 def check_workers(client: Client, folder: Path) -> None:
     """Check that every worker runs this version of jawusd and sees the output folder.
 
+    Args:
+        client: connected to the cluster.
+        folder: the output folder, which workers write to.
+
     Raises:
         ClusterError: a worker cannot build here.
     """

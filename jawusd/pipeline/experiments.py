@@ -67,6 +67,10 @@ def do_experiments(
 def draw_experiments(found: Experiments, folder: Path) -> dict:
     """Write the figures and the table of the experiments; returns what `report_experiments` does.
 
+    Args:
+        found: the results.
+        folder: where the files go; made if missing.
+
     Raises:
         OutputError: a file cannot be written.
     """
@@ -91,7 +95,11 @@ def experiment_files(folder: Path) -> list[Path]:
 
 
 def experiment_lines(summary: dict) -> list[str]:
-    """Return the result of `report_experiments` as text."""
+    """Return the result of `report_experiments` as text.
+
+    Args:
+        summary: what it returned.
+    """
     heads = ("mean", "median", "p95", "max")
     lines = [f"{summary['actor']}: {summary['frames']} captured poses; distances [mm]"]
     lines.append(f"{'experiment':<16}{'model':<30}{'quantity':<32}{'count':>6}" + "".join(f"{h:>9}" for h in heads))

@@ -41,6 +41,10 @@ class Journal:
     def add(self, frame: int, entry: dict[str, Any]) -> None:
         """Note a finished frame.
 
+        Args:
+            frame: its number.
+            entry: what to keep of it, as JSON has it.
+
         Raises:
             OutputError: the file cannot be written.
         """

@@ -35,6 +35,9 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 def load_any_rig(path: Path) -> JawRig:
     """Read a rig from `model.npz` with numpy alone, or from USD.
 
+    Args:
+        path: `model.npz`, or any layer that carries the rig.
+
     Raises:
         JawusdError: it is no rig.
         MissingDependencyError: USD without OpenUSD.
@@ -43,7 +46,11 @@ def load_any_rig(path: Path) -> JawRig:
 
 
 def open_library(folder: str | os.PathLike[str]) -> Library:
-    """Scan a library and bring its index up to date; see `library.index.scan_library`."""
+    """Scan a library and bring its index up to date; see `library.index.scan_library`.
+
+    Args:
+        folder: with a subfolder per person.
+    """
     return scan_library(folder, load_any_rig)
 
 
@@ -157,6 +164,11 @@ def personal_rig(landmarks: Path, library: Library, *, closest: bool, name: str,
 
 def fit_personal(subject: Subject, motion: PersonalMotion, progress: Progress) -> JawModel:
     """Fit the anchored model to a motion carried over, and say in its header what it is worth.
+
+    Args:
+        subject: the person, of landmarks alone.
+        motion: what `library.personal` made for the person.
+        progress: told of the work.
 
     Raises:
         FittingError: see `fitting.fit_model`.

@@ -26,7 +26,12 @@ _CRF = 20  # H.264 quality for looking at, half the time of an archive
 
 
 def overlay_files(capture: Capture, folder: Path) -> list[Path]:
-    """Return the files `write_overlay` writes: a video per camera that has one, and the contact sheet."""
+    """Return the files `write_overlay` writes: a video per camera that has one, and the contact sheet.
+
+    Args:
+        capture: names the cameras.
+        folder: where the files go.
+    """
     return [folder / f"{camera.name}.mp4" for camera in capture.cameras if camera.video] + [folder / SHEET]
 
 

@@ -40,6 +40,10 @@ class Anatomy:
 def open_capture(path: str | os.PathLike[str], *, allow_outside: bool = False) -> Capture:
     """Read a capture and check that its calibration names its cameras.
 
+    Args:
+        path: capture.toml or its folder.
+        allow_outside: let paths in the capture leave its folder.
+
     Raises:
         FormatError, CaptureError: see `formats.capture.load_capture`.
     """
@@ -61,6 +65,9 @@ def load_cameras(capture: Capture) -> list[Camera]:
 
 def rescaled_cameras(capture: Capture) -> dict[str, tuple[tuple[int, int], tuple[int, int]]]:
     """Return the sizes (width, height) [px] calibrated and recorded, by the name of each camera where they differ.
+
+    Args:
+        capture: names calibration and videos.
 
     Raises:
         CalibrationError, CaptureError: as `load_cameras`.
@@ -117,6 +124,9 @@ def _at_recorded_size(camera: Camera, capture: Capture, source: CameraSource) ->
 def load_meshes(capture: Capture) -> dict[str, Mesh]:
     """Read the scans and bones of a capture, by the names of `MESHES`; optional ones may be absent.
 
+    Returns:
+        Meshes in the scan frame [mm].
+
     Raises:
         CaptureError: a mesh is damaged, or of a size that cannot be in mm.
     """
@@ -131,6 +141,10 @@ def load_meshes(capture: Capture) -> dict[str, Mesh]:
 
 def find_anatomy(capture: Capture, meshes: dict[str, Mesh]) -> Anatomy:
     """Return the anatomical frame and the landmarks of a capture, given ones before derived ones.
+
+    Args:
+        capture: may give axes and landmarks.
+        meshes: see `load_meshes`.
 
     Raises:
         CaptureError: a landmark has an unknown name, or the scans are swapped or not in occlusion.

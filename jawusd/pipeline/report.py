@@ -154,7 +154,11 @@ def is_build(folder: Path) -> bool:
 
 
 def fitted_poses(folder: Path) -> Path:
-    """Return the tracks of a build that its model was fitted to: the first pass, without the model's help."""
+    """Return the tracks of a build that its model was fitted to: the first pass, without the model's help.
+
+    Args:
+        folder: of the build.
+    """
     first = folder / FIRST_PASS
     return first if first.is_file() else folder / "tracks.npz"
 
@@ -169,7 +173,14 @@ def missing_packages() -> str | None:
 
 
 def build_facts(folder: Path, state: BuildState, capture: Capture | None, *, allow_outside: bool = False) -> BuildFacts:
-    """Return what a build left behind, with the capture it came from if that is where it was."""
+    """Return what a build left behind, with the capture it came from if that is where it was.
+
+    Args:
+        folder: of the build.
+        state: its record of stages.
+        capture: the capture, None to look where it was.
+        allow_outside: let paths in the capture leave its folder.
+    """
     if capture is not None:
         return BuildFacts(state.stages, _calibrated(capture, folder))
     record = state.stages.get("report")

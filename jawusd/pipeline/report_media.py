@@ -37,6 +37,9 @@ def draw_worst_frames(capture: Capture, offsets: dict[str, int], tracks: Tracks)
         offsets: frame offset by camera.
         tracks: the poses to draw.
 
+    Returns:
+        Pictures, the worst first.
+
     Raises:
         CaptureError: no camera has a video, or one cannot be decoded.
         CalibrationError: a video has another shape than its camera's calibration.
@@ -58,7 +61,12 @@ def draw_worst_frames(capture: Capture, offsets: dict[str, int], tracks: Tracks)
 
 
 def chosen_frames(tracks: Tracks, fps: float) -> list[tuple[int, str]]:
-    """Return rows of the tracks to look at, each with the reason, the worst first."""
+    """Return rows of the tracks to look at, each with the reason, the worst first.
+
+    Args:
+        tracks: the take.
+        fps: frames per second.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # frames without any mask
         uncovered = np.nanmean(tracks.coverage_error, axis=(1, 2))
@@ -87,6 +95,10 @@ def chosen_frames(tracks: Tracks, fps: float) -> list[tuple[int, str]]:
 
 def replay_parts(folder: Path, model: JawModel) -> tuple[ReplayPart, ...]:
     """Return the meshes of a rig thinned for the page, anatomical frame, in the closed bite.
+
+    Args:
+        folder: of the rig.
+        model: gives the anatomical frame and the closed bite.
 
     Raises:
         RigError: there is no geometry.

@@ -120,6 +120,13 @@ def segment_capture(
 ) -> tuple[list[Path], dict[str, Any]]:
     """Segment a capture and sum it up; see `segment_teeth`.
 
+    Args:
+        capture: footage, calibration and scans.
+        offsets: frame offset by camera.
+        folder: where the masks go.
+        options: how to segment.
+        progress: told of the work.
+
     Returns:
         segment.json, and what it holds but for the confidences.
     """

@@ -54,6 +54,11 @@ def sync_cameras(capture: Capture, progress: Progress) -> dict:
 def sync_videos(videos: Mapping[str, Path], reference: str, progress: Progress) -> dict:
     """Return the frame offset of every clip to the reference, as `sync_cameras` does for a capture.
 
+    Args:
+        videos: clips by the names of their cameras.
+        reference: the camera that the others are aligned with.
+        progress: told of the work.
+
     Raises:
         SyncError, CaptureError: see `capture.sync.align_videos`.
     """
@@ -64,7 +69,11 @@ def sync_videos(videos: Mapping[str, Path], reference: str, progress: Progress) 
 
 
 def alignment_result(alignment: Any) -> dict:
-    """Return a `capture.sync.Alignment` as plain data."""
+    """Return a `capture.sync.Alignment` as plain data.
+
+    Args:
+        alignment: of `capture.sync`, which is not imported here.
+    """
     found = alignment.cameras
     return {
         "offsets": alignment.offsets,
@@ -106,7 +115,11 @@ def track_teeth(
 
 @contextlib.contextmanager
 def about(path: Path) -> Iterator[None]:
-    """Name a file in errors of stages that know only its content."""
+    """Name a file in errors of stages that know only its content.
+
+    Args:
+        path: the file named.
+    """
     try:
         yield
     except JawusdError as error:
@@ -197,7 +210,14 @@ def read_motion(path: str | os.PathLike[str], options: TrajectoryOptions | None 
 
 
 def fit_jaw(capture: Capture, motion: Motion, method: str, progress: Progress) -> JawModel:
-    """Fit the jaw model of the person of a capture; see `fit_subject`."""
+    """Fit the jaw model of the person of a capture; see `fit_subject`.
+
+    Args:
+        capture: gives landmarks and mandible.
+        motion: what `read_motion` gives.
+        method: "anchored", "additive", "paper" or "pca".
+        progress: told of the work.
+    """
     with about(capture.folder / "capture.toml"):
         return fit_subject(subject_of_capture(capture), motion, method, progress)
 
@@ -288,6 +308,11 @@ def bake_meshes(
 def write_take(capture: Capture, tracks: Tracks, folder: Path) -> list[Path]:
     """Write the take beside the rig: its cameras, and the actor where the head was.
 
+    Args:
+        capture: gives cameras and frame rate.
+        tracks: the poses of the head.
+        folder: of the rig.
+
     Returns:
         The files written.
 
@@ -308,6 +333,12 @@ def write_take(capture: Capture, tracks: Tracks, folder: Path) -> list[Path]:
 
 def write_demo_capture(folder: Path, seed: int, frames: int, progress: Progress) -> Path:
     """Render a synthetic capture and return its capture.toml.
+
+    Args:
+        folder: where to.
+        seed: another number is another person.
+        frames: exercise frames.
+        progress: told of the work.
 
     Raises:
         MissingDependencyError: OpenGL without a display (EGL) is not available.

@@ -28,6 +28,9 @@ Progress = Callable[[str, int, int], None]
 def hash_files(paths: Iterable[Path]) -> str:
     """Return the SHA-256 of files' names and contents, in the given order.
 
+    Args:
+        paths: the files.
+
     Raises:
         OSError: a file cannot be read.
     """
@@ -90,6 +93,13 @@ class BuildState:
 
     def finish(self, stage: str, inputs: str, outputs: Iterable[Path], seconds: float, result: dict) -> StageRecord:
         """Record a stage whose output files are complete, and write build.json.
+
+        Args:
+            stage: its name.
+            inputs: hash of what it read.
+            outputs: the files it wrote.
+            seconds: how long it took [s].
+            result: what it found, as JSON has it.
 
         Raises:
             OutputError: build.json cannot be written.

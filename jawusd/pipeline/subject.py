@@ -88,6 +88,10 @@ def subject_of_scans(files: Mapping[str, Path], name: str) -> Subject:
 def subject_of_landmarks(path: str | os.PathLike[str], name: str) -> Subject:
     """Return the person of a landmarks file; without scans, errors are measured at the landmarks.
 
+    Args:
+        path: JSON of format jawusd-landmarks/1.
+        name: of the person.
+
     Raises:
         FormatError: see `formats.landmarks.load_landmarks`.
     """
@@ -100,6 +104,10 @@ def subject_of_landmarks(path: str | os.PathLike[str], name: str) -> Subject:
 
 def check_same_jaw(subject: Subject, model: JawModel) -> None:
     """Check that a model and a person's scans are in one frame: their teeth must lie in one place.
+
+    Args:
+        subject: the person with scans.
+        model: the model that shall move them.
 
     Raises:
         RigError: naming the distance.
@@ -115,6 +123,9 @@ def check_same_jaw(subject: Subject, model: JawModel) -> None:
 
 def subject_of_build(folder: Path) -> Subject:
     """Return the person of a finished build: its model, and the meshes of its rig.
+
+    Args:
+        folder: of the build.
 
     Raises:
         FormatError: there is no model.

@@ -38,7 +38,11 @@ def _rounded(value: float) -> float | None:
 
 
 def track_lines(summary: dict) -> list[str]:
-    """Return `track_summary` as text."""
+    """Return `track_summary` as text.
+
+    Args:
+        summary: what it returned.
+    """
     lost = summary["lost"]
     lines = [f"tracked {summary['tracked']} of {summary['frames']} frames"]
     if lost:
@@ -66,7 +70,11 @@ def fit_summary(model: JawModel) -> dict:
 
 
 def fit_lines(summary: dict) -> list[str]:
-    """Return `fit_summary` as text."""
+    """Return `fit_summary` as text.
+
+    Args:
+        summary: what it returned.
+    """
     lines = [f"model: {summary.get('method')}; largest distance per pose [mm]:  mean  median     p95     max"]
     for table, rows in summary.get("errors", {}).items():
         for place, figures in rows.items():

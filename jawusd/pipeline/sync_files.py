@@ -16,6 +16,10 @@ PLOT_SUFFIXES = (".png", ".svg")
 def light_curves(videos: Mapping[str, Path], progress: Progress) -> dict[str, LightCurve]:
     """Return the brightness of every picture of every video; decodes all of them.
 
+    Args:
+        videos: clips by the names of their cameras.
+        progress: told of the work.
+
     Raises:
         CaptureError: a video cannot be read.
     """
@@ -29,6 +33,10 @@ def light_curves(videos: Mapping[str, Path], progress: Progress) -> dict[str, Li
 
 def write_light_curves(path: Path, curves: Mapping[str, LightCurve]) -> None:
     """Write the mean brightness of every picture as CSV: camera, picture, time_s, brightness.
+
+    Args:
+        path: where to.
+        curves: of `light_curves`, by camera.
 
     Raises:
         OutputError: the file cannot be written.

@@ -44,6 +44,10 @@ def read_trajectory(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Read poses from a CSV or JSON table, or from HDF5 of jaw-tracking-system.
 
+    Args:
+        path: `.csv`, `.json`, `.h5` or `.hdf5`.
+        options: how the file is written.
+
     Returns:
         Frame numbers (F,) and T_skull_mandible [mm] (F, 4, 4), NaN where an HDF5 file has no pose.
 

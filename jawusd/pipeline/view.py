@@ -78,6 +78,9 @@ def viewed_actor(path: str | os.PathLike[str]) -> ViewedActor:
 def screen_meshes(path: Path) -> dict[str, Mesh]:
     """Return the meshes of a rig by the viewer's names, teeth and gum apart, coarse enough; placeholders too.
 
+    Args:
+        path: any layer of the rig.
+
     Raises:
         RigError: there is nothing to take hold of.
     """
@@ -97,7 +100,12 @@ def screen_meshes(path: Path) -> dict[str, Mesh]:
 
 
 def part_of(mesh: Mesh, chosen: NDArray[np.bool_]) -> Mesh:
-    """Return some faces (F,) of a mesh, with the vertices they use."""
+    """Return some faces (F,) of a mesh, with the vertices they use.
+
+    Args:
+        mesh: the whole.
+        chosen: which faces, shape (F,).
+    """
     used, faces = np.unique(mesh.faces[chosen], return_inverse=True)
     return Mesh(mesh.vertices[used], faces.reshape(-1, 3), None if mesh.colors is None else mesh.colors[used])
 

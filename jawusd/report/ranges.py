@@ -57,7 +57,11 @@ _REFERENCE = {
 
 
 def human_ranges(tracks: Tracks, model: JawModel) -> list[RangeRow]:
-    """Measure the ranges of the poses that shaped the model; empty if there are none."""
+    """Measure the ranges of the poses that shaped the model; empty if there are none.
+
+    Returns:
+        One row per movement.
+    """
     motion, landmarks = captured_motion(tracks, model)
     if not len(motion):
         return []

@@ -62,6 +62,7 @@ def write_animation(
         RigError: frames do not increase, nothing to animate, or the frame rate is not positive.
         FormatError: `actor` is not a rig.
         OutputError: the file cannot be written.
+        ValueError: frames and d of shapes that do not fit.
     """
     out, actor = Path(out), Path(actor)
     rig = load_rig(actor) if rig is None else rig

@@ -48,6 +48,9 @@ def write_arrays(prim: Sdf.PrimSpec, rig: JawRig, prefixes: tuple[str, ...]) -> 
 def read_arrays(prim: Usd.Prim, kind: str, where: object) -> dict[str, NDArray]:
     """Read all model arrays of a rig prim, by attribute name.
 
+    Returns:
+        The arrays, by the names models give them.
+
     Raises:
         FormatError: an attribute is missing, is no array of numbers, or its length fits no shape.
     """

@@ -59,6 +59,7 @@ def bake_rig(
     Raises:
         RigError: meshes, bounds or frames that make no rig.
         OutputError: the folder cannot be written.
+        ValueError: frames without d, or d without frames.
     """
     folder = Path(folder)
     if (frames is None) != (d is None):

@@ -58,6 +58,7 @@ def write_cameras(
     Raises:
         RigError: no cameras, two of one name, a camera with skewed pixels, or no frame with a pose.
         OutputError: the file cannot be written.
+        ValueError: poses of another shape.
     """
     out = Path(out)
     frames, T_world_skull = np.asarray(frames, dtype=np.float64), np.asarray(T_world_skull, dtype=np.float64)

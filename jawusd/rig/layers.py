@@ -35,7 +35,11 @@ def new_layer(fps: float | None = None, default_prim: str = ACTOR) -> Sdf.Layer:
 
 
 def stage_of(layer: Sdf.Layer) -> Usd.Stage:
-    """Return a stage on a layer in memory, for schema classes that want one."""
+    """Return a stage on a layer in memory, for schema classes that want one.
+
+    Raises:
+        RigError: OpenUSD cannot open it.
+    """
     stage = Usd.Stage.Open(layer, load=Usd.Stage.LoadNone)
     if stage is None:
         raise RigError("OpenUSD could not open a layer in memory.")

@@ -51,62 +51,62 @@ class Graph:
         return self._constants[key]
 
     def op(self, kind: str, *inputs: str | float, name: str | None = None, **attributes: object) -> str:
-        """Add an operator with one output; plain numbers become constants of the graph's type."""
+        """Add an operator and return its one output; plain numbers become constants of the graph's type."""
         names = [value if isinstance(value, str) else self.constant(float(value)) for value in inputs]
         output = name or f"{self.prefix}{kind.lower()}{len(self.nodes)}"
         self.nodes.append(helper.make_node(kind, names, [output], **attributes))
         return output
 
     def add(self, *terms: str | float) -> str:
-        """Add two or more values."""
+        """Return the sum of two or more values."""
         total = terms[0]
         for term in terms[1:]:
             total = self.op("Add", total, term)
         return str(total)
 
     def mul(self, *factors: str | float) -> str:
-        """Multiply two or more values."""
+        """Return the product of two or more values."""
         product = factors[0]
         for factor in factors[1:]:
             product = self.op("Mul", product, factor)
         return str(product)
 
     def sub(self, a: str | float, b: str | float) -> str:
-        """Subtract b from a."""
+        """Return a less b."""
         return self.op("Sub", a, b)
 
     def div(self, a: str | float, b: str | float) -> str:
-        """Divide a by b."""
+        """Return a divided by b."""
         return self.op("Div", a, b)
 
     def matmul(self, a: str, matrix: ArrayLike) -> str:
-        """Multiply rows a (n, k) by a constant matrix (k, m)."""
+        """Return rows a (n, k) times a constant matrix (k, m)."""
         return self.op("MatMul", a, self.constant(matrix))
 
     def concat(self, *columns: str, axis: int = 1) -> str:
-        """Join values along an axis."""
+        """Return values joined along an axis."""
         return self.op("Concat", *columns, axis=axis)
 
     def columns(self, a: str, count: int) -> list[str]:
-        """Split rows (n, count) into columns (n, 1)."""
+        """Return the columns (n, 1) of rows (n, count)."""
         return self.split(a, count, axis=1)
 
     def split(self, a: str, count: int, axis: int) -> list[str]:
-        """Split a value into equal parts along an axis."""
+        """Return equal parts of a value along an axis."""
         names = [f"{self.prefix}part{len(self.nodes)}_{i}" for i in range(count)]
         self.nodes.append(helper.make_node("Split", [a], names, axis=axis))
         return names
 
     def sum_rows(self, a: str) -> str:
-        """Sum over axis 1, keeping it: (n, k) to (n, 1)."""
+        """Return the sum over axis 1, keeping it: (n, k) to (n, 1)."""
         return self.op("ReduceSum", a, self.constant([1], np.int64), keepdims=1)
 
     def clip(self, a: str, low: float, high: float) -> str:
-        """Limit values to an interval."""
+        """Return values limited to an interval."""
         return self.op("Min", self.op("Max", a, low), high)
 
     def horner(self, x: str, coefficients: list[str] | list[float]) -> str:
-        """Evaluate sum_k coefficients[k] x^k."""
+        """Return sum_k coefficients[k] x^k."""
         value: str | float = coefficients[-1]
         for coefficient in reversed(coefficients[:-1]):
             value = self.add(self.mul(value, x), coefficient)

@@ -74,7 +74,11 @@ def find_rig_prim(stage: Usd.Stage, where: object, prim_path: str | None = None)
 
 
 def rig_of(prim: Usd.Prim, where: object) -> JawRig:
-    """Build the evaluator from a rig prim; see `load_rig` for what it raises."""
+    """Build the evaluator from a rig prim; see `load_rig` for what it raises.
+
+    Raises:
+        FormatError: a header that is not JSON or tells of another kind of model; else as `load_rig`.
+    """
     bring_up_to_date(prim, where)
     check_units(prim, where)
     check_assets(prim, where)
@@ -166,6 +170,10 @@ def read_table(prim: Usd.Prim, where: object) -> DecoderTable:
 
 def describe(path: PathArg, prim_path: str | None = None) -> dict[str, Any]:
     """Return what a rig file holds, as plain JSON values, for `jawusd info`.
+
+    Args:
+        path: any layer or package that carries the rig.
+        prim_path: of the rig; the default prim if None.
 
     Raises:
         As `load_rig`.

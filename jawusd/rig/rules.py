@@ -55,7 +55,7 @@ def check_model(prim: Usd.Prim) -> Iterator[Finding]:
 
 
 def check_table(prim: Usd.Prim) -> Iterator[Finding]:
-    """The sampled table is complete, and as near to the exact model as it says."""
+    """Check that the sampled table is complete, and as near to the exact model as it says."""
     try:
         table = read_table(prim, _where(prim))
     except JawusdError as error:
@@ -73,7 +73,7 @@ def check_table(prim: Usd.Prim) -> Iterator[Finding]:
 
 
 def check_onnx(prim: Usd.Prim) -> Iterator[Finding]:
-    """The ONNX files named by the rig were made from this model and give its poses and parameters."""
+    """Check that the ONNX files named by the rig were made from this model and give its results."""
     rig = _rig(prim)
     assets = [prim.GetAttribute(name).Get() for name in ONNX_ATTRIBUTES]
     if rig is None or not any(assets):
@@ -116,7 +116,7 @@ def check_bounds(prim: Usd.Prim) -> Iterator[Finding]:
 
 
 def check_mandible(prim: Usd.Prim) -> Iterator[Finding]:
-    """The mandible moves by translate (double3) and orient (quatd) alone, and where the model says."""
+    """Check that the mandible moves by translate (double3) and orient (quatd) alone, and where the model says."""
     targets = prim.GetRelationship("jaw:mandible").GetTargets() if prim.HasRelationship("jaw:mandible") else []
     if len(targets) != 1:
         yield _finding("error", "Mandible", prim, f"jaw:mandible names {len(targets)} prims, expected 1.")

@@ -14,7 +14,11 @@ _PROBES_PER_AXIS = 41
 
 
 def valid_box(rig: JawRig) -> Array:
-    """Return the box (3, 2) [mm] of d that the table spans: `d_range`, widened to all d with a margin above zero."""
+    """Return the box (3, 2) [mm] of d that the table spans: `d_range`, widened to all d with a margin above zero.
+
+    Raises:
+        RigError: the bounds leave no valid parameters.
+    """
     box = np.array(rig.arrays["d_range"], dtype=np.float64)
     reach = 1.0 + float(rig.arrays["slice_margin_mm"]) + float(rig.arrays["slice_softness_mm"])
     wide = box + np.array([-reach, reach])

@@ -38,6 +38,7 @@ def write_splines(
     Raises:
         RigError: the keys do not increase or are not finite.
         OutputError: the file cannot be written.
+        ValueError: frames and d of shapes that do not fit.
     """
     out = Path(out)
     frames, d = np.asarray(frames, dtype=np.float64), np.asarray(d, dtype=np.float64)

@@ -47,7 +47,11 @@ class Envelope:
         self._grid_points = self._moved(self._grid, self._few)
 
     def limit(self, controls: Array) -> Array:
-        """Bring controls into the ranges: clip, then pull lateral and protrusion back along their direction."""
+        """Bring controls into the ranges: clip, then pull lateral and protrusion back along their direction.
+
+        Returns:
+            Controls inside the ranges, of the same shape.
+        """
         controls = np.clip(controls, _LOWER, _UPPER)
         if self._exponent is None:
             return controls

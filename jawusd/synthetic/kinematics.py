@@ -90,7 +90,11 @@ class Joint:
 
 
 def smoothstep(x: ArrayLike) -> Array:
-    """Blend from 0 to 1 over 0..1 with zero end slopes, any shape."""
+    """Blend from 0 to 1 over 0..1 with zero end slopes, any shape.
+
+    Returns:
+        Values in 0..1, of the same shape.
+    """
     x = np.clip(x, 0.0, 1.0)
     return x * x * (3.0 - 2.0 * x)
 

@@ -139,7 +139,11 @@ class Person:
         return controlled_pose(self.joint, *np.moveaxis(np.asarray(controls, dtype=np.float64), -1, 0), extra_mm)
 
     def limit(self, controls: ArrayLike) -> Array:
-        """Bring controls into the envelope, shape (..., 3); what is inside stays."""
+        """Bring controls into the envelope, shape (..., 3); what is inside stays.
+
+        Returns:
+            Controls inside, of the same shape.
+        """
         return self._envelope.limit(np.asarray(controls, dtype=np.float64))
 
     def nearest(self, T_skull_mandible: ArrayLike, bounded: bool = True) -> tuple[Array, Array]:

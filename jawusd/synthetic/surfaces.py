@@ -57,7 +57,11 @@ def outward(vertices: Array, faces: Faces) -> Faces:
 
 
 def merged(parts: Iterable[tuple[Array, Faces]]) -> tuple[Array, Faces]:
-    """Put meshes (vertices (V, 3), faces (F, 3)) into one."""
+    """Put meshes (vertices (V, 3), faces (F, 3)) into one.
+
+    Returns:
+        Vertices (V, 3) and faces (F, 3) of the whole.
+    """
     vertices, faces, count = [], [], 0
     for v, f in parts:
         vertices.append(v)
@@ -67,7 +71,7 @@ def merged(parts: Iterable[tuple[Array, Faces]]) -> tuple[Array, Faces]:
 
 
 def vertex_normals(vertices: Array, faces: Faces) -> Array:
-    """Area-weighted unit normals of the vertices, shape (V, 3)."""
+    """Return area-weighted unit normals of the vertices, shape (V, 3)."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     face_normals = np.cross(b - a, c - a)
     corners = np.repeat(face_normals, 3, axis=0)

@@ -26,6 +26,8 @@ def first_record(
     """Align the bootstrap frame, starting from the picks.
 
     Args:
+        solver: aligns frames.
+        config: thresholds of the tracker.
         start: T_world_upper, T_world_lower from the picks, shape (2, 4, 4).
         masks: the masks of the take.
         frame: the bootstrap frame.

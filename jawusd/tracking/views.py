@@ -118,7 +118,11 @@ def masked_sources(
 
 
 def working_size(camera: Camera, centre_world: NDArray[np.float64], px_per_mm: float) -> tuple[int, int]:
-    """Return the picture size that shows the given point at the wanted resolution, at most the recorded size."""
+    """Return the picture size that shows the given point at the wanted resolution, at most the recorded size.
+
+    Raises:
+        TrackingError: the point lies behind the camera.
+    """
     depth = float(camera.depth(centre_world))
     if depth <= 0:
         raise TrackingError(
