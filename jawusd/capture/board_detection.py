@@ -34,7 +34,7 @@ def detector(boards: Boards) -> Search:
 
 
 def shown_instead(images: Sequence[NDArray[np.uint8]], boards: Boards, missed: bool) -> str | None:
-    """Say which board pictures show if it is not the one described; None if nothing speaks against that one.
+    """Return which board pictures show if it is not the one described; None if nothing speaks against that one.
 
     Args:
         images: gray pictures, shape (h, w) each.

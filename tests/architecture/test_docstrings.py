@@ -104,7 +104,8 @@ def annotation(node):
 
 def explained_inline(named, text):
     """Tell whether a short docstring explains all parameters in its sentences: each is named there."""
-    return all(re.search(rf"(?<!\w){re.escape(name)}(?!\w)", text) for name in named)
+    sentences = re.split(rf"^(?:{'|'.join(SECTIONS)}):[ ]*$", text, flags=re.M)[0]
+    return all(re.search(rf"(?<!\w){re.escape(name)}(?!\w)", sentences) for name in named)
 
 
 def faults(source, path, exports=frozenset()):
