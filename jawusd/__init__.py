@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from jawusd.evaluator import JawRig
 
 __all__ = ["__version__", "load"]
-__version__ = "0.1.0.dev0"
+__version__ = "0.1.0"
 
 
 def load(path: str | PathLike[str], *, fast: bool = False) -> JawRig:

@@ -6,11 +6,13 @@ import shlex
 import shutil
 import subprocess
 import sys
+import tomllib
 
 import pytest
 import typer
 from package_copy import ROOT
 
+from jawusd import __version__
 from jawusd.cli.main import app
 from jawusd.pipeline.summary import build_lines
 
@@ -66,6 +68,11 @@ def test_scripts_and_pictures_in_the_readme_exist():
     named = re.findall(r"(?:tests|examples)/[\w/]+\.(?:py|png)", README)
     assert named
     assert [name for name in named if not (ROOT / name).exists()] == []
+
+
+def test_package_and_program_have_one_version():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["version"] == __version__
 
 
 def tour():
