@@ -32,7 +32,7 @@ def read_geometry(path: str | os.PathLike[str]) -> dict[str, Mesh]:
 
 
 def read_placeholders(path: str | os.PathLike[str]) -> dict[str, Mesh]:
-    """Read the meshes that only stand in for anatomy; else as `read_geometry`."""
+    """Return the meshes that only stand in for anatomy; else as `read_geometry`."""
     return _read(path, placeholders=True)
 
 
