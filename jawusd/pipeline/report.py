@@ -79,6 +79,8 @@ def write_build_report(
             lambda: do_experiments(subject, load_tracks(fitted_poses(folder)), 1, lambda *_: None, quick=True),
         )
         left_out.append(_NETWORKS)
+    if stage("jawusd.rig").describe(folder / "actor.usda")["placeholders"]:
+        left_out.append("the mandible in 3-D: no mesh of it was given, and the rig's placeholder is no anatomy.")
     progress("report", 1, 4)
     overlays = _attempt("pictures of the footage", left_out, lambda: _overlays(facts, tracks)) or ()
     progress("report", 2, 4)

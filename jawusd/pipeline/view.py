@@ -27,7 +27,7 @@ CAPTURED = "captured take"
 
 _TRACKS = "tracks.npz"
 _ANIMATION = re.compile(r"anim[A-Za-z0-9_-]{0,100}\.usd[ac]?")
-_MOST_FACES = 20_000  # per mesh: what a browser without a graphics card still turns fluently
+_MOST_FACES = 8_000  # per mesh: what a browser without a graphics card still turns fluently
 _DEFAULT_FPS = 24.0
 
 

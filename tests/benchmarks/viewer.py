@@ -5,7 +5,7 @@
 
 The server's figures are the median and the 95 % quantile of the time from a visitor's event to the last message put
 into the queue, viser's own included: on the clock, and of the processor, which other programs do not lengthen. With
---browser also: from opening the page to the jaw, and from a slider's event to the number on the screen.
+--browser also: from opening the page to the jaw, and from a slider's event to the number and the jaw on the screen.
 """
 
 import argparse
@@ -23,6 +23,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 from quiet_page import QuietPage
 
 ROUNDS = 200
+KEYS = 20
 
 
 def timed(loop, actions):
@@ -75,29 +76,65 @@ def in_browser(viewer, path):
             executable_path=path, args=["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
         )
         tab = browser.new_page(viewport={"width": 1200, "height": 720})
+        tab.add_init_script(_WATCH)
         began = time.monotonic()
         tab.goto(viewer.url)
         tab.wait_for_selector("text=nearest captured")
-        print(f"page opened to jaw and panels sent  {time.monotonic() - began:8.2f} s")
+        print(f"page opened to panels               {time.monotonic() - began:8.2f} s")
+        tab.wait_for_function("seen.faces > 1000")
+        tab.evaluate("finish()")
+        print(f"page opened to jaw drawn            {time.monotonic() - began:8.2f} s")
         box = tab.locator("input.mantine-NumberInput-input").first
         box.fill("10")
-        time.sleep(1.0)
-        waits = tab.evaluate(_KEY_TO_NUMBER)
-        print(f"slider key to number on the screen  {np.median(waits):8.1f} ms median of {len(waits)}")
+        time.sleep(2.0)
+        number, drawn = np.median(tab.evaluate(_KEY_TO_SCREEN, KEYS), axis=0)
+        print(f"slider key to number on the screen  {number:8.1f} ms median of {KEYS}")
+        print(f"slider key to jaw drawn             {drawn:8.1f} ms median of {KEYS}")
+        frame = np.median(tab.evaluate(_FRAME))
+        print(f"one picture of the jaw              {frame:8.1f} ms median")
         browser.close()
 
 
-_KEY_TO_NUMBER = """async () => {
+# Notes what the page's WebGL draws: the number of calls, and the faces of the largest mesh.
+_WATCH = """
+window.seen = {draws: 0, faces: 0, gl: null};
+const draw = WebGL2RenderingContext.prototype.drawElements;
+WebGL2RenderingContext.prototype.drawElements = function (...given) {
+  seen.draws++; seen.gl = this; seen.faces = Math.max(seen.faces, given[1] / 3);
+  return draw.apply(this, given);
+};
+// Reading a pixel waits for everything drawn before.
+window.finish = () => seen.gl.readPixels(0, 0, 1, 1, 0x1908, 0x1401, new Uint8Array(4));
+window.rest = (ms) => new Promise((go) => setTimeout(go, ms));
+"""
+_KEY_TO_SCREEN = """async (count) => {
   const thumb = document.querySelector('[role=slider]'), waits = [];
+  const shown = () => [...document.querySelectorAll('td')].map((cell) => cell.textContent).join();
   thumb.focus();
-  const shown = () => [...document.querySelectorAll('td')].map(cell => cell.textContent).join();
-  for (let k = 0; k < 30; k++) {
+  for (let k = 0; k < count; k++) {
+    await rest(700); // events of a visitor that wait for each other tell nothing of one
+    finish();
     const before = shown(), began = performance.now();
     thumb.dispatchEvent(new KeyboardEvent('keydown', {key: 'ArrowRight', code: 'ArrowRight', bubbles: true}));
-    while (shown() === before && performance.now() - began < 3000) await new Promise(requestAnimationFrame);
-    waits.push(performance.now() - began);
+    while (shown() === before && performance.now() - began < 3000) await rest(1);
+    const number = performance.now() - began, draws = seen.draws;
+    while (seen.draws === draws && performance.now() - began < 3000) await rest(1);
+    finish();
+    waits.push([number, performance.now() - began]);
   }
   return waits;
+}"""
+_FRAME = """async () => {
+  const times = [];
+  for (let k = 0; k < 8; k++) { // viser draws at least once a second
+    const draws = seen.draws;
+    while (seen.draws === draws) await rest(1);
+    const began = performance.now();
+    finish();
+    times.push(performance.now() - began);
+    await rest(300);
+  }
+  return times;
 }"""
 
 

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from jawusd.cli.main import app
 from jawusd.errors import FormatError, MissingDependencyError
 from jawusd.evaluator import JawRig
-from jawusd.formats.model import save_model
+from jawusd.formats.model import load_model, save_model
 from jawusd.formats.tracks import load_tracks, save_tracks
 from jawusd.pipeline import report
 from jawusd.pipeline.report import missing_packages, report_build
@@ -27,15 +27,17 @@ def quiet(stage, done, total):
     """Swallow progress."""
 
 
+def baked(folder, model, meshes):
+    rig = JawRig(model.arrays, model.meta)
+    return bake_rig(folder, rig, meshes, name="someone", fps=FPS, frames=model.frames, d=model.d, table_size=17)
+
+
 @pytest.fixture
 def built(tmp_path):
     """Return a folder as a build leaves it; its capture is gone."""
     data = report_data(count=90)
     model = data.model
-    rig = JawRig(model.arrays, model.meta)
-    files = bake_rig(
-        tmp_path, rig, example_meshes(), name="someone", fps=FPS, frames=model.frames, d=model.d, table_size=17
-    )
+    files = baked(tmp_path, model, example_meshes())
     save_model(tmp_path / "model.npz", model)
     save_tracks(tmp_path / "tracks.npz", data.tracks)
     state = BuildState(tmp_path)
@@ -53,6 +55,15 @@ def test_a_report_without_its_capture_says_what_it_lacks(built):
     assert "report DIR --experiments" in text and "replay-data" in text
     record = BuildState(built).valid("report", "as built")  # what --resume asks
     assert record is not None and list(record.outputs) == ["report.html"] and record.result == {"capture": "../gone"}
+
+
+def test_a_placeholder_is_not_shown_as_a_mandible(built):
+    report_build(built, None, quiet)
+    assert "placeholder is no anatomy" not in (built / "report.html").read_text()
+    scans = {name: mesh for name, mesh in example_meshes().items() if name != "mandible"}
+    baked(built, load_model(built / "model.npz"), scans)
+    report_build(built, None, quiet)
+    assert "the rig&#39;s placeholder is no anatomy" in (built / "report.html").read_text()
 
 
 def test_the_experiments_of_a_build_go_into_its_report(built):

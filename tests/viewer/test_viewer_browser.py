@@ -14,7 +14,7 @@ from jawusd.pipeline.view import open_viewer
 from jawusd.rig.bake import bake_rig
 from jawusd.rig.motion_read import read_poses_of_stage
 from jawusd.viewer.readouts import CONDYLES, INCISOR, landmark_places, rest_places
-from jawusd.viewer.scene import PRESETS, preset_view
+from jawusd.viewer.scene import _OUTSIDE, PRESETS, preset_view
 from jawusd.viewer.uploads import MOST_BYTES
 
 # What viser's own page says on its console; nothing here comes from jawusd.
@@ -116,9 +116,11 @@ def test_sliders_pose_the_jaw_and_their_ends_follow(tab):
     until(lambda: not tab.session.keep_valid)
     tab.type_slider(1, 9)
     tab.said("OUTSIDE the bound")
+    assert tuple(tab.page.scene.grips[0].color) == _OUTSIDE
     tab.picture("outside")
     tab.press("undo")
     until(lambda: np.isclose(tab.session.d[1], ends[1], atol=0.011))
+    assert tuple(tab.page.scene.grips[0].color) != _OUTSIDE
 
 
 def test_dragging_the_incisor_is_inverse_kinematics(tab):
