@@ -46,19 +46,18 @@ def retarget(
     use: Annotated[Use, typer.Option(help="With --landmarks: average the library, or take the closest.")] = Use.average,
     fps: Annotated[float | None, typer.Option(min=0.001, help="Frames per second; the motion's own else.")] = None,
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="anim.usdc of the motion, model.npz of a person.")
+        Path | None,
+        typer.Option("-o", "--out", help="Layer of the motion (retargeted.usdc) or model of the person (model.npz)."),
     ] = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Carry a motion to another rig, or make a rig for a person from landmarks and a library."""
-    if out is None:
-        raise typer.BadParameter("give the file to write.", param_hint="--out")
     moving, person = (anim, source, target), (landmarks, library_folder)
     if all(moving) and not any(person):
-        _retarget_motion(anim, source, target, fps, out, force, as_json)
+        _retarget_motion(anim, source, target, fps, out or Path("retargeted.usdc"), force, as_json)
     elif all(person) and not any((*moving, fps)):
-        _personal(landmarks, library_folder, use, out, force, as_json)
+        _personal(landmarks, library_folder, use, out or Path("model.npz"), force, as_json)
     else:
         raise typer.BadParameter("give either ANIM, --from and --to, or --landmarks and --library.")
 

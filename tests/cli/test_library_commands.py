@@ -130,6 +130,12 @@ def test_lost_frames_stay_lost(actors, tmp_path):
     assert np.isnan(read_parameters_of_stage(out)[1][4:6]).all()
 
 
+def test_without_a_name_the_motion_goes_beside(actors, animation, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert run("retarget", "--from", actors[0], animation[0], "--to", actors[1])["file"] == "retargeted.usdc"
+    assert (tmp_path / "retargeted.usdc").exists()
+
+
 def test_animate_takes_motion_of_another_rig(actors, animation, tmp_path):
     path, frames, _ = animation
     run("retarget", path, "--from", actors[0], "--to", actors[1], "-o", tmp_path / "retargeted.usdc")
@@ -146,7 +152,6 @@ def test_retarget_asks_for_one_thing_and_overwrites_nothing(actors, animation, t
     a, b = actors
     for arguments in (
         [path, "--from", a, "-o", tmp_path / "x.usdc"],
-        [path, "--from", a, "--to", b],
         [path, "--from", a, "--to", b, "--library", tmp_path, "-o", tmp_path / "x.usdc"],
         ["--landmarks", path, "-o", tmp_path / "x.npz"],
         [path, "--from", a, "--to", b, "-o", tmp_path / "x.npz"],
