@@ -1,4 +1,4 @@
-"""The command that shows a rig in a browser."""
+"""The command that shows a rig or a capture in a browser."""
 
 from __future__ import annotations
 
@@ -7,6 +7,9 @@ from typing import Annotated
 
 import typer
 
+from jawusd.cli.build_commands import Outside
+from jawusd.cli.output import progress
+
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this module."""
@@ -14,26 +17,49 @@ def register(app: typer.Typer) -> None:
 
 
 def view(
-    rig: Annotated[Path, typer.Argument(help="actor.usda, another layer of it, or its folder.", show_default=False)],
+    rig: Annotated[
+        Path,
+        typer.Argument(
+            help="A rig (actor.usda, another layer of it, or its folder) or a capture (capture.toml or its folder).",
+            metavar="RIG|CAPTURE",
+            show_default=False,
+        ),
+    ],
+    tracks: Annotated[
+        Path | None,
+        typer.Option(
+            help="Poses to draw over a capture's footage: the folder of its build, or tracks.npz.", show_default=False
+        ),
+    ] = None,
     host: Annotated[str, typer.Option(help="Address to listen on; the default is reached from this machine.")] = (
         "127.0.0.1"
     ),
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port; the next free one if it is taken.")] = 8080,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open a browser.")] = True,
+    allow_outside: Outside = False,
 ) -> None:
-    """See a rig in the browser, drag it, key it."""
+    """See a rig in the browser, drag it, key it; or a capture's footage, to judge its poses and to set its picks."""
     import webbrowser
 
     from jawusd.pipeline.extras import stage
     from jawusd.pipeline.view import open_viewer
+    from jawusd.pipeline.view_capture import is_capture, open_capture_viewer
 
+    capture = is_capture(rig)
+    if tracks is not None and not capture:
+        raise typer.BadParameter("--tracks belongs to a capture; a rig has its own poses.")
     if not stage("jawusd.viewer.server").is_loopback(host):
+        may = "write picks into the capture" if capture else "write animations beside the rig"
         typer.echo(
             f"jawusd: warning: listening on {host}: whoever reaches this address sees this person's jaw, without a "
-            "password, and may write animations beside the rig. `ssh -L 8080:localhost:8080` works without --host.",
+            f"password, and may {may}. `ssh -L 8080:localhost:8080` works without --host.",
             err=True,
         )
-    viewer = open_viewer(rig, host, port)
+    if capture:
+        with progress() as report:
+            viewer = open_capture_viewer(rig, tracks, host, port, report, allow_outside=allow_outside)
+    else:
+        viewer = open_viewer(rig, host, port)
     try:
         typer.echo(f"{viewer.url}  (Ctrl+C stops)")
         if browser:

@@ -92,7 +92,15 @@ def open_footage(capture: Capture) -> tuple[dict[str, Camera], dict[str, Any]]:
         CaptureError: no camera has a video, or one cannot be decoded.
         CalibrationError: a video has another shape than its camera's calibration.
     """
-    cameras = {camera.name: camera for camera in load_cameras(capture)}
+    return {camera.name: camera for camera in load_cameras(capture)}, open_videos(capture)
+
+
+def open_videos(capture: Capture) -> dict[str, Any]:
+    """Return the videos of a capture by the names of their cameras.
+
+    Raises:
+        CaptureError: no camera has a video, or one cannot be decoded.
+    """
     sources = {source.name: source.video for source in capture.cameras if source.video}
     if not sources:
         raise CaptureError(
@@ -100,8 +108,7 @@ def open_footage(capture: Capture) -> tuple[dict[str, Camera], dict[str, Any]]:
             path=capture.folder / "capture.toml",
             hint="Name the footage there (video = ...).",
         )
-    videos = {name: stage("jawusd.imaging.video").Video(path) for name, path in sources.items()}
-    return cameras, videos
+    return {name: stage("jawusd.imaging.video").Video(path) for name, path in sources.items()}
 
 
 def _drawn(

@@ -184,19 +184,19 @@ def build_facts(folder: Path, state: BuildState, capture: Capture | None, *, all
         allow_outside: let paths in the capture leave its folder.
     """
     if capture is not None:
-        return BuildFacts(state.stages, _calibrated(capture, folder))
+        return BuildFacts(state.stages, calibrated(capture, folder))
     record = state.stages.get("report")
     place = record.result.get("capture") if record else None
     if not place:
         return BuildFacts(state.stages, None, "the build does not say where its capture is: name it with --capture.")
     path = folder / str(place)
     try:
-        return BuildFacts(state.stages, _calibrated(open_capture(path, allow_outside=allow_outside), folder))
+        return BuildFacts(state.stages, calibrated(open_capture(path, allow_outside=allow_outside), folder))
     except JawusdError as error:
         return BuildFacts(state.stages, None, f"the capture is not at hand ({error}): name it with --capture.")
 
 
-def _calibrated(capture: Capture, folder: Path) -> Capture:
+def calibrated(capture: Capture, folder: Path) -> Capture:
     """Return the capture with the calibration that the build made from its boards, if it names none."""
     made = folder / CALIBRATION
     if capture.calibration is not None or not made.is_file():

@@ -7,15 +7,19 @@ import ipaddress
 import logging
 import socket
 import sys
+from typing import Protocol
 from urllib.parse import urlsplit
 
 import viser
 
 from jawusd.errors import OutputError
+from jawusd.viewer import capture_scene
 from jawusd.viewer.actor import ViewedActor
+from jawusd.viewer.capture_page import CapturePage
 from jawusd.viewer.page import Page
 from jawusd.viewer.plot_panel import StillPlots
 from jawusd.viewer.scene import set_first_view
+from jawusd.viewer.viewed_capture import ViewedCapture
 
 log = logging.getLogger(__name__)
 
@@ -29,32 +33,35 @@ class _LocalServer(viser.ViserServer):
         return None
 
 
-class Viewer:
-    """Serve an actor; every page has a session of its own.
+class _Closable(Protocol):
+    def close(self) -> None:
+        """Stop what runs for this page."""
+
+
+class PageServer:
+    """Serve pages; every visitor has one of their own.
 
     Attributes:
         pages: the open pages by client number.
         url: where to look.
     """
 
-    def __init__(self, actor: ViewedActor, host: str, port: int) -> None:
+    def __init__(self, name: str, host: str, port: int) -> None:
         """Start serving.
 
         Args:
-            actor: what is shown.
+            name: what is shown.
             host: address to listen on.
             port: port to listen on; 0 takes any free one, a taken one the next that is free.
 
         Raises:
             OutputError: the address is not this machine's.
         """
-        self._actor, self._host = actor, host
-        self._still = StillPlots(actor.rig)
-        self.pages: dict[int, Page] = {}
+        self._host = host
+        self.pages: dict[int, _Closable] = {}
         _check_address(host)
         with contextlib.redirect_stdout(sys.stderr):  # viser greets there; results go on stdout
-            self._server = _LocalServer(host=host, port=port, label=actor.name, verbose=False)
-        set_first_view(self._server, self._still.rest)
+            self._server = _LocalServer(host=host, port=port, label=name, verbose=False)
         self._server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
         self._server.on_client_connect(self._welcome)
         self._server.on_client_disconnect(self._farewell)
@@ -64,7 +71,10 @@ class Viewer:
         if not self._trusted(client):
             log.warning("refused a page that belongs to another site")
             return
-        self.pages[client.client_id] = Page(client, self._actor, self._still)
+        self.pages[client.client_id] = self._page(client)
+
+    def _page(self, client: viser.ClientHandle) -> _Closable:
+        raise NotImplementedError
 
     async def _farewell(self, client: viser.ClientHandle) -> None:
         page = self.pages.pop(client.client_id, None)
@@ -84,6 +94,33 @@ class Viewer:
         """Stop serving."""
         with contextlib.redirect_stdout(sys.stderr):
             self._server.stop()
+
+
+class Viewer(PageServer):
+    """Serve a rig."""
+
+    def __init__(self, actor: ViewedActor, host: str, port: int) -> None:
+        """Start serving an actor; see `PageServer` for the rest."""
+        self._actor = actor
+        self._still = StillPlots(actor.rig)
+        super().__init__(actor.name, host, port)
+        set_first_view(self._server, self._still.rest)
+
+    def _page(self, client: viser.ClientHandle) -> Page:
+        return Page(client, self._actor, self._still)
+
+
+class CaptureViewer(PageServer):
+    """Serve a capture."""
+
+    def __init__(self, capture: ViewedCapture, host: str, port: int) -> None:
+        """Start serving a capture; see `PageServer` for the rest."""
+        self._capture = capture
+        super().__init__(capture.name, host, port)
+        capture_scene.set_first_view(self._server)
+
+    def _page(self, client: viser.ClientHandle) -> CapturePage:
+        return CapturePage(client, self._capture)
 
 
 def is_loopback(host: str) -> bool:

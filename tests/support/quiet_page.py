@@ -29,9 +29,13 @@ class QuietPage:
 
         def make():
             began = time.perf_counter()
-            return Page(self.client, viewer._actor, viewer._still), time.perf_counter() - began
+            return self.make_page(viewer), time.perf_counter() - began
 
         self.page, self.made_s = self.call(make)
+
+    def make_page(self, viewer):
+        """Return the page of a rig."""
+        return Page(self.client, viewer._actor, viewer._still)
 
     def call(self, action):
         """Run a function where events of visitors run, and return what it returns."""

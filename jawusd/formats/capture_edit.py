@@ -1,0 +1,150 @@
+"""Put new picks into a capture.toml and leave everything else in it, comments included, as it is."""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from jawusd.errors import FormatError, OutputError
+from jawusd.formats.atomic import write_bytes_atomic
+from jawusd.formats.capture import Bootstrap, Pick
+
+_TABLE = "bootstrap"
+
+
+def write_bootstrap(path: str | os.PathLike[str], picks: Bootstrap, expected: Bootstrap | None) -> None:
+    """Replace `[bootstrap]` of a capture.toml, or add it.
+
+    Args:
+        path: the file.
+        picks: what to write.
+        expected: the picks that were read from the file before; None if it had none.
+
+    Raises:
+        FormatError: the file is not TOML.
+        OutputError: its picks are no longer the expected ones, they are written in a form that cannot be replaced
+            safely, or the file cannot be written. Nothing has changed then.
+    """
+    path = Path(path).resolve()  # a link stays a link
+    try:
+        text = path.read_bytes().decode("utf-8")
+        found = tomllib.loads(text).get(_TABLE)
+        there = None if found is None else Bootstrap.model_validate(found)
+    except OSError as error:
+        raise OutputError(f"cannot be read: {error.strerror}.", path=path) from error
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise FormatError(f"is not valid TOML: {error}.", path=path) from error
+    except ValidationError as error:
+        raise FormatError(f"[{_TABLE}] cannot be read: {error.errors()[0]['msg']}.", path=path) from error
+    if there != expected:
+        raise OutputError(
+            f"its [{_TABLE}] was changed by somebody else since it was read.",
+            path=path,
+            hint="Open the capture again to see the picks that are there now.",
+        )
+    try:
+        changed = with_bootstrap(text, picks)
+    except ValueError as error:
+        raise OutputError(
+            f"{error}.",
+            path=path,
+            hint=f"Bring [{_TABLE}] into the form of tables, [{_TABLE}] and [[{_TABLE}.upper]], or delete it.",
+        ) from error
+    write_bytes_atomic(path, changed.encode())
+
+
+def with_bootstrap(text: str, picks: Bootstrap) -> str:
+    """Return a capture.toml with other picks; comments among the old ones are kept.
+
+    Raises:
+        ValueError: the picks there are written as something else than tables.
+    """
+    blocks = list(_blocks(text))
+    newline = "\r\n" if "\r\n" in text else "\n"
+    own = [number for number, (table, _) in enumerate(blocks) if table == _TABLE]
+    comments = [line for number in own for line in _comments(blocks[number][1], last=number == own[-1])]
+    fresh = newline.join([f"[{_TABLE}]", *comments, *_lines(picks)]) + newline
+    if own:
+        rest = ["".join(lines) for number, (_, lines) in enumerate(blocks) if number not in own]
+        tail = "".join(_after(blocks[own[-1]][1])) or newline * (len(rest) > own[0])
+        changed = "".join([*rest[: own[0]], fresh, tail, *rest[own[0] :]])
+    else:
+        end = "" if not text or text.endswith("\n") else newline
+        changed = f"{text}{end}{newline}{fresh}"
+    _check(text, changed, picks)
+    return changed
+
+
+def _lines(picks: Bootstrap) -> list[str]:
+    lines = [f"frame = {picks.frame}"]
+    for row in ("upper", "lower"):
+        for pick in getattr(picks, row):
+            lines += ["", f"[[{_TABLE}.{row}]]", f"vertex = {pick.vertex}", f"views = [{_views(pick)}]"]
+    return lines
+
+
+def _views(pick: Pick) -> str:
+    # Camera names hold no character that TOML would escape.
+    return ", ".join(f'{{ camera = "{view.camera}", x = {view.x:.2f}, y = {view.y:.2f} }}' for view in pick.views)
+
+
+def _blocks(text: str) -> Iterator[tuple[str, list[str]]]:
+    """Yield the first key of every table header with its lines and those below it; "" before the first header."""
+    table, lines = "", []
+    for statement in _statements(text):
+        if statement[0].lstrip().startswith("["):
+            yield table, lines
+            table, lines = next(iter(tomllib.loads(statement[0]))), []
+        lines += statement
+    yield table, lines
+
+
+def _statements(text: str) -> Iterator[list[str]]:
+    """Yield the lines of each header, value, comment or blank line; values may run over several lines."""
+    pending: list[str] = []
+    for line in text.split("\n")[: None if not text.endswith("\n") else -1]:
+        pending.append(line + "\n")
+        try:
+            tomllib.loads("".join(pending))
+        except tomllib.TOMLDecodeError:
+            continue  # the value goes on in the next line
+        yield pending
+        pending = []
+    if pending:
+        yield pending
+
+
+def _comments(lines: list[str], last: bool) -> list[str]:
+    """Return the comments among the statements of a block; a value with a comment beside it becomes one as a whole."""
+    among = lines[: len(lines) - len(_after(lines))] if last else lines
+    # No value of picks holds a #: what has one carries a comment.
+    return [line.strip() if line.lstrip().startswith("#") else f"# {line.strip()}" for line in among if "#" in line]
+
+
+def _after(lines: list[str]) -> list[str]:
+    """Return the blank lines and comments at the end of a block: they belong to what follows."""
+    count = 0
+    while count < len(lines) and lines[-1 - count].strip()[:1] in ("", "#"):
+        count += 1
+    return lines[len(lines) - count :]
+
+
+def _check(before: str, after: str, picks: Bootstrap) -> None:
+    """Compare what the two texts say.
+
+    Raises:
+        ValueError: more than the picks has changed.
+    """
+    try:
+        old, new = tomllib.loads(before), tomllib.loads(after)
+        written = Bootstrap.model_validate(new.pop(_TABLE))
+    except (tomllib.TOMLDecodeError, ValidationError) as error:
+        raise ValueError(f"[{_TABLE}] is not written as tables of its own") from error
+    old.pop(_TABLE, None)
+    rounded = Bootstrap.model_validate(tomllib.loads("\n".join(_lines(picks)).replace(f"[[{_TABLE}.", "[[")))
+    if old != new or written != rounded:
+        raise ValueError(f"[{_TABLE}] is not written as tables of its own")

@@ -1,0 +1,229 @@
+"""One visitor's page of a capture: pictures, poses and picks of their own."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from jawusd.errors import JawusdError
+from jawusd.formats.capture import Bootstrap
+from jawusd.geometry import make_transform, transform_points
+from jawusd.geometry.se3 import se3_inverse
+from jawusd.viewer.capture_scene import UP, CaptureScene
+from jawusd.viewer.footage_panel import FootagePanel
+from jawusd.viewer.light_table import Table, eye_to_see, hit_vertex, region_around
+from jawusd.viewer.notices import guarded, say
+from jawusd.viewer.picks import ROWS
+from jawusd.viewer.picks_panel import PicksPanel
+from jawusd.viewer.viewed_capture import Region, ViewedCapture
+
+Array = NDArray[np.float64]
+log = logging.getLogger(__name__)
+
+_PANEL_PX = 370
+_USUAL_MM, _USUAL_WEIGHT = 250.0, 1e-3  # from a camera to the mouth
+_SPACE_SIDE = (0.9, -0.7, 0.0)  # how far from straight behind the first camera the visitor stands
+
+
+class CapturePage:
+    """Connect a page's widgets with a capture.
+
+    Attributes:
+        footage, picks: the panels.
+        scene: the picture, the scans and the cameras.
+        table: how the picture lies that is shown, None before the first.
+        poses: where the scans stand, T_page_scan (4, 4) by row.
+        drawn: how many states have been drawn.
+    """
+
+    def __init__(self, client: viser.ClientHandle, capture: ViewedCapture) -> None:
+        """Draw the page."""
+        self.client, self._capture = client, capture
+        gui = client.gui
+        gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
+        gui.set_panel_label(capture.name)
+        self.scene = CaptureScene(client, capture)
+        self.table: Table | None = None
+        self.poses: dict[str, Array] = {}
+        self.drawn = self._wanted = 0
+        self._aim = True
+        self._drawing: asyncio.Task | None = None
+        self._of_picks: tuple[Bootstrap, tuple[Array, Array] | None] | None = None
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("Footage"):
+            self.footage = FootagePanel(client, capture, self._turn_camera, self.refresh)
+        with tabs.add_tab("Picks"):
+            self.picks = PicksPanel(client, capture, self.footage, self.turn, self.refresh)
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(_PANEL_PX)
+        client.scene.on_click()(guarded(client, self._clicked))
+        self.refresh()
+
+    def turn(self) -> None:
+        """Draw anew, and put the visitor's eye where everything is seen."""
+        self._aim = True
+        self.refresh()
+
+    def _turn_camera(self) -> None:
+        if self.picks.picking.value and not self.footage.in_space:
+            self.picks.book.turn_to(self.footage.view)
+        self.turn()
+
+    def refresh(self) -> None:
+        """Draw what is chosen now; while a picture is on its way, only the last wish counts."""
+        self._wanted += 1
+        if self._drawing is None or self._drawing.done():
+            self._drawing = asyncio.get_running_loop().create_task(self._draw())
+
+    @property
+    def busy(self) -> bool:
+        """Return whether something is still to be drawn."""
+        return self.drawn != self._wanted
+
+    async def _draw(self) -> None:
+        while self.drawn != self._wanted:
+            wanted, aim = self._wanted, self._aim
+            self._aim = False
+            try:
+                await self._fit_picks()
+                await self._draw_once(aim)
+            except (JawusdError, ValueError) as error:
+                say(self.client, "That did not work", str(error), bad=True)
+            except Exception as error:  # the page says it, the log has the details, the server lives on
+                log.exception("unexpected error in the viewer")
+                say(self.client, "Unexpected error", f"{type(error).__name__}: {error}", bad=True)
+            self.drawn = wanted
+
+    async def _draw_once(self, aim: bool) -> None:
+        capture, footage = self._capture, self.footage
+        view, frame, look = footage.view, footage.frame, footage.look
+        tracked = self._poses_at(frame)
+        if footage.in_space:
+            names = [name for name in capture.sizes_px if name in capture.cameras]
+            images = {name: await asyncio.to_thread(capture.picture, name, frame, tracked, look) for name in names}
+            self.scene.show_thumbnails(images)
+            waiting = self._waiting_pose()
+            shown = tracked or (waiting, waiting)
+            self.poses = {row: self.scene.T_page_world @ T for row, T in zip(ROWS, shown, strict=True)}
+        else:
+            image = await asyncio.to_thread(capture.picture, view, frame, tracked, look)
+            if aim or self.table is None:
+                self.table = Table(capture.sizes_px[view], await asyncio.to_thread(self._region, view, frame))
+            self.scene.show_picture(image, self.table)
+            beside = self.picks.picking.value
+            self.poses = (
+                self.table.scan_poses(dict(capture.scans), capture.T_anatomical_skull, self.picks.side)
+                if beside
+                else {}
+            )
+        self.scene.place(footage.in_space, self.poses)
+        self.scene.show_marks(
+            self.picks.book, None if footage.in_space else view, frame, None if footage.in_space else self.table
+        )
+        self.picks.refresh()
+        if aim:
+            self._look()
+
+    def _look(self) -> None:
+        """Put the visitor's eye where everything is seen."""
+        camera = self.client.camera
+        aspect = camera.image_width / camera.image_height
+        seen = [
+            transform_points(T, self._capture.scans[row].vertices)
+            for row, T in self.poses.items()
+            if np.isfinite(T).all()
+        ]
+        away = np.array([0.0, 0.0, -1.0])
+        if self.footage.in_space:
+            centres = [c.centre_world() for c in self._capture.cameras.values()]
+            seen.append(transform_points(self.scene.T_page_world, np.array(centres)))
+            away += _SPACE_SIDE
+        elif self.table is not None:
+            seen.append(self.table.corners())
+        self.scene.look(*eye_to_see(np.vstack(seen), away, UP, aspect))
+
+    def _poses_at(self, frame: int) -> tuple[Array, Array] | None:
+        """Return T_world_upper and T_world_lower of a frame: tracked, else those the picks of that frame give."""
+        tracked = self._capture.tracked_poses(frame)
+        if tracked is None and self._of_picks is not None and self._of_picks[0].frame == frame:
+            return self._of_picks[1]
+        return tracked
+
+    async def _fit_picks(self) -> None:
+        """Find the poses that agree with the picks, when these have changed and are complete."""
+        book = self.picks.book
+        if book.lacks() or book.frame is None:
+            if self._of_picks is not None:
+                self.picks.say_fit("")
+            self._of_picks = None
+            return
+        picks = book.bootstrap()
+        if not self._capture.cameras or (self._of_picks is not None and self._of_picks[0] == picks):
+            return
+        try:
+            poses, wrong = await asyncio.to_thread(self._capture.poses_of_picks, picks)
+            self._of_picks = picks, poses
+            self.picks.say_fit(f"these do not fit: {', '.join(wrong)}" if wrong else "all of them fit together")
+        except JawusdError as error:
+            self._of_picks = picks, None
+            self.picks.say_fit(error.message)
+
+    def _region(self, camera: str, frame: int) -> Region:
+        """Return the part of a camera's picture to look at: the teeth, as far as they are known."""
+        capture, size = self._capture, self._capture.sizes_px[camera]
+        tracked = self._poses_at(frame)
+        if tracked is not None and camera in capture.cameras and all(np.isfinite(T).all() for T in tracked):
+            seen = [
+                capture.cameras[camera].project(
+                    transform_points(T, mesh.vertices[np.unique(mesh.faces[capture.crowns[row]])])
+                )
+                for T, (row, mesh) in zip(tracked, capture.scans.items(), strict=True)
+            ]
+            return region_around(np.vstack(seen), size)
+        found = capture.teeth_region(camera, frame)
+        if found is not None:
+            return region_around(np.reshape(found, (2, 2)), size)
+        pixels = [pick.views[camera] for pick in self.picks.book.picks if camera in pick.views]
+        return region_around(pixels, size) if len(pixels) > 1 else (0.0, 0.0, size[0] - 1.0, size[1] - 1.0)
+
+    def _waiting_pose(self) -> Array:
+        """Return T_world_scan of scans nobody has tracked: where the cameras' axes meet, facing the first one."""
+        cameras = list(self._capture.cameras.values())
+        axes = np.stack([camera.T_cam_world[2, :3] for camera in cameras])
+        across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+        centres = np.stack([camera.centre_world() for camera in cameras])
+        # Axes that hardly meet leave the distance open: then a usual one from the first camera decides.
+        usual = centres[0] + _USUAL_MM * axes[0]
+        A = across.sum(axis=0) + _USUAL_WEIGHT * np.eye(3)
+        met = np.linalg.solve(A, np.einsum("nij,nj->i", across, centres) + _USUAL_WEIGHT * usual)
+        T_world_cam = se3_inverse(cameras[0].T_cam_world)
+        facing = make_transform(T_world_cam[:3, :3] @ np.diag([1.0, -1.0, -1.0]), met)
+        return facing @ self._capture.T_anatomical_skull
+
+    async def _clicked(self, event: viser.SceneClickEvent) -> None:
+        """Set a vertex or a pixel where the visitor clicked."""
+        if not self.picks.picking.value:
+            return
+        hits = []
+        for row, T in self.poses.items():
+            hit = hit_vertex(self._capture.scans[row], T, event.ray_origin, event.ray_direction)
+            if hit is not None:
+                hits.append((hit[1], row, hit[0]))
+        if hits:
+            _, row, vertex = min(hits)
+            self.picks.book.add(row, vertex)
+        elif not self.footage.in_space and self.table is not None:
+            pixel = self.table.pixel(event.ray_origin, event.ray_direction)
+            if pixel is None:
+                return
+            self.picks.book.see(self.footage.view, self.footage.frame, pixel)
+        self.refresh()
+
+    def close(self) -> None:
+        """Stop what runs for this page."""
+        if self._drawing is not None:
+            self._drawing.cancel()

@@ -1,0 +1,183 @@
+"""A capture in 3-D: a picture with the scans before it, or the calibrated cameras around the scans."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from jawusd.geometry import wxyz_from_matrix
+from jawusd.geometry.se3 import se3_inverse
+from jawusd.viewer.decimate import for_view
+from jawusd.viewer.light_table import FOV_RAD, Table
+from jawusd.viewer.picks import ROWS, PickBook
+from jawusd.viewer.viewed_capture import ViewedCapture
+
+Array = NDArray[np.float64]
+
+ENAMEL, GUM = (236, 229, 212), (196, 112, 108)
+#: Colours of picks by row, those of the outlines; and of the one selected.
+ROW_COLORS, SELECTED = {"upper": (255, 170, 0), "lower": (0, 200, 255)}, (255, 60, 200)
+#: Upwards in the page.
+UP = (0.0, -1.0, 0.0)
+_MOST_FACES = 7_000  # per part of a row; clicks meet the whole scan
+_JPEG_QUALITY = 88
+_THUMB_PX = 480
+_FRUSTUM_MM = 60.0  # from the eye of a camera to its picture
+_FRUSTUM_COLOR = (120, 120, 120)
+_BALL_MM = 0.7
+_CROSS_MM = (0.35, 1.3)  # a cross leaves its middle free
+_FIRST_EYE_MM, _NEAR_MM, _FAR_MM = 300.0, 1.0, 10_000.0
+_LIFT_MM = 0.05  # marks lie this far before the picture
+
+
+class CaptureScene:
+    """Draw a capture for one page.
+
+    Attributes:
+        T_page_world: the page has the axes of the first camera, so that up is up, shape (4, 4).
+    """
+
+    def __init__(self, client: viser.ClientHandle, capture: ViewedCapture) -> None:
+        """Draw what there is before the first picture has come."""
+        self._client, self._scene, self._capture = client, client.scene, capture
+        scene = self._scene
+        scene.configure_default_lights(cast_shadow=False)
+        self.T_page_world = next((camera.T_cam_world for camera in capture.cameras.values()), np.eye(4))
+        self._table = scene.add_frame("/table", show_axes=False)
+        self._picture: viser.ImageHandle | None = None
+        self._space = scene.add_frame("/space", show_axes=False, visible=False)
+        self._frustums = {name: self._add_frustum(name) for name in capture.sizes_px if name in capture.cameras}
+        self._rows = {row: scene.add_frame(f"/{row}", show_axes=False, visible=False) for row in ROWS}
+        for row in ROWS:
+            self._add_scan(row)
+        self._marks: list[viser.SceneNodeHandle] = []
+
+    def _add_frustum(self, name: str) -> viser.CameraFrustumHandle:
+        camera = self._capture.cameras[name]
+        width, height = camera.size_px
+        T = self.T_page_world @ se3_inverse(camera.T_cam_world)
+        y = 0.5 * height / camera.K[1, 1]
+        frustum = self._scene.add_camera_frustum(
+            f"/space/{name}",
+            fov=float(2 * np.arctan(y)),
+            aspect=width / height,
+            scale=float(_FRUSTUM_MM * np.cbrt(y * y * width / height / 3)),  # the page scales to a volume
+            thickness=0.6,
+            color=_FRUSTUM_COLOR,
+            wxyz=wxyz_from_matrix(T[:3, :3]),
+            position=T[:3, 3],
+            cast_shadow=False,
+            receive_shadow=False,
+            format="jpeg",
+        )
+        self._scene.add_label(f"/space/{name}/name", name, anchor="bottom-center")
+        return frustum
+
+    def _add_scan(self, row: str) -> None:
+        mesh, crowns = self._capture.scans[row], self._capture.crowns[row]
+        for part, faces, color in (("teeth", crowns, ENAMEL), ("gum", ~crowns, GUM)):
+            if faces.any():
+                small = for_view(type(mesh)(mesh.vertices, mesh.faces[faces]), _MOST_FACES)
+                self._scene.add_mesh_simple(
+                    f"/{row}/{part}",
+                    small.vertices,
+                    small.faces,
+                    color=color,
+                    side="double",
+                    cast_shadow=False,
+                    receive_shadow=False,
+                )
+
+    def show_picture(self, image: NDArray[np.uint8], table: Table) -> None:
+        """Put a picture on the table."""
+        width, height = (side / table.px_per_mm for side in table.size_px)
+        if self._picture is None:
+            self._picture = self._scene.add_image(
+                "/table/picture", image, width, height, format="jpeg", jpeg_quality=_JPEG_QUALITY, receive_shadow=False
+            )
+            return
+        with self._client.atomic():
+            self._picture.image = image
+            self._picture.render_width, self._picture.render_height = width, height
+
+    def show_thumbnails(self, images: Mapping[str, NDArray[np.uint8]]) -> None:
+        """Put pictures, made small, on the cameras in space."""
+        for name, image in images.items():
+            step = -(-image.shape[1] // _THUMB_PX)
+            self._frustums[name].image = np.ascontiguousarray(image[::step, ::step])
+
+    def place(self, in_space: bool, poses: Mapping[str, Array]) -> None:
+        """Show the table or the cameras in space, and the scans whose poses (4, 4) are given and finite."""
+        with self._client.atomic():
+            self._table.visible, self._space.visible = not in_space, in_space
+            for row, frame in self._rows.items():
+                T = poses.get(row)
+                shown = T is not None and bool(np.isfinite(T).all())
+                if T is not None and shown:
+                    frame.position, frame.wxyz = tuple(T[:3, 3]), tuple(wxyz_from_matrix(T[:3, :3]))
+                frame.visible = shown
+
+    def show_marks(self, book: PickBook, camera: str | None, frame: int, table: Table | None) -> None:
+        """Mark the picks on the scans and, those of this frame, in the picture of a camera."""
+        with self._client.atomic():
+            for mark in self._marks:
+                mark.remove()
+            self._marks = []
+            crosses, colors = [], []
+            for number, pick in enumerate(book.picks):
+                color = SELECTED if number == book.selected else ROW_COLORS[pick.row]
+                if pick.vertex < len(self._capture.scans[pick.row].vertices):
+                    self._mark_vertex(book.name(number), pick.row, pick.vertex, color)
+                pixel = pick.views.get(camera) if camera is not None else None
+                if pixel is not None and table is not None and frame == book.frame:
+                    place = table.place(pixel) - [0.0, 0.0, _LIFT_MM]
+                    crosses.append(_cross(place))
+                    colors.append(np.broadcast_to(np.array(color, np.uint8), (4, 2, 3)))
+                    self._label(f"/table/name_{number}", book.name(number), place)
+            if crosses:
+                self._marks.append(
+                    self._scene.add_line_segments(
+                        "/table/crosses",
+                        np.concatenate(crosses).astype(np.float32),
+                        np.concatenate(colors),
+                        thickness=2.0,
+                        thickness_units="screen",
+                    )
+                )
+
+    def _mark_vertex(self, name: str, row: str, vertex: int, color: tuple[int, int, int]) -> None:
+        place = self._capture.scans[row].vertices[vertex]
+        ball = self._scene.add_icosphere(
+            f"/{row}/{name}", radius=_BALL_MM, color=color, position=tuple(place), cast_shadow=False
+        )
+        self._marks.append(ball)
+        self._label(f"/{row}/name_{name}", name, place)
+
+    def _label(self, path: str, text: str, place: Array) -> None:
+        self._marks.append(
+            self._scene.add_label(path, text, position=tuple(place), anchor="bottom-left", font_screen_scale=0.8)
+        )
+
+    def look(self, eye: Array, target: Array) -> None:
+        """Put the visitor's eye at a place (3,), looking at another (3,)."""
+        camera = self._client.camera
+        with self._client.atomic():
+            camera.fov = FOV_RAD
+            camera.position, camera.look_at, camera.up_direction = tuple(eye), tuple(target), UP
+
+
+def set_first_view(server: viser.ViserServer) -> None:
+    """Let every page begin before the picture, upright."""
+    server.scene.set_up_direction("-y")
+    first = server.initial_camera
+    first.position, first.look_at, first.up = (0.0, 0.0, -_FIRST_EYE_MM), (0.0, 0.0, 0.0), UP
+    first.fov, first.near, first.far = FOV_RAD, _NEAR_MM, _FAR_MM
+
+
+def _cross(place: Array) -> Array:
+    """Return four segments (4, 2, 3) around a place (3,)."""
+    ends = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], dtype=np.float64)
+    return place + np.stack([_CROSS_MM[0] * ends, _CROSS_MM[1] * ends], axis=1)

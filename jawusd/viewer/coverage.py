@@ -1,0 +1,124 @@
+"""How well tracked poses cover the masks: over time as a plot, and the frames to look at first."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, TRACKED, Tracks
+from jawusd.viewer.plots import BLUE, GREY, ORANGE, VERMILION
+
+Array = NDArray[np.float64]
+
+_APART_S = 0.5  # neighbours show the same trouble
+_MOST_WORST = 12
+_WIDTH, _HEIGHT = 330, 170
+_LEFT, _RIGHT, _TOP, _BOTTOM = 30, 8, 20, 26
+_TEXT = 'font-family="sans-serif" font-size="11" fill="currentColor"'
+_STATUS = {LOST: "lost", TRACKED: "tracked", RECOVERED: "found again", PARTIAL: "tracked without one camera"}
+_COLORS = (ORANGE, BLUE)  # upper, lower, as the outlines in the pictures
+
+
+def uncovered_percent(tracks: Tracks) -> Array:
+    """Return the mask area left uncovered per frame and row, mean over the masks in use [%], shape (F, 2); NaN: none.
+    """
+    value = np.where(tracks.masks_used, tracks.coverage_error, np.nan)
+    known = np.isfinite(value)
+    total = np.where(known, value, 0.0).sum(axis=2)
+    return 100 * np.divide(total, known.sum(axis=2), out=np.full(total.shape, np.nan), where=known.any(axis=2))
+
+
+def worst_frames(tracks: Tracks, fps: float) -> list[int]:
+    """Return frame numbers to look at, the worst first, no two within half a second: lost ones, then by coverage."""
+    badness = np.nan_to_num(uncovered_percent(tracks), nan=-1.0).max(axis=1)
+    badness = np.where(tracks.tracked(), badness, np.inf)
+    apart = max(round(_APART_S * fps), 1)
+    found: list[int] = []
+    for row in np.argsort(-badness, kind="stable"):
+        frame = int(tracks.frames[row])
+        if len(found) == _MOST_WORST or badness[row] < 0:
+            break
+        if all(abs(frame - other) >= apart for other in found):
+            found.append(frame)
+    return found
+
+
+def frame_words(tracks: Tracks, frame: int) -> str:
+    """Say how the tracking of a frame went, as HTML."""
+    row = int(np.searchsorted(tracks.frames, frame))
+    if row == len(tracks.frames) or tracks.frames[row] != frame:
+        return "not tracked"
+    percent = uncovered_percent(tracks)[row]
+    parts = []
+    for index, name in enumerate(("upper", "lower")):
+        status = _STATUS.get(int(tracks.status[row, index]), "?")
+        area = f", {percent[index]:.2f} % uncovered" if np.isfinite(percent[index]) else ", no mask"
+        parts.append(f'<span style="color:{_COLORS[index]}">&#9632;</span> {name}: {status}{area}')
+    if tracks.prior_aided[row]:
+        parts.append("the jaw model helped")
+    return "<br>".join(parts)
+
+
+class CoveragePlot:
+    """Draw the uncovered area of both rows over the frames, once, and a playhead over it.
+
+    Attributes:
+        still: HTML that puts the plot, unseen, into the page.
+    """
+
+    def __init__(self, tracks: Tracks, span: tuple[int, int], worst: list[int]) -> None:
+        """Draw.
+
+        Args:
+            tracks: what is plotted.
+            span: first and last frame of the axis.
+            worst: frames to mark.
+        """
+        self._span = span
+        percent = uncovered_percent(tracks)
+        self._top = max(float(np.nanmax(percent, initial=0.1)) * 1.08, 0.1)
+        bottom = _HEIGHT - _BOTTOM
+        parts = [
+            f'<rect x="{_LEFT}" y="{_TOP}" width="{_WIDTH - _LEFT - _RIGHT}" height="{bottom - _TOP}" fill="none" '
+            f'stroke="{GREY}"/>',
+            f'<text x="{_LEFT}" y="13" {_TEXT} font-weight="bold">mask area left uncovered [%]</text>',
+        ]
+        parts += [self._lost_bar(int(frame)) for frame in tracks.frames[~tracks.tracked()]]
+        parts += [self._curve(tracks.frames, percent[:, k], color) for k, color in enumerate(_COLORS)]
+        for value in np.linspace(0, self._top / 1.08, 3):
+            y = self._y(value)
+            parts.append(f'<text x="{_LEFT - 4}" y="{y + 4:.1f}" text-anchor="end" {_TEXT}>{value:.1f}</text>')
+        for frame in (span[0], (span[0] + span[1]) // 2, span[1]):
+            anchor = "start" if frame == span[0] else "end" if frame == span[1] else "middle"
+            place = f'x="{self._x(frame):.1f}" y="{bottom + 13}" text-anchor="{anchor}"'
+            parts.append(f"<text {place} {_TEXT}>{frame}</text>")
+        for frame in worst:
+            x = self._x(frame)
+            parts.append(f'<path d="M{x:.1f} {_TOP}l-3 -5h6z" fill="{VERMILION}"/>')
+        hidden = 'width="0" height="0" style="position:absolute"'
+        self.still = f'<svg {hidden}><defs><g id="jaw-coverage">{"".join(parts)}</g></defs></svg>'
+
+    def with_playhead(self, frame: int) -> str:
+        """Return the SVG of the plot with a line at the frame shown."""
+        line = f'<path d="M{self._x(frame):.1f} {_TOP}V{_HEIGHT - _BOTTOM}" stroke="currentColor" stroke-width="1.5"/>'
+        box = f'viewBox="0 0 {_WIDTH} {_HEIGHT}" width="100%" style="display:block"'
+        return f'<div style="padding:0 6px"><svg {box}><use href="#jaw-coverage"/>{line}</svg></div>'
+
+    def _x(self, frame: float) -> float:
+        first, last = self._span
+        return _LEFT + (frame - first) / max(last - first, 1) * (_WIDTH - _LEFT - _RIGHT)
+
+    def _y(self, percent: float) -> float:
+        return _HEIGHT - _BOTTOM - percent / self._top * (_HEIGHT - _TOP - _BOTTOM)
+
+    def _lost_bar(self, frame: int) -> str:
+        return f'<path d="M{self._x(frame):.1f} {_TOP}V{_HEIGHT - _BOTTOM}" stroke="{VERMILION}" stroke-opacity=".4"/>'
+
+    def _curve(self, frames: NDArray[np.int64], percent: Array, color: str) -> str:
+        """Return a curve that breaks where there is no value."""
+        steps, pen = [], "M"
+        for frame, value in zip(frames, percent, strict=True):
+            if np.isfinite(value):
+                steps.append(f"{pen}{self._x(frame):.1f} {self._y(value):.1f}")
+            pen = "L" if np.isfinite(value) else "M"
+        return f'<path d="{"".join(steps)}" fill="none" stroke="{color}" stroke-width="1.2"/>'

@@ -1,0 +1,123 @@
+"""The panel that chooses camera and frame, and shows how well the poses cover the masks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import viser
+
+from jawusd.viewer.coverage import CoveragePlot, frame_words, worst_frames
+from jawusd.viewer.notices import guarded
+from jawusd.viewer.viewed_capture import Look, ViewedCapture
+
+SPACE = "3-D"
+_LOOKS: dict[str, Look] = {"outlines of the teeth": "outlines", "tinted teeth": "tinted", "footage alone": "footage"}
+_STEPS = {"-10": -10, "-1": -1, "+1": 1, "+10": 10}
+
+
+class FootagePanel:
+    """Hold the widgets of camera and frame.
+
+    Attributes:
+        view: name of the camera shown, or `SPACE`.
+        frame: frame of the reference camera.
+        worst: frames to look at, the worst first.
+    """
+
+    def __init__(
+        self,
+        client: viser.ClientHandle,
+        capture: ViewedCapture,
+        turned: Callable[[], None],
+        changed: Callable[[], None],
+    ) -> None:
+        """Make the widgets in the present container.
+
+        Args:
+            client: the page.
+            capture: what is shown.
+            turned: called when another view was chosen.
+            changed: called after every other change.
+        """
+        self._capture, self._turned, self._changed = capture, turned, changed
+        self.view = next(iter(capture.sizes_px))
+        self.frame = capture.picks.frame if capture.tracks is None and capture.picks else capture.frames[0]
+        self.frame = min(max(self.frame, capture.frames[0]), capture.frames[1])
+        self.worst = [] if capture.tracks is None else worst_frames(capture.tracks, capture.fps)
+        gui = client.gui
+        views = (*capture.sizes_px, *([SPACE] if capture.cameras else []))
+        self.views = gui.add_button_group("view", views)
+        self.views.on_click(guarded(client, self._choose))
+        self._look = gui.add_dropdown("draw", tuple(_LOOKS))
+        self._look.on_update(guarded(client, self._redraw))
+        if capture.tracks is not None:
+            self._plot = CoveragePlot(capture.tracks, capture.frames, self.worst)
+            gui.add_html(self._plot.still)
+        self._playhead = gui.add_html("")
+        # A range of one frame has no way to slide.
+        self.slider = gui.add_slider("frame", capture.frames[0], max(capture.frames[1], capture.frames[0] + 1), 1,
+                                     self.frame)  # fmt: skip
+        self.slider.on_update(guarded(client, self._slide))
+        self.steps = gui.add_button_group("step", tuple(_STEPS))
+        self.steps.on_click(guarded(client, self._step))
+        if self.worst:
+            self.jumps = gui.add_button_group("worst", ("first", "next worse", "previous"))
+            self.jumps.on_click(guarded(client, self._jump))
+        self._words = gui.add_html("")
+        self.refresh()
+
+    @property
+    def in_space(self) -> bool:
+        """Return whether the cameras are looked at from outside."""
+        return self.view == SPACE
+
+    @property
+    def look(self) -> Look:
+        """Return what is drawn into the pictures."""
+        return _LOOKS[self._look.value]
+
+    def go_to(self, frame: int) -> None:
+        """Show another frame."""
+        first, last = self._capture.frames
+        self.frame = min(max(int(frame), first), last)
+        self.refresh()
+        self._changed()
+
+    def refresh(self) -> None:
+        """Bring the widgets in line with view and frame."""
+        if self.slider.value != self.frame:
+            self.slider.value = self.frame
+        capture = self._capture
+        lines = [f"<b>{self.view}</b>, frame {self.frame}"]
+        if not self.in_space and (own := self.frame - capture.offsets[self.view]) != self.frame:
+            lines[0] += f" (its own frame {own})"
+        if capture.tracks is not None:
+            self._playhead.content = self._plot.with_playhead(self.frame)
+            lines.append(frame_words(capture.tracks, self.frame))
+        else:
+            lines.append("no tracked poses: build the rig, then name its folder with --tracks")
+        if self.frame in self.worst:
+            lines.append(f"number {self.worst.index(self.frame) + 1} of the {len(self.worst)} frames to look at")
+        self._words.content = f'<div style="font-size:12px;padding:2px 12px 6px">{"<br>".join(lines)}</div>'
+
+    async def _choose(self, event: viser.GuiEvent) -> None:
+        self.view = event.target.value
+        self.refresh()
+        self._turned()
+
+    async def _redraw(self, _: object) -> None:
+        self._changed()
+
+    async def _slide(self, _: object) -> None:
+        self.go_to(self.slider.value)
+
+    async def _step(self, event: viser.GuiEvent) -> None:
+        self.go_to(self.frame + _STEPS[event.target.value])
+
+    async def _jump(self, event: viser.GuiEvent) -> None:
+        here = self.worst.index(self.frame) if self.frame in self.worst else None
+        if event.target.value == "first" or here is None:
+            target = 0
+        else:
+            target = (here + (1 if event.target.value == "next worse" else -1)) % len(self.worst)
+        self.go_to(self.worst[target])

@@ -1,0 +1,156 @@
+"""Where things lie when a picture is looked at: the picture as a plane, the scans below its teeth, the eye before it.
+
+The table has x to the right, y down and z away from the eye, in mm; the picture lies in z = 0, its middle at the
+origin, as large as makes its teeth about as large as the scans. Knows nothing of the page.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jawusd.formats.mesh import Mesh
+from jawusd.geometry import make_transform, transform_points
+from jawusd.geometry.se3 import se3_inverse
+from jawusd.viewer.viewed_capture import Region
+
+Array = NDArray[np.float64]
+
+FOV_RAD = 0.35
+#: Turns of the scans about the subject's vertical and transverse axis [deg] by what they show.
+SIDES = {"front": (0.0, 0.0), "left": (-60.0, 0.0), "right": (60.0, 0.0), "biting side": (0.0, 65.0)}
+_TEETH_MM = 60.0  # what a region around the teeth is made as wide as
+_GAP_MM = 5.0
+_EDGE = 1e-9  # no ray slips through between two faces
+_MARGIN = 1.05
+
+
+@dataclass(frozen=True)
+class Table:
+    """Hold how one picture lies on the table.
+
+    Attributes:
+        size_px: width and height of the picture.
+        region: the part of it that is looked at [px].
+    """
+
+    size_px: tuple[int, int]
+    region: Region
+
+    @property
+    def px_per_mm(self) -> float:
+        """Return the pixels per mm of the table."""
+        return max(self.region[2] - self.region[0], 1.0) / _TEETH_MM
+
+    def place(self, pixel: ArrayLike) -> Array:
+        """Return where pixels (..., 2) lie on the table [mm], shape (..., 3)."""
+        middle = (np.array(self.size_px) - 1) / 2
+        flat = (np.asarray(pixel, dtype=np.float64) - middle) / self.px_per_mm
+        return np.concatenate([flat, np.zeros((*flat.shape[:-1], 1))], axis=-1)
+
+    def pixel(self, origin: ArrayLike, direction: ArrayLike) -> tuple[float, float] | None:
+        """Return the pixel that a ray (3,), (3,) meets; None beside the picture."""
+        o, d = np.asarray(origin, dtype=np.float64), np.asarray(direction, dtype=np.float64)
+        if abs(d[2]) < 1e-9 or -o[2] / d[2] <= 0:
+            return None
+        x, y = (o - d * (o[2] / d[2]))[:2] * self.px_per_mm + (np.array(self.size_px) - 1) / 2
+        width, height = self.size_px
+        return (float(x), float(y)) if -0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5 else None
+
+    def scan_poses(self, scans: dict[str, Mesh], T_anatomical_skull: Array, side: str) -> dict[str, Array]:
+        """Return T_table_scan (4, 4) of both rows, before the picture and below the region, seen from a side."""
+        top = float(self.place([self.region[0], self.region[3]])[1]) + _GAP_MM
+        middle = float(self.place([(self.region[0] + self.region[2]) / 2, 0.0])[0])
+        found = {}
+        for row in ("upper", "lower"):
+            yaw, pitch = np.radians(SIDES[side])
+            pitch = pitch if row == "lower" else -pitch
+            turned = make_transform(_about_y(yaw) @ _about_x(pitch), np.zeros(3)) @ T_anatomical_skull
+            table = make_transform(np.diag([1.0, -1.0, -1.0]), np.zeros(3)) @ turned
+            placed = transform_points(table, scans[row].vertices)
+            low, high = placed.min(axis=0), placed.max(axis=0)
+            move = np.array([middle - (low[0] + high[0]) / 2, top - low[1], -high[2] - _GAP_MM])
+            found[row] = make_transform(np.eye(3), move) @ table
+            top += float(high[1] - low[1]) + _GAP_MM
+        return found
+
+    def corners(self) -> Array:
+        """Return the corners of the region on the table [mm], shape (2, 3)."""
+        return self.place(np.reshape(self.region, (2, 2)))
+
+
+def eye_to_see(points: ArrayLike, away: ArrayLike, up: ArrayLike, aspect: float) -> tuple[Array, Array]:
+    """Return the eye and what it looks at (3,), (3,), as near as shows all points.
+
+    Args:
+        points: what is to be seen, shape (n, 3).
+        away: from what is seen to the eye, shape (3,).
+        up: upwards on the screen, about, shape (3,).
+        aspect: width over height of the screen.
+    """
+    p = np.asarray(points, dtype=np.float64)
+    back = np.asarray(away, dtype=np.float64) / np.linalg.norm(away)
+    right = np.cross(up, back)
+    right /= np.linalg.norm(right)
+    axes = np.stack([right, np.cross(back, right), back])
+    q = p @ axes.T
+    middle = (q.min(axis=0) + q.max(axis=0)) / 2
+    reach = np.abs(q - middle)[:, :2] * _MARGIN / np.tan(FOV_RAD / 2) / [aspect, 1.0]
+    distance = float((reach.max(axis=1) + q[:, 2] - middle[2]).max())
+    target = middle @ axes
+    return target + distance * back, target
+
+
+def region_around(points_px: ArrayLike, size_px: tuple[int, int]) -> Region:
+    """Return the part of a picture around points (n, 2) [px], with some room, inside the picture."""
+    points = np.asarray(points_px, dtype=np.float64)
+    low, high = points.min(axis=0), points.max(axis=0)
+    pad = np.maximum(0.18 * (high - low), 0.03 * size_px[0])
+    low = np.clip(low - pad, 0, np.array(size_px) - 2)
+    high = np.clip(high + pad, low + 1, np.array(size_px) - 1)
+    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+
+
+def hit_vertex(mesh: Mesh, T_world_scan: Array, origin: ArrayLike, direction: ArrayLike) -> tuple[int, float] | None:
+    """Return the vertex of a scan nearest to where a ray meets it, and how far away that is [mm]; None for a miss.
+
+    Moeller and Trumbore, "Fast, minimum storage ray/triangle intersection", 1997.
+
+    Args:
+        mesh: the scan.
+        T_world_scan: its pose, shape (4, 4).
+        origin, direction: of the ray in the world, shape (3,).
+    """
+    inverse = se3_inverse(T_world_scan)
+    o = transform_points(inverse, np.asarray(origin, dtype=np.float64))
+    d = inverse[:3, :3] @ np.asarray(direction, dtype=np.float64)
+    d = d / np.linalg.norm(d)
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    e1, e2, s = b - a, c - a, o - a
+    h = np.cross(d, e2)
+    det = np.einsum("ij,ij->i", e1, h)
+    det = np.where(np.abs(det) < 1e-12, np.inf, det)
+    u = np.einsum("ij,ij->i", s, h) / det
+    q = np.cross(s, e1)
+    v = q @ d / det
+    along = np.einsum("ij,ij->i", e2, q) / det
+    met = np.flatnonzero((u >= -_EDGE) & (v >= -_EDGE) & (u + v <= 1 + _EDGE) & (along > 0))
+    if not len(met):
+        return None
+    face = met[along[met].argmin()]
+    corners = mesh.faces[face]
+    distance = float(along[face])
+    nearest = np.linalg.norm(mesh.vertices[corners] - (o + distance * d), axis=1).argmin()
+    return int(corners[nearest]), distance
+
+
+def _about_y(angle: float) -> Array:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+
+
+def _about_x(angle: float) -> Array:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[1, 0, 0], [0, c, -s], [0, s, c]])

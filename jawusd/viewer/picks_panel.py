@@ -1,0 +1,124 @@
+"""The panel of the picks that start the tracking."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+
+import viser
+
+from jawusd.viewer.footage_panel import FootagePanel
+from jawusd.viewer.light_table import SIDES
+from jawusd.viewer.notices import guarded, say
+from jawusd.viewer.picks import PickBook
+from jawusd.viewer.viewed_capture import ViewedCapture
+
+_NONE = "none"
+_HELP = (
+    "Click a vertex on a scan, then the same place in the picture of two or more cameras, all at one frame. Three or "
+    "more of each row, spread over the arch: front teeth and both sides. Wheel: zoom; right button: move."
+)
+
+
+class PicksPanel:
+    """Hold the widgets of the picks.
+
+    Attributes:
+        book: the picks.
+        side: what the scans before the picture show, one of `light_table.SIDES`.
+    """
+
+    def __init__(
+        self,
+        client: viser.ClientHandle,
+        capture: ViewedCapture,
+        footage: FootagePanel,
+        turned: Callable[[], None],
+        changed: Callable[[], None],
+    ) -> None:
+        """Make the widgets in the present container.
+
+        Args:
+            client: the page.
+            capture: where picks come from and go to.
+            footage: says which camera and frame are seen.
+            turned: called when things lie elsewhere.
+            changed: called after every change of the picks.
+        """
+        self._client, self._capture, self._footage = client, capture, footage
+        self._turned, self._changed = turned, changed
+        self.book, self.side = PickBook(capture.picks), "front"
+        self._saved = capture.picks
+        self._fit = ""
+        gui = client.gui
+        gui.add_html(f'<div style="font-size:12px;padding:2px 12px">{_HELP}</div>')
+        self.picking = gui.add_checkbox("clicks set picks", capture.tracks is None)
+        self.picking.on_update(guarded(client, self._turn))
+        self.sides = gui.add_button_group("scans", tuple(SIDES))
+        self.sides.on_click(guarded(client, self._choose_side))
+        self.chosen = gui.add_dropdown("pick", (_NONE,))
+        self.chosen.on_update(guarded(client, self._choose))
+        self.edit = gui.add_button_group("take away", ("pixel", "pick", "all"))
+        self.edit.on_click(guarded(client, self._take_away))
+        self.go = gui.add_button("show their frame")
+        self.go.on_click(guarded(client, self._go))
+        self._list = gui.add_html("")
+        self.write = gui.add_button("write to the capture file", icon=viser.Icon.DEVICE_FLOPPY)
+        self.write.on_click(guarded(client, self._write))
+        self.refresh()
+
+    def say_fit(self, words: str) -> None:
+        """Say how well the picks agree."""
+        self._fit = words
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Bring the widgets in line with the picks."""
+        book = self.book
+        names = tuple(book.name(k) for k in range(len(book.picks)))
+        if self.chosen.options != (_NONE, *names):
+            self.chosen.options = (_NONE, *names)
+        value = _NONE if book.selected is None else names[book.selected]
+        if self.chosen.value != value:
+            self.chosen.value = value
+        rows = [f"frame {book.frame}" if book.frame is not None else "no pixels yet"]
+        for number, pick in enumerate(book.picks):
+            text = f"{names[number]}, vertex {pick.vertex}: {', '.join(pick.views) or 'no pixels yet'}"
+            rows.append(f"<b>{text}</b>" if number == book.selected else text)
+        rows.append(book.lacks() or "complete")
+        if self._fit:
+            rows.append(self._fit)
+        self._list.content = f'<div style="font-size:12px;padding:2px 12px">{"<br>".join(rows)}</div>'
+
+    async def _turn(self, _: object) -> None:
+        self._turned()
+
+    async def _choose_side(self, event: viser.GuiEvent) -> None:
+        self.side = event.target.value
+        self._turned()
+
+    async def _choose(self, _: object) -> None:
+        number = self.chosen.options.index(self.chosen.value) - 1
+        self.book.selected = None if number < 0 else number
+        self._changed()
+
+    async def _take_away(self, event: viser.GuiEvent) -> None:
+        if event.target.value == "pixel":
+            self.book.forget_view(self._footage.view)
+        elif event.target.value == "pick":
+            self.book.remove()
+        else:
+            self.book.clear()
+        self._changed()
+
+    async def _go(self, _: object) -> None:
+        if self.book.frame is None:
+            raise ValueError("the picks have no pixels yet, so they belong to no frame")
+        self._footage.go_to(self.book.frame)
+
+    async def _write(self, _: object) -> None:
+        picks = self.book.bootstrap()
+        await asyncio.to_thread(self._capture.save_picks, picks, self._saved)
+        self._saved = picks
+        count = f"{len(picks.upper)} picks above and {len(picks.lower)} below"
+        say(self._client, "Written", f"{count}, frame {picks.frame}")

@@ -1,0 +1,259 @@
+"""A capture as the viewer is given it, and its page without a browser."""
+
+import asyncio
+import shutil
+import tomllib
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from package_copy import ROOT
+from quiet_page import QuietPage
+from typer.testing import CliRunner
+
+from jawusd.cli.main import app
+from jawusd.errors import CaptureError, FormatError
+from jawusd.formats.capture import load_capture
+from jawusd.formats.tracks import LOST, PARTIAL, TRACKED, Tracks, save_tracks
+from jawusd.geometry import transform_points
+from jawusd.pipeline.view_capture import viewed_capture
+from jawusd.viewer.capture_page import CapturePage
+from jawusd.viewer.server import CaptureViewer
+
+EXAMPLE = ROOT / "examples" / "capture"
+FIRST, STOP = 20, 50
+
+
+def quiet(stage, done, total):
+    """Swallow progress."""
+
+
+def truth():
+    with np.load(EXAMPLE / "truth" / "truth.npz") as archive:
+        return {name: archive[name] for name in archive.files}
+
+
+def write_true_tracks(path, cameras=("cam0", "cam1", "cam2")):
+    """Write tracks of the example's first frames that are the truth, one frame lost."""
+    known = truth()
+    rows = slice(*np.searchsorted(known["frames"], (FIRST, STOP)))
+    count = STOP - FIRST
+    poses = {name: known[name][rows].copy() for name in ("T_world_upper", "T_world_lower", "T_upper_lower")}
+    poses["T_world_lower"][7] = poses["T_upper_lower"][7] = np.nan
+    status = np.full((count, 2), TRACKED, np.int8)
+    status[7, 1], status[3] = LOST, PARTIAL
+    covariance = np.zeros((count, 6, 6))
+    save_tracks(path, Tracks(
+        frames=known["frames"][rows], **poses, **{f"raw_{name}": value for name, value in poses.items()}, status=status,
+        prior_aided=np.arange(count) == 3, coverage_error=np.full((count, 2, 3), 0.004),
+        masks_used=np.ones((count, 2, 3), bool), covariance_upper=covariance, covariance_lower=covariance,
+        covariance_relative=covariance, sigma_mm=np.zeros((count, 5)), residual_px=np.zeros((count, 2)),
+        matched_px=np.zeros((count, 2)), camera_names=cameras,
+    ))  # fmt: skip
+    return path
+
+
+@pytest.fixture(scope="module")
+def copy(tmp_path_factory):
+    """Return a copy of the example that says its offsets, so that nothing has to be found."""
+    folder = shutil.copytree(EXAMPLE, tmp_path_factory.mktemp("viewed") / "capture")
+    known = truth()
+    offsets = ", ".join(f"{n} = {k}" for n, k in zip(known["camera_names"], known["offsets"], strict=True))
+    path = folder / "capture.toml"
+    text = path.read_text().replace('method = "flash"', f'method = "offsets"\noffsets = {{ {offsets} }}')
+    path.write_text(text)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def viewed(copy, tmp_path_factory):
+    return viewed_capture(copy, write_true_tracks(tmp_path_factory.mktemp("tracks") / "tracks.npz"), quiet)
+
+
+class QuietCapturePage(QuietPage):
+    """A page of a capture that no browser shows."""
+
+    def make_page(self, viewer):
+        """Make the page once the visitor's camera is known, as the server does."""
+        state = self.client.camera._state
+        state.update_timestamp, state.image_width, state.image_height, state.fov = 1.0, 900, 700, 0.35
+        state.wxyz, state.position, state.look_at = np.array([1.0, 0, 0, 0]), np.zeros(3), np.array([0, 0, 1.0])
+        state.up_direction, state.near, state.far = np.array([0, -1.0, 0]), 1.0, 1e4
+        return CapturePage(self.client, viewer._capture)
+
+    def settle(self):
+        """Wait until everything is drawn."""
+
+        async def wait():
+            await asyncio.wait_for(self.page._drawing, 100)
+
+        asyncio.run_coroutine_threadsafe(wait(), self.loop).result(120)
+
+    def press(self, group, option):
+        """Press a button of a group, and wait."""
+        self.enter(group, option)
+        self.settle()
+
+    def click(self, place):
+        """Click where a place of the page (3,) is seen, and wait."""
+        eye = np.array(self.client.camera.position)
+        event = SimpleNamespace(client=self.client, ray_origin=tuple(eye), ray_direction=tuple(place - eye))
+
+        async def run():
+            for entry in self.client.scene._scene_pointer_cb:
+                await entry.callback(event)
+
+        asyncio.run_coroutine_threadsafe(run(), self.loop).result(60)
+        self.settle()
+
+
+@pytest.fixture
+def page(viewed):
+    viewer = CaptureViewer(viewed, "127.0.0.1", 0)
+    opened = QuietCapturePage(viewer)
+    opened.settle()
+    yield opened
+    viewer.stop()
+
+
+def test_the_capture_is_read_with_its_poses(viewed):
+    assert viewed.frames == (FIRST, STOP - 1) and list(viewed.sizes_px) == ["cam0", "cam1", "cam2"]
+    plain = viewed.picture("cam0", FIRST, None, "outlines")
+    drawn = viewed.picture("cam0", FIRST, viewed.tracked_poses(FIRST), "outlines")
+    changed = np.argwhere((plain != drawn).any(axis=2))
+    low, high = changed.min(axis=0), changed.max(axis=0)
+    x0, y0, x1, y1 = viewed.teeth_region("cam0", FIRST)
+    assert low[1] < x0 + 8 and high[1] > x1 - 8 and low[0] < y0 and high[0] > y1  # lips hide a part of what is drawn
+    assert viewed.picture("cam0", 10_000, None, "outlines").std() == 0  # not recording: gray
+    assert viewed.tracked_poses(FIRST - 1) is None
+
+
+def test_poses_of_picks_are_near_the_truth(viewed):
+    poses, wrong = viewed.poses_of_picks(viewed.picks)
+    known = truth()
+    assert wrong == []
+    for found, name, row in zip(poses, ("T_world_upper", "T_world_lower"), ("upper", "lower"), strict=True):
+        vertices = viewed.scans[row].vertices
+        error = transform_points(found, vertices) - transform_points(known[name][0], vertices)
+        assert np.linalg.norm(error, axis=1).mean() < 1.0
+
+
+def test_stepping_jumping_and_looking(page):
+    footage = page.page.footage
+    page.press(footage.steps, "+1")
+    assert footage.frame == FIRST + 1 and footage.slider.value == FIRST + 1
+    page.press(footage.steps, "-10")
+    assert footage.frame == FIRST
+    page.press(footage.slider, FIRST + 9)
+    assert f"frame {FIRST + 9}" in footage._words.content
+    page.press(footage.jumps, "next worse")
+    assert footage.frame == FIRST + 7 and "lower: lost" in footage._words.content  # the lost one comes first
+    page.press(footage.jumps, "next worse")
+    assert footage.frame in footage.worst[1:2]
+    page.press(footage.jumps, "previous")
+    assert footage.frame == FIRST + 7
+    page.press(footage.views, "3-D")
+    scene = page.page.scene
+    assert scene._space.visible and not scene._table.visible
+    assert scene._rows["upper"].visible and not scene._rows["lower"].visible
+    page.press(footage.views, "cam1")
+    assert scene._table.visible and "cam1" in footage._words.content
+    page.press(footage._look, "footage alone")
+    own = FIRST + 7 - page.page._capture.offsets["cam1"]
+    assert f"(its own frame {own})" in footage._words.content
+    assert page.notices == []
+
+
+def test_scans_in_space_stand_where_the_cameras_see_them(page):
+    page.press(page.page.footage.views, "3-D")
+    scene, capture = page.page.scene, page.page._capture
+    poses = capture.tracked_poses(FIRST)
+    np.testing.assert_allclose(page.page.poses["upper"], scene.T_page_world @ poses[0], atol=1e-12)
+    np.testing.assert_allclose(scene._rows["upper"].position, (scene.T_page_world @ poses[0])[:3, 3], atol=1e-9)
+
+
+def test_picks_are_clicked_and_written(page, copy, viewed):
+    picks, footage = page.page.picks, page.page.footage
+    before = load_capture(copy).bootstrap
+    page.press(picks.edit, "all")
+    page.press(picks.picking, True)
+    page.click(page.page.table.place((5.0, 5.0)))
+    assert "no pick is selected" in page.notices.pop()[1]
+    for row, pick in [("upper", p) for p in before.upper] + [("lower", p) for p in before.lower]:
+        vertex = viewed.scans[row].vertices[pick.vertex]
+        page.click(transform_points(page.page.poses[row], vertex))
+    assert len(picks.book.picks) == 8
+    known = truth()
+    poses = {row: known[f"T_world_{row}"][0] for row in ("upper", "lower")}
+    for camera in ("cam0", "cam2"):
+        page.press(footage.views, camera)
+        for pick in picks.book.picks:
+            place = transform_points(poses[pick.row], viewed.scans[pick.row].vertices[pick.vertex])
+            page.click(page.page.table.place(viewed.cameras[camera].project(place)))
+    assert "all of them fit together" in picks._list.content and "complete" in picks._list.content
+    page.press(footage.steps, "+1")
+    page.click(page.page.table.place((5.0, 5.0)))
+    assert f"belong to frame {FIRST}, this is frame {FIRST + 1}" in page.notices.pop()[1]
+    page.enter(picks.go, True)
+    assert footage.frame == FIRST
+    page.enter(picks.write, True)
+    assert page.notices.pop()[0] == "Written"
+    written = load_capture(copy).bootstrap
+    assert written == picks.book.bootstrap() and written != before
+    page.press(picks.edit, "pick")
+    page.enter(picks.write, True)  # three of a row are enough
+    assert page.notices.pop()[0] == "Written"
+    page.press(picks.edit, "all")
+    page.enter(picks.write, True)
+    assert "cannot be written yet" in page.notices.pop()[1]
+
+
+def test_a_page_with_old_picks_does_not_overwrite_new_ones(viewed, copy, tmp_path):
+    folder = shutil.copytree(copy, tmp_path / "capture")
+    viewer = CaptureViewer(viewed_capture(folder, None, quiet), "127.0.0.1", 0)
+    one, other = QuietCapturePage(viewer, 0), QuietCapturePage(viewer, 1)
+    for opened in (one, other):
+        opened.settle()
+    assert one.page.picks.picking.value and "all of them fit" in one.page.picks._list.content
+    one.press(one.page.picks.chosen, "U1")
+    one.press(one.page.footage.steps, "+1")
+    assert other.page.picks.book.selected is None and other.page.footage.frame == one.page.footage.frame - 1
+    one.press(one.page.picks.edit, "pick")
+    assert len(one.page.picks.book.picks) == len(other.page.picks.book.picks) - 1
+    one.enter(one.page.picks.write, True)
+    assert one.notices.pop()[0] == "Written"
+    other.press(other.page.picks.chosen, "U2")
+    other.press(other.page.picks.edit, "pick")
+    other.enter(other.page.picks.write, True)
+    assert "changed by somebody else" in other.notices.pop()[1]
+    assert len(tomllib.loads((folder / "capture.toml").read_text())["bootstrap"]["upper"]) == 3
+    viewer.stop()
+
+
+def test_a_capture_without_calibration_still_shows_its_footage(copy, tmp_path):
+    folder = shutil.copytree(copy, tmp_path / "capture")
+    path = folder / "capture.toml"
+    path.write_text(path.read_text().replace('calibration = "calibration.toml"\n', ""))
+    seen = viewed_capture(folder, None, quiet)
+    assert seen.cameras == {} and seen.tracks is None and seen.frames == (20, 319)
+    viewer = CaptureViewer(seen, "127.0.0.1", 0)
+    opened = QuietCapturePage(viewer)
+    opened.settle()
+    assert "3-D" not in opened.page.footage.views.options and opened.notices == []
+    viewer.stop()
+
+
+def test_bad_captures_and_foreign_tracks_are_clear_errors(copy, tmp_path):
+    with pytest.raises(FormatError, match="no such file"):
+        viewed_capture(tmp_path / "capture.toml", None, quiet)
+    tracks = write_true_tracks(tmp_path / "tracks.npz", ("cam0", "cam1", "left"))
+    with pytest.raises(FormatError, match="of the cameras cam0, cam1, left; the capture has cam0, cam1, cam2"):
+        viewed_capture(copy, tracks, quiet)
+    folder = shutil.copytree(copy, tmp_path / "capture")
+    path = folder / "capture.toml"
+    text = path.read_text()
+    path.write_text(text.replace('video = "video/cam0.mp4"', 'video = "calibration.toml"'))
+    with pytest.raises(CaptureError):
+        viewed_capture(path, None, quiet)
+    result = CliRunner().invoke(app, ["view", str(tmp_path), "--tracks", str(tracks)])
+    assert result.exit_code == 2 and "--tracks belongs to a capture" in result.output
