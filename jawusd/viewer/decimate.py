@@ -1,4 +1,4 @@
-"""Fewer triangles for the screen: vertices of one cell of a grid become one."""
+"""What the screen needs of a mesh: fewer triangles, vertices of one cell of a grid become one; and which sides."""
 
 from __future__ import annotations
 
@@ -34,6 +34,17 @@ def for_view(mesh: Mesh, most_faces: int) -> Mesh:
         else:
             coarse, best = cell, clustered
     return best if best is not None and len(best.faces) else mesh
+
+
+def is_solid(mesh: Mesh) -> bool:
+    """Return whether a mesh encloses a volume with its faces outwards: nobody outside sees one from behind."""
+    a, b, c = mesh.faces.T.astype(np.int64)
+    starts, ends = np.concatenate([a, b, c]), np.concatenate([b, c, a])
+    count = len(mesh.vertices)
+    closed = np.isin(starts * count + ends, ends * count + starts).all()
+    corners = mesh.vertices[mesh.faces]
+    volume = np.linalg.det(corners - mesh.vertices.mean(axis=0)).sum()  # six times
+    return bool(closed and volume > 0)
 
 
 def _clustered(mesh: Mesh, cell_mm: float) -> Mesh:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 import viser
 from numpy.typing import NDArray
@@ -11,6 +13,7 @@ from jawusd.geometry import LANDMARKS
 from jawusd.geometry.quaternion import wxyz_from_matrix
 from jawusd.geometry.se3 import se3_inverse, transform_points
 from jawusd.viewer.actor import MOVING, STILL, ViewedActor
+from jawusd.viewer.decimate import is_solid
 from jawusd.viewer.readouts import CONDYLES, INCISOR, habitual_path, landmark_places, rest_places
 
 Array = NDArray[np.float64]
@@ -79,14 +82,14 @@ class JawScene:
         vertices = transform_points(self._T_world_skull, mesh.vertices)
         clear = _SKULL_OPACITY if name == "skull" else None
         self._scene.add_mesh_simple(
-            f"/{name}", vertices, mesh.faces, color=_COLORS.get(name, _BONE), opacity=clear, side="double"
+            f"/{name}", vertices, mesh.faces, color=_COLORS.get(name, _BONE), opacity=clear, side=_side(mesh)
         )
 
     def _add_moving(self, name: str, actor: ViewedActor) -> viser.MeshHandle:
         mesh, color = actor.meshes[name], _COLORS.get(name, self._bone)
         clear = _CLEAR if name in actor.placeholders else None
         return self._scene.add_mesh_simple(
-            f"/jaw/{name}", mesh.vertices, mesh.faces, color=color, opacity=clear, side="double"
+            f"/jaw/{name}", mesh.vertices, mesh.faces, color=color, opacity=clear, side=_side(mesh)
         )
 
     def _add_landmarks(self, landmarks: Array) -> None:
@@ -169,6 +172,11 @@ class JawScene:
             self._mandible.opacity = _CLEAR if preset.startswith("condyle") else None
         with self._client.atomic():
             camera.position, camera.look_at, camera.up_direction = tuple(eye), tuple(target), (0.0, 1.0, 0.0)
+
+
+def _side(mesh: Mesh) -> Literal["front", "double"]:
+    """Return which sides of faces are drawn: both cost twice as much, and only open meshes show the other one."""
+    return "front" if is_solid(mesh) else "double"
 
 
 def preset_view(rest: Array, preset: str) -> tuple[Array, Array]:

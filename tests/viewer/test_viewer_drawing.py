@@ -11,7 +11,7 @@ from jawusd.formats.keys import Key
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import LANDMARKS
 from jawusd.viewer.clip import Clip
-from jawusd.viewer.decimate import for_view
+from jawusd.viewer.decimate import for_view, is_solid
 from jawusd.viewer.plots import bound_plot, curve_plot, posselt_plot, posselt_point, with_playhead
 from jawusd.viewer.pose_panel import reading_html, slider_ends
 from jawusd.viewer.readouts import border_path, habitual_path, landmark_places, read_out, rest_places
@@ -141,6 +141,13 @@ def test_meshes_for_the_screen_are_small_and_keep_their_shape():
     normal = np.cross(b - a, c - a)
     assert (np.einsum("ij,ij->i", normal, a + b + c) > 0).mean() > 0.99  # still turned outwards
     assert len(np.unique(np.sort(small.faces, axis=1), axis=0)) == len(small.faces)
+
+
+def test_only_closed_meshes_that_face_outwards_are_solid():
+    whole = example_meshes()["skull"]
+    assert is_solid(whole) and is_solid(for_view(whole, 60))
+    assert not is_solid(Mesh(whole.vertices, whole.faces[1:]))
+    assert not is_solid(Mesh(whole.vertices, whole.faces[:, ::-1]))
 
 
 def test_small_meshes_are_left_alone_and_colours_are_averaged():
