@@ -176,7 +176,9 @@ def _fit(data: ReportData) -> Verdict:
         _share("frames that shaped the model", 1 - out / count, 0.9, 0.7),
     ]
     for warning in meta.get("warnings", []):
-        if warning["code"] not in _LACKING:
+        if warning["code"] == "few_poses":
+            checks.append(Check("poses of the take", warning["message"], "about 30 s of all movements", LOOK))
+        elif warning["code"] not in _LACKING:
             grade = BAD if warning["code"] in _MISTAKES else LOOK
             checks.append(Check("human range", warning["message"], "see the table of human ranges", grade))
     return _verdict(

@@ -94,6 +94,16 @@ def test_missing_movements_and_unproven_times_ask_for_a_look(code):
     assert [c.found for c in bounds.checks if c.name == "captured movements"] == ["Record protrusion."]
 
 
+@pytest.mark.parametrize(
+    ("code", "name"), [("few_poses", "poses of the take"), ("rotation_range", "human range")]
+)  # fmt: skip
+def test_warnings_of_the_fit_are_named_for_what_they_are(code, name):
+    data = report_data()
+    data.model.meta["warnings"] = [{"code": code, "message": "Odd."}]
+    fit = next(verdict for verdict in judge(data) if verdict.stage == "fit")
+    assert fit.grade == LOOK and [check.name for check in fit.checks if check.found == "Odd."] == [name]
+
+
 def test_ranges_are_those_of_the_motion():
     data = report_data()
     A, rest = data.model.arrays["T_anatomical_skull"], data.model.arrays["T_rest"]
