@@ -60,6 +60,10 @@ def write_bootstrap(path: str | os.PathLike[str], picks: Bootstrap, expected: Bo
 def with_bootstrap(text: str, picks: Bootstrap) -> str:
     """Return a capture.toml with other picks; comments among the old ones are kept.
 
+    Args:
+        text: the file as it is.
+        picks: the new ones.
+
     Raises:
         ValueError: the picks there are written as something else than tables.
     """

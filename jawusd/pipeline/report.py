@@ -197,7 +197,12 @@ def build_facts(folder: Path, state: BuildState, capture: Capture | None, *, all
 
 
 def calibrated(capture: Capture, folder: Path) -> Capture:
-    """Return the capture with the calibration that the build made from its boards, if it names none."""
+    """Return the capture with the calibration that the build made from its boards, if it names none.
+
+    Args:
+        capture: as it was read.
+        folder: of the build.
+    """
     made = folder / CALIBRATION
     if capture.calibration is not None or not made.is_file():
         return capture

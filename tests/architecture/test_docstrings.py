@@ -90,7 +90,7 @@ def faults_of_function(node, front_door):
     is_property = any("property" in ast.unparse(decorator) for decorator in node.decorator_list)
     returns = any(isinstance(n, ast.Return) and n.value and ast.unparse(n.value) != "None" for n in own(node))
     # A function that builds, reads or fits a class of ours says with its annotation what comes back.
-    told = "Returns" in parts or re.search(r"\b[Rr]eturn|\b[Tt]ell", text) or not PLAIN.match(annotation(node))
+    told = "Returns" in parts or re.search(r"\b[Rr]eturn|\b[Tt]ell\b|^Say\b", text) or not PLAIN.match(annotation(node))
     if returns and not is_property and not told:
         found.append("says nothing of what it returns")
     found += [f"raises {name}" for name in sorted(raised(node)) if name not in parts.get("Raises", "")]
