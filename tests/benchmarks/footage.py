@@ -14,7 +14,7 @@ from viser._scene_api import _encode_image_binary
 
 from jawusd.pipeline.view_capture import viewed_capture
 
-STEPS = 40
+STEPS = 16
 
 
 def measured(action, arguments):
