@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linprog
+from scipy.sparse import eye_array, hstack
 from scipy.spatial import cKDTree
 
 from jawusd.evaluator.models import JawModelForm
@@ -94,7 +95,9 @@ def _growth(distance: Array, errors: Array) -> dict[str, float]:
     count = len(errors)
     above, below = np.full(count, _INSIDE_TWO_SD), np.full(count, 1 - _INSIDE_TWO_SD)
     cost = np.concatenate([[0.0, 0.0], above, below])
-    equal = np.hstack([np.ones((count, 1)), distance[:, None], np.eye(count), -np.eye(count)])
+    # Sparse: written out, the two unit matrices of a take of 20,000 frames would take 6 GB.
+    one = eye_array(count, format="csc")
+    equal = hstack([np.column_stack([np.ones(count), distance]), one, -one], format="csc")
     limits = [(0, None), (_SLOWEST_GROWTH, None)] + [(0, None)] * (2 * count)
     found = linprog(cost, A_eq=equal, b_eq=errors / 2, bounds=limits, method="highs")
     return {"base_mm": float(found.x[0]), "per_mm": float(found.x[1])}

@@ -28,6 +28,10 @@ from jawusd.tracking.views import MaskViews
 
 Progress = Callable[[int, int], None]
 
+# Where tracking starts over it learns from so many frames around at most, or a long take with many gaps would cost the
+# square of its length: minutes of film, in which a jaw goes everywhere.
+_NEARBY_FRAMES = 4000
+
 
 def track_capture(
     capture: Capture,
@@ -198,7 +202,7 @@ class _Take:
     def _from(self, frame: int) -> tuple[FrameTracker, Motion]:
         """Return a tracker that knows the frames around a tracked one."""
         history = History(self._config.history_frames, self._config.score_frames)
-        known = sorted(self.records, key=lambda f: -abs(f - frame))
+        known = sorted(self.records, key=lambda f: -abs(f - frame))[-_NEARBY_FRAMES:]
         for near in known[-self._config.history_frames :]:
             history.add(self.records[near])
         motion = Motion(self.records[frame].solution.poses, self._probes)
