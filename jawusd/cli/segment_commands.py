@@ -21,7 +21,9 @@ def segment(
     keys: Annotated[
         Path | None,
         typer.Option(
-            help="Folder with masks you drew for some frames: CAMERA/upper/000123.png, CAMERA/lower/000123.png.",
+            help="Folder with what you drew for some frames: CAMERA/upper/000123.png, CAMERA/lower/000123.png. "
+            "Finished masks, 255 on teeth and 0 elsewhere, also teach how you draw; "
+            "or strokes: 255 on teeth, 0 on anything else, 128 where you say nothing.",
             show_default=False,
         ),
     ] = None,

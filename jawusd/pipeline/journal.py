@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -35,8 +36,8 @@ class Journal:
         lines = self._path.read_text(encoding="utf-8").splitlines() if resume and self._path.exists() else []
         if lines and lines[0] == head:
             self.entries = dict(entry for line in lines[1:] if (entry := _entry(line)) is not None)
-        kept = [head, *(_line(frame, entry) for frame, entry in self.entries.items())]
-        write_text_atomic(self._path, "\n".join(kept) + "\n")
+        self._head = head
+        self.drop(())
 
     def add(self, frame: int, entry: dict[str, Any]) -> None:
         """Note a finished frame.
@@ -54,6 +55,17 @@ class Journal:
                 handle.write(_line(frame, entry) + "\n")
         except OSError as error:
             raise OutputError(f"cannot be written: {error.strerror}.", path=self._path) from error
+
+    def drop(self, frames: Iterable[int]) -> None:
+        """Forget frames.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        for frame in frames:
+            del self.entries[frame]
+        kept = [self._head, *(_line(frame, entry) for frame, entry in self.entries.items())]
+        write_text_atomic(self._path, "\n".join(kept) + "\n")
 
     def known(self, frame: int) -> tuple[NDArray[np.float64], NDArray[np.int8]]:
         """Return T_world_upper and T_world_lower, shape (2, 4, 4), and status, shape (2,), of a frame."""

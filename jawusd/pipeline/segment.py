@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.errors import CaptureError, TrackingError
+from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.capture import Capture, Masks
 from jawusd.formats.tracks import LOST
 from jawusd.pipeline.extras import stage
@@ -19,7 +21,7 @@ from jawusd.pipeline.overlay import open_footage
 from jawusd.pipeline.prepare import input_files, load_meshes
 from jawusd.pipeline.state import Progress, hash_files, hash_value
 
-_WARM_UP = 6  # finished frames gone through again when work is taken up: colours and motion are known from few
+LEARNED = "learned.json"
 ROWS = ("upper", "lower")
 
 
@@ -28,7 +30,7 @@ class SegmentOptions:
     """Choose how to segment.
 
     Attributes:
-        keys: folder with masks a person drew for some frames, or None.
+        keys: folder with masks or strokes a person drew for some frames, or None.
         resume: keep the frames that were finished before.
         jobs: threads.
     """
@@ -112,15 +114,22 @@ class _Segmenting:
         start = bootstrap.frame
         if not self._first <= start < self._stop:
             raise TrackingError(f"bootstrap.frame is {start}, frames run from {self._first} to {self._stop - 1}")
-        self._new_segmenters(poses)
-        self._pictures = self._footage.at(start)
-        begun = self._tracker.begin(start, poses)
-        self._write(start, begun)
-        self._progress("segment", len(self._journal.entries), self._stop - self._first)
+        if start not in self._journal.entries:
+            self._journal.drop(list(self._journal.entries))
+            for path in (*stage("jawusd.segmentation.state").state_files(self._folder), self._folder / LEARNED):
+                path.unlink(missing_ok=True)
+            self._new_segmenters(poses)
+            self._pictures = self._footage.at(start)
+            self._write(start, self._tracker.begin(start, poses))
+        self._tell("segment", len(self._journal.entries))
         for step, end in ((1, self._stop), (-1, self._first - 1)):
-            self._new_segmenters(begun.solution.poses)
             self._go(start, end, step)
+        if keyed := self._keyed():
+            self._learn_and_repeat(keyed)
         return self._journal.entries
+
+    def _tell(self, stage_name: str, done: int) -> None:
+        self._progress(stage_name, done, self._stop - self._first)
 
     def _new_segmenters(self, poses: NDArray[np.float64]) -> None:
         module = stage("jawusd.segmentation.camera")
@@ -134,22 +143,69 @@ class _Segmenting:
         done = start
         while done + step != end and done + step in self._journal.entries:
             done += step
-        while done != start and LOST in self._journal.entries[done]["status"]:
-            done -= step  # nothing can be told from poses that were lost
-        # Even a fresh run judges the first frame once more: its colours come from the poses found there.
-        known = {}
-        warm = range(start, done + step, step)[-_WARM_UP:]
-        for frame, pictures in self._footage.walk(warm):
-            self._pictures = pictures
-            known[frame] = self._tracker.judge(frame, *self._journal.known(frame))
-        frames = range(done + step, end, step)
+        if done + step == end:
+            return
+        poses = self._journal.known(start)[0]
+        self._new_segmenters(poses)
+        colours = {name: segmenter.colours for name, segmenter in self._segmenters.items()}
+        state = stage("jawusd.segmentation.state").ColourStates(self._folder, colours)
+        before = state.take_up(done, step)
+        self._journal.drop(range(before + step if before is not None else start + step, done + step, step))
+        if before is None:  # colours come from the poses found in the first frame
+            before, self._pictures = start, self._footage.at(start)
+            self._see(start, poses, 0)
+        past = [self._past(frame) for frame in range(start, before + step, step)]
+        frames = range(before + step, end, step)
         walk = self._footage.walk(frames)
-        follow = self._tracker.follow(frames, known)
+        follow = self._tracker.follow(frames, past)
         for _ in frames:
             _, self._pictures = next(walk)
             frame, record = next(follow)
+            state.keep(frame, step)
             self._write(frame, record)
-            self._progress("segment", len(self._journal.entries), self._stop - self._first)
+            self._tell("segment", len(self._journal.entries))
+
+    def _past(self, frame: int):
+        """Return what the tracker needs to know about a finished frame."""
+        poses, status = self._journal.known(frame)
+        kept = self._journal.entries[frame]["track"]
+        coverage, score, residual = (np.array(kept[key], np.float64) for key in ("coverage", "score_px", "residual_px"))
+        used = np.array(kept["used"], bool)
+        return stage("jawusd.tracking.history").Past(poses, status, used, coverage, score, residual)
+
+    def _keyed(self) -> list[int]:
+        """Return the frames for which a person drew and whose poses are known."""
+        drawn = {name: set(self._keys.frames(name)) for name in self._names}
+        return [
+            frame
+            for frame in range(self._first, self._stop)
+            if any(self._footage.own(name, frame) in drawn[name] for name in self._names)
+            and LOST not in self._journal.entries[frame]["status"]
+        ]
+
+    def _learn_and_repeat(self, keyed: list[int]) -> None:
+        """Learn colours and numbers from what a person drew, and segment all frames again where the teeth are."""
+        self._new_segmenters(self._journal.known(self._capture.bootstrap.frame)[0])
+        examples = []
+        for frame in keyed:
+            pictures, poses = self._footage.at(frame), self._journal.known(frame)[0]
+            for name in self._names:
+                own = self._footage.own(name, frame)
+                keys = self._keys.of(name, own) if own is not None else [None, None]
+                if pictures[name] is not None and any(keys):
+                    examples.append(self._segmenters[name].study(pictures[name], poses, keys))
+        finished = [example for example in examples if example is not None]
+        if not finished:
+            return
+        config, learned = stage("jawusd.segmentation.learn").learn_numbers(finished, self._config)
+        write_text_atomic(self._folder / LEARNED, json.dumps(learned) + "\n")
+        for segmenter in self._segmenters.values():
+            segmenter.adopt(config)
+        again = [frame for frame in range(self._first, self._stop) if "again" not in self._journal.entries[frame]]
+        for frame, pictures in self._footage.walk(range(again[0], self._stop)) if again else ():
+            self._pictures = pictures
+            self._write(frame, self._tracker.judge(frame, *self._journal.known(frame)), again=True)
+            self._tell("segment again", frame + 1 - self._first)
 
     def _see(self, frame: int, poses: NDArray[np.float64], turn: int) -> list:
         """Segment all cameras' pictures of a frame and return them as the tracker's views."""
@@ -170,7 +226,7 @@ class _Segmenting:
             views.append(view(camera.projection_matrix(), camera.centre_world(), masks, present))
         return views
 
-    def _write(self, frame: int, record) -> None:
+    def _write(self, frame: int, record, again: bool = False) -> None:
         """Write the masks of a frame and what is known about it."""
         residual = stage("jawusd.tracking.quality").view_residual_px(record.solution)
         cameras = {}
@@ -185,11 +241,12 @@ class _Segmenting:
                     "unexpected": found.unexpected.tolist(),
                     "residual_px": residual[:, k].tolist(),
                     "uncovered": record.coverage[:, k].tolist(),
-                    "used": record.used[:, k].tolist(),
                 }
         list(self._pool.map(lambda name: self._write_masks(name, cameras[name]["frame"]), cameras))
-        poses = record.solution.poses
-        self._journal.add(frame, {"poses": poses.tolist(), "status": record.status.tolist(), "cameras": cameras})
+        past = vars(stage("jawusd.tracking.history").Past.of(record))
+        track = {key: past[key].tolist() for key in ("used", "coverage", "score_px", "residual_px")}
+        entry = {"poses": past["poses"].tolist(), "status": past["status"].tolist(), "cameras": cameras, "track": track}
+        self._journal.add(frame, entry | ({"again": True} if again else {}))
 
     def _write_masks(self, name: str, own: int) -> None:
         masks = self._segmenters[name].recorded(self._segments[name])

@@ -15,7 +15,7 @@ from jawusd.formats.capture import Capture
 from jawusd.formats.tracks import LOST
 from jawusd.pipeline import journal
 from jawusd.pipeline.extras import stage
-from jawusd.pipeline.segment import SegmentOptions, segment_teeth
+from jawusd.pipeline.segment import LEARNED, SegmentOptions, segment_teeth
 from jawusd.pipeline.state import Progress
 
 FILE, SHEET = "segment.json", "look_at_these.png"
@@ -26,6 +26,11 @@ _DOUBTFUL = 0.5
 _SYMPTOMS = {"contrast": -1.0, "unexpected": 1.0, "residual_px": 1.0, "uncovered": 1.0}
 _LEAST_SPREAD = {"contrast": 0.03, "unexpected": 0.01, "residual_px": 0.05, "uncovered": 0.01}
 _USUAL_OFF = 3.0  # spreads at which a symptom alone brings the confidence to one half
+# How far off an outline may well be [px of the working picture] where it shows in the picture, where it does not, and
+# between the rows; over the mask's area that tells how much of the mask may be wrong. Small masks and masks without
+# edges in the picture stand out in all cameras alike, so all are judged together, and sooner than by other symptoms.
+_OUTLINE_PX = (0.4, 2.0, 0.6)
+_OUTLINE, _OUTLINE_SPREAD, _OUTLINE_OFF = "outline", 0.01, 2.0
 _SHEET_FRAMES = 12
 
 
@@ -38,13 +43,16 @@ def summarise(entries: dict[int, dict[str, Any]]) -> list[dict[str, Any]]:
     keys = [(frame, name) for frame in sorted(entries) for name in entries[frame]["cameras"]]
     found = [entries[frame]["cameras"][name] for frame, name in keys]
     cameras = np.array([name for _, name in keys])
-    off = np.stack([_off(found, cameras, symptom) for symptom in _SYMPTOMS], axis=-1)  # (N, 2, S)
+    everywhere = np.zeros(len(keys), int)
+    off = [_off(_values(found, symptom), cameras, _LEAST_SPREAD[symptom]) for symptom in _SYMPTOMS]
+    off.append(_off(_outline_doubt(found), everywhere, _OUTLINE_SPREAD) * (_USUAL_OFF / _OUTLINE_OFF))
+    off = np.stack(off, axis=-1)  # (N, 2, S)
     lost = np.array([[state == LOST for state in entries[frame]["status"]] for frame, _ in keys])
     doubt = np.where(lost, np.inf, np.maximum(off, 0).max(-1) / _USUAL_OFF)
     rows = []
     for k, (frame, name) in enumerate(keys):
         worse = int(doubt[k].argmax())
-        reason = "lost" if lost[k, worse] else list(_SYMPTOMS)[int(off[k, worse].argmax())]
+        reason = "lost" if lost[k, worse] else (*_SYMPTOMS, _OUTLINE)[int(off[k, worse].argmax())]
         confidence = float(1 / (1 + doubt[k, worse] ** 2))
         rows.append(
             {
@@ -59,19 +67,28 @@ def summarise(entries: dict[int, dict[str, Any]]) -> list[dict[str, Any]]:
     return rows
 
 
-def _off(found: list[dict], cameras: NDArray, symptom: str) -> NDArray[np.float64]:
-    """Return how many spreads a symptom is worse than the take's median, per camera, shape (N, 2)."""
-    values = _SYMPTOMS[symptom] * np.array(
-        [[np.nan if v is None else v for v in entry[symptom]] for entry in found], np.float64
-    )
+def _values(found: list[dict], symptom: str) -> NDArray[np.float64]:
+    """Return a symptom of every mask, more is worse, NaN without a mask, shape (N, 2)."""
+    values = [[np.nan if v is None else v for v in entry[symptom]] for entry in found]
+    return _SYMPTOMS[symptom] * np.array(values, np.float64)
+
+
+def _outline_doubt(found: list[dict]) -> NDArray[np.float64]:
+    """Return the share of every mask that may be wrong, NaN without a mask, shape (N, 2)."""
+    outline, area = (np.array([entry[key] for entry in found], np.float64) for key in ("outline", "pixels"))
+    return np.where(area > 0, outline @ np.array(_OUTLINE_PX) / np.maximum(area, 1), np.nan)
+
+
+def _off(values: NDArray[np.float64], groups: NDArray, least_spread: float) -> NDArray[np.float64]:
+    """Return how many spreads values, shape (N, 2), lie above the median of their group and row, shape (N, 2)."""
     out = np.zeros_like(values)
-    for camera in np.unique(cameras):
-        of = cameras == camera
+    for group in np.unique(groups):
+        of = groups == group
         for r in (0, 1):
             seen = values[of, r][np.isfinite(values[of, r])]
             if len(seen):
                 middle = np.median(seen)
-                spread = max(1.4826 * np.median(np.abs(seen - middle)), _LEAST_SPREAD[symptom])
+                spread = max(1.4826 * np.median(np.abs(seen - middle)), least_spread)
                 out[of, r] = np.nan_to_num((values[of, r] - middle) / spread)
     return out
 
@@ -93,6 +110,7 @@ def write_summary(capture: Capture, entries: dict[int, dict[str, Any]], folder: 
     """
     rows = summarise(entries)
     doubtful = sorted((row for row in rows if row["confidence"] < _DOUBTFUL), key=lambda row: row["confidence"])
+    learned = folder / LEARNED
     summary = {
         "format": FORMAT,
         "capture": capture.name,
@@ -102,6 +120,7 @@ def write_summary(capture: Capture, entries: dict[int, dict[str, Any]], folder: 
             if camera.video is not None
         },
         "frames": len(entries),
+        "learned": json.loads(learned.read_text(encoding="utf-8")) if learned.exists() else None,
         "look_at": doubtful,
         "sheet": SHEET if doubtful else None,
         "confidence": rows,
@@ -141,8 +160,9 @@ def delete_masks(folder: Path) -> None:
     """
     if not (folder / journal.FILE).is_file():
         return
-    for name in (journal.FILE, FILE, SHEET):
-        (folder / name).unlink(missing_ok=True)
+    states = stage("jawusd.segmentation.state").state_files(folder)
+    for path in (*states, *(folder / name for name in (journal.FILE, FILE, SHEET, LEARNED))):
+        path.unlink(missing_ok=True)
     for path in [*folder.glob("*/upper/*.png"), *folder.glob("*/lower/*.png")]:
         # A link may lead out of the folder.
         if path.stem.isdigit() and path.resolve().is_relative_to(folder.resolve()):
@@ -156,6 +176,9 @@ def segment_lines(summary: dict[str, Any]) -> list[str]:
     """Return the summary for people."""
     doubtful = summary["look_at"]
     lines = [f"{summary['frames']} frames segmented in {len(summary['masks'])} cameras"]
+    if learned := summary.get("learned"):
+        before, after = (f"{100 * value:.1f} %" for value in learned["disagreement"])
+        lines.append(f"learned from {learned['pictures']} drawn pictures: disagreement {before} before, {after} after")
     if doubtful:
         lines.append(f"{len(doubtful)} masks to look at, worst first (thumbnails in {summary['sheet']}):")
     for row in doubtful[:_SHEET_FRAMES]:

@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera, transform_points
-from jawusd.segmentation.border import settle_borders
 from jawusd.segmentation.colours import ColourModel
 from jawusd.segmentation.config import SegmentationConfig
 from jawusd.segmentation.crowns import Expectation, ScanSurface, expect_crowns
+from jawusd.segmentation.files import Key
+from jawusd.segmentation.learn import Example, cut_picture
 from jawusd.segmentation.picture import PictureFrame, Window
-from jawusd.segmentation.rows import cut_rows, learn_colours
+from jawusd.segmentation.rows import Seeds, learn_colours
 
 _ROWS = (0, 1)
 _EVERY = 20  # vertices of a crown to one that tells where it is
@@ -48,7 +49,11 @@ class Segment:
 
 
 class CameraSegmenter:
-    """Find both rows of teeth in one camera's pictures."""
+    """Find both rows of teeth in one camera's pictures.
+
+    Attributes:
+        colours: what was learned about them so far.
+    """
 
     def __init__(
         self, source: Camera, meshes: Sequence[Mesh], poses: NDArray[np.float64], config: SegmentationConfig
@@ -65,14 +70,18 @@ class CameraSegmenter:
         self._scans = tuple(ScanSurface.of(mesh) for mesh in meshes)
         self._points = [scan.crown_points()[::_EVERY] for scan in self._scans]
         self._frame = PictureFrame(source, self._around(poses).mean(0), config.working_px_per_mm)
-        self._colours = ColourModel(config.memory_frames)
+        self.colours = ColourModel(config.memory_frames)
+
+    def adopt(self, config: SegmentationConfig) -> None:
+        """Go on with other numbers."""
+        self._config = config
 
     def segment(
         self,
         image: NDArray[np.uint8],
         poses: NDArray[np.float64],
         turn: int,
-        keys: Sequence[NDArray[np.uint8] | None] = (None, None),
+        keys: Sequence[Key | None] = (None, None),
     ) -> Segment | None:
         """Segment a picture.
 
@@ -80,7 +89,7 @@ class CameraSegmenter:
             image: (H, W, 3) RGB as recorded.
             poses: T_world_upper, T_world_lower as expected, shape (2, 4, 4).
             turn: 0 for predicted poses, then 1 and so on as they get better.
-            keys: masks of both rows made by a person, (H, W) uint8 as recorded, or None.
+            keys: what a person drew for both rows, or None.
 
         Returns:
             What was found; None if the teeth are out of sight.
@@ -90,21 +99,13 @@ class CameraSegmenter:
         if window is None:
             return None
         expected = expect_crowns(self._scans, poses, window.camera)
-        scale = self._frame.px_per_mm
-        drawn = [None if key is None else self._frame.given(key, window) for key in keys]
-        if all(mask is not None for mask in drawn):
-            self._learn_from(window, np.maximum(*drawn), turn)
-        elif turn == 0 or not self._colours.knows():
-            learn_colours(self._colours, window.rgb, expected, c, scale)
+        seeds = self._seeds(window, keys)
+        if turn == 0 or not self.colours.knows():
+            self._learn(window, expected, keys, seeds)
         reach = c.reach_mm[min(turn, len(c.reach_mm) - 1)]
-        shares = cut_rows(window.rgb, expected, self._colours, c, scale, reach)
-        clear = np.zeros(shares.shape[1:], bool)
-        if turn > 0:  # predicted poses call for a look only
-            shares, clear = settle_borders(shares, window.rgb, c, scale)
+        # Predicted poses call for a look only.
+        shares, clear = cut_picture(window, expected, self.colours, c, self._frame.px_per_mm, reach, seeds, turn > 0)
         masks = np.round(255 * shares).astype(np.uint8)
-        for r, mask in enumerate(drawn):
-            if mask is not None:
-                masks[r] = mask
         present = np.array([(mask > 127).sum() >= c.least_px for mask in masks])
         contrast, unexpected = self._contrast(window, masks), _unexpected(masks, expected)
         return Segment(window.camera, masks, present, contrast, unexpected, _outline(masks, clear), window, expected)
@@ -116,18 +117,52 @@ class CameraSegmenter:
     def _around(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.concatenate([transform_points(poses[r], self._points[r]) for r in _ROWS])
 
-    def _learn_from(self, window: Window, teeth: NDArray[np.uint8], turn: int) -> None:
-        """Let the colours follow a person's mask; what it leaves out is surroundings, under crowns too."""
-        if turn > 0:
-            return
-        kernel = np.ones((3, 3), np.uint8)
-        inner = cv2.erode(teeth, kernel) > 127
-        outer = cv2.dilate(teeth, kernel, iterations=2) < 128
-        self._colours.learn(window.rgb, inner, outer, self._config.key_weight)
+    def study(
+        self, image: NDArray[np.uint8], poses: NDArray[np.float64], keys: Sequence[Key | None]
+    ) -> Example | None:
+        """Learn the colours of a picture for which a person drew, and return it as an example.
+
+        Args:
+            image, poses, keys: as for `segment`, the poses aligned.
+
+        Returns:
+            The picture with its masks; None if they are not finished, or the teeth out of sight.
+        """
+        window = self._frame.window(image, self._around(poses), self._config.margin_mm)
+        if window is None:
+            return None
+        expected = expect_crowns(self._scans, poses, window.camera)
+        seeds = self._seeds(window, keys)
+        self._learn(window, expected, keys, seeds)
+        if seeds is None or not seeds.known.all():
+            return None
+        return Example(window, expected, seeds.share, self.colours, self._frame.px_per_mm)
+
+    def _seeds(self, window: Window, keys: Sequence[Key | None]) -> Seeds | None:
+        """Return what a person drew as it shows in a window."""
+        if all(key is None for key in keys):
+            return None
+        known, share = np.zeros((2, *window.rgb.shape[:2]), bool), np.zeros((2, *window.rgb.shape[:2]), np.float32)
+        for r, key in enumerate(keys):
+            if key is not None:
+                known[r] = self._frame.given(key.known, window) > 127
+                share[r] = self._frame.given(key.mask, window) / np.float32(255)
+        return Seeds(known | all(key is not None and key.finished for key in keys), share)
+
+    def _learn(self, window: Window, expected: Expectation, keys: Sequence[Key | None], seeds: Seeds | None) -> None:
+        """Let the colours follow a picture, and above all what a person said about it."""
+        c = self._config
+        if not all(key is not None and key.finished for key in keys):
+            learn_colours(self.colours, window.rgb, expected, c, self._frame.px_per_mm)
+        if seeds is not None:
+            kernel = np.ones((3, 3), np.uint8)
+            teeth = (seeds.known & (seeds.share > 0.5)).any(0).astype(np.uint8)
+            outer = (seeds.known & (seeds.share <= 0.5)).all(0) & (cv2.dilate(teeth, kernel, iterations=2) == 0)
+            self.colours.learn(window.rgb, cv2.erode(teeth, kernel) > 0, outer, c.key_weight)
 
     def _contrast(self, window: Window, masks: NDArray[np.uint8]) -> NDArray[np.float64]:
         """Return how much likelier teeth are just inside the outline of a row than just outside of both rows."""
-        odds = self._colours.weigh(window.rgb)
+        odds = self.colours.weigh(window.rgb)
         share = 1 / (1 + np.exp(-odds))
         teeth = (masks.max(0) > 127).astype(np.uint8)
         kernel = np.ones((5, 5), np.uint8)

@@ -59,6 +59,19 @@ class ColourModel:
         """Tell whether any picture was seen."""
         return bool(self._under.any() and self._beyond.any())
 
+    def counts(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return all that was learned: colours seen, shape (N,), and their counts under and beyond, shape (2, N)."""
+        both = np.stack([self._under.ravel(), self._beyond.ravel()])
+        seen = np.flatnonzero(both.any(0))
+        return seen, both[:, seen]
+
+    def take_up(self, seen: NDArray[np.int64], counts: NDArray[np.float64]) -> None:
+        """Go on from what `counts` returned."""
+        for into, known in zip((self._under, self._beyond), counts, strict=True):
+            into.ravel()[:] = 0
+            into.ravel()[seen] = known
+        self._table = None
+
     def weigh(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Return the log of how many times likelier each pixel is tooth than surroundings, shape (h, w)."""
         return self._odds()[_bins(rgb)]

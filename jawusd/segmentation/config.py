@@ -41,11 +41,17 @@ class SegmentationConfig:
     # Blur of the colours compared [px], and standard deviations the sides must differ by [-].
     border_blur_px: float = 0.7
     border_contrast: float = 2.0
+    # Shares by which outlines of the upper and lower row are moved outwards [-], as drawn masks teach: the soft border
+    # from 0 to 1 is about 3 px wide.
+    wider: tuple[float, float] = (0.0, 0.0)
     # Share of its outline that must show in the picture for a part to be tooth [-], and pixels below which it is none.
     founded_share: float = 0.5
     speck_px: int = 25
     # Iterations of the cut [-].
-    steps: int = 25
+    steps: int = 40
+    # How far from where it is expected the border between the rows is sought [mm], and iterations for that [-].
+    row_band_mm: float = 1.0
+    row_steps: int = 60
     # What a person's mask counts for the colours [frames].
     key_weight: float = 12.0
     # Fewest pixels that make a mask [px]: 4 square millimetres.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -10,10 +11,12 @@ from numpy.typing import NDArray
 
 from jawusd.errors import CaptureError
 from jawusd.formats.atomic import write_bytes_atomic
-from jawusd.imaging.masks import MaskReader
+from jawusd.imaging.mask_files import PngMasks
 
 ROWS = ("upper", "lower")
 PATTERN = "%06d.png"
+_UNKNOWN = 128  # gray value of strokes where nothing is said
+_STROKES_UNKNOWN = 0.5  # share of such pixels that makes a picture one of strokes
 
 
 def mask_pattern(folder: Path, camera: str, row: str) -> Path:
@@ -37,39 +40,82 @@ def write_mask(path: Path, mask: NDArray[np.uint8]) -> None:
     write_bytes_atomic(path, cv2.imencode(".png", mask, settings)[1].tobytes())
 
 
+@dataclass(frozen=True, eq=False)
+class Key:
+    """Hold what a person drew for one row of teeth in one picture.
+
+    Attributes:
+        mask: 255 = tooth, (H, W) uint8.
+        known: 255 where the mask says something, (H, W) uint8: everywhere in a finished mask, under strokes else.
+        finished: whether it says something everywhere.
+    """
+
+    mask: NDArray[np.uint8]
+    known: NDArray[np.uint8]
+    finished: bool
+
+
 class KeyMasks:
-    """Give the masks a person drew for some frames, in folders named as those that are written."""
+    """Give what a person drew for some frames, in folders named as those that are written.
+
+    A picture is a finished mask, or, where at least half of it has the gray value 128, strokes: 255 on teeth of the
+    row, 0 on anything else, 128 where nothing is said.
+    """
 
     def __init__(self, folder: Path | None, sizes_px: dict[str, tuple[int, int]]) -> None:
-        """Find the masks.
+        """Find the pictures.
 
         Args:
-            folder: holds CAMERA/upper/%06d.png and CAMERA/lower/%06d.png, any of them; None for no masks at all.
+            folder: holds CAMERA/upper/%06d.png and CAMERA/lower/%06d.png, any of them; None for none at all.
             sizes_px: (width, height) of the pictures of every camera.
 
         Raises:
-            CaptureError: the folder is missing or holds no mask of these cameras, or a mask has the wrong size.
+            CaptureError: the folder is missing or holds nothing for these cameras.
         """
-        self._readers: dict[tuple[str, str], MaskReader] = {}
+        self._folder, self._sizes_px = folder, sizes_px
+        self._masks: dict[tuple[str, str], PngMasks] = {}
         if folder is None:
             return
         for camera, size in sizes_px.items():
             for row in ROWS:
                 pattern = mask_pattern(folder, camera, row)
                 if pattern.parent.is_dir():
-                    self._readers[camera, row] = MaskReader(pattern, size)
-        if not self._readers:
+                    self._masks[camera, row] = PngMasks(pattern, size)
+        if not self._masks:
             raise CaptureError(
                 f"holds no masks of {', '.join(sizes_px)}.",
                 path=folder,
                 hint="Name them CAMERA/upper/000123.png and CAMERA/lower/000123.png by the camera's own frames.",
             )
 
-    def of(self, camera: str, own: int) -> list[NDArray[np.uint8] | None]:
-        """Return the masks of both rows on a camera's own frame, None where there is none.
+    def frames(self, camera: str) -> list[int]:
+        """Return a camera's own frames for which anything was drawn."""
+        files = [path for row in ROWS if self._folder for path in (self._folder / camera / row).glob("*.png")]
+        return sorted({int(path.stem) for path in files if path.stem.isdecimal()})
+
+    def of(self, camera: str, own: int) -> list[Key | None]:
+        """Return what was drawn for both rows on a camera's own frame, None where there is nothing.
 
         Raises:
-            CaptureError: a mask cannot be decoded.
+            CaptureError: a picture cannot be decoded or has the wrong size.
         """
-        readers = [self._readers.get((camera, row)) for row in ROWS]
-        return [None if reader is None else reader.read(own) for reader in readers]
+        return [self._key(camera, row, own) for row in ROWS]
+
+    def _key(self, camera: str, row: str, own: int) -> Key | None:
+        source = self._masks.get((camera, row))
+        if source is None or not 0 <= own < source.count:
+            return None
+        path = mask_path(self._folder, camera, row, own)
+        gray = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.exists() else None
+        if gray is not None and (gray == _UNKNOWN).mean() >= _STROKES_UNKNOWN:
+            if gray.shape[::-1] != tuple(self._sizes_px[camera]):
+                size = self._sizes_px[camera]
+                raise CaptureError(
+                    f"the strokes are {gray.shape[1]} x {gray.shape[0]} px, the pictures {size[0]} x {size[1]} px.",
+                    path=path,
+                    hint="Draw them over a frame of the video at its own size.",
+                )
+            known = np.where(np.abs(gray.astype(int) - _UNKNOWN) > 64, 255, 0).astype(np.uint8)
+            return Key(np.where(gray > _UNKNOWN, 255, 0).astype(np.uint8) & known, known, False)
+        mask = next(source.masks(own), None)
+        return None if mask is None else Key(mask, np.full_like(mask, 255), True)

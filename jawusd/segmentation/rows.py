@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +14,27 @@ from jawusd.segmentation.crowns import LOWER, OTHER, UPPER, Expectation
 from jawusd.segmentation.cut import cut_three_ways
 
 _NEVER = 30.0  # log-odds that no colour overcomes
+_FEWEST_OPEN = 20  # pixels between the rows worth a border
+_ROW_BLUR_PX = 0.8  # softens the border between the rows to fractions of a pixel
+
+
+@dataclass(frozen=True, eq=False)
+class Seeds:
+    """Hold what a person said about a working picture.
+
+    Attributes:
+        known: where something is said about each row, shape (2, h, w).
+        share: of tooth there, shape (2, h, w).
+    """
+
+    known: NDArray[np.bool_]
+    share: NDArray[np.float32]
+
+    def pinned(self, shares: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return shares of both rows, shape (2, h, w), as a person said where something is said."""
+        shares = np.where(self.known, self.share, shares)
+        other = self.known & (self.share > 0.5)
+        return np.where(other[::-1] & ~self.known, 0, shares)
 
 
 def learn_colours(
@@ -34,6 +57,7 @@ def cut_rows(
     config: SegmentationConfig,
     px_per_mm: float,
     reach_mm: float,
+    seeds: Seeds | None = None,
 ) -> NDArray[np.float32]:
     """Segment a picture.
 
@@ -44,6 +68,7 @@ def cut_rows(
         config: the segmentation's numbers.
         px_per_mm: resolution of the picture.
         reach_mm: how far teeth may lie outside their projection.
+        seeds: what a person said, which no colour overcomes.
 
     Returns:
         Shares of both rows, 0 .. 1, shape (2, h, w).
@@ -58,21 +83,73 @@ def cut_rows(
         place = np.clip(config.place_per_mm * inside[row], -config.place_most[0], config.place_most[1])
         cost[label] = -odds - place - sign * np.minimum(sign * apart, 0.0)
         cost[label][inside[row] < -reach_mm] = _NEVER
-    start = np.stack([expected.labels == label for label in (OTHER, UPPER, LOWER)]).astype(np.float32)
     free = (inside >= -reach_mm).any(0)
+    if seeds is not None:
+        tooth, other = seeds.known & (seeds.share > 0.5), seeds.known & (seeds.share <= 0.5)
+        for label, row in ((UPPER, 0), (LOWER, 1)):
+            cost[label][tooth[row]] = -_NEVER
+            cost[label][other[row]] = _NEVER
+        free |= tooth.any(0)
+    start = np.stack([expected.labels == label for label in (OTHER, UPPER, LOWER)]).astype(np.float32)
     shares = cut_three_ways(cost, _edge_prices(rgb, config), start, free, config.steps)
     return shares[1:]
 
 
-def _edge_prices(rgb: NDArray[np.uint8], config: SegmentationConfig) -> NDArray[np.float32]:
+def part_rows(
+    shares: NDArray[np.float32],
+    rgb: NDArray[np.uint8],
+    expected: Expectation,
+    config: SegmentationConfig,
+    px_per_mm: float,
+) -> NDArray[np.float32]:
+    """Draw the border between the rows once more, by edges among teeth alone.
+
+    Teeth over teeth show a far weaker edge than teeth over lips. Next to the latter it counts for nothing, the border
+    stays where it was expected, and poses follow their own prediction.
+
+    Args:
+        shares: of both rows, shape (2, h, w); their sum is kept.
+        rgb, expected, config, px_per_mm: as for `cut_rows`.
+
+    Returns:
+        Shares of both rows, shape (2, h, w).
+    """
+    inside = expected.inside_px / px_per_mm
+    teeth = shares.sum(0)
+    open_px = (teeth > 0.5) & (np.abs(inside[0] - inside[1]) < 2 * config.row_band_mm)
+    if open_px.sum() < _FEWEST_OPEN:
+        return shares
+    rows, columns = np.flatnonzero(open_px.any(1)), np.flatnonzero(open_px.any(0))
+    box = (slice(max(0, rows[0] - 2), rows[-1] + 3), slice(max(0, columns[0] - 2), columns[-1] + 3))
+    upper, open_px = (shares[0] >= shares[1])[box], open_px[box]
+    apart = np.clip(config.rows_per_mm * (inside[0] - inside[1])[box] / 2, -3, 3)
+    cost = np.full((3, *upper.shape), _NEVER, np.float32)
+    for label, mine, sign in ((UPPER, upper, 1.0), (LOWER, ~upper, -1.0)):
+        cost[label] = np.where(open_px, -sign * apart, np.where(mine, -_NEVER, _NEVER))
+    start = np.stack([np.zeros_like(upper), upper, ~upper]).astype(np.float32)
+    prices = _edge_prices(rgb[box], config, open_px)
+    found = cut_three_ways(cost, prices, start, open_px, config.row_steps)
+    share = cv2.GaussianBlur(found[UPPER], (0, 0), _ROW_BLUR_PX)
+    out = shares.copy()
+    near = cv2.dilate(open_px.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    for r, part in ((0, share), (1, 1 - share)):
+        out[r][box] = np.where(near, teeth[box] * part, shares[r][box])
+    return out
+
+
+def _edge_prices(
+    rgb: NDArray[np.uint8], config: SegmentationConfig, where: NDArray[np.bool_] | None = None
+) -> NDArray[np.float32]:
     """Return what a border costs between each pixel and its right and lower neighbour, shape (2, h, w).
 
-    The contrast that counts as an edge follows the picture's own (Boykov and Jolly 2001).
+    The contrast that counts as an edge follows the picture's own (Boykov and Jolly 2001), or that of a part of it,
+    shape (h, w).
     """
     smooth = cv2.GaussianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB), (0, 0), 0.8).astype(np.float32)
     out = np.full((2, *rgb.shape[:2]), config.border, np.float32)
     squares = [((smooth[:, 1:] - smooth[:, :-1]) ** 2).sum(2), ((smooth[1:] - smooth[:-1]) ** 2).sum(2)]
-    scale = 2 * (squares[0].mean() + squares[1].mean()) / 2 + 1e-6
+    parts = squares if where is None else (squares[0][where[:, 1:]], squares[1][where[1:]])
+    scale = 2 * sum(float(part.mean()) for part in parts) / 2 + 1e-6
     low = config.border_on_edge
     out[0, :, :-1] *= low + (1 - low) * np.exp(-squares[0] / scale)
     out[1, :-1] *= low + (1 - low) * np.exp(-squares[1] / scale)

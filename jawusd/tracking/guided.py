@@ -17,7 +17,7 @@ from jawusd.geometry import Camera
 from jawusd.tracking.bootstrap import pose_from_picks
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.first import first_record
-from jawusd.tracking.history import FrameRecord, History
+from jawusd.tracking.history import FrameRecord, History, Past
 from jawusd.tracking.ladder import FrameTracker
 from jawusd.tracking.motion import Motion
 from jawusd.tracking.quality import uncovered_px
@@ -101,21 +101,19 @@ class GuidedTracker:
             poses = record.solution.poses
         return record
 
-    def follow(self, frames: range, known: Mapping[int, FrameRecord]) -> Iterator[tuple[int, FrameRecord]]:
+    def follow(self, frames: range, past: Sequence[Past]) -> Iterator[tuple[int, FrameRecord]]:
         """Yield frames and what is known about them, one after the other away from known ones.
 
         Args:
-            frames: the frames, in either direction; the one before the first must be known.
-            known: records of frames near the first one.
+            frames: the frames, in either direction.
+            past: what is known of the frames before, from the first one aligned to the one next to these.
         """
-        if not len(frames):
-            return
         history = History(self._config.history_frames, self._config.score_frames)
-        before = frames.start - frames.step
-        near = sorted(known, key=lambda f: -abs(f - before))
-        for frame in near[-self._config.history_frames :]:
-            history.add(known[frame])
-        motion = Motion(known[before].solution.poses, self._probes)
+        motion = Motion(past[0].poses, self._probes)
+        history.take_up(past[0])
+        for before in past[1:]:
+            motion.update(before.poses, before.status != LOST, before.used.any(1))
+            history.take_up(before)
         tracker = FrameTracker(self._solver, self._config, history)
         for frame in frames:
             record = self._one(tracker, motion, frame)
@@ -125,7 +123,7 @@ class GuidedTracker:
 
     def judge(self, frame: int, poses: NDArray[np.float64], status: NDArray[np.int8]) -> FrameRecord:
         """Return the record of a frame whose poses, shape (2, 4, 4), and status, shape (2,), are known already."""
-        views = self._see(frame, poses, 0)
+        views = self._see(frame, poses, self._rounds - 1)
         use = np.array([[view.present[r] for view in views] for r in (0, 1)])
         solution = self._solver.solve(poses, views, (), use)
         bare_px, mask_px = uncovered_px(self._solver.scans, solution, views)

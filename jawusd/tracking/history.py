@@ -30,6 +30,32 @@ class FrameRecord:
     coverage: NDArray[np.float64]
 
 
+@dataclass(frozen=True, eq=False)
+class Past:
+    """Hold what the frames after an instant need to know about it.
+
+    Attributes:
+        poses: T_world_upper and T_world_lower, shape (2, 4, 4).
+        status, used, coverage: as in `FrameRecord`.
+        score_px: contour that fits per row and view, shape (2, C).
+        residual_px: standard deviation of the residuals per row, shape (2,).
+    """
+
+    poses: NDArray[np.float64]
+    status: NDArray[np.int8]
+    used: NDArray[np.bool_]
+    coverage: NDArray[np.float64]
+    score_px: NDArray[np.float64]
+    residual_px: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, record: FrameRecord) -> Past:
+        """Return what to keep of a frame."""
+        solution = record.solution
+        seen = (record.status, record.used, record.coverage)
+        return cls(solution.poses, *seen, score_px(solution), residual_px(solution))
+
+
 class History:
     """Remember what good frames looked like lately, to tell a bad one."""
 
@@ -41,10 +67,14 @@ class History:
 
     def add(self, record: FrameRecord) -> None:
         """Take in a frame; only rows tracked without trouble count."""
-        good = record.status == TRACKED
-        self._scores.append(np.where(good[:, None], score_px(record.solution), np.nan))
-        self._residuals.append(np.where(good, residual_px(record.solution), np.nan))
-        self._coverages.append(np.where(good[:, None] & record.used, record.coverage, np.nan))
+        self.take_up(Past.of(record))
+
+    def take_up(self, past: Past) -> None:
+        """Take in what was kept of a frame."""
+        good = past.status == TRACKED
+        self._scores.append(np.where(good[:, None], past.score_px, np.nan))
+        self._residuals.append(np.where(good, past.residual_px, np.nan))
+        self._coverages.append(np.where(good[:, None] & past.used, past.coverage, np.nan))
 
     def usual_score(self) -> NDArray[np.float64]:
         """Return the median score per row and view [px], shape (2, C); 0 while unknown."""

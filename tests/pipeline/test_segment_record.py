@@ -24,6 +24,8 @@ def entries(count=40):
                 "unexpected": (0.02 + 0.005 * rng.normal(size=2)).tolist(),
                 "residual_px": (0.7 + 0.03 * rng.normal(size=2)).tolist(),
                 "uncovered": (0.01 + 0.002 * rng.normal(size=2)).tolist(),
+                "outline": [[900 + int(20 * rng.normal()), 60, 100] for _ in range(2)],
+                "pixels": [20000, 18000],
             }
             for name in ("cam0", "cam1")
         }
@@ -64,7 +66,14 @@ def test_nothing_is_to_be_looked_at_in_an_even_take():
 
 
 @pytest.mark.parametrize(
-    ("symptom", "value"), [("contrast", 0.3), ("unexpected", 0.3), ("residual_px", 1.6), ("uncovered", 0.2)]
+    ("symptom", "value"),
+    [
+        ("contrast", 0.3),
+        ("unexpected", 0.3),
+        ("residual_px", 1.6),
+        ("uncovered", 0.2),
+        ("outline", [400, 560, 100]),  # most of it does not show
+    ],
 )
 def test_every_symptom_of_a_bad_mask_counts(symptom, value):
     take = entries()

@@ -11,9 +11,13 @@ from jawusd.geometry import Camera
 from jawusd.segmentation.border import settle_borders
 from jawusd.segmentation.colours import ColourModel
 from jawusd.segmentation.config import SegmentationConfig
+from jawusd.segmentation.crowns import LOWER, UPPER, Expectation
 from jawusd.segmentation.cut import cut_three_ways
 from jawusd.segmentation.files import KeyMasks, mask_path, write_mask
-from jawusd.segmentation.picture import PictureFrame
+from jawusd.segmentation.learn import Example, learn_numbers
+from jawusd.segmentation.picture import PictureFrame, Window
+from jawusd.segmentation.rows import Seeds, cut_rows, part_rows
+from jawusd.segmentation.state import ColourStates
 
 
 def exact_two_way_cut(cost, edge):
@@ -153,10 +157,111 @@ def test_key_masks_are_found_by_the_cameras_own_frames(tmp_path):
     keys = KeyMasks(tmp_path, {"cam0": (30, 20), "cam1": (30, 20)})
     upper, lower = keys.of("cam1", 12)
     assert upper is None
-    assert np.array_equal(lower, drawn)
+    assert lower.finished
+    assert np.array_equal(lower.mask, drawn)
+    assert (lower.known == 255).all()
+    assert keys.frames("cam1") == [12]
     assert keys.of("cam1", 11) == [None, None]
     assert keys.of("cam0", 12) == [None, None]
     assert KeyMasks(None, {"cam0": (30, 20)}).of("cam0", 12) == [None, None]
+
+
+def test_strokes_say_something_only_where_they_are(tmp_path):
+    drawn = np.full((20, 30), 128, np.uint8)
+    drawn[5:9, 5:12] = 255
+    drawn[15, 3:20] = 0
+    path = mask_path(tmp_path, "cam0", "upper", 4)
+    path.parent.mkdir(parents=True)
+    write_mask(path, drawn)
+    key = KeyMasks(tmp_path, {"cam0": (30, 20)}).of("cam0", 4)[0]
+    assert not key.finished
+    assert np.array_equal(key.mask == 255, drawn == 255)
+    assert np.array_equal(key.known == 255, drawn != 128)
+    with pytest.raises(CaptureError, match="strokes are 30 x 20 px"):
+        KeyMasks(tmp_path, {"cam0": (60, 40)}).of("cam0", 4)
+
+
+def expect_disks():
+    """Return what is expected of two disks of teeth, and their true places, in a picture of 90 x 120 px."""
+    y, x = np.mgrid[:90, :120]
+    inside = np.stack([22.0 - np.hypot(x - cx, y - 45) for cx in (32, 88)]).astype(np.float32)
+    labels = np.select([inside[0] > 0, inside[1] > 0], [UPPER, LOWER]).astype(np.uint8)
+    return Expectation(labels, inside), inside > 0
+
+
+def taught(rgb, teeth):
+    model = ColourModel(10.0)
+    model.learn(rgb, teeth, ~teeth)
+    return model
+
+
+def test_strokes_overcome_every_colour():
+    rng = np.random.default_rng(5)
+    expected, true = expect_disks()
+    rgb = painted(rng, (90, 120), (170, 104, 96))
+    rgb[true.any(0)] = painted(rng, (int(true.sum()),), (205, 196, 176))
+    known, share = np.zeros((2, 90, 120), bool), np.zeros((2, 90, 120), np.float32)
+    known[0, 40:50, 25:40] = True  # not the upper row, though all else says so
+    known[1, 2:6, 2:6], share[1, 2:6, 2:6] = True, 1.0  # the lower row, though all else speaks against it
+    seeds = Seeds(known, share)
+    model = taught(rgb, true.any(0))
+    free = cut_rows(rgb, expected, model, SegmentationConfig(), 7.2, 1.0)
+    found = seeds.pinned(cut_rows(rgb, expected, model, SegmentationConfig(), 7.2, 1.0, seeds))
+    assert (free[0, 40:50, 25:40] > 0.5).all() and not (free[1, 2:6, 2:6] > 0.5).any()
+    assert not (found[0, 40:50, 25:40] > 0.5).any()
+    assert (found[1, 2:6, 2:6] > 0.5).all()
+    assert ((found[0] > 0.5) == true[0])[:, :22].mean() > 0.98
+
+
+def test_rows_part_where_teeth_meet_and_not_where_they_were_expected():
+    rng = np.random.default_rng(8)
+    y = np.arange(90)[:, None] * np.ones((1, 120))
+    teeth = (y > 15) & (y < 75)
+    clean = np.where(teeth[..., None], np.array((205, 196, 176)), (140, 70, 66))  # lips: a far stronger edge
+    clean = np.where((teeth & (np.abs(y - 43) < 1.5))[..., None], (165, 158, 142), clean)  # where the rows meet
+    rgb = np.clip(clean + rng.normal(0, 3, clean.shape), 0, 255).astype(np.uint8)
+    expected_y = 47.0  # half a millimetre off
+    inside = np.stack([np.minimum(y - 15, expected_y - y), np.minimum(75 - y, y - expected_y)]).astype(np.float32)
+    labels = np.select([inside[0] > 0, inside[1] > 0], [UPPER, LOWER]).astype(np.uint8)
+    shares = np.stack([teeth & (y <= expected_y), teeth & (y > expected_y)]).astype(np.float32)
+    found = part_rows(shares, rgb, Expectation(labels, inside), SegmentationConfig(), 7.2)
+    assert np.allclose(found.sum(0), shares.sum(0), atol=1e-5)
+    edge = (found[0] > 0.5).sum(0) + 16
+    assert edge.min() >= 42 and edge.max() <= 46  # expected it would be 48
+
+
+def test_numbers_are_learned_from_wider_drawn_masks():
+    rng = np.random.default_rng(6)
+    expected, true = expect_disks()
+    tooth = np.clip(expected.inside_px.max(0) / 2 + 0.5, 0, 1)[..., None]
+    clean = tooth * (205, 196, 176) + (1 - tooth) * (170, 104, 96)
+    rgb = np.clip(clean + rng.normal(0, 4, clean.shape), 0, 255).astype(np.uint8)
+    window = Window(Camera("cam", (120, 90), np.eye(3), [], np.eye(4)), rgb, (0, 0))
+    wide = (expected.inside_px > -1.0).astype(np.float32)
+    example = Example(window, expected, wide, taught(rgb, true.any(0)), 7.2)
+    config, learned = learn_numbers([example], SegmentationConfig())
+    before, after = learned["disagreement"]
+    assert after < 0.9 * before
+    assert min(config.wider) > 0 or learned["numbers"]
+    found = example.cut(config) > 0.5
+    assert 1 - np.mean([(f & w).sum() / (f | w).sum() for f, w in zip(found, wide > 0.5)]) == pytest.approx(after)
+
+
+def test_colours_go_on_where_they_stopped(tmp_path):
+    rng = np.random.default_rng(7)
+    _, true = expect_disks()
+    rgb = painted(rng, (90, 120), (170, 104, 96))
+    model = taught(rgb, true.any(0))
+    for frame in (5, 6):
+        ColourStates(tmp_path, {"cam0": model}).keep(frame, 1)
+    fresh = ColourModel(10.0)
+    states = ColourStates(tmp_path, {"cam0": fresh})
+    assert states.take_up(9, 1) is None
+    assert states.take_up(5, -1) is None
+    assert not fresh.knows()
+    assert states.take_up(7, 1) == 6  # frame 7 is on record, its colours are not
+    assert states.take_up(5, 1) == 5
+    assert np.array_equal(fresh.weigh(rgb), model.weigh(rgb))
 
 
 def test_a_folder_without_key_masks_is_refused(tmp_path):

@@ -1,0 +1,138 @@
+"""What finished masks of a few frames teach about the energy: its few numbers, and how wide a person draws."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.segmentation.border import settle_borders
+from jawusd.segmentation.colours import ColourModel
+from jawusd.segmentation.config import SegmentationConfig
+from jawusd.segmentation.crowns import Expectation
+from jawusd.segmentation.picture import Window
+from jawusd.segmentation.rows import Seeds, cut_rows, part_rows
+
+_FACTORS = (0.5, 2.0)  # tried on every number
+_NUMBERS = ("border", "place_per_mm", "rows_per_mm")
+_DOUBTS = (-1.0, 1.0)  # added to the doubt
+_WIDER = np.arange(-6, 7) * 0.05  # tried as shares by which outlines are moved
+_WORTH_IT = 0.01  # share of the disagreement that a change must save: less is chance
+
+
+@dataclass(frozen=True, eq=False)
+class Example:
+    """Hold a picture with finished masks.
+
+    Attributes:
+        window, expected: the picture, and where crowns are expected in it.
+        drawn: shares of both rows, shape (2, h, w).
+        colours: the colours of its camera.
+        px_per_mm: resolution of the picture.
+    """
+
+    window: Window
+    expected: Expectation
+    drawn: NDArray[np.float32]
+    colours: ColourModel
+    px_per_mm: float
+
+    def cut(self, config: SegmentationConfig) -> NDArray[np.float32]:
+        """Return the shares of both rows, shape (2, h, w), that are found without the drawn masks."""
+        where = (self.window, self.expected, self.colours, config, self.px_per_mm)
+        return cut_picture(*where, config.reach_mm[-1], None, True)[0]
+
+
+def cut_picture(
+    window: Window,
+    expected: Expectation,
+    colours: ColourModel,
+    config: SegmentationConfig,
+    px_per_mm: float,
+    reach_mm: float,
+    seeds: Seeds | None,
+    settle: bool,
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Cut both rows out of a picture, settle their borders and keep to what a person said.
+
+    Args:
+        window, expected: the picture, and where crowns are expected in it.
+        colours: the colours of its camera.
+        config: the segmentation's numbers.
+        px_per_mm: resolution of the picture.
+        reach_mm: how far teeth may lie outside their projection.
+        seeds: what a person said.
+        settle: whether to settle the borders.
+
+    Returns:
+        Shares of both rows, shape (2, h, w), and where borders show, shape (h, w).
+    """
+    shares = cut_rows(window.rgb, expected, colours, config, px_per_mm, reach_mm, seeds)
+    clear = np.zeros(shares.shape[1:], bool)
+    if settle:
+        shares, clear = settle_borders(shares, window.rgb, config, px_per_mm)
+        shares = part_rows(shares, window.rgb, expected, config, px_per_mm)
+        shares = _widened(shares, config.wider)
+    return (shares if seeds is None else seeds.pinned(shares)), clear
+
+
+def learn_numbers(examples: Sequence[Example], config: SegmentationConfig) -> tuple[SegmentationConfig, dict]:
+    """Choose the numbers with which the masks agree best with drawn ones, one number after the other.
+
+    Args:
+        examples: pictures with finished masks.
+        config: the numbers to start from.
+
+    Returns:
+        The numbers chosen; and what changed, with the mean disagreement (1 - intersection over union) before and after.
+    """
+    best, cuts = config, [example.cut(config) for example in examples]
+    before = least = _disagreement(examples, cuts)
+    for trial in _trials(config):
+        changed = {name: value for name, value in vars(trial).items() if value != getattr(config, name)}
+        trial = replace(best, **changed)
+        found = [example.cut(trial) for example in examples]
+        value = _disagreement(examples, found)
+        if value < (1 - _WORTH_IT) * least:
+            best, cuts, least = trial, found, value
+    wider = tuple(_best_width([c[r] for c in cuts], [e.drawn[r] for e in examples]) for r in (0, 1))
+    cuts = [_widened(cut, wider) for cut in cuts]
+    value = _disagreement(examples, cuts)
+    if value < (1 - _WORTH_IT) * least:
+        best, least = replace(best, wider=wider), value
+    changed = {name: value for name, value in vars(best).items() if value != getattr(config, name)}
+    return best, {"numbers": changed, "disagreement": [before, least], "pictures": len(examples)}
+
+
+def _trials(config: SegmentationConfig) -> Iterator[SegmentationConfig]:
+    for name in _NUMBERS:
+        for factor in _FACTORS:
+            yield replace(config, **{name: getattr(config, name) * factor})
+    for more in _DOUBTS:
+        yield replace(config, doubt=config.doubt + more)
+
+
+def _widened(shares: NDArray[np.float32], wider: tuple[float, float]) -> NDArray[np.float32]:
+    """Return shares with outlines moved by fractions of their soft border; rows keep the border between them."""
+    if not any(wider):
+        return shares
+    alone = shares[::-1] < 0.05
+    moved = np.where(shares > 0.02, shares + np.array(wider, np.float32)[:, None, None], shares)
+    return np.where(alone, np.clip(moved, 0, 1), shares)
+
+
+def _best_width(found: Sequence[NDArray[np.float32]], drawn: Sequence[NDArray[np.float32]]) -> float:
+    losses = [np.mean([_loss(f + w, d) for f, d in zip(found, drawn, strict=True)]) for w in _WIDER]
+    return float(_WIDER[int(np.argmin(losses))])
+
+
+def _disagreement(examples: Sequence[Example], cuts: Sequence[NDArray[np.float32]]) -> float:
+    pairs = [(cut[r], e.drawn[r]) for cut, e in zip(cuts, examples, strict=True) for r in (0, 1)]
+    return float(np.mean([_loss(found, drawn) for found, drawn in pairs]))
+
+
+def _loss(found: NDArray[np.float32], drawn: NDArray[np.float32]) -> float:
+    a, b = found > 0.5, drawn > 0.5
+    return 1 - (a & b).sum() / max(1, (a | b).sum())

@@ -1,0 +1,61 @@
+"""The colours as they were after the last frames, so that work taken up goes on as if it had never stopped."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from jawusd.formats.atomic import write_bytes_atomic
+from jawusd.segmentation.colours import ColourModel
+
+_FILES = ("colours_0.npz", "colours_1.npz")  # in turns: work may stop between the colours of a frame and its record
+
+
+class ColourStates:
+    """Keep and take up the colours of all cameras."""
+
+    def __init__(self, folder: Path, colours: Mapping[str, ColourModel]) -> None:
+        """Take the folder of the files and the colours by camera."""
+        self._folder, self._colours = folder, dict(colours)
+
+    def keep(self, frame: int, step: int) -> None:
+        """Write the colours after a frame.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        arrays = {"frame": frame, "step": step}
+        for name, model in self._colours.items():
+            arrays[f"seen {name}"], arrays[f"counts {name}"] = model.counts()
+        buffer = io.BytesIO()
+        np.savez(buffer, **arrays)
+        write_bytes_atomic(self._folder / _FILES[frame % 2], buffer.getvalue())
+
+    def take_up(self, done: int, step: int) -> int | None:
+        """Go on from the latest colours kept on the way to a frame that is done.
+
+        Args:
+            done: the last frame done.
+            step: 1 or -1, the way the work goes.
+
+        Returns:
+            The frame after which the colours were; None if there are none to go on from.
+        """
+        for frame in (done, done - step):
+            path = self._folder / _FILES[frame % 2]
+            if not path.exists():
+                continue
+            with np.load(path, allow_pickle=False) as kept:
+                if (int(kept["frame"]), int(kept["step"])) == (frame, step):
+                    for name, model in self._colours.items():
+                        model.take_up(kept[f"seen {name}"], kept[f"counts {name}"])
+                    return frame
+        return None
+
+
+def state_files(folder: Path) -> list[Path]:
+    """Return the files there may be in a folder."""
+    return [folder / name for name in _FILES]
