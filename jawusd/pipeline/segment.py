@@ -250,5 +250,6 @@ class _Segmenting:
 
     def _write_masks(self, name: str, own: int) -> None:
         masks = self._segmenters[name].recorded(self._segments[name])
-        for row, mask in zip(ROWS, masks, strict=True):
+        for row, made, key in zip(ROWS, masks, self._keys.of(name, own), strict=True):
+            mask = np.where(key.mask > 127, np.uint8(255), np.uint8(0)) if key is not None and key.finished else made
             self._files.write_mask(self._files.mask_path(self._folder, name, row, own), mask)

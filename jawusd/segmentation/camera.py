@@ -103,8 +103,14 @@ class CameraSegmenter:
         if turn == 0 or not self.colours.knows():
             self._learn(window, expected, keys, seeds)
         reach = c.reach_mm[min(turn, len(c.reach_mm) - 1)]
+        # Outlines made here are steadier than drawn ones, and the tracker judges them by one another: a finished mask
+        # takes over only where the cut goes wrong.
+        finished = seeds is not None and bool(seeds.known.all())
+        guide = None if finished else seeds
         # Predicted poses call for a look only.
-        shares, clear = cut_picture(window, expected, self.colours, c, self._frame.px_per_mm, reach, seeds, turn > 0)
+        shares, clear = cut_picture(window, expected, self.colours, c, self._frame.px_per_mm, reach, guide, turn > 0)
+        if finished and _overlap(shares, seeds.share) < c.key_overlap:
+            shares = seeds.share
         masks = np.round(255 * shares).astype(np.uint8)
         present = np.array([(mask > 127).sum() >= c.least_px for mask in masks])
         contrast, unexpected = self._contrast(window, masks), _unexpected(masks, expected)
@@ -175,6 +181,12 @@ class CameraSegmenter:
             if inner.any() and outer.any():
                 out[r] = share[inner].mean() - share[outer].mean()
         return out
+
+
+def _overlap(shares: NDArray[np.float32], drawn: NDArray[np.float32]) -> float:
+    """Return the smaller intersection over union of both rows with what was drawn."""
+    a, b = shares > 0.5, drawn > 0.5
+    return float(((a & b).sum((1, 2)) / np.maximum((a | b).sum((1, 2)), 1)).min())
 
 
 def _outline(masks: NDArray[np.uint8], clear: NDArray[np.bool_]) -> NDArray[np.int64]:
