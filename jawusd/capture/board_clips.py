@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.errors import CalibrationError, CaptureError
+from jawusd.imaging.pictures import read_picture
 from jawusd.imaging.video import Video
 
 __all__ = ["BoardClip", "sharpness"]
@@ -84,7 +85,7 @@ def _numbered(pattern: Path) -> list[int]:
 
 
 def _read(path: Path) -> NDArray[np.uint8]:
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    image = read_picture(path, cv2.IMREAD_GRAYSCALE)
     if image is None:
         raise CaptureError("is not a picture that can be read.", path=path, hint="Use PNG, JPEG or TIFF.")
     return image

@@ -10,7 +10,7 @@ import numpy as np
 
 from jawusd.errors import FormatError
 from jawusd.formats.arkit import read_arkit
-from jawusd.formats.keys import load_keys
+from jawusd.formats.keys import FARTHEST_FRAME, MOST_FRAMES, load_keys
 from jawusd.formats.poses import read_parameters, read_poses, table_columns
 
 if TYPE_CHECKING:
@@ -30,6 +30,17 @@ class Motion:
     frames: np.ndarray
     d: np.ndarray
     fps: float | None
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be written out frame by frame."""
+        if not len(self.frames):
+            raise FormatError("the motion has no frames.")
+        first, last = self.frames[0], self.frames[-1]
+        if not (last - first <= MOST_FRAMES and max(abs(first), abs(last)) <= FARTHEST_FRAME):
+            raise FormatError(
+                f"the motion runs from frame {first:g} to {last:g}; allowed are {MOST_FRAMES} frames within "
+                f"+-{FARTHEST_FRAME:g}."
+            )
 
 
 def read_motion(rig: JawRig, source: Path) -> Motion:

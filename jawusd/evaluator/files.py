@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import lzma
 import os
+import struct
 import zipfile
 import zlib
 from pathlib import Path
@@ -19,6 +21,11 @@ FAMILY, VERSION = "jawusd-model", 1
 UNITS = {"length": "mm", "angle": "rad"}
 TWIST_ORDER = ["omega", "v"]
 
+# what zipfile and numpy raise for damaged members, beside OSError
+_DAMAGED = (
+    ValueError, EOFError, LookupError, TypeError, AttributeError, RuntimeError, MemoryError, OverflowError,
+    zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error,
+)  # fmt: skip
 # far above any model (about 100 kB); guards against archives that unpack to fill the memory
 _MOST_BYTES = 256 << 20
 
@@ -51,11 +58,11 @@ def _read_arrays(path: Path) -> dict[str, NDArray]:
             allowed = f"at most {_MOST_BYTES / 1e6:.0f} MB are read."
             raise FormatError(f"unpacks to {size / 1e6:.0f} MB; {allowed}", path=path)
         with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
+            return {name: np.asarray(archive[name]) for name in archive.files}
     except FileNotFoundError as error:
         raise FormatError("there is no such file.", path=path) from error
-    except (OSError, ValueError, EOFError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
-        raise FormatError(f"is not a readable npz file ({error}).", path=path) from error
+    except (OSError, *_DAMAGED) as error:
+        raise FormatError(f"is not a readable npz file ({error!s:.200}).", path=path) from error
 
 
 def _read_meta(arrays: dict[str, NDArray], path: Path) -> dict[str, Any]:
@@ -63,12 +70,12 @@ def _read_meta(arrays: dict[str, NDArray], path: Path) -> dict[str, Any]:
         meta = json.loads(str(arrays.pop("meta")))
     except KeyError as error:
         raise FormatError('has no "meta"; a jaw model carries its format and units there.', path=path) from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise FormatError(f'"meta" is not JSON ({error}).', path=path) from error
     if not isinstance(meta, dict):
         raise FormatError('"meta" must be a JSON object.', path=path)
     family, _, number = str(meta.get("format")).partition("/")
-    if family != FAMILY or not number.isdecimal():
+    if family != FAMILY or not (number.isascii() and number.isdecimal() and len(number) < 10):
         raise FormatError(f'format is "{meta.get("format")}", expected "{FAMILY}/{VERSION}".', path=path)
     if int(number) > VERSION:
         raise VersionError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jawusd.errors import OutputError
+
+# Every unfinished file and folder starts like this: what a killed run leaves behind can be told and cleared away.
+_UNFINISHED = ".jawusd-tmp-"
 
 
 @contextlib.contextmanager
@@ -31,7 +35,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     target = Path(path)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.stem}-", suffix=target.suffix)
+        handle, name = tempfile.mkstemp(dir=target.parent, prefix=f"{_UNFINISHED}{target.stem}-", suffix=target.suffix)
         os.close(handle)
     except OSError as error:
         raise OutputError(f"cannot write here: {error.strerror}.", path=target) from error
@@ -49,6 +53,37 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         ) from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def scratch_folder(beside: str | os.PathLike[str]) -> Iterator[Path]:
+    """Give a temporary folder beside a file that is going to be written; it goes when the block ends.
+
+    Args:
+        beside: the file; its folder is made if missing.
+
+    Raises:
+        OutputError: the folder cannot be written.
+    """
+    target = Path(beside)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        folder = Path(tempfile.mkdtemp(dir=target.parent, prefix=_UNFINISHED))
+    except OSError as error:
+        raise OutputError(f"cannot write here: {error.strerror}.", path=target) from error
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def clear_unfinished(folder: str | os.PathLike[str]) -> None:
+    """Delete what runs that were killed left unfinished in a folder and below; nobody else may be writing there."""
+    for left in list(Path(folder).rglob(f"{_UNFINISHED}*")):
+        if left.is_dir() and not left.is_symlink():
+            shutil.rmtree(left, ignore_errors=True)
+        else:
+            left.unlink(missing_ok=True)
 
 
 def _umask() -> int:

@@ -52,7 +52,7 @@ def _numbers(path: Path, table: str, values: dict, key: str, shapes: tuple[tuple
         raise CalibrationError(f'[{table}] has no "{key}".', path=path)
     try:
         array = np.array(values[key], dtype=np.float64)
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, OverflowError) as error:
         raise CalibrationError(f'[{table}] "{key}" is not an array of numbers.', path=path) from error
     if array.shape not in shapes:
         allowed = " or ".join(str(s) for s in shapes)

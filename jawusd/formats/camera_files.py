@@ -39,6 +39,8 @@ _MODELS = {
 # Images of one camera may differ this much before they count as a moving camera.
 _MOVED_RAD, _MOVED_SHARE = 1e-3, 1e-3
 _MAX_BYTES = 64 << 20
+_MOST_SCALE = 1e9
+_MOST_VALUE = 1e300
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -134,16 +136,18 @@ def load_nerfstudio(path: str | os.PathLike[str]) -> list[Camera]:
     frames = data.get("frames")
     if not isinstance(frames, list) or not frames:
         raise CalibrationError('has no "frames".', path=path)
-    scale = float(data.get("applied_scale", 1.0))
+    scale = data.get("applied_scale", 1.0)
+    if not isinstance(scale, int | float) or not 0 < scale < _MOST_SCALE:
+        raise CalibrationError(f'"applied_scale" is {scale!r:.50}, allowed is a number above 0.', path=path)
     cameras: dict[str, Camera] = {}
     for index, frame in enumerate(frames):
         where = f"frames[{index}]"
-        if not isinstance(frame, dict) or "file_path" not in frame:
+        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
             raise CalibrationError(f'{where} has no "file_path".', path=path)
         size, K, distortion = _nerfstudio_lens(path, {**data, **frame}, where)
         try:
             T_world_gl = np.array(frame["transform_matrix"], dtype=np.float64)
-        except (KeyError, ValueError, TypeError) as error:
+        except (KeyError, ValueError, TypeError, OverflowError) as error:
             raise CalibrationError(f'{where} has no "transform_matrix" of 4 x 4 numbers.', path=path) from error
         T_world_gl = np.vstack([T_world_gl, [0, 0, 0, 1]]) if T_world_gl.shape == (3, 4) else T_world_gl
         if T_world_gl.shape != (4, 4) or not np.isfinite(T_world_gl).all() or rigidity_defect(T_world_gl) > 1e-4:
@@ -218,7 +222,7 @@ def _nerfstudio_lens(path: Path, values: dict, where: str) -> tuple[tuple[int, i
     found = {}
     for key in ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4"):
         value = values.get(key, values.get("fl_x") if key == "fl_y" else 0.0 if key[0] in "kp" else None)
-        if not isinstance(value, int | float) or not np.isfinite(value):
+        if not isinstance(value, int | float) or not abs(value) < _MOST_VALUE:
             raise CalibrationError(f'{where} has no number "{key}".', path=path)
         found[key] = float(value)
     if found["k4"] != 0:

@@ -273,13 +273,17 @@ def _resolve(capture: Capture, folder: Path, source: Path, allow_outside: bool) 
         full = Path(os.path.normpath(folder / value))
         # Resolve links as well: a link may lead out of the folder though its name does not.
         anchor = full.parent if "%" in full.name else full
-        if not allow_outside and not anchor.resolve().is_relative_to(folder):
+        try:
+            inside, exists = anchor.resolve().is_relative_to(folder), anchor.exists()
+        except (OSError, ValueError, RuntimeError) as error:  # too long, a null byte, links in a circle
+            raise CaptureError(f"{key} is no path that can be followed ({error!s:.100}).", path=source) from error
+        if not allow_outside and not inside:
             raise CaptureError(
                 f'{key} = "{value}" leads out of the folder of the capture.',
                 path=source,
                 hint="Move the file inside, or allow it with --allow-outside.",
             )
-        if not anchor.exists():
+        if not exists:
             kind = "folder" if "%" in full.name else "file"
             raise CaptureError(f"{key}: there is no {kind} {anchor}.", path=source, hint="Check the path in the file.")
         return full

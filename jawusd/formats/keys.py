@@ -14,6 +14,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from jawusd.errors import FormatError
 from jawusd.formats.atomic import write_text_atomic
 
+#: Keys are written out frame by frame: an hour at 60 per second fits.
+MOST_FRAMES, FARTHEST_FRAME = 220_000, 1e9
 _MAX_BYTES = 64 << 20
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
@@ -39,6 +41,9 @@ class Keys(BaseModel):
     @model_validator(mode="after")
     def _rising(self) -> Keys:
         frames = [key.frame for key in self.keys]
+        if frames[-1] - frames[0] > MOST_FRAMES or max(abs(frames[0]), abs(frames[-1])) > FARTHEST_FRAME:
+            found = f"frames {frames[0]:g} to {frames[-1]:g}"
+            raise ValueError(f"{found}: allowed are {MOST_FRAMES} within +-{FARTHEST_FRAME:g}")
         for before, after in zip(frames, frames[1:], strict=False):
             if after <= before:
                 raise ValueError(f"frames must rise, frame {after:g} follows {before:g}")

@@ -81,7 +81,7 @@ def load_landmarks(path: str | os.PathLike[str]) -> LandmarkFile:
 def _numbers(value: object, shape: tuple[int, ...], name: str, path: Path) -> NDArray[np.float64]:
     try:
         array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise FormatError(f"{name} is not an array of numbers.", path=path) from error
     if array.shape != shape or not np.isfinite(array).all():
         raise FormatError(f"{name} must be finite numbers of shape {shape}, found shape {array.shape}.", path=path)

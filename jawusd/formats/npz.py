@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import lzma
 import os
+import struct
 import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +18,14 @@ from jawusd.errors import FormatError, UnitsError, VersionError
 UNITS = {"length": "mm", "angle": "rad"}
 TWIST_ORDER = ["omega", "v"]
 
-# Larger arrays than any real file holds; guards against archives that unpack to fill the memory.
-_MAX_ARRAY_BYTES = 2 << 30
+# Ten times what 20,000 frames take; guards against archives that unpack to fill the memory.
+_MAX_ARRAY_BYTES = 512 << 20
+# What zipfile and numpy raise for damaged members, beside OSError: their decoders' own errors, missing methods and
+# passwords (RuntimeError), headers that declare more than there is (MemoryError) or nest too deeply.
+_DAMAGED = (
+    ValueError, EOFError, LookupError, TypeError, AttributeError, RuntimeError, MemoryError, OverflowError,
+    zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error,
+)  # fmt: skip
 
 
 def read_npz(path: str | os.PathLike[str], family: str, version: int) -> tuple[dict[str, NDArray], dict]:
@@ -41,19 +50,21 @@ def read_npz(path: str | os.PathLike[str], family: str, version: int) -> tuple[d
         with zipfile.ZipFile(path) as archive:
             total = sum(member.file_size for member in archive.infolist())
         if total > _MAX_ARRAY_BYTES:
-            raise FormatError(f"unpacks to {total / 1e9:.1f} GB; at most 2 GB are read.", path=path)
+            raise FormatError(f"unpacks to {total / 1e9:.1f} GB; at most 0.5 GB are read.", path=path)
         with np.load(path, allow_pickle=False) as archive:
             for name in archive.files:
                 arrays[name] = archive[name]
+                if not isinstance(arrays[name], np.ndarray):
+                    raise FormatError(f'"{name}" is no array.', path=path)
     except FileNotFoundError as error:
         raise FormatError("there is no such file.", path=path) from error
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError, KeyError) as error:
-        raise FormatError(f"is not a readable npz file ({error}).", path=path) from error
+    except (OSError, *_DAMAGED) as error:
+        raise FormatError(f"is not a readable npz file ({error!s:.200}).", path=path) from error
     if "meta" not in arrays:
         raise FormatError(f'has no "meta"; a {family} file carries its format and units there.', path=path)
     try:
         meta = json.loads(str(arrays.pop("meta")))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise FormatError(f'"meta" is not JSON ({error}).', path=path) from error
     if not isinstance(meta, dict):
         raise FormatError('"meta" must be a JSON object.', path=path)
@@ -76,7 +87,7 @@ def check_format(found: object, family: str, version: int, path: str | os.PathLi
         VersionError: a newer version.
     """
     name, _, number = str(found).partition("/")
-    if name != family or not number.isdigit():
+    if name != family or not (number.isascii() and number.isdigit() and len(number) < 10):
         raise FormatError(f'format is "{found}", expected "{family}/{version}".', path=path)
     if int(number) > version:
         raise VersionError(
@@ -122,6 +133,8 @@ def take(
     if value.ndim != len(shape) or any(w is not None and w != g for w, g in zip(shape, value.shape, strict=True)):
         wanted = "(" + ", ".join("any" if w is None else str(w) for w in shape) + ")"
         raise FormatError(f'"{name}" has shape {value.shape}, expected {wanted}.', path=str(path))
+    if value.dtype.kind not in "fiub":
+        raise FormatError(f'"{name}" holds {value.dtype}, expected numbers.', path=str(path))
     if finite and value.dtype.kind == "f" and not np.isfinite(value).all():
         raise FormatError(f'"{name}" holds values that are not finite.', path=str(path))
     return value

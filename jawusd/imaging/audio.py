@@ -43,7 +43,7 @@ def read_sound(path: str | os.PathLike[str], rate_hz: int) -> Sound | None:
     """
     parts, start_s = [], 0.0
     try:
-        with av.open(os.fspath(path)) as container:
+        with av.open(os.fspath(path), metadata_errors="replace") as container:
             if not container.streams.audio:
                 return None
             resampler = av.AudioResampler(format="flt", layout="mono", rate=rate_hz)

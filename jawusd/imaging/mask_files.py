@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.errors import CaptureError
+from jawusd.imaging.pictures import read_picture
 from jawusd.imaging.video import Video
 
 __all__ = ["LabelValues", "Mask", "PngMasks", "VideoMasks"]
@@ -86,7 +87,7 @@ class PngMasks:
         return width, height
 
     def _load(self, path: Path) -> NDArray:
-        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        image = read_picture(path, cv2.IMREAD_UNCHANGED)
         if image is None:
             raise CaptureError(
                 "the mask cannot be decoded.", path=path, hint="Export it again, or delete it: that frame is skipped."

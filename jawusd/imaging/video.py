@@ -166,7 +166,7 @@ class Video:
 
     def _open(self) -> av.container.InputContainer:
         try:
-            container = av.open(str(self.path))
+            container = av.open(str(self.path), metadata_errors="replace")
         except (av.FFmpegError, OSError) as error:
             raise CaptureError(
                 f"the video cannot be opened ({error.strerror}).",

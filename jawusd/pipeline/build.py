@@ -14,7 +14,7 @@ from jawusd.formats.capture import Capture
 from jawusd.formats.model import load_model, save_model
 from jawusd.formats.tracks import load_tracks, save_tracks
 from jawusd.pipeline.calibration import calibrate_boards
-from jawusd.pipeline.prepare import input_files, open_capture
+from jawusd.pipeline.prepare import input_hashes, open_capture, rescaled_cameras
 from jawusd.pipeline.report import BuildFacts, missing_packages, where, write_build_report
 from jawusd.pipeline.segment import SegmentOptions, with_masks
 from jawusd.pipeline.segment_summary import delete_masks, segment_capture
@@ -27,7 +27,6 @@ from jawusd.pipeline.state import (
     BuildState,
     Progress,
     StageRecord,
-    hash_files,
     hash_value,
     locked,
 )
@@ -122,30 +121,36 @@ class _Build:
     def run(self) -> dict:
         calibrate = self._calibrated()
         capture, options = self.capture, self.options
-        sync = self._stage("sync", self._inputs(["videos"], capture.sync.model_dump()), self._sync)
-        segment = self._segmented(sync.result["offsets"])
+        videos = input_hashes(capture, ["videos"])
+        names = [camera.name for camera in capture.cameras]
+        sync = self._stage("sync", self._inputs([], videos, capture.sync.model_dump(), names, capture.fps), self._sync)
+        segment = self._segmented(sync.result["offsets"], videos)
         # Paths stay out: the contents count, not where the capture lies.
-        described = capture.model_dump(mode="json", include={"frames", "bootstrap", "motion", "anatomy"})
-        described["cameras"] = [(camera.name, camera.masks and camera.masks.labels) for camera in capture.cameras]
+        described = capture.model_dump(mode="json", include={"frames", "bootstrap", "anatomy", "calibration_unit_mm"})
+        masks = [camera.masks and camera.masks.labels for camera in capture.cameras]
         track = self._stage(
             "track",
             self._inputs(
-                ["scans", "calibration", "masks"],
+                ["teeth", "mandible", "calibration", "masks"],
                 described,
+                names,
+                masks,
+                rescaled_cameras(self.capture),
                 sync.result["offsets"],
                 [options.solver, options.backend],
             ),
             lambda: self._track(sync.result["offsets"]),
         )
-        fit = self._stage("fit", hash_value([track.outputs, track.inputs, options.model, __version__]), self._fit)
+        person = [options.model, capture.name, capture.fps]
+        fit = self._stage("fit", self._inputs([], track.outputs, track.inputs, person), self._fit)
         aid = self._stage(
             "aid",
-            hash_value([track.outputs, track.inputs, fit.outputs, __version__]),
+            self._inputs([], track.outputs, track.inputs, fit.outputs),
             lambda: self._aid(sync.result["offsets"]),
         )
-        bake = self._stage("bake", hash_value([fit.outputs, aid.outputs, track.inputs, __version__]), self._bake)
+        bake = self._stage("bake", self._inputs(["skull"], fit.outputs, aid.outputs, track.inputs), self._bake)
         missing = missing_packages()
-        inputs = hash_value([bake.outputs, bake.inputs, missing, __version__])
+        inputs = self._inputs([], bake.outputs, bake.inputs, videos, sync.result, missing)
         report = self._stage("report", inputs, lambda: self._report(missing))
         finished = [made for made in (calibrate, segment, track, fit, aid, bake, report) if made]
         return {
@@ -163,7 +168,7 @@ class _Build:
         }
 
     def _inputs(self, parts: Iterable[str], *values: object) -> str:
-        return hash_value([hash_files(input_files(self.capture, parts)), *values, __version__])
+        return hash_value([input_hashes(self.capture, parts), *values, __version__])
 
     def _stage(self, name: str, inputs: str, work: Callable[[], tuple[list[Path], dict]]) -> StageRecord:
         record = self.state.valid(name, inputs)
@@ -187,13 +192,13 @@ class _Build:
         record = self._stage(
             "calibrate",
             # Without picks, masks tell whether the squares have the size they are said to have.
-            self._inputs(["boards", "scans", *([] if picks else ["masks", "videos"])], described, picks, names),
+            self._inputs(["boards", "teeth", *([] if picks else ["masks", "videos"])], described, picks, names),
             lambda: ([path], calibrate_boards(capture, path, self.progress)),
         )
         self.capture = capture.model_copy(update={"calibration": path, "calibration_unit_mm": 1.0})
         return record
 
-    def _segmented(self, offsets: dict[str, int]) -> StageRecord | None:
+    def _segmented(self, offsets: dict[str, int], videos: dict[str, str]) -> StageRecord | None:
         """Make masks from the videos if the capture names none.
 
         The masks themselves are no outputs of the record: they may be edited, and tracking starts over if they are.
@@ -202,10 +207,10 @@ class _Build:
         if any(camera.masks for camera in capture.cameras):
             return None
         folder = self.folder / MASKS
-        described = capture.model_dump(mode="json", include={"frames", "bootstrap"})
+        described = capture.model_dump(mode="json", include={"name", "frames", "bootstrap", "calibration_unit_mm"})
         record = self._stage(
             "segment",
-            self._inputs(["videos", "scans", "calibration"], described, offsets),
+            self._inputs(["teeth", "calibration"], videos, described, offsets),
             lambda: segment_capture(
                 capture, offsets, folder, SegmentOptions(None, True, self.options.jobs), self.progress
             ),

@@ -26,7 +26,7 @@ RAW_GROUP = "T_model_origin_mand_landmark_t"
 
 _MM = {"mm": 1.0, "m": 1000.0}
 _RIGID_TOLERANCE = 1e-3
-_MOST_FRAMES = 10_000_000
+_MOST_NUMBERS = 16_000_000  # a million 4 x 4 matrices
 
 
 def read_hdf5(path: str | os.PathLike[str], group: str | None = None) -> tuple[NDArray[np.int64], Array]:
@@ -57,13 +57,15 @@ def read_hdf5(path: str | os.PathLike[str], group: str | None = None) -> tuple[N
         raise FormatError("there is no such file.", path=path)
     try:
         with h5py.File(path, "r") as file:
-            groups = [name for name in file if isinstance(file[name], h5py.Group) and "translations" in file[name]]
+            inside = [name for name in file if isinstance(file.get(name, getlink=True), h5py.HardLink)]
+            groups = [name for name in inside if isinstance(file[name], h5py.Group) and "translations" in file[name]]
             name = _chosen(groups, group, path)
             held = {key: _data(file[name], key, name, path) for key in ("translations", "rotations", "transformations")}
             unit = file[name].attrs.get("unit", "mm")
-    except OSError as error:
-        raise FormatError(f"is not an HDF5 file ({error}).", path=path) from error
-    unit = unit.decode() if isinstance(unit, bytes) else str(unit)
+    # h5py reports what is damaged inside a file by whatever its layers stumble over.
+    except (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, MemoryError) as error:
+        raise FormatError(f"is not an HDF5 file that can be read ({error!s:.200}).", path=path) from error
+    unit = unit.decode(errors="replace") if isinstance(unit, bytes) else str(unit)
     if unit not in _MM:
         raise FormatError(f'group "{name}": unit is "{unit}", known are {", ".join(_MM)}.', path=path)
     T = _poses(held, name, path)
@@ -89,9 +91,12 @@ def _chosen(groups: list[str], wanted: str | None, path: Path) -> str:
 def _data(group: Any, key: str, name: str, path: Path) -> Array | None:
     if key not in group:
         return None
-    held = group[key]
-    if not hasattr(held, "shape") or held.dtype.kind not in "fiu" or not held.shape or held.shape[0] > _MOST_FRAMES:
-        raise FormatError(f'group "{name}": "{key}" is not an array of at most {_MOST_FRAMES} numbers.', path=path)
+    link = group.get(key, getlink=True)
+    held = group[key] if type(link).__name__ == "HardLink" else None
+    if held is None or getattr(held, "external", None) or getattr(held, "is_virtual", False):
+        raise FormatError(f'group "{name}": "{key}" lies elsewhere, it must be in the file itself.', path=path)
+    if not hasattr(held, "shape") or held.dtype.kind not in "fiu" or not held.shape or held.size > _MOST_NUMBERS:
+        raise FormatError(f'group "{name}": "{key}" is not an array of at most {_MOST_NUMBERS} numbers.', path=path)
     return np.asarray(held[()], dtype=np.float64)
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from jawusd.errors import OutputError
 from jawusd.formats.atomic import write_text_atomic
+from jawusd.pipeline.state import hash_value
 
 FILE = "segment.jsonl"
 
@@ -28,12 +29,12 @@ class Journal:
             resume: keep what is there if it came from these inputs.
 
         Raises:
-            OutputError: the folder cannot be written.
+            OutputError: the folder cannot be written, or the file not read.
         """
         self._path = folder / FILE
         self.entries: dict[int, dict[str, Any]] = {}
         head = json.dumps({"inputs": inputs})
-        lines = self._path.read_text(encoding="utf-8").splitlines() if resume and self._path.exists() else []
+        lines = _lines(self._path) if resume else []
         if lines and lines[0] == head:
             self.entries = dict(entry for line in lines[1:] if (entry := _entry(line)) is not None)
         self._head = head
@@ -73,8 +74,16 @@ class Journal:
         return np.array(entry["poses"], np.float64), np.array(entry["status"], np.int8)
 
 
+def _lines(path: Path) -> list[str]:
+    try:
+        return path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []
+    except OSError as error:
+        raise OutputError(f"cannot be read: {error.strerror}.", path=path) from error
+
+
 def _line(frame: int, entry: dict[str, Any]) -> str:
-    return json.dumps({"frame": frame, "entry": _without_nan(entry)})
+    data = json.loads(json.dumps({"frame": frame, "entry": _without_nan(entry)}))
+    return json.dumps({**data, "sha256": hash_value(data)})
 
 
 def _without_nan(value: Any) -> Any:
@@ -86,9 +95,10 @@ def _without_nan(value: Any) -> Any:
 
 
 def _entry(line: str) -> tuple[int, dict[str, Any]] | None:
-    """Return a line's frame and entry; None for a line that was cut short when the work was stopped."""
+    """Return a line's frame and entry; None for a line that was cut short when the work was stopped, or damaged."""
     try:
         data = json.loads(line)
-        return int(data["frame"]), dict(data["entry"])
-    except (ValueError, KeyError, TypeError):
+        known = data.pop("sha256")
+        return (data["frame"], data["entry"]) if known == hash_value(data) else None
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None

@@ -17,6 +17,7 @@ from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import LANDMARKS, Camera, anatomical_frame, find_landmarks
 from jawusd.pipeline.extras import stage
+from jawusd.pipeline.state import hash_files
 
 BONES = ("mandible", "skull")
 MESHES = ("upper_teeth", "lower_teeth", *BONES)
@@ -191,30 +192,52 @@ def measure_anatomy(meshes: Mapping[str, Mesh], given: ArrayLike | None, named: 
     return Anatomy(T_anatomical_skull, landmarks, tuple(inferred))
 
 
-def input_files(capture: Capture, names: Iterable[str]) -> list[Path]:
-    """Return the files behind parts of a capture, for hashing.
+def input_files(capture: Capture, names: Iterable[str]) -> dict[str, list[Path]]:
+    """Return the files behind parts of a capture, for hashing, by the part they play.
 
     Args:
         capture: the capture.
-        names: any of "scans", "boards", "calibration", "masks", "videos".
+        names: any of "teeth", "mandible", "skull", "boards", "calibration", "masks", "videos".
     """
-    files: list[Path] = []
+    parts: dict[str, list[Path]] = {}
     for name in names:
-        if name == "scans":
-            files += [path for key in MESHES if (path := getattr(capture.scans, key)) is not None]
+        if name == "teeth":
+            parts |= {key: [getattr(capture.scans, key)] for key in MESHES if key not in BONES}
+        elif name in BONES and (path := getattr(capture.scans, name)) is not None:
+            parts[name] = [path]
         elif name == "calibration" and capture.calibration is not None:
-            files += calibration_files(capture.calibration)
+            parts[name] = calibration_files(capture.calibration)
         elif name == "boards" and capture.boards is not None:
-            files += _sequence_files(capture.boards.videos)
+            parts |= {f"boards {k}": _sequence_files(path) for k, path in enumerate(capture.boards.videos)}
         elif name == "videos":
-            files += [camera.video for camera in capture.cameras if camera.video is not None]
+            parts |= {f"video {camera.name}": [camera.video] for camera in capture.cameras if camera.video is not None}
         elif name == "masks":
             for camera in capture.cameras:
-                masks = camera.masks
-                files += _sequence_files(dict.fromkeys((masks.upper, masks.lower)) if masks else ())
-    return [path for path in files if path.is_file()]
+                rows = {camera.masks.upper: "upper", camera.masks.lower: "lower"} if camera.masks else {}
+                parts |= {f"masks {camera.name} {row}": _sequence_files(path) for path, row in rows.items()}
+    return {part: [path for path in files if path.is_file()] for part, files in parts.items()}
 
 
-def _sequence_files(paths: Iterable[Path]) -> list[Path]:
-    """Return videos as they are and all files beside each picture pattern."""
-    return [file for path in paths for file in (sorted(path.parent.iterdir()) if "%" in path.name else [path])]
+def input_hashes(capture: Capture, names: Iterable[str]) -> dict[str, str]:
+    """Return the content hashes of parts of a capture.
+
+    Args:
+        capture, names: see `input_files`.
+
+    Raises:
+        CaptureError: a file cannot be read.
+    """
+    try:
+        return {part: hash_files(files) for part, files in input_files(capture, names).items()}
+    except OSError as error:
+        raise CaptureError(f"cannot be read: {error.strerror}.", path=error.filename) from error
+
+
+def _sequence_files(path: Path) -> list[Path]:
+    """Return a video as it is, and the numbered files of a picture pattern; others may lie beside them."""
+    head, sign, tail = path.name.partition("%")
+    if not sign:
+        return [path]
+    tail = tail.partition("d")[2]
+    names = (file.name for file in path.parent.iterdir())
+    return [path.parent / n for n in sorted(names) if n.startswith(head) and n.endswith(tail) and n != path.name]

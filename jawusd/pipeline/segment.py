@@ -18,7 +18,7 @@ from jawusd.formats.tracks import LOST
 from jawusd.pipeline.extras import stage
 from jawusd.pipeline.journal import Journal
 from jawusd.pipeline.overlay import open_footage
-from jawusd.pipeline.prepare import input_files, load_meshes
+from jawusd.pipeline.prepare import input_hashes, load_meshes
 from jawusd.pipeline.state import Progress, hash_files, hash_value
 
 LEARNED = "learned.json"
@@ -104,9 +104,10 @@ class _Segmenting:
 
     def _inputs(self, offsets, options) -> str:
         keys = sorted(options.keys.rglob("*.png")) if options.keys else []
-        described = self._capture.model_dump(mode="json", include={"bootstrap", "frames"})
-        files = hash_files([*input_files(self._capture, ["videos", "scans", "calibration"]), *keys])
-        return hash_value([files, described, offsets])
+        drawn = {str(path.relative_to(options.keys)): hash_files([path]) for path in keys}
+        described = self._capture.model_dump(mode="json", include={"bootstrap", "frames", "calibration_unit_mm"})
+        files = input_hashes(self._capture, ["videos", "teeth", "calibration"])
+        return hash_value([files, drawn, described, offsets])
 
     def run(self) -> dict[str, Any]:
         bootstrap = self._capture.bootstrap

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from jawusd.errors import FormatError, OutputError
-from jawusd.formats.atomic import write_text_atomic
+from jawusd.formats.atomic import clear_unfinished, write_text_atomic
 from jawusd.formats.npz import check_format
 
 FAMILY, VERSION = "jawusd-build", 1
@@ -106,10 +106,8 @@ class BuildState:
         """
         hashes = {str(path.relative_to(self.folder)): hash_files([path]) for path in outputs}
         self.stages[stage] = StageRecord(inputs, hashes, round(seconds, 3), result)
-        data = {
-            "format": f"{FAMILY}/{VERSION}",
-            "stages": {name: asdict(record) for name, record in self.stages.items()},
-        }
+        stages = json.loads(json.dumps({name: asdict(record) for name, record in self.stages.items()}))
+        data = {"format": f"{FAMILY}/{VERSION}", "stages": stages, "sha256": hash_value(stages)}
         write_text_atomic(self.folder / BUILD_FILE, json.dumps(data, indent=1, sort_keys=True) + "\n")
         return self.stages[stage]
 
@@ -129,8 +127,11 @@ def _read(path: Path) -> dict[str, StageRecord]:
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
         check_format(data.get("format"), FAMILY, VERSION, path)
+        # Results are used without a look at every value in them: nothing may have changed since they were written.
+        if data["sha256"] != hash_value(data["stages"]):
+            raise ValueError("changed since it was written")
         return {str(name): StageRecord(**record) for name, record in data["stages"].items()}
-    except (OSError, ValueError, TypeError, AttributeError, KeyError) as error:
+    except (OSError, ValueError, TypeError, AttributeError, KeyError, RecursionError) as error:
         raise FormatError(
             f"is damaged ({error}).", path=path, hint="Delete it, or build with --fresh into a new folder."
         ) from error
@@ -139,6 +140,8 @@ def _read(path: Path) -> dict[str, StageRecord]:
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
     """Hold the output folder for one build; the lock falls with the process, however it ends.
+
+    What a killed build left unfinished is deleted.
 
     Raises:
         OutputError: the folder cannot be written, or another build holds it.
@@ -153,6 +156,7 @@ def locked(folder: Path) -> Iterator[None]:
             raise OutputError(
                 "another jawusd build is working in this folder.", path=folder, hint="Wait for it, or name another one."
             )
+        clear_unfinished(folder)
         yield
     finally:
         os.close(handle)

@@ -31,6 +31,8 @@ _BETWEEN_MM = 0.02
 _SHARES = (0.25, 0.5, 0.75)
 _MAX_HALVINGS = 5
 _USD_LERP_BELOW = 1e-5
+# Every whole frame is baked: an hour at 60 per second fits.
+_MOST_FRAMES, _FARTHEST_FRAME = 220_000, 1e9
 #: Key of the lost frames in an animation layer's `customLayerData`.
 LOST = "lostFrames"
 
@@ -69,10 +71,16 @@ def write_animation(
     frames, d = np.asarray(frames, dtype=np.float64), np.asarray(d, dtype=np.float64)
     if frames.ndim != 1 or d.shape != (len(frames), 3):
         raise ValueError(f"frames (F,) and d (F, 3) are needed, got {frames.shape} and {d.shape}")
-    if not np.isfinite(frames).all() or (np.diff(frames) <= 0).any():
+    if not len(frames) or not np.isfinite(frames).all() or (np.diff(frames) <= 0).any():
         raise RigError("the frame numbers of an animation must increase.", path=out)
     if not fps > 0:
         raise RigError(f"{fps} frames per second; it must be more than 0.", path=out)
+    if frames[-1] - frames[0] > _MOST_FRAMES or np.abs(frames).max() > _FARTHEST_FRAME:
+        raise RigError(
+            f"frames {frames[0]:g} to {frames[-1]:g}; an animation has at most {_MOST_FRAMES} frames within "
+            f"+-{_FARTHEST_FRAME:g}.",
+            path=out,
+        )
     known = np.isfinite(d).all(axis=1)
     if not known.any():
         raise RigError("no frame has parameters; there is nothing to animate.", path=out)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +30,7 @@ from jawusd.rig.layout import (
     ONNX_FILE,
     PARAMETERS,
     RIG_FILE,
+    SIDECAR_HASH,
     SKULL,
 )
 from jawusd.rig.sampling import sample_valid
@@ -75,6 +78,13 @@ def interface_layer(rig: JawRig, name: str, meshes: Mapping[str, Mesh], fps: flo
     set_relationship(actor, "jaw:skull", [SKULL])
     set_relationship(actor, "jaw:mandible", [MANDIBLE])
     return layer
+
+
+def record_sidecars(layer: Sdf.Layer, folder: Path) -> None:
+    """Write down in `actor.usda` which ONNX files belong to it: the SHA-256 of each, as custom data."""
+    for attribute, file in zip(ONNX_ATTRIBUTES, (ONNX_FILE, ENCODE_FILE), strict=True):
+        found = hashlib.sha256((folder / file).read_bytes()).hexdigest()
+        layer.GetAttributeAtPath(f"{ACTOR}.{attribute}").customData = {SIDECAR_HASH: found}
 
 
 def decoder_layer(rig: JawRig, table: DecoderTable) -> Sdf.Layer:

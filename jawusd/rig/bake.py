@@ -13,7 +13,7 @@ from jawusd.errors import RigError
 from jawusd.evaluator import JawRig
 from jawusd.formats.mesh import Mesh
 from jawusd.rig.animation import write_animation
-from jawusd.rig.author import decoder_layer, interface_layer
+from jawusd.rig.author import decoder_layer, interface_layer, record_sidecars
 from jawusd.rig.geo import build_geometry, check_meshes
 from jawusd.rig.layers import write_layer
 from jawusd.rig.layout import ACTOR_FILE, ENCODE_FILE, GEO_FILE, ONNX_FILE, PACKAGE_FILE, RIG_FILE, SKEL_FILE
@@ -79,8 +79,10 @@ def bake_rig(
         write_layer(decoder_layer(rig, table), folder / RIG_FILE),
         write_onnx(folder / ONNX_FILE, decode_model(rig)),
         write_onnx(folder / ENCODE_FILE, encode_model(rig)),
-        write_layer(interface_layer(rig, name, meshes, fps), folder / ACTOR_FILE),
     ]
+    interface = interface_layer(rig, name, meshes, fps)
+    record_sidecars(interface, folder)
+    written.append(write_layer(interface, folder / ACTOR_FILE))
     shown = folder / ACTOR_FILE
     if frames is not None and d is not None:
         shown = write_animation(folder / CAPTURED_MOTION, folder / ACTOR_FILE, frames, d, fps, rig=rig)

@@ -13,8 +13,10 @@ from jawusd.errors import RigError
 from jawusd.formats.mesh import Mesh
 from jawusd.rig.geo import MESH_PATHS
 from jawusd.rig.read import open_stage
+from jawusd.rig.untrusted import blames_file
 
 
+@blames_file(0)
 def read_geometry(path: str | os.PathLike[str]) -> dict[str, Mesh]:
     """Read the meshes of `geo.usdc`.
 
@@ -52,6 +54,7 @@ def _read(path: str | os.PathLike[str], *, placeholders: bool) -> dict[str, Mesh
     return found
 
 
+@blames_file(0)
 def read_gum(path: str | os.PathLike[str]) -> dict[str, NDArray[np.bool_]]:
     """Read which faces of the teeth meshes are gum.
 

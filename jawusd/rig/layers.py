@@ -6,10 +6,10 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from pxr import Sdf, Usd, UsdGeom
+from pxr import Sdf, Tf, Usd, UsdGeom
 
 from jawusd import __version__
-from jawusd.errors import RigError
+from jawusd.errors import OutputError, RigError
 from jawusd.formats.atomic import atomic_path
 from jawusd.rig.layout import ACTOR
 from jawusd.rig.schema import SCHEMA_NAME
@@ -96,13 +96,16 @@ def write_layer(layer: Sdf.Layer, path: Path) -> Path:
     """Write a layer to a file atomically; a copy of that file already open in this process is reloaded.
 
     Raises:
-        OutputError: the folder cannot be written.
-        RigError: OpenUSD refused the layer.
+        OutputError: the file cannot be written.
     """
     path = Path(path)
     with atomic_path(path) as temporary:
-        if not layer.Export(str(temporary)):
-            raise RigError("OpenUSD could not write the layer.", path=path)
+        try:
+            written = layer.Export(str(temporary))
+        except Tf.ErrorException:  # says in which line of OpenUSD, not why
+            written = False
+        if not written:
+            raise OutputError("could not be written; is the disk full? What was there before is untouched.", path=path)
     # OpenUSD keeps layers by name; without this a stage opened later in this process would show the old content.
     in_use = Sdf.Layer.Find(str(path.resolve())) or Sdf.Layer.Find(str(path))
     if in_use is not None:

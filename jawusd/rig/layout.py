@@ -15,6 +15,7 @@ SKEL_FILE, PACKAGE_FILE = "actor_skel.usdc", "actor.usdz"
 
 PARAMETERS = ("jaw:d1", "jaw:d2", "jaw:d3")
 ONNX_ATTRIBUTES = ("jaw:onnx", "jaw:onnx:encode")
+SIDECAR_HASH = "sha256"  # key of the custom data of these attributes
 
 
 @dataclass(frozen=True)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
+from pathlib import Path
 
 import numpy as np
 import onnx
 from numpy.typing import NDArray
 from onnx.reference import ReferenceEvaluator
 
-from jawusd.errors import FormatError
+from jawusd.errors import FormatError, JawusdError
 from jawusd.evaluator import JawRig
 from jawusd.geometry.se3 import transform_points
 from jawusd.rig.arrays import model_hash
@@ -17,16 +19,34 @@ from jawusd.rig.onnx_graph import float_type
 from jawusd.rig.onnx_sidecar import FORMAT
 
 
-def onnx_error_mm(path: str | os.PathLike[str], rig: JawRig, d: NDArray[np.float64]) -> float:
+def onnx_error_mm(
+    path: str | os.PathLike[str], rig: JawRig, d: NDArray[np.float64], recorded: str | None = None
+) -> float:
     """Return how far a graph is from the model [mm], as the largest landmark distance over parameters d (n, 3).
 
     A graph that decodes is compared by its poses. One that encodes gets the model's poses of d, and the poses of the
     parameters it finds are compared with them.
 
+    Args:
+        path: the graph.
+        rig: the model.
+        d: parameters (n, 3) [mm].
+        recorded: SHA-256 of the file as the rig knows it; any other file is refused unread. None: rigs baked before
+            0.1.0 know none.
+
     Raises:
-        FormatError: not an ONNX file of jawusd, or made from another model.
+        FormatError: not the file of the rig, not an ONNX file of jawusd, or made from another model.
     """
-    model = _load(path, rig)
+    model = _load(path, rig, recorded)
+    try:
+        return _error_mm(model, rig, d)
+    except JawusdError:
+        raise
+    except Exception as error:  # the evaluator reports damaged graphs by whatever its operators stumble over
+        raise FormatError(f"cannot be run ({type(error).__name__}).", path=path) from error
+
+
+def _error_mm(model: onnx.ModelProto, rig: JawRig, d: NDArray[np.float64]) -> float:
     dtype = float_type(model)
     run = ReferenceEvaluator(model).run
     if model.graph.input[0].name == "d":
@@ -41,9 +61,15 @@ def onnx_error_mm(path: str | os.PathLike[str], rig: JawRig, d: NDArray[np.float
     return float(np.linalg.norm(moved, axis=-1).max())
 
 
-def _load(path: str | os.PathLike[str], rig: JawRig) -> onnx.ModelProto:
+def _load(path: str | os.PathLike[str], rig: JawRig, recorded: str | None) -> onnx.ModelProto:
     try:
-        model = onnx.load(os.fspath(path))
+        content = Path(path).read_bytes()
+    except OSError as error:
+        raise FormatError(f"cannot be read: {error.strerror}.", path=path) from error
+    if recorded is not None and hashlib.sha256(content).hexdigest() != recorded:
+        raise FormatError("is not the file baked with the rig (SHA-256 differs); bake the rig again.", path=path)
+    try:
+        model = onnx.load_from_string(content)  # as bytes: weights in other files are not looked for
         onnx.checker.check_model(model)
     except Exception as error:  # the protobuf and onnx exceptions share no base
         raise FormatError(f"is not a valid ONNX file ({type(error).__name__}).", path=path) from error

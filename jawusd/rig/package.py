@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from pathlib import Path
 
 from pxr import Sdf, Usd, UsdUtils
 
 from jawusd.errors import RigError
-from jawusd.formats.atomic import atomic_path
+from jawusd.formats.atomic import atomic_path, scratch_folder
 from jawusd.rig.layout import ACTOR, ACTOR_FILE, ONNX_ATTRIBUTES
 from jawusd.rig.read import open_stage
 
@@ -36,8 +35,8 @@ def write_package(out: str | os.PathLike[str], source: str | os.PathLike[str]) -
     """
     out = Path(out)
     layer = _flattened(open_stage(source))
-    with tempfile.TemporaryDirectory() as scratch:
-        text = Path(scratch) / ACTOR_FILE
+    with scratch_folder(out) as scratch:
+        text = scratch / ACTOR_FILE
         if not layer.Export(str(text)):
             raise RigError("OpenUSD could not flatten the actor.", path=source)
         os.utime(text, (_ZIP_EPOCH, _ZIP_EPOCH))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from jawusd.rig.arrays import read_arrays, read_value
 from jawusd.rig.layout import ONNX_ATTRIBUTES, PARAMETERS
 from jawusd.rig.schema import has_jaw_api
 from jawusd.rig.table import DecoderTable
+from jawusd.rig.untrusted import blames_file, check_reach
 from jawusd.rig.versions import bring_up_to_date
 
 PathArg = str | os.PathLike[str]
@@ -42,15 +44,19 @@ def open_stage(path: PathArg) -> Usd.Stage:
     """Open a stage.
 
     Raises:
-        RigError: there is no such file, or it is not USD.
+        RigError: there is no such file, it is not USD, or a rig in it names files outside its folder.
     """
     path = Path(path)
     if not path.is_file():
         raise RigError("there is no such file.", path=path)
     try:
-        return Usd.Stage.Open(str(path))
-    except Tf.ErrorException as error:
+        layers = check_reach(path)
+        stage = Usd.Stage.Open(str(path))
+    except (Tf.ErrorException, RuntimeError, MemoryError, ValueError, OSError) as error:
         raise RigError("is not a USD file that OpenUSD can read.", path=path) from error
+    if not layers or stage is None:
+        raise RigError("is not a USD file that OpenUSD can read.", path=path)
+    return stage
 
 
 def find_rig_prim(stage: Usd.Stage, where: object, prim_path: str | None = None) -> Usd.Prim:
@@ -73,6 +79,7 @@ def find_rig_prim(stage: Usd.Stage, where: object, prim_path: str | None = None)
     return prims[0]
 
 
+@blames_file(1)
 def rig_of(prim: Usd.Prim, where: object) -> JawRig:
     """Build the evaluator from a rig prim; see `load_rig` for what it raises.
 
@@ -81,7 +88,6 @@ def rig_of(prim: Usd.Prim, where: object) -> JawRig:
     """
     bring_up_to_date(prim, where)
     check_units(prim, where)
-    check_assets(prim, where)
     kind = read_value(prim, "jaw:model:kind", where)
     arrays = read_arrays(prim, kind, where)
     try:
@@ -111,38 +117,7 @@ def check_units(prim: Usd.Prim, where: object) -> None:
             raise UnitsError(f"{name} is {found}, allowed is {wanted}.", path=str(where))
 
 
-def check_assets(prim: Usd.Prim, where: object) -> None:
-    """Check that the layers of a rig name only files in their own folder or below.
-
-    Layers that merely use a rig (animation, shots) may reach for it anywhere.
-
-    Raises:
-        RigError: naming the path.
-    """
-    for spec in prim.GetAttribute("jaw:formatVersion").GetPropertyStack():
-        layer = spec.layer
-        paths = [*layer.GetCompositionAssetDependencies(), *_authored_onnx(layer, spec.path.GetPrimPath())]
-        for asset in paths:
-            if escapes(asset):
-                raise RigError(f"names the file {asset}, outside its own folder.", path=layer.identifier or str(where))
-
-
-def escapes(asset: str) -> bool:
-    """Return whether an asset path leaves the folder of the layer that names it."""
-    parts = asset.replace("\\", "/").split("/")
-    depth = 0
-    for part in parts:
-        depth += {"..": -1, ".": 0, "": 0}.get(part, 1)
-        if depth < 0:
-            return True
-    return asset.startswith(("/", "\\")) or ":" in parts[0]
-
-
-def _authored_onnx(layer: Sdf.Layer, prim_path: Sdf.Path) -> list[str]:
-    attributes = [layer.GetAttributeAtPath(prim_path.AppendProperty(name)) for name in ONNX_ATTRIBUTES]
-    return [attribute.default.path for attribute in attributes if attribute is not None and attribute.default]
-
-
+@blames_file(1)
 def read_table(prim: Usd.Prim, where: object) -> DecoderTable:
     """Read the sampled decoder of a rig prim.
 
@@ -159,7 +134,7 @@ def read_table(prim: Usd.Prim, where: object) -> DecoderTable:
     if list(values["shape"]) != counts or min(counts) < 2 or any((np.diff(axis) <= 0).any() for axis in knots):
         raise FormatError(f"jaw:decoder:shape is {list(values['shape'])}, the knots are {counts}.", path=str(where))
     shape = (*counts, 6) if values["format"] == "grid" else (sum(counts), 6)
-    if twists.size != np.prod(shape):
+    if twists.size != math.prod(shape):
         raise FormatError(f"jaw:decoder:twists holds {twists.size} numbers, expected {shape}.", path=str(where))
     if not np.isfinite(twists).all() or not all(np.isfinite(axis).all() for axis in knots):
         raise FormatError("jaw:decoder holds values that are not finite.", path=str(where))
@@ -168,6 +143,7 @@ def read_table(prim: Usd.Prim, where: object) -> DecoderTable:
     )
 
 
+@blames_file(0)
 def describe(path: PathArg, prim_path: str | None = None) -> dict[str, Any]:
     """Return what a rig file holds, as plain JSON values, for `jawusd info`.
 

@@ -13,7 +13,7 @@ from jawusd.errors import JawusdError
 from jawusd.evaluator import JawRig
 from jawusd.geometry.se3 import transform_points
 from jawusd.rig import _gf
-from jawusd.rig.layout import ONNX_ATTRIBUTES, PARAMETERS
+from jawusd.rig.layout import ONNX_ATTRIBUTES, PARAMETERS, SIDECAR_HASH
 from jawusd.rig.read import read_table, rig_of
 from jawusd.rig.sampling import sample_valid
 
@@ -75,8 +75,9 @@ def check_table(prim: Usd.Prim) -> Iterator[Finding]:
 def check_onnx(prim: Usd.Prim) -> Iterator[Finding]:
     """Check that the ONNX files named by the rig were made from this model and give its results."""
     rig = _rig(prim)
-    assets = [prim.GetAttribute(name).Get() for name in ONNX_ATTRIBUTES]
-    if rig is None or not any(assets):
+    attributes = [prim.GetAttribute(name) for name in ONNX_ATTRIBUTES]
+    assets = {a.Get(): a.GetCustomDataByKey(SIDECAR_HASH) for a in attributes if isinstance(a.Get(), Sdf.AssetPath)}
+    if rig is None or not assets:
         return
     try:
         from jawusd.rig.onnx_check import onnx_error_mm
@@ -84,12 +85,12 @@ def check_onnx(prim: Usd.Prim) -> Iterator[Finding]:
         yield _finding("info", "Onnx", prim, "not checked: the package onnx is not installed (jawusd[build]).")
         return
     d = sample_valid(rig, _ONNX_PROBES)
-    for asset in filter(None, assets):
+    for asset, recorded in assets.items():
         if not asset.resolvedPath:
             yield _finding("error", "Onnx", prim, f"{asset.path} is not there.")
             continue
         try:
-            error_mm = onnx_error_mm(asset.resolvedPath, rig, d)
+            error_mm = onnx_error_mm(asset.resolvedPath, rig, d, recorded)
         except JawusdError as error:
             yield _finding("error", "Onnx", prim, f"{asset.path} {error.message}")
             continue

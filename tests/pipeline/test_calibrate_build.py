@@ -144,7 +144,7 @@ def test_a_calibration_of_colmap_is_read_where_the_capture_names_it(capture, tmp
     for found, wanted in zip(load_cameras(opened), truth, strict=True):
         np.testing.assert_allclose(found.K, wanted.K, atol=1e-9)
         np.testing.assert_allclose(found.T_cam_world, wanted.T_cam_world, atol=1e-7)
-    assert [path.name for path in input_files(opened, ["calibration"])] == ["cameras.txt", "images.txt"]
+    assert [path.name for path in input_files(opened, ["calibration"])["calibration"]] == ["cameras.txt", "images.txt"]
 
 
 @pytest.fixture(scope="module")

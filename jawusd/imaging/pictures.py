@@ -1,0 +1,31 @@
+"""Read single pictures, whatever is in the file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["read_picture"]
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+_MOST_PX = 1 << 27  # four times 8K; a few bytes can declare a picture that fills the memory
+
+
+def read_picture(path: Path, flags: int) -> NDArray[np.uint8] | NDArray[np.uint16] | None:
+    """Return a picture, or None where the file is none that can be decoded.
+
+    Args:
+        path: PNG, JPEG, TIFF or what else OpenCV knows.
+        flags: of `cv2.imread`.
+    """
+    try:
+        with open(path, "rb") as file:
+            head = file.read(24)
+        if head.startswith(_PNG) and int.from_bytes(head[16:20]) * int.from_bytes(head[20:24]) > _MOST_PX:
+            return None
+        return cv2.imread(str(path), flags)
+    except (OSError, cv2.error, MemoryError):
+        return None

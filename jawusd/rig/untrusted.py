@@ -1,0 +1,139 @@
+"""Read USD that somebody else wrote: nothing outside a rig's folder is opened, and every fault of a file is its own."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pxr import Sdf, Tf, UsdUtils
+
+from jawusd.errors import FormatError, RigError
+from jawusd.rig.schema import SCHEMA_NAME
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+# A value in USD has any type that its file declares: what then does not fit raises one of these.
+_FAULTS = (
+    ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError, Tf.ErrorException,
+)  # fmt: skip
+_OF_A_RIG = ("jaw:formatVersion", "jaw:model", "jaw:bounds", "jaw:decoder")
+
+
+def blames_file(argument: int) -> Callable[[F], F]:
+    """Make a reader raise FormatError where values of a file are not of the kind it expects.
+
+    Args:
+        argument: which positional argument of the reader says where the values come from.
+
+    Returns:
+        The decorator.
+    """
+
+    def decorate(function: F) -> F:
+        @functools.wraps(function)
+        def wrapped(*args: Any, **named: Any) -> Any:
+            try:
+                return function(*args, **named)
+            except _FAULTS as error:
+                found = (str(error).strip().splitlines() or [type(error).__name__])[-1]
+                raise FormatError(f"holds values that cannot be ({found:.200}).", path=str(args[argument])) from error
+
+        return wrapped
+
+    return decorate
+
+
+def check_reach(path: Path) -> list[Sdf.Layer]:
+    """Check, before anything is composed, that the layers of a rig name only files in their own folder or below.
+
+    Layers that merely use a rig (animation, shots) may reach for it anywhere; what a rig's layers bring in must stay
+    where the rig is, through links too.
+
+    Args:
+        path: the layer or package to be opened.
+
+    Returns:
+        The layers, which stay loaded as long as somebody holds them.
+
+    Raises:
+        RigError: naming the path.
+    """
+    layers, seen = [], set()
+    waiting: list[tuple[str, Path | None]] = [(str(path), None)]
+    while waiting:
+        place = waiting.pop()
+        if place in seen:
+            continue
+        seen.add(place)
+        name, home = place
+        layer = _layer(name)
+        if layer is None:
+            continue
+        layers.append(layer)
+        if home is None and _carries_rig(layer):
+            home = _file(name).resolve().parent
+        for asset in _assets(layer):
+            target = layer.ComputeAbsolutePath(asset)
+            if home is not None and (escapes(asset) or not _file(target).resolve().is_relative_to(home)):
+                raise RigError(f"names the file {asset:.200}, outside its own folder.", path=layer.identifier)
+            if asset in layer.GetCompositionAssetDependencies() or Path(asset).suffix.startswith(".usd"):
+                waiting.append((target, home))
+    return layers
+
+
+def escapes(asset: str) -> bool:
+    """Return whether an asset path leaves the folder of the layer that names it."""
+    parts = asset.replace("\\", "/").split("/")
+    depth = 0
+    for part in parts:
+        depth += {"..": -1, ".": 0, "": 0}.get(part, 1)
+        if depth < 0:
+            return True
+    return asset.startswith(("/", "\\")) or ":" in parts[0]
+
+
+def _file(name: str) -> Path:
+    """Return the file of a layer's name: that of the package for a layer inside one."""
+    return Path(name.split("[")[0])
+
+
+def _layer(name: str) -> Sdf.Layer | None:
+    """Open a layer; None where there is none to open: what then is missing is found later."""
+    file = _file(name)
+    if not file.exists():
+        return None
+    if not file.is_file():
+        raise RigError("is not a file.", path=file)
+    try:
+        return Sdf.Layer.FindOrOpen(name)
+    except Tf.ErrorException:
+        return None
+
+
+def _assets(layer: Sdf.Layer) -> list[str]:
+    """Return every path of a file that a layer names: of layers, values, clips and other metadata."""
+    found: list[str] = []
+
+    def note(asset: str) -> str:
+        found.append(asset)
+        return asset
+
+    UsdUtils.ModifyAssetPaths(layer, note)
+    return [asset for asset in dict.fromkeys(found) if asset]
+
+
+def _carries_rig(layer: Sdf.Layer) -> bool:
+    found = []
+
+    def visit(path: Sdf.Path) -> None:
+        if path.IsPropertyPath():
+            found.append(path.name.startswith(_OF_A_RIG))
+        elif path.IsPrimPath() or path.IsPrimVariantSelectionPath():
+            spec = layer.GetPrimAtPath(path)
+            schemas = spec.GetInfo("apiSchemas") if spec else None
+            found.append(schemas is not None and SCHEMA_NAME in schemas.GetAddedOrExplicitItems())
+
+    layer.Traverse(Sdf.Path.absoluteRootPath, visit)
+    return any(found)

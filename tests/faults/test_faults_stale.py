@@ -1,0 +1,141 @@
+"""A changed input or setting makes exactly those stages stale that depend on it."""
+
+import os
+import shutil
+
+import pytest
+from package_copy import ROOT
+
+from jawusd.pipeline import build
+from jawusd.pipeline.build import BuildOptions, build_rig
+from jawusd.pipeline.prepare import input_files, open_capture
+
+EXAMPLE = ROOT / "examples" / "capture"
+FROM_TRACK = ["track", "fit", "aid", "bake", "report"]
+OFFSETS = {"cam0": 0, "cam1": 2, "cam2": -1}
+
+
+@pytest.fixture
+def capture(tmp_path):
+    """A copy of the example; files are links until a test replaces them."""
+    folder = tmp_path / "capture"
+    same_disk = EXAMPLE.stat().st_dev == tmp_path.stat().st_dev
+    shutil.copytree(EXAMPLE, folder, copy_function=os.link if same_disk else shutil.copy)
+    return folder
+
+
+@pytest.fixture
+def rebuilt(monkeypatch, tmp_path, capture):
+    """Return a function that builds with stages that only write what they depend on, and says which ones ran."""
+    ran = []
+
+    def stub(name, write):
+        def work(self, *_):
+            ran.append(name)
+            path = self.folder / f"{name}.txt"
+            path.write_text(write(self))
+            return [path], {"offsets": self.capture.sync.offsets or OFFSETS}
+
+        monkeypatch.setattr(build._Build, f"_{name}", work)
+
+    for name in ("sync", "track", "aid", "bake", "report"):
+        stub(name, lambda _: "always the same")
+    stub("fit", lambda self: f"{self.capture.name} {self.capture.fps} {self.options.model}")
+    monkeypatch.setattr(build, "build_summary", dict, raising=False)
+
+    def run(**options):
+        ran.clear()
+        build_rig(capture, tmp_path / "out", BuildOptions(resume=True, **options), lambda *_: None)
+        return list(ran)
+
+    return run
+
+
+def replace(path, change):
+    """Write a changed file, never through a link."""
+    data = change(path.read_bytes())
+    path.unlink()
+    path.write_bytes(data)
+
+
+def edit(old, new):
+    """Return a change of capture.toml."""
+
+    def change(folder):
+        def swapped(data):
+            assert old.encode() in data
+            return data.replace(old.encode(), new.encode(), 1)
+
+        replace(folder / "capture.toml", swapped)
+
+    return change
+
+
+def grow(name):
+    """Return a change of a file's content that its reader need not notice."""
+    return lambda folder: replace(folder / name, lambda data: data + b"\n")
+
+
+def bone_as_another(folder):
+    edit('mandible = "scans/mandible.ply"\n', "")(folder)
+    edit("scans/skull.ply", "scans/mandible.ply")(folder)
+
+
+@pytest.mark.parametrize(
+    ("change", "stale"),
+    [
+        (lambda folder: None, []),
+        (grow("scans/upper_teeth.ply"), FROM_TRACK),
+        (grow("scans/lower_teeth.ply"), FROM_TRACK),
+        (grow("scans/mandible.ply"), FROM_TRACK),
+        (grow("scans/skull.ply"), ["bake", "report"]),
+        (bone_as_another, FROM_TRACK),
+        (grow("masks/cam1/lower.mkv"), FROM_TRACK),
+        (grow("calibration.toml"), FROM_TRACK),
+        (grow("video/cam2.mp4"), ["sync", "report"]),
+        (edit("fps = 24.0", "fps = 24.5"), ["sync", "fit", "aid", "bake", "report"]),
+        (edit('name = "synthetic_0"', 'name = "other"'), ["fit", "aid", "bake", "report"]),
+        (edit("frames = [20, 320]", "frames = [20, 300]"), FROM_TRACK),
+        (edit("x = 793.13", "x = 793.5"), FROM_TRACK),
+        (edit("[motion]", "[anatomy.landmarks]\nincisor = [0.0, 1.0, 2.0]\n\n[motion]"), FROM_TRACK),
+        (edit('calibration = "calibration.toml"', 'calibration = "calibration.toml"\ncalibration_unit_mm = 2.0'),
+         FROM_TRACK),
+        (edit('method = "flash"', 'method = "audio"'), ["sync"]),
+        (edit('method = "flash"', "offsets = {cam0 = 0, cam1 = 1, cam2 = 1}"), ["sync", *FROM_TRACK]),
+    ],
+)  # fmt: skip
+def test_a_change_redoes_exactly_what_depends_on_it(rebuilt, capture, change, stale):
+    assert rebuilt() == ["sync", *FROM_TRACK]
+    change(capture)
+    assert rebuilt() == stale
+    assert rebuilt() == []
+
+
+@pytest.mark.parametrize(
+    ("options", "stale"),
+    [
+        ({"model": "additive"}, ["fit", "aid", "bake", "report"]),
+        ({"solver": "paper"}, FROM_TRACK),
+        ({"solver": "contour", "jobs": 7}, []),
+    ],
+)
+def test_an_option_redoes_exactly_what_depends_on_it(rebuilt, options, stale):
+    rebuilt()
+    assert rebuilt(**options) == stale
+
+
+def test_a_moved_capture_is_the_same_capture(rebuilt, capture, tmp_path):
+    rebuilt()
+    capture.rename(tmp_path / "elsewhere")
+    (tmp_path / "elsewhere").rename(capture)
+    assert rebuilt() == []
+
+
+def test_files_beside_numbered_masks_do_not_count(capture):
+    folder = capture / "masks" / "cam0" / "numbered"
+    folder.mkdir()
+    for name in ("000001.png", "000002.png", ".jawusd-tmp-000003-x.png", "notes.txt", "Thumbs.db"):
+        (folder / name).write_bytes(b"x")
+    edit("masks/cam0/upper.mkv", "masks/cam0/numbered/%06d.png")(capture)
+    found = input_files(open_capture(capture), ["masks"])["masks cam0 upper"]
+    assert [path.name for path in found] == ["000001.png", "000002.png"]
