@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -239,5 +240,5 @@ def _sequence_files(path: Path) -> list[Path]:
     if not sign:
         return [path]
     tail = tail.partition("d")[2]
-    names = (file.name for file in path.parent.iterdir())
-    return [path.parent / n for n in sorted(names) if n.startswith(head) and n.endswith(tail) and n != path.name]
+    numbered = re.compile(rf"{re.escape(head)}\d+{re.escape(tail)}")
+    return sorted(file for file in path.parent.iterdir() if numbered.fullmatch(file.name))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -18,6 +19,8 @@ F = TypeVar("F", bound=Callable[..., Any])
 _FAULTS = (
     ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError, Tf.ErrorException,
 )  # fmt: skip
+# OpenUSD's parser of text calls itself for every bracket and ends the process when its stack is full.
+_NESTED = re.compile(rb"(?:[(\[{]\s*){500}")
 _OF_A_RIG = ("jaw:formatVersion", "jaw:model", "jaw:bounds", "jaw:decoder")
 
 
@@ -106,6 +109,8 @@ def _layer(name: str) -> Sdf.Layer | None:
         return None
     if not file.is_file():
         raise RigError("is not a file.", path=file)
+    if _NESTED.search(file.read_bytes()):
+        raise RigError("is nested too deeply.", path=file)
     try:
         return Sdf.Layer.FindOrOpen(name)
     except Tf.ErrorException:

@@ -55,19 +55,37 @@ def break_onnx_presence(folder):
     (folder / "actor.onnx").unlink()
 
 
+def break_onnx_hash(folder):
+    rig = example_rig()
+    write_onnx(folder / "actor.onnx", decode_model(rig, np.float64))
+
+
+def forget_hashes(folder):
+    """Make the rig one that recorded no hashes, as before 0.1.0."""
+
+    def change(layer):
+        for name in ("jaw:onnx", "jaw:onnx:encode"):
+            layer.GetAttributeAtPath(f"/Actor.{name}").customData = {}
+
+    edit(folder / "actor.usda", change)
+
+
 def break_onnx_identity(folder):
+    forget_hashes(folder)
     rig = example_rig()
     arrays = {**rig.arrays, "incisor": rig.arrays["incisor"] + 0.1}
     write_onnx(folder / "actor.onnx", decode_model(JawRig(arrays, rig.meta)))
 
 
 def break_encoder_identity(folder):
+    forget_hashes(folder)
     rig = example_rig()
     arrays = {**rig.arrays, "incisor": rig.arrays["incisor"] + 0.1}
     write_onnx(folder / "actor_encode.onnx", encode_model(JawRig(arrays, rig.meta)))
 
 
 def break_onnx_agreement(folder):
+    forget_hashes(folder)
     model = onnx.load(folder / "actor.onnx")
     for tensor in model.graph.initializer:
         values = onnx.numpy_helper.to_array(tensor)
@@ -78,6 +96,7 @@ def break_onnx_agreement(folder):
 
 def break_encoder_agreement(folder):
     """The right label on the graph of another jaw."""
+    forget_hashes(folder)
     rig = example_rig()
     model = encode_model(JawRig({**rig.arrays, "incisor": rig.arrays["incisor"] + 0.5}, rig.meta))
     right = onnx.load(folder / "actor_encode.onnx")
@@ -120,6 +139,7 @@ BROKEN = [
     (break_table_finiteness, "actor.usda", "Table", "error", "not finite"),
     (break_table_agreement, "actor.usda", "Table", "error", "mm from the model"),
     (break_onnx_presence, "actor.usda", "Onnx", "error", "not there"),
+    (break_onnx_hash, "actor.usda", "Onnx", "error", "SHA-256 differs"),
     (break_onnx_identity, "actor.usda", "Onnx", "error", "another model"),
     (break_onnx_agreement, "actor.usda", "Onnx", "error", "mm from the model"),
     (break_encoder_identity, "actor.usda", "Onnx", "error", "actor_encode.onnx was made from another model"),

@@ -1,0 +1,104 @@
+"""Builds that are killed and resumed end with the same files as one that was left alone.
+
+The stages only write what a seed gives, so that kills hit the writing; tests/benchmarks/faults.py kills whole builds.
+"""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+from faults import digests, records, stages, unfinished
+from package_copy import ROOT
+
+PROGRAM = """
+import sys, time
+import numpy as np
+from pathlib import Path
+from jawusd.formats.atomic import scratch_folder, write_npz_atomic
+from jawusd.pipeline import build
+
+def stub(number, name):
+    def work(self, *_):
+        rng = np.random.default_rng(number)
+        paths = [self.folder / f"{name}{k}.npz" for k in range(12)]
+        for path in paths:
+            with scratch_folder(path) as folder:
+                (folder / "half").write_bytes(b"x")
+                write_npz_atomic(path, {"a": rng.normal(size=20_000)})
+        return paths, {"offsets": {"cam0": 0, "cam1": 2, "cam2": -1}, "stage": name}
+    setattr(build._Build, f"_{name}", work)
+
+for number, name in enumerate(("sync", "track", "fit", "aid", "bake", "report")):
+    stub(number, name)
+print("ready", flush=True)
+build.build_rig(sys.argv[1], sys.argv[2], build.BuildOptions(resume=True), lambda *_: None)
+"""
+
+
+def start(out):
+    command = [sys.executable, "-c", PROGRAM, str(ROOT / "examples" / "capture"), str(out)]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)}, start_new_session=True
+    )
+    assert process.stdout.readline().strip() == "ready"
+    return process
+
+
+def end(process):
+    process.wait()
+    process.stdout.close()
+    return process.returncode
+
+
+def test_killed_builds_end_as_one_that_was_left_alone(tmp_path):
+    alone = tmp_path / "alone"
+    begun = time.perf_counter()
+    assert end(start(alone)) == 0
+    whole_s = time.perf_counter() - begun
+    exact, rng, killed = digests(alone), np.random.default_rng(0), 0
+    assert len(exact) == 72
+    out = tmp_path / "killed"
+    for _ in range(3):
+        process = start(out)
+        time.sleep(rng.uniform(0.05, 0.4) * whole_s)
+        killed += process.poll() is None
+        os.killpg(process.pid, signal.SIGKILL)
+        end(process)
+        there = digests(out) if out.exists() else {}
+        assert {name: exact[name] for name in there} == there  # nothing half written
+    assert killed >= 1
+    assert end(start(out)) == 0
+    assert digests(out) == exact and records(out) == records(alone) and unfinished(out) == []
+
+
+def test_what_a_killed_build_left_is_cleared_and_nothing_else(tmp_path):
+    out = tmp_path / "out"
+    (out / "masks").mkdir(parents=True)
+    for name in (".jawusd-tmp-geo-1.usdc", "masks/.jawusd-tmp-000001-2.png", ".mine", "masks/.jawusd-mine"):
+        (out / name).write_bytes(b"x")
+    (out / ".jawusd-tmp-folder").mkdir()
+    assert end(start(out)) == 0
+    assert unfinished(out) == [] and (out / ".mine").exists() and (out / "masks" / ".jawusd-mine").exists()
+
+
+def test_a_record_that_was_changed_is_refused(tmp_path):
+    out = tmp_path / "out"
+    assert end(start(out)) == 0
+    path = out / "build.json"
+    data = json.loads(path.read_text())
+    data["stages"]["sync"]["result"]["offsets"]["cam1"] = 3
+    path.write_text(json.dumps(data))
+    assert stages_are_refused(out)
+    assert end(start(out)) != 0
+
+
+def stages_are_refused(out):
+    try:
+        stages(out)
+    except ValueError:
+        return True
+    return False
