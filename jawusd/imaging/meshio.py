@@ -57,6 +57,8 @@ def load_mesh(path: str | os.PathLike[str], kind: Literal["scan", "bone"] = "sca
         raise CaptureError(f"the mesh cannot be read ({error}).", path=path, hint="Export it again.") from error
     if not isinstance(loaded, trimesh.Trimesh) or len(loaded.faces) == 0:
         raise CaptureError("the file holds no triangles.", path=path, hint="Export the surface, not a point cloud.")
+    if np.shape(loaded.vertices)[1:] != (3,) or np.shape(loaded.faces)[1:] != (3,):
+        raise CaptureError("its vertices do not have three coordinates each.", path=path, hint="Export it again.")
     colors = loaded.visual.vertex_colors[:, :3].astype(np.uint8) if loaded.visual.kind == "vertex" else None
     return _checked(path, np.asarray(loaded.vertices), np.asarray(loaded.faces), colors, kind)
 

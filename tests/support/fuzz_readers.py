@@ -95,7 +95,8 @@ def _captures(folder):
         capture = load_capture(path)
         for source in capture.cameras:
             for named in (source.video, source.masks and source.masks.upper, source.masks and source.masks.lower):
-                if named is not None and not named.parent.resolve().is_relative_to(place.resolve()):
+                anchor = named and (named.parent if "%" in named.name else named)
+                if anchor and not anchor.resolve().is_relative_to(place.resolve()):
                     raise PermissionError(f"escaped: {named}")
 
     shutil.copytree(EXAMPLE, folder, ignore=shutil.ignore_patterns("*.mp4", "*.mkv", "*.ply", "*.npz"))
@@ -383,7 +384,7 @@ def _journal(folder):
     journal = Journal(folder, "a", False)
     poses = np.stack([np.eye(4)] * 2).tolist()
     camera = {"frame": 1, "contrast": [0.5, 0.4], "pixels": [5, 6], "unexpected": [0.1, 0.2], "residual_px": [0.1, 0.2],
-              "uncovered": [0.1, None], "used": [True, True]}  # fmt: skip
+              "uncovered": [0.1, None], "used": [True, True], "outline": [30.0, 40.0]}  # fmt: skip
     for frame in range(3):
         journal.add(frame, {"poses": poses, "status": [1, 0], "cameras": {"cam0": camera}})
     return folder
