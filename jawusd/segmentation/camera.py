@@ -107,8 +107,8 @@ class CameraSegmenter:
         # takes over only where the cut goes wrong.
         finished = seeds is not None and bool(seeds.known.all())
         guide = None if finished else seeds
-        # Predicted poses call for a look only.
-        shares, clear = cut_picture(window, expected, self.colours, c, self._frame.px_per_mm, reach, guide, turn > 0)
+        # Borders settle in the first turn too: the tracker takes rougher outlines than it is used to for a lost row.
+        shares, clear = cut_picture(window, expected, self.colours, c, self._frame.px_per_mm, reach, guide)
         if finished and _overlap(shares, seeds.share) < c.key_overlap:
             shares = seeds.share
         masks = np.round(255 * shares).astype(np.uint8)

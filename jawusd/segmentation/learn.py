@@ -42,7 +42,7 @@ class Example:
     def cut(self, config: SegmentationConfig) -> NDArray[np.float32]:
         """Return the shares of both rows, shape (2, h, w), that are found without the drawn masks."""
         where = (self.window, self.expected, self.colours, config, self.px_per_mm)
-        return cut_picture(*where, config.reach_mm[-1], None, True)[0]
+        return cut_picture(*where, config.reach_mm[-1], None)[0]
 
 
 def cut_picture(
@@ -53,7 +53,6 @@ def cut_picture(
     px_per_mm: float,
     reach_mm: float,
     seeds: Seeds | None,
-    settle: bool,
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Cut both rows out of a picture, settle their borders and keep to what a person said.
 
@@ -64,17 +63,14 @@ def cut_picture(
         px_per_mm: resolution of the picture.
         reach_mm: how far teeth may lie outside their projection.
         seeds: what a person said.
-        settle: whether to settle the borders.
 
     Returns:
         Shares of both rows, shape (2, h, w), and where borders show, shape (h, w).
     """
     shares = cut_rows(window.rgb, expected, colours, config, px_per_mm, reach_mm, seeds)
-    clear = np.zeros(shares.shape[1:], bool)
-    if settle:
-        shares, clear = settle_borders(shares, window.rgb, config, px_per_mm)
-        shares = part_rows(shares, window.rgb, expected, config, px_per_mm)
-        shares = _widened(shares, config.wider)
+    shares, clear = settle_borders(shares, window.rgb, config, px_per_mm)
+    shares = part_rows(shares, window.rgb, expected, config, px_per_mm)
+    shares = _widened(shares, config.wider)
     return (shares if seeds is None else seeds.pinned(shares)), clear
 
 
