@@ -4,88 +4,17 @@ import time
 
 import numpy as np
 import pytest
-from browser import keep_picture
+from browser_tab import Tab, until
 from example_rig import FPS, assert_valid_usd, example_meshes, example_motion, example_rig
 
 from jawusd.formats.keys import load_keys
 from jawusd.formats.poses import read_parameters
-from jawusd.geometry import matrix_from_wxyz
 from jawusd.pipeline.view import open_viewer
 from jawusd.rig.bake import bake_rig
 from jawusd.rig.motion_read import read_poses_of_stage
 from jawusd.viewer.readouts import CONDYLES, INCISOR, landmark_places, rest_places
 from jawusd.viewer.scene import _OUTSIDE, PRESETS, preset_view
 from jawusd.viewer.uploads import MOST_BYTES
-
-# What viser's own page says on its console; nothing here comes from jawusd.
-KNOWN = ("THREE.Clock: This module has been deprecated", "Unable to preventDefault inside passive event listener")
-PATIENCE_S = 120.0  # software GL on a busy machine
-
-
-class Tab:
-    """Drive one open page of a viewer, and keep what its browser complained about."""
-
-    def __init__(self, chromium, viewer):
-        self.viewer, self.complaints, self.elsewhere = viewer, [], []
-        before = set(viewer.pages)
-        self.web = chromium.new_page(viewport={"width": 1200, "height": 720}, accept_downloads=True)
-        self.web.set_default_timeout(1000 * PATIENCE_S)
-        self.web.on("console", self._heard)
-        self.web.on("pageerror", lambda error: self.complaints.append(str(error)))
-        self.web.on("request", self._asked)
-        self.web.goto(viewer.url)
-        self.web.wait_for_selector("text=nearest captured")
-        self.page = viewer.pages[(set(viewer.pages) - before).pop()]
-        self.session = self.page.session
-        until(lambda: self.web.locator(".mantine-Notification-closeButton").count())
-        self.web.locator(".mantine-Notification-closeButton").first.click()  # "Software WebGL" lies over the jaw
-
-    def _heard(self, message):
-        if message.type == "error" and not message.text.startswith(KNOWN):
-            self.complaints.append(message.text)
-
-    def _asked(self, request):
-        if not request.url.startswith((self.viewer.url + "/", "blob:", "data:")):
-            self.elsewhere.append(request.url)
-
-    def type_slider(self, index, value):
-        box = self.web.locator("input.mantine-NumberInput-input:visible").nth(index)
-        box.fill(str(value))
-        box.press("Enter")
-
-    def tab(self, name):
-        self.web.get_by_role("tab", name=name).click()
-
-    def press(self, name):
-        self.web.get_by_role("button", name=name, exact=True).click()
-
-    def said(self, text):
-        self.web.wait_for_selector(f"text={text}")
-
-    def download(self, button, path):
-        self.press(button)
-        with self.web.expect_download() as found:
-            self.web.get_by_role("link").last.click()
-        found.value.save_as(path)
-
-    def pixel(self, place):
-        """Return where a place in anatomical axes [mm] is on the screen."""
-        camera = self.page.client.camera
-        x = matrix_from_wxyz(camera.wxyz).T @ (np.asarray(place) - camera.position)
-        box = self.web.locator("canvas").first.bounding_box()
-        scale = 0.5 * camera.image_height / np.tan(0.5 * camera.fov) / x[2]
-        return box["x"] + 0.5 * box["width"] + scale * x[0], box["y"] + 0.5 * box["height"] + scale * x[1]
-
-    def picture(self, name):
-        keep_picture(self.web, f"viewer_{name}")
-
-
-def until(condition):
-    """Wait until a condition holds."""
-    end = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.05)
 
 
 @pytest.fixture
@@ -257,8 +186,9 @@ def test_three_keys_are_exported_saved_and_loaded_again(tab, folder, tmp_path):
     tab.press("paste")
     until(lambda: [key.frame for key in tab.session.work.keys] == [0, 12, 30, 40])
     np.testing.assert_allclose(tab.session.work.keys[-1].d, tab.session.work.keys[1].d)
-    time.sleep(0.5)  # the page draws the thumbs
-    thumb = tab.web.locator(".multi-slider-thumb").last.bounding_box()
+    thumbs = tab.web.locator(".multi-slider-thumb")
+    until(lambda: thumbs.count() == 4)
+    thumb = tab.resting_place(thumbs.last)
     x, y = thumb["x"] + 0.5 * thumb["width"], thumb["y"] + 0.5 * thumb["height"]
     tab.web.mouse.move(x, y)
     tab.web.mouse.down()

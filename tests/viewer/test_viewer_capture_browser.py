@@ -1,0 +1,173 @@
+"""The real page of a capture in headless Chromium: footage, frames, space, and picks by the mouse that build a rig."""
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browser_tab import Tab, until
+from package_copy import ROOT
+
+from jawusd.formats.capture import load_capture
+from jawusd.formats.tracks import load_tracks
+from jawusd.geometry import transform_points
+from jawusd.pipeline.view_capture import open_capture_viewer
+
+EXAMPLE = ROOT / "examples" / "capture"
+FIRST, STOP = 20, 90
+
+
+def quiet(stage, done, total):
+    """Swallow progress."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Return a copy of the example with few frames and without picks."""
+    copy = shutil.copytree(EXAMPLE, tmp_path_factory.mktemp("capture") / "capture")
+    path = copy / "capture.toml"
+    text = path.read_text()
+    start, end = text.index("[bootstrap]"), text.index("[motion]")
+    text = text[:start] + "# picks go here\n" + text[end:]
+    with np.load(EXAMPLE / "truth" / "truth.npz") as archive:  # found elsewhere; here it would only cost time
+        known = zip(archive["camera_names"], archive["offsets"], strict=True)
+        offsets = ", ".join(f"{name} = {offset}" for name, offset in known)
+    text = text.replace('method = "flash"', f'method = "offsets"\noffsets = {{ {offsets} }}')
+    path.write_text(text.replace("frames = [20, 320]", f"frames = [{FIRST}, {STOP}]"))
+    assert load_capture(copy).bootstrap is None and load_capture(copy).frames == (FIRST, STOP)
+    return copy
+
+
+@pytest.fixture(scope="module")
+def viewer(folder):
+    running = open_capture_viewer(folder, None, "127.0.0.1", 0, quiet)
+    yield running
+    running.stop()
+
+
+class CaptureTab(Tab):
+    """Drive one open page of a capture."""
+
+    READY = "frame 20"
+    SIZE_PX = (1000, 600)
+
+    def settle(self):
+        """Wait until the picture is there and the eye stands still."""
+        until(lambda: not self.page.busy)
+        before = None
+        while before != (before := tuple(self.page.client.camera.position)):
+            time.sleep(1.0)
+
+    def click(self, place):
+        """Click where a place of the page is on the screen, and wait for what it does."""
+        wanted = self.page._wanted
+        self.web.mouse.click(*self.pixel(place))
+        until(lambda: self.page._wanted > wanted)
+        self.settle()
+
+    def view(self, name):
+        """Look at a camera, or at all of them."""
+        self.tab("Footage")
+        self.press(name)
+        until(lambda: self.page.footage.view == name)
+        self.settle()
+        self.tab("Picks")
+
+
+@pytest.fixture(scope="module")
+def tab(chromium, viewer):
+    opened = CaptureTab(chromium, viewer)
+    opened.settle()
+    yield opened
+    opened.web.close()
+    assert opened.complaints == []
+    assert opened.elsewhere == []
+
+
+def clickable(mesh, vertex, pose, eye):
+    """Return a place on the surface nearest to a vertex, on the face there that is turned most towards an eye."""
+    world = transform_points(pose, mesh.vertices)
+    corners = world[mesh.faces[(mesh.faces == vertex).any(axis=1)]]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    middles = corners.mean(axis=1)
+    rays = (eye - middles) / np.linalg.norm(eye - middles, axis=1, keepdims=True)
+    face = np.einsum("ij,ij->i", normals, rays).argmax()
+    return 0.6 * world[vertex] + 0.4 * middles[face]
+
+
+def test_frames_are_stepped_and_the_cameras_stand_in_space(tab):
+    tab.press("+1")
+    until(lambda: tab.page.footage.frame == FIRST + 1 and not tab.page.busy)
+    tab.said(f"frame {FIRST + 1}")
+    tab.type_slider(0, FIRST + 30)
+    until(lambda: tab.page.footage.frame == FIRST + 30 and not tab.page.busy)
+    tab.press("3-D")
+    tab.said("3-D, frame 50")
+    tab.settle()
+    tab.picture("capture_space")
+    box = tab.web.locator("canvas").first.bounding_box()
+    for camera in tab.page._capture.cameras.values():
+        x, y = tab.pixel(transform_points(tab.page.scene.T_page_world, camera.centre_world()))
+        assert box["x"] < x < box["x"] + box["width"] and box["y"] < y < box["y"] + box["height"]
+
+
+def test_two_pages_do_not_mix(chromium, viewer, tab):
+    other = CaptureTab(chromium, viewer)
+    tab.press("cam0")
+    tab.type_slider(0, FIRST)
+    until(lambda: tab.page.footage.frame == FIRST and tab.page.footage.view == "cam0")
+    tab.press("+10")
+    until(lambda: tab.page.footage.frame == FIRST + 10)
+    other.press("cam2")
+    until(lambda: other.page.footage.view == "cam2")
+    assert tab.page.footage.view == "cam0" and other.page.footage.frame == FIRST
+    other.web.close()
+    until(lambda: len(viewer.pages) == 1)
+    assert other.complaints == []
+
+
+def test_picks_made_in_the_page_build_a_rig(tab, folder, tmp_path):
+    capture, page = tab.page._capture, tab.page
+    original = load_capture(EXAMPLE).bootstrap
+    tab.type_slider(0, FIRST)
+    until(lambda: page.footage.frame == FIRST)
+    tab.view("cam0")
+    for row in ("upper", "lower"):
+        for pick in getattr(original, row):
+            eye = np.array(page.client.camera.position)
+            tab.click(clickable(capture.scans[row], pick.vertex, page.poses[row], eye))
+    book = page.picks.book
+    assert [pick.row for pick in book.picks] == ["upper"] * 4 + ["lower"] * 4
+    moved = [
+        np.linalg.norm(np.diff(capture.scans[pick.row].vertices[[pick.vertex, given.vertex]], axis=0))
+        for pick, given in zip(book.picks, (*original.upper, *original.lower), strict=True)
+    ]
+    assert max(moved) < 0.5  # mm: the vertex meant, or one beside it
+    with np.load(EXAMPLE / "truth" / "truth.npz") as archive:  # the eyes of the person who clicks
+        poses = {row: archive[f"T_world_{row}"][0] for row in ("upper", "lower")}
+        assert archive["frames"][0] == FIRST
+    for camera in ("cam0", "cam2"):
+        tab.view(camera)
+        for pick in list(book.picks):
+            place = transform_points(poses[pick.row], capture.scans[pick.row].vertices[pick.vertex])
+            pixel = capture.cameras[camera].project(place)
+            tab.click(page.table.place(pixel))
+            assert np.abs(np.subtract(pick.views[camera], pixel)).max() < 1.5
+    tab.said("all of them fit together")
+    tab.picture("capture_picks")
+    before = (folder / "capture.toml").read_text()
+    tab.press("write to the capture file")
+    tab.said("Written")
+    after = (folder / "capture.toml").read_text()
+    assert after.startswith(before) and load_capture(folder).bootstrap == book.bootstrap()
+    build = [sys.executable, "-m", "jawusd", "build", str(folder), "-o", str(tmp_path / "actor")]
+    done = subprocess.run(build, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
+    assert done.returncode == 0, done.stderr
+    assert Path(tmp_path / "actor" / "actor.usda").is_file()
+    tracks = load_tracks(tmp_path / "actor" / "tracks.npz")
+    assert tracks.tracked().all() and tracks.meta["start"]["picks_left_out"] == {"lower": [], "upper": []}
