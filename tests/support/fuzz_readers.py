@@ -384,7 +384,7 @@ def _journal(folder):
     journal = Journal(folder, "a", False)
     poses = np.stack([np.eye(4)] * 2).tolist()
     camera = {"frame": 1, "contrast": [0.5, 0.4], "pixels": [5, 6], "unexpected": [0.1, 0.2], "residual_px": [0.1, 0.2],
-              "uncovered": [0.1, None], "used": [True, True], "outline": [30.0, 40.0]}  # fmt: skip
+              "uncovered": [0.1, None], "outline": [[30, 2, 4], [40, 1, 4]]}  # fmt: skip
     for frame in range(3):
         journal.add(frame, {"poses": poses, "status": [1, 0], "cameras": {"cam0": camera}})
     return folder
