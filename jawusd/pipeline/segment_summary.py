@@ -30,7 +30,7 @@ _USUAL_OFF = 3.0  # spreads at which a symptom alone brings the confidence to on
 # between the rows; over the mask's area that tells how much of the mask may be wrong. Small masks and masks without
 # edges in the picture stand out in all cameras alike, so all are judged together, and sooner than by other symptoms.
 _OUTLINE_PX = (0.4, 2.0, 0.6)
-_OUTLINE, _OUTLINE_SPREAD, _OUTLINE_OFF = "outline", 0.01, 2.0
+_OUTLINE, _OUTLINE_SPREAD, _OUTLINE_OFF = "outline", 0.01, 1.5
 _SHEET_FRAMES = 12
 
 
