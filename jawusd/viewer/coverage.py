@@ -64,7 +64,10 @@ class CoveragePlot:
 
     Attributes:
         still: HTML that puts the plot, unseen, into the page.
+        across: where the axis begins and ends, as shares of the plot's width.
     """
+
+    across = (_LEFT / _WIDTH, 1 - _RIGHT / _WIDTH)
 
     def __init__(self, tracks: Tracks, span: tuple[int, int], worst: list[int]) -> None:
         """Draw.
@@ -102,7 +105,7 @@ class CoveragePlot:
         """Return the SVG of the plot with a line at the frame shown."""
         line = f'<path d="M{self._x(frame):.1f} {_TOP}V{_HEIGHT - _BOTTOM}" stroke="currentColor" stroke-width="1.5"/>'
         box = f'viewBox="0 0 {_WIDTH} {_HEIGHT}" width="100%" style="display:block"'
-        return f'<div style="padding:0 6px"><svg {box}><use href="#jaw-coverage"/>{line}</svg></div>'
+        return f'<svg {box}><use href="#jaw-coverage"/>{line}</svg>'
 
     def _x(self, frame: float) -> float:
         first, last = self._span

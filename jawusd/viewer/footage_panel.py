@@ -8,6 +8,7 @@ import viser
 
 from jawusd.viewer.coverage import CoveragePlot, frame_words, worst_frames
 from jawusd.viewer.notices import guarded
+from jawusd.viewer.scrubbing import scrubbed_by_pointer
 from jawusd.viewer.viewed_capture import Look, ViewedCapture
 
 SPACE = "3-D"
@@ -39,7 +40,7 @@ class FootagePanel:
             turned: called when another view was chosen.
             changed: called after every other change.
         """
-        self._capture, self._turned, self._changed = capture, turned, changed
+        self._client, self._capture, self._turned, self._changed = client, capture, turned, changed
         self.view = next(iter(capture.sizes_px))
         self.frame = capture.picks.frame if capture.tracks is None and capture.picks else capture.frames[0]
         self.frame = min(max(self.frame, capture.frames[0]), capture.frames[1])
@@ -64,6 +65,8 @@ class FootagePanel:
             self.jumps = gui.add_button_group("worst", ("first", "next worse", "previous"))
             self.jumps.on_click(guarded(client, self._jump))
         self._words = gui.add_html("")
+        dark = gui.add_checkbox("dark page", False)
+        dark.on_update(guarded(client, self._darken))
         self.refresh()
 
     @property
@@ -92,7 +95,10 @@ class FootagePanel:
         if not self.in_space and (own := self.frame - capture.offsets[self.view]) != self.frame:
             lines[0] += f" (its own frame {own})"
         if capture.tracks is not None:
-            self._playhead.content = self._plot.with_playhead(self.frame)
+            drawn = self._plot.with_playhead(self.frame)
+            self._playhead.content = scrubbed_by_pointer(
+                drawn, self._capture.frames, self._plot.across, self.slider._impl.uuid
+            )
             lines.append(frame_words(capture.tracks, self.frame))
         else:
             lines.append("no tracked poses: build the rig, then name its folder with --tracks")
@@ -104,6 +110,10 @@ class FootagePanel:
         self.view = event.target.value
         self.refresh()
         self._turned()
+
+    async def _darken(self, event: viser.GuiEvent) -> None:
+        look = {"control_width": "large", "show_logo": False, "show_share_button": False}
+        self._client.gui.configure_theme(dark_mode=event.target.value, **look)
 
     async def _redraw(self, _: object) -> None:
         self._changed()

@@ -13,7 +13,8 @@ from jawusd.viewer.actor import ViewedActor
 from jawusd.viewer.clip import Clip
 from jawusd.viewer.notices import guarded
 from jawusd.viewer.player import Player
-from jawusd.viewer.plots import Plot, curve_plot, scrubbed_by_pointer, with_playhead
+from jawusd.viewer.plots import Plot, curve_plot, with_playhead
+from jawusd.viewer.scrubbing import scrubbed_by_pointer
 from jawusd.viewer.session import Session
 
 KEYS = "keys"
@@ -102,9 +103,9 @@ class MotionPanel:
             self._curves.content = self._plot.definition()
             self._set_thumbs()
             self.between.value, self.fps.value = work.interpolation, work.fps
-        self._playhead.content = scrubbed_by_pointer(
-            with_playhead(self._plot, self.frame), self._plot, self.frame_slider._impl.uuid
-        )
+        plot, ends = self._plot, (self._plot.low[0], self._plot.high[0])
+        drawn = with_playhead(plot, self.frame)
+        self._playhead.content = scrubbed_by_pointer(drawn, ends, plot.across, self.frame_slider._impl.uuid)
         if self.frame_slider.value != round(self.frame):
             self.frame_slider.value = round(self.frame)
 

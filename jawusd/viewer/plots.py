@@ -7,6 +7,7 @@ a few hundred bytes. Text takes the page's colour and reads on light and dark.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,12 +38,14 @@ class Plot:
         name: id of the still part in the page.
         still: SVG of axes, outlines and points.
         low, high: corners of the plotted area in data.
+        across: where the plotted area begins and ends, as shares of the plot's width.
     """
 
     name: str
     still: str
     low: tuple[float, float]
     high: tuple[float, float]
+    across: ClassVar[tuple[float, float]] = (_LEFT / _WIDTH, 1 - _RIGHT / _WIDTH)
 
     def definition(self) -> str:
         """Return the HTML that puts the still part, unseen, into the page; once."""
@@ -128,29 +131,6 @@ def with_playhead(plot: Plot, frame: float) -> str:
     px = _place(plot, np.array([[frame, plot.low[1]]]))[0, 0]
     line = f'<path d="M{px:.1f} {_TOP}V{_HEIGHT - _BOTTOM}" stroke="{ORANGE}" stroke-width="2"/>'
     return _svg(f'<use href="#{plot.name}"/>{line}')
-
-
-def scrubbed_by_pointer(drawn: str, plot: Plot, slider: str) -> str:
-    """Return the HTML of a drawn curve plot in which a click or a drag moves a slider to the frame under the pointer.
-
-    viser tells the server of no click in a plot, so the page does what a visitor's typing in the slider's box does.
-
-    Args:
-        drawn: SVG of the plot.
-        plot: whose frames these are.
-        slider: id of the slider in the page.
-    """
-    share = f"((event.clientX-r.left)/r.width*{_WIDTH}-{_LEFT})/{_WIDTH - _LEFT - _RIGHT}"
-    box = f"document.getElementById('{slider}').parentElement.querySelector('input:not([type=hidden])')"
-    script = (
-        f"if(event.buttons&1){{const b={box},"
-        f"r=this.firstElementChild.getBoundingClientRect(),s=Math.min(1,Math.max(0,{share}));"
-        "Object.getOwnPropertyDescriptor(HTMLInputElement.prototype,'value').set.call(b,"
-        f"Math.round({plot.low[0]:g}+s*{plot.high[0] - plot.low[0]:g}));"
-        "b.dispatchEvent(new Event('input',{bubbles:true}))}"
-    )
-    style = "padding:0 6px;cursor:col-resize;touch-action:none;user-select:none"
-    return f'<div style="{style}" onpointerdown="{script}" onpointermove="{script}">{drawn}</div>'
 
 
 def _svg(content: str) -> str:

@@ -108,7 +108,8 @@ class PosePanel:
         self._scene.show_paths(event.target.value)
 
     async def _darken(self, event: viser.GuiEvent) -> None:
-        self._client.gui.configure_theme(dark_mode=event.target.value, show_logo=False, show_share_button=False)
+        look = {"control_width": "large", "show_logo": False, "show_share_button": False}
+        self._client.gui.configure_theme(dark_mode=event.target.value, **look)
 
     def refresh(self, readout: Readout) -> None:
         """Bring sliders, pins and numbers in line with the session."""

@@ -1,8 +1,7 @@
 """Damage files and read them, in a process of its own: python fuzz_worker.py FOLDER < requests > answers (JSON lines).
 
-Request {"reader", "seed"}: damage one of the reader's files as the seed says and read it; {"reader", "file"}: read that
-file in place of the first of the reader's with its suffix. Answer {"outcome", "error", "peak_mb", "seconds"}; outcome
-is accepted, refused, traceback or escape. Seconds are the process's own.
+Request {"reader", "seed"}: damage one of the reader's files as the seed says and read it. Answer {"outcome", "error",
+"peak_mb", "seconds"}; outcome is accepted, refused, traceback or escape. Seconds are the process's own.
 """
 
 import json
@@ -100,15 +99,10 @@ def answer(request, targets, folder):
     from jawusd.errors import JawusdError
 
     options = targets[request["reader"]]
-    if "seed" in request:
-        rng = np.random.default_rng([request["seed"], sum(request["reader"].encode())])
-        target = options[rng.integers(len(options))]
-        with np.errstate(all="ignore"):
-            data = damaged(target, rng)
-    else:
-        kept = Path(request["file"])
-        target = next(t for t in options if kept.name.endswith(t.file))
-        data = kept.read_bytes()
+    rng = np.random.default_rng([request["seed"], sum(request["reader"].encode())])
+    target = options[rng.integers(len(options))]
+    with np.errstate(all="ignore"):
+        data = damaged(target, rng)
     os.chdir(folder)
     place = prepare(target, folder)
     path = place / target.file

@@ -171,3 +171,27 @@ def test_picks_made_in_the_page_build_a_rig(tab, folder, tmp_path):
     assert Path(tmp_path / "actor" / "actor.usda").is_file()
     tracks = load_tracks(tmp_path / "actor" / "tracks.npz")
     assert tracks.tracked().all() and tracks.meta["start"]["picks_left_out"] == {"lower": [], "upper": []}
+
+
+def test_tracked_poses_are_drawn_and_the_plot_is_a_timeline(chromium, example_build):
+    viewer = open_capture_viewer(EXAMPLE, example_build[0], "127.0.0.1", 0, quiet)
+    tab = CaptureTab(chromium, viewer)
+    tab.settle()
+    footage = tab.page.footage
+    plot = tab.resting_place(tab.web.locator("svg:has(use[href='#jaw-coverage'])"))
+    left, right = footage._plot.across
+    x = plot["x"] + plot["width"] * (left + 0.5 * (right - left))
+    tab.web.mouse.click(x, plot["y"] + 0.5 * plot["height"])
+    until(lambda: abs(footage.frame - 170) <= 2)  # half way from 20 to 319
+    tab.settle()
+    tab.picture("capture_tracked")
+    tab.press("first")
+    until(lambda: footage.frame == footage.worst[0])
+    tab.said("number 1 of the")
+    tab.web.get_by_label("dark page").click()
+    tab.press("3-D")
+    tab.settle()
+    tab.picture("capture_dark")
+    tab.web.close()
+    viewer.stop()
+    assert tab.complaints == [] and tab.elsewhere == []
