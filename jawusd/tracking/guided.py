@@ -82,8 +82,8 @@ class GuidedTracker:
         if bootstrap is None:
             raise TrackingError(
                 "without masks the tracking starts from picks, and the capture has none",
-                hint="Make them in the page of `jawusd view CAPTURE`, or add [bootstrap]: three or more vertices of each "
-                "scan with their pixels in two cameras.",
+                hint="Make them in the page of `jawusd view CAPTURE`, or add [bootstrap]: three or more vertices of "
+                "each scan with their pixels in two cameras.",
             )
         picks = {"upper": bootstrap.upper, "lower": bootstrap.lower}
         return np.stack(
