@@ -161,7 +161,11 @@ class _Segmenting:
         follow = self._tracker.follow(frames, past)
         for _ in frames:
             _, self._pictures = next(walk)
+            known = {name: model.counts() for name, model in colours.items()}
             frame, record = next(follow)
+            if (record.status == LOST).any():  # colours from where no teeth are would spoil all that follows
+                for name, model in colours.items():
+                    model.take_up(*known[name])
             state.keep(frame, step)
             self._write(frame, record)
             self._tell("segment", len(self._journal.entries))

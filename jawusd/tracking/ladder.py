@@ -63,12 +63,7 @@ class FrameTracker:
             reach_px: how far off the first start may be.
         """
         gates = self._config.gates_from(reach_px)
-        use = np.array([[v.present[r] for v in views] for r in _ROWS])
-        trial = self._try(starts[0], views, gates, use)
-        kept = use & ~self._spoiled(trial, 2)
-        if (kept != use).any():
-            trial = self._try(starts[0], views, gates, kept)
-        first = trial
+        trial = first = self._begin(starts[0], views, gates)
         for rows, attempt in (
             (self._suspect, self._others),
             (self._uneven, self._leave_out),
@@ -82,6 +77,18 @@ class FrameTracker:
         if (kept != trial.use).any():  # a mask that had drawn the first attempt away from all others
             trial = self._try(trial.solution.poses, views, gates, kept)
         return self._record(first, trial)
+
+    def glance(self, start: NDArray[np.float64], views: Sequence[View], reach_px: float) -> FrameRecord:
+        """Align one instant from one prediction, shape (2, 4, 4), without the ladder; see `track`."""
+        trial = self._begin(start, views, self._config.gates_from(reach_px))
+        return self._record(trial, trial)
+
+    def _begin(self, start: NDArray[np.float64], views: Sequence[View], gates: Sequence[float]) -> _Trial:
+        """Align once, and once more without masks that are spoiled."""
+        use = np.array([[v.present[r] for v in views] for r in _ROWS])
+        trial = self._try(start, views, gates, use)
+        kept = use & ~self._spoiled(trial, 2)
+        return trial if (kept == use).all() else self._try(start, views, gates, kept)
 
     def _record(self, first: _Trial, trial: _Trial) -> FrameRecord:
         c = self._config
