@@ -71,7 +71,10 @@ def write_animation(
     frames, d = np.asarray(frames, dtype=np.float64), np.asarray(d, dtype=np.float64)
     if frames.ndim != 1 or d.shape != (len(frames), 3):
         raise ValueError(f"frames (F,) and d (F, 3) are needed, got {frames.shape} and {d.shape}")
-    if not len(frames) or not np.isfinite(frames).all() or (np.diff(frames) <= 0).any():
+    known = np.isfinite(d).all(axis=1)
+    if not known.any():
+        raise RigError("no frame has parameters; there is nothing to animate.", path=out)
+    if not np.isfinite(frames).all() or (np.diff(frames) <= 0).any():
         raise RigError("the frame numbers of an animation must increase.", path=out)
     if not fps > 0:
         raise RigError(f"{fps} frames per second; it must be more than 0.", path=out)
@@ -81,9 +84,6 @@ def write_animation(
             f"+-{_FARTHEST_FRAME:g}.",
             path=out,
         )
-    known = np.isfinite(d).all(axis=1)
-    if not known.any():
-        raise RigError("no frame has parameters; there is nothing to animate.", path=out)
     layer = new_layer(fps)
     layer.subLayerPaths.append(relative_path(actor, out))
     layer.startTimeCode, layer.endTimeCode = float(frames[0]), float(frames[-1])

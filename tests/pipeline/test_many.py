@@ -35,12 +35,16 @@ INSIDE = {
 }
 
 
+def heed_interrupts():
+    """Undo what a shell does to programs in the background, which may be how these tests run."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def started(folder, *arguments):
     """Start the program on the list of a folder, in a process group of its own as in a terminal."""
     command = [sys.executable, "-m", "jawusd", "build-many", str(folder / "list.txt"), "-o", str(folder / "out")]
-    return subprocess.Popen(
-        [*command, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
-    )
+    how = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
+    return subprocess.Popen([*command, *arguments], **how, preexec_fn=heed_interrupts)
 
 
 def worker_on(process, folder):

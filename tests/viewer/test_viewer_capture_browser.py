@@ -19,6 +19,7 @@ from jawusd.pipeline.view_capture import open_capture_viewer
 
 EXAMPLE = ROOT / "examples" / "capture"
 FIRST, STOP = 20, 90
+TWO_PICTURES = "new Promise(drawn => requestAnimationFrame(() => requestAnimationFrame(drawn)))"
 
 
 def quiet(stage, done, total):
@@ -60,7 +61,8 @@ class CaptureTab(Tab):
         until(lambda: not self.page.busy)
         before = None
         while before != (before := tuple(self.page.client.camera.position)):
-            time.sleep(1.0)
+            self.web.evaluate(TWO_PICTURES)  # a busy machine may not have drawn what it was told
+            time.sleep(0.7)
 
     def click(self, place):
         """Click where a place of the page is on the screen, and wait for what it does."""
