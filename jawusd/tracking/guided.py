@@ -30,7 +30,7 @@ See = Callable[[int, NDArray[np.float64], int], Sequence[View]]
 
 # Masks made on the way vary more from frame to frame than drawn ones: outlines get rougher as lips close, and what
 # looks lost by the rules for drawn masks is not. A pose given up for nothing leaves the next masks without a guide.
-_TOLERANT = TrackingConfig(suspect_residual=2.0, suspect_score=0.4)
+_TOLERANT = TrackingConfig(suspect_residual=3.0, suspect_score=0.25)
 _FIRST_ROUNDS = 3  # picks are a few tenths of a millimetre off; each round takes most of the rest
 
 
