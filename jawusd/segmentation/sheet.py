@@ -37,7 +37,8 @@ def write_sheet(path: Path, shown: Sequence[tuple[str, int, str]], videos: Mappi
     tiles = []
     for name, own, remark in shown:
         picture = next(opened[name].frames(own, own + 1, colour="rgb")).image.copy()
-        tiles.append(_tile(picture, masks.of(name, own), f"{name}  frame {own}  {remark}"))
+        rows = [None if mask is None else mask.mask for mask in masks.of(name, own)]
+        tiles.append(_tile(picture, rows, f"{name}  frame {own}  {remark}"))
     save_png(path, contact_sheet(tiles, _COLUMNS))
 
 

@@ -6,10 +6,12 @@ import pytest
 from package_copy import ROOT
 
 from jawusd.formats.capture import load_capture
+from jawusd.imaging.overlay import LOWER_COLOUR, UPPER_COLOUR
 from jawusd.pipeline.journal import FILE
 from jawusd.pipeline.segment import LEARNED, SegmentOptions, segment_teeth, with_masks
 from jawusd.pipeline.segment_summary import write_summary
 from jawusd.segmentation.files import mask_path, write_mask
+from jawusd.segmentation.sheet import write_sheet
 
 FRAMES = 4
 
@@ -89,3 +91,15 @@ def test_finished_masks_teach_and_are_written_as_they_were_drawn(take, undisturb
         for folder in (tmp_path / "masks", undisturbed[0])
     )
     assert wider > before
+
+
+def test_doubtful_masks_are_shown_over_their_pictures(take, undisturbed, tmp_path):
+    capture, offsets = take
+    own = capture.frames[0] + 1 - offsets["cam0"]
+    videos = {camera.name: camera.video for camera in capture.cameras}
+    write_sheet(tmp_path / "sheet.png", [("cam0", own, "outline"), ("cam1", 0, "lost")], videos, undisturbed[0])
+    shown = cv2.cvtColor(cv2.imread(str(tmp_path / "sheet.png")), cv2.COLOR_BGR2RGB).astype(int)
+    drawn, bare = shown[:, : shown.shape[1] // 3], shown[:, shown.shape[1] // 3 : 2 * shown.shape[1] // 3]
+    for colour in (UPPER_COLOUR, LOWER_COLOUR):
+        assert (np.abs(drawn - colour).max(axis=2) < 40).sum() > 100
+        assert (np.abs(bare - colour).max(axis=2) < 40).sum() < 20  # that picture has no masks
