@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from jawusd.errors import FormatError
+from jawusd.formats.text import read_text
 
 _MAX_BYTES = 16 << 20
 _NAME = re.compile(r"[A-Za-z0-9_\-][A-Za-z0-9_\-. ]*")
@@ -50,7 +51,7 @@ def load_capture_list(path: str | os.PathLike[str]) -> list[ListedCapture]:
     """
     path = Path(path)
     folder, found, lines = path.resolve().parent, [], {}
-    for number, line in enumerate(_text(path).splitlines(), start=1):
+    for number, line in enumerate(read_text(path, _MAX_BYTES, "utf-8-sig").splitlines(), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         item = _listed(line, folder, path, number)
@@ -66,19 +67,6 @@ def load_capture_list(path: str | os.PathLike[str]) -> list[ListedCapture]:
     if not found:
         raise FormatError("names no capture; one path a line is expected.", path=path)
     return found
-
-
-def _text(path: Path) -> str:
-    try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise FormatError(f"is {path.stat().st_size} bytes, at most {_MAX_BYTES} are read.", path=path)
-        return path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError as error:
-        raise FormatError("there is no such file.", path=path) from error
-    except UnicodeDecodeError as error:
-        raise FormatError(f"is not UTF-8 text ({error}).", path=path) from error
-    except OSError as error:
-        raise FormatError(f"cannot be read: {error.strerror}.", path=path) from error
 
 
 def _listed(line: str, folder: Path, path: Path, number: int) -> ListedCapture:

@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from jawusd.errors import FormatError
 from jawusd.formats.atomic import write_text_atomic
+from jawusd.formats.text import read_text
 
 #: Keys are written out frame by frame: an hour at 60 per second fits.
 MOST_FRAMES, FARTHEST_FRAME = 220_000, 1e9
@@ -64,16 +65,9 @@ def load_keys(path: str | os.PathLike[str]) -> Keys:
         FormatError: not such a file; the message names the entry.
     """
     path = Path(path)
+    text = read_text(path, _MAX_BYTES)
     try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise FormatError(f"is {path.stat().st_size} bytes, at most {_MAX_BYTES} are read.", path=path)
-        return Keys.model_validate_json(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise FormatError("there is no such file.", path=path) from error
-    except UnicodeDecodeError as error:
-        raise FormatError(f"is not UTF-8 text ({error}).", path=path) from error
-    except OSError as error:
-        raise FormatError(f"cannot be read: {error.strerror}.", path=path) from error
+        return Keys.model_validate_json(text)
     except ValidationError as error:
         problem = error.errors()[0]
         where = ".".join(str(part) for part in problem["loc"])

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from jawusd.errors import FormatError
 from jawusd.formats.atomic import write_text_atomic
+from jawusd.formats.text import read_text
 from jawusd.geometry import make_transform, matrix_from_wxyz, rigidity_defect
 
 MATRIX_COLUMNS = tuple(f"m{row}{column}" for row in range(4) for column in range(4))
@@ -32,16 +33,7 @@ _ZERO_QUATERNION = 1e-6
 
 def _read_table(path: Path) -> dict[str, list[str]]:
     """Return the columns of a CSV or JSON table as text."""
-    try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise FormatError(f"is {path.stat().st_size} bytes, at most {_MAX_BYTES} are read.", path=path)
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError as error:
-        raise FormatError("there is no such file.", path=path) from error
-    except UnicodeDecodeError as error:
-        raise FormatError(f"is not UTF-8 text ({error}).", path=path) from error
-    except OSError as error:
-        raise FormatError(f"cannot be read: {error.strerror}.", path=path) from error
+    text = read_text(path, _MAX_BYTES, "utf-8-sig")
     if path.suffix.lower() == ".json":
         return _json_columns(text, path)
     try:

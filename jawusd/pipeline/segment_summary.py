@@ -10,15 +10,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.errors import FormatError
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.capture import Capture
+from jawusd.formats.text import read_text
 from jawusd.formats.tracks import LOST
 from jawusd.pipeline import journal
 from jawusd.pipeline.extras import stage
+from jawusd.pipeline.made_masks import SUMMARY
 from jawusd.pipeline.segment import LEARNED, SegmentOptions, segment_teeth
 from jawusd.pipeline.state import Progress
 
-FILE, SHEET = "segment.json", "look_at_these.png"
+SHEET = "look_at_these.png"
+_MAX_LEARNED_BYTES = 1 << 20
 FORMAT = "jawusd-segment/1"
 # Below this confidence a mask is to be looked at: a symptom at twice its usual spread.
 _DOUBTFUL = 0.5
@@ -106,11 +110,11 @@ def write_summary(capture: Capture, entries: dict[int, dict[str, Any]], folder: 
 
     Raises:
         CaptureError: a picture or mask cannot be read.
+        FormatError: what was learned from drawn masks cannot be read.
         OutputError: a file cannot be written.
     """
     rows = summarise(entries)
     doubtful = sorted((row for row in rows if row["confidence"] < _DOUBTFUL), key=lambda row: row["confidence"])
-    learned = folder / LEARNED
     summary = {
         "format": FORMAT,
         "capture": capture.name,
@@ -120,18 +124,31 @@ def write_summary(capture: Capture, entries: dict[int, dict[str, Any]], folder: 
             if camera.video is not None
         },
         "frames": len(entries),
-        "learned": json.loads(learned.read_text(encoding="utf-8")) if learned.exists() else None,
+        "learned": _learned(folder / LEARNED),
         "look_at": doubtful,
         "sheet": SHEET if doubtful else None,
         "confidence": rows,
     }
-    write_text_atomic(folder / FILE, json.dumps(summary, indent=1) + "\n")
+    write_text_atomic(folder / SUMMARY, json.dumps(summary, indent=1) + "\n")
     if doubtful:
         sheet = stage("jawusd.segmentation.sheet")
         videos = {camera.name: camera.video for camera in capture.cameras}
         worst = [(row["camera"], row["own_frame"], row["reason"]) for row in doubtful[:_SHEET_FRAMES]]
         sheet.write_sheet(folder / SHEET, worst, videos, folder)
     return summary
+
+
+def _learned(path: Path) -> dict[str, Any] | None:
+    """Return what was learned from drawn masks, None if nothing was."""
+    if not path.exists():
+        return None
+    try:
+        learned = json.loads(read_text(path, _MAX_LEARNED_BYTES))
+        first, last = (float(value) for value in learned["disagreement"])
+        return {**learned, "pictures": int(learned["pictures"]), "disagreement": [first, last]}
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        hint = "Segment again without --resume, or build with --fresh."
+        raise FormatError(f"is not what `jawusd segment` wrote ({error}).", path=path, hint=hint) from error
 
 
 def segment_capture(
@@ -150,7 +167,7 @@ def segment_capture(
         segment.json, and what it holds but for the confidences.
     """
     summary = write_summary(capture, segment_teeth(capture, offsets, folder, options, progress), folder)
-    return [folder / FILE], {key: value for key, value in summary.items() if key != "confidence"}
+    return [folder / SUMMARY], {key: value for key, value in summary.items() if key != "confidence"}
 
 
 def delete_masks(folder: Path) -> None:
@@ -161,7 +178,7 @@ def delete_masks(folder: Path) -> None:
     if not (folder / journal.FILE).is_file():
         return
     states = stage("jawusd.segmentation.state").state_files(folder)
-    for path in (*states, *(folder / name for name in (journal.FILE, FILE, SHEET, LEARNED))):
+    for path in (*states, *(folder / name for name in (journal.FILE, SUMMARY, SHEET, LEARNED))):
         path.unlink(missing_ok=True)
     for path in [*folder.glob("*/upper/*.png"), *folder.glob("*/lower/*.png")]:
         # A link may lead out of the folder.

@@ -17,6 +17,7 @@ from jawusd.formats.mesh import Mesh
 from jawusd.formats.model import JawModel
 from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.pipeline.extras import stage
+from jawusd.pipeline.made_masks import tracking_config
 from jawusd.pipeline.prepare import BONES, find_anatomy, load_cameras, load_meshes, rescaled_cameras, tracked_cameras
 from jawusd.pipeline.state import Progress
 from jawusd.pipeline.subject import Subject, subject_of_capture
@@ -152,6 +153,7 @@ def _track(
         meshes["upper_teeth"],
         meshes["lower_teeth"],
         anatomy.landmarks,
+        tracking_config(capture),
         threads=jobs,
         progress=lambda done, total: progress("track", done, total),
     )
@@ -183,6 +185,7 @@ def aid_teeth(
             offsets,
             meshes["upper_teeth"],
             meshes["lower_teeth"],
+            tracking_config(capture),
             threads=jobs,
             progress=lambda done, total: progress("aid", done, total),
         )

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera, transform_points
+from jawusd.geometry.rays import meet_triangles
 from jawusd.synthetic.dental_arch import DentalArch
 from jawusd.synthetic.surfaces import vertex_normals
 
@@ -114,17 +115,9 @@ def _seen(camera: Camera, points: Array, normals: Array, occluders: list[Mesh]) 
 
 
 def _hits(point: Array, eye: Array, corners: Array) -> bool:
-    """Tell whether a triangle (N, 3, 3) lies between a point and the eye (Moeller and Trumbore 1997)."""
+    """Tell whether a triangle (N, 3, 3) lies between a point and the eye."""
     direction = eye - point
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    e1, e2, s = b - a, c - a, point - a
-    h = np.cross(direction, e2)
-    det = np.einsum("ij,ij->i", e1, h)
-    det = np.where(np.abs(det) < 1e-12, np.inf, det)
-    u = np.einsum("ij,ij->i", s, h) / det
-    q = np.cross(s, e1)
-    v = q @ direction / det
-    along = np.einsum("ij,ij->i", e2, q) / det
+    u, v, along = meet_triangles(point, direction, corners)
     nearest = _CLEARANCE_MM / np.linalg.norm(direction)
     return bool(((u >= 0) & (v >= 0) & (u + v <= 1) & (along > nearest) & (along < 1)).any())
 

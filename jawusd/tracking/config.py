@@ -108,3 +108,9 @@ class TrackingConfig:
     def gates_from(self, reach_px: float) -> tuple[float, ...]:
         """Return the gates to go through when the start is off by about reach_px, and no less than the usual."""
         return tuple(g for g in self.wide_gates_px if g <= max(reach_px, self.first_gate_px))
+
+
+#: For masks that jawusd made. They vary more from frame to frame than drawn ones: outlines get rougher as lips close,
+#: and what looks lost by the rules for drawn masks is not. A pose given up for nothing is a frame without a jaw, and
+#: while masks are made it leaves the next ones without a guide.
+FOR_MADE_MASKS = TrackingConfig(suspect_residual=3.0, suspect_score=0.25)

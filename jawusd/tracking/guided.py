@@ -15,7 +15,7 @@ from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import LOST
 from jawusd.geometry import Camera
 from jawusd.tracking.bootstrap import pose_from_picks
-from jawusd.tracking.config import TrackingConfig
+from jawusd.tracking.config import FOR_MADE_MASKS, TrackingConfig
 from jawusd.tracking.first import first_record
 from jawusd.tracking.history import FrameRecord, History, Past
 from jawusd.tracking.ladder import FrameTracker
@@ -28,9 +28,6 @@ from jawusd.tracking.solver import ContourSolver, View
 #: expected, shape (2, 4, 4), and the round, 0 for poses that are only predicted.
 See = Callable[[int, NDArray[np.float64], int], Sequence[View]]
 
-# Masks made on the way vary more from frame to frame than drawn ones: outlines get rougher as lips close, and what
-# looks lost by the rules for drawn masks is not. A pose given up for nothing leaves the next masks without a guide.
-_TOLERANT = TrackingConfig(suspect_residual=3.0, suspect_score=0.25)
 _FIRST_ROUNDS = 3  # picks are a few tenths of a millimetre off; each round takes most of the rest
 
 
@@ -62,13 +59,13 @@ class GuidedTracker:
             upper, lower: teeth scans in one frame, in occlusion [mm].
             see: makes the masks.
             rounds: how often masks and poses take turns on a frame.
-            config: the tracker's numbers.
+            config: the tracker's numbers; those for masks it asked for unless given.
             executor: runs parts of the work.
 
         Raises:
             TrackingError: a scan cannot be tracked.
         """
-        self._config = config or _TOLERANT
+        self._config = config or FOR_MADE_MASKS
         self._meshes = {"upper": upper, "lower": lower}
         scans = [prepare_scan(mesh, row) for row, mesh in self._meshes.items()]
         self._solver = ContourSolver(scans, self._config, executor)

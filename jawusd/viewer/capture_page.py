@@ -19,6 +19,7 @@ from jawusd.viewer.light_table import Table, eye_to_see, hit_vertex, region_arou
 from jawusd.viewer.notices import guarded, say
 from jawusd.viewer.picks import ROWS
 from jawusd.viewer.picks_panel import PicksPanel
+from jawusd.viewer.theme import set_theme
 from jawusd.viewer.viewed_capture import Region, ViewedCapture
 
 Array = NDArray[np.float64]
@@ -44,7 +45,7 @@ class CapturePage:
         """Draw the page."""
         self.client, self._capture = client, capture
         gui = client.gui
-        gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
+        set_theme(gui)
         gui.set_panel_label(capture.name)
         self.scene = CaptureScene(client, capture)
         self.table: Table | None = None

@@ -9,6 +9,7 @@ import viser
 from jawusd.viewer.coverage import CoveragePlot, frame_words, worst_frames
 from jawusd.viewer.notices import guarded
 from jawusd.viewer.scrubbing import scrubbed_by_pointer
+from jawusd.viewer.theme import set_theme
 from jawusd.viewer.viewed_capture import Look, ViewedCapture
 
 SPACE = "3-D"
@@ -112,8 +113,7 @@ class FootagePanel:
         self._turned()
 
     async def _darken(self, event: viser.GuiEvent) -> None:
-        look = {"control_width": "large", "show_logo": False, "show_share_button": False}
-        self._client.gui.configure_theme(dark_mode=event.target.value, **look)
+        set_theme(self._client.gui, event.target.value)
 
     async def _redraw(self, _: object) -> None:
         self._changed()

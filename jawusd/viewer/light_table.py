@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import make_transform, transform_points
+from jawusd.geometry.rays import meet_triangles
 from jawusd.geometry.se3 import se3_inverse
 from jawusd.viewer.viewed_capture import Region
 
@@ -116,8 +117,6 @@ def region_around(points_px: ArrayLike, size_px: tuple[int, int]) -> Region:
 def hit_vertex(mesh: Mesh, T_world_scan: Array, origin: ArrayLike, direction: ArrayLike) -> tuple[int, float] | None:
     """Return the vertex of a scan nearest to where a ray meets it, and how far away that is [mm]; None for a miss.
 
-    Moeller and Trumbore, "Fast, minimum storage ray/triangle intersection", 1997.
-
     Args:
         mesh: the scan.
         T_world_scan: its pose, shape (4, 4).
@@ -127,15 +126,7 @@ def hit_vertex(mesh: Mesh, T_world_scan: Array, origin: ArrayLike, direction: Ar
     o = transform_points(inverse, np.asarray(origin, dtype=np.float64))
     d = inverse[:3, :3] @ np.asarray(direction, dtype=np.float64)
     d = d / np.linalg.norm(d)
-    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
-    e1, e2, s = b - a, c - a, o - a
-    h = np.cross(d, e2)
-    det = np.einsum("ij,ij->i", e1, h)
-    det = np.where(np.abs(det) < 1e-12, np.inf, det)
-    u = np.einsum("ij,ij->i", s, h) / det
-    q = np.cross(s, e1)
-    v = q @ d / det
-    along = np.einsum("ij,ij->i", e2, q) / det
+    u, v, along = meet_triangles(o, d, mesh.vertices[mesh.faces])
     met = np.flatnonzero((u >= -_EDGE) & (v >= -_EDGE) & (u + v <= 1 + _EDGE) & (along > 0))
     if not len(met):
         return None

@@ -14,6 +14,7 @@ from jawusd.viewer.plots import VERMILION
 from jawusd.viewer.pose_panel import PosePanel
 from jawusd.viewer.scene import JawScene
 from jawusd.viewer.session import Session
+from jawusd.viewer.theme import set_theme
 
 _PANEL_PX = 350
 _PLACEHOLDER = (
@@ -36,7 +37,7 @@ class Page:
         self.client = client
         self.session = Session(actor.rig, actor.fps)
         gui = client.gui
-        gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
+        set_theme(gui)
         gui.set_panel_label(actor.name)
         self.scene = JawScene(client, actor)
         tabs = gui.add_tab_group()

@@ -13,6 +13,7 @@ from jawusd.viewer.plots import GREEN, VERMILION
 from jawusd.viewer.readouts import Readout
 from jawusd.viewer.scene import PRESETS, JawScene
 from jawusd.viewer.session import Session
+from jawusd.viewer.theme import set_theme
 
 STEP_MM = 0.01
 LABELS = ("d1 opening", "d2 to the left", "d3 forward")
@@ -108,8 +109,7 @@ class PosePanel:
         self._scene.show_paths(event.target.value)
 
     async def _darken(self, event: viser.GuiEvent) -> None:
-        look = {"control_width": "large", "show_logo": False, "show_share_button": False}
-        self._client.gui.configure_theme(dark_mode=event.target.value, **look)
+        set_theme(self._client.gui, event.target.value)
 
     def refresh(self, readout: Readout) -> None:
         """Bring sliders, pins and numbers in line with the session."""

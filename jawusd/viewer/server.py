@@ -7,6 +7,7 @@ import ipaddress
 import logging
 import socket
 import sys
+from abc import ABC, abstractmethod
 from typing import Protocol
 from urllib.parse import urlsplit
 
@@ -19,6 +20,7 @@ from jawusd.viewer.capture_page import CapturePage
 from jawusd.viewer.page import Page
 from jawusd.viewer.plot_panel import StillPlots
 from jawusd.viewer.scene import set_first_view
+from jawusd.viewer.theme import set_theme
 from jawusd.viewer.viewed_capture import ViewedCapture
 
 log = logging.getLogger(__name__)
@@ -38,7 +40,7 @@ class _Closable(Protocol):
         """Stop what runs for this page."""
 
 
-class PageServer:
+class PageServer(ABC):
     """Serve pages; every visitor has one of their own.
 
     Attributes:
@@ -62,7 +64,7 @@ class PageServer:
         _check_address(host)
         with contextlib.redirect_stdout(sys.stderr):  # viser greets there; results go on stdout
             self._server = _LocalServer(host=host, port=port, label=name, verbose=False)
-        self._server.gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
+        set_theme(self._server.gui)
         self._server.on_client_connect(self._welcome)
         self._server.on_client_disconnect(self._farewell)
         self.url = f"http://{'localhost' if is_loopback(host) else host}:{self._server.get_port()}"
@@ -73,8 +75,9 @@ class PageServer:
             return
         self.pages[client.client_id] = self._page(client)
 
+    @abstractmethod
     def _page(self, client: viser.ClientHandle) -> _Closable:
-        raise NotImplementedError
+        """Return the page of a visitor."""
 
     async def _farewell(self, client: viser.ClientHandle) -> None:
         page = self.pages.pop(client.client_id, None)

@@ -4,10 +4,15 @@ import json
 
 import numpy as np
 import pytest
+from package_copy import ROOT
 
+from jawusd.errors import FormatError
+from jawusd.formats.capture import load_capture
 from jawusd.formats.tracks import LOST, TRACKED
 from jawusd.pipeline.journal import FILE, Journal
-from jawusd.pipeline.segment_summary import delete_masks, segment_lines, summarise
+from jawusd.pipeline.made_masks import SUMMARY
+from jawusd.pipeline.segment import LEARNED
+from jawusd.pipeline.segment_summary import delete_masks, segment_lines, summarise, write_summary
 
 POSES = np.stack([np.eye(4)] * 2).tolist()
 
@@ -119,3 +124,14 @@ def test_masks_of_an_earlier_build_are_deleted_and_nothing_else(tmp_path):
     delete_masks(folder)
     assert not folder.exists()
     delete_masks(folder)
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"pictures": 2}', '{"pictures": 2, "disagreement": [0.1]}', "\udcff"])
+def test_damaged_notes_of_what_was_learned_are_an_error(tmp_path, text):
+    capture = load_capture(ROOT / "examples" / "capture" / "capture.toml")
+    (tmp_path / LEARNED).write_bytes(text.encode(errors="surrogateescape"))
+    with pytest.raises(FormatError, match=LEARNED):
+        write_summary(capture, entries(), tmp_path)
+    assert not (tmp_path / SUMMARY).exists()
+    (tmp_path / LEARNED).write_text('{"numbers": {}, "pictures": 2, "disagreement": [0.2, 0.1]}')
+    assert write_summary(capture, entries(), tmp_path)["learned"]["disagreement"] == [0.2, 0.1]

@@ -75,11 +75,12 @@ class Tab:
         return box["x"] + 0.5 * box["width"] + scale * x[0], box["y"] + 0.5 * box["height"] + scale * x[1]
 
     def resting_place(self, widget):
-        """Return the bounding box of a widget once it stands still."""
-        before = None
-        while before != (before := widget.bounding_box()):
+        """Return the bounding box of a widget once it stands still; it has none while it is drawn anew."""
+        before, box = None, widget.bounding_box()
+        while box is None or box != before:
             time.sleep(0.5)
-        return before
+            before, box = box, widget.bounding_box()
+        return box
 
     def picture(self, name):
         keep_picture(self.web, f"viewer_{name}")

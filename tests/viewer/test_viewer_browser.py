@@ -233,7 +233,7 @@ def test_the_baked_motion_plays_goes_round_and_stops(tab):
     until(lambda: not motion.loop.value)
     tab.press("play")
     until(lambda: not motion.player.playing and motion.frame == last)
-    plot = tab.web.locator("svg:visible", has=tab.web.locator("use[href='#jaw-curves']")).bounding_box()
+    plot = tab.resting_place(tab.web.locator("svg:visible", has=tab.web.locator("use[href='#jaw-curves']")))
     left, right = plot["x"] + plot["width"] * 36 / 300, plot["x"] + plot["width"] * 288 / 300
     tab.web.mouse.click(left + 0.25 * (right - left), plot["y"] + 0.5 * plot["height"])
     until(lambda: abs(motion.frame - (first + 0.25 * (last - first))) <= 1)

@@ -1,0 +1,129 @@
+"""Valid files that a capture is made of, and what reads them: cameras, pictures, videos, meshes."""
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+from package_copy import ROOT
+
+EXAMPLE = ROOT / "examples" / "capture"
+SIZE = (64, 48)
+
+
+def write_captures(folder):
+    from jawusd.formats.capture import load_capture
+
+    def read(place, path):
+        capture = load_capture(path)
+        for source in capture.cameras:
+            for named in (source.video, source.masks and source.masks.upper, source.masks and source.masks.lower):
+                anchor = named and (named.parent if "%" in named.name else named)
+                if anchor and not anchor.resolve().is_relative_to(place.resolve()):
+                    raise PermissionError(f"escaped: {named}")
+
+    shutil.copytree(EXAMPLE, folder, ignore=shutil.ignore_patterns("*.mp4", "*.mkv", "*.ply", "*.npz"))
+    for path in EXAMPLE.rglob("*"):
+        if path.is_file():
+            (folder / path.relative_to(EXAMPLE)).touch()
+    toml = folder / "capture.toml"
+    shutil.copy(EXAMPLE / "capture.toml", toml)
+    patterns = toml.read_text().replace(".mkv", "/%06d.png")
+    patterns = patterns.replace('method = "flash"', "offsets = {cam0=0,cam1=1,cam2=2}")
+    anatomy = "\n[anatomy]\nT_anatomical_skull = [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]\n"
+    landmarks = "[anatomy.landmarks]\nincisor = [0.0, 1.0, 2.0]\n"
+    (folder / "capture2.toml").write_text(patterns + anatomy + landmarks)
+    for path in list(folder.rglob("*.mkv")):
+        path.with_suffix("").mkdir()
+    return [(folder, "capture.toml", read), (folder, "capture2.toml", read)]
+
+
+def write_cameras(folder):
+    from jawusd.formats.camera_files import load_cameras_file
+
+    folder.mkdir(parents=True)
+    shutil.copy(EXAMPLE / "calibration.toml", folder / "calibration.toml")
+    (folder / "cameras.txt").write_text(
+        "# cameras\n1 OPENCV 1280 720 1000 1001 640 360 0.1 -0.02 0.001 0.002\n"
+        "2 SIMPLE_RADIAL 1280 720 1000 640 360 0.1\n"
+    )
+    (folder / "images.txt").write_text(
+        "1 0.9 0.1 -0.2 0.1 10 20 600 1 cam0/0001.png\n1.0 2.0 -1\n2 1 0 0 0 0 0 600 2 cam1.png\n\n"
+    )
+    pose = [[1.0, 0, 0, 1], [0, 1.0, 0, 2], [0, 0, 1.0, 600], [0, 0, 0, 1]]
+    lens = {"w": 1280, "h": 720, "fl_x": 1000.0, "fl_y": 1000.0, "cx": 640.0, "cy": 360.0, "k1": 0.1, "k2": 0.01}
+    frames = [{"file_path": f"images/cam{k}.png", "transform_matrix": pose} for k in range(2)]
+    data = {"camera_model": "OPENCV", "applied_scale": 2.0, **lens, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(data))
+
+    def read(place, path):
+        for camera in load_cameras_file(path, 10.0):
+            camera.projection_matrix()
+
+    return [(folder, name, read) for name in ("calibration.toml", "cameras.txt", "images.txt", "transforms.json")]
+
+
+def _picture(k):
+    image = np.zeros(SIZE[::-1], np.uint8)
+    image[10 : 30 + k, 12:40] = 255
+    return image
+
+
+def write_pngs(folder):
+    folder.mkdir(parents=True)
+    for k in range(2):
+        cv2.imwrite(str(folder / f"{k:06d}.png"), _picture(k))
+    return folder
+
+
+def read_png(place, path):
+    from jawusd.imaging.masks import MaskReader, mask_size_px
+
+    mask_size_px(place / "%06d.png")
+    with MaskReader(place / "%06d.png", SIZE) as reader:
+        for frame in range(2):
+            reader.read(frame)
+
+
+def write_videos(folder):
+    from jawusd.imaging.video_writer import VideoWriter
+
+    folder.mkdir(parents=True)
+    for name, lossless in (("mask.mkv", True), ("mask.mp4", False)):
+        with VideoWriter(folder / name, SIZE, 24.0, lossless=lossless) as writer:
+            for k in range(5):
+                writer.write(_picture(k))
+    return "mask.mkv", "mask.mp4"
+
+
+def read_video(place, path):
+    from jawusd.imaging.audio import read_sound
+    from jawusd.imaging.masks import MaskReader
+    from jawusd.imaging.video import Video
+
+    video = Video(path)
+    with MaskReader(path, video.size_px) as reader:
+        for frame in range(min(video.count, 8)):
+            reader.read(frame)
+    read_sound(path, 16000)
+
+
+def write_meshes(folder):
+    import trimesh
+
+    folder.mkdir(parents=True)
+    mesh = trimesh.creation.icosphere(1, 40.0)
+    mesh.visual.vertex_colors = np.full((len(mesh.vertices), 4), 255, np.uint8)
+    for name, options in (
+        ("text.ply", {"encoding": "ascii"}), ("bytes.ply", {}), ("bytes.stl", {}), ("text.obj", {}),
+    ):  # fmt: skip
+        mesh.export(folder / name, **options)
+    mesh.export(folder / "text.stl", file_type="stl_ascii")
+    return [(folder, name, name.startswith("text")) for name in
+            ("text.ply", "bytes.ply", "bytes.stl", "text.stl", "text.obj")]  # fmt: skip
+
+
+def read_mesh(place, path):
+    from jawusd.imaging.meshio import load_mesh, tooth_labels
+
+    tooth_labels(load_mesh(path))
