@@ -51,6 +51,7 @@ _ADDITIVE = {
     for part, shape in (("knots", (f"knots{i}",)), ("twists", (f"knots{i}", 6)), ("slopes", (f"knots{i}", 6)))
 }
 _POSITIVE = ("slice_softness_mm", "path_scale_mm", "glide_softness_mm", "glide_fade_mm", "spline_scales")
+_LARGEST = 1e9  # [mm, rad]: far beyond any jaw, and squares and their sums still fit
 _RISING = ("slice_d1", "path_limits", "curve1_knots", "curve2_knots", "curve3_knots")
 
 
@@ -86,7 +87,7 @@ def _checked(
         raise EvaluatorError(f'the model has no array "{name}".')
     try:
         value = np.array(arrays[name], dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise EvaluatorError(f'"{name}" does not hold numbers ({error}).') from error
     wanted = [lengths.get(size, size) if isinstance(size, str) else size for size in shape]
     fits = value.ndim == len(shape) and all(isinstance(w, str) or w == n for w, n in zip(wanted, value.shape))
@@ -94,6 +95,8 @@ def _checked(
         raise EvaluatorError(f'"{name}" has shape {value.shape}, expected ({", ".join(map(str, wanted))}).')
     if not np.isfinite(value).all():
         raise EvaluatorError(f'"{name}" holds values that are not finite.')
+    if (np.abs(value) > _LARGEST).any():
+        raise EvaluatorError(f'"{name}" holds values up to {np.abs(value).max():.3g}, at most {_LARGEST:g} is allowed.')
     lengths.update((size, n) for size, n in zip(shape, value.shape) if isinstance(size, str))
     value.flags.writeable = False
     return value

@@ -222,7 +222,7 @@ def _read_index(path: Path) -> dict[str, Entry]:
         data = json.loads(path.read_text(encoding="utf-8"))
         check_format(data.get("format"), FAMILY, VERSION, path)
         return {entry.path: entry for entry in map(_entry_of, data["rigs"])}
-    except (OSError, ValueError, TypeError, AttributeError, KeyError, RecursionError) as error:
+    except (OSError, ValueError, TypeError, AttributeError, KeyError, OverflowError, RecursionError) as error:
         raise FormatError(f"is damaged ({error}).", path=path, hint="Delete it; it is made anew.") from error
 
 

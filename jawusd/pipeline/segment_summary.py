@@ -146,7 +146,7 @@ def _learned(path: Path) -> dict[str, Any] | None:
         learned = json.loads(read_text(path, _MAX_LEARNED_BYTES))
         first, last = (float(value) for value in learned["disagreement"])
         return {**learned, "pictures": int(learned["pictures"]), "disagreement": [first, last]}
-    except (ValueError, TypeError, KeyError, RecursionError) as error:
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
         hint = "Segment again without --resume, or build with --fresh."
         raise FormatError(f"is not what `jawusd segment` wrote ({error}).", path=path, hint=hint) from error
 

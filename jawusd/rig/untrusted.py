@@ -51,8 +51,8 @@ def blames_file(argument: int) -> Callable[[F], F]:
 def check_reach(path: Path) -> list[Sdf.Layer]:
     """Check, before anything is composed, that the layers of a rig name only files in their own folder or below.
 
-    Layers that merely use a rig (animation, shots) may reach for it anywhere; what a rig's layers bring in must stay
-    where the rig is, through links too.
+    Layers that merely use a rig (animation, shots) may reach out of their folder for it, and for nothing else; what a
+    rig's layers bring in must stay where the rig is, through links too.
 
     Args:
         path: the layer or package to be opened.
@@ -64,25 +64,27 @@ def check_reach(path: Path) -> list[Sdf.Layer]:
         RigError: naming the path.
     """
     layers, seen = [], set()
-    waiting: list[tuple[str, Path | None]] = [(str(path), None)]
+    waiting: list[tuple[str, Path | None, str | None]] = [(str(path), None, None)]
     while waiting:
-        place = waiting.pop()
-        if place in seen:
+        name, home, user = waiting.pop()
+        if (name, home) in seen:
             continue
-        seen.add(place)
-        name, home = place
+        seen.add((name, home))
         layer = _layer(name)
         if layer is None:
             continue
         layers.append(layer)
         if home is None and _carries_rig(layer):
             home = _file(name).resolve().parent
+        if home is None and user is not None:
+            raise RigError(f"names the file {name:.200}, outside its own folder and no rig.", path=user)
         for asset in _assets(layer):
             target = layer.ComputeAbsolutePath(asset)
-            if home is not None and (escapes(asset) or not _file(target).resolve().is_relative_to(home)):
+            inside = _file(target).resolve().is_relative_to(home or _file(name).resolve().parent)
+            if home is not None and (escapes(asset) or not inside):
                 raise RigError(f"names the file {asset:.200}, outside its own folder.", path=layer.identifier)
             if asset in layer.GetCompositionAssetDependencies() or Path(asset).suffix.startswith(".usd"):
-                waiting.append((target, home))
+                waiting.append((target, home, None if inside else layer.identifier))
     return layers
 
 
@@ -112,9 +114,25 @@ def _layer(name: str) -> Sdf.Layer | None:
     if _NESTED.search(file.read_bytes()):
         raise RigError("is nested too deeply.", path=file)
     try:
-        return Sdf.Layer.FindOrOpen(name)
+        layer = Sdf.Layer.FindOrOpen(name)
     except Tf.ErrorException:
         return None
+    if layer is not None and not _is_whole(layer):
+        raise RigError("is damaged: it names prims or properties that it does not hold.", path=file)
+    return layer
+
+
+def _is_whole(layer: Sdf.Layer) -> bool:
+    """Tell whether a layer holds all it names: OpenUSD ends the process where it does not."""
+    missing = []
+
+    def visit(path: Sdf.Path) -> None:
+        named = path.IsPropertyPath() or path.IsPrimPath() or path.IsPrimVariantSelectionPath()
+        if path.isEmpty or (named and not layer.GetObjectAtPath(path)):
+            missing.append(path)
+
+    layer.Traverse(Sdf.Path.absoluteRootPath, visit)
+    return not missing
 
 
 def _assets(layer: Sdf.Layer) -> list[str]:

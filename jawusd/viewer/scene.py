@@ -29,6 +29,7 @@ _SKULL_OPACITY = 0.28
 _GROUND: Color = (196, 190, 186)
 _AMBIENT = 1.6
 _MARKER_MM, _PIN_MM = 1.2, 2.2
+_BALL = 2  # subdivisions of a marker: 320 faces look round at its size
 _CAPTURED_MM, _MOST_CAPTURED = 0.5, 400
 
 #: Views by name: where the camera stands from what it looks at, in anatomical axes [mm].
@@ -99,7 +100,7 @@ class JawScene:
                 self._ball(f"/jaw/{name}", _MARKER_MM, color, position=tuple(place))
 
     def _ball(self, name: str, radius_mm: float, color: Color, **more: object) -> viser.IcosphereHandle:
-        return self._scene.add_icosphere(name, radius=radius_mm, color=color, **more)
+        return self._scene.add_icosphere(name, radius=radius_mm, color=color, subdivisions=_BALL, **more)
 
     def _lines(self, name: str, ends: Array, color: Color) -> viser.LineSegmentsHandle:
         return self._scene.add_line_segments(name, ends, colors=color, thickness=2.5, thickness_units="screen")

@@ -209,6 +209,8 @@ def test_changing_the_given_arrays_does_not_change_the_rig():
         ({"spline_weights": np.zeros((44, 3))}, "one for each centre and 3 linear ones, 43"),
         ({"incisor": np.array([0.0, np.nan, 0.0])}, '"incisor" holds values that are not finite'),
         ({"incisor": np.array(["a", "b", "c"])}, '"incisor" does not hold numbers'),
+        ({"incisor": np.array([10**400, 0, 0], dtype=object)}, '"incisor" does not hold numbers'),
+        ({"incisor": np.array([0.0, -1e200, 0.0])}, '"incisor" holds values up to 1e\\+200, at most 1e\\+09'),
         ({"T_rest": np.diag([1.0, 2.0, 1.0, 1.0])}, '"T_rest" is not rigid'),
         ({"slice_softness_mm": np.array(0.0)}, '"slice_softness_mm" is 0.0; it must be positive'),
         ({"slice_d1": np.zeros(33)}, '"slice_d1" must hold at least two rising values'),

@@ -135,6 +135,7 @@ def test_a_model_with_a_pickle_is_skipped_unread(folder, tmp_path):
         lambda index: index["rigs"][0].update(extra=1),
         lambda index: index["rigs"][0]["ranges_mm"].update(opening=["a", 2]),
         lambda index: index["rigs"][0]["ranges_mm"].update(opening=[1.0]),
+        lambda index: index["rigs"][0]["ranges_mm"].update(opening=[0.0, 10**400]),
         lambda index: index["rigs"][0]["landmarks_mm"].update(incisor=[1.0]),
         lambda index: index["rigs"][0]["landmarks_mm"].pop("incisor"),
     ],

@@ -148,6 +148,23 @@ def test_sublayers_may_not_leave_the_folder(anchored_folder):
         load_rig(anchored_folder / "actor.usda")
 
 
+def test_what_uses_a_rig_may_reach_out_for_it_only(anchored_folder):
+    away = anchored_folder.parent / "shot"
+    away.mkdir()
+    shot = Sdf.Layer.CreateNew(str(away / "shot.usda"))
+    shot.subLayerPaths.append(f"../{anchored_folder.name}/actor.usda")
+    shot.Save()
+    assert load_rig(away / "shot.usda").meta == load_rig(anchored_folder / "actor.usda").meta
+    other = Sdf.Layer.CreateNew(str(anchored_folder.parent / "other.usda"))
+    Sdf.PrimSpec(other, "Other", Sdf.SpecifierDef)
+    other.Save()
+    shot.subLayerPaths.append("../other.usda")
+    shot.Save()
+    del other, shot
+    with pytest.raises(RigError, match="other.usda, outside its own folder and no rig"):
+        load_rig(away / "shot.usda")
+
+
 @pytest.mark.parametrize(
     ("asset", "leaves"),
     [("./a", False), ("a/../b", False), ("a/b", False), ("..", True), ("a/../..", True), ("\\\\host\\x", True)],
