@@ -95,7 +95,9 @@ class _Segmenting:
         self._keys = self._files.KeyMasks(options.keys, {n: self._cameras[n].size_px for n in self._names})
         guided = stage("jawusd.tracking.guided")
         self._config = stage("jawusd.segmentation.config").SegmentationConfig()
-        self._tracker = guided.GuidedTracker(*self._meshes, self._see, len(self._config.reach_mm), None, pool)
+        self._tracker = guided.GuidedTracker(
+            *self._meshes, self._see, self._agreement, len(self._config.reach_mm), None, pool
+        )
         self._first, self._stop = capture.frames or self._footage.range()
         self._journal = Journal(folder, self._inputs(offsets, options), options.resume)
         self._pictures: dict = {}
@@ -230,6 +232,12 @@ class _Segmenting:
             present = np.zeros(2, bool) if found is None else found.present
             views.append(view(camera.projection_matrix(), camera.centre_world(), masks, present))
         return views
+
+    def _agreement(self, frame: int, guesses: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how well the colours of all cameras' pictures of a frame agree with guessed poses, shape (N,)."""
+        seen = [name for name in self._names if self._pictures[name] is not None]
+        each = self._pool.map(lambda name: self._segmenters[name].agreement(self._pictures[name], guesses), seen)
+        return np.sum(list(each), axis=0) if seen else np.zeros(len(guesses))
 
     def _write(self, frame: int, record, again: bool = False) -> None:
         """Write the masks of a frame and what is known about it."""

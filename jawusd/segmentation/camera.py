@@ -13,11 +13,11 @@ from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera, transform_points
 from jawusd.segmentation.colours import ColourModel
 from jawusd.segmentation.config import SegmentationConfig
-from jawusd.segmentation.crowns import Expectation, ScanSurface, expect_crowns
+from jawusd.segmentation.crowns import OTHER, Expectation, ScanSurface, draw_crowns, expect_crowns
 from jawusd.segmentation.files import Key
 from jawusd.segmentation.learn import Example, cut_picture
 from jawusd.segmentation.picture import PictureFrame, Window
-from jawusd.segmentation.rows import Seeds, learn_colours
+from jawusd.segmentation.rows import Seeds, doubted_odds, learn_colours
 
 _ROWS = (0, 1)
 _EVERY = 20  # vertices of a crown to one that tells where it is
@@ -119,6 +119,31 @@ class CameraSegmenter:
     def recorded(self, segment: Segment) -> list[NDArray[np.uint8]]:
         """Return the masks of both rows as recorded, (H, W) uint8, 0 or 255."""
         return [self._frame.recorded(mask.astype(np.float32) / 255, segment.window) for mask in segment.masks]
+
+    def agreement(self, image: NDArray[np.uint8], guesses: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how well the colours of a picture agree with crowns in guessed poses, without cutting anything.
+
+        The sum over the crowns in sight of the log-odds that colours alone give, at a coarse resolution. Lips may hide
+        crowns, so what does not look like teeth under them counts little; teeth that a guess leaves bare cost it all
+        that they would have counted.
+
+        Args:
+            image: (H, W, 3) RGB as recorded.
+            guesses: T_world_upper, T_world_lower, shape (N, 2, 4, 4).
+
+        Returns:
+            Log-odds summed [working pixels], shape (N,); zeros if nothing is known of the colours yet.
+        """
+        c = self._config
+        around = np.concatenate([self._around(poses) for poses in guesses])
+        window = self._frame.window(image, around, c.margin_mm) if self.colours.knows() else None
+        if window is None:
+            return np.zeros(len(guesses))
+        odds = np.clip(doubted_odds(window.rgb, self.colours, c), *c.agreement_range)
+        size = tuple(max(1, n // c.agreement_coarse) for n in window.camera.size_px)
+        odds, camera = cv2.resize(odds, size, interpolation=cv2.INTER_AREA), window.camera.scaled(size)
+        rates = [odds[draw_crowns(self._scans, poses, camera) != OTHER].sum() for poses in guesses]
+        return np.array(rates, np.float64) * c.agreement_coarse**2
 
     def _around(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.concatenate([transform_points(poses[r], self._points[r]) for r in _ROWS])

@@ -67,6 +67,18 @@ def expect_crowns(scans: tuple[ScanSurface, ScanSurface], poses: NDArray[np.floa
         poses: T_world_upper, T_world_lower, shape (2, 4, 4).
         camera: camera of the working picture, without distortion.
     """
+    labels = draw_crowns(scans, poses, camera)
+    return Expectation(labels, np.stack([_signed_distance(labels == label) for label in (UPPER, LOWER)]))
+
+
+def draw_crowns(
+    scans: tuple[ScanSurface, ScanSurface], poses: NDArray[np.float64], camera: Camera
+) -> NDArray[np.uint8]:
+    """Return OTHER, UPPER or LOWER where that row's crowns are nearest, shape (h, w).
+
+    Args:
+        scans, poses, camera: as for `expect_crowns`.
+    """
     width, height = camera.size_px
     inverse_depth, labels = np.zeros((height, width), np.float32), np.zeros((height, width), np.uint8)
     for scan, pose, label in zip(scans, poses, (UPPER, LOWER), strict=True):
@@ -74,7 +86,7 @@ def expect_crowns(scans: tuple[ScanSurface, ScanSurface], poses: NDArray[np.floa
         points = np.column_stack([camera.project_pinhole(world), camera.depth(world)]).astype(np.float32)
         draw_depth_labels(points, scan.gum_faces, 0, 0, False, inverse_depth, labels, OTHER)
         draw_depth_labels(points, scan.crown_faces, 0, 0, False, inverse_depth, labels, label)
-    return Expectation(labels, np.stack([_signed_distance(labels == label) for label in (UPPER, LOWER)]))
+    return labels
 
 
 def _signed_distance(region: NDArray[np.bool_]) -> NDArray[np.float32]:

@@ -50,6 +50,12 @@ def learn_colours(
     model.learn(rgb, nearest > config.inner_mm, nearest < -config.outer_mm, weight)
 
 
+def doubted_odds(rgb: NDArray[np.uint8], model: ColourModel, config: SegmentationConfig) -> NDArray[np.float32]:
+    """Return the log-odds of being tooth that colours alone give, less what is demanded of them, shape (h, w)."""
+    demanded = model.surroundings_reach(config.surroundings_share) + config.doubt
+    return model.weigh(rgb) - np.float32(np.clip(demanded, *config.doubt_range))
+
+
 def cut_rows(
     rgb: NDArray[np.uint8],
     expected: Expectation,
@@ -74,9 +80,7 @@ def cut_rows(
         Shares of both rows, 0 .. 1, shape (2, h, w).
     """
     inside = expected.inside_px / px_per_mm
-    odds = model.weigh(rgb) - np.clip(
-        model.surroundings_reach(config.surroundings_share) + config.doubt, *config.doubt_range
-    )
+    odds = doubted_odds(rgb, model, config)
     cost = np.zeros((3, *rgb.shape[:2]), np.float32)
     apart = np.clip(config.rows_per_mm * (inside[0] - inside[1]) / 2, -3, 3)
     for label, row, sign in ((UPPER, 0, 1.0), (LOWER, 1, -1.0)):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from jawusd.errors import TrackingError
 from jawusd.formats.capture import Bootstrap
 from jawusd.formats.mesh import Mesh
-from jawusd.formats.tracks import LOST
-from jawusd.geometry import Camera
+from jawusd.formats.tracks import LOST, TRACKED
+from jawusd.geometry import Camera, se3_exp, se3_inverse, se3_log
 from jawusd.tracking.bootstrap import pose_from_picks
 from jawusd.tracking.config import FOR_MADE_MASKS, TrackingConfig
 from jawusd.tracking.first import first_record
@@ -28,6 +28,14 @@ from jawusd.tracking.solver import ContourSolver, View
 #: expected, shape (2, 4, 4), and the round, 0 for poses that are only predicted.
 See = Callable[[int, NDArray[np.float64], int], Sequence[View]]
 
+#: Tells how well a frame's pictures agree with guessed poses, without masks: called with the frame and T_world_upper
+#: and T_world_lower, shape (N, 2, 4, 4); returns N numbers, more for better.
+Judge = Callable[[int, NDArray[np.float64]], NDArray[np.float64]]
+
+_CLEARLY = 1.01  # share of a guess's agreement at which another is better: less is noise of colours
+# Shares of the way from where the jaw was to where it has been before: jaws go the same ways again and again.
+_SHARES = (0.15, 0.3, 0.6, 1.0)
+_WEAK_SCORE = 0.5  # share of the usual score below which a pose may have been drawn away by its own masks
 _FIRST_ROUNDS = 3  # picks are a few tenths of a millimetre off; each round takes most of the rest
 
 
@@ -49,6 +57,7 @@ class GuidedTracker:
         upper: Mesh,
         lower: Mesh,
         see: See,
+        agreement: Judge,
         rounds: int,
         config: TrackingConfig | None = None,
         executor: Executor | None = None,
@@ -58,6 +67,7 @@ class GuidedTracker:
         Args:
             upper, lower: teeth scans in one frame, in occlusion [mm].
             see: makes the masks.
+            agreement: tells good guesses from bad ones. Masks made around a guess tend to confirm it.
             rounds: how often masks and poses take turns on a frame.
             config: the tracker's numbers; those for masks it asked for unless given.
             executor: runs parts of the work.
@@ -69,7 +79,7 @@ class GuidedTracker:
         self._meshes = {"upper": upper, "lower": lower}
         scans = [prepare_scan(mesh, row) for row, mesh in self._meshes.items()]
         self._solver = ContourSolver(scans, self._config, executor)
-        self._see, self._rounds = see, rounds
+        self._see, self._agreement, self._rounds = see, agreement, rounds
         # A dozen points of a row show any motion of it.
         self._probes = np.stack([s.probes[np.linspace(0, len(s.probes) - 1, 12).astype(int)] for s in scans])
 
@@ -105,6 +115,8 @@ class GuidedTracker:
     def follow(self, frames: range, past: Sequence[Past]) -> Iterator[tuple[int, FrameRecord]]:
         """Yield frames and what is known about them, one after the other away from known ones.
 
+        Rows that are lost are where colours alone say they may be.
+
         Args:
             frames: the frames, in either direction.
             past: what is known of the frames before, from the first one aligned to the one next to these.
@@ -113,13 +125,15 @@ class GuidedTracker:
         motion = Motion(past[0].poses, self._probes)
         history.take_up(past[0])
         for before in past[1:]:
-            motion.update(before.poses, before.status != LOST, before.used.any(1))
+            motion.update(before.poses, before.status != LOST, before.used.any(1), guessed=True)
             history.take_up(before)
         tracker = FrameTracker(self._solver, self._config, history)
+        sound = _is_sound(past[-1], history)
         for frame in frames:
-            record = self._one(tracker, motion, frame)
-            motion.update(record.solution.poses, record.status != LOST, record.used.any(1))
+            record = self._one(tracker, motion, frame, sound)
+            motion.update(record.solution.poses, record.status != LOST, record.used.any(1), guessed=True)
             history.add(record)
+            sound = _is_sound(Past.of(record), history)
             yield frame, record
 
     def judge(self, frame: int, poses: NDArray[np.float64], status: NDArray[np.int8]) -> FrameRecord:
@@ -131,19 +145,40 @@ class GuidedTracker:
         coverage = np.where(mask_px > 0, bare_px / np.maximum(mask_px, 1), np.nan)
         return FrameRecord(solution, status, use, coverage)
 
-    def _one(self, tracker: FrameTracker, motion: Motion, frame: int) -> FrameRecord:
+    def _one(self, tracker: FrameTracker, motion: Motion, frame: int, sound: bool) -> FrameRecord:
         c = self._config
-        starts = motion.starts()
+        starts = motion.starts() if sound else self._likeliest_first(frame, motion.starts(), motion.gallery())
         gallery = motion.gallery() if motion.worth_searching() else None
         reach = c.gate_per_miss * motion.miss_mm() * c.working_px_per_mm
         views = self._see(frame, starts[0], 0)
+        record = None
         if gallery is None:
             # Masks made around a prediction look suspect next to settled ones: the ladder waits for those.
             record = self._settle(tracker, frame, starts[0], tracker.glance(starts[0], views, reach))
-            if (record.status != LOST).all():
-                return record
-            views = self._see(frame, starts[0], 0)
-        return self._settle(tracker, frame, starts[0], tracker.track(starts, views, gallery, reach))
+            if (record.status == LOST).any():
+                views, record = self._see(frame, starts[0], 0), None
+        if record is None:
+            record = self._settle(tracker, frame, starts[0], tracker.track(starts, views, gallery, reach))
+        lost = (record.status == LOST)[:, None, None]
+        poses = np.where(lost, starts[0], record.solution.poses)
+        return replace(record, solution=replace(record.solution, poses=poses))
+
+    def _likeliest_first(
+        self, frame: int, starts: list[NDArray[np.float64]], gallery: list[NDArray[np.float64]]
+    ) -> list[NDArray[np.float64]]:
+        """Return starts with the one in front that agrees best with the colours.
+
+        Args:
+            frame: the frame.
+            starts: predictions, the likeliest first, each shape (2, 4, 4).
+            gallery: earlier poses; the ways to them are tried too.
+        """
+        guesses = [*starts, *_ways(starts, gallery)]
+        rates = self._agreement(frame, np.stack(guesses))
+        best = int(np.argmax(rates))
+        if rates[best] <= _CLEARLY * rates[0]:
+            return starts
+        return [guesses[best], *(start for k, start in enumerate(starts) if k != best)]
 
     def _settle(
         self, tracker: FrameTracker, frame: int, start: NDArray[np.float64], record: FrameRecord
@@ -154,3 +189,19 @@ class GuidedTracker:
             poses = np.where(lost, start, record.solution.poses)
             record = tracker.track([poses], self._see(frame, poses, turn), None)
         return record
+
+
+def _is_sound(past: Past, history: History) -> bool:
+    """Tell whether nothing about a frame that is in the history already is unusual."""
+    scarce = past.score_px.sum(1) < _WEAK_SCORE * history.usual_score().sum(1)
+    return bool((past.status == TRACKED).all() and not scarce.any())
+
+
+def _ways(starts: Sequence[NDArray[np.float64]], gallery: Sequence[NDArray[np.float64]]) -> list[NDArray[np.float64]]:
+    """Return poses of the jaw on the ways from the last start to earlier ones, the head where it is expected."""
+    head, last = starts[0][0], se3_inverse(starts[0][0]) @ starts[0][1]
+    out = []
+    for poses in gallery:
+        twist = se3_log(se3_inverse(poses[0]) @ poses[1] @ se3_inverse(last))
+        out += [np.stack([head, head @ se3_exp(share * twist) @ last]) for share in _SHARES]
+    return out

@@ -50,13 +50,16 @@ class Motion:
         half = orthonormalise(0.5 * (moving + self._last))
         return [moving, self._last.copy(), half]
 
-    def update(self, poses: NDArray[np.float64], found: NDArray[np.bool_], seen: NDArray[np.bool_]) -> None:
-        """Take in the next frame; rows not found keep their predictions.
+    def update(
+        self, poses: NDArray[np.float64], found: NDArray[np.bool_], seen: NDArray[np.bool_], guessed: bool = False
+    ) -> None:
+        """Take in the next frame; rows not found keep their predictions, or go where they are guessed.
 
         Args:
             poses: T_world_upper, T_world_lower, shape (2, 4, 4).
             found: rows whose poses can be trusted, shape (2,).
             seen: rows that have any mask, shape (2,).
+            guessed: whether poses of rows not found are guesses better than predictions.
         """
         expected = self.predict()
         for r in (0, 1):
@@ -70,7 +73,9 @@ class Motion:
                 self._step[r] = None
         self._lost_for = np.where(found, 0, self._lost_for + 1)
         self._failures = np.where(found, 0, self._failures + seen)
-        if not found[1]:
+        if guessed:
+            expected = poses
+        elif not found[1]:
             head = poses[0] if found[0] else expected[0]
             expected[1] = head @ se3_inverse(self._last[0]) @ self._last[1]
         self._last = np.where(found[:, None, None], poses, expected)
