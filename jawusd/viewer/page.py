@@ -23,6 +23,13 @@ _PLACEHOLDER = (
 )
 
 
+def begin_page(client: viser.ClientHandle, actor: ViewedActor) -> JawScene:
+    """Draw the jaw, without any panel."""
+    set_theme(client.gui)
+    client.gui.set_panel_label(actor.name)
+    return JawScene(client, actor)
+
+
 class Page:
     """Connect a page's widgets with its session.
 
@@ -32,14 +39,11 @@ class Page:
         pose, motion, files, plots: the panels.
     """
 
-    def __init__(self, client: viser.ClientHandle, actor: ViewedActor, still: StillPlots) -> None:
-        """Draw the page."""
-        self.client = client
+    def __init__(self, client: viser.ClientHandle, scene: JawScene, actor: ViewedActor, still: StillPlots) -> None:
+        """Draw the panels beside the jaw that `begin_page` drew."""
+        self.client, self.scene = client, scene
         self.session = Session(actor.rig, actor.fps)
         gui = client.gui
-        set_theme(gui)
-        gui.set_panel_label(actor.name)
-        self.scene = JawScene(client, actor)
         tabs = gui.add_tab_group()
         with tabs.add_tab("Pose"):
             if "mandible" in actor.placeholders:

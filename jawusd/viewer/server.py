@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import ipaddress
 import logging
@@ -17,7 +18,7 @@ from jawusd.errors import OutputError
 from jawusd.viewer import capture_scene
 from jawusd.viewer.actor import ViewedActor
 from jawusd.viewer.capture_page import CapturePage
-from jawusd.viewer.page import Page
+from jawusd.viewer.page import Page, begin_page
 from jawusd.viewer.plot_panel import StillPlots
 from jawusd.viewer.scene import set_first_view
 from jawusd.viewer.theme import set_theme
@@ -33,6 +34,10 @@ class _LocalServer(viser.ViserServer):
         """Refuse to share through viser's relay."""
         log.warning("a page asked for a public address; the viewer gives none")
         return None
+
+
+# A browser without a graphics card is busy with panels for most of a second: it gets the jaw so much earlier [s].
+_HEAD_START_S = 0.5
 
 
 class _Closable(Protocol):
@@ -73,10 +78,14 @@ class PageServer(ABC):
         if not self._trusted(client):
             log.warning("refused a page that belongs to another site")
             return
-        self.pages[client.client_id] = self._page(client)
+        page = await self._page(client)
+        if client.client_id in self._server.get_clients():
+            self.pages[client.client_id] = page
+        else:  # gone before the page was whole
+            page.close()
 
     @abstractmethod
-    def _page(self, client: viser.ClientHandle) -> _Closable:
+    async def _page(self, client: viser.ClientHandle) -> _Closable:
         """Return the page of a visitor."""
 
     async def _farewell(self, client: viser.ClientHandle) -> None:
@@ -109,8 +118,10 @@ class Viewer(PageServer):
         super().__init__(actor.name, host, port)
         set_first_view(self._server, self._still.rest)
 
-    def _page(self, client: viser.ClientHandle) -> Page:
-        return Page(client, self._actor, self._still)
+    async def _page(self, client: viser.ClientHandle) -> Page:
+        scene = begin_page(client, self._actor)
+        await asyncio.sleep(_HEAD_START_S)
+        return Page(client, scene, self._actor, self._still)
 
 
 class CaptureViewer(PageServer):
@@ -122,7 +133,7 @@ class CaptureViewer(PageServer):
         super().__init__(capture.name, host, port)
         capture_scene.set_first_view(self._server)
 
-    def _page(self, client: viser.ClientHandle) -> CapturePage:
+    async def _page(self, client: viser.ClientHandle) -> CapturePage:
         return CapturePage(client, self._capture)
 
 

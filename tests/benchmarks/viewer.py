@@ -79,11 +79,11 @@ def in_browser(viewer, path):
         tab.add_init_script(_WATCH)
         began = time.monotonic()
         tab.goto(viewer.url)
-        tab.wait_for_selector("text=nearest captured")
-        print(f"page opened to panels               {time.monotonic() - began:8.2f} s")
         tab.wait_for_function("seen.faces > 1000")
         tab.evaluate("finish()")
         print(f"page opened to jaw drawn            {time.monotonic() - began:8.2f} s")
+        tab.wait_for_selector("text=nearest captured")
+        print(f"page opened to panels               {time.monotonic() - began:8.2f} s")
         box = tab.locator("input.mantine-NumberInput-input").first
         box.fill("10")
         time.sleep(2.0)
