@@ -157,20 +157,45 @@ class _Segmenting:
         if before is None:  # colours come from the poses found in the first frame
             before, self._pictures = start, self._footage.at(start)
             self._see(start, poses, 0)
-        past = [self._past(frame) for frame in range(start, before + step, step)]
-        frames = range(before + step, end, step)
+        frames, follow = range(before + step, end, step), None
         walk = self._footage.walk(frames)
-        follow = self._tracker.follow(frames, past)
-        for _ in frames:
+        for frame in frames:
+            if follow is None:
+                past = [self._past(done) for done in range(start, frame, step)]
+                follow = self._tracker.follow(range(frame, end, step), past)
             _, self._pictures = next(walk)
             known = {name: model.counts() for name, model in colours.items()}
-            frame, record = next(follow)
+            _, record, found_again = next(follow)
             if (record.status == LOST).any():  # colours from where no teeth are would spoil all that follows
                 for name, model in colours.items():
                     model.take_up(*known[name])
             state.keep(frame, step)
+            if found_again:
+                self._look_back(start, frame, step, record)
+                follow = None  # what it knows has changed
             self._write(frame, record)
             self._tell("segment", len(self._journal.entries))
+
+    def _look_back(self, start: int, found: int, step: int, record) -> None:
+        """Go back from a frame in which a jaw was found again, and do frames anew as long as colours agree better."""
+        pictures, segments = self._pictures, self._segments
+        colours = [(segmenter.colours, segmenter.colours.counts()) for segmenter in self._segmenters.values()]
+        clearly = stage("jawusd.tracking.guided").CLEARLY
+        here = stage("jawusd.tracking.history").Past.of(record)
+        # Twice, for a jaw at rest: nothing is known of how it moves.
+        past = [*(self._past(frame) for frame in range(start, found, step)), here, here]
+        frames = range(found - step, start, -step)
+        walk, follow = self._footage.walk(frames), self._tracker.follow(frames, past)
+        for frame in frames:
+            _, self._pictures = next(walk)
+            _, again, _ = next(follow)
+            held, new = self._agreement(frame, np.stack([self._journal.known(frame)[0], again.solution.poses]))
+            if new <= clearly * held:
+                break
+            self._write(frame, again)
+        self._pictures, self._segments = pictures, segments
+        for model, counts in colours:
+            model.take_up(*counts)
 
     def _past(self, frame: int):
         """Return what the tracker needs to know about a finished frame."""

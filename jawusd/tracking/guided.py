@@ -13,7 +13,7 @@ from jawusd.errors import TrackingError
 from jawusd.formats.capture import Bootstrap
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import LOST, TRACKED
-from jawusd.geometry import Camera, se3_exp, se3_inverse, se3_log
+from jawusd.geometry import Camera, se3_exp, se3_inverse, se3_log, transform_points
 from jawusd.tracking.bootstrap import pose_from_picks
 from jawusd.tracking.config import FOR_MADE_MASKS, TrackingConfig
 from jawusd.tracking.first import first_record
@@ -32,9 +32,13 @@ See = Callable[[int, NDArray[np.float64], int], Sequence[View]]
 #: and T_world_lower, shape (N, 2, 4, 4); returns N numbers, more for better.
 Judge = Callable[[int, NDArray[np.float64]], NDArray[np.float64]]
 
-_CLEARLY = 1.01  # share of a guess's agreement at which another is better: less is noise of colours
+#: Share of a guess's agreement at which another is better [-]: less is noise of colours.
+CLEARLY = 1.01
 # Shares of the way from where the jaw was to where it has been before: jaws go the same ways again and again.
 _SHARES = (0.15, 0.3, 0.6, 1.0)
+# Distance between where the lower row was expected and where it is [mm] beyond which it had gone astray before: what is
+# expected of a jaw that is followed errs by less.
+_ASTRAY_MM = 4.0
 _WEAK_SCORE = 0.5  # share of the usual score below which a pose may have been drawn away by its own masks
 _FIRST_ROUNDS = 3  # picks are a few tenths of a millimetre off; each round takes most of the rest
 
@@ -112,10 +116,10 @@ class GuidedTracker:
             poses = record.solution.poses
         return record
 
-    def follow(self, frames: range, past: Sequence[Past]) -> Iterator[tuple[int, FrameRecord]]:
-        """Yield frames and what is known about them, one after the other away from known ones.
+    def follow(self, frames: range, past: Sequence[Past]) -> Iterator[tuple[int, FrameRecord, bool]]:
+        """Yield frames, what is known about them, and whether a jaw that had gone astray was found again.
 
-        Rows that are lost are where colours alone say they may be.
+        They come one after the other away from known ones. Rows that are lost are where colours alone say they may be.
 
         Args:
             frames: the frames, in either direction.
@@ -131,10 +135,12 @@ class GuidedTracker:
         sound = _is_sound(past[-1], history)
         for frame in frames:
             record = self._one(tracker, motion, frame, sound)
-            motion.update(record.solution.poses, record.status != LOST, record.used.any(1), guessed=True)
+            poses, expected = record.solution.poses, motion.predict()
+            motion.update(poses, record.status != LOST, record.used.any(1), guessed=True)
             history.add(record)
-            sound = _is_sound(Past.of(record), history)
-            yield frame, record
+            before, sound = sound, _is_sound(Past.of(record), history)
+            gap = transform_points(expected[1], self._probes[1]) - transform_points(poses[1], self._probes[1])
+            yield frame, record, sound and not before and np.linalg.norm(gap, axis=1).max() > _ASTRAY_MM
 
     def judge(self, frame: int, poses: NDArray[np.float64], status: NDArray[np.int8]) -> FrameRecord:
         """Return the record of a frame whose poses, shape (2, 4, 4), and status, shape (2,), are known already."""
@@ -176,7 +182,7 @@ class GuidedTracker:
         guesses = [*starts, *_ways(starts, gallery)]
         rates = self._agreement(frame, np.stack(guesses))
         best = int(np.argmax(rates))
-        if rates[best] <= _CLEARLY * rates[0]:
+        if rates[best] <= CLEARLY * rates[0]:
             return starts
         return [guesses[best], *(start for k, start in enumerate(starts) if k != best)]
 

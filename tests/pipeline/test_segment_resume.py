@@ -1,17 +1,21 @@
 """Segmentation stopped at any moment and taken up again, against one that was never stopped."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 from package_copy import ROOT
 
 from jawusd.formats.capture import load_capture
+from jawusd.formats.tracks import PARTIAL, TRACKED
 from jawusd.imaging.overlay import LOWER_COLOUR, UPPER_COLOUR
 from jawusd.pipeline.journal import FILE
 from jawusd.pipeline.segment import LEARNED, SegmentOptions, segment_teeth, with_masks
 from jawusd.pipeline.segment_summary import write_summary
 from jawusd.segmentation.files import mask_path, write_mask
 from jawusd.segmentation.sheet import write_sheet
+from jawusd.tracking.guided import GuidedTracker
 
 FRAMES = 4
 
@@ -103,3 +107,24 @@ def test_doubtful_masks_are_shown_over_their_pictures(take, undisturbed, tmp_pat
     for colour in (UPPER_COLOUR, LOWER_COLOUR):
         assert (np.abs(drawn - colour).max(axis=2) < 40).sum() > 100
         assert (np.abs(bare - colour).max(axis=2) < 40).sum() < 20  # that picture has no masks
+
+
+def test_frames_in_which_the_jaw_went_astray_are_done_anew(take, undisturbed, tmp_path, monkeypatch):
+    first, astray = take[0].frames[0], []
+    follow_one = GuidedTracker._one
+
+    def gone_astray(tracker, ladder, motion, frame, sound):
+        record = follow_one(tracker, ladder, motion, frame, sound)
+        if frame - first not in (1, 2) or frame in astray:
+            return record
+        astray.append(frame)
+        poses = record.solution.poses.copy()
+        poses[1, :3, 3] += [0.0, 3.0 * (frame - first), 0.0]
+        solution = replace(record.solution, poses=poses)
+        return replace(record, solution=solution, status=np.array([TRACKED, PARTIAL], np.int8))
+
+    monkeypatch.setattr(GuidedTracker, "_one", gone_astray)
+    entries, _ = run(take, tmp_path)
+    assert astray == [first + 1, first + 2]
+    for frame, entry in undisturbed[1].items():
+        np.testing.assert_allclose(entries[frame]["poses"], entry["poses"], atol=0.25)
