@@ -23,6 +23,9 @@ from jawusd.pipeline.state import Progress, hash_files, hash_value
 
 LEARNED = "learned.json"
 ROWS = ("upper", "lower")
+# Frames gone back at most from where a jaw that had gone astray was found [-], about a second, and distance at which
+# the way back has met the way there [mm].
+_ASTRAY_FRAMES, _MET_MM = 24, 0.7
 
 
 @dataclass(frozen=True)
@@ -177,21 +180,23 @@ class _Segmenting:
             self._tell("segment", len(self._journal.entries))
 
     def _look_back(self, start: int, found: int, step: int, record) -> None:
-        """Go back from a frame in which a jaw was found again, and do frames anew as long as colours agree better."""
+        """Go back from a frame in which a jaw was found again, until that meets the way there, and do it anew."""
         pictures, segments = self._pictures, self._segments
         colours = [(segmenter.colours, segmenter.colours.counts()) for segmenter in self._segmenters.values()]
-        clearly = stage("jawusd.tracking.guided").CLEARLY
         here = stage("jawusd.tracking.history").Past.of(record)
         # Twice, for a jaw at rest: nothing is known of how it moves.
         past = [*(self._past(frame) for frame in range(start, found, step)), here, here]
-        frames = range(found - step, start, -step)
+        frames = range(found - step, start, -step)[:_ASTRAY_FRAMES]
         walk, follow = self._footage.walk(frames), self._tracker.follow(frames, past)
+        anew, met = [], len(frames) < _ASTRAY_FRAMES  # the frame of the picks is known
         for frame in frames:
             _, self._pictures = next(walk)
             _, again, _ = next(follow)
-            held, new = self._agreement(frame, np.stack([self._journal.known(frame)[0], again.solution.poses]))
-            if new <= clearly * held:
+            if self._tracker.apart_mm(self._journal.known(frame)[0], again.solution.poses) < _MET_MM:
+                met = True
                 break
+            anew.append((frame, again, self._segments))
+        for frame, again, self._segments in anew if met else ():
             self._write(frame, again)
         self._pictures, self._segments = pictures, segments
         for model, counts in colours:

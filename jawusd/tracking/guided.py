@@ -32,8 +32,7 @@ See = Callable[[int, NDArray[np.float64], int], Sequence[View]]
 #: and T_world_lower, shape (N, 2, 4, 4); returns N numbers, more for better.
 Judge = Callable[[int, NDArray[np.float64]], NDArray[np.float64]]
 
-#: Share of a guess's agreement at which another is better [-]: less is noise of colours.
-CLEARLY = 1.01
+_CLEARLY = 1.01  # share of a guess's agreement at which another is better: less is noise of colours
 # Shares of the way from where the jaw was to where it has been before: jaws go the same ways again and again.
 _SHARES = (0.15, 0.3, 0.6, 1.0)
 # Distance between where the lower row was expected and where it is [mm] beyond which it had gone astray before: what is
@@ -139,8 +138,12 @@ class GuidedTracker:
             motion.update(poses, record.status != LOST, record.used.any(1), guessed=True)
             history.add(record)
             before, sound = sound, _is_sound(Past.of(record), history)
-            gap = transform_points(expected[1], self._probes[1]) - transform_points(poses[1], self._probes[1])
-            yield frame, record, sound and not before and np.linalg.norm(gap, axis=1).max() > _ASTRAY_MM
+            yield frame, record, sound and not before and self.apart_mm(expected, poses) > _ASTRAY_MM
+
+    def apart_mm(self, one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+        """Return how far the lower row is between two poses of both, shape (2, 4, 4), at most [mm]."""
+        gap = transform_points(one[1], self._probes[1]) - transform_points(other[1], self._probes[1])
+        return float(np.linalg.norm(gap, axis=1).max())
 
     def judge(self, frame: int, poses: NDArray[np.float64], status: NDArray[np.int8]) -> FrameRecord:
         """Return the record of a frame whose poses, shape (2, 4, 4), and status, shape (2,), are known already."""
@@ -182,7 +185,7 @@ class GuidedTracker:
         guesses = [*starts, *_ways(starts, gallery)]
         rates = self._agreement(frame, np.stack(guesses))
         best = int(np.argmax(rates))
-        if rates[best] <= CLEARLY * rates[0]:
+        if rates[best] <= _CLEARLY * rates[0]:
             return starts
         return [guesses[best], *(start for k, start in enumerate(starts) if k != best)]
 
