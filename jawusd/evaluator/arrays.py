@@ -113,6 +113,8 @@ def _check_values(arrays: dict[str, NDArray[np.float64]]) -> None:
     for name in _RISING:
         if name in arrays and (len(arrays[name]) < 2 or (np.diff(arrays[name]) <= 0).any()):
             raise EvaluatorError(f'"{name}" must hold at least two rising values.')
+    if len(arrays["landmarks"]) < 3:
+        raise EvaluatorError(f'"landmarks" holds {len(arrays["landmarks"])} points; a pose shows in three at least.')
     low, high = arrays["d_range"].T
     if not (low < high).all() or high[0] <= 0:
         raise EvaluatorError(f'"d_range" is {arrays["d_range"].tolist()} mm; rows must be (low, high), opening > 0.')

@@ -211,6 +211,7 @@ def test_changing_the_given_arrays_does_not_change_the_rig():
         ({"incisor": np.array(["a", "b", "c"])}, '"incisor" does not hold numbers'),
         ({"incisor": np.array([10**400, 0, 0], dtype=object)}, '"incisor" does not hold numbers'),
         ({"incisor": np.array([0.0, -1e200, 0.0])}, '"incisor" holds values up to 1e\\+200, at most 1e\\+09'),
+        ({"landmarks": np.zeros((0, 3))}, '"landmarks" holds 0 points'),
         ({"T_rest": np.diag([1.0, 2.0, 1.0, 1.0])}, '"T_rest" is not rigid'),
         ({"slice_softness_mm": np.array(0.0)}, '"slice_softness_mm" is 0.0; it must be positive'),
         ({"slice_d1": np.zeros(33)}, '"slice_d1" must hold at least two rising values'),

@@ -16,13 +16,13 @@ def write_rig(folder, kind):
 
 
 def read_rig(place, path):
-    from pxr import Sdf
-
+    from jawusd.errors import JawusdError
     from jawusd.rig import describe, load_rig
     from jawusd.rig.geo_read import read_geometry, read_gum
     from jawusd.rig.motion_read import read_parameters_of_stage, read_poses_of_stage
 
     shown = path if path.suffix == ".usdz" or path.name.startswith("anim") else place / "actor.usda"
+    uses_a_rig = path.name.startswith("anim")
     try:
         rig = load_rig(shown)
         rig.margin(rig.pose([[5.0, 0.1, 0.0]])[:, :3, 3])
@@ -30,15 +30,24 @@ def read_rig(place, path):
         if path.name == "geo.usdc":
             read_geometry(path)
             read_gum(path)
-        if path.name.startswith("anim"):
+        if uses_a_rig:
             read_parameters_of_stage(shown)
             read_poses_of_stage(shown)
-    finally:
-        inside = str(place.resolve())
-        for layer in Sdf.Layer.GetLoadedLayers():
-            real = layer.realPath
-            if real and not real.startswith(inside) and "/pxr/" not in real and "generatedSchema" not in real:
-                raise PermissionError(f"escaped: {real}")
+    except JawusdError:
+        if not uses_a_rig:  # else it may name a layer elsewhere, which is opened to see that it is no rig
+            _check_inside(place)
+        raise
+    _check_inside(place)
+
+
+def _check_inside(place):
+    from pxr import Sdf
+
+    inside = str(place.resolve())
+    for layer in Sdf.Layer.GetLoadedLayers():
+        real = layer.realPath
+        if real and not real.startswith(inside) and "/pxr/" not in real and "generatedSchema" not in real:
+            raise PermissionError(f"escaped: {real}")
 
 
 def onnx_reader(rig):
