@@ -22,8 +22,8 @@ from jawusd.pipeline.segment import LEARNED, SegmentOptions, segment_teeth
 from jawusd.pipeline.state import Progress
 
 SHEET = "look_at_these.png"
-_MAX_LEARNED_BYTES = 1 << 20
 FORMAT = "jawusd-segment/1"
+_MAX_LEARNED_BYTES = 1 << 20
 # Below this confidence a mask is to be looked at: a symptom at twice its usual spread.
 _DOUBTFUL = 0.5
 # Symptoms of a bad mask and whether more is worse; each is judged by how far it is off what the take's masks are like.

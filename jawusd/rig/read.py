@@ -44,7 +44,7 @@ def open_stage(path: PathArg) -> Usd.Stage:
     """Open a stage.
 
     Raises:
-        RigError: there is no such file, it is not USD, or a rig in it names files outside its folder.
+        RigError: there is no such file, it is not USD, or it names files that `check_reach` forbids.
     """
     path = Path(path)
     if not path.is_file():

@@ -30,7 +30,7 @@ See = Callable[[int, NDArray[np.float64], int], Sequence[View]]
 
 #: Tells how well a frame's pictures agree with guessed poses, without masks: called with the frame and T_world_upper
 #: and T_world_lower, shape (N, 2, 4, 4); returns N numbers, more for better.
-Judge = Callable[[int, NDArray[np.float64]], NDArray[np.float64]]
+Agreement = Callable[[int, NDArray[np.float64]], NDArray[np.float64]]
 
 _CLEARLY = 1.01  # share of a guess's agreement at which another is better: less is noise of colours
 # Shares of the way from where the jaw was to where it has been before: jaws go the same ways again and again.
@@ -60,7 +60,7 @@ class GuidedTracker:
         upper: Mesh,
         lower: Mesh,
         see: See,
-        agreement: Judge,
+        agreement: Agreement,
         rounds: int,
         config: TrackingConfig | None = None,
         executor: Executor | None = None,

@@ -26,6 +26,9 @@ from jawusd.viewer.viewed_capture import ViewedCapture
 
 log = logging.getLogger(__name__)
 
+# A browser without a graphics card is busy with panels for most of a second: it gets the jaw so much earlier [s].
+_HEAD_START_S = 0.5
+
 
 class _LocalServer(viser.ViserServer):
     """A viser server that asks nobody else: any page could order it to open a tunnel to the internet."""
@@ -34,10 +37,6 @@ class _LocalServer(viser.ViserServer):
         """Refuse to share through viser's relay."""
         log.warning("a page asked for a public address; the viewer gives none")
         return None
-
-
-# A browser without a graphics card is busy with panels for most of a second: it gets the jaw so much earlier [s].
-_HEAD_START_S = 0.5
 
 
 class _Closable(Protocol):

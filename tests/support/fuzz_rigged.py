@@ -33,8 +33,9 @@ def read_rig(place, path):
         if uses_a_rig:
             read_parameters_of_stage(shown)
             read_poses_of_stage(shown)
-    except JawusdError:
-        if not uses_a_rig:  # else it may name a layer elsewhere, which is opened to see that it is no rig
+    except JawusdError as refusal:
+        # What uses a rig may name a layer elsewhere: that one alone is opened, to see that it is no rig.
+        if not (uses_a_rig and "outside its own folder and no rig" in str(refusal)):
             _check_inside(place)
         raise
     _check_inside(place)
