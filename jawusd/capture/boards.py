@@ -13,10 +13,10 @@ from jawusd.capture.board_clips import BoardClip, sharpness
 from jawusd.capture.board_detection import corners_and_width, detector, shown_instead
 from jawusd.errors import CalibrationError
 from jawusd.formats.capture import Boards
+from jawusd.geometry.arrays import Array, Mask
 
 __all__ = ["Sightings", "board_points", "board_symmetries", "find_boards"]
 
-Array = NDArray[np.float64]
 
 MOST_VIEWS = 80  # more add minutes, not accuracy
 _LOOKED_AT = 6  # pictures in which another board is looked for
@@ -171,7 +171,7 @@ def _refuse_other_board(name: str, clip: BoardClip, chosen: list[int], boards: B
         )
 
 
-def _refuse_blur(names: tuple[str, ...], clips: list[BoardClip], widths: Array, blurred: NDArray[np.bool_]) -> None:
+def _refuse_blur(names: tuple[str, ...], clips: list[BoardClip], widths: Array, blurred: Mask) -> None:
     """Raise if a camera saw the board, but never sharply."""
     for name, clip, row, out, limit in zip(names, clips, widths, blurred, _limits_px(widths)):
         seen = np.isfinite(row)

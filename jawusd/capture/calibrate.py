@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.capture.boards import Sightings, board_points, board_symmetries, find_boards
 from jawusd.capture.bundle import Bundle, adjust
@@ -16,10 +15,10 @@ from jawusd.capture.shape import ShapeError, board_shape_error, expected_shape_e
 from jawusd.errors import CalibrationError
 from jawusd.formats.capture import Capture
 from jawusd.geometry import Camera
+from jawusd.geometry.arrays import Array
 
 __all__ = ["CalibrationReport", "calibrate_capture", "calibrate_sightings"]
 
-Array = NDArray[np.float64]
 #: Called with the cameras and why picks do not tell the scale.
 MeasureScale = Callable[[list[Camera], ScaleCheck], ScaleCheck]
 

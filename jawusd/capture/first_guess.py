@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from jawusd.errors import CalibrationError
 from jawusd.geometry import make_transform, se3_inverse, so3_exp, so3_log
+from jawusd.geometry.arrays import Array, Mask
 
 __all__ = ["FirstGuess", "guess_cameras"]
 
-Array = NDArray[np.float64]
 
 FEWEST_VIEWS = 6  # per camera; fewer leave focal length and distance exchangeable
 _SAME_ANGLE_RAD, _SAME_SHARE = np.deg2rad(4.0), 0.04  # relative poses this close (share of the distance) agree
@@ -127,7 +127,7 @@ def _turn(points_mm: Array, order: NDArray[np.int64]) -> Array:
     return make_transform(R, np.zeros(3))
 
 
-def _alike(a: Array, b: Array) -> NDArray[np.bool_]:
+def _alike(a: Array, b: Array) -> Mask:
     """Say whether poses agree, shape (...)."""
     angle = np.linalg.norm(so3_log(a[..., :3, :3] @ np.swapaxes(b[..., :3, :3], -1, -2)), axis=-1)
     apart = np.linalg.norm(a[..., :3, 3] - b[..., :3, 3], axis=-1)

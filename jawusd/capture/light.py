@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.errors import SyncError
+from jawusd.geometry.arrays import Array
 from jawusd.imaging.video import Video
 
 __all__ = ["Flashes", "Offset", "Step", "find_flashes", "find_steps", "match_steps", "mean_brightness", "on_grid"]
@@ -75,7 +76,7 @@ class Flashes:
     reason: str = ""
 
 
-def find_steps(brightness: NDArray[np.float64], first_frame: int = 0) -> list[Step]:
+def find_steps(brightness: Array, first_frame: int = 0) -> list[Step]:
     """Find the frames at which the light goes off or on.
 
     Args:
@@ -222,7 +223,7 @@ def find_flashes(video: Video) -> Flashes:
     )
 
 
-def _brightness(video: Video, first: int, last: int) -> NDArray[np.float64]:
+def _brightness(video: Video, first: int, last: int) -> Array:
     return np.array([mean_brightness(frame.image) for frame in video.frames(first, last, threads=1)])
 
 

@@ -5,16 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.capture.bundle import Bundle, camera_from
 from jawusd.capture.scale import triangulated_picks
 from jawusd.formats.capture import Bootstrap
 from jawusd.geometry import Camera, se3_inverse
+from jawusd.geometry.arrays import Array
 
 __all__ = ["ShapeError", "board_shape_error", "distance_errors", "expected_shape_error", "mouth_centre"]
 
-Array = NDArray[np.float64]
 
 _MOUTH_RADIUS_MM = 35.0  # holds both rows of teeth through an opening of 40 mm
 _DRAWS = 40

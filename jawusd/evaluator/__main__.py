@@ -19,11 +19,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.errors import FormatError, JawusdError
 from jawusd.evaluator.files import load
 from jawusd.evaluator.rig import JawRig
+from jawusd.geometry.arrays import Array
 
 _MATRIX_COLUMNS = [f"m{row}{column}" for row in range(4) for column in range(4)]
 
@@ -142,7 +142,7 @@ def _plain(value: object) -> object:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
-def _read_poses(path: Path) -> tuple[list[int], NDArray[np.float64]]:
+def _read_poses(path: Path) -> tuple[list[int], Array]:
     """Return frame numbers and T_skull_mandible (F, 4, 4) of a CSV table; nan and inf are taken as they stand.
 
     Raises:

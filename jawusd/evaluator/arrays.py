@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jawusd.errors import EvaluatorError
 from jawusd.evaluator.models import KINDS
+from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import rigidity_defect
 
 _RIGID_TOLERANCE = 1e-6
@@ -55,7 +56,7 @@ _LARGEST = 1e9  # [mm, rad]: far beyond any jaw, and squares and their sums stil
 _RISING = ("slice_d1", "path_limits", "curve1_knots", "curve2_knots", "curve3_knots")
 
 
-def checked_arrays(arrays: Mapping[str, ArrayLike], kind: str) -> dict[str, NDArray[np.float64]]:
+def checked_arrays(arrays: Mapping[str, ArrayLike], kind: str) -> dict[str, Array]:
     """Return read-only float64 arrays of a rig of the given kind, and nothing else.
 
     Args:
@@ -82,7 +83,7 @@ def checked_arrays(arrays: Mapping[str, ArrayLike], kind: str) -> dict[str, NDAr
 
 def _checked(
     name: str, arrays: Mapping[str, ArrayLike], shape: tuple[int | str, ...], lengths: dict[str, int]
-) -> NDArray[np.float64]:
+) -> Array:
     if name not in arrays:
         raise EvaluatorError(f'the model has no array "{name}".')
     try:
@@ -102,7 +103,7 @@ def _checked(
     return value
 
 
-def _check_values(arrays: dict[str, NDArray[np.float64]]) -> None:
+def _check_values(arrays: dict[str, Array]) -> None:
     for name in ("T_anatomical_skull", "T_rest"):
         defect = float(rigidity_defect(arrays[name]))
         if defect > _RIGID_TOLERANCE:
@@ -122,7 +123,7 @@ def _check_values(arrays: dict[str, NDArray[np.float64]]) -> None:
         raise EvaluatorError('"residual_limit_mm" must be positive and "margin_limit_mm" at most 0.')
 
 
-def _check_sections(arrays: dict[str, NDArray[np.float64]]) -> None:
+def _check_sections(arrays: dict[str, Array]) -> None:
     directions = arrays["slice_directions"]
     if (np.abs(np.linalg.norm(directions, axis=1) - 1.0) > 1e-6).any():
         raise EvaluatorError('"slice_directions" must be unit vectors.')

@@ -15,11 +15,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.evaluator.curves import HermiteCurve
-
-Array = NDArray[np.float64]
+from jawusd.geometry.arrays import Array
 
 _NEWTON_ITERATIONS = 60
 _ROOT_TOLERANCE_MM = 1e-12

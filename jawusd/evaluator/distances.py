@@ -8,11 +8,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jawusd.evaluator.solver import Residual
+from jawusd.geometry.arrays import Array, Indices
 
-Array = NDArray[np.float64]
 # x (k, 3) -> rotations (k, 3, 3), translations (k, 3), spatial derivatives (k, 6, 3)
 Derivative = Callable[[Array], tuple[Array, Array, Array]]
 
@@ -49,7 +49,7 @@ def distance_residual(derivative: Derivative, vectors: Array, target: Array) -> 
     """Return, for `minimise`, how far motions leave the vectors (4, m) from their targets (n, 3, m)."""
     count = vectors.shape[1]
 
-    def residual(x: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]:
+    def residual(x: Array, rows: Indices) -> tuple[Array, Array]:
         R, t, S = derivative(x)
         image = carried(R, t, vectors)
         # a vector (b, h) moves by w x image + v h under the spatial velocity (w, v)

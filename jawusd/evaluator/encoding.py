@@ -12,7 +12,6 @@ derivatives, from the parameters read off the model itself.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.distances import carried, distance_residual, landmark_vectors
@@ -20,9 +19,8 @@ from jawusd.evaluator.frames import RigFrames
 from jawusd.evaluator.models import AnchoredModel, JawModelForm
 from jawusd.evaluator.reach import Reach
 from jawusd.evaluator.solver import minimise
+from jawusd.geometry.arrays import Array, Indices
 from jawusd.geometry.se3 import make_transform, se3_inverse, se3_left_jacobian_inverse, se3_log, transform_points
-
-Array = NDArray[np.float64]
 
 
 class Encoder:
@@ -85,7 +83,7 @@ class Encoder:
     def _most_likely(self, R: Array, t: Array, whitening: Array, start: Array, bound: SliceHull | None) -> Array:
         measured = make_transform(R, t)
 
-        def residual(d: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]:
+        def residual(d: Array, rows: Indices) -> tuple[Array, Array]:
             R_d, t_d, S = self._model.decode_derivative(d)
             xi = se3_log(measured[rows] @ se3_inverse(make_transform(R_d, t_d)))
             W = whitening[rows]

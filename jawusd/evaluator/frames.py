@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import se3_adjoint, se3_inverse
-
-Array = NDArray[np.float64]
 
 
 class RigFrames:

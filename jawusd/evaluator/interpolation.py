@@ -6,12 +6,10 @@ from collections.abc import Callable
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.curves import HermiteCurve
-
-Array = NDArray[np.float64]
+from jawusd.geometry.arrays import Array, Mask
 
 _TANGENT_SCALES = (1.0, 0.7, 0.4, 0.2, 0.0)
 _SAMPLES = 33
@@ -58,13 +56,13 @@ def _catmull_rom(frames: Array, keys: Array) -> Array:
     return tangents
 
 
-def _guarded(keys: Array, bound: SliceHull) -> NDArray[np.bool_]:
+def _guarded(keys: Array, bound: SliceHull) -> Mask:
     """Tell which pieces have both keys inside: only those can be kept inside."""
     inside = bound.excess(keys) <= _ROUNDING_MM
     return inside[:-1] & inside[1:]
 
 
-def _leaves(value: Callable[[Array], Array], frames: Array, bound: SliceHull) -> NDArray[np.bool_]:
+def _leaves(value: Callable[[Array], Array], frames: Array, bound: SliceHull) -> Mask:
     """Tell which pieces of a curve leave the bound, by samples that crowd towards the keys."""
     s = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, _SAMPLES))
     times = frames[:-1, None] + s * np.diff(frames)[:, None]

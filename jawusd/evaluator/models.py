@@ -14,16 +14,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.evaluator.curves import HermiteCurve
 from jawusd.evaluator.gauge import Gauge
 from jawusd.evaluator.motions import anchored_motions, motions_from_twists
 from jawusd.evaluator.single import SingleAdditive, SingleAnchored
+from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import se3_left_jacobian, se3_left_jacobian_inverse
 from jawusd.geometry.so3 import so3_left_jacobian, so3_left_jacobian_inverse
-
-Array = NDArray[np.float64]
 
 KINDS = ("anchored", "additive")
 

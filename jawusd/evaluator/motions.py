@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jawusd.geometry.arrays import Array
 from jawusd.geometry.so3 import angle_coefficients
-
-Array = NDArray[np.float64]
 
 
 def motions_from_twists(twists: Array) -> Array:

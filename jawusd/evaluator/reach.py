@@ -6,7 +6,6 @@ from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.errors import EvaluatorError
 from jawusd.evaluator.bounds import SliceHull
@@ -14,10 +13,10 @@ from jawusd.evaluator.distances import distance_residual
 from jawusd.evaluator.models import JawModelForm
 from jawusd.evaluator.rows import in_chunks
 from jawusd.evaluator.solver import Residual, minimise, pulled_inside
+from jawusd.geometry.arrays import Array, Indices
 
-Array = NDArray[np.float64]
 # (row numbers (k,), starts (k, 3)) -> bottoms (k, 3) and squared residuals (k,)
-Search = Callable[[NDArray[np.intp], Array], tuple[Array, Array]]
+Search = Callable[[Indices, Array], tuple[Array, Array]]
 
 _MOST_VALLEYS = 4
 _RIPPLE_STEPS = (-2.0, -1.0, 1.0, 2.0)
@@ -117,7 +116,7 @@ class Reach:
         """Return the points (n, 3) [mm] nearest to those wanted (n, 3), and their squared distances (n,)."""
         identity = np.eye(3)
 
-        def residual(x: Array, rows: NDArray[np.intp]) -> tuple[Array, Array]:
+        def residual(x: Array, rows: Indices) -> tuple[Array, Array]:
             return x - wanted[rows], np.broadcast_to(identity, (len(x), 3, 3))
 
         return self._bottom(residual, start)
@@ -161,7 +160,7 @@ class _Scan:
         """Return where the motions carry homogeneous vectors (4, m) [mm], flat: shape (p, 3 m)."""
         return (self._motions @ vectors).reshape(len(self.points), -1)
 
-    def valleys(self, features: Array, wanted: Array) -> tuple[NDArray[np.intp], Array]:
+    def valleys(self, features: Array, wanted: Array) -> tuple[Indices, Array]:
         """Return starts: row numbers (m,), several for a row, and d (m, 3) [mm]; rows with NaN have none.
 
         A valley is a slice whose best point is nearer to what is wanted than that of both its neighbours.
@@ -179,7 +178,7 @@ class _Scan:
         rows, places = np.nonzero(found >= 0)
         return rows, self.points[found[rows, places]]
 
-    def _deepest(self, distance: Array) -> NDArray[np.intp]:
+    def _deepest(self, distance: Array) -> Indices:
         """Return the best point in each of the deepest valleys (n, v) of distances (n, p); -1 where there are fewer."""
         least = np.minimum.reduceat(distance, self._first, axis=1)
         walls = np.pad(least, ((0, 0), (1, 1)), constant_values=np.inf)
@@ -202,7 +201,7 @@ def nearest_distance(points: Array, queries: Array) -> Array:
     return np.linalg.norm(queries - points[_nearest_rows(points, queries)], axis=1)
 
 
-def _nearest_rows(points: Array, queries: Array) -> NDArray[np.intp]:
+def _nearest_rows(points: Array, queries: Array) -> Indices:
     """Return for each query (n, k) the number of the nearest point (p, k); 0 for NaN."""
     squared = np.einsum("pk,pk->p", points, points)
     found = np.zeros(len(queries), dtype=np.intp)

@@ -7,7 +7,7 @@ from functools import partial
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jawusd.evaluator import sections
 from jawusd.evaluator.arrays import checked_arrays
@@ -21,9 +21,9 @@ from jawusd.evaluator.polygons import PolygonBound
 from jawusd.evaluator.reach import Reach, nearest_distance
 from jawusd.evaluator.rows import as_keys, as_points, as_rows, in_chunks
 from jawusd.evaluator.verdicts import RIGID_TOLERANCE, Limits, Verdicts, judge, too_fast
+from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import rigidity_defect, transform_points
 
-Array = NDArray[np.float64]
 BoundName = Literal["slices", "polygons"]
 
 _SINGLE_LIMIT_MM = 1e4  # beyond, the float path might raise where the array path gives infinities

@@ -7,9 +7,9 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from jawusd.geometry.arrays import Array
 
 CHUNK_ROWS = 2048
 LARGEST = 1e9  # 1,000 km: no jaw, and squares and cubes of it still fit a float

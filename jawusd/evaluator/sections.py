@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.evaluator.bounds import SliceHull
-
-Array = NDArray[np.float64]
+from jawusd.geometry.arrays import Array
 
 # A range shorter than this counts as this long, which keeps normalising invertible where a section closes.
 SMALLEST_REACH_MM = 0.5

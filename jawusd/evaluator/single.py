@@ -12,7 +12,6 @@ from math import exp, sin, sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.evaluator.gauge import (
     ARCH_BOW_MM,
@@ -21,13 +20,13 @@ from jawusd.evaluator.gauge import (
     FADE_SOFTNESS_MM,
     LIMIT_SOFTNESS_MM,
 )
+from jawusd.geometry.arrays import Array
 
 if TYPE_CHECKING:
     from jawusd.evaluator.curves import HermiteCurve
     from jawusd.evaluator.gauge import Gauge
     from jawusd.evaluator.models import AdditiveModel, AnchoredModel
 
-Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
 Rows = list[list[float]]
 
@@ -198,7 +197,6 @@ class SingleGauge:
         u = gx + d2, -(d1 + drop * fade), gz + rho + d3
         rows = [[gx_1, 1.0, 0.0], [-(1.0 + drop * fade_1), -drop_2 * fade, -drop_3 * fade], [gz_1 + rho_1, rho_2, 1.0]]
         return u, rows
-
 
     def inverse(self, u: Vector) -> Vector | None:
         """Return the d [mm] of u [mm] by plain Newton, or None if that does not settle (see `Gauge.inverse`)."""

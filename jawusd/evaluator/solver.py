@@ -11,11 +11,11 @@ from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from jawusd.geometry.arrays import Array, Indices, Mask
+
 # (x (k, 3), row numbers (k,)) -> residuals (k, m) and their derivatives by x (k, m, 3)
-Residual = Callable[[Array, NDArray[np.intp]], tuple[Array, Array]]
+Residual = Callable[[Array, Indices], tuple[Array, Array]]
 
 ITERATIONS = 80
 TOLERANCE_MM = 1e-6
@@ -103,7 +103,7 @@ def minimise(
     return x
 
 
-def _picked(wanted: NDArray[np.bool_], *arrays: Array) -> tuple[Array, ...]:
+def _picked(wanted: Mask, *arrays: Array) -> tuple[Array, ...]:
     """Return the wanted rows of each array; the arrays themselves, uncopied, if that is all of them."""
     return arrays if wanted.all() else tuple(array[wanted] for array in arrays)
 
@@ -159,7 +159,7 @@ def _bounded_step(bound: Bound, x: Array, r: Array, J: Array, damping: Array, pr
     return step * np.minimum(1.0, LONGEST_STEP_MM / np.maximum(length, 1e-300))[:, None], pressure
 
 
-def pulled_inside(bound: Bound, x: Array) -> tuple[Array, NDArray[np.bool_]]:
+def pulled_inside(bound: Bound, x: Array) -> tuple[Array, Mask]:
     """Move the points x (n, 3) [mm] down the gradient until just inside, in place; return them and which got there."""
     inside = np.zeros(len(x), dtype=bool)
     rows = np.arange(len(x))

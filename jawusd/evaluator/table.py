@@ -5,13 +5,12 @@ from __future__ import annotations
 from bisect import bisect_right
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jawusd.evaluator.motions import motions_from_twists
 from jawusd.evaluator.rows import as_rows, in_chunks
 from jawusd.evaluator.single import motion_rows
-
-Array = NDArray[np.float64]
+from jawusd.geometry.arrays import Array, Indices
 
 _SINGLE_LIMIT_MM = 1e4
 
@@ -88,7 +87,7 @@ class SampledTable:
         return [low + c * (high - low) for low, high in zip(pair, pair[6:])]
 
 
-def _located(knots: Array, x: Array) -> tuple[NDArray[np.intp], Array]:
+def _located(knots: Array, x: Array) -> tuple[Indices, Array]:
     """Return the cell (n,) of each position x (n,) and the share of the way through it, x clamped to the knots."""
     cell = np.clip(knots.searchsorted(x, side="right") - 1, 0, len(knots) - 2)
     start = knots[cell]

@@ -8,7 +8,7 @@ from enum import IntFlag
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
+from jawusd.geometry.arrays import Array, Mask
 
 # A matrix written with 5 decimals or kept in half precision is rigid to about this; sheared or scaled ones are not.
 RIGID_TOLERANCE = 1e-3
@@ -54,13 +54,13 @@ class Verdicts:
         d: Nearest jaw parameters [mm], shape (..., 3); NaN if not finite or rigid.
     """
 
-    valid: NDArray[np.bool_]
+    valid: Mask
     reason: NDArray[np.uint8]
     residual_mm: Array
     margin_mm: Array
     d: Array
 
-    def finished(self, batch: tuple[int, ...], fast: NDArray[np.bool_]) -> Verdicts:
+    def finished(self, batch: tuple[int, ...], fast: Mask) -> Verdicts:
         """Return the verdicts in a batch shape, with the frames marked in ``fast`` (of that shape) too fast."""
         reason = self.reason.reshape(batch) | np.where(fast, Reason.TOO_FAST.value, 0).astype(np.uint8)
         residual_mm, margin_mm = self.residual_mm.reshape(batch), self.margin_mm.reshape(batch)
@@ -106,7 +106,7 @@ def judge(finite: Array, rigid: Array, residual_mm: Array, margin_mm: Array, d: 
     return Verdicts(reason == 0, reason, residual_mm, margin_mm, d)
 
 
-def too_fast(positions: Array, times_s: ArrayLike | None, limit_mm_s: float) -> NDArray[np.bool_]:
+def too_fast(positions: Array, times_s: ArrayLike | None, limit_mm_s: float) -> Mask:
     """Tell which frames were reached too fast.
 
     Args:

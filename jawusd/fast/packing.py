@@ -7,15 +7,13 @@ comes in one. The names below are places in those arrays; a slice of the model h
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.curves import HermiteCurve
 from jawusd.evaluator.frames import RigFrames
 from jawusd.evaluator.models import AdditiveModel, AnchoredModel, JawModelForm
+from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import se3_inverse
-
-Array = NDArray[np.float64]
 
 # the model, both kinds
 COUNT = 0  # spline centres of an anchored model; 0 says additive

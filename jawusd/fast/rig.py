@@ -14,9 +14,8 @@ from jawusd.fast import rows as compiled
 from jawusd.fast.arrays import owned, rows_of
 from jawusd.fast.packing import packed_bound, packed_model
 from jawusd.fast.search import FastReach
+from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import transform_points
-
-Array = NDArray[np.float64]
 
 _SINGLE_LIMIT_MM = 1e4  # beyond, one d goes the way of batches, which tells absurd values from large ones
 

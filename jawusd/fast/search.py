@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.models import JawModelForm
@@ -11,8 +10,7 @@ from jawusd.evaluator.reach import Reach
 from jawusd.fast import rows
 from jawusd.fast.arrays import owned
 from jawusd.fast.descent import PARAMETERS, POINT
-
-Array = NDArray[np.float64]
+from jawusd.geometry.arrays import Array
 
 
 class FastReach(Reach):

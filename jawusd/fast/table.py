@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jawusd.evaluator.table import SampledTable
 from jawusd.fast import grid
 from jawusd.fast.arrays import rows_of
-
-Array = NDArray[np.float64]
+from jawusd.geometry.arrays import Array
 
 _SINGLE_LIMIT_MM = 1e4
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
 from jawusd.evaluator.curves import HermiteCurve
@@ -22,9 +21,7 @@ from jawusd.fitting.path import fit_path
 from jawusd.fitting.spline import choose_smoothing, ridge_solve
 from jawusd.fitting.trimming import within
 from jawusd.geometry import se3_log
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from jawusd.geometry.arrays import Array, Mask
 
 _PIECES = (8, 6, 6)  # polynomial pieces of the three curves
 _ROUNDS = 8

@@ -13,7 +13,7 @@ from scipy.spatial import Delaunay, QhullError
 from shapely import MultiPoint, Polygon, polygons, union_all
 from shapely.geometry.polygon import orient
 
-Array = NDArray[np.float64]
+from jawusd.geometry.arrays import Array
 
 _SMALLEST_RANGE_MM = 0.5  # ranges below this are noise, not motion; dividing by them would blow the noise up
 _SLIVER = 1e-12  # twice the smallest area of a triangle, in normalised units

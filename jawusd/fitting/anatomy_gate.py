@@ -9,12 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.fitting.data import Anatomy, TrainingData
 from jawusd.geometry import se3_inverse, so3_log, transform_points
-
-Array = NDArray[np.float64]
+from jawusd.geometry.arrays import Array
 
 _OPENING_MAX_MM = 75.0
 _LATERAL_MAX_MM = 20.0

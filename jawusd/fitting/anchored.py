@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from jawusd.evaluator.gauge import Gauge
@@ -23,9 +22,7 @@ from jawusd.fitting.path import fit_path
 from jawusd.fitting.spline import SplineBasis, choose_smoothing, farthest_points, ridge_solve
 from jawusd.fitting.trimming import within
 from jawusd.geometry import make_transform, so3_log
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from jawusd.geometry.arrays import Array, Mask
 
 CENTRES = 80
 _ROUNDS = 4

@@ -15,13 +15,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from jawusd.geometry import so3_exp, so3_log
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from jawusd.geometry.arrays import Array, Mask
 
 _SLIDE_SCALE_MM, _OPENING_SCALE_MM = 10.0, 40.0  # make the polynomials' arguments of order one
 _DEGREE = 4

@@ -10,8 +10,7 @@ from jawusd.fitting.data import Anatomy, TrainingData
 from jawusd.formats.experiments import CondylePath, Distances, ParameterPath
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import se3_exp, se3_log, transform_points
-
-Array = NDArray[np.float64]
+from jawusd.geometry.arrays import Array
 
 EXPERIMENT = "condyle path"
 PRINCIPAL = "principal component 1"

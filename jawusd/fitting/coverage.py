@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.fitting.data import TrainingData
 from jawusd.fitting.gauge_fit import path_gauge
 from jawusd.fitting.path import SMALLEST_OPENING_MM, fit_path
-
-Array = NDArray[np.float64]
+from jawusd.geometry.arrays import Array, Mask
 
 PARAMETERS = ("opening", "laterotrusion", "protrusion")
 
@@ -25,7 +23,7 @@ _SECTORS, _SECTOR_REACH, _FEWEST_SECTORS = 8, 0.25, 6
 _SMALLEST_RANGE_MM = np.array([SMALLEST_OPENING_MM, 3.0, 2.5])
 
 
-def shown_parameters(data: TrainingData) -> tuple[NDArray[np.bool_], list[str]]:
+def shown_parameters(data: TrainingData) -> tuple[Mask, list[str]]:
     """Tell which of opening, laterotrusion and protrusion the poses exercise.
 
     Args:
@@ -56,7 +54,7 @@ def _range(values: Array) -> float:
     return float(np.percentile(values, 99) - np.percentile(values, 1))
 
 
-def missing_movements(d: Array, shown: NDArray[np.bool_]) -> list[str]:
+def missing_movements(d: Array, shown: Mask) -> list[str]:
     """Say what a take lacks, one sentence each with what to record.
 
     Args:

@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.errors import FittingError
 from jawusd.evaluator.curves import HermiteCurve
 from jawusd.evaluator.models import AdditiveModel
 from jawusd.fitting.coverage import PARAMETERS
 from jawusd.geometry import se3_exp, se3_left_jacobian
-
-Array = NDArray[np.float64]
+from jawusd.geometry.arrays import Array, Mask
 
 #: A curve of some parameter t (n,): twists (n, 6) and their derivatives by t (n, 6); the twist is zero at t = 0.
 Curve = Callable[[Array], tuple[Array, Array]]
@@ -29,7 +27,7 @@ _SHORTEST_MM = 0.01  # a curve shorter than this is a network that collapsed
 
 def in_millimetres(
     curve: Curve, limits: tuple[float, float], root: Array, incisor: Array, axis: int
-) -> tuple[HermiteCurve, NDArray[np.bool_]]:
+) -> tuple[HermiteCurve, Mask]:
     """Give a curve the parameter d = what it alone moves the incisal point by along its own axis.
 
     Where the incisal point stands still or turns back, d goes on growing with a fifth of the mandible's rms path, so

@@ -11,9 +11,7 @@ from jawusd.errors import FittingError
 from jawusd.fitting.metric import MandibleMetric
 from jawusd.formats.tracks import LOST, Tracks
 from jawusd.geometry import LANDMARKS, hat, orthonormalise, rigidity_defect, se3_inverse, transform_points
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from jawusd.geometry.arrays import Array, Mask
 
 #: How far real jaws stray from a three-parameter model: smaller errors of tracking hardly matter [mm].
 MODEL_SIGMA_MM = 0.3

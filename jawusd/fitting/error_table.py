@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.fitting.data import TrainingData
 from jawusd.geometry import LANDMARKS, transform_points
-
-Array = NDArray[np.float64]
+from jawusd.geometry.arrays import Array
 
 
 def pose_errors(data: TrainingData, model: Array) -> dict[str, Array]:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jawusd.errors import FittingError
 from jawusd.fitting.condyle_paths import condyle_paths, parameter_paths, path_distances, sagittal_section
@@ -23,9 +23,7 @@ from jawusd.formats.experiments import Coverage, Distances, Experiments
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import se3_exp, se3_log, transform_points
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from jawusd.geometry.arrays import Array, Mask
 
 #: Models of the experiments: label and how `FittingConfig` asks for them.
 MODELS: dict[str, dict] = {

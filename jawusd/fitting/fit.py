@@ -24,8 +24,7 @@ from jawusd.fitting.screening import screened
 from jawusd.fitting.slice_hull import fit_slice_hull, valid_box
 from jawusd.formats.model import JawModel
 from jawusd.formats.tracks import Tracks
-
-Array = NDArray[np.float64]
+from jawusd.geometry.arrays import Array, Mask
 
 #: Called with the steps done and the steps in all.
 Progress = Callable[[int, int], None]
@@ -113,7 +112,7 @@ def fit_model(
     return model
 
 
-def fit_form(data: TrainingData, shown: NDArray[np.bool_], config: FittingConfig) -> FittedForm:
+def fit_form(data: TrainingData, shown: Mask, config: FittingConfig) -> FittedForm:
     """Fit the decoder of `config.method` alone, without bounds, checks and hold-out.
 
     Args:

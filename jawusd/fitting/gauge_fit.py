@@ -9,13 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.evaluator.gauge import Gauge
 from jawusd.fitting.path import Path
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from jawusd.geometry.arrays import Array, Mask
 
 SOFTNESS_MM = 2.0  # rounding of the arch across d2 = 0: wide enough that a slider does not jerk there
 FADE_MM = 14.0  # opening at which tooth guidance has faded to 1/e

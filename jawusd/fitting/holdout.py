@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linprog
 from scipy.sparse import eye_array, hstack
 from scipy.spatial import cKDTree
@@ -15,9 +14,8 @@ from jawusd.evaluator.models import JawModelForm
 from jawusd.fitting.data import TrainingData
 from jawusd.fitting.error_table import join, pose_errors, summarise
 from jawusd.geometry import LANDMARKS
+from jawusd.geometry.arrays import Array, Mask
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Tables = dict[str, dict[str, dict[str, float]]]
 
 _INSIDE_TWO_SD = 0.97  # of left-out frames: poses of other exercises lie farther out, 95 % of them are meant

@@ -9,15 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from jawusd.evaluator.distances import carried, distance_residual, landmark_vectors
 from jawusd.evaluator.models import AnchoredModel, JawModelForm
 from jawusd.evaluator.solver import minimise
 from jawusd.geometry import hat, make_transform
-
-Array = NDArray[np.float64]
+from jawusd.geometry.arrays import Array
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-Array = NDArray[np.float64]
+from jawusd.geometry.arrays import Array
 
 _SCALED_SD = 0.1
 _WEIGHT_DECAY = 1e-3
@@ -66,9 +65,7 @@ class Nlpca:
         return ((1 - hidden**2) * (direction @ W3)) @ W4 / self.scale
 
 
-def train_nlpca(
-    data: Array, components: int, seed: int, *, centre: bool = False, stages: int = len(_STAGES)
-) -> Nlpca:
+def train_nlpca(data: Array, components: int, seed: int, *, centre: bool = False, stages: int = len(_STAGES)) -> Nlpca:
     """Train a network with L-BFGS; the same seed gives the same network.
 
     Args:

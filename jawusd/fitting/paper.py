@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.errors import FittingError
 from jawusd.evaluator.curves import HermiteCurve
@@ -26,9 +25,8 @@ from jawusd.fitting.data import TrainingData
 from jawusd.fitting.error_table import pose_errors, summarise
 from jawusd.fitting.nlpca import Nlpca, train_nlpca
 from jawusd.geometry import se3_exp, se3_log
+from jawusd.geometry.arrays import Array, Mask
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Groups = tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]
 
 COMPONENTS = 5

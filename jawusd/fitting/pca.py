@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.errors import FittingError
 from jawusd.evaluator.models import AdditiveModel
@@ -13,9 +12,7 @@ from jawusd.fitting.curves import MEASURED, additive_arrays, straight, translati
 from jawusd.fitting.data import TrainingData
 from jawusd.fitting.metric import velocity_of
 from jawusd.geometry import se3_log
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from jawusd.geometry.arrays import Array, Mask
 
 _LARGEST_CONDITION = 1e3
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from jawusd.fitting.data import Selection, TrainingData
 from jawusd.geometry import so3_log
+from jawusd.geometry.arrays import Array, Mask
 
 _FEWEST = 60  # poses among which odd ones stand out
 _TRIALS, _SAMPLE = 300, 15  # random samples; each somewhat above the ten unknowns per component
@@ -34,7 +35,7 @@ def screened(selection: Selection) -> Selection:
     return Selection(selection.data.select(~odd), used, excluded)
 
 
-def gross_outliers(data: TrainingData) -> NDArray[np.bool_]:
+def gross_outliers(data: TrainingData) -> Mask:
     """Tell which poses lie centimetres off a quadratic map that most agree with, shape (N,); none of fewer than 60."""
     count = len(data)
     if count < _FEWEST:
@@ -57,13 +58,13 @@ def gross_outliers(data: TrainingData) -> NDArray[np.bool_]:
     return residual > max(_TIMES * spread, _FLOOR_MM)
 
 
-def _quadratic(u: NDArray[np.float64]) -> NDArray[np.float64]:
+def _quadratic(u: Array) -> Array:
     """Return the ten monomials up to degree two of displacements (N, 3), scaled to their usual size, shape (N, 10)."""
     x = (u - np.median(u, axis=0)) / np.maximum(np.percentile(np.abs(u), 75, axis=0), 1.0)
     pairs = [x[:, i] * x[:, j] for i in range(3) for j in range(i, 3)]
     return np.column_stack([np.ones(len(x)), x, *pairs])
 
 
-def _residual(columns: NDArray, values: NDArray, rows: NDArray) -> NDArray[np.float64]:
+def _residual(columns: NDArray, values: NDArray, rows: NDArray) -> Array:
     solution = np.linalg.lstsq(columns[rows], values[rows], rcond=1e-8)[0]
     return np.linalg.norm(values - columns @ solution, axis=1)

@@ -11,11 +11,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.evaluator.bounds import SliceHull
-
-Array = NDArray[np.float64]
+from jawusd.geometry.arrays import Array
 
 DIRECTIONS = 16
 KNOTS = 48

@@ -9,10 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-Array = NDArray[np.float64]
+from jawusd.geometry.arrays import Array
 
 _RANK = 1e-9  # singular values below this share of the largest count as zero
 _TIE_DIGITS = 9

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from jawusd.evaluator.bounds import SliceHull
@@ -15,8 +14,7 @@ from jawusd.evaluator.polygons import PolygonBound
 from jawusd.fitting.alpha_shape import alpha_shape
 from jawusd.fitting.metric import MandibleMetric
 from jawusd.fitting.slice_hull import fit_slice_hull, valid_box
-
-Array = NDArray[np.float64]
+from jawusd.geometry.arrays import Array
 
 POSES = 1000
 BOX, POLYGONS, SLICES = "static: box", "dynamic: two polygons", "dynamic: slice hull"

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+
+from jawusd.geometry.arrays import Array, Mask
 
 
-def within(residual_mm: NDArray[np.float64], trim_mad: float, floor_mm: float) -> NDArray[np.bool_]:
+def within(residual_mm: Array, trim_mad: float, floor_mm: float) -> Mask:
     """Return the frames not farther than the median by `trim_mad` normalised median absolute deviations.
 
     Args:

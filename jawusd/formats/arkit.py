@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.errors import FormatError
+from jawusd.geometry.arrays import Array
 
 __all__ = ["FaceCapture", "read_arkit"]
 
@@ -43,8 +44,8 @@ class FaceCapture:
         timecode: that of the first row, as written.
     """
 
-    frames: NDArray[np.float64]
-    weights: NDArray[np.float64]
+    frames: Array
+    weights: Array
     fps: float
     timecode: str
 
@@ -130,9 +131,7 @@ def _seconds_and_frames(text: str, line: int, path: Path) -> tuple[int, float]:
     return 3600 * hours + 60 * minutes + seconds, float(found[4])
 
 
-def _rate(
-    seconds: NDArray[np.int64], inside: NDArray[np.float64], lines: list[int], fps: float | None, path: Path
-) -> float:
+def _rate(seconds: NDArray[np.int64], inside: Array, lines: list[int], fps: float | None, path: Path) -> float:
     """Return the given rate, or the lowest usual one above every frame number once a full second was counted."""
     top = int(np.argmax(inside))
     highest = math.floor(inside[top])
@@ -157,9 +156,7 @@ def _rate(
     return float(fps)
 
 
-def _frames(
-    seconds: NDArray[np.int64], inside: NDArray[np.float64], lines: list[int], rate: float, path: Path
-) -> NDArray[np.float64]:
+def _frames(seconds: NDArray[np.int64], inside: Array, lines: list[int], rate: float, path: Path) -> Array:
     # A rate like 29.97 counts whole frames: 30 numbers per second of time code.
     frames = seconds * math.ceil(rate) + inside
     steps = np.diff(frames)

@@ -15,15 +15,14 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.errors import CalibrationError
 from jawusd.formats.calibration import load_calibration
 from jawusd.geometry import Camera, make_transform, matrix_from_wxyz, rigidity_defect, se3_inverse
+from jawusd.geometry.arrays import Array
 
 __all__ = ["calibration_files", "load_cameras_file", "load_colmap", "load_nerfstudio"]
 
-Array = NDArray[np.float64]
 
 _COLMAP = ("cameras.txt", "images.txt")
 _HALF_PX = 0.5

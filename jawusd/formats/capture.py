@@ -74,9 +74,7 @@ class Masks(_Strict):
     @property
     def exchanged(self) -> Masks:
         """Return the masks with upper and lower exchanged."""
-        return Masks(
-            upper=self.lower, lower=self.upper, upper_value=self.lower_value, lower_value=self.upper_value
-        )
+        return Masks(upper=self.lower, lower=self.upper, upper_value=self.lower_value, lower_value=self.upper_value)
 
 
 class CameraSource(_Strict):

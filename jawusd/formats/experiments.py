@@ -8,11 +8,9 @@ import os
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.formats.atomic import write_text_atomic
-
-Array = NDArray[np.float64]
+from jawusd.geometry.arrays import Array
 
 TABLE_COLUMNS = ("experiment", "model", "quantity", "count", "mean_mm", "median_mm", "p95_mm", "max_mm")
 

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from jawusd.errors import FormatError
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.text import read_text
+from jawusd.geometry.arrays import Array
 
 #: Keys are written out frame by frame: an hour at 60 per second fits.
 MOST_FRAMES, FARTHEST_FRAME = 220_000, 1e9
@@ -50,7 +50,7 @@ class Keys(BaseModel):
                 raise ValueError(f"frames must rise, frame {after:g} follows {before:g}")
         return self
 
-    def arrays(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def arrays(self) -> tuple[Array, Array]:
         """Return the key frames (K,) and their parameters d [mm] (K, 3)."""
         return np.array([key.frame for key in self.keys]), np.array([key.d for key in self.keys])
 

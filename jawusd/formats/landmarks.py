@@ -17,11 +17,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.errors import FormatError, UnitsError
 from jawusd.formats.npz import check_format
 from jawusd.geometry import LANDMARKS, rigidity_defect
+from jawusd.geometry.arrays import Array
 
 FAMILY, VERSION = "jawusd-landmarks", 1
 _RIGID_TOLERANCE = 1e-6
@@ -36,8 +36,8 @@ class LandmarkFile:
         T_anatomical_skull: the file's frame to the anatomical frame, shape (4, 4), or None.
     """
 
-    landmarks: NDArray[np.float64]
-    T_anatomical_skull: NDArray[np.float64] | None
+    landmarks: Array
+    T_anatomical_skull: Array | None
 
 
 def load_landmarks(path: str | os.PathLike[str]) -> LandmarkFile:
@@ -78,7 +78,7 @@ def load_landmarks(path: str | os.PathLike[str]) -> LandmarkFile:
     return LandmarkFile(landmarks, T)
 
 
-def _numbers(value: object, shape: tuple[int, ...], name: str, path: Path) -> NDArray[np.float64]:
+def _numbers(value: object, shape: tuple[int, ...], name: str, path: Path) -> Array:
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:

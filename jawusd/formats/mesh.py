@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.geometry.arrays import Array
+
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
@@ -18,7 +20,7 @@ class Mesh:
         colors: red, green, blue per vertex, shape (V, 3), uint8, or None.
     """
 
-    vertices: NDArray[np.float64]
+    vertices: Array
     faces: NDArray[np.int32]
     colors: NDArray[np.uint8] | None = None
 

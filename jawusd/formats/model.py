@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from jawusd.formats.atomic import write_npz_atomic
 from jawusd.formats.npz import TWIST_ORDER, UNITS, read_npz, take
+from jawusd.geometry.arrays import Array, Mask
 
 FAMILY, VERSION = "jawusd-model", 1
 _CAPTURED = ("captured_frames", "captured_d", "captured_residual_mm", "captured_trained")
@@ -35,9 +36,9 @@ class JawModel:
 
     arrays: dict[str, NDArray]
     frames: NDArray[np.int64]
-    d: NDArray[np.float64]
-    residual_mm: NDArray[np.float64]
-    trained: NDArray[np.bool_]
+    d: Array
+    residual_mm: Array
+    trained: Mask
     meta: dict = field(default_factory=dict)
 
 

@@ -21,6 +21,7 @@ from jawusd.errors import FormatError
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.text import read_text
 from jawusd.geometry import make_transform, matrix_from_wxyz, rigidity_defect
+from jawusd.geometry.arrays import Array
 
 MATRIX_COLUMNS = tuple(f"m{row}{column}" for row in range(4) for column in range(4))
 QUATERNION_COLUMNS = ("tx", "ty", "tz", "qw", "qx", "qy", "qz")
@@ -74,7 +75,7 @@ def _json_columns(text: str, path: Path) -> dict[str, list[str]]:
     return {name: [str(record[name]) for record in records] for name in names}
 
 
-def _numbers(columns: dict[str, list[str]], names: tuple[str, ...], path: Path) -> NDArray[np.float64]:
+def _numbers(columns: dict[str, list[str]], names: tuple[str, ...], path: Path) -> Array:
     """Return the named columns as finite numbers, shape (F, len(names))."""
     out = np.empty((len(columns[names[0]]), len(names)))
     for j, name in enumerate(names):
@@ -109,7 +110,7 @@ def _frames(columns: dict[str, list[str]], name: str, path: Path) -> NDArray[np.
 
 def read_poses(
     path: str | os.PathLike[str], columns: Mapping[str, str] | None = None
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+) -> tuple[NDArray[np.int64], Array]:
     """Read jaw poses from CSV or JSON.
 
     Args:
@@ -154,7 +155,7 @@ def read_poses(
     return frames, _checked_rigid(T, path)
 
 
-def _checked_rigid(T: NDArray[np.float64], path: Path) -> NDArray[np.float64]:
+def _checked_rigid(T: Array, path: Path) -> Array:
     defect = rigidity_defect(T) if len(T) else np.zeros(0)
     if defect.size and defect.max() > _RIGID_TOLERANCE:
         raise FormatError(
@@ -166,7 +167,7 @@ def _checked_rigid(T: NDArray[np.float64], path: Path) -> NDArray[np.float64]:
     return T
 
 
-def read_parameters(path: str | os.PathLike[str]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def read_parameters(path: str | os.PathLike[str]) -> tuple[NDArray[np.int64], Array]:
     """Read parameters d from CSV or JSON.
 
     Args:
@@ -199,7 +200,7 @@ def table_columns(path: str | os.PathLike[str]) -> tuple[str, ...]:
     return tuple(_read_table(Path(path)))
 
 
-def write_poses(path: str | os.PathLike[str], frames: NDArray[np.int64], T: NDArray[np.float64]) -> None:
+def write_poses(path: str | os.PathLike[str], frames: NDArray[np.int64], T: Array) -> None:
     """Write jaw poses as CSV with matrix columns, atomically and with all digits.
 
     Args:
@@ -213,7 +214,7 @@ def write_poses(path: str | os.PathLike[str], frames: NDArray[np.int64], T: NDAr
     write_table(path, ("frame", *MATRIX_COLUMNS), frames, np.asarray(T).reshape(len(frames), 16))
 
 
-def write_parameters(path: str | os.PathLike[str], frames: NDArray[np.int64], d: NDArray[np.float64]) -> None:
+def write_parameters(path: str | os.PathLike[str], frames: NDArray[np.int64], d: Array) -> None:
     """Write parameters d [mm] (F, 3) as CSV, atomically and with all digits.
 
     Args:
@@ -228,7 +229,7 @@ def write_parameters(path: str | os.PathLike[str], frames: NDArray[np.int64], d:
 
 
 def write_table(
-    path: str | os.PathLike[str], header: tuple[str, ...], frames: NDArray[np.int64], values: NDArray[np.float64]
+    path: str | os.PathLike[str], header: tuple[str, ...], frames: NDArray[np.int64], values: Array
 ) -> None:
     """Write a CSV table of one frame column and numbers, atomically.
 

@@ -5,15 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from jawusd.formats.experiments import Experiments
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.model import JawModel
 from jawusd.formats.tracks import Tracks
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from jawusd.errors import FormatError
 from jawusd.formats.atomic import write_npz_atomic
 from jawusd.formats.npz import TWIST_ORDER, UNITS, read_npz, take
 from jawusd.geometry import LANDMARKS, rigidity_defect
+from jawusd.geometry.arrays import Array, Mask
 
 FAMILY, VERSION = "jawusd-tracks", 1
 
@@ -48,26 +49,26 @@ class Tracks:
     """
 
     frames: NDArray[np.int64]
-    T_world_upper: NDArray[np.float64]
-    T_world_lower: NDArray[np.float64]
-    T_upper_lower: NDArray[np.float64]
-    raw_T_world_upper: NDArray[np.float64]
-    raw_T_world_lower: NDArray[np.float64]
-    raw_T_upper_lower: NDArray[np.float64]
+    T_world_upper: Array
+    T_world_lower: Array
+    T_upper_lower: Array
+    raw_T_world_upper: Array
+    raw_T_world_lower: Array
+    raw_T_upper_lower: Array
     status: NDArray[np.int8]
-    prior_aided: NDArray[np.bool_]
-    coverage_error: NDArray[np.float64]
-    masks_used: NDArray[np.bool_]
-    covariance_upper: NDArray[np.float64]
-    covariance_lower: NDArray[np.float64]
-    covariance_relative: NDArray[np.float64]
-    sigma_mm: NDArray[np.float64]
-    residual_px: NDArray[np.float64]
-    matched_px: NDArray[np.float64]
+    prior_aided: Mask
+    coverage_error: Array
+    masks_used: Mask
+    covariance_upper: Array
+    covariance_lower: Array
+    covariance_relative: Array
+    sigma_mm: Array
+    residual_px: Array
+    matched_px: Array
     camera_names: tuple[str, ...]
     meta: dict = field(default_factory=dict)
 
-    def tracked(self) -> NDArray[np.bool_]:
+    def tracked(self) -> Mask:
         """Return which frames have both final poses, shape (F,)."""
         return np.isfinite(self.T_upper_lower).all((1, 2))
 

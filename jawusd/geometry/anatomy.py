@@ -6,8 +6,9 @@ Anatomical axes: x to the subject's left, y up, z anterior, origin at the upper 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import make_transform, transform_points
 from jawusd.geometry.so3 import hat
 
@@ -23,7 +24,7 @@ _MOLAR_BEHIND_INCISOR_MM = 25.0
 _MIDLINE_MM = 4.0
 
 
-def anatomical_frame(upper_vertices: ArrayLike, lower_vertices: ArrayLike) -> NDArray[np.float64]:
+def anatomical_frame(upper_vertices: ArrayLike, lower_vertices: ArrayLike) -> Array:
     """Find the anatomical frame of two dental scans in occlusion, in any common scan frame.
 
     Up is the normal of the common plane of both arches, from the lower to the upper one; the midline is the mirror
@@ -63,9 +64,7 @@ def anatomical_frame(upper_vertices: ArrayLike, lower_vertices: ArrayLike) -> ND
     return make_transform(R, -origin)
 
 
-def _centre_midline(
-    points: NDArray[np.float64], R: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], float]:
+def _centre_midline(points: Array, R: Array) -> tuple[Array, float]:
     """Turn the lateral axis until the middle between the buccal outlines is a straight sagittal line.
 
     Args:
@@ -94,11 +93,11 @@ def _centre_midline(
     return R, float(midline)
 
 
-def _thin(points: NDArray[np.float64], count: int = 3000) -> NDArray[np.float64]:
+def _thin(points: Array, count: int = 3000) -> Array:
     return points[:: max(1, len(points) // count)]
 
 
-def _mirror_angle(flat: NDArray[np.float64]) -> float:
+def _mirror_angle(flat: Array) -> float:
     """Return the angle of the axis about which a planar point set is most nearly symmetric, shape (N, 2) -> rad."""
     # Compare angular-radial histograms of the outline with their mirror image; robust to uneven sampling.
     flat = flat - 0.5 * (np.percentile(flat, 1, axis=0) + np.percentile(flat, 99, axis=0))
@@ -125,7 +124,7 @@ def find_landmarks(
     lower_vertices: ArrayLike,
     mandible_vertices: ArrayLike | None,
     T_anatomical_skull: ArrayLike,
-) -> NDArray[np.float64]:
+) -> Array:
     """Find the five landmarks of `LANDMARKS` on the mandible.
 
     Args:
@@ -158,7 +157,7 @@ def find_landmarks(
     return transform_points(np.linalg.inv(A), out)
 
 
-def landmark_frame(landmarks: ArrayLike) -> NDArray[np.float64]:
+def landmark_frame(landmarks: ArrayLike) -> Array:
     """Find the anatomical frame from landmarks alone: occlusal plane through incisal point and molars.
 
     Args:
@@ -176,7 +175,7 @@ def landmark_frame(landmarks: ArrayLike) -> NDArray[np.float64]:
     return make_transform(R, -R @ incisor)
 
 
-def _condyle(mandible: NDArray[np.float64], side: float) -> NDArray[np.float64]:
+def _condyle(mandible: Array, side: float) -> Array:
     """Return the centre of one condylar head in anatomical coordinates, shape (3,)."""
     half = mandible[mandible[:, 0] * side > 0]
     # The coronoid process may be as high as the condyle but lies well in front of it.
@@ -187,7 +186,7 @@ def _condyle(mandible: NDArray[np.float64], side: float) -> NDArray[np.float64]:
     return np.array([0.5 * (low[0] + high[0]), top - 4.0, 0.5 * (low[2] + high[2])])
 
 
-def mandible_metric(points: ArrayLike) -> NDArray[np.float64]:
+def mandible_metric(points: ArrayLike) -> Array:
     """Return M with ``xi^T M xi`` = mean squared displacement of the points under a small twist xi.
 
     A point p moves by ``omega x p + v``, so M = mean of [-hat(p), I]^T [-hat(p), I].

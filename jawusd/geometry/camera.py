@@ -8,8 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import se3_inverse, transform_points
 
 _ALLOWED_COEFFICIENTS = (0, 4, 5, 8)
@@ -29,9 +30,9 @@ class Camera:
 
     name: str
     size_px: tuple[int, int]
-    K: NDArray[np.float64]
-    distortion: NDArray[np.float64]
-    T_cam_world: NDArray[np.float64]
+    K: Array
+    distortion: Array
+    T_cam_world: Array
 
     def __post_init__(self) -> None:
         for field, shape in (("K", (3, 3)), ("T_cam_world", (4, 4))):
@@ -46,15 +47,15 @@ class Camera:
             )
         object.__setattr__(self, "distortion", distortion)
 
-    def projection_matrix(self) -> NDArray[np.float64]:
+    def projection_matrix(self) -> Array:
         """Return the pinhole projection (world mm -> homogeneous px), shape (3, 4)."""
         return self.K @ self.T_cam_world[:3]
 
-    def centre_world(self) -> NDArray[np.float64]:
+    def centre_world(self) -> Array:
         """Return the centre of projection in world coordinates [mm], shape (3,)."""
         return se3_inverse(self.T_cam_world)[:3, 3]
 
-    def project_pinhole(self, points_world: ArrayLike) -> NDArray[np.float64]:
+    def project_pinhole(self, points_world: ArrayLike) -> Array:
         """Project world points without lens distortion.
 
         Args:
@@ -67,7 +68,7 @@ class Camera:
         h = p @ self.K.T
         return h[..., :2] / h[..., 2:]
 
-    def project(self, points_world: ArrayLike) -> NDArray[np.float64]:
+    def project(self, points_world: ArrayLike) -> Array:
         """Project world points as the real lens does, distortion included.
 
         Args:
@@ -78,7 +79,7 @@ class Camera:
         """
         return self.distort_pixels(self.project_pinhole(points_world))
 
-    def distort_pixels(self, pinhole_px: ArrayLike) -> NDArray[np.float64]:
+    def distort_pixels(self, pinhole_px: ArrayLike) -> Array:
         """Map ideal pinhole pixels to pixels of the recorded picture.
 
         Args:
@@ -90,7 +91,7 @@ class Camera:
         x = self._normalised(np.asarray(pinhole_px, dtype=np.float64))
         return self._pixels(self._distort(x))
 
-    def undistort_pixels(self, pixels: ArrayLike) -> NDArray[np.float64]:
+    def undistort_pixels(self, pixels: ArrayLike) -> Array:
         """Map pixels of the recorded picture to ideal pinhole pixels (Newton, to 1e-10 px for real lenses).
 
         Args:
@@ -150,7 +151,7 @@ class Camera:
         K[1, 2] -= y0_px
         return replace(self, size_px=(int(size_px[0]), int(size_px[1])), K=K)
 
-    def depth(self, points_world: ArrayLike) -> NDArray[np.float64]:
+    def depth(self, points_world: ArrayLike) -> Array:
         """Return the depth of world points along the optical axis [mm], shape (...).
 
         Args:
@@ -160,16 +161,16 @@ class Camera:
             np.shape(points_world)[:-1]
         )
 
-    def _normalised(self, px: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _normalised(self, px: Array) -> Array:
         y = (px[..., 1] - self.K[1, 2]) / self.K[1, 1]
         x = (px[..., 0] - self.K[0, 2] - self.K[0, 1] * y) / self.K[0, 0]
         return np.stack([x, y], axis=-1)
 
-    def _pixels(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _pixels(self, x: Array) -> Array:
         u = self.K[0, 0] * x[..., 0] + self.K[0, 1] * x[..., 1] + self.K[0, 2]
         return np.stack([u, self.K[1, 1] * x[..., 1] + self.K[1, 2]], axis=-1)
 
-    def _distort(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _distort(self, x: Array) -> Array:
         if not self.distortion.size:
             return x
         k1, k2, p1, p2, k3, k4, k5, k6 = np.pad(self.distortion, (0, 8 - self.distortion.size))

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from jawusd.geometry.arrays import Array
 
 
-def wxyz_from_matrix(R: ArrayLike) -> NDArray[np.float64]:
+def wxyz_from_matrix(R: ArrayLike) -> Array:
     """Return the unit quaternion with w >= 0 of rotation matrices (Shepperd 1978).
 
     Args:
@@ -37,7 +39,7 @@ def wxyz_from_matrix(R: ArrayLike) -> NDArray[np.float64]:
     return np.where(q[..., :1] < 0, -q, q)
 
 
-def matrix_from_wxyz(q: ArrayLike) -> NDArray[np.float64]:
+def matrix_from_wxyz(q: ArrayLike) -> Array:
     """Return rotation matrices of quaternions, which are normalised first.
 
     Args:

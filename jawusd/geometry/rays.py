@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from jawusd.geometry.arrays import Array
+
 _PARALLEL = 1e-12  # determinant below which a ray runs along a triangle
 
 

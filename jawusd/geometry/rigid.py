@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import make_transform
 
 
-def rigid_fit(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = None) -> NDArray[np.float64]:
+def rigid_fit(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = None) -> Array:
     """Return the rigid T minimising sum w |T source - target|^2 (Arun et al. 1987, Umeyama 1991).
 
     Args:
@@ -37,7 +38,7 @@ def rigid_fit(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = 
     return make_transform(R, q0 - R @ p0)
 
 
-def triangulate(projections: ArrayLike, pixels: ArrayLike) -> NDArray[np.float64]:
+def triangulate(projections: ArrayLike, pixels: ArrayLike) -> Array:
     """Return the point seen at the given pixels: linear start, then Gauss-Newton on the reprojection error.
 
     The linear system is Hartley & Zisserman, Multiple View Geometry, section 12.2.

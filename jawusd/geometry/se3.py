@@ -7,15 +7,16 @@ of Yang et al., "Building Anatomically Realistic Jaw Kinematics Model from Data"
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from jawusd.geometry.arrays import Array
 from jawusd.geometry.so3 import hat, so3_exp, so3_left_jacobian, so3_left_jacobian_inverse, so3_log
 
 # Below this angle [rad] the coupling block uses its series; the closed form loses digits like a^-5 there.
 _COUPLING_SERIES_RAD = 0.3
 
 
-def make_transform(R: ArrayLike, t: ArrayLike) -> NDArray[np.float64]:
+def make_transform(R: ArrayLike, t: ArrayLike) -> Array:
     """Assemble transforms from rotation and translation.
 
     Args:
@@ -32,7 +33,7 @@ def make_transform(R: ArrayLike, t: ArrayLike) -> NDArray[np.float64]:
     return T
 
 
-def se3_inverse(T: ArrayLike) -> NDArray[np.float64]:
+def se3_inverse(T: ArrayLike) -> Array:
     """Invert rigid transforms: ``T_b_a`` from ``T_a_b``.
 
     Args:
@@ -46,7 +47,7 @@ def se3_inverse(T: ArrayLike) -> NDArray[np.float64]:
     return make_transform(Rt, -np.einsum("...ij,...j->...i", Rt, T[..., :3, 3]))
 
 
-def transform_points(T: ArrayLike, points: ArrayLike) -> NDArray[np.float64]:
+def transform_points(T: ArrayLike, points: ArrayLike) -> Array:
     """Apply transforms to points, ``p_a = T_a_b p_b``.
 
     Args:
@@ -63,7 +64,7 @@ def transform_points(T: ArrayLike, points: ArrayLike) -> NDArray[np.float64]:
     return np.einsum("...ij,...j->...i", T[..., :3, :3], points) + T[..., :3, 3]
 
 
-def relative_pose(T_world_upper: ArrayLike, T_world_lower: ArrayLike) -> NDArray[np.float64]:
+def relative_pose(T_world_upper: ArrayLike, T_world_lower: ArrayLike) -> Array:
     """Return the jaw pose T_skull_mandible from the world poses of both rows of teeth (Yang et al. eqs. 1-3).
 
     Args:
@@ -76,16 +77,14 @@ def relative_pose(T_world_upper: ArrayLike, T_world_lower: ArrayLike) -> NDArray
     return se3_inverse(T_world_upper) @ np.asarray(T_world_lower, dtype=np.float64)
 
 
-def _coupling(w: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
+def _coupling(w: Array, v: Array) -> Array:
     """Return the block Q(w, v) of the left Jacobian of SE(3) (Barfoot 2017, eq. 7.86; Solà et al. eq. 180)."""
     W, V = hat(w), hat(v)
     a = np.linalg.norm(w, axis=-1)[..., None, None]
     small = a < _COUPLING_SERIES_RAD
     s = np.where(small, 1.0, a)
     a2 = a * a
-    c1 = np.where(
-        small, 1 / 6 - a2 / 120 * (1 - a2 / 42 * (1 - a2 / 72 * (1 - a2 / 110))), (s - np.sin(s)) / s**3
-    )
+    c1 = np.where(small, 1 / 6 - a2 / 120 * (1 - a2 / 42 * (1 - a2 / 72 * (1 - a2 / 110))), (s - np.sin(s)) / s**3)
     c2 = np.where(
         small,
         1 / 24 - a2 / 720 * (1 - a2 / 56 * (1 - a2 / 90 * (1 - a2 / 132))),
@@ -99,15 +98,10 @@ def _coupling(w: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.floa
     )
     WV, VW = W @ V, V @ W
     WVW = WV @ W
-    return (
-        0.5 * V
-        + c1 * (WV + VW + WVW)
-        + c2 * (W @ WV + VW @ W - 3 * WVW)
-        + c3 * (WVW @ W + W @ WVW)
-    )
+    return 0.5 * V + c1 * (WV + VW + WVW) + c2 * (W @ WV + VW @ W - 3 * WVW) + c3 * (WVW @ W + W @ WVW)
 
 
-def se3_left_jacobian(twist: ArrayLike) -> NDArray[np.float64]:
+def se3_left_jacobian(twist: ArrayLike) -> Array:
     """Return J with ``exp(twist + d) = exp(J d) exp(twist)`` to first order.
 
     Args:
@@ -124,7 +118,7 @@ def se3_left_jacobian(twist: ArrayLike) -> NDArray[np.float64]:
     return J
 
 
-def se3_right_jacobian(twist: ArrayLike) -> NDArray[np.float64]:
+def se3_right_jacobian(twist: ArrayLike) -> Array:
     """Return J with ``exp(twist + d) = exp(twist) exp(J d)`` to first order.
 
     Args:
@@ -136,7 +130,7 @@ def se3_right_jacobian(twist: ArrayLike) -> NDArray[np.float64]:
     return se3_left_jacobian(-np.asarray(twist, dtype=np.float64))
 
 
-def se3_left_jacobian_inverse(twist: ArrayLike) -> NDArray[np.float64]:
+def se3_left_jacobian_inverse(twist: ArrayLike) -> Array:
     """Return the inverse of `se3_left_jacobian`.
 
     Args:
@@ -154,7 +148,7 @@ def se3_left_jacobian_inverse(twist: ArrayLike) -> NDArray[np.float64]:
     return out
 
 
-def se3_exp(twist: ArrayLike) -> NDArray[np.float64]:
+def se3_exp(twist: ArrayLike) -> Array:
     """Map twists to rigid transforms.
 
     Args:
@@ -173,7 +167,7 @@ def se3_exp(twist: ArrayLike) -> NDArray[np.float64]:
     return make_transform(so3_exp(w), np.einsum("...ij,...j->...i", so3_left_jacobian(w), v))
 
 
-def se3_log(T: ArrayLike) -> NDArray[np.float64]:
+def se3_log(T: ArrayLike) -> Array:
     """Map rigid transforms to twists of rotation angle in [0, pi].
 
     Args:
@@ -193,7 +187,7 @@ def se3_log(T: ArrayLike) -> NDArray[np.float64]:
     return np.concatenate([w, v], axis=-1)
 
 
-def se3_adjoint(T: ArrayLike) -> NDArray[np.float64]:
+def se3_adjoint(T: ArrayLike) -> Array:
     """Return Ad(T) with ``T exp(x) T^-1 = exp(Ad(T) x)``.
 
     Args:
@@ -210,7 +204,7 @@ def se3_adjoint(T: ArrayLike) -> NDArray[np.float64]:
     return out
 
 
-def orthonormalise(T: ArrayLike) -> NDArray[np.float64]:
+def orthonormalise(T: ArrayLike) -> Array:
     """Return the nearest rigid transforms (SVD of the rotation block, Arun et al. 1987).
 
     Args:
@@ -226,7 +220,7 @@ def orthonormalise(T: ArrayLike) -> NDArray[np.float64]:
     return make_transform((U * sign[..., None, :]) @ Vt, T[..., :3, 3])
 
 
-def rigidity_defect(T: ArrayLike) -> NDArray[np.float64]:
+def rigidity_defect(T: ArrayLike) -> Array:
     """Measure how far transforms are from rigid.
 
     Args:

@@ -9,13 +9,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jawusd.geometry.arrays import Array
 from jawusd.geometry.quaternion import wxyz_from_matrix
 
 # Below this angle [rad] the series are exact to double precision with the terms kept (next term < 1e-17 relative).
 _SMALL_ANGLE_RAD = 1e-2
 
 
-def hat(w: ArrayLike) -> NDArray[np.float64]:
+def hat(w: ArrayLike) -> Array:
     """Return the skew matrix of a vector: ``hat(w) @ p == cross(w, p)``.
 
     Args:
@@ -32,7 +33,7 @@ def hat(w: ArrayLike) -> NDArray[np.float64]:
     return out
 
 
-def vee(W: ArrayLike) -> NDArray[np.float64]:
+def vee(W: ArrayLike) -> Array:
     """Return the vector of a skew matrix, the inverse of `hat`.
 
     Args:
@@ -47,7 +48,7 @@ def vee(W: ArrayLike) -> NDArray[np.float64]:
     )
 
 
-def angle_coefficients(angle_rad: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
+def angle_coefficients(angle_rad: Array) -> tuple[NDArray, NDArray, NDArray]:
     """Return sin(a)/a, (1-cos a)/a^2 and (a-sin a)/a^3 without cancellation.
 
     Args:
@@ -67,7 +68,7 @@ def angle_coefficients(angle_rad: NDArray[np.float64]) -> tuple[NDArray, NDArray
     return first, second, third
 
 
-def so3_exp(w: ArrayLike) -> NDArray[np.float64]:
+def so3_exp(w: ArrayLike) -> Array:
     """Map rotation vectors to rotation matrices (Rodrigues' formula).
 
     Args:
@@ -82,7 +83,7 @@ def so3_exp(w: ArrayLike) -> NDArray[np.float64]:
     return np.eye(3) + first[..., None, None] * W + second[..., None, None] * (W @ W)
 
 
-def so3_log(R: ArrayLike) -> NDArray[np.float64]:
+def so3_log(R: ArrayLike) -> Array:
     """Map rotation matrices to rotation vectors of angle in [0, pi].
 
     Args:
@@ -100,7 +101,7 @@ def so3_log(R: ArrayLike) -> NDArray[np.float64]:
     return scale[..., None] * q[..., 1:]
 
 
-def so3_left_jacobian(w: ArrayLike) -> NDArray[np.float64]:
+def so3_left_jacobian(w: ArrayLike) -> Array:
     """Return J with ``exp(w + dw) = exp(J dw) exp(w)`` to first order.
 
     Args:
@@ -115,7 +116,7 @@ def so3_left_jacobian(w: ArrayLike) -> NDArray[np.float64]:
     return np.eye(3) + second[..., None, None] * W + third[..., None, None] * (W @ W)
 
 
-def so3_right_jacobian(w: ArrayLike) -> NDArray[np.float64]:
+def so3_right_jacobian(w: ArrayLike) -> Array:
     """Return J with ``exp(w + dw) = exp(w) exp(J dw)`` to first order.
 
     Args:
@@ -127,7 +128,7 @@ def so3_right_jacobian(w: ArrayLike) -> NDArray[np.float64]:
     return so3_left_jacobian(-np.asarray(w, dtype=np.float64))
 
 
-def so3_left_jacobian_inverse(w: ArrayLike) -> NDArray[np.float64]:
+def so3_left_jacobian_inverse(w: ArrayLike) -> Array:
     """Return the inverse of `so3_left_jacobian` in closed form, for angles below 2 pi.
 
     Args:
@@ -151,7 +152,7 @@ def so3_left_jacobian_inverse(w: ArrayLike) -> NDArray[np.float64]:
     return np.eye(3) - 0.5 * W + factor[..., None, None] * (W @ W)
 
 
-def random_rotation(rng: np.random.Generator, shape: tuple[int, ...] = ()) -> NDArray[np.float64]:
+def random_rotation(rng: np.random.Generator, shape: tuple[int, ...] = ()) -> Array:
     """Draw rotations uniformly (normalised Gaussian quaternions).
 
     Args:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.errors import MissingDependencyError
+from jawusd.geometry.arrays import Array, Mask
 from jawusd.imaging.pixel_counts import checked_screens
 
 try:
@@ -123,7 +124,7 @@ class GlCounter:
     def __init__(
         self,
         context: moderngl.Context,
-        vertices: NDArray[np.float64],
+        vertices: Array,
         plain_faces: NDArray[np.int32],
         boundary_faces: NDArray[np.int32],
         *,
@@ -160,7 +161,7 @@ class GlCounter:
         self._stack.callback(resource.release)
         return resource
 
-    def show(self, matrices: NDArray[np.float64], masks: NDArray[np.bool_], free: NDArray[np.bool_]) -> None:
+    def show(self, matrices: Array, masks: Mask, free: Mask) -> None:
         """Set the pictures of one instant; arguments as for `pixel_counts.RasterCounter.show`.
 
         Raises:
@@ -183,7 +184,7 @@ class GlCounter:
         to_clip = np.array([[2 / size[0], 0, 1 / size[0] - 1], [0, 2 / size[1], 1 / size[1] - 1], [0, 0, 0], [0, 0, 1]])
         self._to_clip = to_clip @ np.asarray(matrices, np.float64)
 
-    def counts(self, poses: NDArray[np.float64]) -> NDArray[np.int64]:
+    def counts(self, poses: Array) -> NDArray[np.int64]:
         """Count the disagreeing pixels of poses, as `pixel_counts.RasterCounter.counts` does.
 
         Args:
@@ -197,7 +198,7 @@ class GlCounter:
         parts = [self._count_part(poses[k : k + most]) for k in range(0, len(poses), most)]
         return np.concatenate(parts) if parts else np.empty((0, views, 2), np.int64)
 
-    def _count_part(self, poses: NDArray[np.float64]) -> NDArray[np.int64]:
+    def _count_part(self, poses: Array) -> NDArray[np.int64]:
         width, height, views = self._masks.size
         clip = np.einsum("cij,njk->ncki", self._to_clip, poses)  # transposed: GL reads columns first
         layers = len(poses) * views

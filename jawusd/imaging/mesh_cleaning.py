@@ -9,6 +9,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from jawusd.formats.mesh import Mesh
+from jawusd.geometry.arrays import Mask
 
 # By how much the parts of a surface that meet in one point only are moved apart [mm]: validators take points at the
 # very same place for a seam that somebody forgot to merge.
@@ -34,7 +35,7 @@ def manifold(mesh: Mesh) -> Mesh:
     return Mesh(vertices, faces)
 
 
-def _surplus_faces(surface: trimesh.Trimesh) -> NDArray[np.bool_]:
+def _surplus_faces(surface: trimesh.Trimesh) -> Mask:
     """Return the smallest faces of every edge that has more than two, shape (F,)."""
     _, edge, count = np.unique(surface.edges_sorted, axis=0, return_inverse=True, return_counts=True)
     owner = np.repeat(np.arange(len(surface.faces)), 3)

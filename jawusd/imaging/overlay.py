@@ -15,6 +15,7 @@ from jawusd.formats.atomic import write_bytes_atomic
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import Camera, transform_points
+from jawusd.geometry.arrays import Array
 from jawusd.imaging.meshio import GUM, tooth_labels
 from jawusd.imaging.raster import draw_depth_labels
 from jawusd.imaging.video import Video
@@ -39,7 +40,7 @@ class PlacedScan:
     """
 
     mesh: Mesh
-    T_world_scan: NDArray[np.float64]
+    T_world_scan: Array
     colour: tuple[int, int, int]
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
+from jawusd.geometry.arrays import Array, Mask
 from jawusd.imaging.raster import count_and_not, draw_silhouette, pack_bits, project
 
 __all__ = ["RasterCounter", "checked_screens"]
@@ -49,7 +50,7 @@ class RasterCounter:
 
     def __init__(
         self,
-        vertices: NDArray[np.float64],
+        vertices: Array,
         plain_faces: NDArray[np.int32],
         boundary_faces: NDArray[np.int32],
         *,
@@ -72,7 +73,7 @@ class RasterCounter:
         self._cull, self._threads = cull, threads
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
 
-    def show(self, matrices: NDArray[np.float64], masks: NDArray[np.bool_], free: NDArray[np.bool_]) -> None:
+    def show(self, matrices: Array, masks: Mask, free: Mask) -> None:
         """Set the pictures of one instant.
 
         Args:
@@ -90,7 +91,7 @@ class RasterCounter:
         self._masks = np.stack([pack_bits(mask) for mask in masks])
         self._free = np.stack([pack_bits(mask) for mask in free])
 
-    def counts(self, poses: NDArray[np.float64]) -> NDArray[np.int64]:
+    def counts(self, poses: Array) -> NDArray[np.int64]:
         """Count the disagreeing pixels of poses.
 
         Args:

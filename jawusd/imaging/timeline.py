@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.geometry.arrays import Array
+
 __all__ = ["Timeline"]
 
 
@@ -20,7 +22,7 @@ class Timeline:
         count: one past the frame of the last picture.
     """
 
-    def __init__(self, times_s: NDArray[np.float64], fps: float) -> None:
+    def __init__(self, times_s: Array, fps: float) -> None:
         """Fit the grid.
 
         Args:
@@ -42,7 +44,7 @@ class Timeline:
         return self._picture.get(int(frame))
 
 
-def _grid(times_s: NDArray[np.float64], fps: float) -> tuple[NDArray[np.int64], float]:
+def _grid(times_s: Array, fps: float) -> tuple[NDArray[np.int64], float]:
     """Return the frame of each picture and frames per second."""
     steps = np.diff(times_s)
     if len(steps) < 2 or not (median := float(np.median(steps))) > 0:

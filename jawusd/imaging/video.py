@@ -207,9 +207,7 @@ class Video:
         latest = np.maximum.accumulate(np.where(is_key, np.arange(len(order)), 0)) if len(order) else order
         return times, np.array(dts, np.int64)[order][latest], stored
 
-    def _decode(
-        self, first: int, last: int, threads: int, alpha: bool = False
-    ) -> Iterator[tuple[int, av.VideoFrame]]:
+    def _decode(self, first: int, last: int, threads: int, alpha: bool = False) -> Iterator[tuple[int, av.VideoFrame]]:
         """Yield (index, decoded frame) for every index of [first, last), or raise naming the one that is missing."""
         wanted = first
         with self._open() as container:

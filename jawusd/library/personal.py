@@ -11,13 +11,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.errors import FittingError
 from jawusd.geometry import LANDMARKS, transform_points
+from jawusd.geometry.arrays import Array
 from jawusd.library.transport import Donor, displacements, landmark_distance_mm, poses_of_landmarks
-
-Array = NDArray[np.float64]
 
 # Landmark distances [mm] at which a person counts exp(-1/2) as much as one with the same landmarks; inf: all alike.
 BANDWIDTHS_MM = (math.inf, 4.0, 2.0, 1.0)

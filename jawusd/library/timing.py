@@ -13,9 +13,8 @@ from __future__ import annotations
 from collections import deque
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from jawusd.geometry.arrays import Array, Mask
 
 STILL_MM = 1e-6  # a smaller step of the original has no direction
 
@@ -41,7 +40,7 @@ def follow(original: Array, carried: Array, least: float) -> Array:
     return kept
 
 
-def _zigzag(rising: NDArray[np.bool_], wanted: Array) -> Array:
+def _zigzag(rising: Mask, wanted: Array) -> Array:
     """Return the values z (n,) nearest to those wanted (n,): z[i + 1] >= z[i] where ``rising`` (n - 1,), else <=."""
     cost = _Slopes()
     cost.add(wanted[0])

@@ -11,12 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.evaluator import JawRig
 from jawusd.geometry import landmark_frame, make_transform, rigid_fit, transform_points
-
-Array = NDArray[np.float64]
+from jawusd.geometry.arrays import Array
 
 
 @dataclass(frozen=True, eq=False)

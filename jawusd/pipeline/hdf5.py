@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from jawusd.errors import FormatError, MissingDependencyError
 from jawusd.geometry import make_transform, matrix_from_wxyz, rigidity_defect
-
-Array = NDArray[np.float64]
+from jawusd.geometry.arrays import Array
 
 RAW_GROUP = "T_model_origin_mand_landmark_t"
 

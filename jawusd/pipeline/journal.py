@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from jawusd.errors import OutputError
 from jawusd.formats.atomic import write_text_atomic
+from jawusd.geometry.arrays import Array
 from jawusd.pipeline.state import hash_value
 
 FILE = "segment.jsonl"
@@ -68,7 +69,7 @@ class Journal:
         kept = [self._head, *(_line(frame, entry) for frame, entry in self.entries.items())]
         write_text_atomic(self._path, "\n".join(kept) + "\n")
 
-    def known(self, frame: int) -> tuple[NDArray[np.float64], NDArray[np.int8]]:
+    def known(self, frame: int) -> tuple[Array, NDArray[np.int8]]:
         """Return T_world_upper and T_world_lower, shape (2, 4, 4), and status, shape (2,), of a frame."""
         entry = self.entries[frame]
         return np.array(entry["poses"], np.float64), np.array(entry["status"], np.int8)

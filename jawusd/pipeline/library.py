@@ -10,20 +10,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.errors import EvaluatorError, FormatError, OutputError
 from jawusd.evaluator import JawRig, load
 from jawusd.evaluator.sections import SMALLEST_REACH_MM
 from jawusd.formats.model import JawModel, load_model, save_model
+from jawusd.geometry.arrays import Array, Mask
 from jawusd.library.index import MODEL_FILE, Library, load_donors, scan_library
 from jawusd.library.personal import PersonalMotion, leave_one_out, personal_motion
 from jawusd.library.timing import follow
 from jawusd.pipeline.extras import stage
 from jawusd.pipeline.stages import Progress
 from jawusd.pipeline.subject import Subject, subject_of_landmarks
-
-Array = NDArray[np.float64]
 
 # A step of a motion carried over is at least so much of the source's, by the ratio of the ranges.
 _SLOWEST = 0.1
@@ -227,7 +225,7 @@ class Retargeted:
 
     frames: Array
     d: Array
-    outside: NDArray[np.bool_]
+    outside: Mask
     moved_mm: Array
 
 

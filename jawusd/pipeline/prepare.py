@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jawusd.errors import CalibrationError, CaptureError
 from jawusd.formats.camera_files import calibration_files, load_cameras_file
@@ -17,6 +17,7 @@ from jawusd.formats.capture import CameraSource, Capture, load_capture
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import LANDMARKS, Camera, anatomical_frame, find_landmarks
+from jawusd.geometry.arrays import Array
 from jawusd.pipeline.extras import stage
 from jawusd.pipeline.state import hash_files
 
@@ -34,8 +35,8 @@ class Anatomy:
         inferred: what was derived from the scans instead of being given.
     """
 
-    T_anatomical_skull: NDArray[np.float64]
-    landmarks: NDArray[np.float64]
+    T_anatomical_skull: Array
+    landmarks: Array
     inferred: tuple[str, ...]
 
 

@@ -6,7 +6,6 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.errors import FormatError
 from jawusd.formats.capture import Capture
@@ -18,8 +17,6 @@ from jawusd.geometry import transform_points
 from jawusd.pipeline.extras import stage
 from jawusd.pipeline.overlay import open_footage
 from jawusd.pipeline.prepare import load_meshes, tracked_cameras
-
-Array = NDArray[np.float64]
 
 _UNCOVERED, _UNSURE = 3, 2  # frames shown for either reason; one typical frame is added, to compare with
 _APART_S = 0.5  # neighbours show the same trouble

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.errors import CaptureError, TrackingError
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.capture import Capture, Masks
 from jawusd.formats.tracks import LOST
+from jawusd.geometry.arrays import Array
 from jawusd.pipeline.extras import stage
 from jawusd.pipeline.journal import Journal
 from jawusd.pipeline.overlay import open_footage
@@ -137,7 +137,7 @@ class _Segmenting:
     def _tell(self, stage_name: str, done: int) -> None:
         self._progress(stage_name, done, self._stop - self._first)
 
-    def _new_segmenters(self, poses: NDArray[np.float64]) -> None:
+    def _new_segmenters(self, poses: Array) -> None:
         module = stage("jawusd.segmentation.camera")
         self._segmenters = {
             name: module.CameraSegmenter(camera, self._meshes, poses, self._config)
@@ -244,7 +244,7 @@ class _Segmenting:
             self._write(frame, self._tracker.judge(frame, *self._journal.known(frame)), again=True)
             self._tell("segment again", frame + 1 - self._first)
 
-    def _see(self, frame: int, poses: NDArray[np.float64], turn: int) -> list:
+    def _see(self, frame: int, poses: Array, turn: int) -> list:
         """Segment all cameras' pictures of a frame and return them as the tracker's views."""
         view = stage("jawusd.tracking.solver").View
 
@@ -263,7 +263,7 @@ class _Segmenting:
             views.append(view(camera.projection_matrix(), camera.centre_world(), masks, present))
         return views
 
-    def _agreement(self, frame: int, guesses: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _agreement(self, frame: int, guesses: Array) -> Array:
         """Return how well the colours of all cameras' pictures of a frame agree with guessed poses, shape (N,)."""
         seen = [name for name in self._names if self._pictures[name] is not None]
         each = self._pool.map(lambda name: self._segmenters[name].agreement(self._pictures[name], guesses), seen)

@@ -15,6 +15,7 @@ from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.capture import Capture
 from jawusd.formats.text import read_text
 from jawusd.formats.tracks import LOST
+from jawusd.geometry.arrays import Array
 from jawusd.pipeline import journal
 from jawusd.pipeline.extras import stage
 from jawusd.pipeline.made_masks import SUMMARY
@@ -71,19 +72,19 @@ def summarise(entries: dict[int, dict[str, Any]]) -> list[dict[str, Any]]:
     return rows
 
 
-def _values(found: list[dict], symptom: str) -> NDArray[np.float64]:
+def _values(found: list[dict], symptom: str) -> Array:
     """Return a symptom of every mask, more is worse, NaN without a mask, shape (N, 2)."""
     values = [[np.nan if v is None else v for v in entry[symptom]] for entry in found]
     return _SYMPTOMS[symptom] * np.array(values, np.float64)
 
 
-def _outline_doubt(found: list[dict]) -> NDArray[np.float64]:
+def _outline_doubt(found: list[dict]) -> Array:
     """Return the share of every mask that may be wrong, NaN without a mask, shape (N, 2)."""
     outline, area = (np.array([entry[key] for entry in found], np.float64) for key in ("outline", "pixels"))
     return np.where(area > 0, outline @ np.array(_OUTLINE_PX) / np.maximum(area, 1), np.nan)
 
 
-def _off(values: NDArray[np.float64], groups: NDArray, least_spread: float) -> NDArray[np.float64]:
+def _off(values: Array, groups: NDArray, least_spread: float) -> Array:
     """Return how many spreads values, shape (N, 2), lie above the median of their group and row, shape (N, 2)."""
     out = np.zeros_like(values)
     for group in np.unique(groups):

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.errors import RigError
 from jawusd.formats.capture import Capture
@@ -16,10 +15,9 @@ from jawusd.formats.landmarks import load_landmarks
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.model import JawModel, load_model
 from jawusd.geometry import LANDMARKS, landmark_frame
+from jawusd.geometry.arrays import Array
 from jawusd.pipeline.extras import stage
 from jawusd.pipeline.prepare import find_anatomy, load_meshes, measure_anatomy
-
-Array = NDArray[np.float64]
 
 _TEETH_APART_MM = 15.0  # molars are picked by hand here, found by rule there
 

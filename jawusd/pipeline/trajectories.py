@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from jawusd.errors import FormatError
 from jawusd.formats.poses import read_poses
 from jawusd.geometry import se3_inverse
+from jawusd.geometry.arrays import Array
 from jawusd.pipeline.hdf5 import read_hdf5
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
@@ -39,9 +40,7 @@ class TrajectoryOptions:
     group: str | None = None
 
 
-def read_trajectory(
-    path: str | os.PathLike[str], options: TrajectoryOptions
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def read_trajectory(path: str | os.PathLike[str], options: TrajectoryOptions) -> tuple[NDArray[np.int64], Array]:
     """Read poses from a CSV or JSON table, or from HDF5 of jaw-tracking-system.
 
     Args:
@@ -74,7 +73,7 @@ def read_trajectory(
     return frames, T
 
 
-def _pose_at(frames: NDArray[np.int64], T: NDArray[np.float64], wanted: int, path: Path) -> NDArray[np.float64]:
+def _pose_at(frames: NDArray[np.int64], T: Array, wanted: int, path: Path) -> Array:
     rows = np.flatnonzero(frames == wanted)
     if not rows.size:
         between = f"; it has {frames.min()} to {frames.max()}" if len(frames) else ""

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.errors import FormatError, OutputError, RigError
 from jawusd.evaluator import JawRig
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import load_tracks
+from jawusd.geometry.arrays import Mask
 from jawusd.pipeline.extras import stage
 
 if TYPE_CHECKING:
@@ -99,7 +99,7 @@ def screen_meshes(path: Path) -> dict[str, Mesh]:
     return {name: for_view(mesh, _MOST_FACES) for name, mesh in parted.items() if len(mesh.faces)}
 
 
-def part_of(mesh: Mesh, chosen: NDArray[np.bool_]) -> Mesh:
+def part_of(mesh: Mesh, chosen: Mask) -> Mesh:
     """Return some faces (F,) of a mesh, with the vertices they use.
 
     Args:

@@ -18,6 +18,7 @@ from jawusd.formats.capture_edit import write_bootstrap
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.geometry import Camera
+from jawusd.geometry.arrays import Array
 from jawusd.pipeline.extras import stage
 from jawusd.pipeline.overlay import open_videos
 from jawusd.pipeline.prepare import find_anatomy, load_cameras, load_meshes, open_capture, tracked_cameras
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
     from jawusd.viewer.server import CaptureViewer
     from jawusd.viewer.viewed_capture import ViewedCapture
 
-Array = NDArray[np.float64]
 
 CAPTURE_FILE = "capture.toml"
 _TRACKS = "tracks.npz"

@@ -8,12 +8,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from jawusd.formats.experiments import CondylePath, Coverage, Distances, Experiments, ParameterPath
+from jawusd.geometry.arrays import Array
 from jawusd.report.style import BLACK, BLUE, GREEN, GREY, ORANGE, PALE, SKY, VERMILION, new_figure, save_figure
-
-Array = NDArray[np.float64]
 
 FIGURES = ("fig5_condyle_path", "fig12_reconstruction", "fig13_synthesis", "coverage")
 

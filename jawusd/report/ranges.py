@@ -5,14 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.formats.model import JawModel
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import se3_inverse, so3_log, transform_points
+from jawusd.geometry.arrays import Array
 from jawusd.report.verdicts import GOOD, LOOK
-
-Array = NDArray[np.float64]
 
 _QUANTILE = 99.5  # one odd frame is no range of motion
 _NEAR_CLOSED_MM = 5.0  # openings in which protrusion is read off, as clinicians do

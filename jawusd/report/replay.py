@@ -11,9 +11,8 @@ from jawusd.evaluator import JawRig
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.report import ReplayPart, ReportData
 from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, Tracks
+from jawusd.geometry.arrays import Array
 from jawusd.report.ranges import anatomical_motion, rest_points
-
-Array = NDArray[np.float64]
 
 #: What the page calls the states of a frame.
 STATES = ("tracked", "recovered after a loss", "tracked without a camera", "lost", "tracked with the model's help")

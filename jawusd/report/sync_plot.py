@@ -82,9 +82,7 @@ def _draw_curves(axis: Axes, curves: Mapping[str, LightCurve], shifts: Mapping[s
 
 def _flashes(curves: Mapping[str, LightCurve], shifts: Mapping[str, int]) -> list[tuple[float, float]]:
     """Return where the first and the last flash of all cameras are [frames]; none without a sudden change."""
-    steps = np.sort(
-        np.concatenate([np.append(c.off_frames, c.on_frames) + shifts[name] for name, c in curves.items()])
-    )
+    steps = np.sort(np.concatenate([np.append(c.off_frames, c.on_frames) + shifts[name] for name, c in curves.items()]))
     if not len(steps):
         return []
     parts = np.split(steps, np.flatnonzero(np.diff(steps) > _APART_FRAMES) + 1)

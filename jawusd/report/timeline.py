@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from jawusd.evaluator import JawRig
 from jawusd.formats.model import JawModel
 from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, TRACKED, Tracks
+from jawusd.geometry.arrays import Array, Mask
 from jawusd.report.style import BLACK, BLUE, GREEN, GREY, ORANGE, SKY, VERMILION, new_figure
-
-Array = NDArray[np.float64]
 
 _COLUMNS = 1200  # points along the frames; longer takes show the extreme of every few frames
 _LANES = ("tracked", "recovered", "without a camera", "lost", "aided by the model")
@@ -84,7 +83,7 @@ def _draw_state(axis: Axes, tracks: Tracks) -> None:
     axis.set_title("frames in each state (upper half of a bar: upper teeth, lower half: lower teeth)", loc="left")
 
 
-def _runs(frames: NDArray[np.int64], has: NDArray[np.bool_]) -> list[tuple[float, float]]:
+def _runs(frames: NDArray[np.int64], has: Mask) -> list[tuple[float, float]]:
     """Return the spans (start, width) of frames in a row that have something."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], has, [False]]).astype(np.int8)))
     spans = zip(edges[::2], edges[1::2], strict=True)

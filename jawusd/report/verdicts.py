@@ -6,13 +6,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.evaluator import JawRig
 from jawusd.formats.report import ReportData
 from jawusd.formats.tracks import LOST, RECOVERED, Tracks
-
-Array = NDArray[np.float64]
 
 #: Grades, the best first; "open" is what cannot be judged.
 GOOD, LOOK, BAD, OPEN = "good", "look", "bad", "open"

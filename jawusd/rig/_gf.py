@@ -6,9 +6,10 @@ numpy side: column vectors (`p_a = T_a_b @ p_b`), quaternions (w, x, y, z), C-co
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pxr import Gf, Vt
 
+from jawusd.geometry.arrays import Array
 from jawusd.geometry.quaternion import matrix_from_wxyz, wxyz_from_matrix
 
 
@@ -52,7 +53,7 @@ def quatf_arrays(T: ArrayLike) -> list[Vt.QuatfArray]:
     return [Vt.QuatfArray([Gf.Quatf(w, x, y, z)]) for w, x, y, z in _continuous_wxyz(T).tolist()]
 
 
-def _continuous_wxyz(T: ArrayLike) -> NDArray[np.float64]:
+def _continuous_wxyz(T: ArrayLike) -> Array:
     # USD's slerp takes the short way between two samples, but readers that interpolate the four numbers do not.
     wxyz = wxyz_from_matrix(np.asarray(T, dtype=np.float64)[:, :3, :3])
     if len(wxyz) > 1:
@@ -66,7 +67,7 @@ def row_matrix(T: ArrayLike) -> Gf.Matrix4d:
     return Gf.Matrix4d(np.asarray(T, dtype=np.float64).T.tolist())
 
 
-def transform_from_ops(translation: Gf.Vec3d, rotation: Gf.Quatd) -> NDArray[np.float64]:
+def transform_from_ops(translation: Gf.Vec3d, rotation: Gf.Quatd) -> Array:
     """Return the transform (4, 4) of a translate and an orient op."""
     T = np.eye(4)
     T[:3, :3] = matrix_from_wxyz([rotation.GetReal(), *rotation.GetImaginary()])

@@ -11,11 +11,12 @@ import os
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pxr import Sdf
 
 from jawusd.errors import RigError
 from jawusd.evaluator import JawRig
+from jawusd.geometry.arrays import Array
 from jawusd.geometry.quaternion import wxyz_from_matrix
 from jawusd.geometry.se3 import make_transform, transform_points
 from jawusd.geometry.so3 import so3_exp
@@ -23,8 +24,6 @@ from jawusd.rig import _gf
 from jawusd.rig.layers import new_layer, relative_path, write_layer
 from jawusd.rig.layout import ACTOR, MANDIBLE, PARAMETERS
 from jawusd.rig.read import load_rig
-
-Array = NDArray[np.float64]
 
 # Between two baked samples no landmark may be farther from the model than this; tried at these shares of the way.
 _BETWEEN_MM = 0.02

@@ -8,12 +8,12 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from pxr import Kind, Sdf, Vt
 
 from jawusd.evaluator import JawRig
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry.anatomy import LANDMARKS
+from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import transform_points
 from jawusd.rig import _gf
 from jawusd.rig.arrays import model_hash, write_arrays
@@ -107,7 +107,7 @@ def decoder_layer(rig: JawRig, table: DecoderTable) -> Sdf.Layer:
     return layer
 
 
-def reach(rig: JawRig, meshes: Mapping[str, Mesh]) -> NDArray[np.float64]:
+def reach(rig: JawRig, meshes: Mapping[str, Mesh]) -> Array:
     """Return the box (2, 3) [mm] that holds all meshes at rest and, at 500 valid parameters, the mandible's own box."""
     fixed = [extent(meshes[name].vertices) for name in ("skull", "upper_teeth") if name in meshes]
     moving = [meshes[name].vertices for name in ("mandible", "lower_teeth") if name in meshes]

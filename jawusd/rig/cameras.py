@@ -7,10 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom
 
 from jawusd.errors import RigError
+from jawusd.geometry.arrays import Array
 from jawusd.geometry.camera import Camera
 from jawusd.geometry.se3 import se3_inverse
 from jawusd.rig import _gf
@@ -93,13 +94,13 @@ def _prim_name(name: str) -> str:
     return cleaned if cleaned[:1].isalpha() else f"cam_{cleaned}"
 
 
-def _add_pose(stage: Usd.Stage, path: str | Sdf.Path, T: NDArray[np.float64]) -> None:
+def _add_pose(stage: Usd.Stage, path: str | Sdf.Path, T: Array) -> None:
     xform = UsdGeom.Xformable(stage.GetPrimAtPath(path))
     xform.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(_gf.translations(T[None])[0])
     xform.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(_gf.rotations(T[None])[0])
 
 
-def _motion_layer(frames: NDArray[np.float64], T_world_skull: NDArray[np.float64], fps: float) -> Sdf.Layer:
+def _motion_layer(frames: Array, T_world_skull: Array, fps: float) -> Sdf.Layer:
     """Return the layer that moves the actor with the head."""
     layer = new_layer(fps, TAKE)
     for path in (TAKE, TAKE_ACTOR):

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdShade
 
 from jawusd.errors import RigError
 from jawusd.formats.mesh import Mesh
+from jawusd.geometry.arrays import Array, Mask
 from jawusd.rig import _gf
 from jawusd.rig.layers import define_prim, new_layer, set_attribute, stage_of
 from jawusd.rig.layout import ACTOR, GEO, MANDIBLE, MATERIALS, SKULL
@@ -34,9 +34,7 @@ _MATERIALS = {
 _PAINT_CONTRAST = 60
 
 
-def build_geometry(
-    meshes: Mapping[str, Mesh], T_rest: NDArray[np.float64], placeholder: str | None = None
-) -> Sdf.Layer:
+def build_geometry(meshes: Mapping[str, Mesh], T_rest: Array, placeholder: str | None = None) -> Sdf.Layer:
     """Build the layer with all meshes under /Actor.
 
     Args:
@@ -81,7 +79,7 @@ def _mark_placeholder(mesh: Sdf.PrimSpec, condyles: str) -> None:
     set_attribute(mesh, "jaw:placeholder:condyles", Sdf.ValueTypeNames.String, condyles)
 
 
-def place_mandible(mandible: UsdGeom.Xformable, T: NDArray[np.float64]) -> None:
+def place_mandible(mandible: UsdGeom.Xformable, T: Array) -> None:
     """Give the mandible its translate and orient ops and their default value, a pose (4, 4).
 
     Never a matrix op: USD interpolates matrix samples number by number, which shears the mandible between frames.
@@ -90,7 +88,7 @@ def place_mandible(mandible: UsdGeom.Xformable, T: NDArray[np.float64]) -> None:
     mandible.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(_gf.rotations(T[None])[0])
 
 
-def extent(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
+def extent(vertices: Array) -> Array:
     """Return the smallest and largest corner, shape (2, 3), of points (n, 3)."""
     return np.stack([vertices.min(axis=0), vertices.max(axis=0)])
 
@@ -149,7 +147,7 @@ def _define_mesh(
         binding.SetMaterialBindSubsetsFamilyType(UsdGeom.Tokens.partition)
 
 
-def gum_faces(mesh: Mesh) -> NDArray[np.bool_]:
+def gum_faces(mesh: Mesh) -> Mask:
     """Return which faces of a painted teeth scan are gum, shape (F,): two corners neither red nor green.
 
     A scan without colours, or without any painted crown, is all enamel.
@@ -163,7 +161,7 @@ def gum_faces(mesh: Mesh) -> NDArray[np.bool_]:
     return ~crown if crown.any() else crown
 
 
-def corner_normals(mesh: Mesh) -> NDArray[np.float64]:
+def corner_normals(mesh: Mesh) -> Array:
     """Return smooth unit normals at every corner of every face, shape (3 F, 3): faces weighted by their area."""
     a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
     area = np.cross(b - a, c - a)

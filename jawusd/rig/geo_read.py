@@ -6,11 +6,11 @@ import os
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from pxr import UsdGeom
 
 from jawusd.errors import RigError
 from jawusd.formats.mesh import Mesh
+from jawusd.geometry.arrays import Mask
 from jawusd.rig.geo import MESH_PATHS
 from jawusd.rig.read import open_stage
 from jawusd.rig.untrusted import blames_file
@@ -55,7 +55,7 @@ def _read(path: str | os.PathLike[str], *, placeholders: bool) -> dict[str, Mesh
 
 
 @blames_file(0)
-def read_gum(path: str | os.PathLike[str]) -> dict[str, NDArray[np.bool_]]:
+def read_gum(path: str | os.PathLike[str]) -> dict[str, Mask]:
     """Read which faces of the teeth meshes are gum.
 
     Args:

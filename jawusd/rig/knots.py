@@ -7,12 +7,10 @@ root of the curvature spread it evenly (de Boor, A Practical Guide to Splines, c
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.evaluator import JawRig
+from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import transform_points
-
-Array = NDArray[np.float64]
 
 _FINE = 161  # places per axis at which the curvature is measured
 _COARSE = 13  # places along the two other axes

@@ -9,13 +9,12 @@ from numpy.typing import NDArray
 from pxr import Usd, UsdGeom
 
 from jawusd.errors import FormatError
+from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import rigidity_defect
 from jawusd.rig.animation import LOST
 from jawusd.rig.layout import ACTOR, MANDIBLE, PARAMETERS
 from jawusd.rig.read import find_rig_prim, open_stage
 from jawusd.rig.untrusted import blames_file
-
-Array = NDArray[np.float64]
 
 _MOST_FRAMES = 220_000  # as many as are written, an hour at 60 per second
 _RIGID = 1e-5  # single-precision quaternions, as DCCs write them, stay below

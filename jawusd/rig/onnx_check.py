@@ -8,20 +8,18 @@ from pathlib import Path
 
 import numpy as np
 import onnx
-from numpy.typing import NDArray
 from onnx.reference import ReferenceEvaluator
 
 from jawusd.errors import FormatError, JawusdError
 from jawusd.evaluator import JawRig
+from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import transform_points
 from jawusd.rig.arrays import model_hash
 from jawusd.rig.onnx_graph import float_type
 from jawusd.rig.onnx_sidecar import FORMAT
 
 
-def onnx_error_mm(
-    path: str | os.PathLike[str], rig: JawRig, d: NDArray[np.float64], recorded: str | None = None
-) -> float:
+def onnx_error_mm(path: str | os.PathLike[str], rig: JawRig, d: Array, recorded: str | None = None) -> float:
     """Return how far a graph is from the model [mm], as the largest landmark distance over parameters d (n, 3).
 
     A graph that decodes is compared by its poses. One that encodes gets the model's poses of d, and the poses of the
@@ -46,7 +44,7 @@ def onnx_error_mm(
         raise FormatError(f"cannot be run ({type(error).__name__}).", path=path) from error
 
 
-def _error_mm(model: onnx.ModelProto, rig: JawRig, d: NDArray[np.float64]) -> float:
+def _error_mm(model: onnx.ModelProto, rig: JawRig, d: Array) -> float:
     dtype = float_type(model)
     run = ReferenceEvaluator(model).run
     if model.graph.input[0].name == "d":

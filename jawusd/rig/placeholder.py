@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from jawusd.evaluator import JawRig
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry.anatomy import LANDMARKS
+from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import se3_inverse, transform_points
-
-Array = NDArray[np.float64]
 
 _CONDYLES = [LANDMARKS.index(name) for name in ("condyle_left", "condyle_right")]
 _INCISOR = LANDMARKS.index("incisor")

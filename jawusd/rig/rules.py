@@ -6,18 +6,16 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pxr import Gf, Sdf, Usd, UsdGeom
 
 from jawusd.errors import JawusdError
 from jawusd.evaluator import JawRig
+from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import transform_points
 from jawusd.rig import _gf
 from jawusd.rig.layout import ONNX_ATTRIBUTES, PARAMETERS, SIDECAR_HASH
 from jawusd.rig.read import read_table, rig_of
 from jawusd.rig.sampling import sample_valid
-
-Array = NDArray[np.float64]
 
 _TABLE_SLACK_MM = 0.01  # the table states its error over more parameters than are tried here
 _ONNX_MM = 0.01

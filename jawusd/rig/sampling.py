@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.errors import RigError
 from jawusd.evaluator import JawRig
-
-Array = NDArray[np.float64]
+from jawusd.geometry.arrays import Array
 
 _PROBES_PER_AXIS = 41
 

@@ -6,18 +6,17 @@ import os
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pxr import Kind, Sdf, Usd, UsdSkel, Vt
 
 from jawusd.evaluator import JawRig
 from jawusd.geometry.anatomy import LANDMARKS
+from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import make_transform, se3_inverse, transform_points
 from jawusd.rig import _gf
 from jawusd.rig.geo import MESH_PATHS
 from jawusd.rig.layers import define_prim, new_layer, stage_of, write_layer
 from jawusd.rig.layout import ACTOR, GEO_FILE, MANDIBLE
-
-Array = NDArray[np.float64]
 
 JOINTS = ("skull", "skull/jaw")
 SKELETON, MOTION = f"{ACTOR}/Skel", f"{ACTOR}/Skel/Motion"

@@ -10,11 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 from jawusd.errors import RigError
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.table import SampledTable
+from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import se3_exp
 from jawusd.rig.knots import sample_knots
 from jawusd.rig.sampling import sample_valid, valid_box
-
-Array = NDArray[np.float64]
 
 DEFAULT_SIZE = 33
 SIZES = (17, 33, 65)

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.geometry.arrays import Mask
 from jawusd.segmentation.colours import shadeless
 from jawusd.segmentation.config import SegmentationConfig
 
@@ -32,7 +33,7 @@ class _Sides:
 
 def settle_borders(
     shares: NDArray[np.float32], rgb: NDArray[np.uint8], config: SegmentationConfig, px_per_mm: float
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+) -> tuple[NDArray[np.float32], Mask]:
     """Tell teeth from surroundings once more, along their border, by the colours on either side right there.
 
     Colours learned over the take decide what is tooth; where exactly it ends they decide badly, as the middle between
@@ -66,7 +67,7 @@ def settle_borders(
     return teeth * np.stack([upper, lower]) / np.maximum(upper + lower, 1e-6), clear
 
 
-def _signed_distance(region: NDArray[np.bool_]) -> NDArray[np.float32]:
+def _signed_distance(region: Mask) -> NDArray[np.float32]:
     """Return the distance to the other kind of pixel, positive inside the region [px]."""
     inner = cv2.distanceTransform(region.astype(np.uint8), cv2.DIST_L2, 5)
     return inner - cv2.distanceTransform((~region).astype(np.uint8), cv2.DIST_L2, 5)
@@ -89,7 +90,7 @@ def _compare_sides(inside: NDArray[np.float32], colours: NDArray[np.float32], wi
     return _Sides(share, np.where(has_tooth & has_other, np.sqrt(np.maximum(contrast, 0)), 0))
 
 
-def _mean_near(side: NDArray[np.bool_], colours: NDArray[np.float32], window: int):
+def _mean_near(side: Mask, colours: NDArray[np.float32], window: int):
     """Return the mean colour of one side around every pixel, and where enough of that side is near."""
     weight = side.astype(np.float32)
     count = cv2.boxFilter(weight, -1, (window, window), normalize=False)
@@ -97,7 +98,7 @@ def _mean_near(side: NDArray[np.bool_], colours: NDArray[np.float32], window: in
     return total / np.maximum(count, 1)[..., None], count >= window
 
 
-def _unfounded(teeth: NDArray[np.bool_], clear: NDArray[np.bool_], config: SegmentationConfig) -> NDArray[np.bool_]:
+def _unfounded(teeth: Mask, clear: Mask, config: SegmentationConfig) -> Mask:
     """Tell which pixels belong to specks, and to parts with hardly a border in the picture, shape (h, w)."""
     count, parts, stats, _ = cv2.connectedComponentsWithStats(teeth.astype(np.uint8))
     outline = teeth & (cv2.erode(teeth.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera, transform_points
+from jawusd.geometry.arrays import Array, Mask
 from jawusd.segmentation.colours import ColourModel
 from jawusd.segmentation.config import SegmentationConfig
 from jawusd.segmentation.crowns import OTHER, Expectation, ScanSurface, draw_crowns, expect_crowns
@@ -40,9 +41,9 @@ class Segment:
 
     camera: Camera
     masks: NDArray[np.uint8]
-    present: NDArray[np.bool_]
-    contrast: NDArray[np.float64]
-    unexpected: NDArray[np.float64]
+    present: Mask
+    contrast: Array
+    unexpected: Array
     outline: NDArray[np.int64]
     window: Window
     expected: Expectation
@@ -55,9 +56,7 @@ class CameraSegmenter:
         colours: what was learned about them so far.
     """
 
-    def __init__(
-        self, source: Camera, meshes: Sequence[Mesh], poses: NDArray[np.float64], config: SegmentationConfig
-    ) -> None:
+    def __init__(self, source: Camera, meshes: Sequence[Mesh], poses: Array, config: SegmentationConfig) -> None:
         """Prepare for a take.
 
         Args:
@@ -79,7 +78,7 @@ class CameraSegmenter:
     def segment(
         self,
         image: NDArray[np.uint8],
-        poses: NDArray[np.float64],
+        poses: Array,
         turn: int,
         keys: Sequence[Key | None] = (None, None),
     ) -> Segment | None:
@@ -120,7 +119,7 @@ class CameraSegmenter:
         """Return the masks of both rows as recorded, (H, W) uint8, 0 or 255."""
         return [self._frame.recorded(mask.astype(np.float32) / 255, segment.window) for mask in segment.masks]
 
-    def agreement(self, image: NDArray[np.uint8], guesses: NDArray[np.float64]) -> NDArray[np.float64]:
+    def agreement(self, image: NDArray[np.uint8], guesses: Array) -> Array:
         """Return how well the colours of a picture agree with crowns in guessed poses, without cutting anything.
 
         The sum over the crowns in sight of the log-odds that colours alone give, at a coarse resolution. Lips may hide
@@ -145,12 +144,10 @@ class CameraSegmenter:
         rates = [odds[draw_crowns(self._scans, poses, camera) != OTHER].sum() for poses in guesses]
         return np.array(rates, np.float64) * c.agreement_coarse**2
 
-    def _around(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _around(self, poses: Array) -> Array:
         return np.concatenate([transform_points(poses[r], self._points[r]) for r in _ROWS])
 
-    def study(
-        self, image: NDArray[np.uint8], poses: NDArray[np.float64], keys: Sequence[Key | None]
-    ) -> Example | None:
+    def study(self, image: NDArray[np.uint8], poses: Array, keys: Sequence[Key | None]) -> Example | None:
         """Learn the colours of a picture for which a person drew, and return it as an example.
 
         Args:
@@ -191,7 +188,7 @@ class CameraSegmenter:
             outer = (seeds.known & (seeds.share <= 0.5)).all(0) & (cv2.dilate(teeth, kernel, iterations=2) == 0)
             self.colours.learn(window.rgb, cv2.erode(teeth, kernel) > 0, outer, c.key_weight)
 
-    def _contrast(self, window: Window, masks: NDArray[np.uint8]) -> NDArray[np.float64]:
+    def _contrast(self, window: Window, masks: NDArray[np.uint8]) -> Array:
         """Return how much likelier teeth are just inside the outline of a row than just outside of both rows."""
         odds = self.colours.weigh(window.rgb)
         share = 1 / (1 + np.exp(-odds))
@@ -214,7 +211,7 @@ def _overlap(shares: NDArray[np.float32], drawn: NDArray[np.float32]) -> float:
     return float(((a & b).sum((1, 2)) / np.maximum((a | b).sum((1, 2)), 1)).min())
 
 
-def _outline(masks: NDArray[np.uint8], clear: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _outline(masks: NDArray[np.uint8], clear: Mask) -> NDArray[np.int64]:
     kernel = np.ones((3, 3), np.uint8)
     out = np.zeros((2, 3), np.int64)
     for r, mask in enumerate(masks):
@@ -225,7 +222,7 @@ def _outline(masks: NDArray[np.uint8], clear: NDArray[np.bool_]) -> NDArray[np.i
     return out
 
 
-def _unexpected(masks: NDArray[np.uint8], expected: Expectation) -> NDArray[np.float64]:
+def _unexpected(masks: NDArray[np.uint8], expected: Expectation) -> Array:
     out = np.full(2, np.nan)
     for r, mask in enumerate(masks):
         teeth = mask > 127

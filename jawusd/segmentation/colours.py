@@ -7,6 +7,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.geometry.arrays import Array, Indices, Mask
+
 _BINS = 32  # per channel
 _FLOOR = 12.0  # added to every channel before ratios [8-bit steps]: noise of dark pixels has no colour
 _RATIO_STEP = 0.03  # width of a bin of the log ratios [-]: from red over green 0.6 to 1.6 and beyond
@@ -39,7 +41,7 @@ class ColourModel:
         self._beyond = np.zeros((_BINS,) * 3)
         self._table: NDArray[np.float32] | None = None
 
-    def learn(self, rgb: NDArray[np.uint8], under: NDArray[np.bool_], beyond: NDArray[np.bool_], weight=1.0) -> None:
+    def learn(self, rgb: NDArray[np.uint8], under: Mask, beyond: Mask, weight=1.0) -> None:
         """Take in a picture.
 
         Args:
@@ -59,13 +61,13 @@ class ColourModel:
         """Tell whether any picture was seen."""
         return bool(self._under.any() and self._beyond.any())
 
-    def counts(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    def counts(self) -> tuple[NDArray[np.int64], Array]:
         """Return all that was learned: colours seen, shape (N,), and their counts under and beyond, shape (2, N)."""
         both = np.stack([self._under.ravel(), self._beyond.ravel()])
         seen = np.flatnonzero(both.any(0))
         return seen, both[:, seen]
 
-    def take_up(self, seen: NDArray[np.int64], counts: NDArray[np.float64]) -> None:
+    def take_up(self, seen: NDArray[np.int64], counts: Array) -> None:
         """Go on from what `counts` returned."""
         for into, known in zip((self._under, self._beyond), counts, strict=True):
             into.ravel()[:] = 0
@@ -98,7 +100,7 @@ def shadeless(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
 _LOGS = np.log(np.arange(256, dtype=np.float32) + np.float32(_FLOOR))
 
 
-def _bins(rgb: NDArray[np.uint8]) -> NDArray[np.intp]:
+def _bins(rgb: NDArray[np.uint8]) -> Indices:
     red, green, blue = (_LOGS[rgb[..., k]] for k in range(3))
     light = (rgb[..., 1].astype(np.intp) * _BINS) >> 8
     a, b = (
@@ -109,7 +111,7 @@ def _bins(rgb: NDArray[np.uint8]) -> NDArray[np.intp]:
 
 
 @cache
-def _terms() -> NDArray[np.float64]:
+def _terms() -> Array:
     """Return the terms of the regression for the centre of every bin, shape (bins, 7).
 
     Lightness enters once: dark lips that happen to lie under crowns only must not teach that what is dark is tooth.
@@ -122,7 +124,7 @@ def _terms() -> NDArray[np.float64]:
     return np.stack([np.ones_like(a), light, a, b, a**2, b**2, a * b], axis=1)
 
 
-def _tell_apart(under: NDArray[np.float64], beyond: NDArray[np.float64]) -> NDArray[np.float64]:
+def _tell_apart(under: Array, beyond: Array) -> Array:
     """Return the weights of the terms from the counts of every bin, shape (7,); darkness never speaks for teeth."""
     seen = np.flatnonzero(under + beyond)
     x = _terms()[seen]
@@ -134,7 +136,7 @@ def _tell_apart(under: NDArray[np.float64], beyond: NDArray[np.float64]) -> NDAr
     return weights
 
 
-def _regress(x: NDArray[np.float64], under: NDArray[np.float64], beyond: NDArray[np.float64]) -> NDArray[np.float64]:
+def _regress(x: Array, under: Array, beyond: Array) -> Array:
     """Return the weights of terms (N, 7) that tell shares of two kinds (N,) apart, the first of them a mixture."""
     weights, ridge = np.zeros(x.shape[1]), _RIDGE * np.eye(x.shape[1])
     ridge[0, 0] = 1e-9
@@ -151,5 +153,5 @@ def _regress(x: NDArray[np.float64], under: NDArray[np.float64], beyond: NDArray
     return weights
 
 
-def _logistic(odds: NDArray[np.float64]) -> NDArray[np.float64]:
+def _logistic(odds: Array) -> Array:
     return 1 / (1 + np.exp(-np.clip(odds, -30, 30)))

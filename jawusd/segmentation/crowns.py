@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera, transform_points
+from jawusd.geometry.arrays import Array, Mask
 from jawusd.imaging.meshio import GUM, tooth_labels
 from jawusd.imaging.raster import draw_depth_labels
 
@@ -26,7 +27,7 @@ class ScanSurface:
         gum_faces: faces that only hide what lies behind them, int32, shape (G, 3).
     """
 
-    vertices: NDArray[np.float64]
+    vertices: Array
     crown_faces: NDArray[np.int32]
     gum_faces: NDArray[np.int32]
 
@@ -41,7 +42,7 @@ class ScanSurface:
             np.ascontiguousarray(faces[~crown]),
         )
 
-    def crown_points(self) -> NDArray[np.float64]:
+    def crown_points(self) -> Array:
         """Return the vertices of the crowns [mm], shape (N, 3)."""
         return self.vertices[np.unique(self.crown_faces)]
 
@@ -59,7 +60,7 @@ class Expectation:
     inside_px: NDArray[np.float32]
 
 
-def expect_crowns(scans: tuple[ScanSurface, ScanSurface], poses: NDArray[np.float64], camera: Camera) -> Expectation:
+def expect_crowns(scans: tuple[ScanSurface, ScanSurface], poses: Array, camera: Camera) -> Expectation:
     """Draw both rows as a pinhole camera sees them.
 
     Args:
@@ -71,9 +72,7 @@ def expect_crowns(scans: tuple[ScanSurface, ScanSurface], poses: NDArray[np.floa
     return Expectation(labels, np.stack([_signed_distance(labels == label) for label in (UPPER, LOWER)]))
 
 
-def draw_crowns(
-    scans: tuple[ScanSurface, ScanSurface], poses: NDArray[np.float64], camera: Camera
-) -> NDArray[np.uint8]:
+def draw_crowns(scans: tuple[ScanSurface, ScanSurface], poses: Array, camera: Camera) -> NDArray[np.uint8]:
     """Return OTHER, UPPER or LOWER where that row's crowns are nearest, shape (h, w).
 
     Args:
@@ -89,7 +88,7 @@ def draw_crowns(
     return labels
 
 
-def _signed_distance(region: NDArray[np.bool_]) -> NDArray[np.float32]:
+def _signed_distance(region: Mask) -> NDArray[np.float32]:
     """Return the distance to the outline of a region, positive inside [px]; far outside where there is none."""
     if not region.any():
         return np.full(region.shape, -1e3, np.float32)

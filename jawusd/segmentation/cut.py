@@ -6,6 +6,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.geometry.arrays import Mask
+
 _TAU = _SIGMA = 0.35  # steps of the primal-dual iteration: their product times 8, the norm of the gradient, stays < 1
 
 
@@ -72,7 +74,7 @@ def cut_three_ways(
     cost: NDArray[np.float32],
     edge: NDArray[np.float32],
     start: NDArray[np.float32],
-    free: NDArray[np.bool_],
+    free: Mask,
     steps: int,
 ) -> NDArray[np.float32]:
     """Minimise label costs plus the weighted length of the borders between labels.

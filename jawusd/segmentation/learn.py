@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.geometry.arrays import Mask
 from jawusd.segmentation.border import settle_borders
 from jawusd.segmentation.colours import ColourModel
 from jawusd.segmentation.config import SegmentationConfig
@@ -53,7 +54,7 @@ def cut_picture(
     px_per_mm: float,
     reach_mm: float,
     seeds: Seeds | None,
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+) -> tuple[NDArray[np.float32], Mask]:
     """Cut both rows out of a picture, settle their borders and keep to what a person said.
 
     Args:

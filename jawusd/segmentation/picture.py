@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.geometry import Camera
+from jawusd.geometry.arrays import Array
 from jawusd.imaging.working_view import WorkingView
 
 _NODE_PX = 8  # spacing of undistorted positions; the lens is smooth in between
@@ -32,7 +33,7 @@ class Window:
 class PictureFrame:
     """Cut windows around the teeth out of one camera's pictures."""
 
-    def __init__(self, source: Camera, centre_world: NDArray[np.float64], px_per_mm: float) -> None:
+    def __init__(self, source: Camera, centre_world: Array, px_per_mm: float) -> None:
         """Choose the working size.
 
         Args:
@@ -47,7 +48,7 @@ class PictureFrame:
         self._working = WorkingView(source, tuple(max(1, round(s * scale)) for s in source.size_px))
         self._back = _positions(source, self._working.camera)
 
-    def window(self, image: NDArray[np.uint8], points_world: NDArray[np.float64], margin_mm: float) -> Window | None:
+    def window(self, image: NDArray[np.uint8], points_world: Array, margin_mm: float) -> Window | None:
         """Return what surrounds some world points [mm], shape (N, 3), in a recorded RGB picture; None if out of sight.
 
         Args:

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.geometry.arrays import Mask
 from jawusd.segmentation.colours import ColourModel
 from jawusd.segmentation.config import SegmentationConfig
 from jawusd.segmentation.crowns import LOWER, OTHER, UPPER, Expectation
@@ -27,7 +28,7 @@ class Seeds:
         share: of tooth there, shape (2, h, w).
     """
 
-    known: NDArray[np.bool_]
+    known: Mask
     share: NDArray[np.float32]
 
     def pinned(self, shares: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -141,9 +142,7 @@ def part_rows(
     return out
 
 
-def _edge_prices(
-    rgb: NDArray[np.uint8], config: SegmentationConfig, where: NDArray[np.bool_] | None = None
-) -> NDArray[np.float32]:
+def _edge_prices(rgb: NDArray[np.uint8], config: SegmentationConfig, where: Mask | None = None) -> NDArray[np.float32]:
     """Return what a border costs between each pixel and its right and lower neighbour, shape (2, h, w).
 
     The contrast that counts as an edge follows the picture's own (Boykov and Jolly 2001), or that of a part of it,

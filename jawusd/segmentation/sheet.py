@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.geometry.arrays import Mask
 from jawusd.imaging.overlay import LOWER_COLOUR, UPPER_COLOUR, contact_sheet, save_png
 from jawusd.imaging.video import Video
 from jawusd.segmentation.files import ROWS, KeyMasks
@@ -57,7 +58,7 @@ def _tile(picture: NDArray[np.uint8], masks: Sequence[NDArray[np.uint8] | None],
     return tile
 
 
-def _cut(picture: NDArray[np.uint8], extent: NDArray[np.bool_]) -> NDArray[np.uint8]:
+def _cut(picture: NDArray[np.uint8], extent: Mask) -> NDArray[np.uint8]:
     """Return the part of a picture around what is marked, of the tile's shape as far as the picture reaches."""
     if not extent.any():
         return picture

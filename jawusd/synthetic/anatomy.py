@@ -5,16 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.formats.mesh import Mesh
+from jawusd.geometry.arrays import Array
 from jawusd.synthetic.bones import build_mandible, build_skull
 from jawusd.synthetic.dental_arch import ArchShape, DentalArch, build_arch
 from jawusd.synthetic.occlusion import Occlusion
 from jawusd.synthetic.person import Person
 from jawusd.synthetic.teeth import LOWER, UPPER
-
-Array = NDArray[np.float64]
 
 # Heights of edges and cusps below the plane of the upper central incisors [mm], first incisor to second molar.
 _UPPER_TIPS_MM = -np.array([0.0, 0.5, 0.2, 0.3, 0.4, 0.6, 1.0])
@@ -67,9 +65,7 @@ def build_anatomy(person: Person) -> Anatomy:
         gaps = Occlusion(upper, lower).gaps(np.eye(4))
         tips = tips + np.where(np.arange(7) >= 3, gaps - _CONTACT_GAP_MM, np.minimum(gaps - _CONTACT_GAP_MM, 0.0))
     lower = build_arch(LOWER, ArchShape(quadratic, quartic, -z, tips, x), cusp_slope, False, person.seed)
-    return Anatomy(
-        upper, lower, build_mandible(person.joint), build_skull(person.joint), Occlusion(upper, lower)
-    )
+    return Anatomy(upper, lower, build_mandible(person.joint), build_skull(person.joint), Occlusion(upper, lower))
 
 
 def lifted_bite(person: Person, occlusion: Occlusion, controls: Array, extra_mm: Array) -> Array:

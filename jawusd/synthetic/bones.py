@@ -7,13 +7,11 @@ condyles describe the paths of `jawusd.synthetic.kinematics`.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.formats.mesh import Mesh
+from jawusd.geometry.arrays import Array
 from jawusd.synthetic.kinematics import Joint, eminence
 from jawusd.synthetic.surfaces import Faces, grid_faces, loft, merged, outward
-
-Array = NDArray[np.float64]
 
 #: Half axes of a condyle [mm]: lateral, up, forward.
 CONDYLE_MM = np.array([9.0, 4.2, 4.8])
@@ -212,9 +210,7 @@ def _socket(joint: Joint, k: int) -> tuple[Array, Faces]:
     ends = []
     for start, turn in ((0, 1), (39 * n, -1)):
         below, above = start + j, start + n - 1 - j
-        strip = np.concatenate(
-            [np.stack([below, below + 1, above], -1), np.stack([below + 1, above - 1, above], -1)]
-        )
+        strip = np.concatenate([np.stack([below, below + 1, above], -1), np.stack([below + 1, above - 1, above], -1)])
         ends.append(strip[:, ::turn])
     faces = np.concatenate([grid_faces(40, n, closed=True), *ends]).astype(np.int32)
     return vertices, outward(vertices, faces)

@@ -15,6 +15,7 @@ from jawusd.formats.atomic import write_bytes_atomic, write_npz_atomic, write_te
 from jawusd.formats.calibration import save_calibration
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import LANDMARKS, Camera
+from jawusd.geometry.arrays import Array
 from jawusd.imaging.video_writer import VideoWriter
 from jawusd.synthetic.anatomy import Anatomy, build_anatomy
 from jawusd.synthetic.masks import Outline, drawn_mask
@@ -25,7 +26,6 @@ from jawusd.synthetic.scene import Scene
 from jawusd.synthetic.studio import BOARD_COLUMNS, BOARD_ROWS, SQUARE_MM, board, board_poses, build_cameras
 from jawusd.synthetic.take import FPS, LEAD, OPEN_HOLD, REST_HOLD, TAIL, Take, perform
 
-Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
 # Frame k of a camera shows the instant of frame k + offset of the first one.
@@ -235,9 +235,7 @@ def _truth(person: Person, cameras: list[Camera], take: Take, T_world_board: Arr
     }
 
 
-def _description(
-    config: DemoConfig, cameras: list[Camera], take: Take, picks: dict[str, list[SeenVertex]]
-) -> str:
+def _description(config: DemoConfig, cameras: list[Camera], take: Take, picks: dict[str, list[SeenVertex]]) -> str:
     """Text of capture.toml."""
     lines = [
         'format = "jawusd-capture/1"',

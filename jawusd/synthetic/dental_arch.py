@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import so3_exp
+from jawusd.geometry.arrays import Array
 from jawusd.synthetic.surfaces import Faces, loft, merged, outward
 from jawusd.synthetic.teeth import CrownForm, crown
-
-Array = NDArray[np.float64]
 
 RED, GREEN, GREY = (215, 45, 40), (40, 190, 60), (150, 150, 150)
 # Depth of the contact points behind the incisal edges and buccal cusp tips [mm]; teeth are strung along them.

@@ -9,11 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.geometry import transform_points
+from jawusd.geometry.arrays import Array
 
-Array = NDArray[np.float64]
 PoseFunction = Callable[[Array, Array, Array], Array]
 
 _LOWER = np.array([0.0, -1.0, -1.0])

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.geometry import make_transform, so3_exp
+from jawusd.geometry.arrays import Array
 from jawusd.synthetic.kinematics import smoothstep
 from jawusd.synthetic.person import Person
 
-Array = NDArray[np.float64]
 Kind = Literal["training", "hidden"]
 
 # The order of exercises; a recording repeats it until it is long enough.
@@ -234,7 +234,7 @@ def _chew(rng: np.random.Generator) -> tuple[Array, Array, Array]:
     n = int(rng.integers(14, 20))
     part = np.arange(n) / n
     opening = rng.uniform(0.25, 0.5) * _bump(n)
-    sideways = -np.sin(np.pi * part) ** 2 * np.sin(2 * np.pi * (part - 0.25))
+    sideways = -(np.sin(np.pi * part) ** 2) * np.sin(2 * np.pi * (part - 0.25))
     return opening, rng.choice([-1, 1]) * rng.uniform(0.3, 0.7) * sideways, rng.uniform(-0.15, 0.15) * _swing(n)
 
 

@@ -12,11 +12,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jawusd.geometry import make_transform, so3_exp
-
-Array = NDArray[np.float64]
+from jawusd.geometry.arrays import Array
 
 # Pitch [rad] at which the tooth contact has let go of the mandible: one e-folding of its Gaussian fade.
 _CONTACT_FADE_RAD = np.deg2rad(4.0)

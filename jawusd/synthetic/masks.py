@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from jawusd.geometry.arrays import Array, Mask
 
 # Size of the wobble [px] and of its cells at a picture height of 1080; habits stay, the rest changes in some frames.
 _WOBBLE_PX, _CELL_PX = 0.7, 36.0
@@ -78,7 +78,7 @@ def drawn_mask(coverage: NDArray[np.uint8], rng: np.random.Generator) -> NDArray
     return np.where(mask, np.uint8(255), np.uint8(0))
 
 
-def _ellipse(mask: NDArray[np.bool_], row: float, column: float, radius: Array, value: bool) -> None:
+def _ellipse(mask: Mask, row: float, column: float, radius: Array, value: bool) -> None:
     """Set the pixels of a small ellipse."""
     y, x = np.ogrid[: mask.shape[0], : mask.shape[1]]
     mask[((y - row) / radius[0]) ** 2 + ((x - column) / radius[1]) ** 2 <= 1.0] = value

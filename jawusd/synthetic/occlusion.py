@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jawusd.geometry import transform_points
+from jawusd.geometry.arrays import Array
 from jawusd.synthetic.dental_arch import DentalArch
-
-Array = NDArray[np.float64]
 
 _CELL_MM = 0.2
 _SAMPLES_PER_EDGE = 5

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jawusd.geometry import transform_points
+from jawusd.geometry.arrays import Array, Mask
 from jawusd.synthetic.envelope import Envelope
 from jawusd.synthetic.kinematics import Joint, controlled_pose
 
-Array = NDArray[np.float64]
 EnvelopeKind = Literal["box", "competing"]
 
 
@@ -158,7 +158,7 @@ class Person:
         """
         return self._envelope.nearest(np.asarray(T_skull_mandible, dtype=np.float64), bounded)
 
-    def is_valid(self, T_skull_mandible: ArrayLike, tolerance_mm: float = 1.0) -> NDArray[np.bool_]:
+    def is_valid(self, T_skull_mandible: ArrayLike, tolerance_mm: float = 1.0) -> Mask:
         """Tell which poses this person can take: no mandible point further than the tolerance from a possible pose.
 
         Args:

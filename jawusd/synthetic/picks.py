@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera, transform_points
+from jawusd.geometry.arrays import Array
 from jawusd.geometry.rays import meet_triangles
 from jawusd.synthetic.dental_arch import DentalArch
 from jawusd.synthetic.surfaces import vertex_normals
-
-Array = NDArray[np.float64]
 
 # A pick lies this far inside the picture, and on a surface not turned away by more than about 70 degrees.
 _BORDER_PX = 10.0

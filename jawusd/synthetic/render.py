@@ -14,11 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from jawusd.errors import MissingDependencyError
 from jawusd.geometry import Camera, se3_inverse
+from jawusd.geometry.arrays import Array
 from jawusd.synthetic import shaders
 from jawusd.synthetic.soft_tissue import Surface
 from jawusd.synthetic.surfaces import vertex_normals
-
-Array = NDArray[np.float64]
 
 NEAR_MM, FAR_MM = 80.0, 700.0
 #: Labels of surfaces; everything but teeth hides teeth.
@@ -149,9 +148,7 @@ class Renderer:
         self._shadow.use()
         self._shadow_quad.render(moderngl.TRIANGLE_STRIP)
 
-    def _draw_lens(
-        self, camera: int, light: float, wobble_px: tuple[ArrayLike, ArrayLike] | None
-    ) -> Picture:
+    def _draw_lens(self, camera: int, light: float, wobble_px: tuple[ArrayLike, ArrayLike] | None) -> Picture:
         program = self._lens_program
         still = np.zeros((2, 2, 2))
         upper, lower = (still, still) if wobble_px is None else wobble_px

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import transform_points
+from jawusd.geometry.arrays import Array
 from jawusd.synthetic.anatomy import Anatomy
 from jawusd.synthetic.dental_arch import DentalArch
 from jawusd.synthetic.person import Person
 from jawusd.synthetic.render import LOWER_TEETH, UPPER_TEETH, Picture, Renderer
 from jawusd.synthetic.soft_tissue import Face, LipState, Surface, palate, tongue
 from jawusd.synthetic.take import Take
-
-Array = NDArray[np.float64]
 
 _ENAMEL = np.array([0.80, 0.745, 0.63])
 _GUM = np.array([0.56, 0.22, 0.21])
@@ -94,7 +93,7 @@ def _arch_surfaces(arch: DentalArch) -> tuple[Surface, Surface]:
         own = arch.tooth[:first_gum] == k
         height = np.abs(vertices[:first_gum][own, 1])
         share = (height - height.min()) / np.ptp(height)  # 0 at the end towards the other jaw
-        colors[own] *= (1.0 - 0.16 * share[:, None] * np.array([0.6, 0.8, 1.3]))
+        colors[own] *= 1.0 - 0.16 * share[:, None] * np.array([0.6, 0.8, 1.3])
         if abs(k) == 3:
             colors[own] *= _CANINE_TINT
     n, m = first_gum, len(vertices) - first_gum

@@ -9,13 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jawusd.geometry import transform_points
+from jawusd.geometry.arrays import Array
 from jawusd.synthetic.kinematics import smoothstep
 from jawusd.synthetic.surfaces import Faces, grid_faces
-
-Array = NDArray[np.float64]
 
 _COLUMNS = 160
 _SKIN_ROWS = 30

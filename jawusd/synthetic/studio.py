@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.geometry import Camera, make_transform, se3_inverse, so3_exp
+from jawusd.geometry.arrays import Array
 from jawusd.synthetic.soft_tissue import Surface
 from jawusd.synthetic.surfaces import grid_faces
-
-Array = NDArray[np.float64]
 
 #: The scan frame to the world (the frame of the first camera: x right, y down, z forward) with the head still.
 T_WORLD_SCAN = make_transform(np.diag([1.0, -1.0, -1.0]), [0.0, -14.0, 214.0])

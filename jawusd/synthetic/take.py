@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.geometry import make_transform, so3_exp
+from jawusd.geometry.arrays import Array
 from jawusd.synthetic.anatomy import lifted_bite
 from jawusd.synthetic.exercises import schedule, smooth_noise, smoothed
 from jawusd.synthetic.kinematics import smoothstep
@@ -15,8 +16,6 @@ from jawusd.synthetic.occlusion import Occlusion
 from jawusd.synthetic.person import Person
 from jawusd.synthetic.soft_tissue import LipState
 from jawusd.synthetic.studio import T_WORLD_SCAN
-
-Array = NDArray[np.float64]
 
 FPS = 24.0
 #: Frames before the first and after the last tracked one; the flashes lie there.

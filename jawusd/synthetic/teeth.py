@@ -12,9 +12,8 @@ from math import comb
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.geometry.arrays import Array
 from jawusd.synthetic.surfaces import loft
-
-Array = NDArray[np.float64]
 
 #: Crown below the gum line [mm]; hidden by the gum.
 ROOT_MM = 2.5

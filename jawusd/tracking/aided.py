@@ -14,6 +14,7 @@ from jawusd.formats.capture import Capture
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, Tracks
 from jawusd.geometry import Camera, relative_pose, se3_adjoint, se3_exp, se3_inverse, se3_log, transform_points
+from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.extrinsics import corrected_cameras
 from jawusd.tracking.kinematic_prior import KinematicPrior
@@ -30,7 +31,7 @@ _HARD_MM = 0.3
 _FEWEST_GOOD = 15  # frames that must agree with the model before it may help others
 
 
-def hard_frames(tracks: Tracks) -> NDArray[np.bool_]:
+def hard_frames(tracks: Tracks) -> Mask:
     """Return the frames a model should help with: lost, recovered, without a camera, or uncertain; shape (F,)."""
     sigma = tracks.sigma_mm.max(1)
     return (tracks.status != TRACKED).any(1) | ~(sigma <= _HARD_MM)
@@ -96,8 +97,8 @@ def aid_tracks(
 class _Aided:
     """Hold a frame's poses (2, 4, 4) with the joint covariance of their left world twists (12, 12)."""
 
-    poses: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    poses: Array
+    covariance: Array
 
 
 class _SecondPass:
@@ -108,7 +109,7 @@ class _SecondPass:
         self._usual_px = np.nanmedian(np.where(tracks.status == TRACKED, tracks.residual_px, np.nan), axis=0)
         self._correlation_px = float(tracks.meta.get("correlation_px", config.correlation_px))
 
-    def align(self, k: int, start: NDArray[np.float64], views: Sequence[View]) -> _Aided | None:
+    def align(self, k: int, start: Array, views: Sequence[View]) -> _Aided | None:
         """Return the poses of frame index k found with the prior, or None if they cannot be trusted."""
         present = np.array([[v.present[r] for v in views] for r in _ROWS])
         lost = self._tracks.status[k] == LOST
@@ -120,7 +121,7 @@ class _SecondPass:
             return None
         return _Aided(solution.poses, covariance)
 
-    def _fits(self, solution: Solution, views: Sequence[View], use: NDArray[np.bool_], covariance: NDArray) -> bool:
+    def _fits(self, solution: Solution, views: Sequence[View], use: Mask, covariance: NDArray) -> bool:
         c, jaw = self._config, self._prior.jaw
         bare_px, mask_px = uncovered_px(self._solver.scans, solution, views)
         bare = np.where(use & (mask_px > 0), bare_px / np.maximum(mask_px, 1), 0.0).max()
@@ -135,19 +136,19 @@ class _SecondPass:
         )  # fmt: skip
 
 
-def _spread_mm(jaw: JawRig, tracks: Tracks, good: NDArray[np.bool_]) -> float:
+def _spread_mm(jaw: JawRig, tracks: Tracks, good: Mask) -> float:
     """Return the rms landmark distance of good raw poses from the model [mm]; tracking noise counts, so no less."""
     residual_mm = jaw.encode(tracks.raw_T_upper_lower[good])[1]
     return float(np.sqrt(np.mean(residual_mm**2)))
 
 
-def _variances(tracks: Tracks) -> NDArray[np.float64]:
+def _variances(tracks: Tracks) -> Array:
     """Return the outline variance times correlation length per row [px^3], shape (2,)."""
     typical = np.nanmedian(np.where(tracks.status == TRACKED, tracks.residual_px, np.nan), axis=0)
     return typical**2 * float(tracks.meta["correlation_px"])
 
 
-def _starts(tracks: Tracks, jaw: JawRig, measured: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _starts(tracks: Tracks, jaw: JawRig, measured: Mask) -> Array:
     """Return where to start every frame, T_world_upper and T_world_lower, shape (F, 2, 4, 4).
 
     Where a row is lost, the other row and the model between the neighbouring frames tell where it is; where both are,
@@ -172,7 +173,7 @@ def _starts(tracks: Tracks, jaw: JawRig, measured: NDArray[np.bool_]) -> NDArray
     return np.stack([upper, lower], axis=1)
 
 
-def _corrected(views: Sequence[View], tracks: Tracks, k: int, poses: NDArray[np.float64]) -> list[View]:
+def _corrected(views: Sequence[View], tracks: Tracks, k: int, poses: Array) -> list[View]:
     """Return the views of frame index k with the delays and the mask bias of the first pass taken out."""
     before, after = poses[max(k - 1, 0)], poses[min(k + 1, len(poses) - 1)]
     span = max(1, min(k + 1, len(poses) - 1) - max(k - 1, 0))
@@ -185,7 +186,7 @@ def _corrected(views: Sequence[View], tracks: Tracks, k: int, poses: NDArray[np.
     return out
 
 
-def _relative_covariance(poses: NDArray[np.float64], covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+def _relative_covariance(poses: Array, covariance: Array) -> Array:
     """Return the covariance of the left twist of T_upper_lower from the joint one of both rows, shape (6, 6)."""
     A = se3_adjoint(se3_inverse(poses[0]))
     slope = np.hstack([-A, A])

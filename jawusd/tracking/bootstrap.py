@@ -21,6 +21,7 @@ from jawusd.geometry import (
     transform_points,
     triangulate,
 )
+from jawusd.geometry.arrays import Array
 
 _FEWEST = 3
 # A pick whose vertex projects farther than this from its pixel counts as wrong [mm at the teeth]: three times the
@@ -35,14 +36,14 @@ class _Sighting:
     """One pick ready for fitting: the scan point and its undistorted pixels."""
 
     number: int
-    point: NDArray[np.float64]
-    matrices: NDArray[np.float64]
-    pixels: NDArray[np.float64]
+    point: Array
+    matrices: Array
+    pixels: Array
 
 
 def pose_from_picks(
-    picks: Sequence[Pick], vertices: NDArray[np.float64], cameras: Mapping[str, Camera], row: str
-) -> tuple[NDArray[np.float64], list[int]]:
+    picks: Sequence[Pick], vertices: Array, cameras: Mapping[str, Camera], row: str
+) -> tuple[Array, list[int]]:
     """Return the pose of one row of teeth that agrees with its picks.
 
     Args:
@@ -95,10 +96,10 @@ def pose_from_picks(
 
 def picked_sigma_mm(
     picks: Sequence[Pick],
-    vertices: NDArray[np.float64],
+    vertices: Array,
     cameras: Mapping[str, Camera],
-    pose: NDArray[np.float64],
-    probes: NDArray[np.float64],
+    pose: Array,
+    probes: Array,
 ) -> float:
     """Return how far careless clicks let a row stray, the rms standard deviation over its crowns [mm].
 
@@ -147,7 +148,7 @@ def _sighting(number: int, pick: Pick, vertices: NDArray, cameras: Mapping[str, 
     return _Sighting(number, vertices[pick.vertex], np.stack(matrices), np.stack(pixels))
 
 
-def _residuals_px(s: _Sighting, pose: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
+def _residuals_px(s: _Sighting, pose: Array) -> tuple[NDArray, NDArray, NDArray]:
     """Return projection minus pixel (C, 2), depths (C,) and the derivative by the world point (C, 2, 3)."""
     h = s.matrices @ np.append(transform_points(pose, s.point), 1.0)
     projected = h[:, :2] / h[:, 2:]
@@ -155,7 +156,7 @@ def _residuals_px(s: _Sighting, pose: NDArray[np.float64]) -> tuple[NDArray, NDA
     return projected - s.pixels, h[:, 2], slope
 
 
-def _miss_mm(s: _Sighting, pose: NDArray[np.float64]) -> float:
+def _miss_mm(s: _Sighting, pose: Array) -> float:
     """Return the largest distance between a pick's vertex and its pixel, measured at the vertex [mm]."""
     residual, depth, slope = _residuals_px(s, pose)
     if (depth <= 0).any():
@@ -164,7 +165,7 @@ def _miss_mm(s: _Sighting, pose: NDArray[np.float64]) -> float:
     return float((np.linalg.norm(residual, axis=1) / px_per_mm).max())
 
 
-def _refined(sightings: Sequence[_Sighting], pose: NDArray[np.float64]) -> NDArray[np.float64]:
+def _refined(sightings: Sequence[_Sighting], pose: Array) -> Array:
     """Minimise the pixel error of the picks by Gauss-Newton, starting close by."""
     for _ in range(10):
         H, g = np.zeros((6, 6)), np.zeros(6)

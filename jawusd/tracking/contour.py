@@ -9,6 +9,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.geometry.arrays import Array
 from jawusd.tracking.scan import Scan
 
 # Columns of a sample: point in scan coordinates [mm], pixel, outward unit normal in the picture, contour length it
@@ -21,13 +22,13 @@ CROWN, GUM = 1, 2  # labels of the rendered scan; 0 is empty
 
 def contour_samples(
     scan: Scan,
-    matrix: NDArray[np.float64],
-    eye: NDArray[np.float64],
+    matrix: Array,
+    eye: Array,
     labels: NDArray[np.uint8],
     inverse_depth: NDArray[np.float32],
     step_px: float,
     depth_tolerance_mm: float,
-) -> NDArray[np.float64]:
+) -> Array:
     """Return the contour points at which the picture of the scan changes from crown to anything but crown.
 
     Args:

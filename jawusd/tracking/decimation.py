@@ -6,10 +6,12 @@ import numpy as np
 import pyfqmr
 from numpy.typing import NDArray
 
+from jawusd.geometry.arrays import Array
+
 
 def thinned(
-    vertices: NDArray[np.float64], crown_faces: NDArray[np.int32], gum_faces: NDArray[np.int32], crown_count: int
-) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.int32]]:
+    vertices: Array, crown_faces: NDArray[np.int32], gum_faces: NDArray[np.int32], crown_count: int
+) -> tuple[Array, NDArray[np.int32], NDArray[np.int32]]:
     """Return crowns and gum with about so many crown faces, and gum thinned alike.
 
     Quadric edge collapse (Garland & Heckbert 1997); the line between crown and gum stays where it is.

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.geometry import Camera, make_transform, se3_adjoint, se3_exp, se3_inverse, se3_log
+from jawusd.geometry.arrays import Array
 from jawusd.tracking.solver import View
 
 
@@ -26,28 +26,28 @@ class Extrinsics:
         sigma: their standard deviations [rad, mm], shape (C, 6).
     """
 
-    T_cam_world: NDArray[np.float64]
-    pivot: NDArray[np.float64]
-    twists: NDArray[np.float64]
-    sigma: NDArray[np.float64]
+    T_cam_world: Array
+    pivot: Array
+    twists: Array
+    sigma: Array
 
     @classmethod
-    def calibrated(cls, cameras: Sequence[Camera], pivot: NDArray[np.float64]) -> Extrinsics:
+    def calibrated(cls, cameras: Sequence[Camera], pivot: Array) -> Extrinsics:
         """Return the cameras as calibrated, nothing corrected."""
         nothing = np.zeros((len(cameras), 6))
         return cls(np.stack([c.T_cam_world for c in cameras]), np.asarray(pivot, float), nothing, nothing)
 
-    def motions(self) -> NDArray[np.float64]:
+    def motions(self) -> Array:
         """Return how each camera sees the world moved, shape (C, 4, 4)."""
         to = make_transform(np.eye(3), -self.pivot)
         return se3_inverse(to) @ se3_exp(self.twists) @ to
 
-    def then(self, twists: NDArray[np.float64], sigma: NDArray[np.float64]) -> Extrinsics:
+    def then(self, twists: Array, sigma: Array) -> Extrinsics:
         """Return the corrections with more on top of them, shapes (C, 6)."""
         both = se3_log(se3_exp(self.twists) @ se3_exp(twists))
         return replace(self, twists=both - both.mean(0), sigma=sigma)
 
-    def poses(self) -> NDArray[np.float64]:
+    def poses(self) -> Array:
         """Return the corrected T_cam_world, shape (C, 4, 4)."""
         return self.T_cam_world @ self.motions()
 
@@ -59,7 +59,7 @@ class Extrinsics:
             for view, M in zip(views, moved, strict=True)
         ]
 
-    def precision(self, turn_rad: float, move_mm: float) -> NDArray[np.float64]:
+    def precision(self, turn_rad: float, move_mm: float) -> Array:
         """Return what is known of the twists of each camera beforehand, shape (C, 6, 6).
 
         Args:
@@ -72,7 +72,7 @@ class Extrinsics:
     def report(self, names: Sequence[str]) -> dict:
         """Return corrections, uncertainties and corrected poses by camera name, for the tracks' meta data."""
 
-        def by_name(values: NDArray[np.float64]) -> dict[str, list]:
+        def by_name(values: Array) -> dict[str, list]:
             return dict(zip(names, values.tolist(), strict=True))
 
         return {
@@ -86,7 +86,7 @@ class Extrinsics:
         }
 
 
-def lever(pivot: NDArray[np.float64], centre: NDArray[np.float64]) -> NDArray[np.float64]:
+def lever(pivot: Array, centre: Array) -> Array:
     """Return what turns a twist about a pivot into the same motion's twist about a centre, shape (6, 6)."""
     return se3_adjoint(make_transform(np.eye(3), pivot - centre))
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.errors import TrackingError
 from jawusd.formats.tracks import PARTIAL, TRACKED
+from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.history import FrameRecord
 from jawusd.tracking.quality import row_fit, score_px, uncovered_px
@@ -21,7 +21,7 @@ _LEAST_FIT = 0.05
 
 
 def first_record(
-    solver: ContourSolver, config: TrackingConfig, start: NDArray[np.float64], masks: MaskViews, frame: int
+    solver: ContourSolver, config: TrackingConfig, start: Array, masks: MaskViews, frame: int
 ) -> FrameRecord:
     """Align the bootstrap frame, starting from the picks.
 

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from jawusd.errors import TrackingError
 from jawusd.formats.capture import CameraSource
 from jawusd.geometry import Camera
+from jawusd.geometry.arrays import Array
 from jawusd.tracking.mask_geometry import MaskSurvey, survey_masks
 from jawusd.tracking.views import MaskViews
 
@@ -26,7 +24,7 @@ class Start:
     """
 
     frame: int
-    poses: NDArray[np.float64]
+    poses: Array
     notes: dict
 
 
@@ -50,7 +48,7 @@ class Footage:
         """Look at evenly spread frames, of the whole footage if no range is given."""
         return survey_masks(self.sources, self.cameras, self.offsets, frames or self.frames, count)
 
-    def views(self, centre: NDArray[np.float64], px_per_mm: float) -> MaskViews:
+    def views(self, centre: Array, px_per_mm: float) -> MaskViews:
         """Open the masks at a resolution at the teeth, which are near a world point [mm], shape (3,)."""
         return MaskViews(self.sources, self.cameras, self.offsets, centre, px_per_mm)
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.errors import CaptureError, TrackingError
 from jawusd.geometry import transform_points
+from jawusd.geometry.arrays import Array
 from jawusd.tracking.first import first_record
 from jawusd.tracking.footage import Footage, Start
 from jawusd.tracking.mixups import all_rows_exchanged, likely_mixup, possible_mixups
@@ -70,7 +70,7 @@ def search_start(search: StartSearch, footage: Footage) -> Start:
     return Start(frame, found.poses, {**notes, "failed": {str(f): m for f, m in failed.items()}})
 
 
-def search_around(search: StartSearch, footage: Footage, frame: int, poses: NDArray[np.float64]) -> Found:
+def search_around(search: StartSearch, footage: Footage, frame: int, poses: Array) -> Found:
     """Find the poses near given ones; if none fits beyond doubt, the best ones of all.
 
     Raises:
@@ -86,7 +86,7 @@ def search_around(search: StartSearch, footage: Footage, frame: int, poses: NDAr
     return max(near, anywhere, key=lambda found: found.worth_px)
 
 
-def _aligned(search: StartSearch, footage: Footage, poses: NDArray[np.float64], frame: int) -> NDArray[np.float64]:
+def _aligned(search: StartSearch, footage: Footage, poses: Array, frame: int) -> Array:
     """Return the poses as aligned by the solver if they pass the checks of a first frame, shape (2, 4, 4)."""
     solver = search.solver
     centre = np.mean([transform_points(poses[r], solver.scans[r].centre) for r in _ROWS], axis=0)

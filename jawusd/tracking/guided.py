@@ -14,6 +14,7 @@ from jawusd.formats.capture import Bootstrap
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import LOST, TRACKED
 from jawusd.geometry import Camera, se3_exp, se3_inverse, se3_log, transform_points
+from jawusd.geometry.arrays import Array
 from jawusd.tracking.bootstrap import pose_from_picks
 from jawusd.tracking.config import FOR_MADE_MASKS, TrackingConfig
 from jawusd.tracking.first import first_record
@@ -26,11 +27,11 @@ from jawusd.tracking.solver import ContourSolver, View
 
 #: Makes the views of a frame of the reference camera: called with the frame, T_world_upper and T_world_lower as
 #: expected, shape (2, 4, 4), and the round, 0 for poses that are only predicted.
-See = Callable[[int, NDArray[np.float64], int], Sequence[View]]
+See = Callable[[int, Array, int], Sequence[View]]
 
 #: Tells how well a frame's pictures agree with guessed poses, without masks: called with the frame and T_world_upper
 #: and T_world_lower, shape (N, 2, 4, 4); returns N numbers, more for better.
-Agreement = Callable[[int, NDArray[np.float64]], NDArray[np.float64]]
+Agreement = Callable[[int, Array], Array]
 
 _CLEARLY = 1.01  # share of a guess's agreement at which another is better: less is noise of colours
 # Shares of the way from where the jaw was to where it has been before: jaws go the same ways again and again.
@@ -86,7 +87,7 @@ class GuidedTracker:
         # A dozen points of a row show any motion of it.
         self._probes = np.stack([s.probes[np.linspace(0, len(s.probes) - 1, 12).astype(int)] for s in scans])
 
-    def picked(self, bootstrap: Bootstrap | None, cameras: Mapping[str, Camera]) -> NDArray[np.float64]:
+    def picked(self, bootstrap: Bootstrap | None, cameras: Mapping[str, Camera]) -> Array:
         """Return T_world_upper and T_world_lower that agree with the picks, shape (2, 4, 4).
 
         Raises:
@@ -103,7 +104,7 @@ class GuidedTracker:
             [pose_from_picks(picks[row], mesh.vertices, cameras, row)[0] for row, mesh in self._meshes.items()]
         )
 
-    def begin(self, frame: int, poses: NDArray[np.float64]) -> FrameRecord:
+    def begin(self, frame: int, poses: Array) -> FrameRecord:
         """Align the first frame from picked poses.
 
         Raises:
@@ -140,12 +141,12 @@ class GuidedTracker:
             before, sound = sound, _is_sound(Past.of(record), history)
             yield frame, record, sound and not before and self.apart_mm(expected, poses) > _ASTRAY_MM
 
-    def apart_mm(self, one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
+    def apart_mm(self, one: Array, other: Array) -> float:
         """Return how far the lower row is between two poses of both, shape (2, 4, 4), at most [mm]."""
         gap = transform_points(one[1], self._probes[1]) - transform_points(other[1], self._probes[1])
         return float(np.linalg.norm(gap, axis=1).max())
 
-    def judge(self, frame: int, poses: NDArray[np.float64], status: NDArray[np.int8]) -> FrameRecord:
+    def judge(self, frame: int, poses: Array, status: NDArray[np.int8]) -> FrameRecord:
         """Return the record of a frame whose poses, shape (2, 4, 4), and status, shape (2,), are known already."""
         views = self._see(frame, poses, self._rounds - 1)
         use = np.array([[view.present[r] for view in views] for r in (0, 1)])
@@ -172,9 +173,7 @@ class GuidedTracker:
         poses = np.where(lost, starts[0], record.solution.poses)
         return replace(record, solution=replace(record.solution, poses=poses))
 
-    def _likeliest_first(
-        self, frame: int, starts: list[NDArray[np.float64]], gallery: list[NDArray[np.float64]]
-    ) -> list[NDArray[np.float64]]:
+    def _likeliest_first(self, frame: int, starts: list[Array], gallery: list[Array]) -> list[Array]:
         """Return starts with the one in front that agrees best with the colours.
 
         Args:
@@ -189,9 +188,7 @@ class GuidedTracker:
             return starts
         return [guesses[best], *(start for k, start in enumerate(starts) if k != best)]
 
-    def _settle(
-        self, tracker: FrameTracker, frame: int, start: NDArray[np.float64], record: FrameRecord
-    ) -> FrameRecord:
+    def _settle(self, tracker: FrameTracker, frame: int, start: Array, record: FrameRecord) -> FrameRecord:
         """Let masks and poses take turns after the first look."""
         for turn in range(1, self._rounds):
             lost = (record.status == LOST)[:, None, None]
@@ -206,7 +203,7 @@ def _is_sound(past: Past, history: History) -> bool:
     return bool((past.status == TRACKED).all() and not scarce.any())
 
 
-def _ways(starts: Sequence[NDArray[np.float64]], gallery: Sequence[NDArray[np.float64]]) -> list[NDArray[np.float64]]:
+def _ways(starts: Sequence[Array], gallery: Sequence[Array]) -> list[Array]:
     """Return poses of the jaw on the ways from the last start to earlier ones, the head where it is expected."""
     head, last = starts[0][0], se3_inverse(starts[0][0]) @ starts[0][1]
     out = []

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.formats.tracks import TRACKED
+from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.quality import residual_px, score_px
 from jawusd.tracking.solver import Solution
 
@@ -26,8 +27,8 @@ class FrameRecord:
 
     solution: Solution
     status: NDArray[np.int8]
-    used: NDArray[np.bool_]
-    coverage: NDArray[np.float64]
+    used: Mask
+    coverage: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,12 +42,12 @@ class Past:
         residual_px: standard deviation of the residuals per row, shape (2,).
     """
 
-    poses: NDArray[np.float64]
+    poses: Array
     status: NDArray[np.int8]
-    used: NDArray[np.bool_]
-    coverage: NDArray[np.float64]
-    score_px: NDArray[np.float64]
-    residual_px: NDArray[np.float64]
+    used: Mask
+    coverage: Array
+    score_px: Array
+    residual_px: Array
 
     @classmethod
     def of(cls, record: FrameRecord) -> Past:
@@ -76,20 +77,20 @@ class History:
         self._residuals.append(np.where(good, past.residual_px, np.nan))
         self._coverages.append(np.where(good[:, None] & past.used, past.coverage, np.nan))
 
-    def usual_score(self) -> NDArray[np.float64]:
+    def usual_score(self) -> Array:
         """Return the median score per row and view [px], shape (2, C); 0 while unknown."""
         return _median(self._scores, 0.0)
 
-    def usual_residual(self) -> NDArray[np.float64]:
+    def usual_residual(self) -> Array:
         """Return the median residual per row [px], shape (2,); infinite while unknown."""
         return _median(self._residuals, np.inf)
 
-    def usual_coverage(self) -> NDArray[np.float64]:
+    def usual_coverage(self) -> Array:
         """Return the median coverage error per row and view, shape (2, C); 0 while unknown."""
         return _median(self._coverages, 0.0)
 
 
-def _median(values: deque[NDArray], otherwise: float) -> NDArray[np.float64]:
+def _median(values: deque[NDArray], otherwise: float) -> Array:
     stack = np.array(values)
     known = np.isfinite(stack).any(0)
     out = np.full(stack.shape[1:], otherwise)

@@ -18,6 +18,7 @@ from jawusd.geometry import (
     se3_log,
     transform_points,
 )
+from jawusd.geometry.arrays import Array
 
 _NORMAL_DIRECTIONS = 3  # six motions of a rigid body less the three the model allows
 
@@ -40,9 +41,9 @@ class KinematicPrior:
 
     jaw: JawRig
     spread_mm: float
-    variance_px3: NDArray[np.float64]
+    variance_px3: Array
 
-    def terms(self, poses: NDArray[np.float64], centres: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
+    def terms(self, poses: Array, centres: Array) -> tuple[NDArray, NDArray]:
         """Return the normal equations of the prior.
 
         Args:
@@ -63,7 +64,7 @@ class KinematicPrior:
         slope = np.hstack([-to_skull @ about[0], to_skull @ about[1]])
         return slope.T @ precision @ slope, -slope.T @ precision @ deviation
 
-    def _precision(self, d: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _precision(self, d: Array, pose: Array) -> Array:
         """Return P at a model pose, shape (6, 6)."""
         M = mandible_metric(transform_points(pose, self.jaw.arrays["landmarks"]))
         # The derivative of the logarithm becomes that of the pose by the left Jacobian (Barfoot 2017, eq. 7.85).

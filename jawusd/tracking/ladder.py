@@ -6,10 +6,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, TRACKED
 from jawusd.geometry import make_transform, se3_exp, transform_points
+from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.history import FrameRecord, History
 from jawusd.tracking.quality import crown_sigma_mm, matched_px, residual_px, score_px, uncovered_px, view_residual_px
@@ -25,16 +25,16 @@ class _Trial:
     """Hold a solution with the mask pixels it leaves uncovered; arrays per row and view, shape (2, C)."""
 
     solution: Solution
-    bare_px: NDArray[np.float64]
-    mask_px: NDArray[np.float64]
-    use: NDArray[np.bool_]
+    bare_px: Array
+    mask_px: Array
+    use: Mask
 
     @property
-    def coverage(self) -> NDArray[np.float64]:
+    def coverage(self) -> Array:
         """Return E_SP over mask pixels, NaN without a mask."""
         return np.where(self.mask_px > 0, self.bare_px / np.maximum(self.mask_px, 1), np.nan)
 
-    def worth(self, price: float) -> NDArray[np.float64]:
+    def worth(self, price: float) -> Array:
         """Return what ranks poses, per row and view: contour that fits less the price of uncovered mask [px]."""
         return score_px(self.solution) - price * np.where(self.use, self.bare_px, 0.0)
 
@@ -49,9 +49,9 @@ class FrameTracker:
 
     def track(
         self,
-        starts: Sequence[NDArray[np.float64]],
+        starts: Sequence[Array],
         views: Sequence[View],
-        gallery: Sequence[NDArray[np.float64]] | None,
+        gallery: Sequence[Array] | None,
         reach_px: float = 0.0,
     ) -> FrameRecord:
         """Align one instant.
@@ -78,12 +78,12 @@ class FrameTracker:
             trial = self._try(trial.solution.poses, views, gates, kept)
         return self._record(first, trial)
 
-    def glance(self, start: NDArray[np.float64], views: Sequence[View], reach_px: float) -> FrameRecord:
+    def glance(self, start: Array, views: Sequence[View], reach_px: float) -> FrameRecord:
         """Align one instant from one prediction, shape (2, 4, 4), without the ladder; see `track`."""
         trial = self._begin(start, views, self._config.gates_from(reach_px))
         return self._record(trial, trial)
 
-    def _begin(self, start: NDArray[np.float64], views: Sequence[View], gates: Sequence[float]) -> _Trial:
+    def _begin(self, start: Array, views: Sequence[View], gates: Sequence[float]) -> _Trial:
         """Align once, and once more without masks that are spoiled."""
         use = np.array([[v.present[r] for v in views] for r in _ROWS])
         trial = self._try(start, views, gates, use)
@@ -102,33 +102,33 @@ class FrameTracker:
         solution = self._solver.solve(start, views, gates, use)
         return _Trial(solution, *uncovered_px(self._solver.scans, solution, views), use)
 
-    def _suspect(self, trial: _Trial) -> NDArray[np.bool_]:
+    def _suspect(self, trial: _Trial) -> Mask:
         """Tell which rows look worse than they lately did, shape (2,)."""
         return (self._scarce(trial) | self._rough(trial) | self._bare(trial).any(1)) & trial.use.any(1)
 
-    def _alarming(self, trial: _Trial) -> NDArray[np.bool_]:
+    def _alarming(self, trial: _Trial) -> Mask:
         """Tell which rows look so bad that closing lips alone do not explain it, shape (2,)."""
         bad = self._scarce(trial, self._config.alarming_score) | self._rough(trial) | self._bare(trial).any(1)
         return bad & trial.use.any(1)
 
-    def _uneven(self, trial: _Trial) -> NDArray[np.bool_]:
+    def _uneven(self, trial: _Trial) -> Mask:
         """Tell which rows are alarming or fit one view far worse than they usually fit, shape (2,)."""
         limit = self._config.uneven_residual * self.history.usual_residual()[:, None]
         return self._alarming(trial) | (trial.use & (view_residual_px(trial.solution) > limit)).any(1)
 
-    def _scarce(self, trial: _Trial, share: float | None = None) -> NDArray[np.bool_]:
+    def _scarce(self, trial: _Trial, share: float | None = None) -> Mask:
         share = self._config.suspect_score if share is None else share
         return score_px(trial.solution).sum(1) < share * self.history.usual_score().sum(1)
 
-    def _rough(self, trial: _Trial, factor: float = 1.0) -> NDArray[np.bool_]:
+    def _rough(self, trial: _Trial, factor: float = 1.0) -> Mask:
         limit = factor * self._config.suspect_residual * self.history.usual_residual()
         return ~(residual_px(trial.solution) < limit)
 
-    def _bare(self, trial: _Trial) -> NDArray[np.bool_]:
+    def _bare(self, trial: _Trial) -> Mask:
         """Tell which masks stay uncovered more than they lately did, shape (2, C)."""
         return trial.use & (trial.coverage - self.history.usual_coverage() > self._config.suspect_coverage)
 
-    def _spoiled(self, trial: _Trial, fewest: int) -> NDArray[np.bool_]:
+    def _spoiled(self, trial: _Trial, fewest: int) -> Mask:
         """Tell which masks the scan neither covers nor fits while it does at least so many others, shape (2, C)."""
         fit = score_px(trial.solution)
         dead = trial.use & (fit < self._config.dead_score * self.history.usual_score())
@@ -138,7 +138,7 @@ class FrameTracker:
                 wrong[r] = False  # it is the pose that is wrong, not so many masks
         return wrong
 
-    def _lost(self, trial: _Trial) -> NDArray[np.bool_]:
+    def _lost(self, trial: _Trial) -> Mask:
         """Tell which rows cannot be trusted, shape (2,)."""
         c = self._config
         few = matched_px(trial.solution) < c.least_matched_px
@@ -195,14 +195,14 @@ class FrameTracker:
                 trial = self._better(trial, self._try(poses, views, c.wide_gates_px, trial.use), only, views)
         return trial
 
-    def _brought_near(self, pose: NDArray[np.float64], r: int, views: Sequence[View], use: NDArray[np.bool_]):
+    def _brought_near(self, pose: Array, r: int, views: Sequence[View], use: Mask):
         """Return the pose moved onto its masks if they lie farther off than the search reaches."""
         shift = shift_to_masks(self._solver.scans[r], pose, r, views, use)
         if np.linalg.norm(shift) <= self._config.search_rings[0][0]:
             return pose
         return make_transform(np.eye(3), shift) @ pose
 
-    def _better(self, trial: _Trial, other: _Trial, rows: NDArray[np.bool_], views: Sequence[View]) -> _Trial:
+    def _better(self, trial: _Trial, other: _Trial, rows: Mask, views: Sequence[View]) -> _Trial:
         """Return the better of two poses of each of the given rows."""
         price = self._config.bare_price
         take = rows & (other.worth(price).sum(1) > trial.worth(price).sum(1))
@@ -214,9 +214,7 @@ class FrameTracker:
         return self._try(poses, views, self._config.wide_gates_px[-2:], trial.use)
 
 
-def _around(
-    pose: NDArray[np.float64], centre: NDArray[np.float64], rings: Sequence[tuple[float, float]]
-) -> Iterator[NDArray[np.float64]]:
+def _around(pose: Array, centre: Array, rings: Sequence[tuple[float, float]]) -> Iterator[Array]:
     """Yield a pose and, for each (mm, rad), the poses moved and turned both ways along each axis about a scan point."""
     yield pose
     c = transform_points(pose, centre)

@@ -10,12 +10,12 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.geometry.arrays import Array, Mask
+
 _SHORTEST_MM = 1e-3  # shorter pieces carry no direction
 
 
-def crown_gum_segments(
-    vertices: NDArray[np.float64], crown_faces: NDArray[np.int32], gum_faces: NDArray[np.int32]
-) -> NDArray[np.float64]:
+def crown_gum_segments(vertices: Array, crown_faces: NDArray[np.int32], gum_faces: NDArray[np.int32]) -> Array:
     """Return the segments in which crown triangles cut gum triangles.
 
     Args:
@@ -42,7 +42,7 @@ def crown_gum_segments(
     return segments[np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1) > _SHORTEST_MM]
 
 
-def _touching(triangles: NDArray, low: NDArray, high: NDArray) -> NDArray[np.bool_]:
+def _touching(triangles: NDArray, low: NDArray, high: NDArray) -> Mask:
     return (triangles.min(1) <= high).all(1) & (triangles.max(1) >= low).all(1)
 
 

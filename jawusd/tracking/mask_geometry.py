@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from jawusd.errors import TrackingError
 from jawusd.formats.capture import CameraSource
 from jawusd.geometry import Camera, triangulate
+from jawusd.geometry.arrays import Array
 from jawusd.imaging.masks import open_masks
 from jawusd.imaging.working_view import WorkingView
 
@@ -33,12 +34,12 @@ class MaskSurvey:
     """
 
     frames: NDArray[np.int64]
-    middles: NDArray[np.float64]
-    areas_px: NDArray[np.float64]
-    matrices: NDArray[np.float64]
-    eyes: NDArray[np.float64]
+    middles: Array
+    areas_px: Array
+    matrices: Array
+    eyes: Array
 
-    def places(self) -> NDArray[np.float64]:
+    def places(self) -> Array:
         """Return the world points seen at the middles of the masks [mm], NaN with fewer than two, shape (F, 2, 3)."""
         out = np.full((len(self.frames), 2, 3), np.nan)
         for f, r in np.ndindex(out.shape[:2]):

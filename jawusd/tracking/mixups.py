@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from jawusd.errors import CaptureError, TrackingError
 from jawusd.formats.capture import CameraSource, Masks
 from jawusd.geometry import transform_points
+from jawusd.geometry.arrays import Array
 from jawusd.imaging.raster import count_and_not, count_bits, draw_silhouette, pack_bits, project
 from jawusd.tracking.footage import Footage
 from jawusd.tracking.scan import Scan
@@ -77,7 +78,7 @@ def possible_mixups(sources: Sequence[CameraSource]) -> list[Mixup]:
     return out
 
 
-def likely_mixup(footage: Footage, solver: ContourSolver, poses: NDArray[np.float64], frame: int) -> Mixup | None:
+def likely_mixup(footage: Footage, solver: ContourSolver, poses: Array, frame: int) -> Mixup | None:
     """Return the exchange that explains masks far better which lie off their scans, with the evidence; None without.
 
     Args:
@@ -105,16 +106,14 @@ def likely_mixup(footage: Footage, solver: ContourSolver, poses: NDArray[np.floa
     return replace(mixup, finding=f"{mixup.finding}: {evidence}")
 
 
-def _bare_shares(
-    footage: Footage, solver: ContourSolver, poses: NDArray[np.float64], frame: int
-) -> NDArray[np.float64]:
+def _bare_shares(footage: Footage, solver: ContourSolver, poses: Array, frame: int) -> Array:
     """Return the share of each camera's masks that lies off their scans, NaN without a mask, shape (C,)."""
     centre = np.mean([transform_points(poses[r], solver.scans[r].centre) for r in _ROWS], axis=0)
     with footage.views(centre, solver.config.working_px_per_mm / 2) as masks:
         return np.array([_bare_share(view, solver.scans, poses) for view in masks.at(frame)])
 
 
-def _bare_share(view: View, scans: Sequence[Scan], poses: NDArray[np.float64]) -> float:
+def _bare_share(view: View, scans: Sequence[Scan], poses: Array) -> float:
     bare = total = 0
     for r in _ROWS:
         if view.present[r]:
@@ -123,7 +122,7 @@ def _bare_share(view: View, scans: Sequence[Scan], poses: NDArray[np.float64]) -
     return bare / total if total else np.nan
 
 
-def _crown_bits(view: View, scan: Scan, pose: NDArray[np.float64]) -> NDArray[np.uint64]:
+def _crown_bits(view: View, scan: Scan, pose: Array) -> NDArray[np.uint64]:
     """Return the silhouette of the crowns in a view as bit rows, shape (h, words)."""
     points = np.empty((len(scan.vertices), 3), np.float32)
     bits = np.zeros_like(pack_bits(view.masks[0]))

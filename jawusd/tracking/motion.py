@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections import deque
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.geometry import orthonormalise, se3_inverse, transform_points
+from jawusd.geometry.arrays import Array, Mask
 
 _GALLERY = 16  # earlier poses kept: enough to cover the exercises of a jaw at 2 mm
 _APART_MM = 2.0  # poses nearer than this have the same basin
@@ -17,7 +17,7 @@ _RECENT = 8  # frames over which prediction errors are remembered: a third of a 
 class Motion:
     """Extrapolate with constant velocity; keep a gallery of earlier poses for getting back after a loss."""
 
-    def __init__(self, poses: NDArray[np.float64], points: NDArray[np.float64]) -> None:
+    def __init__(self, poses: Array, points: Array) -> None:
         """Start at rest.
 
         Args:
@@ -27,12 +27,12 @@ class Motion:
         self._points = points
         self._misses: deque[float] = deque(maxlen=2 * _RECENT)  # two rows
         self._last = np.array(poses)
-        self._step: list[NDArray[np.float64] | None] = [None, None]
+        self._step: list[Array | None] = [None, None]
         self._lost_for = np.zeros(2, int)
         self._failures = np.zeros(2, int)
-        self._seen: list[NDArray[np.float64]] = []
+        self._seen: list[Array] = []
 
-    def predict(self) -> NDArray[np.float64]:
+    def predict(self) -> Array:
         """Return the expected T_world_upper, T_world_lower of the next frame, shape (2, 4, 4)."""
         out = self._last.copy()
         for r in (0, 1):
@@ -42,7 +42,7 @@ class Motion:
             out[1] = out[0] @ se3_inverse(self._last[0]) @ self._last[1]  # a lost jaw is carried along by the head
         return orthonormalise(out)
 
-    def starts(self) -> list[NDArray[np.float64]]:
+    def starts(self) -> list[Array]:
         """Return predictions for the next frame, the likeliest first: going on as before, at rest, and half way."""
         moving = self.predict()
         if self._step[0] is None and self._step[1] is None:
@@ -50,9 +50,7 @@ class Motion:
         half = orthonormalise(0.5 * (moving + self._last))
         return [moving, self._last.copy(), half]
 
-    def update(
-        self, poses: NDArray[np.float64], found: NDArray[np.bool_], seen: NDArray[np.bool_], guessed: bool = False
-    ) -> None:
+    def update(self, poses: Array, found: Mask, seen: Mask, guessed: bool = False) -> None:
         """Take in the next frame; rows not found keep their predictions, or go where they are guessed.
 
         Args:
@@ -85,7 +83,7 @@ class Motion:
         """Return the largest recent error of a prediction at the given points [mm]."""
         return max(self._misses, default=0.0)
 
-    def remember(self, poses: NDArray[np.float64], found: NDArray[np.bool_]) -> None:
+    def remember(self, poses: Array, found: Mask) -> None:
         """Keep poses of both rows, shape (2, 4, 4), as later starts if they are unlike those kept."""
         if not found.all():
             return
@@ -102,7 +100,7 @@ class Motion:
         failures = int(self._failures.max())
         return failures & (failures - 1) == 0 or failures % 16 == 0
 
-    def gallery(self) -> list[NDArray[np.float64]]:
+    def gallery(self) -> list[Array]:
         """Return earlier poses as starts for the next frame: the jaw relative to where the head is now."""
         head = self.predict()[0]
         return [np.stack([p[0], head @ se3_inverse(p[0]) @ p[1]]) for p in self._seen]

@@ -6,10 +6,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.formats.tracks import LOST
 from jawusd.geometry import make_transform, se3_exp, se3_inverse, se3_log
+from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.extrinsics import Extrinsics, lever
 from jawusd.tracking.history import FrameRecord
@@ -27,12 +27,12 @@ class Nuisances:
         shift_px: rms distance by which the twists shift contours beyond what poses of the teeth make up for.
     """
 
-    delays: NDArray[np.float64]
-    bias_px: NDArray[np.float64]
-    sigma_delays: NDArray[np.float64]
-    sigma_bias_px: NDArray[np.float64]
-    twists: NDArray[np.float64]
-    sigma_twists: NDArray[np.float64]
+    delays: Array
+    bias_px: Array
+    sigma_delays: Array
+    sigma_bias_px: Array
+    twists: Array
+    sigma_twists: Array
     shift_px: float = 0.0
 
     def plus(self, more: Nuisances) -> Nuisances:
@@ -75,7 +75,7 @@ class TakeEquations:
     def __init__(
         self,
         records: Mapping[int, FrameRecord],
-        variance_px3: NDArray[np.float64],
+        variance_px3: Array,
         extrinsics: Extrinsics,
         frames: Iterable[int] | None = None,
     ) -> None:
@@ -135,7 +135,7 @@ class TakeEquations:
         )
 
 
-def leads(records: Mapping[int, FrameRecord], frame: int, delays: NDArray[np.float64]) -> NDArray[np.float64]:
+def leads(records: Mapping[int, FrameRecord], frame: int, delays: Array) -> Array:
     """Return the motion of both rows from the reference instant to each camera's own, shape (C, 2, 4, 4)."""
     out = np.tile(np.eye(4), (len(delays), 2, 1, 1))
     for row in (0, 1):
@@ -149,7 +149,7 @@ def leads(records: Mapping[int, FrameRecord], frame: int, delays: NDArray[np.flo
     return out
 
 
-def _reduced(solution, velocity, row: int, pivot) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+def _reduced(solution, velocity, row: int, pivot) -> tuple[Array, Array, float]:
     """Return one frame's part of the normal equations, the pose eliminated, and the weight of its samples."""
     systems = solution.systems[row]
     C = len(systems)
@@ -170,7 +170,7 @@ def _reduced(solution, velocity, row: int, pivot) -> tuple[NDArray[np.float64], 
     return S - B.T @ eliminated[:, :-1], r - B.T @ eliminated[:, -1], float(systems[:, 6, 6].sum())
 
 
-def velocity_twist(records: Mapping[int, FrameRecord], frame: int, row: int) -> NDArray[np.float64] | None:
+def velocity_twist(records: Mapping[int, FrameRecord], frame: int, row: int) -> Array | None:
     """Return the twist per frame about the row's centre, shape (6,); None without tracked frames before and after."""
     around = [records.get(f) for f in (frame - 1, frame, frame + 1)]
     if any(r is None or r.status[row] == LOST for r in around):
@@ -184,9 +184,7 @@ def velocity_twist(records: Mapping[int, FrameRecord], frame: int, row: int) -> 
 _BRIDGE_FRAMES = 6  # a quarter of a second at 24 fps: jaws turn round in less than two of these
 
 
-def bridge(
-    records: Mapping[int, FrameRecord], frame: int, row: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+def bridge(records: Mapping[int, FrameRecord], frame: int, row: int) -> tuple[Array, Array] | None:
     """Return a row's pose (4, 4) and twist per frame about its centre (6,), going evenly between tracked frames.
 
     None without tracked frames close by on both sides.

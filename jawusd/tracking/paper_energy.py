@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from jawusd.errors import TrackingError
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import transform_points
+from jawusd.geometry.arrays import Array, Mask
 from jawusd.imaging.meshio import BOUNDARY, GUM, tooth_labels, winding
 from jawusd.tracking.solver import View
 
@@ -22,10 +23,10 @@ _FARTHEST_PX = 1024  # that the buffer reaches beyond the masks, wherever the se
 class PixelCounter(Protocol):
     """Draw a scan and count pixels: `imaging.pixel_counts.RasterCounter` or `imaging.gl.GlCounter`."""
 
-    def show(self, matrices: NDArray[np.float64], masks: NDArray[np.bool_], free: NDArray[np.bool_]) -> None:
+    def show(self, matrices: Array, masks: Mask, free: Mask) -> None:
         """Set the pictures of one instant: matrices (C, 3, 4), masks and free (C, h, w)."""
 
-    def counts(self, poses: NDArray[np.float64]) -> NDArray[np.int64]:
+    def counts(self, poses: Array) -> NDArray[np.int64]:
         """Return E_SP and E_BND of poses (N, 4, 4) in every view, shape (N, C, 2)."""
 
 
@@ -41,11 +42,11 @@ class PaperScan:
         centre: centroid of the teeth [mm], shape (3,).
     """
 
-    vertices: NDArray[np.float64]
+    vertices: Array
     plain_faces: NDArray[np.int32]
     boundary_faces: NDArray[np.int32]
     cull: bool
-    centre: NDArray[np.float64]
+    centre: Array
 
 
 def paper_scan(mesh: Mesh, name: str) -> PaperScan:
@@ -104,7 +105,7 @@ class PaperEnergy:
         self._counter, self._scan, self._weight = counter, scan, boundary_weight
         self.evaluations = 0
 
-    def show(self, views: Sequence[View], row: int, start: NDArray[np.float64], other_row_hides: bool) -> None:
+    def show(self, views: Sequence[View], row: int, start: Array, other_row_hides: bool) -> None:
         """Set the masks of one instant.
 
         Args:
@@ -127,7 +128,7 @@ class PaperEnergy:
         self.mask_px = masks.sum((1, 2))
         self._counter.show(matrices, masks, free)
 
-    def _box(self, view: View, start: NDArray[np.float64]) -> NDArray[np.int64]:
+    def _box(self, view: View, start: Array) -> NDArray[np.int64]:
         """Return x0, y0, x1, y1 [px] around a view's masks and the scan where it starts; x0, y0 are at most 0."""
         vertices = self._scan.vertices[np.unique(self._scan.boundary_faces)]
         h = transform_points(start, vertices) @ view.matrix[:, :3].T + view.matrix[:, 3]
@@ -137,12 +138,12 @@ class PaperEnergy:
         high = np.clip(np.ceil(seen.max(0)) + _MARGIN_PX, size, size + _FARTHEST_PX)
         return np.concatenate([low, high]).astype(np.int64)
 
-    def __call__(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    def __call__(self, poses: Array) -> Array:
         """Return E = E_SP + lambda E_BND (eq. 7), summed over the views (eq. 6), of poses (N, 4, 4), shape (N,)."""
         self.evaluations += len(poses)
         counts = self._counter.counts(poses).sum(1)
         return counts[:, 0] + self._weight * counts[:, 1]
 
-    def uncovered_px(self, pose: NDArray[np.float64]) -> NDArray[np.int64]:
+    def uncovered_px(self, pose: Array) -> NDArray[np.int64]:
         """Return E_SP (eq. 8) of a pose (4, 4) per view, shape (C,)."""
         return self._counter.counts(pose[None])[0, :, 0]

@@ -15,6 +15,7 @@ from jawusd.formats.capture import Capture
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import LOST, PARTIAL, TRACKED, Tracks
 from jawusd.geometry import LANDMARKS, Camera, relative_pose, transform_points
+from jawusd.geometry.arrays import Array
 from jawusd.imaging.pixel_counts import RasterCounter
 from jawusd.tracking.bootstrap import pose_from_picks
 from jawusd.tracking.paper_energy import PaperEnergy, PaperScan, paper_scan
@@ -32,9 +33,9 @@ Backend = Literal["cpu", "gl"]
 class _Record:
     """Hold one instant: poses (2, 4, 4), status (2,), coverage error (2, C)."""
 
-    poses: NDArray[np.float64]
+    poses: Array
     status: NDArray[np.int8]
-    coverage: NDArray[np.float64]
+    coverage: Array
 
 
 def track_capture_paper(
@@ -99,7 +100,7 @@ def track_capture_paper(
     return _assembled(records, names, {**notes, "tracking": asdict(config)})
 
 
-def _start_poses(capture: Capture, cameras: Mapping[str, Camera], meshes: tuple[Mesh, Mesh]) -> NDArray[np.float64]:
+def _start_poses(capture: Capture, cameras: Mapping[str, Camera], meshes: tuple[Mesh, Mesh]) -> Array:
     """Return T_world_upper, T_world_lower from the picks, shape (2, 4, 4)."""
     if capture.bootstrap is None:
         raise TrackingError(
@@ -137,7 +138,7 @@ def _instant(
     energies: Sequence[PaperEnergy],
     scans: Sequence[PaperScan],
     config: PaperConfig,
-    last: NDArray[np.float64],
+    last: Array,
     views: Sequence[View],
 ) -> _Record:
     """Align both rows, each by itself; a row without enough masks keeps its pose and counts as lost."""

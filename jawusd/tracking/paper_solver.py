@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.geometry import orthonormalise, transform_points
+from jawusd.geometry.arrays import Array
 
 _GOLDEN = (np.sqrt(5) - 1) / 2
 
-Energy = Callable[[NDArray[np.float64]], NDArray[np.float64]]
-Line = Callable[[list[float]], NDArray[np.float64]]
+Energy = Callable[[Array], Array]
+Line = Callable[[list[float]], Array]
 
 
 @dataclass(frozen=True)
@@ -63,14 +64,12 @@ class PaperSolution:
         rounds: rounds of rotation and translation.
     """
 
-    pose: NDArray[np.float64]
+    pose: Array
     energy: float
     rounds: int
 
 
-def solve_paper(
-    energy: Energy, start: NDArray[np.float64], centre: NDArray[np.float64], config: PaperConfig
-) -> PaperSolution:
+def solve_paper(energy: Energy, start: Array, centre: Array, config: PaperConfig) -> PaperSolution:
     """Minimise the energy of one row of teeth at one instant.
 
     The six numbers are those of eq. 6, R = Rz(theta_z) Ry(theta_y) Rx(theta_x) and t, taken from the start: zero is
@@ -83,7 +82,7 @@ def solve_paper(
         config: the method's numbers.
     """
 
-    def at(parameters: NDArray[np.float64]) -> NDArray[np.float64]:
+    def at(parameters: Array) -> Array:
         return energy(_poses(start, centre, parameters))
 
     best, lowest = np.zeros(6), float(at(np.zeros((1, 6)))[0])
@@ -105,9 +104,7 @@ def solve_paper(
     return PaperSolution(_poses(start, centre, best[None])[0], lowest, rounds)
 
 
-def _descend(
-    at: Energy, best: NDArray[np.float64], lowest: float, block: slice, config: PaperConfig
-) -> tuple[NDArray[np.float64], float]:
+def _descend(at: Energy, best: Array, lowest: float, block: slice, config: PaperConfig) -> tuple[Array, float]:
     """Take one step in rotation or in translation; return the better of the two ends with its energy."""
     rotation = block.start == 0
     step = config.difference_rad if rotation else config.difference_mm
@@ -153,7 +150,7 @@ def golden_section(line: Line, reach: float, tolerance: float) -> tuple[float, f
     return (a, at_a) if at_a <= at_b else (b, at_b)
 
 
-def _poses(start: NDArray[np.float64], centre: NDArray[np.float64], parameters: NDArray) -> NDArray[np.float64]:
+def _poses(start: Array, centre: Array, parameters: NDArray) -> Array:
     """Return T_world_scan of (N, 6) angles and translations from the start, shape (N, 4, 4)."""
     cx, cy, cz = np.cos(parameters[:, :3]).T
     sx, sy, sz = np.sin(parameters[:, :3]).T

@@ -16,6 +16,7 @@ from scipy import fft, ndimage
 
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import make_transform, so3_exp, transform_points
+from jawusd.geometry.arrays import Array
 from jawusd.imaging.raster import draw_depth_labels, project
 from jawusd.tracking.contour import CROWN, GUM
 from jawusd.tracking.scan import Scan, prepare_scan
@@ -37,20 +38,20 @@ class Grid:
         step_mm: distance of the translations.
     """
 
-    yaw_rad: NDArray[np.float64]
-    pitch_rad: NDArray[np.float64]
-    roll_rad: NDArray[np.float64]
+    yaw_rad: Array
+    pitch_rad: Array
+    roll_rad: Array
     reach_mm: tuple[float, float, float]
     step_mm: float = 1.5
 
-    def turns(self) -> Iterable[NDArray[np.float64]]:
+    def turns(self) -> Iterable[Array]:
         """Yield the rotations to be tried, shape (3, 3)."""
         for yaw in self.yaw_rad:
             for pitch in self.pitch_rad:
                 for roll in self.roll_rad:
                     yield so3_exp([0, yaw, 0]) @ so3_exp([pitch, 0, 0]) @ so3_exp([0, 0, roll])
 
-    def shifts(self) -> NDArray[np.float64]:
+    def shifts(self) -> Array:
         """Return the translations to be tried along left, up and front [mm], shape (N, 3)."""
         axes = [np.arange(-r, r + self.step_mm / 2, self.step_mm) for r in self.reach_mm]
         return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -61,7 +62,7 @@ class Candidate:
     """Hold one pose that the search found promising: its worth [px] and T_world_row, shape (4, 4)."""
 
     worth: float
-    pose: NDArray[np.float64]
+    pose: Array
 
 
 def coarse_scan(mesh: Mesh, name: str) -> Scan:
@@ -78,7 +79,7 @@ def coarse_scan(mesh: Mesh, name: str) -> Scan:
 class _Screen:
     """Tell what the drawn row is worth in one picture at every shift."""
 
-    def __init__(self, view: View, row: int, px_per_mm: float, shifts: NDArray[np.float64], at: NDArray) -> None:
+    def __init__(self, view: View, row: int, px_per_mm: float, shifts: Array, at: NDArray) -> None:
         """Prepare the correlation.
 
         Args:
@@ -103,7 +104,7 @@ class _Screen:
         self._matrix = np.array([[1, 0, right - x[0]], [0, 1, down - y[0]], [0, 0, 1.0]]) @ view.matrix
         self._columns, self._rows = (pixels % self._full[::-1]).T
 
-    def worth(self, scan: Scan, pose: NDArray[np.float64]) -> NDArray[np.float32]:
+    def worth(self, scan: Scan, pose: Array) -> NDArray[np.float32]:
         """Return the worth of a pose under all shifts [px], shape (N,)."""
         points = np.empty((len(scan.vertices), 3), np.float32)
         project(scan.vertices_single, (self._matrix @ pose).astype(np.float32), points)
@@ -119,8 +120,8 @@ def search_row(
     row: int,
     views: Sequence[View],
     px_per_mm: float,
-    base: NDArray[np.float64],
-    hinge: NDArray[np.float64],
+    base: Array,
+    hinge: Array,
     grid: Grid,
     map_: Callable[..., Iterable] = map,
 ) -> list[Candidate]:
@@ -140,7 +141,7 @@ def search_row(
     shifts = grid.shifts() @ base[:3, :3].T
     screens = [_Screen(view, row, px_per_mm, shifts, base[:3, 3]) for view in views if view.present[row]]
 
-    def look(turn: NDArray[np.float64]) -> Candidate:
+    def look(turn: Array) -> Candidate:
         pose = base @ make_transform(turn, np.zeros(3)) @ hinge
         worth = sum(screen.worth(scan, pose) for screen in screens)
         best = int(worth.argmax())
@@ -149,7 +150,7 @@ def search_row(
     return sorted(map_(look, grid.turns()), key=lambda c: -c.worth)
 
 
-def _template(mask: NDArray[np.uint8], other: NDArray[np.uint8], px_per_mm: float) -> NDArray[np.float64]:
+def _template(mask: NDArray[np.uint8], other: NDArray[np.uint8], px_per_mm: float) -> Array:
     """Return the picture whose correlation with the drawn crowns is their worth, up to a constant [px].
 
     Worth is the length of outline that lies on the mask's outline, less a price of uncovered mask pixels. The first is
@@ -165,13 +166,13 @@ def _template(mask: NDArray[np.uint8], other: NDArray[np.uint8], px_per_mm: floa
     return edges + _BARE_PRICE / px_per_mm * inside
 
 
-def _slope(matrix: NDArray[np.float64], point: NDArray[np.float64]) -> NDArray[np.float64]:
+def _slope(matrix: Array, point: Array) -> Array:
     """Return the derivative of the pixel by the world point, shape (2, 3)."""
     h = matrix @ np.append(point, 1.0)
     return (matrix[:2, :3] - (h[:2] / h[2])[:, None] * matrix[2, :3]) / h[2]
 
 
-def hinge_at_front(crowns: NDArray[np.float64], T_anatomical_scan: NDArray[np.float64]) -> NDArray[np.float64]:
+def hinge_at_front(crowns: Array, T_anatomical_scan: Array) -> Array:
     """Return the anatomical frame of a row, moved to the middle of its front teeth, shape (4, 4).
 
     Args:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.geometry import hat, make_transform, mandible_metric, se3_adjoint, se3_inverse, transform_points
+from jawusd.geometry.arrays import Array
 from jawusd.imaging.raster import count_and_not, count_bits, draw_silhouette, pack_bits, project
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.scan import Scan
@@ -17,24 +17,24 @@ from jawusd.tracking.solver import Solution, View, WeighedPrior
 _TUKEY_VARIANCE = 0.828
 
 
-def score_px(solution: Solution) -> NDArray[np.float64]:
+def score_px(solution: Solution) -> Array:
     """Return the contour length that fits its mask edges, closeness counted, per row and view [px], shape (2, C)."""
     return solution.systems[:, :, 6, 0]
 
 
-def matched_px(solution: Solution) -> NDArray[np.float64]:
+def matched_px(solution: Solution) -> Array:
     """Return the matched contour length per row [px], shape (2,)."""
     return solution.systems[:, :, 7, 7].sum(1)
 
 
-def residual_px(solution: Solution) -> NDArray[np.float64]:
+def residual_px(solution: Solution) -> Array:
     """Return the standard deviation of the matched residuals per row [px], shape (2,); NaN without a match."""
     total = solution.systems.sum(1)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.sqrt(total[:, 7, 6] / total[:, 6, 6] / _TUKEY_VARIANCE)
 
 
-def view_residual_px(solution: Solution) -> NDArray[np.float64]:
+def view_residual_px(solution: Solution) -> Array:
     """Return the standard deviation of the matched residuals per row and view [px], shape (2, C); NaN without any."""
     weight, square = solution.systems[:, :, 6, 6], solution.systems[:, :, 7, 6]
     out = np.full(weight.shape, np.nan)
@@ -42,9 +42,7 @@ def view_residual_px(solution: Solution) -> NDArray[np.float64]:
     return np.sqrt(out)
 
 
-def uncovered_px(
-    scans: Sequence[Scan], solution: Solution, views: Sequence[View]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def uncovered_px(scans: Sequence[Scan], solution: Solution, views: Sequence[View]) -> tuple[Array, Array]:
     """Return E_SP of paper eq. 8, the mask pixels that the projected crowns leave uncovered, and all mask pixels.
 
     Returns:
@@ -64,7 +62,7 @@ def uncovered_px(
     return bare, total
 
 
-def row_fit(scans: Sequence[Scan], solution: Solution, views: Sequence[View], bare_price: float) -> NDArray[np.float64]:
+def row_fit(scans: Sequence[Scan], solution: Solution, views: Sequence[View], bare_price: float) -> Array:
     """Return how much of a row's visible contour fits its masks, less the price of uncovered mask, shape (2,) [-].
 
     The median over the views, so that one spoiled mask of three does not count; -inf where nothing is visible.
@@ -85,7 +83,7 @@ def row_fit(scans: Sequence[Scan], solution: Solution, views: Sequence[View], ba
     return out
 
 
-def twist_covariance(solution: Solution, row: int, sigma_px: float, correlation_px: float) -> NDArray[np.float64]:
+def twist_covariance(solution: Solution, row: int, sigma_px: float, correlation_px: float) -> Array:
     """Return the covariance of a row's left twist about the world origin, sigma^2 l H^-1, shape (6, 6).
 
     Args:
@@ -106,9 +104,7 @@ def twist_covariance(solution: Solution, row: int, sigma_px: float, correlation_
     return A @ (sigma_px**2 * correlation_px * np.linalg.inv(H)) @ A.T
 
 
-def joint_covariance(
-    solution: Solution, prior: WeighedPrior, sigma_px: NDArray[np.float64], correlation_px: float
-) -> NDArray[np.float64] | None:
+def joint_covariance(solution: Solution, prior: WeighedPrior, sigma_px: Array, correlation_px: float) -> Array | None:
     """Return the covariance of both rows' left twists about the world origin given masks and prior, shape (12, 12).
 
     Args:
@@ -134,7 +130,7 @@ def joint_covariance(
     return scale[:, None] * np.linalg.inv(scaled) * scale
 
 
-def correlation_px(solution: Solution, config: TrackingConfig) -> NDArray[np.float64]:
+def correlation_px(solution: Solution, config: TrackingConfig) -> Array:
     """Return the contour length over which outline errors move together, as this frame shows it, shape (2,).
 
     tr(H^-1 S) / (6 sigma^2) with the scatter S of tiles is that length, but for the configured factor; NaN without a
@@ -160,9 +156,7 @@ def crown_sigma_mm(scan: Scan, solution: Solution, row: int, config: TrackingCon
     return float(np.sqrt(np.trace(mandible_metric(points) @ covariance)))
 
 
-def relative_covariance(
-    T_world_upper: NDArray[np.float64], covariance_upper: NDArray[np.float64], covariance_lower: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def relative_covariance(T_world_upper: Array, covariance_upper: Array, covariance_lower: Array) -> Array:
     """Return the covariance of the left twist of T_upper_lower about the skull origin, shape (..., 6, 6).
 
     T_true = T_u^-1 exp(x_l - x_u) T_u T to first order, so the twist is Ad(T_u^-1)(x_l - x_u); the rows' errors are
@@ -172,9 +166,7 @@ def relative_covariance(
     return A @ (covariance_upper + covariance_lower) @ np.swapaxes(A, -1, -2)
 
 
-def landmark_sigmas(
-    T_upper_lower: NDArray[np.float64], covariance: NDArray[np.float64], landmarks: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def landmark_sigmas(T_upper_lower: Array, covariance: Array, landmarks: Array) -> Array:
     """Return the standard deviation of the landmarks' position in the skull frame [mm], shape (..., L).
 
     Args:

@@ -5,17 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.geometry import transform_points
+from jawusd.geometry.arrays import Array, Mask
 from jawusd.imaging.raster import draw_silhouette, project, unpack_bits, words_for
 from jawusd.tracking.scan import Scan
 from jawusd.tracking.solver import View
 
 
-def shift_to_masks(
-    scan: Scan, pose: NDArray[np.float64], row: int, views: Sequence[View], use: NDArray[np.bool_]
-) -> NDArray[np.float64]:
+def shift_to_masks(scan: Scan, pose: Array, row: int, views: Sequence[View], use: Mask) -> Array:
     """Return the translation across the line of sight that brings the crowns' middle onto that of their masks [mm].
 
     Lips hide the back teeth, and others in every view, so the depth found would be wrong by a centimetre or two: it
@@ -57,7 +55,7 @@ def shift_to_masks(
     return across.T @ np.linalg.solve(across @ H @ across.T, across @ g)
 
 
-def _middle(picture: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _middle(picture: Mask) -> Array:
     """Return the mean position (x, y) of the set pixels, shape (2,)."""
     rows, columns = np.nonzero(picture)
     return np.array([columns.mean(), rows.mean()])

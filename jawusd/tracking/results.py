@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from dataclasses import asdict
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.formats.tracks import LOST, Tracks
 from jawusd.geometry import relative_pose
+from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.extrinsics import Extrinsics
 from jawusd.tracking.history import FrameRecord
@@ -28,7 +28,7 @@ from jawusd.tracking.smoothing import smooth_poses
 def assemble(
     records: Mapping[int, FrameRecord],
     camera_names: tuple[str, ...],
-    landmarks: NDArray[np.float64],
+    landmarks: Array,
     nuisances: Nuisances,
     extrinsics: Extrinsics,
     config: TrackingConfig,
@@ -94,7 +94,7 @@ def assemble(
     )
 
 
-def outline_variance(records: Mapping[int, FrameRecord], config: TrackingConfig) -> NDArray[np.float64]:
+def outline_variance(records: Mapping[int, FrameRecord], config: TrackingConfig) -> Array:
     """Return the variance times correlation length of the outline errors per row [px^3], shape (2,)."""
     residual = np.stack([np.where(r.status != LOST, residual_px(r.solution), np.nan) for r in records.values()])
     typical = np.full(2, config.typical_noise_px3)
@@ -112,7 +112,7 @@ def take_correlation_px(records: Mapping[int, FrameRecord], config: TrackingConf
     return float(np.median(values)) if len(values) else config.correlation_px
 
 
-def _covariances(records: list[FrameRecord], correlation: float) -> NDArray[np.float64]:
+def _covariances(records: list[FrameRecord], correlation: float) -> Array:
     """Return the covariance of both rows' left twists, NaN where lost, shape (F, 2, 6, 6)."""
     out = np.full((len(records), 2, 6, 6), np.nan)
     for k, record in enumerate(records):
@@ -122,7 +122,7 @@ def _covariances(records: list[FrameRecord], correlation: float) -> NDArray[np.f
     return out
 
 
-def _relative(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+def _relative(poses: Array) -> Array:
     """Return T_upper_lower, NaN where a row is lost, shape (F, 4, 4)."""
     out = np.full((len(poses), 4, 4), np.nan)
     both = np.isfinite(poses).all((1, 2, 3))
@@ -130,7 +130,7 @@ def _relative(poses: NDArray[np.float64]) -> NDArray[np.float64]:
     return out
 
 
-def _relative_covariance(poses: NDArray[np.float64], covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+def _relative_covariance(poses: Array, covariance: Array) -> Array:
     """Return the covariance of T_upper_lower's left twist, NaN where a row is lost, shape (F, 6, 6)."""
     out = np.full((len(poses), 6, 6), np.nan)
     both = np.isfinite(poses).all((1, 2, 3))

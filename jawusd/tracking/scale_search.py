@@ -10,12 +10,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.errors import TrackingError
 from jawusd.formats.capture import Capture
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera, transform_points
+from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.footage import Footage
 from jawusd.tracking.quality import row_fit, score_px, uncovered_px
@@ -96,7 +96,7 @@ class _Sizes:
         sources = masked_sources(self._capture.cameras, cameras, self._offsets)
         return Footage(sources, cameras, self._offsets, self._capture.frames)
 
-    def climb(self, frame: int, size: float, poses: NDArray[np.float64]) -> tuple[float, float]:
+    def climb(self, frame: int, size: float, poses: Array) -> tuple[float, float]:
         """Return the size at which the fit is best, going uphill from given poses, and the fit of the worse row."""
         worth, fit, poses = self._fitted(frame, size, poses, size)
         beside = {}
@@ -118,9 +118,7 @@ class _Sizes:
             size *= (1 + _STEPS[-1]) ** (0.5 * (beside[-1] - beside[1]) / bend if bend < 0 else 0.0)
         return size, fit
 
-    def _fitted(
-        self, frame: int, size: float, poses: NDArray[np.float64], size_of_poses: float
-    ) -> tuple[float, float, NDArray[np.float64]]:
+    def _fitted(self, frame: int, size: float, poses: Array, size_of_poses: float) -> tuple[float, float, Array]:
         """Return worth, fit of the worse row and poses, aligned from poses found at another size."""
         scans, config = self._solver.scans, self._solver.config
         start = poses.copy()

@@ -11,6 +11,7 @@ from scipy.sparse.csgraph import connected_components
 
 from jawusd.errors import TrackingError
 from jawusd.formats.mesh import Mesh
+from jawusd.geometry.arrays import Array
 from jawusd.imaging.meshio import tooth_labels
 from jawusd.tracking.decimation import thinned
 from jawusd.tracking.margin import crown_gum_segments
@@ -44,20 +45,20 @@ class Scan:
     """
 
     name: str
-    vertices: NDArray[np.float64]
+    vertices: Array
     vertices_single: NDArray[np.float32]
     crown_faces: NDArray[np.int32]
     gum_faces: NDArray[np.int32]
-    planes: NDArray[np.float64]
+    planes: Array
     edges: NDArray[np.int32]
-    margin: NDArray[np.float64]
-    probes: NDArray[np.float64]
-    centre: NDArray[np.float64]
+    margin: Array
+    probes: Array
+    centre: Array
     radius_mm: float
     painted: bool
     thin: Scan | None = None
 
-    def crown_vertices(self, limit: int | None = None) -> NDArray[np.float64]:
+    def crown_vertices(self, limit: int | None = None) -> Array:
         """Return the vertices of the crowns [mm], shape (N, 3), at most about `limit` of them."""
         points = self.vertices[np.unique(self.crown_faces)]
         return points if limit is None else points[:: max(1, len(points) // limit)]
@@ -98,7 +99,7 @@ def prepare_scan(mesh: Mesh, name: str) -> Scan:
 
 def _with_tables(
     name: str,
-    vertices: NDArray[np.float64],
+    vertices: Array,
     crown_faces: NDArray[np.int32],
     gum_faces: NDArray[np.int32],
     painted: bool,
@@ -124,13 +125,13 @@ def _with_tables(
     )
 
 
-def _weld(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> tuple[NDArray, NDArray[np.int32]]:
+def _weld(vertices: Array, faces: NDArray[np.int32]) -> tuple[NDArray, NDArray[np.int32]]:
     """Merge vertices at the same place: triangle soups would otherwise consist of borders only."""
     unique, inverse = np.unique(vertices, axis=0, return_inverse=True)
     return np.ascontiguousarray(unique), np.ascontiguousarray(inverse.reshape(-1)[faces], np.int32)
 
 
-def _wound_outwards(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> NDArray[np.int32]:
+def _wound_outwards(vertices: Array, faces: NDArray[np.int32]) -> NDArray[np.int32]:
     """Return the faces with those connected pieces turned round that enclose a negative volume.
 
     Volumes are taken about each piece's own centre, so the open base of a crown adds little.

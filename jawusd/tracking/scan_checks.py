@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from jawusd.errors import TrackingError
 from jawusd.geometry import anatomical_frame, transform_points
+from jawusd.geometry.arrays import Array
 from jawusd.tracking.scan import Scan
 
 # Teeth in occlusion touch. Scans taken slightly open, or a bite registered carelessly, stay within the first limit;
@@ -25,9 +26,7 @@ _LEAST_HEIGHT_MM = 2.5
 _SHARE = 0.005  # of the crown vertices that may be exceptions
 
 
-def check_occlusion(
-    scans: Sequence[Scan], T_anatomical_scan: ArrayLike | None
-) -> tuple[NDArray[np.float64], list[str]]:
+def check_occlusion(scans: Sequence[Scan], T_anatomical_scan: ArrayLike | None) -> tuple[Array, list[str]]:
     """Check that both rows of teeth lie in one frame, in occlusion.
 
     Args:
@@ -89,7 +88,7 @@ def check_occlusion(
     return T, findings
 
 
-def _gum_side(scan: Scan, up: NDArray[np.float64]) -> float:
+def _gum_side(scan: Scan, up: Array) -> float:
     """Return on which side of its crowns a row has its gum: 1 towards `up`, -1 away from it, 0 if it has none."""
     if not scan.painted or not len(scan.gum_faces):
         return 0.0
@@ -97,7 +96,7 @@ def _gum_side(scan: Scan, up: NDArray[np.float64]) -> float:
     return float(np.sign(up @ (gum - crowns)))
 
 
-def _gap_mm(crowns: Sequence[NDArray[np.float64]]) -> float:
+def _gap_mm(crowns: Sequence[Array]) -> float:
     """Return the distance of the vertices that are closest to the other row [mm]."""
     distance = cKDTree(crowns[0]).query(crowns[1])[0]
     return float(np.quantile(distance, _SHARE))
@@ -119,16 +118,16 @@ def _overlap_mm(scans: Sequence[Scan]) -> float:
     return float(np.quantile(inside, 1.0 - _SHARE))
 
 
-def _thin_direction(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _thin_direction(points: Array) -> Array:
     """Return the direction in which a row of teeth extends least, shape (3,)."""
     return np.linalg.svd(points - points.mean(0), full_matrices=False)[2][2]
 
 
-def _midline(points: NDArray[np.float64]) -> float:
+def _midline(points: Array) -> float:
     """Return the middle of an arch from side to side [mm]."""
     return float(np.percentile(points[:, 0], [1, 99]).mean())
 
 
-def _width(points: NDArray[np.float64]) -> float:
+def _width(points: Array) -> float:
     low, high = np.percentile(points[:, 0], [1, 99])
     return float(high - low)

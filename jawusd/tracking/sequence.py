@@ -7,12 +7,12 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.formats.capture import Capture
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, Tracks
 from jawusd.geometry import Camera, transform_points
+from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.extrinsics import Extrinsics
 from jawusd.tracking.first import first_record
@@ -39,7 +39,7 @@ def track_capture(
     offsets: Mapping[str, int],
     upper: Mesh,
     lower: Mesh,
-    landmarks: NDArray[np.float64],
+    landmarks: Array,
     config: TrackingConfig | None = None,
     *,
     threads: int = 2,
@@ -108,7 +108,7 @@ class _Take:
         self._probes = np.stack([s.probes[np.linspace(0, len(s.probes) - 1, 12).astype(int)] for s in solver.scans])
         self.records: dict[int, FrameRecord] = {}
 
-    def begin(self, frame: int, poses: NDArray[np.float64]) -> None:
+    def begin(self, frame: int, poses: Array) -> None:
         """Align the bootstrap frame from the pick poses."""
         self.records[frame] = first_record(self._solver, self._config, poses, self._masks, frame)
         self._progress(1, self._stop - self._first)
@@ -160,7 +160,7 @@ class _Take:
     def _equations(self, extrinsics: Extrinsics) -> TakeEquations:
         return TakeEquations(self.records, outline_variance(self.records, self._config), extrinsics)
 
-    def _middle(self) -> NDArray[np.float64]:
+    def _middle(self) -> Array:
         """Return a point amid the teeth, world coordinates [mm], shape (3,)."""
         return np.median([r.solution.centres for r in self.records.values()], axis=(0, 1))
 
@@ -232,7 +232,7 @@ def _put_right(
     return [replace(v, lead=m, bias_px=nuisances.bias_px) for v, m in zip(views, moved, strict=True)]
 
 
-def _starts_again(records: Mapping[int, FrameRecord], frame: int) -> list[NDArray[np.float64]]:
+def _starts_again(records: Mapping[int, FrameRecord], frame: int) -> list[Array]:
     """Return the poses from which to align a frame again: where it is; where a row is lost, from even motion first."""
     own = records[frame].solution.poses
     lost = np.flatnonzero(records[frame].status == LOST)

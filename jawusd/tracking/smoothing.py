@@ -8,6 +8,7 @@ from scipy.linalg import solveh_banded
 from scipy.ndimage import uniform_filter1d
 
 from jawusd.geometry import make_transform, orthonormalise, se3_adjoint, se3_exp, se3_inverse, se3_log
+from jawusd.geometry.arrays import Array, Mask
 
 # Frames on either side over which liveliness is judged: a third of a second at 24 fps.
 _WINDOW = 4
@@ -17,9 +18,7 @@ _FLOOR = 0.5
 _SHORTEST = 5  # frames; shorter runs say nothing about their own smoothness
 
 
-def smooth_poses(
-    frames: NDArray[np.int64], poses: NDArray[np.float64], covariance: NDArray[np.float64], centre: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def smooth_poses(frames: NDArray[np.int64], poses: Array, covariance: Array, centre: Array) -> Array:
     """Return the poses that balance the measured ones against even motion.
 
     Minimises sum x_k^T C_k^-1 x_k + sum a_k^T Q_k^-1 a_k over left twists x_k about a fixed point, with the second
@@ -46,7 +45,7 @@ def smooth_poses(
     return out
 
 
-def _runs(frames: NDArray[np.int64], known: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
+def _runs(frames: NDArray[np.int64], known: Mask) -> list[NDArray[np.int64]]:
     index = np.flatnonzero(known)
     if not len(index):
         return []
@@ -54,7 +53,7 @@ def _runs(frames: NDArray[np.int64], known: NDArray[np.bool_]) -> list[NDArray[n
     return np.split(index, breaks)
 
 
-def _corrections(poses: NDArray[np.float64], covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+def _corrections(poses: Array, covariance: Array) -> Array:
     """Return the twists that take one run of poses to the smooth ones, shape (N, 6)."""
     count = len(poses)
     steps = se3_log(poses[1:] @ se3_inverse(poses[:-1]))

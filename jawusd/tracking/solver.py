@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.geometry import make_transform, orthonormalise, se3_exp, se3_inverse, se3_log, transform_points
+from jawusd.geometry.arrays import Array, Mask
 from jawusd.imaging.raster import draw_depth_labels, project
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour import CROWN, GUM, LENGTH, contour_samples
@@ -34,12 +35,12 @@ class View:
         bias_px: how far the masks reach beyond the teeth [px], shape (2,).
     """
 
-    matrix: NDArray[np.float64]
-    eye: NDArray[np.float64]
+    matrix: Array
+    eye: Array
     masks: NDArray[np.uint8]
-    present: NDArray[np.bool_]
-    lead: NDArray[np.float64] = field(default_factory=lambda: np.tile(np.eye(4), (2, 1, 1)))
-    bias_px: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
+    present: Mask
+    lead: Array = field(default_factory=lambda: np.tile(np.eye(4), (2, 1, 1)))
+    bias_px: Array = field(default_factory=lambda: np.zeros(2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,11 +56,11 @@ class Solution:
         iterations: how many linearised steps were taken.
     """
 
-    poses: NDArray[np.float64]
-    systems: NDArray[np.float64]
-    centres: NDArray[np.float64]
-    scatters: NDArray[np.float64]
-    visible_px: NDArray[np.float64]
+    poses: Array
+    systems: Array
+    centres: Array
+    scatters: Array
+    visible_px: Array
     iterations: int
 
 
@@ -70,11 +71,9 @@ class WeighedPrior(Protocol):
         variance_px3: outline variance times correlation length per row [px^3], shape (2,).
     """
 
-    variance_px3: NDArray[np.float64]
+    variance_px3: Array
 
-    def terms(
-        self, poses: NDArray[np.float64], centres: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def terms(self, poses: Array, centres: Array) -> tuple[Array, Array]:
         """Return precision (12, 12) and right side (12,) of left twists about the centres, rows (upper, lower)."""
         ...
 
@@ -91,10 +90,10 @@ class ContourSolver:
 
     def solve(
         self,
-        poses: NDArray[np.float64],
+        poses: Array,
         views: Sequence[View],
         gates_px: Sequence[float],
-        use: NDArray[np.bool_] | None = None,
+        use: Mask | None = None,
         prior: WeighedPrior | None = None,
     ) -> Solution:
         """Align both rows, starting from given poses.
@@ -187,7 +186,7 @@ class ContourSolver:
             return gate
         return float(np.clip(self.config.gate_sigmas * 1.4826 * np.median(d), *self.config.final_gate_px))
 
-    def _step(self, state: Solution, start: NDArray[np.float64], prior: WeighedPrior | None) -> NDArray[np.float64]:
+    def _step(self, state: Solution, start: Array, prior: WeighedPrior | None) -> Array:
         """Solve the joint 12x12 normal equations; twists about the centres, shape (2, 6).
 
         A weak pull towards the start keeps motions finite that the masks leave free.
@@ -207,7 +206,7 @@ class ContourSolver:
             H, g = weight[:, None] * H + known, weight * g + towards
         return np.linalg.solve(H, g).reshape(2, 6)
 
-    def _motion_mm(self, step: NDArray[np.float64]) -> float:
+    def _motion_mm(self, step: Array) -> float:
         """Return the largest motion of a crown vertex under twists about the centres [mm]."""
         return max(
             float(np.linalg.norm(step[r, :3]) * self.scans[r].radius_mm + np.linalg.norm(step[r, 3:])) for r in _ROWS
@@ -225,12 +224,12 @@ class _Rendering:
         self.labels = [np.zeros(s, np.uint8) for s in shapes]
         self.depths = [np.zeros(s, np.float32) for s in shapes]
 
-    def update(self, poses: NDArray[np.float64]) -> None:
+    def update(self, poses: Array) -> None:
         """Draw the scans whose projection has moved by more than the allowed pixels."""
         tasks = [(r, c) for r in _ROWS for c in range(len(self._views)) if self._moved(r, c, poses[r])]
         list(self._solver._map(lambda task: self._draw(*task, poses[task[0]]), tasks))
 
-    def _moved(self, r: int, c: int, pose: NDArray[np.float64]) -> bool:
+    def _moved(self, r: int, c: int, pose: Array) -> bool:
         last = self._drawn[r][c]
         if last is None:
             return True
@@ -241,7 +240,7 @@ class _Rendering:
         )
         return float(np.abs(change).max()) > self._solver.config.redraw_px
 
-    def _draw(self, r: int, c: int, pose: NDArray[np.float64]) -> None:
+    def _draw(self, r: int, c: int, pose: Array) -> None:
         scan, view = self._solver.scans[r], self._views[c]
         points = np.empty((len(scan.vertices), 3), np.float32)
         project(scan.vertices_single, (view.matrix @ view.lead[r] @ pose).astype(np.float32), points)
@@ -253,18 +252,18 @@ class _Rendering:
         self._drawn[r][c] = pose.copy()
 
 
-def _pixels(matrix: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _pixels(matrix: Array, points: Array) -> Array:
     h = points @ matrix[:, :3].T + matrix[:, 3]
     return h[:, :2] / h[:, 2:]
 
 
-def _twist_between(start: NDArray[np.float64], pose: NDArray[np.float64], centre: NDArray) -> NDArray[np.float64]:
+def _twist_between(start: Array, pose: Array, centre: NDArray) -> Array:
     """Return the twist about a world point that takes one pose to another, shape (6,)."""
     to, back = make_transform(np.eye(3), -centre), make_transform(np.eye(3), centre)
     return se3_log(to @ pose @ se3_inverse(start) @ back)
 
 
-def _moved(pose: NDArray[np.float64], twist: NDArray[np.float64], centre: NDArray[np.float64]) -> NDArray[np.float64]:
+def _moved(pose: Array, twist: Array, centre: Array) -> Array:
     """Return the pose after a left twist about a world point; rotations are made orthonormal again.
 
     Without the last step rounding grows exponentially when predictions multiply poses frame after frame.

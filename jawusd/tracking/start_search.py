@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.errors import TrackingError
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import make_transform, so3_log, transform_points
+from jawusd.geometry.arrays import Array
 from jawusd.tracking.footage import Footage
 from jawusd.tracking.pose_search import Candidate, Grid, coarse_scan, hinge_at_front, search_row
 from jawusd.tracking.quality import row_fit, score_px, uncovered_px
@@ -50,7 +50,7 @@ class Found:
         fit: `row_fit` of the row that fits worse [-].
     """
 
-    poses: NDArray[np.float64]
+    poses: Array
     worth_px: float
     fit: float
 
@@ -62,7 +62,7 @@ class StartSearch:
         self,
         meshes: Sequence[Mesh],
         solver: ContourSolver,
-        T_anatomical_scan: NDArray[np.float64],
+        T_anatomical_scan: Array,
         map_: Callable[..., Iterable] = map,
     ) -> None:
         """Prepare coarse scans.
@@ -93,7 +93,7 @@ class StartSearch:
         finalists = [self._searched(r, views, bases[r], _GRID) for r in _ROWS]
         return self._settled(finalists, views, footage, frame)
 
-    def near(self, footage: Footage, frame: int, poses: NDArray[np.float64]) -> Found:
+    def near(self, footage: Footage, frame: int, poses: Array) -> Found:
         """Return the best poses on a frame near given ones, T_world_upper and T_world_lower, shape (2, 4, 4).
 
         Raises:
@@ -107,15 +107,13 @@ class StartSearch:
             finalists.append([poses[r], *self._searched(r, views, base, _NEAR_GRID)])
         return self._settled(finalists, views, footage, frame)
 
-    def _searched(
-        self, r: int, views: Sequence[View], base: NDArray[np.float64], grid: Grid
-    ) -> list[NDArray[np.float64]]:
+    def _searched(self, r: int, views: Sequence[View], base: Array, grid: Grid) -> list[Array]:
         """Return the best poses of a row that differ from one another."""
         found = search_row(self._coarse[r], r, views, _PX_PER_MM, base, self._hinges[r], grid, self._map)
         return self._distinct(found, r)
 
     def _settled(
-        self, finalists: Sequence[Sequence[NDArray[np.float64]]], views: Sequence[View], footage: Footage, frame: int
+        self, finalists: Sequence[Sequence[Array]], views: Sequence[View], footage: Footage, frame: int
     ) -> Found:
         """Return the best pair of finalists, refined at the working size."""
         pairs = self._refined_pairs(finalists, views)
@@ -130,10 +128,10 @@ class StartSearch:
         fit = row_fit(self.solver.scans, ends[best], views, self._config.bare_price)
         return Found(ends[best].poses, float(worth[best]), float(fit.min()))
 
-    def _distinct(self, found: Sequence[Candidate], r: int) -> list[NDArray[np.float64]]:
+    def _distinct(self, found: Sequence[Candidate], r: int) -> list[Array]:
         """Return the best poses that differ from one another."""
         probes = self._coarse[r].probes
-        kept: list[NDArray[np.float64]] = []
+        kept: list[Array] = []
         for candidate in found:
             here = transform_points(candidate.pose, probes)
             if all(np.linalg.norm(here - transform_points(k, probes), axis=1).mean() > _DISTINCT_MM for k in kept):
@@ -142,9 +140,7 @@ class StartSearch:
                     break
         return kept
 
-    def _refined_pairs(
-        self, finalists: Sequence[Sequence[NDArray[np.float64]]], views: Sequence[View]
-    ) -> list[NDArray[np.float64]]:
+    def _refined_pairs(self, finalists: Sequence[Sequence[Array]], views: Sequence[View]) -> list[Array]:
         """Refine the finalists coarsely and return up to four pairs a jaw can take, shape (2, 4, 4) each."""
         ranked = []
         for r in _ROWS:
@@ -158,13 +154,13 @@ class StartSearch:
         pairs = [p for p in pairs if self._possible(p[1])]
         return [poses for _, poses in sorted(pairs, key=lambda p: -p[0])[:4]]
 
-    def _possible(self, poses: NDArray[np.float64]) -> bool:
+    def _possible(self, poses: Array) -> bool:
         """Tell whether a jaw can bring the rows into these poses."""
         turn = so3_log(poses[0, :3, :3].T @ poses[1, :3, :3])
         fronts = [(poses[r] @ np.linalg.inv(self._hinges[r]))[:3, 3] for r in _ROWS]
         return np.linalg.norm(turn) < _WIDEST_JAW_RAD and np.linalg.norm(fronts[1] - fronts[0]) < _FARTHEST_JAW_MM
 
-    def _worth(self, solver: ContourSolver, solution: Solution, views: Sequence[View]) -> NDArray[np.float64]:
+    def _worth(self, solver: ContourSolver, solution: Solution, views: Sequence[View]) -> Array:
         """Return the fitting contour less the price of uncovered mask per row [px], shape (2,)."""
         bare, _ = uncovered_px(solver.scans, solution, views)
         # A price per area: the coarse pictures' pixels are larger.
@@ -174,7 +170,7 @@ class StartSearch:
         return (score_px(solution) - price * bare).sum(1)
 
 
-def _guessed_axes(places: NDArray[np.float64], eyes: NDArray[np.float64]) -> NDArray[np.float64]:
+def _guessed_axes(places: Array, eyes: Array) -> Array:
     """Return left, up and front of the teeth in the world as far as the masks tell, shape (3, 3), axes in columns.
 
     Args:

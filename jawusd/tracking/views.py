@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from jawusd.errors import TrackingError
 from jawusd.formats.capture import CameraSource
 from jawusd.geometry import Camera
+from jawusd.geometry.arrays import Array
 from jawusd.imaging.masks import open_masks
 from jawusd.imaging.working_view import WorkingView
 from jawusd.tracking.solver import View
@@ -32,7 +33,7 @@ class MaskViews:
         sources: Sequence[CameraSource],
         cameras: Mapping[str, Camera],
         offsets: Mapping[str, int],
-        centre_world: NDArray[np.float64],
+        centre_world: Array,
         working_px_per_mm: float,
     ) -> None:
         """Open the mask readers and choose the working sizes.
@@ -117,7 +118,7 @@ def masked_sources(
     return masked
 
 
-def working_size(camera: Camera, centre_world: NDArray[np.float64], px_per_mm: float) -> tuple[int, int]:
+def working_size(camera: Camera, centre_world: Array, px_per_mm: float) -> tuple[int, int]:
     """Return the picture size that shows the given point at the wanted resolution, at most the recorded size.
 
     Raises:

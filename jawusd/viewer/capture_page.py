@@ -7,11 +7,11 @@ import logging
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
 
 from jawusd.errors import JawusdError
 from jawusd.formats.capture import Bootstrap
 from jawusd.geometry import make_transform, transform_points
+from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import se3_inverse
 from jawusd.viewer.capture_scene import UP, CaptureScene
 from jawusd.viewer.footage_panel import FootagePanel
@@ -22,7 +22,6 @@ from jawusd.viewer.picks_panel import PicksPanel
 from jawusd.viewer.theme import set_theme
 from jawusd.viewer.viewed_capture import Region, ViewedCapture
 
-Array = NDArray[np.float64]
 log = logging.getLogger(__name__)
 
 _PANEL_PX = 370

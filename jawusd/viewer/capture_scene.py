@@ -9,13 +9,12 @@ import viser
 from numpy.typing import NDArray
 
 from jawusd.geometry import wxyz_from_matrix
+from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import se3_inverse
 from jawusd.viewer.decimate import for_view
 from jawusd.viewer.light_table import FOV_RAD, Table
 from jawusd.viewer.picks import ROWS, PickBook
 from jawusd.viewer.viewed_capture import ViewedCapture
-
-Array = NDArray[np.float64]
 
 ENAMEL, GUM = (236, 229, 212), (196, 112, 108)
 #: Colours of picks by row, those of the outlines; and of the one selected.

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.errors import FormatError
-
-Array = NDArray[np.float64]
+from jawusd.geometry.arrays import Array
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,9 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, TRACKED, Tracks
+from jawusd.geometry.arrays import Array
 from jawusd.viewer.plots import BLUE, GREY, ORANGE, VERMILION
-
-Array = NDArray[np.float64]
 
 _APART_S = 0.5  # neighbours show the same trouble
 _MOST_WORST = 12
@@ -20,8 +19,7 @@ _COLORS = (ORANGE, BLUE)  # upper, lower, as the outlines in the pictures
 
 
 def uncovered_percent(tracks: Tracks) -> Array:
-    """Return the mask area left uncovered per frame and row, mean over the masks in use [%], shape (F, 2); NaN: none.
-    """
+    """Return the mask area left uncovered per frame and row, mean over the used masks [%], shape (F, 2); NaN: none."""
     value = np.where(tracks.masks_used, tracks.coverage_error, np.nan)
     known = np.isfinite(value)
     total = np.where(known, value, 0.0).sum(axis=2)

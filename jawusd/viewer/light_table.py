@@ -9,15 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import make_transform, transform_points
+from jawusd.geometry.arrays import Array
 from jawusd.geometry.rays import meet_triangles
 from jawusd.geometry.se3 import se3_inverse
 from jawusd.viewer.viewed_capture import Region
-
-Array = NDArray[np.float64]
 
 FOV_RAD = 0.35
 #: Turns of the scans about the subject's vertical and transverse axis [deg] by what they show.

@@ -1,5 +1,4 @@
-"""The picks one visitor makes: vertices of the scans with the pixels where cameras see them. Knows nothing of the page.
-"""
+"""The picks one visitor makes: vertices of the scans with the pixels where cameras see them."""
 
 from __future__ import annotations
 

@@ -10,14 +10,12 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.evaluator import JawRig
+from jawusd.geometry.arrays import Array
 from jawusd.viewer.clip import Clip
 from jawusd.viewer.keytrack import KeyTrack
 from jawusd.viewer.readouts import INCISOR, border_path, landmark_places, rest_places
-
-Array = NDArray[np.float64]
 
 # Okabe and Ito's colours, told apart by everybody; those of the jaw in 3-D too.
 BLUE, ORANGE, GREEN, VERMILION, GREY = "#0072b2", "#e69f00", "#009e73", "#d55e00", "#888888"

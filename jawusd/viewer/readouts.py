@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.evaluator import JawRig
 from jawusd.geometry import LANDMARKS
+from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import transform_points
-
-Array = NDArray[np.float64]
 
 INCISOR, CONDYLES = LANDMARKS.index("incisor"), (LANDMARKS.index("condyle_left"), LANDMARKS.index("condyle_right"))
 # A margin this little below zero is rounding: `ranges` and `ik` end on the bound itself.

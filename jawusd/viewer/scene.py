@@ -6,17 +6,16 @@ from typing import Literal
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
 
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import LANDMARKS
+from jawusd.geometry.arrays import Array
 from jawusd.geometry.quaternion import wxyz_from_matrix
 from jawusd.geometry.se3 import se3_inverse, transform_points
 from jawusd.viewer.actor import MOVING, STILL, ViewedActor
 from jawusd.viewer.decimate import is_solid
 from jawusd.viewer.readouts import CONDYLES, INCISOR, habitual_path, landmark_places, rest_places
 
-Array = NDArray[np.float64]
 Color = tuple[int, int, int]
 
 _ENAMEL, _GUM, _BONE = (236, 229, 212), (196, 112, 108), (222, 207, 178)

@@ -7,18 +7,18 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jawusd.evaluator import JawRig
 from jawusd.formats.keys import Keys
 from jawusd.geometry import LANDMARKS
+from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import se3_inverse, transform_points
 from jawusd.viewer import keytrack
 from jawusd.viewer.clip import Clip
 from jawusd.viewer.keytrack import KeyTrack
 from jawusd.viewer.readouts import ON_BOUND_MM, Readout, read_out
 
-Array = NDArray[np.float64]
 Interpolation = Literal["linear", "smooth"]
 
 # A pinned landmark counts this much more than the point under the pointer (squared distances): 5 mm of pull move it

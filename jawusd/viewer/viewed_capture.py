@@ -13,8 +13,8 @@ from jawusd.formats.capture import Bootstrap
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import Camera
+from jawusd.geometry.arrays import Array, Mask
 
-Array = NDArray[np.float64]
 Look = Literal["outlines", "tinted", "footage"]
 #: Left, top, right, bottom of a part of a picture [px].
 Region = tuple[float, float, float, float]
@@ -51,7 +51,7 @@ class ViewedCapture:
     sizes_px: Mapping[str, tuple[int, int]]
     cameras: Mapping[str, Camera]
     scans: Mapping[str, Mesh]
-    crowns: Mapping[str, NDArray[np.bool_]]
+    crowns: Mapping[str, Mask]
     T_anatomical_skull: Array
     tracks: Tracks | None
     picks: Bootstrap | None

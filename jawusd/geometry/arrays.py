@@ -1,0 +1,10 @@
+"""The array types that annotations name; shapes, frames and units stand in the docstrings."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+
+__all__ = ["Array", "Indices", "Mask"]
