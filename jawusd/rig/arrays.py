@@ -32,7 +32,7 @@ def model_hash(rig: JawRig) -> str:
 
 
 def write_arrays(prim: Sdf.PrimSpec, rig: JawRig, prefixes: tuple[str, ...]) -> None:
-    """Author the model arrays whose attribute names start with one of the prefixes."""
+    """Write the model arrays whose attribute names start with one of the prefixes."""
     for name, spec in specs_of(rig.meta["kind"]).items():
         if not spec.attribute.startswith(prefixes):
             continue

@@ -64,7 +64,7 @@ def apply_jaw_api(spec: Sdf.PrimSpec, *others: str) -> None:
 def set_attribute(
     spec: Sdf.PrimSpec, name: str, type_name: Sdf.ValueTypeName, value: object, *, animated: bool = False
 ) -> None:
-    """Author an attribute with its default value.
+    """Write an attribute with its default value.
 
     `custom` is set on every one: Blender imports no other attribute.
 
@@ -81,7 +81,7 @@ def set_attribute(
 
 
 def set_relationship(spec: Sdf.PrimSpec, name: str, targets: Iterable[str]) -> None:
-    """Author a relationship to prims."""
+    """Write a relationship to prims."""
     relationship = Sdf.RelationshipSpec(spec, name, custom=True)
     relationship.targetPathList.explicitItems = [Sdf.Path(target) for target in targets]
 

@@ -110,7 +110,7 @@ def _spline(knots: Array, values: Array, at: Array) -> Array:
 
 
 def _body(joint: Joint) -> tuple[Array, Faces]:
-    """The horseshoe from ramus to ramus, below the lower gum."""
+    """Return the horseshoe from ramus to ramus, below the lower gum."""
     x, y, z = joint.incisor
     half = []  # x, middle height, z, half width, half height; from the chin to the left ramus
     half.append([0.0, y - 24.0, z - 5.5, 5.5, 10.5])
@@ -129,7 +129,7 @@ def _body(joint: Joint) -> tuple[Array, Faces]:
 
 
 def _ramus(joint: Joint, side: float, centre: Array) -> tuple[Array, Faces]:
-    """The plate from the angle of the jaw up to the notch."""
+    """Return the plate from the angle of the jaw up to the notch."""
     # height below the condyle, inward shift, forward position of its middle, half thickness, half length
     rows = np.array(
         [
@@ -165,7 +165,7 @@ def _condyle(side: float, centre: Array) -> tuple[Array, Faces]:
 
 
 def _coronoid(side: float, centre: Array) -> tuple[Array, Faces]:
-    """The process in front of the notch."""
+    """Return the process in front of the notch."""
     rows = np.array(
         [
             [-24.0, 2.5, 21.0, 2.6, 7.0],
@@ -234,7 +234,7 @@ def _cheekbone(joint: Joint, k: int, side: float) -> tuple[Array, Faces]:
 
 
 def _maxilla(joint: Joint) -> tuple[Array, Faces]:
-    """The horseshoe of bone over the upper gum."""
+    """Return the horseshoe of bone over the upper gum."""
     y = 0.5 * joint.condyles[:, 1].mean()
     half = np.array(
         [[0.0, y, -8.0, 4.5, 8.0], [11.0, y, -9.0, 5.0, 9.0], [21.0, y, -19.0, 6.0, 9.5],

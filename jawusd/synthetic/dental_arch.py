@@ -163,7 +163,7 @@ def _crown_colors(local: Array, form: CrownForm, k: int) -> NDArray[np.uint8]:
 
 
 def _gum(forms: tuple[CrownForm, ...], shape: ArchShape, line: _Line, crowns: Array) -> tuple[Array, Faces]:
-    """Closed gum ridge: margins scalloped between the teeth, faces standing a little proud of the crowns."""
+    """Return a closed gum ridge: margins scalloped between the teeth, faces standing a little proud of the crowns."""
     half = _centres(forms)[-1] + forms[-1].width_mm / 2 + 2.5
     s = np.linspace(-half, half, int(2 * half / _COLUMN_MM))
     margin = _margin(forms, shape, s)

@@ -85,7 +85,7 @@ def record(person: Person, n_frames: int, seed: int, kind: Kind = "training", no
 def schedule(
     names: tuple[str, ...], n_frames: int, rng: np.random.Generator, tempo: float = 1.0
 ) -> tuple[Array, NDArray[np.str_]]:
-    """String exercises together until the frames are filled.
+    """Join exercises until the frames are filled.
 
     Args:
         names: exercises, repeated as needed.

@@ -108,7 +108,7 @@ def perform(person: Person, occlusion: Occlusion, frames: int, offsets: tuple[in
 def _controls(
     person: Person, frames: int, start: int, n: int, rng: np.random.Generator
 ) -> tuple[Array, NDArray[np.str_], Array]:
-    """Controls and phase of every instant, and where the jaw is held still (1) at the closed bite."""
+    """Return controls and phase of every instant, and where the jaw is held still (1) at the closed bite."""
     exercises = frames - OPEN_HOLD - REST_HOLD
     curves, names = schedule(_EXERCISES, exercises, rng, tempo=1.5)
     still = np.array([_HALF_OPEN, 0.0, 0.0])

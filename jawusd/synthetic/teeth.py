@@ -116,7 +116,7 @@ def crown(form: CrownForm, cusp_slope: float, rng: np.random.Generator) -> tuple
 
 
 def _section(angle: Array, squareness: float) -> tuple[Array, Array]:
-    """Unit superellipse: x and z over the angle."""
+    """Return a unit superellipse: x and z over the angle."""
     c, s = np.cos(angle), np.sin(angle)
     return np.sign(c) * np.abs(c) ** squareness, np.sign(s) * np.abs(s) ** squareness
 

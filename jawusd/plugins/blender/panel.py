@@ -6,10 +6,11 @@ from . import jaw
 
 
 class JAWUSD_OT_key(bpy.types.Operator):
-    """Set a key on all three jaw parameters at the current frame"""
+    """The operator behind the key button."""
 
     bl_idname = "jawusd.key"
     bl_label = "Key Jaw"
+    bl_description = "Set a key on all three jaw parameters at the current frame"
     bl_options = {"REGISTER", "UNDO"}
 
     actor: bpy.props.StringProperty()
