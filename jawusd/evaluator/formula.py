@@ -1,11 +1,12 @@
 """The jaw model's formulas, stated once for every kind of number.
 
 Each function takes numbers that know ``+ - * /`` (floats, numpy arrays, torch tensors, values of an ONNX graph, sockets
-of Blender nodes) and, where a formula needs more, an `Operations` object for that kind. The torch layer, the ONNX
-exporter, the Blender nodes and the single-file reader are built from these functions; `jawusd.evaluator.derivatives`
-is the one other statement, with derivatives, for floats, compiled code and numpy.
+of Blender nodes) and, where a formula needs more, an `Operations` object for that kind of number. The torch layer, the
+ONNX exporter, the Blender nodes and the single-file reader are built from `MODELS` and `BoundFormula`;
+`jawusd.evaluator.derivatives` is the one other statement, with derivatives, for floats, compiled code and numpy.
 
-This file imports nothing but the standard library and `jawusd.geometry.rodrigues`: both are copied into the reader.
+This file imports nothing but the standard library, `jawusd.evaluator.operations` and `jawusd.geometry.rodrigues`: all
+three are copied into the reader, which runs in Python 3.9.
 
 The gauge maps the parameters d = (d1 opening, d2 laterotrusion, d3 protrusion) [mm] to the displacement u [mm] of the
 lower incisal point, anatomical frame (x left, y up, z anterior):
@@ -20,19 +21,12 @@ jaw clears when it slides with the teeth together, fading out with opening.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Sequence
-from typing import Generic, NamedTuple, Protocol, TypeVar
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Generic, NamedTuple, Protocol
 
-from jawusd.geometry.rodrigues import (
-    SMALL_SQUARED_ANGLE,
-    N,
-    Triple,
-    angle_quotients,
-    angle_series,
-    apply_series,
-    dot,
-)
+from jawusd.evaluator.operations import FloatOperations, Operations, Rows, Table, rows, triple
+from jawusd.geometry.rodrigues import N, Triple, apply_series, dot, turning
 
 FADE_SOFTNESS_MM = 1.0  # rounding of the kink at d1 = 0 in the fading of the glide surface
 LIMIT_SOFTNESS_MM = 4.0  # rounding of the kinks where the gothic arch stops changing with opening
@@ -40,7 +34,7 @@ ARCH_BOW_MM = 10.0  # the quadratic arch features are d2^2 / 10 mm, to keep all 
 DROP_BEND = 0.15  # slope gained by the bent drop features per mm, saturating at 4 mm (below)
 DROP_SATURATION_MM2 = 16.0
 
-Weights = TypeVar("Weights", contravariant=True)
+Arrays = Mapping[str, Sequence[float]]  # a rig's named arrays, each flat, row by row
 
 
 class GaugeNumbers(NamedTuple):
@@ -69,51 +63,6 @@ class GaugeNumbers(NamedTuple):
     fade_mm: float
 
 
-class Operations(Protocol[N]):
-    """What the formulas need of a kind of number beyond arithmetic."""
-
-    def sqrt(self, x: N) -> N:
-        """Return the square root."""
-
-    def exp(self, x: N) -> N:
-        """Return the exponential."""
-
-    def clip(self, x: N, low: float, high: float) -> N:
-        """Return x limited to [low, high]."""
-
-    def angle_coefficients(self, squared: N) -> Triple[N]:
-        """Return the coefficients a, b and c of `jawusd.geometry.rodrigues` at a squared angle [rad^2]."""
-
-    def log_sum_exp(self, terms: Sequence[N]) -> N:
-        """Return the logarithm of the sum of the exponentials of all terms."""
-
-
-class FloatOperations:
-    """`Operations` on Python's floats."""
-
-    sqrt = staticmethod(math.sqrt)
-    exp = staticmethod(math.exp)
-
-    @staticmethod
-    def clip(x: float, low: float, high: float) -> float:
-        """Return x limited to [low, high]."""
-        return min(max(x, low), high)
-
-    @staticmethod
-    def angle_coefficients(squared: float) -> Triple[float]:
-        """Return a, b and c at a squared angle [rad^2]."""
-        if squared < SMALL_SQUARED_ANGLE:
-            return angle_series(squared)
-        angle = math.sqrt(squared)
-        return angle_quotients(squared, angle, math.sin(angle), math.sin(0.5 * angle))
-
-    @staticmethod
-    def log_sum_exp(terms: Sequence[float]) -> float:
-        """Return the logarithm of the sum of exponentials, free of overflow."""
-        peak = max(terms)
-        return peak + math.log(sum(math.exp(term - peak) for term in terms))
-
-
 def polynomial(coefficients: Sequence[N | float], x: N) -> N:
     """Return ``sum_k coefficients[k] x^k`` of two coefficients or more (Horner's scheme)."""
     value = x * coefficients[-1] + coefficients[-2]
@@ -122,23 +71,23 @@ def polynomial(coefficients: Sequence[N | float], x: N) -> N:
     return value
 
 
-def soft_absolute(x: N, softness_mm: float, ops: Operations[N]) -> N:
+def soft_absolute(x: N, softness_mm: float, ops: Operations[N, Table]) -> N:
     """Return |x| with the kink rounded, zero at zero: ``sqrt(x^2 + e^2) - e``."""
     return ops.sqrt(x * x + softness_mm * softness_mm) - softness_mm
 
 
-def soft_ramp(x: N, softness_mm: float, ops: Operations[N]) -> N:
+def soft_ramp(x: N, softness_mm: float, ops: Operations[N, Table]) -> N:
     """Return max(x, 0) with the kink rounded, zero at zero: ``(x + sqrt(x^2 + e^2) - e) / 2``."""
     return 0.5 * (x + soft_absolute(x, softness_mm, ops))
 
 
-def bent(x: N, ops: Operations[N]) -> N:
+def bent(x: N, ops: Operations[N, Table]) -> N:
     """Return ``0.15 x^2 / sqrt(1 + x^2 / 16)`` [mm]: a drop that steepens and then runs straight."""
     square = x * x
     return DROP_BEND * square / ops.sqrt(1.0 + square / DROP_SATURATION_MM2)
 
 
-def path(gauge: GaugeNumbers, d1: N, ops: Operations[N]) -> tuple[N, N]:
+def path(gauge: GaugeNumbers, d1: N, ops: Operations[N, Table]) -> tuple[N, N]:
     """Return gx and gz [mm] at opening d1 [mm]."""
     inside = ops.clip(d1, gauge.low_mm, gauge.high_mm)
     s, beyond = inside / gauge.path_scale_mm, d1 - inside
@@ -150,7 +99,7 @@ def path(gauge: GaugeNumbers, d1: N, ops: Operations[N]) -> tuple[N, N]:
     return along(gauge.path_x), along(gauge.path_z)
 
 
-def arch(gauge: GaugeNumbers, d1: N, d2: N, ops: Operations[N]) -> N:
+def arch(gauge: GaugeNumbers, d1: N, d2: N, ops: Operations[N, Table]) -> N:
     """Return rho [mm]: how far forward a lateral excursion d2 [mm] carries the incisal point at opening d1 [mm]."""
     rise = soft_ramp(d1 - gauge.low_mm, LIMIT_SOFTNESS_MM, ops)
     stop = soft_ramp(d1 - gauge.high_mm, LIMIT_SOFTNESS_MM, ops)
@@ -161,7 +110,7 @@ def arch(gauge: GaugeNumbers, d1: N, d2: N, ops: Operations[N]) -> N:
     return side * polynomial(c[:3], t) + d2 * (polynomial(c[3:5], t) + d2 * bow)
 
 
-def drop(gauge: GaugeNumbers, d2: N, d3: N, ops: Operations[N]) -> N:
+def drop(gauge: GaugeNumbers, d2: N, d3: N, ops: Operations[N, Table]) -> N:
     """Return how far the tooth-glide surface pushes the jaw down at d2, d3 [mm]."""
     side = soft_absolute(d2, gauge.softness_mm, ops)
     front = soft_ramp(d3, gauge.softness_mm, ops)
@@ -169,13 +118,13 @@ def drop(gauge: GaugeNumbers, d2: N, d3: N, ops: Operations[N]) -> N:
     return side * c[0] + front * c[1] + bent(side, ops) * c[2] + bent(front, ops) * c[3]
 
 
-def fade(gauge: GaugeNumbers, d1: N, ops: Operations[N]) -> N:
+def fade(gauge: GaugeNumbers, d1: N, ops: Operations[N, Table]) -> N:
     """Return the share of the glide surface felt at opening d1 [mm]."""
     x = soft_ramp(d1, FADE_SOFTNESS_MM, ops) / gauge.fade_mm
     return ops.exp(-(x * x))
 
 
-def displacement(gauge: GaugeNumbers, d: Triple[N], ops: Operations[N]) -> Triple[N]:
+def displacement(gauge: GaugeNumbers, d: Triple[N], ops: Operations[N, Table]) -> Triple[N]:
     """Return the displacement u [mm] of the incisal point at the jaw parameters d [mm]."""
     d1, d2, d3 = d
     gx, gz = path(gauge, d1, ops)
@@ -183,75 +132,67 @@ def displacement(gauge: GaugeNumbers, d: Triple[N], ops: Operations[N]) -> Tripl
     return gx + d2, -down, gz + arch(gauge, d1, d2, ops) + d3
 
 
-def spline_input(gauge: GaugeNumbers, scales: Sequence[float], u: Triple[N], ops: Operations[N]) -> Triple[N]:
+def spline_input(gauge: GaugeNumbers, scales: Sequence[float], u: Triple[N], ops: Operations[N, Table]) -> Triple[N]:
     """Return the argument of the spline: u [mm] sheared by the habitual path, over the scales [mm]."""
     opening = -u[1]
     gx, gz = path(gauge, opening, ops)
     return opening / scales[0], (u[0] - gx) / scales[1], (u[2] - gz) / scales[2]
 
 
-class Kernels(Protocol[N, Weights]):
-    """How a kind of number adds up the kernels of a spline."""
-
-    def weighted(self, kernel: N, weights: Weights) -> Triple[N]:
-        """Return the kernels, one number or all of a block, times their weights, summed over the block."""
-
-
 def spline(
-    q: Triple[N],
-    blocks: Iterable[tuple[Triple[N] | Triple[float], Weights]],
-    linear: Sequence[Sequence[float]],
-    kernels: Kernels[N, Weights],
-    ops: Operations[N],
+    q: Triple[N], centres: Table, weights: Table, linear: Sequence[Sequence[float]], ops: Operations[N, Table]
 ) -> Triple[N]:
     """Return ``sum_i W_i |q - c_i|^3 + q L``: a polyharmonic spline with a linear tail (Duchon 1977).
 
     Args:
         q: Where, see `spline_input`.
-        blocks: Centres and kernel weights, one centre at a time or, for kinds that hold many numbers, several.
+        centres: The centres c_i, one a row.
+        weights: The kernel weights W_i, one a row.
         linear: The linear terms, 3 inputs times 3 outputs.
-        kernels: Sums weighted kernels.
         ops: Operations on numbers.
     """
-    x, y, z = (q[0] * linear[0][k] + q[1] * linear[1][k] + q[2] * linear[2][k] for k in range(3))
-    for centre, weights in blocks:
-        away = (q[0] - centre[0], q[1] - centre[1], q[2] - centre[2])
+    kernels = []
+    for x, y, z in zip(*ops.columns(centres)):
+        away = (q[0] - x, q[1] - y, q[2] - z)
         squared = dot(away, away)
-        a, b, c = kernels.weighted(squared * ops.sqrt(squared), weights)
-        x, y, z = x + a, y + b, z + c
-    return x, y, z
+        kernels.append(squared * ops.sqrt(squared))
+    bent_part = ops.weighted_sum(kernels, weights)
+    return triple([bent_part[k] + q[0] * linear[0][k] + q[1] * linear[1][k] + q[2] * linear[2][k] for k in range(3)])
 
 
-class RigidMotion(NamedTuple, Generic[N]):
+@dataclass(frozen=True)
+class RigidMotion(Generic[N]):
     """A rigid motion.
 
     Attributes:
         omega: Rotation vector [rad].
+        turn: Rows of the rotation matrix less the identity.
         t: Translation [mm].
-        coefficients: a, b and c of `jawusd.geometry.rodrigues` for omega.
     """
 
     omega: Triple[N]
+    turn: tuple[Triple[N], Triple[N], Triple[N]]
     t: Triple[N]
-    coefficients: Triple[N]
 
-    def rotate(self, v: Triple[N]) -> Triple[N]:
-        """Return a vector turned."""
-        return apply_series(self.omega, v, self.coefficients[0], self.coefficients[1])
+    def carry(self, p: Triple[N]) -> Triple[N]:
+        """Return the image of a point [mm]."""
+        return triple([p[i] + dot(self.turn[i], p) + self.t[i] for i in range(3)])
 
 
-def anchored_motion(omega: Triple[N], u: Triple[N], anchor: Triple[N], ops: Operations[N]) -> RigidMotion[N]:
+def anchored_motion(
+    omega: Triple[N], u: Triple[N], anchor: Sequence[float], ops: Operations[N, Table]
+) -> RigidMotion[N]:
     """Return the motion that turns by omega [rad] and carries the anchor [mm] by u [mm]: ``t = u + p - R p``."""
-    still = RigidMotion(omega, u, ops.angle_coefficients(dot(omega, omega)))
-    turned = still.rotate(anchor)
-    t = tuple(u[i] + anchor[i] - turned[i] for i in range(3))
-    return still._replace(t=(t[0], t[1], t[2]))
+    a, b, _ = ops.angle_coefficients(dot(omega, omega))
+    turn = turning(omega, a, b)
+    shifts = [u[i] - (row[0] * anchor[0] + row[1] * anchor[1] + row[2] * anchor[2]) for i, row in enumerate(turn)]
+    return RigidMotion(omega, turn, triple(shifts))
 
 
-def twist_motion(omega: Triple[N], v: Triple[N], ops: Operations[N]) -> RigidMotion[N]:
+def twist_motion(omega: Triple[N], v: Triple[N], ops: Operations[N, Table]) -> RigidMotion[N]:
     """Return the motion exp(omega, v) of a twist (omega [rad], v [mm])."""
     a, b, c = ops.angle_coefficients(dot(omega, omega))
-    return RigidMotion(omega, apply_series(omega, v, b, c), (a, b, c))
+    return RigidMotion(omega, turning(omega, a, b), apply_series(omega, v, b, c))
 
 
 def cubic(h: N, y0: N, y1: N, m0: N, m1: N) -> tuple[N, N, N, N]:
@@ -273,34 +214,129 @@ def catmull_rom(before: N, after: N, span: N) -> N:
     return (after - before) / span
 
 
-def signed_distance(v: Sequence[N], softness_mm: float, margin_mm: float, ops: Operations[N]) -> N:
-    """Return how far outside a slice hull a point lies [mm], negative inside: the soft maximum of its half-spaces.
+_CURVE_TABLES = ("start", "power0", "power1", "power2", "power3")
+
+
+def curve_tables(name: str, knots: Sequence[float], values: Rows, slopes: Rows) -> dict[str, Rows]:
+    """Return the tables of a C1 cubic Hermite curve that goes on straight outside its knots, see `curve`.
 
     Args:
-        v: How far outside each half-space it lies [mm], see `half_spaces`.
-        softness_mm: Radius of the rounding where half-spaces meet.
-        margin_mm: Distance by which the hull is wider than its supports.
-        ops: Operations on numbers.
+        name: Prefix of the names of the tables.
+        knots: n rising parameter values.
+        values: Points of the curve at the knots, n rows.
+        slopes: Derivatives at the knots, n rows.
+
+    Returns:
+        The knots, and for each of the n + 1 intervals, the straight ends among them, its start and its powers 0..3.
     """
-    return softness_mm * ops.log_sum_exp([x / softness_mm for x in v]) - margin_mm
+    still = [0.0] * len(values[0])
+    pieces = [[[knots[0]], values[0], slopes[0], still, still]]
+    for i in range(len(knots) - 1):
+        ends = zip(values[i], values[i + 1], slopes[i], slopes[i + 1])
+        powers = zip(*(cubic(knots[i + 1] - knots[i], *end) for end in ends))
+        pieces.append([[knots[i]], *map(list, powers)])
+    pieces.append([[knots[-1]], values[-1], slopes[-1], still, still])
+    tables = {f"{name}_{part}": list(table) for part, table in zip(_CURVE_TABLES, zip(*pieces))}
+    return {f"{name}_knot": [[knot] for knot in knots], **tables}
 
 
-def half_spaces(
-    d: Triple[N],
-    directions: Iterable[tuple[N, N] | tuple[float, float]],
-    supports: Iterable[N],
-    first_mm: float,
-    last_mm: float,
-) -> list[N]:
-    """Return how far outside each half-space of a slice hull d [mm] lies [mm].
+def curve(name: str, x: N, tables: Mapping[str, Table], ops: Operations[N, Table]) -> list[N]:
+    """Return the point at x of the curve of `curve_tables`, a row."""
+    found = ops.lookup(x, tables[f"{name}_knot"], [tables[f"{name}_{part}"] for part in _CURVE_TABLES])
+    s = x - found[0][0]
+    return [polynomial(powers, s) for powers in zip(*found[1:])]
 
-    Args:
-        d: Jaw parameters.
-        directions: Unit normals in (d2, d3).
-        supports: The supports h_k at d1 [mm], one for each direction.
-        first_mm: Smallest captured opening.
-        last_mm: Largest captured opening.
+
+class JawFormula(Protocol):
+    """The motion of one kind of model.
+
+    Attributes:
+        tables: The rows of floats it needs, to be stored as the kind of number stores them.
     """
-    d1, d2, d3 = d
-    sides = [d2 * n[0] + d3 * n[1] - h for n, h in zip(directions, supports)]
-    return [*sides, first_mm - d1, d1 - last_mm]
+
+    tables: dict[str, Rows]
+
+    def __init__(self, arrays: Arrays) -> None: ...
+
+    def motion(self, d: Triple[N], tables: Mapping[str, Table], ops: Operations[N, Table]) -> RigidMotion[N]:
+        """Return the motion away from the closed bite, anatomical frame, at the jaw parameters d [mm]."""
+
+
+class AnchoredFormula:
+    """Rotation as a function of where the lower incisal point is: ``omega = f(u), t = u + p - R(omega) p``."""
+
+    def __init__(self, arrays: Arrays) -> None:
+        path_x, path_z = rows(arrays["path_coefficients"], 5)
+        self.gauge = GaugeNumbers(
+            path_x=path_x,
+            path_z=path_z,
+            path_scale_mm=arrays["path_scale_mm"][0],
+            low_mm=arrays["path_limits"][0],
+            high_mm=arrays["path_limits"][1],
+            arch=arrays["glide_arch"],
+            drop=arrays["glide_drop"],
+            softness_mm=arrays["glide_softness_mm"][0],
+            fade_mm=arrays["glide_fade_mm"][0],
+        )
+        self.incisor, self.scales = arrays["incisor"], arrays["spline_scales"]
+        *weights, first, second, third = rows(arrays["spline_weights"], 3)
+        self.linear = [first, second, third]
+        self.tables = {"centres": rows(arrays["spline_centres"], 3), "weights": weights}
+        at_rest = (0.0, 0.0, 0.0)
+        self.offset = spline(at_rest, self.tables["centres"], weights, self.linear, FloatOperations())
+
+    def motion(self, d: Triple[N], tables: Mapping[str, Table], ops: Operations[N, Table]) -> RigidMotion[N]:
+        """Return the motion away from the closed bite, anatomical frame, at the jaw parameters d [mm]."""
+        u = displacement(self.gauge, d, ops)
+        q = spline_input(self.gauge, self.scales, u, ops)
+        omega = spline(q, tables["centres"], tables["weights"], self.linear, ops)
+        return anchored_motion(triple([x - o for x, o in zip(omega, self.offset)]), u, self.incisor, ops)
+
+
+class AdditiveFormula:
+    """A sum of three curves in se(3): ``log M(d) = Phi1(d1) + Phi2(d2) + Phi3(d3)`` (Yang et al. 2019, eq. 5)."""
+
+    def __init__(self, arrays: Arrays) -> None:
+        self.tables = {}
+        for name in ("curve1", "curve2", "curve3"):
+            values, slopes = (rows(arrays[f"{name}_{part}"], 6) for part in ("twists", "slopes"))
+            self.tables.update(curve_tables(name, arrays[f"{name}_knots"], values, slopes))
+
+    def motion(self, d: Triple[N], tables: Mapping[str, Table], ops: Operations[N, Table]) -> RigidMotion[N]:
+        """Return the motion away from the closed bite, anatomical frame, at the jaw parameters d [mm]."""
+        first, second, third = (curve(f"curve{i}", x, tables, ops) for i, x in enumerate(d, start=1))
+        twist = ops.split([x + y + z for x, y, z in zip(first, second, third)], 6)
+        return twist_motion(triple(twist[:3]), triple(twist[3:]), ops)
+
+
+MODELS: dict[str, type[JawFormula]] = {"anchored": AnchoredFormula, "additive": AdditiveFormula}
+
+
+class BoundFormula:
+    """The slice hull: which jaw parameters are anatomically possible.
+
+    Attributes:
+        tables: The rows of floats it needs, to be stored as the kind of number stores them.
+    """
+
+    def __init__(self, arrays: Arrays) -> None:
+        knots, directions = arrays["slice_d1"], rows(arrays["slice_directions"], 2)
+        supports = rows(arrays["slice_support"], len(directions))
+        slopes = [[0.0] * len(directions) for _ in knots]  # flat ends: beyond them the supports stay as they are
+        for i in range(1, len(knots) - 1):
+            span = knots[i + 1] - knots[i - 1]
+            slopes[i] = [catmull_rom(x, y, span) for x, y in zip(supports[i - 1], supports[i + 1])]
+        self.tables = {"directions": directions, **curve_tables("support", knots, supports, slopes)}
+        self.first_mm, self.last_mm = knots[0], knots[-1]
+        self.softness_mm, self.margin_mm = arrays["slice_softness_mm"][0], arrays["slice_margin_mm"][0]
+
+    def margin(self, d: Triple[N], tables: Mapping[str, Table], ops: Operations[N, Table]) -> N:
+        """Return the signed distance of d [mm] to the bound [mm], positive inside.
+
+        The soft maximum of the half-planes ``n_k . (d2, d3) <= h_k(d1)`` and of the ends of the captured openings.
+        """
+        d1, d2, d3 = d
+        supports = curve("support", d1, tables, ops)
+        sides = [d2 * x + d3 * y - h for x, y, h in zip(*ops.columns(tables["directions"]), supports)]
+        terms = [x / self.softness_mm for x in (*sides, self.first_mm - d1, d1 - self.last_mm)]
+        return self.margin_mm - self.softness_mm * ops.log_sum_exp(terms)

@@ -63,3 +63,12 @@ def apply_series(omega: Triple[N], v: Triple[N], first: N | float, second: N | f
         v[1] + once[1] * first + twice[1] * second,
         v[2] + once[2] * first + twice[2] * second,
     )
+
+
+def turning(omega: Triple[N], a: N | float, b: N | float) -> tuple[Triple[N], Triple[N], Triple[N]]:
+    """Return the rows of ``a W + b W W``, the rotation less the identity: small rotations lose no digits."""
+    x, y, z = omega
+    ax, ay, az = x * a, y * a, z * a
+    bx, by, bz = x * b, y * b, z * b
+    xx, yy, zz, xy, xz, yz = x * bx, y * by, z * bz, x * by, x * bz, y * bz
+    return (-(yy + zz), xy - az, xz + ay), (xy + az, -(xx + zz), yz - ax), (xz - ay, yz + ax, -(xx + yy))

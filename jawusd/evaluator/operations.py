@@ -1,0 +1,109 @@
+"""What the formulas need of a kind of number beyond arithmetic, and its form for Python's floats.
+
+A table is rows of floats, stored as the kind of number likes. A column of one is a sequence of numbers, or of one wide
+number that holds them all: a tensor, say. This file imports nothing but the standard library and
+`jawusd.geometry.rodrigues`: it is copied into the reader that runs inside other programs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Protocol, TypeVar
+
+from jawusd.geometry.rodrigues import SMALL_SQUARED_ANGLE, N, Triple, angle_quotients, angle_series
+
+Rows = list[list[float]]
+Table = TypeVar("Table", contravariant=True)  # how a kind of number stores rows of floats
+
+
+class Operations(Protocol[N, Table]):
+    """What the formulas need of a kind of number beyond arithmetic."""
+
+    def sqrt(self, x: N) -> N:
+        """Return the square root."""
+
+    def exp(self, x: N) -> N:
+        """Return the exponential."""
+
+    def clip(self, x: N, low: float, high: float) -> N:
+        """Return x limited to [low, high]."""
+
+    def angle_coefficients(self, squared: N) -> Triple[N]:
+        """Return the coefficients a, b and c of `jawusd.geometry.rodrigues` at a squared angle [rad^2]."""
+
+    def log_sum_exp(self, terms: Sequence[N]) -> N:
+        """Return the logarithm of the sum of the exponentials of all terms."""
+
+    def columns(self, table: Table) -> Sequence[Sequence[N]]:
+        """Return the columns of a table."""
+
+    def weighted_sum(self, factors: Sequence[N], weights: Table) -> Triple[N]:
+        """Return the sum of the rows of a table with three columns, each row times its factor."""
+
+    def lookup(self, x: N, knots: Table, tables: Sequence[Table]) -> Sequence[Sequence[N]]:
+        """Return row i of each table, where i is the number of knots, a table with one column, at or below x."""
+
+    def split(self, row: Sequence[N], width: int) -> Sequence[N]:
+        """Return a row as `width` separate numbers."""
+
+
+class FloatOperations:
+    """`Operations` on Python's floats."""
+
+    sqrt = staticmethod(math.sqrt)
+    exp = staticmethod(math.exp)
+
+    @staticmethod
+    def clip(x: float, low: float, high: float) -> float:
+        """Return x limited to [low, high]."""
+        return min(max(x, low), high)
+
+    @staticmethod
+    def angle_coefficients(squared: float) -> Triple[float]:
+        """Return a, b and c at a squared angle [rad^2]."""
+        if squared < SMALL_SQUARED_ANGLE:
+            return angle_series(squared)
+        angle = math.sqrt(squared)
+        return angle_quotients(squared, angle, math.sin(angle), math.sin(0.5 * angle))
+
+    @staticmethod
+    def log_sum_exp(terms: Sequence[float]) -> float:
+        """Return the logarithm of the sum of exponentials, free of overflow."""
+        peak = max(terms)
+        return peak + math.log(sum(math.exp(term - peak) for term in terms))
+
+    @staticmethod
+    def columns(table: Rows) -> list[tuple[float, ...]]:
+        """Return the columns of a table."""
+        return list(zip(*table))
+
+    @staticmethod
+    def weighted_sum(factors: Sequence[float], weights: Rows) -> Triple[float]:
+        """Return the sum of the rows of a table, each times its factor."""
+        x = y = z = 0.0
+        for factor, (a, b, c) in zip(factors, weights):
+            x, y, z = x + factor * a, y + factor * b, z + factor * c
+        return x, y, z
+
+    @staticmethod
+    def lookup(x: float, knots: Rows, tables: Sequence[Rows]) -> list[list[float]]:
+        """Return row i of each table, where i is the number of knots at or below x."""
+        interval = sum(knot <= x for (knot,) in knots)
+        return [table[interval] for table in tables]
+
+    @staticmethod
+    def split(row: Sequence[float], width: int) -> Sequence[float]:
+        """Return the row: it is separate numbers."""
+        return row
+
+
+def rows(flat: Sequence[float], width: int) -> Rows:
+    """Return the rows of a flat array."""
+    return [list(flat[i : i + width]) for i in range(0, len(flat), width)]
+
+
+def triple(values: Sequence[N]) -> Triple[N]:
+    """Return a vector of three numbers."""
+    x, y, z = values
+    return x, y, z
