@@ -13,7 +13,7 @@ import numpy as np
 import jawusd
 from jawusd.evaluator import JawRig
 from jawusd.formats.poses import read_poses, write_poses
-from jawusd.geometry import transform_points
+from jawusd.geometry import transform_point
 
 EXAGGERATED = 1.5
 WRONG_AXIS_MM = np.array([0.0, 40.0, 0.0])  # a hinge far above the bite
@@ -53,7 +53,7 @@ def main() -> None:
     repaired = np.where(valid[:, None, None], poses, rig.pose(rig.project(verdicts.d)))
     print(f"valid after the repair: {rig.validate(repaired).valid.sum()} of {len(frames)}")
     incisor = rig.arrays["landmarks"][0]
-    moved_mm = np.linalg.norm(transform_points(repaired, incisor) - transform_points(poses, incisor), axis=1)
+    moved_mm = np.linalg.norm(transform_point(repaired, incisor) - transform_point(poses, incisor), axis=1)
     print(f"farthest move of the incisal point: {moved_mm.max():.1f} mm, in frame {frames[moved_mm.argmax()]}")
     write_poses(options.out, frames, repaired)
     print(options.out)

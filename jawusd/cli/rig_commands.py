@@ -232,14 +232,14 @@ def ik(
 ) -> None:
     """Find the valid parameters that bring a point of the mandible nearest to a target."""
     import jawusd
-    from jawusd.geometry import transform_points
+    from jawusd.geometry import transform_point
 
     for values, option in ((point, "--point"), (target, "--target"), (start or point, "--start")):
         _check_finite(values, option)
     loaded = jawusd.load(rig)
     d, distance = loaded.ik(point, target, start=start)
     distance_mm = float(distance)
-    reached = transform_points(loaded.pose(d), point)
+    reached = transform_point(loaded.pose(d), point)
     result = {"d": d, "reached": reached, "distance_mm": distance_mm, "margin_mm": float(loaded.margin(d))}
     emit(result, as_json, lambda: [f"d {d[0]:.3f} {d[1]:.3f} {d[2]:.3f} mm, {distance_mm:.3f} mm from the target"])
 

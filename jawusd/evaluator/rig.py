@@ -274,7 +274,7 @@ class JawRig:
         """Return the verdicts in batch shape, frames reached too fast marked if there is a speed limit."""
         fast = np.zeros(batch, dtype=bool)
         if limits.speed_mm_s is not None:
-            positions = transform_points(poses, self.arrays["landmarks"][None]).reshape(*batch, -1, 3)
+            positions = transform_points(poses, self.arrays["landmarks"]).reshape(*batch, -1, 3)
             fast = too_fast(positions, times_s, limits.speed_mm_s)
         return verdicts.finished(batch, fast)
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jawusd.fitting.data import Anatomy, TrainingData
-from jawusd.geometry import se3_inverse, so3_log, transform_points
+from jawusd.geometry import se3_inverse, so3_log, transform_point
 from jawusd.geometry.arrays import Array
 
 _OPENING_MAX_MM = 75.0
@@ -94,13 +94,13 @@ def _condyle_travel(data: TrainingData, anatomy: Anatomy, factor: float) -> floa
     T = se3_inverse(anatomy.T_anatomical_skull) @ data.motion @ anatomy.T_anatomical_skull @ anatomy.T_rest
     T[:, :3, 3] *= factor
     centre = data.landmarks[3:].mean(0)
-    return float(np.percentile(np.linalg.norm(transform_points(anatomy.motion(T), centre) - centre, axis=-1), 90))
+    return float(np.percentile(np.linalg.norm(transform_point(anatomy.motion(T), centre) - centre, axis=-1), 90))
 
 
 def _swap_mistake(data: TrainingData) -> AnatomyWarning | None:
     rise = float(np.percentile(data.displacement()[:, 1], _QUANTILE))
     inverse = se3_inverse(data.motion)
-    swapped_rise = float(np.percentile(transform_points(inverse, data.incisor)[:, 1] - data.incisor[1], _QUANTILE))
+    swapped_rise = float(np.percentile(transform_point(inverse, data.incisor)[:, 1] - data.incisor[1], _QUANTILE))
     if rise > _RISE_MAX_MM and swapped_rise < _RISE_MAX_MM:
         return AnatomyWarning(
             "swapped_jaws",
@@ -114,7 +114,7 @@ def _out_of_range(data: TrainingData) -> list[AnatomyWarning]:
     u = data.displacement()
     near = u[-u[:, 1] < _NEAR_CLOSED_MM]
     forward = near[:, 2] if len(near) else np.zeros(1)
-    condyles = transform_points(data.motion, data.landmarks[3]), transform_points(data.motion, data.landmarks[4])
+    condyles = transform_point(data.motion, data.landmarks[3]), transform_point(data.motion, data.landmarks[4])
     travel = np.concatenate([np.linalg.norm(c - p, axis=-1) for c, p in zip(condyles, data.landmarks[3:], strict=True)])
     found = [
         ("opening", float(np.percentile(-u[:, 1], _QUANTILE)), _OPENING_MAX_MM, "mm"),

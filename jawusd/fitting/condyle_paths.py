@@ -9,7 +9,7 @@ from jawusd.evaluator.models import JawModelForm
 from jawusd.fitting.data import Anatomy, TrainingData
 from jawusd.formats.experiments import CondylePath, Distances, ParameterPath
 from jawusd.formats.mesh import Mesh
-from jawusd.geometry import se3_exp, se3_log, transform_points
+from jawusd.geometry import se3_exp, se3_log, transform_point, transform_points
 from jawusd.geometry.arrays import Array
 
 EXPERIMENT = "condyle path"
@@ -67,7 +67,7 @@ def parameter_paths(data: TrainingData, models: dict[str, JawModelForm], capture
             shown = near if axis and len(near) else captured
             low, high = np.percentile(shown[:, axis], [0.5, 99.5])
             d[:, axis] = np.linspace(min(low, 0.0) if axis else 0.0, max(high, 0.0), _STEPS)
-            points = transform_points(model.motion(d), data.landmarks[3])
+            points = transform_point(model.motion(d), data.landmarks[3])
             found.append(ParameterPath(name, axis, d[:, axis], points))
     return tuple(found)
 
@@ -89,8 +89,8 @@ def principal_opening(data: TrainingData) -> Array:
 
 
 def _path(name: str, motion: Array, data: TrainingData, bone: Mesh | None) -> CondylePath:
-    points = np.stack([transform_points(motion, centre) for centre in data.landmarks[3:]])
-    opening = -(transform_points(motion, data.incisor) - data.incisor)[:, 1]
+    points = np.stack([transform_point(motion, centre) for centre in data.landmarks[3:]])
+    opening = -(transform_point(motion, data.incisor) - data.incisor)[:, 1]
     heads = []
     if bone is not None:
         near = Mesh(bone.vertices, _faces_near(bone, data.landmarks[3]))

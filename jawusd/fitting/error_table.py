@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from jawusd.fitting.data import TrainingData
-from jawusd.geometry import LANDMARKS, transform_points
+from jawusd.geometry import LANDMARKS, transform_point
 from jawusd.geometry.arrays import Array
 
 
@@ -21,7 +21,7 @@ def pose_errors(data: TrainingData, model: Array) -> dict[str, Array]:
     """
     errors = {"mandible": data.metric.largest(model, data.motion)}
     for name, point in zip(LANDMARKS, data.landmarks, strict=True):
-        errors[name] = np.linalg.norm(transform_points(model, point) - transform_points(data.motion, point), axis=-1)
+        errors[name] = np.linalg.norm(transform_point(model, point) - transform_point(data.motion, point), axis=-1)
     return errors
 
 

@@ -22,7 +22,7 @@ from jawusd.fitting.synthesis import Bounds, captured_reference, distance_to_nea
 from jawusd.formats.experiments import Coverage, Distances, Experiments
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import Tracks
-from jawusd.geometry import se3_exp, se3_log, transform_points
+from jawusd.geometry import se3_exp, se3_log, transform_point, transform_points
 from jawusd.geometry.arrays import Array, Mask
 
 #: Models of the experiments: label and how `FittingConfig` asks for them.
@@ -94,7 +94,7 @@ def run_experiments(
     shown, sentences = shown_parameters(data)
     fitted = _fit_all(data, shown, wanted, config, lambda done: tell(done, steps))
     nets = [] if quick else _networks(data, config, fitted.forms.get("paper"), lambda d: tell(len(wanted) + d, steps))
-    captured = np.stack([transform_points(data.motion, centre) for centre in data.landmarks[3:]])
+    captured = np.stack([transform_point(data.motion, centre) for centre in data.landmarks[3:]])
     d, kept = fitted.d[DEFAULT], fitted.d[DEFAULT][fitted.forms[DEFAULT].kept]
     swept = {name: fitted.forms[name].model for name in ("paper", DEFAULT) if name in fitted.forms}
     widest = float(np.quantile(kept[:, 0], _OPENING_QUANTILE))

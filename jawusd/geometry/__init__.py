@@ -23,6 +23,7 @@ from jawusd.geometry.se3 import (
     se3_left_jacobian_inverse,
     se3_log,
     se3_right_jacobian,
+    transform_point,
     transform_points,
 )
 from jawusd.geometry.so3 import (
@@ -63,6 +64,7 @@ __all__ = [
     "so3_left_jacobian_inverse",
     "so3_log",
     "so3_right_jacobian",
+    "transform_point",
     "transform_points",
     "triangulate",
     "vee",

@@ -47,21 +47,27 @@ def se3_inverse(T: ArrayLike) -> Array:
     return make_transform(Rt, -np.einsum("...ij,...j->...i", Rt, T[..., :3, 3]))
 
 
+def transform_point(T: ArrayLike, p: ArrayLike) -> Array:
+    """Apply each transform (..., 4, 4) to its own point (..., 3) [mm], ``p_a = T_a_b p_b``, shape (..., 3).
+
+    The leading axes are broadcast: one point may go with many transforms.
+    """
+    T, p = np.asarray(T, dtype=np.float64), np.asarray(p, dtype=np.float64)
+    return np.einsum("...ij,...j->...i", T[..., :3, :3], p) + T[..., :3, 3]
+
+
 def transform_points(T: ArrayLike, points: ArrayLike) -> Array:
-    """Apply transforms to points, ``p_a = T_a_b p_b``.
+    """Apply each transform (..., 4, 4) to all points (N, 3) [mm], ``p_a = T_a_b p_b``, shape (..., N, 3).
 
-    Args:
-        T: transforms, shape (..., 4, 4).
-        points: points [mm], shape (..., 3), or (N, 3) per transform.
+    Points (..., N, 3) are a set per transform: all axes before the last two are broadcast against those of `T`.
 
-    Returns:
-        Points: shape (..., 3) for one point per transform, (..., N, 3) when `points` is (N, 3) or (..., N, 3) and `T`
-        has fewer leading axes than it.
+    Raises:
+        ValueError: a single point, see `transform_point`.
     """
     T, points = np.asarray(T, dtype=np.float64), np.asarray(points, dtype=np.float64)
-    if points.ndim >= 2 and points.shape[:-1] != T.shape[:-2]:
-        return points @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3]
-    return np.einsum("...ij,...j->...i", T[..., :3, :3], points) + T[..., :3, 3]
+    if points.ndim < 2:
+        raise ValueError(f"points must have shape (..., N, 3), got {points.shape}")
+    return points @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3]
 
 
 def relative_pose(T_world_upper: ArrayLike, T_world_lower: ArrayLike) -> Array:

@@ -113,11 +113,11 @@ def leave_one_out(donors: Sequence[Donor], *, closest: bool = False) -> Learned:
         others = [*donors[:i], *donors[i + 1 :]]
         shares, rest = _captured_shares(left_out, _POSES_LEFT_OUT), left_out.landmarks
         own = left_out.rig.arrays["landmarks"]
-        truth = transform_points(left_out.rig.pose(left_out.rig.denormalized(shares)), own[None])
+        truth = transform_points(left_out.rig.pose(left_out.rig.denormalized(shares)), own)
         moved = np.stack([displacements(donor, rest, shares) for donor in others])
         for found, bandwidth in zip(errors, choices, strict=True):
             average = np.einsum("j,jkpi->kpi", _weights(others, rest, bandwidth), moved)
-            predicted = transform_points(poses_of_landmarks(rest, rest + average), rest[None])
+            predicted = transform_points(poses_of_landmarks(rest, rest + average), rest)
             found[left_out.name] = np.linalg.norm(predicted - truth, axis=-1)
     expected = [Expected(found) for found in errors]
     best = int(np.argmin([found.pooled().mean() for found in expected]))

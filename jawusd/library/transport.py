@@ -69,7 +69,7 @@ def displacements(donor: Donor, target: Array, shares: Array) -> Array:
     """
     rest = donor.landmarks
     d = donor.rig.denormalized(shares)
-    moved = transform_points(donor.rig.pose(d), donor.rig.arrays["landmarks"][None]) - rest
+    moved = transform_points(donor.rig.pose(d), donor.rig.arrays["landmarks"]) - rest
     width = condylar_distance_mm(target) / condylar_distance_mm(rest)
     reach = condyle_incisor_mm(target) / condyle_incisor_mm(rest)
     axes = landmark_frame(target)[:3, :3]  # rows: left, up and anterior in the target's frame

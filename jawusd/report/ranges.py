@@ -8,7 +8,7 @@ import numpy as np
 
 from jawusd.formats.model import JawModel
 from jawusd.formats.tracks import Tracks
-from jawusd.geometry import se3_inverse, so3_log, transform_points
+from jawusd.geometry import se3_inverse, so3_log, transform_point, transform_points
 from jawusd.geometry.arrays import Array
 from jawusd.report.verdicts import GOOD, LOOK
 
@@ -89,10 +89,10 @@ def rest_points(model: JawModel, points: Array) -> Array:
 
 
 def _measured(motion: Array, landmarks: Array) -> list[float]:
-    u = transform_points(motion, landmarks[0]) - landmarks[0]
+    u = transform_point(motion, landmarks[0]) - landmarks[0]
     near = u[-u[:, 1] < _NEAR_CLOSED_MM]
     turns = np.rad2deg(np.linalg.norm(so3_log(motion[:, :3, :3]), axis=-1))
-    travels = [np.linalg.norm(transform_points(motion, point) - point, axis=-1) for point in landmarks[3:]]
+    travels = [np.linalg.norm(transform_point(motion, point) - point, axis=-1) for point in landmarks[3:]]
     forward = near[:, 2] if len(near) else np.zeros(1)
     return [float(np.percentile(v, _QUANTILE)) for v in (-u[:, 1], u[:, 0], -u[:, 0], forward, turns, *travels)]
 

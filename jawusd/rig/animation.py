@@ -173,4 +173,4 @@ def _shown(T_a: Array, T_b: Array, share: float) -> Array:
 def _landmark_distance(rig: JawRig, T_a: Array, T_b: Array) -> Array:
     landmarks = rig.arrays["landmarks"]
     difference = T_a - T_b
-    return np.linalg.norm(transform_points(difference, landmarks[None]), axis=-1).max(axis=1)
+    return np.linalg.norm(transform_points(difference, landmarks), axis=-1).max(axis=1)

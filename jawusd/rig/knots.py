@@ -66,7 +66,7 @@ def _curvature(rig: JawRig, box: Array, points: Array, axis: int) -> Array:
     bend = np.zeros(_FINE)
     step = axes[axis][1] - axes[axis][0]
     for j in range(d.shape[1]):
-        moved = transform_points(rig.pose(d[:, j]), points[None, None].repeat(_FINE, 0).repeat(_COARSE, 1))
+        moved = transform_points(rig.pose(d[:, j]), points)
         second = np.linalg.norm(moved[2:] - 2 * moved[1:-1] + moved[:-2], axis=-1).max(-1) / step**2
         bend[1:-1] = np.maximum(bend[1:-1], np.where(near[1:-1, j], second, 0.0).max(-1))
     bend[[0, -1]] = bend[[1, -2]]

@@ -55,7 +55,7 @@ def _error_mm(model: onnx.ModelProto, rig: JawRig, d: Array) -> float:
         exact = rig.pose(d).astype(dtype).astype(np.float64)
         (encoded,) = run(["d"], {"pose": exact.astype(dtype)})
         found = rig.pose(encoded)
-    moved = transform_points(found.astype(np.float64) - exact, rig.arrays["landmarks"][None])
+    moved = transform_points(found.astype(np.float64) - exact, rig.arrays["landmarks"])
     return float(np.linalg.norm(moved, axis=-1).max())
 
 

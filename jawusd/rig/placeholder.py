@@ -17,7 +17,7 @@ from jawusd.evaluator import JawRig
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry.anatomy import LANDMARKS
 from jawusd.geometry.arrays import Array
-from jawusd.geometry.se3 import se3_inverse, transform_points
+from jawusd.geometry.se3 import se3_inverse, transform_point, transform_points
 
 _CONDYLES = [LANDMARKS.index(name) for name in ("condyle_left", "condyle_right")]
 _INCISOR = LANDMARKS.index("incisor")
@@ -105,7 +105,7 @@ def _thinnest(poses: Array, mean: Array) -> Array | None:
 
 def _thickness(poses: Array, point: Array) -> float:
     """Return the RMS distance [mm] of a point's sagittal trajectory from a smooth path through it."""
-    y, z = transform_points(poses, point)[:, 1:].T
+    y, z = transform_point(poses, point)[:, 1:].T
     travel = np.ptp(z)
     if travel < _LEAST_TRAVEL_MM:
         return np.inf

@@ -194,5 +194,5 @@ def _parameters(prim: Usd.Prim, times: list[Usd.TimeCode]) -> Array:
 
 def _landmark_distance(rig: JawRig, T_a: Array, T_b: Array) -> Array:
     """Return the largest distance [mm] of a landmark between poses (n, 4, 4), shape (n,)."""
-    points = transform_points(T_a - T_b, rig.arrays["landmarks"][None])
+    points = transform_points(T_a - T_b, rig.arrays["landmarks"])
     return np.linalg.norm(points, axis=-1).max(axis=-1)

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jawusd.geometry import transform_points
+from jawusd.geometry import transform_point
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.synthetic.envelope import Envelope
 from jawusd.synthetic.kinematics import Joint, controlled_pose
@@ -172,7 +172,7 @@ class Person:
 
     def incisor(self, T_skull_mandible: ArrayLike) -> Array:
         """Return the displacement of the lower incisal point from rest [mm], scan axes, shape (..., 3)."""
-        return transform_points(T_skull_mandible, self.joint.incisor) - self.joint.incisor
+        return transform_point(T_skull_mandible, self.joint.incisor) - self.joint.incisor
 
 
 def _dental_landmarks(joint: Joint) -> Array:

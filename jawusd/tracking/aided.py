@@ -13,7 +13,7 @@ from jawusd.evaluator import JawRig
 from jawusd.formats.capture import Capture
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, Tracks
-from jawusd.geometry import Camera, relative_pose, se3_adjoint, se3_exp, se3_inverse, se3_log, transform_points
+from jawusd.geometry import Camera, relative_pose, se3_adjoint, se3_exp, se3_inverse, se3_log, transform_point
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.extrinsics import corrected_cameras
@@ -73,7 +73,7 @@ def aid_tracks(
         return tracks
     scans = (prepare_scan(upper, "upper"), prepare_scan(lower, "lower"))
     table = {camera.name: camera for camera in corrected_cameras(cameras, tracks.meta)}
-    middle = np.mean([transform_points(tracks.T_world_upper[good][0], s.centre) for s in scans], axis=0)
+    middle = np.mean([transform_point(tracks.T_world_upper[good][0], s.centre) for s in scans], axis=0)
     prior = KinematicPrior(jaw, _spread_mm(jaw, tracks, good), _variances(tracks))
     starts = _starts(tracks, jaw, measured)
     found: dict[int, _Aided] = {}

@@ -18,6 +18,7 @@ from jawusd.geometry import (
     orthonormalise,
     rigid_fit,
     se3_exp,
+    transform_point,
     transform_points,
     triangulate,
 )
@@ -116,7 +117,7 @@ def picked_sigma_mm(
         _, _, slope = _residuals_px(s, pose)
         px_per_mm = np.linalg.norm(slope, axis=(1, 2)) / np.sqrt(2)
         slope = (slope / (px_per_mm * _CLICK_MM)[:, None, None]).reshape(-1, 3)
-        p = transform_points(pose, s.point)
+        p = transform_point(pose, s.point)
         J = np.hstack([np.cross(p, slope), slope])
         H += J.T @ J
     M = mandible_metric(transform_points(pose, probes))
@@ -150,7 +151,7 @@ def _sighting(number: int, pick: Pick, vertices: NDArray, cameras: Mapping[str, 
 
 def _residuals_px(s: _Sighting, pose: Array) -> tuple[NDArray, NDArray, NDArray]:
     """Return projection minus pixel (C, 2), depths (C,) and the derivative by the world point (C, 2, 3)."""
-    h = s.matrices @ np.append(transform_points(pose, s.point), 1.0)
+    h = s.matrices @ np.append(transform_point(pose, s.point), 1.0)
     projected = h[:, :2] / h[:, 2:]
     slope = (s.matrices[:, :2, :3] - projected[:, :, None] * s.matrices[:, 2:, :3]) / h[:, 2, None, None]
     return projected - s.pixels, h[:, 2], slope
@@ -169,10 +170,10 @@ def _refined(sightings: Sequence[_Sighting], pose: Array) -> Array:
     """Minimise the pixel error of the picks by Gauss-Newton, starting close by."""
     for _ in range(10):
         H, g = np.zeros((6, 6)), np.zeros(6)
-        centre = transform_points(pose, np.mean([s.point for s in sightings], axis=0))
+        centre = transform_point(pose, np.mean([s.point for s in sightings], axis=0))
         for s in sightings:
             residual, _, slope = _residuals_px(s, pose)
-            p = transform_points(pose, s.point) - centre
+            p = transform_point(pose, s.point) - centre
             turn = np.stack([np.cross(p, row) for row in slope.reshape(-1, 3)])
             J = np.hstack([turn, slope.reshape(-1, 3)])
             H += J.T @ J

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from jawusd.errors import CaptureError, TrackingError
-from jawusd.geometry import transform_points
+from jawusd.geometry import transform_point
 from jawusd.geometry.arrays import Array
 from jawusd.tracking.first import first_record
 from jawusd.tracking.footage import Footage, Start
@@ -89,7 +89,7 @@ def search_around(search: StartSearch, footage: Footage, frame: int, poses: Arra
 def _aligned(search: StartSearch, footage: Footage, poses: Array, frame: int) -> Array:
     """Return the poses as aligned by the solver if they pass the checks of a first frame, shape (2, 4, 4)."""
     solver = search.solver
-    centre = np.mean([transform_points(poses[r], solver.scans[r].centre) for r in _ROWS], axis=0)
+    centre = np.mean([transform_point(poses[r], solver.scans[r].centre) for r in _ROWS], axis=0)
     with footage.views(centre, solver.config.working_px_per_mm) as masks:
         return first_record(solver, solver.config, poses, masks, frame).solution.poses
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, TRACKED
-from jawusd.geometry import make_transform, se3_exp, transform_points
+from jawusd.geometry import make_transform, se3_exp, transform_point
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.history import FrameRecord, History
@@ -217,7 +217,7 @@ class FrameTracker:
 def _around(pose: Array, centre: Array, rings: Sequence[tuple[float, float]]) -> Iterator[Array]:
     """Yield a pose and, for each (mm, rad), the poses moved and turned both ways along each axis about a scan point."""
     yield pose
-    c = transform_points(pose, centre)
+    c = transform_point(pose, centre)
     to, back = make_transform(np.eye(3), -c), make_transform(np.eye(3), c)
     for mm, rad in rings:
         for k in range(6):

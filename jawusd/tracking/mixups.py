@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from jawusd.errors import CaptureError, TrackingError
 from jawusd.formats.capture import CameraSource, Masks
-from jawusd.geometry import transform_points
+from jawusd.geometry import transform_point
 from jawusd.geometry.arrays import Array
 from jawusd.imaging.raster import count_and_not, count_bits, draw_silhouette, pack_bits, project
 from jawusd.tracking.footage import Footage
@@ -108,7 +108,7 @@ def likely_mixup(footage: Footage, solver: ContourSolver, poses: Array, frame: i
 
 def _bare_shares(footage: Footage, solver: ContourSolver, poses: Array, frame: int) -> Array:
     """Return the share of each camera's masks that lies off their scans, NaN without a mask, shape (C,)."""
-    centre = np.mean([transform_points(poses[r], solver.scans[r].centre) for r in _ROWS], axis=0)
+    centre = np.mean([transform_point(poses[r], solver.scans[r].centre) for r in _ROWS], axis=0)
     with footage.views(centre, solver.config.working_px_per_mm / 2) as masks:
         return np.array([_bare_share(view, solver.scans, poses) for view in masks.at(frame)])
 

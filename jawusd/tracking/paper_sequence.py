@@ -14,7 +14,7 @@ from jawusd.errors import TrackingError
 from jawusd.formats.capture import Capture
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import LOST, PARTIAL, TRACKED, Tracks
-from jawusd.geometry import LANDMARKS, Camera, relative_pose, transform_points
+from jawusd.geometry import LANDMARKS, Camera, relative_pose, transform_point
 from jawusd.geometry.arrays import Array
 from jawusd.imaging.pixel_counts import RasterCounter
 from jawusd.tracking.bootstrap import pose_from_picks
@@ -75,7 +75,7 @@ def track_capture_paper(
     table = {camera.name: camera for camera in cameras}
     scans = (paper_scan(upper, "upper"), paper_scan(lower, "lower"))
     start = _start_poses(capture, table, (upper, lower))
-    centre = np.mean([transform_points(start[r], scans[r].centre) for r in _ROWS], axis=0)
+    centre = np.mean([transform_point(start[r], scans[r].centre) for r in _ROWS], axis=0)
     with ExitStack() as stack:
         masks = stack.enter_context(MaskViews(capture.cameras, table, offsets, centre, config.working_px_per_mm))
         first, stop = capture.frames or masks.frames

@@ -13,7 +13,7 @@ from math import radians
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.geometry import orthonormalise, transform_points
+from jawusd.geometry import orthonormalise, transform_point
 from jawusd.geometry.arrays import Array
 
 _GOLDEN = (np.sqrt(5) - 1) / 2
@@ -161,7 +161,7 @@ def _poses(start: Array, centre: Array, parameters: NDArray) -> Array:
             [-sy, cy * sx, cy * cx],
         ]
     ).transpose(2, 0, 1)
-    pivot = transform_points(start, centre)
+    pivot = transform_point(start, centre)
     out = np.zeros((len(parameters), 4, 4))
     out[:, :3, :3] = R @ start[:3, :3]
     out[:, :3, 3] = R @ (start[:3, 3] - pivot) + pivot + parameters[:, 3:]

@@ -174,7 +174,6 @@ def landmark_sigmas(T_upper_lower: Array, covariance: Array, landmarks: Array) -
         covariance: as `relative_covariance` gives it, shape (..., 6, 6).
         landmarks: points in mandible coordinates [mm], shape (L, 3).
     """
-    # Not transform_points: with as many poses as landmarks it would pair them off.
-    points = landmarks @ np.swapaxes(T_upper_lower[..., :3, :3], -1, -2) + T_upper_lower[..., None, :3, 3]
+    points = transform_points(T_upper_lower, landmarks)
     J = np.concatenate([-hat(points), np.broadcast_to(np.eye(3), (*points.shape, 3))], axis=-1)
     return np.sqrt(np.einsum("...lij,...jk,...lik->...l", J, covariance, J))

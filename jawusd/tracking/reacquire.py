@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jawusd.geometry import transform_points
+from jawusd.geometry import transform_point
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.imaging.raster import draw_silhouette, project, unpack_bits, words_for
 from jawusd.tracking.scan import Scan
@@ -30,7 +30,7 @@ def shift_to_masks(scan: Scan, pose: Array, row: int, views: Sequence[View], use
         World translation, shape (3,); zero without a mask.
     """
     points = np.empty((len(scan.vertices), 3), np.float32)
-    centre = np.append(transform_points(pose, scan.centre), 1.0)
+    centre = np.append(transform_point(pose, scan.centre), 1.0)
     H, g, sight = np.zeros((3, 3)), np.zeros(3), np.zeros(3)
     for c in np.flatnonzero(use[row]):
         view = views[c]

@@ -14,7 +14,7 @@ import numpy as np
 from jawusd.errors import TrackingError
 from jawusd.formats.capture import Capture
 from jawusd.formats.mesh import Mesh
-from jawusd.geometry import Camera, transform_points
+from jawusd.geometry import Camera, transform_point
 from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.footage import Footage
@@ -123,7 +123,7 @@ class _Sizes:
         scans, config = self._solver.scans, self._solver.config
         start = poses.copy()
         start[:, :3, 3] *= size / size_of_poses
-        centre = np.mean([transform_points(start[r], scans[r].centre) for r in _ROWS], axis=0)
+        centre = np.mean([transform_point(start[r], scans[r].centre) for r in _ROWS], axis=0)
         with self.footage(size).views(centre, config.working_px_per_mm) as masks:
             views = masks.at(frame)
         end = self._solver.solve(start, views, config.wide_gates_px)

@@ -11,7 +11,7 @@ import numpy as np
 from jawusd.formats.capture import Capture
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, Tracks
-from jawusd.geometry import Camera, transform_points
+from jawusd.geometry import Camera, transform_point
 from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.extrinsics import Extrinsics
@@ -68,7 +68,7 @@ def track_capture(
     with ThreadPoolExecutor(threads) as pool:
         solver = ContourSolver(scans, config, pool if threads > 1 else None)
         start = find_start(capture, table, offsets, (upper, lower), solver, pool.map)
-        centre = np.mean([transform_points(start.poses[r], scans[r].centre) for r in (0, 1)], axis=0)
+        centre = np.mean([transform_point(start.poses[r], scans[r].centre) for r in (0, 1)], axis=0)
         with MaskViews(capture.cameras, table, offsets, centre, config.working_px_per_mm) as masks:
             first, stop = capture.frames or masks.frames
             take = _Take(solver, config, masks, first, stop, progress)

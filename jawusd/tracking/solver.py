@@ -10,7 +10,15 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.geometry import make_transform, orthonormalise, se3_exp, se3_inverse, se3_log, transform_points
+from jawusd.geometry import (
+    make_transform,
+    orthonormalise,
+    se3_exp,
+    se3_inverse,
+    se3_log,
+    transform_point,
+    transform_points,
+)
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.imaging.raster import draw_depth_labels, project
 from jawusd.tracking.config import TrackingConfig
@@ -134,7 +142,7 @@ class ContourSolver:
         config = self.config
         render.update(poses)
         tasks = [(r, c) for r in _ROWS for c in range(len(views)) if use[r, c]]
-        centres = np.stack([transform_points(poses[r], self.scans[r].centre) for r in _ROWS])
+        centres = np.stack([transform_point(poses[r], self.scans[r].centre) for r in _ROWS])
         reach = gate + 1.0
 
         def match(task):

@@ -9,7 +9,7 @@ import numpy as np
 
 from jawusd.errors import TrackingError
 from jawusd.formats.mesh import Mesh
-from jawusd.geometry import make_transform, so3_log, transform_points
+from jawusd.geometry import make_transform, so3_log, transform_point, transform_points
 from jawusd.geometry.arrays import Array
 from jawusd.tracking.footage import Footage
 from jawusd.tracking.pose_search import Candidate, Grid, coarse_scan, hinge_at_front, search_row
@@ -99,7 +99,7 @@ class StartSearch:
         Raises:
             TrackingError: no pair of poses that a jaw can take.
         """
-        with footage.views(transform_points(poses[0], self._coarse[0].centre), _PX_PER_MM) as masks:
+        with footage.views(transform_point(poses[0], self._coarse[0].centre), _PX_PER_MM) as masks:
             views = masks.at(frame)
         finalists = []
         for r in _ROWS:
@@ -119,7 +119,7 @@ class StartSearch:
         pairs = self._refined_pairs(finalists, views)
         if not pairs:
             raise TrackingError(f"frame {frame}: the best poses of the two rows of teeth are none a jaw can take")
-        centre = np.mean([transform_points(pairs[0][r], self._coarse[r].centre) for r in _ROWS], axis=0)
+        centre = np.mean([transform_point(pairs[0][r], self._coarse[r].centre) for r in _ROWS], axis=0)
         with footage.views(centre, self._config.working_px_per_mm) as masks:
             views = masks.at(frame)
         ends = [self.solver.solve(poses, views, self._config.wide_gates_px) for poses in pairs]

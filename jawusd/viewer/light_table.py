@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jawusd.formats.mesh import Mesh
-from jawusd.geometry import make_transform, transform_points
+from jawusd.geometry import make_transform, transform_point, transform_points
 from jawusd.geometry.arrays import Array
 from jawusd.geometry.rays import meet_triangles
 from jawusd.geometry.se3 import se3_inverse
@@ -122,7 +122,7 @@ def hit_vertex(mesh: Mesh, T_world_scan: Array, origin: ArrayLike, direction: Ar
         origin, direction: of the ray in the world, shape (3,).
     """
     inverse = se3_inverse(T_world_scan)
-    o = transform_points(inverse, np.asarray(origin, dtype=np.float64))
+    o = transform_point(inverse, np.asarray(origin, dtype=np.float64))
     d = inverse[:3, :3] @ np.asarray(direction, dtype=np.float64)
     d = d / np.linalg.norm(d)
     u, v, along = meet_triangles(o, d, mesh.vertices[mesh.faces])

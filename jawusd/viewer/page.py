@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import viser
 
-from jawusd.geometry.se3 import transform_points
+from jawusd.geometry.se3 import transform_point
 from jawusd.viewer.actor import ViewedActor
 from jawusd.viewer.file_panel import FilePanel
 from jawusd.viewer.motion_panel import MotionPanel
@@ -83,7 +83,7 @@ class Page:
         with self.client.atomic():
             self.scene.move(session.pose(), readout.inside)
             self.scene.show_pins(
-                {pin.name: transform_points(session.pose(), pin.p_mandible) for pin in session.work.pins}
+                {pin.name: transform_point(session.pose(), pin.p_mandible) for pin in session.work.pins}
             )
             self.pose.refresh(readout)
             self.plots.refresh(session.work.d, readout.inside)

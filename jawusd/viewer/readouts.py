@@ -41,8 +41,7 @@ class Readout:
 def landmark_places(rig: JawRig, d: Array) -> Array:
     """Return where the landmarks are, anatomical frame [mm], shape (..., 5, 3), for d (..., 3) [mm]."""
     T = rig.arrays["T_anatomical_skull"] @ rig.pose(d)
-    # With an axis more than landmarks have: five poses would otherwise count as one for each of the five.
-    return transform_points(T[..., None, :, :], rig.arrays["landmarks"])[..., 0, :, :]
+    return transform_points(T, rig.arrays["landmarks"])
 
 
 def rest_places(rig: JawRig) -> Array:

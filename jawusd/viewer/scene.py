@@ -11,7 +11,7 @@ from jawusd.formats.mesh import Mesh
 from jawusd.geometry import LANDMARKS
 from jawusd.geometry.arrays import Array
 from jawusd.geometry.quaternion import wxyz_from_matrix
-from jawusd.geometry.se3 import se3_inverse, transform_points
+from jawusd.geometry.se3 import se3_inverse, transform_point, transform_points
 from jawusd.viewer.actor import MOVING, STILL, ViewedActor
 from jawusd.viewer.decimate import is_solid
 from jawusd.viewer.readouts import CONDYLES, INCISOR, habitual_path, landmark_places, rest_places
@@ -156,13 +156,13 @@ class JawScene:
         """Mark pinned landmarks at their places (3,) [mm], skull frame."""
         for name, ball in self._pins.items():
             if name in places_skull:
-                ball.position = tuple(transform_points(self._T_world_skull, places_skull[name]))
+                ball.position = tuple(transform_point(self._T_world_skull, places_skull[name]))
             if ball.visible != (name in places_skull):
                 ball.visible = name in places_skull
 
     def skull_from_page(self, position: tuple[float, float, float]) -> Array:
         """Return a place of the page's world in the skull frame [mm], shape (3,)."""
-        return transform_points(se3_inverse(self._T_world_skull), np.array(position))
+        return transform_point(se3_inverse(self._T_world_skull), np.array(position))
 
     def look(self, preset: str) -> None:
         """Put the camera where a preset says; in a close-up the condyle's path shows through the mandible."""

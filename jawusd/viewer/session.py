@@ -13,7 +13,7 @@ from jawusd.evaluator import JawRig
 from jawusd.formats.keys import Keys
 from jawusd.geometry import LANDMARKS
 from jawusd.geometry.arrays import Array
-from jawusd.geometry.se3 import se3_inverse, transform_points
+from jawusd.geometry.se3 import se3_inverse, transform_point
 from jawusd.viewer import keytrack
 from jawusd.viewer.clip import Clip
 from jawusd.viewer.keytrack import KeyTrack
@@ -158,7 +158,7 @@ class Session:
 
     def grab(self, p_skull: ArrayLike) -> None:
         """Take hold of the point of the mandible that is now at p_skull [mm] (3,), skull frame."""
-        self._handle = transform_points(se3_inverse(self.pose()), np.asarray(p_skull, dtype=np.float64))
+        self._handle = transform_point(se3_inverse(self.pose()), np.asarray(p_skull, dtype=np.float64))
         self._gesture = None
 
     def drag_to(self, p_skull: ArrayLike) -> float:
@@ -181,7 +181,7 @@ class Session:
         weights = [1.0] + [_PIN_WEIGHT] * len(self.work.pins)
         d, _ = self.rig.ik(handles, targets, start=self.d, weights=weights)
         self._change("drag", d=_triple(d))
-        return float(np.linalg.norm(transform_points(self.rig.pose(d), self._handle) - target))
+        return float(np.linalg.norm(transform_point(self.rig.pose(d), self._handle) - target))
 
     def release(self) -> None:
         """Let go of the held point."""
@@ -190,7 +190,7 @@ class Session:
 
     def held_place(self) -> Array | None:
         """Return where the held point is now [mm], skull frame, shape (3,); None when nothing is held."""
-        return None if self._handle is None else transform_points(self.pose(), self._handle)
+        return None if self._handle is None else transform_point(self.pose(), self._handle)
 
     def set_pin(self, name: str, on: bool) -> None:
         """Pin a landmark where it is now, or let it go. Pins hold while dragging; sliders and keys move them along.
@@ -202,7 +202,7 @@ class Session:
         pins = tuple(pin for pin in self.work.pins if pin.name != name)
         if on:
             place = self.rig.arrays["landmarks"][LANDMARKS.index(name)]
-            pins += (Pin(name, _triple(place), _triple(transform_points(self.pose(), place))),)
+            pins += (Pin(name, _triple(place), _triple(transform_point(self.pose(), place))),)
         self._change(None, pins=pins)
 
     def set_keys(self, keys: KeyTrack) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 from jawusd.capture.calibrate import calibrate_capture
 from jawusd.formats.calibration import load_calibration, save_calibration
 from jawusd.formats.capture import load_capture
-from jawusd.geometry import rigid_fit, transform_points, triangulate
+from jawusd.geometry import rigid_fit, transform_point, transform_points, triangulate
 from jawusd.imaging.meshio import load_mesh
 
 POINTS = 400
@@ -52,7 +52,7 @@ def main() -> None:
     points = []
     for jaw, vertices in scans.items():
         for T in poses[jaw][rng.integers(len(poses[jaw]), size=POINTS // 2)]:
-            points.append(transform_points(T, vertices[rng.integers(len(vertices))]))
+            points.append(transform_point(T, vertices[rng.integers(len(vertices))]))
     exact = np.array(points)
     pixels = [found.undistort_pixels(camera.project(exact)) for found, camera in zip(cameras, truth, strict=True)]
     projections = [camera.projection_matrix() for camera in cameras]

@@ -17,7 +17,7 @@ import numpy as np
 
 from jawusd.formats.capture import load_capture
 from jawusd.formats.tracks import load_tracks
-from jawusd.geometry import LANDMARKS, mandible_metric, relative_pose, transform_points
+from jawusd.geometry import LANDMARKS, mandible_metric, relative_pose, transform_point, transform_points
 from jawusd.pipeline.prepare import find_anatomy, load_cameras, load_meshes
 from jawusd.tracking import TrackingConfig
 from jawusd.tracking.quality import landmark_sigmas, relative_covariance, residual_px, twist_covariance
@@ -52,7 +52,7 @@ def main() -> None:
     at = {int(frame): k for k, frame in enumerate(truth["frames"])}
     chosen = [k for k, frame in enumerate(tracks.frames) if int(frame) in at][:: options.step]
     solver, solutions = ContourSolver(scans, config), []
-    centre = np.mean([transform_points(exact[0, r], scans[r].centre) for r in (0, 1)], axis=0)
+    centre = np.mean([transform_point(exact[0, r], scans[r].centre) for r in (0, 1)], axis=0)
     table = {camera.name: camera for camera in cameras}
     with MaskViews(capture.cameras, table, offsets, centre, config.working_px_per_mm) as masks:
         for k in chosen:
@@ -76,9 +76,8 @@ def main() -> None:
     least = landmark_sigmas(relative, relative_covariance(poses[:, 0], bound[:, 0], bound[:, 1]), landmarks) ** 2
     measured = relative_pose(found[:, 0], found[:, 1])
     for k, name in enumerate(LANDMARKS):
-        point = np.broadcast_to(landmarks[k], (len(chosen), 1, 3))
-        gap = transform_points(measured, point) - transform_points(relative, point)
-        line(f"relative pose, {name}", least[:, k], (gap**2).sum(-1)[:, 0])
+        gap = transform_point(measured, landmarks[k]) - transform_point(relative, landmarks[k])
+        line(f"relative pose, {name}", least[:, k], (gap**2).sum(-1))
 
 
 def outline_noise_px3(solution: object) -> np.ndarray:

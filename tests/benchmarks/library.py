@@ -63,9 +63,7 @@ class Captured:
     def error(self, poses: np.ndarray) -> np.ndarray:
         """Return the mean vertex distance of poses from the captured ones [mm], shape (FRAMES,)."""
         points = self.person.mandible_points
-        return np.linalg.norm(
-            transform_points(poses, points[None]) - transform_points(self.poses, points[None]), axis=-1
-        ).mean(1)
+        return np.linalg.norm(transform_points(poses, points) - transform_points(self.poses, points), axis=-1).mean(1)
 
     def errors(self, rig: JawRig) -> tuple[np.ndarray, np.ndarray]:
         """Return the errors of a rig made for this person: at equal shares, and of the nearest poses [mm]."""

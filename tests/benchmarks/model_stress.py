@@ -31,7 +31,7 @@ from jawusd.fitting.nlpca import train_nlpca  # noqa: E402
 from jawusd.fitting.paper import fit_paper  # noqa: E402
 from jawusd.formats.capture import load_capture  # noqa: E402
 from jawusd.formats.tracks import load_tracks  # noqa: E402
-from jawusd.geometry import LANDMARKS, make_transform, se3_exp, se3_log, so3_exp, transform_points  # noqa: E402
+from jawusd.geometry import LANDMARKS, make_transform, se3_exp, se3_log, so3_exp, transform_point  # noqa: E402
 from jawusd.pipeline.prepare import find_anatomy, load_meshes  # noqa: E402
 from jawusd.synthetic.exercises import record  # noqa: E402
 
@@ -112,7 +112,7 @@ def covered(subject: Subject, rig: JawRig, uncertainty: dict) -> np.ndarray:
     shares = []
     for name, point in zip(LANDMARKS, subject.person.landmarks, strict=True):
         sd = uncertainty[name]["base_mm"] + uncertainty[name]["per_mm"] * distance
-        error = np.linalg.norm(transform_points(near, point) - transform_points(subject.hidden, point), axis=-1)
+        error = np.linalg.norm(transform_point(near, point) - transform_point(subject.hidden, point), axis=-1)
         shares.append((error <= 2 * sd).mean())
     return np.array(shares)
 

@@ -71,12 +71,8 @@ class Scorer:
         index = np.searchsorted(self.truth["frames"], tracks.frames)
         found, exact = [], []
         for row, crown in zip(ROWS, self.crowns):
-            # One frame after the other: with as many poses as points they would be paired off.
-            for out, poses in (
-                (found, getattr(tracks, f"{prefix}T_world_{row}")),
-                (exact, self.truth[f"T_world_{row}"][index]),
-            ):
-                out.append(np.stack([transform_points(T, crown) for T in poses]))
+            found.append(transform_points(getattr(tracks, f"{prefix}T_world_{row}"), crown))
+            exact.append(transform_points(self.truth[f"T_world_{row}"][index], crown))
         if own_world:
             good = tracks.tracked()
             flat = [np.concatenate([p[good].reshape(-1, 3) for p in points]) for points in (found, exact)]
@@ -88,10 +84,8 @@ class Scorer:
         """Return the error of the landmarks of tracked frames in the skull frame, shape (F, 5)."""
         good = tracks.tracked()
         exact = self.truth["T_upper_lower"][np.searchsorted(self.truth["frames"], tracks.frames[good])]
-        gap = [
-            transform_points(a, self.landmarks) - transform_points(b, self.landmarks)
-            for a, b in zip(tracks.T_upper_lower[good], exact)
-        ]
+        found = tracks.T_upper_lower[good]
+        gap = transform_points(found, self.landmarks) - transform_points(exact, self.landmarks)
         return np.linalg.norm(gap, axis=-1)
 
     def flagged(self, tracks: Tracks) -> np.ndarray:

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from jawusd.formats.capture import Capture, load_capture
-from jawusd.geometry import LANDMARKS, se3_inverse, transform_points
+from jawusd.geometry import LANDMARKS, se3_inverse, transform_point
 from jawusd.imaging.masks import MaskReader
 from jawusd.imaging.video import Video
 from jawusd.pipeline.prepare import find_anatomy, load_meshes
@@ -58,7 +58,7 @@ def overlaps(capture: Capture, entries: dict, folder: Path) -> dict[tuple[str, s
 def incisor_error(truth: dict, landmark: np.ndarray, frames: np.ndarray, T_upper_lower: np.ndarray) -> np.ndarray:
     """Return the distance [mm] between the tracked and the true lower incisal point, NaN where not tracked."""
     exact = truth["T_upper_lower"][np.searchsorted(truth["frames"], frames)]
-    return np.linalg.norm(transform_points(T_upper_lower, landmark) - transform_points(exact, landmark), axis=-1)
+    return np.linalg.norm(transform_point(T_upper_lower, landmark) - transform_point(exact, landmark), axis=-1)
 
 
 def report(name: str, error: np.ndarray) -> None:

@@ -21,7 +21,7 @@ import numpy as np
 
 from jawusd.errors import TrackingError
 from jawusd.formats.capture import Bootstrap, load_capture
-from jawusd.geometry import transform_points
+from jawusd.geometry import transform_point, transform_points
 from jawusd.imaging.raster import draw_depth_labels, project
 from jawusd.pipeline.prepare import load_cameras, load_meshes
 from jawusd.pipeline.stages import sync_cameras
@@ -107,7 +107,7 @@ def clicks(bench: Bench, frame: int, noise_px: float, rng: np.random.Generator) 
             return None
         picks[row] = []
         for vertex in rng.choice(vertices, 4, replace=False):
-            point = transform_points(truth[r], bench.meshes[r].vertices[vertex])
+            point = transform_point(truth[r], bench.meshes[r].vertices[vertex])
             views = []
             for c in rng.permutation(np.flatnonzero(table[:, vertex]))[:2]:
                 x, y = cameras[c].project(point) + noise_px * rng.normal(size=2)

@@ -130,7 +130,7 @@ def cut(capture: object, cameras: list, scans: list, truth: dict, start: int, le
     import numpy as np
 
     from jawusd.formats.capture import Bootstrap, Pick, PickView
-    from jawusd.geometry import transform_points
+    from jawusd.geometry import transform_point
     from jawusd.imaging.meshio import tooth_labels
 
     first = int(truth["frames"][start])
@@ -141,7 +141,7 @@ def cut(capture: object, cameras: list, scans: list, truth: dict, start: int, le
         chosen = {int(teeth[np.argmax(scan.vertices[teeth] @ direction)]) for direction in spread}
         picks[row] = []
         for vertex in sorted(chosen):
-            place = transform_points(truth[f"T_world_{row}"][start], scan.vertices[vertex])
+            place = transform_point(truth[f"T_world_{row}"][start], scan.vertices[vertex])
             pixels = [(camera.name, camera.project(place)) for camera in cameras]
             views = tuple(PickView(camera=name, x=float(x), y=float(y)) for name, (x, y) in pixels)
             picks[row].append(Pick(vertex=vertex, views=views))

@@ -27,7 +27,7 @@ import small_take  # noqa: E402
 from jawusd.formats.calibration import load_calibration  # noqa: E402
 from jawusd.formats.capture import Capture, load_capture  # noqa: E402
 from jawusd.formats.mesh import Mesh  # noqa: E402
-from jawusd.geometry import Camera, transform_points  # noqa: E402
+from jawusd.geometry import Camera, transform_point  # noqa: E402
 from jawusd.imaging.meshio import load_mesh  # noqa: E402
 from jawusd.tracking import TrackingConfig, track_capture  # noqa: E402
 from jawusd.tracking.scan import prepare_scan  # noqa: E402
@@ -81,7 +81,7 @@ def report(take: Take) -> None:
         tracks = track_capture(*arguments, threads=threads)
         rows[threads] = (time.perf_counter() - wall, time.process_time() - clock)
     poses = np.stack([tracks.raw_T_world_upper, tracks.raw_T_world_lower], 1)
-    centre = np.mean([transform_points(poses[0, r], scans[r].centre) for r in (0, 1)], axis=0)
+    centre = np.mean([transform_point(poses[0, r], scans[r].centre) for r in (0, 1)], axis=0)
     table = {c.name: c for c in take.cameras}
     solver, gates = ContourSolver(scans, config), config.gates_from(0.0)
     with MaskViews(take.capture.cameras, table, take.offsets, centre, config.working_px_per_mm) as masks:

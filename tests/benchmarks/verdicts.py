@@ -22,7 +22,14 @@ import numpy as np
 
 from jawusd.evaluator import JawRig, load
 from jawusd.formats.tracks import load_tracks
-from jawusd.geometry import make_transform, mandible_metric, se3_exp, se3_left_jacobian, transform_points
+from jawusd.geometry import (
+    make_transform,
+    mandible_metric,
+    se3_exp,
+    se3_left_jacobian,
+    transform_point,
+    transform_points,
+)
 
 COUNT = 2500
 
@@ -62,7 +69,7 @@ def knocked(rig: JawRig, captured: np.ndarray, rng: np.random.Generator) -> np.n
     d = rig.encode(chosen)[0]
     out = np.empty_like(chosen)
     for k, T in enumerate(chosen):
-        middle = transform_points(T, rig.arrays["landmarks"][:3].mean(0))
+        middle = transform_point(T, rig.arrays["landmarks"][:3].mean(0))
         to, back = make_transform(np.eye(3), -middle), make_transform(np.eye(3), middle)
         # Of equal length before and after: what lay along the model is turned away from it.
         M = mandible_metric(transform_points(to @ T, rig.arrays["landmarks"]))
@@ -82,8 +89,8 @@ def gaping(rig: JawRig, rng: np.random.Generator) -> np.ndarray:
     d = np.stack([d1, rng.uniform(low2, high2), rng.uniform(low3, high3)], axis=1)
     T = rig.pose(rig.project(d))
     incisor = rig.arrays["landmarks"][0]
-    closed = transform_points(rig.arrays["T_rest"], incisor)
-    T[:, :3, 3] += closed - transform_points(T, np.broadcast_to(incisor, (COUNT, 3)))
+    closed = transform_point(rig.arrays["T_rest"], incisor)
+    T[:, :3, 3] += closed - transform_point(T, incisor)
     return T
 
 

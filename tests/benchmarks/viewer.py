@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jawusd.geometry.se3 import transform_points
+from jawusd.geometry.se3 import transform_point
 from jawusd.pipeline.view import open_viewer
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
@@ -41,7 +41,7 @@ def drags(page, rng):
     """Return drag events: the pointer wanders by millimetres from the incisal point."""
     session = page.session
     session.set_pose([12.0, 0.0, 0.0])
-    place = transform_points(session.pose(), session.rig.arrays["landmarks"][0])
+    place = transform_point(session.pose(), session.rig.arrays["landmarks"][0])
     session.grab(place)
     path = place + np.cumsum(rng.normal(0, 0.6, (ROUNDS, 3)), axis=0) * np.exp(-np.arange(ROUNDS) / 300)[:, None]
 

@@ -16,7 +16,7 @@ from jawusd.fitting.synthesis import BOX, POLYGONS, POSES, SLICES, Bounds, captu
 from jawusd.formats.experiments import TABLE_COLUMNS, CondylePath, save_table
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import TRACKED, Tracks
-from jawusd.geometry import make_transform, se3_exp, transform_points
+from jawusd.geometry import make_transform, se3_exp, transform_point, transform_points
 from jawusd.synthetic.exercises import record
 from jawusd.synthetic.person import Person
 
@@ -109,7 +109,7 @@ def test_the_first_component_of_a_screw_motion_is_that_screw(data):
     amount = np.random.default_rng(2).uniform(0, 40, FRAMES)
     straight = replace(data, motion=se3_exp(amount[:, None] * screw))
     swept = principal_opening(straight)
-    points = transform_points(swept, data.incisor)
+    points = transform_point(swept, data.incisor)
     expected = transform_points(se3_exp(np.linspace(0, 40, 4000)[:, None] * screw), data.incisor)
     assert np.linalg.norm(points[:, None] - expected, axis=-1).min(1).max() < 0.02
     opened = -(points[:, 1] - data.incisor[1])

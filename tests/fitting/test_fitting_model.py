@@ -10,7 +10,7 @@ from jawusd.fitting.data import Anatomy, select_poses
 from jawusd.fitting.holdout import unseen_errors
 from jawusd.fitting.pca import fit_pca
 from jawusd.formats.model import load_model, save_model
-from jawusd.geometry import LANDMARKS, make_transform, random_rotation, se3_exp, so3_exp, transform_points
+from jawusd.geometry import LANDMARKS, make_transform, random_rotation, se3_exp, so3_exp, transform_point
 from jawusd.synthetic.exercises import record
 from jawusd.synthetic.person import Person
 
@@ -89,7 +89,7 @@ def test_predicted_uncertainty_covers_errors_on_unseen_exercises(person, model, 
     for name, point in zip(LANDMARKS, person.landmarks, strict=True):
         sure = model.meta["uncertainty"][name]
         assert sure["per_mm"] > 0
-        error = np.linalg.norm(transform_points(near, point) - transform_points(hidden, point), axis=-1)
+        error = np.linalg.norm(transform_point(near, point) - transform_point(hidden, point), axis=-1)
         inside.append((error <= 2 * (sure["base_mm"] + sure["per_mm"] * distance)).mean())
     assert min(inside) >= 0.9 and np.mean(inside) <= 0.985
 

@@ -68,10 +68,7 @@ def test_log_at_pi_returns_an_axis_that_gives_the_same_rotation():
 def test_left_jacobian_is_the_derivative_of_exp(angle):
     xi, h = twists(angle, ()), 1e-6
     numeric = np.stack(
-        [
-            g.se3_log(g.se3_exp(xi + h * e) @ g.se3_inverse(g.se3_exp(xi - h * e))) / (2 * h)
-            for e in np.eye(6)
-        ],
+        [g.se3_log(g.se3_exp(xi + h * e) @ g.se3_inverse(g.se3_exp(xi - h * e))) / (2 * h) for e in np.eye(6)],
         axis=1,
     )
     np.testing.assert_allclose(g.se3_left_jacobian(xi), numeric, atol=2e-7)
@@ -108,14 +105,18 @@ def test_relative_pose_takes_the_head_out():
     np.testing.assert_allclose(found[:, :3, :3], R, atol=1e-13)
 
 
-def test_transform_points_takes_one_point_per_pose_or_a_cloud():
+def test_points_go_one_per_pose_or_all_to_every_pose():
     T = g.se3_exp(twists(0.4, (5,), 7))
     p = np.random.default_rng(8).normal(size=(5, 3))
-    one = g.transform_points(T, p)
-    cloud = g.transform_points(T, p[:3])
-    assert one.shape == (5, 3) and cloud.shape == (5, 3, 3)
+    one = g.transform_point(T, p)
+    cloud = g.transform_points(T, p)
+    assert one.shape == (5, 3) and cloud.shape == (5, 5, 3)
     np.testing.assert_allclose(one[2], T[2, :3, :3] @ p[2] + T[2, :3, 3])
     np.testing.assert_allclose(cloud[4, 1], T[4, :3, :3] @ p[1] + T[4, :3, 3])
+    sets = g.transform_points(T[:2], np.stack([p, -p]))
+    np.testing.assert_allclose(sets[1], g.transform_points(T[1], -p))
+    with pytest.raises(ValueError, match="shape"):
+        g.transform_points(T, p[0])
 
 
 def test_orthonormalise_repairs_and_rigidity_defect_sees_damage():

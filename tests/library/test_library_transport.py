@@ -49,7 +49,7 @@ def test_a_wider_jaw_opens_alike_and_slides_its_condyles_apart_no_farther(donor)
     wider = person("wide", wider_mm=4.0)
     target = Donor("wide", wider).landmarks
     moved = transform_points(carried(donor, target, D[[1, 3]]), target) - target
-    own = transform_points(motions(donor, D[[1, 3]]), donor.landmarks[None]) - donor.landmarks
+    own = transform_points(motions(donor, D[[1, 3]]), donor.landmarks) - donor.landmarks
     np.testing.assert_allclose(moved[:, 0], own[:, 0], atol=1.0)
     assert np.linalg.norm(moved[:, 3:] - own[:, 3:], axis=-1).max() < 1.0
 
@@ -88,8 +88,8 @@ def test_the_expected_error_of_a_person_does_not_use_that_person(donor):
     codes = codes[:: -(-len(codes) // 120)]
     shares = odd.rig.normalized(codes)
     predicted = poses_of_landmarks(odd.landmarks, odd.landmarks + displacements(donor, odd.landmarks, shares))
-    truth = transform_points(odd.rig.pose(codes), odd.rig.arrays["landmarks"][None])
-    by_hand = np.linalg.norm(transform_points(predicted, odd.landmarks[None]) - truth, axis=-1)
+    truth = transform_points(odd.rig.pose(codes), odd.rig.arrays["landmarks"])
+    by_hand = np.linalg.norm(transform_points(predicted, odd.landmarks) - truth, axis=-1)
     np.testing.assert_allclose(learned.expected.errors_mm["odd"], by_hand, atol=1e-6)
     assert by_hand.mean() > 1
 

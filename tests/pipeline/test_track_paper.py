@@ -13,7 +13,7 @@ from bumpy_teeth import arch, jaw_poses, make_cameras, render_masks, vertex_erro
 from jawusd.formats.calibration import save_calibration
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import load_tracks
-from jawusd.geometry import transform_points
+from jawusd.geometry import transform_point
 from jawusd.pipeline.summary import track_lines, track_summary
 
 ROWS = ("upper", "lower")
@@ -52,7 +52,7 @@ def capture(tmp_path):
             folder / f"{row}.ply"
         )
         for vertex in (100, 900, 1500, 2000):
-            place = transform_points(POSES[0, r], MESHES[r].vertices[vertex])
+            place = transform_point(POSES[0, r], MESHES[r].vertices[vertex])
             views = ", ".join(
                 f'{{ camera = "{c.name}", x = {c.project(place)[0]:.1f}, y = {c.project(place)[1]:.1f} }}'
                 for c in CAMERAS

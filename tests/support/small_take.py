@@ -10,7 +10,7 @@ from bumpy_teeth import arch, jaw_poses, make_cameras, render_masks, vertex_erro
 
 from jawusd.formats.capture import Capture
 from jawusd.formats.tracks import Tracks
-from jawusd.geometry import transform_points
+from jawusd.geometry import transform_point
 from jawusd.tracking import track_capture
 
 ROWS = ("upper", "lower")
@@ -66,7 +66,7 @@ def make_capture(folder: Path, count: int, away_mm: float = 0.0, **change: objec
     poses = jaw_poses(START + 1)[START]
     for r, row in enumerate(ROWS):
         for vertex in rng.choice(len(MESHES[r].vertices), 5, replace=False):
-            place = transform_points(poses[r], MESHES[r].vertices[vertex]) + [0, away_mm, 0]
+            place = transform_point(poses[r], MESHES[r].vertices[vertex]) + [0, away_mm, 0]
             pixels = [(c.name, c.project(place) + rng.normal(size=2) * 0.7) for c in CAMERAS[:2]]
             views = [{"camera": n, "x": float(p[0]), "y": float(p[1])} for n, p in pixels]
             picks[row].append({"vertex": int(vertex), "views": views})

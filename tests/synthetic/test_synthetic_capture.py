@@ -10,7 +10,7 @@ import trimesh
 from jawusd.errors import MissingDependencyError, OutputError
 from jawusd.formats.calibration import load_calibration
 from jawusd.formats.capture import Capture, load_capture
-from jawusd.geometry import LANDMARKS, transform_points
+from jawusd.geometry import LANDMARKS, transform_point, transform_points
 from jawusd.synthetic.capture_writer import DemoConfig, write_demo
 from jawusd.synthetic.take import LEAD, TAIL
 
@@ -127,7 +127,7 @@ def test_picks_see_their_vertices(capture: Capture, truth: dict[str, np.ndarray]
     for jaw, picks in (("upper", capture.bootstrap.upper), ("lower", capture.bootstrap.lower)):
         vertices = np.asarray(trimesh.load(getattr(capture.scans, f"{jaw}_teeth"), process=False).vertices)
         for pick in picks:
-            point = transform_points(truth[f"T_world_{jaw}"][row], vertices[pick.vertex])
+            point = transform_point(truth[f"T_world_{jaw}"][row], vertices[pick.vertex])
             for view in pick.views:
                 assert np.abs(cameras[view.camera].project(point) - [view.x, view.y]).max() < 5.0
 

@@ -7,7 +7,7 @@ import trimesh
 
 from jawusd.formats.calibration import load_calibration
 from jawusd.formats.capture import load_capture
-from jawusd.geometry import transform_points
+from jawusd.geometry import transform_point
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "capture"
 
@@ -37,6 +37,6 @@ def test_the_picks_of_the_example_hit_their_vertices() -> None:
     for jaw, picks in (("upper", capture.bootstrap.upper), ("lower", capture.bootstrap.lower)):
         vertices = np.asarray(trimesh.load(getattr(capture.scans, f"{jaw}_teeth"), process=False).vertices)
         for pick in picks:
-            point = transform_points(poses[jaw], vertices[pick.vertex])
+            point = transform_point(poses[jaw], vertices[pick.vertex])
             misses += [cameras[view.camera].project(point) - [view.x, view.y] for view in pick.views]
     assert np.abs(misses).max() < 5.0 and 0.3 < np.std(misses) < 2.0

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jawusd.geometry import rigidity_defect, se3_exp, se3_log, transform_points
+from jawusd.geometry import rigidity_defect, se3_exp, se3_log, transform_point, transform_points
 from jawusd.synthetic.exercises import record
 from jawusd.synthetic.kinematics import eminence
 from jawusd.synthetic.person import Person
@@ -75,7 +75,7 @@ def test_condylar_inclination_and_bennett_angle_lie_in_the_human_range(people: l
             assert min(inclination) > 20 and max(inclination) < 62
         for lateral, balancing, towards_midline in ((1.0, 1, 1.0), (-1.0, 0, -1.0)):
             T = person.pose(0.0, lateral, 0.0)
-            moved = transform_points(T, person.joint.condyles[balancing]) - person.joint.condyles[balancing]
+            moved = transform_point(T, person.joint.condyles[balancing]) - person.joint.condyles[balancing]
             assert 3 < np.rad2deg(np.arctan2(towards_midline * moved[0], moved[2])) < 25
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jawusd.formats.mesh import Mesh
-from jawusd.geometry import se3_inverse, se3_log, transform_points
+from jawusd.geometry import se3_inverse, se3_log, transform_point, transform_points
 from jawusd.synthetic.anatomy import Anatomy, build_anatomy
 from jawusd.synthetic.masks import Outline, drawn_mask
 from jawusd.synthetic.person import Person
@@ -64,7 +64,7 @@ def test_the_head_moves_a_few_millimetres_and_degrees_smoothly(take: Take) -> No
     motion = se3_inverse(T_WORLD_SCAN) @ take.T_world_skull
     angle_deg = np.rad2deg(np.linalg.norm(se3_log(motion)[:, :3], axis=1))
     assert 1.0 < angle_deg.max() < 8.0
-    mouth = transform_points(motion, np.zeros(3))
+    mouth = transform_point(motion, np.zeros(3))
     assert 1.0 < np.ptp(mouth, axis=0).max() < 20.0
     assert np.linalg.norm(np.diff(mouth, 2, axis=0), axis=1).max() < 0.2
 
@@ -82,7 +82,7 @@ def test_the_lower_lip_follows_the_jaw_and_the_upper_does_not() -> None:
     columns = rest.shape[1]
     top, bottom = columns // 4, 3 * columns // 4
     np.testing.assert_allclose(open_[edge, top], rest[edge, top], atol=1e-9)
-    np.testing.assert_allclose(open_[edge, bottom], transform_points(T, rest[edge, bottom]), atol=1e-9)
+    np.testing.assert_allclose(open_[edge, bottom], transform_point(T, rest[edge, bottom]), atol=1e-9)
     assert rest[edge, top, 1] - rest[edge, bottom, 1] > 12
     assert open_[edge, top, 1] - open_[edge, bottom, 1] > 40
 
@@ -137,7 +137,7 @@ def test_picks_are_spread_tips_near_their_projections(anatomy: Anatomy) -> None:
         assert anatomy.lower.tooth[pick.vertex] != 0 and len(pick.views) == 2
         for name, x, y in pick.views:
             camera = next(c for c in cameras if c.name == name)
-            miss = camera.project(transform_points(T_WORLD_SCAN @ T_jaw, point)) - [x, y]
+            miss = camera.project(transform_point(T_WORLD_SCAN @ T_jaw, point)) - [x, y]
             assert 0 < np.abs(miss).max() < 5
 
 

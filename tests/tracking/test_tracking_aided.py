@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 
 from jawusd.evaluator import JawRig
 from jawusd.formats.tracks import LOST, RECOVERED
-from jawusd.geometry import make_transform, relative_pose, se3_exp, transform_points
+from jawusd.geometry import make_transform, relative_pose, se3_exp, transform_point, transform_points
 from jawusd.tracking.aided import aid_tracks, hard_frames
 from jawusd.tracking.kinematic_prior import KinematicPrior
 
@@ -96,7 +96,7 @@ def take(jaw, truth, tmp_path_factory):
         for row in small_take.ROWS:
             (folder / camera.name / row).mkdir(parents=True)
         for k, poses in enumerate(truth):
-            tips_mm = transform_points(relative_pose(*poses), [0.0, 0.0, 1.0])[1]
+            tips_mm = transform_point(relative_pose(*poses), [0.0, 0.0, 1.0])[1]
             lips = (7.5, tips_mm + LIP_MM if k in HIDDEN else -17.0)
             masks = render_masks(small_take.MESHES, poses, camera, lips, 0.3, rng)
             for row, mask in zip(small_take.ROWS, masks):
@@ -110,7 +110,7 @@ def picks_of(truth):
     picks = {}
     for r, row in enumerate(small_take.ROWS):
         vertices = small_take.MESHES[r].vertices
-        places = [(k, transform_points(truth[0, r], vertices[k])) for k in (10, 900, 1500, 2000)]
+        places = [(k, transform_point(truth[0, r], vertices[k])) for k in (10, 900, 1500, 2000)]
         picks[row] = [
             {
                 "vertex": k,
@@ -143,8 +143,7 @@ def test_hidden_teeth_are_found_with_the_model(take, jaw, truth):
     before = relative_pose(truth[:, 0], truth[:, 1])
     condyle = jaw.arrays["landmarks"][3]
     error = np.linalg.norm(
-        transform_points(aided.T_upper_lower, np.tile(condyle, (COUNT, 1))[:, None])
-        - transform_points(before, np.tile(condyle, (COUNT, 1))[:, None]),
+        transform_point(aided.T_upper_lower, condyle) - transform_point(before, condyle),
         axis=-1,
     )
     assert error[list(HIDDEN)].max() < 0.4

@@ -6,7 +6,7 @@ from bumpy_teeth import arch, jaw_poses, make_cameras, vertex_error_mm
 
 from jawusd.errors import TrackingError
 from jawusd.formats.capture import Pick, PickView
-from jawusd.geometry import transform_points
+from jawusd.geometry import transform_point
 from jawusd.tracking.bootstrap import pose_from_picks
 
 MESH = arch(True)
@@ -20,7 +20,7 @@ def _picks(count, noise_px=0.0, views=2, seed=0):
     out = []
     for k, vertex in enumerate(rng.permutation(np.linspace(0, len(MESH.vertices) - 1, count).astype(int))):
         seen = [names[(k + j) % len(names)] for j in range(views)]
-        place = transform_points(POSE, MESH.vertices[vertex])
+        place = transform_point(POSE, MESH.vertices[vertex])
         pixels = [CAMERAS[n].project(place) + noise_px * rng.normal(size=2) for n in seen]
         spots = tuple(PickView(camera=n, x=float(p[0]), y=float(p[1])) for n, p in zip(seen, pixels))
         out.append(Pick(vertex=int(vertex), views=spots))
@@ -84,7 +84,7 @@ def test_picks_on_a_line_are_refused():
     line = np.column_stack([np.linspace(-20, 20, 5), np.zeros(5), np.zeros(5)])
     picks = []
     for k, point in enumerate(line):
-        place = transform_points(POSE, point)
+        place = transform_point(POSE, point)
         spots = [(n, CAMERAS[n].project(place)) for n in ("cam0", "cam1")]
         picks.append(Pick(vertex=k, views=tuple(PickView(camera=n, x=float(p[0]), y=float(p[1])) for n, p in spots)))
     with pytest.raises(TrackingError, match="lie on a line"):

@@ -11,7 +11,7 @@ from jawusd.errors import MissingDependencyError, TrackingError
 from jawusd.formats.capture import Capture
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import LOST, PARTIAL, TRACKED, load_tracks, save_tracks
-from jawusd.geometry import make_transform, transform_points
+from jawusd.geometry import make_transform, transform_point, transform_points
 from jawusd.imaging.pixel_counts import RasterCounter
 from jawusd.tracking.paper_energy import PaperEnergy, paper_scan
 from jawusd.tracking.paper_sequence import track_capture_paper
@@ -167,7 +167,7 @@ CENTRE = np.array([1.0, 4.0, -12.0])
 def pose_at(parameters: np.ndarray) -> np.ndarray:
     """Return eq. 6's pose by scipy: extrinsic x, y, z angles about the centroid, then t."""
     R = Rotation.from_euler("xyz", parameters[:3]).as_matrix()
-    pivot = transform_points(START, CENTRE)
+    pivot = transform_point(START, CENTRE)
     about = make_transform(R, pivot - R @ pivot + parameters[3:])
     return about @ START
 
@@ -266,7 +266,7 @@ def take(folder, **change) -> Capture:
     picks = {row: [] for row in ROWS}
     for r, row in enumerate(ROWS):
         for vertex in rng.choice(len(MESHES[r].vertices), 5, replace=False):
-            place = transform_points(POSES[start, r], MESHES[r].vertices[vertex])
+            place = transform_point(POSES[start, r], MESHES[r].vertices[vertex])
             pixels = [(c.name, c.project(place) + rng.normal(size=2) * 1.5) for c in CAMERAS[:2]]
             views = [{"camera": n, "x": float(p[0]), "y": float(p[1])} for n, p in pixels]
             picks[row].append({"vertex": int(vertex), "views": views})

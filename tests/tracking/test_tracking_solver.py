@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from bumpy_teeth import arch, disturbed, jaw_poses, make_cameras, render_masks, vertex_error_mm
 
-from jawusd.geometry import make_transform, rigidity_defect, se3_exp, se3_inverse, transform_points
+from jawusd.geometry import make_transform, rigidity_defect, se3_exp, se3_inverse, transform_point, transform_points
 from jawusd.imaging.raster import draw_depth_labels, project
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour import COLUMNS, CROWN, GUM, INVERSE_DEPTH, LENGTH, NX, NY, U, V, contour_samples
@@ -37,7 +37,7 @@ def _samples(r, pose, camera):
     project(SCANS[r].vertices_single, (camera.projection_matrix() @ pose).astype(np.float32), points)
     draw_depth_labels(points, SCANS[r].crown_faces, 0, 0, False, depth, labels, CROWN)
     draw_depth_labels(points, SCANS[r].gum_faces, 0, 0, False, depth, labels, GUM)
-    eye = transform_points(se3_inverse(pose), camera.centre_world())
+    eye = transform_point(se3_inverse(pose), camera.centre_world())
     return contour_samples(SCANS[r], camera.projection_matrix() @ pose, eye, labels, depth, 3.0, 1.5), labels
 
 
@@ -105,7 +105,7 @@ def test_normal_equations_agree_with_finite_differences():
     samples, _ = _samples(1, pose, camera)
     rng = np.random.default_rng(1)
     distances = rng.normal(size=len(samples)) * 0.5
-    centre = transform_points(pose, SCANS[1].centre)
+    centre = transform_point(pose, SCANS[1].centre)
     system = np.zeros((8, 8))
     accumulate(samples, distances, 2.0, 2.5, 0.0, pose, camera.projection_matrix(), centre, system)
     h, J = 1e-5, np.empty((len(samples), 6))

@@ -25,7 +25,7 @@ from small_take import (
 
 from jawusd.errors import TrackingError
 from jawusd.formats.mesh import Mesh
-from jawusd.geometry import make_transform, random_rotation, se3_exp, se3_inverse, transform_points
+from jawusd.geometry import make_transform, random_rotation, se3_exp, se3_inverse, transform_point, transform_points
 from jawusd.imaging.raster import draw_silhouette, project, unpack_bits, words_for
 from jawusd.tracking import global_start, start_search, track_capture
 from jawusd.tracking.config import TrackingConfig
@@ -177,7 +177,7 @@ def test_picks_close_together_are_helped_by_the_masks(pictures):
         near = np.argsort(np.linalg.norm(MESHES[r].vertices - middle, axis=1))[[0, 60, 120, 180]]
         picks[row] = []
         for vertex in near:
-            place = transform_points(poses[r], MESHES[r].vertices[vertex])
+            place = transform_point(poses[r], MESHES[r].vertices[vertex])
             views = [(c.name, c.project(place) + rng.normal(size=2)) for c in CAMERAS[:2]]
             views = [{"camera": n, "x": float(p[0]), "y": float(p[1])} for n, p in views]
             picks[row].append({"vertex": int(vertex), "views": views})
@@ -254,14 +254,14 @@ def test_survey_finds_the_rows(pictures):
         for r in (0, 1):
             pose = jaw_poses(FRAMES)[frame - FIRST, r]
             # Lips and gum hide a part, and every camera sees another side of the arch.
-            assert np.linalg.norm(survey.places()[k, r] - transform_points(pose, SCANS[r].centre)) < 12.0
+            assert np.linalg.norm(survey.places()[k, r] - transform_point(pose, SCANS[r].centre)) < 12.0
 
 
 def test_all_shifts_at_once_agree_with_drawing_each(pictures):
     capture = _capture(pictures)
     footage = Footage(masked_sources(capture.cameras, TABLE, OFFSETS), TABLE, OFFSETS, capture.frames)
     pose = jaw_poses(3)[2, 1]
-    centre = transform_points(pose, SCANS[1].centre)
+    centre = transform_point(pose, SCANS[1].centre)
     with footage.views(centre, 2.0) as masks:
         view = masks.at(FIRST + 2)[1]
     scan = coarse_scan(Mesh(MESHES[1].vertices, MESHES[1].faces), "lower")  # without gum silhouettes say all

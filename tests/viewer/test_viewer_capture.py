@@ -15,7 +15,7 @@ from jawusd.cli.main import app
 from jawusd.errors import CaptureError, FormatError
 from jawusd.formats.capture import load_capture
 from jawusd.formats.tracks import LOST, PARTIAL, TRACKED, Tracks, save_tracks
-from jawusd.geometry import transform_points
+from jawusd.geometry import transform_point, transform_points
 from jawusd.pipeline.view_capture import viewed_capture
 from jawusd.viewer.capture_page import CapturePage
 from jawusd.viewer.server import CaptureViewer
@@ -181,14 +181,14 @@ def test_picks_are_clicked_and_written(page, copy, viewed):
     assert "no pick is selected" in page.notices.pop()[1]
     for row, pick in [("upper", p) for p in before.upper] + [("lower", p) for p in before.lower]:
         vertex = viewed.scans[row].vertices[pick.vertex]
-        page.click(transform_points(page.page.poses[row], vertex))
+        page.click(transform_point(page.page.poses[row], vertex))
     assert len(picks.book.picks) == 8
     known = truth()
     poses = {row: known[f"T_world_{row}"][0] for row in ("upper", "lower")}
     for camera in ("cam0", "cam2"):
         page.press(footage.views, camera)
         for pick in picks.book.picks:
-            place = transform_points(poses[pick.row], viewed.scans[pick.row].vertices[pick.vertex])
+            place = transform_point(poses[pick.row], viewed.scans[pick.row].vertices[pick.vertex])
             page.click(page.page.table.place(viewed.cameras[camera].project(place)))
     assert "all of them fit together" in picks._list.content and "complete" in picks._list.content
     page.press(footage.steps, "+1")

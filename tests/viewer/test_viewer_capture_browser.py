@@ -14,7 +14,7 @@ from package_copy import ROOT
 
 from jawusd.formats.capture import load_capture
 from jawusd.formats.tracks import load_tracks
-from jawusd.geometry import transform_points
+from jawusd.geometry import transform_point, transform_points
 from jawusd.pipeline.view_capture import open_capture_viewer
 
 EXAMPLE = ROOT / "examples" / "capture"
@@ -114,7 +114,7 @@ def test_frames_are_stepped_and_the_cameras_stand_in_space(tab):
     tab.picture("capture_space")
     box = tab.web.locator("canvas").first.bounding_box()
     for camera in tab.page._capture.cameras.values():
-        x, y = tab.pixel(transform_points(tab.page.scene.T_page_world, camera.centre_world()))
+        x, y = tab.pixel(transform_point(tab.page.scene.T_page_world, camera.centre_world()))
         assert box["x"] < x < box["x"] + box["width"] and box["y"] < y < box["y"] + box["height"]
 
 
@@ -156,7 +156,7 @@ def test_picks_made_in_the_page_build_a_rig(tab, folder, tmp_path):
     for camera in ("cam0", "cam2"):
         tab.view(camera)
         for pick in list(book.picks):
-            place = transform_points(poses[pick.row], capture.scans[pick.row].vertices[pick.vertex])
+            place = transform_point(poses[pick.row], capture.scans[pick.row].vertices[pick.vertex])
             pixel = capture.cameras[camera].project(place)
             tab.click(page.table.place(pixel))
             assert np.abs(np.subtract(pick.views[camera], pixel)).max() < 1.5
