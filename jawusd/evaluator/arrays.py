@@ -1,4 +1,4 @@
-"""The named arrays a rig is made of: which there are, their shapes, and what must hold of their values."""
+"""Check the named arrays of a rig: presence, shapes and values."""
 
 from __future__ import annotations
 
@@ -8,49 +8,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jawusd.errors import EvaluatorError
-from jawusd.evaluator.models import KINDS
+from jawusd.evaluator.schema import ANCHORED, KINDS, arrays_of
 from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import rigidity_defect
 
 _RIGID_TOLERANCE = 1e-6
 
-# letters stand for lengths that must agree wherever they appear
-_COMMON = {
-    "T_anatomical_skull": (4, 4),
-    "T_rest": (4, 4),
-    "incisor": (3,),
-    "d_range": (3, 2),
-    "landmarks": ("landmarks", 3),
-    "slice_d1": ("openings",),
-    "slice_directions": ("directions", 2),
-    "slice_support": ("openings", "directions"),
-    "slice_softness_mm": (),
-    "slice_margin_mm": (),
-    "polygon_d1d2": ("lateral corners", 2),
-    "polygon_d1d2_counts": ("lateral outlines",),
-    "polygon_d1d3": ("protrusion corners", 2),
-    "polygon_d1d3_counts": ("protrusion outlines",),
-    "residual_limit_mm": (),
-    "margin_limit_mm": (),
-    "codes": ("codes", 3),
-}
-_ANCHORED = {
-    "path_coefficients": (2, 5),
-    "path_scale_mm": (),
-    "path_limits": (2,),
-    "glide_arch": (7,),
-    "glide_drop": (4,),
-    "glide_softness_mm": (),
-    "glide_fade_mm": (),
-    "spline_scales": (3,),
-    "spline_centres": ("centres", 3),
-    "spline_weights": ("weights", 3),
-}
-_ADDITIVE = {
-    f"curve{i}_{part}": shape
-    for i in (1, 2, 3)
-    for part, shape in (("knots", (f"knots{i}",)), ("twists", (f"knots{i}", 6)), ("slopes", (f"knots{i}", 6)))
-}
 _POSITIVE = ("slice_softness_mm", "path_scale_mm", "glide_softness_mm", "glide_fade_mm", "spline_scales")
 _LARGEST = 1e9  # [mm, rad]: far beyond any jaw, and squares and their sums still fit
 _RISING = ("slice_d1", "path_limits", "curve1_knots", "curve2_knots", "curve3_knots")
@@ -60,7 +23,7 @@ def checked_arrays(arrays: Mapping[str, ArrayLike], kind: str) -> dict[str, Arra
     """Return read-only float64 arrays of a rig of the given kind, and nothing else.
 
     Args:
-        arrays: Named arrays; others than the rig's are left out.
+        arrays: Named arrays, see `jawusd.evaluator.schema`; others are left out.
         kind: "anchored" or "additive".
 
     Raises:
@@ -68,12 +31,11 @@ def checked_arrays(arrays: Mapping[str, ArrayLike], kind: str) -> dict[str, Arra
     """
     if kind not in KINDS:
         raise EvaluatorError(f'the model is of kind "{kind}"; this jawusd knows {" and ".join(KINDS)}.')
-    shapes = _COMMON | (_ANCHORED if kind == "anchored" else _ADDITIVE)
     lengths: dict[str, int] = {}
-    checked = {name: _checked(name, arrays, shape, lengths) for name, shape in shapes.items()}
+    checked = {name: _checked(name, arrays, spec.shape, lengths) for name, spec in arrays_of(kind).items()}
     _check_values(checked)
     _check_sections(checked)
-    if kind == "anchored" and lengths["weights"] != lengths["centres"] + 3:
+    if kind == ANCHORED and lengths["weights"] != lengths["centres"] + 3:
         raise EvaluatorError(
             f'"spline_weights" has {lengths["weights"]} rows for {lengths["centres"]} centres; '
             f"it needs one for each centre and 3 linear ones, {lengths['centres'] + 3}."

@@ -23,8 +23,6 @@ from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import se3_left_jacobian, se3_left_jacobian_inverse
 from jawusd.geometry.so3 import so3_left_jacobian, so3_left_jacobian_inverse
 
-KINDS = ("anchored", "additive")
-
 
 @dataclass(frozen=True)
 class AnchoredModel:

@@ -11,7 +11,7 @@ import math
 from collections.abc import Sequence
 from typing import Protocol, TypeVar
 
-from jawusd.geometry.rodrigues import SMALL_SQUARED_ANGLE, N, Triple, angle_quotients, angle_series
+from jawusd.geometry.rodrigues import N, Triple, angle_coefficients
 
 Rows = list[list[float]]
 Table = TypeVar("Table", contravariant=True)  # how a kind of number stores rows of floats
@@ -53,19 +53,12 @@ class FloatOperations:
 
     sqrt = staticmethod(math.sqrt)
     exp = staticmethod(math.exp)
+    angle_coefficients = staticmethod(angle_coefficients)
 
     @staticmethod
     def clip(x: float, low: float, high: float) -> float:
         """Return x limited to [low, high]."""
         return min(max(x, low), high)
-
-    @staticmethod
-    def angle_coefficients(squared: float) -> Triple[float]:
-        """Return a, b and c at a squared angle [rad^2]."""
-        if squared < SMALL_SQUARED_ANGLE:
-            return angle_series(squared)
-        angle = math.sqrt(squared)
-        return angle_quotients(squared, angle, math.sin(angle), math.sin(0.5 * angle))
 
     @staticmethod
     def log_sum_exp(terms: Sequence[float]) -> float:

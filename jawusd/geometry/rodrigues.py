@@ -8,6 +8,7 @@ reader that runs inside other programs.
 
 from __future__ import annotations
 
+import math
 from typing import Protocol, TypeVar
 
 SMALL_SQUARED_ANGLE = 1e-4  # rad^2; below, the closed forms lose digits and the series are exact to double precision
@@ -42,6 +43,14 @@ def angle_series(x: N) -> Triple[N]:
 def angle_quotients(x: N, angle: N, sine: N, sine_of_half: N) -> Triple[N]:
     """Return a, b and c at a squared angle x [rad^2] that is not small, given the angle and its sines."""
     return sine / angle, 2.0 * sine_of_half * sine_of_half / x, (angle - sine) / (x * angle)
+
+
+def angle_coefficients(x: float) -> Triple[float]:
+    """Return a, b and c at a squared angle x [rad^2]."""
+    if x < SMALL_SQUARED_ANGLE:
+        return angle_series(x)
+    angle = math.sqrt(x)
+    return angle_quotients(x, angle, math.sin(angle), math.sin(0.5 * angle))
 
 
 def cross(a: Triple[N], b: Triple[N]) -> Triple[N]:

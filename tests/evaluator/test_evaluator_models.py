@@ -8,7 +8,8 @@ from example_model import example_arrays
 from scipy.spatial.transform import Rotation
 
 from jawusd.evaluator.curves import HermiteCurve
-from jawusd.evaluator.models import KINDS, AnchoredModel, model_from_arrays
+from jawusd.evaluator.models import AnchoredModel, model_from_arrays
+from jawusd.evaluator.schema import KINDS
 from jawusd.geometry.se3 import se3_exp
 
 # inside, on a knot of the curves, past both ends of the path, at rest

@@ -1,0 +1,77 @@
+"""The named arrays of a rig: shapes, model kinds, and the USD attribute that holds each.
+
+This file imports nothing but the standard library: it is copied into the reader that runs inside other programs.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+ANCHORED, ADDITIVE = KINDS = ("anchored", "additive")
+
+
+class ArraySpec(NamedTuple):
+    """Shape and place of one array.
+
+    Attributes:
+        attribute: USD attribute, which holds the values row by row; None for `d_range`, see `D_RANGE_ATTRIBUTES`.
+        shape: Lengths; a name stands for a length that must be the same wherever the name appears.
+        kind: The model kind that has the array, None for both.
+        integer: Whole numbers in USD; all arrays of a rig in memory are float64.
+    """
+
+    attribute: str | None
+    shape: tuple[int | str, ...] = ()
+    kind: str | None = None
+    integer: bool = False
+
+
+D_RANGE_ATTRIBUTES = ("jaw:d1:range", "jaw:d2:range", "jaw:d3:range")  # rows of `d_range`, (low, high) [mm]
+
+
+def _curve(i: int) -> dict[str, ArraySpec]:
+    knots = f"knots{i}"
+    return {
+        f"curve{i}_knots": ArraySpec(f"jaw:model:curve{i}Knots", (knots,), ADDITIVE),
+        f"curve{i}_twists": ArraySpec(f"jaw:model:curve{i}Twists", (knots, 6), ADDITIVE),
+        f"curve{i}_slopes": ArraySpec(f"jaw:model:curve{i}Slopes", (knots, 6), ADDITIVE),
+    }
+
+
+ARRAYS: dict[str, ArraySpec] = {
+    "T_anatomical_skull": ArraySpec("jaw:model:tAnatomicalSkull", (4, 4)),
+    "T_rest": ArraySpec("jaw:model:tRest", (4, 4)),
+    "incisor": ArraySpec("jaw:model:incisor", (3,)),
+    "d_range": ArraySpec(None, (3, 2)),
+    "landmarks": ArraySpec("jaw:landmarks:positions", ("landmarks", 3)),
+    "slice_d1": ArraySpec("jaw:bounds:sliceD1", ("openings",)),
+    "slice_directions": ArraySpec("jaw:bounds:sliceDirections", ("directions", 2)),
+    "slice_support": ArraySpec("jaw:bounds:sliceSupport", ("openings", "directions")),
+    "slice_softness_mm": ArraySpec("jaw:bounds:sliceSoftness"),
+    "slice_margin_mm": ArraySpec("jaw:bounds:sliceMargin"),
+    "polygon_d1d2": ArraySpec("jaw:bounds:polygonD1D2", ("lateral corners", 2)),
+    "polygon_d1d2_counts": ArraySpec("jaw:bounds:polygonD1D2Counts", ("lateral outlines",), integer=True),
+    "polygon_d1d3": ArraySpec("jaw:bounds:polygonD1D3", ("protrusion corners", 2)),
+    "polygon_d1d3_counts": ArraySpec("jaw:bounds:polygonD1D3Counts", ("protrusion outlines",), integer=True),
+    "residual_limit_mm": ArraySpec("jaw:thresholds:residual"),
+    "margin_limit_mm": ArraySpec("jaw:thresholds:margin"),
+    "codes": ArraySpec("jaw:model:codes", ("codes", 3)),
+    "path_coefficients": ArraySpec("jaw:model:pathCoefficients", (2, 5), ANCHORED),
+    "path_scale_mm": ArraySpec("jaw:model:pathScale", (), ANCHORED),
+    "path_limits": ArraySpec("jaw:model:pathLimits", (2,), ANCHORED),
+    "glide_arch": ArraySpec("jaw:model:glideArch", (7,), ANCHORED),
+    "glide_drop": ArraySpec("jaw:model:glideDrop", (4,), ANCHORED),
+    "glide_softness_mm": ArraySpec("jaw:model:glideSoftness", (), ANCHORED),
+    "glide_fade_mm": ArraySpec("jaw:model:glideFade", (), ANCHORED),
+    "spline_scales": ArraySpec("jaw:model:splineScales", (3,), ANCHORED),
+    "spline_centres": ArraySpec("jaw:model:splineCentres", ("centres", 3), ANCHORED),
+    "spline_weights": ArraySpec("jaw:model:splineWeights", ("weights", 3), ANCHORED),
+    **_curve(1),
+    **_curve(2),
+    **_curve(3),
+}
+
+
+def arrays_of(kind: str) -> dict[str, ArraySpec]:
+    """Return the arrays that a rig of a model kind has, by name."""
+    return {name: spec for name, spec in ARRAYS.items() if spec.kind in (None, kind)}
