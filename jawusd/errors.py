@@ -20,6 +20,8 @@ A message says where (file, frame, camera), what was found, what is allowed with
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from os import PathLike
 
 __all__ = [
@@ -37,7 +39,20 @@ __all__ = [
     "TrackingError",
     "UnitsError",
     "VersionError",
+    "explain_missing_packages",
 ]
+
+_EXTRA_OF_PACKAGE = {
+    "moderngl": "demo",
+    "viser": "view",
+    "h5py": "hdf5",
+    "dask": "many",
+    "distributed": "many",
+    **dict.fromkeys(
+        ("PIL", "av", "cv2", "jinja2", "matplotlib", "numba", "onnx", "pyfqmr", "scipy", "shapely", "torch", "trimesh"),
+        "build",
+    ),
+}
 
 
 class JawusdError(Exception):
@@ -139,3 +154,34 @@ class ClusterError(JawusdError):
     """Report a cluster that does not answer, or whose workers cannot build."""
 
     exit_code = 11
+
+
+@contextlib.contextmanager
+def explain_missing_packages(extra: str | None = None) -> Iterator[None]:
+    """Say which extra to install when a package is missing; use it in a `with` statement or as a decorator.
+
+    Args:
+        extra: the extra that everything inside belongs to; by default it is looked up by the missing package.
+
+    Raises:
+        MissingDependencyError: in place of the ModuleNotFoundError.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package in ("", "jawusd"):
+            raise
+        raise MissingDependencyError(
+            f'{_importing_module(error)} needs the package "{error.name}", which is not installed.',
+            hint=f"Install it with: pip install 'jawusd[{extra or _EXTRA_OF_PACKAGE.get(package, 'all')}]'",
+        ) from error
+
+
+def _importing_module(error: ModuleNotFoundError) -> str:
+    """Return the innermost module of jawusd on the way to an import error."""
+    found, step = "jawusd", error.__traceback__
+    while step is not None:
+        name = str(step.tb_frame.f_globals.get("__name__"))
+        found, step = (name if name.startswith("jawusd.") else found), step.tb_next
+    return found

@@ -17,7 +17,7 @@ from jawusd.cli import (
     segment_commands,
     view_commands,
 )
-from jawusd.errors import JawusdError
+from jawusd.errors import JawusdError, explain_missing_packages
 
 app = typer.Typer(
     name="jawusd",
@@ -53,7 +53,8 @@ def _root(version: bool = typer.Option(False, "--version", help="Print the versi
 def main() -> None:
     """Run the command line and leave with its exit code: 0 ok, 1 a "no", 2 usage, 3 and up one per error family."""
     try:
-        app()
+        with explain_missing_packages():
+            app()
     except JawusdError as error:
         typer.echo(f"jawusd: {error}", err=True)
         sys.exit(error.exit_code)

@@ -51,12 +51,11 @@ def build_many(
     from dataclasses import asdict
 
     from jawusd.formats.capture_list import load_capture_list
+    from jawusd.pipeline import many
     from jawusd.pipeline.build import BuildOptions
-    from jawusd.pipeline.extras import stage
 
     if cluster is not None and workers is not None:
         raise typer.BadParameter("--workers are processes of this machine; a --cluster has its own.")
-    many = stage("jawusd.pipeline.many")
     build = BuildOptions(model.value, jobs=jobs, resume=resume, fresh=fresh, allow_outside=allow_outside)
     outcomes = many.build_many(
         load_capture_list(captures),

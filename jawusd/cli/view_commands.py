@@ -41,14 +41,14 @@ def view(
     """See a rig in the browser, drag it, key it; or a capture's footage, to judge its poses and to set its picks."""
     import webbrowser
 
-    from jawusd.pipeline.extras import stage
     from jawusd.pipeline.view import open_viewer
     from jawusd.pipeline.view_capture import is_capture, open_capture_viewer
+    from jawusd.viewer.server import is_loopback
 
     capture = is_capture(rig)
     if tracks is not None and not capture:
         raise typer.BadParameter("--tracks belongs to a capture; a rig has its own poses.")
-    if not stage("jawusd.viewer.server").is_loopback(host):
+    if not is_loopback(host):
         may = "write picks into the capture" if capture else "write animations beside the rig"
         typer.echo(
             f"jawusd: warning: listening on {host}: whoever reaches this address sees this person's jaw, without a "

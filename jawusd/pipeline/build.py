@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from jawusd import __version__
-from jawusd.errors import OutputError
+from jawusd.errors import OutputError, explain_missing_packages
 from jawusd.formats.capture import Capture
 from jawusd.formats.model import load_model, save_model
 from jawusd.formats.tracks import load_tracks, save_tracks
@@ -58,6 +58,7 @@ class BuildOptions:
     allow_outside: bool = False
 
 
+@explain_missing_packages()
 def build_rig(
     capture_path: str | os.PathLike[str], out: str | os.PathLike[str], options: BuildOptions, progress: Progress
 ) -> dict:

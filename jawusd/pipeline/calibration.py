@@ -6,12 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from jawusd.errors import SyncError, TrackingError
+from jawusd.errors import SyncError, TrackingError, explain_missing_packages
 from jawusd.formats.calibration import save_calibration
 from jawusd.formats.capture import Capture
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera
-from jawusd.pipeline.extras import stage
 from jawusd.pipeline.prepare import load_meshes
 from jawusd.pipeline.stages import about, sync_cameras
 from jawusd.pipeline.state import Progress
@@ -20,6 +19,7 @@ _LISTED = 10
 _SIZE_SIGMA = 0.005  # of the teeth's size as masks tell it
 
 
+@explain_missing_packages()
 def calibrate_boards(capture: Capture, out: Path, progress: Progress) -> dict:
     """Calibrate the cameras from the boards of a capture and write the calibration.
 
@@ -36,11 +36,12 @@ def calibrate_boards(capture: Capture, out: Path, progress: Progress) -> dict:
         CaptureError: a clip or scan cannot be read.
         OutputError: the file cannot be written.
     """
-    calibrate = stage("jawusd.capture.calibrate")
+    from jawusd.capture.calibrate import calibrate_capture
+
     with about(capture.folder / "capture.toml"):
         meshes = load_meshes(capture)
         scans = {jaw: meshes[f"{jaw}_teeth"].vertices for jaw in ("upper", "lower")}
-        cameras, report = calibrate.calibrate_capture(
+        cameras, report = calibrate_capture(
             capture,
             scans,
             lambda done, total: progress("calibrate", done, total),
@@ -58,19 +59,21 @@ def _scale_by_masks(
     Raises:
         CalibrationError: the teeth come out with another size than their scans.
     """
-    scale = stage("jawusd.capture.scale")
+    from jawusd.capture.scale import ScaleCheck, judged_scale
+    from jawusd.tracking.scale_search import seen_size
+
     if sum(camera.masks is not None for camera in capture.cameras) < 2:
-        return scale.ScaleCheck(None, None, f"{by_picks.reason}, nor masks of two cameras to search the teeth in")
+        return ScaleCheck(None, None, f"{by_picks.reason}, nor masks of two cameras to search the teeth in")
     scans = [meshes[f"{jaw}_teeth"] for jaw in ("upper", "lower")]
     progress("size of the teeth", 0, 1)
     try:
         offsets = sync_cameras(capture, progress)["offsets"]
-        ratio = stage("jawusd.tracking.scale_search").seen_size(capture, cameras, offsets, scans)
+        ratio = seen_size(capture, cameras, offsets, scans)
     except (SyncError, TrackingError) as error:
         why = f"{by_picks.reason}, and the teeth could not be searched in the masks ({error.message.rstrip('.')})"
-        return scale.ScaleCheck(None, None, why)
+        return ScaleCheck(None, None, why)
     progress("size of the teeth", 1, 1)
-    return scale.judged_scale(ratio, _SIZE_SIGMA, capture.boards.square_mm)
+    return judged_scale(ratio, _SIZE_SIGMA, capture.boards.square_mm)
 
 
 def calibration_lines(report: dict) -> list[str]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from jawusd.errors import explain_missing_packages
 from jawusd.formats.experiments import Experiments, save_table
-from jawusd.pipeline.extras import stage
 from jawusd.pipeline.stages import Motion
 from jawusd.pipeline.state import Progress
 from jawusd.pipeline.subject import Subject
@@ -13,6 +13,7 @@ from jawusd.pipeline.subject import Subject
 TABLE_FILE = "experiments.csv"
 
 
+@explain_missing_packages()
 def report_experiments(subject: Subject, motion: Motion, folder: Path, starts: int, progress: Progress) -> dict:
     """Do the paper's experiments and write figures and table.
 
@@ -31,10 +32,12 @@ def report_experiments(subject: Subject, motion: Motion, folder: Path, starts: i
         MissingDependencyError: matplotlib is not installed.
         OutputError: a file cannot be written.
     """
-    stage("jawusd.report.figures")  # before minutes of computing: it may not be installed
+    import jawusd.report.figures  # noqa: F401 before minutes of computing: it may not be installed
+
     return draw_experiments(do_experiments(subject, motion, starts, progress), folder)
 
 
+@explain_missing_packages()
 def do_experiments(
     subject: Subject, motion: Motion, starts: int, progress: Progress, *, quick: bool = False
 ) -> Experiments:
@@ -50,20 +53,23 @@ def do_experiments(
     Raises:
         FittingError: the poses cannot carry a model.
     """
-    experiments, fitting = stage("jawusd.fitting.experiments"), stage("jawusd.fitting")
-    data = stage("jawusd.fitting.data")
-    anatomy = data.Anatomy.of(subject.T_anatomical_skull, subject.landmarks, subject.measured_points(), subject.T_rest)
-    return experiments.run_experiments(
+    from jawusd.fitting import FittingConfig
+    from jawusd.fitting.data import Anatomy
+    from jawusd.fitting.experiments import run_experiments
+
+    anatomy = Anatomy.of(subject.T_anatomical_skull, subject.landmarks, subject.measured_points(), subject.T_rest)
+    return run_experiments(
         motion,
         anatomy,
         bones=subject.bones,
-        config=fitting.FittingConfig(starts=starts),
+        config=FittingConfig(starts=starts),
         actor=subject.name,
         quick=quick,
         progress=lambda done, total: progress("experiments", done, total),
     )
 
 
+@explain_missing_packages()
 def draw_experiments(found: Experiments, folder: Path) -> dict:
     """Write the figures and the table of the experiments; returns what `report_experiments` does.
 
@@ -74,7 +80,8 @@ def draw_experiments(found: Experiments, folder: Path) -> dict:
     Raises:
         OutputError: a file cannot be written.
     """
-    figures = stage("jawusd.report.figures")
+    from jawusd.report import figures
+
     files = figures.draw_experiments(found, folder)
     table = found.table()
     save_table(folder / TABLE_FILE, table)
@@ -88,10 +95,12 @@ def draw_experiments(found: Experiments, folder: Path) -> dict:
     }
 
 
+@explain_missing_packages()
 def experiment_files(folder: Path) -> list[Path]:
     """Return the files that `report_experiments` writes into a folder."""
-    names = stage("jawusd.report.figures").FIGURES
-    return [folder / f"{name}.{suffix}" for name in names for suffix in ("png", "svg")] + [folder / TABLE_FILE]
+    from jawusd.report.figures import FIGURES
+
+    return [folder / f"{name}.{suffix}" for name in FIGURES for suffix in ("png", "svg")] + [folder / TABLE_FILE]
 
 
 def experiment_lines(summary: dict) -> list[str]:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import FormatError, MissingDependencyError
+from jawusd.errors import FormatError, explain_missing_packages
 from jawusd.geometry import make_transform, matrix_from_wxyz, rigidity_defect
 from jawusd.geometry.arrays import Array
 
@@ -28,6 +28,7 @@ _RIGID_TOLERANCE = 1e-3
 _MOST_NUMBERS = 16_000_000  # a million 4 x 4 matrices
 
 
+@explain_missing_packages()
 def read_hdf5(path: str | os.PathLike[str], group: str | None = None) -> tuple[NDArray[np.int64], Array]:
     """Read a trajectory.
 
@@ -43,14 +44,8 @@ def read_hdf5(path: str | os.PathLike[str], group: str | None = None) -> tuple[N
         FormatError: not such a file, no such group, data sets of wrong shapes, or poses that are not rigid.
         MissingDependencyError: h5py is not installed.
     """
-    try:
-        import h5py
-    except ModuleNotFoundError as error:
-        raise MissingDependencyError(
-            'reading HDF5 needs the package "h5py", which is not installed.',
-            path=path,
-            hint="Install it with: pip install 'jawusd[hdf5]'",
-        ) from error
+    import h5py
+
     path = Path(path)
     if not path.is_file():
         raise FormatError("there is no such file.", path=path)

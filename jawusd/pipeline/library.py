@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from jawusd.errors import EvaluatorError, FormatError, OutputError
+from jawusd.errors import EvaluatorError, FormatError, OutputError, explain_missing_packages
 from jawusd.evaluator import JawRig, load
 from jawusd.evaluator.sections import SMALLEST_REACH_MM
 from jawusd.formats.model import JawModel, load_model, save_model
@@ -19,7 +19,6 @@ from jawusd.geometry.arrays import Array, Mask
 from jawusd.library.index import MODEL_FILE, Library, load_donors, scan_library
 from jawusd.library.personal import PersonalMotion, leave_one_out, personal_motion
 from jawusd.library.timing import follow
-from jawusd.pipeline.extras import stage
 from jawusd.pipeline.stages import Progress
 from jawusd.pipeline.subject import Subject, subject_of_landmarks
 
@@ -30,6 +29,7 @@ _ROUNDS = 10  # of timing and bound in turns; most motions need one or two
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 
+@explain_missing_packages()
 def load_any_rig(path: Path) -> JawRig:
     """Read a rig from `model.npz` with numpy alone, or from USD.
 
@@ -40,7 +40,11 @@ def load_any_rig(path: Path) -> JawRig:
         JawusdError: it is no rig.
         MissingDependencyError: USD without OpenUSD.
     """
-    return load(path) if path.suffix == ".npz" else stage("jawusd.rig").load_rig(path)
+    if path.suffix == ".npz":
+        return load(path)
+    from jawusd.rig import load_rig
+
+    return load_rig(path)
 
 
 def open_library(folder: str | os.PathLike[str]) -> Library:
@@ -96,6 +100,7 @@ def _as_model(rig: JawRig, source: Path, name: str) -> JawModel:
     )
 
 
+@explain_missing_packages()
 def plot_ranges(entries: Sequence[Mapping[str, Any]], folder: Path, force: bool) -> list[Path]:
     """Draw the ranges of persons of a library side by side, as PNG and SVG.
 
@@ -111,11 +116,12 @@ def plot_ranges(entries: Sequence[Mapping[str, Any]], folder: Path, force: bool)
         MissingDependencyError: matplotlib is not installed.
         OutputError: a file exists already, or cannot be written.
     """
-    people = stage("jawusd.report.people")
+    from jawusd.report.people import RANGES, draw_ranges
+
     for suffix in (".png", ".svg"):
-        if (folder / (people.RANGES + suffix)).exists() and not force:
-            raise OutputError("exists already.", path=folder / (people.RANGES + suffix), hint="Overwrite with --force.")
-    return people.draw_ranges([(entry["actor"], entry["ranges_mm"]) for entry in entries], folder)
+        if (folder / (RANGES + suffix)).exists() and not force:
+            raise OutputError("exists already.", path=folder / (RANGES + suffix), hint="Overwrite with --force.")
+    return draw_ranges([(entry["actor"], entry["ranges_mm"]) for entry in entries], folder)
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,6 +166,7 @@ def personal_rig(landmarks: Path, library: Library, *, closest: bool, name: str,
     return PersonalRig(model, motion, tuple(entry.path for entry in library.entries if entry.not_shown))
 
 
+@explain_missing_packages()
 def fit_personal(subject: Subject, motion: PersonalMotion, progress: Progress) -> JawModel:
     """Fit the anchored model to a motion carried over, and say in its header what it is worth.
 
@@ -171,12 +178,13 @@ def fit_personal(subject: Subject, motion: PersonalMotion, progress: Progress) -
     Raises:
         FittingError: see `fitting.fit_model`.
     """
-    fitting = stage("jawusd.fitting")
-    model = fitting.fit_model(
+    from jawusd.fitting import FittingConfig, fit_model
+
+    model = fit_model(
         (np.arange(len(motion.poses)), motion.poses),
         T_anatomical_skull=subject.T_anatomical_skull,
         landmarks=subject.landmarks,
-        config=fitting.FittingConfig(holdout_folds=0),  # frames left out are poses of the library, not of this person
+        config=FittingConfig(holdout_folds=0),  # frames left out are poses of the library, not of this person
         actor=subject.name,
         progress=lambda done, total: progress("fit", done, total),
     )

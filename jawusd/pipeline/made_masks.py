@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 from jawusd.formats.capture import Capture
-from jawusd.pipeline.extras import stage
+
+if TYPE_CHECKING:
+    from jawusd.tracking.config import TrackingConfig
 
 #: What `jawusd segment` leaves beside its masks, which lie there as CAMERA/upper/000123.png.
 SUMMARY = "segment.json"
@@ -17,7 +19,8 @@ def are_made(capture: Capture) -> bool:
     return bool(rows) and all(len(row.parents) > 2 and (row.parents[2] / SUMMARY).is_file() for row in rows)
 
 
-def tracking_config(capture: Capture) -> Any:
-    """Return the tracker's numbers for the masks of a capture, a `TrackingConfig`."""
-    config = stage("jawusd.tracking.config")
-    return config.FOR_MADE_MASKS if are_made(capture) else config.TrackingConfig()
+def tracking_config(capture: Capture) -> TrackingConfig:
+    """Return the tracker's numbers for the masks of a capture."""
+    from jawusd.tracking.config import FOR_MADE_MASKS, TrackingConfig
+
+    return FOR_MADE_MASKS if are_made(capture) else TrackingConfig()

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import CaptureError, OutputError
+from jawusd.errors import CaptureError, OutputError, explain_missing_packages
 from jawusd.formats.capture import Capture
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import Camera
-from jawusd.pipeline.extras import stage
 from jawusd.pipeline.prepare import load_cameras, load_meshes, tracked_cameras
 from jawusd.pipeline.state import Progress
+
+if TYPE_CHECKING:
+    from jawusd.imaging.video import Video
 
 SHEET = "contact_sheet.png"
 _SHEET_FRAMES = 6
@@ -35,6 +36,7 @@ def overlay_files(capture: Capture, folder: Path) -> list[Path]:
     return [folder / f"{camera.name}.mp4" for camera in capture.cameras if camera.video] + [folder / SHEET]
 
 
+@explain_missing_packages()
 def write_overlay(
     capture: Capture, offsets: dict[str, int], tracks: Tracks, folder: Path, progress: Progress
 ) -> list[Path]:
@@ -57,11 +59,13 @@ def write_overlay(
         CalibrationError: a video has another shape than its camera's calibration.
         OutputError: the files cannot be written.
     """
+    from jawusd.imaging.overlay import save_png, tracking_sheet
+    from jawusd.imaging.video_writer import VideoWriter
+
     cameras, videos = open_footage(capture)
     cameras = {camera.name: camera for camera in tracked_cameras(list(cameras.values()), tracks)}
     meshes = load_meshes(capture)
     upper, lower = meshes["upper_teeth"], meshes["lower_teeth"]
-    drawing = stage("jawusd.imaging.overlay")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -69,23 +73,21 @@ def write_overlay(
     done, total = 0, len(videos) * len(tracks.frames)
     for name, video in videos.items():
         width, height = (side // 2 * 2 for side in video.size_px)  # H.264 halves the colours
-        writer = stage("jawusd.imaging.video_writer").VideoWriter(
-            folder / f"{name}.mp4", (width, height), capture.fps, quality_crf=_CRF
-        )
+        writer = VideoWriter(folder / f"{name}.mp4", (width, height), capture.fps, quality_crf=_CRF)
         with writer as out:
-            for image in _drawn(drawing, tracks, video, offsets[name], cameras[name], upper, lower):
+            for image in _drawn(tracks, video, offsets[name], cameras[name], upper, lower):
                 out.write(image[:height, :width])
                 done += 1
                 progress("overlay", done, total)
     shown = np.unique(np.linspace(0, len(tracks.frames) - 1, _SHEET_FRAMES).round().astype(int))
-    sheet = drawing.tracking_sheet(
+    sheet = tracking_sheet(
         tracks, tracks.frames[shown].tolist(), [cameras[name] for name in videos], videos, offsets, upper, lower
     )
-    drawing.save_png(folder / SHEET, sheet)
+    save_png(folder / SHEET, sheet)
     return overlay_files(capture, folder)
 
 
-def open_footage(capture: Capture) -> tuple[dict[str, Camera], dict[str, Any]]:
+def open_footage(capture: Capture) -> tuple[dict[str, Camera], dict[str, Video]]:
     """Return the calibrated cameras of a capture, and the videos of those that have one, by name.
 
     Raises:
@@ -95,12 +97,15 @@ def open_footage(capture: Capture) -> tuple[dict[str, Camera], dict[str, Any]]:
     return {camera.name: camera for camera in load_cameras(capture)}, open_videos(capture)
 
 
-def open_videos(capture: Capture) -> dict[str, Any]:
+@explain_missing_packages()
+def open_videos(capture: Capture) -> dict[str, Video]:
     """Return the videos of a capture by the names of their cameras.
 
     Raises:
         CaptureError: no camera has a video, or one cannot be decoded.
     """
+    from jawusd.imaging.video import Video
+
     sources = {source.name: source.video for source in capture.cameras if source.video}
     if not sources:
         raise CaptureError(
@@ -108,20 +113,22 @@ def open_videos(capture: Capture) -> dict[str, Any]:
             path=capture.folder / "capture.toml",
             hint="Name the footage there (video = ...).",
         )
-    return {name: stage("jawusd.imaging.video").Video(path) for name, path in sources.items()}
+    return {name: Video(path) for name, path in sources.items()}
 
 
 def _drawn(
-    drawing: ModuleType, tracks: Tracks, video, offset: int, camera: Camera, upper: Mesh, lower: Mesh
+    tracks: Tracks, video: Video, offset: int, camera: Camera, upper: Mesh, lower: Mesh
 ) -> Iterator[NDArray[np.uint8]]:
     """Yield the picture of every tracked frame, (h, w, 3) RGB."""
+    from jawusd.imaging.overlay import LOWER_COLOUR, UPPER_COLOUR, PlacedScan, draw_overlay
+
     wanted = [video.timeline.picture(frame - offset) for frame in tracks.frames.tolist()]
     for row, image in enumerate(video.pictures(wanted, colour="rgb")):
         if image is None:
             yield np.full((camera.size_px[1], camera.size_px[0], 3), _GRAY, np.uint8)
             continue
         scans = [
-            drawing.PlacedScan(upper, tracks.T_world_upper[row], drawing.UPPER_COLOUR),
-            drawing.PlacedScan(lower, tracks.T_world_lower[row], drawing.LOWER_COLOUR),
+            PlacedScan(upper, tracks.T_world_upper[row], UPPER_COLOUR),
+            PlacedScan(lower, tracks.T_world_lower[row], LOWER_COLOUR),
         ]
-        yield drawing.draw_overlay(image, camera, scans)
+        yield draw_overlay(image, camera, scans)

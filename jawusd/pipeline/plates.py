@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import OutputError
+from jawusd.errors import OutputError, explain_missing_packages
 from jawusd.formats.capture import Capture
-from jawusd.pipeline.extras import stage
 from jawusd.pipeline.overlay import open_footage
 from jawusd.pipeline.state import Progress
 
 
+@explain_missing_packages()
 def write_plates(
     capture: Capture, offsets: dict[str, int], frames: NDArray[np.int64], folder: Path, progress: Progress
 ) -> list[str]:
@@ -35,12 +35,14 @@ def write_plates(
         CalibrationError: a video has another shape than its camera's calibration.
         OutputError: the files cannot be written.
     """
+    from jawusd.imaging.plates import PlateWriter
+    from jawusd.rig.cameras import PLATE
+
     cameras, videos = open_footage(capture)
-    pattern = stage("jawusd.rig.cameras").PLATE
     done, total = 0, len(videos) * len(frames)
     for name, video in videos.items():
-        plates = stage("jawusd.imaging.plates").PlateWriter(cameras[name])
-        files = str(folder / pattern.format(name=name))
+        plates = PlateWriter(cameras[name])
+        files = str(folder / PLATE.format(name=name))
         try:
             Path(files).parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -51,4 +53,4 @@ def write_plates(
                 plates.write(files % frame, image)
             done += 1
             progress("plates", done, total)
-    return [pattern.format(name=name) for name in videos]
+    return [PLATE.format(name=name) for name in videos]

@@ -11,14 +11,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jawusd.errors import CalibrationError, CaptureError
+from jawusd.errors import CalibrationError, CaptureError, explain_missing_packages
 from jawusd.formats.camera_files import calibration_files, load_cameras_file
 from jawusd.formats.capture import CameraSource, Capture, load_capture
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import LANDMARKS, Camera, anatomical_frame, find_landmarks
 from jawusd.geometry.arrays import Array
-from jawusd.pipeline.extras import stage
 from jawusd.pipeline.state import hash_files
 
 BONES = ("mandible", "skull")
@@ -53,6 +52,7 @@ def open_capture(path: str | os.PathLike[str], *, allow_outside: bool = False) -
     return load_capture(path, allow_outside=allow_outside)
 
 
+@explain_missing_packages()
 def load_cameras(capture: Capture) -> list[Camera]:
     """Return the calibrated cameras in the capture's order, at the size the pictures were recorded in.
 
@@ -66,6 +66,7 @@ def load_cameras(capture: Capture) -> list[Camera]:
     return [_at_recorded_size(camera, capture, source) for camera, source in _calibrated(capture)]
 
 
+@explain_missing_packages()
 def rescaled_cameras(capture: Capture) -> dict[str, tuple[tuple[int, int], tuple[int, int]]]:
     """Return the sizes (width, height) [px] calibrated and recorded, by the name of each camera where they differ.
 
@@ -81,7 +82,9 @@ def rescaled_cameras(capture: Capture) -> dict[str, tuple[tuple[int, int], tuple
 
 def tracked_cameras(cameras: Sequence[Camera], tracks: Tracks) -> list[Camera]:
     """Return the cameras the poses of tracks belong to: as loaded but for what the take itself corrected."""
-    return stage("jawusd.tracking.extrinsics").corrected_cameras(cameras, tracks.meta)
+    from jawusd.tracking.extrinsics import corrected_cameras
+
+    return corrected_cameras(cameras, tracks.meta)
 
 
 def _calibrated(capture: Capture) -> list[tuple[Camera, CameraSource]]:
@@ -103,11 +106,14 @@ def _calibrated(capture: Capture) -> list[tuple[Camera, CameraSource]]:
 
 
 def _at_recorded_size(camera: Camera, capture: Capture, source: CameraSource) -> Camera:
+    from jawusd.imaging.masks import mask_size_px
+    from jawusd.imaging.video import Video
+
     if source.video is not None:
-        recorded, path = stage("jawusd.imaging.video").Video(source.video).size_px, source.video
+        recorded, path = Video(source.video).size_px, source.video
     elif source.masks is not None:
         path = source.masks.upper
-        recorded = stage("jawusd.imaging.masks").mask_size_px(path)
+        recorded = mask_size_px(path)
     else:
         return camera
     width, height = camera.size_px
@@ -124,6 +130,7 @@ def _at_recorded_size(camera: Camera, capture: Capture, source: CameraSource) ->
     return camera.scaled(recorded)
 
 
+@explain_missing_packages()
 def load_meshes(capture: Capture) -> dict[str, Mesh]:
     """Read the scans and bones of a capture, by the names of `MESHES`; optional ones may be absent.
 
@@ -133,10 +140,11 @@ def load_meshes(capture: Capture) -> dict[str, Mesh]:
     Raises:
         CaptureError: a mesh is damaged, or of a size that cannot be in mm.
     """
-    imaging = stage("jawusd.imaging.meshio")
+    from jawusd.imaging.meshio import load_mesh
+
     paths = {name: getattr(capture.scans, name) for name in MESHES}
     return {
-        name: imaging.load_mesh(path, kind="scan" if name.endswith("teeth") else "bone")
+        name: load_mesh(path, kind="scan" if name.endswith("teeth") else "bone")
         for name, path in paths.items()
         if path is not None
     }
@@ -162,6 +170,7 @@ def find_anatomy(capture: Capture, meshes: dict[str, Mesh]) -> Anatomy:
     return measure_anatomy(meshes, capture.anatomy.T_anatomical_skull, named)
 
 
+@explain_missing_packages()
 def measure_anatomy(meshes: Mapping[str, Mesh], given: ArrayLike | None, named: Mapping[str, ArrayLike]) -> Anatomy:
     """Derive from the scans what is not given.
 
@@ -173,8 +182,9 @@ def measure_anatomy(meshes: Mapping[str, Mesh], given: ArrayLike | None, named: 
     Raises:
         CaptureError: the scans are swapped or not in occlusion.
     """
-    imaging = stage("jawusd.imaging.meshio")
-    crowns = {name: mesh.vertices[imaging.tooth_labels(mesh) > 0] for name, mesh in meshes.items() if "teeth" in name}
+    from jawusd.imaging.meshio import tooth_labels
+
+    crowns = {name: mesh.vertices[tooth_labels(mesh) > 0] for name, mesh in meshes.items() if "teeth" in name}
     inferred = []
     if given is None:
         T_anatomical_skull = anatomical_frame(crowns["upper_teeth"], crowns["lower_teeth"])

@@ -10,14 +10,13 @@ from pathlib import Path
 from typing import TypeVar
 
 from jawusd import __version__
-from jawusd.errors import FormatError, JawusdError, MissingDependencyError
+from jawusd.errors import FormatError, JawusdError, MissingDependencyError, explain_missing_packages
 from jawusd.formats.capture import Capture
 from jawusd.formats.experiments import Experiments
 from jawusd.formats.model import load_model
 from jawusd.formats.report import CameraFacts, Overlay, ReportData, RigFacts
 from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.pipeline.experiments import do_experiments
-from jawusd.pipeline.extras import stage
 from jawusd.pipeline.prepare import load_cameras, open_capture
 from jawusd.pipeline.report_media import draw_worst_frames, replay_parts
 from jawusd.pipeline.state import BUILD_FILE, CALIBRATION, FIRST_PASS, BuildState, Progress, StageRecord, locked
@@ -48,6 +47,7 @@ class BuildFacts:
     why_not: str = ""
 
 
+@explain_missing_packages()
 def write_build_report(
     folder: Path, facts: BuildFacts, progress: Progress, experiments: Experiments | None = None
 ) -> Path:
@@ -67,7 +67,9 @@ def write_build_report(
         FormatError, RigError: a file of the build is damaged.
         OutputError: the file cannot be written.
     """
-    document = stage("jawusd.report.document")  # before the work: it may not be installed
+    from jawusd.report.document import write_document  # before the work: it may not be installed
+    from jawusd.rig.read import describe
+
     progress("report", 0, 4)
     left_out: list[str] = []
     tracks, model = load_tracks(folder / "tracks.npz"), load_model(folder / "model.npz")
@@ -79,7 +81,7 @@ def write_build_report(
             lambda: do_experiments(subject, load_tracks(fitted_poses(folder)), 1, lambda *_: None, quick=True),
         )
         left_out.append(_NETWORKS)
-    if stage("jawusd.rig").describe(folder / "actor.usda")["placeholders"]:
+    if describe(folder / "actor.usda")["placeholders"]:
         left_out.append("the mandible in 3-D: no mesh of it was given, and the rig's placeholder is no anatomy.")
     progress("report", 1, 4)
     overlays = _attempt("pictures of the footage", left_out, lambda: _overlays(facts, tracks)) or ()
@@ -102,7 +104,7 @@ def write_build_report(
         left_out=tuple(dict.fromkeys(left_out)),
     )
     progress("report", 3, 4)
-    document.write_document(folder / REPORT_FILE, data)
+    write_document(folder / REPORT_FILE, data)
     progress("report", 4, 4)
     return folder / REPORT_FILE
 
@@ -168,10 +170,15 @@ def fitted_poses(folder: Path) -> Path:
 def missing_packages() -> str | None:
     """Return what keeps a report from being written, None if nothing does."""
     try:
-        stage("jawusd.report.document")
+        _import_document()
     except MissingDependencyError as error:
         return str(error)
     return None
+
+
+@explain_missing_packages()
+def _import_document() -> None:
+    import jawusd.report.document  # noqa: F401
 
 
 def build_facts(folder: Path, state: BuildState, capture: Capture | None, *, allow_outside: bool = False) -> BuildFacts:
@@ -220,7 +227,8 @@ def where(capture: Capture, folder: Path) -> str:
 def _attempt(what: str, left_out: list[str], work: Callable[[], T]) -> T | None:
     """Do a part of the report; what cannot be done is named in the report instead of stopping it."""
     try:
-        return work()
+        with explain_missing_packages():
+            return work()
     except JawusdError as error:
         left_out.append(f"{what}: {error}")
         return None
@@ -249,9 +257,10 @@ def _cameras(facts: BuildFacts) -> tuple[CameraFacts, ...]:
 
 
 def _rig_facts(folder: Path) -> RigFacts:
-    rig = stage("jawusd.rig")
-    found = stage("jawusd.rig.validate").validate_stage(folder / "actor.usda")
-    error_mm = float(rig.describe(folder / "actor.usda")["table"]["max_error_mm"])
+    from jawusd.rig import describe, validate_stage
+
+    found = validate_stage(folder / "actor.usda")
+    error_mm = float(describe(folder / "actor.usda")["table"]["max_error_mm"])
     return RigFacts(error_mm, tuple(f"{finding.severity}: {finding.message}" for finding in found))
 
 

@@ -14,7 +14,6 @@ from jawusd.formats.model import JawModel
 from jawusd.formats.report import Overlay, ReplayPart
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import transform_points
-from jawusd.pipeline.extras import stage
 from jawusd.pipeline.overlay import open_footage
 from jawusd.pipeline.prepare import load_meshes, tracked_cameras
 
@@ -42,18 +41,20 @@ def draw_worst_frames(capture: Capture, offsets: dict[str, int], tracks: Tracks)
         CalibrationError: a video has another shape than its camera's calibration.
         FormatError: the tracks are of another capture.
     """
+    from jawusd.imaging.overlay import encode_jpeg, tracking_sheet
+
     if list(tracks.camera_names) != [camera.name for camera in capture.cameras]:
         raise FormatError(f"the capture has other cameras than the tracks ({', '.join(tracks.camera_names)}).")
     cameras, videos = open_footage(capture)
     shown = [name for name in videos][:_MOST_CAMERAS]
     placed = tracked_cameras([cameras[name] for name in shown], tracks)
-    meshes, drawing = load_meshes(capture), stage("jawusd.imaging.overlay")
+    meshes = load_meshes(capture)
     found = []
     for row, reason in chosen_frames(tracks, capture.fps):
         frame = int(tracks.frames[row])
         scans = meshes["upper_teeth"], meshes["lower_teeth"]
-        sheet = drawing.tracking_sheet(tracks, [frame], placed, videos, offsets, *scans, tile_px=_TILE_PX)
-        found.append(Overlay(frame, reason, drawing.encode_jpeg(sheet, _QUALITY)))
+        sheet = tracking_sheet(tracks, [frame], placed, videos, offsets, *scans, tile_px=_TILE_PX)
+        found.append(Overlay(frame, reason, encode_jpeg(sheet, _QUALITY)))
     return tuple(found)
 
 
@@ -100,9 +101,10 @@ def replay_parts(folder: Path, model: JawModel) -> tuple[ReplayPart, ...]:
     Raises:
         RigError: there is no geometry.
     """
-    geometry = stage("jawusd.rig.geo_read")
+    from jawusd.rig.geo_read import read_geometry, read_gum
+
     path = folder / "geo.usdc"
-    meshes, gums = geometry.read_geometry(path), geometry.read_gum(path)
+    meshes, gums = read_geometry(path), read_gum(path)
     A, rest = model.arrays["T_anatomical_skull"], model.arrays["T_rest"]
     found = []
     for name, mesh in meshes.items():
@@ -119,7 +121,9 @@ def replay_parts(folder: Path, model: JawModel) -> tuple[ReplayPart, ...]:
 
 
 def _small(mesh: Mesh) -> Mesh:
+    from jawusd.tracking.decimation import thinned
+
     none = np.empty((0, 3), np.int32)
     count = min(_MOST_FACES, len(mesh.faces))
-    vertices, faces, _ = stage("jawusd.tracking.decimation").thinned(mesh.vertices, mesh.faces, none, count)
+    vertices, faces, _ = thinned(mesh.vertices, mesh.faces, none, count)
     return Mesh(vertices, faces)

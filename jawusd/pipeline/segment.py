@@ -10,12 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from jawusd.errors import CaptureError, TrackingError
+from jawusd.errors import CaptureError, TrackingError, explain_missing_packages
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.capture import Capture, Masks
 from jawusd.formats.tracks import LOST
 from jawusd.geometry.arrays import Array
-from jawusd.pipeline.extras import stage
 from jawusd.pipeline.journal import Journal
 from jawusd.pipeline.overlay import open_footage
 from jawusd.pipeline.prepare import input_hashes, load_meshes
@@ -43,6 +42,7 @@ class SegmentOptions:
     jobs: int = 2
 
 
+@explain_missing_packages()
 def segment_teeth(
     capture: Capture, offsets: dict[str, int], folder: Path, options: SegmentOptions, progress: Progress
 ) -> dict[str, Any]:
@@ -69,11 +69,12 @@ def segment_teeth(
 
 def with_masks(capture: Capture, folder: Path) -> Capture:
     """Return the capture with the masks that `segment_teeth` wrote to a folder."""
-    pattern = stage("jawusd.segmentation.files").mask_pattern
+    from jawusd.segmentation.files import mask_pattern
+
     cameras = tuple(
         camera
         if camera.video is None
-        else camera.model_copy(update={"masks": Masks(**{row: pattern(folder, camera.name, row) for row in ROWS})})
+        else camera.model_copy(update={"masks": Masks(**{row: mask_pattern(folder, camera.name, row) for row in ROWS})})
         for camera in capture.cameras
     )
     return capture.model_copy(update={"cameras": cameras})
@@ -83,6 +84,11 @@ class _Segmenting:
     """One run over the frames of a capture."""
 
     def __init__(self, capture, offsets, folder, options, progress, pool) -> None:
+        from jawusd.segmentation.config import SegmentationConfig
+        from jawusd.segmentation.files import KeyMasks
+        from jawusd.segmentation.footage import ColourFootage
+        from jawusd.tracking.guided import GuidedTracker
+
         self._capture, self._folder, self._progress, self._pool = capture, folder, progress, pool
         cameras, videos = open_footage(capture)
         if len(videos) < 2:
@@ -93,14 +99,10 @@ class _Segmenting:
         self._names = [name for name in cameras if name in videos]
         self._cameras = {name: cameras[name] for name in self._names}
         self._meshes = [load_meshes(capture)[name] for name in ("upper_teeth", "lower_teeth")]
-        self._footage = stage("jawusd.segmentation.footage").ColourFootage(videos, offsets)
-        self._files = stage("jawusd.segmentation.files")
-        self._keys = self._files.KeyMasks(options.keys, {n: self._cameras[n].size_px for n in self._names})
-        guided = stage("jawusd.tracking.guided")
-        self._config = stage("jawusd.segmentation.config").SegmentationConfig()
-        self._tracker = guided.GuidedTracker(
-            *self._meshes, self._see, self._agreement, len(self._config.reach_mm), None, pool
-        )
+        self._footage = ColourFootage(videos, offsets)
+        self._keys = KeyMasks(options.keys, {n: self._cameras[n].size_px for n in self._names})
+        self._config = SegmentationConfig()
+        self._tracker = GuidedTracker(*self._meshes, self._see, self._agreement, len(self._config.reach_mm), None, pool)
         self._first, self._stop = capture.frames or self._footage.range()
         self._journal = Journal(folder, self._inputs(offsets, options), options.resume)
         self._pictures: dict = {}
@@ -115,6 +117,8 @@ class _Segmenting:
         return hash_value([files, drawn, described, offsets])
 
     def run(self) -> dict[str, Any]:
+        from jawusd.segmentation.state import state_files
+
         bootstrap = self._capture.bootstrap
         poses = self._tracker.picked(bootstrap, self._cameras)
         start = bootstrap.frame
@@ -122,7 +126,7 @@ class _Segmenting:
             raise TrackingError(f"bootstrap.frame is {start}, frames run from {self._first} to {self._stop - 1}")
         if start not in self._journal.entries:
             self._journal.drop(list(self._journal.entries))
-            for path in (*stage("jawusd.segmentation.state").state_files(self._folder), self._folder / LEARNED):
+            for path in (*state_files(self._folder), self._folder / LEARNED):
                 path.unlink(missing_ok=True)
             self._new_segmenters(poses)
             self._pictures = self._footage.at(start)
@@ -138,14 +142,16 @@ class _Segmenting:
         self._progress(stage_name, done, self._stop - self._first)
 
     def _new_segmenters(self, poses: Array) -> None:
-        module = stage("jawusd.segmentation.camera")
+        from jawusd.segmentation.camera import CameraSegmenter
+
         self._segmenters = {
-            name: module.CameraSegmenter(camera, self._meshes, poses, self._config)
-            for name, camera in self._cameras.items()
+            name: CameraSegmenter(camera, self._meshes, poses, self._config) for name, camera in self._cameras.items()
         }
 
     def _go(self, start: int, end: int, step: int) -> None:
         """Go from the frame of the picks to one end of the take, past what was finished before."""
+        from jawusd.segmentation.state import ColourStates
+
         done = start
         while done + step != end and done + step in self._journal.entries:
             done += step
@@ -154,7 +160,7 @@ class _Segmenting:
         poses = self._journal.known(start)[0]
         self._new_segmenters(poses)
         colours = {name: segmenter.colours for name, segmenter in self._segmenters.items()}
-        state = stage("jawusd.segmentation.state").ColourStates(self._folder, colours)
+        state = ColourStates(self._folder, colours)
         before = state.take_up(done, step)
         self._journal.drop(range(before + step if before is not None else start + step, done + step, step))
         if before is None:  # colours come from the poses found in the first frame
@@ -181,9 +187,11 @@ class _Segmenting:
 
     def _look_back(self, start: int, found: int, step: int, record) -> None:
         """Go back from a frame in which a jaw was found again, until that meets the way there, and do it anew."""
+        from jawusd.tracking.history import Past
+
         pictures, segments = self._pictures, self._segments
         colours = [(segmenter.colours, segmenter.colours.counts()) for segmenter in self._segmenters.values()]
-        here = stage("jawusd.tracking.history").Past.of(record)
+        here = Past.of(record)
         # Twice, for a jaw at rest: nothing is known of how it moves.
         past = [*(self._past(frame) for frame in range(start, found, step)), here, here]
         frames = range(found - step, start, -step)[:_ASTRAY_FRAMES]
@@ -204,11 +212,13 @@ class _Segmenting:
 
     def _past(self, frame: int):
         """Return what the tracker needs to know about a finished frame."""
+        from jawusd.tracking.history import Past
+
         poses, status = self._journal.known(frame)
         kept = self._journal.entries[frame]["track"]
         coverage, score, residual = (np.array(kept[key], np.float64) for key in ("coverage", "score_px", "residual_px"))
         used = np.array(kept["used"], bool)
-        return stage("jawusd.tracking.history").Past(poses, status, used, coverage, score, residual)
+        return Past(poses, status, used, coverage, score, residual)
 
     def _keyed(self) -> list[int]:
         """Return the frames for which a person drew and whose poses are known."""
@@ -222,6 +232,8 @@ class _Segmenting:
 
     def _learn_and_repeat(self, keyed: list[int]) -> None:
         """Learn colours and numbers from what a person drew, and segment all frames again where the teeth are."""
+        from jawusd.segmentation.learn import learn_numbers
+
         self._new_segmenters(self._journal.known(self._capture.bootstrap.frame)[0])
         examples = []
         for frame in keyed:
@@ -234,7 +246,7 @@ class _Segmenting:
         finished = [example for example in examples if example is not None]
         if not finished:
             return
-        config, learned = stage("jawusd.segmentation.learn").learn_numbers(finished, self._config)
+        config, learned = learn_numbers(finished, self._config)
         write_text_atomic(self._folder / LEARNED, json.dumps(learned) + "\n")
         for segmenter in self._segmenters.values():
             segmenter.adopt(config)
@@ -246,7 +258,7 @@ class _Segmenting:
 
     def _see(self, frame: int, poses: Array, turn: int) -> list:
         """Segment all cameras' pictures of a frame and return them as the tracker's views."""
-        view = stage("jawusd.tracking.solver").View
+        from jawusd.tracking.solver import View
 
         def one(name: str):
             image, own = self._pictures[name], self._footage.own(name, frame)
@@ -260,7 +272,7 @@ class _Segmenting:
             camera = self._cameras[name] if found is None else found.camera
             masks = np.zeros((2, 1, 1), np.uint8) if found is None else found.masks
             present = np.zeros(2, bool) if found is None else found.present
-            views.append(view(camera.projection_matrix(), camera.centre_world(), masks, present))
+            views.append(View(camera.projection_matrix(), camera.centre_world(), masks, present))
         return views
 
     def _agreement(self, frame: int, guesses: Array) -> Array:
@@ -271,7 +283,10 @@ class _Segmenting:
 
     def _write(self, frame: int, record, again: bool = False) -> None:
         """Write the masks of a frame and what is known about it."""
-        residual = stage("jawusd.tracking.quality").view_residual_px(record.solution)
+        from jawusd.tracking.history import Past
+        from jawusd.tracking.quality import view_residual_px
+
+        residual = view_residual_px(record.solution)
         cameras = {}
         for k, name in enumerate(self._names):
             found = self._segments[name]
@@ -286,13 +301,15 @@ class _Segmenting:
                     "uncovered": record.coverage[:, k].tolist(),
                 }
         list(self._pool.map(lambda name: self._write_masks(name, cameras[name]["frame"]), cameras))
-        past = vars(stage("jawusd.tracking.history").Past.of(record))
+        past = vars(Past.of(record))
         track = {key: past[key].tolist() for key in ("used", "coverage", "score_px", "residual_px")}
         entry = {"poses": past["poses"].tolist(), "status": past["status"].tolist(), "cameras": cameras, "track": track}
         self._journal.add(frame, entry | ({"again": True} if again else {}))
 
     def _write_masks(self, name: str, own: int) -> None:
+        from jawusd.segmentation.files import mask_path, write_mask
+
         masks = self._segmenters[name].recorded(self._segments[name])
         for row, made, key in zip(ROWS, masks, self._keys.of(name, own), strict=True):
             mask = np.where(key.mask > 127, np.uint8(255), np.uint8(0)) if key is not None and key.finished else made
-            self._files.write_mask(self._files.mask_path(self._folder, name, row, own), mask)
+            write_mask(mask_path(self._folder, name, row, own), mask)

@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import FormatError
+from jawusd.errors import FormatError, explain_missing_packages
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.capture import Capture
 from jawusd.formats.text import read_text
 from jawusd.formats.tracks import LOST
 from jawusd.geometry.arrays import Array
 from jawusd.pipeline import journal
-from jawusd.pipeline.extras import stage
 from jawusd.pipeline.made_masks import SUMMARY
 from jawusd.pipeline.segment import LEARNED, SegmentOptions, segment_teeth
 from jawusd.pipeline.state import Progress
@@ -98,6 +97,7 @@ def _off(values: Array, groups: NDArray, least_spread: float) -> Array:
     return out
 
 
+@explain_missing_packages()
 def write_summary(capture: Capture, entries: dict[int, dict[str, Any]], folder: Path) -> dict[str, Any]:
     """Write segment.json, and thumbnails of the worst masks if any are to be looked at.
 
@@ -132,10 +132,11 @@ def write_summary(capture: Capture, entries: dict[int, dict[str, Any]], folder: 
     }
     write_text_atomic(folder / SUMMARY, json.dumps(summary, indent=1) + "\n")
     if doubtful:
-        sheet = stage("jawusd.segmentation.sheet")
+        from jawusd.segmentation.sheet import write_sheet
+
         videos = {camera.name: camera.video for camera in capture.cameras}
         worst = [(row["camera"], row["own_frame"], row["reason"]) for row in doubtful[:_SHEET_FRAMES]]
-        sheet.write_sheet(folder / SHEET, worst, videos, folder)
+        write_sheet(folder / SHEET, worst, videos, folder)
     return summary
 
 
@@ -171,6 +172,7 @@ def segment_capture(
     return [folder / SUMMARY], {key: value for key, value in summary.items() if key != "confidence"}
 
 
+@explain_missing_packages()
 def delete_masks(folder: Path) -> None:
     """Delete the masks that were made in a folder, what was said of them, and folders left empty.
 
@@ -178,7 +180,9 @@ def delete_masks(folder: Path) -> None:
     """
     if not (folder / journal.FILE).is_file():
         return
-    states = stage("jawusd.segmentation.state").state_files(folder)
+    from jawusd.segmentation.state import state_files
+
+    states = state_files(folder)
     for path in (*states, *(folder / name for name in (journal.FILE, SUMMARY, SHEET, LEARNED))):
         path.unlink(missing_ok=True)
     for path in [*folder.glob("*/upper/*.png"), *folder.glob("*/lower/*.png")]:

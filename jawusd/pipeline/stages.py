@@ -10,13 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from jawusd.errors import FormatError, JawusdError
+from jawusd.errors import FormatError, JawusdError, explain_missing_packages
 from jawusd.evaluator import JawRig
 from jawusd.formats.capture import Capture
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.model import JawModel
 from jawusd.formats.tracks import Tracks, load_tracks
-from jawusd.pipeline.extras import stage
 from jawusd.pipeline.made_masks import tracking_config
 from jawusd.pipeline.prepare import BONES, find_anatomy, load_cameras, load_meshes, rescaled_cameras, tracked_cameras
 from jawusd.pipeline.state import Progress
@@ -26,6 +25,7 @@ from jawusd.pipeline.trajectories import TrajectoryOptions, read_trajectory
 Motion = Tracks | tuple[np.ndarray, np.ndarray]
 
 
+@explain_missing_packages()
 def sync_cameras(capture: Capture, progress: Progress) -> dict:
     """Return the frame offset of every camera to the reference camera.
 
@@ -47,11 +47,14 @@ def sync_cameras(capture: Capture, progress: Progress) -> dict:
         result = {"offsets": {camera.name: 0 for camera in capture.cameras}, "method": "taken as simultaneous"}
     else:
         with about(capture.folder / "capture.toml"):
-            result = alignment_result(stage("jawusd.capture.sync").estimate_offsets(capture))
+            from jawusd.capture.sync import estimate_offsets
+
+            result = alignment_result(estimate_offsets(capture))
     progress("sync", 1, 1)
     return result
 
 
+@explain_missing_packages()
 def sync_videos(videos: Mapping[str, Path], reference: str, progress: Progress) -> dict:
     """Return the frame offset of every clip to the reference, as `sync_cameras` does for a capture.
 
@@ -63,8 +66,10 @@ def sync_videos(videos: Mapping[str, Path], reference: str, progress: Progress) 
     Raises:
         SyncError, CaptureError: see `capture.sync.align_videos`.
     """
+    from jawusd.capture.sync import align_videos
+
     progress("sync", 0, 1)
-    result = alignment_result(stage("jawusd.capture.sync").align_videos(videos, reference))
+    result = alignment_result(align_videos(videos, reference))
     progress("sync", 1, 1)
     return result
 
@@ -86,6 +91,7 @@ def alignment_result(alignment: Any) -> dict:
     }
 
 
+@explain_missing_packages()
 def track_teeth(
     capture: Capture,
     offsets: dict[str, int],
@@ -134,7 +140,9 @@ def _track(
 ) -> Tracks:
     cameras, meshes = load_cameras(capture), load_meshes(capture)
     if solver == "paper":
-        return stage("jawusd.tracking.paper_sequence").track_capture_paper(
+        from jawusd.tracking.paper_sequence import track_capture_paper
+
+        return track_capture_paper(
             capture,
             cameras,
             offsets,
@@ -144,9 +152,10 @@ def _track(
             threads=jobs,
             progress=lambda done, total: progress("track", done, total),
         )
-    tracking = stage("jawusd.tracking")
+    from jawusd.tracking.sequence import track_capture
+
     anatomy = find_anatomy(capture, meshes)
-    return tracking.track_capture(
+    return track_capture(
         capture,
         cameras,
         offsets,
@@ -159,6 +168,7 @@ def _track(
     )
 
 
+@explain_missing_packages()
 def aid_teeth(
     capture: Capture, offsets: dict[str, int], tracks: Tracks, model: JawModel, jobs: int, progress: Progress
 ) -> Tracks:
@@ -175,9 +185,11 @@ def aid_teeth(
     Raises:
         CaptureError: a mask cannot be read.
     """
+    from jawusd.tracking.aided import aid_tracks
+
     with about(capture.folder / "capture.toml"):
         meshes = load_meshes(capture)
-        return stage("jawusd.tracking.aided").aid_tracks(
+        return aid_tracks(
             tracks,
             JawRig(model.arrays, model.meta),
             capture,
@@ -225,6 +237,7 @@ def fit_jaw(capture: Capture, motion: Motion, method: str, progress: Progress) -
         return fit_subject(subject_of_capture(capture), motion, method, progress)
 
 
+@explain_missing_packages()
 def fit_subject(subject: Subject, motion: Motion, method: str, progress: Progress) -> JawModel:
     """Fit the jaw model.
 
@@ -237,14 +250,15 @@ def fit_subject(subject: Subject, motion: Motion, method: str, progress: Progres
     Raises:
         FittingError: the poses cannot carry a model.
     """
-    fitting = stage("jawusd.fitting")
-    model = fitting.fit_model(
+    from jawusd.fitting import FittingConfig, fit_model
+
+    model = fit_model(
         motion,
         T_anatomical_skull=subject.T_anatomical_skull,
         landmarks=subject.landmarks,
         mandible_vertices=subject.measured_points(),
         T_rest=subject.T_rest,
-        config=fitting.FittingConfig(method=method),
+        config=FittingConfig(method=method),
         actor=subject.name,
         progress=lambda done, total: progress("fit", done, total),
     )
@@ -273,6 +287,7 @@ def bake_files(capture: Capture, model: JawModel, folder: Path, progress: Progre
     return bake_meshes(load_meshes(capture), capture.name, capture.fps, model, folder, progress, table_size)
 
 
+@explain_missing_packages()
 def bake_meshes(
     meshes: Mapping[str, Mesh],
     name: str,
@@ -296,18 +311,21 @@ def bake_meshes(
     Raises:
         RigError, OutputError: the rig cannot be written.
     """
-    bake, cleaning = stage("jawusd.rig.bake"), stage("jawusd.imaging.mesh_cleaning")
+    from jawusd.imaging.mesh_cleaning import manifold
+    from jawusd.rig.bake import bake_rig
+
     # Bones come from segmented scans with all their faults; teeth scans stay as they are, vertex for vertex.
-    meshes = {key: cleaning.manifold(mesh) if key in BONES else mesh for key, mesh in meshes.items()}
+    meshes = {key: manifold(mesh) if key in BONES else mesh for key, mesh in meshes.items()}
     motion = {"frames": model.frames, "d": model.d} if len(model.frames) else {}
     progress("bake", 0, 1)
-    files = bake.bake_rig(
+    files = bake_rig(
         folder, JawRig(model.arrays, model.meta), meshes, name=name, fps=fps, table_size=table_size, **motion
     )
     progress("bake", 1, 1)
     return files
 
 
+@explain_missing_packages()
 def write_take(capture: Capture, tracks: Tracks, folder: Path) -> list[Path]:
     """Write the take beside the rig: its cameras, and the actor where the head was.
 
@@ -323,8 +341,9 @@ def write_take(capture: Capture, tracks: Tracks, folder: Path) -> list[Path]:
         CalibrationError: a camera of the capture has no calibration.
         RigError, OutputError: the take cannot be written.
     """
-    cameras = stage("jawusd.rig.cameras")
-    return cameras.write_cameras(
+    from jawusd.rig.cameras import write_cameras
+
+    return write_cameras(
         folder / "cameras.usda",
         tracked_cameras(load_cameras(capture), tracks),
         folder / "anim_capture.usdc",
@@ -334,6 +353,7 @@ def write_take(capture: Capture, tracks: Tracks, folder: Path) -> list[Path]:
     )
 
 
+@explain_missing_packages("demo")
 def write_demo_capture(folder: Path, seed: int, frames: int, progress: Progress) -> Path:
     """Render a synthetic capture and return its capture.toml.
 
@@ -347,7 +367,8 @@ def write_demo_capture(folder: Path, seed: int, frames: int, progress: Progress)
         MissingDependencyError: OpenGL without a display (EGL) is not available.
         OutputError: the folder cannot be written.
     """
-    synthetic = stage("jawusd.synthetic.capture_writer")
-    config = synthetic.DemoConfig(seed=seed, frames=frames)
-    synthetic.write_demo(folder, config, progress=lambda done, total: progress("demo", done, total))
+    from jawusd.synthetic.capture_writer import DemoConfig, write_demo
+
+    config = DemoConfig(seed=seed, frames=frames)
+    write_demo(folder, config, progress=lambda done, total: progress("demo", done, total))
     return folder / "capture.toml"

@@ -9,14 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from jawusd.errors import RigError
+from jawusd.errors import RigError, explain_missing_packages
 from jawusd.formats.capture import Capture
 from jawusd.formats.landmarks import load_landmarks
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.model import JawModel, load_model
 from jawusd.geometry import LANDMARKS, landmark_frame
 from jawusd.geometry.arrays import Array
-from jawusd.pipeline.extras import stage
 from jawusd.pipeline.prepare import find_anatomy, load_meshes, measure_anatomy
 
 _TEETH_APART_MM = 15.0  # molars are picked by hand here, found by rule there
@@ -52,6 +51,7 @@ class Subject:
         return None
 
 
+@explain_missing_packages()
 def subject_of_capture(capture: Capture) -> Subject:
     """Return the person of a capture.
 
@@ -65,6 +65,7 @@ def subject_of_capture(capture: Capture) -> Subject:
     )
 
 
+@explain_missing_packages()
 def subject_of_scans(files: Mapping[str, Path], name: str) -> Subject:
     """Return the person of loose scans in one frame, teeth in occlusion.
 
@@ -75,10 +76,9 @@ def subject_of_scans(files: Mapping[str, Path], name: str) -> Subject:
     Raises:
         CaptureError: a mesh is damaged or not in mm, or the scans are swapped or not in occlusion.
     """
-    imaging = stage("jawusd.imaging.meshio")
-    meshes = {
-        key: imaging.load_mesh(path, kind="scan" if key.endswith("teeth") else "bone") for key, path in files.items()
-    }
+    from jawusd.imaging.meshio import load_mesh
+
+    meshes = {key: load_mesh(path, kind="scan" if key.endswith("teeth") else "bone") for key, path in files.items()}
     anatomy = measure_anatomy(meshes, None, {})
     return Subject(name, anatomy.T_anatomical_skull, anatomy.landmarks, meshes, inferred=anatomy.inferred)
 
@@ -129,8 +129,10 @@ def subject_of_build(folder: Path) -> Subject:
         FormatError: there is no model.
         RigError: there is no geometry.
     """
+    from jawusd.rig.geo_read import read_geometry
+
     model = load_model(folder / "model.npz")
-    bones = stage("jawusd.rig.geo_read").read_geometry(folder / "geo.usdc")
+    bones = read_geometry(folder / "geo.usdc")
     return Subject(
         str(model.meta.get("actor") or folder.resolve().name),
         np.asarray(model.arrays["T_anatomical_skull"], dtype=np.float64),

@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+from jawusd.errors import explain_missing_packages
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.light_curve import LightCurve
-from jawusd.pipeline.extras import stage
 from jawusd.pipeline.state import Progress
 
 PLOT_SUFFIXES = (".png", ".svg")
 
 
+@explain_missing_packages()
 def light_curves(videos: Mapping[str, Path], progress: Progress) -> dict[str, LightCurve]:
     """Return the brightness of every picture of every video; decodes all of them.
 
@@ -23,10 +24,12 @@ def light_curves(videos: Mapping[str, Path], progress: Progress) -> dict[str, Li
     Raises:
         CaptureError: a video cannot be read.
     """
-    sync, found = stage("jawusd.capture.sync"), {}
+    from jawusd.capture.sync import light_curve
+
+    found = {}
     for name, video in videos.items():
         progress("brightness", len(found), len(videos))
-        found[name] = sync.light_curve(video)
+        found[name] = light_curve(video)
     progress("brightness", len(videos), len(videos))
     return found
 
@@ -48,6 +51,7 @@ def write_light_curves(path: Path, curves: Mapping[str, LightCurve]) -> None:
     write_text_atomic(path, "\n".join([*lines, ""]))
 
 
+@explain_missing_packages()
 def write_sync_plot(path: Path, curves: Mapping[str, LightCurve], result: Mapping | None) -> None:
     """Draw the brightness of all clips before and after they were aligned.
 
@@ -60,9 +64,11 @@ def write_sync_plot(path: Path, curves: Mapping[str, LightCurve], result: Mappin
         OutputError: the file cannot be written.
         MissingDependencyError: matplotlib is not installed.
     """
+    from jawusd.report.sync_plot import draw_sync
+
     title, offsets = "the cameras could not be aligned", None
     if result is not None:
         offsets = result["offsets"]
         listed = ", ".join(f"{name} {offsets[name]:+d}" for name in curves)
         title = f"aligned ({result['method']}): {listed} frames"
-    stage("jawusd.report.sync_plot").draw_sync(curves, offsets, title, path)
+    draw_sync(curves, offsets, title, path)

@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jawusd.errors import FormatError, OutputError, RigError
+from jawusd.errors import FormatError, OutputError, RigError, explain_missing_packages
 from jawusd.evaluator import JawRig
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import load_tracks
 from jawusd.geometry.arrays import Mask
-from jawusd.pipeline.extras import stage
 
 if TYPE_CHECKING:
     from jawusd.viewer.actor import ViewedActor
@@ -31,6 +30,7 @@ _MOST_FACES = 8_000  # per mesh: what a browser without a graphics card still tu
 _DEFAULT_FPS = 24.0
 
 
+@explain_missing_packages()
 def open_viewer(path: str | os.PathLike[str], host: str, port: int) -> Viewer:
     """Serve the rig at a path to browsers; see `viewed_actor` and `Viewer` for what it raises.
 
@@ -42,8 +42,9 @@ def open_viewer(path: str | os.PathLike[str], host: str, port: int) -> Viewer:
     Raises:
         MissingDependencyError: the viewer is not installed.
     """
-    server = stage("jawusd.viewer.server")
-    return server.Viewer(viewed_actor(path), host, port)
+    from jawusd.viewer.server import Viewer
+
+    return Viewer(viewed_actor(path), host, port)
 
 
 def viewed_actor(path: str | os.PathLike[str]) -> ViewedActor:
@@ -56,17 +57,20 @@ def viewed_actor(path: str | os.PathLike[str]) -> ViewedActor:
         FormatError: not a rig, or one without geometry.
         RigError: not a USD file.
     """
+    from jawusd.rig.geo_read import read_placeholders
+    from jawusd.rig.read import describe, load_rig
+    from jawusd.viewer.actor import ViewedActor
+
     path = Path(path)
     path = path / "actor.usda" if path.is_dir() else path
     if path.suffix == ".npz":
         raise FormatError("holds a model without meshes; nothing to see.", path=path, hint="Name the actor.usda.")
-    rig_read = stage("jawusd.rig.read")
-    rig, about = rig_read.load_rig(path), rig_read.describe(path)
-    return stage("jawusd.viewer.actor").ViewedActor(
+    rig, about = load_rig(path), describe(path)
+    return ViewedActor(
         name=str(about["actor"] or path.stem),
         rig=rig,
         meshes=screen_meshes(path),
-        placeholders=frozenset(stage("jawusd.rig.geo_read").read_placeholders(path)),
+        placeholders=frozenset(read_placeholders(path)),
         fps=float(about["fps"] or _DEFAULT_FPS),
         folder=path.parent,
         clip_names=partial(motion_names, path.parent),
@@ -84,8 +88,10 @@ def screen_meshes(path: Path) -> dict[str, Mesh]:
     Raises:
         RigError: there is nothing to take hold of.
     """
-    geometry = stage("jawusd.rig.geo_read")
-    meshes, gum = geometry.read_geometry(path) | geometry.read_placeholders(path), geometry.read_gum(path)
+    from jawusd.rig.geo_read import read_geometry, read_gum, read_placeholders
+    from jawusd.viewer.decimate import for_view
+
+    meshes, gum = read_geometry(path) | read_placeholders(path), read_gum(path)
     if not {"mandible", "lower_teeth"} & set(meshes):
         raise RigError("has no mandible to look at.", path=path)
     parted: dict[str, Mesh] = {}
@@ -95,7 +101,6 @@ def screen_meshes(path: Path) -> dict[str, Mesh]:
             parted[name.replace("teeth", "gum")] = part_of(mesh, gum[name])
         else:
             parted[name] = mesh
-    for_view = stage("jawusd.viewer.decimate").for_view
     return {name: for_view(mesh, _MOST_FACES) for name, mesh in parted.items() if len(mesh.faces)}
 
 
@@ -129,16 +134,20 @@ def load_motion(folder: Path, rig: JawRig, fps: float, name: str) -> Clip:
         FormatError: there is no such motion, or it cannot be read.
         RigError: it is not USD.
     """
+    from jawusd.rig.motion_read import read_poses_of_stage
+    from jawusd.rig.read import describe
+    from jawusd.viewer.clip import Clip
+
     if name not in motion_names(folder):
         raise FormatError(f'there is no motion called "{name}" here.', path=folder)
     if name == CAPTURED:
         tracks = load_tracks(folder / _TRACKS)
         frames, poses = tracks.frames, tracks.T_upper_lower
     else:
-        frames, poses = stage("jawusd.rig.motion_read").read_poses_of_stage(folder / name)
-        fps = float(stage("jawusd.rig.read").describe(folder / name)["fps"])
+        frames, poses = read_poses_of_stage(folder / name)
+        fps = float(describe(folder / name)["fps"])
     d, _ = rig.encode(poses)
-    return stage("jawusd.viewer.clip").Clip.of(name, frames, d, fps)
+    return Clip.of(name, frames, d, fps)
 
 
 def save_motion(actor: Path, rig: JawRig, name: str, clip: Clip, overwrite: bool) -> Path:
@@ -154,6 +163,8 @@ def save_motion(actor: Path, rig: JawRig, name: str, clip: Clip, overwrite: bool
     Raises:
         OutputError: the name is not allowed or taken, or the file cannot be written.
     """
+    from jawusd.rig.animation import write_animation
+
     if not _ANIMATION.fullmatch(name):
         raise OutputError(
             f'"{name}" is no name for an animation: anim, then letters, digits, _ or -, then .usdc or .usda.'
@@ -161,5 +172,5 @@ def save_motion(actor: Path, rig: JawRig, name: str, clip: Clip, overwrite: bool
     target = actor.parent / name
     if target.exists() and not overwrite:
         raise OutputError("exists already.", path=target, hint="Choose another name, or tick overwrite.")
-    stage("jawusd.rig.animation").write_animation(target, actor, clip.frames, clip.d, clip.fps, rig=rig)
+    write_animation(target, actor, clip.frames, clip.d, clip.fps, rig=rig)
     return target

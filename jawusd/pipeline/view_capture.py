@@ -7,19 +7,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import FormatError
+from jawusd.errors import FormatError, explain_missing_packages
 from jawusd.formats.capture import Bootstrap, Capture
 from jawusd.formats.capture_edit import write_bootstrap
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.geometry import Camera
 from jawusd.geometry.arrays import Array
-from jawusd.pipeline.extras import stage
 from jawusd.pipeline.overlay import open_videos
 from jawusd.pipeline.prepare import find_anatomy, load_cameras, load_meshes, open_capture, tracked_cameras
 from jawusd.pipeline.report import calibrated, is_build
@@ -27,6 +26,8 @@ from jawusd.pipeline.stages import sync_cameras
 from jawusd.pipeline.state import BuildState, Progress
 
 if TYPE_CHECKING:
+    from jawusd.imaging.frame_reader import FrameReader
+    from jawusd.imaging.video import Video
     from jawusd.viewer.server import CaptureViewer
     from jawusd.viewer.viewed_capture import ViewedCapture
 
@@ -43,6 +44,7 @@ def is_capture(path: Path) -> bool:
     return path.suffix == ".toml" or (path / CAPTURE_FILE).is_file()
 
 
+@explain_missing_packages()
 def open_capture_viewer(
     path: str | os.PathLike[str],
     tracks: Path | None,
@@ -65,8 +67,9 @@ def open_capture_viewer(
     Raises:
         MissingDependencyError: the viewer is not installed.
     """
-    server = stage("jawusd.viewer.server")
-    return server.CaptureViewer(viewed_capture(path, tracks, progress, allow_outside=allow_outside), host, port)
+    from jawusd.viewer.server import CaptureViewer
+
+    return CaptureViewer(viewed_capture(path, tracks, progress, allow_outside=allow_outside), host, port)
 
 
 def viewed_capture(
@@ -85,6 +88,10 @@ def viewed_capture(
         CaptureError: there is no footage, or a file cannot be decoded.
         SyncError: the cameras cannot be aligned in time.
     """
+    from jawusd.imaging.frame_reader import FrameReader
+    from jawusd.imaging.meshio import GUM, tooth_labels
+    from jawusd.viewer.viewed_capture import ViewedCapture
+
     path = Path(path)
     capture = open_capture(path, allow_outside=allow_outside)
     build = tracks if tracks is not None and is_build(tracks) else None
@@ -99,14 +106,13 @@ def viewed_capture(
     offsets = _offsets(capture, build, progress)
     footage = _Footage(
         capture=capture,
-        readers={name: stage("jawusd.imaging.frame_reader").FrameReader(video) for name, video in videos.items()},
+        readers={name: FrameReader(video) for name, video in videos.items()},
         cameras={camera.name: camera for camera in cameras},
         offsets=offsets,
         scans={row: meshes[f"{row}_teeth"] for row in ("upper", "lower")},
     )
-    meshio = stage("jawusd.imaging.meshio")
-    labels = {row: meshio.tooth_labels(mesh) != meshio.GUM for row, mesh in footage.scans.items()}
-    return stage("jawusd.viewer.viewed_capture").ViewedCapture(
+    labels = {row: tooth_labels(mesh) != GUM for row, mesh in footage.scans.items()}
+    return ViewedCapture(
         name=capture.name,
         fps=capture.fps,
         frames=_frames(capture, poses, videos, offsets),
@@ -149,7 +155,7 @@ def _offsets(capture: Capture, build: Path | None, progress: Progress) -> dict[s
 
 
 def _frames(
-    capture: Capture, poses: Tracks | None, videos: Mapping[str, Any], offsets: Mapping[str, int]
+    capture: Capture, poses: Tracks | None, videos: Mapping[str, Video], offsets: Mapping[str, int]
 ) -> tuple[int, int]:
     """Return the first and the last frame of the reference camera to step through."""
     if poses is not None and len(poses.frames):
@@ -168,13 +174,15 @@ class _Footage:
     """Answer what a page asks of a capture; several threads may ask."""
 
     capture: Capture
-    readers: Mapping[str, Any]
+    readers: Mapping[str, FrameReader]
     cameras: Mapping[str, Camera]
     offsets: Mapping[str, int]
     scans: Mapping[str, Mesh]
 
     def picture(self, name: str, frame: int, poses: tuple[Array, Array] | None, look: str) -> NDArray[np.uint8]:
         """Return a camera's picture at a frame of the reference camera, with the teeth drawn over it."""
+        from jawusd.imaging.overlay import LOWER_COLOUR, UPPER_COLOUR, PlacedScan, draw_overlay
+
         reader = self.readers[name]
         own = reader.video.timeline.picture(frame - self.offsets[name])
         if own is None:
@@ -183,18 +191,19 @@ class _Footage:
         image = reader.picture(own)
         if poses is None or look == "footage" or name not in self.cameras:
             return image
-        drawing = stage("jawusd.imaging.overlay")
-        colours = drawing.UPPER_COLOUR, drawing.LOWER_COLOUR
-        placed = [drawing.PlacedScan(*scan) for scan in zip(self.scans.values(), poses, colours, strict=True)]
-        return drawing.draw_overlay(image, self.cameras[name], placed, fill=_FILL[look])
+        colours = UPPER_COLOUR, LOWER_COLOUR
+        placed = [PlacedScan(*scan) for scan in zip(self.scans.values(), poses, colours, strict=True)]
+        return draw_overlay(image, self.cameras[name], placed, fill=_FILL[look])
 
     def teeth_region(self, name: str, frame: int) -> tuple[float, float, float, float] | None:
         """Return left, top, right and bottom [px] of what the masks of a camera show at a frame, None without any."""
+        from jawusd.imaging.masks import open_masks
+
         source = next(camera for camera in self.capture.cameras if camera.name == name)
         if source.masks is None:
             return None
         seen = []
-        for reader in stage("jawusd.imaging.masks").open_masks(source, self.readers[name].video.size_px):
+        for reader in open_masks(source, self.readers[name].video.size_px):
             with reader as masks:
                 mask = masks.read(frame - self.offsets[name])
             if mask is not None:
@@ -208,10 +217,11 @@ class _Footage:
 
     def poses_of_picks(self, picks: Bootstrap) -> tuple[tuple[Array, Array], list[str]]:
         """Return the poses that agree with picks, and the names of those that do not fit."""
-        bootstrap = stage("jawusd.tracking.bootstrap")
+        from jawusd.tracking.bootstrap import pose_from_picks
+
         poses, wrong = [], []
         for row, mesh in self.scans.items():
-            pose, bad = bootstrap.pose_from_picks(getattr(picks, row), mesh.vertices, self.cameras, row)
+            pose, bad = pose_from_picks(getattr(picks, row), mesh.vertices, self.cameras, row)
             poses.append(pose)
             wrong += [f"{row[0].upper()}{number}" for number in bad]
         return (poses[0], poses[1]), wrong

@@ -1,6 +1,7 @@
 """The report of a finished build: written anew, with what is not at hand named, and kept by --resume."""
 
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,11 +12,10 @@ from report_data import report_data
 from typer.testing import CliRunner
 
 from jawusd.cli.main import app
-from jawusd.errors import FormatError, MissingDependencyError
+from jawusd.errors import FormatError
 from jawusd.evaluator import JawRig
 from jawusd.formats.model import load_model, save_model
 from jawusd.formats.tracks import load_tracks, save_tracks
-from jawusd.pipeline import report
 from jawusd.pipeline.report import missing_packages, report_build
 from jawusd.pipeline.report_media import chosen_frames
 from jawusd.pipeline.state import BuildState
@@ -94,10 +94,9 @@ def test_a_folder_that_is_no_build_is_one_clear_error(tmp_path):
 def test_missing_packages_are_named_with_the_cure(monkeypatch):
     assert missing_packages() is None
 
-    def absent(module):
-        raise MissingDependencyError("needs matplotlib.", hint="Install it with: pip install 'jawusd[build]'")
-
-    monkeypatch.setattr(report, "stage", absent)
+    for name in [name for name in sys.modules if name.startswith("jawusd.report")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
     missing = missing_packages()
     assert "matplotlib" in missing and "jawusd[build]" in missing
     track = {
