@@ -60,7 +60,7 @@ def _scale_by_masks(
         CalibrationError: the teeth come out with another size than their scans.
     """
     from jawusd.capture.scale import ScaleCheck, judged_scale
-    from jawusd.tracking.scale_search import seen_size
+    from jawusd.tracking.initialization.scale_search import seen_size
 
     if sum(camera.masks is not None for camera in capture.cameras) < 2:
         return ScaleCheck(None, None, f"{by_picks.reason}, nor masks of two cameras to search the teeth in")

@@ -82,7 +82,7 @@ def rescaled_cameras(capture: Capture) -> dict[str, tuple[tuple[int, int], tuple
 
 def tracked_cameras(cameras: Sequence[Camera], tracks: Tracks) -> list[Camera]:
     """Return the cameras the poses of tracks belong to: as loaded but for what the take itself corrected."""
-    from jawusd.tracking.extrinsics import corrected_cameras
+    from jawusd.tracking.sequence.extrinsics import corrected_cameras
 
     return corrected_cameras(cameras, tracks.meta)
 

@@ -121,7 +121,7 @@ def replay_parts(folder: Path, model: JawModel) -> tuple[ReplayPart, ...]:
 
 
 def _small(mesh: Mesh) -> Mesh:
-    from jawusd.tracking.decimation import thinned
+    from jawusd.tracking.contour.decimation import thinned
 
     none = np.empty((0, 3), np.int32)
     count = min(_MOST_FACES, len(mesh.faces))

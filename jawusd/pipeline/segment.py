@@ -87,7 +87,7 @@ class _Segmenting:
         from jawusd.segmentation.config import SegmentationConfig
         from jawusd.segmentation.files import KeyMasks
         from jawusd.segmentation.footage import ColourFootage
-        from jawusd.tracking.guided import GuidedTracker
+        from jawusd.tracking.sequence.guided import GuidedTracker
 
         self._capture, self._folder, self._progress, self._pool = capture, folder, progress, pool
         cameras, videos = open_footage(capture)
@@ -187,11 +187,11 @@ class _Segmenting:
 
     def _look_back(self, start: int, found: int, step: int, record) -> None:
         """Go back from a frame in which a jaw was found again, until that meets the way there, and do it anew."""
-        from jawusd.tracking.history import Past
+        from jawusd.tracking.contour.frame_record import FrameSummary
 
         pictures, segments = self._pictures, self._segments
         colours = [(segmenter.colours, segmenter.colours.counts()) for segmenter in self._segmenters.values()]
-        here = Past.of(record)
+        here = FrameSummary.of(record)
         # Twice, for a jaw at rest: nothing is known of how it moves.
         past = [*(self._past(frame) for frame in range(start, found, step)), here, here]
         frames = range(found - step, start, -step)[:_ASTRAY_FRAMES]
@@ -212,13 +212,13 @@ class _Segmenting:
 
     def _past(self, frame: int):
         """Return what the tracker needs to know about a finished frame."""
-        from jawusd.tracking.history import Past
+        from jawusd.tracking.contour.frame_record import FrameSummary
 
         poses, status = self._journal.known(frame)
         kept = self._journal.entries[frame]["track"]
         coverage, score, residual = (np.array(kept[key], np.float64) for key in ("coverage", "score_px", "residual_px"))
         used = np.array(kept["used"], bool)
-        return Past(poses, status, used, coverage, score, residual)
+        return FrameSummary(poses, status, used, coverage, score, residual)
 
     def _keyed(self) -> list[int]:
         """Return the frames for which a person drew and whose poses are known."""
@@ -258,7 +258,7 @@ class _Segmenting:
 
     def _see(self, frame: int, poses: Array, turn: int) -> list:
         """Segment all cameras' pictures of a frame and return them as the tracker's views."""
-        from jawusd.tracking.solver import View
+        from jawusd.tracking.contour.views import View
 
         def one(name: str):
             image, own = self._pictures[name], self._footage.own(name, frame)
@@ -283,8 +283,8 @@ class _Segmenting:
 
     def _write(self, frame: int, record, again: bool = False) -> None:
         """Write the masks of a frame and what is known about it."""
-        from jawusd.tracking.history import Past
-        from jawusd.tracking.quality import view_residual_px
+        from jawusd.tracking.contour.frame_record import FrameSummary
+        from jawusd.tracking.contour.quality import view_residual_px
 
         residual = view_residual_px(record.solution)
         cameras = {}
@@ -301,7 +301,7 @@ class _Segmenting:
                     "uncovered": record.coverage[:, k].tolist(),
                 }
         list(self._pool.map(lambda name: self._write_masks(name, cameras[name]["frame"]), cameras))
-        past = vars(Past.of(record))
+        past = vars(FrameSummary.of(record))
         track = {key: past[key].tolist() for key in ("used", "coverage", "score_px", "residual_px")}
         entry = {"poses": past["poses"].tolist(), "status": past["status"].tolist(), "cameras": cameras, "track": track}
         self._journal.add(frame, entry | ({"again": True} if again else {}))

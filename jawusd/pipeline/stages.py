@@ -111,7 +111,7 @@ def track_teeth(
         backend: where the paper's method draws, "cpu" or "gl".
 
     Raises:
-        CaptureError, TrackingError: see `tracking.track_capture` and `tracking.paper_sequence`.
+        CaptureError, TrackingError: see `tracking.track_capture` and `tracking.paper.take`.
         MissingDependencyError: the GL backend has no OpenGL to work with.
     """
     with about(capture.folder / "capture.toml"):
@@ -140,7 +140,7 @@ def _track(
 ) -> Tracks:
     cameras, meshes = load_cameras(capture), load_meshes(capture)
     if solver == "paper":
-        from jawusd.tracking.paper_sequence import track_capture_paper
+        from jawusd.tracking.paper.take import track_capture_paper
 
         return track_capture_paper(
             capture,
@@ -152,7 +152,7 @@ def _track(
             threads=jobs,
             progress=lambda done, total: progress("track", done, total),
         )
-    from jawusd.tracking.sequence import track_capture
+    from jawusd.tracking import track_capture
 
     anatomy = find_anatomy(capture, meshes)
     return track_capture(
@@ -185,11 +185,11 @@ def aid_teeth(
     Raises:
         CaptureError: a mask cannot be read.
     """
-    from jawusd.tracking.aided import aid_tracks
+    from jawusd.tracking.sequence.model_refinement import refine_tracks
 
     with about(capture.folder / "capture.toml"):
         meshes = load_meshes(capture)
-        return aid_tracks(
+        return refine_tracks(
             tracks,
             JawRig(model.arrays, model.meta),
             capture,

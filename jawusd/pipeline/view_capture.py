@@ -217,7 +217,7 @@ class _Footage:
 
     def poses_of_picks(self, picks: Bootstrap) -> tuple[tuple[Array, Array], list[str]]:
         """Return the poses that agree with picks, and the names of those that do not fit."""
-        from jawusd.tracking.bootstrap import pose_from_picks
+        from jawusd.tracking.initialization.bootstrap import pose_from_picks
 
         poses, wrong = [], []
         for row, mesh in self.scans.items():

@@ -1,6 +1,6 @@
 """Poses of both rows of teeth from masks in several views."""
 
 from jawusd.tracking.config import TrackingConfig
-from jawusd.tracking.sequence import track_capture
+from jawusd.tracking.sequence.take import track_capture
 
 __all__ = ["TrackingConfig", "track_capture"]

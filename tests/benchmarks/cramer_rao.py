@@ -20,10 +20,10 @@ from jawusd.formats.tracks import load_tracks
 from jawusd.geometry import LANDMARKS, mandible_metric, relative_pose, transform_point, transform_points
 from jawusd.pipeline.prepare import find_anatomy, load_cameras, load_meshes
 from jawusd.tracking import TrackingConfig
-from jawusd.tracking.quality import landmark_sigmas, relative_covariance, residual_px, twist_covariance
-from jawusd.tracking.scan import prepare_scan
-from jawusd.tracking.solver import ContourSolver
-from jawusd.tracking.views import MaskViews
+from jawusd.tracking.contour.quality import landmark_sigmas, relative_covariance, residual_px, twist_covariance
+from jawusd.tracking.contour.scan import prepare_scan
+from jawusd.tracking.contour.solver import ContourSolver
+from jawusd.tracking.contour.views import MaskViews
 
 ROWS = ("upper", "lower")
 # Moments of the Tukey weight w of a unit normal residual x at c = 4.685, by the normal's moments: the solver's normal

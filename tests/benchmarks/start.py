@@ -25,16 +25,16 @@ from jawusd.geometry import transform_point, transform_points
 from jawusd.imaging.raster import draw_depth_labels, project
 from jawusd.pipeline.prepare import load_cameras, load_meshes
 from jawusd.pipeline.stages import sync_cameras
-from jawusd.tracking.bootstrap import pose_from_picks
 from jawusd.tracking.config import TrackingConfig
-from jawusd.tracking.first import first_record
-from jawusd.tracking.footage import Footage
-from jawusd.tracking.scan import prepare_scan
-from jawusd.tracking.scan_checks import check_occlusion
-from jawusd.tracking.solver import ContourSolver, View
-from jawusd.tracking.start import find_start
-from jawusd.tracking.start_search import StartSearch
-from jawusd.tracking.views import masked_sources
+from jawusd.tracking.contour.scan import prepare_scan
+from jawusd.tracking.contour.solver import ContourSolver
+from jawusd.tracking.contour.views import View, masked_sources
+from jawusd.tracking.initialization.bootstrap import pose_from_picks
+from jawusd.tracking.initialization.first_frame import first_record
+from jawusd.tracking.initialization.footage import Footage
+from jawusd.tracking.initialization.scan_checks import check_occlusion
+from jawusd.tracking.initialization.start import find_start
+from jawusd.tracking.initialization.start_search import StartSearch
 
 ROWS = ("upper", "lower")
 CLICK_LIMIT_MM, SEARCH_LIMIT_MM = 0.2, 0.3

@@ -92,9 +92,10 @@ def run_setup(path: Path, setup: Setup, windows: int, length: int) -> dict:
     from jawusd.geometry import transform_points
     from jawusd.imaging.meshio import tooth_labels
     from jawusd.pipeline.prepare import find_anatomy, load_cameras, load_meshes
-    from jawusd.tracking import paper_sequence, track_capture
-    from jawusd.tracking.paper_solver import PaperConfig
-    from jawusd.tracking.solver import ContourSolver
+    from jawusd.tracking import track_capture
+    from jawusd.tracking.contour.solver import ContourSolver
+    from jawusd.tracking.paper import take as paper_take
+    from jawusd.tracking.paper.solver import PaperConfig
 
     capture = load_capture(path)
     cameras, meshes = load_cameras(capture), load_meshes(capture)
@@ -102,7 +103,7 @@ def run_setup(path: Path, setup: Setup, windows: int, length: int) -> dict:
         truth = {name: archive[name] for name in archive.files}
     offsets = dict(zip(truth["camera_names"].tolist(), truth["offsets"].tolist(), strict=True))
     scans = [meshes[f"{row}_teeth"] for row in ROWS]
-    watch = Watch(*((paper_sequence, "solve_paper") if setup.solver == "paper" else (ContourSolver, "solve")))
+    watch = Watch(*((paper_take, "solve_paper") if setup.solver == "paper" else (ContourSolver, "solve")))
     landmarks = find_anatomy(capture, meshes).landmarks
     config = replace(PaperConfig(), other_row_hides=setup.other_row_hides)
     times: list[list[float]] = []
@@ -111,7 +112,7 @@ def run_setup(path: Path, setup: Setup, windows: int, length: int) -> dict:
         window = cut(capture, cameras, scans, truth, int(start), length)
         if setup.solver == "paper":
             options = {"backend": setup.backend, "threads": setup.threads, "progress": watch.mark}
-            tracks = paper_sequence.track_capture_paper(window, cameras, offsets, *scans, config, **options)
+            tracks = paper_take.track_capture_paper(window, cameras, offsets, *scans, config, **options)
         else:
             options = {"threads": setup.threads, "progress": watch.mark}
             tracks = track_capture(window, cameras, offsets, *scans, landmarks, **options)

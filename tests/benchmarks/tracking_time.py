@@ -30,9 +30,9 @@ from jawusd.formats.mesh import Mesh  # noqa: E402
 from jawusd.geometry import Camera, transform_point  # noqa: E402
 from jawusd.imaging.meshio import load_mesh  # noqa: E402
 from jawusd.tracking import TrackingConfig, track_capture  # noqa: E402
-from jawusd.tracking.scan import prepare_scan  # noqa: E402
-from jawusd.tracking.solver import ContourSolver  # noqa: E402
-from jawusd.tracking.views import MaskViews  # noqa: E402
+from jawusd.tracking.contour.scan import prepare_scan  # noqa: E402
+from jawusd.tracking.contour.solver import ContourSolver  # noqa: E402
+from jawusd.tracking.contour.views import MaskViews  # noqa: E402
 
 FRAMES = 60
 

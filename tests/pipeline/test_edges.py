@@ -8,7 +8,7 @@ from example_rig import example_rig
 from jawusd.errors import FittingError
 from jawusd.fitting import fit_model
 from jawusd.geometry import make_transform, so3_exp
-from jawusd.tracking.smoothing import smooth_poses
+from jawusd.tracking.sequence.smoothing import smooth_poses
 
 
 @pytest.mark.parametrize("opened_mm", [0.0, 12.0])

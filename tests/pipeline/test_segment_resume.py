@@ -16,7 +16,7 @@ from jawusd.pipeline.segment import LEARNED, SegmentOptions, segment_teeth, with
 from jawusd.pipeline.segment_summary import write_summary
 from jawusd.segmentation.files import mask_path, write_mask
 from jawusd.segmentation.sheet import write_sheet
-from jawusd.tracking.guided import GuidedTracker
+from jawusd.tracking.sequence.guided import GuidedTracker
 
 FRAMES = 4
 

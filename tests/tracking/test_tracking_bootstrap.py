@@ -7,7 +7,7 @@ from bumpy_teeth import arch, jaw_poses, make_cameras, vertex_error_mm
 from jawusd.errors import TrackingError
 from jawusd.formats.capture import Pick, PickView
 from jawusd.geometry import transform_point
-from jawusd.tracking.bootstrap import pose_from_picks
+from jawusd.tracking.initialization.bootstrap import pose_from_picks
 
 MESH = arch(True)
 POSE = jaw_poses(4)[3, 0]

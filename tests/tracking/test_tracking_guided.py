@@ -5,9 +5,9 @@ from bumpy_teeth import arch, make_cameras, render_masks, vertex_error_mm
 
 from jawusd.formats.tracks import LOST
 from jawusd.geometry import se3_exp
-from jawusd.tracking.guided import GuidedTracker
-from jawusd.tracking.history import Past
-from jawusd.tracking.solver import View
+from jawusd.tracking.contour.frame_record import FrameSummary
+from jawusd.tracking.contour.views import View
+from jawusd.tracking.sequence.guided import GuidedTracker
 
 MESHES = (arch(True), arch(False))
 CAMERAS = make_cameras()
@@ -40,7 +40,7 @@ def see(frame, poses, turn):
 def followed(agreement):
     """Return the errors of the lower row by frame [mm], which frames were lost, and where it was found again."""
     tracker = GuidedTracker(*MESHES, see, agreement, 2)
-    past = [Past.of(tracker.begin(0, pose_at(0)))]
+    past = [FrameSummary.of(tracker.begin(0, pose_at(0)))]
     found = list(tracker.follow(range(1, 32), past))
     return (
         {frame: lower_error_mm(frame, record.solution.poses) for frame, record, _ in found},

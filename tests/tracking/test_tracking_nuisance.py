@@ -10,11 +10,11 @@ from small_take import CAMERAS, LANDMARKS, MESHES, OFFSETS, errors_mm, make_capt
 from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, load_tracks, save_tracks
 from jawusd.geometry import rigidity_defect, se3_exp, se3_inverse, se3_log
 from jawusd.tracking import TrackingConfig, track_capture
-from jawusd.tracking.extrinsics import Extrinsics, corrected_cameras
-from jawusd.tracking.history import FrameRecord
-from jawusd.tracking.ladder import FrameTracker
-from jawusd.tracking.nuisance import Nuisances, bridge, leads
-from jawusd.tracking.solver import Solution
+from jawusd.tracking.contour.frame_record import FrameRecord
+from jawusd.tracking.contour.solver import Solution
+from jawusd.tracking.sequence.extrinsics import Extrinsics, corrected_cameras
+from jawusd.tracking.sequence.frame_tracker import FrameTracker
+from jawusd.tracking.sequence.nuisance import Nuisances, bridge, leads
 
 FRAMES = 16
 WITHOUT = TrackingConfig(refine_rounds=0)

@@ -13,10 +13,10 @@ from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import LOST, PARTIAL, TRACKED, load_tracks, save_tracks
 from jawusd.geometry import make_transform, transform_point, transform_points
 from jawusd.imaging.pixel_counts import RasterCounter
-from jawusd.tracking.paper_energy import PaperEnergy, paper_scan
-from jawusd.tracking.paper_sequence import track_capture_paper
-from jawusd.tracking.paper_solver import PaperConfig, golden_section, solve_paper
-from jawusd.tracking.solver import View
+from jawusd.tracking.contour.views import View
+from jawusd.tracking.paper.energy import PaperEnergy, paper_scan
+from jawusd.tracking.paper.solver import PaperConfig, golden_section, solve_paper
+from jawusd.tracking.paper.take import track_capture_paper
 
 RED, GREEN, GREY = (215, 45, 40), (40, 200, 60), (150, 150, 150)
 LAMBDA = 0.4

@@ -8,8 +8,7 @@ from small_take import CAMERAS, FIRST, MESHES, OFFSETS, make_capture, write_mask
 from jawusd.errors import TrackingError
 from jawusd.geometry import make_transform, relative_pose, se3_exp, se3_inverse, se3_log, transform_points
 from jawusd.tracking.config import TrackingConfig
-from jawusd.tracking.motion import Motion
-from jawusd.tracking.quality import (
+from jawusd.tracking.contour.quality import (
     correlation_px,
     crown_sigma_mm,
     landmark_sigmas,
@@ -18,10 +17,11 @@ from jawusd.tracking.quality import (
     twist_covariance,
     uncovered_px,
 )
-from jawusd.tracking.reacquire import shift_to_masks
-from jawusd.tracking.scan import prepare_scan
-from jawusd.tracking.solver import ContourSolver, View
-from jawusd.tracking.views import MaskViews, working_size
+from jawusd.tracking.contour.scan import prepare_scan
+from jawusd.tracking.contour.solver import ContourSolver
+from jawusd.tracking.contour.views import MaskViews, View, working_size
+from jawusd.tracking.initialization.reacquire import shift_to_masks
+from jawusd.tracking.sequence.history import MotionPredictor
 
 CONFIG = TrackingConfig()
 SCANS = tuple(prepare_scan(m, n) for m, n in zip(MESHES, ("upper", "lower")))
@@ -116,7 +116,7 @@ BOTH, UPPER = np.array([True, True]), np.array([True, False])
 
 
 def _motion(poses):
-    return Motion(poses, np.zeros((2, 3, 3)) + np.eye(3) * 10)
+    return MotionPredictor(poses, np.zeros((2, 3, 3)) + np.eye(3) * 10)
 
 
 def test_prediction_goes_on_and_starts_offer_to_stop():

@@ -6,7 +6,7 @@ import pytest
 from small_take import CAMERAS, MESHES, OFFSETS, make_capture, write_masks
 
 from jawusd.errors import TrackingError
-from jawusd.tracking.scale_search import seen_size
+from jawusd.tracking.initialization.scale_search import seen_size
 
 COUNT = 3
 
@@ -33,7 +33,7 @@ def test_the_size_is_that_of_the_world(capture, factor):
 
 
 def test_masks_of_something_else_tell_no_size(capture, monkeypatch):
-    monkeypatch.setattr("jawusd.tracking.scale_search._STARTS", (1.0,))
+    monkeypatch.setattr("jawusd.tracking.initialization.scale_search._STARTS", (1.0,))
     turned = [replace(m, vertices=m.vertices * [0.6, 1.0, 1.3]) for m in MESHES]
     with pytest.raises(TrackingError, match=r"fit the masks of frames \d+, \d+ at no size from 0\.5 to 2"):
         seen_size(capture, CAMERAS, OFFSETS, turned)

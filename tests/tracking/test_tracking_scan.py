@@ -9,9 +9,10 @@ from scipy.spatial import cKDTree
 from jawusd.errors import TrackingError
 from jawusd.formats.mesh import Mesh
 from jawusd.tracking.config import TrackingConfig
-from jawusd.tracking.margin import crown_gum_segments
-from jawusd.tracking.scan import prepare_scan
-from jawusd.tracking.solver import ContourSolver, View
+from jawusd.tracking.contour.gingival_margin import crown_gum_segments
+from jawusd.tracking.contour.scan import prepare_scan
+from jawusd.tracking.contour.solver import ContourSolver
+from jawusd.tracking.contour.views import View
 
 
 def _painted(parts):

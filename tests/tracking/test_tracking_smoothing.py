@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import minimize
 
 from jawusd.geometry import rigidity_defect, se3_exp, se3_inverse, se3_log
-from jawusd.tracking.smoothing import smooth_poses
+from jawusd.tracking.sequence.smoothing import smooth_poses
 
 
 def _motion(count, rng, noise):

@@ -9,10 +9,11 @@ from bumpy_teeth import arch, disturbed, jaw_poses, make_cameras, render_masks, 
 from jawusd.geometry import make_transform, rigidity_defect, se3_exp, se3_inverse, transform_point, transform_points
 from jawusd.imaging.raster import draw_depth_labels, project
 from jawusd.tracking.config import TrackingConfig
-from jawusd.tracking.contour import COLUMNS, CROWN, GUM, INVERSE_DEPTH, LENGTH, NX, NY, U, V, contour_samples
-from jawusd.tracking.correspond import accumulate, search_edges
-from jawusd.tracking.scan import prepare_scan
-from jawusd.tracking.solver import ContourSolver, View
+from jawusd.tracking.contour.correspondences import accumulate, search_edges
+from jawusd.tracking.contour.samples import COLUMNS, CROWN, GUM, INVERSE_DEPTH, LENGTH, NX, NY, U, V, contour_samples
+from jawusd.tracking.contour.scan import prepare_scan
+from jawusd.tracking.contour.solver import ContourSolver
+from jawusd.tracking.contour.views import View
 
 CONFIG = TrackingConfig()
 USUAL = CONFIG.gates_from(0.0)

@@ -27,19 +27,20 @@ from jawusd.errors import TrackingError
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import make_transform, random_rotation, se3_exp, se3_inverse, transform_point, transform_points
 from jawusd.imaging.raster import draw_silhouette, project, unpack_bits, words_for
-from jawusd.tracking import global_start, start_search, track_capture
+from jawusd.tracking import track_capture
 from jawusd.tracking.config import TrackingConfig
-from jawusd.tracking.first import first_record
-from jawusd.tracking.footage import Footage
-from jawusd.tracking.mask_geometry import MaskSurvey, survey_masks
-from jawusd.tracking.mixups import possible_mixups
-from jawusd.tracking.pose_search import Grid, _Screen, _template, coarse_scan
-from jawusd.tracking.scan import prepare_scan
-from jawusd.tracking.scan_checks import check_occlusion
-from jawusd.tracking.solver import ContourSolver
-from jawusd.tracking.start import find_start
-from jawusd.tracking.start_search import Found, StartSearch
-from jawusd.tracking.views import masked_sources
+from jawusd.tracking.contour.scan import prepare_scan
+from jawusd.tracking.contour.solver import ContourSolver
+from jawusd.tracking.contour.views import masked_sources
+from jawusd.tracking.initialization import start as take_start
+from jawusd.tracking.initialization import start_search
+from jawusd.tracking.initialization.first_frame import first_record
+from jawusd.tracking.initialization.footage import Footage, MaskSurvey, survey_masks
+from jawusd.tracking.initialization.mixups import possible_mixups
+from jawusd.tracking.initialization.pose_search import Grid, _Screen, _template, coarse_scan
+from jawusd.tracking.initialization.scan_checks import check_occlusion
+from jawusd.tracking.initialization.start import find_start
+from jawusd.tracking.initialization.start_search import Found, StartSearch
 
 FRAMES = 5
 TABLE = {camera.name: camera for camera in CAMERAS}
@@ -57,7 +58,7 @@ def short_search(monkeypatch):
     """Search few orientations, on one frame."""
     turns = np.radians([-18.0, 0.0, 18.0])
     monkeypatch.setattr(start_search, "_GRID", Grid(turns, turns, turns, (10.0, 8.0, 12.0)))
-    monkeypatch.setattr(global_start, "_FRAMES_TRIED", 1)
+    monkeypatch.setattr(take_start, "_FRAMES_TRIED", 1)
     monkeypatch.setattr(start_search, "_FINALISTS", 2)
 
 
@@ -115,7 +116,7 @@ def test_two_cameras_are_enough(pictures, short_search):
 
 
 def test_masks_of_something_else_are_refused_with_what_was_tried(tmp_path, short_search, monkeypatch):
-    monkeypatch.setattr(global_start, "_MIXUPS_TRIED", 1)
+    monkeypatch.setattr(take_start, "_MIXUPS_TRIED", 1)
     folder = write_masks(tmp_path / "take", FRAMES)
     for k, path in enumerate(sorted(folder.rglob("*.png"))):
         picture = np.zeros_like(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
@@ -314,7 +315,7 @@ class _FoundBefore:
 def _searched(folder, search):
     footage = _footage(folder)
     search.sources = footage.sources
-    return global_start.search_start(search, footage)
+    return take_start.search_start(search, footage)
 
 
 def test_first_frame_that_fits_beyond_doubt_is_taken(pictures):
@@ -351,7 +352,7 @@ def test_poor_poses_accuse_no_masks(pictures, monkeypatch):
     def accuse(footage, solver, poses, frame):
         return possible_mixups(footage.sources)[0] if frame == search.asked[0] else None
 
-    monkeypatch.setattr(global_start, "likely_mixup", accuse)
+    monkeypatch.setattr(take_start, "likely_mixup", accuse)
     search = _FoundBefore([0.1, 0.5])
     assert _searched(pictures, search).frame == search.asked[1]
     search = _FoundBefore([0.5])
@@ -364,7 +365,7 @@ def test_picks_far_off_are_helped_by_a_search_everywhere(pictures, short_search)
     search = StartSearch(MESHES, ContourSolver(SCANS, TrackingConfig()), np.eye(4))
     off = make_transform(np.eye(3), [14.0, 0, -14.0]) @ truth
     assert search.near(footage, FIRST + START, off).fit < 0.1
-    found = global_start.search_around(search, footage, FIRST + START, off)
+    found = take_start.search_around(search, footage, FIRST + START, off)
     assert max(vertex_error_mm(MESHES[r], found.poses[r], truth[r]) for r in (0, 1)) < 0.1 and found.fit > 0.3
 
 

@@ -1,0 +1,200 @@
+"""Match contour samples with mask edges along their normals and sum up normal equations.
+
+Every compiled function here releases the GIL and keeps no state.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from jawusd.tracking.contour.samples import INVERSE_DEPTH, LENGTH, NX, NY, U, V, X, Y, Z, pixel_of
+
+_EDGE = 127.5  # mask value at the outline: half of a pixel belongs to the teeth
+
+
+@numba.njit(nogil=True, cache=True, inline="always")
+def _sample(mask, x, y):
+    """Interpolate a uint8 picture bilinearly; 0 outside."""
+    if x < 0 or y < 0 or x >= mask.shape[1] - 1 or y >= mask.shape[0] - 1:
+        return 0.0
+    i = int(x)
+    j = int(y)
+    a = x - i
+    b = y - j
+    return (mask[j, i] * (1 - a) + mask[j, i + 1] * a) * (1 - b) + (
+        mask[j + 1, i] * (1 - a) + mask[j + 1, i + 1] * a
+    ) * b
+
+
+@numba.njit(nogil=True, cache=True, inline="always")
+def _at(picture, x, y):
+    i = pixel_of(x)
+    j = pixel_of(y)
+    if i < 0 or j < 0 or j >= picture.shape[0] or i >= picture.shape[1]:
+        return 0.0
+    return picture[j, i]
+
+
+@numba.njit(nogil=True, cache=True)
+def _nearest_edge(mask, x, y, nx, ny, reach):
+    """Return the signed distance [px] along the normal to the nearest way out of the mask.
+
+    NaN where there is none within reach; positive infinity where all of the reach lies inside the mask.
+    """
+    start = _sample(mask, x, y)
+    outer = inner = start
+    steps = int(np.ceil(reach))
+    for k in range(1, steps + 1):
+        best = np.inf
+        value = _sample(mask, x + k * nx, y + k * ny)
+        if outer >= _EDGE and value < _EDGE:
+            best = k - 1 + (outer - _EDGE) / (outer - value)
+        outer = value
+        value = _sample(mask, x - k * nx, y - k * ny)
+        if value >= _EDGE and inner < _EDGE:
+            d = -k + (value - _EDGE) / (value - inner)
+            if -d < best:
+                best = d
+        inner = value
+        if best < np.inf:
+            return best
+    return np.inf if start >= _EDGE and outer >= _EDGE else np.nan
+
+
+@numba.njit(nogil=True, cache=True)
+def search_edges(samples, mask, other_mask, other_inverse_depth, reach_px, tolerance_mm, cos_limit, out):
+    """Write the signed distance [px] from every contour sample to the mask edge it should lie on.
+
+    Args:
+        samples: contour samples, shape (n, COLUMNS).
+        mask: this row's mask, uint8, 255 = teeth, shape (h, w).
+        other_mask: the other row's mask or zeros, shape (h, w).
+        other_inverse_depth: rendered inverse depth of the other row's scan [1/mm], 0 = empty, shape (h, w).
+        reach_px: how far to look on both sides.
+        tolerance_mm: depth difference between the rows that counts as real.
+        cos_limit: least cosine between the sample's normal and the mask's own at the edge.
+        out: receives, shape (n,): the distance, positive outwards; NaN where the sample is hidden, or no edge or only
+            another object's edge is near; +inf where the whole reach lies inside the mask.
+    """
+    for s in range(len(samples)):
+        row = samples[s]
+        x, y, nx, ny, own = row[U], row[V], row[NX], row[NY], row[INVERSE_DEPTH]
+        out[s] = np.nan
+        if _at(other_inverse_depth, x, y) * (1 - tolerance_mm * own) > own:
+            continue  # the other row of teeth is in front
+        d = _nearest_edge(mask, x, y, nx, ny, reach_px)
+        if np.isfinite(d):
+            ex = x + d * nx
+            ey = y + d * ny
+            gx = _sample(mask, ex + 1, ey) - _sample(mask, ex - 1, ey)
+            gy = _sample(mask, ex, ey + 1) - _sample(mask, ex, ey - 1)
+            if -(gx * nx + gy * ny) < cos_limit * np.sqrt(gx * gx + gy * gy):
+                continue  # runs across the contour: a lip or a neighbouring tooth
+            if _sample(other_mask, ex + 2 * nx, ey + 2 * ny) > _EDGE:
+                other = _at(other_inverse_depth, ex + 2 * nx, ey + 2 * ny)
+                if other == 0.0 or other * (1 - 0.25 * tolerance_mm * own) > own:
+                    continue  # this edge is made by the other row, which lies in front
+        out[s] = d
+
+
+@numba.njit(nogil=True, cache=True)
+def _slope(row, pose, matrix, centre, jacobian):
+    """Write how far a sample moves along its normal [px] per unit of a left twist about a world point."""
+    a = pose[0, 0] * row[X] + pose[0, 1] * row[Y] + pose[0, 2] * row[Z] + pose[0, 3]
+    b = pose[1, 0] * row[X] + pose[1, 1] * row[Y] + pose[1, 2] * row[Z] + pose[1, 3]
+    c = pose[2, 0] * row[X] + pose[2, 1] * row[Y] + pose[2, 2] * row[Z] + pose[2, 3]
+    w = matrix[2, 0] * a + matrix[2, 1] * b + matrix[2, 2] * c + matrix[2, 3]
+    for k in range(3):
+        along = row[NX] * (matrix[0, k] - row[U] * matrix[2, k]) + row[NY] * (matrix[1, k] - row[V] * matrix[2, k])
+        jacobian[3 + k] = along / w
+    a -= centre[0]
+    b -= centre[1]
+    c -= centre[2]
+    jacobian[0] = b * jacobian[5] - c * jacobian[4]
+    jacobian[1] = c * jacobian[3] - a * jacobian[5]
+    jacobian[2] = a * jacobian[4] - b * jacobian[3]
+
+
+@numba.njit(nogil=True, cache=True)
+def accumulate(samples, distances, gate_px, score_gate_px, pull, pose, matrix, centre, system):
+    """Add the Tukey-weighted normal equations of one row of teeth in one view.
+
+    The residual d of a sample shrinks by n . du when the sample moves by du in the picture; du follows from a left
+    twist (omega, v) of the row about `centre` (Drummond & Cipolla 2002 use the same point-to-edge distances).
+
+    Args:
+        samples: contour samples, shape (n, COLUMNS).
+        distances: as `search_edges` writes them, shape (n,).
+        gate_px: residual beyond which the Tukey weight is zero.
+        score_gate_px: residual beyond which a sample adds nothing to the score.
+        pull: weight at the gate of samples deep inside the mask; 0 leaves them out.
+        pose: scan to world, shape (4, 4).
+        matrix: world [mm] to homogeneous px, shape (3, 4).
+        centre: point the twist turns about, world coordinates [mm], shape (3,).
+        system: shape (8, 8), added to: rows 0-5 hold [H | g | sum w J], [6, 6] sum w, [6, 7] sum w d,
+            [7, 6] sum w d^2, [7, 7] the matched contour length [px], [6, 0] the score: contour length, each sample
+            counted by 1 minus Tukey's loss at the score gate [px].
+    """
+    jacobian = np.empty(6)
+    for s in range(len(samples)):
+        d = distances[s]
+        if np.isnan(d):
+            continue
+        row = samples[s]
+        if np.isinf(d):
+            if pull == 0.0:
+                continue
+            d = gate_px
+            weight = pull
+        else:
+            e = 1.0 - (d / score_gate_px) ** 2
+            if e > 0:
+                system[6, 0] += e * e * e * row[LENGTH]
+            e = 1.0 - (d / gate_px) ** 2
+            if e <= 0:
+                continue
+            weight = e * e
+            system[7, 7] += row[LENGTH]
+        weight *= row[LENGTH]
+        _slope(row, pose, matrix, centre, jacobian)
+        for i in range(6):
+            for k in range(6):
+                system[i, k] += weight * jacobian[i] * jacobian[k]
+            system[i, 6] += weight * jacobian[i] * d
+            system[i, 7] += weight * jacobian[i]
+        system[6, 6] += weight
+        system[6, 7] += weight * d
+        system[7, 6] += weight * d * d
+
+
+@numba.njit(nogil=True, cache=True)
+def scatter_of_tiles(samples, distances, gate_px, pose, matrix, centre, shape, tile_px):
+    """Return the sum over picture tiles of s s^T, s = sum of w J d over the samples in the tile.
+
+    Errors of the outline move together over some length of contour; within a tile they add up before they are
+    squared. Over the normal matrix this tells how much less a pixel of contour says than independent errors would
+    (cluster-robust covariance, Liang & Zeger 1986).
+
+    Args:
+        samples, distances, gate_px, pose, matrix, centre: as for `accumulate`.
+        shape: (h, w) of the picture.
+        tile_px: side of the square tiles, longer than the errors' correlation.
+
+    Returns:
+        Scatter matrix, shape (6, 6).
+    """
+    across = shape[1] // tile_px + 1
+    sums = np.zeros(((shape[0] // tile_px + 1) * across, 6))
+    jacobian = np.empty(6)
+    for s in range(len(samples)):
+        d = distances[s]
+        if not abs(d) < gate_px:
+            continue
+        row = samples[s]
+        weight = (1.0 - (d / gate_px) ** 2) ** 2 * row[LENGTH]
+        _slope(row, pose, matrix, centre, jacobian)
+        tile = int(row[V]) // tile_px * across + int(row[U]) // tile_px
+        for k in range(6):
+            sums[tile, k] += weight * d * jacobian[k]
+    return sums.T @ sums

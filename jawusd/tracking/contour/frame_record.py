@@ -1,0 +1,55 @@
+"""What is known about single frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.geometry.arrays import Array, Mask
+from jawusd.tracking.contour.quality import residual_px, score_px
+from jawusd.tracking.contour.solver import Solution
+
+
+@dataclass(frozen=True, eq=False)
+class FrameRecord:
+    """Hold what is known about one instant.
+
+    Attributes:
+        solution: the alignment; its poses of lost rows mean nothing.
+        status: of both rows, as in `Tracks`, shape (2,).
+        used: masks that took part, shape (2, C).
+        coverage: E_SP over mask pixels, shape (2, C); NaN without a mask.
+    """
+
+    solution: Solution
+    status: NDArray[np.int8]
+    used: Mask
+    coverage: Array
+
+
+@dataclass(frozen=True, eq=False)
+class FrameSummary:
+    """Hold what the frames after an instant need to know about it.
+
+    Attributes:
+        poses: T_world_upper and T_world_lower, shape (2, 4, 4).
+        status, used, coverage: as in `FrameRecord`.
+        score_px: contour that fits per row and view, shape (2, C).
+        residual_px: standard deviation of the residuals per row, shape (2,).
+    """
+
+    poses: Array
+    status: NDArray[np.int8]
+    used: Mask
+    coverage: Array
+    score_px: Array
+    residual_px: Array
+
+    @classmethod
+    def of(cls, record: FrameRecord) -> FrameSummary:
+        """Return what to keep of a frame."""
+        solution = record.solution
+        seen = (record.status, record.used, record.coverage)
+        return cls(solution.poses, *seen, score_px(solution), residual_px(solution))

@@ -1,0 +1,180 @@
+"""What a solution is worth: score, residual, coverage, covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from jawusd.geometry import hat, make_transform, mandible_metric, se3_adjoint, se3_inverse, transform_points
+from jawusd.geometry.arrays import Array
+from jawusd.imaging.raster import count_and_not, count_bits, draw_silhouette, pack_bits, project
+from jawusd.tracking.config import TrackingConfig
+from jawusd.tracking.contour.scan import Scan
+from jawusd.tracking.contour.solver import Solution, WeighedPrior
+from jawusd.tracking.contour.views import View
+
+# E[w d^2] / E[w] of a unit normal residual under the Tukey weight at 4.685 standard deviations, by quadrature.
+_TUKEY_VARIANCE = 0.828
+
+
+def score_px(solution: Solution) -> Array:
+    """Return the contour length that fits its mask edges, closeness counted, per row and view [px], shape (2, C)."""
+    return solution.systems[:, :, 6, 0]
+
+
+def matched_px(solution: Solution) -> Array:
+    """Return the matched contour length per row [px], shape (2,)."""
+    return solution.systems[:, :, 7, 7].sum(1)
+
+
+def residual_px(solution: Solution) -> Array:
+    """Return the standard deviation of the matched residuals per row [px], shape (2,); NaN without a match."""
+    total = solution.systems.sum(1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.sqrt(total[:, 7, 6] / total[:, 6, 6] / _TUKEY_VARIANCE)
+
+
+def view_residual_px(solution: Solution) -> Array:
+    """Return the standard deviation of the matched residuals per row and view [px], shape (2, C); NaN without any."""
+    weight, square = solution.systems[:, :, 6, 6], solution.systems[:, :, 7, 6]
+    out = np.full(weight.shape, np.nan)
+    np.divide(square, weight * _TUKEY_VARIANCE, out=out, where=weight > 0)
+    return np.sqrt(out)
+
+
+def uncovered_px(scans: Sequence[Scan], solution: Solution, views: Sequence[View]) -> tuple[Array, Array]:
+    """Return E_SP of paper eq. 8, the mask pixels that the projected crowns leave uncovered, and all mask pixels.
+
+    Returns:
+        Pixel counts per row and view, shape (2, C) each.
+    """
+    bare, total = np.zeros((2, len(views))), np.zeros((2, len(views)))
+    for r, scan in enumerate(scans):
+        points = np.empty((len(scan.vertices), 3), np.float32)
+        for c, view in enumerate(views):
+            if not view.present[r]:
+                continue
+            mask = pack_bits(view.masks[r] > 127)
+            crowns = np.zeros_like(mask)
+            project(scan.vertices_single, (view.matrix @ view.lead[r] @ solution.poses[r]).astype(np.float32), points)
+            draw_silhouette(points, scan.crown_faces, 0, 0, view.masks.shape[2], scan.painted, crowns)
+            bare[r, c], total[r, c] = count_and_not(mask, crowns), count_bits(mask)
+    return bare, total
+
+
+def row_fit(scans: Sequence[Scan], solution: Solution, views: Sequence[View], bare_price: float) -> Array:
+    """Return how much of a row's visible contour fits its masks, less the price of uncovered mask, shape (2,) [-].
+
+    The median over the views, so that one spoiled mask of three does not count; -inf where nothing is visible.
+
+    Args:
+        scans: upper and lower, prepared.
+        solution: an alignment.
+        views: the pictures it was made with.
+        bare_price: price of an uncovered pixel in px of contour [1/px].
+    """
+    bare, _ = uncovered_px(scans, solution, views)
+    shares = (score_px(solution) - bare_price * bare) / np.maximum(solution.visible_px, 1.0)
+    out = np.full(2, -np.inf)
+    for r in (0, 1):
+        seen = shares[r, solution.visible_px[r] > 0]
+        if len(seen):
+            out[r] = np.median(seen)
+    return out
+
+
+def twist_covariance(solution: Solution, row: int, sigma_px: float, correlation_px: float) -> Array:
+    """Return the covariance of a row's left twist about the world origin, sigma^2 l H^-1, shape (6, 6).
+
+    Args:
+        solution: an alignment.
+        row: 0 upper, 1 lower.
+        sigma_px: standard deviation of the mask outline.
+        correlation_px: contour length l over which the outline's errors move together: n pixels of contour hold n / l
+            independent measurements.
+
+    Returns:
+        Covariance (rad, mm); infinite on the diagonal where the masks leave a motion free.
+    """
+    H = solution.systems[row, :, :6, :6].sum(0)
+    free = np.diag(np.full(6, np.inf))
+    if not np.isfinite(sigma_px) or np.linalg.matrix_rank(H, hermitian=True) < 6:
+        return free
+    A = se3_adjoint(make_transform(np.eye(3), solution.centres[row]))
+    return A @ (sigma_px**2 * correlation_px * np.linalg.inv(H)) @ A.T
+
+
+def joint_covariance(solution: Solution, prior: WeighedPrior, sigma_px: Array, correlation_px: float) -> Array | None:
+    """Return the covariance of both rows' left twists about the world origin given masks and prior, shape (12, 12).
+
+    Args:
+        solution: an alignment with the prior.
+        prior: what else is known of the two poses.
+        sigma_px, correlation_px: as for `twist_covariance`, the former per row, shape (2,).
+
+    Returns:
+        Covariance (rad, mm), rows (upper, lower); None where masks and prior leave a motion free.
+    """
+    precision, _ = prior.terms(solution.poses, np.zeros((2, 3)))
+    for r in (0, 1):
+        to_centre = se3_adjoint(make_transform(np.eye(3), -solution.centres[r]))
+        block = slice(6 * r, 6 * r + 6)
+        H = solution.systems[r, :, :6, :6].sum(0) / (sigma_px[r] ** 2 * correlation_px)
+        precision[block, block] += to_centre.T @ H @ to_centre
+    if not np.isfinite(precision).all():
+        return None
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(precision), 1e-300))
+    scaled = scale[:, None] * precision * scale
+    if np.linalg.matrix_rank(scaled, hermitian=True) < 12:
+        return None
+    return scale[:, None] * np.linalg.inv(scaled) * scale
+
+
+def correlation_px(solution: Solution, config: TrackingConfig) -> Array:
+    """Return the contour length over which outline errors move together, as this frame shows it, shape (2,).
+
+    tr(H^-1 S) / (6 sigma^2) with the scatter S of tiles is that length, but for the configured factor; NaN without a
+    match in every direction.
+    """
+    out = np.full(2, np.nan)
+    sigma = residual_px(solution)
+    for r in (0, 1):
+        H = solution.systems[r, :, :6, :6].sum(0)
+        if sigma[r] > 0 and np.linalg.matrix_rank(H, hermitian=True) == 6:
+            measured = np.trace(np.linalg.solve(H, solution.scatters[r])) / (6 * sigma[r] ** 2)
+            out[r] = config.tile_factor * measured
+    return out
+
+
+def crown_sigma_mm(scan: Scan, solution: Solution, row: int, config: TrackingConfig) -> float:
+    """Return the rms standard deviation of the position of crown vertices [mm]; infinite if the masks leave it free."""
+    sigma = float(residual_px(solution)[row])
+    covariance = twist_covariance(solution, row, sigma, config.correlation_px)
+    if not np.isfinite(covariance).all():
+        return np.inf
+    points = transform_points(solution.poses[row], scan.probes)
+    return float(np.sqrt(np.trace(mandible_metric(points) @ covariance)))
+
+
+def relative_covariance(T_world_upper: Array, covariance_upper: Array, covariance_lower: Array) -> Array:
+    """Return the covariance of the left twist of T_upper_lower about the skull origin, shape (..., 6, 6).
+
+    T_true = T_u^-1 exp(x_l - x_u) T_u T to first order, so the twist is Ad(T_u^-1)(x_l - x_u); the rows' errors are
+    independent because no mask edge counts for both.
+    """
+    A = se3_adjoint(se3_inverse(T_world_upper))
+    return A @ (covariance_upper + covariance_lower) @ np.swapaxes(A, -1, -2)
+
+
+def landmark_sigmas(T_upper_lower: Array, covariance: Array, landmarks: Array) -> Array:
+    """Return the standard deviation of the landmarks' position in the skull frame [mm], shape (..., L).
+
+    Args:
+        T_upper_lower: relative poses, shape (..., 4, 4).
+        covariance: as `relative_covariance` gives it, shape (..., 6, 6).
+        landmarks: points in mandible coordinates [mm], shape (L, 3).
+    """
+    points = transform_points(T_upper_lower, landmarks)
+    J = np.concatenate([-hat(points), np.broadcast_to(np.eye(3), (*points.shape, 3))], axis=-1)
+    return np.sqrt(np.einsum("...lij,...jk,...lik->...l", J, covariance, J))

@@ -1,0 +1,188 @@
+"""Points on the visible contour of a projected scan: silhouette edges, scan borders and the crown-gum line.
+
+Every compiled function here releases the GIL and keeps no state.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.geometry.arrays import Array
+from jawusd.tracking.contour.scan import Scan
+
+# Columns of a sample: point in scan coordinates [mm], pixel, outward unit normal in the picture, contour length it
+# stands for [px], inverse depth [1/mm].
+X, Y, Z, U, V, NX, NY, LENGTH, INVERSE_DEPTH = range(9)
+COLUMNS = 9
+
+CROWN, GUM = 1, 2  # labels of the rendered scan; 0 is empty
+
+
+def contour_samples(
+    scan: Scan,
+    matrix: Array,
+    eye: Array,
+    labels: NDArray[np.uint8],
+    inverse_depth: NDArray[np.float32],
+    step_px: float,
+    depth_tolerance_mm: float,
+) -> Array:
+    """Return the contour points at which the picture of the scan changes from crown to anything but crown.
+
+    Args:
+        scan: the row of teeth.
+        matrix: projection from scan coordinates [mm] to homogeneous px of the region, shape (3, 4).
+        eye: camera centre in scan coordinates [mm], shape (3,).
+        labels: what is seen at every pixel of the region: CROWN, GUM or 0, shape (h, w).
+        inverse_depth: its inverse depth [1/mm], shape (h, w).
+        step_px: largest distance between samples.
+        depth_tolerance_mm: how much nearer the surface just inside the contour may be before the contour counts as
+            hidden behind it.
+
+    Returns:
+        Samples, shape (n, COLUMNS).
+    """
+    scan_tables = (scan.vertices, scan.crown_faces, scan.planes, scan.edges)
+    candidates = _silhouette(*scan_tables, eye, matrix, step_px, labels.shape)
+    kept = _seen(candidates, labels, inverse_depth, depth_tolerance_mm)
+    line = _gum_line(scan.margin, matrix, labels, inverse_depth, depth_tolerance_mm)
+    return np.concatenate([kept, line])
+
+
+@numba.njit(nogil=True, cache=True, inline="always")
+def _pixel(matrix, x, y, z):
+    w = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z + matrix[2, 3]
+    u = (matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z + matrix[0, 3]) / w
+    v = (matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z + matrix[1, 3]) / w
+    return u, v, w
+
+
+@numba.njit(nogil=True, cache=True)
+def _silhouette(vertices, faces, planes, edges, eye, matrix, step_px, shape):
+    """Sample the edges between faces turned to and away from the eye, and all borders, inside the region."""
+    front = np.empty(len(faces), np.bool_)
+    for f in range(len(faces)):
+        front[f] = planes[f, 0] * eye[0] + planes[f, 1] * eye[1] + planes[f, 2] * eye[2] > planes[f, 3]
+    out = np.empty((4096, COLUMNS))
+    n = 0
+    for e in range(len(edges)):
+        f = edges[e, 2]
+        g = edges[e, 3]
+        if g >= 0 and front[f] == front[g]:
+            continue
+        if g >= 0 and not front[f]:
+            f = g
+        i = edges[e, 0]
+        j = edges[e, 1]
+        ui, vi, wi = _pixel(matrix, vertices[i, 0], vertices[i, 1], vertices[i, 2])
+        uj, vj, wj = _pixel(matrix, vertices[j, 0], vertices[j, 1], vertices[j, 2])
+        if wi <= 0 or wj <= 0:
+            continue
+        if max(ui, uj) < 0 or max(vi, vj) < 0 or min(ui, uj) > shape[1] - 1 or min(vi, vj) > shape[0] - 1:
+            continue
+        length = np.sqrt((uj - ui) ** 2 + (vj - vi) ** 2)
+        if length < 1e-6:
+            continue
+        nx = (vj - vi) / length
+        ny = (ui - uj) / length
+        k = faces[f, 0]
+        if k in (i, j):
+            k = faces[f, 1]
+        if k in (i, j):
+            k = faces[f, 2]
+        uk, vk, wk = _pixel(matrix, vertices[k, 0], vertices[k, 1], vertices[k, 2])
+        if nx * (uk - ui) + ny * (vk - vi) > 0:  # outward is away from the face's third corner
+            nx = -nx
+            ny = -ny
+        pieces = max(1, int(np.ceil(length / step_px)))
+        if n + pieces > len(out):
+            grown = np.empty((2 * len(out) + pieces, COLUMNS))
+            grown[:n] = out[:n]
+            out = grown
+        for q in range(pieces):
+            t = (q + 0.5) / pieces
+            row = out[n]
+            for a in range(3):
+                row[a] = vertices[i, a] + t * (vertices[j, a] - vertices[i, a])
+            row[U], row[V], w = _pixel(matrix, row[X], row[Y], row[Z])
+            row[NX] = nx
+            row[NY] = ny
+            row[LENGTH] = length / pieces
+            row[INVERSE_DEPTH] = 1.0 / w
+            n += 1
+    return out[:n]
+
+
+@numba.njit(nogil=True, cache=True, inline="always")
+def pixel_of(coordinate):
+    """Return the index of the pixel a coordinate falls into."""
+    return int(np.floor(coordinate + 0.5))
+
+
+@numba.njit(nogil=True, cache=True)
+def _seen(samples, labels, inverse_depth, tolerance_mm):
+    """Keep samples with this very surface visible on the inner side and no crown on the outer side."""
+    out = np.empty_like(samples)
+    height, width = labels.shape
+    n = 0
+    for s in range(len(samples)):
+        row = samples[s]
+        i = pixel_of(row[U] - row[NX])
+        j = pixel_of(row[V] - row[NY])
+        a = pixel_of(row[U] + row[NX])
+        b = pixel_of(row[V] + row[NY])
+        if min(i, a) < 0 or min(j, b) < 0 or max(i, a) >= width or max(j, b) >= height:
+            continue
+        if labels[b, a] == CROWN or labels[j, i] != CROWN:
+            continue
+        if _nearer(inverse_depth[j, i], row[INVERSE_DEPTH], tolerance_mm):
+            continue
+        out[n] = row
+        n += 1
+    return out[:n]
+
+
+@numba.njit(nogil=True, cache=True, inline="always")
+def _nearer(seen, own, tolerance_mm):
+    """Tell whether an inverse depth lies more than the tolerance in front of another one."""
+    return seen * (1.0 - tolerance_mm * own) > own
+
+
+@numba.njit(nogil=True, cache=True)
+def _gum_line(segments, matrix, labels, inverse_depth, tolerance_mm):
+    """Sample the crown-gum line where crown is seen on one side and gum on the other; outward is towards the gum."""
+    reach = 1.5  # px: the nearest pixels that surely belong to one side
+    out = np.empty((len(segments), COLUMNS))
+    height, width = labels.shape
+    n = 0
+    for s in range(len(segments)):
+        p = segments[s, 0]
+        q = segments[s, 1]
+        x, y, z = 0.5 * (p[0] + q[0]), 0.5 * (p[1] + q[1]), 0.5 * (p[2] + q[2])
+        u, v, w = _pixel(matrix, x, y, z)
+        if w <= 0 or u < 3 or v < 3 or u > width - 4 or v > height - 4:
+            continue
+        up, vp, wp = _pixel(matrix, p[0], p[1], p[2])
+        uq, vq, wq = _pixel(matrix, q[0], q[1], q[2])
+        length = np.sqrt((uq - up) ** 2 + (vq - vp) ** 2)
+        if length < 0.05:  # px: seen end-on, no direction
+            continue
+        nx = reach * (vq - vp) / length
+        ny = reach * (up - uq) / length
+        first = labels[pixel_of(v + ny), pixel_of(u + nx)]
+        second = labels[pixel_of(v - ny), pixel_of(u - nx)]
+        if first == CROWN and second == GUM:
+            nx = -nx
+            ny = -ny
+        elif first != GUM or second != CROWN:
+            continue
+        if _nearer(inverse_depth[pixel_of(v - ny), pixel_of(u - nx)], 1.0 / w, tolerance_mm):
+            continue
+        if _nearer(inverse_depth[pixel_of(v + ny), pixel_of(u + nx)], 1.0 / w, tolerance_mm):
+            continue
+        out[n, X], out[n, Y], out[n, Z], out[n, U], out[n, V] = x, y, z, u, v
+        out[n, NX], out[n, NY], out[n, LENGTH], out[n, INVERSE_DEPTH] = nx / reach, ny / reach, length, 1.0 / w
+        n += 1
+    return out[:n]

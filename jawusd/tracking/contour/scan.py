@@ -1,0 +1,167 @@
+"""A teeth scan prepared for tracking: crowns with an edge table, gum as occluder, the crown-gum line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from jawusd.errors import TrackingError
+from jawusd.formats.mesh import Mesh
+from jawusd.geometry.arrays import Array
+from jawusd.imaging.meshio import tooth_labels
+from jawusd.tracking.contour.decimation import thinned
+from jawusd.tracking.contour.gingival_margin import crown_gum_segments
+
+_PROBES = 300  # enough for a mean over the crowns to one per cent
+# Crown faces above which most steps use a thinned scan, and how many that one keeps: thinning from 20,000 to 5,000
+# costs 0.002 mm at 1 px of mask noise, and time goes with the faces.
+_DENSE_FACES, _THIN_FACES = 60_000, 20_000
+_FEWEST_CROWN_FACES = 100  # fewer cannot show a contour in several directions
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """Hold one row of teeth ready for projection.
+
+    Attributes:
+        name: "upper" or "lower".
+        vertices: welded vertices in scan coordinates [mm], float64, shape (V, 3).
+        vertices_single: the same in float32 for the rasteriser.
+        crown_faces: faces to be matched, int32, shape (F, 3).
+        gum_faces: faces that only hide what lies behind them, int32, shape (G, 3).
+        planes: normal and offset (n, n.p) of every crown face, shape (F, 4); only signs of n.x - offset are used.
+        edges: vertex, vertex, face, other face or -1 at a border, int32, shape (E, 4).
+        margin: segments of the crown-gum line that are no mesh edges [mm], shape (S, 2, 3).
+        probes: some vertices spread over the crowns, at which motion is measured [mm], shape (N <= 300, 3).
+        centre: centroid of the crown vertices [mm], shape (3,).
+        radius_mm: largest distance of a crown vertex from the centre.
+        painted: whether the scan's colours told crown from gum; otherwise the whole scan counts as crown.
+            Painted crowns are wound outwards, so faces turned away need not be drawn.
+        thin: the same row with fewer faces, for all but the last steps; None where this one is thin enough.
+    """
+
+    name: str
+    vertices: Array
+    vertices_single: NDArray[np.float32]
+    crown_faces: NDArray[np.int32]
+    gum_faces: NDArray[np.int32]
+    planes: Array
+    edges: NDArray[np.int32]
+    margin: Array
+    probes: Array
+    centre: Array
+    radius_mm: float
+    painted: bool
+    thin: Scan | None = None
+
+    def crown_vertices(self, limit: int | None = None) -> Array:
+        """Return the vertices of the crowns [mm], shape (N, 3), at most about `limit` of them."""
+        points = self.vertices[np.unique(self.crown_faces)]
+        return points if limit is None else points[:: max(1, len(points) // limit)]
+
+
+def prepare_scan(mesh: Mesh, name: str) -> Scan:
+    """Split a teeth scan into crowns and gum and build the tables of the contour search.
+
+    Args:
+        mesh: the teeth scan; vertex colours red and green mark crowns, anything else gum. Without such colours the
+            whole scan counts as crown.
+        name: "upper" or "lower", for messages.
+
+    Raises:
+        TrackingError: the scan has too few faces to be tracked.
+    """
+    vertices, faces = _weld(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int32))
+    tooth = tooth_labels(mesh) > 0
+    painted = not tooth.all()
+    crown = tooth[np.asarray(mesh.faces)].sum(1) >= 2
+    solid = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    crown_faces = np.ascontiguousarray(faces[crown & solid])
+    if painted:
+        crown_faces = _wound_outwards(vertices, crown_faces)
+    gum_faces = np.ascontiguousarray(faces[~crown & solid])
+    if len(crown_faces) < _FEWEST_CROWN_FACES:
+        raise TrackingError(
+            f"{name} teeth scan: {len(crown_faces)} tooth faces, at least {_FEWEST_CROWN_FACES} are needed",
+            hint="Check the scan file and that its teeth are painted red and green.",
+        )
+    scan = _with_tables(name, vertices, crown_faces, gum_faces, painted)
+    if len(crown_faces) <= _DENSE_FACES:
+        return scan
+    thin = _with_tables(name, *thinned(vertices, crown_faces, gum_faces, _THIN_FACES), painted)
+    # Steps turn about the centre, so both must have the same.
+    return replace(scan, thin=replace(thin, probes=scan.probes, centre=scan.centre, radius_mm=scan.radius_mm))
+
+
+def _with_tables(
+    name: str,
+    vertices: Array,
+    crown_faces: NDArray[np.int32],
+    gum_faces: NDArray[np.int32],
+    painted: bool,
+) -> Scan:
+    """Return the scan with the tables of the contour search."""
+    corner = vertices[crown_faces]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    crowns = vertices[np.unique(crown_faces)]
+    centre = crowns.mean(0)
+    return Scan(
+        name=name,
+        vertices=vertices,
+        vertices_single=vertices.astype(np.float32),
+        crown_faces=crown_faces,
+        gum_faces=gum_faces,
+        planes=np.column_stack([normal, np.einsum("ij,ij->i", normal, corner[:, 0])]),
+        edges=_edge_table(crown_faces),
+        margin=crown_gum_segments(vertices, crown_faces, gum_faces),
+        probes=crowns[np.linspace(0, len(crowns) - 1, min(len(crowns), _PROBES)).astype(int)],
+        centre=centre,
+        radius_mm=float(np.linalg.norm(corner.reshape(-1, 3) - centre, axis=1).max()),
+        painted=painted,
+    )
+
+
+def _weld(vertices: Array, faces: NDArray[np.int32]) -> tuple[NDArray, NDArray[np.int32]]:
+    """Merge vertices at the same place: triangle soups would otherwise consist of borders only."""
+    unique, inverse = np.unique(vertices, axis=0, return_inverse=True)
+    return np.ascontiguousarray(unique), np.ascontiguousarray(inverse.reshape(-1)[faces], np.int32)
+
+
+def _wound_outwards(vertices: Array, faces: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Return the faces with those connected pieces turned round that enclose a negative volume.
+
+    Volumes are taken about each piece's own centre, so the open base of a crown adds little.
+    """
+    links = coo_array(
+        (np.ones(3 * len(faces)), (faces.ravel(), np.roll(faces, 1, axis=1).ravel())), [len(vertices)] * 2
+    )
+    piece = connected_components(links, directed=False)[1][faces[:, 0]]
+    corners = vertices[faces]
+    count = np.bincount(piece)
+    middle = corners.mean(1)
+    centre = np.stack([np.bincount(piece, middle[:, k]) / np.maximum(count, 1) for k in range(3)], axis=1)
+    corners = corners - centre[piece][:, None]
+    six_volumes = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
+    inside_out = np.bincount(piece, six_volumes)[piece] < 0
+    return np.ascontiguousarray(np.where(inside_out[:, None], faces[:, ::-1], faces), np.int32)
+
+
+def _edge_table(faces: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Return vertex, vertex, face, other face (-1 at a border) of every edge, shape (E, 4).
+
+    Where more than two faces meet in an edge, all but the first two are paired off as edges of their own.
+    """
+    pairs = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    owner = np.repeat(np.arange(len(faces), dtype=np.int32), 3)
+    order = np.lexsort((owner, pairs[:, 1], pairs[:, 0]))
+    pairs, owner = pairs[order], owner[order]
+    new = np.r_[True, (pairs[1:] != pairs[:-1]).any(1)]
+    rank = np.arange(len(pairs)) - np.flatnonzero(new)[np.cumsum(new) - 1]
+    first = rank % 2 == 0
+    has_second = np.r_[~first[1:], False]
+    second = np.where(has_second, np.r_[owner[1:], -1], -1)
+    return np.ascontiguousarray(np.column_stack([pairs, owner, second])[first], np.int32)

@@ -1,0 +1,176 @@
+"""The masks of a capture at the working size, one set of views per instant."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.errors import TrackingError
+from jawusd.formats.capture import CameraSource
+from jawusd.geometry import Camera
+from jawusd.geometry.arrays import Array, Mask
+from jawusd.imaging.masks import open_masks
+from jawusd.imaging.working_view import WorkingView
+
+_BORDER_PX = 20  # kept around the masks: more than the widest search
+_CHUNK = 48  # instants held at once when going backwards: about 20 MB
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """Hold what one camera shows of both rows of teeth at one instant, undistorted, at the working size.
+
+    Attributes:
+        matrix: world [mm] to homogeneous px of this picture, shape (3, 4).
+        eye: camera centre in the world [mm], shape (3,).
+        masks: of the upper and the lower row, uint8, 255 = teeth, shape (2, h, w); zeros where there is none.
+        present: which of the two masks exist, shape (2,).
+        lead: how the rows move, in the world, from the reference instant to this camera's own, shape (2, 4, 4).
+        bias_px: how far the masks reach beyond the teeth [px], shape (2,).
+    """
+
+    matrix: Array
+    eye: Array
+    masks: NDArray[np.uint8]
+    present: Mask
+    lead: Array = field(default_factory=lambda: np.tile(np.eye(4), (2, 1, 1)))
+    bias_px: Array = field(default_factory=lambda: np.zeros(2))
+
+
+class MaskViews:
+    """Read the masks of all cameras at instants of the reference camera; use as a context manager.
+
+    Attributes:
+        cameras: the cameras that have masks, in capture order.
+        frames: first instant with a mask that could exist, and one past the last.
+    """
+
+    def __init__(
+        self,
+        sources: Sequence[CameraSource],
+        cameras: Mapping[str, Camera],
+        offsets: Mapping[str, int],
+        centre_world: Array,
+        working_px_per_mm: float,
+    ) -> None:
+        """Open the mask readers and choose the working sizes.
+
+        Args:
+            sources: the capture's cameras.
+            cameras: calibrated cameras by name.
+            offsets: reference frame minus own frame number of every camera.
+            centre_world: where the teeth are at the start [mm], shape (3,).
+            working_px_per_mm: resolution at the teeth; pictures are never enlarged.
+
+        Raises:
+            TrackingError: fewer than two cameras have masks, or a camera is not calibrated or not synchronised.
+        """
+        self._stack = ExitStack()
+        masked = masked_sources(sources, cameras, offsets)
+        self.cameras = tuple(cameras[s.name] for s in masked)
+        self._offsets = [offsets[s.name] for s in masked]
+        self._working, self._readers = [], []
+        for source, camera in zip(masked, self.cameras, strict=True):
+            working = WorkingView(camera, working_size(camera, centre_world, working_px_per_mm))
+            self._working.append(working)
+            readers = open_masks(source, camera.size_px, prepare=working.mask)
+            self._readers.append([self._stack.enter_context(reader) for reader in readers])
+        self.frames = (
+            min(self._offsets),
+            max(o + r.count for o, pair in zip(self._offsets, self._readers, strict=True) for r in pair),
+        )
+
+    def __enter__(self) -> MaskViews:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._stack.close()
+
+    def at(self, frame: int) -> list[View]:
+        """Return the views of one instant of the reference camera.
+
+        Raises:
+            CaptureError: a mask cannot be decoded.
+        """
+        return [
+            _view(working, [r.read(frame - offset) for r in pair])
+            for working, offset, pair in zip(self._working, self._offsets, self._readers, strict=True)
+        ]
+
+    def walk(self, first: int, stop: int, step: int = 1) -> Iterator[tuple[int, list[View]]]:
+        """Yield instants with their views in either direction, reading forwards all the same.
+
+        Args:
+            first, stop, step: as for `range`; step is 1 or -1.
+        """
+        if step > 0:
+            for frame in range(first, stop):
+                yield frame, self.at(frame)
+            return
+        for end in range(first + 1, stop + 1, -_CHUNK):
+            begin = max(end - _CHUNK, stop + 1)
+            held = [(frame, self.at(frame)) for frame in range(begin, end)]
+            while held:
+                yield held.pop()
+
+
+def masked_sources(
+    sources: Sequence[CameraSource], cameras: Mapping[str, Camera], offsets: Mapping[str, int]
+) -> tuple[CameraSource, ...]:
+    """Return the cameras that have masks.
+
+    Raises:
+        TrackingError: fewer than two have, or one of them is not calibrated or not synchronised.
+    """
+    masked = tuple(s for s in sources if s.masks is not None)
+    if len(masked) < 2:
+        raise TrackingError(
+            f"{len(masked)} of {len(sources)} cameras have masks; one view leaves the depth of the teeth unknown",
+            hint="Give masks for two cameras at least, some 30 degrees apart or more.",
+        )
+    for source in masked:
+        for table, what in ((cameras, "calibration"), (offsets, "time offset")):
+            if source.name not in table:
+                raise TrackingError(f"camera {source.name} has no {what}", hint="Calibrate and synchronise first.")
+    return masked
+
+
+def working_size(camera: Camera, centre_world: Array, px_per_mm: float) -> tuple[int, int]:
+    """Return the picture size that shows the given point at the wanted resolution, at most the recorded size.
+
+    Raises:
+        TrackingError: the point lies behind the camera.
+    """
+    depth = float(camera.depth(centre_world))
+    if depth <= 0:
+        raise TrackingError(
+            f"camera {camera.name}: the teeth lie {-depth:.0f} mm behind it",
+            hint="Check the calibration and the camera names of the picks.",
+        )
+    recorded = np.sqrt(camera.K[0, 0] * camera.K[1, 1]) / depth
+    scale = min(1.0, px_per_mm / recorded)
+    return max(1, round(camera.size_px[0] * scale)), max(1, round(camera.size_px[1] * scale))
+
+
+def _view(working: WorkingView, masks: Sequence[NDArray[np.uint8] | None]) -> View:
+    """Cut both masks of a camera down to their surroundings."""
+    camera = working.camera
+    present = np.array([m is not None for m in masks])
+    if not present.any():
+        return View(camera.projection_matrix(), camera.centre_world(), np.zeros((2, 1, 1), np.uint8), present)
+    union = np.maximum.reduce([m for m in masks if m is not None])
+    rows, columns = np.flatnonzero(union.any(1)), np.flatnonzero(union.any(0))
+    if not len(rows):  # too small a speck to show at the working size
+        return View(camera.projection_matrix(), camera.centre_world(), np.zeros((2, 1, 1), np.uint8), present & False)
+    y0, x0 = max(0, rows[0] - _BORDER_PX), max(0, columns[0] - _BORDER_PX)
+    y1, x1 = min(union.shape[0], rows[-1] + 1 + _BORDER_PX), min(union.shape[1], columns[-1] + 1 + _BORDER_PX)
+    cut = np.zeros((2, y1 - y0, x1 - x0), np.uint8)
+    for r, mask in enumerate(masks):
+        if mask is not None:
+            cut[r] = mask[y0:y1, x0:x1]
+    part = camera.cropped(int(x0), int(y0), (int(x1 - x0), int(y1 - y0)))
+    return View(part.projection_matrix(), part.centre_world(), cut, present)

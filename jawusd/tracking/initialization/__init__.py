@@ -1,0 +1,1 @@
+"""Find the poses of the first frame: from picks, or by search."""

@@ -1,0 +1,160 @@
+"""The masks of a take before anything is known about the teeth: where they are, and which frames show them well."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.errors import TrackingError
+from jawusd.formats.capture import CameraSource
+from jawusd.geometry import Camera, triangulate
+from jawusd.geometry.arrays import Array
+from jawusd.imaging.masks import open_masks
+from jawusd.imaging.working_view import WorkingView
+from jawusd.tracking.contour.views import MaskViews
+
+_BESIDE = 2  # surveyed frames to either side that show much the same
+_WIDTH_PX = 320  # of the surveyed pictures: their middles are good to a tenth of a millimetre
+
+
+@dataclass(frozen=True, eq=False)
+class Footage:
+    """Name the masks to be tracked.
+
+    Attributes:
+        sources: cameras with masks.
+        cameras: calibrated cameras by name.
+        offsets: reference frame minus own frame number, by camera name.
+        frames: first frame and one past the last, or None for all that have masks.
+    """
+
+    sources: Sequence[CameraSource]
+    cameras: Mapping[str, Camera]
+    offsets: Mapping[str, int]
+    frames: tuple[int, int] | None
+
+    def survey(self, frames: tuple[int, int] | None, count: int) -> MaskSurvey:
+        """Look at evenly spread frames, of the whole footage if no range is given."""
+        return survey_masks(self.sources, self.cameras, self.offsets, frames or self.frames, count)
+
+    def views(self, centre: Array, px_per_mm: float) -> MaskViews:
+        """Open the masks at a resolution at the teeth, which are near a world point [mm], shape (3,)."""
+        return MaskViews(self.sources, self.cameras, self.offsets, centre, px_per_mm)
+
+    def has_masks(self, frame: int) -> bool:
+        """Tell whether both rows have masks in two cameras on a frame."""
+        try:
+            self.survey((frame, frame + 1), 1)
+        except TrackingError:
+            return False
+        return True
+
+
+@dataclass(frozen=True, eq=False)
+class MaskSurvey:
+    """Hold middles and areas of the masks of some frames.
+
+    Attributes:
+        frames: reference camera frames, shape (F,).
+        middles: mean position (x, y) of every mask in its undistorted survey picture [px], NaN without a mask, shape
+            (F, 2, C, 2); rows are upper, lower.
+        areas_px: size of every mask, shape (F, 2, C); 0 without one.
+        matrices: world [mm] to homogeneous px of the survey pictures, shape (C, 3, 4).
+        eyes: camera centres in the world [mm], shape (C, 3).
+    """
+
+    frames: NDArray[np.int64]
+    middles: Array
+    areas_px: Array
+    matrices: Array
+    eyes: Array
+
+    def places(self) -> Array:
+        """Return the world points seen at the middles of the masks [mm], NaN with fewer than two, shape (F, 2, 3)."""
+        out = np.full((len(self.frames), 2, 3), np.nan)
+        for f, r in np.ndindex(out.shape[:2]):
+            seen = self.areas_px[f, r] > 0
+            if seen.sum() >= 2:
+                out[f, r] = triangulate(self.matrices[seen], self.middles[f, r, seen])
+        return out
+
+    def promising(self, count: int) -> NDArray[np.int64]:
+        """Return frames that show much of both rows in all cameras, the best first, at most `count`.
+
+        Beyond what a tenth of the frames reach more area counts for nothing: a mask that large may be a wrong one.
+        Frames next to one another resemble each other: neighbours come after all others.
+        """
+        full = np.maximum(np.quantile(self.areas_px, 0.9, axis=0), 1.0)
+        shown = np.sqrt(np.minimum(self.areas_px / full, 1.0)).sum(-1).min(-1)
+        usable = ((self.areas_px > 0).sum(-1) >= 2).all(-1)
+        apart, beside = [], []
+        for f in np.argsort(-shown, kind="stable"):
+            if usable[f]:
+                (beside if any(abs(f - g) <= _BESIDE for g in apart) else apart).append(f)
+        return self.frames[[*apart, *beside][:count]]
+
+
+def survey_masks(
+    sources: Sequence[CameraSource],
+    cameras: Mapping[str, Camera],
+    offsets: Mapping[str, int],
+    frames: tuple[int, int] | None,
+    count: int,
+) -> MaskSurvey:
+    """Look at evenly spread frames of a take.
+
+    Args:
+        sources: cameras that have masks.
+        cameras: calibrated cameras by name.
+        offsets: reference frame minus own frame number, by camera name.
+        frames: first frame and one past the last; all that could have masks by default.
+        count: how many frames are looked at.
+
+    Raises:
+        TrackingError: no frame shows both rows of teeth in two cameras.
+        CaptureError: a mask cannot be read.
+    """
+    with ExitStack() as stack:
+        working, readers = [], []
+        for source in sources:
+            camera = cameras[source.name]
+            width, height = camera.size_px
+            scale = min(1.0, _WIDTH_PX / max(width, height))
+            view = WorkingView(camera, (max(1, round(width * scale)), max(1, round(height * scale))))
+            working.append(view)
+            opened = open_masks(source, camera.size_px, prepare=view.mask)
+            readers.append([stack.enter_context(reader) for reader in opened])
+        shifts = [offsets[source.name] for source in sources]
+        first, stop = frames or (
+            min(shifts),
+            max(o + r.count for o, pair in zip(shifts, readers, strict=True) for r in pair),
+        )
+        chosen = np.unique(np.linspace(first, stop - 1, min(count, stop - first)).round().astype(np.int64))
+        middles = np.full((len(chosen), 2, len(sources), 2), np.nan)
+        areas = np.zeros((len(chosen), 2, len(sources)))
+        for f, c, r in np.ndindex(len(chosen), len(sources), 2):
+            mask = readers[c][r].read(int(chosen[f]) - shifts[c])
+            if mask is not None and (area := float(mask.sum(dtype=np.float64)) / 255.0) > 1.0:
+                rows, columns = mask.sum(1, dtype=np.float64), mask.sum(0, dtype=np.float64)
+                middles[f, r, c] = [
+                    columns @ np.arange(len(columns)) / columns.sum(),
+                    rows @ np.arange(len(rows)) / rows.sum(),
+                ]
+                areas[f, r, c] = area
+    if not ((areas > 0).sum(-1) >= 2).all(-1).any():
+        raise TrackingError(
+            f"none of {len(chosen)} frames looked at from {chosen[0]} to {chosen[-1]} has masks of both rows of teeth "
+            "in two cameras",
+            hint="Segment some frames in every camera, or give [bootstrap] picks on one that is.",
+        )
+    return MaskSurvey(
+        frames=chosen,
+        middles=middles,
+        areas_px=areas,
+        matrices=np.stack([view.camera.projection_matrix() for view in working]),
+        eyes=np.stack([view.camera.centre_world() for view in working]),
+    )

@@ -1,0 +1,143 @@
+"""Masks that were named for the wrong camera or the wrong row of teeth: which exchange would put them right?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.errors import CaptureError, TrackingError
+from jawusd.formats.capture import CameraSource, Masks
+from jawusd.geometry import transform_point
+from jawusd.geometry.arrays import Array
+from jawusd.imaging.raster import count_and_not, count_bits, draw_silhouette, pack_bits, project
+from jawusd.tracking.contour.scan import Scan
+from jawusd.tracking.contour.solver import ContourSolver
+from jawusd.tracking.contour.views import View
+from jawusd.tracking.initialization.footage import Footage
+
+_ROWS = (0, 1)
+# An exchange is believed if it leaves less than this share of what is uncovered as the masks are named.
+_PROOF = 0.5
+# Uncovered share of all masks of a camera from which an exchange is looked for: good poses leave 0.01, and two cameras'
+# masks may resemble one another up to 0.1.
+_ODD_SHARE = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Mixup:
+    """Hold one way in which masks may have been exchanged.
+
+    Attributes:
+        finding: what is wrong, to follow "frame F: ".
+        hint: what to do.
+        sources: the cameras with their masks put right.
+    """
+
+    finding: str
+    hint: str
+    sources: tuple[CameraSource, ...]
+
+    def refusal(self, frame: int) -> TrackingError:
+        """Return the error that names the exchange."""
+        return TrackingError(f"frame {frame}: {self.finding}", hint=self.hint)
+
+
+def all_rows_exchanged(sources: Sequence[CameraSource]) -> Mixup:
+    """Return the exchange of rows in all cameras, which exchanged scan files look like as well."""
+    return Mixup(
+        "the masks of the upper and lower teeth are exchanged in every camera",
+        "Exchange masks.upper and masks.lower, or upper_teeth and lower_teeth in [scans].",
+        _with_masks(sources, {k: s.masks.exchanged for k, s in enumerate(sources)}),
+    )
+
+
+def possible_mixups(sources: Sequence[CameraSource]) -> list[Mixup]:
+    """Return every exchange of rows in one camera or in all, and of masks between two cameras of one picture size."""
+    out = []
+    for k, source in enumerate(sources):
+        out.append(
+            Mixup(
+                f"the masks of the upper and lower teeth are exchanged in camera {source.name}",
+                f"Exchange masks.upper and masks.lower of camera {source.name}.",
+                _with_masks(sources, {k: source.masks.exchanged}),
+            )
+        )
+    out.append(all_rows_exchanged(sources))
+    for a, b in combinations(range(len(sources)), 2):
+        first, second = sources[a].name, sources[b].name
+        out.append(
+            Mixup(
+                f"the masks of cameras {first} and {second} are exchanged",
+                f"Exchange the masks of cameras {first} and {second}, or their entries in the calibration.",
+                _with_masks(sources, {a: sources[b].masks, b: sources[a].masks}),
+            )
+        )
+    return out
+
+
+def likely_mixup(footage: Footage, solver: ContourSolver, poses: Array, frame: int) -> Mixup | None:
+    """Return the exchange that explains masks far better which lie off their scans, with the evidence; None without.
+
+    Args:
+        footage: the masks as they are named.
+        solver: holds the scans.
+        poses: T_world_upper, T_world_lower, good to a millimetre or so, shape (2, 4, 4).
+        frame: the frame of these poses.
+    """
+    given = _bare_shares(footage, solver, poses, frame)
+    if not (given >= _ODD_SHARE).any():
+        return None
+    found = []
+    for mixup in possible_mixups(footage.sources):
+        if _sizes_differ(footage, mixup.sources):
+            continue
+        try:
+            shares = _bare_shares(replace(footage, sources=mixup.sources), solver, poses, frame)
+        except CaptureError:
+            continue  # mask videos of other lengths than those cameras' clips
+        found.append((float(np.nanmean(shares)), mixup))
+    share, mixup = min(found, key=lambda f: f[0])
+    if share >= _PROOF * np.nanmean(given):
+        return None
+    evidence = f"{np.nanmean(given):.0%} of the masks lie off their scans, {share:.0%} would after exchanging them"
+    return replace(mixup, finding=f"{mixup.finding}: {evidence}")
+
+
+def _bare_shares(footage: Footage, solver: ContourSolver, poses: Array, frame: int) -> Array:
+    """Return the share of each camera's masks that lies off their scans, NaN without a mask, shape (C,)."""
+    centre = np.mean([transform_point(poses[r], solver.scans[r].centre) for r in _ROWS], axis=0)
+    with footage.views(centre, solver.config.working_px_per_mm / 2) as masks:
+        return np.array([_bare_share(view, solver.scans, poses) for view in masks.at(frame)])
+
+
+def _bare_share(view: View, scans: Sequence[Scan], poses: Array) -> float:
+    bare = total = 0
+    for r in _ROWS:
+        if view.present[r]:
+            mask, crowns = pack_bits(view.masks[r] > 127), _crown_bits(view, scans[r], poses[r])
+            bare, total = bare + count_and_not(mask, crowns), total + count_bits(mask)
+    return bare / total if total else np.nan
+
+
+def _crown_bits(view: View, scan: Scan, pose: Array) -> NDArray[np.uint64]:
+    """Return the silhouette of the crowns in a view as bit rows, shape (h, words)."""
+    points = np.empty((len(scan.vertices), 3), np.float32)
+    bits = np.zeros_like(pack_bits(view.masks[0]))
+    project(scan.vertices_single, (view.matrix @ pose).astype(np.float32), points)
+    draw_silhouette(points, scan.crown_faces, 0, 0, view.masks.shape[2], scan.painted, bits)
+    return bits
+
+
+def _with_masks(sources: Sequence[CameraSource], masks: dict[int, Masks]) -> tuple[CameraSource, ...]:
+    return tuple(s.model_copy(update={"masks": masks.get(k, s.masks)}) for k, s in enumerate(sources))
+
+
+def _sizes_differ(footage: Footage, sources: Sequence[CameraSource]) -> bool:
+    """Tell whether masks would go to a camera with pictures of another size."""
+    size = {source.masks.upper: footage.cameras[source.name].size_px for source in footage.sources}
+    size |= {source.masks.lower: footage.cameras[source.name].size_px for source in footage.sources}
+    return any(size[source.masks.upper] != footage.cameras[source.name].size_px for source in sources)

@@ -1,0 +1,184 @@
+"""Brute-force search for the pose of one row of teeth: orientations one by one, all translations at once.
+
+For one orientation the picture of the row hardly changes under small translations but for a shift. How well it fits
+its mask at every shift is a correlation, which the fast Fourier transform gives for all shifts together; a translation
+is then worth the sum over the cameras of what its shifts are worth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, ndimage
+
+from jawusd.formats.mesh import Mesh
+from jawusd.geometry import make_transform, so3_exp, transform_points
+from jawusd.geometry.arrays import Array
+from jawusd.imaging.raster import draw_depth_labels, project
+from jawusd.tracking.contour.samples import CROWN, GUM
+from jawusd.tracking.contour.scan import Scan, prepare_scan
+from jawusd.tracking.contour.views import View
+
+_CELL_MM = 1.2  # vertices closer than this become one: below the pixels of the search
+_BLUR_MM = 0.9  # of the outlines, so that a grid of a few degrees and two millimetres does not miss the optimum
+# Price of an uncovered mask pixel of 1 mm in mm of fitting outline [1/mm].
+_BARE_PRICE = 1.0
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Lay out the poses to be tried about a guess.
+
+    Attributes:
+        yaw_rad, pitch_rad, roll_rad: turns about the up, left and front axes of the row.
+        reach_mm: translations to either side along left, up and front.
+        step_mm: distance of the translations.
+    """
+
+    yaw_rad: Array
+    pitch_rad: Array
+    roll_rad: Array
+    reach_mm: tuple[float, float, float]
+    step_mm: float = 1.5
+
+    def turns(self) -> Iterable[Array]:
+        """Yield the rotations to be tried, shape (3, 3)."""
+        for yaw in self.yaw_rad:
+            for pitch in self.pitch_rad:
+                for roll in self.roll_rad:
+                    yield so3_exp([0, yaw, 0]) @ so3_exp([pitch, 0, 0]) @ so3_exp([0, 0, roll])
+
+    def shifts(self) -> Array:
+        """Return the translations to be tried along left, up and front [mm], shape (N, 3)."""
+        axes = [np.arange(-r, r + self.step_mm / 2, self.step_mm) for r in self.reach_mm]
+        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """Hold one pose that the search found promising: its worth [px] and T_world_row, shape (4, 4)."""
+
+    worth: float
+    pose: Array
+
+
+def coarse_scan(mesh: Mesh, name: str) -> Scan:
+    """Return a teeth scan with as few faces as the search needs; crowns and gum stay apart."""
+    cells = np.floor(mesh.vertices / _CELL_MM).astype(np.int64)
+    _, chosen, inverse = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+    faces = inverse.reshape(-1)[mesh.faces]
+    solid = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    faces = np.unique(faces[solid], axis=0)
+    colors = None if mesh.colors is None else mesh.colors[chosen]
+    return prepare_scan(Mesh(mesh.vertices[chosen], faces, colors), name)
+
+
+class _Screen:
+    """Tell what the drawn row is worth in one picture at every shift."""
+
+    def __init__(self, view: View, row: int, px_per_mm: float, shifts: Array, at: NDArray) -> None:
+        """Prepare the correlation.
+
+        Args:
+            view: the picture, with a mask of the row.
+            row: 0 upper, 1 lower.
+            px_per_mm: its resolution at the teeth.
+            shifts: world translations that will be asked for [mm], shape (N, 3).
+            at: world point that is shifted [mm], shape (3,).
+        """
+        # Rounded: sub-pixel shifts gain nothing on blurred outlines.
+        pixels = np.rint(shifts @ _slope(view.matrix, at).T).astype(np.int64)
+        picture = _template(view.masks[row], view.masks[1 - row], px_per_mm)
+        some = np.abs(picture) > 1e-3
+        y, x = np.flatnonzero(some.any(1)), np.flatnonzero(some.any(0))
+        picture = picture[y[0] : y[-1] + 1, x[0] : x[-1] + 1]
+        # With as much border as the farthest shift nothing that wraps around meets the template.
+        right, down = np.abs(pixels).max(0)
+        picture = np.pad(picture, ((down, down), (right, right))).astype(np.float32)
+        self._shape = picture.shape
+        self._full = tuple(fft.next_fast_len(n, real=True) for n in picture.shape)
+        self._template = fft.rfft2(picture, self._full)
+        self._matrix = np.array([[1, 0, right - x[0]], [0, 1, down - y[0]], [0, 0, 1.0]]) @ view.matrix
+        self._columns, self._rows = (pixels % self._full[::-1]).T
+
+    def worth(self, scan: Scan, pose: Array) -> NDArray[np.float32]:
+        """Return the worth of a pose under all shifts [px], shape (N,)."""
+        points = np.empty((len(scan.vertices), 3), np.float32)
+        project(scan.vertices_single, (self._matrix @ pose).astype(np.float32), points)
+        depth, labels = np.zeros(self._shape, np.float32), np.zeros(self._shape, np.uint8)
+        draw_depth_labels(points, scan.crown_faces, 0, 0, scan.painted, depth, labels, CROWN)
+        draw_depth_labels(points, scan.gum_faces, 0, 0, False, depth, labels, GUM)
+        drawn = fft.rfft2((labels == CROWN).astype(np.float32), self._full)
+        return fft.irfft2(np.conj(drawn) * self._template, self._full)[self._rows, self._columns]
+
+
+def search_row(
+    scan: Scan,
+    row: int,
+    views: Sequence[View],
+    px_per_mm: float,
+    base: Array,
+    hinge: Array,
+    grid: Grid,
+    map_: Callable[..., Iterable] = map,
+) -> list[Candidate]:
+    """Return the best translation of every orientation of a grid, the best orientations first.
+
+    Args:
+        scan: the row of teeth, coarse.
+        row: 0 upper, 1 lower.
+        views: pictures of one instant; those without a mask of the row are left out.
+        px_per_mm: their resolution at the teeth.
+        base: guessed pose of the row's (left, up, front) axes about the point to turn about, world <- axes, shape
+            (4, 4).
+        hinge: scan frame to (left, up, front) axes about that point, shape (4, 4).
+        grid: what to try.
+        map_: runs orientations, in threads if it likes.
+    """
+    shifts = grid.shifts() @ base[:3, :3].T
+    screens = [_Screen(view, row, px_per_mm, shifts, base[:3, 3]) for view in views if view.present[row]]
+
+    def look(turn: Array) -> Candidate:
+        pose = base @ make_transform(turn, np.zeros(3)) @ hinge
+        worth = sum(screen.worth(scan, pose) for screen in screens)
+        best = int(worth.argmax())
+        return Candidate(float(worth[best]), make_transform(np.eye(3), shifts[best]) @ pose)
+
+    return sorted(map_(look, grid.turns()), key=lambda c: -c.worth)
+
+
+def _template(mask: NDArray[np.uint8], other: NDArray[np.uint8], px_per_mm: float) -> Array:
+    """Return the picture whose correlation with the drawn crowns is their worth, up to a constant [px].
+
+    Worth is the length of outline that lies on the mask's outline, less a price of uncovered mask pixels. The first is
+    the correlation of the blurred gradients of both pictures, normalised to 1 per pixel of a straight edge; moving
+    both derivatives to the mask makes it -div(w grad m). Where the other row begins, the outline is that row's (w = 0).
+    """
+    sigma = _BLUR_MM * px_per_mm * np.sqrt(2)  # both outlines' blur in one
+    inside = mask / 255.0
+    own = 1.0 - ndimage.binary_dilation(other > 127, iterations=max(1, round(px_per_mm)))
+    smooth = ndimage.gaussian_filter(inside, sigma)
+    dy, dx = np.gradient(smooth)
+    edges = -(np.gradient(own * dy, axis=0) + np.gradient(own * dx, axis=1)) * sigma * np.sqrt(2 * np.pi)
+    return edges + _BARE_PRICE / px_per_mm * inside
+
+
+def _slope(matrix: Array, point: Array) -> Array:
+    """Return the derivative of the pixel by the world point, shape (2, 3)."""
+    h = matrix @ np.append(point, 1.0)
+    return (matrix[:2, :3] - (h[:2] / h[2])[:, None] * matrix[2, :3]) / h[2]
+
+
+def hinge_at_front(crowns: Array, T_anatomical_scan: Array) -> Array:
+    """Return the anatomical frame of a row, moved to the middle of its front teeth, shape (4, 4).
+
+    Args:
+        crowns: crown vertices in the scan frame [mm], shape (N, 3).
+        T_anatomical_scan: scan to anatomical axes, shape (4, 4).
+    """
+    points = transform_points(T_anatomical_scan, crowns)
+    front = points[points[:, 2] > points[:, 2].max() - 15.0]  # incisors to first premolars: what cameras see
+    return make_transform(np.eye(3), -front.mean(0)) @ T_anatomical_scan

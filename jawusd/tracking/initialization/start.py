@@ -1,0 +1,207 @@
+"""Where a take's tracking begins: at the picks, or on a frame where a search finds the teeth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from jawusd.errors import CaptureError, TrackingError
+from jawusd.formats.capture import Capture
+from jawusd.formats.mesh import Mesh
+from jawusd.geometry import Camera, transform_point
+from jawusd.geometry.arrays import Array
+from jawusd.tracking.contour.solver import ContourSolver
+from jawusd.tracking.contour.views import masked_sources
+from jawusd.tracking.initialization.bootstrap import picked_sigma_mm, pose_from_picks
+from jawusd.tracking.initialization.first_frame import first_record
+from jawusd.tracking.initialization.footage import Footage
+from jawusd.tracking.initialization.mixups import all_rows_exchanged, likely_mixup, possible_mixups
+from jawusd.tracking.initialization.scan_checks import check_occlusion
+from jawusd.tracking.initialization.start_search import Found, StartSearch
+
+_ROWS = (0, 1)
+_SURVEYED = 24  # frames looked at: two seconds of reading, and every exercise of a usual take is met
+_FRAMES_TRIED = 5
+_MIXUPS_TRIED = 12  # all of them with four cameras; every one costs a search
+# Fit that leaves no doubt [-]. Wrong poses of a hundred searches stayed below 0.1 in one of the rows, right ones
+# exceed 0.35 where much of the teeth shows, and 0.1 with lips nearly closed or cameras 0.1 degrees off.
+_CLEAR_FIT = 0.3
+# Poses as sure as this [mm] lie within the basin of the contour solver.
+_SURE_MM = 0.8
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Say where tracking begins.
+
+    Attributes:
+        frame: reference camera frame.
+        poses: T_world_upper, T_world_lower, shape (2, 4, 4).
+        notes: how it was found, for the meta data of the tracks.
+    """
+
+    frame: int
+    poses: Array
+    notes: dict
+
+
+def find_start(
+    capture: Capture,
+    cameras: Mapping[str, Camera],
+    offsets: Mapping[str, int],
+    meshes: Sequence[Mesh],
+    solver: ContourSolver,
+    map_: Callable[..., Iterable] = map,
+) -> Start:
+    """Return the first frame and the poses there, from the capture's picks or, without any, by search.
+
+    Args:
+        capture: the capture; its masks, picks and frame range are used.
+        cameras: calibrated cameras by name.
+        offsets: reference frame minus own frame number, by camera name.
+        meshes: upper and lower teeth scans in one frame, in occlusion [mm].
+        solver: holds the same scans, prepared.
+        map_: runs parts of the search, in threads if it likes.
+
+    Raises:
+        TrackingError: picks that cannot be, scans that do not belong together, masks that were exchanged, or no frame
+            on which the search finds the teeth.
+        CaptureError: a mask cannot be read.
+    """
+    footage = Footage(masked_sources(capture.cameras, cameras, offsets), cameras, offsets, capture.frames)
+    T_anatomical_scan, findings = check_occlusion(solver.scans, capture.anatomy.T_anatomical_skull)
+    search = StartSearch(meshes, solver, T_anatomical_scan, map_)
+    if capture.bootstrap is not None:
+        start = _picked(capture, footage, meshes, search)
+    else:
+        start = search_start(search, footage)
+    return Start(start.frame, start.poses, {**start.notes, "scan_findings": findings})
+
+
+def _picked(capture: Capture, footage: Footage, meshes: Sequence[Mesh], search: StartSearch) -> Start:
+    """Return the poses that agree with the picks; where picks leave much open, the best ones for the masks nearby."""
+    bootstrap = capture.bootstrap
+    first, stop = capture.frames or (0, bootstrap.frame + 1)
+    if not first <= bootstrap.frame < stop:
+        raise TrackingError(f"bootstrap.frame is {bootstrap.frame}, frames run from {first} to {stop - 1}")
+    poses, left_out, sigma_mm = [], {}, {}
+    for scan, mesh, picks in zip(search.solver.scans, meshes, (bootstrap.upper, bootstrap.lower), strict=True):
+        pose, wrong = pose_from_picks(picks, mesh.vertices, footage.cameras, scan.name)
+        poses.append(pose)
+        left_out[scan.name] = wrong
+        good = [pick for k, pick in enumerate(picks, start=1) if k not in wrong]
+        sigma_mm[scan.name] = picked_sigma_mm(good, mesh.vertices, footage.cameras, pose, scan.probes)
+    notes = {"by": "picks", "frame": bootstrap.frame, "picks_left_out": left_out, "picks_sigma_mm": sigma_mm}
+    start = Start(bootstrap.frame, np.stack(poses), notes)
+    if (mixup := likely_mixup(footage, search.solver, start.poses, start.frame)) is not None:
+        raise mixup.refusal(start.frame)
+    if max(sigma_mm.values()) <= _SURE_MM or not footage.has_masks(start.frame):
+        return start
+    found = search_around(search, footage, start.frame, start.poses)
+    notes |= {"by": "picks, then search", "worth_px": found.worth_px, "fit": found.fit}
+    return Start(start.frame, found.poses, notes)
+
+
+def search_start(search: StartSearch, footage: Footage) -> Start:
+    """Find a frame on which both rows of teeth can be aligned, and their poses there.
+
+    The first frame that fits beyond doubt is taken, or else the one that fits best.
+
+    Raises:
+        TrackingError: no frame of those tried could be aligned; the message says what happened on each, or which
+            exchange of masks would let it succeed.
+    """
+    frames = footage.survey(None, _SURVEYED).promising(_FRAMES_TRIED).tolist()
+    failed: dict[int, str] = {}
+    accused: set[str] = set()
+    best: tuple[int, Found] | None = None
+    for frame in frames:
+        try:
+            found = search.at(footage, frame)
+            # Most masks being right, the poses are, and show which ones are not. Poor poses may accuse any.
+            mixup = likely_mixup(footage, search.solver, found.poses, frame)
+            if mixup is None:
+                found = replace(found, poses=_aligned(search, footage, found.poses, frame))
+        except TrackingError as error:
+            failed[frame] = error.message.removeprefix(f"frame {frame}: ")
+            continue
+        if mixup is not None:
+            if found.fit >= _CLEAR_FIT:
+                raise mixup.refusal(frame)
+            failed[frame] = mixup.finding
+            accused.add(mixup.hint)
+            continue
+        if best is None or found.fit > best[1].fit:
+            best = frame, found
+        if found.fit >= _CLEAR_FIT:
+            break
+    if best is None:
+        _name_mixup(search, footage, frames[0], accused)
+        raise TrackingError(
+            f"there are no [bootstrap] picks, and searching the teeth failed on all {len(frames)} frames tried. "
+            + " ".join(f"Frame {frame}: {message}." for frame, message in failed.items()),
+            hint="Give [bootstrap] picks, three or more per row of teeth, each seen by two cameras; and check the "
+            "masks, the calibration and the time offsets.",
+        )
+    frame, found = best
+    _check_upright(search, footage, frame, found)
+    notes = {"by": "search", "frame": frame, "worth_px": found.worth_px, "fit": found.fit}
+    return Start(frame, found.poses, {**notes, "failed": {str(f): m for f, m in failed.items()}})
+
+
+def search_around(search: StartSearch, footage: Footage, frame: int, poses: Array) -> Found:
+    """Find the poses near given ones; if none fits beyond doubt, the best ones of all.
+
+    Raises:
+        TrackingError: no pair of poses that a jaw can take.
+    """
+    near = search.near(footage, frame, poses)
+    if near.fit >= _CLEAR_FIT:
+        return near
+    try:
+        anywhere = search.at(footage, frame)
+    except TrackingError:
+        return near
+    return max(near, anywhere, key=lambda found: found.worth_px)
+
+
+def _aligned(search: StartSearch, footage: Footage, poses: Array, frame: int) -> Array:
+    """Return the poses as aligned by the solver if they pass the checks of a first frame, shape (2, 4, 4)."""
+    solver = search.solver
+    centre = np.mean([transform_point(poses[r], solver.scans[r].centre) for r in _ROWS], axis=0)
+    with footage.views(centre, solver.config.working_px_per_mm) as masks:
+        return first_record(solver, solver.config, poses, masks, frame).solution.poses
+
+
+def _check_upright(search: StartSearch, footage: Footage, frame: int, found: Found) -> None:
+    """Refuse masks that fit better with the rows exchanged everywhere: turned over, an upper row resembles a lower."""
+    mixup = all_rows_exchanged(footage.sources)
+    try:
+        other = search.at(replace(footage, sources=mixup.sources), frame)
+    except TrackingError:
+        return
+    if other.worth_px > found.worth_px:
+        raise TrackingError(
+            f"frame {frame}: {mixup.finding}: {other.worth_px:.0f} px of contour fit after exchanging them, "
+            f"{found.worth_px:.0f} px as they are named",
+            hint=mixup.hint,
+        )
+
+
+def _name_mixup(search: StartSearch, footage: Footage, frame: int, accused: set[str]) -> None:
+    """Refuse masks with which the search succeeds after an exchange, those first that were accused by their hints."""
+    explained: list[tuple[float, TrackingError]] = []
+    mixups = sorted(possible_mixups(footage.sources), key=lambda m: m.hint not in accused)
+    for mixup in mixups[:_MIXUPS_TRIED]:
+        try:
+            righted = replace(footage, sources=mixup.sources)
+            found = search.at(righted, frame)
+            _aligned(search, righted, found.poses, frame)
+        except (TrackingError, CaptureError):
+            continue  # this exchange explains nothing
+        why = f"{mixup.finding}: the teeth are found only after exchanging them"
+        explained.append((found.fit, replace(mixup, finding=why).refusal(frame)))
+    if explained:
+        raise max(explained, key=lambda e: e[0])[1]

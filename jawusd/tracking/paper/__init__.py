@@ -1,0 +1,1 @@
+"""The energy and the solver of the paper, for comparison."""

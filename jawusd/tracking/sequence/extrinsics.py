@@ -1,0 +1,102 @@
+"""Camera poses that a whole take corrects: what is known of them beforehand, and how views are put right."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from jawusd.geometry import Camera, make_transform, se3_adjoint, se3_exp, se3_inverse, se3_log
+from jawusd.geometry.arrays import Array
+from jawusd.tracking.contour.views import View
+
+
+@dataclass(frozen=True, eq=False)
+class Extrinsics:
+    """Hold corrections of camera poses.
+
+    Camera c sees the world moved by exp(twists[c]) about the pivot: T_cam_world is followed by it on its right side.
+    A motion common to all cameras is a motion of the world, so the twists add up to nothing.
+
+    Attributes:
+        T_cam_world: the calibrated poses, shape (C, 4, 4).
+        pivot: a point amid the teeth, about which the masks tell most, world coordinates [mm], shape (3,).
+        twists: the corrections [rad, mm], shape (C, 6).
+        sigma: their standard deviations [rad, mm], shape (C, 6).
+    """
+
+    T_cam_world: Array
+    pivot: Array
+    twists: Array
+    sigma: Array
+
+    @classmethod
+    def calibrated(cls, cameras: Sequence[Camera], pivot: Array) -> Extrinsics:
+        """Return the cameras as calibrated, nothing corrected."""
+        nothing = np.zeros((len(cameras), 6))
+        return cls(np.stack([c.T_cam_world for c in cameras]), np.asarray(pivot, float), nothing, nothing)
+
+    def motions(self) -> Array:
+        """Return how each camera sees the world moved, shape (C, 4, 4)."""
+        to = make_transform(np.eye(3), -self.pivot)
+        return se3_inverse(to) @ se3_exp(self.twists) @ to
+
+    def then(self, twists: Array, sigma: Array) -> Extrinsics:
+        """Return the corrections with more on top of them, shapes (C, 6)."""
+        both = se3_log(se3_exp(self.twists) @ se3_exp(twists))
+        return replace(self, twists=both - both.mean(0), sigma=sigma)
+
+    def poses(self) -> Array:
+        """Return the corrected T_cam_world, shape (C, 4, 4)."""
+        return self.T_cam_world @ self.motions()
+
+    def put_right(self, views: Sequence[View]) -> list[View]:
+        """Return the views as the corrected cameras see them."""
+        moved = self.motions()
+        return [
+            replace(view, matrix=view.matrix @ M, eye=se3_inverse(M)[:3, :3] @ view.eye + se3_inverse(M)[:3, 3])
+            for view, M in zip(views, moved, strict=True)
+        ]
+
+    def precision(self, turn_rad: float, move_mm: float) -> Array:
+        """Return what is known of the twists of each camera beforehand, shape (C, 6, 6).
+
+        Args:
+            turn_rad, move_mm: how far cameras turn about themselves and move, standard deviation per axis.
+        """
+        A = se3_adjoint(make_transform(np.eye(3), -self.pivot) @ se3_inverse(self.T_cam_world))
+        variance = np.r_[np.full(3, turn_rad**2), np.full(3, move_mm**2)]
+        return np.linalg.inv(A @ (variance[:, None] * np.swapaxes(A, -1, -2)))
+
+    def report(self, names: Sequence[str]) -> dict:
+        """Return corrections, uncertainties and corrected poses by camera name, for the tracks' meta data."""
+
+        def by_name(values: Array) -> dict[str, list]:
+            return dict(zip(names, values.tolist(), strict=True))
+
+        return {
+            "corrected": bool(self.twists.any()),
+            "pivot_mm": self.pivot.tolist(),
+            "turns_deg": by_name(np.degrees(self.twists[:, :3])),
+            "turns_sigma_deg": by_name(np.degrees(self.sigma[:, :3])),
+            "moves_mm": by_name(self.twists[:, 3:]),
+            "moves_sigma_mm": by_name(self.sigma[:, 3:]),
+            "T_cam_world": by_name(self.poses()),
+        }
+
+
+def lever(pivot: Array, centre: Array) -> Array:
+    """Return what turns a twist about a pivot into the same motion's twist about a centre, shape (6, 6)."""
+    return se3_adjoint(make_transform(np.eye(3), pivot - centre))
+
+
+def corrected_cameras(cameras: Sequence[Camera], meta: Mapping) -> list[Camera]:
+    """Return the cameras the poses of tracks belong to: as calibrated but for what the take corrected.
+
+    Args:
+        cameras: as calibrated.
+        meta: the tracks' meta data.
+    """
+    poses = meta.get("extrinsics", {}).get("T_cam_world", {})
+    return [replace(c, T_cam_world=np.array(poses.get(c.name, c.T_cam_world))) for c in cameras]

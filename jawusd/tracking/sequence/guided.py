@@ -1,0 +1,214 @@
+"""Track through masks that are made on the way, each from where the teeth are expected."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.errors import TrackingError
+from jawusd.formats.capture import Bootstrap
+from jawusd.formats.mesh import Mesh
+from jawusd.formats.tracks import LOST, TRACKED
+from jawusd.geometry import Camera, se3_exp, se3_inverse, se3_log, transform_points
+from jawusd.geometry.arrays import Array
+from jawusd.tracking.config import FOR_MADE_MASKS, TrackingConfig
+from jawusd.tracking.contour.frame_record import FrameRecord, FrameSummary
+from jawusd.tracking.contour.quality import uncovered_px
+from jawusd.tracking.contour.scan import prepare_scan
+from jawusd.tracking.contour.solver import ContourSolver
+from jawusd.tracking.contour.views import View
+from jawusd.tracking.initialization.bootstrap import pose_from_picks
+from jawusd.tracking.initialization.first_frame import first_record
+from jawusd.tracking.sequence.frame_tracker import FrameTracker
+from jawusd.tracking.sequence.history import History, MotionPredictor
+
+#: Makes the views of a frame of the reference camera: called with the frame, T_world_upper and T_world_lower as
+#: expected, shape (2, 4, 4), and the round, 0 for poses that are only predicted.
+See = Callable[[int, Array, int], Sequence[View]]
+
+#: Tells how well a frame's pictures agree with guessed poses, without masks: called with the frame and T_world_upper
+#: and T_world_lower, shape (N, 2, 4, 4); returns N numbers, more for better.
+Agreement = Callable[[int, Array], Array]
+
+_CLEARLY = 1.01  # share of a guess's agreement at which another is better: less is noise of colours
+# Shares of the way from where the jaw was to where it has been before: jaws go the same ways again and again.
+_SHARES = (0.15, 0.3, 0.6, 1.0)
+# Distance between where the lower row was expected and where it is [mm] beyond which it had gone astray before: what is
+# expected of a jaw that is followed errs by less.
+_ASTRAY_MM = 4.0
+_WEAK_SCORE = 0.5  # share of the usual score below which a pose may have been drawn away by its own masks
+_FIRST_ROUNDS = 3  # picks are a few tenths of a millimetre off; each round takes most of the rest
+
+
+@dataclass(frozen=True, eq=False)
+class _OneFrame:
+    """Show the views of a single frame in the way `MaskViews` does."""
+
+    views: Sequence[View]
+
+    def at(self, frame: int) -> Sequence[View]:
+        return self.views
+
+
+class GuidedTracker:
+    """Follow the teeth frame by frame, asking for masks where they are expected."""
+
+    def __init__(
+        self,
+        upper: Mesh,
+        lower: Mesh,
+        see: See,
+        agreement: Agreement,
+        rounds: int,
+        config: TrackingConfig | None = None,
+        executor: Executor | None = None,
+    ) -> None:
+        """Prepare the scans.
+
+        Args:
+            upper, lower: teeth scans in one frame, in occlusion [mm].
+            see: makes the masks.
+            agreement: tells good guesses from bad ones. Masks made around a guess tend to confirm it.
+            rounds: how often masks and poses take turns on a frame.
+            config: the tracker's numbers; those for masks it asked for unless given.
+            executor: runs parts of the work.
+
+        Raises:
+            TrackingError: a scan cannot be tracked.
+        """
+        self._config = config or FOR_MADE_MASKS
+        self._meshes = {"upper": upper, "lower": lower}
+        scans = [prepare_scan(mesh, row) for row, mesh in self._meshes.items()]
+        self._solver = ContourSolver(scans, self._config, executor)
+        self._see, self._agreement, self._rounds = see, agreement, rounds
+        # A dozen points of a row show any motion of it.
+        self._probes = np.stack([s.probes[np.linspace(0, len(s.probes) - 1, 12).astype(int)] for s in scans])
+
+    def picked(self, bootstrap: Bootstrap | None, cameras: Mapping[str, Camera]) -> Array:
+        """Return T_world_upper and T_world_lower that agree with the picks, shape (2, 4, 4).
+
+        Raises:
+            TrackingError: no picks, too few, or picks that contradict one another.
+        """
+        if bootstrap is None:
+            raise TrackingError(
+                "without masks the tracking starts from picks, and the capture has none",
+                hint="Make them in the page of `jawusd view CAPTURE`, or add [bootstrap]: three or more vertices of "
+                "each scan with their pixels in two cameras.",
+            )
+        picks = {"upper": bootstrap.upper, "lower": bootstrap.lower}
+        return np.stack(
+            [pose_from_picks(picks[row], mesh.vertices, cameras, row)[0] for row, mesh in self._meshes.items()]
+        )
+
+    def begin(self, frame: int, poses: Array) -> FrameRecord:
+        """Align the first frame from picked poses.
+
+        Raises:
+            TrackingError: the teeth do not fit what is seen.
+        """
+        for turn in range(_FIRST_ROUNDS):
+            views = _OneFrame(self._see(frame, poses, min(turn, self._rounds - 1)))
+            record = first_record(self._solver, self._config, poses, views, frame)
+            poses = record.solution.poses
+        return record
+
+    def follow(self, frames: range, past: Sequence[FrameSummary]) -> Iterator[tuple[int, FrameRecord, bool]]:
+        """Yield frames, what is known about them, and whether a jaw that had gone astray was found again.
+
+        They come one after the other away from known ones. Rows that are lost are where colours alone say they may be.
+
+        Args:
+            frames: the frames, in either direction.
+            past: what is known of the frames before, from the first one aligned to the one next to these.
+        """
+        history = History(self._config.history_frames, self._config.score_frames)
+        motion = MotionPredictor(past[0].poses, self._probes)
+        history.take_up(past[0])
+        for before in past[1:]:
+            motion.update(before.poses, before.status != LOST, before.used.any(1), guessed=True)
+            history.take_up(before)
+        tracker = FrameTracker(self._solver, self._config, history)
+        sound = _is_sound(past[-1], history)
+        for frame in frames:
+            record = self._one(tracker, motion, frame, sound)
+            poses, expected = record.solution.poses, motion.predict()
+            motion.update(poses, record.status != LOST, record.used.any(1), guessed=True)
+            history.add(record)
+            before, sound = sound, _is_sound(FrameSummary.of(record), history)
+            yield frame, record, sound and not before and self.apart_mm(expected, poses) > _ASTRAY_MM
+
+    def apart_mm(self, one: Array, other: Array) -> float:
+        """Return how far the lower row is between two poses of both, shape (2, 4, 4), at most [mm]."""
+        gap = transform_points(one[1], self._probes[1]) - transform_points(other[1], self._probes[1])
+        return float(np.linalg.norm(gap, axis=1).max())
+
+    def judge(self, frame: int, poses: Array, status: NDArray[np.int8]) -> FrameRecord:
+        """Return the record of a frame whose poses, shape (2, 4, 4), and status, shape (2,), are known already."""
+        views = self._see(frame, poses, self._rounds - 1)
+        use = np.array([[view.present[r] for view in views] for r in (0, 1)])
+        solution = self._solver.solve(poses, views, (), use)
+        bare_px, mask_px = uncovered_px(self._solver.scans, solution, views)
+        coverage = np.where(mask_px > 0, bare_px / np.maximum(mask_px, 1), np.nan)
+        return FrameRecord(solution, status, use, coverage)
+
+    def _one(self, tracker: FrameTracker, motion: MotionPredictor, frame: int, sound: bool) -> FrameRecord:
+        c = self._config
+        starts = motion.starts() if sound else self._likeliest_first(frame, motion.starts(), motion.gallery())
+        gallery = motion.gallery() if motion.worth_searching() else None
+        reach = c.gate_per_miss * motion.miss_mm() * c.working_px_per_mm
+        views = self._see(frame, starts[0], 0)
+        record = None
+        if gallery is None:
+            # Masks made around a prediction look suspect next to settled ones: the ladder waits for those.
+            record = self._settle(tracker, frame, starts[0], tracker.glance(starts[0], views, reach))
+            if (record.status == LOST).any():
+                views, record = self._see(frame, starts[0], 0), None
+        if record is None:
+            record = self._settle(tracker, frame, starts[0], tracker.track(starts, views, gallery, reach))
+        lost = (record.status == LOST)[:, None, None]
+        poses = np.where(lost, starts[0], record.solution.poses)
+        return replace(record, solution=replace(record.solution, poses=poses))
+
+    def _likeliest_first(self, frame: int, starts: list[Array], gallery: list[Array]) -> list[Array]:
+        """Return starts with the one in front that agrees best with the colours.
+
+        Args:
+            frame: the frame.
+            starts: predictions, the likeliest first, each shape (2, 4, 4).
+            gallery: earlier poses; the ways to them are tried too.
+        """
+        guesses = [*starts, *_ways(starts, gallery)]
+        rates = self._agreement(frame, np.stack(guesses))
+        best = int(np.argmax(rates))
+        if rates[best] <= _CLEARLY * rates[0]:
+            return starts
+        return [guesses[best], *(start for k, start in enumerate(starts) if k != best)]
+
+    def _settle(self, tracker: FrameTracker, frame: int, start: Array, record: FrameRecord) -> FrameRecord:
+        """Let masks and poses take turns after the first look."""
+        for turn in range(1, self._rounds):
+            lost = (record.status == LOST)[:, None, None]
+            poses = np.where(lost, start, record.solution.poses)
+            record = tracker.track([poses], self._see(frame, poses, turn), None)
+        return record
+
+
+def _is_sound(past: FrameSummary, history: History) -> bool:
+    """Tell whether nothing about a frame that is in the history already is unusual."""
+    scarce = past.score_px.sum(1) < _WEAK_SCORE * history.usual_score().sum(1)
+    return bool((past.status == TRACKED).all() and not scarce.any())
+
+
+def _ways(starts: Sequence[Array], gallery: Sequence[Array]) -> list[Array]:
+    """Return poses of the jaw on the ways from the last start to earlier ones, the head where it is expected."""
+    head, last = starts[0][0], se3_inverse(starts[0][0]) @ starts[0][1]
+    out = []
+    for poses in gallery:
+        twist = se3_log(se3_inverse(poses[0]) @ poses[1] @ se3_inverse(last))
+        out += [np.stack([head, head @ se3_exp(share * twist) @ last]) for share in _SHARES]
+    return out

@@ -1,0 +1,150 @@
+"""What earlier frames tell about the next one: expected poses, and what is normal for a good frame."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.formats.tracks import TRACKED
+from jawusd.geometry import orthonormalise, se3_inverse, transform_points
+from jawusd.geometry.arrays import Array, Mask
+from jawusd.tracking.contour.frame_record import FrameRecord, FrameSummary
+
+_GALLERY = 16  # earlier poses kept: enough to cover the exercises of a jaw at 2 mm
+_APART_MM = 2.0  # poses nearer than this have the same basin
+_RECENT = 8  # frames over which prediction errors are remembered: a third of a chewing stroke at 24 fps
+
+
+class MotionPredictor:
+    """Extrapolate with constant velocity; keep a gallery of earlier poses for getting back after a loss."""
+
+    def __init__(self, poses: Array, points: Array) -> None:
+        """Start at rest.
+
+        Args:
+            poses: T_world_upper, T_world_lower, shape (2, 4, 4).
+            points: some points of both rows, at which prediction errors are measured, shape (2, N, 3).
+        """
+        self._points = points
+        self._misses: deque[float] = deque(maxlen=2 * _RECENT)  # two rows
+        self._last = np.array(poses)
+        self._step: list[Array | None] = [None, None]
+        self._lost_for = np.zeros(2, int)
+        self._failures = np.zeros(2, int)
+        self._seen: list[Array] = []
+
+    def predict(self) -> Array:
+        """Return the expected T_world_upper, T_world_lower of the next frame, shape (2, 4, 4)."""
+        out = self._last.copy()
+        for r in (0, 1):
+            if self._step[r] is not None:
+                out[r] = self._step[r] @ self._last[r]
+        if self._lost_for[1] and not self._lost_for[0]:
+            out[1] = out[0] @ se3_inverse(self._last[0]) @ self._last[1]  # a lost jaw is carried along by the head
+        return orthonormalise(out)
+
+    def starts(self) -> list[Array]:
+        """Return predictions for the next frame, the likeliest first: going on as before, at rest, and half way."""
+        moving = self.predict()
+        if self._step[0] is None and self._step[1] is None:
+            return [moving]
+        half = orthonormalise(0.5 * (moving + self._last))
+        return [moving, self._last.copy(), half]
+
+    def update(self, poses: Array, found: Mask, seen: Mask, guessed: bool = False) -> None:
+        """Take in the next frame; rows not found keep their predictions, or go where they are guessed.
+
+        Args:
+            poses: T_world_upper, T_world_lower, shape (2, 4, 4).
+            found: rows whose poses can be trusted, shape (2,).
+            seen: rows that have any mask, shape (2,).
+            guessed: whether poses of rows not found are guesses better than predictions.
+        """
+        expected = self.predict()
+        for r in (0, 1):
+            if found[r]:
+                if not self._lost_for[r]:
+                    gap = transform_points(expected[r], self._points[r]) - transform_points(poses[r], self._points[r])
+                    self._misses.append(float(np.linalg.norm(gap, axis=1).max()))
+                # After a loss the last pose is a guess, and a velocity from it would be another.
+                self._step[r] = None if self._lost_for[r] else poses[r] @ se3_inverse(self._last[r])
+            else:
+                self._step[r] = None
+        self._lost_for = np.where(found, 0, self._lost_for + 1)
+        self._failures = np.where(found, 0, self._failures + seen)
+        if guessed:
+            expected = poses
+        elif not found[1]:
+            head = poses[0] if found[0] else expected[0]
+            expected[1] = head @ se3_inverse(self._last[0]) @ self._last[1]
+        self._last = np.where(found[:, None, None], poses, expected)
+        self.remember(poses, found)
+
+    def miss_mm(self) -> float:
+        """Return the largest recent error of a prediction at the given points [mm]."""
+        return max(self._misses, default=0.0)
+
+    def remember(self, poses: Array, found: Mask) -> None:
+        """Keep poses of both rows, shape (2, 4, 4), as later starts if they are unlike those kept."""
+        if not found.all():
+            return
+        new = se3_inverse(poses[0]) @ poses[1]
+        if any(np.linalg.norm((new - se3_inverse(p[0]) @ p[1])[:3, 3]) < _APART_MM for p in self._seen):
+            return
+        self._seen = [*self._seen[-_GALLERY + 1 :], np.array(poses)]
+
+    def worth_searching(self) -> bool:
+        """Tell whether a search from many starts is due: always at first, then ever less often while it fails.
+
+        Frames without masks do not count: teeth that come back are looked for at once.
+        """
+        failures = int(self._failures.max())
+        return failures & (failures - 1) == 0 or failures % 16 == 0
+
+    def gallery(self) -> list[Array]:
+        """Return earlier poses as starts for the next frame: the jaw relative to where the head is now."""
+        head = self.predict()[0]
+        return [np.stack([p[0], head @ se3_inverse(p[0]) @ p[1]]) for p in self._seen]
+
+
+class History:
+    """Remember what good frames looked like lately, to tell a bad one."""
+
+    def __init__(self, length: int, score_length: int) -> None:
+        """Start empty; keep at most `length` frames, scores of at most `score_length`."""
+        self._scores: deque[NDArray] = deque(maxlen=score_length)
+        self._residuals: deque[NDArray] = deque(maxlen=length)
+        self._coverages: deque[NDArray] = deque(maxlen=length)
+
+    def add(self, record: FrameRecord) -> None:
+        """Take in a frame; only rows tracked without trouble count."""
+        self.take_up(FrameSummary.of(record))
+
+    def take_up(self, past: FrameSummary) -> None:
+        """Take in what was kept of a frame."""
+        good = past.status == TRACKED
+        self._scores.append(np.where(good[:, None], past.score_px, np.nan))
+        self._residuals.append(np.where(good, past.residual_px, np.nan))
+        self._coverages.append(np.where(good[:, None] & past.used, past.coverage, np.nan))
+
+    def usual_score(self) -> Array:
+        """Return the median score per row and view [px], shape (2, C); 0 while unknown."""
+        return _median(self._scores, 0.0)
+
+    def usual_residual(self) -> Array:
+        """Return the median residual per row [px], shape (2,); infinite while unknown."""
+        return _median(self._residuals, np.inf)
+
+    def usual_coverage(self) -> Array:
+        """Return the median coverage error per row and view, shape (2, C); 0 while unknown."""
+        return _median(self._coverages, 0.0)
+
+
+def _median(values: deque[NDArray], otherwise: float) -> Array:
+    stack = np.array(values)
+    known = np.isfinite(stack).any(0)
+    out = np.full(stack.shape[1:], otherwise)
+    out[known] = np.nanmedian(stack[:, known], axis=0)
+    return out

@@ -1,0 +1,256 @@
+"""A whole take: bootstrap, forwards, backwards, and once more from the far side into what was lost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+
+from jawusd.formats.capture import Capture
+from jawusd.formats.mesh import Mesh
+from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, Tracks
+from jawusd.geometry import Camera, transform_point
+from jawusd.geometry.arrays import Array
+from jawusd.tracking.config import TrackingConfig
+from jawusd.tracking.contour.frame_record import FrameRecord
+from jawusd.tracking.contour.scan import prepare_scan
+from jawusd.tracking.contour.solver import ContourSolver
+from jawusd.tracking.contour.views import MaskViews, View
+from jawusd.tracking.initialization.first_frame import first_record
+from jawusd.tracking.initialization.start import find_start
+from jawusd.tracking.sequence.extrinsics import Extrinsics
+from jawusd.tracking.sequence.frame_tracker import FrameTracker
+from jawusd.tracking.sequence.history import History, MotionPredictor
+from jawusd.tracking.sequence.nuisance import Nuisances, TakeEquations, bridge, leads
+from jawusd.tracking.sequence.results import assemble, outline_variance
+
+Progress = Callable[[int, int], None]
+
+# Where tracking starts over it learns from so many frames around at most, or a long take with many gaps would cost the
+# square of its length: minutes of film, in which a jaw goes everywhere.
+_NEARBY_FRAMES = 4000
+
+
+def track_capture(
+    capture: Capture,
+    cameras: Sequence[Camera],
+    offsets: Mapping[str, int],
+    upper: Mesh,
+    lower: Mesh,
+    landmarks: Array,
+    config: TrackingConfig | None = None,
+    *,
+    threads: int = 2,
+    progress: Progress | None = None,
+) -> Tracks:
+    """Track both rows of teeth through a capture.
+
+    Args:
+        capture: the capture; its masks, frame range and bootstrap picks are used; without picks the teeth are
+            searched.
+        cameras: calibrated cameras; world lengths in mm.
+        offsets: reference frame minus own frame number, per camera name.
+        upper, lower: teeth scans in one frame, in occlusion [mm].
+        landmarks: points whose uncertainty is reported, mandible (= scan) coordinates [mm], shape (5, 3).
+        config: the tracker's numbers.
+        threads: worker threads; the result does not depend on it.
+        progress: called with frames done and frames in all, once per frame.
+
+    Raises:
+        TrackingError: one camera only, masks or scans mixed up, or no frame on which the teeth can be aligned.
+        CaptureError: a mask cannot be read.
+    """
+    config = config or TrackingConfig()
+    table = {camera.name: camera for camera in cameras}
+    scans = (prepare_scan(upper, "upper"), prepare_scan(lower, "lower"))
+    with ThreadPoolExecutor(threads) as pool:
+        solver = ContourSolver(scans, config, pool if threads > 1 else None)
+        start = find_start(capture, table, offsets, (upper, lower), solver, pool.map)
+        centre = np.mean([transform_point(start.poses[r], scans[r].centre) for r in (0, 1)], axis=0)
+        with MaskViews(capture.cameras, table, offsets, centre, config.working_px_per_mm) as masks:
+            first, stop = capture.frames or masks.frames
+            take = _Take(solver, config, masks, first, stop, progress)
+            take.begin(start.frame, start.poses)
+            take.run(range(start.frame + 1, stop))
+            take.run(range(start.frame - 1, first - 1, -1))
+            take.re_enter()
+            nuisances, extrinsics = take.refine()
+            records = take.records if capture.frames else _trimmed(take.records)
+            names = tuple(camera.name for camera in masks.cameras)
+    notes = {"start": start.notes, "painted": [s.painted for s in scans]}
+    return assemble(records, names, np.asarray(landmarks, np.float64), nuisances, extrinsics, config, notes)
+
+
+def _trimmed(records: dict[int, FrameRecord]) -> dict[int, FrameRecord]:
+    """Drop frames without any mask before the first and after the last frame that has one."""
+    masked = [frame for frame, record in records.items() if np.isfinite(record.coverage).any()]
+    return {f: r for f, r in records.items() if min(masked) <= f <= max(masked)}
+
+
+class _Take:
+    """Run the tracker over the frames of a take and keep one record per frame."""
+
+    def __init__(
+        self,
+        solver: ContourSolver,
+        config: TrackingConfig,
+        masks: MaskViews,
+        first: int,
+        stop: int,
+        progress: Progress | None,
+    ) -> None:
+        self._solver, self._config, self._masks = solver, config, masks
+        self._first, self._stop = first, stop
+        self._progress = progress or (lambda done, total: None)
+        # A dozen points of a row show any motion of it.
+        self._probes = np.stack([s.probes[np.linspace(0, len(s.probes) - 1, 12).astype(int)] for s in solver.scans])
+        self.records: dict[int, FrameRecord] = {}
+
+    def begin(self, frame: int, poses: Array) -> None:
+        """Align the bootstrap frame from the pick poses."""
+        self.records[frame] = first_record(self._solver, self._config, poses, self._masks, frame)
+        self._progress(1, self._stop - self._first)
+
+    def run(self, frames: range) -> None:
+        """Track away from the frame next to the first one given."""
+        if not len(frames):
+            return
+        tracker, motion = self._from(frames.start - frames.step)
+        for frame, views in self._masks.walk(frames.start, frames.stop, frames.step):
+            record = self._one(tracker, motion, views)
+            self.records[frame] = record
+            self._progress(len(self.records), self._stop - self._first)
+
+    def re_enter(self) -> None:
+        """Track backwards into every gap from the frame after it, and keep what is found."""
+        for first, stop in _gaps(self.records):
+            if stop not in self.records:
+                continue
+            tracker, motion = self._from(stop)
+            for frame, views in self._masks.walk(stop - 1, first - 1, -1):
+                record = self._one(tracker, motion, views)
+                lost, was_lost = record.status == LOST, self.records[frame].status == LOST
+                if (lost <= was_lost).all() and (lost != was_lost).any():
+                    status = np.where(was_lost & ~lost, RECOVERED, record.status).astype(np.int8)
+                    self.records[frame] = replace(record, status=status)
+
+    def refine(self) -> tuple[Nuisances, Extrinsics]:
+        """Estimate delays, biases and camera poses; where they matter, align all frames again with them put right."""
+        c = self._config
+        extrinsics = Extrinsics.calibrated(self._masks.cameras, self._middle())
+        equations = self._equations(extrinsics)
+        found = equations.solve(c, True)
+        cameras_moved = found.cameras_moved(c) and c.refine_rounds > 0
+        if not cameras_moved:
+            extrinsics = extrinsics.then(np.zeros_like(found.twists), found.sigma_twists)
+            found = equations.solve(c, False)
+        pending, rounds = found.matters(c), 0
+        if pending and c.refine_rounds:
+            found, extrinsics = self._settle(found, extrinsics, cameras_moved)
+        while pending and rounds < c.refine_rounds:
+            if cameras_moved:
+                extrinsics = extrinsics.then(found.twists, found.sigma_twists)
+            self._realign(found, extrinsics)
+            residual = self._equations(extrinsics).solve(c, cameras_moved)
+            found, pending, rounds = found.plus(residual), residual.matters(c), rounds + 1
+        return found, extrinsics
+
+    def _equations(self, extrinsics: Extrinsics) -> TakeEquations:
+        return TakeEquations(self.records, outline_variance(self.records, self._config), extrinsics)
+
+    def _middle(self) -> Array:
+        """Return a point amid the teeth, world coordinates [mm], shape (3,)."""
+        return np.median([r.solution.centres for r in self.records.values()], axis=(0, 1))
+
+    def _settle(self, found: Nuisances, extrinsics: Extrinsics, cameras_moved: bool) -> tuple[Nuisances, Extrinsics]:
+        """Align some frames again and again until the nuisances stay: matches follow them only step by step."""
+        c, records = self._config, dict(self.records)
+        whole = [f for f, r in sorted(records.items()) if (r.status != LOST).all()]
+        sample = {
+            whole[k]: self._masks.at(whole[k]) for k in np.linspace(0, len(whole) - 1, c.settle_frames).astype(int)
+        }
+        variance = outline_variance(records, c)
+        for _ in range(c.settle_rounds):
+            if cameras_moved:
+                extrinsics = extrinsics.then(found.twists, found.sigma_twists)
+            for frame, views in sample.items():
+                start, used = records[frame].solution.poses, records[frame].used
+                views = _put_right(views, self.records, frame, found, extrinsics)
+                solution = self._solver.solve(start, views, c.gates_from(0.0), used)
+                records[frame] = replace(records[frame], solution=solution)
+            more = TakeEquations(records, variance, extrinsics, sample).solve(c, cameras_moved)
+            found = found.plus(more)
+            if more.settled(c):
+                break
+        return found, extrinsics
+
+    def _realign(self, nuisances: Nuisances, extrinsics: Extrinsics) -> None:
+        """Align every frame again, starting from where it is, with all that the take tells put right."""
+        before = dict(self.records)
+        tracker, _ = self._from(self._first)
+        for frame, views in self._masks.walk(self._first, self._stop):
+            views = _put_right(views, before, frame, nuisances, extrinsics)
+            record = tracker.track(_starts_again(before, frame), views, None)
+            found = record.status == TRACKED
+            doubted = np.isin(before[frame].status, (RECOVERED, LOST))
+            status = np.where(found & doubted, RECOVERED, record.status).astype(np.int8)
+            self.records[frame] = replace(record, status=status)
+            tracker.history.add(record)
+
+    def _from(self, frame: int) -> tuple[FrameTracker, MotionPredictor]:
+        """Return a tracker that knows the frames around a tracked one."""
+        history = History(self._config.history_frames, self._config.score_frames)
+        known = sorted(self.records, key=lambda f: -abs(f - frame))[-_NEARBY_FRAMES:]
+        for near in known[-self._config.history_frames :]:
+            history.add(self.records[near])
+        motion = MotionPredictor(self.records[frame].solution.poses, self._probes)
+        for near in known[::10]:
+            motion.remember(self.records[near].solution.poses, self.records[near].status != LOST)
+        return FrameTracker(self._solver, self._config, history), motion
+
+    def _one(self, tracker: FrameTracker, motion: MotionPredictor, views: Sequence[View]) -> FrameRecord:
+        reach = self._config.gate_per_miss * motion.miss_mm() * self._config.working_px_per_mm
+        gallery = motion.gallery() if motion.worth_searching() else None
+        record = tracker.track(motion.starts(), views, gallery, reach)
+        motion.update(record.solution.poses, record.status != LOST, record.used.any(1))
+        tracker.history.add(record)
+        return record
+
+
+def _put_right(
+    views: Sequence[View],
+    records: Mapping[int, FrameRecord],
+    frame: int,
+    nuisances: Nuisances,
+    extrinsics: Extrinsics,
+) -> list[View]:
+    """Return the views of a frame with delays, biases and camera poses put right."""
+    moved = leads(records, frame, nuisances.delays)
+    views = extrinsics.put_right(views)
+    return [replace(v, lead=m, bias_px=nuisances.bias_px) for v, m in zip(views, moved, strict=True)]
+
+
+def _starts_again(records: Mapping[int, FrameRecord], frame: int) -> list[Array]:
+    """Return the poses from which to align a frame again: where it is; where a row is lost, from even motion first."""
+    own = records[frame].solution.poses
+    lost = np.flatnonzero(records[frame].status == LOST)
+    even = own.copy()
+    for row in lost:
+        across = bridge(records, frame, row)
+        if across is not None:
+            even[row] = across[0]
+    return [even, own] if len(lost) else [own]
+
+
+def _gaps(records: Mapping[int, FrameRecord]) -> Iterable[tuple[int, int]]:
+    """Yield runs of frames in which a row is lost, as first frame and one past the last."""
+    lost = [frame for frame in sorted(records) if (records[frame].status == LOST).any()]
+    runs: list[list[int]] = []
+    for frame in lost:
+        if runs and runs[-1][1] == frame:
+            runs[-1][1] = frame + 1
+        else:
+            runs.append([frame, frame + 1])
+    return [(a, b) for a, b in runs]

@@ -1,0 +1,105 @@
+"""The failure ladder on single instants."""
+
+import numpy as np
+import pytest
+from bumpy_teeth import arch, disturbed, jaw_poses, make_cameras, render_masks, vertex_error_mm
+
+from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, TRACKED
+from jawusd.geometry import make_transform, se3_exp
+from jawusd.tracking.config import TrackingConfig
+from jawusd.tracking.contour.frame_record import FrameRecord
+from jawusd.tracking.contour.quality import uncovered_px
+from jawusd.tracking.contour.scan import prepare_scan
+from jawusd.tracking.contour.solver import ContourSolver
+from jawusd.tracking.contour.views import View
+from jawusd.tracking.sequence.frame_tracker import FrameTracker
+from jawusd.tracking.sequence.history import History
+
+CONFIG = TrackingConfig()
+MESHES = (arch(True), arch(False))
+SCANS = tuple(prepare_scan(m, n) for m, n in zip(MESHES, ("upper", "lower")))
+POSES = jaw_poses(3)
+
+
+def _views(k):
+    return [
+        View(c.projection_matrix(), c.centre_world(), render_masks(MESHES, POSES[k], c, (7.5, -16.0)), np.ones(2, bool))
+        for c in make_cameras()
+    ]
+
+
+@pytest.fixture
+def tracker():
+    """A tracker that has seen one good frame."""
+    solver, views = ContourSolver(SCANS, CONFIG), _views(0)
+    solution = solver.solve(POSES[0], views, CONFIG.gates_from(0.0))
+    bare, total = uncovered_px(SCANS, solution, views)
+    history = History(CONFIG.history_frames, CONFIG.score_frames)
+    history.add(FrameRecord(solution, np.full(2, TRACKED, np.int8), np.ones((2, 3), bool), bare / total))
+    return FrameTracker(solver, CONFIG, history)
+
+
+def _errors(record):
+    return [vertex_error_mm(MESHES[r], record.solution.poses[r], POSES[1, r]) for r in (0, 1)]
+
+
+def test_good_prediction_is_tracked(tracker):
+    record = tracker.track([POSES[0]], _views(1), [])
+    assert record.status.tolist() == [TRACKED, TRACKED] and record.used.all()
+    assert max(_errors(record)) < 0.05
+
+
+def test_jaw_far_from_its_prediction_is_found(tracker):
+    away = POSES[1].copy()
+    away[1] = make_transform(np.eye(3), [1.0, 9.0, 1.0]) @ away[1] @ se3_exp([-0.08, 0, 0, 0, 0, 0])
+    record = tracker.track([away], _views(1), [])
+    # The upper row may count as recovered too: the misplaced jaw had hidden parts of it.
+    assert record.status[1] in (RECOVERED, PARTIAL) and record.status[0] != LOST
+    assert max(_errors(record)) < 0.1
+
+
+def test_a_second_start_helps_before_anything_dearer(tracker):
+    bad = disturbed(POSES[1], 6.0, 0.15, np.random.default_rng(1))
+    record = tracker.track([bad, POSES[1]], _views(1), None)
+    assert (record.status != LOST).all() and max(_errors(record)) < 0.1
+
+
+def test_masks_of_nothing_lose_both_rows(tracker):
+    rng = np.random.default_rng(2)
+    views = [View(v.matrix, v.eye, np.zeros_like(v.masks), v.present) for v in _views(1)]
+    for view in views:
+        for mask in view.masks:
+            x, y = rng.integers(40, 300, 2)
+            mask[y : y + 12, x : x + 12] = 255
+    assert tracker.track([POSES[1]], views, []).status.tolist() == [LOST, LOST]
+
+
+def test_absent_masks_lose_only_their_row(tracker):
+    views = [View(v.matrix, v.eye, v.masks, np.array([True, False])) for v in _views(1)]
+    record = tracker.track([POSES[1]], views, [])
+    assert record.status.tolist() == [TRACKED, LOST] and np.isnan(record.coverage[1]).all()
+
+
+def test_a_mask_that_draws_the_pose_away_is_left_out_in_the_end(tracker):
+    """Start where only the spoiled mask is: all masks look wrong there, and the one that is so shows only later."""
+    views, far = _views(1), _views(2)
+    moved = np.roll(views[2].masks[0], (30, 45), axis=(0, 1))
+    spoiled = np.stack([moved, views[2].masks[1]])
+    views[2] = View(far[2].matrix, far[2].eye, spoiled, np.ones(2, bool))
+    away = POSES[1].copy()
+    away[0] = make_transform(np.eye(3), [5.0, 4.0, 2.0]) @ away[0]
+    record = tracker.track([away], views, [])
+    assert record.used[0].tolist() == [True, True, False] and record.status[0] == PARTIAL
+    assert max(_errors(record)) < 0.15
+
+
+def test_one_mask_does_not_outvote_two(tracker):
+    """Start where the spoiled mask says: it fits there to the pixel, and the two good ones do not."""
+    views = _views(1)
+    away = POSES[1].copy()
+    away[0] = make_transform(np.eye(3), [3.0, 2.5, 1.0]) @ away[0]
+    spoiled = render_masks(MESHES, away, make_cameras()[2], (7.5, -16.0))[0]
+    views[2] = View(views[2].matrix, views[2].eye, np.stack([spoiled, views[2].masks[1]]), np.ones(2, bool))
+    record = tracker.track([away], views, [])
+    assert record.used[0].tolist() == [True, True, False] and record.status[0] == PARTIAL
+    assert max(_errors(record)) < 0.15
