@@ -180,7 +180,7 @@ class RigidMotion(Generic[N]):
 
 
 def anchored_motion(
-    omega: Triple[N], u: Triple[N], anchor: Sequence[float], ops: Operations[N, Table]
+    omega: Triple[N], u: Triple[N], anchor: Triple[N] | Triple[float], ops: Operations[N, Table]
 ) -> RigidMotion[N]:
     """Return the motion that turns by omega [rad] and carries the anchor [mm] by u [mm]: ``t = u + p - R p``."""
     a, b, _ = ops.angle_coefficients(dot(omega, omega))
@@ -278,7 +278,7 @@ class AnchoredFormula:
             softness_mm=arrays["glide_softness_mm"][0],
             fade_mm=arrays["glide_fade_mm"][0],
         )
-        self.incisor, self.scales = arrays["incisor"], arrays["spline_scales"]
+        self.incisor, self.scales = triple(arrays["incisor"]), arrays["spline_scales"]
         *weights, first, second, third = rows(arrays["spline_weights"], 3)
         self.linear = [first, second, third]
         self.tables = {"centres": rows(arrays["spline_centres"], 3), "weights": weights}

@@ -5,7 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from jawusd.solvers.motion import rotation, transform
+from jawusd.evaluator.formula import anchored_motion
+from jawusd.evaluator.operations import triple
+from jawusd.solvers.motion import OPERATIONS, transforms
 
 
 def jaw_pose_from_axis_angle(
@@ -35,9 +37,9 @@ def jaw_pose_from_axis_angle(
         T_skull_mandible [mm], shape (..., 4, 4).
     """
     batch = axis_angle.shape[:-1]
-    R = rotation(axis_angle.reshape(-1, 3))
-    t = (joint - R @ joint) * unit_mm
-    if translation is not None:
-        t = t + translation.reshape(-1, 3) * unit_mm
-    T = T_skull_model @ transform(R, t) @ torch.linalg.inv(T_skull_model) @ T_rest
+    omega = axis_angle.reshape(-1, 3)
+    moved = torch.zeros_like(omega) if translation is None else translation.reshape(-1, 3) * unit_mm
+    turn, shift, anchor = (triple(x.split(1, dim=-1)) for x in (omega, moved, joint * unit_mm))
+    turned = transforms(anchored_motion(turn, shift, anchor, OPERATIONS))
+    T = T_skull_model @ turned @ torch.linalg.inv(T_skull_model) @ T_rest
     return T.reshape(*batch, 4, 4)

@@ -6,11 +6,9 @@ import torch
 from torch import Tensor, nn
 
 from jawusd.evaluator import JawRig
-from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.distances import landmark_vectors
-from jawusd.evaluator.models import AnchoredModel
 from jawusd.geometry.se3 import se3_inverse
-from jawusd.solvers.motion import AdditiveMotion, AnchoredMotion, Curve
+from jawusd.solvers.motion import Margin, Motion
 
 _LEAST_CURVATURE = 1e-9  # relative; keeps encodings differentiable where a parameter hardly moves the landmarks
 
@@ -24,12 +22,15 @@ class JawLayer(nn.Module):
         rig: The rig. Encoding searches with it on the CPU.
     """
 
+    from_anatomical: Tensor
+    closed: Tensor
+    vectors: Tensor
+
     def __init__(self, rig: JawRig) -> None:
         super().__init__()
         self.rig = rig
-        anchored = isinstance(rig.model, AnchoredModel)
-        self.motion = AnchoredMotion(rig.model) if anchored else AdditiveMotion(rig.model)
-        self.bound = _Bound(rig.bound)
+        self.motion = Motion(str(rig.meta["kind"]), rig.arrays)
+        self.bound = Margin(rig.arrays)
         A = rig.arrays["T_anatomical_skull"]
         closed = A @ rig.arrays["T_rest"]
         self.register_buffer("from_anatomical", torch.tensor(se3_inverse(A)))
@@ -60,9 +61,16 @@ class JawLayer(nn.Module):
             T_skull_mandible: Poses, shape (..., 4, 4).
 
         Returns:
-            d [mm], shape (..., 3), and the squared residual [mm^2], shape (...): the square, because the distance
-            itself has no gradient where it is zero.
+            d [mm], shape (..., 3), and residual_mm, shape (...). The distance has a kink where it is zero; its
+            gradient there is taken as zero.
         """
+        d, squared = self._encode(T_skull_mandible)
+        on_model = squared == 0
+        distance = torch.sqrt(torch.where(on_model, torch.ones_like(squared), squared))
+        return d, torch.where(on_model, torch.zeros_like(squared), distance)
+
+    def _encode(self, T_skull_mandible: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the nearest d [mm], shape (..., 3), and the squared residual [mm^2], smooth at zero too."""
         T = _rows(T_skull_mandible, (4, 4))
         found, _ = self.rig.encode(T.detach().cpu().double().numpy())
         at = torch.tensor(found, dtype=T.dtype, device=T.device)
@@ -77,15 +85,12 @@ class JawLayer(nn.Module):
         return d.reshape(*batch, 3), squared.reshape(batch)
 
     def loss(self, T_skull_mandible: Tensor) -> Tensor:
-        """Return a prior on jaw poses [mm^2], shape (...): squared residual plus `penalty` of the nearest parameters.
+        """Return a prior on jaw poses (..., 4, 4) [mm^2]: squared residual plus `penalty` of the nearest parameters.
 
-        Zero for every pose of this person's jaw, and growing with the millimetres a pose is off the model or outside
-        the bound: a replacement for the usual pull towards the closed mouth.
-
-        Args:
-            T_skull_mandible: Poses, shape (..., 4, 4).
+        It is zero for every pose of this person's jaw and grows with the distance to the model and to the bound: a
+        replacement for the usual pull towards the closed mouth. Shape (...), smooth everywhere.
         """
-        d, squared = self.encode(T_skull_mandible)
+        d, squared = self._encode(T_skull_mandible)
         return squared + self.penalty(d)
 
     def _poses(self, d: Tensor) -> Tensor:
@@ -110,24 +115,6 @@ class JawLayer(nn.Module):
         H = torch.stack(columns, dim=2)
         floor = _LEAST_CURVATURE * H.diagonal(dim1=1, dim2=2).abs().mean(dim=1)
         return slope, H + floor[:, None, None] * torch.eye(3, dtype=d.dtype, device=d.device)
-
-
-class _Bound(nn.Module):
-    """The margin of a `SliceHull` in torch."""
-
-    def __init__(self, bound: SliceHull) -> None:
-        super().__init__()
-        self.supports = Curve(bound.supports)
-        self.register_buffer("directions", torch.tensor(bound.directions))
-        self._softness_mm, self._margin_mm = bound.softness_mm, bound.margin_mm
-
-    def forward(self, d: Tensor) -> Tensor:
-        """Return the margins (n,) [mm] of d (n, 3) [mm]."""
-        d1 = d[:, :1]
-        knots = self.supports.knots
-        sides = d[:, 1:] @ self.directions.T - self.supports(d[:, 0])
-        v = torch.cat([sides, knots[0] - d1, d1 - knots[-1]], dim=1)
-        return self._margin_mm - self._softness_mm * torch.logsumexp(v / self._softness_mm, dim=1)
 
 
 def _rows(values: Tensor, tail: tuple[int, ...]) -> Tensor:

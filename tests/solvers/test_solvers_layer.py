@@ -51,18 +51,18 @@ def test_float32_agrees_to_a_hundredth_of_a_millimetre(pair):
     T = layer(torch.tensor(d, dtype=torch.float32))
     assert T.dtype == torch.float32
     np.testing.assert_allclose(T.numpy(), rig.pose(d), atol=1e-2)
-    found, squared = layer.encode(T)
-    assert found.dtype == squared.dtype == torch.float32
+    found, residual_mm = layer.encode(T)
+    assert found.dtype == residual_mm.dtype == torch.float32
     np.testing.assert_allclose(found.numpy(), d, atol=0.05)
 
 
 def test_encode_is_the_evaluators(pair):
     rig, layer = pair
     T = noisy_poses(rig, 30)
-    d, squared = layer.encode(T)
-    expected, residual_mm = rig.encode(T.numpy())
+    d, residual_mm = layer.encode(T)
+    expected, expected_mm = rig.encode(T.numpy())
     np.testing.assert_allclose(d.numpy(), expected, atol=1e-12)
-    np.testing.assert_allclose(squared.numpy(), residual_mm**2, atol=1e-10)
+    np.testing.assert_allclose(residual_mm.numpy(), expected_mm, atol=1e-10)
     assert layer.encode(T.reshape(5, 6, 4, 4))[0].shape == (5, 6, 3)
 
 
@@ -87,7 +87,19 @@ def test_gradcheck_of_encoding_and_loss_far_off_the_model(pair):
         return torch.cat([base[:, :3] + shift, base[:, 3:]], dim=1)
 
     assert torch.autograd.gradcheck(lambda s: layer.encode(moved(s))[0], shift, eps=1e-4, atol=1e-4, rtol=1e-4)
+    assert torch.autograd.gradcheck(lambda s: layer.encode(moved(s))[1], shift, eps=1e-4, atol=1e-4, rtol=1e-4)
     assert torch.autograd.gradcheck(lambda s: layer.loss(moved(s)), shift, eps=1e-4, atol=1e-3, rtol=1e-4)
+
+
+def test_the_residual_has_a_finite_gradient_on_the_model(pair):
+    rig, layer = pair
+    T = torch.tensor(rig.pose(np.concatenate([np.zeros((1, 3)), random_d(rig, (20,))])), requires_grad=True)
+    d, residual_mm = layer.encode(T)
+    assert residual_mm.max() < 1e-9
+    residual_mm.sum().backward()
+    assert torch.isfinite(T.grad).all()
+    lost = torch.full((1, 4, 4), torch.nan, dtype=torch.float64)
+    assert torch.isnan(layer.encode(lost)[1]).all()
 
 
 def test_gradients_at_rest_and_at_spline_centres_are_finite():
