@@ -17,9 +17,9 @@ from jawusd.formats.tracks import load_tracks
 from jawusd.geometry.arrays import Mask
 
 if TYPE_CHECKING:
-    from jawusd.viewer.actor import ViewedActor
-    from jawusd.viewer.clip import Clip
+    from jawusd.viewer.motion import Clip
     from jawusd.viewer.server import Viewer
+    from jawusd.viewer.viewed import ViewedActor
 
 #: What the motion that was captured is called among the motions of an actor.
 CAPTURED = "captured take"
@@ -59,7 +59,7 @@ def viewed_actor(path: str | os.PathLike[str]) -> ViewedActor:
     """
     from jawusd.rig.geo_read import read_placeholders
     from jawusd.rig.read import describe, load_rig
-    from jawusd.viewer.actor import ViewedActor
+    from jawusd.viewer.viewed import ViewedActor
 
     path = Path(path)
     path = path / "actor.usda" if path.is_dir() else path
@@ -136,7 +136,7 @@ def load_motion(folder: Path, rig: JawRig, fps: float, name: str) -> Clip:
     """
     from jawusd.rig.motion_read import read_poses_of_stage
     from jawusd.rig.read import describe
-    from jawusd.viewer.clip import Clip
+    from jawusd.viewer.motion import Clip
 
     if name not in motion_names(folder):
         raise FormatError(f'there is no motion called "{name}" here.', path=folder)

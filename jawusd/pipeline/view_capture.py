@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from jawusd.imaging.frame_reader import FrameReader
     from jawusd.imaging.video import Video
     from jawusd.viewer.server import CaptureViewer
-    from jawusd.viewer.viewed_capture import ViewedCapture
+    from jawusd.viewer.viewed import ViewedCapture
 
 
 CAPTURE_FILE = "capture.toml"
@@ -90,7 +90,7 @@ def viewed_capture(
     """
     from jawusd.imaging.frame_reader import FrameReader
     from jawusd.imaging.meshio import GUM, tooth_labels
-    from jawusd.viewer.viewed_capture import ViewedCapture
+    from jawusd.viewer.viewed import ViewedCapture
 
     path = Path(path)
     capture = open_capture(path, allow_outside=allow_outside)

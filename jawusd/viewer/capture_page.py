@@ -1,9 +1,8 @@
-"""One visitor's page of a capture: pictures, poses and picks of their own."""
+"""One visitor's page of a capture, with a view and picks of its own."""
 
 from __future__ import annotations
 
 import asyncio
-import logging
 
 import numpy as np
 import viser
@@ -15,18 +14,15 @@ from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import se3_inverse
 from jawusd.viewer.capture_scene import UP, CaptureScene
 from jawusd.viewer.footage_panel import FootagePanel
-from jawusd.viewer.light_table import Table, eye_to_see, hit_vertex, region_around
-from jawusd.viewer.notices import guarded, say
-from jawusd.viewer.picks import ROWS
+from jawusd.viewer.picking_layout import PickingLayout, eye_to_see, hit_vertex, region_around
+from jawusd.viewer.picks import ARCHES
 from jawusd.viewer.picks_panel import PicksPanel
-from jawusd.viewer.theme import set_theme
-from jawusd.viewer.viewed_capture import Region, ViewedCapture
-
-log = logging.getLogger(__name__)
+from jawusd.viewer.viewed import Region, ViewedCapture
+from jawusd.viewer.widgets import errors_shown, guarded, set_theme
 
 _PANEL_PX = 370
 _USUAL_MM, _USUAL_WEIGHT = 250.0, 1e-3  # from a camera to the mouth
-_SPACE_SIDE = (0.9, -0.7, 0.0)  # how far from straight behind the first camera the visitor stands
+_SPACE_SIDE = (0.9, -0.7, 0.0)  # offset of the view direction in space from that of the first camera
 
 
 class CapturePage:
@@ -34,10 +30,9 @@ class CapturePage:
 
     Attributes:
         footage, picks: the panels.
-        scene: the picture, the scans and the cameras.
-        table: how the picture lies that is shown, None before the first.
-        poses: where the scans stand, T_page_scan (4, 4) by row.
-        drawn: how many states have been drawn.
+        layout: of the picture shown, None before the first.
+        poses: T_page_scan (4, 4) of the scans shown, by arch.
+        drawn: number of the last state drawn.
     """
 
     def __init__(self, client: viser.ClientHandle, capture: ViewedCapture) -> None:
@@ -47,11 +42,11 @@ class CapturePage:
         set_theme(gui)
         gui.set_panel_label(capture.name)
         self.scene = CaptureScene(client, capture)
-        self.table: Table | None = None
+        self.layout: PickingLayout | None = None
         self.poses: dict[str, Array] = {}
         self.drawn = self._wanted = 0
         self._aim = True
-        self._drawing: asyncio.Task | None = None
+        self._drawing: asyncio.Task[None] | None = None
         self._of_picks: tuple[Bootstrap, tuple[Array, Array] | None] | None = None
         tabs = gui.add_tab_group()
         with tabs.add_tab("Footage"):
@@ -60,11 +55,11 @@ class CapturePage:
             self.picks = PicksPanel(client, capture, self.footage, self.turn, self.refresh)
         gui.main_panel.dock_right()
         gui.main_panel.set_width(_PANEL_PX)
-        client.scene.on_click()(guarded(client, self._clicked))
+        client.scene.on_click()(guarded(client, self._clicked))  # type: ignore[arg-type]  # viser awaits coroutines
         self.refresh()
 
     def turn(self) -> None:
-        """Draw anew, and put the visitor's eye where everything is seen."""
+        """Draw again, and move the visitor's eye so that everything is in view."""
         self._aim = True
         self.refresh()
 
@@ -74,7 +69,7 @@ class CapturePage:
         self.turn()
 
     def refresh(self) -> None:
-        """Draw what is chosen now; while a picture is on its way, only the last wish counts."""
+        """Draw the current state; requests that arrive while a picture is being made are merged into one."""
         self._wanted += 1
         if self._drawing is None or self._drawing.done():
             self._drawing = asyncio.get_running_loop().create_task(self._draw())
@@ -88,14 +83,9 @@ class CapturePage:
         while self.drawn != self._wanted:
             wanted, aim = self._wanted, self._aim
             self._aim = False
-            try:
+            with errors_shown(self.client):
                 await self._fit_picks()
                 await self._draw_once(aim)
-            except (JawusdError, ValueError) as error:
-                say(self.client, "That did not work", str(error), bad=True)
-            except Exception as error:  # the page says it, the log has the details, the server lives on
-                log.exception("unexpected error in the viewer")
-                say(self.client, "Unexpected error", f"{type(error).__name__}: {error}", bad=True)
             self.drawn = wanted
 
     async def _draw_once(self, aim: bool) -> None:
@@ -106,35 +96,31 @@ class CapturePage:
             names = [name for name in capture.sizes_px if name in capture.cameras]
             images = {name: await asyncio.to_thread(capture.picture, name, frame, tracked, look) for name in names}
             self.scene.show_thumbnails(images)
-            waiting = self._waiting_pose()
-            shown = tracked or (waiting, waiting)
-            self.poses = {row: self.scene.T_page_world @ T for row, T in zip(ROWS, shown, strict=True)}
+            default = self._default_pose()
+            shown = tracked or (default, default)
+            self.poses = {arch: self.scene.T_page_world @ T for arch, T in zip(ARCHES, shown, strict=True)}
         else:
             image = await asyncio.to_thread(capture.picture, view, frame, tracked, look)
-            if aim or self.table is None:
-                self.table = Table(capture.sizes_px[view], await asyncio.to_thread(self._region, view, frame))
-            self.scene.show_picture(image, self.table)
-            beside = self.picks.picking.value
-            self.poses = (
-                self.table.scan_poses(dict(capture.scans), capture.T_anatomical_skull, self.picks.side)
-                if beside
-                else {}
-            )
+            if aim or self.layout is None:
+                self.layout = PickingLayout(capture.sizes_px[view], await asyncio.to_thread(self._region, view, frame))
+            self.scene.show_picture(image, self.layout)
+            self.poses = {}
+            if self.picks.picking.value:
+                self.poses = self.layout.scan_poses(capture.scans, capture.T_anatomical_skull, self.picks.side)
         self.scene.place(footage.in_space, self.poses)
-        self.scene.show_marks(
-            self.picks.book, None if footage.in_space else view, frame, None if footage.in_space else self.table
-        )
+        camera, layout = (None, None) if footage.in_space else (view, self.layout)
+        self.scene.show_marks(self.picks.book, camera, frame, layout)
         self.picks.refresh()
         if aim:
             self._look()
 
     def _look(self) -> None:
-        """Put the visitor's eye where everything is seen."""
+        """Move the visitor's eye so that everything is in view."""
         camera = self.client.camera
         aspect = camera.image_width / camera.image_height
         seen = [
-            transform_points(T, self._capture.scans[row].vertices)
-            for row, T in self.poses.items()
+            transform_points(T, self._capture.scans[arch].vertices)
+            for arch, T in self.poses.items()
             if np.isfinite(T).all()
         ]
         away = np.array([0.0, 0.0, -1.0])
@@ -142,19 +128,19 @@ class CapturePage:
             centres = [c.centre_world() for c in self._capture.cameras.values()]
             seen.append(transform_points(self.scene.T_page_world, np.array(centres)))
             away += _SPACE_SIDE
-        elif self.table is not None:
-            seen.append(self.table.corners())
+        elif self.layout is not None:
+            seen.append(self.layout.corners())
         self.scene.look(*eye_to_see(np.vstack(seen), away, UP, aspect))
 
     def _poses_at(self, frame: int) -> tuple[Array, Array] | None:
-        """Return T_world_upper and T_world_lower of a frame: tracked, else those the picks of that frame give."""
+        """Return T_world_upper and T_world_lower of a frame: tracked, else from the picks of that frame."""
         tracked = self._capture.tracked_poses(frame)
         if tracked is None and self._of_picks is not None and self._of_picks[0].frame == frame:
             return self._of_picks[1]
         return tracked
 
     async def _fit_picks(self) -> None:
-        """Find the poses that agree with the picks, when these have changed and are complete."""
+        """Fit poses to the picks when these have changed and are complete."""
         book = self.picks.book
         if book.lacks() or book.frame is None:
             if self._of_picks is not None:
@@ -173,15 +159,15 @@ class CapturePage:
             self.picks.say_fit(error.message)
 
     def _region(self, camera: str, frame: int) -> Region:
-        """Return the part of a camera's picture to look at: the teeth, as far as they are known."""
+        """Return the region of a camera's picture to show: the teeth, as far as they are known."""
         capture, size = self._capture, self._capture.sizes_px[camera]
         tracked = self._poses_at(frame)
         if tracked is not None and camera in capture.cameras and all(np.isfinite(T).all() for T in tracked):
             seen = [
                 capture.cameras[camera].project(
-                    transform_points(T, mesh.vertices[np.unique(mesh.faces[capture.crowns[row]])])
+                    transform_points(T, mesh.vertices[np.unique(mesh.faces[capture.crowns[arch]])])
                 )
-                for T, (row, mesh) in zip(tracked, capture.scans.items(), strict=True)
+                for T, (arch, mesh) in zip(tracked, capture.scans.items(), strict=True)
             ]
             return region_around(np.vstack(seen), size)
         found = capture.teeth_region(camera, frame)
@@ -190,13 +176,13 @@ class CapturePage:
         pixels = [pick.views[camera] for pick in self.picks.book.picks if camera in pick.views]
         return region_around(pixels, size) if len(pixels) > 1 else (0.0, 0.0, size[0] - 1.0, size[1] - 1.0)
 
-    def _waiting_pose(self) -> Array:
-        """Return T_world_scan of scans nobody has tracked: where the cameras' axes meet, facing the first one."""
+    def _default_pose(self) -> Array:
+        """Return T_world_scan of untracked scans: where the cameras' axes meet, facing the first one."""
         cameras = list(self._capture.cameras.values())
         axes = np.stack([camera.T_cam_world[2, :3] for camera in cameras])
         across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
         centres = np.stack([camera.centre_world() for camera in cameras])
-        # Axes that hardly meet leave the distance open: then a usual one from the first camera decides.
+        # Nearly parallel axes do not fix the distance: a prior at a usual distance from the first camera does.
         usual = centres[0] + _USUAL_MM * axes[0]
         A = across.sum(axis=0) + _USUAL_WEIGHT * np.eye(3)
         met = np.linalg.solve(A, np.einsum("nij,nj->i", across, centres) + _USUAL_WEIGHT * usual)
@@ -205,19 +191,19 @@ class CapturePage:
         return facing @ self._capture.T_anatomical_skull
 
     async def _clicked(self, event: viser.SceneClickEvent) -> None:
-        """Set a vertex or a pixel where the visitor clicked."""
+        """Pick the vertex or the pixel under the pointer."""
         if not self.picks.picking.value:
             return
         hits = []
-        for row, T in self.poses.items():
-            hit = hit_vertex(self._capture.scans[row], T, event.ray_origin, event.ray_direction)
+        for arch, T in self.poses.items():
+            hit = hit_vertex(self._capture.scans[arch], T, event.ray_origin, event.ray_direction)
             if hit is not None:
-                hits.append((hit[1], row, hit[0]))
+                hits.append((hit[1], arch, hit[0]))
         if hits:
-            _, row, vertex = min(hits)
-            self.picks.book.add(row, vertex)
-        elif not self.footage.in_space and self.table is not None:
-            pixel = self.table.pixel(event.ray_origin, event.ray_direction)
+            _, arch, vertex = min(hits)
+            self.picks.book.add(arch, vertex)
+        elif not self.footage.in_space and self.layout is not None:
+            pixel = self.layout.pixel(event.ray_origin, event.ray_direction)
             if pixel is None:
                 return
             self.picks.book.see(self.footage.view, self.footage.frame, pixel)

@@ -1,4 +1,4 @@
-"""A capture in 3-D: a picture with the scans before it, or the calibrated cameras around the scans."""
+"""A capture in 3-D: a picture with the scans in front of it, or the calibrated cameras around the scans."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from jawusd.geometry import wxyz_from_matrix
 from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import se3_inverse
 from jawusd.viewer.decimate import for_view
-from jawusd.viewer.light_table import FOV_RAD, Table
-from jawusd.viewer.picks import ROWS, PickBook
-from jawusd.viewer.viewed_capture import ViewedCapture
+from jawusd.viewer.picking_layout import FOV_RAD, PickingLayout
+from jawusd.viewer.picks import ARCHES, PickBook
+from jawusd.viewer.viewed import ViewedCapture
 
 ENAMEL, GUM = (236, 229, 212), (196, 112, 108)
-#: Colours of picks by row, those of the outlines; and of the one selected.
-ROW_COLORS, SELECTED = {"upper": (255, 170, 0), "lower": (0, 200, 255)}, (255, 60, 200)
+#: Colours of picks by arch, equal to those of the outlines; and of the one selected.
+ARCH_COLORS, SELECTED = {"upper": (255, 170, 0), "lower": (0, 200, 255)}, (255, 60, 200)
 #: Upwards in the page.
 UP = (0.0, -1.0, 0.0)
-_MOST_FACES = 7_000  # per part of a row; clicks meet the whole scan
+_MOST_FACES = 7_000  # per part of an arch; clicks are tested against the whole scan
 _JPEG_QUALITY = 88
 _THUMB_PX = 480
 _FRUSTUM_MM = 60.0  # from the eye of a camera to its picture
@@ -29,29 +29,29 @@ _FRUSTUM_COLOR = (120, 120, 120)
 _BALL_MM = 0.7
 _CROSS_MM = (0.35, 1.3)  # a cross leaves its middle free
 _FIRST_EYE_MM, _NEAR_MM, _FAR_MM = 300.0, 1.0, 10_000.0
-_LIFT_MM = 0.05  # marks lie this far before the picture
+_LIFT_MM = 0.05  # from the picture to the marks in front of it
 
 
 class CaptureScene:
     """Draw a capture for one page.
 
     Attributes:
-        T_page_world: the page has the axes of the first camera, so that up is up, shape (4, 4).
+        T_page_world: the page has the axes of the first camera, so that it is upright, shape (4, 4).
     """
 
     def __init__(self, client: viser.ClientHandle, capture: ViewedCapture) -> None:
-        """Draw what there is before the first picture has come."""
+        """Draw what does not depend on a picture."""
         self._client, self._scene, self._capture = client, client.scene, capture
         scene = self._scene
         scene.configure_default_lights(cast_shadow=False)
         self.T_page_world = next((camera.T_cam_world for camera in capture.cameras.values()), np.eye(4))
-        self._table = scene.add_frame("/table", show_axes=False)
+        self._layout = scene.add_frame("/layout", show_axes=False)
         self._picture: viser.ImageHandle | None = None
         self._space = scene.add_frame("/space", show_axes=False, visible=False)
         self._frustums = {name: self._add_frustum(name) for name in capture.sizes_px if name in capture.cameras}
-        self._rows = {row: scene.add_frame(f"/{row}", show_axes=False, visible=False) for row in ROWS}
-        for row in ROWS:
-            self._add_scan(row)
+        self._arches = {arch: scene.add_frame(f"/{arch}", show_axes=False, visible=False) for arch in ARCHES}
+        for arch in ARCHES:
+            self._add_scan(arch)
         self._marks: list[viser.SceneNodeHandle] = []
 
     def _add_frustum(self, name: str) -> viser.CameraFrustumHandle:
@@ -63,7 +63,7 @@ class CaptureScene:
             f"/space/{name}",
             fov=float(2 * np.arctan(y)),
             aspect=width / height,
-            scale=float(_FRUSTUM_MM * np.cbrt(y * y * width / height / 3)),  # the page scales to a volume
+            scale=float(_FRUSTUM_MM * np.cbrt(y * y * width / height / 3)),  # viser's scale fixes the volume
             thickness=0.6,
             color=_FRUSTUM_COLOR,
             wxyz=wxyz_from_matrix(T[:3, :3]),
@@ -75,13 +75,13 @@ class CaptureScene:
         self._scene.add_label(f"/space/{name}/name", name, anchor="bottom-center")
         return frustum
 
-    def _add_scan(self, row: str) -> None:
-        mesh, crowns = self._capture.scans[row], self._capture.crowns[row]
+    def _add_scan(self, arch: str) -> None:
+        mesh, crowns = self._capture.scans[arch], self._capture.crowns[arch]
         for part, faces, color in (("teeth", crowns, ENAMEL), ("gum", ~crowns, GUM)):
             if faces.any():
                 small = for_view(type(mesh)(mesh.vertices, mesh.faces[faces]), _MOST_FACES)
                 self._scene.add_mesh_simple(
-                    f"/{row}/{part}",
+                    f"/{arch}/{part}",
                     small.vertices,
                     small.faces,
                     color=color,
@@ -90,12 +90,12 @@ class CaptureScene:
                     receive_shadow=False,
                 )
 
-    def show_picture(self, image: NDArray[np.uint8], table: Table) -> None:
-        """Put a picture on the table."""
-        width, height = (side / table.px_per_mm for side in table.size_px)
+    def show_picture(self, image: NDArray[np.uint8], layout: PickingLayout) -> None:
+        """Show a picture in the layout."""
+        width, height = (side / layout.px_per_mm for side in layout.size_px)
         if self._picture is None:
             self._picture = self._scene.add_image(
-                "/table/picture", image, width, height, format="jpeg", jpeg_quality=_JPEG_QUALITY, receive_shadow=False
+                "/layout/picture", image, width, height, format="jpeg", jpeg_quality=_JPEG_QUALITY, receive_shadow=False
             )
             return
         with self._client.atomic():
@@ -103,23 +103,23 @@ class CaptureScene:
             self._picture.render_width, self._picture.render_height = width, height
 
     def show_thumbnails(self, images: Mapping[str, NDArray[np.uint8]]) -> None:
-        """Put pictures, made small, on the cameras in space."""
+        """Show reduced pictures on the cameras in space."""
         for name, image in images.items():
             step = -(-image.shape[1] // _THUMB_PX)
             self._frustums[name].image = np.ascontiguousarray(image[::step, ::step])
 
     def place(self, in_space: bool, poses: Mapping[str, Array]) -> None:
-        """Show the table or the cameras in space, and the scans whose poses (4, 4) are given and finite."""
+        """Show the picture or the cameras in space, and the scans whose poses (4, 4) are given and finite."""
         with self._client.atomic():
-            self._table.visible, self._space.visible = not in_space, in_space
-            for row, frame in self._rows.items():
-                T = poses.get(row)
+            self._layout.visible, self._space.visible = not in_space, in_space
+            for arch, frame in self._arches.items():
+                T = poses.get(arch)
                 shown = T is not None and bool(np.isfinite(T).all())
                 if T is not None and shown:
                     frame.position, frame.wxyz = tuple(T[:3, 3]), tuple(wxyz_from_matrix(T[:3, :3]))
                 frame.visible = shown
 
-    def show_marks(self, book: PickBook, camera: str | None, frame: int, table: Table | None) -> None:
+    def show_marks(self, book: PickBook, camera: str | None, frame: int, layout: PickingLayout | None) -> None:
         """Mark the picks on the scans and, those of this frame, in the picture of a camera."""
         with self._client.atomic():
             for mark in self._marks:
@@ -127,19 +127,19 @@ class CaptureScene:
             self._marks = []
             crosses, colors = [], []
             for number, pick in enumerate(book.picks):
-                color = SELECTED if number == book.selected else ROW_COLORS[pick.row]
-                if pick.vertex < len(self._capture.scans[pick.row].vertices):
-                    self._mark_vertex(book.name(number), pick.row, pick.vertex, color)
+                color = SELECTED if number == book.selected else ARCH_COLORS[pick.arch]
+                if pick.vertex < len(self._capture.scans[pick.arch].vertices):
+                    self._mark_vertex(book.name(number), pick.arch, pick.vertex, color)
                 pixel = pick.views.get(camera) if camera is not None else None
-                if pixel is not None and table is not None and frame == book.frame:
-                    place = table.place(pixel) - [0.0, 0.0, _LIFT_MM]
+                if pixel is not None and layout is not None and frame == book.frame:
+                    place = layout.place(pixel) - [0.0, 0.0, _LIFT_MM]
                     crosses.append(_cross(place))
                     colors.append(np.broadcast_to(np.array(color, np.uint8), (4, 2, 3)))
-                    self._label(f"/table/name_{number}", book.name(number), place)
+                    self._label(f"/layout/name_{number}", book.name(number), place)
             if crosses:
                 self._marks.append(
                     self._scene.add_line_segments(
-                        "/table/crosses",
+                        "/layout/crosses",
                         np.concatenate(crosses).astype(np.float32),
                         np.concatenate(colors),
                         thickness=2.0,
@@ -147,13 +147,13 @@ class CaptureScene:
                     )
                 )
 
-    def _mark_vertex(self, name: str, row: str, vertex: int, color: tuple[int, int, int]) -> None:
-        place = self._capture.scans[row].vertices[vertex]
+    def _mark_vertex(self, name: str, arch: str, vertex: int, color: tuple[int, int, int]) -> None:
+        place = self._capture.scans[arch].vertices[vertex]
         ball = self._scene.add_icosphere(
-            f"/{row}/{name}", radius=_BALL_MM, color=color, position=tuple(place), cast_shadow=False
+            f"/{arch}/{name}", radius=_BALL_MM, color=color, position=tuple(place), cast_shadow=False
         )
         self._marks.append(ball)
-        self._label(f"/{row}/name_{name}", name, place)
+        self._label(f"/{arch}/name_{name}", name, place)
 
     def _label(self, path: str, text: str, place: Array) -> None:
         self._marks.append(
@@ -161,7 +161,7 @@ class CaptureScene:
         )
 
     def look(self, eye: Array, target: Array) -> None:
-        """Put the visitor's eye at a place (3,), looking at another (3,)."""
+        """Set the eye (3,) and target (3,) of the visitor's view."""
         camera = self._client.camera
         with self._client.atomic():
             camera.fov = FOV_RAD
@@ -169,7 +169,7 @@ class CaptureScene:
 
 
 def set_first_view(server: viser.ViserServer) -> None:
-    """Let every page begin before the picture, upright."""
+    """Let every page start in front of the picture, upright."""
     server.scene.set_up_direction("-y")
     first = server.initial_camera
     first.position, first.look_at, first.up = (0.0, 0.0, -_FIRST_EYE_MM), (0.0, 0.0, 0.0), UP

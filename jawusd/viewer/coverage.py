@@ -1,4 +1,4 @@
-"""How well tracked poses cover the masks: over time as a plot, and the frames to look at first."""
+"""How well tracked poses cover the masks: a plot over the frames, and the worst frames."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, TRACKED, Tracks
 from jawusd.geometry.arrays import Array
-from jawusd.viewer.plots import BLUE, GREY, ORANGE, VERMILION
+from jawusd.viewer.plots import BLUE, GREY, ORANGE, VERMILION, svg_definition
 
-_APART_S = 0.5  # neighbours show the same trouble
+_APART_S = 0.5  # neighbouring frames show the same problem
 _MOST_WORST = 12
 _WIDTH, _HEIGHT = 330, 170
 _LEFT, _RIGHT, _TOP, _BOTTOM = 30, 8, 20, 26
@@ -19,7 +19,7 @@ _COLORS = (ORANGE, BLUE)  # upper, lower, as the outlines in the pictures
 
 
 def uncovered_percent(tracks: Tracks) -> Array:
-    """Return the mask area left uncovered per frame and row, mean over the used masks [%], shape (F, 2); NaN: none."""
+    """Return the mask area left uncovered per frame and arch, mean over the used masks [%], shape (F, 2); NaN: none."""
     value = np.where(tracks.masks_used, tracks.coverage_error, np.nan)
     known = np.isfinite(value)
     total = np.where(known, value, 0.0).sum(axis=2)
@@ -27,14 +27,14 @@ def uncovered_percent(tracks: Tracks) -> Array:
 
 
 def worst_frames(tracks: Tracks, fps: float) -> list[int]:
-    """Return frame numbers to look at, the worst first, no two within half a second: lost ones, then by coverage."""
+    """Return frames to inspect, the worst first, no two within half a second: lost ones, then by coverage."""
     badness = np.nan_to_num(uncovered_percent(tracks), nan=-1.0).max(axis=1)
     badness = np.where(tracks.tracked(), badness, np.inf)
     apart = max(round(_APART_S * fps), 1)
     found: list[int] = []
-    for row in np.argsort(-badness, kind="stable"):
-        frame = int(tracks.frames[row])
-        if len(found) == _MOST_WORST or badness[row] < 0:
+    for index in np.argsort(-badness, kind="stable"):
+        frame = int(tracks.frames[index])
+        if len(found) == _MOST_WORST or badness[index] < 0:
             break
         if all(abs(frame - other) >= apart for other in found):
             found.append(frame)
@@ -42,39 +42,33 @@ def worst_frames(tracks: Tracks, fps: float) -> list[int]:
 
 
 def frame_words(tracks: Tracks, frame: int) -> str:
-    """Say how the tracking of a frame went, as HTML."""
-    row = int(np.searchsorted(tracks.frames, frame))
-    if row == len(tracks.frames) or tracks.frames[row] != frame:
+    """Return HTML about the tracking of a frame."""
+    index = int(np.searchsorted(tracks.frames, frame))
+    if index == len(tracks.frames) or tracks.frames[index] != frame:
         return "not tracked"
-    percent = uncovered_percent(tracks)[row]
     parts = []
-    for index, name in enumerate(("upper", "lower")):
-        status = _STATUS.get(int(tracks.status[row, index]), "?")
-        area = f", {percent[index]:.2f} % uncovered" if np.isfinite(percent[index]) else ", no mask"
-        parts.append(f'<span style="color:{_COLORS[index]}">&#9632;</span> {name}: {status}{area}')
-    if tracks.prior_aided[row]:
+    for name, color, code, percent in zip(
+        ("upper", "lower"), _COLORS, tracks.status[index], uncovered_percent(tracks)[index], strict=True
+    ):
+        area = f", {percent:.2f} % uncovered" if np.isfinite(percent) else ", no mask"
+        parts.append(f'<span style="color:{color}">&#9632;</span> {name}: {_STATUS.get(int(code), "?")}{area}')
+    if tracks.prior_aided[index]:
         parts.append("the jaw model helped")
     return "<br>".join(parts)
 
 
 class CoveragePlot:
-    """Draw the uncovered area of both rows over the frames, once, and a playhead over it.
+    """Draw the uncovered area of both arches over the frames, once, and a playhead over it.
 
     Attributes:
-        still: HTML that puts the plot, unseen, into the page.
+        definition: HTML that defines the plot, invisibly.
         across: where the axis begins and ends, as shares of the plot's width.
     """
 
     across = (_LEFT / _WIDTH, 1 - _RIGHT / _WIDTH)
 
     def __init__(self, tracks: Tracks, span: tuple[int, int], worst: list[int]) -> None:
-        """Draw.
-
-        Args:
-            tracks: what is plotted.
-            span: first and last frame of the axis.
-            worst: frames to mark.
-        """
+        """Draw tracks over a span of frames and mark the worst ones."""
         self._span = span
         percent = uncovered_percent(tracks)
         self._top = max(float(np.nanmax(percent, initial=0.1)) * 1.08, 0.1)
@@ -96,8 +90,7 @@ class CoveragePlot:
         for frame in worst:
             x = self._x(frame)
             parts.append(f'<path d="M{x:.1f} {_TOP}l-3 -5h6z" fill="{VERMILION}"/>')
-        hidden = 'width="0" height="0" style="position:absolute"'
-        self.still = f'<svg {hidden}><defs><g id="jaw-coverage">{"".join(parts)}</g></defs></svg>'
+        self.definition = svg_definition("jaw-coverage", "".join(parts))
 
     def with_playhead(self, frame: int) -> str:
         """Return the SVG of the plot with a line at the frame shown."""

@@ -1,4 +1,4 @@
-"""What the screen needs of a mesh: fewer triangles, vertices of one cell of a grid become one; and which sides."""
+"""Meshes for a screen: decimation, and which ones need both sides of their faces drawn."""
 
 from __future__ import annotations
 
@@ -10,17 +10,10 @@ _STEPS = 18
 
 
 def for_view(mesh: Mesh, most_faces: int) -> Mesh:
-    """Return a mesh with at most about so many faces, made for looking at only.
+    """Return a mesh decimated to at most `most_faces` faces for display; the mesh itself when it has no more.
 
     Vertex clustering (Rossignac and Borrel, "Multi-resolution 3D approximations for rendering complex scenes", 1993):
     the finest grid that is coarse enough is found by bisection.
-
-    Args:
-        mesh: the mesh [mm].
-        most_faces: how many faces may stay.
-
-    Returns:
-        The mesh itself when it is small enough.
     """
     if len(mesh.faces) <= most_faces:
         return mesh
@@ -37,7 +30,7 @@ def for_view(mesh: Mesh, most_faces: int) -> Mesh:
 
 
 def is_solid(mesh: Mesh) -> bool:
-    """Return whether a mesh encloses a volume with its faces outwards: nobody outside sees one from behind."""
+    """Return whether a mesh is closed with its faces outwards, so that no back face is visible from outside."""
     a, b, c = mesh.faces.T.astype(np.int64)
     starts, ends = np.concatenate([a, b, c]), np.concatenate([b, c, a])
     count = len(mesh.vertices)
@@ -61,7 +54,7 @@ def _clustered(mesh: Mesh, cell_mm: float) -> Mesh:
     faces = owner[mesh.faces]
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
-    # The same three vertices in another order of rotation are the same face; flipped ones are its other side.
+    # Cyclic permutations of three vertices are the same face; flipped ones are its other side.
     first = faces.argmin(axis=1)[:, None]
     turned = np.take_along_axis(faces, (first + np.arange(3)) % 3, axis=1)
     return Mesh(means, np.unique(turned, axis=0), colors)

@@ -9,16 +9,18 @@ from pathlib import Path
 
 import numpy as np
 import viser
+from viser import _messages
 
 from jawusd.errors import FormatError
 from jawusd.formats.keys import load_keys, save_keys
 from jawusd.formats.poses import read_parameters, write_parameters
-from jawusd.viewer.actor import ViewedActor
-from jawusd.viewer.clip import Clip
+from jawusd.viewer.motion import Clip
 from jawusd.viewer.motion_panel import MotionPanel
-from jawusd.viewer.notices import guarded, say
 from jawusd.viewer.session import Session
-from jawusd.viewer.uploads import MOST_BYTES, limit_uploads
+from jawusd.viewer.viewed import ViewedActor
+from jawusd.viewer.widgets import guarded, say
+
+MOST_BYTES = 8 << 20
 
 
 class FilePanel:
@@ -32,15 +34,7 @@ class FilePanel:
         motion: MotionPanel,
         changed: Callable[[], None],
     ) -> None:
-        """Make the widgets in the present container.
-
-        Args:
-            client: the page.
-            session: whose keys are saved and loaded.
-            actor: writes animation layers.
-            motion: has the motion that is exported.
-            changed: called when keys were loaded.
-        """
+        """Make the widgets in the present container; call `changed` after keys were loaded."""
         self._client, self._session, self._actor = client, session, actor
         self._motion, self._changed = motion, changed
         gui = client.gui
@@ -52,11 +46,7 @@ class FilePanel:
             self.overwrite = gui.add_checkbox("overwrite", False)
             gui.add_button("write animation").on_click(guarded(client, self._write))
         gui.add_button("save CSV of d").on_click(guarded(client, self._save_csv))
-        limit_uploads(client, self._refuse)
-
-    def _refuse(self, name: str, size: int) -> None:
-        body = f"{name}: is {size} bytes, at most {MOST_BYTES} are read."
-        say(self._client, "That did not work", body, bad=True)
+        _limit_uploads(client)
 
     async def _save(self, _: object) -> None:
         saved = self._session.saved_keys()
@@ -109,3 +99,31 @@ def _written(write: Callable[[Path], None], name: str) -> bytes:
         path = Path(folder) / name
         write(path)
         return path.read_bytes()
+
+
+def _limit_uploads(client: viser.ClientHandle) -> None:
+    """Drop uploads larger than `MOST_BYTES` while they arrive, and say so once per file.
+
+    viser keeps the parts of an upload until the last one has arrived, without a limit; its handlers run before these.
+    """
+    gui = client.gui
+    pending = gui._current_file_upload_states
+
+    def drop(transfer: str, size: int) -> None:
+        state = pending.pop(transfer, None)
+        if state is not None:
+            body = f"{state['filename']}: is {size} bytes, at most {MOST_BYTES} are read."
+            say(client, "That did not work", body, bad=True)
+
+    async def started(_: int, message: _messages.FileTransferStartUpload) -> None:
+        if message.size_bytes > MOST_BYTES:
+            drop(message.transfer_uuid, message.size_bytes)
+
+    async def part_received(_: int, message: _messages.FileTransferPart) -> None:
+        state = pending.get(message.transfer_uuid)
+        # A page may announce less than it sends.
+        if state is not None and state["transferred_bytes"] > MOST_BYTES:
+            drop(message.transfer_uuid, state["transferred_bytes"])
+
+    gui._websock_interface.register_handler(_messages.FileTransferStartUpload, started)
+    gui._websock_interface.register_handler(_messages.FileTransferPart, part_received)

@@ -1,4 +1,4 @@
-"""The panel that chooses camera and frame, and shows how well the poses cover the masks."""
+"""The panel for camera and frame, with a plot of how well the poses cover the masks."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from collections.abc import Callable
 import viser
 
 from jawusd.viewer.coverage import CoveragePlot, frame_words, worst_frames
-from jawusd.viewer.notices import guarded
-from jawusd.viewer.scrubbing import scrubbed_by_pointer
-from jawusd.viewer.theme import set_theme
-from jawusd.viewer.viewed_capture import Look, ViewedCapture
+from jawusd.viewer.plots import plot_seek
+from jawusd.viewer.viewed import Look, ViewedCapture
+from jawusd.viewer.widgets import Choice, add_dark_checkbox, assign, guarded, small_text
 
 SPACE = "3-D"
 _LOOKS: dict[str, Look] = {"outlines of the teeth": "outlines", "tinted teeth": "tinted", "footage alone": "footage"}
@@ -23,7 +22,7 @@ class FootagePanel:
     Attributes:
         view: name of the camera shown, or `SPACE`.
         frame: frame of the reference camera.
-        worst: frames to look at, the worst first.
+        worst: frames to inspect, the worst first.
     """
 
     def __init__(
@@ -33,14 +32,7 @@ class FootagePanel:
         turned: Callable[[], None],
         changed: Callable[[], None],
     ) -> None:
-        """Make the widgets in the present container.
-
-        Args:
-            client: the page.
-            capture: what is shown.
-            turned: called when another view was chosen.
-            changed: called after every other change.
-        """
+        """Make the widgets in the present container; call `turned` for another view, `changed` for other changes."""
         self._client, self._capture, self._turned, self._changed = client, capture, turned, changed
         self.view = next(iter(capture.sizes_px))
         self.frame = capture.picks.frame if capture.tracks is None and capture.picks else capture.frames[0]
@@ -54,11 +46,10 @@ class FootagePanel:
         self._look.on_update(guarded(client, self._redraw))
         if capture.tracks is not None:
             self._plot = CoveragePlot(capture.tracks, capture.frames, self.worst)
-            gui.add_html(self._plot.still)
+            gui.add_html(self._plot.definition)
         self._playhead = gui.add_html("")
-        # A range of one frame has no way to slide.
-        self.slider = gui.add_slider("frame", capture.frames[0], max(capture.frames[1], capture.frames[0] + 1), 1,
-                                     self.frame)  # fmt: skip
+        first, last = capture.frames
+        self.slider = gui.add_slider("frame", first, max(last, first + 1), 1, self.frame)  # viser needs two values
         self.slider.on_update(guarded(client, self._slide))
         self.steps = gui.add_button_group("step", tuple(_STEPS))
         self.steps.on_click(guarded(client, self._step))
@@ -66,13 +57,12 @@ class FootagePanel:
             self.jumps = gui.add_button_group("worst", ("first", "next worse", "previous"))
             self.jumps.on_click(guarded(client, self._jump))
         self._words = gui.add_html("")
-        dark = gui.add_checkbox("dark page", False)
-        dark.on_update(guarded(client, self._darken))
+        add_dark_checkbox(client)
         self.refresh()
 
     @property
     def in_space(self) -> bool:
-        """Return whether the cameras are looked at from outside."""
+        """Return whether the view shows the cameras from outside."""
         return self.view == SPACE
 
     @property
@@ -88,32 +78,26 @@ class FootagePanel:
         self._changed()
 
     def refresh(self) -> None:
-        """Bring the widgets in line with view and frame."""
-        if self.slider.value != self.frame:
-            self.slider.value = self.frame
+        """Update the widgets from view and frame."""
+        assign(self.slider, self.frame)
         capture = self._capture
         lines = [f"<b>{self.view}</b>, frame {self.frame}"]
         if not self.in_space and (own := self.frame - capture.offsets[self.view]) != self.frame:
             lines[0] += f" (its own frame {own})"
         if capture.tracks is not None:
             drawn = self._plot.with_playhead(self.frame)
-            self._playhead.content = scrubbed_by_pointer(
-                drawn, self._capture.frames, self._plot.across, self.slider._impl.uuid
-            )
+            self._playhead.content = plot_seek(drawn, capture.frames, self._plot.across, self.slider._impl.uuid)
             lines.append(frame_words(capture.tracks, self.frame))
         else:
             lines.append("no tracked poses: build the rig, then name its folder with --tracks")
         if self.frame in self.worst:
             lines.append(f"number {self.worst.index(self.frame) + 1} of the {len(self.worst)} frames to look at")
-        self._words.content = f'<div style="font-size:12px;padding:2px 12px 6px">{"<br>".join(lines)}</div>'
+        self._words.content = small_text("<br>".join(lines), "padding-bottom:6px")
 
-    async def _choose(self, event: viser.GuiEvent) -> None:
+    async def _choose(self, event: Choice) -> None:
         self.view = event.target.value
         self.refresh()
         self._turned()
-
-    async def _darken(self, event: viser.GuiEvent) -> None:
-        set_theme(self._client.gui, event.target.value)
 
     async def _redraw(self, _: object) -> None:
         self._changed()
@@ -121,10 +105,10 @@ class FootagePanel:
     async def _slide(self, _: object) -> None:
         self.go_to(self.slider.value)
 
-    async def _step(self, event: viser.GuiEvent) -> None:
+    async def _step(self, event: Choice) -> None:
         self.go_to(self.frame + _STEPS[event.target.value])
 
-    async def _jump(self, event: viser.GuiEvent) -> None:
+    async def _jump(self, event: Choice) -> None:
         here = self.worst.index(self.frame) if self.frame in self.worst else None
         if event.target.value == "first" or here is None:
             target = 0

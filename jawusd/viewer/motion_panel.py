@@ -1,21 +1,19 @@
-"""The panel of the timeline: keys, curves, playing and scrubbing."""
+"""The timeline panel: keys, curves, playback and seeking."""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from typing import get_args
 
 import viser
 
 from jawusd.errors import FormatError
-from jawusd.viewer import keytrack
-from jawusd.viewer.actor import ViewedActor
-from jawusd.viewer.clip import Clip
-from jawusd.viewer.notices import guarded
-from jawusd.viewer.player import Player
-from jawusd.viewer.plots import Plot, curve_plot, with_playhead
-from jawusd.viewer.scrubbing import scrubbed_by_pointer
-from jawusd.viewer.session import Session
+from jawusd.viewer.motion import Clip, KeyTrack, Player, with_key, without_key
+from jawusd.viewer.plots import Plot, curve_plot, plot_seek, with_playhead
+from jawusd.viewer.session import Interpolation, Session
+from jawusd.viewer.viewed import ViewedActor
+from jawusd.viewer.widgets import Choice, assign, guarded
 
 KEYS = "keys"
 _LENGTH = 100
@@ -23,28 +21,16 @@ _MOST_THUMBS = 40  # more keys than this are moved with the buttons alone
 
 
 class MotionPanel:
-    """Hold the timeline of one page.
-
-    Attributes:
-        frame: the frame shown.
-        player: plays.
-    """
+    """Hold the timeline of one page and the frame it shows."""
 
     def __init__(
         self, client: viser.ClientHandle, session: Session, actor: ViewedActor, changed: Callable[[], None]
     ) -> None:
-        """Make the widgets in the present container.
-
-        Args:
-            client: the page.
-            session: whose keys these are.
-            actor: has motions to load.
-            changed: called after every change of the pose or the keys.
-        """
+        """Make the widgets in the present container; call `changed` after every change of the pose or the keys."""
         self._client, self._session, self._actor, self._changed = client, session, actor, changed
         self._loaded: dict[str, Clip] = {}
         self._copied: tuple[float, float, float] | None = None
-        self._drawn: tuple[object, ...] = ()
+        self._drawn: tuple[str, Clip | None, KeyTrack, Interpolation, float] | None = None
         self.player = Player(self.show, self._stopped)
         gui = client.gui
         self.source = gui.add_dropdown("motion", (KEYS, *actor.clip_names()))
@@ -60,7 +46,7 @@ class MotionPanel:
         self._playhead = gui.add_html("")
         self.thumbs = gui.add_multi_slider("move keys", 0, _LENGTH, 1, (0,), visible=False)
         self.thumbs.on_update(guarded(client, self._drag_keys))
-        self.between = gui.add_dropdown("between keys", ("linear", "smooth"))
+        self.between = gui.add_dropdown("between keys", get_args(Interpolation))
         self.between.on_update(guarded(client, self._interpolate))
         self.fps = gui.add_number("frames per second", session.work.fps, min=1.0, max=1000.0, step=1.0)
         self.fps.on_update(guarded(client, self._rate))
@@ -75,11 +61,11 @@ class MotionPanel:
         """Offer a motion that came from a file of the visitor, and choose it."""
         self._loaded[clip.name] = clip
         self.source.options = tuple(dict.fromkeys((*self.source.options, clip.name)))
-        self.source.value = clip.name
+        assign(self.source, clip.name)
         self._begin(clip)
 
     def offer_clips(self) -> None:
-        """Offer motions that came to lie beside the rig."""
+        """Offer motions that were added beside the rig."""
         self.source.options = tuple(dict.fromkeys((*self.source.options, *self._actor.clip_names())))
 
     def show(self, frame: float) -> None:
@@ -91,10 +77,10 @@ class MotionPanel:
         self._changed()
 
     def refresh(self) -> None:
-        """Bring the widgets in line with session and frame."""
+        """Update the widgets from session and frame."""
         work = self._session.work
         chosen = self.source.value
-        drawn = (chosen, id(self._loaded.get(chosen)), work.keys, work.interpolation, work.fps)
+        drawn = (chosen, self._loaded.get(chosen), work.keys, work.interpolation, work.fps)
         if drawn != self._drawn:
             self._drawn = drawn
             clip = self.clip()
@@ -102,15 +88,15 @@ class MotionPanel:
             self._plot = curve_plot(clip, work.keys if chosen == KEYS else (), span)
             self._curves.content = self._plot.definition()
             self._set_thumbs()
-            self.between.value, self.fps.value = work.interpolation, work.fps
+            assign(self.between, work.interpolation)
+            assign(self.fps, work.fps)
         plot, ends = self._plot, (self._plot.low[0], self._plot.high[0])
-        drawn = with_playhead(plot, self.frame)
-        self._playhead.content = scrubbed_by_pointer(drawn, ends, plot.across, self.frame_slider._impl.uuid)
-        if self.frame_slider.value != round(self.frame):
-            self.frame_slider.value = round(self.frame)
+        svg = with_playhead(plot, self.frame)
+        self._playhead.content = plot_seek(svg, ends, plot.across, self.frame_slider._impl.uuid)
+        assign(self.frame_slider, float(round(self.frame)))
 
     def _set_ends(self, clip: Clip | None) -> tuple[float, float]:
-        """Let the timeline reach over a motion; return its first and last frame."""
+        """Fit the timeline to a motion; return its first and last frame."""
         first, last = (0.0, 0.0) if clip is None else clip.span
         if self.source.value == KEYS:
             first, last = min(first, 0.0), max(last + 25.0, float(_LENGTH))
@@ -124,7 +110,7 @@ class MotionPanel:
         visible = 0 < len(frames) <= _MOST_THUMBS and whole and self.source.value == KEYS
         if visible:
             self.thumbs.min, self.thumbs.max = int(self.frame_slider.min), int(self.frame_slider.max)
-            self.thumbs.value = tuple(int(frame) for frame in frames)
+            assign(self.thumbs, tuple(int(frame) for frame in frames))
         self.thumbs.visible = visible
 
     async def _choose(self, _: object) -> None:
@@ -134,13 +120,13 @@ class MotionPanel:
             try:
                 self._loaded[name] = await asyncio.to_thread(self._actor.load_clip, name)
             except Exception:
-                self.source.value = KEYS
+                assign(self.source, KEYS)
                 raise
-        if self.source.value == name:  # the visitor may have gone on while the file was read
+        if self.source.value == name:  # the visitor may have chosen another one while the file was read
             self._begin(self.clip())
 
     def _begin(self, clip: Clip | None) -> None:
-        self._drawn = ()
+        self._drawn = None
         if clip is None:
             self._changed()
         else:
@@ -164,25 +150,25 @@ class MotionPanel:
     def _stopped(self) -> None:
         self.play.label, self.play.icon = "play", viser.Icon.PLAYER_PLAY
 
-    async def _edit(self, event: viser.GuiEvent) -> None:
+    async def _edit(self, event: Choice) -> None:
         session, frame = self._session, float(round(self.frame))
         self.player.stop()
         if event.target.value == "set":
             session.add_key(frame)
         elif event.target.value == "delete":
-            session.set_keys(keytrack.without_key(session.work.keys, frame))
+            session.set_keys(without_key(session.work.keys, frame))
         elif event.target.value == "copy":
             self._copied = session.work.d
         elif self._copied is None:
             raise FormatError("nothing was copied yet.", hint='Go to a frame and press "copy".')
         else:
-            session.set_keys(keytrack.with_key(session.work.keys, frame, self._copied))
+            session.set_keys(with_key(session.work.keys, frame, self._copied))
             session.show(self._copied)
-        self.source.value = KEYS
+        assign(self.source, KEYS)
         self.frame = frame
         self._changed()
 
-    async def _jump(self, event: viser.GuiEvent) -> None:
+    async def _jump(self, event: Choice) -> None:
         self.player.stop()
         frames = [key.frame for key in self._session.work.keys]
         if event.target.value == "next":

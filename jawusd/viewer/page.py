@@ -1,26 +1,67 @@
-"""One visitor's page: a session of their own, and everything drawn from it."""
+"""One visitor's page of a rig: its session, panels and plots."""
 
 from __future__ import annotations
 
+import numpy as np
 import viser
 
+from jawusd.evaluator import JawRig
 from jawusd.geometry.se3 import transform_point
-from jawusd.viewer.actor import ViewedActor
 from jawusd.viewer.file_panel import FilePanel
 from jawusd.viewer.motion_panel import MotionPanel
-from jawusd.viewer.notices import guarded
-from jawusd.viewer.plot_panel import PlotPanel, StillPlots
-from jawusd.viewer.plots import VERMILION
+from jawusd.viewer.plots import VERMILION, bound_plot, posselt_plot, posselt_point
 from jawusd.viewer.pose_panel import PosePanel
+from jawusd.viewer.readouts import landmark_places, rest_places
 from jawusd.viewer.scene import JawScene
 from jawusd.viewer.session import Session
-from jawusd.viewer.theme import set_theme
+from jawusd.viewer.viewed import ViewedActor
+from jawusd.viewer.widgets import guarded, set_theme, small_text
 
-_PANEL_PX = 350
-_PLACEHOLDER = (
-    f'<div style="font-size:12px;padding:2px 12px;color:{VERMILION}"><b>The mandible is a placeholder, no anatomy:</b> '
-    "the rig was built without its mesh. It shows where the teeth and condyles go, not the bone.</div>"
+_PANEL_PX, _PLOTS_PX = 350, 310
+_PLACEHOLDER = small_text(
+    "<b>The mandible is a placeholder, no anatomy:</b> the rig was built without its mesh. It shows where the teeth "
+    "and condyles go, not the bone.",
+    f"color:{VERMILION}",
 )
+_PLOT_HELP = (
+    '<div style="font-size:11px;opacity:.7;padding:0 12px">blue: bound of this person; dashed: outline of the captured '
+    "poses; grey: captured poses</div>"
+)
+
+
+class StaticPlots:
+    """Draw the static parts of a rig's plots, once for all pages."""
+
+    def __init__(self, rig: JawRig) -> None:
+        """Draw the four plots of a rig."""
+        self.rest = rest_places(rig)
+        self.bounds = {axis: bound_plot(rig, axis) for axis in (1, 2)}
+        self.posselt = {axis: posselt_plot(rig, axis) for axis in (2, 1)}
+
+
+class PlotPanel:
+    """Hold the plots of one page that follow the jaw: bounds and Posselt's figures."""
+
+    def __init__(self, client: viser.ClientHandle, rig: JawRig, static: StaticPlots) -> None:
+        """Make the panel, docked at the left."""
+        self._rig, self._static = rig, static
+        panel = client.gui.add_panel()
+        with panel.add_tab("Bounds and borders"):
+            plots = [*static.bounds.values(), *static.posselt.values()]
+            client.gui.add_html("".join(plot.definition() for plot in plots))
+            self._moving = client.gui.add_html("")
+            client.gui.add_html(_PLOT_HELP)
+        panel.dock_left()
+        panel.set_width(_PLOTS_PX)
+
+    def refresh(self, d: tuple[float, float, float], inside: bool) -> None:
+        """Mark the present pose [mm]."""
+        static, places = self._static, landmark_places(self._rig, np.array(d))
+        parts = [plot.with_point(d[0], d[axis], inside) for axis, plot in static.bounds.items()]
+        parts += [
+            plot.with_point(*posselt_point(places, static.rest, axis), inside) for axis, plot in static.posselt.items()
+        ]
+        self._moving.content = f'<div style="padding:0 6px">{"".join(parts)}</div>'
 
 
 def begin_page(client: viser.ClientHandle, actor: ViewedActor) -> JawScene:
@@ -31,15 +72,9 @@ def begin_page(client: viser.ClientHandle, actor: ViewedActor) -> JawScene:
 
 
 class Page:
-    """Connect a page's widgets with its session.
+    """Connect a page's widgets with its session."""
 
-    Attributes:
-        session: what the visitor does.
-        scene: the jaw in 3-D.
-        pose, motion, files, plots: the panels.
-    """
-
-    def __init__(self, client: viser.ClientHandle, scene: JawScene, actor: ViewedActor, still: StillPlots) -> None:
+    def __init__(self, client: viser.ClientHandle, scene: JawScene, actor: ViewedActor, static: StaticPlots) -> None:
         """Draw the panels beside the jaw that `begin_page` drew."""
         self.client, self.scene = client, scene
         self.session = Session(actor.rig, actor.fps)
@@ -53,14 +88,14 @@ class Page:
             self.motion = MotionPanel(client, self.session, actor, self.refresh)
         with tabs.add_tab("Files"):
             self.files = FilePanel(client, self.session, actor, self.motion, self.refresh)
-        self.plots = PlotPanel(client, actor.rig, still)
+        self.plots = PlotPanel(client, actor.rig, static)
         gui.main_panel.dock_right()
         gui.main_panel.set_width(_PANEL_PX)
         for grip in self.scene.grips:
             grip.on_drag(guarded(client, self._drag))
         self.refresh()
 
-    async def _drag(self, event: viser.SceneNodeDragEvent) -> None:
+    async def _drag(self, event: viser.SceneNodeDragEvent[viser.MeshHandle]) -> None:
         session, scene = self.session, self.scene
         if event.phase == "start":
             self.motion.player.stop()
@@ -77,7 +112,7 @@ class Page:
         self.refresh()
 
     def refresh(self) -> None:
-        """Bring everything in line with the session."""
+        """Update everything from the session."""
         session = self.session
         readout = session.readout()
         with self.client.atomic():
@@ -90,5 +125,5 @@ class Page:
             self.motion.refresh()
 
     def close(self) -> None:
-        """Stop what runs for this page."""
+        """Stop playback."""
         self.motion.player.stop()

@@ -1,4 +1,4 @@
-"""The picks one visitor makes: vertices of the scans with the pixels where cameras see them."""
+"""The picks of one visitor: vertices of the scans with their pixels in the cameras."""
 
 from __future__ import annotations
 
@@ -6,21 +6,15 @@ from dataclasses import dataclass, field
 
 from jawusd.formats.capture import Bootstrap, Pick, PickView
 
-ROWS = ("upper", "lower")
+ARCHES = ("upper", "lower")
 _FEWEST, _FEWEST_VIEWS = 3, 2
 
 
 @dataclass
 class PickDraft:
-    """Hold a pick that may still lack views.
+    """Hold a pick that may still lack views: a vertex of an arch's scan, its pixel (x, y) by camera."""
 
-    Attributes:
-        row: "upper" or "lower".
-        vertex: of its scan.
-        views: pixel (x, y) by camera.
-    """
-
-    row: str
+    arch: str
     vertex: int
     views: dict[str, tuple[float, float]] = field(default_factory=dict)
 
@@ -41,29 +35,24 @@ class PickBook:
         self.selected: int | None = None
         if given is not None:
             self.frame = given.frame
-            for row in ROWS:
-                for pick in getattr(given, row):
-                    self.picks.append(PickDraft(row, pick.vertex, {v.camera: (v.x, v.y) for v in pick.views}))
+            for arch in ARCHES:
+                for pick in getattr(given, arch):
+                    self.picks.append(PickDraft(arch, pick.vertex, {v.camera: (v.x, v.y) for v in pick.views}))
 
     def name(self, number: int) -> str:
-        """Return what a pick is called: U1, U2 .. on the upper row, L1 .. on the lower, as trackers count them."""
-        row = self.picks[number].row
-        return f"{row[0].upper()}{sum(pick.row == row for pick in self.picks[: number + 1])}"
+        """Return the name of a pick: U1, U2 .. on the upper arch, L1 .. on the lower, numbered as in tracking."""
+        arch = self.picks[number].arch
+        return f"{arch[0].upper()}{sum(pick.arch == arch for pick in self.picks[: number + 1])}"
 
-    def add(self, row: str, vertex: int) -> None:
-        """Begin a pick at a vertex, and select it; one that is there already is only selected."""
-        same = [k for k, pick in enumerate(self.picks) if (pick.row, pick.vertex) == (row, vertex)]
+    def add(self, arch: str, vertex: int) -> None:
+        """Select the pick at a vertex, adding it if there is none."""
+        same = [k for k, pick in enumerate(self.picks) if (pick.arch, pick.vertex) == (arch, vertex)]
         if not same:
-            self.picks.append(PickDraft(row, vertex))
+            self.picks.append(PickDraft(arch, vertex))
         self.selected = same[0] if same else len(self.picks) - 1
 
     def see(self, camera: str, frame: int, pixel: tuple[float, float]) -> None:
-        """Say where the selected pick is seen, and select the next one that this camera has not seen.
-
-        Args:
-            camera: its name.
-            frame: of the reference camera.
-            pixel: x and y in the recorded picture [px].
+        """Set the selected pick's pixel (x, y) in a camera, and select the next pick without one in this camera.
 
         Raises:
             ValueError: no pick is selected, or the pixels of the others belong to another frame.
@@ -84,11 +73,11 @@ class PickBook:
         self.selected = next((k for k in rest if camera not in self.picks[k].views), self.selected)
 
     def turn_to(self, camera: str) -> None:
-        """Select the first pick that a camera has not seen, if there is one."""
+        """Select the first pick without a pixel in a camera, if there is one."""
         self.selected = next((k for k, pick in enumerate(self.picks) if camera not in pick.views), self.selected)
 
     def forget_view(self, camera: str) -> None:
-        """Take the selected pick's pixel in a camera away."""
+        """Remove the selected pick's pixel in a camera."""
         if self.selected is not None:
             self.picks[self.selected].views.pop(camera, None)
 
@@ -106,11 +95,11 @@ class PickBook:
         self.picks, self.frame, self.selected = [], None, None
 
     def lacks(self) -> str:
-        """Say in a few words what is missing before the picks can be written; "" when nothing is."""
-        for row in ROWS:
-            whole = sum(len(pick.views) >= _FEWEST_VIEWS for pick in self.picks if pick.row == row)
+        """Return a few words about what is missing before the picks can be written; "" when nothing is."""
+        for arch in ARCHES:
+            whole = sum(len(pick.views) >= _FEWEST_VIEWS for pick in self.picks if pick.arch == arch)
             if whole < _FEWEST:
-                return f"{row} teeth: {whole} picks in {_FEWEST_VIEWS} cameras, at least {_FEWEST} are needed"
+                return f"{arch} teeth: {whole} picks in {_FEWEST_VIEWS} cameras, at least {_FEWEST} are needed"
         for number, pick in enumerate(self.picks):
             if len(pick.views) < _FEWEST_VIEWS:
                 return f"{self.name(number)} is seen by {len(pick.views)} camera, {_FEWEST_VIEWS} are needed"
@@ -125,8 +114,8 @@ class PickBook:
         lacking = self.lacks()
         if lacking or self.frame is None:
             raise ValueError(f"{lacking}: the picks cannot be written yet")
-        rows = {row: tuple(_finished(pick) for pick in self.picks if pick.row == row) for row in ROWS}
-        return Bootstrap(frame=self.frame, **rows)
+        upper, lower = (tuple(_finished(pick) for pick in self.picks if pick.arch == arch) for arch in ARCHES)
+        return Bootstrap(frame=self.frame, upper=upper, lower=lower)
 
 
 def _finished(pick: PickDraft) -> Pick:

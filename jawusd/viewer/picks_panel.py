@@ -8,15 +8,15 @@ from collections.abc import Callable
 import viser
 
 from jawusd.viewer.footage_panel import FootagePanel
-from jawusd.viewer.light_table import SIDES
-from jawusd.viewer.notices import guarded, say
+from jawusd.viewer.picking_layout import SIDES
 from jawusd.viewer.picks import PickBook
-from jawusd.viewer.viewed_capture import ViewedCapture
+from jawusd.viewer.viewed import ViewedCapture
+from jawusd.viewer.widgets import Choice, assign, guarded, say, small_text
 
 _NONE = "none"
 _HELP = (
     "Click a vertex on a scan, then the same place in the picture of two or more cameras, all at one frame. Three or "
-    "more of each row, spread over the arch: front teeth and both sides. Wheel: zoom; right button: move."
+    "more of each arch, spread over it: front teeth and both sides. Wheel: zoom; right button: move."
 )
 
 
@@ -25,7 +25,7 @@ class PicksPanel:
 
     Attributes:
         book: the picks.
-        side: what the scans before the picture show, one of `light_table.SIDES`.
+        side: that the scans in front of the picture show, one of `picking_layout.SIDES`.
     """
 
     def __init__(
@@ -36,22 +36,14 @@ class PicksPanel:
         turned: Callable[[], None],
         changed: Callable[[], None],
     ) -> None:
-        """Make the widgets in the present container.
-
-        Args:
-            client: the page.
-            capture: where picks come from and go to.
-            footage: says which camera and frame are seen.
-            turned: called when things lie elsewhere.
-            changed: called after every change of the picks.
-        """
+        """Make the widgets in the present container; call `turned` for another side, `changed` for other picks."""
         self._client, self._capture, self._footage = client, capture, footage
         self._turned, self._changed = turned, changed
         self.book, self.side = PickBook(capture.picks), "front"
         self._saved = capture.picks
         self._fit = ""
         gui = client.gui
-        gui.add_html(f'<div style="font-size:12px;padding:2px 12px">{_HELP}</div>')
+        gui.add_html(small_text(_HELP))
         self.picking = gui.add_checkbox("clicks set picks", capture.tracks is None)
         self.picking.on_update(guarded(client, self._turn))
         self.sides = gui.add_button_group("scans", tuple(SIDES))
@@ -68,32 +60,30 @@ class PicksPanel:
         self.refresh()
 
     def say_fit(self, words: str) -> None:
-        """Say how well the picks agree."""
+        """Show a sentence about how well the picks agree."""
         self._fit = words
         self.refresh()
 
     def refresh(self) -> None:
-        """Bring the widgets in line with the picks."""
+        """Update the widgets from the picks."""
         book = self.book
         names = tuple(book.name(k) for k in range(len(book.picks)))
         if self.chosen.options != (_NONE, *names):
             self.chosen.options = (_NONE, *names)
-        value = _NONE if book.selected is None else names[book.selected]
-        if self.chosen.value != value:
-            self.chosen.value = value
-        rows = [f"frame {book.frame}" if book.frame is not None else "no pixels yet"]
+        assign(self.chosen, _NONE if book.selected is None else names[book.selected])
+        lines = [f"frame {book.frame}" if book.frame is not None else "no pixels yet"]
         for number, pick in enumerate(book.picks):
             text = f"{names[number]}, vertex {pick.vertex}: {', '.join(pick.views) or 'no pixels yet'}"
-            rows.append(f"<b>{text}</b>" if number == book.selected else text)
-        rows.append(book.lacks() or "complete")
+            lines.append(f"<b>{text}</b>" if number == book.selected else text)
+        lines.append(book.lacks() or "complete")
         if self._fit:
-            rows.append(self._fit)
-        self._list.content = f'<div style="font-size:12px;padding:2px 12px">{"<br>".join(rows)}</div>'
+            lines.append(self._fit)
+        self._list.content = small_text("<br>".join(lines))
 
     async def _turn(self, _: object) -> None:
         self._turned()
 
-    async def _choose_side(self, event: viser.GuiEvent) -> None:
+    async def _choose_side(self, event: Choice) -> None:
         self.side = event.target.value
         self._turned()
 
@@ -102,7 +92,7 @@ class PicksPanel:
         self.book.selected = None if number < 0 else number
         self._changed()
 
-    async def _take_away(self, event: viser.GuiEvent) -> None:
+    async def _take_away(self, event: Choice) -> None:
         if event.target.value == "pixel":
             self.book.forget_view(self._footage.view)
         elif event.target.value == "pick":

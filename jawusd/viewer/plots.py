@@ -1,23 +1,22 @@
 """Plots as SVG text: the bounds, Posselt's figures and the curves of an animation.
 
-The still part of a plot is sent once and has an id; what moves refers to it (`<use>`), so that following the jaw costs
-a few hundred bytes. Text takes the page's colour and reads on light and dark.
+The static part of a plot is sent once and has an id; the moving part refers to it (`<use>`), so that an update takes a
+few hundred bytes. Text has the page's colour and is legible on light and dark pages.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 
 from jawusd.evaluator import JawRig
 from jawusd.geometry.arrays import Array
-from jawusd.viewer.clip import Clip
-from jawusd.viewer.keytrack import KeyTrack
-from jawusd.viewer.readouts import INCISOR, border_path, landmark_places, rest_places
+from jawusd.viewer.motion import Clip, KeyTrack
+from jawusd.viewer.readouts import INCISOR, border_path, captured_d, landmark_places, rest_places
 
-# Okabe and Ito's colours, told apart by everybody; those of the jaw in 3-D too.
+# Okabe and Ito's palette for all kinds of colour vision, also used for the jaw in 3-D.
 BLUE, ORANGE, GREEN, VERMILION, GREY = "#0072b2", "#e69f00", "#009e73", "#d55e00", "#888888"
 CURVE_COLORS = (BLUE, VERMILION, GREEN)
 
@@ -30,25 +29,24 @@ _TEXT = 'font-family="sans-serif" font-size="11" fill="currentColor"'
 
 @dataclass(frozen=True)
 class Plot:
-    """Hold a plot whose still part is drawn.
+    """Hold a plot whose static part is drawn.
 
     Attributes:
-        name: id of the still part in the page.
-        still: SVG of axes, outlines and points.
+        name: id of the static part in the page.
+        static: SVG of axes, outlines and points.
         low, high: corners of the plotted area in data.
         across: where the plotted area begins and ends, as shares of the plot's width.
     """
 
     name: str
-    still: str
+    static: str
     low: tuple[float, float]
     high: tuple[float, float]
     across: ClassVar[tuple[float, float]] = (_LEFT / _WIDTH, 1 - _RIGHT / _WIDTH)
 
     def definition(self) -> str:
-        """Return the HTML that puts the still part, unseen, into the page; once."""
-        hidden = 'width="0" height="0" style="position:absolute"'
-        return f'<svg {hidden}><defs><g id="{self.name}">{self.still}</g></defs></svg>'
+        """Return the HTML that defines the static part, invisibly; once per page."""
+        return svg_definition(self.name, self.static)
 
     def with_point(self, x: float, y: float, inside: bool) -> str:
         """Return the SVG of the plot with the present pose marked."""
@@ -58,17 +56,12 @@ class Plot:
 
 
 def bound_plot(rig: JawRig, axis: int) -> Plot:
-    """Draw the paper's outline and the slice bound in the plane of d1 and another parameter, with captured poses.
-
-    Args:
-        rig: the rig.
-        axis: 1 for d2, 2 for d3.
-    """
+    """Draw the paper's outline, the slice bound and captured poses in the plane of d1 and d2 (axis 1) or d3 (2)."""
     name = ("", "d1d2", "d1d3")[axis]
     corners = rig.arrays[f"polygon_{name}"]
     rings = np.split(corners, np.cumsum(rig.arrays[f"polygon_{name}_counts"])[:-1].astype(int))
     border = border_path(rig, axis)[:, [0, axis]]
-    captured = _thinned(rig.arrays["codes"][:, [0, axis]])
+    captured = _thinned(captured_d(rig)[:, [0, axis]])
     title = ("", "lateral d2 over opening d1", "protrusion d3 over opening d1")[axis]
     plot = _framed(f"jaw-{name}", np.vstack([corners, border, captured]), title, "opening d1 [mm]", "mm")
     parts = [_dots(plot, captured), *(_ring(plot, ring, GREY, "4 3") for ring in rings), _ring(plot, border, BLUE)]
@@ -76,16 +69,15 @@ def bound_plot(rig: JawRig, axis: int) -> Plot:
 
 
 def posselt_plot(rig: JawRig, axis: int) -> Plot:
-    """Draw Posselt's figure: where the lower incisal point can go, seen from the side or the front.
+    """Draw Posselt's figure, the border movements of the lower incisal point.
 
     Args:
-        rig: the rig.
         axis: 1 frontal (x is lateral, d3 = 0), 2 sagittal (x is forward, d2 = 0).
     """
     origin = rest_places(rig)[INCISOR]
     columns = [0, 1] if axis == 1 else [2, 1]
     border = (landmark_places(rig, border_path(rig, axis))[:, INCISOR] - origin)[:, columns]
-    captured = (landmark_places(rig, _thinned(rig.arrays["codes"]))[:, INCISOR] - origin)[:, columns]
+    captured = (landmark_places(rig, _thinned(captured_d(rig)))[:, INCISOR] - origin)[:, columns]
     name, title, label = (
         ("jaw-frontal", "Posselt, frontal: up over left", "to the subject's left [mm]"),
         ("jaw-sagittal", "Posselt, sagittal: up over forward", "forward [mm]"),
@@ -95,7 +87,7 @@ def posselt_plot(rig: JawRig, axis: int) -> Plot:
 
 
 def posselt_point(places: Array, rest: Array, axis: int) -> tuple[float, float]:
-    """Return where landmark places (5, 3) lie in Posselt's figure `axis`, given those at rest [mm]."""
+    """Return the point of landmark places (5, 3) in Posselt's figure `axis`, given those at rest [mm]."""
     moved = places[INCISOR] - rest[INCISOR]
     return float(moved[0 if axis == 1 else 2]), float(moved[1])
 
@@ -129,6 +121,36 @@ def with_playhead(plot: Plot, frame: float) -> str:
     px = _place(plot, np.array([[frame, plot.low[1]]]))[0, 0]
     line = f'<path d="M{px:.1f} {_TOP}V{_HEIGHT - _BOTTOM}" stroke="{ORANGE}" stroke-width="2"/>'
     return _svg(f'<use href="#{plot.name}"/>{line}')
+
+
+def plot_seek(drawn: str, ends: tuple[float, float], across: tuple[float, float], slider: str) -> str:
+    """Return the HTML of a drawn plot in which a click or drag sets a frame slider to the frame under the pointer.
+
+    viser does not report clicks in a plot, so the page does what typing in the slider's box does.
+
+    Args:
+        drawn: SVG of the plot, one element.
+        ends: first and last frame of its axis.
+        across: their positions, as shares of the plot's width.
+        slider: id of the slider in the page.
+    """
+    low, high = across
+    share = f"((event.clientX-r.left)/r.width-{low:.5f})/{high - low:.5f}"
+    box = f"document.getElementById('{slider}').parentElement.querySelector('input:not([type=hidden])')"
+    script = (
+        f"if(event.buttons&1){{const b={box},"
+        f"r=this.firstElementChild.getBoundingClientRect(),s=Math.min(1,Math.max(0,{share}));"
+        "Object.getOwnPropertyDescriptor(HTMLInputElement.prototype,'value').set.call(b,"
+        f"Math.round({ends[0]:g}+s*{ends[1] - ends[0]:g}));"
+        "b.dispatchEvent(new Event('input',{bubbles:true}))}"
+    )
+    style = "padding:0 6px;cursor:col-resize;touch-action:none;user-select:none"
+    return f'<div style="{style}" onpointerdown="{script}" onpointermove="{script}">{drawn}</div>'
+
+
+def svg_definition(name: str, content: str) -> str:
+    """Return HTML that defines SVG content under an id without showing it."""
+    return f'<svg width="0" height="0" style="position:absolute"><defs><g id="{name}">{content}</g></defs></svg>'
 
 
 def _svg(content: str) -> str:
@@ -168,11 +190,11 @@ def _framed(name: str, data: Array, title: str, x_label: str, y_label: str, pad_
         py = _place(plot, np.array([[low[0], tick]]))[0, 1]
         parts.append(f'<text x="{_LEFT - 4}" y="{py + 4:.1f}" text-anchor="end" {_TEXT}>{tick:g}</text>')
         parts.append(f'<path d="M{_LEFT} {py:.1f}h{area[0]}" stroke="{GREY}" stroke-opacity=".25"/>')
-    return Plot(name, "".join(parts), plot.low, plot.high)
+    return _drawn(plot, parts)
 
 
 def _drawn(plot: Plot, parts: list[str]) -> Plot:
-    return Plot(plot.name, plot.still + "".join(parts), plot.low, plot.high)
+    return replace(plot, static=plot.static + "".join(parts))
 
 
 def _ticks(low: float, high: float) -> list[float]:

@@ -1,4 +1,4 @@
-"""The panel that poses the jaw: sliders with live ends, read-outs, pins, undo, views."""
+"""The panel that poses the jaw: sliders with limits that follow the pose, read-outs, pins, undo, views."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from collections.abc import Callable
 import viser
 
 from jawusd.geometry import LANDMARKS
-from jawusd.viewer.notices import guarded
+from jawusd.geometry.arrays import Array
 from jawusd.viewer.plots import GREEN, VERMILION
 from jawusd.viewer.readouts import Readout
 from jawusd.viewer.scene import PRESETS, JawScene
 from jawusd.viewer.session import Session
-from jawusd.viewer.theme import set_theme
+from jawusd.viewer.widgets import Choice, add_dark_checkbox, assign, guarded, small_text
 
 STEP_MM = 0.01
 LABELS = ("d1 opening", "d2 to the left", "d3 forward")
@@ -28,23 +28,12 @@ _PINNABLE = tuple(name for name in LANDMARKS if not name.startswith("molar"))
 
 
 class PosePanel:
-    """Hold the widgets that pose the jaw.
-
-    Attributes:
-        sliders: of d1, d2, d3 [mm].
-    """
+    """Hold the widgets that pose the jaw; `sliders` are those of d1, d2, d3 [mm]."""
 
     def __init__(
         self, client: viser.ClientHandle, session: Session, scene: JawScene, changed: Callable[[], None]
     ) -> None:
-        """Make the widgets in the present container.
-
-        Args:
-            client: the page.
-            session: what the widgets change.
-            scene: where the camera is.
-            changed: called after every change.
-        """
+        """Make the widgets in the present container; call `changed` after every change."""
         self._client, self._session, self._scene, self._changed = client, session, scene, changed
         gui = client.gui
         self.sliders = [self._add_slider(index, label) for index, label in enumerate(LABELS)]
@@ -60,8 +49,7 @@ class PosePanel:
             views.on_click(guarded(client, self._look))
             paths = gui.add_checkbox("paths and captured places", True)
             paths.on_update(guarded(client, self._show_paths))
-            dark = gui.add_checkbox("dark page", False)
-            dark.on_update(guarded(client, self._darken))
+            add_dark_checkbox(client)
         undo = gui.add_command("Undo", hotkey="Z", modifier="cmd/ctrl")
         undo.on_trigger(guarded(client, self._undo))
 
@@ -89,7 +77,7 @@ class PosePanel:
         self._session.set_keep_valid(self.keep_valid.value)
         self._changed()
 
-    async def _step(self, event: viser.GuiEvent) -> None:
+    async def _step(self, event: Choice) -> None:
         if event.target.value == "undo":
             self._session.undo()
         elif event.target.value == "redo":
@@ -102,17 +90,14 @@ class PosePanel:
         self._session.undo()
         self._changed()
 
-    async def _look(self, event: viser.GuiEvent) -> None:
+    async def _look(self, event: Choice) -> None:
         self._scene.look(event.target.value)
 
-    async def _show_paths(self, event: viser.GuiEvent) -> None:
+    async def _show_paths(self, event: viser.GuiEvent[viser.GuiCheckboxHandle]) -> None:
         self._scene.show_paths(event.target.value)
 
-    async def _darken(self, event: viser.GuiEvent) -> None:
-        set_theme(self._client.gui, event.target.value)
-
     def refresh(self, readout: Readout) -> None:
-        """Bring sliders, pins and numbers in line with the session."""
+        """Update sliders, pins and numbers from the session."""
         session = self._session
         limits = session.limits()
         ends = slider_ends(limits, session.rig.arrays["d_range"], session.keep_valid)
@@ -121,36 +106,33 @@ class PosePanel:
             if (slider.min, slider.max) != (low, high):
                 slider.min, slider.max = low, high
             if abs(slider.value - value) > 0.5 * STEP_MM:
-                slider.value = value
+                assign(slider, value)
         for name, box in self.pins.items():
-            box.value = any(pin.name == name for pin in session.work.pins)
+            assign(box, any(pin.name == name for pin in session.work.pins))
         self.reading.content = reading_html(readout, session.work.d, limits)
 
 
-def slider_ends(limits: object, d_range: object, keep_valid: bool) -> list[tuple[float, float]]:
+def slider_ends(limits: Array, d_range: Array, keep_valid: bool) -> list[tuple[float, float]]:
     """Return low and high end of the three sliders [mm].
 
     Args:
         limits: valid ends at the present pose, shape (3, 2) [mm].
         d_range: ends of the rig as a whole, shape (3, 2) [mm].
-        keep_valid: whether sliders stay inside; their ends are then rounded inwards to the step of the sliders.
+        keep_valid: use `limits`, rounded inwards to the step of the sliders, instead of a widened `d_range`.
     """
     if keep_valid:
-        return [
-            (_outwards(low, 1), _outwards(high, -1))  # towards each other
-            for low, high in limits
-        ]
+        return [(_outwards(low, 1), _outwards(high, -1)) for low, high in limits]
     beyond = [(low - _BEYOND * (high - low), high + _BEYOND * (high - low)) for low, high in d_range]
     return [(_outwards(low, -1), _outwards(high, 1)) for low, high in beyond]
 
 
 def _outwards(value: float, sign: int) -> float:
-    """Return a value rounded down or up to the step of the sliders, but for the noise of computing."""
+    """Return a value rounded down (sign -1) or up (1) to the step of the sliders, up to rounding noise."""
     return round(sign * math.ceil(sign * value / STEP_MM - 1e-6) * STEP_MM, 6)
 
 
-def reading_html(readout: Readout, d: tuple[float, float, float], limits: object) -> str:
-    """Return the numbers of a pose as HTML; the verdict in colour and in words."""
+def reading_html(readout: Readout, d: tuple[float, float, float], limits: Array) -> str:
+    """Return the numbers of a pose and its verdict as HTML."""
     color, verdict = (GREEN, "valid") if readout.inside else (VERMILION, "OUTSIDE the bound")
     captured = f"{readout.captured_mm:.2f} mm" if math.isfinite(readout.captured_mm) else "nothing captured"
     rows = [
@@ -169,7 +151,7 @@ def reading_html(readout: Readout, d: tuple[float, float, float], limits: object
     )
     head = f'<div style="color:{color};font-weight:bold">&#9679; {verdict}</div>'
     foot = '<div style="opacity:.6">L, D, F: to the left, down, forward [mm]</div>'
-    return f'<div style="font-size:12px;padding:2px 12px;line-height:1.35">{head}<table>{cells}</table>{foot}</div>'
+    return small_text(f"{head}<table>{cells}</table>{foot}", "line-height:1.35")
 
 
 def _plain(value: float) -> str:

@@ -1,4 +1,4 @@
-"""What a pose of the jaw means in a clinic's numbers, and the paths that landmarks take."""
+"""A pose of the jaw in clinical measures, and the paths of landmarks."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import transform_points
 
 INCISOR, CONDYLES = LANDMARKS.index("incisor"), (LANDMARKS.index("condyle_left"), LANDMARKS.index("condyle_right"))
-# A margin this little below zero is rounding: `ranges` and `ik` end on the bound itself.
+# Margins this little below zero are rounding errors: `ranges` and `ik` end on the bound itself.
 ON_BOUND_MM = 1e-6
 
 
@@ -21,8 +21,8 @@ class Readout:
     """Hold what is shown of one pose.
 
     Attributes:
-        opening_mm, lateral_mm, protrusion_mm: how far the incisal point went down, to the subject's left and forward.
-        condyle_left_mm, condyle_right_mm: how far the condyle centres went left, up and forward.
+        opening_mm, lateral_mm, protrusion_mm: displacement of the incisal point down, to the subject's left, forward.
+        condyle_left_mm, condyle_right_mm: displacement of the condyle centres to the left, up and forward.
         margin_mm: signed distance to the bound, > 0 inside.
         captured_mm: distance in d to the nearest captured pose; infinite without any.
         inside: the pose is valid.
@@ -39,13 +39,13 @@ class Readout:
 
 
 def landmark_places(rig: JawRig, d: Array) -> Array:
-    """Return where the landmarks are, anatomical frame [mm], shape (..., 5, 3), for d (..., 3) [mm]."""
+    """Return the landmarks, anatomical frame [mm], shape (..., 5, 3), for d (..., 3) [mm]."""
     T = rig.arrays["T_anatomical_skull"] @ rig.pose(d)
     return transform_points(T, rig.arrays["landmarks"])
 
 
 def rest_places(rig: JawRig) -> Array:
-    """Return where the landmarks are in the closed bite, anatomical frame [mm], shape (5, 3)."""
+    """Return the landmarks in the closed bite, anatomical frame [mm], shape (5, 3)."""
     T = rig.arrays["T_anatomical_skull"] @ rig.arrays["T_rest"]
     return transform_points(T, rig.arrays["landmarks"])
 
@@ -55,29 +55,31 @@ def read_out(rig: JawRig, d: Array) -> Readout:
     moved = landmark_places(rig, d) - rest_places(rig)
     lateral, up, forward = moved[INCISOR].tolist()
     margin = float(rig.margin(d))
-    left, right = (tuple(moved[index].tolist()) for index in CONDYLES)
+    left, right = (triple(moved[index]) for index in CONDYLES)
     captured = float(rig.captured_distance(d))
     return Readout(-up, lateral, forward, left, right, margin, captured, margin >= -ON_BOUND_MM)
 
 
+def triple(values: Array) -> tuple[float, float, float]:
+    """Return an array of three as floats."""
+    x, y, z = values.tolist()
+    return x, y, z
+
+
+def captured_d(rig: JawRig) -> Array:
+    """Return the parameters of the captured poses that a rig holds [mm], shape (N, 3)."""
+    return rig.arrays["codes"]
+
+
 def habitual_path(rig: JawRig, samples: int = 60) -> Array:
-    """Return the places of the landmarks along plain opening, anatomical frame [mm], shape (samples, 5, 3)."""
+    """Return the landmarks along plain opening (d2 = d3 = 0), anatomical frame [mm], shape (samples, 5, 3)."""
     opening = np.linspace(0.0, float(rig.arrays["d_range"][0, 1]), samples)
     return landmark_places(rig, np.stack([opening, np.zeros(samples), np.zeros(samples)], axis=1))
 
 
 def border_path(rig: JawRig, axis: int, samples: int = 40) -> Array:
-    """Return a ring of parameters [mm] on the bound in the plane of d1 and another one.
-
-    Args:
-        rig: the rig.
-        axis: 1 for d2, 2 for d3; the third parameter is 0.
-        samples: openings per side.
-
-    Returns:
-        Shape (n, 3), down one side and up the other.
-    """
-    # denser at both ends, where the bound closes
+    """Return a ring of parameters (n, 3) [mm] on the bound in the plane of d1 and d2 (axis 1) or d3 (axis 2)."""
+    # Samples are denser at both ends, where the bound closes.
     low, high = rig.arrays["d_range"][0]
     opening = low + (high - low) * 0.5 * (1.0 - np.cos(np.linspace(0.0, np.pi, samples)))
     ends = rig.ranges(opening)

@@ -1,4 +1,4 @@
-"""The jaw in 3-D: meshes, paths, markers and where the camera stands. World of the page: anatomical frame, mm."""
+"""The jaw in 3-D: meshes, paths, markers and the camera. World of the page: anatomical frame, mm."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from jawusd.geometry import LANDMARKS
 from jawusd.geometry.arrays import Array
 from jawusd.geometry.quaternion import wxyz_from_matrix
 from jawusd.geometry.se3 import se3_inverse, transform_point, transform_points
-from jawusd.viewer.actor import MOVING, STILL, ViewedActor
 from jawusd.viewer.decimate import is_solid
-from jawusd.viewer.readouts import CONDYLES, INCISOR, habitual_path, landmark_places, rest_places
+from jawusd.viewer.readouts import CONDYLES, INCISOR, captured_d, habitual_path, landmark_places, rest_places
+from jawusd.viewer.viewed import MOVING, STILL, ViewedActor
 
 Color = tuple[int, int, int]
 
 _ENAMEL, _GUM, _BONE = (236, 229, 212), (196, 112, 108), (222, 207, 178)
 _COLORS = {"upper_teeth": _ENAMEL, "lower_teeth": _ENAMEL, "upper_gum": _GUM, "lower_gum": _GUM}
 _OUTSIDE: Color = (222, 120, 90)
-_PLACEHOLDER: Color = (150, 158, 168)  # no anatomy: not the colour of bone, and seen through
-_CLEAR = 0.45  # opacity of a mandible that is seen through
+_PLACEHOLDER: Color = (150, 158, 168)  # not anatomy: not the colour of bone, and translucent
+_CLEAR = 0.45  # opacity of a translucent mandible
 _INCISOR, _CONDYLE, _PIN, _HELD = (0, 114, 178), (0, 158, 115), (230, 159, 0), (213, 94, 0)
 _SKULL_OPACITY = 0.28
 _GROUND: Color = (196, 190, 186)
 _AMBIENT = 1.6
 _MARKER_MM, _PIN_MM = 1.2, 2.2
-_BALL = 2  # subdivisions of a marker: 320 faces look round at its size
+_BALL = 2  # subdivisions of a marker (320 faces)
 _CAPTURED_MM, _MOST_CAPTURED = 0.5, 400
 
-#: Views by name: where the camera stands from what it looks at, in anatomical axes [mm].
+#: Views by name: from the target to the camera, in anatomical axes [mm].
 PRESETS = {
     "front": (0.0, 10.0, 330.0),
     "left": (330.0, 10.0, 0.0),
@@ -43,20 +43,16 @@ _FOV_RAD, _NEAR_MM, _FAR_MM = 0.6, 1.0, 5000.0
 
 
 class JawScene:
-    """Draw the jaw for one page.
-
-    Attributes:
-        grips: the meshes that can be taken hold of.
-    """
+    """Draw the jaw for one page; `grips` are the meshes that can be dragged."""
 
     def __init__(self, client: viser.ClientHandle, actor: ViewedActor) -> None:
-        """Draw everything that stands still and the jaw in the closed bite."""
+        """Draw the skull side and the jaw in the closed bite."""
         self._client, self._scene = client, client.scene
         rig = actor.rig
         self._T_world_skull = np.array(rig.arrays["T_anatomical_skull"])
         self._rest = rest_places(rig)
         self._scene.configure_default_lights(cast_shadow=False)
-        # Lit from everywhere: pictures of surroundings take half the time of a frame where no graphics card draws.
+        # Hemisphere light: an environment map takes half of a frame's time on machines without a graphics card.
         self._scene.configure_environment_map(None)
         self._scene.add_light_hemisphere("/light", ground_color=_GROUND, intensity=_AMBIENT)
         for name in STILL:
@@ -96,18 +92,23 @@ class JawScene:
         for name, place in zip(LANDMARKS, landmarks, strict=True):
             color = _CONDYLE if name.startswith("condyle") else _INCISOR
             if not name.startswith("molar"):
-                self._ball(f"/jaw/{name}", _MARKER_MM, color, position=tuple(place))
+                self._ball(f"/jaw/{name}", _MARKER_MM, color, place)
 
-    def _ball(self, name: str, radius_mm: float, color: Color, **more: object) -> viser.IcosphereHandle:
-        return self._scene.add_icosphere(name, radius=radius_mm, color=color, subdivisions=_BALL, **more)
+    def _ball(
+        self, name: str, radius_mm: float, color: Color, place: Array | None = None, opacity: float | None = None
+    ) -> viser.IcosphereHandle:
+        position = (0.0, 0.0, 0.0) if place is None else place
+        return self._scene.add_icosphere(
+            name, radius=radius_mm, color=color, subdivisions=_BALL, opacity=opacity, position=position
+        )
 
     def _lines(self, name: str, ends: Array, color: Color) -> viser.LineSegmentsHandle:
         return self._scene.add_line_segments(name, ends, colors=color, thickness=2.5, thickness_units="screen")
 
     def _add_paths(self, actor: ViewedActor) -> list[viser.SceneNodeHandle]:
-        """Draw the paths of incisal point and condyles in plain opening, and where they were in the capture."""
-        codes = actor.rig.arrays["codes"]
-        captured = landmark_places(actor.rig, codes[:: max(1, -(-len(codes) // _MOST_CAPTURED))])
+        """Draw the paths of incisal point and condyles in plain opening, and their captured places."""
+        d = captured_d(actor.rig)
+        captured = landmark_places(actor.rig, d[:: max(1, -(-len(d) // _MOST_CAPTURED))])
         path = habitual_path(actor.rig)
         handles: list[viser.SceneNodeHandle] = []
         for index in (INCISOR, *CONDYLES):
@@ -133,7 +134,7 @@ class JawScene:
             handle.visible = visible
 
     def move(self, T_skull_mandible: Array, inside: bool) -> None:
-        """Put the mandible where it belongs, in another colour when the pose is not valid."""
+        """Pose the mandible, in another colour when the pose is not valid."""
         T = self._T_world_skull @ T_skull_mandible
         with self._client.atomic():
             self._jaw.position = tuple(T[:3, 3])
@@ -165,7 +166,7 @@ class JawScene:
         return transform_point(se3_inverse(self._T_world_skull), np.array(position))
 
     def look(self, preset: str) -> None:
-        """Put the camera where a preset says; in a close-up the condyle's path shows through the mandible."""
+        """Move the camera to a preset; in a close-up the condyle's path shows through the mandible."""
         target, eye = preset_view(self._rest, preset)
         camera = self._client.camera
         if self._mandible is not None and self._bone != _PLACEHOLDER:
@@ -175,12 +176,12 @@ class JawScene:
 
 
 def _side(mesh: Mesh) -> Literal["front", "double"]:
-    """Return which sides of faces are drawn: both cost twice as much, and only open meshes show the other one."""
+    """Return which sides of faces are drawn: both cost twice as much and are needed for open meshes only."""
     return "front" if is_solid(mesh) else "double"
 
 
 def preset_view(rest: Array, preset: str) -> tuple[Array, Array]:
-    """Return what a preset looks at and from where, shape (3,) each [mm], given the landmarks (5, 3) at rest."""
+    """Return target (3,) and eye (3,) of a preset [mm], given the landmarks (5, 3) at rest."""
     target = rest[list(CONDYLES) + [INCISOR]].mean(axis=0)
     if preset.startswith("condyle"):
         target = rest[CONDYLES[0] if preset.endswith("left") else CONDYLES[1]]
@@ -188,7 +189,7 @@ def preset_view(rest: Array, preset: str) -> tuple[Array, Array]:
 
 
 def set_first_view(server: viser.ViserServer, rest: Array, preset: str = "front") -> None:
-    """Let every page begin with a preset, given the landmarks (5, 3) at rest [mm]."""
+    """Let every page start with a preset, given the landmarks (5, 3) at rest [mm]."""
     target, eye = preset_view(rest, preset)
     server.scene.set_up_direction("+y")
     first = server.initial_camera

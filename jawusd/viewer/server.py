@@ -16,22 +16,20 @@ import viser
 
 from jawusd.errors import OutputError
 from jawusd.viewer import capture_scene
-from jawusd.viewer.actor import ViewedActor
 from jawusd.viewer.capture_page import CapturePage
-from jawusd.viewer.page import Page, begin_page
-from jawusd.viewer.plot_panel import StillPlots
+from jawusd.viewer.page import Page, StaticPlots, begin_page
 from jawusd.viewer.scene import set_first_view
-from jawusd.viewer.theme import set_theme
-from jawusd.viewer.viewed_capture import ViewedCapture
+from jawusd.viewer.viewed import ViewedActor, ViewedCapture
+from jawusd.viewer.widgets import set_theme
 
 log = logging.getLogger(__name__)
 
-# A browser without a graphics card is busy with panels for most of a second: it gets the jaw so much earlier [s].
+# Panels occupy a browser without a graphics card for most of a second: the jaw is sent this much earlier [s].
 _HEAD_START_S = 0.5
 
 
 class _LocalServer(viser.ViserServer):
-    """A viser server that asks nobody else: any page could order it to open a tunnel to the internet."""
+    """A viser server that opens no public tunnel, which any page could request."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         """Refuse to share through viser's relay."""
@@ -41,24 +39,14 @@ class _LocalServer(viser.ViserServer):
 
 class _Closable(Protocol):
     def close(self) -> None:
-        """Stop what runs for this page."""
+        """Stop the tasks of this page."""
 
 
 class PageServer(ABC):
-    """Serve pages; every visitor has one of their own.
-
-    Attributes:
-        pages: the open pages by client number.
-        url: where to look.
-    """
+    """Serve one page per visitor; `pages` holds the open ones by client number, `url` is the address to open."""
 
     def __init__(self, name: str, host: str, port: int) -> None:
-        """Start serving.
-
-        Args:
-            name: what is shown.
-            host: address to listen on.
-            port: port to listen on; 0 takes any free one, a taken one the next that is free.
+        """Start serving on a port: 0 takes any free one, a port in use the next free one.
 
         Raises:
             OutputError: the address is not this machine's.
@@ -66,7 +54,7 @@ class PageServer(ABC):
         self._host = host
         self.pages: dict[int, _Closable] = {}
         _check_address(host)
-        with contextlib.redirect_stdout(sys.stderr):  # viser greets there; results go on stdout
+        with contextlib.redirect_stdout(sys.stderr):  # viser prints a greeting; stdout is for results
             self._server = _LocalServer(host=host, port=port, label=name, verbose=False)
         set_theme(self._server.gui)
         self._server.on_client_connect(self._welcome)
@@ -80,7 +68,7 @@ class PageServer(ABC):
         page = await self._page(client)
         if client.client_id in self._server.get_clients():
             self.pages[client.client_id] = page
-        else:  # gone before the page was whole
+        else:  # disconnected before the page was complete
             page.close()
 
     @abstractmethod
@@ -94,8 +82,10 @@ class PageServer(ABC):
 
     def _trusted(self, client: viser.ClientHandle) -> bool:
         """Return whether the page came from this server: browsers let pages of any site connect to localhost."""
-        headers = self._server._websock_server._live_connections[client.client_id].request.headers
-        return is_own_page(headers.get("Host", ""), headers.get("Origin"), local=is_loopback(self._host))
+        request = self._server._websock_server._live_connections[client.client_id].request
+        if request is None:
+            return False
+        return is_own_page(request.headers.get("Host", ""), request.headers.get("Origin"), is_loopback(self._host))
 
     def wait(self) -> None:
         """Serve until interrupted."""
@@ -113,14 +103,14 @@ class Viewer(PageServer):
     def __init__(self, actor: ViewedActor, host: str, port: int) -> None:
         """Start serving an actor; see `PageServer` for the rest."""
         self._actor = actor
-        self._still = StillPlots(actor.rig)
+        self._static = StaticPlots(actor.rig)
         super().__init__(actor.name, host, port)
-        set_first_view(self._server, self._still.rest)
+        set_first_view(self._server, self._static.rest)
 
     async def _page(self, client: viser.ClientHandle) -> Page:
         scene = begin_page(client, self._actor)
         await asyncio.sleep(_HEAD_START_S)
-        return Page(client, scene, self._actor, self._still)
+        return Page(client, scene, self._actor, self._static)
 
 
 class CaptureViewer(PageServer):
@@ -146,13 +136,13 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-def is_own_page(host: str, origin: str | None, *, local: bool) -> bool:
+def is_own_page(host: str, origin: str | None, local: bool) -> bool:
     """Return whether a connection comes from a page that this server sent.
 
     Args:
         host: the Host header, name and port.
-        origin: the Origin header; programs that are no browser send none.
-        local: the server listens on this machine alone; another name in `host` is then a trick with DNS.
+        origin: the Origin header; programs other than browsers send none.
+        local: the server listens on this machine alone; another name in `host` then means DNS rebinding.
     """
     name = urlsplit(f"//{host}").hostname or ""
     if local and not is_loopback(name):
@@ -161,10 +151,10 @@ def is_own_page(host: str, origin: str | None, *, local: bool) -> bool:
 
 
 def _check_address(host: str) -> None:
-    """Try to listen on an address: viser would look for a free port for ever.
+    """Check that an address can be listened on, since viser would search for a free port forever.
 
     Raises:
-        OutputError: nobody can.
+        OutputError: it cannot.
     """
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]

@@ -1,4 +1,4 @@
-"""What one visitor does with a rig: sliders, dragging with pins, keys, undo. Knows nothing of the page."""
+"""The state of one visitor's work with a rig: parameters, pins, keys, undo; independent of the page."""
 
 from __future__ import annotations
 
@@ -14,15 +14,13 @@ from jawusd.formats.keys import Keys
 from jawusd.geometry import LANDMARKS
 from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import se3_inverse, transform_point
-from jawusd.viewer import keytrack
-from jawusd.viewer.clip import Clip
-from jawusd.viewer.keytrack import KeyTrack
-from jawusd.viewer.readouts import ON_BOUND_MM, Readout, read_out
+from jawusd.viewer.motion import Clip, KeyTrack, at_frames, with_key
+from jawusd.viewer.readouts import ON_BOUND_MM, Readout, read_out, triple
 
 Interpolation = Literal["linear", "smooth"]
 
-# A pinned landmark counts this much more than the point under the pointer (squared distances): 5 mm of pull move it
-# by a fraction of a millimetre where the jaw could follow either.
+# Weight of a pinned landmark relative to the point under the pointer (squared distances): 5 mm of pull move it by a
+# fraction of a millimetre where the jaw could follow either.
 _PIN_WEIGHT = 100.0
 _MOST_UNDO = 200
 _SHARES = np.linspace(1.0, 0.0, 65)
@@ -30,7 +28,7 @@ _SHARES = np.linspace(1.0, 0.0, 65)
 
 @dataclass(frozen=True)
 class Pin:
-    """Hold a landmark where it was when it was pinned: mandible and skull frame [mm]."""
+    """Hold a landmark's place when it was pinned, mandible and skull frame [mm]."""
 
     name: str
     p_mandible: tuple[float, float, float]
@@ -39,7 +37,7 @@ class Pin:
 
 @dataclass(frozen=True)
 class Work:
-    """Hold everything that undo brings back."""
+    """Hold everything that undo restores."""
 
     d: tuple[float, float, float] = (0.0, 0.0, 0.0)
     pins: tuple[Pin, ...] = ()
@@ -49,23 +47,12 @@ class Work:
 
 
 class Session:
-    """Let one visitor pose, drag and key a rig.
-
-    Attributes:
-        rig: the rig.
-        work: pose, pins and keys now.
-        keep_valid: whether sliders stay inside the bound.
-    """
+    """Let one visitor pose, drag and key a rig; with `keep_valid` sliders stay inside the bound."""
 
     def __init__(self, rig: JawRig, fps: float) -> None:
-        """Start at the closed bite, without keys.
-
-        Args:
-            rig: the rig.
-            fps: frames per second of new animations.
-        """
+        """Start at the closed bite, without keys."""
         self.rig = rig
-        self.work = Work(d=_triple(rig.project(np.zeros(3))), fps=fps)
+        self.work = Work(d=triple(rig.project(np.zeros(3))), fps=fps)
         self.keep_valid = True
         self._undo: list[Work] = []
         self._redo: list[Work] = []
@@ -87,30 +74,27 @@ class Session:
         return self.rig.pose(self.d)
 
     def readout(self) -> Readout:
-        """Return what is measured of the pose now."""
+        """Return the measures of the pose now."""
         return read_out(self.rig, self.d)
 
     def limits(self) -> Array:
-        """Return how far each parameter may go [mm], shape (3, 2): low and high.
+        """Return the limits of each parameter [mm], shape (3, 2): low and high.
 
-        The opening may use its whole range. d2 and d3 have the ends that are valid at the opening now and with the
-        other one where it is; if no value is, with the other one at 0, else none at all: both ends are then the value
-        itself.
+        The opening may use its whole range. d2 and d3 have the limits that are valid at the present opening and the
+        present value of the other one; if there are none, those with the other one at 0; otherwise both limits are the
+        value itself.
         """
         d = self.d
-        found = np.array(self.rig.ranges(*d)).reshape(2, 2)
         alone = np.array(self.rig.ranges(d[0])).reshape(2, 2)
-        found = np.where(np.isfinite(found).all(axis=1, keepdims=True), found, alone)
-        found = np.where(np.isfinite(found).all(axis=1, keepdims=True), found, d[1:, None])
+        found = np.array(self.rig.ranges(*d)).reshape(2, 2)
+        for other in (alone, d[1:, None]):
+            found = np.where(np.isfinite(found).all(axis=1, keepdims=True), found, other)
         return np.vstack([self.rig.arrays["d_range"][0], found])
 
     def set_parameter(self, index: int, value: float) -> None:
-        """Move one parameter, as a slider does; a run of moves of the same one is one step for undo.
+        """Set d1, d2 or d3 (index 0 .. 2) [mm], as a slider does; successive moves of one are one step for undo.
 
-        Args:
-            index: 0, 1 or 2 for d1, d2, d3.
-            value: its new value [mm]. With `keep_valid` the opening wins, d2 and d3 shrink with it; d2 and d3 stop at
-                the bound.
+        With `keep_valid` a new opening scales d2 and d3 down until they are valid; d2 and d3 stop at the bound.
 
         Raises:
             ValueError: the value is not finite.
@@ -119,16 +103,17 @@ class Session:
             raise ValueError(f"d{index + 1} must be finite, got {value}")
         d = self.d
         d[index] = value
-        self._change(f"d{index + 1}", d=_triple(self._kept(d, index) if self.keep_valid else d))
+        kept = self._kept(d, index) if self.keep_valid else d
+        self._change(f"d{index + 1}", replace(self.work, d=triple(kept)))
 
     def set_pose(self, d: ArrayLike) -> None:
         """Move all parameters [mm] (3,) at once, inside the bound if `keep_valid`."""
         d = np.asarray(d, dtype=np.float64)
-        self._change(None, d=_triple(self._inside(d) if self.keep_valid else d))
+        self._change(None, replace(self.work, d=triple(self._inside(d) if self.keep_valid else d)))
 
     def show(self, d: ArrayLike) -> None:
-        """Show parameters [mm] (3,) of a motion as they are: nothing to undo, nothing kept inside."""
-        self.work = replace(self.work, d=_triple(np.asarray(d, dtype=np.float64)))
+        """Show parameters [mm] (3,) of a motion unchanged and without an undo step."""
+        self.work = replace(self.work, d=triple(np.asarray(d, dtype=np.float64)))
         self._gesture = None
 
     def set_keep_valid(self, keep: bool) -> None:
@@ -162,13 +147,10 @@ class Session:
         self._gesture = None
 
     def drag_to(self, p_skull: ArrayLike) -> float:
-        """Let the jaw follow the pointer: inverse kinematics from the last pose, pins held.
-
-        Args:
-            p_skull: where the held point should go [mm], skull frame, shape (3,).
+        """Move the held point towards p_skull [mm] (3,), skull frame: inverse kinematics from the last pose, pins held.
 
         Returns:
-            Distance left between the held point and the pointer [mm].
+            Distance left between the held point and p_skull [mm].
 
         Raises:
             RuntimeError: nothing is held.
@@ -180,7 +162,7 @@ class Session:
         targets = np.array([target, *(pin.p_skull for pin in self.work.pins)])
         weights = [1.0] + [_PIN_WEIGHT] * len(self.work.pins)
         d, _ = self.rig.ik(handles, targets, start=self.d, weights=weights)
-        self._change("drag", d=_triple(d))
+        self._change("drag", replace(self.work, d=triple(d)))
         return float(np.linalg.norm(transform_point(self.rig.pose(d), self._handle) - target))
 
     def release(self) -> None:
@@ -189,48 +171,44 @@ class Session:
         self._gesture = None
 
     def held_place(self) -> Array | None:
-        """Return where the held point is now [mm], skull frame, shape (3,); None when nothing is held."""
+        """Return the held point now [mm], skull frame, shape (3,); None when nothing is held."""
         return None if self._handle is None else transform_point(self.pose(), self._handle)
 
     def set_pin(self, name: str, on: bool) -> None:
-        """Pin a landmark where it is now, or let it go. Pins hold while dragging; sliders and keys move them along.
-
-        Args:
-            name: one of `geometry.LANDMARKS`.
-            on: pin it.
-        """
+        """Pin one of `geometry.LANDMARKS` at its place, or unpin it. Pins hold while dragging; sliders move them."""
         pins = tuple(pin for pin in self.work.pins if pin.name != name)
         if on:
             place = self.rig.arrays["landmarks"][LANDMARKS.index(name)]
-            pins += (Pin(name, _triple(place), _triple(transform_point(self.pose(), place))),)
-        self._change(None, pins=pins)
+            pins += (Pin(name, triple(place), triple(transform_point(self.pose(), place))),)
+        self._change(None, replace(self.work, pins=pins))
 
     def set_keys(self, keys: KeyTrack) -> None:
         """Replace the keys."""
-        self._change(None, keys=keys)
+        self._change(None, replace(self.work, keys=keys))
 
     def move_keys(self, frames: Sequence[float], shown: float) -> None:
-        """Move the keys to other frames and show the frame `shown`; a run of moves is one step for undo.
+        """Move the keys to other frames and show the frame `shown`; successive moves are one step for undo.
 
         Raises:
             FormatError: not one frame per key, or two keys would share a frame.
         """
-        self._change("move keys", keys=keytrack.at_frames(self.work.keys, frames))
+        self._change("move keys", replace(self.work, keys=at_frames(self.work.keys, frames)))
         clip = self.key_clip()
         if clip is not None:
-            self.work = replace(self.work, d=_triple(clip.at(shown)))
+            self.work = replace(self.work, d=triple(clip.at(shown)))
 
     def add_key(self, frame: float) -> None:
         """Set a key of the pose now at a frame; a key that was there is replaced."""
-        self.set_keys(keytrack.with_key(self.work.keys, frame, self.work.d))
+        self.set_keys(with_key(self.work.keys, frame, self.work.d))
 
     def load_keys(self, loaded: Keys) -> None:
         """Replace keys, frame rate and interpolation by those of a file."""
-        self._change(None, keys=loaded.keys, fps=loaded.fps, interpolation=loaded.interpolation)
+        work = replace(self.work, keys=loaded.keys, fps=loaded.fps, interpolation=loaded.interpolation)
+        self._change(None, work)
 
     def set_interpolation(self, interpolation: Interpolation) -> None:
         """Choose how the jaw moves between keys."""
-        self._change(None, interpolation=interpolation)
+        self._change(None, replace(self.work, interpolation=interpolation))
 
     def set_fps(self, fps: float) -> None:
         """Set the frames per second.
@@ -240,7 +218,7 @@ class Session:
         """
         if not 0 < fps <= 1000:
             raise ValueError(f"fps must be above 0 and at most 1000, got {fps}")
-        self._change("fps", fps=float(fps))
+        self._change("fps", replace(self.work, fps=float(fps)))
 
     def saved_keys(self) -> Keys | None:
         """Return the keys as they are saved, None without any."""
@@ -275,16 +253,11 @@ class Session:
         self._gesture = None
         return True
 
-    def _change(self, gesture: str | None, **values: object) -> None:
-        """Change the work; changes of one gesture in a row are one step."""
+    def _change(self, gesture: str | None, work: Work) -> None:
+        """Replace the work; successive changes of one gesture are one step for undo."""
         if gesture is None or gesture != self._gesture:
             self._undo.append(self.work)
             del self._undo[:-_MOST_UNDO]
         self._redo.clear()
         self._gesture = gesture
-        self.work = replace(self.work, **values)
-
-
-def _triple(values: Array) -> tuple[float, float, float]:
-    x, y, z = (float(value) for value in values)
-    return x, y, z
+        self.work = work

@@ -35,7 +35,7 @@ class QuietPage:
 
     def make_page(self, viewer):
         """Return the page of a rig."""
-        return Page(self.client, begin_page(self.client, viewer._actor), viewer._actor, viewer._still)
+        return Page(self.client, begin_page(self.client, viewer._actor), viewer._actor, viewer._static)
 
     def call(self, action):
         """Run a function where events of visitors run, and return what it returns."""

@@ -132,8 +132,8 @@ def test_poses_of_picks_are_near_the_truth(viewed):
     poses, wrong = viewed.poses_of_picks(viewed.picks)
     known = truth()
     assert wrong == []
-    for found, name, row in zip(poses, ("T_world_upper", "T_world_lower"), ("upper", "lower"), strict=True):
-        vertices = viewed.scans[row].vertices
+    for found, name, arch in zip(poses, ("T_world_upper", "T_world_lower"), ("upper", "lower"), strict=True):
+        vertices = viewed.scans[arch].vertices
         error = transform_points(found, vertices) - transform_points(known[name][0], vertices)
         assert np.linalg.norm(error, axis=1).mean() < 1.0
 
@@ -154,10 +154,10 @@ def test_stepping_jumping_and_looking(page):
     assert footage.frame == FIRST + 7
     page.press(footage.views, "3-D")
     scene = page.page.scene
-    assert scene._space.visible and not scene._table.visible
-    assert scene._rows["upper"].visible and not scene._rows["lower"].visible
+    assert scene._space.visible and not scene._layout.visible
+    assert scene._arches["upper"].visible and not scene._arches["lower"].visible
     page.press(footage.views, "cam1")
-    assert scene._table.visible and "cam1" in footage._words.content
+    assert scene._layout.visible and "cam1" in footage._words.content
     page.press(footage._look, "footage alone")
     own = FIRST + 7 - page.page._capture.offsets["cam1"]
     assert f"(its own frame {own})" in footage._words.content
@@ -169,7 +169,7 @@ def test_scans_in_space_stand_where_the_cameras_see_them(page):
     scene, capture = page.page.scene, page.page._capture
     poses = capture.tracked_poses(FIRST)
     np.testing.assert_allclose(page.page.poses["upper"], scene.T_page_world @ poses[0], atol=1e-12)
-    np.testing.assert_allclose(scene._rows["upper"].position, (scene.T_page_world @ poses[0])[:3, 3], atol=1e-9)
+    np.testing.assert_allclose(scene._arches["upper"].position, (scene.T_page_world @ poses[0])[:3, 3], atol=1e-9)
 
 
 def test_picks_are_clicked_and_written(page, copy, viewed):
@@ -177,22 +177,22 @@ def test_picks_are_clicked_and_written(page, copy, viewed):
     before = load_capture(copy).bootstrap
     page.press(picks.edit, "all")
     page.press(picks.picking, True)
-    page.click(page.page.table.place((5.0, 5.0)))
+    page.click(page.page.layout.place((5.0, 5.0)))
     assert "no pick is selected" in page.notices.pop()[1]
-    for row, pick in [("upper", p) for p in before.upper] + [("lower", p) for p in before.lower]:
-        vertex = viewed.scans[row].vertices[pick.vertex]
-        page.click(transform_point(page.page.poses[row], vertex))
+    for arch, pick in [("upper", p) for p in before.upper] + [("lower", p) for p in before.lower]:
+        vertex = viewed.scans[arch].vertices[pick.vertex]
+        page.click(transform_point(page.page.poses[arch], vertex))
     assert len(picks.book.picks) == 8
     known = truth()
-    poses = {row: known[f"T_world_{row}"][0] for row in ("upper", "lower")}
+    poses = {arch: known[f"T_world_{arch}"][0] for arch in ("upper", "lower")}
     for camera in ("cam0", "cam2"):
         page.press(footage.views, camera)
         for pick in picks.book.picks:
-            place = transform_point(poses[pick.row], viewed.scans[pick.row].vertices[pick.vertex])
-            page.click(page.page.table.place(viewed.cameras[camera].project(place)))
+            place = transform_point(poses[pick.arch], viewed.scans[pick.arch].vertices[pick.vertex])
+            page.click(page.page.layout.place(viewed.cameras[camera].project(place)))
     assert "all of them fit together" in picks._list.content and "complete" in picks._list.content
     page.press(footage.steps, "+1")
-    page.click(page.page.table.place((5.0, 5.0)))
+    page.click(page.page.layout.place((5.0, 5.0)))
     assert f"belong to frame {FIRST}, this is frame {FIRST + 1}" in page.notices.pop()[1]
     page.enter(picks.go, True)
     assert footage.frame == FIRST
@@ -201,7 +201,7 @@ def test_picks_are_clicked_and_written(page, copy, viewed):
     written = load_capture(copy).bootstrap
     assert written == picks.book.bootstrap() and written != before
     page.press(picks.edit, "pick")
-    page.enter(picks.write, True)  # three of a row are enough
+    page.enter(picks.write, True)  # three of an arch are enough
     assert page.notices.pop()[0] == "Written"
     page.press(picks.edit, "all")
     page.enter(picks.write, True)

@@ -139,26 +139,26 @@ def test_picks_made_in_the_page_build_a_rig(tab, folder, tmp_path):
     tab.type_slider(0, FIRST)
     until(lambda: page.footage.frame == FIRST)
     tab.view("cam0")
-    for row in ("upper", "lower"):
-        for pick in getattr(original, row):
+    for arch in ("upper", "lower"):
+        for pick in getattr(original, arch):
             eye = np.array(page.client.camera.position)
-            tab.click(clickable(capture.scans[row], pick.vertex, page.poses[row], eye))
+            tab.click(clickable(capture.scans[arch], pick.vertex, page.poses[arch], eye))
     book = page.picks.book
-    assert [pick.row for pick in book.picks] == ["upper"] * 4 + ["lower"] * 4
+    assert [pick.arch for pick in book.picks] == ["upper"] * 4 + ["lower"] * 4
     moved = [
-        np.linalg.norm(np.diff(capture.scans[pick.row].vertices[[pick.vertex, given.vertex]], axis=0))
+        np.linalg.norm(np.diff(capture.scans[pick.arch].vertices[[pick.vertex, given.vertex]], axis=0))
         for pick, given in zip(book.picks, (*original.upper, *original.lower), strict=True)
     ]
     assert max(moved) < 0.5  # mm: the vertex meant, or one beside it
     with np.load(EXAMPLE / "truth" / "truth.npz") as archive:  # the eyes of the person who clicks
-        poses = {row: archive[f"T_world_{row}"][0] for row in ("upper", "lower")}
+        poses = {arch: archive[f"T_world_{arch}"][0] for arch in ("upper", "lower")}
         assert archive["frames"][0] == FIRST
     for camera in ("cam0", "cam2"):
         tab.view(camera)
         for pick in list(book.picks):
-            place = transform_point(poses[pick.row], capture.scans[pick.row].vertices[pick.vertex])
+            place = transform_point(poses[pick.arch], capture.scans[pick.arch].vertices[pick.vertex])
             pixel = capture.cameras[camera].project(place)
-            tab.click(page.table.place(pixel))
+            tab.click(page.layout.place(pixel))
             assert np.abs(np.subtract(pick.views[camera], pixel)).max() < 1.5
     tab.said("all of them fit together")
     tab.picture("capture_picks")

@@ -13,16 +13,16 @@ from jawusd.formats.tracks import Tracks, save_tracks
 from jawusd.pipeline.view import motion_names, open_viewer, part_of, viewed_actor
 from jawusd.rig.geo_read import read_geometry, read_gum
 from jawusd.rig.motion_read import read_poses_of_stage
-from jawusd.viewer.clip import Clip
+from jawusd.viewer.motion import Clip
 
 
 def test_an_actor_brings_its_meshes_with_teeth_and_gum_apart(folder):
     actor = viewed_actor(folder)
     assert actor.name == "someone" and actor.fps == FPS and actor.folder == folder
     whole = read_geometry(folder / "geo.usdc")
-    for row in ("upper", "lower"):
-        parts = len(actor.meshes[f"{row}_teeth"].faces), len(actor.meshes[f"{row}_gum"].faces)
-        assert min(parts) > 0 and sum(parts) == len(whole[f"{row}_teeth"].faces)
+    for arch in ("upper", "lower"):
+        parts = len(actor.meshes[f"{arch}_teeth"].faces), len(actor.meshes[f"{arch}_gum"].faces)
+        assert min(parts) > 0 and sum(parts) == len(whole[f"{arch}_teeth"].faces)
     assert set(actor.meshes) == {"skull", "mandible", "upper_teeth", "upper_gum", "lower_teeth", "lower_gum"}
     np.testing.assert_allclose(actor.rig.pose([9, 1, 0]), example_rig().pose([9, 1, 0]), atol=1e-9)
 

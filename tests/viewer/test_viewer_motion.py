@@ -7,9 +7,8 @@ import pytest
 
 from jawusd.errors import FormatError
 from jawusd.formats.keys import Key
-from jawusd.viewer import keytrack
-from jawusd.viewer.clip import Clip, frame_after
-from jawusd.viewer.player import Player
+from jawusd.viewer import motion
+from jawusd.viewer.motion import Clip, Player, frame_after
 
 KEYS = (Key(frame=0, d=(0, 0, 0)), Key(frame=10, d=(1, 2, 3)), Key(frame=20, d=(4, 5, 6)))
 
@@ -19,12 +18,12 @@ def frames_of(keys):
 
 
 def test_keys_are_added_replaced_deleted_and_moved():
-    added = keytrack.with_key(KEYS, 5, [7, 8, 9])
+    added = motion.with_key(KEYS, 5, [7, 8, 9])
     assert frames_of(added) == [0, 5, 10, 20] and added[1].d == (7, 8, 9)
-    replaced = keytrack.with_key(KEYS, 10, [7, 8, 9])
+    replaced = motion.with_key(KEYS, 10, [7, 8, 9])
     assert frames_of(replaced) == [0, 10, 20] and replaced[1].d == (7, 8, 9)
-    assert frames_of(keytrack.without_key(KEYS, 10)) == [0, 20]
-    shifted = keytrack.at_frames(KEYS, (3, 11, 90))
+    assert frames_of(motion.without_key(KEYS, 10)) == [0, 20]
+    shifted = motion.at_frames(KEYS, (3, 11, 90))
     assert frames_of(shifted) == [3, 11, 90] and [key.d for key in shifted] == [key.d for key in KEYS]
     assert frames_of(KEYS) == [0, 10, 20]  # nothing was changed in place
 
@@ -32,9 +31,9 @@ def test_keys_are_added_replaced_deleted_and_moved():
 @pytest.mark.parametrize(
     "action",
     [
-        lambda: keytrack.without_key(KEYS, 5),
-        lambda: keytrack.at_frames(KEYS, (1, 2)),
-        lambda: keytrack.at_frames(KEYS, (1, 2, 2)),
+        lambda: motion.without_key(KEYS, 5),
+        lambda: motion.at_frames(KEYS, (1, 2)),
+        lambda: motion.at_frames(KEYS, (1, 2, 2)),
     ],
 )
 def test_what_cannot_be_done_to_keys_is_said(action):

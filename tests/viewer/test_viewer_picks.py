@@ -9,16 +9,16 @@ from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import LOST, TRACKED, Tracks
 from jawusd.geometry import make_transform, random_rotation, transform_points
 from jawusd.viewer.coverage import CoveragePlot, frame_words, uncovered_percent, worst_frames
-from jawusd.viewer.light_table import FOV_RAD, Table, eye_to_see, hit_vertex, region_around
+from jawusd.viewer.picking_layout import FOV_RAD, PickingLayout, eye_to_see, hit_vertex, region_around
 from jawusd.viewer.picks import PickBook
 
 
 def filled():
-    """Return three picks of each row, seen by two cameras at frame 20."""
+    """Return three picks of each arch, seen by two cameras at frame 20."""
     book = PickBook()
-    for row in ("upper", "lower"):
+    for arch in ("upper", "lower"):
         for vertex in (3, 5, 7):
-            book.add(row, vertex)
+            book.add(arch, vertex)
     for camera in ("a", "b"):
         book.turn_to(camera)
         for k in range(6):
@@ -92,8 +92,8 @@ def test_a_ray_meets_the_vertex_that_faces_it(ball):
         assert hit_vertex(ball, pose, origin, outwards) is None
 
 
-def test_table_pixels_and_rays_agree():
-    table = Table((1280, 720), (400.0, 150.0, 900.0, 400.0))
+def test_layout_pixels_and_rays_agree():
+    table = PickingLayout((1280, 720), (400.0, 150.0, 900.0, 400.0))
     eye = np.array([3.0, -5.0, -200.0])
     for pixel in ((0.0, 0.0), (641.3, 278.9), (1279.4, 719.4)):
         assert table.pixel(eye, table.place(pixel) - eye) == pytest.approx(pixel, abs=1e-9)
@@ -123,7 +123,7 @@ def test_a_region_has_room_and_stays_in_the_picture():
 
 
 def made_up_tracks(count=100):
-    """Return tracks with frame 140 lost and frame 120 badly covered by the lower row."""
+    """Return tracks with frame 140 lost and frame 120 badly covered by the lower arch."""
     frames = np.arange(100, 100 + count)
     poses = np.tile(np.eye(4), (count, 1, 1))
     lost = poses.copy()
@@ -158,7 +158,7 @@ def test_the_plot_marks_the_frame_and_breaks_where_nothing_is_known():
     tracks = made_up_tracks()
     tracks.coverage_error[50:60] = np.nan
     plot = CoveragePlot(tracks, (100, 199), [140])
-    assert plot.still.count("M") >= 4 and "nan" not in plot.still
+    assert plot.definition.count("M") >= 4 and "nan" not in plot.definition
     left, right = plot.with_playhead(100), plot.with_playhead(199)
     assert left != right and "nan" not in left + right
 

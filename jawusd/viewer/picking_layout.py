@@ -1,11 +1,12 @@
-"""Where things lie when a picture is looked at: the picture as a plane, the scans below its teeth, the eye before it.
+"""The layout for picking: the picture as a plane, the scans below its teeth, the eye in front of it.
 
-The table has x to the right, y down and z away from the eye, in mm; the picture lies in z = 0, its middle at the
-origin, as large as makes its teeth about as large as the scans. Knows nothing of the page.
+The layout frame has x to the right, y down and z away from the eye, in mm. The picture lies in z = 0 with its middle at
+the origin, scaled so that its teeth are about as large as the scans.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,36 +17,32 @@ from jawusd.geometry import make_transform, transform_point, transform_points
 from jawusd.geometry.arrays import Array
 from jawusd.geometry.rays import meet_triangles
 from jawusd.geometry.se3 import se3_inverse
-from jawusd.viewer.viewed_capture import Region
+from jawusd.viewer.picks import ARCHES
+from jawusd.viewer.viewed import Region
 
 FOV_RAD = 0.35
-#: Turns of the scans about the subject's vertical and transverse axis [deg] by what they show.
+#: Rotation of the scans about the subject's vertical and transverse axis [deg], by the side they show.
 SIDES = {"front": (0.0, 0.0), "left": (-60.0, 0.0), "right": (60.0, 0.0), "biting side": (0.0, 65.0)}
-_TEETH_MM = 60.0  # what a region around the teeth is made as wide as
+_TEETH_MM = 60.0  # width of a region around the teeth in the layout
 _GAP_MM = 5.0
-_EDGE = 1e-9  # no ray slips through between two faces
+_EDGE = 1e-9  # tolerance, so that no ray passes between two faces
 _MARGIN = 1.05
 
 
 @dataclass(frozen=True)
-class Table:
-    """Hold how one picture lies on the table.
-
-    Attributes:
-        size_px: width and height of the picture.
-        region: the part of it that is looked at [px].
-    """
+class PickingLayout:
+    """Place one picture of a size [px] and the scans, so that a region of the picture is in view."""
 
     size_px: tuple[int, int]
     region: Region
 
     @property
     def px_per_mm(self) -> float:
-        """Return the pixels per mm of the table."""
+        """Return the pixels per mm of the layout."""
         return max(self.region[2] - self.region[0], 1.0) / _TEETH_MM
 
     def place(self, pixel: ArrayLike) -> Array:
-        """Return where pixels (..., 2) lie on the table [mm], shape (..., 3)."""
+        """Return the places of pixels (..., 2) in the layout [mm], shape (..., 3)."""
         middle = (np.array(self.size_px) - 1) / 2
         flat = (np.asarray(pixel, dtype=np.float64) - middle) / self.px_per_mm
         return np.concatenate([flat, np.zeros((*flat.shape[:-1], 1))], axis=-1)
@@ -59,40 +56,39 @@ class Table:
         width, height = self.size_px
         return (float(x), float(y)) if -0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5 else None
 
-    def scan_poses(self, scans: dict[str, Mesh], T_anatomical_skull: Array, side: str) -> dict[str, Array]:
-        """Return T_table_scan (4, 4) of both rows, before the picture and below the region, seen from a side."""
+    def scan_poses(self, scans: Mapping[str, Mesh], T_anatomical_skull: Array, side: str) -> dict[str, Array]:
+        """Return T_layout_scan (4, 4) of both arches, in front of the picture and below the region, showing a side."""
         top = float(self.place([self.region[0], self.region[3]])[1]) + _GAP_MM
         middle = float(self.place([(self.region[0] + self.region[2]) / 2, 0.0])[0])
         found = {}
-        for row in ("upper", "lower"):
+        for arch in ARCHES:
             yaw, pitch = np.radians(SIDES[side])
-            pitch = pitch if row == "lower" else -pitch
+            pitch = pitch if arch == "lower" else -pitch
             turned = make_transform(_about_y(yaw) @ _about_x(pitch), np.zeros(3)) @ T_anatomical_skull
-            table = make_transform(np.diag([1.0, -1.0, -1.0]), np.zeros(3)) @ turned
-            placed = transform_points(table, scans[row].vertices)
+            facing = make_transform(np.diag([1.0, -1.0, -1.0]), np.zeros(3)) @ turned
+            placed = transform_points(facing, scans[arch].vertices)
             low, high = placed.min(axis=0), placed.max(axis=0)
             move = np.array([middle - (low[0] + high[0]) / 2, top - low[1], -high[2] - _GAP_MM])
-            found[row] = make_transform(np.eye(3), move) @ table
+            found[arch] = make_transform(np.eye(3), move) @ facing
             top += float(high[1] - low[1]) + _GAP_MM
         return found
 
     def corners(self) -> Array:
-        """Return the corners of the region on the table [mm], shape (2, 3)."""
+        """Return two opposite corners of the region in the layout [mm], shape (2, 3)."""
         return self.place(np.reshape(self.region, (2, 2)))
 
 
 def eye_to_see(points: ArrayLike, away: ArrayLike, up: ArrayLike, aspect: float) -> tuple[Array, Array]:
-    """Return the eye and what it looks at (3,), (3,), as near as shows all points.
+    """Return the nearest eye (3,) and its target (3,) that show all points (n, 3).
 
     Args:
-        points: what is to be seen, shape (n, 3).
-        away: from what is seen to the eye, shape (3,).
+        away: direction from the target to the eye, shape (3,).
         up: upwards on the screen, about, shape (3,).
         aspect: width over height of the screen.
     """
     p = np.asarray(points, dtype=np.float64)
     back = np.asarray(away, dtype=np.float64) / np.linalg.norm(away)
-    right = np.cross(up, back)
+    right = np.cross(np.asarray(up, dtype=np.float64), back)
     right /= np.linalg.norm(right)
     axes = np.stack([right, np.cross(back, right), back])
     q = p @ axes.T
@@ -114,13 +110,7 @@ def region_around(points_px: ArrayLike, size_px: tuple[int, int]) -> Region:
 
 
 def hit_vertex(mesh: Mesh, T_world_scan: Array, origin: ArrayLike, direction: ArrayLike) -> tuple[int, float] | None:
-    """Return the vertex of a scan nearest to where a ray meets it, and how far away that is [mm]; None for a miss.
-
-    Args:
-        mesh: the scan.
-        T_world_scan: its pose, shape (4, 4).
-        origin, direction: of the ray in the world, shape (3,).
-    """
+    """Return the vertex nearest to where a world ray (3,), (3,) meets a posed scan, and its distance [mm], or None."""
     inverse = se3_inverse(T_world_scan)
     o = transform_point(inverse, np.asarray(origin, dtype=np.float64))
     d = inverse[:3, :3] @ np.asarray(direction, dtype=np.float64)

@@ -1,0 +1,145 @@
+"""Motion on a timeline: clips of parameters over frames, the keys they are made of, and playback."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jawusd.errors import FormatError
+from jawusd.formats.keys import Key
+from jawusd.geometry.arrays import Array
+
+#: Keys of an animation, in the order of their frames.
+KeyTrack = tuple[Key, ...]
+
+_MOST_PER_S = 30.0  # limits the load on the network; screens hardly show more
+
+
+@dataclass(frozen=True, eq=False)
+class Clip:
+    """Hold parameters at rising frames, linear in between.
+
+    Attributes:
+        frames: frame numbers, shape (F,).
+        d: parameters [mm], shape (F, 3); finite.
+    """
+
+    name: str
+    frames: Array
+    d: Array
+    fps: float
+
+    @classmethod
+    def of(cls, name: str, frames: ArrayLike, d: ArrayLike, fps: float) -> Clip:
+        """Make a clip of frame numbers (F,) and parameters (F, 3) [mm]; lost frames (NaN) are bridged.
+
+        Raises:
+            FormatError: no frame has parameters, or the frames do not rise.
+        """
+        frames, d = np.asarray(frames, dtype=np.float64), np.asarray(d, dtype=np.float64)
+        known = np.all(np.isfinite(d), axis=1)
+        if not known.any():
+            raise FormatError("no frame has parameters; there is nothing to play.", path=name)
+        if (np.diff(frames[known]) <= 0).any():
+            raise FormatError("its frame numbers do not rise.", path=name)
+        return cls(name, frames[known], d[known], float(fps))
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """Return the first and the last frame."""
+        return float(self.frames[0]), float(self.frames[-1])
+
+    def at(self, frames: ArrayLike) -> Array:
+        """Return parameters [mm] (..., 3) at frames (...); the first and last one hold outside."""
+        at = np.asarray(frames, dtype=np.float64)
+        return np.stack([np.interp(at, self.frames, column) for column in self.d.T], axis=-1)
+
+
+def with_key(keys: KeyTrack, frame: float, d: tuple[float, float, float]) -> KeyTrack:
+    """Return the keys with one added or replaced at a frame."""
+    added = Key(frame=float(frame), d=d)
+    return tuple(sorted([*(key for key in keys if key.frame != frame), added], key=lambda key: key.frame))
+
+
+def without_key(keys: KeyTrack, frame: float) -> KeyTrack:
+    """Return the keys without the one at a frame.
+
+    Raises:
+        FormatError: there is none.
+    """
+    kept = tuple(key for key in keys if key.frame != frame)
+    if len(kept) == len(keys):
+        known = ", ".join(f"{key.frame:g}" for key in keys) or "none"
+        raise FormatError(f"there is no key at frame {frame:g}; keys are at: {known}.")
+    return kept
+
+
+def at_frames(keys: KeyTrack, frames: Sequence[float]) -> KeyTrack:
+    """Return the keys, in their order, at other frames.
+
+    Raises:
+        FormatError: not one frame per key, or two keys would share a frame.
+    """
+    if len(frames) != len(keys) or len(set(frames)) != len(keys):
+        raise FormatError(f"{len(set(frames))} frames for {len(keys)} keys; each key needs a frame of its own.")
+    return tuple(Key(frame=float(frame), d=key.d) for key, frame in zip(keys, sorted(frames), strict=True))
+
+
+def frame_after(frame: float, elapsed_s: float, fps: float, span: tuple[float, float], loop: bool) -> float | None:
+    """Return the frame that plays `elapsed_s` seconds after `frame`; None when the end is passed without a loop.
+
+    Playing starts at the beginning of the span when `frame` lies outside it.
+    """
+    first, last = span
+    if not first <= frame < last:
+        frame = first
+    frame += elapsed_s * fps
+    if frame <= last:
+        return frame
+    # The last frame is shown for its own duration before the first one follows.
+    return min(first + (frame - first) % (last - first + 1), last) if loop else None
+
+
+class Player:
+    """Step through the frames of a motion in the event loop, one task at a time."""
+
+    def __init__(self, show: Callable[[float], None], ended: Callable[[], None]) -> None:
+        """Make a player that calls `show` with every frame number and `ended` whenever it stops."""
+        self._show, self._ended = show, ended
+        self._task: asyncio.Task[None] | None = None
+
+    @property
+    def playing(self) -> bool:
+        """Return whether it plays."""
+        return self._task is not None
+
+    def start(self, frame: float, fps: float, span: tuple[float, float], loop: Callable[[], bool]) -> None:
+        """Play from a frame on; `loop` is evaluated at every step."""
+        self.stop()
+        self._task = asyncio.get_running_loop().create_task(self._run(frame, fps, span, loop))
+
+    def stop(self) -> None:
+        """Stop; does nothing when it does not play."""
+        if self._task is not None:
+            self._task.cancel()
+            self._task = None
+            self._ended()
+
+    async def _run(self, frame: float, fps: float, span: tuple[float, float], loop: Callable[[], bool]) -> None:
+        began = time.monotonic()
+        try:
+            while True:
+                now = frame_after(frame, time.monotonic() - began, fps, span, loop())
+                self._show(span[1] if now is None else now)
+                if now is None:
+                    break
+                await asyncio.sleep(1.0 / min(fps, _MOST_PER_S))
+        finally:
+            if self._task is asyncio.current_task():  # otherwise `stop` has called `ended` already
+                self._task = None
+                self._ended()

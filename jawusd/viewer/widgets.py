@@ -1,0 +1,80 @@
+"""What all pages share: theme, messages, callbacks whose errors are shown, and small text."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import logging
+from collections.abc import Callable, Coroutine, Iterator
+from typing import TypeVar
+
+import viser
+
+from jawusd.errors import JawusdError
+
+log = logging.getLogger(__name__)
+
+Event = TypeVar("Event")
+Value = TypeVar("Value")
+#: The event of a button group.
+Choice = viser.GuiEvent[viser.GuiButtonGroupHandle]
+
+
+def set_theme(gui: viser.GuiApi, dark: bool = False) -> None:
+    """Widen the controls of a page, or of all later pages of a server, and hide viser's logo and share button."""
+    gui.configure_theme(control_width="large", show_logo=False, show_share_button=False, dark_mode=dark)
+
+
+def add_dark_checkbox(client: viser.ClientHandle) -> None:
+    """Add the checkbox that makes the page dark."""
+    box = client.gui.add_checkbox("dark page", False)
+
+    async def darken(_: object) -> None:
+        set_theme(client.gui, box.value)
+
+    box.on_update(guarded(client, darken))
+
+
+def assign(widget: viser.GuiInputHandle[Value], value: Value) -> None:
+    """Set the value of a widget where it differs, which saves a message to the page."""
+    if widget.value != value:
+        widget.value = value  # type: ignore[misc]  # viser's setter is not next to its getter, so mypy misses it
+
+
+def small_text(html: str, style: str = "") -> str:
+    """Return HTML as a block of small text."""
+    return f'<div style="font-size:12px;padding:2px 12px;{style}">{html}</div>'
+
+
+def say(client: viser.ClientHandle, title: str, body: str, *, bad: bool = False) -> None:
+    """Show a message in a page; one of a failure (`bad`) stays until it is closed."""
+    client.add_notification(title, body, color="red" if bad else "teal", auto_close_seconds=None if bad else 5.0)
+
+
+@contextlib.contextmanager
+def errors_shown(client: viser.ClientHandle) -> Iterator[None]:
+    """Show errors in the page instead of raising them, so that one page's error does not stop the server."""
+    try:
+        yield
+    except (JawusdError, ValueError) as error:
+        say(client, "That did not work", str(error), bad=True)
+    except Exception as error:
+        log.exception("unexpected error in the viewer")
+        say(client, "Unexpected error", f"{type(error).__name__}: {error}", bad=True)
+
+
+def guarded(
+    client: viser.ClientHandle, action: Callable[[Event], Coroutine[object, None, None]]
+) -> Callable[[Event], Coroutine[object, None, None]]:
+    """Return a callback for a visitor's events that shows errors in the page.
+
+    Events without a client come from the program itself (a slider that was set) and are ignored.
+    """
+
+    @functools.wraps(action)
+    async def callback(event: Event) -> None:
+        if getattr(event, "client", None) is not None:
+            with errors_shown(client):
+                await action(event)
+
+    return callback
