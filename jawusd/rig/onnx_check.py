@@ -50,12 +50,13 @@ def _error_mm(model: onnx.ModelProto, rig: JawRig, d: Array) -> float:
     if model.graph.input[0].name == "d":
         d = d.astype(dtype)
         exact = rig.pose(d.astype(np.float64))
-        (found,) = run(["pose"], {"d": d})
+        (pose,) = run(["pose"], {"d": d})
+        found = np.asarray(pose, dtype=np.float64)
     else:
         exact = rig.pose(d).astype(dtype).astype(np.float64)
         (encoded,) = run(["d"], {"pose": exact.astype(dtype)})
-        found = rig.pose(encoded)
-    moved = transform_points(found.astype(np.float64) - exact, rig.arrays["landmarks"])
+        found = rig.pose(np.asarray(encoded))
+    moved = transform_points(found - exact, rig.arrays["landmarks"])
     return float(np.linalg.norm(moved, axis=-1).max())
 
 

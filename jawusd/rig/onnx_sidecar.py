@@ -12,17 +12,15 @@ from pathlib import Path
 
 import numpy as np
 import onnx
-from numpy.typing import NDArray
 from onnx import helper
 
 from jawusd import __version__
 from jawusd.evaluator import JawRig
-from jawusd.evaluator.bounds import SliceHull
 from jawusd.formats.atomic import write_bytes_atomic
 from jawusd.rig.arrays import model_hash
 from jawusd.rig.onnx_encode import add_encoder
-from jawusd.rig.onnx_graph import Graph
-from jawusd.rig.onnx_model import Motion, decode_motion
+from jawusd.rig.onnx_graph import FloatType, Graph, Value
+from jawusd.rig.onnx_model import add_margin, add_twist, decode_motion, images
 
 FORMAT = "jawusd-onnx/1"
 OPSET = 17
@@ -41,7 +39,7 @@ def write_onnx(path: str | os.PathLike[str], model: onnx.ModelProto) -> Path:
     return Path(path)
 
 
-def decode_model(rig: JawRig, dtype: type = np.float32) -> onnx.ModelProto:
+def decode_model(rig: JawRig, dtype: FloatType = np.float32) -> onnx.ModelProto:
     """Build the graph that decodes jaw parameters.
 
     Input `d` (N, 3) [mm]. Outputs `pose` (N, 4, 4): T_skull_mandible, row-major, for column vectors [mm]; `twist`
@@ -52,16 +50,21 @@ def decode_model(rig: JawRig, dtype: type = np.float32) -> onnx.ModelProto:
         rig: the exact model.
         dtype: float32 or float64, of input, outputs and all arithmetic.
     """
-    g = Graph(np.dtype(dtype))
-    motion = decode_motion(g, rig, "d")
-    g.op("Concat", motion.omega, motion.v, axis=1, name="twist")
-    _add_pose(g, motion, rig.arrays["T_rest"])
-    _add_margin(g, rig, "d")
+    g = Graph(dtype)
+    d = Value(g, "d")
+    motion = decode_motion(g, rig, d)
+    add_twist(g, rig, motion, "twist")
+    upper = images(g, rig, motion, np.eye(4))  # the columns of the pose, without its bottom row
+    columns = g.reshape(upper, [-1, 4, 3])
+    zero = g.op("Slice", columns, *(g.constant([x], np.int64) for x in (0, 1, 2))) * 0.0  # as long as the batch
+    bottom = zero + g.constant([[[0.0], [0.0], [0.0], [1.0]]])
+    g.op("Transpose", g.concat([columns, bottom], axis=2), perm=[0, 2, 1], name="pose")
+    g.op("Squeeze", add_margin(g, rig, d), g.constant([1], np.int64), name="margin")
     outputs: Shapes = {"pose": ["N", 4, 4], "twist": ["N", 6], "margin": ["N"]}
     return _model(g, rig, "jaw_decode", decode_model.__doc__, {"d": ["N", 3]}, outputs)
 
 
-def encode_model(rig: JawRig, dtype: type = np.float32) -> onnx.ModelProto:
+def encode_model(rig: JawRig, dtype: FloatType = np.float32) -> onnx.ModelProto:
     """Build the graph that finds the jaw parameters of poses.
 
     Input `pose` (N, 4, 4): T_skull_mandible, row-major, for column vectors [mm]. Outputs `d` (N, 3) [mm]: the
@@ -72,8 +75,8 @@ def encode_model(rig: JawRig, dtype: type = np.float32) -> onnx.ModelProto:
         rig: the exact model.
         dtype: float32 or float64, of input and outputs; the search computes in float64.
     """
-    g = Graph(np.dtype(dtype))
-    add_encoder(g, rig, "pose", "d", "residual")
+    g = Graph(dtype)
+    add_encoder(g, rig, Value(g, "pose"), "d", "residual")
     outputs: Shapes = {"d": ["N", 3], "residual": ["N"]}
     return _model(g, rig, "jaw_encode", encode_model.__doc__, {"pose": ["N", 4, 4]}, outputs)
 
@@ -108,27 +111,3 @@ def _metadata(rig: JawRig) -> dict[str, str]:
         "rig_hash": model_hash(rig),
         "d_range_mm": json.dumps(rig.arrays["d_range"].tolist()),
     }
-
-
-def _add_pose(g: Graph, motion: Motion, T_rest: NDArray) -> None:
-    """Add the output `pose` = exp(twist) rest: every column of rest is rotated, the last one moved as well."""
-    axes = g.constant([2], np.int64)
-    images = [motion.carry(g, T_rest[:3, i], moves=i == 3) for i in range(4)]
-    upper = g.concat(*(g.op("Unsqueeze", image, axes) for image in images), axis=2)
-    zero = g.mul(g.sum_rows(motion.omega), 0.0)  # as long as the batch
-    bottom = g.concat(zero, zero, zero, g.add(zero, 1.0))
-    g.op("Concat", upper, g.op("Unsqueeze", bottom, g.constant([1], np.int64)), axis=1, name="pose")
-
-
-def _add_margin(g: Graph, rig: JawRig, d: str) -> None:
-    """Add the output `margin`: minus the soft maximum of the half-spaces (jawusd.evaluator.bounds)."""
-    hull = SliceHull.from_arrays(rig.arrays)
-    knots = hull.supports.knots
-    d1, d2, d3 = g.columns(d, 3)
-    reach = g.hermite(d1, knots, hull.supports.values, hull.supports.slopes)
-    sides = g.sub(g.matmul(g.concat(d2, d3), hull.directions.T), reach)
-    v = g.concat(sides, g.sub(float(knots[0]), d1), g.sub(d1, float(knots[-1])))
-    peak = g.op("ReduceMax", v, axes=[1], keepdims=1)
-    powers = g.op("Exp", g.mul(g.sub(v, peak), 1.0 / hull.softness_mm))
-    excess = g.add(peak, g.mul(g.op("Log", g.sum_rows(powers)), hull.softness_mm), -hull.margin_mm)
-    g.op("Squeeze", g.op("Neg", excess), g.constant([1], np.int64), name="margin")
