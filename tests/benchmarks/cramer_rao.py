@@ -84,7 +84,7 @@ def outline_noise_px3(solution: object) -> np.ndarray:
     """Return sigma^2 l of both rows as tiles of the picture show it, shape (2,); NaN where the masks say too little."""
     out = np.full(2, np.nan)
     for r in (0, 1):
-        H = solution.systems[r, :, :6, :6].sum(0)
+        H = solution.outline.precision[r].sum(0)
         if np.linalg.matrix_rank(H, hermitian=True) == 6:
             out[r] = np.trace(np.linalg.solve(H, solution.scatters[r])) / 6 * MEAN_W / MEAN_WWXX
     return out

@@ -13,6 +13,7 @@ from scipy.optimize import minimize
 from jawusd.evaluator import JawRig
 from jawusd.formats.tracks import LOST, RECOVERED
 from jawusd.geometry import make_transform, relative_pose, se3_exp, transform_point, transform_points
+from jawusd.tracking.contour.equations import NormalEquations, OutlineSums, Solution
 from jawusd.tracking.sequence.kinematic_prior import KinematicPrior
 from jawusd.tracking.sequence.model_refinement import hard_frames, refine_tracks
 
@@ -38,6 +39,15 @@ def truth(jaw):
     return np.stack([head, head @ jaw.pose(d)], axis=1)
 
 
+def terms(prior, poses, centres):
+    """Return the precision and the right side that a prior adds."""
+    equations = NormalEquations()
+    prior.accumulate(
+        Solution(poses, OutlineSums.zeros(0), centres, np.zeros((2, 6, 6)), np.zeros((2, 0)), 0), equations
+    )
+    return equations.matrix, equations.right
+
+
 def cost(prior, poses, centres, twists):
     """Distance of twisted poses to the model by brute force over d: mean squared landmark distance, whitened."""
     moved = []
@@ -56,10 +66,10 @@ def cost(prior, poses, centres, twists):
 
 
 def test_terms_are_slope_and_curvature_of_the_distance_to_the_model(jaw, truth):
-    prior = KinematicPrior(jaw, SPREAD_MM, np.ones(2))
+    prior = KinematicPrior(jaw, SPREAD_MM)
     poses, centres = truth[4].copy(), np.array([[0, 4.0, -3], [0, -9.0, -4]])
     poses[1] = poses[1] @ se3_exp([0.004, -0.003, 0.005, 0.08, -0.05, 0.1])
-    precision, right = prior.terms(poses, centres)
+    precision, right = terms(prior, poses, centres)
     rng = np.random.default_rng(0)
     for _ in range(4):
         direction = rng.normal(size=12) * np.tile([0.01, 0.01, 0.01, 0.3, 0.3, 0.3], 2)
@@ -71,8 +81,8 @@ def test_terms_are_slope_and_curvature_of_the_distance_to_the_model(jaw, truth):
 
 
 def test_motion_along_the_model_costs_nothing(jaw, truth):
-    prior = KinematicPrior(jaw, SPREAD_MM, np.ones(2))
-    precision, right = prior.terms(truth[4], np.zeros((2, 3)))
+    prior = KinematicPrior(jaw, SPREAD_MM)
+    precision, right = terms(prior, truth[4], np.zeros((2, 3)))
     d = jaw.encode(relative_pose(*truth[4]))[0]
     for k in range(3):
         other = truth[4, 0] @ jaw.pose(d + 1e-4 * np.eye(3)[k])

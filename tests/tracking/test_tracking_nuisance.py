@@ -10,8 +10,8 @@ from small_take import CAMERAS, LANDMARKS, MESHES, OFFSETS, errors_mm, make_capt
 from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, load_tracks, save_tracks
 from jawusd.geometry import rigidity_defect, se3_exp, se3_inverse, se3_log
 from jawusd.tracking import TrackingConfig, track_capture
+from jawusd.tracking.contour.equations import OutlineSums, Solution
 from jawusd.tracking.contour.frame_record import FrameRecord
-from jawusd.tracking.contour.solver import Solution
 from jawusd.tracking.sequence.extrinsics import Extrinsics, corrected_cameras
 from jawusd.tracking.sequence.frame_tracker import FrameTracker
 from jawusd.tracking.sequence.nuisance import Nuisances, bridge, leads
@@ -188,7 +188,7 @@ def _records(count, lost=()):
         status = np.full(2, TRACKED, np.int8)
         if f in lost:
             poses[1], status[1] = se3_exp([0, 0, 0, 30.0, 0, 0]) @ poses[1], LOST
-        nothing = np.zeros((2, 2, 8, 8)), np.ones((2, 3)), np.zeros((2, 6, 6)), np.zeros((2, 2)), 1
+        nothing = OutlineSums.zeros(2), np.ones((2, 3)), np.zeros((2, 6, 6)), np.zeros((2, 2)), 1
         records[f] = FrameRecord(Solution(poses, *nothing), status, np.ones((2, 2), bool), np.zeros((2, 2)))
     return records, step
 

@@ -117,7 +117,7 @@ def _slope(row, pose, matrix, centre, jacobian):
 
 
 @numba.njit(nogil=True, cache=True)
-def accumulate(samples, distances, gate_px, score_gate_px, pull, pose, matrix, centre, system):
+def accumulate(samples, distances, gate_px, score_gate_px, pull, pose, matrix, centre, precision, gradient, bias_slope):
     """Add the Tukey-weighted normal equations of one row of teeth in one view.
 
     The residual d of a sample shrinks by n . du when the sample moves by du in the picture; du follows from a left
@@ -132,10 +132,12 @@ def accumulate(samples, distances, gate_px, score_gate_px, pull, pose, matrix, c
         pose: scan to world, shape (4, 4).
         matrix: world [mm] to homogeneous px, shape (3, 4).
         centre: point the twist turns about, world coordinates [mm], shape (3,).
-        system: shape (8, 8), added to: rows 0-5 hold [H | g | sum w J], [6, 6] sum w, [6, 7] sum w d,
-            [7, 6] sum w d^2, [7, 7] the matched contour length [px], [6, 0] the score: contour length, each sample
-            counted by 1 minus Tukey's loss at the score gate [px].
+        precision, gradient, bias_slope: added to, shapes (6, 6), (6,), (6,); see `OutlineSums`.
+
+    Returns:
+        The sums weight, distance, square, matched_px and score_px of `OutlineSums`.
     """
+    sum_weight = sum_distance = sum_square = matched_px = score_px = 0.0
     jacobian = np.empty(6)
     for s in range(len(samples)):
         d = distances[s]
@@ -150,22 +152,23 @@ def accumulate(samples, distances, gate_px, score_gate_px, pull, pose, matrix, c
         else:
             e = 1.0 - (d / score_gate_px) ** 2
             if e > 0:
-                system[6, 0] += e * e * e * row[LENGTH]
+                score_px += e * e * e * row[LENGTH]
             e = 1.0 - (d / gate_px) ** 2
             if e <= 0:
                 continue
             weight = e * e
-            system[7, 7] += row[LENGTH]
+            matched_px += row[LENGTH]
         weight *= row[LENGTH]
         _slope(row, pose, matrix, centre, jacobian)
         for i in range(6):
             for k in range(6):
-                system[i, k] += weight * jacobian[i] * jacobian[k]
-            system[i, 6] += weight * jacobian[i] * d
-            system[i, 7] += weight * jacobian[i]
-        system[6, 6] += weight
-        system[6, 7] += weight * d
-        system[7, 6] += weight * d * d
+                precision[i, k] += weight * jacobian[i] * jacobian[k]
+            gradient[i] += weight * jacobian[i] * d
+            bias_slope[i] += weight * jacobian[i]
+        sum_weight += weight
+        sum_distance += weight * d
+        sum_square += weight * d * d
+    return sum_weight, sum_distance, sum_square, matched_px, score_px
 
 
 @numba.njit(nogil=True, cache=True)

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.geometry.arrays import Array, Mask
+from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.quality import residual_px, score_px
-from jawusd.tracking.contour.solver import Solution
 
 
 @dataclass(frozen=True, eq=False)

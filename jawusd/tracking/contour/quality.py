@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,8 +11,8 @@ from jawusd.geometry import hat, make_transform, mandible_metric, se3_adjoint, s
 from jawusd.geometry.arrays import Array
 from jawusd.imaging.raster import count_and_not, count_bits, draw_silhouette, pack_bits, project
 from jawusd.tracking.config import TrackingConfig
+from jawusd.tracking.contour.equations import NormalEquations, ResidualTerm, Solution
 from jawusd.tracking.contour.scan import Scan
-from jawusd.tracking.contour.solver import Solution, WeighedPrior
 from jawusd.tracking.contour.views import View
 
 # E[w d^2] / E[w] of a unit normal residual under the Tukey weight at 4.685 standard deviations, by quadrature.
@@ -20,24 +21,23 @@ _TUKEY_VARIANCE = 0.828
 
 def score_px(solution: Solution) -> Array:
     """Return the contour length that fits its mask edges, closeness counted, per row and view [px], shape (2, C)."""
-    return solution.systems[:, :, 6, 0]
+    return solution.outline.score_px
 
 
 def matched_px(solution: Solution) -> Array:
     """Return the matched contour length per row [px], shape (2,)."""
-    return solution.systems[:, :, 7, 7].sum(1)
+    return solution.outline.matched_px.sum(1)
 
 
 def residual_px(solution: Solution) -> Array:
     """Return the standard deviation of the matched residuals per row [px], shape (2,); NaN without a match."""
-    total = solution.systems.sum(1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.sqrt(total[:, 7, 6] / total[:, 6, 6] / _TUKEY_VARIANCE)
+        return np.sqrt(solution.outline.square.sum(1) / solution.outline.weight.sum(1) / _TUKEY_VARIANCE)
 
 
 def view_residual_px(solution: Solution) -> Array:
     """Return the standard deviation of the matched residuals per row and view [px], shape (2, C); NaN without any."""
-    weight, square = solution.systems[:, :, 6, 6], solution.systems[:, :, 7, 6]
+    weight, square = solution.outline.weight, solution.outline.square
     out = np.full(weight.shape, np.nan)
     np.divide(square, weight * _TUKEY_VARIANCE, out=out, where=weight > 0)
     return np.sqrt(out)
@@ -97,7 +97,7 @@ def twist_covariance(solution: Solution, row: int, sigma_px: float, correlation_
     Returns:
         Covariance (rad, mm); infinite on the diagonal where the masks leave a motion free.
     """
-    H = solution.systems[row, :, :6, :6].sum(0)
+    H = solution.outline.precision[row].sum(0)
     free = np.diag(np.full(6, np.inf))
     if not np.isfinite(sigma_px) or np.linalg.matrix_rank(H, hermitian=True) < 6:
         return free
@@ -105,23 +105,24 @@ def twist_covariance(solution: Solution, row: int, sigma_px: float, correlation_
     return A @ (sigma_px**2 * correlation_px * np.linalg.inv(H)) @ A.T
 
 
-def joint_covariance(solution: Solution, prior: WeighedPrior, sigma_px: Array, correlation_px: float) -> Array | None:
+def joint_covariance(solution: Solution, prior: ResidualTerm, sigma_px: Array, correlation_px: float) -> Array | None:
     """Return the covariance of both rows' left twists about the world origin given masks and prior, shape (12, 12).
 
     Args:
         solution: an alignment with the prior.
-        prior: what else is known of the two poses.
+        prior: what else is known of the two poses, as log-likelihood.
         sigma_px, correlation_px: as for `twist_covariance`, the former per row, shape (2,).
 
     Returns:
         Covariance (rad, mm), rows (upper, lower); None where masks and prior leave a motion free.
     """
-    precision, _ = prior.terms(solution.poses, np.zeros((2, 3)))
+    equations = NormalEquations()
+    prior.accumulate(replace(solution, centres=np.zeros((2, 3))), equations)
     for r in (0, 1):
         to_centre = se3_adjoint(make_transform(np.eye(3), -solution.centres[r]))
-        block = slice(6 * r, 6 * r + 6)
-        H = solution.systems[r, :, :6, :6].sum(0) / (sigma_px[r] ** 2 * correlation_px)
-        precision[block, block] += to_centre.T @ H @ to_centre
+        H = solution.outline.precision[r].sum(0) / (sigma_px[r] ** 2 * correlation_px)
+        equations.add(r, to_centre.T @ H @ to_centre, np.zeros(6))
+    precision = equations.matrix
     if not np.isfinite(precision).all():
         return None
     scale = 1.0 / np.sqrt(np.maximum(np.diag(precision), 1e-300))
@@ -140,7 +141,7 @@ def correlation_px(solution: Solution, config: TrackingConfig) -> Array:
     out = np.full(2, np.nan)
     sigma = residual_px(solution)
     for r in (0, 1):
-        H = solution.systems[r, :, :6, :6].sum(0)
+        H = solution.outline.precision[r].sum(0)
         if sigma[r] > 0 and np.linalg.matrix_rank(H, hermitian=True) == 6:
             measured = np.trace(np.linalg.solve(H, solution.scatters[r])) / (6 * sigma[r] ** 2)
             out[r] = config.tile_factor * measured

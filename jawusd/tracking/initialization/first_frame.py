@@ -8,9 +8,10 @@ from jawusd.errors import TrackingError
 from jawusd.formats.tracks import PARTIAL, TRACKED
 from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import TrackingConfig
+from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.frame_record import FrameRecord
 from jawusd.tracking.contour.quality import row_fit, score_px, uncovered_px
-from jawusd.tracking.contour.solver import ContourSolver, Solution
+from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import MaskViews
 
 _ROWS = (0, 1)

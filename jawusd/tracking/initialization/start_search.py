@@ -11,8 +11,9 @@ from jawusd.errors import TrackingError
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import make_transform, so3_log, transform_point, transform_points
 from jawusd.geometry.arrays import Array
+from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.quality import row_fit, score_px, uncovered_px
-from jawusd.tracking.contour.solver import ContourSolver, Solution
+from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import View
 from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.initialization.pose_search import Candidate, Grid, coarse_scan, hinge_at_front, search_row

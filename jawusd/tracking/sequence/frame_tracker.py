@@ -11,6 +11,7 @@ from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, TRACKED
 from jawusd.geometry import make_transform, se3_exp, transform_point
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.config import TrackingConfig
+from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.frame_record import FrameRecord
 from jawusd.tracking.contour.quality import (
     crown_sigma_mm,
@@ -20,7 +21,7 @@ from jawusd.tracking.contour.quality import (
     uncovered_px,
     view_residual_px,
 )
-from jawusd.tracking.contour.solver import ContourSolver, Solution
+from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import View
 from jawusd.tracking.initialization.reacquire import shift_to_masks
 from jawusd.tracking.sequence.history import History

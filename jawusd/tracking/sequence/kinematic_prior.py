@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.evaluator import JawRig
 from jawusd.geometry import (
@@ -19,6 +18,7 @@ from jawusd.geometry import (
     transform_points,
 )
 from jawusd.geometry.arrays import Array
+from jawusd.tracking.contour.equations import NormalEquations, Solution
 
 _NORMAL_DIRECTIONS = 3  # six motions of a rigid body less the three the model allows
 
@@ -36,33 +36,24 @@ class KinematicPrior:
     Attributes:
         jaw: the person's model.
         spread_mm: rms landmark distance s of good tracked poses from the model [mm].
-        variance_px3: outline variance times correlation length per row [px^3], shape (2,): what the masks weigh.
     """
 
     jaw: JawRig
     spread_mm: float
-    variance_px3: Array
 
-    def terms(self, poses: Array, centres: Array) -> tuple[NDArray, NDArray]:
-        """Return the normal equations of the prior.
-
-        Args:
-            poses: T_world_upper, T_world_lower, shape (2, 4, 4).
-            centres: world points that the rows' left twists turn about [mm], shape (2, 3).
-
-        Returns:
-            Precision matrix (12, 12) and right side (12,) of the twists (upper, lower).
-        """
+    def accumulate(self, state: Solution, equations: NormalEquations) -> None:
+        """Add the log-likelihood of the deviation from the model, linearised."""
+        poses = state.poses
         relative = relative_pose(poses[0], poses[1])
         d = self.jaw.encode(relative)[0]
         pose = self.jaw.pose(d)
         deviation = se3_log(relative @ se3_inverse(pose))
         precision = self._precision(d, pose)
         to_skull = se3_adjoint(se3_inverse(poses[0]))
-        about = [se3_adjoint(make_transform(np.eye(3), centre)) for centre in centres]
+        about = [se3_adjoint(make_transform(np.eye(3), centre)) for centre in state.centres]
         # To first order exp(xi') = exp(Ad(T_u^-1) (x_l - x_u)) exp(xi).
         slope = np.hstack([-to_skull @ about[0], to_skull @ about[1]])
-        return slope.T @ precision @ slope, -slope.T @ precision @ deviation
+        equations.add_joint(slope.T @ precision @ slope, -slope.T @ precision @ deviation)
 
     def _precision(self, d: Array, pose: Array) -> Array:
         """Return P at a model pose, shape (6, 6)."""

@@ -16,9 +16,10 @@ from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, Tracks
 from jawusd.geometry import Camera, relative_pose, se3_adjoint, se3_exp, se3_inverse, se3_log, transform_point
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.config import TrackingConfig
+from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.quality import joint_covariance, landmark_sigmas, matched_px, residual_px, uncovered_px
 from jawusd.tracking.contour.scan import prepare_scan
-from jawusd.tracking.contour.solver import ContourSolver, Solution
+from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import MaskViews, View
 from jawusd.tracking.sequence.extrinsics import corrected_cameras
 from jawusd.tracking.sequence.kinematic_prior import KinematicPrior
@@ -74,7 +75,7 @@ def refine_tracks(
     scans = (prepare_scan(upper, "upper"), prepare_scan(lower, "lower"))
     table = {camera.name: camera for camera in corrected_cameras(cameras, tracks.meta)}
     middle = np.mean([transform_point(tracks.T_world_upper[good][0], s.centre) for s in scans], axis=0)
-    prior = KinematicPrior(jaw, _spread_mm(jaw, tracks, good), _variances(tracks))
+    prior = KinematicPrior(jaw, _spread_mm(jaw, tracks, good))
     starts = _starts(tracks, jaw, measured)
     found: dict[int, _Aided] = {}
     with (
@@ -107,6 +108,7 @@ class _SecondPass:
     def __init__(self, solver: ContourSolver, config: TrackingConfig, prior: KinematicPrior, tracks: Tracks) -> None:
         self._solver, self._config, self._prior, self._tracks = solver, config, prior, tracks
         self._usual_px = np.nanmedian(np.where(tracks.status == TRACKED, tracks.residual_px, np.nan), axis=0)
+        self._outline_weight = 1.0 / _variances(tracks)
         self._correlation_px = float(tracks.meta.get("correlation_px", config.correlation_px))
 
     def align(self, k: int, start: Array, views: Sequence[View]) -> _Aided | None:
@@ -115,7 +117,7 @@ class _SecondPass:
         lost = self._tracks.status[k] == LOST
         use = present & (self._tracks.masks_used[k] | lost[:, None])
         gates = self._config.wide_gates_px if lost.any() else self._config.gates_from(0.0)
-        solution = self._solver.solve(start, views, gates, use, self._prior)
+        solution = self._solver.solve(start, views, gates, use, (self._prior,), self._outline_weight)
         covariance = joint_covariance(solution, self._prior, residual_px(solution), self._correlation_px)
         if covariance is None or not self._fits(solution, views, use, covariance):
             return None

@@ -151,23 +151,28 @@ def leads(records: Mapping[int, FrameRecord], frame: int, delays: Array) -> Arra
 
 def _reduced(solution, velocity, row: int, pivot) -> tuple[Array, Array, float]:
     """Return one frame's part of the normal equations, the pose eliminated, and the weight of its samples."""
-    systems = solution.systems[row]
-    C = len(systems)
+    outline = solution.outline
+    C = len(outline.weight[row])
     size = 7 * C + 2
     to_centre = lever(pivot, solution.centres[row])
     S, r, B = np.zeros((size, size)), np.zeros(size), np.zeros((6, size))
     bias = np.eye(size)[C + row]
-    for c, system in enumerate(systems):
-        H, g, s = system[:6, :6], system[:6, 6], system[:6, 7]
+    for c in range(C):
+        H, g, s = outline.precision[row, c], outline.gradient[row, c], outline.bias_slope[row, c]
         D = np.zeros((6, size))  # how the nuisances move the row in this camera
         D[:, c] = velocity
         D[:, C + 2 + 6 * c : C + 8 + 6 * c] = to_centre
         B += H @ D + np.outer(s, bias)
-        S += D.T @ H @ D + np.outer(D.T @ s, bias) + np.outer(bias, s @ D) + system[6, 6] * np.outer(bias, bias)
-        r += D.T @ g + system[6, 7] * bias
-    H, g = systems[:, :6, :6].sum(0), systems[:, :6, 6].sum(0)
+        S += (
+            D.T @ H @ D
+            + np.outer(D.T @ s, bias)
+            + np.outer(bias, s @ D)
+            + outline.weight[row, c] * np.outer(bias, bias)
+        )
+        r += D.T @ g + outline.distance[row, c] * bias
+    H, g = outline.precision[row].sum(0), outline.gradient[row].sum(0)
     eliminated = np.linalg.lstsq(H, np.column_stack([B, g]), rcond=1e-10)[0]
-    return S - B.T @ eliminated[:, :-1], r - B.T @ eliminated[:, -1], float(systems[:, 6, 6].sum())
+    return S - B.T @ eliminated[:, :-1], r - B.T @ eliminated[:, -1], float(outline.weight[row].sum())
 
 
 def velocity_twist(records: Mapping[int, FrameRecord], frame: int, row: int) -> Array | None:

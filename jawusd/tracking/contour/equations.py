@@ -1,0 +1,151 @@
+"""The normal equations of one Gauss-Newton step, and the terms that add to them.
+
+Unknown are the left twists (omega [rad], v [mm]) of both arches about their centres. Whatever constrains the two poses
+is a `ResidualTerm`: the outline against the masks, the pull towards the start, the jaw model of the person. A new
+kind of measurement is a new class with `accumulate`, handed to `ContourSolver.solve`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from jawusd.geometry import make_transform, se3_inverse, se3_log
+from jawusd.geometry.arrays import Array
+
+ARCHES = (0, 1)  # upper, lower
+
+
+class OutlineSums(NamedTuple):
+    """Sums over matched contour samples per arch and view; w weight, d distance to the mask edge [px], J slope.
+
+    Attributes:
+        precision: sum w J^T J, shape (2, C, 6, 6).
+        gradient: sum w J d, shape (2, C, 6).
+        bias_slope: sum w J, which couples poses with masks that are too wide, shape (2, C, 6).
+        weight, distance, square: sum w, sum w d and sum w d^2, shape (2, C).
+        matched_px: contour length within the gate, shape (2, C).
+        score_px: contour length, each sample counted by 1 minus Tukey's loss at the score gate, shape (2, C).
+    """
+
+    precision: Array
+    gradient: Array
+    bias_slope: Array
+    weight: Array
+    distance: Array
+    square: Array
+    matched_px: Array
+    score_px: Array
+
+    @classmethod
+    def zeros(cls, cameras: int) -> OutlineSums:
+        """Return empty sums for so many views."""
+        shapes: tuple[tuple[int, ...], ...] = ((6, 6), (6,), (6,), (), (), (), (), ())
+        return cls(*(np.zeros((2, cameras, *shape)) for shape in shapes))
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Hold poses with their linearised residuals: the state of an iteration, and the outcome of an alignment.
+
+    Attributes:
+        poses: T_world_upper and T_world_lower, shape (2, 4, 4).
+        outline: sums over the matched contour samples.
+        centres: points the twists turn about, world coordinates [mm], shape (2, 3).
+        scatters: sums over picture tiles of the squared score of `scatter_of_tiles`, per arch, shape (2, 6, 6).
+        visible_px: contour length that could have been matched, per arch and view [px], shape (2, C).
+        iterations: how many linearised steps were taken.
+    """
+
+    poses: Array
+    outline: OutlineSums
+    centres: Array
+    scatters: Array
+    visible_px: Array
+    iterations: int
+
+
+class NormalEquations:
+    """Sum up precision and right side of both arches' twists, in named blocks.
+
+    Attributes:
+        matrix: precision, arches in the order (upper, lower), shape (12, 12); `upper`, `lower` and `coupling` are
+            views of its blocks.
+        right: right side, shape (12,).
+        outline_weight: what a squared pixel of distance times a pixel of contour counts, per arch [1/px^3], shape (2,):
+            1, or the inverse of outline variance times correlation length if other terms are log-likelihoods.
+    """
+
+    def __init__(self, outline_weight: Array | None = None) -> None:
+        self.matrix, self.right = np.zeros((12, 12)), np.zeros(12)
+        self.outline_weight = np.ones(2) if outline_weight is None else outline_weight
+
+    @property
+    def upper(self) -> Array:
+        """The precision of the upper arch, shape (6, 6)."""
+        return self.matrix[:6, :6]
+
+    @property
+    def lower(self) -> Array:
+        """The precision of the lower arch, shape (6, 6)."""
+        return self.matrix[6:, 6:]
+
+    @property
+    def coupling(self) -> Array:
+        """The precision that couples upper (rows) and lower arch (columns), shape (6, 6)."""
+        return self.matrix[:6, 6:]
+
+    def add(self, arch: int, precision: Array, right: Array) -> None:
+        """Add what constrains one arch alone, shapes (6, 6) and (6,)."""
+        (self.upper, self.lower)[arch][:] += precision
+        self.right[6 * arch : 6 * arch + 6] += right
+
+    def add_joint(self, precision: Array, right: Array) -> None:
+        """Add what constrains both arches together, shapes (12, 12) and (12,)."""
+        self.matrix += precision
+        self.right += right
+
+    def solve(self) -> Array:
+        """Return the twists of both arches, shape (2, 6)."""
+        return np.linalg.solve(self.matrix, self.right).reshape(2, 6)
+
+
+class ResidualTerm(Protocol):
+    """Constrain the poses of both arches."""
+
+    def accumulate(self, state: Solution, equations: NormalEquations) -> None:
+        """Add the term's linearised residuals at the poses of a state."""
+        ...
+
+
+class OutlineTerm:
+    """Draw silhouettes and gingival margins onto the edges of their masks."""
+
+    def accumulate(self, state: Solution, equations: NormalEquations) -> None:
+        """Add the sums over the matched contour samples of all views."""
+        for arch, weight in enumerate(equations.outline_weight):
+            precision, gradient = (table[arch].sum(0) for table in state.outline[:2])
+            equations.add(arch, weight * precision, weight * gradient)
+
+
+@dataclass(frozen=True, eq=False)
+class StartTerm:
+    """Pull weakly towards the start, which keeps motions finite that the masks leave free.
+
+    Attributes:
+        start: T_world_upper and T_world_lower, shape (2, 4, 4).
+        strength: precision of every component of the twists, in units of the outline sums, shape (2, 6).
+    """
+
+    start: Array
+    strength: Array
+
+    def accumulate(self, state: Solution, equations: NormalEquations) -> None:
+        """Add the pull at the state's poses."""
+        for arch, weight in enumerate(equations.outline_weight):
+            to, back = (make_transform(np.eye(3), sign * state.centres[arch]) for sign in (-1, 1))
+            away = se3_log(to @ state.poses[arch] @ se3_inverse(self.start[arch]) @ back)
+            strength = weight * self.strength[arch]
+            equations.add(arch, np.diag(strength), -strength * away)
