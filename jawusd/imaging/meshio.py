@@ -1,4 +1,4 @@
-"""Read scans and bones from PLY, STL and OBJ, and tell teeth from gum by their colours."""
+"""Read scans and bones from PLY, STL and OBJ."""
 
 from __future__ import annotations
 
@@ -14,18 +14,12 @@ from numpy.typing import NDArray
 from jawusd.errors import CaptureError
 from jawusd.formats.mesh import Mesh
 
-__all__ = ["BOUNDARY", "GUM", "TOOTH", "Winding", "load_mesh", "tooth_labels", "winding"]
-
-GUM, TOOTH, BOUNDARY = 0, 1, 2
+__all__ = ["Winding", "load_mesh", "winding"]
 
 _KINDS = (".ply", ".stl", ".obj")
 # Diagonal of the bounding box [mm]: smallest, typical, largest. A full arch has about 80, a mandible 165, a skull 290.
 _DIAGONAL_MM = {"scan": (20.0, 80.0, 150.0), "bone": (50.0, 200.0, 500.0)}
 _UNITS_MM = {"metres": 1000.0, "centimetres": 10.0, "inches": 25.4, "micrometres": 0.001}
-# How far red or green must stand out from the other channels (of 255) to be a label: painted labels stand out by more
-# (pure red by 255), the gum of photographic scan textures, such as (200, 110, 110), by less.
-_PAINT_CONTRAST = 100
-_FEWEST_PAINTED = 0.01  # share of the vertices; a handful of reddish ones is no labelling
 
 
 def load_mesh(path: str | os.PathLike[str], kind: Literal["scan", "bone"] = "scan") -> Mesh:
@@ -94,28 +88,6 @@ def _checked(path: Path, vertices: NDArray, faces: NDArray, colors: NDArray[np.u
     if turned.closed and not turned.outward:
         return Mesh(mesh.vertices, mesh.faces[:, ::-1], colors)
     return mesh
-
-
-def tooth_labels(mesh: Mesh) -> NDArray[np.uint8]:
-    """Tell teeth from gum by vertex colour.
-
-    Red vertices are teeth, green ones teeth whose border is of interest (the incisal edge), all others gum. A scan
-    without colours, or with hardly any red or green, counts as teeth all over.
-
-    Args:
-        mesh: a teeth scan.
-
-    Returns:
-        GUM, TOOTH or BOUNDARY per vertex, shape (V,), uint8; everything that is tooth is > 0.
-    """
-    labels = np.full(len(mesh.vertices), GUM, np.uint8)
-    if mesh.colors is not None:
-        red, green, blue = mesh.colors.astype(np.int16).T
-        labels[red - np.maximum(green, blue) > _PAINT_CONTRAST] = TOOTH
-        labels[green - np.maximum(red, blue) > _PAINT_CONTRAST] = BOUNDARY
-    if np.count_nonzero(labels) < _FEWEST_PAINTED * len(labels) or mesh.colors is None:
-        labels[:] = TOOTH
-    return labels
 
 
 class Winding(NamedTuple):

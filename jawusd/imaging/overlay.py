@@ -12,11 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.formats.atomic import write_bytes_atomic
-from jawusd.formats.mesh import Mesh
+from jawusd.formats.mesh import Mesh, crown_faces
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import Camera, transform_points
 from jawusd.geometry.arrays import Array
-from jawusd.imaging.meshio import GUM, tooth_labels
 from jawusd.imaging.raster import draw_depth_labels
 from jawusd.imaging.video import Video
 
@@ -167,7 +166,7 @@ def _visible_crowns(camera: Camera, scans: Sequence[PlacedScan]) -> NDArray[np.u
         if not np.isfinite(scan.T_world_scan).all():
             continue
         points = _points(camera, scan)
-        crown = (tooth_labels(scan.mesh)[scan.mesh.faces] != GUM).all(axis=1)
+        crown = crown_faces(scan.mesh)
         for faces, label in ((scan.mesh.faces[~crown], 0), (scan.mesh.faces[crown], number)):
             draw_depth_labels(points, faces, 0, 0, False, inverse_depth, labels, label)
     return labels

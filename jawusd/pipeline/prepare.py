@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from jawusd.errors import CalibrationError, CaptureError, explain_missing_packages
 from jawusd.formats.camera_files import calibration_files, load_cameras_file
 from jawusd.formats.capture import CameraSource, Capture, load_capture
-from jawusd.formats.mesh import Mesh
+from jawusd.formats.mesh import Mesh, tooth_labels
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import LANDMARKS, Camera, anatomical_frame, find_landmarks
 from jawusd.geometry.arrays import Array
@@ -182,8 +182,6 @@ def measure_anatomy(meshes: Mapping[str, Mesh], given: ArrayLike | None, named: 
     Raises:
         CaptureError: the scans are swapped or not in occlusion.
     """
-    from jawusd.imaging.meshio import tooth_labels
-
     crowns = {name: mesh.vertices[tooth_labels(mesh) > 0] for name, mesh in meshes.items() if "teeth" in name}
     inferred = []
     if given is None:

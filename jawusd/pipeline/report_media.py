@@ -121,9 +121,7 @@ def replay_parts(folder: Path, model: JawModel) -> tuple[ReplayPart, ...]:
 
 
 def _small(mesh: Mesh) -> Mesh:
-    from jawusd.tracking.contour.decimation import thinned
+    from jawusd.imaging.decimation import decimated
 
-    none = np.empty((0, 3), np.int32)
     count = min(_MOST_FACES, len(mesh.faces))
-    vertices, faces, _ = thinned(mesh.vertices, mesh.faces, none, count)
-    return Mesh(vertices, faces)
+    return Mesh(*decimated(mesh.vertices, mesh.faces, count))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from jawusd.errors import FormatError, explain_missing_packages
 from jawusd.formats.capture import Bootstrap, Capture
 from jawusd.formats.capture_edit import write_bootstrap
-from jawusd.formats.mesh import Mesh
+from jawusd.formats.mesh import Mesh, crown_faces
 from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.geometry import Camera
 from jawusd.geometry.arrays import Array
@@ -89,7 +89,6 @@ def viewed_capture(
         SyncError: the cameras cannot be aligned in time.
     """
     from jawusd.imaging.frame_reader import FrameReader
-    from jawusd.imaging.meshio import GUM, tooth_labels
     from jawusd.viewer.viewed import ViewedCapture
 
     path = Path(path)
@@ -111,7 +110,6 @@ def viewed_capture(
         offsets=offsets,
         scans={row: meshes[f"{row}_teeth"] for row in ("upper", "lower")},
     )
-    labels = {row: tooth_labels(mesh) != GUM for row, mesh in footage.scans.items()}
     return ViewedCapture(
         name=capture.name,
         fps=capture.fps,
@@ -120,7 +118,7 @@ def viewed_capture(
         sizes_px={name: video.size_px for name, video in videos.items()},
         cameras=footage.cameras,
         scans=footage.scans,
-        crowns={row: labels[row][mesh.faces].all(axis=1) for row, mesh in footage.scans.items()},
+        crowns={row: crown_faces(mesh) for row, mesh in footage.scans.items()},
         T_anatomical_skull=find_anatomy(capture, meshes).T_anatomical_skull,
         tracks=poses,
         picks=capture.bootstrap,

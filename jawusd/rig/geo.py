@@ -8,8 +8,8 @@ import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdShade
 
 from jawusd.errors import RigError
-from jawusd.formats.mesh import Mesh
-from jawusd.geometry.arrays import Array, Mask
+from jawusd.formats.mesh import Mesh, crown_faces
+from jawusd.geometry.arrays import Array
 from jawusd.rig import _gf
 from jawusd.rig.layers import define_prim, new_layer, set_attribute, stage_of
 from jawusd.rig.layout import ACTOR, GEO, MANDIBLE, MATERIALS, SKULL
@@ -30,8 +30,6 @@ _MATERIALS = {
     "Bone": ((0.75, 0.68, 0.54), 0.70),
     "Placeholder": ((0.35, 0.45, 0.60), 0.90),
 }
-# A vertex counts as crown when red or green stands out by this much of 255; grey is gum.
-_PAINT_CONTRAST = 60
 
 
 def build_geometry(meshes: Mapping[str, Mesh], T_rest: Array, placeholder: str | None = None) -> Sdf.Layer:
@@ -134,7 +132,7 @@ def _define_mesh(
     prim.CreateDoubleSidedAttr(True)  # scans are open surfaces
     prim.CreateNormalsAttr(_gf.vec3f_array(corner_normals(mesh)))
     prim.SetNormalsInterpolation(UsdGeom.Tokens.faceVarying)
-    gum = gum_faces(mesh) if base == "Enamel" else np.zeros(len(mesh.faces), dtype=bool)
+    gum = ~crown_faces(mesh) if base == "Enamel" else np.zeros(len(mesh.faces), dtype=bool)
     prim.CreateDisplayColorAttr([Gf.Vec3f(*_MATERIALS[base][0])])
     binding = UsdShade.MaterialBindingAPI.Apply(prim.GetPrim())
     binding.Bind(materials[base])
@@ -145,20 +143,6 @@ def _define_mesh(
             )
             UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(materials[name])
         binding.SetMaterialBindSubsetsFamilyType(UsdGeom.Tokens.partition)
-
-
-def gum_faces(mesh: Mesh) -> Mask:
-    """Return which faces of a painted teeth scan are gum, shape (F,): two corners neither red nor green.
-
-    A scan without colours, or without any painted crown, is all enamel.
-    """
-    if mesh.colors is None:
-        return np.zeros(len(mesh.faces), dtype=bool)
-    color = mesh.colors.astype(np.int16)
-    red = color[:, 0] - np.maximum(color[:, 1], color[:, 2])
-    green = color[:, 1] - np.maximum(color[:, 0], color[:, 2])
-    crown = (np.maximum(red, green) > _PAINT_CONTRAST)[mesh.faces].sum(axis=1) >= 2
-    return ~crown if crown.any() else crown
 
 
 def corner_normals(mesh: Mesh) -> Array:

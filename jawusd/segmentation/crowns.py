@@ -8,10 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.formats.mesh import Mesh
+from jawusd.formats.mesh import Mesh, crown_faces
 from jawusd.geometry import Camera, transform_points
 from jawusd.geometry.arrays import Array, Mask
-from jawusd.imaging.meshio import GUM, tooth_labels
 from jawusd.imaging.raster import draw_depth_labels
 
 OTHER, UPPER, LOWER = 0, 1, 2
@@ -34,13 +33,8 @@ class ScanSurface:
     @classmethod
     def of(cls, mesh: Mesh) -> ScanSurface:
         """Split a teeth scan at the line where most corners of a face are tooth."""
-        faces = np.asarray(mesh.faces, np.int32)
-        crown = (tooth_labels(mesh) != GUM)[faces].sum(1) >= 2
-        return cls(
-            np.asarray(mesh.vertices, np.float64),
-            np.ascontiguousarray(faces[crown]),
-            np.ascontiguousarray(faces[~crown]),
-        )
+        crown = crown_faces(mesh)
+        return cls(mesh.vertices, mesh.faces[crown], mesh.faces[~crown])
 
     def crown_points(self) -> Array:
         """Return the vertices of the crowns [mm], shape (N, 3)."""

@@ -25,9 +25,9 @@ sys.path.insert(0, str(Path(__file__).parent))
 from degrade import KINDS, ROWS, degrade
 
 from jawusd.formats.capture import load_capture
+from jawusd.formats.mesh import tooth_labels
 from jawusd.formats.tracks import TRACKED, Tracks, load_tracks, save_tracks
 from jawusd.geometry import LANDMARKS, mandible_metric, transform_points
-from jawusd.imaging.meshio import tooth_labels
 from jawusd.pipeline.prepare import find_anatomy, load_cameras, load_meshes
 from jawusd.tracking import track_capture
 

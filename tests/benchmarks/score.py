@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from jawusd.formats.capture import load_capture
+from jawusd.formats.mesh import tooth_labels
 from jawusd.formats.tracks import load_tracks
 from jawusd.geometry import LANDMARKS, se3_inverse, se3_log, transform_points
-from jawusd.imaging.meshio import load_mesh, tooth_labels
+from jawusd.imaging.meshio import load_mesh
 from jawusd.pipeline.prepare import find_anatomy, load_meshes
 
 

@@ -89,8 +89,8 @@ def run_setup(path: Path, setup: Setup, windows: int, length: int) -> dict:
     import numpy as np
 
     from jawusd.formats.capture import load_capture
+    from jawusd.formats.mesh import tooth_labels
     from jawusd.geometry import transform_points
-    from jawusd.imaging.meshio import tooth_labels
     from jawusd.pipeline.prepare import find_anatomy, load_cameras, load_meshes
     from jawusd.tracking import track_capture
     from jawusd.tracking.contour.solver import ContourSolver
@@ -131,8 +131,8 @@ def cut(capture: object, cameras: list, scans: list, truth: dict, start: int, le
     import numpy as np
 
     from jawusd.formats.capture import Bootstrap, Pick, PickView
+    from jawusd.formats.mesh import tooth_labels
     from jawusd.geometry import transform_point
-    from jawusd.imaging.meshio import tooth_labels
 
     first = int(truth["frames"][start])
     picks = {}

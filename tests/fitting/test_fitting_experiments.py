@@ -110,7 +110,7 @@ def test_the_first_component_of_a_screw_motion_is_that_screw(data):
     straight = replace(data, motion=se3_exp(amount[:, None] * screw))
     swept = principal_opening(straight)
     points = transform_point(swept, data.incisor)
-    expected = transform_points(se3_exp(np.linspace(0, 40, 4000)[:, None] * screw), data.incisor)
+    expected = transform_point(se3_exp(np.linspace(0, 40, 4000)[:, None] * screw), data.incisor)
     assert np.linalg.norm(points[:, None] - expected, axis=-1).min(1).max() < 0.02
     opened = -(points[:, 1] - data.incisor[1])
     assert opened[-1] == pytest.approx(opened.max()) and opened[-1] > 20

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from jawusd.errors import CaptureError
-from jawusd.formats.mesh import Mesh
+from jawusd.formats.mesh import BOUNDARY, GUM, TOOTH, Mesh, crown_faces, tooth_labels
 from jawusd.imaging import meshio
 
 
@@ -37,16 +37,16 @@ def test_vertex_order_faces_and_colours_survive(tmp_path: Path, name: str) -> No
     assert np.allclose(mesh.vertices, source.vertices, atol=1e-5) and mesh.vertices.dtype == np.float64
     assert np.array_equal(mesh.faces, source.faces) and mesh.faces.dtype == np.int32
     assert np.abs(mesh.colors.astype(int) - colors).max() <= 1
-    labels = meshio.tooth_labels(mesh)
+    labels = tooth_labels(mesh)
     x = source.vertices[:, 0]
-    assert np.array_equal(labels, np.select([x > 20, x > 0], [meshio.BOUNDARY, meshio.TOOTH], meshio.GUM))
+    assert np.array_equal(labels, np.select([x > 20, x > 0], [BOUNDARY, TOOTH], GUM))
 
 
 def test_stl_keeps_the_triangles(tmp_path: Path) -> None:
     source = arch()
     source.export(tmp_path / "a.stl")
     mesh = meshio.load_mesh(tmp_path / "a.stl")
-    assert mesh.colors is None and (meshio.tooth_labels(mesh) == meshio.TOOTH).all()
+    assert mesh.colors is None and (tooth_labels(mesh) == TOOTH).all()
     assert np.allclose(mesh.vertices[mesh.faces], source.triangles, atol=1e-5)
     found = meshio.winding(mesh)
     assert found.closed and found.outward and found.volume_mm3 == pytest.approx(source.volume, rel=1e-5)
@@ -124,7 +124,15 @@ def test_photographic_colours_are_no_labels() -> None:
     skin = np.clip(rng.normal((205, 125, 120), 4, (len(source.vertices), 3)), 0, 255).astype(np.uint8)
     skin[0] = (255, 0, 0)
     mesh = Mesh(source.vertices, source.faces, skin)
-    assert (meshio.tooth_labels(mesh) == meshio.TOOTH).all()
+    assert (tooth_labels(mesh) == TOOTH).all()
+
+
+def test_a_face_is_crown_with_two_tooth_corners() -> None:
+    vertices = np.random.default_rng(2).normal(size=(4, 3))
+    colors = np.array([(255, 0, 0), (0, 255, 0), (90, 90, 90), (200, 110, 110)], np.uint8)
+    mesh = Mesh(vertices, np.array([[0, 1, 2], [0, 2, 3], [2, 0, 1], [0, 3, 1]]), colors)
+    assert crown_faces(mesh).tolist() == [True, False, True, True]
+    assert crown_faces(Mesh(vertices, mesh.faces)).all()
 
 
 def test_winding_tells_closed_from_open_and_out_from_in() -> None:

@@ -124,6 +124,7 @@ def write_meshes(folder):
 
 
 def read_mesh(place, path):
-    from jawusd.imaging.meshio import load_mesh, tooth_labels
+    from jawusd.formats.mesh import tooth_labels
+    from jawusd.imaging.meshio import load_mesh
 
     tooth_labels(load_mesh(path))

@@ -10,10 +10,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from jawusd.errors import TrackingError
-from jawusd.formats.mesh import Mesh
+from jawusd.formats.mesh import Mesh, crown_faces, tooth_labels
 from jawusd.geometry.arrays import Array
-from jawusd.imaging.meshio import tooth_labels
-from jawusd.tracking.contour.decimation import thinned
+from jawusd.imaging.decimation import decimated_scan
 from jawusd.tracking.contour.gingival_margin import crown_gum_segments
 
 _PROBES = 300  # enough for a mean over the crowns to one per cent
@@ -76,9 +75,8 @@ def prepare_scan(mesh: Mesh, name: str) -> Scan:
         TrackingError: the scan has too few faces to be tracked.
     """
     vertices, faces = _weld(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int32))
-    tooth = tooth_labels(mesh) > 0
-    painted = not tooth.all()
-    crown = tooth[np.asarray(mesh.faces)].sum(1) >= 2
+    painted = not (tooth_labels(mesh) > 0).all()
+    crown = crown_faces(mesh)
     solid = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
     crown_faces = np.ascontiguousarray(faces[crown & solid])
     if painted:
@@ -92,7 +90,7 @@ def prepare_scan(mesh: Mesh, name: str) -> Scan:
     scan = _with_tables(name, vertices, crown_faces, gum_faces, painted)
     if len(crown_faces) <= _DENSE_FACES:
         return scan
-    thin = _with_tables(name, *thinned(vertices, crown_faces, gum_faces, _THIN_FACES), painted)
+    thin = _with_tables(name, *decimated_scan(vertices, crown_faces, gum_faces, _THIN_FACES), painted)
     # Steps turn about the centre, so both must have the same.
     return replace(scan, thin=replace(thin, probes=scan.probes, centre=scan.centre, radius_mm=scan.radius_mm))
 

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.errors import TrackingError
-from jawusd.formats.mesh import Mesh
+from jawusd.formats.mesh import BOUNDARY, Mesh, crown_faces, tooth_labels
 from jawusd.geometry import transform_points
 from jawusd.geometry.arrays import Array, Mask
-from jawusd.imaging.meshio import BOUNDARY, GUM, tooth_labels, winding
+from jawusd.imaging.meshio import winding
 from jawusd.tracking.contour.views import View
 
 _MARGIN_PX = 48  # of the screen buffer around the scan at the start: 7 mm, farther than any search goes
@@ -60,7 +60,7 @@ def paper_scan(mesh: Mesh, name: str) -> PaperScan:
         TrackingError: the scan has no boundary of interest.
     """
     corner = tooth_labels(mesh)[mesh.faces]
-    teeth = (corner != GUM).sum(1) >= 2
+    teeth = crown_faces(mesh)
     boundary = (corner == BOUNDARY).sum(1) >= 2
     if not boundary.any():
         raise TrackingError(
