@@ -21,7 +21,8 @@ A message says where (file, frame, camera), what was found, what is allowed with
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from os import PathLike
 
 __all__ = [
@@ -60,30 +61,44 @@ class JawusdError(Exception):
 
     Args:
         message: what was found and what is allowed, with units.
-        path: the file or folder it is about.
-        hint: what to do about it.
+        path, camera, frame: where, each printed before the message.
+        hint: what to do about it, printed after it.
     """
 
     exit_code = 1
 
-    def __init__(self, message: str, *, path: str | PathLike[str] | None = None, hint: str | None = None) -> None:
+    def __init__(
+        self,
+        message: str,
+        *,
+        path: str | PathLike[str] | None = None,
+        camera: str | None = None,
+        frame: int | None = None,
+        hint: str | None = None,
+    ) -> None:
         self.message = message
         self.path = None if path is None else str(path)
+        self.camera = camera
+        self.frame = frame
         self.hint = hint
         super().__init__(message)
+
+    def statement(self) -> str:
+        """Return camera, frame and message, without path and hint."""
+        camera = [] if self.camera is None else [f"camera {self.camera}"]
+        frame = [] if self.frame is None else [f"frame {self.frame}"]
+        where = ", ".join(camera + frame)
+        return f"{where}: {self.message}" if where else self.message
 
     def __str__(self) -> str:
         where = f"{self.path}: " if self.path is not None else ""
         advice = f" {self.hint}" if self.hint else ""
-        return f"{where}{self.message}{advice}"
+        return f"{where}{self.statement()}{advice}"
 
-    def __reduce__(self) -> tuple:
+    def __reduce__(self) -> tuple[Callable[[str], JawusdError], tuple[str]]:
         # Exceptions cross process boundaries; keyword arguments are lost by the default protocol.
-        return (_rebuild, (type(self), self.message, self.path, self.hint))
-
-
-def _rebuild(kind: type[JawusdError], message: str, path: str | None, hint: str | None) -> JawusdError:
-    return kind(message, path=path, hint=hint)
+        where = {"path": self.path, "camera": self.camera, "frame": self.frame, "hint": self.hint}
+        return partial(type(self), **where), (self.message,)
 
 
 class FormatError(JawusdError):

@@ -156,15 +156,17 @@ def _refuse_other_board(name: str, clip: BoardClip, chosen: list[int], boards: B
     some = [image for _, image in clip.pictures(chosen[:: max(1, len(chosen) // _LOOKED_AT)])]
     if (other := shown_instead(some, boards, missed)) is not None:
         raise CalibrationError(
-            f"camera {name}: {other}.",
+            f"{other}.",
+            camera=name,
             path=clip.path,
             hint="Correct [boards] in capture.toml; cols and rows count inner corners, one fewer than squares.",
         )
     if not found:
         extra = f" of {boards.dictionary}" if boards.pattern == "charuco" else ""
         raise CalibrationError(
-            f"camera {name}: no {boards.pattern}{extra} with {boards.cols} x {boards.rows} inner corners in any of "
+            f"no {boards.pattern}{extra} with {boards.cols} x {boards.rows} inner corners in any of "
             f"{len(chosen)} pictures.",
+            camera=name,
             path=clip.path,
             hint="Check [boards]: pattern and inner corners; all of a chessboard must be in view, sharp, with a white "
             "rim.",
@@ -177,8 +179,9 @@ def _refuse_blur(names: tuple[str, ...], clips: list[BoardClip], widths: Array, 
         seen = np.isfinite(row)
         if seen.any() and out[seen].all():
             raise CalibrationError(
-                f"camera {name}: all {seen.sum()} pictures of the board are blurred: its edges are "
+                f"all {seen.sum()} pictures of the board are blurred: its edges are "
                 f"{np.median(row[seen]):.1f} px wide (10 to 90 %), at most {limit:.1f} px are allowed.",
+                camera=name,
                 path=clip.path,
                 hint="Film the board again: in focus, held still, with more light or a shorter exposure.",
             )

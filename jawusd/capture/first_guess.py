@@ -97,7 +97,8 @@ def _single_camera(name: str, size_px: tuple[int, int], corners_px: Array, point
     used = np.flatnonzero(seen.any(1))
     if len(used) < FEWEST_VIEWS:
         raise CalibrationError(
-            f"camera {name}: the board is seen sharply in {len(used)} pictures, at least {FEWEST_VIEWS} are needed.",
+            f"the board is seen sharply in {len(used)} pictures, at least {FEWEST_VIEWS} are needed.",
+            camera=name,
             hint="Film the board again: 40 poses where the teeth will be, tilted up to 30 degrees, held still.",
         )
     objects = [points_mm[seen[v]].astype(np.float32) for v in used]
@@ -108,7 +109,8 @@ def _single_camera(name: str, size_px: tuple[int, int], corners_px: Array, point
         )
     except cv2.error as error:
         raise CalibrationError(
-            f"camera {name}: the board's views do not fix the lens ({error.err}).",
+            f"the board's views do not fix the lens ({error.err}).",
+            camera=name,
             hint="Tilt the board by up to 30 degrees in all directions; views facing the camera tell nothing.",
         ) from error
     T = np.full((len(corners_px), 4, 4), np.nan)

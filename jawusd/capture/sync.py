@@ -186,7 +186,7 @@ def _against(
         return work()
     except SyncError as error:
         raise SyncError(
-            f"{before}camera {name}, against {reference}: {error.message}", path=video.path, hint=hint
+            f"{before}camera {name}, against {reference}: {error.statement()}", path=video.path, hint=hint
         ) from error
 
 

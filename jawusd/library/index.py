@@ -133,7 +133,7 @@ def scan_library(folder: str | os.PathLike[str], load: Loader) -> Library:
                 entry, reread = _entry(name, content, load(path)), reread + 1
             entries.append(entry)
         except JawusdError as error:
-            skipped[name] = f"{error.message} {error.hint or ''}".strip()
+            skipped[name] = f"{error.statement()} {error.hint or ''}".strip()
     if {entry.path: entry for entry in entries} != known:
         data = {"format": f"{FAMILY}/{VERSION}", "units": "mm", "rigs": [asdict(entry) for entry in entries]}
         write_text_atomic(root / INDEX_FILE, json.dumps(data, indent=1, sort_keys=True) + "\n")

@@ -70,7 +70,7 @@ def _scale_by_masks(
         offsets = sync_cameras(capture, progress)["offsets"]
         ratio = seen_size(capture, cameras, offsets, scans)
     except (SyncError, TrackingError) as error:
-        why = f"{by_picks.reason}, and the teeth could not be searched in the masks ({error.message.rstrip('.')})"
+        why = f"{by_picks.reason}, and the teeth could not be searched in the masks ({error.statement().rstrip('.')})"
         return ScaleCheck(None, None, why)
     progress("size of the teeth", 1, 1)
     return judged_scale(ratio, _SIZE_SIGMA, capture.boards.square_mm)

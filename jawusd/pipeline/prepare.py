@@ -122,8 +122,9 @@ def _at_recorded_size(camera: Camera, capture: Capture, source: CameraSource) ->
     # One pixel is what rounding of a scaled height makes.
     if abs(recorded[0] * height / width - recorded[1]) > 1.0:
         raise CalibrationError(
-            f"camera {camera.name}: calibrated for pictures of {width} x {height} px, but {path.name} has "
+            f"calibrated for pictures of {width} x {height} px, but {path.name} has "
             f"{recorded[0]} x {recorded[1]} px, another shape.",
+            camera=camera.name,
             path=capture.calibration,
             hint="Calibrate in the recording's own mode: a crop cannot be told from the sizes alone.",
         )

@@ -156,7 +156,7 @@ class CapturePage:
             self.picks.say_fit(f"these do not fit: {', '.join(wrong)}" if wrong else "all of them fit together")
         except JawusdError as error:
             self._of_picks = picks, None
-            self.picks.say_fit(error.message)
+            self.picks.say_fit(error.statement())
 
     def _region(self, camera: str, frame: int) -> Region:
         """Return the region of a camera's picture to show: the teeth, as far as they are known."""

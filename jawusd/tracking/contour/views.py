@@ -148,7 +148,8 @@ def working_size(camera: Camera, centre_world: Array, px_per_mm: float) -> tuple
     depth = float(camera.depth(centre_world))
     if depth <= 0:
         raise TrackingError(
-            f"camera {camera.name}: the teeth lie {-depth:.0f} mm behind it",
+            f"the teeth lie {-depth:.0f} mm behind it",
+            camera=camera.name,
             hint="Check the calibration and the camera names of the picks.",
         )
     recorded = np.sqrt(camera.K[0, 0] * camera.K[1, 1]) / depth

@@ -41,7 +41,8 @@ def first_record(
     for r in _ROWS:
         if use[r].sum() < 2:
             raise TrackingError(
-                f"frame {frame}: {use[r].sum()} masks of the {_NAMES[r]} teeth, the first frame needs two",
+                f"{use[r].sum()} masks of the {_NAMES[r]} teeth, the first frame needs two",
+                frame=frame,
                 hint="Choose a bootstrap frame that is segmented in every camera.",
             )
     best: Solution | None = None
@@ -60,10 +61,11 @@ def first_record(
         bare = np.nanmedian(coverage[r])
         if share < config.first_share or bare > config.lost_coverage or fit[r] < _LEAST_FIT:
             raise TrackingError(
-                f"frame {frame}: the {_NAMES[r]} teeth do not fit their masks: {share:.0%} of the visible contour "
+                f"the {_NAMES[r]} teeth do not fit their masks: {share:.0%} of the visible contour "
                 f"matches (at least {config.first_share:.0%} is needed), {bare:.1%} of the masks stays uncovered "
                 f"(at most {config.lost_coverage:.0%} is allowed), and the first less the price of the second is "
                 f"{fit[r]:.2f} (at least {_LEAST_FIT} is needed)",
+                frame=frame,
                 hint="Check the picks, the calibration, the time offsets and the masks of this frame.",
             )
     status = np.where(use.all(1), TRACKED, PARTIAL).astype(np.int8)

@@ -43,7 +43,7 @@ class Mixup:
 
     def refusal(self, frame: int) -> TrackingError:
         """Return the error that names the exchange."""
-        return TrackingError(f"frame {frame}: {self.finding}", hint=self.hint)
+        return TrackingError(self.finding, frame=frame, hint=self.hint)
 
 
 def all_rows_exchanged(sources: Sequence[CameraSource]) -> Mixup:

@@ -125,7 +125,7 @@ def search_start(search: StartSearch, footage: Footage) -> Start:
             if mixup is None:
                 found = replace(found, poses=_aligned(search, footage, found.poses, frame))
         except TrackingError as error:
-            failed[frame] = error.message.removeprefix(f"frame {frame}: ")
+            failed[frame] = error.message
             continue
         if mixup is not None:
             if found.fit >= _CLEAR_FIT:
@@ -184,8 +184,9 @@ def _check_upright(search: StartSearch, footage: Footage, frame: int, found: Fou
         return
     if other.worth_px > found.worth_px:
         raise TrackingError(
-            f"frame {frame}: {mixup.finding}: {other.worth_px:.0f} px of contour fit after exchanging them, "
+            f"{mixup.finding}: {other.worth_px:.0f} px of contour fit after exchanging them, "
             f"{found.worth_px:.0f} px as they are named",
+            frame=frame,
             hint=mixup.hint,
         )
 

@@ -120,7 +120,7 @@ class StartSearch:
         """Return the best pair of finalists, refined at the working size."""
         pairs = self._refined_pairs(finalists, views)
         if not pairs:
-            raise TrackingError(f"frame {frame}: the best poses of the two rows of teeth are none a jaw can take")
+            raise TrackingError("the best poses of the two rows of teeth are none a jaw can take", frame=frame)
         centre = np.mean([transform_point(pairs[0][r], self._coarse[r].centre) for r in _ROWS], axis=0)
         with footage.views(centre, self._config.working_px_per_mm) as masks:
             views = masks.at(frame)
