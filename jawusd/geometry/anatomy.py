@@ -25,17 +25,13 @@ _MIDLINE_MM = 4.0
 
 
 def anatomical_frame(upper_vertices: ArrayLike, lower_vertices: ArrayLike) -> Array:
-    """Find the anatomical frame of two dental scans in occlusion, in any common scan frame.
+    """Return T_anatomical_skull (4, 4) of two dental scans in occlusion, in any common scan frame.
 
     Up is the normal of the common plane of both arches, from the lower to the upper one; the midline is the mirror
     axis of the arches in that plane; anterior is the closed end of the horseshoe.
 
     Args:
-        upper_vertices: crown vertices of the upper scan [mm], shape (N, 3).
-        lower_vertices: crown vertices of the lower scan [mm], shape (M, 3).
-
-    Returns:
-        T_anatomical_skull, shape (4, 4).
+        upper_vertices, lower_vertices: crown vertices [mm], shapes (N, 3) and (M, 3).
     """
     upper, lower = np.asarray(upper_vertices, dtype=np.float64), np.asarray(lower_vertices, dtype=np.float64)
     both = np.concatenate([_thin(upper), _thin(lower)])
@@ -125,16 +121,13 @@ def find_landmarks(
     mandible_vertices: ArrayLike | None,
     T_anatomical_skull: ArrayLike,
 ) -> Array:
-    """Find the five landmarks of `LANDMARKS` on the mandible.
+    """Return the five landmarks of `LANDMARKS` on the mandible, mandible (scan) frame [mm], shape (5, 3).
 
     Args:
         lower_vertices: crown vertices of the lower scan, scan frame [mm], shape (N, 3).
-        mandible_vertices: mandible mesh in the same frame [mm], shape (M, 3), or None: the condyles are then placed
-            at mean adult distances from the incisal point.
+        mandible_vertices: mandible mesh in the same frame [mm], shape (M, 3); without it the condyles are placed at
+            mean adult distances from the incisal point.
         T_anatomical_skull: scan frame to anatomical frame with the teeth in occlusion, shape (4, 4).
-
-    Returns:
-        Landmarks in the mandible (scan) frame [mm], shape (5, 3).
     """
     A = np.asarray(T_anatomical_skull, dtype=np.float64)
     lower = transform_points(A, np.asarray(lower_vertices, dtype=np.float64))
@@ -158,13 +151,12 @@ def find_landmarks(
 
 
 def landmark_frame(landmarks: ArrayLike) -> Array:
-    """Find the anatomical frame from landmarks alone: occlusal plane through incisal point and molars.
+    """Return the transform (4, 4) from the landmarks' frame to the anatomical frame, found from landmarks alone.
+
+    The occlusal plane goes through the incisal point and the molars; the origin is the lower incisal point.
 
     Args:
         landmarks: in the order of `LANDMARKS`, teeth in occlusion [mm], shape (5, 3).
-
-    Returns:
-        The landmarks' frame to the anatomical frame, origin at the lower incisal point, shape (4, 4).
     """
     incisor, molar_left, molar_right = np.asarray(landmarks, dtype=np.float64)[:3]
     forward = incisor - 0.5 * (molar_left + molar_right)
@@ -187,15 +179,9 @@ def _condyle(mandible: Array, side: float) -> Array:
 
 
 def mandible_metric(points: ArrayLike) -> Array:
-    """Return M with ``xi^T M xi`` = mean squared displacement of the points under a small twist xi.
+    """Return M (6, 6) with ``xi^T M xi`` = mean squared displacement of points (N, 3) [mm] under a small twist xi.
 
     A point p moves by ``omega x p + v``, so M = mean of [-hat(p), I]^T [-hat(p), I].
-
-    Args:
-        points: points [mm], shape (N, 3), in the frame of the twist.
-
-    Returns:
-        Symmetric positive definite matrix in (omega, v) order, shape (6, 6).
     """
     p = np.asarray(points, dtype=np.float64)
     J = np.concatenate([-hat(p), np.broadcast_to(np.eye(3), (len(p), 3, 3))], axis=-1)

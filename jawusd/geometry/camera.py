@@ -56,50 +56,22 @@ class Camera:
         return se3_inverse(self.T_cam_world)[:3, 3]
 
     def project_pinhole(self, points_world: ArrayLike) -> Array:
-        """Project world points without lens distortion.
-
-        Args:
-            points_world: points [mm], shape (..., 3).
-
-        Returns:
-            Image points [px], shape (..., 2).
-        """
+        """Project world points (..., 3) [mm] without lens distortion, shape (..., 2) [px]."""
         p = np.asarray(points_world, dtype=np.float64) @ self.T_cam_world[:3, :3].T + self.T_cam_world[:3, 3]
         h = p @ self.K.T
         return h[..., :2] / h[..., 2:]
 
     def project(self, points_world: ArrayLike) -> Array:
-        """Project world points as the real lens does, distortion included.
-
-        Args:
-            points_world: points [mm], shape (..., 3).
-
-        Returns:
-            Image points [px], shape (..., 2).
-        """
+        """Project world points (..., 3) [mm] through the lens, distortion included, shape (..., 2) [px]."""
         return self.distort_pixels(self.project_pinhole(points_world))
 
     def distort_pixels(self, pinhole_px: ArrayLike) -> Array:
-        """Map ideal pinhole pixels to pixels of the recorded picture.
-
-        Args:
-            pinhole_px: image points [px], shape (..., 2).
-
-        Returns:
-            Distorted image points [px], shape (..., 2).
-        """
+        """Map ideal pinhole pixels (..., 2) to pixels of the recorded picture."""
         x = self._normalised(np.asarray(pinhole_px, dtype=np.float64))
         return self._pixels(self._distort(x))
 
     def undistort_pixels(self, pixels: ArrayLike) -> Array:
-        """Map pixels of the recorded picture to ideal pinhole pixels (Newton, to 1e-10 px for real lenses).
-
-        Args:
-            pixels: image points [px], shape (..., 2).
-
-        Returns:
-            Pinhole image points [px], shape (..., 2).
-        """
+        """Map pixels (..., 2) of the recorded picture to ideal pinhole pixels (Newton, to 1e-10 px for real lenses)."""
         target = self._normalised(np.asarray(pixels, dtype=np.float64))
         x = target.copy()
         h = 1e-6
@@ -122,11 +94,7 @@ class Camera:
         return self._pixels(x)
 
     def scaled(self, size_px: tuple[int, int]) -> Camera:
-        """Return the camera of the same picture resized to another size (pixel centres at integers).
-
-        Args:
-            size_px: new width and height [px].
-        """
+        """Return the camera of the same picture resized to a width and height [px] (pixel centres at integers)."""
         sx, sy = size_px[0] / self.size_px[0], size_px[1] / self.size_px[1]
         K = self.K.copy()
         K[0] *= sx
@@ -137,14 +105,9 @@ class Camera:
         return replace(self, size_px=(int(size_px[0]), int(size_px[1])), K=K)
 
     def cropped(self, x0_px: int, y0_px: int, size_px: tuple[int, int]) -> Camera:
-        """Return the camera of a part of the picture.
+        """Return the camera of a part of the picture: size_px is its width and height, (x0_px, y0_px) its first pixel.
 
         The crop's own distortion stays exact because it acts on normalised coordinates.
-
-        Args:
-            x0_px: left column of the crop [px].
-            y0_px: top row of the crop [px].
-            size_px: width and height of the crop [px].
         """
         K = self.K.copy()
         K[0, 2] -= x0_px
@@ -152,11 +115,7 @@ class Camera:
         return replace(self, size_px=(int(size_px[0]), int(size_px[1])), K=K)
 
     def depth(self, points_world: ArrayLike) -> Array:
-        """Return the depth of world points along the optical axis [mm], shape (...).
-
-        Args:
-            points_world: points [mm], shape (..., 3).
-        """
+        """Return the depth of world points (..., 3) along the optical axis [mm], shape (...)."""
         return transform_points(self.T_cam_world, np.atleast_2d(points_world))[..., 2].reshape(
             np.shape(points_world)[:-1]
         )

@@ -9,13 +9,7 @@ from jawusd.geometry.arrays import Array
 
 
 def wxyz_from_matrix(R: ArrayLike) -> Array:
-    """Return the unit quaternion with w >= 0 of rotation matrices (Shepperd 1978).
-
-    Args:
-        R: rotation matrices, shape (..., 3, 3).
-
-    Returns:
-        Quaternions (w, x, y, z), shape (..., 4).
+    """Return the unit quaternions (..., 4) with w >= 0 of rotation matrices (..., 3, 3) (Shepperd 1978).
 
     Raises:
         ValueError: another shape.
@@ -40,22 +34,16 @@ def wxyz_from_matrix(R: ArrayLike) -> Array:
 
 
 def matrix_from_wxyz(q: ArrayLike) -> Array:
-    """Return rotation matrices of quaternions, which are normalised first.
-
-    Args:
-        q: quaternions (w, x, y, z) of any non-zero length, shape (..., 4).
-
-    Returns:
-        Rotation matrices, shape (..., 3, 3).
+    """Return the rotation matrices (..., 3, 3) of quaternions (..., 4), which are normalised first.
 
     Raises:
         ValueError: another shape.
     """
-    q = np.asarray(q, dtype=np.float64)
-    if q.shape[-1:] != (4,):
-        raise ValueError(f"quaternions must have shape (..., 4), got {q.shape}")
-    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    w, x, y, z = np.moveaxis(q, -1, 0)
+    unit: Array = np.asarray(q, dtype=np.float64)
+    if unit.shape[-1:] != (4,):
+        raise ValueError(f"quaternions must have shape (..., 4), got {unit.shape}")
+    unit = unit / np.linalg.norm(unit, axis=-1, keepdims=True)
+    w, x, y, z = np.moveaxis(unit, -1, 0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],

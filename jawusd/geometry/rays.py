@@ -13,8 +13,7 @@ def meet_triangles(origin: Array, direction: Array, corners: Array) -> tuple[Arr
     """Return where a line meets the planes of triangles (Moeller and Trumbore 1997, fast ray/triangle intersection).
 
     Args:
-        origin: a point of the line, shape (3,).
-        direction: of the line, of any length, shape (3,).
+        origin, direction: a point of the line and its direction, of any length, shape (3,).
         corners: of the triangles, shape (N, 3, 3).
 
     Returns:

@@ -10,15 +10,12 @@ from jawusd.geometry.se3 import make_transform
 
 
 def rigid_fit(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = None) -> Array:
-    """Return the rigid T minimising sum w |T source - target|^2 (Arun et al. 1987, Umeyama 1991).
+    """Return the rigid T (4, 4) minimising sum w |T source - target|^2 (Arun et al. 1987, Umeyama 1991).
 
     Args:
         source: points [mm], shape (N, 3), N >= 3, not on one line.
         target: points [mm], shape (N, 3).
-        weights: non-negative weights, shape (N,).
-
-    Returns:
-        Transform, shape (4, 4).
+        weights: non-negative, shape (N,).
 
     Raises:
         ValueError: wrong shapes, fewer than three points, or points on one line.
@@ -39,16 +36,14 @@ def rigid_fit(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = 
 
 
 def triangulate(projections: ArrayLike, pixels: ArrayLike) -> Array:
-    """Return the point seen at the given pixels: linear start, then Gauss-Newton on the reprojection error.
+    """Return the world point (3,) [mm] seen at the given pixels.
 
-    The linear system is Hartley & Zisserman, Multiple View Geometry, section 12.2.
+    A linear start (Hartley & Zisserman, Multiple View Geometry, section 12.2), then Gauss-Newton on the reprojection
+    error.
 
     Args:
         projections: pinhole projection matrices (world mm -> px), shape (C, 3, 4), C >= 2.
         pixels: undistorted image points [px], shape (C, 2).
-
-    Returns:
-        World point [mm], shape (3,).
 
     Raises:
         ValueError: wrong shapes or fewer than two views.

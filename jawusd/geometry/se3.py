@@ -17,15 +17,7 @@ _COUPLING_SERIES_RAD = 0.3
 
 
 def make_transform(R: ArrayLike, t: ArrayLike) -> Array:
-    """Assemble transforms from rotation and translation.
-
-    Args:
-        R: rotation matrices, shape (..., 3, 3).
-        t: translations [mm], shape (..., 3).
-
-    Returns:
-        Transforms, shape (..., 4, 4).
-    """
+    """Assemble transforms (..., 4, 4) from rotation matrices (..., 3, 3) and translations (..., 3) [mm]."""
     R, t = np.asarray(R, dtype=np.float64), np.asarray(t, dtype=np.float64)
     shape = np.broadcast_shapes(R.shape[:-2], t.shape[:-1])
     T = np.zeros((*shape, 4, 4))
@@ -34,14 +26,7 @@ def make_transform(R: ArrayLike, t: ArrayLike) -> Array:
 
 
 def se3_inverse(T: ArrayLike) -> Array:
-    """Invert rigid transforms: ``T_b_a`` from ``T_a_b``.
-
-    Args:
-        T: rigid transforms, shape (..., 4, 4).
-
-    Returns:
-        Inverses, shape (..., 4, 4).
-    """
+    """Invert rigid transforms (..., 4, 4): ``T_b_a`` from ``T_a_b``."""
     T = np.asarray(T, dtype=np.float64)
     Rt = np.swapaxes(T[..., :3, :3], -1, -2)
     return make_transform(Rt, -np.einsum("...ij,...j->...i", Rt, T[..., :3, 3]))
@@ -71,14 +56,9 @@ def transform_points(T: ArrayLike, points: ArrayLike) -> Array:
 
 
 def relative_pose(T_world_upper: ArrayLike, T_world_lower: ArrayLike) -> Array:
-    """Return the jaw pose T_skull_mandible from the world poses of both rows of teeth (Yang et al. eqs. 1-3).
+    """Return the jaw pose T_skull_mandible from the world poses of the upper and lower teeth (Yang et al. eqs. 1-3).
 
-    Args:
-        T_world_upper: upper teeth (skull) poses, shape (..., 4, 4).
-        T_world_lower: lower teeth (mandible) poses, shape (..., 4, 4).
-
-    Returns:
-        T_skull_mandible, shape (..., 4, 4).
+    All have shape (..., 4, 4).
     """
     return se3_inverse(T_world_upper) @ np.asarray(T_world_lower, dtype=np.float64)
 
@@ -108,14 +88,7 @@ def _coupling(w: Array, v: Array) -> Array:
 
 
 def se3_left_jacobian(twist: ArrayLike) -> Array:
-    """Return J with ``exp(twist + d) = exp(J d) exp(twist)`` to first order.
-
-    Args:
-        twist: twists (omega [rad], v [mm]), shape (..., 6).
-
-    Returns:
-        Left Jacobians in (omega, v) order, shape (..., 6, 6).
-    """
+    """Return J (..., 6, 6) with ``exp(twist + d) = exp(J d) exp(twist)`` to first order, for twists (..., 6)."""
     twist = np.asarray(twist, dtype=np.float64)
     w, v = twist[..., :3], twist[..., 3:]
     J = np.zeros((*twist.shape[:-1], 6, 6))
@@ -125,26 +98,12 @@ def se3_left_jacobian(twist: ArrayLike) -> Array:
 
 
 def se3_right_jacobian(twist: ArrayLike) -> Array:
-    """Return J with ``exp(twist + d) = exp(twist) exp(J d)`` to first order.
-
-    Args:
-        twist: twists (omega [rad], v [mm]), shape (..., 6).
-
-    Returns:
-        Right Jacobians in (omega, v) order, shape (..., 6, 6).
-    """
+    """Return J (..., 6, 6) with ``exp(twist + d) = exp(twist) exp(J d)`` to first order, for twists (..., 6)."""
     return se3_left_jacobian(-np.asarray(twist, dtype=np.float64))
 
 
 def se3_left_jacobian_inverse(twist: ArrayLike) -> Array:
-    """Return the inverse of `se3_left_jacobian`.
-
-    Args:
-        twist: twists (omega [rad], v [mm]), shape (..., 6).
-
-    Returns:
-        Inverse left Jacobians, shape (..., 6, 6).
-    """
+    """Return the inverse of `se3_left_jacobian`, shape (..., 6, 6)."""
     twist = np.asarray(twist, dtype=np.float64)
     w, v = twist[..., :3], twist[..., 3:]
     Ji = so3_left_jacobian_inverse(w)
@@ -155,13 +114,7 @@ def se3_left_jacobian_inverse(twist: ArrayLike) -> Array:
 
 
 def se3_exp(twist: ArrayLike) -> Array:
-    """Map twists to rigid transforms.
-
-    Args:
-        twist: twists (omega [rad], v [mm]), shape (..., 6).
-
-    Returns:
-        Transforms, shape (..., 4, 4).
+    """Map twists (omega [rad], v [mm]), shape (..., 6), to rigid transforms (..., 4, 4).
 
     Raises:
         ValueError: another shape.
@@ -174,13 +127,7 @@ def se3_exp(twist: ArrayLike) -> Array:
 
 
 def se3_log(T: ArrayLike) -> Array:
-    """Map rigid transforms to twists of rotation angle in [0, pi].
-
-    Args:
-        T: rigid transforms, shape (..., 4, 4).
-
-    Returns:
-        Twists (omega [rad], v [mm]), shape (..., 6).
+    """Map rigid transforms (..., 4, 4) to twists (omega [rad], v [mm]), shape (..., 6), of rotation angle in [0, pi].
 
     Raises:
         ValueError: another shape.
@@ -194,14 +141,7 @@ def se3_log(T: ArrayLike) -> Array:
 
 
 def se3_adjoint(T: ArrayLike) -> Array:
-    """Return Ad(T) with ``T exp(x) T^-1 = exp(Ad(T) x)``.
-
-    Args:
-        T: rigid transforms, shape (..., 4, 4).
-
-    Returns:
-        Adjoint matrices in (omega, v) order, shape (..., 6, 6).
-    """
+    """Return Ad(T), shape (..., 6, 6) in (omega, v) order, with ``T exp(x) T^-1 = exp(Ad(T) x)``."""
     T = np.asarray(T, dtype=np.float64)
     R = T[..., :3, :3]
     out = np.zeros((*T.shape[:-2], 6, 6))
@@ -211,14 +151,7 @@ def se3_adjoint(T: ArrayLike) -> Array:
 
 
 def orthonormalise(T: ArrayLike) -> Array:
-    """Return the nearest rigid transforms (SVD of the rotation block, Arun et al. 1987).
-
-    Args:
-        T: nearly rigid transforms, shape (..., 4, 4).
-
-    Returns:
-        Rigid transforms with exact bottom row, shape (..., 4, 4).
-    """
+    """Return the nearest rigid transforms to (..., 4, 4) (SVD of the rotation block, Arun et al. 1987)."""
     T = np.asarray(T, dtype=np.float64)
     U, _, Vt = np.linalg.svd(T[..., :3, :3])
     sign = np.ones((*T.shape[:-2], 3))
@@ -227,13 +160,10 @@ def orthonormalise(T: ArrayLike) -> Array:
 
 
 def rigidity_defect(T: ArrayLike) -> Array:
-    """Measure how far transforms are from rigid.
+    """Measure how far transforms (..., 4, 4) are from rigid, shape (...).
 
-    Args:
-        T: transforms, shape (..., 4, 4).
-
-    Returns:
-        Largest absolute entry of R R^T - I and of the bottom row's error, and 2 for reflections; shape (...).
+    The defect is the largest absolute entry of R R^T - I and of the bottom row's error, and at least 2 for
+    reflections.
     """
     T = np.asarray(T, dtype=np.float64)
     R = T[..., :3, :3]
