@@ -60,6 +60,6 @@ def tooth_labels(mesh: Mesh) -> NDArray[np.uint8]:
     return labels
 
 
-def crown_faces(mesh: Mesh) -> Mask:
+def crown_face_mask(mesh: Mesh) -> Mask:
     """Return which faces of a teeth scan belong to crowns, shape (F,): those with two or three tooth corners."""
     return (tooth_labels(mesh) != GUM)[mesh.faces].sum(axis=1) >= 2

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.formats.atomic import write_bytes_atomic
-from jawusd.formats.mesh import Mesh, crown_faces
+from jawusd.formats.mesh import Mesh, crown_face_mask
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import Camera, transform_points
 from jawusd.geometry.arrays import Array
@@ -166,7 +166,7 @@ def _visible_crowns(camera: Camera, scans: Sequence[PlacedScan]) -> NDArray[np.u
         if not np.isfinite(scan.T_world_scan).all():
             continue
         points = _points(camera, scan)
-        crown = crown_faces(scan.mesh)
+        crown = crown_face_mask(scan.mesh)
         for faces, label in ((scan.mesh.faces[~crown], 0), (scan.mesh.faces[crown], number)):
             draw_depth_labels(points, faces, 0, 0, False, inverse_depth, labels, label)
     return labels

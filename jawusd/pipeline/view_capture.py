@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from jawusd.errors import FormatError, explain_missing_packages
 from jawusd.formats.capture import Bootstrap, Capture
 from jawusd.formats.capture_edit import write_bootstrap
-from jawusd.formats.mesh import Mesh, crown_faces
+from jawusd.formats.mesh import Mesh, crown_face_mask
 from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.geometry import Camera
 from jawusd.geometry.arrays import Array
@@ -118,7 +118,7 @@ def viewed_capture(
         sizes_px={name: video.size_px for name, video in videos.items()},
         cameras=footage.cameras,
         scans=footage.scans,
-        crowns={row: crown_faces(mesh) for row, mesh in footage.scans.items()},
+        crowns={row: crown_face_mask(mesh) for row, mesh in footage.scans.items()},
         T_anatomical_skull=find_anatomy(capture, meshes).T_anatomical_skull,
         tracks=poses,
         picks=capture.bootstrap,

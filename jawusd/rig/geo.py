@@ -8,7 +8,7 @@ import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdShade
 
 from jawusd.errors import RigError
-from jawusd.formats.mesh import Mesh, crown_faces
+from jawusd.formats.mesh import Mesh, crown_face_mask
 from jawusd.geometry.arrays import Array
 from jawusd.rig import _gf
 from jawusd.rig.layers import define_prim, new_layer, set_attribute, stage_of
@@ -132,7 +132,7 @@ def _define_mesh(
     prim.CreateDoubleSidedAttr(True)  # scans are open surfaces
     prim.CreateNormalsAttr(_gf.vec3f_array(corner_normals(mesh)))
     prim.SetNormalsInterpolation(UsdGeom.Tokens.faceVarying)
-    gum = ~crown_faces(mesh) if base == "Enamel" else np.zeros(len(mesh.faces), dtype=bool)
+    gum = ~crown_face_mask(mesh) if base == "Enamel" else np.zeros(len(mesh.faces), dtype=bool)
     prim.CreateDisplayColorAttr([Gf.Vec3f(*_MATERIALS[base][0])])
     binding = UsdShade.MaterialBindingAPI.Apply(prim.GetPrim())
     binding.Bind(materials[base])

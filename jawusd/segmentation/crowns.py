@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.formats.mesh import Mesh, crown_faces
+from jawusd.formats.mesh import Mesh, crown_face_mask
 from jawusd.geometry import Camera, transform_points
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.imaging.raster import draw_depth_labels
@@ -33,7 +33,7 @@ class ScanSurface:
     @classmethod
     def of(cls, mesh: Mesh) -> ScanSurface:
         """Split a teeth scan at the line where most corners of a face are tooth."""
-        crown = crown_faces(mesh)
+        crown = crown_face_mask(mesh)
         return cls(mesh.vertices, mesh.faces[crown], mesh.faces[~crown])
 
     def crown_points(self) -> Array:

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from jawusd.errors import CaptureError
-from jawusd.formats.mesh import BOUNDARY, GUM, TOOTH, Mesh, crown_faces, tooth_labels
+from jawusd.formats.mesh import BOUNDARY, GUM, TOOTH, Mesh, crown_face_mask, tooth_labels
 from jawusd.imaging import meshio
 
 
@@ -131,8 +131,8 @@ def test_a_face_is_crown_with_two_tooth_corners() -> None:
     vertices = np.random.default_rng(2).normal(size=(4, 3))
     colors = np.array([(255, 0, 0), (0, 255, 0), (90, 90, 90), (200, 110, 110)], np.uint8)
     mesh = Mesh(vertices, np.array([[0, 1, 2], [0, 2, 3], [2, 0, 1], [0, 3, 1]]), colors)
-    assert crown_faces(mesh).tolist() == [True, False, True, True]
-    assert crown_faces(Mesh(vertices, mesh.faces)).all()
+    assert crown_face_mask(mesh).tolist() == [True, False, True, True]
+    assert crown_face_mask(Mesh(vertices, mesh.faces)).all()
 
 
 def test_winding_tells_closed_from_open_and_out_from_in() -> None:

@@ -17,7 +17,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial.transform import Rotation
 
 from jawusd.errors import RigError
-from jawusd.formats.mesh import Mesh, crown_faces
+from jawusd.formats.mesh import Mesh, crown_face_mask
 from jawusd.geometry import so3_left_jacobian
 from jawusd.rig.bake import bake_rig
 from jawusd.rig.geo import corner_normals
@@ -197,7 +197,7 @@ def test_gum_and_enamel_split_the_teeth(anchored_folder):
     subsets = {subset.GetPrim().GetName(): subset for subset in UsdGeom.Subset.GetAllGeomSubsets(mesh)}
     assert set(subsets) == {"LowerTeethMeshGum", "LowerTeethMeshEnamel"}
     gum = np.array(subsets["LowerTeethMeshGum"].GetIndicesAttr().Get())
-    np.testing.assert_array_equal(gum, np.flatnonzero(~crown_faces(example_meshes()["lower_teeth"])))
+    np.testing.assert_array_equal(gum, np.flatnonzero(~crown_face_mask(example_meshes()["lower_teeth"])))
     names = {
         name: UsdShade.MaterialBindingAPI(subset.GetPrim()).ComputeBoundMaterial()[0].GetPrim().GetName()
         for name, subset in subsets.items()
@@ -207,8 +207,8 @@ def test_gum_and_enamel_split_the_teeth(anchored_folder):
 
 def test_unpainted_teeth_are_enamel():
     mesh = example_meshes()["lower_teeth"]
-    assert crown_faces(Mesh(mesh.vertices, mesh.faces)).all()
-    assert crown_faces(Mesh(mesh.vertices, mesh.faces, np.full_like(mesh.vertices, 90, dtype=np.uint8))).all()
+    assert crown_face_mask(Mesh(mesh.vertices, mesh.faces)).all()
+    assert crown_face_mask(Mesh(mesh.vertices, mesh.faces, np.full_like(mesh.vertices, 90, dtype=np.uint8))).all()
 
 
 def test_normals_point_outward_like_those_of_trimesh():

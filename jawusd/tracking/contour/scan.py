@@ -10,7 +10,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from jawusd.errors import TrackingError
-from jawusd.formats.mesh import Mesh, crown_faces, tooth_labels
+from jawusd.formats.mesh import Mesh, crown_face_mask, tooth_labels
 from jawusd.geometry.arrays import Array
 from jawusd.imaging.decimation import decimated_scan
 from jawusd.tracking.contour.gingival_margin import crown_gum_segments
@@ -76,7 +76,7 @@ def prepare_scan(mesh: Mesh, name: str) -> Scan:
     """
     vertices, faces = _weld(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int32))
     painted = not (tooth_labels(mesh) > 0).all()
-    crown = crown_faces(mesh)
+    crown = crown_face_mask(mesh)
     solid = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
     crown_faces = np.ascontiguousarray(faces[crown & solid])
     if painted:

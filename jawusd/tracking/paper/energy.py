@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.errors import TrackingError
-from jawusd.formats.mesh import BOUNDARY, Mesh, crown_faces, tooth_labels
+from jawusd.formats.mesh import BOUNDARY, Mesh, crown_face_mask, tooth_labels
 from jawusd.geometry import transform_points
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.imaging.meshio import winding
@@ -60,7 +60,7 @@ def paper_scan(mesh: Mesh, name: str) -> PaperScan:
         TrackingError: the scan has no boundary of interest.
     """
     corner = tooth_labels(mesh)[mesh.faces]
-    teeth = crown_faces(mesh)
+    teeth = crown_face_mask(mesh)
     boundary = (corner == BOUNDARY).sum(1) >= 2
     if not boundary.any():
         raise TrackingError(
