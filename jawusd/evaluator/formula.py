@@ -21,6 +21,7 @@ jaw clears when it slides with the teeth together, fading out with opening.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Generic, NamedTuple, Protocol
@@ -69,6 +70,12 @@ def polynomial(coefficients: Sequence[N | float], x: N) -> N:
     for coefficient in reversed(coefficients[:-2]):
         value = value * x + coefficient
     return value
+
+
+def long_angle_series(squared: N) -> Triple[N]:
+    """Return a, b and c of `jawusd.geometry.rodrigues` from eight terms: to 1e-8 up to 2 rad [squared in rad^2]."""
+    series = [[(-1.0) ** k / math.factorial(2 * k + start) for k in range(8)] for start in (1, 2, 3)]
+    return triple([polynomial(terms, squared) for terms in series])
 
 
 def soft_absolute(x: N, softness_mm: float, ops: Operations[N, Table]) -> N:

@@ -13,12 +13,16 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, NamedTuple
 
 import bpy
 
+if TYPE_CHECKING:
+    from pxr import Usd
+
 sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
 import jawusd_reader
+from jawusd_reader import Rows, Triple, dot, long_angle_series, triple
 
 MODIFIER = "Jaw"
 SLIDERS = ("d1", "d2", "d3")
@@ -55,7 +59,7 @@ def make_file(usd: str, blend: str) -> None:
     bpy.ops.wm.save_as_mainfile(filepath=os.path.abspath(blend))
 
 
-def add_sliders(rig: jawusd_reader.Rig, meshes: Sequence[bpy.types.Object], prim: Any) -> None:
+def add_sliders(rig: jawusd_reader.Rig, meshes: Sequence[bpy.types.Object], prim: Usd.Prim) -> None:
     """Give the meshes of a mandible the modifier; the first one carries the sliders, with the keys of the prim."""
     group, inputs = _node_group(rig)
     for mesh in meshes:
@@ -92,7 +96,7 @@ def _find_pxr() -> None:
             sys.path.append(folder)
 
 
-def _mandible_meshes(prim: Any) -> list[bpy.types.Object]:
+def _mandible_meshes(prim: Usd.Prim) -> list[bpy.types.Object]:
     """Return the imported meshes below a prim, freed of the cached motion and of the rest pose of their parents."""
     names = [child.GetName() for child in prim.GetChildren()]
     meshes = [bpy.data.objects[name] for name in names if name in bpy.data.objects]
@@ -122,13 +126,13 @@ def _node_group(rig: jawusd_reader.Rig) -> tuple[bpy.types.NodeTree, list[str]]:
     group.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
     nodes = _Nodes(group)
     given = group.nodes.new("NodeGroupInput")
-    d = [given.outputs[name] for name in SLIDERS]
-    omega, translate = (_anchored if rig.kind == "anchored" else _additive)(nodes, rig.arrays, d)
-    moved = nodes.affine(rig.matrices[1], nodes.position())
-    moved = nodes.vector("ADD", nodes.rotate(omega, moved), translate)
+    d = triple([_Number(nodes, given.outputs[name]) for name in SLIDERS])
+    motion = rig.formula.motion(d, {name: nodes.store(name, rows) for name, rows in rig.formula.tables.items()}, nodes)
+    closed = _image(rig.matrices[1], triple(nodes.separated(nodes.node("GeometryNodeInputPosition").outputs[0])))
     setter = group.nodes.new("GeometryNodeSetPosition")
     group.links.new(given.outputs["Geometry"], setter.inputs["Geometry"])
-    group.links.new(nodes.affine(rig.matrices[0], moved), setter.inputs["Position"])
+    combined = nodes.node("ShaderNodeCombineXYZ", *_image(rig.matrices[0], motion.carry(closed)))
+    group.links.new(combined.outputs[0], setter.inputs["Position"])
     result = group.nodes.new("NodeGroupOutput")
     group.links.new(setter.outputs["Geometry"], result.inputs["Geometry"])
     for index, node in enumerate(group.nodes):
@@ -137,228 +141,155 @@ def _node_group(rig: jawusd_reader.Rig) -> tuple[bpy.types.NodeTree, list[str]]:
     return group, identifiers
 
 
+def _image(T: Rows, p: Triple[_Number]) -> Triple[_Number]:
+    """Return the image of a point under a constant transform."""
+    return triple([dot(p, triple(row[:3])) + row[3] for row in T[:3]])
+
+
+class _Number:
+    """A socket with operators, each of which adds a node."""
+
+    def __init__(self, nodes: _Nodes, socket: bpy.types.NodeSocket) -> None:
+        self.nodes, self.socket = nodes, socket
+
+    def __add__(self, other: _Number | float) -> _Number:
+        return self.nodes.math("ADD", self, other)
+
+    __radd__ = __add__
+
+    def __sub__(self, other: _Number | float) -> _Number:
+        return self.nodes.math("SUBTRACT", self, other)
+
+    def __rsub__(self, other: float) -> _Number:
+        return self.nodes.math("SUBTRACT", other, self)
+
+    def __mul__(self, other: _Number | float) -> _Number:
+        return self.nodes.math("MULTIPLY", self, other)
+
+    __rmul__ = __mul__
+
+    def __truediv__(self, other: _Number | float) -> _Number:
+        return self.nodes.math("DIVIDE", self, other)
+
+    def __neg__(self) -> _Number:
+        return self.nodes.math("MULTIPLY", self, -1.0)
+
+
+class _Table(NamedTuple):
+    """A table in a hidden mesh: one point a row, and named attributes that hold three columns each."""
+
+    geometry: bpy.types.NodeSocket
+    attributes: list[str]
+    width: int
+
+
 class _Nodes:
-    """Write arithmetic as nodes: values are sockets or numbers, vectors are sockets or triples."""
+    """Write formulas as nodes: `Operations` on `_Number`, of which a wide one is a field over the points of a table."""
 
     def __init__(self, group: bpy.types.NodeTree) -> None:
         self._group = group
+        self._carriers: dict[int, tuple[bpy.types.Mesh, bpy.types.NodeSocket]] = {}
 
-    def _node(self, kind: str, *values: Any, **settings: Any) -> bpy.types.Node:
+    def node(self, kind: str, *values: _Number | float, **settings: str | bool) -> bpy.types.Node:
+        """Add a node; return it."""
         node = self._group.nodes.new(kind)
-        for name, value in settings.items():
-            setattr(node, name, value)
+        for name, setting in settings.items():
+            setattr(node, name, setting)
         for socket, value in zip([socket for socket in node.inputs if socket.enabled], values):
-            if isinstance(value, bpy.types.NodeSocket):
-                self._group.links.new(value, socket)
+            if isinstance(value, _Number):
+                self._group.links.new(value.socket, socket)
             else:
                 socket.default_value = value
         return node
 
-    def math(self, operation: str, *values: Any) -> Any:
-        return self._node("ShaderNodeMath", *values, operation=operation).outputs[0]
+    def math(self, operation: str, *values: _Number | float) -> _Number:
+        """Return the result of a scalar operation."""
+        return _Number(self, self.node("ShaderNodeMath", *values, operation=operation).outputs[0])
 
-    def vector(self, operation: str, *values: Any) -> Any:
-        node = self._node("ShaderNodeVectorMath", *values, operation=operation)
-        return next(socket for socket in node.outputs if socket.enabled)
+    def separated(self, vector: bpy.types.NodeSocket) -> list[_Number]:
+        """Return the three components of a vector."""
+        node = self.node("ShaderNodeSeparateXYZ")
+        self._group.links.new(vector, node.inputs[0])
+        return [_Number(self, socket) for socket in node.outputs]
 
-    def sum(self, *values: Any) -> Any:
-        total = values[0]
-        for value in values[1:]:
-            total = self.math("ADD", total, value)
-        return total
+    def store(self, name: str, rows: Rows) -> _Table:
+        """Store a table; those with as many rows share a mesh."""
+        if len(rows) not in self._carriers:
+            mesh = bpy.data.meshes.new(f"{_TABLES}{len(rows)}")
+            mesh.from_pydata([(0.0, 0.0, 0.0)] * len(rows), [], [])
+            carrier = bpy.data.objects.new(mesh.name, mesh)  # in no collection: it is not visible
+            carrier.use_fake_user = True
+            node = self.node("GeometryNodeObjectInfo", transform_space="ORIGINAL")
+            node.inputs["Object"].default_value = carrier
+            self._carriers[len(rows)] = (mesh, node.outputs["Geometry"])
+        mesh, geometry = self._carriers[len(rows)]
+        width, attributes = len(rows[0]), []
+        for first in range(0, width, 3):
+            attributes.append(f"{name}{first}")
+            stored = mesh.attributes.new(attributes[-1], "FLOAT_VECTOR", "POINT")
+            flat = [row[k] if k < width else 0.0 for row in rows for k in range(first, first + 3)]
+            stored.data.foreach_set("vector", flat)
+        return _Table(geometry, attributes, width)
 
-    def combine(self, *values: Any) -> Any:
-        return self._node("ShaderNodeCombineXYZ", *values).outputs[0]
+    def sqrt(self, x: _Number) -> _Number:
+        """Return the square root."""
+        return self.math("SQRT", x)
 
-    def separate(self, vector: Any) -> Any:
-        return self._node("ShaderNodeSeparateXYZ", vector).outputs
+    def exp(self, x: _Number) -> _Number:
+        """Return the exponential."""
+        return self.math("EXPONENT", x)
 
-    def scaled(self, vector: Any, factor: Any) -> Any:
-        return self.vector("SCALE", vector, factor)
+    def clip(self, x: _Number, low: float, high: float) -> _Number:
+        """Return x limited to [low, high]."""
+        return self.math("MINIMUM", self.math("MAXIMUM", x, low), high)
 
-    def polynomial(self, coefficients: Sequence[float], x: Any) -> Any:
-        """Return c0 + x (c1 + x (c2 + ...))."""
-        value = coefficients[-1]
-        for c in reversed(coefficients[:-1]):
-            value = self.math("MULTIPLY_ADD", value, x, c)
-        return value
+    def angle_coefficients(self, squared: _Number) -> Triple[_Number]:
+        """Return a, b and c of Rodrigues' formula, to single precision up to 2 rad."""
+        return long_angle_series(squared)
 
-    def position(self) -> Any:
-        return self._node("GeometryNodeInputPosition").outputs[0]
+    def columns(self, table: _Table) -> list[tuple[_Number]]:
+        """Return the columns of a table as fields."""
+        return [(x,) for name in table.attributes for x in self.separated(self._field(name))][: table.width]
 
-    def affine(self, rows: Sequence[Sequence[float]], vector: Any) -> Any:
-        turned = self.combine(*(self.vector("DOT_PRODUCT", vector, tuple(row[:3])) for row in rows[:3]))
-        return self.vector("ADD", turned, tuple(row[3] for row in rows[:3]))
+    def weighted_sum(self, factors: Sequence[_Number], weights: _Table) -> Triple[_Number]:
+        """Return the sum of the rows of a table with three columns, each times its factor."""
+        scale = self.node("ShaderNodeVectorMath", operation="SCALE")
+        self._group.links.new(self._field(weights.attributes[0]), scale.inputs[0])
+        self._group.links.new(factors[0].socket, scale.inputs["Scale"])
+        return triple(self.separated(self._total(weights.geometry, scale.outputs[0])))
 
-    def rotate(self, omega: Any, vector: Any) -> Any:
-        angle = self.vector("LENGTH", omega)
-        rotation = self._node("FunctionNodeAxisAngleToRotation", omega, angle).outputs[0]
-        return self._node("FunctionNodeRotateVector", vector, rotation).outputs[0]
+    def lookup(self, x: _Number, knots: _Table, tables: Sequence[_Table]) -> list[list[_Number]]:
+        """Return row i of each table, where i is the number of knots at or below x."""
+        reached = 1.0 - self.math("GREATER_THAN", self.columns(knots)[0][0], x)
+        field = self.node("ShaderNodeCombineXYZ", reached).outputs[0]
+        interval = self.separated(self._total(knots.geometry, field))[0]
+        return [self._row(table, interval) for table in tables]
 
-    def table(self, name: str, columns: dict[str, list], points: list) -> Any:
-        """Return the geometry of a hidden mesh that carries a table: points, and named columns."""
-        mesh = bpy.data.meshes.new(f"{_TABLES}{name}")
-        mesh.from_pydata(points, [], [])
-        for key, values in columns.items():
-            vector = isinstance(values[0], Sequence)
-            stored = mesh.attributes.new(key, "FLOAT_VECTOR" if vector else "FLOAT", "POINT")
-            flat = [x for value in values for x in value] if vector else values
-            stored.data.foreach_set("vector" if vector else "value", flat)
-        carrier = bpy.data.objects.new(mesh.name, mesh)  # in no collection: nobody sees it
-        carrier.use_fake_user = True
-        node = self._node("GeometryNodeObjectInfo", transform_space="ORIGINAL")
-        node.inputs["Object"].default_value = carrier
-        return node.outputs["Geometry"]
+    def split(self, row: Sequence[_Number], width: int) -> Sequence[_Number]:
+        """Return a row: it is separate numbers."""
+        return row
 
-    def column(self, key: str, data_type: str) -> Any:
-        node = self._node("GeometryNodeInputNamedAttribute", data_type=data_type)
-        node.inputs["Name"].default_value = key
+    def _row(self, table: _Table, index: _Number) -> list[_Number]:
+        numbers = []
+        for name in table.attributes:
+            node = self.node("GeometryNodeSampleIndex", data_type="FLOAT_VECTOR", domain="POINT", clamp=True)
+            self._group.links.new(table.geometry, node.inputs["Geometry"])
+            self._group.links.new(self._field(name), next(s for s in node.inputs if s.name == "Value" and s.enabled))
+            self._group.links.new(index.socket, node.inputs["Index"])
+            numbers += self.separated(next(socket for socket in node.outputs if socket.enabled))
+        return numbers[: table.width]
+
+    def _field(self, name: str) -> bpy.types.NodeSocket:
+        node = self.node("GeometryNodeInputNamedAttribute", data_type="FLOAT_VECTOR")
+        node.inputs["Name"].default_value = name
         return node.outputs["Attribute"]
 
-    def total(self, geometry: Any, field: Any) -> Any:
+    def _total(self, geometry: bpy.types.NodeSocket, field: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
         """Return the sum of a vector field over the points of a geometry."""
-        node = self._node("GeometryNodeAttributeStatistic", data_type="FLOAT_VECTOR", domain="POINT")
+        node = self.node("GeometryNodeAttributeStatistic", data_type="FLOAT_VECTOR", domain="POINT")
         self._group.links.new(geometry, node.inputs["Geometry"])
         self._group.links.new(field, next(s for s in node.inputs if s.name == "Attribute" and s.enabled))
         return next(socket for socket in node.outputs if socket.name == "Sum" and socket.enabled)
-
-    def sample(self, geometry: Any, field: Any, index: Any, data_type: str) -> Any:
-        """Return a field at the point of an index."""
-        node = self._node("GeometryNodeSampleIndex", data_type=data_type, domain="POINT", clamp=True)
-        self._group.links.new(geometry, node.inputs["Geometry"])
-        self._group.links.new(field, next(s for s in node.inputs if s.name == "Value" and s.enabled))
-        self._group.links.new(index, node.inputs["Index"])
-        return next(socket for socket in node.outputs if socket.enabled)
-
-
-def _rows(flat: Sequence[float], width: int) -> list[list[float]]:
-    return [list(flat[i : i + width]) for i in range(0, len(flat), width)]
-
-
-def _anchored(n: _Nodes, arrays: dict[str, list[float]], d: Sequence[Any]) -> tuple[Any, Any]:
-    """Return rotation vector and translation of the anchored model: omega = f(u), t = u + p - R p."""
-    u = _displacement(n, arrays, d)
-    opening = n.math("MULTIPLY", u[1], -1.0)
-    gx, gz = _path(n, arrays, opening)
-    away = n.combine(opening, n.math("SUBTRACT", u[0], gx), n.math("SUBTRACT", u[2], gz))
-    q = n.vector("DIVIDE", away, tuple(arrays["spline_scales"]))
-    centres, weights = _rows(arrays["spline_centres"], 3), _rows(arrays["spline_weights"], 3)
-    table = n.table("Spline", {"weight": weights[: len(centres)]}, centres)
-    radius = n.vector("LENGTH", n.vector("SUBTRACT", n.position(), q))
-    cube = n.math("POWER", radius, 3.0)
-    omega = n.total(table, n.scaled(n.column("weight", "FLOAT_VECTOR"), cube))
-    for x, row in zip(n.separate(q), weights[len(centres) :]):
-        omega = n.vector("ADD", omega, n.scaled(tuple(row), x))
-    # f(0) is taken off, so that the closed bite is exact; summed here in double precision
-    cubes = [sum(x * x for x in centre) ** 1.5 for centre in centres]
-    omega = n.vector("SUBTRACT", omega, tuple(sum(c * w[i] for c, w in zip(cubes, weights)) for i in range(3)))
-    p = tuple(arrays["incisor"])
-    translate = n.vector("SUBTRACT", n.vector("ADD", n.combine(*u), p), n.rotate(omega, p))
-    return omega, translate
-
-
-def _path(n: _Nodes, arrays: dict[str, list[float]], opening: Any) -> list[Any]:
-    low, high = arrays["path_limits"]
-    scale = arrays["path_scale_mm"][0]
-    inside = n.math("MINIMUM", n.math("MAXIMUM", opening, low), high)
-    s, beyond = n.math("DIVIDE", inside, scale), n.math("SUBTRACT", opening, inside)
-    out = []
-    for c in _rows(arrays["path_coefficients"], 5):
-        slope = n.polynomial([(k + 1) * c[k] / scale for k in range(5)], s)
-        out.append(n.math("MULTIPLY_ADD", slope, beyond, n.polynomial([0.0, *c], s)))
-    return out
-
-
-def _displacement(n: _Nodes, arrays: dict[str, list[float]], d: Sequence[Any]) -> list[Any]:
-    d1, d2, d3 = d
-    e = arrays["glide_softness_mm"][0]
-    low, high = arrays["path_limits"]
-    gx, gz = _path(n, arrays, d1)
-    soft = jawusd_reader.LIMIT_SOFTNESS_MM
-    s = n.math("ADD", _soft_ramp(n, n.math("SUBTRACT", d1, low), soft), low)
-    s = n.math("SUBTRACT", s, _soft_ramp(n, n.math("SUBTRACT", d1, high), soft))
-    s = n.math("DIVIDE", s, arrays["path_scale_mm"][0])
-    side, front = n.math("SUBTRACT", _root(n, d2, e), e), _soft_ramp(n, d3, e)
-    c, w = arrays["glide_arch"], arrays["glide_drop"]
-    bow = n.math("DIVIDE", n.math("MULTIPLY", d2, d2), jawusd_reader.ARCH_BOW_MM)
-    rho = n.sum(
-        n.math("MULTIPLY", side, n.polynomial(c[:3], s)),
-        n.math("MULTIPLY", d2, n.polynomial(c[3:5], s)),
-        n.math("MULTIPLY", bow, n.polynomial(c[5:], s)),
-    )
-    parts = zip((side, front, _bent(n, side), _bent(n, front)), w)
-    drop = n.sum(*(n.math("MULTIPLY", part, weight) for part, weight in parts))
-    share = n.math("DIVIDE", _soft_ramp(n, d1, jawusd_reader.FADE_SOFTNESS_MM), arrays["glide_fade_mm"][0])
-    fade = n.math("EXPONENT", n.math("MULTIPLY", n.math("MULTIPLY", share, share), -1.0))
-    down = n.math("MULTIPLY_ADD", drop, fade, d1)
-    return [n.math("ADD", gx, d2), n.math("MULTIPLY", down, -1.0), n.sum(gz, rho, d3)]
-
-
-def _root(n: _Nodes, x: Any, e: float) -> Any:
-    return n.math("SQRT", n.math("MULTIPLY_ADD", x, x, e * e))
-
-
-def _soft_ramp(n: _Nodes, x: Any, e: float) -> Any:
-    return n.math("MULTIPLY", n.math("SUBTRACT", n.math("ADD", x, _root(n, x, e)), e), 0.5)
-
-
-def _bent(n: _Nodes, x: Any) -> Any:
-    square = n.math("MULTIPLY", x, x)
-    grown = n.math("SQRT", n.math("MULTIPLY_ADD", square, 1.0 / jawusd_reader.DROP_SATURATION_MM2, 1.0))
-    return n.math("DIVIDE", n.math("MULTIPLY", square, jawusd_reader.DROP_BEND), grown)
-
-
-def _additive(n: _Nodes, arrays: dict[str, list[float]], d: Sequence[Any]) -> tuple[Any, Any]:
-    """Return rotation vector and translation of the additive model: exp of the sum of three curves."""
-    curves = [_curve(n, arrays, i, x) for i, x in enumerate(d, start=1)]
-    omega, v = (n.vector("ADD", n.vector("ADD", a, b), c) for a, b, c in zip(*curves))
-    # the left Jacobian of SO(3): v + b omega x v + c omega x (omega x v); its coefficients as series, exact to 1e-8
-    # up to 1 rad
-    square = n.vector("DOT_PRODUCT", omega, omega)
-    first = n.polynomial([1 / 2, -1 / 24, 1 / 720, -1 / 40320, 1 / 3628800], square)
-    second = n.polynomial([1 / 6, -1 / 120, 1 / 5040, -1 / 362880, 1 / 39916800], square)
-    once = n.vector("CROSS_PRODUCT", omega, v)
-    twice = n.vector("CROSS_PRODUCT", omega, once)
-    return omega, n.vector("ADD", n.vector("ADD", v, n.scaled(once, first)), n.scaled(twice, second))
-
-
-def _curve(n: _Nodes, arrays: dict[str, list[float]], i: int, x: Any) -> tuple[Any, Any]:
-    """Return the two halves of a cubic Hermite curve at x that goes on straight outside its knots."""
-    knots = arrays[f"curve{i}_knots"]
-    twists, slopes = (_rows(arrays[f"curve{i}_{part}"], 6) for part in ("twists", "slopes"))
-    halves = {"y0": (twists, 0), "m0": (slopes, 0), "y1": (twists, 3), "m1": (slopes, 3)}
-    columns = {key: [row[at : at + 3] for row in rows] for key, (rows, at) in halves.items()}
-    table = n.table(f"Curve{i}", columns, [(knot, 0.0, 0.0) for knot in knots])
-    inside = n.math("MINIMUM", n.math("MAXIMUM", x, knots[0]), knots[-1])
-    beyond = n.math("SUBTRACT", x, inside)
-    # the number of knots at or below x, less one
-    reached = n.combine(n.math("SUBTRACT", 1.0, n.math("GREATER_THAN", n.separate(n.position())[0], inside)), 0.0, 0.0)
-    count = n.separate(n.total(table, reached))[0]
-    low = n.math("MINIMUM", n.math("SUBTRACT", count, 1.0), len(knots) - 2.0)
-    high = n.math("ADD", low, 1.0)
-    start, end = (n.separate(n.sample(table, n.position(), k, "FLOAT_VECTOR"))[0] for k in (low, high))
-    h = n.math("SUBTRACT", end, start)
-    t = n.math("DIVIDE", n.math("SUBTRACT", inside, start), h)
-    basis = (
-        n.polynomial([1.0, 0.0, -3.0, 2.0], t),
-        n.polynomial([0.0, 0.0, 3.0, -2.0], t),
-        n.math("MULTIPLY", n.polynomial([0.0, 1.0, -2.0, 1.0], t), h),
-        n.math("MULTIPLY", n.polynomial([0.0, 0.0, -1.0, 1.0], t), h),
-    )
-    last = n.math("GREATER_THAN", x, knots[-1])
-    out = []
-    for half in ("0", "1"):
-        value, slope = (n.column(f"{name}{half}", "FLOAT_VECTOR") for name in "ym")
-        parts = [n.sample(table, field, k, "FLOAT_VECTOR") for field in (value, slope) for k in (low, high)]
-        total = n.scaled(parts[0], basis[0])
-        for part, weight in zip(parts[1:], basis[1:]):
-            total = n.vector("ADD", total, n.scaled(part, weight))
-        # straight on with the slope of the end that was passed
-        ends = columns[f"m{half}"]
-        step = tuple(b - a for a, b in zip(ends[0], ends[-1]))
-        straight = n.vector("ADD", n.scaled(step, last), tuple(ends[0]))
-        out.append(n.vector("ADD", total, n.scaled(straight, beyond)))
-    return out[0], out[1]
 
 
 if __name__ == "__main__":

@@ -1,41 +1,117 @@
-"""Hand out what runs inside other programs: the Blender extension as one zip, the scripts as files."""
+"""Write what runs inside other programs: the Blender extension as one zip, the scripts as files."""
 
 from __future__ import annotations
 
+import ast
 import shutil
+import sys
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 
 _HERE = Path(__file__).parent
-_SCRIPTS = ("jawusd_reader.py", "jawusd_recipes.py", "blender_nodes.py")
+_READER = "jawusd_reader.py"
+_SCRIPTS = ("jawusd_recipes.py", "blender_nodes.py")
 # one fixed time: equal sources give equal bytes
 _ZIP_TIME = (1980, 1, 1, 0, 0, 0)
 
 
 def build_extension(out: Path) -> Path:
-    """Write the zip that Blender's "Install from Disk" takes (4.2 and later).
-
-    Returns:
-        The file.
+    """Write the zip that Blender's "Install from Disk" takes (4.2 and later) and return it.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: It cannot be written.
     """
     sources = [*sorted((_HERE / "blender").glob("*.py")), _HERE / "blender" / "blender_manifest.toml"]
+    contents = {source.name: source.read_bytes() for source in sources}
+    contents[_READER] = packed_reader().encode()
     with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
-        for source in [*sources, _HERE / "jawusd_reader.py"]:
-            archive.writestr(zipfile.ZipInfo(source.name, _ZIP_TIME), source.read_bytes(), zipfile.ZIP_DEFLATED)
+        for name, content in contents.items():
+            archive.writestr(zipfile.ZipInfo(name, _ZIP_TIME), content, zipfile.ZIP_DEFLATED)
     return out
 
 
 def copy_scripts(folder: Path) -> list[Path]:
-    """Copy the reader, and the scripts that need nothing but it, into a folder; made if missing.
-
-    Returns:
-        The files.
+    """Write the reader, and the scripts that need nothing but it, into a folder, made if missing; return the files.
 
     Raises:
-        OSError: they cannot be written.
+        OSError: They cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    return [Path(shutil.copyfile(_HERE / name, folder / name)) for name in _SCRIPTS]
+    reader = folder / _READER
+    reader.write_text(packed_reader(), encoding="utf-8")
+    return [reader, *(Path(shutil.copyfile(_HERE / name, folder / name)) for name in _SCRIPTS)]
+
+
+def packed_reader() -> str:
+    """Return the source of the reader as one file that needs only the standard library.
+
+    The modules of jawusd that it imports take the place of its imports.
+
+    Raises:
+        ValueError: A module does what cannot be packed: it imports in another form or from another package, or defines
+            a name that another module defines.
+    """
+    modules: dict[Path, ast.Module] = {}
+    _collect(_HERE / _READER, modules)
+    imported: dict[str, set[str]] = {}
+    defined: dict[str, Path] = {}
+    bodies = []
+    for source, tree in modules.items():
+        for name in _defined_names(tree):
+            if defined.setdefault(name, source) != source:
+                raise ValueError(f"{name} is defined in {defined[name].name} and in {source.name}")
+        bodies.append(_body(source, tree, imported))
+    header = [f"import {name}" for name, names in imported.items() if not names]
+    header += [f"from {name} import {', '.join(sorted(names))}" for name, names in imported.items() if names]
+    docstring = ast.get_docstring(modules[_HERE / _READER], clean=False)
+    start = f'"""{docstring}"""\n\nfrom __future__ import annotations\n\n' + "\n".join(sorted(header))
+    return "\n\n\n".join([start, *bodies]) + "\n"
+
+
+def _collect(source: Path, modules: dict[Path, ast.Module]) -> None:
+    """Parse a module and those of jawusd that it imports, each after the ones it needs."""
+    tree = ast.parse(source.read_text(encoding="utf-8"))
+    for node in tree.body:
+        if isinstance(node, ast.ImportFrom) and str(node.module).startswith("jawusd."):
+            needed = _HERE.parent.joinpath(*str(node.module).split(".")[1:]).with_suffix(".py")
+            if needed not in modules:
+                _collect(needed, modules)
+    modules[source] = tree
+
+
+def _body(source: Path, tree: ast.Module, imported: dict[str, set[str]]) -> str:
+    """Return a module without docstring and imports; those of the standard library go to `imported`."""
+    lines: list[str | None] = [*source.read_text(encoding="utf-8").splitlines()]
+    for node in ast.walk(tree):
+        if isinstance(node, (ast.Import, ast.ImportFrom)) and node not in tree.body and "jawusd" in ast.unparse(node):
+            raise ValueError(f"{source.name}, line {node.lineno}: only imports at the top of a module can be packed")
+    dropped = [node for node in tree.body if isinstance(node, (ast.Import, ast.ImportFrom))]
+    for node in dropped:
+        _note(source, node, imported)
+    docstring = tree.body[0] if ast.get_docstring(tree) else None
+    for node in (*dropped, *([docstring] if docstring else [])):
+        lines[node.lineno - 1 : node.end_lineno] = [None] * (int(node.end_lineno or node.lineno) - node.lineno + 1)
+    return "\n".join(line for line in lines if line is not None).strip()
+
+
+def _note(source: Path, node: ast.Import | ast.ImportFrom, imported: dict[str, set[str]]) -> None:
+    """Add an import of the standard library to those at the top of the packed file."""
+    names = {alias.name for alias in node.names}
+    modules = [str(node.module)] if isinstance(node, ast.ImportFrom) else sorted(names)
+    renamed = any(alias.asname or alias.name == "*" for alias in node.names)
+    relative = isinstance(node, ast.ImportFrom) and node.level
+    for module in modules:
+        top = module.split(".")[0]
+        if renamed or relative or top not in {*sys.stdlib_module_names, "jawusd"} or module == "jawusd":
+            raise ValueError(f"{source.name}, line {node.lineno}: {ast.unparse(node)!r} cannot be packed")
+        if top != "jawusd" and module != "__future__":
+            imported.setdefault(module, set()).update(names if isinstance(node, ast.ImportFrom) else ())
+
+
+def _defined_names(tree: ast.Module) -> Iterator[str]:
+    for node in tree.body:
+        if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
+            yield node.name
+        for target in getattr(node, "targets", []) or [getattr(node, "target", None)]:
+            yield from (name.id for name in ast.walk(target) if isinstance(name, ast.Name)) if target else ()

@@ -23,9 +23,13 @@ are millimetres; where the parent does not scale them, give `scale`, 0.1 for cen
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 import jawusd_reader
+
+if TYPE_CHECKING:
+    import hou
+    import unreal
 
 PARAMETERS = ("d1", "d2", "d3")
 _LABELS = ("Opening [mm]", "Laterotrusion [mm], + left", "Protrusion [mm], + forward")
@@ -75,7 +79,7 @@ def maya_bake(rig: jawusd_reader.Rig, controls: str, mandible: str, first: int, 
         cmds.setKeyframe(mandible, attribute=["translate", "rotate"], time=frame)
 
 
-def houdini_controls(rig: jawusd_reader.Rig, node: Any) -> None:
+def houdini_controls(rig: jawusd_reader.Rig, node: hou.Node) -> None:
     """Give a node the three parameters."""
     import hou
 
@@ -86,7 +90,7 @@ def houdini_controls(rig: jawusd_reader.Rig, node: Any) -> None:
 
 
 def houdini_bake(
-    rig: jawusd_reader.Rig, controls: Any, mandible: Any, first: int, last: int, scale: float = 1.0
+    rig: jawusd_reader.Rig, controls: hou.Node, mandible: hou.Node, first: int, last: int, scale: float = 1.0
 ) -> None:
     """Key the mandible's object at every frame from first to last by what the controls say there."""
     import hou
@@ -101,7 +105,12 @@ def houdini_bake(
                 parm.setKeyframe(key)
 
 
-def unreal_keys(rig: jawusd_reader.Rig, binding: Any, keys: Mapping[int, Sequence[float]], scale: float = 0.1) -> None:
+def unreal_keys(
+    rig: jawusd_reader.Rig,
+    binding: unreal.MovieSceneBindingProxy,
+    keys: Mapping[int, Sequence[float]],
+    scale: float = 0.1,
+) -> None:
     """Give a mandible's binding in a level sequence a transform track through parameters (d1, d2, d3) [mm] by frame."""
     import unreal
 

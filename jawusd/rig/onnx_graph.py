@@ -11,14 +11,13 @@ import onnx
 from numpy.typing import ArrayLike
 from onnx import TensorProto, helper, numpy_helper
 
-from jawusd.evaluator.formula import polynomial
+from jawusd.evaluator.formula import long_angle_series, polynomial
 from jawusd.evaluator.operations import triple
 from jawusd.geometry.arrays import Array
 from jawusd.geometry.rodrigues import Triple, angle_quotients
 
 # |B_2k|, k = 1..8, of the series of the inverse left Jacobian
 _BERNOULLI = (1 / 6, 1 / 30, 1 / 42, 1 / 30, 5 / 66, 691 / 2730, 7 / 6, 3617 / 510)
-_SERIES_TERMS = 8
 # Below this squared angle the closed forms lose digits in float32 to cancellation, above it the series would.
 _SERIES_BELOW_RAD2 = 0.25
 
@@ -144,8 +143,7 @@ class Graph:
         small, far = self._near_and_far(squared)
         angle = self.sqrt(far)
         quotients = angle_quotients(far, angle, self.op("Sin", angle), self.op("Sin", 0.5 * angle))
-        series = [[(-1.0) ** k / factorial(2 * k + offset) for k in range(_SERIES_TERMS)] for offset in (1, 2, 3)]
-        return triple([self.op("Where", small, polynomial(c, squared), x) for c, x in zip(series, quotients)])
+        return triple([self.op("Where", small, x, y) for x, y in zip(long_angle_series(squared), quotients)])
 
     def inverse_coefficient(self, squared: Value, a: Value, b: Value) -> Value:
         """Return e of the inverse left Jacobian ``I - W / 2 + e W W``: ``(1 - a / (2 b)) / x`` (Barfoot 2017, 7.77)."""

@@ -24,9 +24,7 @@ def test_sliders_ranges_and_keys_survive_saving(tmp_path, blender, kind):
     (tmp_path / "poses.json").write_text(json.dumps(poses.tolist()))
     (tmp_path / "work").mkdir()
     for arguments in (["import", tmp_path / "actor" / "anim_capture.usdc"], ["reopen"]):
-        found = run_in(
-            blender, "blender_addon.py", archive, tmp_path / "work", *arguments, tmp_path / "poses.json"
-        )
+        found = run_in(blender, "blender_addon.py", archive, tmp_path / "work", *arguments, tmp_path / "poses.json")
         distance = np.linalg.norm(np.array(found["poses"]) - moved(rig.pose(poses), vertices), axis=-1)
         assert distance.max() < 0.001
         expected = np.array([rig.ranges(*row) for row in poses])

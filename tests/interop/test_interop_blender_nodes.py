@@ -1,18 +1,16 @@
 """The Blender file without add-on: Geometry Nodes pose the mandible with all scripts switched off."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 from example_rig import FPS, example_meshes, example_motion, example_rig, moved
 from foreign import run_in
 
-import jawusd.plugins
+from jawusd.plugins.extension import copy_scripts
 from jawusd.rig.bake import bake_rig
 from jawusd.rig.sampling import sample_valid
 
-PLUGINS = Path(jawusd.plugins.__file__).parent
 MESHES = {"MandibleMesh": "mandible", "LowerTeethMesh": "lower_teeth"}
 
 
@@ -26,11 +24,12 @@ def test_nodes_pose_the_mandible_without_scripts(tmp_path, blender, kind, file):
     # also at rest, and beyond the ends of the model's curves
     poses = np.concatenate([np.zeros((1, 3)), sample_valid(rig, 50, seed=6), [[-2, 3, 1], [70, 0, 0], [5, -14, -5]]])
     (tmp_path / "poses.json").write_text(json.dumps(poses.tolist()))
-    run_in(blender, "blender_nodes.py", PLUGINS, "make", tmp_path / "actor" / file, tmp_path / "jaw.blend")
+    copy_scripts(tmp_path / "scripts")
+    run_in(blender, "blender_nodes.py", tmp_path / "scripts", "make", tmp_path / "actor" / file, tmp_path / "jaw.blend")
     (tmp_path / "actor").rename(tmp_path / "gone")  # the file stands alone
     shown = (30, 38, 55)
     arguments = ("reopen", tmp_path / "jaw.blend", tmp_path / "poses.json", ",".join(map(str, shown)), ",".join(MESHES))
-    found = run_in(blender, "blender_nodes.py", PLUGINS, *arguments)
+    found = run_in(blender, "blender_nodes.py", tmp_path / "scripts", *arguments)
     for mesh, name in MESHES.items():
         places = np.array(found["poses"][mesh])
         distance = np.linalg.norm(places - moved(rig.pose(poses), meshes[name].vertices), axis=-1)

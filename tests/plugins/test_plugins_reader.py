@@ -1,11 +1,10 @@
-"""The single-file reader against the evaluator, in this Python and in a bare one."""
+"""The single-file reader against the evaluator, in this Python and, as one file, in a bare one."""
 
+import ast
 import json
 import os
-import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,11 +13,10 @@ from pxr import Sdf
 from scipy.spatial.transform import Rotation
 
 from jawusd.formats.model import JawModel, save_model
-from jawusd.plugins import jawusd_reader
+from jawusd.plugins import extension, jawusd_reader
+from jawusd.plugins.extension import packed_reader
 from jawusd.rig.bake import bake_rig
 from jawusd.rig.sampling import sample_valid
-
-SOURCE = Path(jawusd_reader.__file__)
 
 
 @pytest.fixture(params=["anchored", "additive"])
@@ -72,9 +70,9 @@ def test_ranges_end_on_the_bound(rig, model_file, d1):
 
 def test_bare_interpreter_reads_the_model(rig, model_file):
     """Isolated, without site packages: neither numpy nor pxr is there."""
-    copied = shutil.copy(SOURCE, model_file.parent)
+    (model_file.parent / "jawusd_reader.py").write_text(packed_reader())
     code = f"""
-import sys; sys.path.insert(0, {str(Path(copied).parent)!r})
+import sys; sys.path.insert(0, {str(model_file.parent)!r})
 import jawusd_reader, json
 assert "numpy" not in sys.modules and "jawusd" not in sys.modules
 rig = jawusd_reader.load({str(model_file)!r})
@@ -136,5 +134,29 @@ def test_newer_and_missing_rigs_in_usd_are_refused(tmp_path):
         jawusd_reader.load(tmp_path / "actor.usda")
 
 
-def test_reader_imports_nothing_but_the_standard_library():
-    assert "import jawusd\n" not in SOURCE.read_text() and "from jawusd" not in SOURCE.read_text()
+def test_packed_reader_imports_nothing_but_the_standard_library():
+    tree = ast.parse(packed_reader(), feature_version=(3, 9))
+    names = [node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+    names += [alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names]
+    assert {name.split(".")[0] for name in names} - set(sys.stdlib_module_names) == {"pxr"}
+    assert "match" not in {type(node).__name__.lower() for node in ast.walk(tree)}
+    assert packed_reader().count("from __future__") == 1 and packed_reader().startswith('"""Read and evaluate jaw rigs')
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("import numpy as np", "cannot be packed"),
+        ("import numpy", "cannot be packed"),
+        ("import jawusd", "cannot be packed"),
+        ("from jawusd.evaluator.schema import arrays_of as wanted", "cannot be packed"),
+        ("from . import extension", "cannot be packed"),
+        ("def f():\n    from jawusd.evaluator.schema import arrays_of", "only imports at the top"),
+        ("def polynomial(): ...\nfrom jawusd.evaluator.formula import MODELS", "defined in"),
+    ],
+)
+def test_what_cannot_be_packed_is_refused(tmp_path, monkeypatch, line, message):
+    monkeypatch.setattr(extension, "_READER", tmp_path / "jawusd_reader.py")  # an absolute path replaces the folder
+    (tmp_path / "jawusd_reader.py").write_text(f'"""Reader."""\n{line}\n')
+    with pytest.raises(ValueError, match=message):
+        packed_reader()

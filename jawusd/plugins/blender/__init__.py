@@ -3,6 +3,8 @@
 The extension is built by `python -m jawusd.plugins FILE.zip`, which puts `jawusd_reader.py` beside these modules.
 """
 
+from __future__ import annotations
+
 import os
 import sys
 
@@ -28,7 +30,7 @@ class JawUsdHook(bpy.types.USDHook):
     bl_label = "jawusd jaw rigs"
 
     @staticmethod
-    def on_import(context: object) -> bool:
+    def on_import(context: bpy.types.Context) -> bool:
         """Link every rig of the stage; Blender calls this at the end of an import."""
         return jaw.link_rigs(context.get_stage(), context.get_prim_map())
 

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import bpy
 
 from . import jawusd_reader
+
+if TYPE_CHECKING:
+    from pxr import Sdf, Usd
+
+PrimMap = Mapping["Sdf.Path", list[bpy.types.ID]]  # prim path to the objects and data made from it
 
 SLIDERS = ("d1", "d2", "d3")
 LABELS = ("Opening [mm]", "Laterotrusion [mm], + left", "Protrusion [mm], + forward")
@@ -17,21 +23,13 @@ _CHANNELS = (("location", 3), ("rotation_quaternion", 4))
 # It normalises quaternions before use, so longer ones lose nothing.
 _QUATERNION_LENGTH = 1024.0
 
-_rigs = {}
-_poses = {}
-_openings = {}
+_rigs: dict[str, jawusd_reader.Rig] = {}  # by the text stored in the actor
+_poses: dict[tuple[str, float, float, float], tuple[float, ...]] = {}
+_parameters: dict[str, tuple[float, float, float]] = {}  # by actor, as last seen
 
 
-def link_rigs(stage: Any, prim_map: dict) -> bool:
-    """Make the rigs of an imported stage live.
-
-    Args:
-        stage: the USD stage.
-        prim_map: prim path to the objects and data made from it.
-
-    Returns:
-        True when there was a rig.
-    """
+def link_rigs(stage: Usd.Stage, prim_map: PrimMap) -> bool:
+    """Make the rigs of an imported stage live; return whether there is one."""
     prims = jawusd_reader.find_rigs(stage)
     for prim in prims:
         mandible_path = prim.GetRelationship("jaw:mandible").GetTargets()[0]
@@ -67,7 +65,7 @@ def update_ranges(actor: bpy.types.Object) -> None:
     """Set the slider limits of d2 and d3 to what is valid at the present d1, with the other one as it is."""
     rig = rig_of(actor)
     d1, d2, d3 = (actor[name] for name in SLIDERS)
-    _openings[actor.name_full] = (d1, d2, d3)
+    _parameters[actor.name_full] = (d1, d2, d3)
     # along each axis through the present value of the other; where that leaves nothing, through the path itself
     for name, found, fallback in zip(SLIDERS[1:], rig.ranges(d1, d2, d3), rig.ranges(d1)):
         low, high = found if found[0] == found[0] else fallback
@@ -75,7 +73,7 @@ def update_ranges(actor: bpy.types.Object) -> None:
             actor.id_properties_ui(name).update(min=low, max=high, soft_min=low, soft_max=high)
 
 
-def _object_of(prim_map: dict, path: Any) -> bpy.types.Object | None:
+def _object_of(prim_map: PrimMap, path: Sdf.Path) -> bpy.types.Object | None:
     """Return the object made from a prim; of a prim merged with its only child, the child's."""
     exact = [found for found in prim_map.get(path, []) if isinstance(found, bpy.types.Object)]
     if exact:
@@ -118,7 +116,7 @@ def _drive(mandible: bpy.types.Object, actor: bpy.types.Object) -> None:
             channel += 1
 
 
-def _key(actor: bpy.types.Object, prim: Any) -> None:
+def _key(actor: bpy.types.Object, prim: Usd.Prim) -> None:
     """Give the sliders the samples of the file as keys, linear between them as the file means them."""
     for name in SLIDERS:
         attribute = prim.GetAttribute(f"jaw:{name}")
@@ -158,14 +156,14 @@ def _install(*_: object) -> None:
     """Make the driver function known; Blender forgets it with every file it opens."""
     bpy.app.driver_namespace[_FUNCTION] = _channel
     _poses.clear()
-    _openings.clear()
+    _parameters.clear()
 
 
 @bpy.app.handlers.persistent
 def _follow(*_: object) -> None:
     """Update the ranges of every actor whose sliders have moved."""
     for actor in actors():
-        if _openings.get(actor.name_full) != tuple(actor[name] for name in SLIDERS):
+        if _parameters.get(actor.name_full) != tuple(actor[name] for name in SLIDERS):
             update_ranges(actor)
 
 

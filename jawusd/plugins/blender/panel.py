@@ -1,5 +1,7 @@
 """The sidebar panel: sliders of the rigs in the scene, and whether their pose is valid."""
 
+from __future__ import annotations
+
 import bpy
 
 from . import jaw
@@ -13,7 +15,7 @@ class JAWUSD_OT_key(bpy.types.Operator):
     bl_description = "Set a key on all three jaw parameters at the current frame"
     bl_options = {"REGISTER", "UNDO"}
 
-    actor: bpy.props.StringProperty()
+    __annotations__ = {"actor": bpy.props.StringProperty()}  # Blender reads properties from annotations
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Insert the keys."""

@@ -1,0 +1,5 @@
+from jawusd.plugins.jawusd_reader import Rig as Rig
+from jawusd.plugins.jawusd_reader import decompose as decompose
+from jawusd.plugins.jawusd_reader import find_rigs as find_rigs
+from jawusd.plugins.jawusd_reader import from_json as from_json
+from jawusd.plugins.jawusd_reader import from_prim as from_prim
