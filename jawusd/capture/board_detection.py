@@ -38,7 +38,6 @@ def shown_instead(images: Sequence[NDArray[np.uint8]], boards: Boards, missed: b
 
     Args:
         images: gray pictures, shape (h, w) each.
-        boards: the board described.
         missed: that one is not found in most of the clip's pictures, so markers that never show may not exist.
     """
     plain: Counter[tuple[int, int]] = Counter()

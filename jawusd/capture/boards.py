@@ -71,9 +71,7 @@ def find_boards(names: tuple[str, ...], boards: Boards, progress: Callable[[int,
     """Choose sharp pictures of the boards and find the corners in them.
 
     Args:
-        names: the camera names, in the order of `boards.videos`.
         boards: the board, and one video or numbered picture pattern per camera.
-        progress: told of every picture searched (done, total).
 
     Raises:
         CalibrationError: the clips share no pictures, show no board, or a board with other counts.

@@ -70,13 +70,8 @@ def calibrate_capture(
     """Calibrate from the boards of a capture.
 
     Args:
-        capture: names boards, cameras and picks.
         scans: vertices of the teeth scans [mm] by "upper" and "lower", shape (n, 3); picks refer to them.
-        progress: told of every picture searched (done, total).
         scale_without_picks: measures the size of the teeth with the cameras found, where picks do not tell.
-
-    Returns:
-        The cameras, the first one being the world, and the report.
 
     Raises:
         CalibrationError: there are no boards, or they do not carry a calibration.
@@ -99,9 +94,6 @@ def calibrate_sightings(
     scale_without_picks: MeasureScale | None = None,
 ) -> tuple[list[Camera], CalibrationReport]:
     """Calibrate from corners already found; see `calibrate_capture`.
-
-    Returns:
-        The cameras, and what is known of their accuracy.
 
     Raises:
         CalibrationError: the corners do not carry a calibration.

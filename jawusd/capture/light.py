@@ -108,11 +108,6 @@ def find_steps(brightness: Array, first_frame: int = 0) -> list[Step]:
 def match_steps(steps: list[Step], reference: list[Step], fps: float) -> Offset:
     """Align the steps of one camera with those of the reference camera.
 
-    Args:
-        steps: of the camera.
-        reference: of the reference camera.
-        fps: frames per second of both.
-
     Raises:
         SyncError: fewer than two steps fit, two alignments fit equally well, or frames were lost in between.
     """
@@ -193,9 +188,6 @@ def on_grid(steps: list[Step], numbers: NDArray[np.int64]) -> list[Step]:
 
 def find_flashes(video: Video) -> Flashes:
     """Find the steps near both ends of a video, looking further in until there are some.
-
-    Returns:
-        The steps, their times in pictures of the video.
 
     Raises:
         CaptureError: the video cannot be decoded.

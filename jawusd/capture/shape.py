@@ -54,8 +54,6 @@ def board_shape_error(cameras: list[Camera], bundle: Bundle, points_mm: Array, c
     """Compare distances between triangulated corners with those on the board, near the mouth.
 
     Args:
-        cameras: the calibrated cameras.
-        bundle: the corners they were calibrated from.
         points_mm: corners on the board, shape (N, 3).
         centre_mm: middle of the mouth in the world, shape (3,).
     """

@@ -86,7 +86,6 @@ def align_videos(videos: Mapping[str, Path], reference: str, *, by_light: bool =
     no flash and all have sound, the sound aligns them.
 
     Args:
-        videos: video file per camera name.
         reference: the camera that counts the frames.
         by_light: look for flashes at all.
 

@@ -54,7 +54,6 @@ def read_arkit(path: str | os.PathLike[str], fps: float | None = None) -> FaceCa
     """Read a face capture.
 
     Args:
-        path: CSV file of Live Link Face.
         fps: rate at which the time codes count; found from them if None, which takes a capture that passes at least
             one full second.
 

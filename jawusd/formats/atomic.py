@@ -106,10 +106,6 @@ def _sync_folder(folder: Path) -> None:
 def write_bytes_atomic(path: str | os.PathLike[str], data: bytes) -> None:
     """Write bytes to a file atomically.
 
-    Args:
-        path: where to; its folder is made if missing.
-        data: the whole content.
-
     Raises:
         OutputError: the file cannot be written.
     """
@@ -120,10 +116,6 @@ def write_bytes_atomic(path: str | os.PathLike[str], data: bytes) -> None:
 def write_text_atomic(path: str | os.PathLike[str], text: str) -> None:
     """Write UTF-8 text to a file atomically.
 
-    Args:
-        path: where to; its folder is made if missing.
-        text: the whole content.
-
     Raises:
         OutputError: the file cannot be written.
     """
@@ -132,10 +124,6 @@ def write_text_atomic(path: str | os.PathLike[str], text: str) -> None:
 
 def write_npz_atomic(path: str | os.PathLike[str], arrays: dict[str, ArrayLike]) -> None:
     """Write a compressed npz atomically, byte for byte the same for the same arrays.
-
-    Args:
-        path: file to write.
-        arrays: named arrays; object arrays are refused.
 
     Raises:
         OutputError: the file cannot be written.

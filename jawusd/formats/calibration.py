@@ -25,12 +25,6 @@ _CAMERA_TABLE = re.compile(r"^cam_\d+$")
 def load_calibration(path: str | os.PathLike[str]) -> list[Camera]:
     """Read the cameras of a calibration file.
 
-    Args:
-        path: aniposelib TOML.
-
-    Returns:
-        Cameras in the file's order.
-
     Raises:
         CalibrationError: a value is missing, of the wrong shape or not finite, or a rotation is not one.
         FormatError: not TOML.
@@ -99,10 +93,6 @@ def _camera(path: Path, table: str, values: object) -> Camera:
 
 def save_calibration(path: str | os.PathLike[str], cameras: list[Camera]) -> None:
     """Write cameras as aniposelib TOML, atomically.
-
-    Args:
-        path: where to.
-        cameras: calibrated cameras, in the order written.
 
     Raises:
         OutputError: the file cannot be written.

@@ -68,11 +68,7 @@ def load_cameras_file(path: str | os.PathLike[str], unit_mm: float = 1.0) -> lis
 
 
 def calibration_files(path: Path) -> list[Path]:
-    """Return the files that make up a calibration.
-
-    Args:
-        path: the file or folder that a capture names.
-    """
+    """Return the files that make up a calibration."""
     if path.is_dir() or path.name in _COLMAP:
         return [(path if path.is_dir() else path.parent) / name for name in _COLMAP]
     return [path]
@@ -83,9 +79,6 @@ def load_colmap(folder: str | os.PathLike[str]) -> list[Camera]:
 
     An image in a folder is named after it (`cam0/0001.png` is cam0), else after its file (`cam0.png`). Several images
     of one camera must share its pose: the cameras of a capture stand still.
-
-    Args:
-        folder: holds cameras.txt and images.txt.
 
     Returns:
         Cameras by name, in the model's unit.
@@ -120,9 +113,6 @@ def load_colmap(folder: str | os.PathLike[str]) -> list[Camera]:
 
 def load_nerfstudio(path: str | os.PathLike[str]) -> list[Camera]:
     """Read nerfstudio's transforms.json; names as in `load_colmap`.
-
-    Args:
-        path: transforms.json.
 
     Returns:
         Cameras by name, in the file's unit before its `applied_scale`.

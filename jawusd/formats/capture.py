@@ -223,10 +223,6 @@ def load_capture(path: str | os.PathLike[str], *, allow_outside: bool = False) -
 
     Args:
         path: `capture.toml`, or the folder that holds it.
-        allow_outside: let paths in the file leave its folder.
-
-    Returns:
-        The capture with absolute paths.
 
     Raises:
         FormatError: not such a file; the message names the key.

@@ -20,8 +20,6 @@ def write_bootstrap(path: str | os.PathLike[str], picks: Bootstrap, expected: Bo
     """Replace `[bootstrap]` of a capture.toml, or add it.
 
     Args:
-        path: the file.
-        picks: what to write.
         expected: the picks that were read from the file before; None if it had none.
 
     Raises:
@@ -59,10 +57,6 @@ def write_bootstrap(path: str | os.PathLike[str], picks: Bootstrap, expected: Bo
 
 def with_bootstrap(text: str, picks: Bootstrap) -> str:
     """Return a capture.toml with other picks; comments among the old ones are kept.
-
-    Args:
-        text: the file as it is.
-        picks: the new ones.
 
     Raises:
         ValueError: the picks there are written as something else than tables.

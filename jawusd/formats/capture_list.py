@@ -40,12 +40,6 @@ class ListedCapture:
 def load_capture_list(path: str | os.PathLike[str]) -> list[ListedCapture]:
     """Read a list of captures.
 
-    Args:
-        path: the list.
-
-    Returns:
-        The captures, in the order of the lines.
-
     Raises:
         FormatError: missing, not text, empty, a line that cannot be read, or two captures of one name.
     """

@@ -135,10 +135,6 @@ class Experiments:
 def save_table(path: str | os.PathLike[str], rows: list[dict[str, str | int | float]]) -> None:
     """Write a table of experiments as CSV, atomically.
 
-    Args:
-        path: the file.
-        rows: what `Experiments.table` gives.
-
     Raises:
         OutputError: the file cannot be written.
     """

@@ -58,9 +58,6 @@ class Keys(BaseModel):
 def load_keys(path: str | os.PathLike[str]) -> Keys:
     """Read animation keys.
 
-    Args:
-        path: keys.json.
-
     Raises:
         FormatError: not such a file; the message names the entry.
     """
@@ -76,10 +73,6 @@ def load_keys(path: str | os.PathLike[str]) -> Keys:
 
 def save_keys(path: str | os.PathLike[str], keys: Keys) -> None:
     """Write animation keys atomically.
-
-    Args:
-        path: where to.
-        keys: the animation.
 
     Raises:
         OutputError: the file cannot be written.

@@ -43,9 +43,6 @@ class LandmarkFile:
 def load_landmarks(path: str | os.PathLike[str]) -> LandmarkFile:
     """Read landmarks.
 
-    Args:
-        path: JSON of format jawusd-landmarks/1.
-
     Raises:
         FormatError: not such a file; the message names the key.
         VersionError: written for a newer version.

@@ -45,10 +45,6 @@ class JawModel:
 def save_model(path: str | os.PathLike[str], model: JawModel) -> None:
     """Write a model atomically.
 
-    Args:
-        path: where to, `.npz`.
-        model: what to write.
-
     Raises:
         OutputError: the file cannot be written.
         ValueError: the captured arrays differ in length.
@@ -64,9 +60,6 @@ def save_model(path: str | os.PathLike[str], model: JawModel) -> None:
 
 def load_model(path: str | os.PathLike[str]) -> JawModel:
     """Read a model.
-
-    Args:
-        path: `model.npz` of format jawusd-model/1.
 
     Raises:
         FormatError: not a model file, or wrong shapes.

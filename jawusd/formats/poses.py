@@ -191,9 +191,6 @@ def read_parameters(path: str | os.PathLike[str]) -> tuple[NDArray[np.int64], Ar
 def table_columns(path: str | os.PathLike[str]) -> tuple[str, ...]:
     """Return the column names of a CSV or JSON table.
 
-    Args:
-        path: the table.
-
     Raises:
         FormatError: the file is not such a table.
     """
@@ -204,7 +201,6 @@ def write_poses(path: str | os.PathLike[str], frames: NDArray[np.int64], T: Arra
     """Write jaw poses as CSV with matrix columns, atomically and with all digits.
 
     Args:
-        path: file to write.
         frames: frame numbers, shape (F,).
         T: T_skull_mandible, shape (F, 4, 4).
 
@@ -216,11 +212,6 @@ def write_poses(path: str | os.PathLike[str], frames: NDArray[np.int64], T: Arra
 
 def write_parameters(path: str | os.PathLike[str], frames: NDArray[np.int64], d: Array) -> None:
     """Write parameters d [mm] (F, 3) as CSV, atomically and with all digits.
-
-    Args:
-        path: where to.
-        frames: frame numbers, shape (F,).
-        d: parameters [mm], shape (F, 3).
 
     Raises:
         OutputError: the file cannot be written.
@@ -234,9 +225,7 @@ def write_table(
     """Write a CSV table of one frame column and numbers, atomically.
 
     Args:
-        path: file to write.
         header: column names, the frame's first.
-        frames: frame numbers, shape (F,).
         values: numbers, shape (F, len(header) - 1).
 
     Raises:

@@ -11,8 +11,6 @@ def read_text(path: Path, most_bytes: int, encoding: str = "utf-8") -> str:
     """Return what a text file holds.
 
     Args:
-        path: the file.
-        most_bytes: a larger file is refused.
         encoding: "utf-8", or "utf-8-sig" where spreadsheets put a byte order mark in front.
 
     Raises:

@@ -14,12 +14,6 @@ _MAX_BYTES = 4 << 20
 def read_toml(path: str | os.PathLike[str]) -> dict:
     """Read a TOML file.
 
-    Args:
-        path: the file.
-
-    Returns:
-        Its tables and values.
-
     Raises:
         FormatError: missing, too large, not UTF-8 or not TOML.
     """

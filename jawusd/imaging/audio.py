@@ -31,10 +31,6 @@ class Sound(NamedTuple):
 def read_sound(path: str | os.PathLike[str], rate_hz: int) -> Sound | None:
     """Read the first sound track of a file.
 
-    Args:
-        path: a video or sound file.
-        rate_hz: samples per second to return.
-
     Returns:
         The sound, or None if the file carries none.
 

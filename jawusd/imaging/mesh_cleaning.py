@@ -21,9 +21,6 @@ def manifold(mesh: Mesh) -> Mesh:
 
     Points at the same place are merged, empty and repeated faces dropped; where more than two faces meet in an edge,
     the smallest ones go; faces that are linked are wound alike; parts that touch in a point alone get a point each.
-
-    Args:
-        mesh: without colours [mm].
     """
     surface = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     surface.merge_vertices()

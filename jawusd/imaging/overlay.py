@@ -50,8 +50,6 @@ def draw_overlay(
 
     Args:
         image: (h, w, 3) RGB, of the camera's size; recorded pictures are drawn on with their distortion.
-        camera: the camera that took the picture.
-        scans: what to draw; nearer surfaces hide farther ones.
         fill: opacity of the tint, 0 .. 1; the outline is opaque.
 
     Raises:
@@ -85,12 +83,8 @@ def tracking_sheet(
     """Return one picture with a row per frame and a column per camera, cut to the teeth and captioned.
 
     Args:
-        tracks: the tracked poses.
         frames: frames of the reference camera, all of them in tracks.
-        cameras: the calibrated cameras to show.
-        videos: the video per camera name.
         offsets: whole-frame offset per camera name, see `capture.sync`.
-        upper, lower: the teeth scans.
         tile_px: (width, height) of a tile.
 
     Returns:

@@ -15,12 +15,7 @@ _MOST_PX = 1 << 27  # four times 8K; a few bytes can declare a picture that fill
 
 
 def read_picture(path: Path, flags: int) -> NDArray[np.uint8] | NDArray[np.uint16] | None:
-    """Return a picture, or None where the file is none that can be decoded.
-
-    Args:
-        path: PNG, JPEG, TIFF or what else OpenCV knows.
-        flags: of `cv2.imread`.
-    """
+    """Return a picture, or None where the file is none that can be decoded."""
     try:
         with open(path, "rb") as file:
             head = file.read(24)

@@ -223,7 +223,6 @@ def draw_depth_labels(
         points, faces, x0, y0, cull: as for `draw_silhouette`.
         inverse_depth: (h, w) float32, 1/z [1/mm], 0 = empty; clear it before the first call. Ties keep the earlier.
         labels: (h, w) uint8, receives label where the mesh is nearest; an empty (0, 0) array stores none.
-        label: number of this mesh.
 
     Raises:
         ValueError: labels is neither empty nor as large as inverse_depth.
@@ -264,11 +263,7 @@ def _popcount(x):
 
 @numba.njit(_INT(_BITS), nogil=True, cache=True)
 def count_bits(bits: np.ndarray) -> int:
-    """Count the set pixels of a (h, words) uint64 bit-row picture.
-
-    Returns:
-        How many pixels are set.
-    """
+    """Count the set pixels of a (h, words) uint64 bit-row picture."""
     total = np.uint64(0)
     for y in range(bits.shape[0]):
         for k in range(bits.shape[1]):
@@ -279,9 +274,6 @@ def count_bits(bits: np.ndarray) -> int:
 @numba.njit(_INT(_BITS, _BITS), nogil=True, cache=True)
 def count_and_not(first: np.ndarray, second: np.ndarray) -> int:
     """Count the pixels set in first and not in second; both (h, words) uint64.
-
-    Returns:
-        How many pixels they are.
 
     Raises:
         ValueError: the two pictures differ in shape.

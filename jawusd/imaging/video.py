@@ -61,9 +61,6 @@ class Video:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         """Read the table of frames and the first picture.
 
-        Args:
-            path: video file of any format FFmpeg knows.
-
         Raises:
             CaptureError: the file is missing, empty, truncated, not a video, or carries no presentation times.
         """
@@ -123,7 +120,6 @@ class Video:
         buffer, without a copy.
 
         Args:
-            first: first picture.
             last: one after the last picture; None = to the end.
             colour: what to make of each picture.
             region: (x0, y0, x1, y1) [px], x1 and y1 exclusive, in the turned picture; None = all of it.

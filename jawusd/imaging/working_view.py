@@ -32,7 +32,6 @@ class WorkingView:
         """Prepare the maps.
 
         Args:
-            source: the calibrated camera.
             size_px: (width, height) of the working pictures, no larger than the recorded ones.
 
         Raises:

@@ -110,10 +110,6 @@ def scan_library(folder: str | os.PathLike[str], load: Loader) -> Library:
     Every subfolder counts as one person: its `model.npz`, else its `actor.usda`. Links that leave the folder are not
     followed.
 
-    Args:
-        folder: the library.
-        load: reads a rig.
-
     Raises:
         FormatError: no such folder, too many folders, or an index that is damaged.
         VersionError: an index written by a newer version.
@@ -142,13 +138,6 @@ def scan_library(folder: str | os.PathLike[str], load: Loader) -> Library:
 
 def load_donors(library: Library, load: Loader) -> list[Donor]:
     """Read the rigs of all persons whose captures show every movement, named by their paths.
-
-    Args:
-        library: a scanned folder.
-        load: reads a rig.
-
-    Returns:
-        The persons, in the order of the entries.
 
     Raises:
         JawusdError: a rig has become unreadable since the scan.

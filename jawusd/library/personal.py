@@ -128,7 +128,6 @@ def personal_motion(donors: Sequence[Donor], target: Array, learned: Learned) ->
     """Make the motion of a person from landmarks and a library.
 
     Args:
-        donors: the persons of the library, each showing all three movements.
         target: the person's landmarks with the teeth together [mm], shape (5, 3), in the order of `LANDMARKS`.
         learned: what `leave_one_out` says of these donors.
     """

@@ -60,7 +60,6 @@ def displacements(donor: Donor, target: Array, shares: Array) -> Array:
     """Return how the target's landmarks move when a donor's motion is carried over.
 
     Args:
-        donor: whose motion it is.
         target: the other person's landmarks with the teeth together [mm], shape (5, 3).
         shares: parameters as shares of the ranges, see `JawRig.normalized`, shape (K, 3).
 

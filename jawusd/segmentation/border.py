@@ -44,7 +44,6 @@ def settle_borders(
     Args:
         shares: of the upper and lower row, shape (2, h, w).
         rgb: the picture, shape (h, w, 3).
-        config: the segmentation's numbers.
         px_per_mm: resolution of the picture.
 
     Returns:

@@ -60,10 +60,8 @@ class CameraSegmenter:
         """Prepare for a take.
 
         Args:
-            source: the calibrated camera.
             meshes: upper and lower teeth scan [mm].
             poses: T_world_upper, T_world_lower at some time of the take, shape (2, 4, 4).
-            config: the segmentation's numbers.
         """
         self._config = config
         self._scans = tuple(ScanSurface.of(mesh) for mesh in meshes)

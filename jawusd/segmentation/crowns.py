@@ -67,11 +67,7 @@ def expect_crowns(scans: tuple[ScanSurface, ScanSurface], poses: Array, camera: 
 
 
 def draw_crowns(scans: tuple[ScanSurface, ScanSurface], poses: Array, camera: Camera) -> NDArray[np.uint8]:
-    """Return OTHER, UPPER or LOWER where that row's crowns are nearest, shape (h, w).
-
-    Args:
-        scans, poses, camera: as for `expect_crowns`.
-    """
+    """Return OTHER, UPPER or LOWER where that row's crowns are nearest, shape (h, w)."""
     width, height = camera.size_px
     inverse_depth, labels = np.zeros((height, width), np.float32), np.zeros((height, width), np.uint8)
     for scan, pose, label in zip(scans, poses, (UPPER, LOWER), strict=True):

@@ -86,7 +86,6 @@ def cut_three_ways(
         edge: price of a border between a pixel and its right and lower neighbour, shape (2, h, w).
         start: first guess of the shares, shape (3, h, w).
         free: pixels whose label is open, shape (h, w); the others keep the first guess.
-        steps: iterations.
 
     Returns:
         Shares of the labels, not negative, sum 1, shape (3, h, w).

@@ -59,11 +59,7 @@ def cut_picture(
 
     Args:
         window, expected: the picture, and where crowns are expected in it.
-        colours: the colours of its camera.
-        config: the segmentation's numbers.
-        px_per_mm: resolution of the picture.
         reach_mm: how far teeth may lie outside their projection.
-        seeds: what a person said.
 
     Returns:
         Shares of both rows, shape (2, h, w), and where borders show, shape (h, w).
@@ -80,7 +76,6 @@ def learn_numbers(examples: Sequence[Example], config: SegmentationConfig) -> tu
 
     Args:
         examples: pictures with finished masks.
-        config: the numbers to start from.
 
     Returns:
         The numbers chosen; and what changed, with the mean disagreement (1 - intersection over union) before and after.

@@ -37,7 +37,6 @@ class PictureFrame:
         """Choose the working size.
 
         Args:
-            source: the calibrated camera.
             centre_world: where the teeth are [mm], shape (3,).
             px_per_mm: resolution there; pictures are never enlarged.
         """
@@ -53,7 +52,6 @@ class PictureFrame:
 
         Args:
             image: (H, W, 3) RGB as recorded.
-            points_world: the points to be in the window.
             margin_mm: what to leave around them.
         """
         camera = self._working.camera

@@ -71,9 +71,6 @@ def cut_rows(
     Args:
         rgb: the picture, shape (h, w, 3).
         expected: where the crowns are expected in it.
-        model: the colours of this camera.
-        config: the segmentation's numbers.
-        px_per_mm: resolution of the picture.
         reach_mm: how far teeth may lie outside their projection.
         seeds: what a person said, which no colour overcomes.
 

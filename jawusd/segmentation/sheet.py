@@ -24,10 +24,7 @@ def write_sheet(path: Path, shown: Sequence[tuple[str, int, str]], videos: Mappi
     """Write a PNG with a tile per mask, upper and lower row outlined.
 
     Args:
-        path: the file.
         shown: camera, its own frame and a remark, tile after tile.
-        videos: video by camera.
-        folder: the folder of the masks.
 
     Raises:
         CaptureError: a picture or mask cannot be decoded.

@@ -38,7 +38,6 @@ class ColourStates:
         """Go on from the latest colours kept on the way to a frame that is done.
 
         Args:
-            done: the last frame done.
             step: 1 or -1, the way the work goes.
 
         Returns:
