@@ -97,8 +97,8 @@ class JawusdError(Exception):
 
     def __reduce__(self) -> tuple[Callable[[str], JawusdError], tuple[str]]:
         # Exceptions cross process boundaries; keyword arguments are lost by the default protocol.
-        where = {"path": self.path, "camera": self.camera, "frame": self.frame, "hint": self.hint}
-        return partial(type(self), **where), (self.message,)
+        kind = partial(type(self), path=self.path, camera=self.camera, frame=self.frame, hint=self.hint)
+        return kind, (self.message,)
 
 
 class FormatError(JawusdError):

@@ -10,6 +10,7 @@ column is ignored. A row whose count is 0 is a moment without a face.
 from __future__ import annotations
 
 import csv
+import io
 import math
 import os
 import re
@@ -20,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.errors import FormatError
+from jawusd.formats.text import read_text
 from jawusd.geometry.arrays import Array
 
 __all__ = ["FaceCapture", "read_arkit"]
@@ -93,20 +95,11 @@ def read_arkit(path: str | os.PathLike[str], fps: float | None = None) -> FaceCa
 
 def _rows(path: Path) -> list[tuple[int, list[str]]]:
     """Return the rows that are not empty with their line numbers, the header first."""
+    reader = csv.reader(io.StringIO(read_text(path, _MAX_BYTES, "utf-8-sig"), newline=""), strict=True)
     try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise FormatError(f"is {path.stat().st_size} bytes, at most {_MAX_BYTES} are read.", path=path)
-        with path.open(encoding="utf-8-sig", newline="") as opened:
-            reader = csv.reader(opened, strict=True)
-            rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
-    except FileNotFoundError as error:
-        raise FormatError("there is no such file.", path=path) from error
-    except UnicodeDecodeError as error:
-        raise FormatError(f"is not UTF-8 text ({error}).", path=path) from error
+        rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
     except csv.Error as error:
         raise FormatError(f"is not a CSV table ({error}).", path=path) from error
-    except OSError as error:
-        raise FormatError(f"cannot be read: {error.strerror}.", path=path) from error
     if not rows:
         raise FormatError("is empty; the first line must name the columns.", path=path)
     return rows

@@ -130,12 +130,12 @@ def write_npz_atomic(path: str | os.PathLike[str], arrays: dict[str, ArrayLike])
         ValueError: an array would need a pickle.
     """
     buffer = io.BytesIO()
-    checked = {}
+    checked: dict[str, ArrayLike] = {}
     for name, value in arrays.items():
         array = np.asarray(value)
         if array.dtype.hasobject:
             raise ValueError(f"{name} holds Python objects; files carry plain arrays only")
         checked[name] = array
     # numpy stamps every member with 1980-01-01, so equal content gives equal bytes.
-    np.savez_compressed(buffer, **checked)
+    np.savez_compressed(buffer, allow_pickle=False, **checked)
     write_bytes_atomic(path, buffer.getvalue())

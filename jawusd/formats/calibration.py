@@ -16,6 +16,7 @@ from jawusd.errors import CalibrationError
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.toml import read_toml
 from jawusd.geometry import Camera, make_transform, rigidity_defect, so3_exp, so3_log
+from jawusd.geometry.arrays import Array
 
 # Entries of R R^T - I; a rotation written with 6 digits stays below it.
 _ROTATION_TOLERANCE = 1e-4
@@ -41,7 +42,7 @@ def load_calibration(path: str | os.PathLike[str]) -> list[Camera]:
     return cameras
 
 
-def _numbers(path: Path, table: str, values: dict, key: str, shapes: tuple[tuple[int, ...], ...]) -> np.ndarray:
+def _numbers(path: Path, table: str, values: dict[str, object], key: str, shapes: tuple[tuple[int, ...], ...]) -> Array:
     if key not in values:
         raise CalibrationError(f'[{table}] has no "{key}".', path=path)
     try:

@@ -200,7 +200,7 @@ def _colmap_lens(path: Path, row: list[str]) -> tuple[tuple[int, int], Array, Ar
     return size, _matrix(path, f"camera {row[0]}", fx, fy, cx, cy), distortion
 
 
-def _nerfstudio_lens(path: Path, values: dict, where: str) -> tuple[tuple[int, int], Array, Array]:
+def _nerfstudio_lens(path: Path, values: dict[str, object], where: str) -> tuple[tuple[int, int], Array, Array]:
     model = values.get("camera_model", "OPENCV")
     if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL") or values.get("is_fisheye"):
         raise CalibrationError(
@@ -247,7 +247,7 @@ def _add(cameras: dict[str, Camera], camera: Camera, path: Path) -> None:
         )
 
 
-def _json(path: Path) -> dict:
+def _json(path: Path) -> dict[str, object]:
     try:
         if path.stat().st_size > _MAX_BYTES:
             raise CalibrationError(f"is {path.stat().st_size} bytes, at most {_MAX_BYTES} are read.", path=path)

@@ -54,7 +54,7 @@ class Masks(_Strict):
         return rest | {"upper": data["labels"], "lower": data["labels"]}
 
     @model_validator(mode="after")
-    def _values_tell_the_rows(self) -> Masks:
+    def _values_tell_the_arches(self) -> Masks:
         values = (self.upper_value, self.lower_value)
         if self.upper == self.lower and None in values:
             raise ValueError("one file for both rows needs upper_value and lower_value, their gray values")
@@ -151,14 +151,14 @@ class Bootstrap(_Strict):
     lower: tuple[Pick, ...] = ()
 
 
-class Motion(_Strict):
+class MotionSection(_Strict):
     """Name a reference frame with the teeth in occlusion."""
 
     rest_frame: Annotated[int, Field(ge=0)] | None = None
 
 
-class Anatomy(_Strict):
-    """Override what is else derived from the scans."""
+class AnatomySection(_Strict):
+    """Override what is otherwise derived from the scans."""
 
     T_anatomical_skull: list[list[float]] | None = None
     landmarks: dict[str, tuple[float, float, float]] | None = None
@@ -188,8 +188,8 @@ class Capture(_Strict):
     boards: Boards | None = None
     sync: Sync = Sync()
     bootstrap: Bootstrap | None = None
-    motion: Motion = Motion()
-    anatomy: Anatomy = Anatomy()
+    motion: MotionSection = MotionSection()
+    anatomy: AnatomySection = AnatomySection()
 
     @model_validator(mode="after")
     def _consistent(self) -> Capture:

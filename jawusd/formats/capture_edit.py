@@ -92,7 +92,8 @@ def _views(pick: Pick) -> str:
 
 def _blocks(text: str) -> Iterator[tuple[str, list[str]]]:
     """Yield the first key of every table header with its lines and those below it; "" before the first header."""
-    table, lines = "", []
+    table = ""
+    lines: list[str] = []
     for statement in _statements(text):
         if statement[0].lstrip().startswith("["):
             yield table, lines

@@ -44,7 +44,8 @@ def load_capture_list(path: str | os.PathLike[str]) -> list[ListedCapture]:
         FormatError: missing, not text, empty, a line that cannot be read, or two captures of one name.
     """
     path = Path(path)
-    folder, found, lines = path.resolve().parent, [], {}
+    folder, found = path.resolve().parent, []
+    lines: dict[str, int] = {}
     for number, line in enumerate(read_text(path, _MAX_BYTES, "utf-8-sig").splitlines(), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue

@@ -34,12 +34,12 @@ class JawModel:
         meta: kind, method, actor, error tables, warnings, configuration, versions, hashes.
     """
 
-    arrays: dict[str, NDArray]
+    arrays: dict[str, Array]
     frames: NDArray[np.int64]
     d: Array
     residual_mm: Array
     trained: Mask
-    meta: dict = field(default_factory=dict)
+    meta: dict[str, object] = field(default_factory=dict)
 
 
 def save_model(path: str | os.PathLike[str], model: JawModel) -> None:

@@ -97,7 +97,7 @@ class ReportData:
     actor: str
     tracks: Tracks
     model: JawModel
-    sync: Mapping
+    sync: Mapping[str, object]
     cameras: tuple[CameraFacts, ...]
     inferred: tuple[str, ...]
     seconds: Mapping[str, float]

@@ -7,11 +7,12 @@ import tomllib
 from pathlib import Path
 
 from jawusd.errors import FormatError
+from jawusd.formats.text import read_text
 
 _MAX_BYTES = 4 << 20
 
 
-def read_toml(path: str | os.PathLike[str]) -> dict:
+def read_toml(path: str | os.PathLike[str]) -> dict[str, object]:
     """Read a TOML file.
 
     Raises:
@@ -19,12 +20,6 @@ def read_toml(path: str | os.PathLike[str]) -> dict:
     """
     path = Path(path)
     try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise FormatError(f"is {path.stat().st_size} bytes, at most {_MAX_BYTES} are read.", path=path)
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise FormatError("there is no such file.", path=path) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        return tomllib.loads(read_text(path, _MAX_BYTES))
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise FormatError(f"is not valid TOML: {error}.", path=path) from error
-    except OSError as error:
-        raise FormatError(f"cannot be read: {error.strerror}.", path=path) from error
