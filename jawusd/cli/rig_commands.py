@@ -34,10 +34,26 @@ def register(app: typer.Typer) -> None:
     app.command("animate")(animate)
 
 
-def info(rig: RigArg, as_json: Json = False) -> None:
-    """Say what a rig file holds."""
+def info(
+    rig: Annotated[
+        Path, typer.Argument(help="actor.usda, another layer, model.npz or tracks.npz.", show_default=False)
+    ],
+    frame: Annotated[int | None, typer.Option(help="Of tracks.npz: say how this frame was tracked.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Say what a rig file or tracks hold."""
+    from jawusd.formats.tracks import is_tracks, load_tracks
     from jawusd.rig import describe
 
+    if rig.suffix == ".npz" and is_tracks(rig):
+        from jawusd.pipeline.summary import frame_lines, frame_summary, track_lines, track_summary
+
+        tracks = load_tracks(rig)
+        told = track_summary(tracks) if frame is None else frame_summary(tracks, frame)
+        emit(told, as_json, lambda: track_lines(told) if frame is None else frame_lines(told))
+        return
+    if frame is not None:
+        raise typer.BadParameter("--frame belongs to tracks.npz.")
     found = describe(rig)
     emit(found, as_json, lambda: _info_lines(found))
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +18,50 @@ from jawusd.geometry.arrays import Array, Mask
 
 FAMILY, VERSION = "jawusd-tracks", 1
 
-#: Values of `Tracks.status`.
-LOST, TRACKED, RECOVERED, PARTIAL = 0, 1, 2, 3
+
+class TrackStatus(IntEnum):
+    """Values of `Tracks.status`."""
+
+    LOST = 0
+    TRACKED = 1
+    RECOVERED = 2  # after a loss
+    PARTIAL = 3  # without one of the cameras
+
+    def __str__(self) -> str:
+        return self.name.lower()
+
+
+LOST, TRACKED, RECOVERED, PARTIAL = TrackStatus
+
+
+class LostReason(IntEnum):
+    """Values of `Tracks.lost_reason`: which check made the tracker give an arch up, with the figure it looks at."""
+
+    NONE = 0  # not lost, or not recorded
+    FEW_MASKS = 1  # masks that took part
+    LITTLE_CONTOUR = 2  # matched contour [px]
+    ROUGH_FIT = 3  # standard deviation of the residuals [px]
+    LOW_SCORE = 4  # matched contour over the recent median, with residuals above theirs as well [-]
+    UNCOVERED_MASK = 5  # largest share of a mask that the scan leaves uncovered [-]
+    UNCERTAIN = 6  # standard deviation of the crowns' position [mm]
+
+    def __str__(self) -> str:
+        return self.name.lower().replace("_", " ")
+
+    def explain(self, value: float, limit: float) -> str:
+        """Say what was found and what was needed."""
+        return _EXPLANATIONS[self].format(value=value, limit=limit)
+
+
+_EXPLANATIONS = {
+    LostReason.NONE: "no reason is recorded",
+    LostReason.FEW_MASKS: "masks that took part: {value:.0f}, at least {limit:.0f} are needed",
+    LostReason.LITTLE_CONTOUR: "matched contour {value:.0f} px, at least {limit:.0f} px are needed",
+    LostReason.ROUGH_FIT: "residual {value:.2f} px, less than {limit:.2f} px is needed",
+    LostReason.LOW_SCORE: "matched contour {value:.0%} of the usual, at least {limit:.0%} is needed",
+    LostReason.UNCOVERED_MASK: "{value:.1%} of a mask stays uncovered, at most {limit:.0%} is allowed",
+    LostReason.UNCERTAIN: "expected error of the crowns {value:.2f} mm, at most {limit:.2f} mm is allowed",
+}
 
 
 @dataclass(eq=False)
@@ -32,8 +75,7 @@ class Tracks:
         frames: frame numbers of the reference camera, shape (F,).
         T_world_upper, T_world_lower, T_upper_lower: final poses, shape (F, 4, 4); the last is T_skull_mandible.
         raw_T_world_upper, raw_T_world_lower, raw_T_upper_lower: first-pass poses, shape (F, 4, 4).
-        status: 0 lost, 1 tracked, 2 recovered after a loss, 3 tracked without one of the cameras; (upper, lower),
-            shape (F, 2).
+        status: `TrackStatus` of (upper, lower), shape (F, 2).
         prior_aided: a kinematic prior took part in the final pose, shape (F,).
         coverage_error: mask pixels the projected scan leaves uncovered, as a fraction of the mask (E_SP of paper
             eq. 8 over segmented pixels), shape (F, 2, C); NaN without a mask.
@@ -44,6 +86,10 @@ class Tracks:
         sigma_mm: standard deviation of the landmarks' position in the skull frame [mm], shape (F, 5).
         residual_px: rms distance of matched contour samples at the working size [px], shape (F, 2).
         matched_px: matched contour length at the working size [px], shape (F, 2).
+        lost_reason: `LostReason` of the first pass, shape (F, 2); it stays where a prior then found the pose. Files may
+            lack it and the next two.
+        lost_value, lost_limit: the figure that was found and its limit, in the unit the reason names, shape (F, 2);
+            NaN without a reason.
         camera_names: the cameras, length C.
         meta: configuration, versions, hashes, estimated nuisances.
     """
@@ -67,10 +113,24 @@ class Tracks:
     matched_px: Array
     camera_names: tuple[str, ...]
     meta: dict = field(default_factory=dict)
+    lost_reason: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 2), np.uint8))
+    lost_value: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    lost_limit: Array = field(default_factory=lambda: np.zeros((0, 2)))
+
+    def __post_init__(self) -> None:
+        if not len(self.lost_reason):
+            shape = np.shape(self.status)
+            self.lost_reason = np.zeros(shape, np.uint8)
+            self.lost_value, self.lost_limit = np.full(shape, np.nan), np.full(shape, np.nan)
 
     def tracked(self) -> Mask:
         """Return which frames have both final poses, shape (F,)."""
         return np.isfinite(self.T_upper_lower).all((1, 2))
+
+    def explain_loss(self, index: int, arch: int) -> str:
+        """Say why an arch (0 upper, 1 lower) was given up in the frame at an index."""
+        reason = LostReason(int(self.lost_reason[index, arch]))
+        return reason.explain(self.lost_value[index, arch], self.lost_limit[index, arch])
 
 
 def _shapes(count: int, cameras: int) -> dict[str, tuple[int, ...]]:
@@ -91,6 +151,9 @@ def _shapes(count: int, cameras: int) -> dict[str, tuple[int, ...]]:
         "sigma_mm": (count, len(LANDMARKS)),
         "residual_px": (count, 2),
         "matched_px": (count, 2),
+        "lost_reason": (count, 2),
+        "lost_value": (count, 2),
+        "lost_limit": (count, 2),
     }
 
 
@@ -145,7 +208,10 @@ def load_tracks(path: str | os.PathLike[str]) -> Tracks:
         # NaN is how a lost frame is written, so only the frame numbers must be finite.
         name: take(arrays, name, shape, path, finite=name == "frames")
         for name, shape in _shapes(count, len(names)).items()
+        if not name.startswith("lost_") or "lost_reason" in arrays  # older files have none of the three
     }
+    if not np.isin(values.get("lost_reason", 0), list(LostReason)).all():
+        raise FormatError('"lost_reason" holds a number that names no reason.', path=path)
     for name in values:
         if "T_" in name:
             present = np.isfinite(values[name]).all((1, 2))
@@ -155,5 +221,12 @@ def load_tracks(path: str | os.PathLike[str]) -> Tracks:
                 raise FormatError(
                     f'"{name}" of frame {frame} is not rigid (off by {defect.max():.2g}, allowed 1e-6).', path=path
                 )
-    known = {f.name for f in fields(Tracks)}
-    return Tracks(**{k: v for k, v in values.items() if k in known}, camera_names=tuple(names), meta=meta)
+    return Tracks(**values, camera_names=tuple(names), meta=meta)
+
+
+def is_tracks(path: str | os.PathLike[str]) -> bool:
+    """Tell whether a file's format label says that it holds tracks; `load_tracks` checks the rest."""
+    try:
+        return read_npz(path, FAMILY, VERSION) is not None
+    except FormatError:
+        return False

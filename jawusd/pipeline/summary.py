@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from jawusd.errors import TrackingError
 from jawusd.formats.model import JawModel
-from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, Tracks
+from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, LostReason, Tracks, TrackStatus
 from jawusd.geometry import LANDMARKS
 from jawusd.pipeline.calibration import calibration_lines
 from jawusd.pipeline.segment_summary import segment_lines
@@ -24,6 +25,7 @@ def track_summary(tracks: Tracks) -> dict:
         "frames": len(tracks.frames),
         "tracked": int(tracked.sum()),
         "lost": [int(frame) for frame in lost],
+        "lost_reasons": lost_reasons(tracks),
         "recovered": int((tracks.status == RECOVERED).any(1).sum()),
         "without_a_camera": int((tracks.status == PARTIAL).any(1).sum()),
         "prior_aided": int(tracks.prior_aided.sum()),
@@ -31,6 +33,66 @@ def track_summary(tracks: Tracks) -> dict:
         "sigma_mm": {name: _rounded(value) for name, value in zip(LANDMARKS, sigma, strict=True)},
         "coverage_error_percent": _rounded(100 * np.nanmean(coverage)) if np.isfinite(coverage).any() else None,
     }
+
+
+def lost_reasons(tracks: Tracks) -> dict[str, dict[str, int]]:
+    """Return how many frames each arch lost for each recorded reason."""
+    out = {}
+    for arch, name in enumerate(("upper", "lower")):
+        reasons = tracks.lost_reason[tracks.status[:, arch] == LOST, arch]
+        out[name] = {str(LostReason(code)): int((reasons == code).sum()) for code in np.unique(reasons) if code}
+    return {name: counts for name, counts in out.items() if counts}
+
+
+def frame_summary(tracks: Tracks, frame: int) -> dict:
+    """Return what is known about the tracking of one frame; of lost arches the reason.
+
+    Raises:
+        TrackingError: the tracks do not hold the frame.
+    """
+    if frame not in tracks.frames:
+        raise TrackingError(
+            f"the tracks do not hold it; they go from {tracks.frames[0]} to {tracks.frames[-1]}",
+            frame=frame,
+        )
+    k = int(np.searchsorted(tracks.frames, frame))
+    cameras = np.array(tracks.camera_names)
+    arches = {}
+    for arch, name in enumerate(("upper", "lower")):
+        status = TrackStatus(int(tracks.status[k, arch]))
+        used, masked = tracks.masks_used[k, arch], np.isfinite(tracks.coverage_error[k, arch])
+        arches[name] = {
+            "status": str(status),
+            "masks_used": cameras[used].tolist(),
+            "masks_left_out": cameras[masked & ~used].tolist(),
+            "matched_px": _rounded(tracks.matched_px[k, arch]),
+            "residual_px": _rounded(tracks.residual_px[k, arch]),
+        }
+        if status == TrackStatus.LOST or tracks.lost_reason[k, arch]:
+            arches[name] |= {
+                "lost_reason": str(LostReason(int(tracks.lost_reason[k, arch]))),
+                "lost_value": _rounded(tracks.lost_value[k, arch]),
+                "lost_limit": _rounded(tracks.lost_limit[k, arch]),
+                "explanation": tracks.explain_loss(k, arch),
+            }
+    return {"frame": frame, "prior_aided": bool(tracks.prior_aided[k]), "arches": arches}
+
+
+def frame_lines(summary: dict) -> list[str]:
+    """Return `frame_summary` as text."""
+    lines = []
+    for name, arch in summary["arches"].items():
+        line = f"frame {summary['frame']}, {name} arch: {arch['status']}"
+        if "explanation" in arch:
+            line += (
+                f": {arch['explanation']}" if arch["status"] == "lost" else f"; the masks alone: {arch['explanation']}"
+            )
+        if arch["masks_left_out"]:
+            line += f"; mask left out: {', '.join(arch['masks_left_out'])}"
+        lines.append(line)
+    if summary["prior_aided"]:
+        lines.append("the jaw model helped to find these poses")
+    return lines
 
 
 def _rounded(value: float) -> float | None:
@@ -48,6 +110,8 @@ def track_lines(summary: dict) -> list[str]:
     if lost:
         more = "" if len(lost) <= _LISTED_FRAMES else f" and {len(lost) - _LISTED_FRAMES} more"
         lines.append(f"  lost: {', '.join(map(str, lost[:_LISTED_FRAMES]))}{more}")
+    for name, counts in summary["lost_reasons"].items():
+        lines.append(f"  {name} arch lost by: " + ", ".join(f"{reason} {count}" for reason, count in counts.items()))
     lines.append(f"  recovered {summary['recovered']}, without one of the cameras {summary['without_a_camera']}")
     for name, (was, now) in summary["calibration_rescaled_px"].items():
         lines.append(

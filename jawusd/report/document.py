@@ -13,7 +13,7 @@ from markupsafe import Markup
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.experiments import Experiments
 from jawusd.formats.report import ReportData
-from jawusd.formats.tracks import LOST
+from jawusd.formats.tracks import LOST, LostReason
 from jawusd.report.figures import (
     condyle_figure,
     coverage_figure,
@@ -120,6 +120,11 @@ def _frame_lists(data: ReportData) -> list[tuple[str, int, str]]:
     """Return (reason, count, frames as text) of frames that were lost, helped, or kept out of the model."""
     tracks, meta = data.tracks, data.model.meta
     lists = {"lost by the tracker": tracks.frames[(tracks.status == LOST).any(1)]}
+    for arch, name in enumerate(("upper", "lower")):
+        for reason in list(LostReason)[1:]:
+            chosen = (tracks.status[:, arch] == LOST) & (tracks.lost_reason[:, arch] == reason)
+            if chosen.any():
+                lists[f"lost, {name} arch: {reason}"] = tracks.frames[chosen]
     lists["tracked with the model's help"] = tracks.frames[tracks.prior_aided]
     for reason, frames in meta.get("excluded_frames", {}).items():
         lists[f"kept out of the fit: {reason}"] = frames

@@ -47,11 +47,12 @@ def frame_words(tracks: Tracks, frame: int) -> str:
     if index == len(tracks.frames) or tracks.frames[index] != frame:
         return "not tracked"
     parts = []
-    for name, color, code, percent in zip(
-        ("upper", "lower"), _COLORS, tracks.status[index], uncovered_percent(tracks)[index], strict=True
+    for arch, (name, color, code, percent) in enumerate(
+        zip(("upper", "lower"), _COLORS, tracks.status[index], uncovered_percent(tracks)[index], strict=True)
     ):
         area = f", {percent:.2f} % uncovered" if np.isfinite(percent) else ", no mask"
-        parts.append(f'<span style="color:{color}">&#9632;</span> {name}: {_STATUS.get(int(code), "?")}{area}')
+        state = f"lost, {tracks.explain_loss(index, arch)}" if code == LOST else _STATUS.get(int(code), "?")
+        parts.append(f'<span style="color:{color}">&#9632;</span> {name}: {state}{area}')
     if tracks.prior_aided[index]:
         parts.append("the jaw model helped")
     return "<br>".join(parts)

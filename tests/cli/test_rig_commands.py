@@ -7,10 +7,12 @@ import sys
 import numpy as np
 import pytest
 from example_rig import FPS, example_meshes, example_motion, example_rig, mandible_vertices, moved
+from example_tracks import make_tracks
 from pxr import Usd, UsdGeom
 
 import jawusd
 from jawusd.formats.poses import read_parameters, write_parameters, write_poses
+from jawusd.formats.tracks import LostReason, TrackStatus, save_tracks
 from jawusd.geometry import se3_exp, se3_log
 from jawusd.rig.bake import bake_rig
 from jawusd.rig.validate import validate_stage
@@ -79,6 +81,24 @@ def test_info_names_actor_ranges_and_meshes(actor):
     assert found["actor"] == "someone" and found["model"]["kind"] == "anchored"
     text = run("info", actor.parent / "anim_capture.usdc")
     assert "someone" in text and "animation: 40 samples" in text
+
+
+def test_info_says_how_a_frame_was_tracked(tmp_path):
+    tracks = make_tracks(4)
+    tracks.status[1, 1], tracks.lost_reason[1, 1] = TrackStatus.LOST, LostReason.LOW_SCORE
+    tracks.lost_value[1, 1], tracks.lost_limit[1, 1] = 0.31, 0.6
+    tracks.masks_used[1, 0, 1] = False
+    save_tracks(tmp_path / "tracks.npz", tracks)
+    text = run("info", tmp_path / "tracks.npz", "--frame", 31).splitlines()
+    assert text == [
+        "frame 31, upper arch: tracked; mask left out: b",
+        "frame 31, lower arch: lost: matched contour 31% of the usual, at least 60% is needed",
+    ]
+    found = json.loads(run("info", tmp_path / "tracks.npz", "--frame", 31, "--json"))["arches"]["lower"]
+    assert (found["lost_reason"], found["lost_value"], found["lost_limit"]) == ("low score", 0.31, 0.6)
+    assert json.loads(run("info", tmp_path / "tracks.npz", "--json"))["frames"] == 4
+    run("info", tmp_path / "tracks.npz", "--frame", 99, code=6)
+    assert "lower arch lost by: low score 1" in run("info", tmp_path / "tracks.npz")
 
 
 def test_ik_reaches_a_reachable_target(actor):

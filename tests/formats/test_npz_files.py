@@ -5,27 +5,12 @@ import pickle
 
 import numpy as np
 import pytest
+from example_tracks import make_tracks
 
 from jawusd.errors import FormatError, UnitsError, VersionError
 from jawusd.formats.atomic import write_npz_atomic
 from jawusd.formats.model import JawModel, load_model, save_model
-from jawusd.formats.tracks import Tracks, load_tracks, save_tracks
-from jawusd.geometry import se3_exp
-
-
-def make_tracks(count=5, cameras=("a", "b")):
-    rng = np.random.default_rng(0)
-    poses = [se3_exp(rng.normal(size=(count, 6)) * 0.2) for _ in range(6)]
-    for pose in poses:
-        pose[2] = np.nan
-    cov = np.broadcast_to(np.eye(6) * 1e-3, (count, 6, 6)).copy()
-    cov[2] = np.nan
-    return Tracks(
-        np.arange(30, 30 + count), *poses, np.ones((count, 2), np.int8), np.zeros(count, bool),
-        np.full((count, 2, len(cameras)), 0.01), np.ones((count, 2, len(cameras)), bool),
-        cov, cov.copy(), cov.copy(), np.full((count, 5), 0.05),
-        np.full((count, 2), 0.5), np.full((count, 2), 800.0), cameras, {"config": {"gate_px": 2.5}},
-    )  # fmt: skip
+from jawusd.formats.tracks import LostReason, TrackStatus, is_tracks, load_tracks, save_tracks
 
 
 def test_tracks_round_trip_bit_for_bit(tmp_path):
@@ -49,6 +34,22 @@ def test_trackers_that_do_not_say_which_masks_they_used_used_all(tmp_path):
     rewrite(tmp_path / "t.npz", lambda arrays: arrays.pop("masks_used"))
     used = load_tracks(tmp_path / "t.npz").masks_used
     assert not used[3, 1, 0] and used.sum() == used.size - 1
+
+
+def test_reasons_of_losses_are_kept_and_may_be_missing(tmp_path):
+    tracks = make_tracks()
+    tracks.status[2, 1], tracks.lost_reason[2, 1] = TrackStatus.LOST, LostReason.LOW_SCORE
+    tracks.lost_value[2, 1], tracks.lost_limit[2, 1] = 0.31, 0.6
+    save_tracks(tmp_path / "t.npz", tracks)
+    again = load_tracks(tmp_path / "t.npz")
+    assert again.explain_loss(2, 1) == "matched contour 31% of the usual, at least 60% is needed"
+    assert again.explain_loss(2, 0) == "no reason is recorded" and is_tracks(tmp_path / "t.npz")
+    rewrite(tmp_path / "t.npz", lambda arrays: [arrays.pop(f"lost_{name}") for name in ("reason", "value", "limit")])
+    assert load_tracks(tmp_path / "t.npz").explain_loss(2, 1) == "no reason is recorded"
+    save_tracks(tmp_path / "t.npz", tracks)
+    rewrite(tmp_path / "t.npz", lambda arrays: arrays["lost_reason"].fill(77))
+    with pytest.raises(FormatError, match="lost_reason"):
+        load_tracks(tmp_path / "t.npz")
 
 
 def rewrite(path, change):

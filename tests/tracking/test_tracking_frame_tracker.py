@@ -1,10 +1,13 @@
-"""The failure ladder on single instants."""
+"""Single instants: escalation, and the reason why an arch is lost."""
+
+import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from bumpy_teeth import arch, disturbed, jaw_poses, make_cameras, render_masks, vertex_error_mm
 
-from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, TRACKED
+from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, TRACKED, LostReason
 from jawusd.geometry import make_transform, se3_exp
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.frame_record import FrameRecord
@@ -103,3 +106,39 @@ def test_one_mask_does_not_outvote_two(tracker):
     record = tracker.track([away], views, [])
     assert record.used[0].tolist() == [True, True, False] and record.status[0] == PARTIAL
     assert max(_errors(record)) < 0.15
+
+
+@pytest.mark.parametrize(
+    ("reason", "limits", "words"),
+    [
+        (
+            LostReason.LITTLE_CONTOUR,
+            {"least_matched_px": 1e5},
+            r"matched contour \d+ px, at least 100000 px are needed",
+        ),
+        (LostReason.ROUGH_FIT, {"suspect_residual": 0.1}, r"residual 0\.\d\d px, less than 0.0\d px is needed"),
+        (
+            LostReason.LOW_SCORE,
+            {"suspect_residual": 0.1, "lost_residual": 50.0, "suspect_score": 1.8},
+            r"matched contour 1?\d\d% of the usual, at least 180% is needed",
+        ),
+        (LostReason.UNCOVERED_MASK, {"lost_coverage": 1e-5}, r"\d\.\d% of a mask stays uncovered, at most 0%"),
+        (LostReason.UNCERTAIN, {"lost_sigma_mm": 0.001}, r"expected error of the crowns 0\.\d\d mm, at most 0\.00 mm"),
+    ],
+)
+def test_every_check_names_its_figure_and_its_limit(tracker, reason, limits, words):
+    strict = FrameTracker(ContourSolver(SCANS, CONFIG), replace(CONFIG, **limits), tracker.history)
+    record = strict.align_once(POSES[1], _views(1), 0.0)
+    assert record.status.tolist() == [LOST, LOST] and {loss.reason for loss in record.losses} == {reason}
+    for loss in record.losses:
+        assert re.search(words, loss.reason.explain(loss.value, loss.limit))
+
+
+def test_one_mask_is_too_few_for_an_arch(tracker):
+    views = _views(1)
+    for view in views[1:]:
+        view.present[1] = False
+    record = tracker.align_once(POSES[1], views, 0.0)
+    assert record.status.tolist() == [TRACKED, LOST]
+    assert record.losses[1] == (LostReason.FEW_MASKS, 1, 2) and record.losses[0].reason == LostReason.NONE
+    assert str(LostReason.FEW_MASKS) == "few masks" and str(LOST) == "lost"

@@ -1,5 +1,6 @@
 """A whole small take, from PNG masks and picks to tracks, and what goes wrong with takes."""
 
+import re
 import shutil
 
 import cv2
@@ -8,7 +9,8 @@ import pytest
 from small_take import CAMERAS, LANDMARKS, MESHES, ROWS, START, errors_mm, make_capture, png, source, track, write_masks
 
 from jawusd.errors import TrackingError
-from jawusd.formats.tracks import load_tracks, save_tracks
+from jawusd.formats.tracks import LOST, load_tracks, save_tracks
+from jawusd.pipeline.summary import track_lines, track_summary
 from jawusd.tracking import track_capture
 
 FRAMES = 10
@@ -106,6 +108,22 @@ def test_hidden_teeth_are_lost_and_found_again(take):
     assert np.isfinite(tracks.T_world_upper).all() and np.isnan(tracks.sigma_mm[5:7]).all()
     assert (tracks.status[7:] != 0).all()
     assert np.nanmax(errors_mm(tracks)) < 0.1
+
+
+def test_every_lost_frame_of_a_spoiled_stretch_names_its_reason(take, tmp_path):
+    for camera in CAMERAS:
+        path = png(take, camera.name, "lower", 5)
+        cv2.imwrite(str(path), cv2.dilate(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), np.ones((31, 31), np.uint8)))
+    for camera in CAMERAS[1:]:
+        png(take, camera.name, "lower", 6).unlink()
+    save_tracks(tmp_path / "tracks.npz", track(_capture(take)))
+    tracks = load_tracks(tmp_path / "tracks.npz")
+    assert ((tracks.status == LOST) == (tracks.lost_reason > 0)).all()
+    assert np.isfinite(tracks.lost_value).sum() == np.isfinite(tracks.lost_limit).sum() == 2
+    assert re.fullmatch(r"residual 1\.\d\d px, less than 0\.\d\d px is needed", tracks.explain_loss(5, 1))
+    assert tracks.explain_loss(6, 1) == "masks that took part: 1, at least 2 are needed"
+    assert track_summary(tracks)["lost_reasons"] == {"lower": {"few masks": 1, "rough fit": 1}}
+    assert "  lower arch lost by: few masks 1, rough fit 1" in track_lines(track_summary(tracks))
 
 
 def test_one_camera_is_refused_because_of_its_depth(pictures):

@@ -1,15 +1,29 @@
-"""What is known about single frames."""
+"""What is known about single frames, and why an arch was given up in one."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.formats.tracks import LostReason
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.quality import residual_px, score_px
+
+
+class Loss(NamedTuple):
+    """Name the check an arch failed, with the figure found and its limit in the unit of `LostReason`."""
+
+    reason: LostReason
+    value: float
+    limit: float
+
+
+#: Of an arch that is not lost, or whose loss has no recorded reason.
+NO_LOSS = Loss(LostReason.NONE, np.nan, np.nan)
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,12 +35,14 @@ class FrameRecord:
         status: of both rows, as in `Tracks`, shape (2,).
         used: masks that took part, shape (2, C).
         coverage: E_SP over mask pixels, shape (2, C); NaN without a mask.
+        losses: why each arch is lost.
     """
 
     solution: Solution
     status: NDArray[np.int8]
     used: Mask
     coverage: Array
+    losses: tuple[Loss, Loss] = (NO_LOSS, NO_LOSS)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from jawusd.errors import TrackingError
 from jawusd.formats.capture import Capture
 from jawusd.formats.mesh import Mesh
-from jawusd.formats.tracks import LOST, PARTIAL, TRACKED, Tracks
+from jawusd.formats.tracks import LOST, PARTIAL, TRACKED, LostReason, Tracks
 from jawusd.geometry import LANDMARKS, Camera, relative_pose, transform_point
 from jawusd.geometry.arrays import Array
 from jawusd.imaging.pixel_counts import RasterCounter
@@ -166,6 +166,7 @@ def _assembled(records: Mapping[int, _Record], camera_names: tuple[str, ...], me
     both = (status != LOST).all(1)
     relative[both] = relative_pose(poses[both, 0], poses[both, 1])
     unknown = np.full((count, 6, 6), np.nan)
+    used = np.stack([np.isfinite(records[f].coverage) for f in frames])
     return Tracks(
         frames=frames,
         T_world_upper=poses[:, 0],
@@ -177,7 +178,7 @@ def _assembled(records: Mapping[int, _Record], camera_names: tuple[str, ...], me
         status=status,
         prior_aided=np.zeros(count, bool),
         coverage_error=np.stack([records[f].coverage for f in frames]),
-        masks_used=np.stack([np.isfinite(records[f].coverage) for f in frames]),
+        masks_used=used,
         covariance_upper=unknown,
         covariance_lower=unknown.copy(),
         covariance_relative=unknown.copy(),
@@ -186,4 +187,7 @@ def _assembled(records: Mapping[int, _Record], camera_names: tuple[str, ...], me
         matched_px=np.full((count, 2), np.nan),
         camera_names=camera_names,
         meta=meta,
+        lost_reason=np.where(status == LOST, LostReason.FEW_MASKS, LostReason.NONE).astype(np.uint8),
+        lost_value=np.where(status == LOST, used.sum(2), np.nan),
+        lost_limit=np.where(status == LOST, _FEWEST_MASKS, np.nan),
     )

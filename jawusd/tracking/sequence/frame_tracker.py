@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, TRACKED
+from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, TRACKED, LostReason
 from jawusd.geometry import make_transform, se3_exp, transform_point
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.equations import Solution
-from jawusd.tracking.contour.frame_record import FrameRecord
+from jawusd.tracking.contour.frame_record import NO_LOSS, FrameRecord, Loss
 from jawusd.tracking.contour.quality import (
     crown_sigma_mm,
     matched_px,
@@ -88,7 +88,7 @@ class FrameTracker:
             trial = self._try(trial.solution.poses, views, gates, kept)
         return self._record(first, trial)
 
-    def glance(self, start: Array, views: Sequence[View], reach_px: float) -> FrameRecord:
+    def align_once(self, start: Array, views: Sequence[View], reach_px: float) -> FrameRecord:
         """Align one instant from one prediction, shape (2, 4, 4), without the ladder; see `track`."""
         trial = self._begin(start, views, self._config.gates_from(reach_px))
         return self._record(trial, trial)
@@ -105,8 +105,9 @@ class FrameTracker:
         status = np.where(trial.use.all(1), TRACKED, PARTIAL).astype(np.int8)
         gain = trial.worth(c.bare_price).sum(1) - first.worth(c.bare_price).sum(1)
         status[(gain > c.recovery_gain * score_px(trial.solution).sum(1)) & (status == TRACKED)] = RECOVERED
-        status[self._lost(trial)] = LOST
-        return FrameRecord(trial.solution, status, trial.use, trial.coverage)
+        losses = self._losses(trial)
+        status[[loss.reason != LostReason.NONE for loss in losses]] = LOST
+        return FrameRecord(trial.solution, status, trial.use, trial.coverage, losses)
 
     def _try(self, start, views, gates, use) -> _Trial:
         solution = self._solver.solve(start, views, gates, use)
@@ -148,14 +149,30 @@ class FrameTracker:
                 wrong[r] = False  # it is the pose that is wrong, not so many masks
         return wrong
 
-    def _lost(self, trial: _Trial) -> Mask:
-        """Tell which rows cannot be trusted, shape (2,)."""
-        c = self._config
-        few = matched_px(trial.solution) < c.least_matched_px
-        rough = self._rough(trial, c.lost_residual) | (self._rough(trial) & self._scarce(trial))
-        bare = np.where(trial.use, trial.coverage, 0.0).max(1) > c.lost_coverage
-        loose = np.array([crown_sigma_mm(self._solver.scans[r], trial.solution, r, c) > c.lost_sigma_mm for r in _ROWS])
-        return few | rough | bare | loose | (trial.use.sum(1) < _FEWEST_MASKS)
+    def _losses(self, trial: _Trial) -> tuple[Loss, Loss]:
+        """Return the first check that each arch fails."""
+        c, solution = self._config, trial.solution
+        residual, score, usual = residual_px(solution), score_px(solution).sum(1), self.history.usual_score().sum(1)
+        masks, matched = trial.use.sum(1), matched_px(solution)
+        uncovered = np.where(trial.use, trial.coverage, 0.0).max(1)
+        sigma = [crown_sigma_mm(scan, solution, r, c) for r, scan in enumerate(self._solver.scans)]
+        rough_px = c.lost_residual * c.suspect_residual * self.history.usual_residual()
+        weak = self._rough(trial) & self._scarce(trial)
+
+        def first(r: int) -> Loss:
+            share = float(score[r] / usual[r]) if usual[r] > 0 else np.inf
+            checks = (
+                (masks[r] < _FEWEST_MASKS, LostReason.FEW_MASKS, masks[r], _FEWEST_MASKS),
+                (matched[r] < c.least_matched_px, LostReason.LITTLE_CONTOUR, matched[r], c.least_matched_px),
+                (not residual[r] < rough_px[r], LostReason.ROUGH_FIT, residual[r], rough_px[r]),
+                (weak[r], LostReason.LOW_SCORE, share, c.suspect_score),
+                (uncovered[r] > c.lost_coverage, LostReason.UNCOVERED_MASK, uncovered[r], c.lost_coverage),
+                (sigma[r] > c.lost_sigma_mm, LostReason.UNCERTAIN, sigma[r], c.lost_sigma_mm),
+            )
+            found = (Loss(reason, float(value), float(limit)) for failed, reason, value, limit in checks if failed)
+            return next(found, NO_LOSS)
+
+        return first(0), first(1)
 
     def _others(self, trial, suspect, starts, views, gallery) -> _Trial:
         """Try the other predictions."""

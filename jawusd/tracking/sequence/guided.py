@@ -165,7 +165,7 @@ class GuidedTracker:
         record = None
         if gallery is None:
             # Masks made around a prediction look suspect next to settled ones: the ladder waits for those.
-            record = self._settle(tracker, frame, starts[0], tracker.glance(starts[0], views, reach))
+            record = self._settle(tracker, frame, starts[0], tracker.align_once(starts[0], views, reach))
             if (record.status == LOST).any():
                 views, record = self._see(frame, starts[0], 0), None
         if record is None:

@@ -91,6 +91,9 @@ def assemble(
         matched_px=np.stack([matched_px(r.solution) for r in ordered]),
         camera_names=camera_names,
         meta=meta,
+        lost_reason=np.array([[loss.reason for loss in r.losses] for r in ordered], np.uint8),
+        lost_value=np.array([[loss.value for loss in r.losses] for r in ordered]),
+        lost_limit=np.array([[loss.limit for loss in r.losses] for r in ordered]),
     )
 
 
