@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from jawusd.evaluator.curves import HermiteCurve
+from jawusd.evaluator.formula import catmull_rom
 from jawusd.geometry.arrays import Array
 
 _NEWTON_ITERATIONS = 60
@@ -59,7 +60,7 @@ class SliceHull:
         knots = np.asarray(arrays["slice_d1"], dtype=float)
         values = np.asarray(arrays["slice_support"], dtype=float)
         slopes = np.zeros_like(values)  # flat ends: the supports stay as they are beyond the captured openings
-        slopes[1:-1] = (values[2:] - values[:-2]) / (knots[2:] - knots[:-2])[:, None]  # Catmull-Rom
+        slopes[1:-1] = catmull_rom(values[:-2], values[2:], (knots[2:] - knots[:-2])[:, None])
         return cls(
             supports=HermiteCurve(knots, values, slopes),
             directions=np.asarray(arrays["slice_directions"], dtype=float),

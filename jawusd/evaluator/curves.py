@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from jawusd.evaluator.formula import cubic, polynomial
 from jawusd.geometry.arrays import Array
 
 
@@ -30,12 +31,8 @@ class HermiteCurve:
     def __post_init__(self) -> None:
         # Per interval the powers 0..3 of s = x - knot; intervals 0 and n are the straight ends, so that no
         # evaluation has to treat them apart.
-        h = np.diff(self.knots)[:, None]
         y, m = self.values, self.slopes
-        rise = (y[1:] - y[:-1]) / h
-        square = (3 * rise - 2 * m[:-1] - m[1:]) / h
-        cube = (m[:-1] + m[1:] - 2 * rise) / (h * h)
-        inner = np.stack([y[:-1], m[:-1], square, cube], axis=1)
+        inner = np.stack(cubic(np.diff(self.knots)[:, None], y[:-1], y[1:], m[:-1], m[1:]), axis=1)
         straight = np.zeros((2, *inner.shape[1:]))
         straight[0, :2] = y[0], m[0]
         straight[1, :2] = y[-1], m[-1]
@@ -45,7 +42,7 @@ class HermiteCurve:
     def value(self, x: Array) -> Array:
         """Return the points at x (n,), shape (n, k)."""
         c, s = self._locate(x)
-        return ((c[:, 3] * s + c[:, 2]) * s + c[:, 1]) * s + c[:, 0]
+        return polynomial((c[:, 0], c[:, 1], c[:, 2], c[:, 3]), s)
 
     def value_and_slope(self, x: Array) -> tuple[Array, Array]:
         """Return the points and the derivatives at x (n,), both of shape (n, k)."""

@@ -38,7 +38,7 @@ class Encoder:
         self, model: JawModelForm, frames: RigFrames, bound: SliceHull, reach: Reach, landmarks: Array
     ) -> None:
         self._model, self._frames, self._bound, self._reach = model, frames, bound, reach
-        self._vectors = landmark_vectors(transform_points(frames.closed, landmarks))
+        self._vectors = landmark_vectors(transform_points(frames.T_anatomical_mandible_rest, landmarks))
 
     def encode(self, T: Array, *, bounded: bool) -> tuple[Array, Array]:
         """Return the d (n, 3) nearest to poses T_skull_mandible (n, 4, 4), and the residuals (n,) [mm]."""

@@ -16,9 +16,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from jawusd.evaluator.curves import HermiteCurve
+from jawusd.evaluator.derivatives import ARRAYS, gradient_by_u, spline_input
 from jawusd.evaluator.gauge import Gauge
 from jawusd.evaluator.motions import anchored_motions, motions_from_twists
-from jawusd.evaluator.single import SingleAdditive, SingleAnchored
+from jawusd.evaluator.single import SingleAdditive, SingleAnchored, motion_matrix
 from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import se3_left_jacobian, se3_left_jacobian_inverse
 from jawusd.geometry.so3 import so3_left_jacobian, so3_left_jacobian_inverse
@@ -51,6 +52,7 @@ class AnchoredModel:
     centres_squared: Array = field(init=False, repr=False)
     moments: Array = field(init=False, repr=False)
     offset: Array = field(init=False, repr=False)
+    _scales: tuple[float, float, float] = field(init=False, repr=False)
     single: SingleAnchored = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -61,10 +63,12 @@ class AnchoredModel:
         by_centre = (kernel[:, :, None] * self.centres[:, None, :]).reshape(len(kernel), 9)
         moments = np.concatenate([kernel, by_centre, kernel * squared[:, None]], axis=1)
         object.__setattr__(self, "centres_squared", squared)
+        object.__setattr__(self, "_scales", tuple(self.scales.tolist()))
         object.__setattr__(self, "moments", np.ascontiguousarray(moments))
         object.__setattr__(self, "offset", np.zeros(3))
         object.__setattr__(self, "offset", self._spline(np.zeros((1, 3)))[0][0])
-        object.__setattr__(self, "single", SingleAnchored(self))
+        single = SingleAnchored(self.gauge.numbers, self.incisor, self.scales, self.centres, self.weights, self.offset)
+        object.__setattr__(self, "single", single)
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Array]) -> AnchoredModel:
@@ -80,7 +84,7 @@ class AnchoredModel:
     def decode(self, d: Array) -> tuple[Array, Array]:
         """Return the rotation (n, 3, 3) and translation (n, 3) [mm] of M(d)."""
         if len(d) == 1 and np.isfinite(d).all():
-            M = np.array([self.single.motion(*d[0].tolist())])
+            M = motion_matrix(self.single.motion(*d[0].tolist()), self.single.anchor)[None]
         else:
             M = self.motion(d)
         return M[:, :3, :3], M[:, :3, 3]
@@ -128,8 +132,7 @@ class AnchoredModel:
 
     def parameters_at(self, u: Array) -> Array:
         """Return the d (n, 3) [mm] of incisal displacements u (n, 3) [mm]."""
-        d = self.single.parameters_at(u) if len(u) == 1 and np.isfinite(u).all() else None
-        return self.gauge.inverse(u) if d is None else d
+        return self.gauge.inverse(u)
 
     def displacement_of(self, R: Array, t: Array) -> Array:
         """Return the displacement u (n, 3) [mm] of the incisal point under the motions (R, t)."""
@@ -137,19 +140,15 @@ class AnchoredModel:
 
     def rotation(self, u: Array) -> Array:
         """Return the rotation vector f(u) (n, 3) [rad] for incisal displacements u (n, 3) [mm]."""
-        gx, gz, _, _ = self.gauge.path(-u[:, 1])
-        return self._spline(self._sheared(u, gx, gz))[0]
+        q, _ = spline_input(self.gauge.numbers, self._scales, tuple(u.T), ARRAYS)
+        return self._spline(np.stack(q, axis=1))[0]
 
     def rotation_jacobian(self, u: Array) -> tuple[Array, Array]:
         """Return f(u) (n, 3) [rad] and df/du (n, 3, 3) [rad/mm]."""
-        gx, gz, gx_1, gz_1 = self.gauge.path(-u[:, 1])
-        omega, omega_q = self._spline(self._sheared(u, gx, gz))
-        by_opening, by_side, by_front = np.moveaxis(omega_q / self.scales, 2, 0)
-        by_y = -by_opening + by_side * gx_1[:, None] + by_front * gz_1[:, None]
-        return omega, np.stack([by_side, by_y, by_front], axis=2)
-
-    def _sheared(self, u: Array, gx: Array, gz: Array) -> Array:
-        return np.stack([-u[:, 1], u[:, 0] - gx, u[:, 2] - gz], axis=1) / self.scales
+        q, slopes = spline_input(self.gauge.numbers, self._scales, tuple(u.T), ARRAYS)
+        omega, omega_q = self._spline(np.stack(q, axis=1))
+        by_u = gradient_by_u(tuple(np.moveaxis(omega_q, 2, 0)), self._scales, tuple(x[:, None] for x in slopes))
+        return omega, np.stack(by_u, axis=2)
 
     def _spline(self, q: Array) -> tuple[Array, Array]:
         """Return the spline at q (n, 3) and its gradient (n, 3 outputs, 3 inputs).
@@ -194,7 +193,7 @@ class AdditiveModel:
     start_displacements: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "single", SingleAdditive(self))
+        object.__setattr__(self, "single", SingleAdditive(self.curves))
         # opening is long and curved, the other two short: 13 x 9 x 9 starts lie within the basin of Gauss-Newton
         axes = [np.linspace(low, high, n) for (low, high), n in zip(self.d_range, (13, 9, 9))]
         starts = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -5,18 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 from jawusd.geometry.arrays import Array
+from jawusd.geometry.rodrigues import Triple, apply_series, dot, turning
 from jawusd.geometry.so3 import angle_coefficients
 
 
 def motions_from_twists(twists: Array) -> Array:
     """Return the motions (n, 4, 4) of twists (omega [rad], v [mm]), shape (n, 6): what `geometry.se3_exp` does."""
     wx, wy, wz, vx, vy, vz = twists.T
-    a, b, c = angle_coefficients(np.sqrt(wx * wx + wy * wy + wz * wz))
-    M = _with_rotation(wx, wy, wz, a, b)
-    cx, cy, cz = wy * vz - wz * vy, wz * vx - wx * vz, wx * vy - wy * vx
-    M[:, 0, 3] = vx + b * cx + c * (wy * cz - wz * cy)
-    M[:, 1, 3] = vy + b * cy + c * (wz * cx - wx * cz)
-    M[:, 2, 3] = vz + b * cz + c * (wx * cy - wy * cx)
+    omega = wx, wy, wz
+    a, b, c = angle_coefficients(dot(omega, omega))
+    M = _with_rotation(omega, a, b)
+    M[:, 0, 3], M[:, 1, 3], M[:, 2, 3] = apply_series(omega, (vx, vy, vz), b, c)
     return M
 
 
@@ -29,21 +28,16 @@ def anchored_motions(omega: Array, moved: Array, anchor: Array) -> Array:
         anchor: The point [mm], shape (3,).
     """
     wx, wy, wz = omega.T
-    a, b, _ = angle_coefficients(np.sqrt(wx * wx + wy * wy + wz * wz))
-    M = _with_rotation(wx, wy, wz, a, b)
+    a, b, _ = angle_coefficients(dot((wx, wy, wz), (wx, wy, wz)))
+    M = _with_rotation((wx, wy, wz), a, b)
     M[:, :3, 3] = moved - (M[:, :3, :3].reshape(-1, 3) @ anchor).reshape(-1, 3)
     return M
 
 
-def _with_rotation(wx: Array, wy: Array, wz: Array, a: Array, b: Array) -> Array:
-    """Return transforms (n, 4, 4) with Rodrigues' rotations, a = sin(angle) / angle, b = (1 - cos(angle)) / angle^2."""
-    M = np.zeros((len(wx), 4, 4))
-    xx, yy, zz = wx * wx, wy * wy, wz * wz
-    ax, ay, az = a * wx, a * wy, a * wz
-    bx = b * wx
-    xy, xz, yz = bx * wy, bx * wz, b * wy * wz
-    M[:, 0, 0], M[:, 0, 1], M[:, 0, 2] = 1.0 - b * (yy + zz), xy - az, xz + ay
-    M[:, 1, 0], M[:, 1, 1], M[:, 1, 2] = xy + az, 1.0 - b * (xx + zz), yz - ax
-    M[:, 2, 0], M[:, 2, 1], M[:, 2, 2] = xz - ay, yz + ax, 1.0 - b * (xx + yy)
-    M[:, 3, 3] = 1.0
+def _with_rotation(omega: Triple[Array], a: Array, b: Array) -> Array:
+    """Return transforms (n, 4, 4) with the rotations of `turning`."""
+    M = np.zeros((len(a), 4, 4))
+    for i, row in enumerate(turning(omega, a, b)):
+        M[:, i, 0], M[:, i, 1], M[:, i, 2] = row
+    M.reshape(-1, 16)[:, ::5] += 1.0
     return M

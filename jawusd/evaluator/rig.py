@@ -61,7 +61,7 @@ class JawRig:
         self.polygons = PolygonBound.from_arrays(self.arrays)
         self._opening_mm = float(self.arrays["d_range"][0, 1])
         self.limits = Limits(float(self.arrays["residual_limit_mm"]), float(self.arrays["margin_limit_mm"]))
-        self._frames = RigFrames(self.arrays["T_anatomical_skull"], self.arrays["T_rest"])
+        self._frames = RigFrames(self.arrays["T_anatomical_skull"], self.arrays["T_rest"], self.model.single.anchor)
         self._reach = Reach(self.model, self.bound)
         self._encoder = Encoder(self.model, self._frames, self.bound, self._reach, self.arrays["landmarks"])
 
@@ -81,8 +81,7 @@ class JawRig:
         if d.shape == (3,):
             d1, d2, d3 = d.tolist()
             if abs(d1) + abs(d2) + abs(d3) < _SINGLE_LIMIT_MM:  # False for NaN
-                M = np.array(self.model.single.motion(d1, d2, d3))
-                return self._frames.from_anatomical.dot(M).dot(self._frames.closed)
+                return self._frames.pose(self.model.single.motion(d1, d2, d3))
         rows, batch = as_rows(d, (3,), "d")
         return in_chunks(self._poses, rows).reshape(*batch, 4, 4)
 
@@ -125,13 +124,13 @@ class JawRig:
         """
         rows, batch = as_rows(d, (3,), "d")
         points = as_points(p_mandible, "p_mandible")
-        at_rest = transform_points(self._frames.closed, points.reshape(-1, 3))
+        at_rest = transform_points(self._frames.T_anatomical_mandible_rest, points.reshape(-1, 3))
 
         def derivative(d: Array) -> Array:
             R, t, S = self.model.decode_derivative(d)
             image = at_rest @ np.swapaxes(R, 1, 2) + t[:, None]
             moved = np.cross(S[:, None, :3], image[..., None], axis=2) + S[:, None, 3:]
-            return self._frames.from_anatomical[:3, :3] @ moved
+            return self._frames.T_skull_anatomical[:3, :3] @ moved
 
         return in_chunks(derivative, rows).reshape(*batch, *points.shape, 3)
 
@@ -305,10 +304,12 @@ class JawRig:
             EvaluatorError: the bound of the rig is empty.
         """
         handles = as_points(p_mandible, "p_mandible")
-        vectors = handle_vectors(transform_points(self._frames.closed, handles.reshape(-1, 3)), weights)
+        vectors = handle_vectors(
+            transform_points(self._frames.T_anatomical_mandible_rest, handles.reshape(-1, 3)), weights
+        )
         targets, batch = as_rows(p_skull, handles.shape, "p_skull")
         targets = targets.reshape(len(targets), vectors.shape[1], 3)
-        scaled = np.swapaxes(transform_points(self._frames.to_anatomical, targets), 1, 2) * vectors[3]
+        scaled = np.swapaxes(transform_points(self._frames.T_anatomical_skull, targets), 1, 2) * vectors[3]
         if start is None:
             d = in_chunks(lambda target: self._reach.best_pull(vectors, target), scaled)
         else:

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from jawusd.evaluator.motions import motions_from_twists
 from jawusd.evaluator.rows import as_rows, in_chunks
-from jawusd.evaluator.single import motion_rows
+from jawusd.evaluator.single import motion_matrix, motion_of_twist
 from jawusd.geometry.arrays import Array, Indices
 
 _SINGLE_LIMIT_MM = 1e4
@@ -60,7 +60,7 @@ class SampledTable:
         if d.shape == (3,):
             x, y, z = d.tolist()
             if abs(x) + abs(y) + abs(z) < _SINGLE_LIMIT_MM:  # NaN and infinities go the long way
-                return np.array(motion_rows(*self._single_twist(x, y, z))).dot(self.T_rest)
+                return motion_matrix(motion_of_twist(*self._single_twist(x, y, z))).dot(self.T_rest)
         rows, batch = as_rows(d, (3,), "d")
         return in_chunks(self._poses, rows).reshape(*batch, 4, 4)
 

@@ -13,7 +13,6 @@ from jawusd.evaluator.curves import HermiteCurve
 from jawusd.evaluator.frames import RigFrames
 from jawusd.evaluator.models import AdditiveModel, AnchoredModel, JawModelForm
 from jawusd.geometry.arrays import Array
-from jawusd.geometry.se3 import se3_inverse
 
 # the model, both kinds
 COUNT = 0  # spline centres of an anchored model; 0 says additive
@@ -62,10 +61,10 @@ def packed_model(model: JawModelForm, frames: RigFrames, vectors: Array) -> Arra
     both = [
         [len(model.centres) if anchored else 0],
         model.incisor,
-        frames.from_anatomical,
-        frames.closed,
-        frames.to_anatomical,
-        se3_inverse(frames.closed),
+        frames.T_skull_anatomical,
+        frames.T_anatomical_mandible_rest,
+        frames.T_anatomical_skull,
+        frames.T_mandible_anatomical_rest,
         frames.adjoint,
         vectors,
     ]

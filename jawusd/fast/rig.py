@@ -29,7 +29,7 @@ class FastRig(JawRig):
     def __init__(self, arrays: dict[str, ArrayLike], meta: dict) -> None:
         """Build the rig; arguments and errors as those of `JawRig`."""
         super().__init__(arrays, meta)
-        vectors = landmark_vectors(transform_points(self._frames.closed, self.arrays["landmarks"]))
+        vectors = landmark_vectors(transform_points(self._frames.T_anatomical_mandible_rest, self.arrays["landmarks"]))
         self._numbers = packed_model(self.model, self._frames, vectors)
         self._hull = packed_bound(self.bound)
         self._reach = FastReach(self.model, self.bound, self._numbers, self._hull)

@@ -1,39 +1,51 @@
-"""Compiled: rotations, rigid motions and small linear algebra, for one row.
-
-Formulas as in `jawusd.geometry`, which gives their sources.
-"""
+"""Compiled: rotations, rigid motions and small linear algebra, for one row."""
 
 from __future__ import annotations
 
-from math import cos, sin, sqrt, tan
+import math
+from math import cos, sqrt, tan
 
 import numba
+from numba.extending import register_jitable
+
+from jawusd.evaluator import derivatives
+from jawusd.evaluator.derivatives import Elementary
+from jawusd.geometry import rodrigues
+from jawusd.geometry.rodrigues import angle_coefficients, apply_series, dot, turning
 
 # inlined into the functions of `rows` and `searches`, which are the ones kept on disk
-device = numba.njit(nogil=True, error_model="numpy")
+_OPTIONS = {"nogil": True, "error_model": "numpy"}
+device = numba.njit(**_OPTIONS)
 
-_SMALL_ANGLE_SQUARED = 1e-4  # as geometry.so3: the series are exact below
+# Plain functions of other modules that compiled code calls. Inlined, or else the functions in an `Elementary` would
+# be addresses in the machine code, which then cannot be kept on disk.
+for _function in (
+    *(rodrigues.angle_series, rodrigues.angle_quotients, rodrigues.angle_coefficients, rodrigues.cross, rodrigues.dot),
+    *(rodrigues.apply_series, rodrigues.turning, derivatives.path, derivatives.arch, derivatives.drop),
+    *(derivatives.fade, derivatives.displacement, derivatives.opening_equation, derivatives.inverse),
+    *(derivatives.spline_input, derivatives.gradient_by_u),
+):
+    register_jitable(forceinline=True, **_OPTIONS)(_function)
+
 _SERIES_SQUARED = 0.09  # below, derivatives of the coefficients come from their series; closed forms lose digits
 
 
 @device
-def cross(a0, a1, a2, b0, b1, b2):
-    """Return the cross product."""
-    return a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
+def _sqrt(x):
+    return math.sqrt(x)
 
 
 @device
-def angle_coefficients(squared):
-    """Return sin(a)/a, (1 - cos a)/a^2 and (a - sin a)/a^3 for a^2."""
-    if squared < _SMALL_ANGLE_SQUARED:
-        return (
-            1.0 - squared / 6.0 * (1.0 - squared / 20.0 * (1.0 - squared / 42.0)),
-            0.5 - squared / 24.0 * (1.0 - squared / 30.0 * (1.0 - squared / 56.0)),
-            1.0 / 6.0 - squared / 120.0 * (1.0 - squared / 42.0 * (1.0 - squared / 72.0)),
-        )
-    angle = sqrt(squared)
-    sine, half = sin(angle), sin(0.5 * angle)
-    return sine / angle, 2.0 * half * half / squared, (angle - sine) / (squared * angle)
+def _exp(x):
+    return math.exp(x)
+
+
+@device
+def _clip(x, low, high):
+    return min(max(x, low), high)
+
+
+FLOATS = Elementary(_sqrt, _exp, _clip)
 
 
 @device
@@ -64,31 +76,22 @@ def inverse_coefficient(squared):
 
 
 @device
-def rotate(w0, w1, w2, M):
+def rotate(omega, M):
     """Write the rotation of a rotation vector [rad] to the first three columns of M (3, 4)."""
-    xx, yy, zz = w0 * w0, w1 * w1, w2 * w2
-    a, b, _ = angle_coefficients(xx + yy + zz)
-    ax, ay, az, xy, xz, yz = a * w0, a * w1, a * w2, b * w0 * w1, b * w0 * w2, b * w1 * w2
-    M[0, 0], M[0, 1], M[0, 2] = 1.0 - b * (yy + zz), xy - az, xz + ay
-    M[1, 0], M[1, 1], M[1, 2] = xy + az, 1.0 - b * (xx + zz), yz - ax
-    M[2, 0], M[2, 1], M[2, 2] = xz - ay, yz + ax, 1.0 - b * (xx + yy)
-
-
-@device
-def series(w0, w1, w2, first, second, v0, v1, v2):
-    """Return ``(I + first W + second W W) v``, W the skew matrix of w: the form of both Jacobians of a rotation."""
-    x, y, z = cross(w0, w1, w2, v0, v1, v2)
-    xx, yy, zz = cross(w0, w1, w2, x, y, z)
-    return v0 + first * x + second * xx, v1 + first * y + second * yy, v2 + first * z + second * zz
+    a, b, _ = angle_coefficients(dot(omega, omega))
+    rows = turning(omega, a, b)
+    for i in range(3):
+        M[i, 0], M[i, 1], M[i, 2] = rows[i]
+        M[i, i] += 1.0
 
 
 @device
 def move(twist, M):
     """Write the rigid motion exp(twist) to M (3, 4)."""
-    w0, w1, w2 = twist[0], twist[1], twist[2]
-    rotate(w0, w1, w2, M)
-    _, b, c = angle_coefficients(w0 * w0 + w1 * w1 + w2 * w2)
-    M[0, 3], M[1, 3], M[2, 3] = series(w0, w1, w2, b, c, twist[3], twist[4], twist[5])
+    omega = (twist[0], twist[1], twist[2])
+    rotate(omega, M)
+    _, b, c = angle_coefficients(dot(omega, omega))
+    M[0, 3], M[1, 3], M[2, 3] = apply_series(omega, (twist[3], twist[4], twist[5]), b, c)
 
 
 @device

@@ -10,8 +10,9 @@ import numpy as np
 from jawusd.evaluator.rows import LARGEST
 from jawusd.evaluator.verdicts import RIGID_TOLERANCE, ROUNDING_MM, Reason
 from jawusd.fast.descent import DISPLACEMENT, PARAMETERS, Problem, descend, normal_scratch
+from jawusd.fast.forms import parameters_at
 from jawusd.fast.hull import excess
-from jawusd.fast.motion import motion, parameters_at, scratch
+from jawusd.fast.motion import motion, scratch
 from jawusd.fast.packing import COUNT, FROM_CLOSED, GRID, INCISOR, SIDES, STARTS, TO_ANATOMICAL, VECTORS
 from jawusd.fast.rigid import device
 
@@ -45,7 +46,7 @@ def encode(model, T, e):
     if model[COUNT] != 0:
         # the nearest pose does not depend on the chart: searching over the displacement spares the gauge
         descend(model, Problem(DISPLACEMENT, vectors, e.target), e.x, e.w, e.n)
-        e.x[0], e.x[1], e.x[2] = parameters_at(model, e.x[0], e.x[1], e.x[2])
+        e.x[0], e.x[1], e.x[2] = parameters_at(model, (e.x[0], e.x[1], e.x[2]))
     else:
         _read_off(model, e.x)
         descend(model, Problem(PARAMETERS, vectors, e.target), e.x, e.w, e.n)

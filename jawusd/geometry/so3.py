@@ -11,9 +11,7 @@ from numpy.typing import ArrayLike
 
 from jawusd.geometry.arrays import Array
 from jawusd.geometry.quaternion import matrix_from_wxyz, wxyz_from_matrix
-from jawusd.geometry.rodrigues import SMALL_SQUARED_ANGLE, angle_quotients, angle_series
-
-_SMALL_ANGLE_RAD = SMALL_SQUARED_ANGLE**0.5
+from jawusd.geometry.rodrigues import SMALL_SQUARED_ANGLE, angle_quotients, angle_series, turning
 
 
 def hat(w: ArrayLike) -> Array:
@@ -27,32 +25,42 @@ def hat(w: ArrayLike) -> Array:
 
 
 def vee(W: ArrayLike) -> Array:
-    """Return the vectors (..., 3) of skew matrices (..., 3, 3), the inverse of `hat`; symmetric parts are ignored."""
+    """Return the vectors (..., 3) of matrices (..., 3, 3), the inverse of `hat`; the symmetric part is ignored."""
     W = np.asarray(W, dtype=np.float64)
     return 0.5 * np.stack(
         [W[..., 2, 1] - W[..., 1, 2], W[..., 0, 2] - W[..., 2, 0], W[..., 1, 0] - W[..., 0, 1]], axis=-1
     )
 
 
-def angle_coefficients(angle_rad: Array) -> tuple[Array, Array, Array]:
-    """Return sin(a)/a, (1-cos a)/a^2 and (a-sin a)/a^3 of angles >= 0 [rad], without cancellation."""
-    small = angle_rad < _SMALL_ANGLE_RAD
-    safe = np.where(small, 1.0, angle_rad)
-    near = angle_series(angle_rad * angle_rad)
-    far = angle_quotients(safe * safe, safe, np.sin(safe), np.sin(0.5 * safe))
-    return np.where(small, near[0], far[0]), np.where(small, near[1], far[1]), np.where(small, near[2], far[2])
+def angle_coefficients(squared: Array) -> tuple[Array, Array, Array]:
+    """Return a, b and c of `jawusd.geometry.rodrigues` at squared angles [rad^2] of any shape."""
+    small = squared < SMALL_SQUARED_ANGLE
+    safe = np.where(small, 1.0, squared)
+    angle = np.sqrt(safe)
+    series, quotients = angle_series(squared), angle_quotients(safe, angle, np.sin(angle), np.sin(0.5 * angle))
+    a, b, c = (np.where(small, near, far) for near, far in zip(series, quotients))
+    return a, b, c
+
+
+def _series(w: Array, first: Array | float, second: Array) -> Array:
+    """Return ``I + first W + second W W``, W = hat(w), shape (..., 3, 3)."""
+    x, y, z = np.moveaxis(w, -1, 0)
+    out = np.empty((*w.shape[:-1], 3, 3))
+    for i, row in enumerate(turning((x, y, z), first, second)):
+        for k, entry in enumerate(row):
+            out[..., i, k] = entry
+    return out + np.eye(3)
 
 
 def so3_exp(w: ArrayLike) -> Array:
     """Map rotation vectors (..., 3) [rad] to rotation matrices (..., 3, 3) (Rodrigues' formula)."""
     w = np.asarray(w, dtype=np.float64)
-    first, second, _ = angle_coefficients(np.linalg.norm(w, axis=-1))
-    W = hat(w)
-    return np.eye(3) + first[..., None, None] * W + second[..., None, None] * (W @ W)
+    a, b, _ = angle_coefficients(np.einsum("...i,...i->...", w, w))
+    return _series(w, a, b)
 
 
 def so3_log(R: ArrayLike) -> Array:
-    """Map rotation matrices (..., 3, 3) to rotation vectors (..., 3) [rad] of angle in [0, pi]."""
+    """Map rotation matrices (..., 3, 3) to rotation vectors (..., 3) of angle in [0, pi] [rad]."""
     q = wxyz_from_matrix(R)
     norm = np.linalg.norm(q[..., 1:], axis=-1)
     angle = 2 * np.arctan2(norm, q[..., 0])
@@ -65,9 +73,8 @@ def so3_log(R: ArrayLike) -> Array:
 def so3_left_jacobian(w: ArrayLike) -> Array:
     """Return J (..., 3, 3) with ``exp(w + dw) = exp(J dw) exp(w)`` to first order, for w (..., 3) [rad]."""
     w = np.asarray(w, dtype=np.float64)
-    _, second, third = angle_coefficients(np.linalg.norm(w, axis=-1))
-    W = hat(w)
-    return np.eye(3) + second[..., None, None] * W + third[..., None, None] * (W @ W)
+    _, b, c = angle_coefficients(np.einsum("...i,...i->...", w, w))
+    return _series(w, b, c)
 
 
 def so3_right_jacobian(w: ArrayLike) -> Array:
@@ -76,22 +83,17 @@ def so3_right_jacobian(w: ArrayLike) -> Array:
 
 
 def so3_left_jacobian_inverse(w: ArrayLike) -> Array:
-    """Return the inverse of `so3_left_jacobian` in closed form, for angles below 2 pi."""
+    """Return the inverse (..., 3, 3) of `so3_left_jacobian` in closed form, for angles below 2 pi."""
     w = np.asarray(w, dtype=np.float64)
-    a = np.linalg.norm(w, axis=-1)
-    small = a < _SMALL_ANGLE_RAD
-    safe = np.where(small, 1.0, a)
-    a2 = a * a
-    # (1 - (a/2) cot(a/2)) / a^2, the even function of the closed form.
-    factor = np.where(
-        small,
-        1 / 12 + a2 / 720 * (1 + a2 / 42),
-        (1 - 0.5 * safe / np.tan(0.5 * safe)) / (safe * safe),
-    )
-    W = hat(w)
-    return np.eye(3) - 0.5 * W + factor[..., None, None] * (W @ W)
+    x = np.einsum("...i,...i->...", w, w)
+    small = x < SMALL_SQUARED_ANGLE
+    safe = np.where(small, 1.0, x)
+    half = 0.5 * np.sqrt(safe)
+    # (1 - (a/2) cot(a/2)) / a^2, the even function of the closed form
+    factor = np.where(small, 1 / 12 + x / 720 * (1 + x / 42), (1 - half / np.tan(half)) / safe)
+    return _series(w, -0.5, factor)
 
 
 def random_rotation(rng: np.random.Generator, shape: tuple[int, ...] = ()) -> Array:
-    """Draw rotations (*shape, 3, 3) uniformly (normalised Gaussian quaternions)."""
+    """Draw rotation matrices (*shape, 3, 3) uniformly (normalised Gaussian quaternions)."""
     return matrix_from_wxyz(rng.normal(size=(*shape, 4)))

@@ -49,7 +49,7 @@ def test_inverse_survives_a_gauge_with_a_steep_glide_surface():
 
 
 def test_one_row_is_inverted_as_many_are():
-    """The float path agrees with the array path, and hands over what plain Newton cannot do."""
+    """The float path agrees with the array path, also where plain Newton overshoots."""
     model = AnchoredModel.from_arrays(ARRAYS)
     rng = np.random.default_rng(3)
     u = rng.uniform([-14, -60, -20], [14, 10, 12], (300, 3))
@@ -60,7 +60,6 @@ def test_one_row_is_inverted_as_many_are():
     )
     found = np.array([steep.parameters_at(row[None])[0] for row in u])
     np.testing.assert_allclose(steep.gauge.displacement(found), u, atol=1e-9)
-    assert any(steep.single.parameters_at(row[None]) is None for row in u)
 
 
 def test_inverse_passes_nan_rows_through():
