@@ -65,7 +65,8 @@ class BoardClip:
                     )
                 yield number, image
             return
-        needed = {self._video.timeline.picture(number): number for number in wanted}
+        shown = {self._video.timeline.picture(number): number for number in wanted}
+        needed = {picture: number for picture, number in shown.items() if picture is not None}
         for frame in self._video.frames(min(needed), max(needed) + 1, threads=1):
             if frame.index in needed:
                 yield needed[frame.index], frame.image
@@ -88,7 +89,7 @@ def _read(path: Path) -> NDArray[np.uint8]:
     image = read_picture(path, cv2.IMREAD_GRAYSCALE)
     if image is None:
         raise CaptureError("is not a picture that can be read.", path=path, hint="Use PNG, JPEG or TIFF.")
-    return image
+    return np.asarray(image, np.uint8)
 
 
 def sharpness(image: NDArray[np.uint8]) -> float:

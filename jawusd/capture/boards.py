@@ -81,15 +81,14 @@ def find_boards(names: tuple[str, ...], boards: Boards, progress: Callable[[int,
     chosen, notes = _choose(names, clips)
     total, done = len(chosen) * len(clips), 0
 
-    def told(result: tuple) -> tuple:
-        nonlocal done
-        done += 1
-        progress(done, total)
-        return result
-
     def search(clip: BoardClip) -> list[tuple[Array, float]]:
-        one = detector(boards)
-        return [told(corners_and_width(one, image, boards)) for _, image in clip.pictures(chosen)]
+        nonlocal done
+        one, found = detector(boards), []
+        for _, image in clip.pictures(chosen):
+            found.append(corners_and_width(one, image, boards))
+            done += 1
+            progress(done, total)
+        return found
 
     progress(0, total)
     with ThreadPoolExecutor(max_workers=min(len(clips), 4)) as pool:

@@ -204,7 +204,9 @@ class _Problem:
         world = turned + boards[v, 3:]
         R = so3_exp(pose[:3])
         carried = world @ R.T
-        pixels, J = cv2.projectPoints(carried + pose[3:], np.zeros(3), np.zeros(3), K, np.array([*lens[4:], 0.0, 0.0]))
+        terms = np.array([*lens[4:], 0.0, 0.0])
+        found, derived = cv2.projectPoints(carried + pose[3:], np.zeros(3), np.zeros(3), K, terms)
+        pixels, J = np.asarray(found, np.float64), np.asarray(derived, np.float64)
         residual = (pixels.reshape(-1, 2) - self.corners_px[c, v, self.seen[c, v]]).ravel()
         if not derive:
             return residual, []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
+from typing import TypedDict
 
 import numpy as np
 
@@ -30,13 +31,26 @@ _LITTLE_COVERAGE = 0.5
 _LARGE_EXPECTED_MM = 0.05  # a share of the tracking error of about 0.1 mm
 
 
+class CameraFigures(TypedDict):
+    """What is known of one camera's calibration.
+
+    `coverage` is the share of the picture's cells with corners; `blurred` and `missed` are picture numbers.
+    """
+
+    views: int
+    rms_px: float
+    coverage: float
+    empty_corners: list[str]
+    blurred: list[int]
+    missed: list[int]
+
+
 @dataclass(frozen=True)
 class CalibrationReport:
     """Say how good a calibration is.
 
     Attributes:
-        cameras: per camera `views`, `rms_px`, `coverage` (share of the picture's cells with corners), `blurred` and
-            `missed` picture numbers.
+        cameras: per camera.
         views: board poses used.
         board_shape: error of distances between triangulated corners near the mouth, on the very pictures used.
         expected_shape_mm: mean error of distances in the mouth volume expected from the corners' scatter.
@@ -46,7 +60,7 @@ class CalibrationReport:
         notes: what was assumed.
     """
 
-    cameras: dict[str, dict]
+    cameras: dict[str, CameraFigures]
     views: int
     board_shape: ShapeError
     expected_shape_mm: float
@@ -56,7 +70,7 @@ class CalibrationReport:
     advice: tuple[str, ...]
     notes: tuple[str, ...]
 
-    def as_dict(self) -> dict:
+    def as_dict(self) -> dict[str, object]:
         """Return the report as plain data."""
         return asdict(self)
 
@@ -121,7 +135,7 @@ def calibrate_sightings(
         len(bundle.T_world_board),
         shape,
         expected,
-        tuple(float(value) for value in centre),
+        (float(centre[0]), float(centre[1]), float(centre[2])),
         source,
         scale,
         tuple(_advice(figures, bundle, points, centre, expected)),
@@ -130,7 +144,7 @@ def calibrate_sightings(
     return cameras, report
 
 
-def _camera_figures(c: int, camera: Camera, bundle: Bundle, sightings: Sightings) -> dict:
+def _camera_figures(c: int, camera: Camera, bundle: Bundle, sightings: Sightings) -> CameraFigures:
     seen = np.isfinite(bundle.corners_px[c, ..., 0])
     pixels = bundle.corners_px[c][seen]
     cells = np.floor(pixels / camera.size_px * _GRID).astype(int)
@@ -149,7 +163,9 @@ def _camera_figures(c: int, camera: Camera, bundle: Bundle, sightings: Sightings
     }
 
 
-def _advice(figures: dict[str, dict], bundle: Bundle, points_mm: Array, centre_mm: Array, expected_mm: float) -> list:
+def _advice(
+    figures: Mapping[str, CameraFigures], bundle: Bundle, points_mm: Array, centre_mm: Array, expected_mm: float
+) -> list[str]:
     advice = []
     fewest = min(figures, key=lambda name: figures[name]["views"])
     if figures[fewest]["views"] < _ENOUGH_VIEWS:

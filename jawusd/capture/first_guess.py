@@ -90,7 +90,9 @@ def guess_cameras(
     return FirstGuess(K, distortion, T_cam_world, T_world_board, corners)
 
 
-def _single_camera(name: str, size_px: tuple[int, int], corners_px: Array, points_mm: Array) -> tuple:
+def _single_camera(
+    name: str, size_px: tuple[int, int], corners_px: Array, points_mm: Array
+) -> tuple[Array, Array, Array]:
     """Return K (3, 3), k1 and k2 and T_cam_board (V, 4, 4) of one camera (Zhang 2000, by OpenCV)."""
     seen = np.isfinite(corners_px[..., 0])
     used = np.flatnonzero(seen.any(1))

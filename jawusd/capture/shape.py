@@ -15,7 +15,7 @@ from jawusd.geometry.arrays import Array
 __all__ = ["ShapeError", "board_shape_error", "distance_errors", "expected_shape_error", "mouth_centre"]
 
 
-_MOUTH_RADIUS_MM = 35.0  # holds both rows of teeth through an opening of 40 mm
+_MOUTH_RADIUS_MM = 35.0  # holds both arches through an opening of 40 mm
 _DRAWS = 40
 _POINTS = 150
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -112,20 +113,19 @@ def align_videos(videos: Mapping[str, Path], reference: str, *, by_light: bool =
         if by_light and dark is None:
             steps = {name: on_grid(found[name].steps, video.timeline.numbers) for name, video in opened.items()}
             offsets = {
-                name: _against(
-                    name, reference, video, hint, lambda n=name: match_steps(steps[n], steps[reference], rate)
-                )
+                name: _against(name, reference, video, hint, partial(match_steps, steps[name], steps[reference], rate))
                 for name, video in opened.items()
             }
             return Alignment(reference, offsets, "light flash", (*notes, *_stopped_early(opened, offsets, rate)))
-        sounds = dict(zip(opened, pool.map(lambda video: read_sound(video.path, RATE_HZ), opened.values())))
+        found_sounds = pool.map(lambda video: read_sound(video.path, RATE_HZ), opened.values())
+        sounds = {name: sound for name, sound in zip(opened, found_sounds) if sound is not None}
     why = "" if dark is None else f"camera {dark} {found[dark].reason}; "
-    silent = [name for name, sound in sounds.items() if sound is None]
+    silent = [name for name in opened if name not in sounds]
     if silent:
         whose = "no clip has" if len(silent) == len(opened) else f"camera {silent[0]} has no"
         raise SyncError(f"{why}{whose} sound to go by.", path=opened[dark or silent[0]].path, hint=hint)
     offsets = {
-        name: _against(name, reference, video, hint, lambda n=name: _by_sound(n, reference, sounds, opened, rate), why)
+        name: _against(name, reference, video, hint, partial(_by_sound, name, reference, sounds, opened, rate), why)
         for name, video in opened.items()
     }
     by_sound = (f"{why}the sound aligns the cameras",) if why else ()

@@ -66,7 +66,7 @@ class Masks(_Strict):
 
     @property
     def labels(self) -> tuple[int, int] | None:
-        """Return the gray values of upper and lower teeth in label images, None where each row has its own file."""
+        """Return the gray values of upper and lower teeth in label images, None where each arch has its own file."""
         if self.upper_value is None or self.lower_value is None:
             return None
         return self.upper_value, self.lower_value

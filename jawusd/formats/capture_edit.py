@@ -79,9 +79,9 @@ def with_bootstrap(text: str, picks: Bootstrap) -> str:
 
 def _lines(picks: Bootstrap) -> list[str]:
     lines = [f"frame = {picks.frame}"]
-    for row in ("upper", "lower"):
-        for pick in getattr(picks, row):
-            lines += ["", f"[[{_TABLE}.{row}]]", f"vertex = {pick.vertex}", f"views = [{_views(pick)}]"]
+    for arch, picked in (("upper", picks.upper), ("lower", picks.lower)):
+        for pick in picked:
+            lines += ["", f"[[{_TABLE}.{arch}]]", f"vertex = {pick.vertex}", f"views = [{_views(pick)}]"]
     return lines
 
 

@@ -37,14 +37,15 @@ def read_sound(path: str | os.PathLike[str], rate_hz: int) -> Sound | None:
     Raises:
         CaptureError: the file or its sound cannot be decoded.
     """
-    parts, start_s = [], 0.0
+    parts: list[NDArray[np.float32]] = []
+    start_s = 0.0
     try:
         with av.open(os.fspath(path), metadata_errors="replace") as container:
             if not container.streams.audio:
                 return None
             resampler = av.AudioResampler(format="flt", layout="mono", rate=rate_hz)
             for frame in container.decode(container.streams.audio[0]):
-                if not parts and frame.pts is not None:
+                if not parts and frame.pts is not None and frame.time_base is not None:
                     start_s = float(frame.pts * frame.time_base)
                 parts += [piece.to_ndarray()[0] for piece in resampler.resample(frame)]
             parts += [piece.to_ndarray()[0] for piece in resampler.resample(None)]

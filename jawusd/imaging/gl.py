@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 from dataclasses import dataclass
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,7 +87,8 @@ def open_context() -> moderngl.Context:
         MissingDependencyError: there is no EGL, no driver for it, or the driver lacks what is needed.
     """
     try:
-        context = moderngl.create_standalone_context(backend="egl", require=430)
+        # moderngl annotates each setting as if it were all of them.
+        context = moderngl.create_standalone_context(backend="egl", require=430)  # type: ignore[arg-type]
     except Exception as error:  # moderngl raises bare exceptions with the loader's text
         raise MissingDependencyError(
             f"drawing on the GPU needs OpenGL 4.3 through EGL, which did not start ({error}).",
@@ -101,6 +103,13 @@ def open_context() -> moderngl.Context:
             hint="Update the graphics driver, or use the CPU backend.",
         )
     return context
+
+
+class _Releasable(Protocol):
+    def release(self) -> None: ...
+
+
+Resource = TypeVar("Resource", bound=_Releasable)
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +166,7 @@ class GlCounter:
         self._masks: moderngl.TextureArray | None = None
         self._most_layers = int(context.info["GL_MAX_ARRAY_TEXTURE_LAYERS"])
 
-    def _own(self, resource: object) -> object:
+    def _own(self, resource: Resource) -> Resource:
         self._stack.callback(resource.release)
         return resource
 
@@ -169,7 +178,7 @@ class GlCounter:
         """
         checked_screens(matrices, masks, free)
         views, height, width = masks.shape
-        size = tuple(-(-side // _ROUND_PX) * _ROUND_PX for side in (width, height))
+        size = (-(-width // _ROUND_PX) * _ROUND_PX, -(-height // _ROUND_PX) * _ROUND_PX)
         if size[0] * size[1] * views > _MOST_PIXELS or views > self._most_layers:
             raise ValueError(f"{views} pictures of {width} x {height} px are more than one drawing may hold")
         if self._masks is None or self._masks.size != (*size, views):
@@ -193,20 +202,25 @@ class GlCounter:
         Returns:
             E_SP and E_BND, shape (N, C, 2).
         """
-        width, height, views = self._masks.size
+        width, height, views = self._shown().size
         most = max(1, min(self._most_layers, _MOST_PIXELS // (width * height)) // views)
         parts = [self._count_part(poses[k : k + most]) for k in range(0, len(poses), most)]
         return np.concatenate(parts) if parts else np.empty((0, views, 2), np.int64)
 
+    def _shown(self) -> moderngl.TextureArray:
+        if self._masks is None:
+            raise ValueError("counting needs pictures: call `show` first")
+        return self._masks
+
     def _count_part(self, poses: Array) -> NDArray[np.int64]:
-        width, height, views = self._masks.size
+        width, height, views = self._shown().size
         clip = np.einsum("cij,njk->ncki", self._to_clip, poses)  # transposed: GL reads columns first
         layers = len(poses) * views
         matrices = self._gl.buffer(np.ascontiguousarray(clip, np.float32))
         counts = self._gl.buffer(np.zeros(2 * layers, np.uint32))
         try:
             self._draw(self._target(layers), matrices, layers)
-            self._masks.use(1)
+            self._shown().use(1)
             counts.bind_to_storage_buffer(1)
             self._compute["views"], self._compute["size"] = views, (width, height)
             self._compute.run(-(-width // _TILE_PX), -(-height // _TILE_PX), layers)
@@ -229,7 +243,7 @@ class GlCounter:
 
     def _target(self, layers: int) -> _Target:
         """Return a target of at least so many layers; clearing costs time, so small ones exist beside large ones."""
-        width, height, views = self._masks.size
+        width, height, views = self._shown().size
         room = min(1 << (layers - 1).bit_length(), self._most_layers)
         if room not in self._targets:
             texture = self._gl.texture_array((width, height, room), 1, dtype="f1")

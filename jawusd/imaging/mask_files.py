@@ -14,12 +14,14 @@ from numpy.typing import NDArray
 
 from jawusd.errors import CaptureError
 from jawusd.imaging.pictures import read_picture
+from jawusd.imaging.pixels import Colour
 from jawusd.imaging.video import Video
 
-__all__ = ["LabelValues", "Mask", "PngMasks", "VideoMasks"]
+__all__ = ["LabelValues", "MaskImage", "PngMasks", "VideoMasks"]
 
-Mask = NDArray[np.uint8]
-#: Gray values of the wanted row of teeth and of the other one in label images; all else must be 0.
+MaskImage = NDArray[np.uint8]
+RawImage = NDArray[np.uint8] | NDArray[np.uint16]  # as files store it
+#: Gray values of the wanted arch and of the other one in label images; all else must be 0.
 LabelValues = tuple[int, int]
 
 _NUMBER = re.compile(r"%(0(\d+))?d")
@@ -43,7 +45,7 @@ class PngMasks:
         Args:
             pattern: name with one %d or %06d.
             size_px: (width, height) all must have, None for any.
-            labels: values of label images; None where a picture shows one row of teeth.
+            labels: values of label images; None where a picture shows one arch.
 
         Raises:
             CaptureError: the folder is missing or holds no such file, or all are opaque pictures.
@@ -71,7 +73,7 @@ class PngMasks:
         if labels is None and _png_has_alpha(self._files[min(self._files)]):
             _refuse_opaque((self._load(self._files[k]) for k in sorted(self._files)), pattern)
 
-    def masks(self, first: int) -> Iterator[Mask | None]:
+    def masks(self, first: int) -> Iterator[MaskImage | None]:
         """Yield the masks from a number on, (h, w) uint8, None where there is no file or nothing segmented.
 
         Raises:
@@ -86,7 +88,7 @@ class PngMasks:
         height, width = self._load(self._files[min(self._files)]).shape[:2]
         return width, height
 
-    def _load(self, path: Path) -> NDArray:
+    def _load(self, path: Path) -> RawImage:
         image = read_picture(path, cv2.IMREAD_UNCHANGED)
         if image is None:
             raise CaptureError(
@@ -114,6 +116,7 @@ class VideoMasks:
         self._video, self._labels = Video(path), labels
         _check_size(path, self._video.size_px, size_px)
         self.count, self.timeline = self._video.count, self._video.timeline
+        self._colour: Colour
         if labels is not None:  # luma, unless there is none: conversions would change values
             self._colour = "rgb" if self._video.is_rgb else "gray"
         else:
@@ -121,7 +124,7 @@ class VideoMasks:
         if self._colour == "rgba":
             _refuse_opaque_video(path, path.stat().st_mtime_ns)
 
-    def masks(self, first: int) -> Iterator[Mask | None]:
+    def masks(self, first: int) -> Iterator[MaskImage | None]:
         """Yield the masks from a picture on, (h, w) uint8, None where nothing is segmented.
 
         Raises:
@@ -146,7 +149,7 @@ def _png_has_alpha(path: Path) -> bool:
     return len(header) == _HEADER_BYTES and header[_COLOUR_TYPE] in _WITH_ALPHA
 
 
-def _refuse_opaque(images: Iterator[NDArray], path: Path) -> None:
+def _refuse_opaque(images: Iterator[RawImage], path: Path) -> None:
     """Raise if every picture with an alpha channel is an opaque photograph; mostly the first one is not."""
     count = 0
     for image in images:
@@ -166,15 +169,15 @@ def _refuse_opaque_video(path: Path, changed_ns: int) -> None:
     _refuse_opaque((frame.image for frame in Video(path).frames(colour="rgba", threads=1)), path)
 
 
-def _is_opaque_photograph(image: NDArray) -> bool:
+def _is_opaque_photograph(image: RawImage) -> bool:
     """Tell whether alpha says nothing, and colours are no black-and-white mask either."""
     if image.ndim != 3 or image.shape[2] != 4:
         return False
-    image = _eight_bits(image)
-    return bool(image[..., 3].min() == 255) and _gray_share(image[..., :3].max(axis=2)) > _MOST_GRAY
+    small = _eight_bits(image)
+    return bool(small[..., 3].min() == 255) and _gray_share(small[..., :3].max(axis=2)) > _MOST_GRAY
 
 
-def _mask(image: NDArray, labels: LabelValues | None, path: Path, where: str) -> Mask | None:
+def _mask(image: RawImage, labels: LabelValues | None, path: Path, where: str) -> MaskImage | None:
     if labels is not None:
         return _labelled(image, labels, path, where)
     if _is_opaque_photograph(image):
@@ -182,7 +185,7 @@ def _mask(image: NDArray, labels: LabelValues | None, path: Path, where: str) ->
     return _coverage(_eight_bits(image), path, where)
 
 
-def _coverage(image: NDArray[np.uint8], path: Path, where: str) -> Mask:
+def _coverage(image: MaskImage, path: Path, where: str) -> MaskImage:
     """Return 8-bit coverage: alpha where it is used, else the brightest colour; 0/1 becomes 0/255."""
     if image.ndim == 3:
         has_alpha = image.shape[2] == 4 and image[..., 3].min() < 255
@@ -193,11 +196,11 @@ def _coverage(image: NDArray[np.uint8], path: Path, where: str) -> Mask:
             path=path,
             hint="Check that `masks` in capture.toml names the masks and not the footage.",
         )
-    return image * np.uint8(255) if image.max() == 1 else image
+    return np.multiply(image, 255, dtype=np.uint8) if image.max() == 1 else image
 
 
-def _labelled(image: NDArray, labels: LabelValues, path: Path, where: str) -> Mask:
-    """Return 255 where a label image shows the wanted row of teeth; refuse values that mean nothing."""
+def _labelled(image: RawImage, labels: LabelValues, path: Path, where: str) -> MaskImage:
+    """Return 255 where a label image shows the wanted arch; refuse values that mean nothing."""
     plane = image if image.ndim == 2 else image[..., 0]
     if image.ndim == 3 and not all((image[..., c] == plane).all() for c in (1, 2)):
         raise CaptureError(
@@ -218,10 +221,10 @@ def _labelled(image: NDArray, labels: LabelValues, path: Path, where: str) -> Ma
     return np.where(plane == labels[0], np.uint8(255), np.uint8(0))
 
 
-def _eight_bits(image: NDArray) -> NDArray[np.uint8]:
-    return (image >> 8).astype(np.uint8) if image.dtype == np.uint16 else image
+def _eight_bits(image: RawImage) -> MaskImage:
+    return np.asarray(image >> 8 if image.dtype == np.uint16 else image, np.uint8)
 
 
-def _gray_share(image: NDArray[np.uint8]) -> float:
+def _gray_share(image: MaskImage) -> float:
     white = int(image.max())
     return cv2.countNonZero(cv2.inRange(image, white // 10 + 1, white - white // 10 - 1)) / image.size

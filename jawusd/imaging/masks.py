@@ -6,15 +6,14 @@ import contextlib
 import os
 import queue
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from functools import lru_cache
 from pathlib import Path
 from types import TracebackType
-from typing import Any
 
 from jawusd.errors import CaptureError
 from jawusd.formats.capture import CameraSource
-from jawusd.imaging.mask_files import LabelValues, Mask, PngMasks, VideoMasks
+from jawusd.imaging.mask_files import LabelValues, MaskImage, PngMasks, VideoMasks
 from jawusd.imaging.timeline import Timeline
 from jawusd.imaging.video import Video
 
@@ -24,7 +23,7 @@ _AHEAD = 4  # pictures waiting at most: 8 MB of full HD per reader
 
 
 class MaskReader:
-    """Read the masks of one row of teeth in one camera.
+    """Read the masks of one arch in one camera.
 
     Reading frame after frame decodes the next few in a background thread; any other order works and decodes on
     demand. One reader serves one thread; use it as a context manager or close it, or its thread waits for ever.
@@ -44,7 +43,7 @@ class MaskReader:
         *,
         timeline: Timeline | None = None,
         labels: LabelValues | None = None,
-        prepare: Callable[[Mask], Any] | None = None,
+        prepare: Callable[[MaskImage], MaskImage] | None = None,
     ) -> None:
         """Find the masks; decodes nothing yet, except first pictures of videos and of files with transparency.
 
@@ -53,24 +52,27 @@ class MaskReader:
                 with one picture per picture, or per frame, of the camera's video.
             size_px: (width, height) of the camera's pictures.
             timeline: of the camera's video; without one, PNG files are numbered by frames.
-            labels: for label images, the gray values of the wanted row of teeth and of the other one.
-            prepare: applied to each mask in the background thread, such as `WorkingView.mask`; its result is returned
-                instead of the mask.
+            labels: for label images, the gray values of the wanted arch and of the other one.
+            prepare: applied to each mask in the background thread, such as `WorkingView.mask`.
 
         Raises:
             CaptureError: the folder or file is missing, holds no masks, or their size or count is wrong.
         """
         self.path = Path(path)
-        is_pattern = "%" in self.path.name
-        self._source = (PngMasks if is_pattern else VideoMasks)(self.path, size_px, labels)
-        find_timeline = _timeline_of_pngs if is_pattern else _timeline_of_video
-        self._timeline = find_timeline(self.path, self._source, timeline)
+        self._source: PngMasks | VideoMasks
+        self._timeline: Timeline | None
+        if "%" in self.path.name:
+            self._source = pngs = PngMasks(self.path, size_px, labels)
+            self._timeline = _timeline_of_pngs(self.path, pngs, timeline)
+        else:
+            self._source = pictures = VideoMasks(self.path, size_px, labels)
+            self._timeline = _timeline_of_video(self.path, pictures, timeline)
         self.count = self._source.count if self._timeline is None else self._timeline.count
         self._prepare = prepare
         self._previous: int | None = None
         self._ahead: _Ahead | None = None
 
-    def read(self, frame: int) -> Any:
+    def read(self, frame: int) -> MaskImage | None:
         """Return the mask of a frame of the camera.
 
         Args:
@@ -111,13 +113,13 @@ class MaskReader:
     ) -> None:
         self.close()
 
-    def _results(self, first: int) -> Iterator[Any]:
+    def _results(self, first: int) -> Generator[MaskImage | None]:
         for mask in self._masks(first):
             if mask is not None and not mask.any():
                 mask = None
             yield mask if mask is None or self._prepare is None else self._prepare(mask)
 
-    def _masks(self, first: int) -> Iterator[Mask | None]:
+    def _masks(self, first: int) -> Iterator[MaskImage | None]:
         """Yield the mask of every frame from the first on."""
         if self._timeline is None:
             yield from self._source.masks(first)
@@ -166,7 +168,7 @@ def _timeline_of_video(path: Path, source: VideoMasks, video: Timeline | None) -
 
 
 def open_masks(
-    source: CameraSource, size_px: tuple[int, int], *, prepare: Callable[[Mask], Any] | None = None
+    source: CameraSource, size_px: tuple[int, int], *, prepare: Callable[[MaskImage], MaskImage] | None = None
 ) -> tuple[MaskReader, MaskReader]:
     """Return readers of the masks of the upper and the lower teeth of a camera that has some; see `MaskReader`.
 
@@ -205,14 +207,14 @@ def mask_size_px(path: str | os.PathLike[str]) -> tuple[int, int]:
 class _Ahead:
     """Run an iterator in a thread, a few items ahead of whoever takes them."""
 
-    def __init__(self, items: Iterator[Any], first_frame: int) -> None:
+    def __init__(self, items: Generator[MaskImage | None], first_frame: int) -> None:
         self.next_frame = first_frame
-        self._queue: queue.Queue[tuple[Any, Exception | None]] = queue.Queue(_AHEAD)
+        self._queue: queue.Queue[tuple[MaskImage | None, Exception | None]] = queue.Queue(_AHEAD)
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, args=(items,), daemon=True, name="jawusd-masks")
         self._thread.start()
 
-    def take(self) -> Any:
+    def take(self) -> MaskImage | None:
         self.next_frame += 1
         item, error = self._queue.get()
         if error is not None:
@@ -224,7 +226,7 @@ class _Ahead:
         self._stopping.set()
         self._thread.join()
 
-    def _run(self, items: Iterator[Any]) -> None:
+    def _run(self, items: Generator[MaskImage | None]) -> None:
         try:
             with contextlib.closing(items):
                 for item in items:
@@ -234,7 +236,7 @@ class _Ahead:
         except Exception as error:  # handed to the thread that reads, whatever it is
             self._put(None, error)
 
-    def _put(self, item: Any, error: Exception | None) -> None:
+    def _put(self, item: MaskImage | None, error: Exception | None) -> None:
         while not self._stopping.is_set():
             with contextlib.suppress(queue.Full):
                 self._queue.put((item, error), timeout=0.05)

@@ -9,7 +9,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from jawusd.formats.mesh import Mesh
-from jawusd.geometry.arrays import Mask
+from jawusd.geometry.arrays import Array, Mask
 
 # By how much the parts of a surface that meet in one point only are moved apart [mm]: validators take points at the
 # very same place for a seam that somebody forgot to merge.
@@ -29,7 +29,7 @@ def manifold(mesh: Mesh) -> Mesh:
         surface.update_faces(~surplus)
     trimesh.repair.fix_winding(surface)
     vertices, faces = _unpinched(np.asarray(surface.vertices), np.asarray(surface.faces), surface)
-    return Mesh(vertices, faces)
+    return Mesh(vertices, faces.astype(np.int32))
 
 
 def _surplus_faces(surface: trimesh.Trimesh) -> Mask:
@@ -43,7 +43,7 @@ def _surplus_faces(surface: trimesh.Trimesh) -> Mask:
     return out
 
 
-def _unpinched(vertices: NDArray, faces: NDArray, surface: trimesh.Trimesh) -> tuple[NDArray, NDArray]:
+def _unpinched(vertices: Array, faces: NDArray[np.int64], surface: trimesh.Trimesh) -> tuple[Array, NDArray[np.int64]]:
     """Return vertices and faces with a vertex of its own for every fan of faces around a point."""
     corners = np.arange(faces.size).reshape(faces.shape)
     linked = []

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from jawusd.errors import CaptureError
 from jawusd.formats.mesh import Mesh
+from jawusd.geometry.arrays import Array
 
 __all__ = ["Winding", "load_mesh", "winding"]
 
@@ -53,11 +54,15 @@ def load_mesh(path: str | os.PathLike[str], kind: Literal["scan", "bone"] = "sca
         raise CaptureError("the file holds no triangles.", path=path, hint="Export the surface, not a point cloud.")
     if np.shape(loaded.vertices)[1:] != (3,) or np.shape(loaded.faces)[1:] != (3,):
         raise CaptureError("its vertices do not have three coordinates each.", path=path, hint="Export it again.")
-    colors = loaded.visual.vertex_colors[:, :3].astype(np.uint8) if loaded.visual.kind == "vertex" else None
+    visual, colors = loaded.visual, None
+    if isinstance(visual, trimesh.visual.ColorVisuals) and visual.kind == "vertex":
+        colors = visual.vertex_colors[:, :3].astype(np.uint8)
     return _checked(path, np.asarray(loaded.vertices), np.asarray(loaded.faces), colors, kind)
 
 
-def _checked(path: Path, vertices: NDArray, faces: NDArray, colors: NDArray[np.uint8] | None, kind: str) -> Mesh:
+def _checked(
+    path: Path, vertices: Array, faces: NDArray[np.int64], colors: NDArray[np.uint8] | None, kind: str
+) -> Mesh:
     bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
     if bad.size:
         raise CaptureError(

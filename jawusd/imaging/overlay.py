@@ -177,7 +177,7 @@ def _cut_to_teeth(
     scale = float(np.min(np.array(tile_px) / np.maximum((high - low) * (1 + 2 * _MARGIN), 1)))
     to_tile = np.array([[scale, 0, tile_px[0] / 2 - scale * centre[0]], [0, scale, tile_px[1] / 2 - scale * centre[1]]])
     shrinks = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
-    return cv2.warpAffine(image, to_tile, tile_px, flags=shrinks)
+    return np.asarray(cv2.warpAffine(image, to_tile, tile_px, flags=shrinks), np.uint8)
 
 
 def _captioned(tile: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:

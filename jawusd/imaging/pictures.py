@@ -21,6 +21,9 @@ def read_picture(path: Path, flags: int) -> NDArray[np.uint8] | NDArray[np.uint1
             head = file.read(24)
         if head.startswith(_PNG) and int.from_bytes(head[16:20]) * int.from_bytes(head[20:24]) > _MOST_PX:
             return None
-        return cv2.imread(str(path), flags)
+        image = cv2.imread(str(path), flags)
+        if image is None or image.dtype == np.uint8:
+            return None if image is None else np.asarray(image, np.uint8)
+        return np.asarray(image, np.uint16)
     except (OSError, cv2.error, MemoryError):
         return None

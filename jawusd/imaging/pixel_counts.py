@@ -13,7 +13,7 @@ from numba import types
 from numpy.typing import NDArray
 
 from jawusd.geometry.arrays import Array, Mask
-from jawusd.imaging.raster import count_and_not, draw_silhouette, pack_bits, project
+from jawusd.imaging.raster import Bits, Singles, count_and_not, draw_silhouette, pack_bits, project
 
 __all__ = ["RasterCounter", "checked_screens"]
 
@@ -31,7 +31,18 @@ _COUNTS = types.Array(types.int64, 2, "C")
     nogil=True,
     cache=True,
 )
-def _count(vertices, plain_faces, boundary_faces, cull, matrices, first, masks, free, width, counts):
+def _count(
+    vertices: Singles,
+    plain_faces: NDArray[np.int32],
+    boundary_faces: NDArray[np.int32],
+    cull: bool,
+    matrices: Singles,
+    first: int,
+    masks: Bits,
+    free: Bits,
+    width: int,
+    counts: NDArray[np.int64],
+) -> None:
     """Fill counts (T, 2) for drawings first .. first + T of the list pose by pose, view by view."""
     points = np.empty((vertices.shape[0], 3), np.float32)
     bits = np.empty((masks.shape[1], masks.shape[2]), np.uint64)
@@ -126,7 +137,7 @@ class RasterCounter:
         self.close()
 
 
-def checked_screens(matrices: NDArray, masks: NDArray, free: NDArray) -> None:
+def checked_screens(matrices: Array, masks: Mask, free: Mask) -> None:
     """Check that matrices are (C, 3, 4) and masks and free (C, h, w) with C, h, w > 0.
 
     Raises:

@@ -14,9 +14,14 @@ cracks; a pixel covered twice is harmless both for a union and for a nearest-dep
 matter for counting, and would drop centres that lie exactly on the outline.)
 """
 
+from __future__ import annotations
+
 import numba
 import numpy as np
 from numba import types
+from numpy.typing import NDArray
+
+from jawusd.geometry.arrays import Mask
 
 __all__ = [
     "count_and_not",
@@ -47,9 +52,13 @@ _DEPTH_OUT = _array(types.float32, mutable=True)
 _LABELS_OUT = _array(types.uint8, mutable=True)
 _INT = types.int64
 
+Singles = NDArray[np.float32]
+Bits = NDArray[np.uint64]
+_Edges = tuple[float, float, float, float, float, float, float, float, float]
+
 
 @numba.njit(types.void(_POINTS, _POINTS, _DEPTH_OUT), nogil=True, cache=True)
-def project(vertices: np.ndarray, matrix: np.ndarray, out: np.ndarray) -> None:
+def project(vertices: Singles, matrix: Singles, out: Singles) -> None:
     """Project vertices with a 3x4 matrix.
 
     Args:
@@ -69,7 +78,7 @@ def project(vertices: np.ndarray, matrix: np.ndarray, out: np.ndarray) -> None:
 
 
 @numba.njit(nogil=True, cache=True)
-def _hidden(points, a, b, c, cull):
+def _hidden(points: Singles, a: int, b: int, c: int, cull: bool) -> bool:
     """Tell whether a triangle is not to be drawn: touches the camera plane, or (cull) is turned away.
 
     With y down an outward counter-clockwise face seen from the front has negative signed area.
@@ -85,7 +94,7 @@ def _hidden(points, a, b, c, cull):
 
 
 @numba.njit(nogil=True, cache=True)
-def _edges(points, a, b, c):
+def _edges(points: Singles, a: int, b: int, c: int) -> _Edges:
     """Sort a triangle's corners by v; return the corners and the three edge slopes du/dv (0 for level edges)."""
     ax = np.float64(points[a, 0])
     ay = np.float64(points[a, 1])
@@ -106,7 +115,7 @@ def _edges(points, a, b, c):
 
 
 @numba.njit(nogil=True, cache=True)
-def _interval(low, high, first, last):
+def _interval(low: float, high: float, first: int, last: int) -> tuple[int, int]:
     """Return the integers of [low, high] within [first, last] as (i, j); i > j when there is none (or NaN).
 
     Clamped as floats first: casting a NaN or a huge coordinate to an integer is undefined.
@@ -123,7 +132,7 @@ def _interval(low, high, first, last):
 
 
 @numba.njit(nogil=True, cache=True)
-def _span(edges, y, first, last):
+def _span(edges: _Edges, y: int, first: int, last: int) -> tuple[int, int]:
     """Return the covered pixels (i, j), inclusive, of image row y between two columns."""
     ax, ay, bx, by, cx, cy, slope_ac, slope_ab, slope_bc = edges
     if ay == cy:  # a line seen edge-on along the row
@@ -136,7 +145,7 @@ def _span(edges, y, first, last):
 
 
 @numba.njit(nogil=True, cache=True)
-def _fill(row, i, j):
+def _fill(row: Bits, i: int, j: int) -> None:
     """Set bits i..j (inclusive) of a bit row."""
     word = i >> 6
     last = j >> 6
@@ -153,7 +162,7 @@ def _fill(row, i, j):
 
 @numba.njit(types.void(_POINTS, _FACES, _INT, _INT, _INT, types.boolean, _BITS_OUT), nogil=True, cache=True)
 def draw_silhouette(
-    points: np.ndarray, faces: np.ndarray, x0: int, y0: int, width: int, cull: bool, bits: np.ndarray
+    points: Singles, faces: NDArray[np.int32], x0: int, y0: int, width: int, cull: bool, bits: Bits
 ) -> None:
     """Add the silhouette of projected triangles to a bit-row buffer.
 
@@ -183,7 +192,7 @@ def draw_silhouette(
 
 
 @numba.njit(nogil=True, cache=True)
-def _inverse_depth_plane(points, a, b, c):
+def _inverse_depth_plane(points: Singles, a: int, b: int, c: int) -> tuple[float, float, float, float, float]:
     """Return 1/z at corner a, its image gradient, and its range: 1/z is affine over a projected triangle."""
     ia = 1.0 / points[a, 2]
     ib = 1.0 / points[b, 2]
@@ -208,13 +217,13 @@ def _inverse_depth_plane(points, a, b, c):
     cache=True,
 )
 def draw_depth_labels(
-    points: np.ndarray,
-    faces: np.ndarray,
+    points: Singles,
+    faces: NDArray[np.int32],
     x0: int,
     y0: int,
     cull: bool,
-    inverse_depth: np.ndarray,
-    labels: np.ndarray,
+    inverse_depth: Singles,
+    labels: NDArray[np.uint8],
     label: int,
 ) -> None:
     """Draw projected triangles into a nearest-surface buffer and note which mesh is seen.
@@ -253,7 +262,7 @@ def draw_depth_labels(
 
 
 @numba.njit(types.uint64(types.uint64), nogil=True, cache=True)
-def _popcount(x):
+def _popcount(x: np.uint64) -> np.uint64:
     """Count the set bits of a word (H. S. Warren, Hacker's Delight, fig. 5-2; LLVM turns it into popcnt)."""
     x = x - ((x >> _ONE) & np.uint64(0x5555555555555555))
     x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
@@ -262,7 +271,7 @@ def _popcount(x):
 
 
 @numba.njit(_INT(_BITS), nogil=True, cache=True)
-def count_bits(bits: np.ndarray) -> int:
+def count_bits(bits: Bits) -> np.int64:
     """Count the set pixels of a (h, words) uint64 bit-row picture."""
     total = np.uint64(0)
     for y in range(bits.shape[0]):
@@ -272,7 +281,7 @@ def count_bits(bits: np.ndarray) -> int:
 
 
 @numba.njit(_INT(_BITS, _BITS), nogil=True, cache=True)
-def count_and_not(first: np.ndarray, second: np.ndarray) -> int:
+def count_and_not(first: Bits, second: Bits) -> np.int64:
     """Count the pixels set in first and not in second; both (h, words) uint64.
 
     Raises:
@@ -292,7 +301,7 @@ def words_for(width: int) -> int:
     return (width + 63) // 64
 
 
-def pack_bits(mask: np.ndarray) -> np.ndarray:
+def pack_bits(mask: Mask | NDArray[np.uint8]) -> Bits:
     """Pack a (h, w) picture (non-zero = set) into (h, words) uint64 bit rows.
 
     Raises:
@@ -306,7 +315,7 @@ def pack_bits(mask: np.ndarray) -> np.ndarray:
     return np.packbits(padded, axis=1, bitorder="little").view("<u8").astype(np.uint64, copy=False)
 
 
-def unpack_bits(bits: np.ndarray, width: int) -> np.ndarray:
+def unpack_bits(bits: Bits, width: int) -> Mask:
     """Unpack (h, words) uint64 bit rows into a (h, width) bool picture.
 
     Raises:

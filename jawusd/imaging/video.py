@@ -9,15 +9,15 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import av
 import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.errors import CaptureError
-from jawusd.imaging.pixels import CONVERSIONS, Colour
+from jawusd.imaging.pixels import Colour, Slices, converted
 from jawusd.imaging.timeline import Timeline
 
 __all__ = ["Video", "VideoFrame"]
@@ -27,7 +27,8 @@ _REENCODE = "Re-encode it, for example: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp
 _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
 
 
-class VideoFrame(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class VideoFrame:
     """One decoded picture.
 
     Attributes:
@@ -72,7 +73,7 @@ class Video:
         with self._open() as container:
             stream = container.streams.video[0]
             announced = stream.frames
-            self._time_base = float(stream.time_base)
+            self._time_base = float(stream.time_base or 1)
             self._pts, self._seek_dts, stored = self._packet_table(container, stream)
             self.fps = float(stream.average_rate or 0)
             hidden = {key.lower(): value for key, value in stream.metadata.items()}.get("alpha_mode") == "1"
@@ -154,9 +155,9 @@ class Video:
         for number in wanted:
             yield None if number is None else next(frame.image for frame in decoded if frame.index == number)
 
-    def _converted(self, first: int, last: int, colour: Colour, window: tuple, threads: int) -> Iterator[VideoFrame]:
+    def _converted(self, first: int, last: int, colour: Colour, window: Slices, threads: int) -> Iterator[VideoFrame]:
         for index, frame in self._decode(first, last, threads, alpha=colour == "rgba"):
-            image = CONVERSIONS[colour](frame, self.rotation_deg, window)
+            image = converted(frame, colour, self.rotation_deg, window)
             image.flags.writeable = False  # the gray buffer may be a reference the decoder still needs
             yield VideoFrame(index, float(self.times_s[index]), image)
 
@@ -235,7 +236,8 @@ class Video:
             return
         decoder = av.CodecContext.create(self._alpha_decoder, "r")
         for packet in container.demux(stream):
-            yield from decoder.decode(packet if packet.size else None)
+            # PyAV's stub does not say that a decoder of pictures is made.
+            yield from decoder.decode(packet if packet.size else None)  # type: ignore[attr-defined]
 
     def _undecodable(self, index: int) -> CaptureError:
         return CaptureError(

@@ -4,16 +4,29 @@ from __future__ import annotations
 
 from dataclasses import replace
 from math import ceil
+from typing import TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.geometry.arrays import Mask
 from jawusd.geometry.camera import Camera
+from jawusd.imaging.pixels import Slices
 
-__all__ = ["WorkingView"]
+__all__ = ["WorkingView", "remap"]
 
 _NODE_PX = 16  # spacing of the map samples that locate a region
+
+
+_Pixel = TypeVar("_Pixel", np.uint8, np.float32)
+
+
+def remap(image: NDArray[_Pixel], positions: NDArray[np.float32]) -> NDArray[_Pixel]:
+    """Return an image sampled bilinearly at positions (h, w, 2) [px], 0 outside of it."""
+    # cv2's stub asks for a second map, which a map of two channels does without.
+    found = cv2.remap(image, positions, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)  # type: ignore[call-overload]
+    return np.asarray(found, image.dtype)
 
 
 class WorkingView:
@@ -44,9 +57,10 @@ class WorkingView:
         self._samples = ceil(max(source.size_px[0] / size_px[0], source.size_px[1] / size_px[1]))
         fine_size = (size_px[0] * self._samples, size_px[1] * self._samples)
         distortion = source.distortion if source.distortion.size else None
-        self._map = cv2.initUndistortRectifyMap(
+        maps = cv2.initUndistortRectifyMap(
             source.K, distortion, None, source.scaled(fine_size).K, fine_size, cv2.CV_32FC2
-        )[0]
+        )
+        self._map = np.asarray(maps[0], np.float32)
         self._nodes = np.ascontiguousarray(self._map[::_NODE_PX, ::_NODE_PX])
         # No node of a region lies farther from its neighbour than this [px of the recorded picture].
         steps = [np.abs(np.diff(self._nodes, axis=axis)).max(initial=_NODE_PX) for axis in (0, 1)]
@@ -88,7 +102,7 @@ class WorkingView:
         width, height = self.camera.size_px
         return self._averaged(image, (slice(0, height), slice(0, width)))
 
-    def part(self, image: NDArray[np.uint8], window: tuple[slice, slice]) -> NDArray[np.uint8]:
+    def part(self, image: NDArray[np.uint8], window: Slices) -> NDArray[np.uint8]:
         """Bring a part of a picture to the working size.
 
         Args:
@@ -108,15 +122,16 @@ class WorkingView:
         if image.shape[1::-1] != self.source.size_px or image.dtype != np.uint8:
             raise ValueError(f"picture must be uint8 of {self.source.size_px} px, got {image.dtype} {image.shape}")
 
-    def _averaged(self, image: NDArray[np.uint8], window: tuple[slice, slice]) -> NDArray[np.uint8]:
+    def _averaged(self, image: NDArray[np.uint8], window: Slices) -> NDArray[np.uint8]:
         n, (rows, cols) = self._samples, window
         part = self._map[rows.start * n : rows.stop * n, cols.start * n : cols.stop * n]
-        fine = cv2.remap(image, part, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        fine = remap(image, part)
         if n == 1:
             return fine
-        return cv2.resize(fine, (cols.stop - cols.start, rows.stop - rows.start), interpolation=cv2.INTER_AREA)
+        size = (cols.stop - cols.start, rows.stop - rows.start)
+        return np.asarray(cv2.resize(fine, size, interpolation=cv2.INTER_AREA), np.uint8)
 
-    def _window(self, mask: NDArray[np.uint8]) -> tuple[slice, slice] | None:
+    def _window(self, mask: NDArray[np.uint8]) -> Slices | None:
         """Return the working pixels that can see a non-black pixel of the mask, or None."""
         rows = np.flatnonzero(mask.max(axis=1))
         if rows.size == 0:
@@ -126,12 +141,13 @@ class WorkingView:
         high = np.array([cols[-1], rows[-1]], np.float32) + self._reach_px
         # Within the reach of the box there is at least one node beyond each of its sides; the ring of cells around
         # those nodes therefore holds the box.
-        inside = ((self._nodes >= low) & (self._nodes <= high)).all(axis=2)
+        inside: Mask = np.all((self._nodes >= low) & (self._nodes <= high), axis=2)
         spans = []
         for hits, limit in zip((inside.any(axis=1), inside.any(axis=0)), self.camera.size_px[::-1]):
             where = np.flatnonzero(hits)
             if where.size == 0:
                 return None
-            first, last = (where[0] - 1) * _NODE_PX // self._samples, (where[-1] + 1) * _NODE_PX // self._samples
+            first = int(where[0] - 1) * _NODE_PX // self._samples
+            last = int(where[-1] + 1) * _NODE_PX // self._samples
             spans.append(slice(max(first, 0), min(last + 1, limit)))
         return spans[0], spans[1]

@@ -20,6 +20,7 @@ from jawusd.evaluator import JawRig
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.npz import check_format
 from jawusd.geometry import LANDMARKS, landmark_frame, transform_points
+from jawusd.geometry.arrays import Array
 from jawusd.library.transport import Donor, condylar_distance_mm, condyle_incisor_mm
 
 FAMILY, VERSION = "jawusd-library", 1
@@ -60,10 +61,10 @@ class Entry:
     landmarks_mm: dict[str, list[float]]
     condylar_distance_mm: float
     condyle_incisor_mm: float
-    errors_mm: dict
+    errors_mm: dict[str, object]
     not_shown: bool
 
-    def landmarks(self) -> np.ndarray:
+    def landmarks(self) -> Array:
         """Return the landmarks in the order of `LANDMARKS` [mm], shape (5, 3)."""
         return np.array([self.landmarks_mm[name] for name in LANDMARKS])
 
@@ -215,7 +216,9 @@ def _read_index(path: Path) -> dict[str, Entry]:
         raise FormatError(f"is damaged ({error}).", path=path, hint="Delete it; it is made anew.") from error
 
 
-def _entry_of(record: dict) -> Entry:
+def _entry_of(record: object) -> Entry:
+    if not isinstance(record, dict):
+        raise TypeError("an entry is no object")
     entry = Entry(**record)
     text = [field.name for field in fields(Entry) if field.type == "str"]
     if not all(isinstance(getattr(entry, name), str) for name in text):

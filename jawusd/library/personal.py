@@ -39,7 +39,7 @@ class Expected:
         """Return the errors of all persons [mm], shape (N, 5)."""
         return np.concatenate(list(self.errors_mm.values()))
 
-    def summary(self) -> dict:
+    def summary(self) -> dict[str, object]:
         """Return mean, 95 % quantile and largest error over landmarks [mm], and the mean by person."""
         errors = self.pooled()
         return {

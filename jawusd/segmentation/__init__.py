@@ -1,1 +1,1 @@
-"""Masks of both rows of teeth from footage, guided by projected scans."""
+"""Masks of both arches from footage, guided by projected scans."""

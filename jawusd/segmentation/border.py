@@ -14,8 +14,8 @@ from jawusd.segmentation.config import SegmentationConfig
 
 _EVEN = 1e-4  # variance of the logs that is added [-]: half an 8-bit step
 _FEWEST = 100  # pixels that tell how much colours spread
-_ROW_BLUR_PX = 0.8  # softens the border between the rows to fractions of a pixel
-_FAR_BLUR_PX = 2.0  # finds the nearer row for pixels that have become teeth
+_ARCH_BLUR_PX = 0.8  # softens the border between the arches to fractions of a pixel
+_FAR_BLUR_PX = 2.0  # finds the nearer arch for pixels that have become teeth
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,14 +42,14 @@ def settle_borders(
     not differ the border stays, and what has such a border most of the way round is no tooth.
 
     Args:
-        shares: of the upper and lower row, shape (2, h, w).
+        shares: of the upper and lower arch, shape (2, h, w).
         rgb: the picture, shape (h, w, 3).
         px_per_mm: resolution of the picture.
 
     Returns:
         Shares with soft borders, half at the outline, shape (2, h, w); and where a border would show, shape (h, w).
     """
-    colours = cv2.GaussianBlur(shadeless(rgb), (0, 0), config.border_blur_px)
+    colours = _blurred(shadeless(rgb), config.border_blur_px)
     band, window = config.border_band_mm * px_per_mm, 2 * round(config.border_side_mm * px_per_mm) + 1
     inside = _signed_distance(shares.sum(0) > 0.5)
     sides = _compare_sides(inside, colours, window)
@@ -59,11 +59,15 @@ def settle_borders(
     moved = clear & (np.abs(inside) < band)
     teeth = np.where(moved, np.clip(sides.share, 0, 1), inside > 0).astype(np.float32)
     teeth[_unfounded(teeth > 0.5, clear, config)] = 0.0
-    rows = [cv2.GaussianBlur(share, (0, 0), _ROW_BLUR_PX) for share in shares]
-    far = [cv2.GaussianBlur(share, (0, 0), _FAR_BLUR_PX) for share in shares]
-    upper, lower = np.where(rows[0] + rows[1] > 0.2, rows, far)
-    teeth = cv2.GaussianBlur(teeth, (0, 0), config.border_blur_px)
+    near = [_blurred(share, _ARCH_BLUR_PX) for share in shares]
+    far = [_blurred(share, _FAR_BLUR_PX) for share in shares]
+    upper, lower = np.where(near[0] + near[1] > 0.2, near, far)
+    teeth = _blurred(teeth, config.border_blur_px)
     return teeth * np.stack([upper, lower]) / np.maximum(upper + lower, 1e-6), clear
+
+
+def _blurred(image: NDArray[np.float32], sigma_px: float) -> NDArray[np.float32]:
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma_px), np.float32)
 
 
 def _signed_distance(region: Mask) -> NDArray[np.float32]:
@@ -89,12 +93,12 @@ def _compare_sides(inside: NDArray[np.float32], colours: NDArray[np.float32], wi
     return _Sides(share, np.where(has_tooth & has_other, np.sqrt(np.maximum(contrast, 0)), 0))
 
 
-def _mean_near(side: Mask, colours: NDArray[np.float32], window: int):
+def _mean_near(side: Mask, colours: NDArray[np.float32], window: int) -> tuple[NDArray[np.float32], Mask]:
     """Return the mean colour of one side around every pixel, and where enough of that side is near."""
     weight = side.astype(np.float32)
     count = cv2.boxFilter(weight, -1, (window, window), normalize=False)
     total = cv2.boxFilter(colours * weight[..., None], -1, (window, window), normalize=False)
-    return total / np.maximum(count, 1)[..., None], count >= window
+    return np.asarray(total / np.maximum(count, 1)[..., None], np.float32), np.asarray(count >= window)
 
 
 def _unfounded(teeth: Mask, clear: Mask, config: SegmentationConfig) -> Mask:

@@ -12,29 +12,29 @@ from numpy.typing import NDArray
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera, transform_points
 from jawusd.geometry.arrays import Array, Mask
+from jawusd.segmentation.arches import Seeds, doubted_odds, learn_colours
 from jawusd.segmentation.colours import ColourModel
 from jawusd.segmentation.config import SegmentationConfig
 from jawusd.segmentation.crowns import OTHER, Expectation, ScanSurface, draw_crowns, expect_crowns
 from jawusd.segmentation.files import Key
 from jawusd.segmentation.learn import Example, cut_picture
 from jawusd.segmentation.picture import PictureFrame, Window
-from jawusd.segmentation.rows import Seeds, doubted_odds, learn_colours
 
-_ROWS = (0, 1)
+_ARCHES = (0, 1)
 _EVERY = 20  # vertices of a crown to one that tells where it is
 
 
 @dataclass(frozen=True, eq=False)
 class Segment:
-    """Hold both rows in one picture.
+    """Hold both arches in one picture.
 
     Attributes:
         camera: the pinhole camera of the window.
-        masks: shares of the upper and lower row, 255 = all, uint8, shape (2, h, w).
-        present: which rows are to be seen at all, shape (2,).
-        contrast: how far colours change for the better at the outline, per row, -1 .. 1; NaN where there is none.
-        unexpected: how much of each row's mask is not where the crowns were expected, as a share; NaN without a mask.
-        outline: pixels of each row's outline that show in the picture, that do not, and that border the other row,
+        masks: shares of the upper and lower arch, 255 = all, uint8, shape (2, h, w).
+        present: which arches are in sight at all, shape (2,).
+        contrast: how far colours change for the better at the outline, per arch, -1 .. 1; NaN where there is none.
+        unexpected: how much of each arch's mask is not where the crowns were expected, as a share; NaN without a mask.
+        outline: pixels of each arch's outline that show in the picture, that do not, and that border the other arch,
             shape (2, 3).
         window, expected: what was segmented, and what was expected there.
     """
@@ -50,7 +50,7 @@ class Segment:
 
 
 class CameraSegmenter:
-    """Find both rows of teeth in one camera's pictures.
+    """Segment both arches in one camera's pictures.
 
     Attributes:
         colours: what was learned about them so far.
@@ -64,13 +64,14 @@ class CameraSegmenter:
             poses: T_world_upper, T_world_lower at some time of the take, shape (2, 4, 4).
         """
         self._config = config
-        self._scans = tuple(ScanSurface.of(mesh) for mesh in meshes)
+        upper, lower = meshes
+        self._scans = ScanSurface.of(upper), ScanSurface.of(lower)
         self._points = [scan.crown_points()[::_EVERY] for scan in self._scans]
         self._frame = PictureFrame(source, self._around(poses).mean(0), config.working_px_per_mm)
         self.colours = ColourModel(config.memory_frames)
 
     def adopt(self, config: SegmentationConfig) -> None:
-        """Go on with other numbers."""
+        """Use other numbers from now on."""
         self._config = config
 
     def segment(
@@ -86,7 +87,7 @@ class CameraSegmenter:
             image: (H, W, 3) RGB as recorded.
             poses: T_world_upper, T_world_lower as expected, shape (2, 4, 4).
             turn: 0 for predicted poses, then 1 and so on as they get better.
-            keys: what a person drew for both rows, or None.
+            keys: what a person drew for each arch, or None.
 
         Returns:
             What was found; None if the teeth are out of sight.
@@ -102,19 +103,19 @@ class CameraSegmenter:
         reach = c.reach_mm[min(turn, len(c.reach_mm) - 1)]
         # Outlines made here are steadier than drawn ones, and the tracker judges them by one another: a finished mask
         # takes over only where the cut goes wrong.
-        finished = seeds is not None and bool(seeds.known.all())
-        guide = None if finished else seeds
+        drawn = seeds.share if seeds is not None and seeds.known.all() else None
+        guide = None if drawn is not None else seeds
         # Borders settle in the first turn too: the tracker takes rougher outlines than it is used to for a lost row.
         shares, clear = cut_picture(window, expected, self.colours, c, self._frame.px_per_mm, reach, guide)
-        if finished and _overlap(shares, seeds.share) < c.key_overlap:
-            shares = seeds.share
+        if drawn is not None and _overlap(shares, drawn) < c.key_overlap:
+            shares = drawn
         masks = np.round(255 * shares).astype(np.uint8)
         present = np.array([(mask > 127).sum() >= c.least_px for mask in masks])
         contrast, unexpected = self._contrast(window, masks), _unexpected(masks, expected)
         return Segment(window.camera, masks, present, contrast, unexpected, _outline(masks, clear), window, expected)
 
     def recorded(self, segment: Segment) -> list[NDArray[np.uint8]]:
-        """Return the masks of both rows as recorded, (H, W) uint8, 0 or 255."""
+        """Return the masks of both arches as recorded, (H, W) uint8, 0 or 255."""
         return [self._frame.recorded(mask.astype(np.float32) / 255, segment.window) for mask in segment.masks]
 
     def agreement(self, image: NDArray[np.uint8], guesses: Array) -> Array:
@@ -129,7 +130,7 @@ class CameraSegmenter:
             guesses: T_world_upper, T_world_lower, shape (N, 2, 4, 4).
 
         Returns:
-            Log-odds summed [working pixels], shape (N,); zeros if nothing is known of the colours yet.
+            Log-odds summed [working pixels], shape (N,); zeros before any colours were learned.
         """
         c = self._config
         around = np.concatenate([self._around(poses) for poses in guesses])
@@ -137,13 +138,14 @@ class CameraSegmenter:
         if window is None:
             return np.zeros(len(guesses))
         odds = np.clip(doubted_odds(window.rgb, self.colours, c), *c.agreement_range)
-        size = tuple(max(1, n // c.agreement_coarse) for n in window.camera.size_px)
-        odds, camera = cv2.resize(odds, size, interpolation=cv2.INTER_AREA), window.camera.scaled(size)
-        rates = [odds[draw_crowns(self._scans, poses, camera) != OTHER].sum() for poses in guesses]
+        width, height = (max(1, n // c.agreement_coarse) for n in window.camera.size_px)
+        coarse = cv2.resize(odds, (width, height), interpolation=cv2.INTER_AREA)
+        camera = window.camera.scaled((width, height))
+        rates = [coarse[draw_crowns(self._scans, poses, camera) != OTHER].sum() for poses in guesses]
         return np.array(rates, np.float64) * c.agreement_coarse**2
 
     def _around(self, poses: Array) -> Array:
-        return np.concatenate([transform_points(poses[r], self._points[r]) for r in _ROWS])
+        return np.concatenate([transform_points(poses[r], self._points[r]) for r in _ARCHES])
 
     def study(self, image: NDArray[np.uint8], poses: Array, keys: Sequence[Key | None]) -> Example | None:
         """Learn the colours of a picture for which a person drew, and return it as an example.
@@ -182,29 +184,29 @@ class CameraSegmenter:
             learn_colours(self.colours, window.rgb, expected, c, self._frame.px_per_mm)
         if seeds is not None:
             kernel = np.ones((3, 3), np.uint8)
-            teeth = (seeds.known & (seeds.share > 0.5)).any(0).astype(np.uint8)
-            outer = (seeds.known & (seeds.share <= 0.5)).all(0) & (cv2.dilate(teeth, kernel, iterations=2) == 0)
+            teeth = np.any(seeds.known & (seeds.share > 0.5), axis=0).astype(np.uint8)
+            outer = np.all(seeds.known & (seeds.share <= 0.5), axis=0) & (cv2.dilate(teeth, kernel, iterations=2) == 0)
             self.colours.learn(window.rgb, cv2.erode(teeth, kernel) > 0, outer, c.key_weight)
 
     def _contrast(self, window: Window, masks: NDArray[np.uint8]) -> Array:
-        """Return how much likelier teeth are just inside the outline of a row than just outside of both rows."""
+        """Return how much likelier teeth are just inside the outline of an arch than just outside of both."""
         odds = self.colours.weigh(window.rgb)
         share = 1 / (1 + np.exp(-odds))
         teeth = (masks.max(0) > 127).astype(np.uint8)
         kernel = np.ones((5, 5), np.uint8)
         outside = (cv2.dilate(teeth, kernel) > 0) & (teeth == 0)
         out = np.full(2, np.nan)
-        for r in _ROWS:
-            row = (masks[r] > 127).astype(np.uint8)
-            inner = (row > 0) & (cv2.dilate(1 - teeth, kernel) > 0)
-            outer = outside & (cv2.dilate(row, kernel) > 0)
+        for r in _ARCHES:
+            arch = (masks[r] > 127).astype(np.uint8)
+            inner = (arch > 0) & (cv2.dilate(1 - teeth, kernel) > 0)
+            outer = outside & (cv2.dilate(arch, kernel) > 0)
             if inner.any() and outer.any():
                 out[r] = share[inner].mean() - share[outer].mean()
         return out
 
 
 def _overlap(shares: NDArray[np.float32], drawn: NDArray[np.float32]) -> float:
-    """Return the smaller intersection over union of both rows with what was drawn."""
+    """Return the smaller intersection over union of both arches with what was drawn."""
     a, b = shares > 0.5, drawn > 0.5
     return float(((a & b).sum((1, 2)) / np.maximum((a | b).sum((1, 2)), 1)).min())
 
@@ -213,8 +215,8 @@ def _outline(masks: NDArray[np.uint8], clear: Mask) -> NDArray[np.int64]:
     kernel = np.ones((3, 3), np.uint8)
     out = np.zeros((2, 3), np.int64)
     for r, mask in enumerate(masks):
-        row = (mask > 127).astype(np.uint8)
-        outline = (row > 0) & (cv2.erode(row, kernel) == 0)
+        arch = (mask > 127).astype(np.uint8)
+        outline = (arch > 0) & (cv2.erode(arch, kernel) == 0)
         other = cv2.dilate((masks[1 - r] > 127).astype(np.uint8), kernel) > 0
         out[r] = (outline & clear & ~other).sum(), (outline & ~clear & ~other).sum(), (outline & other).sum()
     return out

@@ -12,7 +12,7 @@ from jawusd.geometry.arrays import Array, Indices, Mask
 _BINS = 32  # per channel
 _FLOOR = 12.0  # added to every channel before ratios [8-bit steps]: noise of dark pixels has no colour
 _RATIO_STEP = 0.03  # width of a bin of the log ratios [-]: from red over green 0.6 to 1.6 and beyond
-_MOST = 6.0  # no colour alone is surer than this
+_MOST = 6.0  # bound of the log-odds by colour alone [-]
 _ROUNDS, _STEPS = 5, 8  # times covered crowns are told apart, and Newton steps each time
 _LIGHT = 1  # the term of lightness
 _RIDGE = 0.01  # keeps weights finite where colours do not overlap
@@ -23,7 +23,7 @@ class ColourModel:
 
     What lies under projected crowns is teeth and, where lips, cheeks or tongue hide them, surroundings; what lies
     beyond them is surroundings. A logistic regression on the colours, their squares and products tells the two apart;
-    what it finds to be surroundings under the crowns changes sides, and it is fitted again. So few terms cannot follow
+    what it finds to be surroundings under the crowns changes class, and it is fitted again. So few terms cannot follow
     colours of lips that happen to lie under crowns only.
 
     Colours are lightness and the logs of red and blue over green: shade scales the channels alike and leaves those
@@ -31,7 +31,7 @@ class ColourModel:
     """
 
     def __init__(self, memory: float) -> None:
-        """Know nothing yet.
+        """Start without any colours.
 
         Args:
             memory: frames over which colours are remembered.
@@ -41,14 +41,14 @@ class ColourModel:
         self._beyond = np.zeros((_BINS,) * 3)
         self._table: NDArray[np.float32] | None = None
 
-    def learn(self, rgb: NDArray[np.uint8], under: Mask, beyond: Mask, weight=1.0) -> None:
-        """Take in a picture.
+    def learn(self, rgb: NDArray[np.uint8], under: Mask, beyond: Mask, weight: float = 1.0) -> None:
+        """Update the histograms with a picture.
 
         Args:
             rgb: (h, w, 3) 8-bit RGB.
             under: pixels well inside projected crowns, shape (h, w).
             beyond: pixels well outside all of them, shape (h, w).
-            weight: what the picture counts, in frames.
+            weight: of the picture [frames].
         """
         index = _bins(rgb)
         for counts, where in ((self._under, under), (self._beyond, beyond)):
@@ -68,14 +68,14 @@ class ColourModel:
         return seen, both[:, seen]
 
     def take_up(self, seen: NDArray[np.int64], counts: Array) -> None:
-        """Go on from what `counts` returned."""
+        """Restore what `counts` returned."""
         for into, known in zip((self._under, self._beyond), counts, strict=True):
             into.ravel()[:] = 0
             into.ravel()[seen] = known
         self._table = None
 
     def weigh(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Return the log of how many times likelier each pixel is tooth than surroundings, shape (h, w)."""
+        """Return the log-odds of tooth against surroundings per pixel, shape (h, w)."""
         return self._odds()[_bins(rgb)]
 
     def surroundings_reach(self, share: float) -> float:
@@ -125,7 +125,7 @@ def _terms() -> Array:
 
 
 def _tell_apart(under: Array, beyond: Array) -> Array:
-    """Return the weights of the terms from the counts of every bin, shape (7,); darkness never speaks for teeth."""
+    """Return the weights of the terms from the counts of every bin, shape (7,); darkness never counts for teeth."""
     seen = np.flatnonzero(under + beyond)
     x = _terms()[seen]
     under, beyond = (c[seen] / max(c.sum(), 1e-12) for c in (under, beyond))

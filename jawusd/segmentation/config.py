@@ -21,19 +21,20 @@ class SegmentationConfig:
     reach_mm: tuple[float, ...] = (1.6, 1.0)
     # Frames over which colours are remembered [-]: light changes with the head, not from frame to frame.
     memory_frames: float = 24.0
-    # Share of the surroundings below whose log-odds a colour cannot be tooth [-], and how much more [-] it must speak
-    # for teeth where place says nothing: how well colours tell the two apart differs from person to person.
+    # Share of the surroundings below whose log-odds a colour cannot be tooth [-], and how much higher [-] its log-odds
+    # must be where place says nothing: how well colours tell the two apart differs from person to person.
     surroundings_share: float = 0.95
     doubt: float = 1.5
     # Bounds of the log-odds demanded in all [-].
     doubt_range: tuple[float, float] = (-1.0, 1.0)
-    # Log-odds of being tooth per mm inside the projected outline [1/mm], and what place alone may say against and for.
+    # Log-odds of being tooth per mm inside the projected outline [1/mm], and the most that place alone may count
+    # against and for it.
     place_per_mm: float = 2.0
     place_most: tuple[float, float] = (1.5, 1.0)
     # Price of a border in log-odds per pixel of its length [-], and the share left of it on the strongest edges.
     border: float = 4.0
     border_on_edge: float = 0.15
-    # Log-odds between the rows per mm from their projected common border [1/mm].
+    # Log-odds between the arches per mm from their projected common border [1/mm]; segment.json has this name.
     rows_per_mm: float = 2.0
     # How far borders may move to where the picture changes [mm] and how far to either side colours are compared [mm].
     border_band_mm: float = 0.4
@@ -41,7 +42,7 @@ class SegmentationConfig:
     # Blur of the colours compared [px], and standard deviations the sides must differ by [-].
     border_blur_px: float = 0.7
     border_contrast: float = 2.0
-    # Shares by which outlines of the upper and lower row are moved outwards [-], as drawn masks teach: the soft border
+    # Shares by which outlines of the upper and lower arch are moved outwards [-], as drawn masks teach: the soft border
     # from 0 to 1 is about 3 px wide.
     wider: tuple[float, float] = (0.0, 0.0)
     # Share of its outline that must show in the picture for a part to be tooth [-], and pixels below which it is none.
@@ -49,14 +50,14 @@ class SegmentationConfig:
     speck_px: int = 25
     # Iterations of the cut [-].
     steps: int = 40
-    # How far from where it is expected the border between the rows is sought [mm], and iterations for that [-].
-    row_band_mm: float = 1.0
-    row_steps: int = 60
-    # What a person's mask counts for the colours [frames].
+    # How far from where it is expected the border between the arches is sought [mm], and iterations for that [-].
+    arch_band_mm: float = 1.0
+    arch_steps: int = 60
+    # Weight of a person's mask in the colours [frames].
     key_weight: float = 12.0
     # Overlap with a finished mask below which a cut is wrong [-]: good ones reach 0.85 on the worst frames.
     key_overlap: float = 0.8
-    # Bounds of the log-odds by which colours judge guessed poses [-]: lips over crowns are no fault of a pose; and how
+    # Bounds of the log-odds by which colours rate guessed poses [-]: lips over crowns are no fault of a pose; and how
     # much coarser the picture is for that [-]: guesses differ by half a millimetre and more.
     agreement_range: tuple[float, float] = (-0.5, 2.0)
     agreement_coarse: int = 4

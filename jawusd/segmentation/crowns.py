@@ -1,4 +1,4 @@
-"""Where the scans say that crowns, and what hides them, are to be seen."""
+"""Where crowns, and what hides them, project to according to the scans."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ OTHER, UPPER, LOWER = 0, 1, 2
 
 @dataclass(frozen=True, eq=False)
 class ScanSurface:
-    """Hold one row of teeth ready to be drawn.
+    """Hold one arch ready to be drawn.
 
     Attributes:
         vertices: scan coordinates [mm], shape (V, 3).
@@ -43,11 +43,11 @@ class ScanSurface:
 
 @dataclass(frozen=True, eq=False)
 class Expectation:
-    """Say what is expected where in a picture; px are pixels of that picture.
+    """Hold what is expected where in a picture; px are pixels of that picture.
 
     Attributes:
-        labels: OTHER, UPPER or LOWER where that row's crowns are nearest, shape (h, w).
-        inside_px: signed distance to the outline of each row's visible crowns, positive inside, shape (2, h, w).
+        labels: OTHER, UPPER or LOWER where that arch's crowns are nearest, shape (h, w).
+        inside_px: signed distance to the outline of each arch's visible crowns, positive inside, shape (2, h, w).
     """
 
     labels: NDArray[np.uint8]
@@ -55,10 +55,10 @@ class Expectation:
 
 
 def expect_crowns(scans: tuple[ScanSurface, ScanSurface], poses: Array, camera: Camera) -> Expectation:
-    """Draw both rows as a pinhole camera sees them.
+    """Draw both arches as a pinhole camera sees them.
 
     Args:
-        scans: upper and lower row.
+        scans: upper and lower arch.
         poses: T_world_upper, T_world_lower, shape (2, 4, 4).
         camera: camera of the working picture, without distortion.
     """
@@ -67,7 +67,7 @@ def expect_crowns(scans: tuple[ScanSurface, ScanSurface], poses: Array, camera: 
 
 
 def draw_crowns(scans: tuple[ScanSurface, ScanSurface], poses: Array, camera: Camera) -> NDArray[np.uint8]:
-    """Return OTHER, UPPER or LOWER where that row's crowns are nearest, shape (h, w)."""
+    """Return OTHER, UPPER or LOWER where that arch's crowns are nearest, shape (h, w)."""
     width, height = camera.size_px
     inverse_depth, labels = np.zeros((height, width), np.float32), np.zeros((height, width), np.uint8)
     for scan, pose, label in zip(scans, poses, (UPPER, LOWER), strict=True):

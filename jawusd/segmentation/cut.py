@@ -12,7 +12,13 @@ _TAU = _SIGMA = 0.35  # steps of the primal-dual iteration: their product times 
 
 
 @numba.njit(nogil=True, cache=True)
-def _iterate(cost, edge, u, spans, steps):
+def _iterate(
+    cost: NDArray[np.float32],
+    edge: NDArray[np.float32],
+    u: NDArray[np.float32],
+    spans: NDArray[np.int64],
+    steps: int,
+) -> None:
     """Run the first-order primal-dual iteration (Chambolle and Pock 2011) of the relaxed Potts energy.
 
     cost (3, h, w), edge (2, h, w) weights of the links to the right and down; u (3, h, w) in and out; spans (h, 2)
@@ -56,7 +62,7 @@ def _iterate(cost, edge, u, spans, steps):
 
 
 @numba.njit(nogil=True, cache=True)
-def _to_simplex(a, b, c):
+def _to_simplex(a: np.float32, b: np.float32, c: np.float32) -> tuple[np.float32, np.float32, np.float32]:
     """Return the nearest three shares that are not negative and sum to one."""
     high = max(a, b, c)
     low = min(a, b, c)

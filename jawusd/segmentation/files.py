@@ -1,4 +1,4 @@
-"""Mask files: where they lie, how they are written and given."""
+"""Mask files: where they lie, how they are written, and masks drawn by a person."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from jawusd.errors import CaptureError
 from jawusd.formats.atomic import write_bytes_atomic
 from jawusd.imaging.mask_files import PngMasks
 
-ROWS = ("upper", "lower")
+ARCHES = ("upper", "lower")
 PATTERN = "%06d.png"
 _UNKNOWN = 128  # gray value of strokes where nothing is said
 _STROKES_UNKNOWN = 0.5  # share of such pixels that makes a picture one of strokes
 
 
-def mask_pattern(folder: Path, camera: str, row: str) -> Path:
-    """Return the file pattern of a camera's masks of a row, numbered by its own frames."""
-    return folder / camera / row / PATTERN
+def mask_pattern(folder: Path, camera: str, arch: str) -> Path:
+    """Return the file pattern of a camera's masks of an arch, numbered by its own frames."""
+    return folder / camera / arch / PATTERN
 
 
-def mask_path(folder: Path, camera: str, row: str, own: int) -> Path:
+def mask_path(folder: Path, camera: str, arch: str, own: int) -> Path:
     """Return the file of one mask."""
-    return folder / camera / row / (PATTERN % own)
+    return folder / camera / arch / (PATTERN % own)
 
 
 def write_mask(path: Path, mask: NDArray[np.uint8]) -> None:
@@ -42,12 +42,12 @@ def write_mask(path: Path, mask: NDArray[np.uint8]) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Key:
-    """Hold what a person drew for one row of teeth in one picture.
+    """Hold what a person drew for one arch in one picture.
 
     Attributes:
         mask: 255 = tooth, (H, W) uint8.
-        known: 255 where the mask says something, (H, W) uint8: everywhere in a finished mask, under strokes else.
-        finished: whether it says something everywhere.
+        known: 255 where the mask holds, (H, W) uint8: everywhere in a finished mask, else under strokes.
+        finished: whether it holds everywhere.
     """
 
     mask: NDArray[np.uint8]
@@ -59,7 +59,7 @@ class KeyMasks:
     """Give what a person drew for some frames, in folders named as those that are written.
 
     A picture is a finished mask, or, where at least half of it has the gray value 128, strokes: 255 on teeth of the
-    row, 0 on anything else, 128 where nothing is said.
+    arch, 0 on anything else, 128 where nothing is said.
     """
 
     def __init__(self, folder: Path | None, sizes_px: dict[str, tuple[int, int]]) -> None:
@@ -77,10 +77,10 @@ class KeyMasks:
         if folder is None:
             return
         for camera, size in sizes_px.items():
-            for row in ROWS:
-                pattern = mask_pattern(folder, camera, row)
+            for arch in ARCHES:
+                pattern = mask_pattern(folder, camera, arch)
                 if pattern.parent.is_dir():
-                    self._masks[camera, row] = PngMasks(pattern, size)
+                    self._masks[camera, arch] = PngMasks(pattern, size)
         if not self._masks:
             raise CaptureError(
                 f"holds no masks of {', '.join(sizes_px)}.",
@@ -90,22 +90,22 @@ class KeyMasks:
 
     def frames(self, camera: str) -> list[int]:
         """Return a camera's own frames for which anything was drawn."""
-        files = [path for row in ROWS if self._folder for path in (self._folder / camera / row).glob("*.png")]
+        files = [path for arch in ARCHES if self._folder for path in (self._folder / camera / arch).glob("*.png")]
         return sorted({int(path.stem) for path in files if path.stem.isdecimal()})
 
     def of(self, camera: str, own: int) -> list[Key | None]:
-        """Return what was drawn for both rows on a camera's own frame, None where there is nothing.
+        """Return what was drawn for both arches on a camera's own frame, None where there is nothing.
 
         Raises:
             CaptureError: a picture cannot be decoded or has the wrong size.
         """
-        return [self._key(camera, row, own) for row in ROWS]
+        return [self._key(camera, arch, own) for arch in ARCHES]
 
-    def _key(self, camera: str, row: str, own: int) -> Key | None:
-        source = self._masks.get((camera, row))
-        if source is None or not 0 <= own < source.count:
+    def _key(self, camera: str, arch: str, own: int) -> Key | None:
+        source = self._masks.get((camera, arch))
+        if source is None or self._folder is None or not 0 <= own < source.count:
             return None
-        path = mask_path(self._folder, camera, row, own)
+        path = mask_path(self._folder, camera, arch, own)
         gray = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.exists() else None
         if gray is not None and (gray == _UNKNOWN).mean() >= _STROKES_UNKNOWN:
             if gray.shape[::-1] != tuple(self._sizes_px[camera]):

@@ -12,6 +12,7 @@ from jawusd.imaging.video import Video
 _CHUNK = 16  # instants held at once when going backwards: 100 MB per full HD camera
 
 Pictures = dict[str, NDArray[np.uint8] | None]
+_Frames = range  # inside the class below, `range` is its method
 
 
 class ColourFootage:
@@ -35,7 +36,7 @@ class ColourFootage:
         """Return the RGB pictures (H, W, 3) of one frame of the reference camera, None where there is none."""
         return next(self.walk(range(frame, frame + 1)))[1]
 
-    def walk(self, frames: range) -> Iterator[tuple[int, Pictures]]:
+    def walk(self, frames: _Frames) -> Iterator[tuple[int, Pictures]]:
         """Yield frames with their pictures; a range that runs backwards is read forwards in parts.
 
         Raises:
@@ -50,7 +51,7 @@ class ColourFootage:
             while held:
                 yield held.pop()
 
-    def _forwards(self, frames: range) -> Iterator[tuple[int, Pictures]]:
+    def _forwards(self, frames: _Frames) -> Iterator[tuple[int, Pictures]]:
         wanted = {name: [self.own(name, frame) for frame in frames] for name in self._videos}
         readers = {name: self._videos[name].pictures(own, colour="rgb") for name, own in wanted.items()}
         for frame in frames:

@@ -4,23 +4,32 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.geometry.arrays import Mask
+from jawusd.segmentation.arches import Seeds, cut_arches, part_arches
 from jawusd.segmentation.border import settle_borders
 from jawusd.segmentation.colours import ColourModel
 from jawusd.segmentation.config import SegmentationConfig
 from jawusd.segmentation.crowns import Expectation
 from jawusd.segmentation.picture import Window
-from jawusd.segmentation.rows import Seeds, cut_rows, part_rows
 
 _FACTORS = (0.5, 2.0)  # tried on every number
 _NUMBERS = ("border", "place_per_mm", "rows_per_mm")
 _DOUBTS = (-1.0, 1.0)  # added to the doubt
 _WIDER = np.arange(-6, 7) * 0.05  # tried as shares by which outlines are moved
-_WORTH_IT = 0.01  # share of the disagreement that a change must save: less is chance
+_LEAST_GAIN = 0.01  # share of the disagreement that a change must remove: less is chance
+
+
+class LearnedNumbers(TypedDict):
+    """What was learned: changed numbers, the mean disagreement (1 - intersection over union) before and after."""
+
+    numbers: dict[str, object]
+    disagreement: list[float]
+    pictures: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +38,7 @@ class Example:
 
     Attributes:
         window, expected: the picture, and where crowns are expected in it.
-        drawn: shares of both rows, shape (2, h, w).
+        drawn: shares of both arches, shape (2, h, w).
         colours: the colours of its camera.
         px_per_mm: resolution of the picture.
     """
@@ -41,7 +50,7 @@ class Example:
     px_per_mm: float
 
     def cut(self, config: SegmentationConfig) -> NDArray[np.float32]:
-        """Return the shares of both rows, shape (2, h, w), that are found without the drawn masks."""
+        """Return the shares of both arches, shape (2, h, w), that are found without the drawn masks."""
         where = (self.window, self.expected, self.colours, config, self.px_per_mm)
         return cut_picture(*where, config.reach_mm[-1], None)[0]
 
@@ -55,30 +64,27 @@ def cut_picture(
     reach_mm: float,
     seeds: Seeds | None,
 ) -> tuple[NDArray[np.float32], Mask]:
-    """Cut both rows out of a picture, settle their borders and keep to what a person said.
+    """Cut both arches out of a picture, settle their borders and keep what a person drew.
 
     Args:
         window, expected: the picture, and where crowns are expected in it.
         reach_mm: how far teeth may lie outside their projection.
 
     Returns:
-        Shares of both rows, shape (2, h, w), and where borders show, shape (h, w).
+        Shares of both arches, shape (2, h, w), and where borders show, shape (h, w).
     """
-    shares = cut_rows(window.rgb, expected, colours, config, px_per_mm, reach_mm, seeds)
+    shares = cut_arches(window.rgb, expected, colours, config, px_per_mm, reach_mm, seeds)
     shares, clear = settle_borders(shares, window.rgb, config, px_per_mm)
-    shares = part_rows(shares, window.rgb, expected, config, px_per_mm)
+    shares = part_arches(shares, window.rgb, expected, config, px_per_mm)
     shares = _widened(shares, config.wider)
     return (shares if seeds is None else seeds.pinned(shares)), clear
 
 
-def learn_numbers(examples: Sequence[Example], config: SegmentationConfig) -> tuple[SegmentationConfig, dict]:
-    """Choose the numbers with which the masks agree best with drawn ones, one number after the other.
+def learn_numbers(examples: Sequence[Example], config: SegmentationConfig) -> tuple[SegmentationConfig, LearnedNumbers]:
+    """Choose the numbers with which the masks agree best with drawn ones, one number after the other, and what changed.
 
     Args:
         examples: pictures with finished masks.
-
-    Returns:
-        The numbers chosen; and what changed, with the mean disagreement (1 - intersection over union) before and after.
     """
     best, cuts = config, [example.cut(config) for example in examples]
     before = least = _disagreement(examples, cuts)
@@ -87,12 +93,13 @@ def learn_numbers(examples: Sequence[Example], config: SegmentationConfig) -> tu
         trial = replace(best, **changed)
         found = [example.cut(trial) for example in examples]
         value = _disagreement(examples, found)
-        if value < (1 - _WORTH_IT) * least:
+        if value < (1 - _LEAST_GAIN) * least:
             best, cuts, least = trial, found, value
-    wider = tuple(_best_width([c[r] for c in cuts], [e.drawn[r] for e in examples]) for r in (0, 1))
+    upper, lower = (_best_width([c[r] for c in cuts], [e.drawn[r] for e in examples]) for r in (0, 1))
+    wider = (upper, lower)
     cuts = [_widened(cut, wider) for cut in cuts]
     value = _disagreement(examples, cuts)
-    if value < (1 - _WORTH_IT) * least:
+    if value < (1 - _LEAST_GAIN) * least:
         best, least = replace(best, wider=wider), value
     changed = {name: value for name, value in vars(best).items() if value != getattr(config, name)}
     return best, {"numbers": changed, "disagreement": [before, least], "pictures": len(examples)}
@@ -107,7 +114,7 @@ def _trials(config: SegmentationConfig) -> Iterator[SegmentationConfig]:
 
 
 def _widened(shares: NDArray[np.float32], wider: tuple[float, float]) -> NDArray[np.float32]:
-    """Return shares with outlines moved by fractions of their soft border; rows keep the border between them."""
+    """Return shares with outlines moved by fractions of their soft border; arches keep the border between them."""
     if not any(wider):
         return shares
     alone = shares[::-1] < 0.05

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.geometry import Camera
-from jawusd.geometry.arrays import Array
-from jawusd.imaging.working_view import WorkingView
+from jawusd.geometry.arrays import Array, Mask
+from jawusd.imaging.working_view import WorkingView, remap
 
 _NODE_PX = 8  # spacing of undistorted positions; the lens is smooth in between
 
@@ -44,7 +44,8 @@ class PictureFrame:
         scale = min(1.0, px_per_mm / recorded)
         self.px_per_mm = recorded * scale
         self.source = source
-        self._working = WorkingView(source, tuple(max(1, round(s * scale)) for s in source.size_px))
+        width, height = (max(1, round(side * scale)) for side in source.size_px)
+        self._working = WorkingView(source, (width, height))
         self._back = _positions(source, self._working.camera)
 
     def window(self, image: NDArray[np.uint8], points_world: Array, margin_mm: float) -> Window | None:
@@ -52,7 +53,7 @@ class PictureFrame:
 
         Args:
             image: (H, W, 3) RGB as recorded.
-            margin_mm: what to leave around them.
+            margin_mm: left around them.
         """
         camera = self._working.camera
         seen = camera.project_pinhole(points_world[camera.depth(points_world) > 0])
@@ -77,14 +78,14 @@ class PictureFrame:
     def recorded(self, shares: NDArray[np.float32], window: Window) -> NDArray[np.uint8]:
         """Return the mask at recorded size, 0 or 255, of a window's shares of teeth, shape (h, w)."""
         nodes = self._back[::_NODE_PX, ::_NODE_PX] - np.array(window.corner, np.float32)
-        inside = ((nodes > -_NODE_PX) & (nodes < np.array(shares.shape[::-1], np.float32) + _NODE_PX)).all(2)
+        limit = np.array(shares.shape[::-1], np.float32) + _NODE_PX
+        inside: Mask = np.all((nodes > -_NODE_PX) & (nodes < limit), axis=2)
         rows, columns = (np.flatnonzero(inside.any(axis)) * _NODE_PX for axis in (1, 0))
         out = np.zeros(self._back.shape[:2], np.uint8)
         if len(rows):
             box = (slice(rows[0], rows[-1] + _NODE_PX), slice(columns[0], columns[-1] + _NODE_PX))
             local = self._back[box] - np.array(window.corner, np.float32)
-            part = cv2.remap(shares, local, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-            out[box] = np.where(part > 0.5, 255, 0)
+            out[box] = np.where(remap(shares, local) > 0.5, 255, 0)
         return out
 
 
@@ -97,4 +98,4 @@ def _positions(source: Camera, working: Camera) -> NDArray[np.float32]:
     scale = np.array(working.size_px) / np.array(source.size_px)
     nodes = ((pinhole + 0.5) * scale - 0.5).astype(np.float32)
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    return cv2.remap(nodes, x / _NODE_PX, y / _NODE_PX, cv2.INTER_LINEAR)
+    return np.asarray(cv2.remap(nodes, x / _NODE_PX, y / _NODE_PX, cv2.INTER_LINEAR), np.float32)

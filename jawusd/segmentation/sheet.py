@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from jawusd.geometry.arrays import Mask
 from jawusd.imaging.overlay import LOWER_COLOUR, UPPER_COLOUR, contact_sheet, save_png
 from jawusd.imaging.video import Video
-from jawusd.segmentation.files import ROWS, KeyMasks
+from jawusd.segmentation.files import ARCHES, KeyMasks
 
 _COLUMNS = 3
 _TILE_PX = (480, 270)
@@ -21,7 +21,7 @@ _MARGIN = 0.15  # of the teeth's extent, left around them
 
 
 def write_sheet(path: Path, shown: Sequence[tuple[str, int, str]], videos: Mapping[str, Path], folder: Path) -> None:
-    """Write a PNG with a tile per mask, upper and lower row outlined.
+    """Write a PNG with a tile per mask, upper and lower arch outlined.
 
     Args:
         shown: camera, its own frame and a remark, tile after tile.
@@ -35,21 +35,21 @@ def write_sheet(path: Path, shown: Sequence[tuple[str, int, str]], videos: Mappi
     tiles = []
     for name, own, remark in shown:
         picture = next(opened[name].frames(own, own + 1, colour="rgb")).image.copy()
-        rows = [None if mask is None else mask.mask for mask in masks.of(name, own)]
-        tiles.append(_tile(picture, rows, f"{name}  frame {own}  {remark}"))
+        drawn = [None if key is None else key.mask for key in masks.of(name, own)]
+        tiles.append(_tile(picture, drawn, f"{name}  frame {own}  {remark}"))
     save_png(path, contact_sheet(tiles, _COLUMNS))
 
 
 def _tile(picture: NDArray[np.uint8], masks: Sequence[NDArray[np.uint8] | None], caption: str) -> NDArray[np.uint8]:
     """Return a picture with its masks outlined, cut to them and captioned, RGB."""
     extent = np.zeros(picture.shape[:2], bool)
-    for _, mask, colour in zip(ROWS, masks, (UPPER_COLOUR, LOWER_COLOUR), strict=True):
+    for _, mask, colour in zip(ARCHES, masks, (UPPER_COLOUR, LOWER_COLOUR), strict=True):
         if mask is not None:
             outlines = cv2.findContours((mask > 127).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
             cv2.drawContours(picture, outlines, -1, colour, 2)
             extent |= mask > 127
-    tile = cv2.resize(_cut(picture, extent), _TILE_PX, interpolation=cv2.INTER_AREA)
-    tile = np.vstack([np.zeros((_CAPTION_PX, tile.shape[1], 3), np.uint8), tile])
+    cut = np.asarray(cv2.resize(_cut(picture, extent), _TILE_PX, interpolation=cv2.INTER_AREA), np.uint8)
+    tile = np.vstack([np.zeros((_CAPTION_PX, cut.shape[1], 3), np.uint8), cut])
     place = (6, _CAPTION_PX - 7)
     cv2.putText(tile, caption, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1, cv2.LINE_AA)
     return tile

@@ -1,4 +1,4 @@
-"""The colours as they were after the last frames, so that work taken up goes on as if it had never stopped."""
+"""The colours as they were after the last frames, so that resumed work gives what uninterrupted work would."""
 
 from __future__ import annotations
 
@@ -7,15 +7,17 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jawusd.formats.atomic import write_bytes_atomic
 from jawusd.segmentation.colours import ColourModel
 
-_FILES = ("colours_0.npz", "colours_1.npz")  # in turns: work may stop between the colours of a frame and its record
+# Alternating: a run may be killed between saving the colours of a frame and recording it.
+_FILES = ("colours_0.npz", "colours_1.npz")
 
 
 class ColourStates:
-    """Keep and take up the colours of all cameras."""
+    """Save and restore the colours of all cameras."""
 
     def __init__(self, folder: Path, colours: Mapping[str, ColourModel]) -> None:
         """Take the folder of the files and the colours by camera."""
@@ -27,21 +29,21 @@ class ColourStates:
         Raises:
             OutputError: the file cannot be written.
         """
-        arrays = {"frame": frame, "step": step}
+        arrays: dict[str, ArrayLike] = {"frame": frame, "step": step}
         for name, model in self._colours.items():
             arrays[f"seen {name}"], arrays[f"counts {name}"] = model.counts()
         buffer = io.BytesIO()
-        np.savez(buffer, **arrays)
+        np.savez(buffer, allow_pickle=False, **arrays)
         write_bytes_atomic(self._folder / _FILES[frame % 2], buffer.getvalue())
 
     def take_up(self, done: int, step: int) -> int | None:
-        """Go on from the latest colours kept on the way to a frame that is done.
+        """Restore the latest colours saved up to a frame that is done.
 
         Args:
-            step: 1 or -1, the way the work goes.
+            step: 1 or -1, forwards or backwards.
 
         Returns:
-            The frame after which the colours were; None if there are none to go on from.
+            The frame after which they were saved; None if there are none to resume from.
         """
         for frame in (done, done - step):
             path = self._folder / _FILES[frame % 2]

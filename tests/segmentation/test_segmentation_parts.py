@@ -8,6 +8,7 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
 from jawusd.errors import CaptureError
 from jawusd.geometry import Camera
+from jawusd.segmentation.arches import Seeds, cut_arches, part_arches
 from jawusd.segmentation.border import settle_borders
 from jawusd.segmentation.colours import ColourModel
 from jawusd.segmentation.config import SegmentationConfig
@@ -16,7 +17,6 @@ from jawusd.segmentation.cut import cut_three_ways
 from jawusd.segmentation.files import KeyMasks, mask_path, write_mask
 from jawusd.segmentation.learn import Example, learn_numbers
 from jawusd.segmentation.picture import PictureFrame, Window
-from jawusd.segmentation.rows import Seeds, cut_rows, part_rows
 from jawusd.segmentation.state import ColourStates
 
 
@@ -205,8 +205,8 @@ def test_strokes_overcome_every_colour():
     known[1, 2:6, 2:6], share[1, 2:6, 2:6] = True, 1.0  # the lower row, though all else speaks against it
     seeds = Seeds(known, share)
     model = taught(rgb, true.any(0))
-    free = cut_rows(rgb, expected, model, SegmentationConfig(), 7.2, 1.0)
-    found = seeds.pinned(cut_rows(rgb, expected, model, SegmentationConfig(), 7.2, 1.0, seeds))
+    free = cut_arches(rgb, expected, model, SegmentationConfig(), 7.2, 1.0)
+    found = seeds.pinned(cut_arches(rgb, expected, model, SegmentationConfig(), 7.2, 1.0, seeds))
     assert (free[0, 40:50, 25:40] > 0.5).all() and not (free[1, 2:6, 2:6] > 0.5).any()
     assert not (found[0, 40:50, 25:40] > 0.5).any()
     assert (found[1, 2:6, 2:6] > 0.5).all()
@@ -224,7 +224,7 @@ def test_rows_part_where_teeth_meet_and_not_where_they_were_expected():
     inside = np.stack([np.minimum(y - 15, expected_y - y), np.minimum(75 - y, y - expected_y)]).astype(np.float32)
     labels = np.select([inside[0] > 0, inside[1] > 0], [UPPER, LOWER]).astype(np.uint8)
     shares = np.stack([teeth & (y <= expected_y), teeth & (y > expected_y)]).astype(np.float32)
-    found = part_rows(shares, rgb, Expectation(labels, inside), SegmentationConfig(), 7.2)
+    found = part_arches(shares, rgb, Expectation(labels, inside), SegmentationConfig(), 7.2)
     assert np.allclose(found.sum(0), shares.sum(0), atol=1e-5)
     edge = (found[0] > 0.5).sum(0) + 16
     assert edge.min() >= 42 and edge.max() <= 46  # expected it would be 48

@@ -1,4 +1,4 @@
-"""Both rows of teeth in one picture: colours, place and edges weighed against one another."""
+"""Both arches in one picture: colours, place and edges weighed against one another."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from jawusd.segmentation.crowns import LOWER, OTHER, UPPER, Expectation
 from jawusd.segmentation.cut import cut_three_ways
 
 _NEVER = 30.0  # log-odds that no colour overcomes
-_FEWEST_OPEN = 20  # pixels between the rows worth a border
-_ROW_BLUR_PX = 0.8  # softens the border between the rows to fractions of a pixel
+_FEWEST_OPEN = 20  # pixels between the arches; with fewer the border stays
+_ARCH_BLUR_PX = 0.8  # softens the border between the arches to fractions of a pixel
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +24,7 @@ class Seeds:
     """Hold what a person said about a working picture.
 
     Attributes:
-        known: where something is said about each row, shape (2, h, w).
+        known: where something is said about each arch, shape (2, h, w).
         share: of tooth there, shape (2, h, w).
     """
 
@@ -32,7 +32,7 @@ class Seeds:
     share: NDArray[np.float32]
 
     def pinned(self, shares: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return shares of both rows, shape (2, h, w), as a person said where something is said."""
+        """Return shares of both arches, shape (2, h, w), replaced by what a person said where something is said."""
         shares = np.where(self.known, self.share, shares)
         other = self.known & (self.share > 0.5)
         return np.where(other[::-1] & ~self.known, 0, shares)
@@ -57,7 +57,7 @@ def doubted_odds(rgb: NDArray[np.uint8], model: ColourModel, config: Segmentatio
     return model.weigh(rgb) - np.float32(np.clip(demanded, *config.doubt_range))
 
 
-def cut_rows(
+def cut_arches(
     rgb: NDArray[np.uint8],
     expected: Expectation,
     model: ColourModel,
@@ -66,59 +66,53 @@ def cut_rows(
     reach_mm: float,
     seeds: Seeds | None = None,
 ) -> NDArray[np.float32]:
-    """Segment a picture.
+    """Segment a picture; return the shares of both arches, 0 .. 1, shape (2, h, w).
 
     Args:
         rgb: the picture, shape (h, w, 3).
         expected: where the crowns are expected in it.
         reach_mm: how far teeth may lie outside their projection.
         seeds: what a person said, which no colour overcomes.
-
-    Returns:
-        Shares of both rows, 0 .. 1, shape (2, h, w).
     """
     inside = expected.inside_px / px_per_mm
     odds = doubted_odds(rgb, model, config)
     cost = np.zeros((3, *rgb.shape[:2]), np.float32)
     apart = np.clip(config.rows_per_mm * (inside[0] - inside[1]) / 2, -3, 3)
-    for label, row, sign in ((UPPER, 0, 1.0), (LOWER, 1, -1.0)):
-        place = np.clip(config.place_per_mm * inside[row], -config.place_most[0], config.place_most[1])
+    for label, arch, sign in ((UPPER, 0, 1.0), (LOWER, 1, -1.0)):
+        place = np.clip(config.place_per_mm * inside[arch], -config.place_most[0], config.place_most[1])
         cost[label] = -odds - place - sign * np.minimum(sign * apart, 0.0)
-        cost[label][inside[row] < -reach_mm] = _NEVER
-    free = (inside >= -reach_mm).any(0)
+        cost[label][inside[arch] < -reach_mm] = _NEVER
+    free: Mask = np.any(inside >= -reach_mm, axis=0)
     if seeds is not None:
         tooth, other = seeds.known & (seeds.share > 0.5), seeds.known & (seeds.share <= 0.5)
-        for label, row in ((UPPER, 0), (LOWER, 1)):
-            cost[label][tooth[row]] = -_NEVER
-            cost[label][other[row]] = _NEVER
+        for label, arch in ((UPPER, 0), (LOWER, 1)):
+            cost[label][tooth[arch]] = -_NEVER
+            cost[label][other[arch]] = _NEVER
         free |= tooth.any(0)
     start = np.stack([expected.labels == label for label in (OTHER, UPPER, LOWER)]).astype(np.float32)
     shares = cut_three_ways(cost, _edge_prices(rgb, config), start, free, config.steps)
     return shares[1:]
 
 
-def part_rows(
+def part_arches(
     shares: NDArray[np.float32],
     rgb: NDArray[np.uint8],
     expected: Expectation,
     config: SegmentationConfig,
     px_per_mm: float,
 ) -> NDArray[np.float32]:
-    """Draw the border between the rows once more, by edges among teeth alone.
+    """Return the shares of both arches, shape (2, h, w), with the border between them drawn by edges among teeth alone.
 
-    Teeth over teeth show a far weaker edge than teeth over lips. Next to the latter it counts for nothing, the border
-    stays where it was expected, and poses follow their own prediction.
+    Teeth over teeth show a far weaker edge than teeth over lips. Beside the latter it would count for nothing: the
+    border would stay where it was expected, and poses would follow their own prediction.
 
     Args:
-        shares: of both rows, shape (2, h, w); their sum is kept.
-        rgb, expected, config, px_per_mm: as for `cut_rows`.
-
-    Returns:
-        Shares of both rows, shape (2, h, w).
+        shares: of both arches, shape (2, h, w); their sum is kept.
+        rgb, expected, config, px_per_mm: as for `cut_arches`.
     """
     inside = expected.inside_px / px_per_mm
     teeth = shares.sum(0)
-    open_px = (teeth > 0.5) & (np.abs(inside[0] - inside[1]) < 2 * config.row_band_mm)
+    open_px = (teeth > 0.5) & (np.abs(inside[0] - inside[1]) < 2 * config.arch_band_mm)
     if open_px.sum() < _FEWEST_OPEN:
         return shares
     rows, columns = np.flatnonzero(open_px.any(1)), np.flatnonzero(open_px.any(0))
@@ -130,8 +124,8 @@ def part_rows(
         cost[label] = np.where(open_px, -sign * apart, np.where(mine, -_NEVER, _NEVER))
     start = np.stack([np.zeros_like(upper), upper, ~upper]).astype(np.float32)
     prices = _edge_prices(rgb[box], config, open_px)
-    found = cut_three_ways(cost, prices, start, open_px, config.row_steps)
-    share = cv2.GaussianBlur(found[UPPER], (0, 0), _ROW_BLUR_PX)
+    found = cut_three_ways(cost, prices, start, open_px, config.arch_steps)
+    share = cv2.GaussianBlur(found[UPPER], (0, 0), _ARCH_BLUR_PX)
     out = shares.copy()
     near = cv2.dilate(open_px.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     for r, part in ((0, share), (1, 1 - share)):
