@@ -101,7 +101,7 @@ def replay_parts(folder: Path, model: JawModel) -> tuple[ReplayPart, ...]:
     Raises:
         RigError: there is no geometry.
     """
-    from jawusd.rig.geo_read import read_geometry, read_gum
+    from jawusd.rig.geo import read_geometry, read_gum
 
     path = folder / "geo.usdc"
     meshes, gums = read_geometry(path), read_gum(path)

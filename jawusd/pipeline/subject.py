@@ -129,7 +129,7 @@ def subject_of_build(folder: Path) -> Subject:
         FormatError: there is no model.
         RigError: there is no geometry.
     """
-    from jawusd.rig.geo_read import read_geometry
+    from jawusd.rig.geo import read_geometry
 
     model = load_model(folder / "model.npz")
     bones = read_geometry(folder / "geo.usdc")

@@ -57,7 +57,7 @@ def viewed_actor(path: str | os.PathLike[str]) -> ViewedActor:
         FormatError: not a rig, or one without geometry.
         RigError: not a USD file.
     """
-    from jawusd.rig.geo_read import read_placeholders
+    from jawusd.rig.geo import read_placeholders
     from jawusd.rig.read import describe, load_rig
     from jawusd.viewer.viewed import ViewedActor
 
@@ -88,7 +88,7 @@ def screen_meshes(path: Path) -> dict[str, Mesh]:
     Raises:
         RigError: there is nothing to take hold of.
     """
-    from jawusd.rig.geo_read import read_geometry, read_gum, read_placeholders
+    from jawusd.rig.geo import read_geometry, read_gum, read_placeholders
     from jawusd.viewer.decimate import for_view
 
     meshes, gum = read_geometry(path) | read_placeholders(path), read_gum(path)

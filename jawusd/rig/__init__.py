@@ -3,14 +3,13 @@
 `jawusd.rig.bake` and `jawusd.rig.onnx_sidecar` need the package onnx (`jawusd[build]`); nothing else here does.
 """
 
-from jawusd.rig.animation import write_animation
+from jawusd.rig.animation import write_animation, write_splines
 from jawusd.rig.nvidia import find_nvidia_validator, nvidia_findings
 from jawusd.rig.read import describe, load_rig
 from jawusd.rig.schema import register_schema, schema_is_live
-from jawusd.rig.splines import write_splines
 from jawusd.rig.validate import Finding, register_validators, validate_stage
 
-# As early as possible: OpenUSD ignores schemas that come after a process has used its first stage.
+# At import: OpenUSD ignores schemas registered after a process has used its first stage.
 register_schema()
 
 __all__ = [

@@ -1,8 +1,7 @@
-"""Animation layers: samples of d for those who know the rig, baked mandible ops for everybody else.
+"""Animation layers: samples of d for tools that know the rig, a baked translation and quaternion for all others.
 
-Between two samples of d every reader interpolates linearly; the baked ops follow that motion through the model. They
-are a translation and a quaternion: matrix samples shear, and layers or products of single parameters are millimetres
-wrong as soon as two parameters are combined.
+Every reader interpolates d linearly between two samples; the baked ops follow that motion through the model. Matrix
+samples would shear, and products of one transform per parameter are millimetres off where two parameters combine.
 """
 
 from __future__ import annotations
@@ -12,20 +11,21 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pxr import Sdf
+from pxr import Gf, Sdf, Ts
 
 from jawusd.errors import RigError
 from jawusd.evaluator import JawRig
 from jawusd.geometry.arrays import Array
 from jawusd.geometry.quaternion import wxyz_from_matrix
-from jawusd.geometry.se3 import make_transform, transform_points
+from jawusd.geometry.se3 import make_transform
 from jawusd.geometry.so3 import so3_exp
 from jawusd.rig import _gf
-from jawusd.rig.layers import new_layer, relative_path, write_layer
+from jawusd.rig.layers import new_layer, relative_path, stage_of, write_layer
 from jawusd.rig.layout import ACTOR, MANDIBLE, PARAMETERS
 from jawusd.rig.read import load_rig
+from jawusd.rig.table import landmark_distance
 
-# Between two baked samples no landmark may be farther from the model than this; tried at these shares of the way.
+# Between two baked samples, at these shares of the interval, no landmark may be farther from the model than this.
 _BETWEEN_MM = 0.02
 _SHARES = (0.25, 0.5, 0.75)
 _MAX_HALVINGS = 5
@@ -48,22 +48,19 @@ def write_animation(
     """Write an animation layer that sublayers an actor; a time code is a frame number.
 
     Args:
-        out: file to write, `.usdc` or `.usda`.
-        actor: the `actor.usda` it animates.
-        frames: increasing frame numbers (F,), whole or not; keys or every frame.
-        d: parameters (F, 3) [mm]; rows with NaN are lost frames, bridged linearly and listed in the layer's
+        out: File to write, `.usdc` or `.usda`.
+        actor: The `actor.usda` it animates.
+        frames: Increasing frame numbers (F,), whole or not; keys or every frame.
+        d: Parameters (F, 3) [mm]; rows with NaN are lost frames, bridged linearly and listed in the layer's
             `customLayerData["lostFrames"]`.
-        fps: frames per second.
-        rig: the evaluator, when the caller has it already; else it is read from `actor`.
-
-    Returns:
-        The file.
+        fps: Frames per second.
+        rig: The evaluator; read from `actor` if None.
 
     Raises:
-        RigError: frames do not increase, nothing to animate, or the frame rate is not positive.
+        RigError: Frames do not increase, nothing to animate, or the frame rate is not positive.
         FormatError: `actor` is not a rig.
-        OutputError: the file cannot be written.
-        ValueError: frames and d of shapes that do not fit.
+        OutputError: The file cannot be written.
+        ValueError: Shapes of frames and d that do not match.
     """
     out, actor = Path(out), Path(actor)
     rig = load_rig(actor) if rig is None else rig
@@ -94,16 +91,16 @@ def write_animation(
 
 
 def bake_times(rig: JawRig, frames: Array, d: Array, span: Array) -> tuple[Array, Array]:
-    """Choose the times of the baked samples: every whole frame, every sample of d, and between where it takes more.
+    """Return the times (n,) of the baked samples and their poses T_skull_mandible (n, 4, 4).
+
+    Every whole frame of the span (first and last time), every sample of d, and times between them until no landmark is
+    farther than 0.02 mm from the model.
 
     Args:
-        rig: the model.
-        frames: times of the samples of d, increasing, shape (F,).
-        d: their values [mm], shape (F, 3).
-        span: first and last time to cover.
-
-    Returns:
-        Times (n,) and T_skull_mandible (n, 4, 4).
+        rig: The model.
+        frames: Times of the samples of d, increasing, shape (F,).
+        d: Their values [mm], shape (F, 3).
+        span: First and last time to cover.
     """
     whole = np.arange(np.ceil(span[0]), np.floor(span[1]) + 1)
     times = np.union1d(np.union1d(whole, span), frames)
@@ -113,7 +110,7 @@ def bake_times(rig: JawRig, frames: Array, d: Array, span: Array) -> tuple[Array
         errors = []
         for share in _SHARES:
             exact = rig.pose(_at(start + share * step, frames, d))
-            errors.append(_landmark_distance(rig, exact, _shown(poses[:-1], poses[1:], share)))
+            errors.append(landmark_distance(rig, exact, _shown(poses[:-1], poses[1:], share)))
         coarse = np.max(errors, axis=0) > _BETWEEN_MM
         if not coarse.any():
             break
@@ -139,7 +136,9 @@ def _author(layer: Sdf.Layer, rig: JawRig, frames: Array, d: Array, span: Array)
     _set_samples(layer, orient, times, _gf.rotations(poses))
 
 
-def _set_samples(layer: Sdf.Layer, attribute: Sdf.AttributeSpec, times: Array, values: list) -> None:
+def _set_samples(
+    layer: Sdf.Layer, attribute: Sdf.AttributeSpec, times: Array, values: list[float] | list[Gf.Vec3d] | list[Gf.Quatd]
+) -> None:
     for time, value in zip(times.tolist(), values, strict=True):
         layer.SetTimeSample(attribute.path, time, value)
 
@@ -149,7 +148,7 @@ def _at(times: Array, frames: Array, d: Array) -> Array:
 
 
 def _shown(T_a: Array, T_b: Array, share: float) -> Array:
-    """Return what OpenUSD shows a share of the way from one sample to the next.
+    """Return the transforms that OpenUSD shows between two samples, a share of the interval after the first.
 
     It interpolates quaternions by slerp (Shoemake 1985), but nearly equal ones (GfSlerp: cosine above 1 - 1e-5)
     linearly and without normalising, and then takes the angle from the real part alone (GfRotation). Close to the
@@ -170,7 +169,48 @@ def _shown(T_a: Array, T_b: Array, share: float) -> Array:
     return make_transform(R, (1 - share) * T_a[:, :3, 3] + share * T_b[:, :3, 3])
 
 
-def _landmark_distance(rig: JawRig, T_a: Array, T_b: Array) -> Array:
-    landmarks = rig.arrays["landmarks"]
-    difference = T_a - T_b
-    return np.linalg.norm(transform_points(difference, landmarks), axis=-1).max(axis=1)
+def write_splines(
+    out: str | os.PathLike[str], animation: str | os.PathLike[str], frames: ArrayLike, d: ArrayLike, fps: float
+) -> Path:
+    """Write a layer that holds the keys of an animation as linear splines and sublayers that animation.
+
+    The splines go through the same values as the animation's samples. They stay out of every delivered layer: OpenUSD
+    before 25.05 ignores splines or cannot parse them, and other readers refuse the whole file.
+
+    Args:
+        out: File to write.
+        animation: The animation layer made from the same keys.
+        frames: Key frames (F,), increasing.
+        d: Keys (F, 3) [mm].
+        fps: Frames per second.
+
+    Raises:
+        RigError: The keys do not increase or are not finite.
+        OutputError: The file cannot be written.
+        ValueError: Shapes of frames and d that do not match.
+    """
+    out = Path(out)
+    frames, d = np.asarray(frames, dtype=np.float64), np.asarray(d, dtype=np.float64)
+    if d.shape != (len(frames), 3):
+        raise ValueError(f"frames (F,) and d (F, 3) are needed, got {frames.shape} and {d.shape}")
+    if not len(frames) or not np.isfinite(d).all() or not (np.diff(frames) > 0).all():
+        raise RigError("keys need increasing frames and finite values.", path=out)
+    layer = new_layer(fps)
+    layer.startTimeCode, layer.endTimeCode = float(frames[0]), float(frames[-1])
+    stage = stage_of(layer)
+    actor = stage.OverridePrim(ACTOR)
+    for name, values in zip(PARAMETERS, d.T, strict=True):
+        actor.CreateAttribute(name, Sdf.ValueTypeNames.Double, custom=True).SetSpline(_linear(frames, values))
+    layer.subLayerPaths.append(relative_path(Path(animation), out))
+    return write_layer(layer, out)
+
+
+def _linear(frames: Array, values: Array) -> Ts.Spline:
+    spline = Ts.Spline("double")
+    for frame, value in zip(frames.tolist(), values.tolist(), strict=True):
+        knot = Ts.Knot("double")
+        knot.SetTime(frame)
+        knot.SetValue(value)
+        knot.SetNextInterpolation(Ts.InterpLinear)
+        spline.SetKnot(knot)
+    return spline

@@ -71,7 +71,7 @@ def read_value(prim: Usd.Prim, name: str, where: object) -> object:
     """Return the default value of an attribute.
 
     Raises:
-        FormatError: it has none.
+        FormatError: It has none.
     """
     attribute = prim.GetAttribute(name)
     value = attribute.Get() if attribute else None

@@ -44,14 +44,7 @@ _DECODER_ARRAYS = ("jaw:model:", "jaw:bounds:")
 
 
 def interface_layer(rig: JawRig, name: str, meshes: Mapping[str, Mesh], fps: float) -> Sdf.Layer:
-    """Build `actor.usda`: the prim that users and tools meet.
-
-    Args:
-        rig: the exact model.
-        name: name of the actor.
-        meshes: the meshes of `build_geometry`, for the extent of the moving actor.
-        fps: time codes per second.
-    """
+    """Build `actor.usda`, the prim that users and tools see; meshes as for `build_geometry`, fps the time code rate."""
     layer = new_layer(fps)
     layer.subLayerPaths.append(f"./{RIG_FILE}")
     actor = define_prim(layer, ACTOR, "Xform")
@@ -81,7 +74,7 @@ def interface_layer(rig: JawRig, name: str, meshes: Mapping[str, Mesh], fps: flo
 
 
 def record_sidecars(layer: Sdf.Layer, folder: Path) -> None:
-    """Write down in `actor.usda` which ONNX files belong to it: the SHA-256 of each, as custom data."""
+    """Record in `actor.usda` the SHA-256 of its ONNX files, as custom data."""
     for attribute, file in zip(ONNX_ATTRIBUTES, (ONNX_FILE, ENCODE_FILE), strict=True):
         found = hashlib.sha256((folder / file).read_bytes()).hexdigest()
         layer.GetAttributeAtPath(f"{ACTOR}.{attribute}").customData = {SIDECAR_HASH: found}
@@ -90,7 +83,7 @@ def record_sidecars(layer: Sdf.Layer, folder: Path) -> None:
 def decoder_layer(rig: JawRig, table: DecoderTable) -> Sdf.Layer:
     """Build `rig.usdc`: the exact model, the bounds, and the sampled table with its error.
 
-    It does not apply JawRigAPI: alone it is no rig, the interface that sublayers it is.
+    It does not apply JawRigAPI: only the interface that sublayers it is a rig.
     """
     layer = new_layer()
     actor = define_prim(layer, ACTOR, "Xform")
@@ -98,8 +91,8 @@ def decoder_layer(rig: JawRig, table: DecoderTable) -> Sdf.Layer:
     set_attribute(actor, "jaw:model:kind", _TYPES.Token, rig.meta["kind"])
     write_arrays(actor, rig, _DECODER_ARRAYS)
     set_attribute(actor, "jaw:decoder:format", _TYPES.Token, table.format)
-    set_attribute(actor, "jaw:decoder:shape", _TYPES.IntArray, _gf.int_array([len(axis) for axis in table.knots]))
-    for i, axis in enumerate(table.knots, start=1):
+    set_attribute(actor, "jaw:decoder:shape", _TYPES.IntArray, _gf.int_array([len(axis) for axis in table.axes]))
+    for i, axis in enumerate(table.axes, start=1):
         set_attribute(actor, f"jaw:decoder:d{i}Knots", _TYPES.DoubleArray, _gf.double_array(axis))
     set_attribute(actor, "jaw:decoder:twists", _TYPES.FloatArray, _gf.float_array(table.twists))
     set_attribute(actor, "jaw:decoder:maxError", _TYPES.Double, float(table.max_error_mm))

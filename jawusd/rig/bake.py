@@ -39,27 +39,27 @@ def bake_rig(
 ) -> list[Path]:
     """Write a rig: interface, decoder, geometry, ONNX graphs, captured motion if there is one, skeleton, package.
 
-    Without a mandible mesh a placeholder is grown from the lower scan, and marked as such. Every file is written in one
-    step, `actor.usda` after all it refers to.
+    Without a mandible mesh a placeholder is grown from the lower scan, and marked as such. Every file is written
+    atomically, `actor.usda` after all it refers to.
 
     Args:
-        folder: where the files go; made if missing.
-        rig: the exact model.
-        meshes: `upper_teeth` and optionally `skull` in skull coordinates, `lower_teeth` and optionally `mandible` in
-            mandible coordinates [mm].
-        name: name of the actor.
-        fps: frames per second of the captured motion.
-        frames: captured frame numbers (F,), increasing.
-        d: parameters of the captured frames (F, 3) [mm], NaN where lost.
-        table_size: knots per axis of the sampled decoder, 17, 33 or 65.
+        folder: Where the files go; made if missing.
+        rig: The exact model.
+        meshes: `upper_teeth` and optionally `skull` in the skull frame, `lower_teeth` and optionally `mandible` in the
+            mandible frame [mm].
+        name: Name of the actor.
+        fps: Frames per second of the captured motion.
+        frames: Captured frame numbers (F,), increasing.
+        d: Parameters of the captured frames (F, 3) [mm], NaN where lost.
+        table_size: Values per axis of the sampled decoder, 17, 33 or 65.
 
     Returns:
         The files, in the order written.
 
     Raises:
-        RigError: meshes, bounds or frames that make no rig.
-        OutputError: the folder cannot be written.
-        ValueError: frames without d, or d without frames.
+        RigError: Meshes, bounds or frames that make no rig.
+        OutputError: The folder cannot be written.
+        ValueError: Frames without d, or d without frames.
     """
     folder = Path(folder)
     if (frames is None) != (d is None):

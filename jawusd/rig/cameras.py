@@ -1,4 +1,4 @@
-"""The take as a scene: the calibrated cameras and the actor where the head was, to be laid over the footage."""
+"""The take as a scene, to be composited over the footage: the calibrated cameras and the actor carried by the head."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from jawusd.geometry.arrays import Array
 from jawusd.geometry.camera import Camera
 from jawusd.geometry.se3 import se3_inverse
 from jawusd.rig import _gf
-from jawusd.rig.layers import define_prim, new_layer, relative_path, set_attribute, stage_of, write_layer
+from jawusd.rig.layers import add_pose, define_prim, new_layer, relative_path, set_attribute, stage_of, write_layer
 
 TAKE, TAKE_ACTOR, TAKE_CAMERAS = "/Take", "/Take/Actor", "/Take/Cameras"
 
-#: Where the undistorted pictures of a camera lie beside the take, numbered by time code.
+# Undistorted images of a camera, relative to the take, numbered by time code.
 PLATE = "plates/{name}/{name}.%06d.jpg"
 
-# Apertures and focal lengths only count relative to one another; tools that read them as mm see a 36 mm sensor.
+# Only ratios of apertures and focal lengths matter; tools that read them in mm see a 36 mm sensor.
 _SENSOR_WIDTH = 36.0
 _CLIPPING_MM = (1.0, 10_000.0)
 _LARGEST_SKEW = 1e-6
@@ -40,26 +40,25 @@ def write_cameras(
 ) -> list[Path]:
     """Write the take: one `UsdGeom.Camera` per camera, and the actor carried by the tracked head.
 
-    The cameras are pinholes: they match footage without lens distortion. Where such plates of a camera are to be found
-    says its `jaw:plate`, a printf pattern for the time code, relative to the take; the OpenCV coefficients of the
-    footage itself stand in `jaw:distortion`, the picture size in `jaw:imageSize`. The head's motion lies in a binary
-    layer of its own beside the take, which sublayers it: text is no place for a sample per frame.
+    The cameras are pinholes: they match footage without lens distortion. `jaw:plate` of a camera is a printf pattern,
+    by time code and relative to the take, of such undistorted images; `jaw:distortion` holds the OpenCV coefficients of
+    the footage itself, `jaw:imageSize` its size. The head's motion goes to a binary layer that the take sublayers.
 
     Args:
-        out: file to write, `.usda`; the motion goes to `<name>_motion.usdc` beside it.
-        cameras: the calibrated cameras.
-        actor: the layer to show, `anim_capture.usdc` or `actor.usda`.
-        frames: frame numbers (F,), increasing.
-        T_world_skull: poses of the skull (F, 4, 4), NaN where it was lost.
-        fps: frames per second.
+        out: File to write, `.usda`; the motion goes to `<name>_motion.usdc` beside it.
+        cameras: The calibrated cameras.
+        actor: The layer to show, `anim_capture.usdc` or `actor.usda`.
+        frames: Frame numbers (F,), increasing.
+        T_world_skull: Poses of the skull (F, 4, 4) [mm], NaN where lost.
+        fps: Frames per second.
 
     Returns:
         The motion's file and the take's, in the order written.
 
     Raises:
-        RigError: no cameras, two of one name, a camera with skewed pixels, or no frame with a pose.
-        OutputError: the file cannot be written.
-        ValueError: poses of another shape.
+        RigError: No cameras, two of one name, a camera with skewed pixels, or no frame with a pose.
+        OutputError: The file cannot be written.
+        ValueError: Poses of another shape.
     """
     out = Path(out)
     frames, T_world_skull = np.asarray(frames, dtype=np.float64), np.asarray(T_world_skull, dtype=np.float64)
@@ -78,7 +77,7 @@ def write_cameras(
     define_prim(layer, TAKE_CAMERAS, "Scope")
     shown = define_prim(layer, TAKE_ACTOR, "Xform")
     stage = stage_of(layer)
-    _add_pose(stage, TAKE, _FLIP)
+    add_pose(stage.GetPrimAtPath(TAKE), _FLIP)
     for name, camera in zip(names, cameras, strict=True):
         _define_camera(stage, name, camera)
     # A stage still open on the nameless layer would look for the files beside it, and complain.
@@ -94,19 +93,13 @@ def _prim_name(name: str) -> str:
     return cleaned if cleaned[:1].isalpha() else f"cam_{cleaned}"
 
 
-def _add_pose(stage: Usd.Stage, path: str | Sdf.Path, T: Array) -> None:
-    xform = UsdGeom.Xformable(stage.GetPrimAtPath(path))
-    xform.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(_gf.translations(T[None])[0])
-    xform.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(_gf.rotations(T[None])[0])
-
-
 def _motion_layer(frames: Array, T_world_skull: Array, fps: float) -> Sdf.Layer:
     """Return the layer that moves the actor with the head."""
     layer = new_layer(fps, TAKE)
     for path in (TAKE, TAKE_ACTOR):
         define_prim(layer, path, "Xform")
     stage = stage_of(layer)
-    _add_pose(stage, TAKE_ACTOR, T_world_skull[0])
+    add_pose(stage.GetPrimAtPath(TAKE_ACTOR), T_world_skull[0])
     translate, orient = UsdGeom.Xformable(stage.GetPrimAtPath(TAKE_ACTOR)).GetOrderedXformOps()
     samples = zip(frames.tolist(), _gf.translations(T_world_skull), _gf.rotations(T_world_skull), strict=True)
     for frame, translation, rotation in samples:
@@ -116,7 +109,7 @@ def _motion_layer(frames: Array, T_world_skull: Array, fps: float) -> Sdf.Layer:
 
 
 def _define_camera(stage: Usd.Stage, path: Sdf.Path, camera: Camera) -> None:
-    """Define one camera: the picture spans pixel edges, half a pixel outside the first and last centres."""
+    """Define one camera: the image spans pixel edges, half a pixel outside the first and last centres."""
     (fx, skew, cx), (_, fy, cy) = camera.K[:2]
     width, height = camera.size_px
     if abs(skew) > _LARGEST_SKEW * fx:
@@ -130,7 +123,7 @@ def _define_camera(stage: Usd.Stage, path: Sdf.Path, camera: Camera) -> None:
     prim.CreateHorizontalApertureOffsetAttr(_SENSOR_WIDTH * (0.5 - (cx + 0.5) / width))
     prim.CreateVerticalApertureOffsetAttr(aperture_height * ((cy + 0.5) / height - 0.5))
     prim.CreateClippingRangeAttr(Gf.Vec2f(*_CLIPPING_MM))
-    _add_pose(stage, path, se3_inverse(camera.T_cam_world) @ _FLIP)
+    add_pose(prim.GetPrim(), se3_inverse(camera.T_cam_world) @ _FLIP)
     spec = stage.GetRootLayer().GetPrimAtPath(path)
     set_attribute(spec, "jaw:distortion", Sdf.ValueTypeNames.DoubleArray, _gf.double_array(camera.distortion))
     set_attribute(spec, "jaw:imageSize", Sdf.ValueTypeNames.Int2, Gf.Vec2i(width, height))

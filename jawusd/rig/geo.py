@@ -1,18 +1,22 @@
-"""The geometry payload: skull, teeth and mandible with normals and materials."""
+"""The geometry payload: skull, teeth and mandible with normals and materials, written and read."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdShade
 
 from jawusd.errors import RigError
 from jawusd.formats.mesh import Mesh, crown_face_mask
-from jawusd.geometry.arrays import Array
+from jawusd.geometry.arrays import Array, Mask
 from jawusd.rig import _gf
-from jawusd.rig.layers import define_prim, new_layer, set_attribute, stage_of
+from jawusd.rig.layers import add_pose, define_prim, new_layer, set_attribute, stage_of
 from jawusd.rig.layout import ACTOR, GEO, MANDIBLE, MATERIALS, SKULL
+from jawusd.rig.read import open_stage
+from jawusd.rig.untrusted import blames_file
 
 # Every mesh name is unique: Blender merges an Xform with an only child and keeps the child's name.
 MESH_PATHS = {
@@ -36,31 +40,34 @@ def build_geometry(meshes: Mapping[str, Mesh], T_rest: Array, placeholder: str |
     """Build the layer with all meshes under /Actor.
 
     Args:
-        meshes: `upper_teeth` and `skull` in skull coordinates, `lower_teeth` and `mandible` in mandible coordinates
-            [mm]; `skull` and `mandible` may be missing.
-        T_rest: T_skull_mandible of the closed bite, shape (4, 4); the mandible stands there by default.
-        placeholder: where the condyles of the mandible come from, if its mesh is a stand-in; it is then marked so.
+        meshes: `upper_teeth` and `skull` in the skull frame, `lower_teeth` and `mandible` in the mandible frame [mm];
+            `skull` and `mandible` may be missing.
+        T_rest: T_skull_mandible of the closed bite, shape (4, 4), the mandible's default pose.
+        placeholder: If given, the mandible's mesh is marked as a placeholder; says where its condyles come from.
 
     Raises:
-        RigError: an unknown or missing mesh, or a mesh without faces or with values that are not finite.
+        RigError: An unknown or missing mesh, or a mesh without faces or with values that are not finite.
     """
     check_meshes(meshes)
     layer = new_layer()
-    define_prim(layer, ACTOR, "Xform")
-    define_prim(layer, MATERIALS, "Scope")
-    define_prim(layer, GEO, "Scope")
-    define_prim(layer, SKULL, "Xform")
-    define_prim(layer, MANDIBLE, "Xform")
+    for path, type_name in (
+        (ACTOR, "Xform"),
+        (MATERIALS, "Scope"),
+        (GEO, "Scope"),
+        (SKULL, "Xform"),
+        (MANDIBLE, "Xform"),
+    ):
+        define_prim(layer, path, type_name)
     stage = stage_of(layer)
     for path in (SKULL, MANDIBLE):
         Usd.ModelAPI(stage.GetPrimAtPath(path)).SetKind(Kind.Tokens.subcomponent)
-    place_mandible(UsdGeom.Xformable(stage.GetPrimAtPath(MANDIBLE)), T_rest)
-    stand_in = "mandible" if placeholder is not None else None
-    used = [name for name in _MATERIALS if name != "Placeholder" or stand_in]
+    add_pose(stage.GetPrimAtPath(MANDIBLE), T_rest)
+    replaced = "mandible" if placeholder is not None else None
+    used = [name for name in _MATERIALS if name != "Placeholder" or replaced]
     materials = {name: _material(stage, name) for name in used}
     for name, path in MESH_PATHS.items():
         if name in meshes:
-            base = "Enamel" if name.endswith("teeth") else "Placeholder" if name == stand_in else "Bone"
+            base = "Enamel" if name.endswith("teeth") else "Placeholder" if name == replaced else "Bone"
             _define_mesh(stage, path, meshes[name], materials, base)
     if placeholder is not None:
         _mark_placeholder(layer.GetPrimAtPath(MESH_PATHS["mandible"]), placeholder)
@@ -68,7 +75,7 @@ def build_geometry(meshes: Mapping[str, Mesh], T_rest: Array, placeholder: str |
 
 
 def _mark_placeholder(mesh: Sdf.PrimSpec, condyles: str) -> None:
-    """Say on a mesh, in every way readers show, that it is a stand-in."""
+    """Mark a mesh as a placeholder in every way that readers show."""
     text = f"Not anatomy: a placeholder grown from the lower scan, there was no mandible mesh. Condyles: {condyles}."
     mesh.SetInfo("displayName", "Mandible (placeholder)")
     mesh.SetInfo("documentation", text)
@@ -77,25 +84,16 @@ def _mark_placeholder(mesh: Sdf.PrimSpec, condyles: str) -> None:
     set_attribute(mesh, "jaw:placeholder:condyles", Sdf.ValueTypeNames.String, condyles)
 
 
-def place_mandible(mandible: UsdGeom.Xformable, T: Array) -> None:
-    """Give the mandible its translate and orient ops and their default value, a pose (4, 4).
-
-    Never a matrix op: USD interpolates matrix samples number by number, which shears the mandible between frames.
-    """
-    mandible.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(_gf.translations(T[None])[0])
-    mandible.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(_gf.rotations(T[None])[0])
-
-
 def extent(vertices: Array) -> Array:
     """Return the smallest and largest corner, shape (2, 3), of points (n, 3)."""
     return np.stack([vertices.min(axis=0), vertices.max(axis=0)])
 
 
 def check_meshes(meshes: Mapping[str, Mesh]) -> None:
-    """Check that meshes make a rig.
+    """Check the meshes of a rig.
 
     Raises:
-        RigError: an unknown or missing mesh, or a mesh without faces or with values that are not finite.
+        RigError: An unknown or missing mesh, or a mesh without faces or with values that are not finite.
     """
     unknown = sorted(set(meshes) - set(MESH_PATHS))
     if unknown:
@@ -157,3 +155,59 @@ def corner_normals(mesh: Mesh) -> Array:
     # corners of degenerate faces only: any unit vector is as good as another
     normals = np.where(length > 0, normals / np.where(length > 0, length, 1.0), [0.0, 1.0, 0.0])
     return normals[corners]
+
+
+@blames_file(0)
+def read_geometry(path: str | os.PathLike[str]) -> dict[str, Mesh]:
+    """Read the meshes of `geo.usdc`.
+
+    Returns:
+        Meshes by the names of `MESH_PATHS`, skull ones in the skull frame, mandible ones in the mandible frame
+        [mm], with the layer's single precision. Meshes the rig lacks are missing, and so is a placeholder.
+
+    Raises:
+        RigError: Not a USD file, or a mesh that is not made of triangles.
+    """
+    return _read(path, placeholders=False)
+
+
+def read_placeholders(path: str | os.PathLike[str]) -> dict[str, Mesh]:
+    """Return the placeholders, as `read_geometry` does the other meshes."""
+    return _read(path, placeholders=True)
+
+
+def _read(path: str | os.PathLike[str], *, placeholders: bool) -> dict[str, Mesh]:
+    stage = open_stage(path)
+    found = {}
+    for name, prim_path in MESH_PATHS.items():
+        mesh = UsdGeom.Mesh(stage.GetPrimAtPath(prim_path))
+        if not mesh or bool(mesh.GetPrim().GetAttribute("jaw:placeholder").Get()) != placeholders:
+            continue
+        counts = np.array(mesh.GetFaceVertexCountsAttr().Get() or [])
+        if not counts.size or (counts != 3).any():
+            raise RigError(f"{prim_path} must be made of triangles.", path=Path(path))
+        vertices = np.array(mesh.GetPointsAttr().Get(), dtype=np.float64)
+        faces = np.array(mesh.GetFaceVertexIndicesAttr().Get(), dtype=np.int32).reshape(-1, 3)
+        found[name] = Mesh(vertices, faces)
+    return found
+
+
+@blames_file(0)
+def read_gum(path: str | os.PathLike[str]) -> dict[str, Mask]:
+    """Return which faces (F,) of the teeth meshes are gum, by the names of `MESH_PATHS`.
+
+    Meshes without such a subset are missing.
+
+    Raises:
+        RigError: Not a USD file.
+    """
+    stage = open_stage(path)
+    found = {}
+    for name, prim_path in MESH_PATHS.items():
+        mesh = UsdGeom.Mesh(stage.GetPrimAtPath(prim_path))
+        subset = UsdGeom.Subset(stage.GetPrimAtPath(f"{prim_path}/{prim_path.rsplit('/', 1)[1]}Gum"))
+        if mesh and subset:
+            gum = np.zeros(len(mesh.GetFaceVertexCountsAttr().Get()), dtype=bool)
+            gum[np.array(subset.GetIndicesAttr().Get())] = True
+            found[name] = gum
+    return found

@@ -11,6 +11,8 @@ from pxr import Sdf, Tf, Usd, UsdGeom
 from jawusd import __version__
 from jawusd.errors import OutputError, RigError
 from jawusd.formats.atomic import atomic_path
+from jawusd.geometry.arrays import Array
+from jawusd.rig import _gf
 from jawusd.rig.layout import ACTOR
 from jawusd.rig.schema import SCHEMA_NAME
 
@@ -19,8 +21,8 @@ def new_layer(fps: float | None = None, default_prim: str = ACTOR) -> Sdf.Layer:
     """Return a layer in memory with the units of every jawusd file: Y up, mm.
 
     Args:
-        fps: time codes per second; None leaves the layer without time.
-        default_prim: path of the default prim.
+        fps: Time codes per second; None leaves the layer without time.
+        default_prim: Path of the default prim.
     """
     layer = Sdf.Layer.CreateAnonymous(".usda")
     root = layer.pseudoRoot
@@ -35,7 +37,7 @@ def new_layer(fps: float | None = None, default_prim: str = ACTOR) -> Sdf.Layer:
 
 
 def stage_of(layer: Sdf.Layer) -> Usd.Stage:
-    """Return a stage on a layer in memory, for schema classes that want one.
+    """Return a stage on a layer in memory, for schema classes that need one.
 
     Raises:
         RigError: OpenUSD cannot open it.
@@ -64,16 +66,9 @@ def apply_jaw_api(spec: Sdf.PrimSpec, *others: str) -> None:
 def set_attribute(
     spec: Sdf.PrimSpec, name: str, type_name: Sdf.ValueTypeName, value: object, *, animated: bool = False
 ) -> None:
-    """Write an attribute with its default value.
+    """Write an attribute with its default value, uniform unless animated.
 
-    `custom` is set on every one: Blender imports no other attribute.
-
-    Args:
-        spec: prim spec that gets it.
-        name: attribute name.
-        type_name: e.g. `Sdf.ValueTypeNames.Double`.
-        value: default value.
-        animated: may vary over time; everything else is uniform.
+    `custom` is set on all: Blender imports no other attributes.
     """
     variability = Sdf.VariabilityVarying if animated else Sdf.VariabilityUniform
     attribute = Sdf.AttributeSpec(spec, name, type_name, variability, declaresCustom=True)
@@ -86,6 +81,16 @@ def set_relationship(spec: Sdf.PrimSpec, name: str, targets: Iterable[str]) -> N
     relationship.targetPathList.explicitItems = [Sdf.Path(target) for target in targets]
 
 
+def add_pose(prim: Usd.Prim, T: Array) -> None:
+    """Give a prim translate and orient ops whose default value is a pose (4, 4).
+
+    Never a matrix op: USD interpolates matrix samples entry by entry, which shears between frames.
+    """
+    xform = UsdGeom.Xformable(prim)
+    xform.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble).Set(_gf.translations(T[None])[0])
+    xform.AddOrientOp(UsdGeom.XformOp.PrecisionDouble).Set(_gf.rotations(T[None])[0])
+
+
 def relative_path(target: Path, layer: Path) -> str:
     """Return the path of a file as a layer should name it: relative to the layer's folder, starting with a dot."""
     relative = Path(os.path.relpath(target.resolve(), layer.resolve().parent)).as_posix()
@@ -96,7 +101,7 @@ def write_layer(layer: Sdf.Layer, path: Path) -> Path:
     """Write a layer to a file atomically; a copy of that file already open in this process is reloaded.
 
     Raises:
-        OutputError: the file cannot be written.
+        OutputError: The file cannot be written.
     """
     path = Path(path)
     with atomic_path(path) as temporary:

@@ -1,4 +1,4 @@
-"""Read how the mandible moves in a stage: by its transforms alone, whoever made them."""
+"""Read how the mandible moves in a stage, from its transforms or from samples of d."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ def read_poses_of_stage(path: str | os.PathLike[str], prim_path: str | None = No
     """Read the poses of the mandible at every whole frame of a stage.
 
     Args:
-        path: an animation layer of a rig, or a shot that references one.
-        prim_path: which rig, where the stage has several.
+        path: An animation layer of a rig, or a shot that references one.
+        prim_path: Which rig, where the stage has several.
 
     Returns:
-        Frame numbers (F,) and T_skull_mandible (F, 4, 4), mm: relative to the actor, wherever it stands.
+        Frame numbers (F,) and T_skull_mandible (F, 4, 4) [mm], relative to the actor.
 
     Raises:
-        RigError: not a stage.
-        FormatError: no rig or several, no mandible, no motion, or one that is not rigid.
+        RigError: Not a stage.
+        FormatError: No rig or several, no mandible, no motion, or one that is not rigid.
     """
     stage = open_stage(path)
     actor = find_rig_prim(stage, path, prim_path)
@@ -61,17 +61,13 @@ def read_parameters_of_stage(
 ) -> tuple[Array, Array, float] | None:
     """Read the samples of d that an animation layer holds.
 
-    Args:
-        path: an animation layer of a rig, or a shot that references one.
-        prim_path: which rig, where the stage has several.
-
     Returns:
         Times (F,), d (F, 3) [mm] with NaN in the frames the layer lists as lost, and frames per second; None when the
-        motion is not given by d, only by transforms.
+        motion is given by transforms alone.
 
     Raises:
-        RigError: not a stage.
-        FormatError: no rig or several, or parameters that are not finite.
+        RigError: Not a stage.
+        FormatError: No rig or several, or parameters that are not finite.
     """
     stage = open_stage(path)
     actor = find_rig_prim(stage, path, prim_path)

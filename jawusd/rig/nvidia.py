@@ -25,14 +25,10 @@ def find_nvidia_validator() -> Path | None:
 
 
 def nvidia_findings(path: str | os.PathLike[str], program: Path) -> list[Finding]:
-    """Return what NVIDIA's validator says of a file, with its default rules.
-
-    Args:
-        path: a USD file.
-        program: what `find_nvidia_validator` gave.
+    """Return the findings of NVIDIA's validator, as `find_nvidia_validator` gives it, with its default rules.
 
     Raises:
-        RigError: the program failed to give a report.
+        RigError: The program failed to give a report.
     """
     with tempfile.TemporaryDirectory() as scratch:
         report = Path(scratch) / "report.json"
@@ -44,9 +40,13 @@ def nvidia_findings(path: str | os.PathLike[str], program: Path) -> list[Finding
         if not report.is_file():
             raise RigError(f"{PROGRAM} gave no report: {done.stderr.strip()[-300:]}", path=path)
         rules = json.loads(report.read_text(encoding="utf-8")).get("rules", [])
-    return [_finding(issue) for rule in rules for issue in rule["issues"]]
-
-
-def _finding(issue: dict) -> Finding:
-    severity = _SEVERITIES.get(issue["severity"], "error")
-    return Finding(severity, issue["rule"]["name"], str(issue["at"] or "/"), issue["message"])
+    return [
+        Finding(
+            _SEVERITIES.get(issue["severity"], "error"),
+            issue["rule"]["name"],
+            str(issue["at"] or "/"),
+            issue["message"],
+        )
+        for rule in rules
+        for issue in rule["issues"]
+    ]

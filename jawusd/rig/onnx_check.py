@@ -13,10 +13,10 @@ from onnx.reference import ReferenceEvaluator
 from jawusd.errors import FormatError, JawusdError
 from jawusd.evaluator import JawRig
 from jawusd.geometry.arrays import Array
-from jawusd.geometry.se3 import transform_points
 from jawusd.rig.arrays import model_hash
 from jawusd.rig.onnx_graph import float_type
 from jawusd.rig.onnx_sidecar import FORMAT
+from jawusd.rig.table import landmark_distance
 
 
 def onnx_error_mm(path: str | os.PathLike[str], rig: JawRig, d: Array, recorded: str | None = None) -> float:
@@ -26,21 +26,21 @@ def onnx_error_mm(path: str | os.PathLike[str], rig: JawRig, d: Array, recorded:
     parameters it finds are compared with them.
 
     Args:
-        path: the graph.
-        rig: the model.
-        d: parameters (n, 3) [mm].
-        recorded: SHA-256 of the file as the rig knows it; any other file is refused unread. None: rigs baked before
-            0.1.0 know none.
+        path: The graph.
+        rig: The model.
+        d: Parameters (n, 3) [mm].
+        recorded: SHA-256 of the file that the rig records; any other file is refused unread. None disables the check:
+            rigs baked before 0.1.0 record none.
 
     Raises:
-        FormatError: not the file of the rig, not an ONNX file of jawusd, or made from another model.
+        FormatError: Not the file of the rig, not an ONNX file of jawusd, or made from another model.
     """
     model = _load(path, rig, recorded)
     try:
         return _error_mm(model, rig, d)
     except JawusdError:
         raise
-    except Exception as error:  # the evaluator reports damaged graphs by whatever its operators stumble over
+    except Exception as error:  # damaged graphs raise errors of any type, depending on the operator
         raise FormatError(f"cannot be run ({type(error).__name__}).", path=path) from error
 
 
@@ -56,8 +56,7 @@ def _error_mm(model: onnx.ModelProto, rig: JawRig, d: Array) -> float:
         exact = rig.pose(d).astype(dtype).astype(np.float64)
         (encoded,) = run(["d"], {"pose": exact.astype(dtype)})
         found = rig.pose(np.asarray(encoded))
-    moved = transform_points(found - exact, rig.arrays["landmarks"])
-    return float(np.linalg.norm(moved, axis=-1).max())
+    return float(landmark_distance(rig, found, exact).max())
 
 
 def _load(path: str | os.PathLike[str], rig: JawRig, recorded: str | None) -> onnx.ModelProto:

@@ -1,7 +1,7 @@
-"""The ONNX sidecars: the exact model as graphs d -> pose, twist, margin and pose -> d, residual, for any runtime.
+"""The ONNX sidecars: the exact model, not a fit of it, as graphs d -> pose, twist, margin and pose -> d, residual.
 
-Built operator by operator from the model's own arrays, so they are the model and not a fit of it. Dynamic batch. Two
-files, because decoding needs only plain arithmetic, which every runtime has, and encoding needs a loop.
+The batch size is dynamic. Two files, because decoding needs only arithmetic, which every runtime has, and encoding
+needs a loop.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def write_onnx(path: str | os.PathLike[str], model: onnx.ModelProto) -> Path:
     """Write a graph atomically.
 
     Raises:
-        OutputError: the file cannot be written.
+        OutputError: The file cannot be written.
     """
     write_bytes_atomic(path, model.SerializeToString(deterministic=True))
     return Path(path)

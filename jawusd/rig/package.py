@@ -12,26 +12,19 @@ from jawusd.formats.atomic import atomic_path, scratch_folder
 from jawusd.rig.layout import ACTOR, ACTOR_FILE, ONNX_ATTRIBUTES
 from jawusd.rig.read import open_stage
 
-# Archives carry the time of their files. A fixed one makes equal rigs equal: the first a zip can hold in any time zone.
+# Archives store the times of their files. A fixed one gives equal packages: the first a zip can hold in any time zone.
 _ZIP_EPOCH = 315_619_200
 
 
 def write_package(out: str | os.PathLike[str], source: str | os.PathLike[str]) -> Path:
-    """Flatten a stage of one actor into a package.
+    """Flatten a stage of one actor, `actor.usda` or an animation layer on it, into a `.usdz`.
 
     The layer inside is text: three.js turns a whole-number translation of a binary layer into NaN. The ONNX files stay
-    outside, packages may hold USD, images and sound only.
-
-    Args:
-        out: the `.usdz` to write.
-        source: `actor.usda` or an animation layer on it.
-
-    Returns:
-        The package.
+    outside: packages may hold USD, images and sound only.
 
     Raises:
-        RigError: the source cannot be opened or packed.
-        OutputError: the package cannot be written.
+        RigError: The source cannot be opened or packed.
+        OutputError: The package cannot be written.
     """
     out = Path(out)
     layer = _flattened(open_stage(source))

@@ -1,9 +1,9 @@
-"""A stand-in for the mandible where no mesh of it was given: grown from the lower scan, marked wherever it goes.
+"""A placeholder for a missing mandible mesh: a tube swept below the lower scan and up to the condyles.
 
-It shows where bone may be and gives condyles to look at; it is no anatomy. The condyles come from the landmarks, or,
-where those were only put at mean adult places, from the motion: during opening and protrusion alike the condyle slides
-along one path, the eminence, so that its trajectories are thinner than those of all points around it (the kinematic
-condylar centre; Kohno 1972, Yatabe et al. 1995, J Dent Res 74:1321).
+It shows roughly where bone may be; it is not anatomy, and marked as such. The condyles come from the landmarks, or,
+where those are only mean adult positions, from the motion: in opening and protrusion alike the condyle slides along one
+path, the eminence, so that its trajectories are thinner than those of the points around it (the kinematic condylar
+centre; Kohno 1972, Yatabe et al. 1995, J Dent Res 74:1321).
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from jawusd.geometry.se3 import se3_inverse, transform_point, transform_points
 _CONDYLES = [LANDMARKS.index(name) for name in ("condyle_left", "condyle_right")]
 _INCISOR = LANDMARKS.index("incisor")
 
-# Search for the thinnest trajectories: so far from the mean adult place, up and forward [mm].
+# Search range and step for the thinnest trajectories, up and forward from the mean adult position [mm].
 _REACH_MM = 18.0
 _STEP_MM = 1.5
 _PATH_DEGREE = 3
-# The motion tells only if the condyles travel this far and their paths are clearly thinner than at the mean place.
+# The motion is used only if the condyles travel this far and their paths are clearly thinner than at the mean position.
 _LEAST_TRAVEL_MM = 5.0
 _CLEARLY_THINNER = 0.85
 _FEWEST_POSES = 30
@@ -35,7 +35,7 @@ _FEWEST_POSES = 30
 _STATIONS = np.radians([75.0, 50.0, 25.0, 0.0, -25.0, -50.0, -75.0])
 _STATION_WIDTH = np.radians(9.0)
 _FEWEST_VERTICES = 10
-# Half thickness and half height of the cross-sections, and where they lie, about a mean adult mandible [mm].
+# Half thickness and half height of the cross-sections, and their depth, of a mean adult mandible [mm].
 _BODY_MM = (5.5, 13.0)
 _BODY_BELOW_SCAN_MM = 9.0
 _HEAD_MM, _NECK_MM, _RAMUS_MM, _ANGLE_MM = (9.0, 4.5), (5.0, 4.0), (4.5, 14.0), (5.0, 13.0)
@@ -45,12 +45,12 @@ _SECTIONS = 12  # per part between two control sections
 
 @dataclass(frozen=True, eq=False)
 class Placeholder:
-    """Hold a stand-in for a mandible.
+    """A placeholder for a mandible.
 
     Attributes:
-        mesh: closed surface, mandible coordinates [mm].
-        condyles: centres left and right, mandible coordinates [mm], shape (2, 3).
-        source: where the condyles come from, in words.
+        mesh: Closed surface, mandible frame [mm].
+        condyles: Centres left and right, mandible frame [mm], shape (2, 3).
+        source: Where the condyles come from.
     """
 
     mesh: Mesh
@@ -59,12 +59,7 @@ class Placeholder:
 
 
 def grow_placeholder(rig: JawRig, lower_teeth: Mesh) -> Placeholder:
-    """Grow a stand-in for a mandible from the lower scan.
-
-    Args:
-        rig: gives anatomical axes, landmarks and motion.
-        lower_teeth: the lower scan, mandible coordinates [mm].
-    """
+    """Build a placeholder from a rig and the lower scan, mandible frame [mm]."""
     T_anatomical_mandible = rig.arrays["T_anatomical_skull"] @ rig.arrays["T_rest"]
     condyles, source = find_condyles(rig)
     scan = transform_points(T_anatomical_mandible, lower_teeth.vertices)
@@ -73,9 +68,9 @@ def grow_placeholder(rig: JawRig, lower_teeth: Mesh) -> Placeholder:
 
 
 def find_condyles(rig: JawRig) -> tuple[Array, str]:
-    """Return the condyle centres left and right, mandible coordinates [mm], shape (2, 3), and their source in words.
+    """Return the condyle centres left and right, mandible frame [mm], shape (2, 3), and where they come from.
 
-    The motion tells height and depth of a condyle; its distance from the midline stays that of the landmark.
+    The motion gives height and depth of a condyle; its distance from the midline is that of the landmark.
     """
     landmarks = rig.arrays["landmarks"][_CONDYLES]
     inferred = [text for text in rig.meta.get("inferred", ()) if text.startswith("condyle")]
@@ -93,7 +88,7 @@ def find_condyles(rig: JawRig) -> tuple[Array, str]:
 
 
 def _thinnest(poses: Array, mean: Array) -> Array | None:
-    """Return the point near a mean place whose sagittal trajectory is thinnest, or None if the motion cannot tell."""
+    """Return the point near a mean position whose sagittal trajectory is thinnest; None if the motion is too poor."""
     offsets = np.arange(-_REACH_MM, _REACH_MM + 0.5 * _STEP_MM, _STEP_MM)
     grid = np.stack(np.meshgrid([0.0], offsets, offsets, indexing="ij"), axis=-1)[0] + mean
     thickness = np.array([[_thickness(poses, point) for point in row] for row in grid])
@@ -118,11 +113,9 @@ def _thickness(poses: Array, point: Array) -> float:
 def _control_sections(scan: Array, condyles: Array) -> tuple[Array, Array, Array]:
     """Return centres and both half axes of the control sections from the left condyle to the right one, each (n, 3)."""
     body, thin, tall = _body(scan)
-    rows = [_ramus(condyle, body[end]) for condyle, end in ((condyles[0], 0), (condyles[1], -1))]
-    left, right = ([np.array(part) for part in zip(*row, strict=True)] for row in rows)
-    return tuple(
-        np.concatenate([a, middle, b[::-1]]) for a, middle, b in zip(left, (body, thin, tall), right, strict=True)
-    )
+    left, right = (np.array(_ramus(condyle, body[end])) for condyle, end in ((condyles[0], 0), (condyles[1], -1)))
+    sections = np.concatenate([left, np.stack([body, thin, tall], axis=1), right[::-1]])
+    return sections[:, 0], sections[:, 1], sections[:, 2]
 
 
 def _ramus(condyle: Array, rear: Array) -> list[tuple[Array, Array, Array]]:
@@ -140,7 +133,8 @@ def _body(scan: Array) -> tuple[Array, Array, Array]:
     """Return centres and half axes of the body's sections, below the arch of the scan, each (n, 3)."""
     open_end = np.percentile(scan[:, 2], 5)
     direction = np.arctan2(scan[:, 0], scan[:, 2] - open_end)
-    known, found = [], []
+    known: list[float] = []
+    found: list[list[float]] = []
     for station in _STATIONS:
         near = scan[np.abs(direction - station) < _STATION_WIDTH]
         if len(near) >= _FEWEST_VERTICES:
@@ -148,9 +142,8 @@ def _body(scan: Array) -> tuple[Array, Array, Array]:
             found.append([*near[:, [0, 2]].mean(axis=0), np.percentile(near[:, 1], 5)])
     if len(known) < 2:  # a scan of a few teeth: a body of its own size around them
         known, found = [0.0], [[*scan[:, [0, 2]].mean(axis=0), scan[:, 1].min()]]
-    # stations run from left to right, np.interp wants them rising
-    known, found = np.array(known)[::-1], np.array(found)[::-1]
-    x, z, low = (np.interp(_STATIONS, known, column) for column in found.T)
+    # stations run from left to right, np.interp needs rising ones
+    x, z, low = (np.interp(_STATIONS, known[::-1], column) for column in np.array(found)[::-1].T)
     centres = np.stack([x, low - _BODY_BELOW_SCAN_MM, z], axis=1)
     outward = np.stack([np.sin(_STATIONS), np.zeros(len(_STATIONS)), np.cos(_STATIONS)], axis=1)
     return centres, _BODY_MM[0] * outward, np.tile([0.0, _BODY_MM[1], 0.0], (len(_STATIONS), 1))
@@ -165,8 +158,8 @@ def _swept(centres: Array, thin: Array, tall: Array) -> tuple[Array, NDArray[np.
     for end, inner in ((0, 1), (-1, -2)):
         ahead = centres[end] - centres[inner]
         ahead *= np.linalg.norm(tall[end]) / np.linalg.norm(ahead)
-        dome = (centres[end] + np.sin(turn)[:, None] * ahead, np.cos(turn)[:, None] * thin[end])
-        dome = (*dome, np.cos(turn)[:, None] * tall[end])
+        shrinking = np.cos(turn)[:, None]
+        dome = (centres[end] + np.sin(turn)[:, None] * ahead, shrinking * thin[end], shrinking * tall[end])
         parts = ((d[::-1], rows) if end == 0 else (rows, d) for d, rows in zip(dome, (centres, thin, tall)))
         centres, thin, tall = (np.concatenate(pair) for pair in parts)
     around = 2 * np.pi * np.arange(_CORNERS) / _CORNERS

@@ -1,4 +1,4 @@
-"""Read rigs from USD: by attribute name, whether or not this process knows the schema."""
+"""Read rigs from USD by attribute name, whether or not this process knows the schema."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import json
 import math
 import os
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 from pxr import Sdf, Tf, Usd, UsdGeom
 
 from jawusd.errors import EvaluatorError, FormatError, RigError, UnitsError
 from jawusd.evaluator import JawRig
+from jawusd.geometry.arrays import Array
 from jawusd.rig.arrays import read_arrays, read_value
 from jawusd.rig.layout import ONNX_ATTRIBUTES, PARAMETERS
 from jawusd.rig.schema import has_jaw_api
@@ -28,13 +29,13 @@ def load_rig(path: PathArg, prim_path: str | None = None) -> JawRig:
 
     Args:
         path: `actor.usda`, an animation layer, a package, or any stage that references an actor.
-        prim_path: which rig, where a stage has several.
+        prim_path: Which rig, where a stage has several.
 
     Raises:
-        FormatError: no rig, several rigs, missing or malformed values.
-        VersionError: written by a newer version.
-        UnitsError: other units or twist order.
-        RigError: the stage cannot be opened, or names files outside its folder.
+        FormatError: No rig, several rigs, missing or malformed values.
+        VersionError: Written by a newer version.
+        UnitsError: Other units or twist order.
+        RigError: The stage cannot be opened, or names files outside its folder.
     """
     stage = open_stage(path)
     return rig_of(find_rig_prim(stage, path, prim_path), path)
@@ -44,7 +45,7 @@ def open_stage(path: PathArg) -> Usd.Stage:
     """Open a stage.
 
     Raises:
-        RigError: there is no such file, it is not USD, or it names files that `check_reach` forbids.
+        RigError: There is no such file, it is not USD, or it names files that `check_reach` forbids.
     """
     path = Path(path)
     if not path.is_file():
@@ -63,7 +64,7 @@ def find_rig_prim(stage: Usd.Stage, where: object, prim_path: str | None = None)
     """Return the prim that carries the rig.
 
     Raises:
-        FormatError: there is none, there are several, or the named prim is none.
+        FormatError: There is none, there are several, or the named prim is none.
     """
     if prim_path is not None:
         prim = stage.GetPrimAtPath(prim_path) if Sdf.Path.IsValidPathString(prim_path) else None
@@ -81,17 +82,17 @@ def find_rig_prim(stage: Usd.Stage, where: object, prim_path: str | None = None)
 
 @blames_file(1)
 def rig_of(prim: Usd.Prim, where: object) -> JawRig:
-    """Build the evaluator from a rig prim; see `load_rig` for what it raises.
+    """Build the evaluator from a rig prim.
 
     Raises:
-        FormatError: a header that is not JSON or tells of another kind of model; else as `load_rig`.
+        FormatError: A header that is not JSON or names another kind of model; else as `load_rig`.
     """
     bring_up_to_date(prim, where)
     check_units(prim, where)
-    kind = read_value(prim, "jaw:model:kind", where)
+    kind = str(read_value(prim, "jaw:model:kind", where))
     arrays = read_arrays(prim, kind, where)
     try:
-        meta = json.loads(read_value(prim, "jaw:meta", where))
+        meta = json.loads(str(read_value(prim, "jaw:meta", where)))
     except (TypeError, ValueError) as error:
         raise FormatError(f"jaw:meta is not JSON ({error}).", path=str(where)) from error
     if not isinstance(meta, dict):
@@ -108,11 +109,10 @@ def check_units(prim: Usd.Prim, where: object) -> None:
     """Check units and twist order.
 
     Raises:
-        UnitsError: they are not mm, rad and (omega, v).
+        UnitsError: They are not mm, rad and (omega, v).
     """
     for name, wanted in (("jaw:lengthUnit", "mm"), ("jaw:angleUnit", "rad"), ("jaw:twistOrder", ["omega", "v"])):
-        value = read_value(prim, name, where)
-        found = value if isinstance(value, str) else list(value)
+        found = np.array(read_value(prim, name, where)).tolist()
         if found != wanted:
             raise UnitsError(f"{name} is {found}, allowed is {wanted}.", path=str(where))
 
@@ -122,53 +122,79 @@ def read_table(prim: Usd.Prim, where: object) -> DecoderTable:
     """Read the sampled decoder of a rig prim.
 
     Raises:
-        FormatError: values are missing, or do not fit one another.
-        VersionError: written by a newer version.
+        FormatError: Values are missing, or do not match one another.
+        VersionError: Written by a newer version.
     """
     bring_up_to_date(prim, where)
-    names = ("shape", "d1Knots", "d2Knots", "d3Knots", "twists", "format", "maxError", "errorSamples")
-    values = {name: read_value(prim, f"jaw:decoder:{name}", where) for name in names}
-    knots = tuple(np.array(values[f"d{i}Knots"], dtype=np.float64) for i in (1, 2, 3))
-    twists = np.array(values["twists"], dtype=np.float32)
-    counts = [len(axis) for axis in knots]
-    if list(values["shape"]) != counts or min(counts) < 2 or any((np.diff(axis) <= 0).any() for axis in knots):
-        raise FormatError(f"jaw:decoder:shape is {list(values['shape'])}, the knots are {counts}.", path=str(where))
-    shape = (*counts, 6) if values["format"] == "grid" else (sum(counts), 6)
+    stored_as = str(read_value(prim, "jaw:decoder:format", where))
+    d1, d2, d3 = (_numbers(prim, f"jaw:decoder:d{i}Knots", where) for i in (1, 2, 3))
+    axes, counts = (d1, d2, d3), [len(d1), len(d2), len(d3)]
+    found = _numbers(prim, "jaw:decoder:shape", where).tolist()
+    if found != counts or min(counts) < 2 or any((np.diff(axis) <= 0).any() for axis in axes):
+        raise FormatError(f"jaw:decoder:shape is {[int(n) for n in found]}, the knots are {counts}.", path=str(where))
+    twists = _numbers(prim, "jaw:decoder:twists", where).astype(np.float32)
+    shape = (*counts, 6) if stored_as == "grid" else (sum(counts), 6)
     if twists.size != math.prod(shape):
         raise FormatError(f"jaw:decoder:twists holds {twists.size} numbers, expected {shape}.", path=str(where))
-    if not np.isfinite(twists).all() or not all(np.isfinite(axis).all() for axis in knots):
+    if not np.isfinite(twists).all() or not all(np.isfinite(axis).all() for axis in axes):
         raise FormatError("jaw:decoder holds values that are not finite.", path=str(where))
-    return DecoderTable(
-        values["format"], knots, twists.reshape(shape), float(values["maxError"]), int(values["errorSamples"])
-    )
+    error_mm, samples = (_numbers(prim, f"jaw:decoder:{name}", where) for name in ("maxError", "errorSamples"))
+    return DecoderTable(stored_as, axes, twists.reshape(shape), float(error_mm), int(samples))
+
+
+def _numbers(prim: Usd.Prim, name: str, where: object) -> Array:
+    return np.array(read_value(prim, name, where), dtype=np.float64)
+
+
+class TableDescription(TypedDict):
+    """The sampled decoder of a rig, see `DecoderTable`."""
+
+    format: str
+    shape: list[int]
+    max_error_mm: float
+
+
+class Description(TypedDict):
+    """What a rig file holds, as plain JSON values."""
+
+    file: str
+    prim: str
+    format_version: int
+    actor: str
+    model: dict[str, str | None]
+    model_hash: str
+    units: dict[str, str]
+    twist_order: list[str]
+    ranges_mm: dict[str, list[float]]
+    landmarks_mm: dict[str, list[float]]
+    thresholds_mm: dict[str, float]
+    table: TableDescription
+    onnx: list[str]
+    fps: float
+    animation: dict[str, float] | None
+    meshes: dict[str, int]
+    placeholders: list[str]
+    errors: object
 
 
 @blames_file(0)
-def describe(path: PathArg, prim_path: str | None = None) -> dict[str, Any]:
-    """Return what a rig file holds, as plain JSON values, for `jawusd info`.
-
-    Args:
-        path: any layer or package that carries the rig.
-        prim_path: of the rig; the default prim if None.
-
-    Raises:
-        As `load_rig`.
-    """
+def describe(path: PathArg, prim_path: str | None = None) -> Description:
+    """Return what a rig file holds, for `jawusd info`; arguments and errors as for `load_rig`."""
     stage = open_stage(path)
     prim = find_rig_prim(stage, path, prim_path)
     rig = rig_of(prim, path)
     table = read_table(prim, path)
-    names = list(read_value(prim, "jaw:landmarks:names", path))
+    names = np.array(read_value(prim, "jaw:landmarks:names", path)).tolist()
     samples = prim.GetAttribute(PARAMETERS[0]).GetTimeSamples()
     animation = {"samples": len(samples), "first": samples[0], "last": samples[-1]} if samples else None
     onnx = [prim.GetAttribute(name).Get() for name in ONNX_ATTRIBUTES]
     return {
         "file": str(path),
         "prim": str(prim.GetPath()),
-        "format_version": read_value(prim, "jaw:formatVersion", path),
-        "actor": read_value(prim, "jaw:actor", path),
-        "model": {"kind": read_value(prim, "jaw:model:kind", path), "method": rig.meta.get("method")},
-        "model_hash": read_value(prim, "jaw:modelHash", path),
+        "format_version": int(_numbers(prim, "jaw:formatVersion", path)),
+        "actor": str(read_value(prim, "jaw:actor", path)),
+        "model": {"kind": str(rig.meta["kind"]), "method": rig.meta.get("method")},
+        "model_hash": str(read_value(prim, "jaw:modelHash", path)),
         "units": {"length": "mm", "angle": "rad"},
         "twist_order": ["omega", "v"],
         "ranges_mm": {name.removeprefix("jaw:"): row.tolist() for name, row in zip(PARAMETERS, rig.arrays["d_range"])},
@@ -179,7 +205,7 @@ def describe(path: PathArg, prim_path: str | None = None) -> dict[str, Any]:
         },
         "table": {
             "format": table.format,
-            "shape": [len(axis) for axis in table.knots],
+            "shape": [len(axis) for axis in table.axes],
             "max_error_mm": table.max_error_mm,
         },
         "onnx": [asset.path for asset in onnx if asset is not None],

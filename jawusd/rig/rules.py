@@ -1,4 +1,4 @@
-"""The rules a rig must keep: plain functions of a rig prim, independent of UsdValidation and of the schema plugin."""
+"""The rules for rigs: plain functions of a rig prim, independent of UsdValidation and of the schema plugin."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from pxr import Gf, Sdf, Usd, UsdGeom
 from jawusd.errors import JawusdError
 from jawusd.evaluator import JawRig
 from jawusd.geometry.arrays import Array
-from jawusd.geometry.se3 import transform_points
 from jawusd.rig import _gf
 from jawusd.rig.layout import ONNX_ATTRIBUTES, PARAMETERS, SIDECAR_HASH
 from jawusd.rig.read import read_table, rig_of
 from jawusd.rig.sampling import sample_valid
+from jawusd.rig.table import landmark_distance
 
 _TABLE_SLACK_MM = 0.01  # the table states its error over more parameters than are tried here
 _ONNX_MM = 0.01
@@ -26,13 +26,13 @@ _ONNX_PROBES = 100
 
 @dataclass(frozen=True)
 class Finding:
-    """Say what breaks a rule.
+    """A violation of a rule, or a note.
 
     Attributes:
         severity: "error", "warning" or "info".
-        rule: name of the rule.
-        path: prim or attribute it is about.
-        message: what was found and what is allowed.
+        rule: Name of the rule.
+        path: Prim or attribute concerned.
+        message: What was found and what is allowed.
     """
 
     severity: str
@@ -45,7 +45,7 @@ Rule = Callable[[Usd.Prim], Iterator[Finding]]
 
 
 def check_model(prim: Usd.Prim) -> Iterator[Finding]:
-    """Version, units, asset paths and model arrays can be read: all there, right shapes, finite."""
+    """Check that version, units and model arrays can be read: complete, of the right shapes, finite."""
     try:
         rig_of(prim, _where(prim))
     except JawusdError as error:
@@ -64,7 +64,7 @@ def check_table(prim: Usd.Prim) -> Iterator[Finding]:
         return
     d = sample_valid(rig, _PROBES)
     read = table.pose(d, rig.arrays["T_rest"])
-    error_mm = _landmark_distance(rig, read, rig.pose(d)).max()
+    error_mm = landmark_distance(rig, read, rig.pose(d)).max()
     if error_mm > table.max_error_mm + _TABLE_SLACK_MM:
         message = f"the table is {error_mm:.3f} mm from the model, maxError says {table.max_error_mm:.3f} mm."
         yield _finding("error", "Table", prim, message)
@@ -98,7 +98,7 @@ def check_onnx(prim: Usd.Prim) -> Iterator[Finding]:
 
 
 def check_bounds(prim: Usd.Prim) -> Iterator[Finding]:
-    """Every value of d1, d2, d3, at every time, lies inside the bounds."""
+    """Check that every value of d1, d2, d3, at every time, lies inside the bounds."""
     rig = _rig(prim)
     if rig is None:
         return
@@ -142,7 +142,7 @@ def _check_baked(
 ) -> Iterator[Finding]:
     times = _times(prim, [translate, orient])
     baked = np.stack([_gf.transform_from_ops(_at(translate, time), _at(orient, time)) for time in times])
-    error_mm = _landmark_distance(rig, baked, rig.pose(_parameters(prim, times)))
+    error_mm = landmark_distance(rig, baked, rig.pose(_parameters(prim, times)))
     worst = int(np.argmax(np.where(np.isfinite(error_mm), error_mm, np.inf)))
     if not error_mm[worst] <= _BAKED_MM:
         message = f"the baked pose at {times[worst]} is {error_mm[worst]:.3f} mm from that of d ({_BAKED_MM} allowed)."
@@ -167,7 +167,7 @@ def _finding(severity: str, rule: str, prim: Usd.Prim, message: str) -> Finding:
 
 
 def _rig(prim: Usd.Prim) -> JawRig | None:
-    """Return the evaluator, or None when the rule `check_model` has something to say."""
+    """Return the evaluator, or None where `check_model` finds an error."""
     try:
         return rig_of(prim, _where(prim))
     except JawusdError:
@@ -190,9 +190,3 @@ def _at(attribute: Usd.Attribute, time: Usd.TimeCode) -> Gf.Vec3d | Gf.Quatd:
 def _parameters(prim: Usd.Prim, times: list[Usd.TimeCode]) -> Array:
     rows = [[prim.GetAttribute(name).Get(time) for name in PARAMETERS] for time in times]
     return np.array(rows, dtype=np.float64)
-
-
-def _landmark_distance(rig: JawRig, T_a: Array, T_b: Array) -> Array:
-    """Return the largest distance [mm] of a landmark between poses (n, 4, 4), shape (n,)."""
-    points = transform_points(T_a - T_b, rig.arrays["landmarks"])
-    return np.linalg.norm(points, axis=-1).max(axis=-1)

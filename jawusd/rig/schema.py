@@ -1,7 +1,7 @@
-"""Make the codeless schema JawRigAPI known to OpenUSD.
+"""Register the codeless schema JawRigAPI with OpenUSD.
 
-Knowing it gives documentation, slider limits and type checks. Reading and writing rigs never depends on it: attributes
-are taken by name, and the applied schema from the raw `apiSchemas` metadata.
+It gives documentation, slider limits and type checks. Reading and writing rigs never depends on it: attributes are read
+by name, and the applied schema from the raw `apiSchemas` metadata.
 """
 
 from __future__ import annotations
@@ -22,13 +22,10 @@ def schema_folder() -> Path | None:
 
 
 def register_schema() -> bool:
-    """Register the schema with OpenUSD and say whether it is live.
+    """Register the schema with OpenUSD, once or more, and return whether this process knows it.
 
     OpenUSD builds its schema registry when a process first uses a stage; a plugin registered later stays unknown
-    (OpenUSD issue 3596). Registering twice does no harm.
-
-    Returns:
-        True if prims can be asked about JawRigAPI in this process.
+    (OpenUSD issue 3596).
     """
     folder = schema_folder()
     if folder is not None:
@@ -37,11 +34,11 @@ def register_schema() -> bool:
 
 
 def schema_is_live() -> bool:
-    """Return whether this process knows JawRigAPI. Asking fixes the schema registry of the process."""
+    """Return whether this process knows JawRigAPI; the call freezes the schema registry of the process."""
     return Usd.SchemaRegistry().FindAppliedAPIPrimDefinition(SCHEMA_NAME) is not None
 
 
 def has_jaw_api(prim: Usd.Prim) -> bool:
-    """Return whether a prim carries JawRigAPI, whatever this process knows of the schema."""
+    """Return whether a prim carries JawRigAPI, whether or not this process knows the schema."""
     applied = prim.GetMetadata("apiSchemas")
     return applied is not None and SCHEMA_NAME in applied.GetAddedOrExplicitItems()

@@ -36,18 +36,15 @@ def write_skel(
     no bounds.
 
     Args:
-        out: file to write, in the folder of `geo.usdc`.
-        rig: the exact model.
-        mesh_names: the meshes that `geo.usdc` holds, names as in `MESH_PATHS`.
-        fps: frames per second.
-        frames: frame numbers (F,), increasing; without them the jaw rests.
-        d: parameters (F, 3) [mm]; rows with NaN get no key.
-
-    Returns:
-        The file.
+        out: File to write, in the folder of `geo.usdc`.
+        rig: The exact model.
+        mesh_names: The meshes in `geo.usdc`, names as in `MESH_PATHS`.
+        fps: Frames per second.
+        frames: Frame numbers (F,), increasing; without them the jaw stays in the closed bite.
+        d: Parameters (F, 3) [mm]; rows with NaN get no key.
 
     Raises:
-        OutputError: the file cannot be written.
+        OutputError: The file cannot be written.
     """
     layer = new_layer(fps)
     root = define_prim(layer, ACTOR, "SkelRoot")
@@ -59,7 +56,7 @@ def write_skel(
     keys = _define_motion(stage, rig, hinge, frames, d)
     if keys is not None:
         layer.startTimeCode, layer.endTimeCode = float(keys[0]), float(keys[-1])
-    # The meshes stand where their bind transforms put them; Blender would apply the op of the payload on top.
+    # The bind transforms place the meshes; Blender would apply the ops of the payload on top.
     mandible = Sdf.CreatePrimInLayer(layer, MANDIBLE)
     order = Sdf.AttributeSpec(mandible, "xformOpOrder", Sdf.ValueTypeNames.TokenArray, Sdf.VariabilityUniform)
     order.default = Vt.TokenArray()
@@ -115,7 +112,7 @@ def _define_motion(
 
 
 def _bind(layer: Sdf.Layer, path: str, bind: Array, joint: int) -> None:
-    """Bind a mesh of the payload rigidly to a joint; written as overs, the payload is not loaded here."""
+    """Bind a mesh of the payload, which is not loaded here, rigidly to a joint."""
     mesh = Sdf.CreatePrimInLayer(layer, path)
     schemas = Sdf.TokenListOp()
     schemas.prependedItems = ["SkelBindingAPI"]

@@ -1,4 +1,4 @@
-"""The sampled decoder: a table of twists for readers that do not know the exact model, and how wrong it is."""
+"""The sampled decoder: a table of twists for readers that do not know the exact model, and its error."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ from jawusd.errors import RigError
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.table import SampledTable
 from jawusd.geometry.arrays import Array
-from jawusd.geometry.se3 import se3_exp
-from jawusd.rig.knots import sample_knots
-from jawusd.rig.sampling import sample_valid, valid_box
+from jawusd.geometry.se3 import se3_exp, transform_points
+from jawusd.rig.sampling import grid_axes, sample_valid, valid_box
 
 DEFAULT_SIZE = 33
 SIZES = (17, 33, 65)
@@ -23,24 +22,24 @@ _FULL_CHECKS = 200
 
 @dataclass(frozen=True, eq=False)
 class DecoderTable:
-    """Hold twists sampled over d.
+    """Twists sampled over d.
 
     Attributes:
         format: "grid" (twists over the three axes) or "curves" (three curves, to be added).
-        knots: sample positions of d1, d2, d3 [mm], increasing, three arrays.
-        twists: twists (omega [rad], v [mm]) in the skull frame, float32: (n1, n2, n3, 6), or (n1 + n2 + n3, 6).
-        max_error_mm: largest distance to the exact model found at any vertex.
-        error_samples: number of valid d at which it was measured.
+        axes: Values of d1, d2, d3 [mm], each array increasing.
+        twists: Twists (omega [rad], v [mm]) in the skull frame, float32: (n1, n2, n3, 6), or (n1 + n2 + n3, 6).
+        max_error_mm: Largest distance to the exact model found at any vertex.
+        error_samples: Number of valid d at which it was measured.
     """
 
     format: str
-    knots: tuple[Array, Array, Array]
+    axes: tuple[Array, Array, Array]
     twists: NDArray[np.float32]
     max_error_mm: float = 0.0
     error_samples: int = 0
 
     def __post_init__(self) -> None:
-        counts = tuple(len(axis) for axis in self.knots)
+        counts = tuple(len(axis) for axis in self.axes)
         wanted = (*counts, 6) if self.format == "grid" else (sum(counts), 6)
         if self.twists.shape != wanted:
             raise ValueError(f"twists of a {self.format} {counts} must have shape {wanted}, got {self.twists.shape}")
@@ -49,9 +48,11 @@ class DecoderTable:
         """Return interpolated twists, shape (n, 6), at d (n, 3) [mm], d clamped to the knots."""
         d = np.asarray(d, dtype=np.float64)
         if self.format == "curves":
-            parts = np.split(self.twists.astype(np.float64), np.cumsum([len(axis) for axis in self.knots])[:2])
-            return sum(_along(part, axis, x) for part, axis, x in zip(parts, self.knots, d.T, strict=True))
-        return SampledTable(self.knots, self.twists, np.eye(4)).twist(d)
+            parts = np.split(self.twists.astype(np.float64), np.cumsum([len(axis) for axis in self.axes])[:2])
+            curves = zip(parts, self.axes, d.T, strict=True)
+            columns = [[np.interp(x, axis, column) for column in part.T] for part, axis, x in curves]
+            return np.sum(columns, axis=0).T
+        return SampledTable(self.axes, self.twists, np.eye(4)).twist(d)
 
     def pose(self, d: ArrayLike, T_rest: Array) -> Array:
         """Return poses T_skull_mandible, shape (n, 4, 4), at d (n, 3) [mm]: exp(twist) times the rest pose."""
@@ -62,19 +63,19 @@ def build_table(rig: JawRig, vertices: Array, size: int = DEFAULT_SIZE) -> Decod
     """Sample a rig and measure the table's error.
 
     Args:
-        rig: the exact model.
-        vertices: mandible vertices (V, 3) in mandible coordinates [mm], at which the error is measured.
-        size: knots per axis, 17, 33 or 65.
+        rig: The exact model.
+        vertices: Mandible vertices (V, 3), mandible frame [mm], at which the error is measured.
+        size: Values per axis, 17, 33 or 65.
 
     Returns:
         A grid, or three curves for an additive model, whose sum is exact between the axes.
 
     Raises:
-        RigError: the size is not offered, or the bounds leave nothing valid.
+        RigError: The size is not offered, or the bounds leave nothing valid.
     """
     if size not in SIZES:
         raise RigError(f"a table of {size} knots per axis is not offered; allowed are {', '.join(map(str, SIZES))}.")
-    axes = sample_knots(rig, valid_box(rig), vertices[extreme_vertices(vertices)], size)
+    axes = grid_axes(rig, valid_box(rig), vertices[extreme_vertices(vertices)], size)
     if rig.meta["kind"] == "additive":
         twists = np.concatenate([rig.twist(_on_axis(i, axis)) for i, axis in enumerate(axes)])
         table = DecoderTable("curves", axes, twists.astype(np.float32))
@@ -87,7 +88,7 @@ def build_table(rig: JawRig, vertices: Array, size: int = DEFAULT_SIZE) -> Decod
     middles = middles.reshape(-1, 3)
     samples = np.concatenate([middles[rig.margin(middles) >= 0], sample_valid(rig, _VALID_SAMPLES)])
     error = table_error(rig, table, vertices, samples)
-    return DecoderTable(table.format, table.knots, table.twists, error, len(samples))
+    return DecoderTable(table.format, table.axes, table.twists, error, len(samples))
 
 
 def table_error(rig: JawRig, table: DecoderTable, vertices: Array, d: Array) -> float:
@@ -101,6 +102,11 @@ def table_error(rig: JawRig, table: DecoderTable, vertices: Array, d: Array) -> 
     rough = largest_distance(exact, read, vertices[extreme_vertices(vertices)])
     worst = np.argsort(rough)[-_FULL_CHECKS:]
     return float(largest_distance(exact[worst], read[worst], vertices).max())
+
+
+def landmark_distance(rig: JawRig, T_a: Array, T_b: Array) -> Array:
+    """Return the largest distance [mm] of a landmark between two sets of poses (n, 4, 4), shape (n,)."""
+    return np.linalg.norm(transform_points(T_a - T_b, rig.arrays["landmarks"]), axis=-1).max(axis=-1)
 
 
 def largest_distance(T_a: Array, T_b: Array, points: Array) -> Array:
@@ -132,8 +138,3 @@ def _on_axis(i: int, values: Array) -> Array:
     d = np.zeros((len(values), 3))
     d[:, i] = values
     return d
-
-
-def _along(values: Array, knots: Array, x: Array) -> Array:
-    """Return values (n, 6) at knots (n,) interpolated linearly at x (m,), clamped to the knots."""
-    return np.stack([np.interp(x, knots, column) for column in values.T], axis=1)

@@ -1,4 +1,4 @@
-"""Read USD that somebody else wrote: nothing outside a rig's folder is opened, and every fault of a file is its own."""
+"""Read USD from untrusted sources: files outside a rig's folder stay closed, faults of a file become FormatErrors."""
 
 from __future__ import annotations
 
@@ -6,37 +6,35 @@ import functools
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import ParamSpec, TypeVar
 
 from pxr import Sdf, Tf, UsdUtils
 
 from jawusd.errors import FormatError, RigError
 from jawusd.rig.schema import SCHEMA_NAME
 
-F = TypeVar("F", bound=Callable[..., Any])
+P = ParamSpec("P")
+R = TypeVar("R")
 
-# A value in USD has any type that its file declares: what then does not fit raises one of these.
+# A value in USD has whatever type its file declares; code that expects another type raises one of these.
 _FAULTS = (
     ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError, Tf.ErrorException,
 )  # fmt: skip
-# OpenUSD's parser of text calls itself for every bracket and ends the process when its stack is full.
+# OpenUSD's text parser recurses for every bracket and ends the process when its stack overflows.
 _NESTED = re.compile(rb"(?:[(\[{]\s*){500}")
 _OF_A_RIG = ("jaw:formatVersion", "jaw:model", "jaw:bounds", "jaw:decoder")
 
 
-def blames_file(argument: int) -> Callable[[F], F]:
-    """Make a reader raise FormatError where values of a file are not of the kind it expects.
+def blames_file(argument: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Return a decorator that makes a reader raise FormatError where values of a file have unexpected types.
 
     Args:
-        argument: which positional argument of the reader says where the values come from.
-
-    Returns:
-        The decorator.
+        argument: Index of the reader's positional argument that names the file.
     """
 
-    def decorate(function: F) -> F:
+    def decorate(function: Callable[P, R]) -> Callable[P, R]:
         @functools.wraps(function)
-        def wrapped(*args: Any, **named: Any) -> Any:
+        def wrapped(*args: P.args, **named: P.kwargs) -> R:
             try:
                 return function(*args, **named)
             except _FAULTS as error:
@@ -49,19 +47,16 @@ def blames_file(argument: int) -> Callable[[F], F]:
 
 
 def check_reach(path: Path) -> list[Sdf.Layer]:
-    """Check, before anything is composed, that the layers of a rig name only files in their own folder or below.
+    """Check, before a layer or package is composed, that a rig's layers name only files in their own folder or below.
 
-    Layers that merely use a rig (animation, shots) may reach out of their folder for it, and for nothing else; what a
-    rig's layers bring in must stay where the rig is, through links too.
-
-    Args:
-        path: the layer or package to be opened.
+    Layers that only use a rig (animation, shots) may name it outside their folder, and nothing else. Files that a rig's
+    layers name must lie in the rig's folder, with links resolved.
 
     Returns:
-        The layers, which stay loaded as long as somebody holds them.
+        The layers, which stay loaded as long as they are referenced.
 
     Raises:
-        RigError: naming the path.
+        RigError: A path that is not allowed.
     """
     layers, seen = [], set()
     waiting: list[tuple[str, Path | None, str | None]] = [(str(path), None, None)]
@@ -105,7 +100,7 @@ def _file(name: str) -> Path:
 
 
 def _layer(name: str) -> Sdf.Layer | None:
-    """Open a layer; None where there is none to open: what then is missing is found later."""
+    """Open a layer; None if it cannot be opened, which its reader reports later."""
     file = _file(name)
     if not file.exists():
         return None
@@ -123,7 +118,7 @@ def _layer(name: str) -> Sdf.Layer | None:
 
 
 def _is_whole(layer: Sdf.Layer) -> bool:
-    """Tell whether a layer holds all it names: OpenUSD ends the process where it does not."""
+    """Return whether a layer holds all prims and properties it names; OpenUSD ends the process where it does not."""
     missing = []
 
     def visit(path: Sdf.Path) -> None:
@@ -136,7 +131,7 @@ def _is_whole(layer: Sdf.Layer) -> bool:
 
 
 def _assets(layer: Sdf.Layer) -> list[str]:
-    """Return every path of a file that a layer names: of layers, values, clips and other metadata."""
+    """Return every file path in a layer: of layers, values, clips and other metadata."""
     found: list[str] = []
 
     def note(asset: str) -> str:

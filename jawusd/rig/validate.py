@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 
 from pxr import Usd
 
@@ -26,8 +27,7 @@ _NO_STOCK = "OpenUSD's own validators were not run: usd-core is older than 26.5.
 def register_validators() -> bool:
     """Register the rules with UsdValidation, once per process, so that any tool that validates applies them.
 
-    Returns:
-        False if this OpenUSD takes no validators written in Python.
+    Returns False if this OpenUSD takes no validators written in Python.
     """
     if not _PLUGGABLE:
         return False
@@ -40,23 +40,19 @@ def register_validators() -> bool:
 
 
 def validate_stage(path: str | os.PathLike[str]) -> list[Finding]:
-    """Return everything UsdValidation and jawusd's own rules have to say about a file; nothing means all is well.
+    """Return the findings of UsdValidation and of jawusd's own rules about any USD file.
 
-    Args:
-        path: any USD file. A file without a rig is checked by the stock validators alone.
+    A file without a rig is checked by the stock validators alone.
 
     Raises:
-        RigError: the file cannot be opened.
+        RigError: The file cannot be opened.
     """
     stage = open_stage(path)
     if not register_validators():
-        return [*_apply_rules(stage), Finding("info", "Stock", "/", _NO_STOCK)]
+        found = [finding for prim in _rig_prims(stage) for rule in RULES.values() for finding in rule(prim)]
+        return [*found, Finding("info", "Stock", "/", _NO_STOCK)]
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
     return [_finding(error) for error in UsdValidation.ValidationContext(validators).Validate(stage)]
-
-
-def _apply_rules(stage: Usd.Stage) -> list[Finding]:
-    return [finding for prim in _rig_prims(stage) for rule in RULES.values() for finding in rule(prim)]
 
 
 def _rig_prims(stage: Usd.Stage) -> list[Usd.Prim]:
@@ -64,14 +60,14 @@ def _rig_prims(stage: Usd.Stage) -> list[Usd.Prim]:
     return [prim for prim in stage.Traverse() if has_jaw_api(prim)]
 
 
-def _stage_validator(rule: Rule):
+def _stage_validator(rule: Rule) -> Callable[[Usd.Stage, object], list[UsdValidation.ValidationError]]:
     severities = {
         "error": UsdValidation.ValidationErrorType.Error,
         "warning": UsdValidation.ValidationErrorType.Warn,
         "info": UsdValidation.ValidationErrorType.Info,
     }
 
-    def validate(stage: Usd.Stage, time_range: object = None) -> list:
+    def validate(stage: Usd.Stage, time_range: object = None) -> list[UsdValidation.ValidationError]:
         return [
             UsdValidation.ValidationError(
                 finding.rule,

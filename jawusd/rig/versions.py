@@ -1,10 +1,10 @@
-"""Format versions: what is read, what is refused, and the one place where an older rig becomes a present one.
+"""Format versions: refuse newer rigs, upgrade older ones.
 
-A new version of the format takes four steps: raise `layout.FORMAT_VERSION`; write here the step from the version before
-it, `STEPS[1]` from 1 to 2, which gives a prim the attributes of the next version out of its own; let
-`tests/golden/make_golden_rig.py` write the golden rigs of the new version beside the old ones, which stay for ever and
-go through the steps in the tests; do the same in `plugins/jawusd_reader.py`, which stands alone. Files are never
-rewritten: `jawusd bake` on the model gives a rig of the present version.
+A new version of the format takes four steps: raise `layout.FORMAT_VERSION`; write here the upgrade from the version
+before it, `STEPS[1]` from 1 to 2, which derives a prim's new attributes from its old ones; let
+`tests/golden/make_golden_rig.py` write golden rigs of the new version beside the old ones, which the tests upgrade; do
+the same in `plugins/jawusd_reader.py`. Files are never rewritten: `jawusd bake` on the model gives a rig of the present
+version.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ STEPS: dict[int, Callable[[Usd.Prim], None]] = {}
 
 
 def bring_up_to_date(prim: Usd.Prim, where: object) -> None:
-    """Check the version of a rig prim and carry an older one to the present version.
+    """Check the version of a rig prim and upgrade an older one.
 
     The new attributes are authored in the session layer of the prim's stage: in memory, stronger than the files, never
     in them.
 
     Raises:
-        FormatError: the version is not a positive whole number.
-        VersionError: it is newer than this jawusd.
+        FormatError: The version is not a positive whole number.
+        VersionError: It is newer than this jawusd.
     """
     version = read_value(prim, "jaw:formatVersion", where)
     if not isinstance(version, int) or version < 1:

@@ -21,8 +21,7 @@ from jawusd.formats.mesh import Mesh, crown_face_mask
 from jawusd.geometry import so3_left_jacobian
 from jawusd.rig.bake import bake_rig
 from jawusd.rig.geo import corner_normals
-from jawusd.rig.knots import sample_knots
-from jawusd.rig.sampling import sample_valid, valid_box
+from jawusd.rig.sampling import grid_axes, sample_valid, valid_box
 from jawusd.rig.table import SIZES, build_table, table_error
 
 GRAPHS = {"actor.onnx", "actor_encode.onnx"}
@@ -127,7 +126,7 @@ def test_finer_tables_are_better(kind):
 def test_knots_span_the_valid_box_and_hold_the_closed_bite(kind):
     rig = example_rig(kind)
     table = build_table(rig, mandible_vertices())
-    for (low, high), axis in zip(valid_box(rig), table.knots, strict=True):
+    for (low, high), axis in zip(valid_box(rig), table.axes, strict=True):
         assert (axis[0], axis[-1], len(axis)) == (low, high, 33)
         assert 0.0 in axis and (np.diff(axis) > 0).all()
     assert np.abs(table.twist(np.zeros((1, 3)))).max() < 1e-12
@@ -151,7 +150,7 @@ class BentAtTen:
 def test_knots_are_dense_where_the_motion_bends():
     box = np.array([[-1.0, 40.0], [-5.0, 5.0], [-2.0, 6.0]])
     rig = BentAtTen()
-    d1, d2, _ = sample_knots(rig, box, np.zeros((1, 3)), 33)
+    d1, d2, _ = grid_axes(rig, box, np.zeros((1, 3)), 33)
     assert np.diff(d1)[np.searchsorted(d1, 10.0) - 1] < 0.25 * np.diff(d1).max()
     np.testing.assert_allclose(np.diff(d2), np.diff(d2).mean(), rtol=0.1)
     x = np.linspace(-1, 40, 5000)

@@ -6,7 +6,7 @@ from example_rig import FPS, example_meshes, example_motion, example_rig
 
 from jawusd.errors import RigError
 from jawusd.rig.bake import bake_rig
-from jawusd.rig.geo_read import read_geometry, read_placeholders
+from jawusd.rig.geo import read_geometry, read_placeholders
 
 
 def bake(folder, meshes):

@@ -11,7 +11,7 @@ from jawusd.errors import FormatError, MissingDependencyError, OutputError, RigE
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import Tracks, save_tracks
 from jawusd.pipeline.view import motion_names, open_viewer, part_of, viewed_actor
-from jawusd.rig.geo_read import read_geometry, read_gum
+from jawusd.rig.geo import read_geometry, read_gum
 from jawusd.rig.motion_read import read_poses_of_stage
 from jawusd.viewer.motion import Clip
 
