@@ -25,24 +25,6 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from os import PathLike
 
-__all__ = [
-    "CalibrationError",
-    "CaptureError",
-    "ClusterError",
-    "EvaluatorError",
-    "FittingError",
-    "FormatError",
-    "JawusdError",
-    "MissingDependencyError",
-    "OutputError",
-    "RigError",
-    "SyncError",
-    "TrackingError",
-    "UnitsError",
-    "VersionError",
-    "explain_missing_packages",
-]
-
 _EXTRA_OF_PACKAGE = {
     "moderngl": "demo",
     "viser": "view",

@@ -13,8 +13,6 @@ from jawusd.errors import CalibrationError, CaptureError
 from jawusd.imaging.pictures import read_picture
 from jawusd.imaging.video import Video
 
-__all__ = ["BoardClip", "sharpness"]
-
 
 class BoardClip:
     """Hold the board pictures of one camera: a video, or numbered pictures (a pattern with %d).

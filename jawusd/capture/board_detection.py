@@ -13,8 +13,6 @@ from jawusd.errors import CalibrationError
 from jawusd.formats.capture import Boards
 from jawusd.geometry.arrays import Array
 
-__all__ = ["corners_and_width", "detector", "edge_width_px", "shown_instead"]
-
 Search = Callable[[NDArray[np.uint8]], Array | None]
 
 _TIMES, _FEW_MARKERS = 2, 4  # pictures that must agree on another board; markers by which one is believed

@@ -15,9 +15,6 @@ from jawusd.errors import CalibrationError
 from jawusd.formats.capture import Boards
 from jawusd.geometry.arrays import Array, Mask
 
-__all__ = ["Sightings", "board_points", "board_symmetries", "find_boards"]
-
-
 MOST_VIEWS = 80  # more add minutes, not accuracy
 _LOOKED_AT = 6  # pictures in which another board is looked for
 _PER_WINDOW = 2  # successive video pictures of which the sharpest is taken

@@ -19,9 +19,6 @@ from jawusd.errors import CalibrationError
 from jawusd.geometry import hat, make_transform, so3_exp, so3_left_jacobian, so3_log
 from jawusd.geometry.arrays import Array
 
-__all__ = ["Bundle", "adjust"]
-
-
 _LENS = 6  # fx, fy, cx, cy, k1, k2
 _POSE = 6  # rotation vector [rad], translation [mm]
 _HUBER_SIGMAS, _LEAST_SIGMA_PX = 3.0, 0.02

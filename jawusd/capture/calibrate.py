@@ -18,8 +18,6 @@ from jawusd.formats.capture import Capture
 from jawusd.geometry import Camera
 from jawusd.geometry.arrays import Array
 
-__all__ = ["CalibrationReport", "calibrate_capture", "calibrate_sightings"]
-
 #: Called with the cameras and why picks do not tell the scale.
 MeasureScale = Callable[[list[Camera], ScaleCheck], ScaleCheck]
 

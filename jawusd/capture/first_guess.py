@@ -17,9 +17,6 @@ from jawusd.errors import CalibrationError
 from jawusd.geometry import make_transform, se3_inverse, so3_exp, so3_log
 from jawusd.geometry.arrays import Array, Mask
 
-__all__ = ["FirstGuess", "guess_cameras"]
-
-
 FEWEST_VIEWS = 6  # per camera; fewer leave focal length and distance exchangeable
 _SAME_ANGLE_RAD, _SAME_SHARE = np.deg2rad(4.0), 0.04  # relative poses this close (share of the distance) agree
 _LEAST_AGREEMENT = 0.5  # of the views shared by two cameras

@@ -17,8 +17,6 @@ from jawusd.errors import SyncError
 from jawusd.geometry.arrays import Array
 from jawusd.imaging.video import Video
 
-__all__ = ["Flashes", "Offset", "Step", "find_flashes", "find_steps", "match_steps", "mean_brightness", "on_grid"]
-
 _FIRST_WINDOW_S = 4.0  # searched at either end; doubled until a flash is found
 _SPARSE = 8  # every 8th pixel in both directions tells the mean brightness
 _CONTRAST = 0.3  # share of the brightness a flash must change; moving people change a few per cent

@@ -13,9 +13,6 @@ from jawusd.formats.capture import Bootstrap
 from jawusd.geometry import Camera, triangulate
 from jawusd.geometry.arrays import Array
 
-__all__ = ["ScaleCheck", "check_scale", "judged_scale", "triangulated_picks"]
-
-
 _FEWEST_PICKS = 3  # per jaw
 _TOLERANCE = 0.03  # picks tell the scale to about half a per cent
 _SIGMAS = 4.0

@@ -12,9 +12,6 @@ from jawusd.formats.capture import Bootstrap
 from jawusd.geometry import Camera, se3_inverse
 from jawusd.geometry.arrays import Array
 
-__all__ = ["ShapeError", "board_shape_error", "distance_errors", "expected_shape_error", "mouth_centre"]
-
-
 _MOUTH_RADIUS_MM = 35.0  # holds both arches through an opening of 40 mm
 _DRAWS = 40
 _POINTS = 150

@@ -15,8 +15,6 @@ from scipy.fft import irfft, next_fast_len, rfft
 from jawusd.errors import SyncError
 from jawusd.imaging.audio import Sound
 
-__all__ = ["RATE_HZ", "SoundMatch", "match_sounds"]
-
 RATE_HZ = 16000
 _WHITENING = 0.75
 _LOWEST_HZ = 80.0  # below it is mains hum and wind

@@ -22,8 +22,6 @@ from jawusd.formats.light_curve import LightCurve
 from jawusd.imaging.audio import Sound, read_sound
 from jawusd.imaging.video import Video
 
-__all__ = ["Alignment", "align_videos", "estimate_offsets", "light_curve"]
-
 _RATE_TOLERANCE = 1e-3
 _FPS_TOLERANCE = 5e-3  # people write 24 for 23.976
 _EARLY_S = 2.0  # people stop their cameras one after the other

@@ -24,8 +24,6 @@ from jawusd.errors import FormatError
 from jawusd.formats.text import read_text
 from jawusd.geometry.arrays import Array
 
-__all__ = ["FaceCapture", "read_arkit"]
-
 JAW_COLUMNS = ("jawopen", "jawleft", "jawright", "jawforward")
 _TIME, _COUNT = "timecode", "blendshapecount"
 _TIMECODE = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})[:;](\d{1,3}(?:\.\d+)?)")

@@ -21,9 +21,6 @@ from jawusd.formats.calibration import load_calibration
 from jawusd.geometry import Camera, make_transform, matrix_from_wxyz, rigidity_defect, se3_inverse
 from jawusd.geometry.arrays import Array
 
-__all__ = ["calibration_files", "load_cameras_file", "load_colmap", "load_nerfstudio"]
-
-
 _COLMAP = ("cameras.txt", "images.txt")
 _HALF_PX = 0.5
 # Per COLMAP model: which parameters are fx, fy, cx, cy and, from there on, OpenCV's distortion; SIMPLE ones share f.

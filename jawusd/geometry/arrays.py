@@ -6,5 +6,3 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 Mask = NDArray[np.bool_]
-
-__all__ = ["Array", "Indices", "Mask"]

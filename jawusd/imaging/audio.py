@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from jawusd.errors import CaptureError
 
-__all__ = ["Sound", "read_sound"]
-
 
 class Sound(NamedTuple):
     """Hold the sound of a file.

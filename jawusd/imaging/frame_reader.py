@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from jawusd.errors import CaptureError
 from jawusd.imaging.video import Video, VideoFrame
 
-__all__ = ["FrameReader"]
-
 _AHEAD = 24  # pictures: to decode on is quicker than to start over at a key frame
 _BACK = 8  # pictures decoded at once for somebody who walks backwards
 _KEPT_BYTES = 128 << 20

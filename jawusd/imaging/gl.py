@@ -25,7 +25,6 @@ except ModuleNotFoundError as error:
         hint="Install it with: pip install 'jawusd[all]', or use the CPU backend.",
     ) from error
 
-__all__ = ["GlCounter", "open_context"]
 
 _LAYER_EXTENSION = "GL_ARB_shader_viewport_layer_array"
 _MOST_PIXELS = 1 << 26  # of one layered picture: 64 MB

@@ -17,8 +17,6 @@ from jawusd.imaging.pictures import read_picture
 from jawusd.imaging.pixels import Colour
 from jawusd.imaging.video import Video
 
-__all__ = ["LabelValues", "MaskImage", "PngMasks", "VideoMasks"]
-
 MaskImage = NDArray[np.uint8]
 RawImage = NDArray[np.uint8] | NDArray[np.uint16]  # as files store it
 #: Gray values of the wanted arch and of the other one in label images; all else must be 0.

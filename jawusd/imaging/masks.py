@@ -17,8 +17,6 @@ from jawusd.imaging.mask_files import LabelValues, MaskImage, PngMasks, VideoMas
 from jawusd.imaging.timeline import Timeline
 from jawusd.imaging.video import Video
 
-__all__ = ["MaskReader", "mask_size_px", "open_masks"]
-
 _AHEAD = 4  # pictures waiting at most: 8 MB of full HD per reader
 
 

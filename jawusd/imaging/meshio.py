@@ -15,8 +15,6 @@ from jawusd.errors import CaptureError
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry.arrays import Array
 
-__all__ = ["Winding", "load_mesh", "winding"]
-
 _KINDS = (".ply", ".stl", ".obj")
 # Diagonal of the bounding box [mm]: smallest, typical, largest. A full arch has about 80, a mandible 165, a skull 290.
 _DIAGONAL_MM = {"scan": (20.0, 80.0, 150.0), "bone": (50.0, 200.0, 500.0)}

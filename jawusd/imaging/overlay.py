@@ -19,8 +19,6 @@ from jawusd.geometry.arrays import Array
 from jawusd.imaging.raster import draw_depth_labels
 from jawusd.imaging.video import Video
 
-__all__ = ["PlacedScan", "contact_sheet", "draw_overlay", "encode_jpeg", "save_png", "tracking_sheet"]
-
 UPPER_COLOUR = (255, 170, 0)
 LOWER_COLOUR = (0, 200, 255)
 _LINE_PX = 2

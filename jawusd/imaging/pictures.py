@@ -8,8 +8,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["read_picture"]
-
 _PNG = b"\x89PNG\r\n\x1a\n"
 _MOST_PX = 1 << 27  # four times 8K; a few bytes can declare a picture that fills the memory
 

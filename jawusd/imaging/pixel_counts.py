@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.imaging.raster import Bits, Singles, count_and_not, draw_silhouette, pack_bits, project
 
-__all__ = ["RasterCounter", "checked_screens"]
-
 _MATRICES = types.Array(types.float32, 3, "C", readonly=True)
 _SCREENS = types.Array(types.uint64, 3, "C", readonly=True)
 _VERTICES = types.Array(types.float32, 2, "C", readonly=True)

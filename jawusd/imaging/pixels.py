@@ -9,8 +9,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Colour", "Slices", "converted"]
-
 Colour = Literal["gray", "rgb", "rgba"]
 #: Rows and columns of a part of a picture.
 Slices: TypeAlias = "tuple[slice[int, int, int], slice[int, int, int]]"

@@ -12,8 +12,6 @@ from jawusd.formats.atomic import write_bytes_atomic
 from jawusd.geometry import Camera
 from jawusd.imaging.working_view import WorkingView
 
-__all__ = ["PlateWriter"]
-
 _QUALITY = 95
 
 

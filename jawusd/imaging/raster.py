@@ -23,17 +23,6 @@ from numpy.typing import NDArray
 
 from jawusd.geometry.arrays import Mask
 
-__all__ = [
-    "count_and_not",
-    "count_bits",
-    "draw_depth_labels",
-    "draw_silhouette",
-    "pack_bits",
-    "project",
-    "unpack_bits",
-    "words_for",
-]
-
 _ALL = np.uint64(0xFFFFFFFFFFFFFFFF)
 _ONE = np.uint64(1)
 _LOW6 = 63

@@ -7,8 +7,6 @@ from numpy.typing import NDArray
 
 from jawusd.geometry.arrays import Array
 
-__all__ = ["Timeline"]
-
 
 class Timeline:
     """Place the pictures of a video on an even grid of frames by their presentation times.

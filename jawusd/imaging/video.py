@@ -20,8 +20,6 @@ from jawusd.errors import CaptureError
 from jawusd.imaging.pixels import Colour, Slices, converted
 from jawusd.imaging.timeline import Timeline
 
-__all__ = ["Video", "VideoFrame"]
-
 _REENCODE = "Re-encode it, for example: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp4."
 # WebM keeps transparency in a second stream, which only these decoders read; the file's meta data tell of it.
 _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from jawusd.formats.atomic import atomic_path
 
-__all__ = ["VideoWriter"]
-
 
 class VideoWriter:
     """Write pictures to a video, one after the other, as a context manager.

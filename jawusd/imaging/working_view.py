@@ -14,8 +14,6 @@ from jawusd.geometry.arrays import Mask
 from jawusd.geometry.camera import Camera
 from jawusd.imaging.pixels import Slices
 
-__all__ = ["WorkingView", "remap"]
-
 _NODE_PX = 16  # spacing of the map samples that locate a region
 
 
