@@ -1,6 +1,5 @@
-"""Fit jaw models to captured poses: the model, its bounds, its errors and what the capture lacks."""
+"""Fit jaw models to captured poses: the model, its bounds, its errors and the movements it lacks."""
 
-from jawusd.fitting.config import FittingConfig
-from jawusd.fitting.fit import fit_model
+from jawusd.fitting.fit import FittingConfig, fit_model
 
 __all__ = ["FittingConfig", "fit_model"]

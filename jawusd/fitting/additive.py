@@ -1,25 +1,22 @@
 """The best sum of three curves: log M = Phi1(d1) + Phi2(d2) + Phi3(d3), fitted jointly to the captured poses.
 
 The twist is taken about the incisal point p, (omega, s = omega x p + v), and one component of s of each curve is its
-parameter t itself (-s_y of Phi1, s_x of Phi2, s_z of Phi3), which leaves nothing of the sum undetermined. All other
-components are smoothing splines, solved for together by least squares while the poses are projected onto the sum.
+parameter t itself (-s_y of Phi1, s_x of Phi2, s_z of Phi3), which makes the sum unique. All other components are
+smoothing splines, solved for together by least squares while the poses are projected onto the sum.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import BSpline
 
 from jawusd.evaluator.curves import HermiteCurve
 from jawusd.evaluator.models import AdditiveModel
-from jawusd.fitting.curves import MEASURED, Curve, additive_arrays, in_millimetres
+from jawusd.fitting.curves import MEASURED, Curve, in_millimetres
 from jawusd.fitting.data import TrainingData
-from jawusd.fitting.gauge_fit import fit_gauge
-from jawusd.fitting.path import fit_path
-from jawusd.fitting.spline import choose_smoothing, ridge_solve
-from jawusd.fitting.trimming import within
+from jawusd.fitting.form import FittedForm
+from jawusd.fitting.gauge_fit import fit_gauge, fit_path
+from jawusd.fitting.spline import choose_smoothing, ridge_solve, within
 from jawusd.geometry import se3_log
 from jawusd.geometry.arrays import Array, Mask
 
@@ -30,30 +27,6 @@ _TAIL_RIDGE = 1e-4  # keeps the coefficients finite where there are no frames
 _HIDDEN_RIDGE = 1e9  # and at zero in directions the data do not show
 _TRIM_FLOOR_MM = 0.8  # a sum of curves misses whole exercises by more than tracking noise
 _CV_BLOCK, _CV_FOLDS, _CV_CAP_MM = 25, 5, 1.0
-
-
-@dataclass(frozen=True)
-class AdditiveFit:
-    """Hold a fitted sum of curves.
-
-    Attributes:
-        model: the decoder.
-        smoothing: what cross-validation chose.
-        kept: training frames that were not trimmed, shape (N,).
-    """
-
-    model: AdditiveModel
-    smoothing: float
-    kept: Mask
-    kind = "additive"
-
-    def arrays(self) -> dict[str, Array]:
-        """Return the model's own arrays."""
-        return additive_arrays(self.model)
-
-    def notes(self) -> dict[str, float]:
-        """Return what the header says about the fit."""
-        return {"smoothing": self.smoothing}
 
 
 class _Basis:
@@ -78,25 +51,23 @@ class _Basis:
         return self._splines(np.clip(t, *self.limits), nu=1)
 
 
-def fit_additive(data: TrainingData, shown: Mask, trim_mad: float) -> AdditiveFit:
+def fit_additive(data: TrainingData, shown: Mask, trim_mad: float) -> FittedForm:
     """Fit the sum of three curves.
 
     Args:
-        data: the training data.
         shown: which parameters the data show, shape (3,); the curves of the others are translations without rotation.
-        trim_mad: frames farther from the model than the median by this many normalised median absolute deviations
-            are left out of the fit.
+        trim_mad: see `FittingConfig`.
     """
     u = data.displacement()
     t = fit_gauge(u, data.weights, fit_path(u, data.weights), shown).gauge.inverse(u)
-    kept = np.isfinite(t).all(1)
+    kept = np.all(np.isfinite(t), axis=1)
     for _ in range(_ROUNDS):
         fitted = kept
         model, smoothing = _regress(data, t, fitted, shown)
         d, nearest = data.metric.nearest(model, data.motion)
         t = np.stack([_own(curve, d[:, i], data.incisor, i) for i, curve in enumerate(model.curves)], axis=1)
         kept = within(data.metric.rms(nearest, data.motion), trim_mad, _TRIM_FLOOR_MM)
-    return AdditiveFit(model, smoothing, fitted)
+    return FittedForm(model, fitted, {"smoothing": smoothing})
 
 
 def _own(curve: HermiteCurve, d: Array, incisor: Array, axis: int) -> Array:

@@ -1,4 +1,4 @@
-"""The anatomical gate: are these poses those of a human jaw, and if not, what went wrong?
+"""The anatomical gate: compare landmarks and poses with human ranges and recognise common mistakes.
 
 Ranges: opening 49 +-9 mm, laterotrusion 10-12 +-3 mm, protrusion 8-9 +-2.5 mm, rotation 39 +-6 deg, condylar path
 20 +-4 mm (Zawawi 2003; Hirsch 2006; Muto & Kanazawa 1996); limits lie three standard deviations out or more.
@@ -10,15 +10,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jawusd.fitting.data import Anatomy, TrainingData
-from jawusd.geometry import se3_inverse, so3_log, transform_point
+from jawusd.fitting.data import SubjectAnatomy, TrainingData, displacement
+from jawusd.geometry import se3_inverse, so3_log
 from jawusd.geometry.arrays import Array
 
 _OPENING_MAX_MM = 75.0
 _LATERAL_MAX_MM = 20.0
 _PROTRUSION_MAX_MM = 16.0
 _RETRUSION_MAX_MM = 6.0  # backwards beyond the habitual path, teeth nearly together
-_NEAR_CLOSED_MM = 5.0  # openings in which protrusion and retrusion are read off
+_NEAR_CLOSED_MM = 5.0  # openings up to which protrusion and retrusion are measured
 _RISE_MAX_MM = 4.0  # the lower incisor cannot rise above the bite by more
 _ROTATION_MAX_DEG = 57.0
 _CONDYLE_MAX_MM = 32.0
@@ -30,23 +30,14 @@ _UNITS = {"metres": 1000.0, "centimetres": 10.0, "inches": 25.4, "micrometres": 
 
 @dataclass(frozen=True)
 class AnatomyWarning:
-    """Name one thing that no human jaw does.
-
-    Attributes:
-        code: short name, for machines.
-        message: what was found and what is normal, with units.
-    """
+    """Report one finding that no human jaw shows: a short code, and a message with the normal range."""
 
     code: str
     message: str
 
 
-def check_anatomy(data: TrainingData, anatomy: Anatomy) -> list[AnatomyWarning]:
-    """Compare landmarks and motions with human ranges; a recognised mistake is reported alone.
-
-    Returns:
-        What is not human, or nothing.
-    """
+def check_anatomy(data: TrainingData, anatomy: SubjectAnatomy) -> list[AnatomyWarning]:
+    """Compare landmarks and motions with human ranges; a recognised mistake is reported alone."""
     mistake = _frame_mistake(data) or _unit_mistake(data, anatomy) or _swap_mistake(data)
     return [mistake] if mistake else _out_of_range(data)
 
@@ -74,8 +65,8 @@ def _frame_mistake(data: TrainingData) -> AnatomyWarning | None:
     return None
 
 
-def _unit_mistake(data: TrainingData, anatomy: Anatomy) -> AnatomyWarning | None:
-    """Recognise translations in another unit: the condyles stay in their joints only with the right one."""
+def _unit_mistake(data: TrainingData, anatomy: SubjectAnatomy) -> AnatomyWarning | None:
+    """Recognise translations in a wrong unit, which move the condyles out of their joints."""
     travel = _condyle_travel(data, anatomy, 1.0)
     if travel <= _CONDYLE_MAX_MM:
         return None
@@ -89,18 +80,18 @@ def _unit_mistake(data: TrainingData, anatomy: Anatomy) -> AnatomyWarning | None
     )
 
 
-def _condyle_travel(data: TrainingData, anatomy: Anatomy, factor: float) -> float:
+def _condyle_travel(data: TrainingData, anatomy: SubjectAnatomy, factor: float) -> float:
     """Return how far the middle between the condyles moves [mm] with the poses' translations scaled."""
-    T = se3_inverse(anatomy.T_anatomical_skull) @ data.motion @ anatomy.T_anatomical_skull @ anatomy.T_rest
+    T = anatomy.frames.poses(data.motion)
     T[:, :3, 3] *= factor
-    centre = data.landmarks[3:].mean(0)
-    return float(np.percentile(np.linalg.norm(transform_point(anatomy.motion(T), centre) - centre, axis=-1), 90))
+    moved = displacement(anatomy.motion(T), data.landmarks[3:].mean(0))
+    return float(np.percentile(np.linalg.norm(moved, axis=-1), 90))
 
 
 def _swap_mistake(data: TrainingData) -> AnatomyWarning | None:
     rise = float(np.percentile(data.displacement()[:, 1], _QUANTILE))
-    inverse = se3_inverse(data.motion)
-    swapped_rise = float(np.percentile(transform_point(inverse, data.incisor)[:, 1] - data.incisor[1], _QUANTILE))
+    swapped = displacement(se3_inverse(data.motion), data.incisor)
+    swapped_rise = float(np.percentile(swapped[:, 1], _QUANTILE))
     if rise > _RISE_MAX_MM and swapped_rise < _RISE_MAX_MM:
         return AnatomyWarning(
             "swapped_jaws",
@@ -114,8 +105,7 @@ def _out_of_range(data: TrainingData) -> list[AnatomyWarning]:
     u = data.displacement()
     near = u[-u[:, 1] < _NEAR_CLOSED_MM]
     forward = near[:, 2] if len(near) else np.zeros(1)
-    condyles = transform_point(data.motion, data.landmarks[3]), transform_point(data.motion, data.landmarks[4])
-    travel = np.concatenate([np.linalg.norm(c - p, axis=-1) for c, p in zip(condyles, data.landmarks[3:], strict=True)])
+    travel = np.linalg.norm([displacement(data.motion, condyle) for condyle in data.landmarks[3:]], axis=-1)
     found = [
         ("opening", float(np.percentile(-u[:, 1], _QUANTILE)), _OPENING_MAX_MM, "mm"),
         ("rise", float(np.percentile(u[:, 1], _QUANTILE)), _RISE_MAX_MM, "mm"),
@@ -123,7 +113,12 @@ def _out_of_range(data: TrainingData) -> list[AnatomyWarning]:
         ("protrusion", float(np.percentile(forward, _QUANTILE)), _PROTRUSION_MAX_MM, "mm"),
         ("retrusion", float(np.percentile(-forward, _QUANTILE)), _RETRUSION_MAX_MM, "mm"),
         ("rotation", _largest_rotation_deg(data.motion), _ROTATION_MAX_DEG, "deg"),
-        ("condylar translation", float(np.percentile(travel, _QUANTILE)), _CONDYLE_MAX_MM, "mm"),
+        (
+            "condylar translation",
+            float(np.percentile(travel, _QUANTILE)),
+            _CONDYLE_MAX_MM,
+            "mm",
+        ),
     ]
     return [
         AnatomyWarning(

@@ -3,7 +3,7 @@
 On the three-dimensional set of reachable poses the displacement u of the incisal point is itself a coordinate system,
 so omega = f(u), t = u + p - R(omega) p with f(0) = 0 describes any smooth three-parameter jaw. f is a smoothing
 polyharmonic spline; it is refitted while the captured poses are projected onto it, so that noise in u does not bias f.
-Where no poses were captured the spline follows, weakly, what the condyles' paths say of them (see `condylar`).
+Where no poses were captured, predictions from the condyles' paths guide the spline weakly (see `condylar`).
 """
 
 from __future__ import annotations
@@ -17,10 +17,9 @@ from jawusd.evaluator.gauge import Gauge
 from jawusd.evaluator.models import AnchoredModel
 from jawusd.fitting.condylar import CondylarGuidance
 from jawusd.fitting.data import MODEL_SIGMA_MM, TrainingData
-from jawusd.fitting.gauge_fit import GaugeFit, fit_gauge, path_gauge
-from jawusd.fitting.path import fit_path
-from jawusd.fitting.spline import SplineBasis, choose_smoothing, farthest_points, ridge_solve
-from jawusd.fitting.trimming import within
+from jawusd.fitting.form import FittedForm
+from jawusd.fitting.gauge_fit import fit_gauge, fit_path
+from jawusd.fitting.spline import SplineBasis, choose_smoothing, farthest_points, ridge_solve, within
 from jawusd.geometry import make_transform, so3_log
 from jawusd.geometry.arrays import Array, Mask
 
@@ -34,65 +33,20 @@ _CV_CAP_MM = 1.0
 _TAIL_RIDGE = 1e-6  # keeps the slope finite along a direction without motion
 _FRAMES_PER_CENTRE = 4
 _TRIM_FLOOR_MM = 0.5
-_GUIDED_GRID = (9, 7, 7)  # points along opening, sideways and forward at which the condyles' paths are consulted
+_GUIDED_GRID = (9, 7, 7)  # points along opening, sideways and forward with predictions from the condyles' paths
 _GUIDED_SHARE = 0.08  # weight of all of them together, relative to the frames, if the paths fitted perfectly
 
 
-@dataclass(frozen=True)
-class AnchoredFit:
-    """Hold a fitted anchored model.
-
-    Attributes:
-        model: the decoder.
-        gauge_fit: the gauge and its invertibility check.
-        smoothing: what cross-validation chose.
-        kept: training frames that were not trimmed, shape (N,).
-    """
-
-    model: AnchoredModel
-    gauge_fit: GaugeFit
-    smoothing: float
-    kept: Mask
-    kind = "anchored"
-
-    def arrays(self) -> dict[str, Array]:
-        """Return the model's own arrays."""
-        gauge = self.model.gauge
-        return {
-            "path_coefficients": gauge.path_coefficients,
-            "path_scale_mm": np.array(gauge.path_scale_mm),
-            "path_limits": np.array(gauge.path_limits),
-            "glide_arch": gauge.glide_arch,
-            "glide_drop": gauge.glide_drop,
-            "glide_softness_mm": np.array(gauge.glide_softness_mm),
-            "glide_fade_mm": np.array(gauge.glide_fade_mm),
-            "spline_scales": self.model.scales,
-            "spline_centres": self.model.centres,
-            "spline_weights": self.model.weights,
-        }
-
-    def notes(self) -> dict[str, float | None]:
-        """Return what the header says about the fit."""
-        return {
-            "centres": len(self.model.centres),
-            "smoothing": self.smoothing,
-            "gauge_smallest_minor": self.gauge_fit.smallest_minor,
-            "gauge_stiffness": self.gauge_fit.stiffness,
-        }
-
-
-def fit_anchored(data: TrainingData, shown: Mask, trim_mad: float) -> AnchoredFit:
+def fit_anchored(data: TrainingData, shown: Mask, trim_mad: float) -> FittedForm:
     """Fit the anchored model.
 
     Args:
-        data: the training data.
         shown: which of opening, laterotrusion, protrusion the data show, shape (3,); f does not depend on the others.
-        trim_mad: frames farther from the model than the median by this many normalised median absolute deviations
-            are left out of the fit.
+        trim_mad: see `FittingConfig`.
     """
     u = data.displacement()
     path = fit_path(u, data.weights)
-    chart = _Chart(path_gauge(path), np.where(shown, _SCALES_MM, _HIDDEN_SCALE_MM))
+    chart = _Chart(path, np.where(shown, _SCALES_MM, _HIDDEN_SCALE_MM))
     kept = np.ones(len(data), dtype=bool)
     for _ in range(_ROUNDS):
         fitted = kept
@@ -100,14 +54,20 @@ def fit_anchored(data: TrainingData, shown: Mask, trim_mad: float) -> AnchoredFi
         d, nearest = data.metric.nearest(model, data.motion)
         u = chart.path.displacement(d)
         kept = within(data.metric.rms(nearest, data.motion), trim_mad, _TRIM_FLOOR_MM)
-    gauge_fit = fit_gauge(u[fitted], data.weights[fitted], path, shown)
-    model = AnchoredModel(gauge_fit.gauge, data.incisor, chart.scales, model.centres, model.weights)
-    return AnchoredFit(model, gauge_fit, smoothing, fitted)
+    found = fit_gauge(u[fitted], data.weights[fitted], path, shown)
+    model = AnchoredModel(found.gauge, data.incisor, chart.scales, model.centres, model.weights)
+    notes: dict[str, object] = {
+        "centres": len(model.centres),
+        "smoothing": smoothing,
+        "gauge_smallest_minor": found.smallest_minor,
+        "gauge_stiffness": found.stiffness,
+    }
+    return FittedForm(model, fitted, notes)
 
 
 @dataclass(frozen=True)
 class _Chart:
-    """Map incisal displacements u (N, 3) [mm] to the sheared and scaled arguments q (N, 3) of the spline."""
+    """Map incisal displacements u (N, 3) [mm] to the arguments q (N, 3) of the spline: sheared by the path, scaled."""
 
     path: Gauge
     scales: Array
@@ -123,17 +83,16 @@ class _Chart:
 
 
 def _regress(data: TrainingData, u: Array, kept: Mask, chart: _Chart, guided: bool) -> tuple[AnchoredModel, float]:
-    """Fit f to the rotations that suit the frames best while their incisal points stay at u.
+    """Fit f to the best rotations of the frames while their incisal points stay at u.
 
-    The smoothing is chosen anew each time: gross outliers, once trimmed, no longer ask for a stiffer f.
+    The smoothing is chosen again in every round, since trimmed outliers no longer require a stiffer f.
     """
     rotation = data.metric.best_rotation(data.motion, data.incisor, u + data.incisor)[kept]
     omega, q, weights = so3_log(rotation), chart.of(u[kept]), data.weights[kept]
     folds = (np.arange(len(data)) // _CV_BLOCK % _CV_FOLDS)[kept]
     if guided:
-        more = _guided_rows(
-            data, make_transform(rotation, u[kept] + data.incisor - rotation @ data.incisor), weights, chart
-        )
+        motion = make_transform(rotation, u[kept] + data.incisor - rotation @ data.incisor)
+        more = _guided_rows(data, motion, weights, chart)
         omega, q, weights = (np.concatenate(pair) for pair in zip((omega, q, weights), more, strict=True))
         folds = np.append(folds, np.full(len(q) - len(folds), -1))
     # In units of mm: |L^T domega|^2 is the mean squared displacement of the mandible about the incisal point.
@@ -152,10 +111,10 @@ def _regress(data: TrainingData, u: Array, kept: Mask, chart: _Chart, guided: bo
 
 
 def _guided_rows(data: TrainingData, motion: Array, weights: Array, chart: _Chart) -> tuple[Array, Array, Array]:
-    """Return rotation vectors (G, 3), spline arguments (G, 3) and weights (G,) where the condyles' paths lead.
+    """Return rotation vectors (G, 3), spline arguments (G, 3) and weights (G,) predicted from the condyles' paths.
 
-    They fill the box around the captured poses, and weigh together a few percent of what those weigh: where there are
-    poses, these decide.
+    They fill the box around the captured poses and have a few percent of their total weight, so that they matter only
+    where there are no poses.
     """
     guidance = CondylarGuidance.of_motion(motion, weights, data.incisor, data.landmarks[-2:])
     q = chart.of(motion[:, :3, :3] @ data.incisor + motion[:, :3, 3] - data.incisor)

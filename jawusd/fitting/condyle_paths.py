@@ -1,4 +1,4 @@
-"""Paper Fig. 5: where the condyles go when the jaw opens, in the principal component and in the models."""
+"""Paper Fig. 5: the paths of the condyles when the jaw opens, in the principal component and in the models."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.evaluator.models import JawModelForm
-from jawusd.fitting.data import Anatomy, TrainingData
+from jawusd.fitting.data import SubjectAnatomy, TrainingData
 from jawusd.formats.experiments import CondylePath, Distances, ParameterPath
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import se3_exp, se3_log, transform_point, transform_points
@@ -16,28 +16,25 @@ EXPERIMENT = "condyle path"
 PRINCIPAL = "principal component 1"
 
 _STEPS = 121
-_SHOWN_OPENINGS = (0.0, 1 / 3, 2 / 3, 1.0)  # of the path at which the condyle's outline is drawn: four, as the paper
-_AROUND_MM = 24.0  # of the outlines about the closed condyle
+_SHOWN_OPENINGS = (0.0, 1 / 3, 2 / 3, 1.0)  # shares of the path with the condyle's outline: four, as in the paper
+_AROUND_MM = 24.0  # half size of the outlines
 _NEAR_CLOSED_MM = 5.0
 _HABITUAL_MM = 1.5  # captured poses with |d2| and |d3| below this belong to plain opening
-_BESIDE_MM = 0.75  # captured condyles this near in z say how high the eminence lets a condyle go
+_BESIDE_MM = 0.75  # captured condyles this near in z bound the height of a condyle under the eminence
 _FEWEST_BESIDE = 3
 
 
 def condyle_paths(
-    data: TrainingData, models: dict[str, JawModelForm], widest_mm: float, mandible: Mesh | None, anatomy: Anatomy
+    data: TrainingData,
+    models: dict[str, JawModelForm],
+    widest_mm: float,
+    mandible: Mesh | None,
+    anatomy: SubjectAnatomy,
 ) -> list[CondylePath]:
-    """Sweep the first principal component, and the opening of each model.
+    """Sweep the first principal component, then the opening d1 of each model up to `widest_mm`.
 
     Args:
-        data: the captured poses.
-        models: decoders by name; d1 alone is swept.
-        widest_mm: opening at which the sweeps of models end.
         mandible: for outlines of the condyle, mandible frame.
-        anatomy: where the jaw lies.
-
-    Returns:
-        The path of the captured component, then one per model.
     """
     sweeps = {PRINCIPAL: principal_opening(data)}
     d = np.zeros((_STEPS, 3))
@@ -48,18 +45,13 @@ def condyle_paths(
 
 
 def parameter_paths(data: TrainingData, models: dict[str, JawModelForm], captured: Array) -> tuple[ParameterPath, ...]:
-    """Sweep each parameter of each model alone, from the closed bite through what was captured.
+    """Sweep each parameter of each model alone, from the closed bite over its captured range.
 
     Args:
-        data: the captured poses.
-        models: decoders by name.
         captured: parameters of the captured poses in the default model [mm], shape (N, 3).
-
-    Returns:
-        One path per model and parameter.
     """
     found = []
-    # The other parameters stay zero: only what was captured with the teeth nearly together can be reached so.
+    # The other parameters stay zero, so that d2 and d3 reach only what was captured with the teeth nearly together.
     near = captured[captured[:, 0] < _NEAR_CLOSED_MM]
     for name, model in models.items():
         for axis in range(3):
@@ -107,12 +99,7 @@ def _faces_near(mesh: Mesh, centre: Array) -> NDArray[np.int32]:
 
 
 def sagittal_section(mesh: Mesh, centre: Array, around_mm: float) -> Array:
-    """Cut a mesh with the plane x = centre[0].
-
-    Args:
-        mesh: anatomical frame.
-        centre: a point of the plane [mm], shape (3,).
-        around_mm: segments farther from the centre than this are left out.
+    """Cut a mesh (anatomical frame) with the plane x = centre[0], within `around_mm` of the centre (3,) [mm].
 
     Returns:
         Segments of the cut, end points (z, y) [mm], shape (S, 2, 2).
@@ -123,7 +110,7 @@ def sagittal_section(mesh: Mesh, centre: Array, around_mm: float) -> Array:
         return np.empty((0, 2, 2))
     height = cut[:, :, 0] - centre[0]
     above = height > 0
-    # Of three corners one lies alone on its side of the plane: the cut runs between its two edges.
+    # One of three corners is alone on its side of the plane: the cut connects its two edges.
     alone = np.where(above.sum(1) == 1, above.argmax(1), (~above).argmax(1))
     rows = np.arange(len(cut))
     ends = []
@@ -132,23 +119,21 @@ def sagittal_section(mesh: Mesh, centre: Array, around_mm: float) -> Array:
         share = height[rows, alone] / (height[rows, alone] - height[rows, far])
         ends.append(cut[rows, alone] + share[:, None] * (cut[rows, far] - cut[rows, alone]))
     segments = np.stack(ends, axis=1)[:, :, [2, 1]]
-    near = (np.abs(segments - centre[[2, 1]]) < around_mm).all(axis=(1, 2))
-    return segments[near]
+    return segments[np.all(np.abs(segments - centre[[2, 1]]) < around_mm, axis=(1, 2))]
 
 
 def path_distances(paths: list[CondylePath], captured: Array, d: Array) -> list[Distances]:
     """Measure the paths against the captured condyles.
 
     Args:
-        paths: of the models.
         captured: condyle centres of the captured poses [mm], shape (2, N, 3).
         d: parameters of the captured poses in the default model [mm], shape (N, 3).
 
     Returns:
-        For each path how far its points lie from the nearest captured condyle of plain opening, and how far above
-        the highest captured condyle beside them, where there is any: the eminence lets no condyle go there.
+        For each path the distances of its points from the nearest captured condyle of plain opening, and their heights
+        above the highest captured condyle beside them, if any, which the eminence makes impossible.
     """
-    habitual = captured[:, (np.abs(d[:, 1:]) < _HABITUAL_MM).all(axis=1)]
+    habitual = captured[:, np.all(np.abs(d[:, 1:]) < _HABITUAL_MM, axis=1)]
     found = []
     for path in paths:
         above = np.concatenate([_above(path.points[side], captured[side]) for side in (0, 1)])
@@ -160,7 +145,7 @@ def path_distances(paths: list[CondylePath], captured: Array, d: Array) -> list[
 
 
 def _above(path: Array, captured: Array) -> Array:
-    """Return how far path points (K, 3) lie above the highest captured ones (N, 3) at the same z [mm], 0 if below."""
+    """Return heights of path points (K, 3) above the highest captured ones (N, 3) at the same z [mm], 0 if below."""
     beside = np.abs(path[:, None, 2] - captured[None, :, 2]) < _BESIDE_MM
     highest = np.where(beside, captured[None, :, 1], -np.inf).max(1)
     known = beside.sum(1) >= _FEWEST_BESIDE

@@ -1,42 +1,34 @@
-"""What the captured poses show and what they lack: which parameters they move, and which parts of the envelope."""
+"""Which parameters the captured poses move, and which parts of the envelope are missing."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from jawusd.fitting.data import TrainingData
-from jawusd.fitting.gauge_fit import path_gauge
-from jawusd.fitting.path import SMALLEST_OPENING_MM, fit_path
+from jawusd.fitting.gauge_fit import SMALLEST_OPENING_MM, fit_path
 from jawusd.geometry.arrays import Array, Mask
 
 PARAMETERS = ("opening", "laterotrusion", "protrusion")
 
-# Limits below which a take is worth repeating: smaller than nearly all adults' ranges (Hirsch 2006, Zawawi 2003)
+# Ranges below which a take should be repeated: smaller than those of nearly all adults (Hirsch 2006, Zawawi 2003)
 _SMALL_OPENING_MM, _SMALL_LATERAL_MM, _SMALL_PROTRUSION_MM = 30.0, 5.0, 4.0
 _WIDE, _FEW_WIDE_FRAMES = 0.85, 10  # share of the largest opening that counts as wide open
 _HALF_OPEN = (0.25, 0.65)
 _HALF_OPEN_SHARE = 0.35  # of the range with closed teeth that should be reached half open
-# Directions of (laterotrusion, protrusion) that frames should reach half open, as far as this share of the closed range
+# Directions of (laterotrusion, protrusion) that frames should reach half open, to this share of the closed range
 _SECTORS, _SECTOR_REACH, _FEWEST_SECTORS = 8, 0.25, 6
 
-# Ranges (1 to 99 %) below which a parameter is noise and habit, not an exercise [mm]
+# Ranges (1 to 99 %) below which a parameter is noise or habit, not an exercise [mm]
 _SMALLEST_RANGE_MM = np.array([SMALLEST_OPENING_MM, 3.0, 2.5])
 
 
 def shown_parameters(data: TrainingData) -> tuple[Mask, list[str]]:
-    """Tell which of opening, laterotrusion and protrusion the poses exercise.
-
-    Args:
-        data: the training data.
-
-    Returns:
-        Shown or not, shape (3,), and one sentence for each parameter that is not.
-    """
+    """Return which of opening, laterotrusion and protrusion the poses exercise, (3,), and a sentence for each other."""
     u = data.displacement()
-    gx, gz, _, _ = path_gauge(fit_path(u, data.weights)).path(-u[:, 1])
+    gx, gz, _, _ = fit_path(u, data.weights).path(-u[:, 1])
     side, front = u[:, 0] - gx, u[:, 2] - gz
     if _range(side) >= _SMALLEST_RANGE_MM[1]:
-        # A lateral excursion carries the jaw forward by itself; only what goes beyond that shows protrusion.
+        # A lateral excursion moves the jaw forward too; only motion beyond that shows protrusion.
         arch = np.stack([np.abs(side), side, side**2], axis=-1)
         front = front - arch @ np.linalg.lstsq(arch, front, rcond=None)[0]
     spread = np.array([_range(values) for values in (-u[:, 1], side, front)])
@@ -55,14 +47,11 @@ def _range(values: Array) -> float:
 
 
 def missing_movements(d: Array, shown: Mask) -> list[str]:
-    """Say what a take lacks, one sentence each with what to record.
+    """Return a sentence for each movement that a take lacks, with what to record.
 
     Args:
         d: parameters of the captured poses [mm], shape (N, 3).
         shown: which parameters the data show, shape (3,); the others have their own sentences.
-
-    Returns:
-        The sentences; none when nothing is missing.
     """
     widest = float(d[:, 0].max())
     found = []
@@ -81,7 +70,7 @@ def missing_movements(d: Array, shown: Mask) -> list[str]:
 
 
 def _missing_half_open(d: Array) -> list[str]:
-    """Say what is missing between a quarter and two thirds of the opening."""
+    """Return sentences for what is missing between a quarter and two thirds of the opening."""
     low, high = (share * d[:, 0].max() for share in _HALF_OPEN)
     half = d[(d[:, 0] > low) & (d[:, 0] < high), 1:]
     where = f"between {low:.0f} and {high:.0f} mm of opening"

@@ -8,7 +8,6 @@ import numpy as np
 
 from jawusd.errors import FittingError
 from jawusd.evaluator.curves import HermiteCurve
-from jawusd.evaluator.models import AdditiveModel
 from jawusd.fitting.coverage import PARAMETERS
 from jawusd.geometry import se3_exp, se3_left_jacobian
 from jawusd.geometry.arrays import Array, Mask
@@ -17,7 +16,7 @@ from jawusd.geometry.arrays import Array, Mask
 Curve = Callable[[Array], tuple[Array, Array]]
 
 KNOTS = 97
-#: What opening, laterotrusion and protrusion measure: the incisal displacement along these directions.
+#: Directions of the incisal displacement that opening, laterotrusion and protrusion measure.
 MEASURED = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 # Share of the mandible's rms speed below which the incisal point counts as standing still or turning back
@@ -28,20 +27,19 @@ _SHORTEST_MM = 0.01  # a curve shorter than this is a network that collapsed
 def in_millimetres(
     curve: Curve, limits: tuple[float, float], root: Array, incisor: Array, axis: int
 ) -> tuple[HermiteCurve, Mask]:
-    """Give a curve the parameter d = what it alone moves the incisal point by along its own axis.
+    """Reparametrise a curve by d, the displacement of the incisal point along the curve's own axis [mm].
 
     Where the incisal point stands still or turns back, d goes on growing with a fifth of the mandible's rms path, so
     that every point of the curve has a parameter.
 
     Args:
-        curve: the curve, zero at t = 0.
         limits: interval of t that the data reach, containing 0.
         root: L with |L^T xi| = rms displacement of the mandible under a small twist xi [mm], shape (6, 6).
         incisor: incisal point at rest [mm], shape (3,).
         axis: 0 opening, 1 laterotrusion, 2 protrusion.
 
     Returns:
-        The curve over d [mm], through zero at d = 0, and at which of its knots the incisal point advances steadily.
+        The curve over d, through zero at d = 0, and at which of its knots the incisal point advances steadily.
 
     Raises:
         FittingError: the curve does not move at all.
@@ -69,27 +67,14 @@ def in_millimetres(
     return HermiteCurve(d[order], twist[order], slopes[order]), steady[order]
 
 
-def straight(direction: Array, limits: tuple[float, float]) -> HermiteCurve:
-    """Return the straight curve d -> d * direction, twists per mm (6,)."""
-    knots = np.array(limits, dtype=float)
+def straight(direction: Array, knots: Array) -> HermiteCurve:
+    """Return the straight curve d -> d * direction, twists per mm (6,), between two knots (2,) [mm]."""
     return HermiteCurve(knots, knots[:, None] * direction, np.stack([direction, direction]))
 
 
 def translation(axis: int) -> Array:
-    """Return the twist per mm (6,) of a translation along what a parameter measures, without rotation."""
+    """Return the twist per mm (6,) of a pure translation along the axis of a parameter."""
     return np.concatenate([np.zeros(3), MEASURED[axis]])
-
-
-def additive_arrays(model: AdditiveModel) -> dict[str, Array]:
-    """Return the model's own arrays under their names."""
-    arrays = {}
-    for number, curve in enumerate(model.curves, start=1):
-        arrays |= {
-            f"curve{number}_knots": curve.knots,
-            f"curve{number}_twists": curve.values,
-            f"curve{number}_slopes": curve.slopes,
-        }
-    return arrays
 
 
 def _incisal_advance(twist: Array, rate: Array, incisor: Array, direction: Array) -> tuple[Array, Array]:

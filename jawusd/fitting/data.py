@@ -1,4 +1,4 @@
-"""Training data: captured poses, seen from the anatomical frame and from the closed bite."""
+"""Training data: captured poses as motions away from the closed bite, in the anatomical frame."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jawusd.errors import FittingError
+from jawusd.evaluator.frames import RigFrames
 from jawusd.fitting.metric import MandibleMetric
 from jawusd.formats.tracks import LOST, Tracks
-from jawusd.geometry import LANDMARKS, hat, orthonormalise, rigidity_defect, se3_inverse, transform_points
+from jawusd.geometry import LANDMARKS, hat, make_transform, orthonormalise, rigidity_defect, transform_points
 from jawusd.geometry.arrays import Array, Mask
 
-#: How far real jaws stray from a three-parameter model: smaller errors of tracking hardly matter [mm].
+#: How far real jaws deviate from a three-parameter model: smaller tracking errors hardly matter [mm].
 MODEL_SIGMA_MM = 0.3
 _LARGEST_SIGMA_MM = 2.0  # frames less certain than this over the mandible (rms) are left out
 _RIGID = 1e-3
@@ -22,8 +23,8 @@ _SMALLEST_MOTION_MM = 1.0  # rms over the mandible from the first pose, 95 % qua
 
 
 @dataclass(frozen=True)
-class Anatomy:
-    """Say where a person's jaw lies in the frames of the poses.
+class SubjectAnatomy:
+    """Hold the landmarks and measured points of a person's jaw and the frames of its poses.
 
     Attributes:
         T_anatomical_skull: skull (scan) frame to anatomical frame, shape (4, 4).
@@ -44,8 +45,8 @@ class Anatomy:
         landmarks: ArrayLike,
         mandible_vertices: ArrayLike | None,
         T_rest: ArrayLike | None,
-    ) -> Anatomy:
-        """Check and complete the arrays.
+    ) -> SubjectAnatomy:
+        """Check the arrays; the defaults are the landmarks as points and the identity as closed bite.
 
         Raises:
             ValueError: a wrong shape, or values that are not finite.
@@ -59,18 +60,18 @@ class Anatomy:
             np.eye(4) if T_rest is None else _array(T_rest, (4, 4), "T_rest"),
         )
 
-    def at_rest(self, points: ArrayLike) -> Array:
+    @property
+    def frames(self) -> RigFrames:
+        """Return the conversion between poses and motions away from the closed bite."""
+        return RigFrames(self.T_anatomical_skull, self.T_rest)
+
+    def at_rest(self, points: Array) -> Array:
         """Return mandible points (N, 3) in the closed bite, anatomical coordinates [mm]."""
-        return transform_points(self.T_anatomical_skull @ self.T_rest, np.asarray(points, dtype=np.float64))
+        return transform_points(self.frames.closed, points)
 
-    def metric(self) -> MandibleMetric:
-        """Return the mandible metric in anatomical coordinates."""
-        return MandibleMetric.of_points(self.at_rest(self.mandible_vertices))
-
-    def motion(self, T_skull_mandible: ArrayLike) -> Array:
-        """Return motions M = A T rest^-1 A^-1 away from the closed bite, shape (..., 4, 4)."""
-        to_rest = se3_inverse(self.T_anatomical_skull @ self.T_rest)
-        return self.T_anatomical_skull @ np.asarray(T_skull_mandible, dtype=np.float64) @ to_rest
+    def motion(self, T_skull_mandible: Array) -> Array:
+        """Return motions away from the closed bite, anatomical frame, of poses; both of shape (..., 4, 4)."""
+        return make_transform(*self.frames.motions(T_skull_mandible)).reshape(T_skull_mandible.shape)
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,6 @@ class TrainingData:
     """Hold the poses a model is fitted to.
 
     Attributes:
-        frames: frame numbers, shape (N,).
         motion: motions away from the closed bite, anatomical frame, shape (N, 4, 4).
         weights: between 0 and 1, shape (N,).
         incisor: lower incisal point in the closed bite, anatomical frame [mm], shape (3,).
@@ -98,7 +98,7 @@ class TrainingData:
 
     def displacement(self) -> Array:
         """Return the displacement of the incisal point of every frame [mm], shape (N, 3)."""
-        return self.motion[:, :3, :3] @ self.incisor + self.motion[:, :3, 3] - self.incisor
+        return displacement(self.motion, self.incisor)
 
     def select(self, rows: Mask) -> TrainingData:
         """Return the given frames only."""
@@ -107,33 +107,32 @@ class TrainingData:
 
 @dataclass(frozen=True)
 class Selection:
-    """Hold training data and which captured frames became part of it.
-
-    Attributes:
-        data: the frames used.
-        used: of all captured frames, shape (F,).
-        excluded: reason to frame numbers left out.
-    """
+    """Hold training data, which of the captured frames (F,) it uses, and the frame numbers excluded, by reason."""
 
     data: TrainingData
     used: Mask
     excluded: dict[str, list[int]]
 
 
-def select_tracks(tracks: Tracks, anatomy: Anatomy) -> Selection:
-    """Select the frames of a take that can train a model: measured, not guessed by a prior, and certain enough.
+def displacement(motion: Array, point: Array) -> Array:
+    """Return the displacement (N, 3) of a point (3,) under motions (N, 4, 4) [mm]."""
+    return motion[:, :3, :3] @ point + motion[:, :3, 3] - point
+
+
+def select_tracks(tracks: Tracks, anatomy: SubjectAnatomy) -> Selection:
+    """Select the frames of a take that can train a model: measured without a prior, and certain enough.
 
     Raises:
         FittingError: too few frames or no motion.
     """
     T = tracks.raw_T_upper_lower
-    finite = np.isfinite(T).all((1, 2))
+    finite = np.all(np.isfinite(T), axis=(1, 2))
     sigma = np.full(len(T), np.nan)
     sigma[finite] = _mandible_sigma(T[finite], tracks.covariance_relative[finite], anatomy)
     known = sigma[np.isfinite(sigma)]
     sigma = np.where(np.isfinite(sigma), sigma, np.median(known) if known.size else 0.0)
     reasons = {
-        "lost": (tracks.status == LOST).any(1),
+        "lost": np.any(tracks.status == LOST, axis=1),
         "prior aided": tracks.prior_aided,
         f"uncertain (sd over the mandible above {_LARGEST_SIGMA_MM} mm)": sigma > _LARGEST_SIGMA_MM,
     }
@@ -141,13 +140,8 @@ def select_tracks(tracks: Tracks, anatomy: Anatomy) -> Selection:
     return _select(tracks.frames, T, weights, reasons, anatomy)
 
 
-def select_poses(frames: ArrayLike, T_skull_mandible: ArrayLike, anatomy: Anatomy) -> Selection:
-    """Select the frames of a list of poses that can train a model; rows with NaN count as lost.
-
-    Args:
-        frames: frame numbers, shape (F,).
-        T_skull_mandible: poses, shape (F, 4, 4).
-        anatomy: where the jaw lies.
+def select_poses(frames: ArrayLike, T_skull_mandible: ArrayLike, anatomy: SubjectAnatomy) -> Selection:
+    """Select the frames (F,) of a list of poses (F, 4, 4) that can train a model; poses with NaN count as lost.
 
     Raises:
         ValueError: wrong shapes.
@@ -170,23 +164,24 @@ def _array(value: ArrayLike, shape: tuple[int | None, ...], name: str) -> Array:
 
 
 def _select(
-    frames: NDArray[np.int64], T: Array, weights: Array, reasons: dict[str, Mask], anatomy: Anatomy
+    frames: NDArray[np.int64], T: Array, weights: Array, reasons: dict[str, Mask], anatomy: SubjectAnatomy
 ) -> Selection:
     used = np.ones(len(frames), dtype=bool)
     excluded: dict[str, list[int]] = {}
-    reasons = {"no pose": ~np.isfinite(T).all((1, 2)), **reasons}
+    reasons = {"no pose": np.any(~np.isfinite(T), axis=(1, 2)), **reasons}
     for reason, mask in reasons.items():
         _exclude(used, mask, reason, frames, excluded)
     _exclude(used, _repeats(frames[:, None], used), "frame number repeated", frames, excluded)
     _exclude(used, _repeats(T.reshape(len(T), 16), used), "same pose as an earlier frame", frames, excluded)
     _check(frames[used], T[used])
+    landmarks = anatomy.at_rest(anatomy.landmarks)
     data = TrainingData(
         frames=frames[used],
         motion=anatomy.motion(orthonormalise(T[used])),
         weights=weights[used],
-        incisor=anatomy.at_rest(anatomy.landmarks)[0],
-        landmarks=anatomy.at_rest(anatomy.landmarks),
-        metric=anatomy.metric(),
+        incisor=landmarks[0],
+        landmarks=landmarks,
+        metric=MandibleMetric.of_points(anatomy.at_rest(anatomy.mandible_vertices)),
     )
     _check_motion(data)
     return Selection(data, used, excluded)
@@ -199,7 +194,7 @@ def _exclude(used: Mask, mask: Mask, reason: str, frames: NDArray[np.int64], exc
         used &= ~out
 
 
-def _repeats(rows: NDArray, used: Mask) -> Mask:
+def _repeats(rows: NDArray[np.int64] | Array, used: Mask) -> Mask:
     """Return which used rows equal an earlier used one, shape (F,)."""
     index = np.flatnonzero(used)
     repeats = np.zeros(len(rows), dtype=bool)
@@ -234,7 +229,7 @@ def _check_motion(data: TrainingData) -> None:
         )
 
 
-def _mandible_sigma(T: Array, covariance: Array, anatomy: Anatomy) -> Array:
+def _mandible_sigma(T: Array, covariance: Array, anatomy: SubjectAnatomy) -> Array:
     """Return the rms standard deviation of the mandible's points [mm], shape (F,).
 
     The twist covariance is that of xi in T_true = exp(xi) T, skull frame, about the skull origin; a point y moves by

@@ -11,11 +11,10 @@ from numpy.typing import ArrayLike
 
 from jawusd.errors import FittingError
 from jawusd.fitting.condyle_paths import condyle_paths, parameter_paths, path_distances, sagittal_section
-from jawusd.fitting.config import FittingConfig
 from jawusd.fitting.coverage import missing_movements, shown_parameters
-from jawusd.fitting.data import Anatomy, TrainingData, select_poses, select_tracks
-from jawusd.fitting.fit import fit_form
-from jawusd.fitting.holdout import FittedForm
+from jawusd.fitting.data import SubjectAnatomy, TrainingData, select_poses, select_tracks
+from jawusd.fitting.fit import FittingConfig, Progress, fit_form
+from jawusd.fitting.form import FittedForm
 from jawusd.fitting.nlpca import Nlpca, train_nlpca
 from jawusd.fitting.paper import COMPONENTS, PaperFit, fit_paper
 from jawusd.fitting.synthesis import Bounds, captured_reference, distance_to_nearest
@@ -25,13 +24,13 @@ from jawusd.formats.tracks import Tracks
 from jawusd.geometry import se3_exp, se3_log, transform_point, transform_points
 from jawusd.geometry.arrays import Array, Mask
 
-#: Models of the experiments: label and how `FittingConfig` asks for them.
-MODELS: dict[str, dict] = {
-    "paper, literal": {"method": "paper", "literal": True},
-    "paper": {"method": "paper"},
-    "additive": {"method": "additive"},
-    "anchored": {"method": "anchored"},
-    "pca": {"method": "pca"},
+#: Models of the experiments by label.
+MODELS: dict[str, FittingConfig] = {
+    "paper, literal": FittingConfig(method="paper", literal=True),
+    "paper": FittingConfig(method="paper"),
+    "additive": FittingConfig(method="additive"),
+    "anchored": FittingConfig(method="anchored"),
+    "pca": FittingConfig(method="pca"),
 }
 DEFAULT, LINEAR = "anchored", "pca"
 #: Models that take seconds, for `quick`.
@@ -39,14 +38,11 @@ QUICK = ("additive", DEFAULT, LINEAR)
 RECONSTRUCTION, SYNTHESIS = "reconstruction", "synthesis"
 
 _LARGEST = "largest vertex distance"
-_OPENING_QUANTILE = 0.995  # the sweep of Fig. 5 ends here, not at the one widest frame
+_OPENING_QUANTILE = 0.995  # where the sweep of Fig. 5 ends, so that a single frame does not decide
 _SKULL_AROUND_MM = 30.0
 _GRID_MM = 0.5
 _FAR_MM = np.array([3.0, 2.0, 2.0])  # a pose farther than this from all captured ones lies in a gap
 _SLICES = 60
-
-#: Called with the steps done and the steps in all.
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -61,7 +57,7 @@ class _Fitted:
 
 def run_experiments(
     source: Tracks | tuple[ArrayLike, ArrayLike],
-    anatomy: Anatomy,
+    anatomy: SubjectAnatomy,
     *,
     bones: Mapping[str, Mesh] | None = None,
     config: FittingConfig = FittingConfig(),  # noqa: B008 - frozen
@@ -72,14 +68,11 @@ def run_experiments(
     """Do the paper's experiments on a take.
 
     Args:
-        source: tracks (their raw poses are used, those a prior helped with are not), or frame numbers (F,) and poses
+        source: tracks (their raw poses are used, except prior-aided ones), or frame numbers (F,) and poses
             T_skull_mandible (F, 4, 4) with NaN where there is none.
-        anatomy: where the jaw lies and which points are measured.
         bones: meshes "mandible" and "skull" for outlines, scan frame [mm]; either may be missing.
-        config: starts and seed of the networks, trimming, alpha, folds; the method is not looked at.
-        actor: whose jaw.
+        config: starts and seed of the networks, trimming, alpha, folds; the method is ignored.
         quick: leave out the networks and the paper's model, and draw random poses of the default model alone.
-        progress: told of the steps done.
 
     Returns:
         The results. Models that cannot be fitted to the take are left out and named in `notes`.
@@ -122,12 +115,17 @@ def run_experiments(
 def _fit_all(
     data: TrainingData, shown: Mask, wanted: tuple[str, ...], config: FittingConfig, tell: Callable[[int], None]
 ) -> _Fitted:
-    forms, codes, nearest, notes, nets = {}, {}, {}, [], {}
+    forms: dict[str, FittedForm] = {}
+    parameters: dict[str, Array] = {}
+    nearest: dict[str, Array] = {}
+    nets: dict[int, Nlpca] = {}
+    notes = []
     for step, name in enumerate(wanted):
         tell(step)
         start = time.perf_counter()
         try:
-            form = _fit(data, shown, replace(config, **MODELS[name]), nets)
+            chosen = replace(config, method=MODELS[name].method, literal=MODELS[name].literal)
+            form = _fit(data, shown, chosen, nets)
         except FittingError as error:
             if name == DEFAULT:
                 raise
@@ -135,15 +133,15 @@ def _fit_all(
             continue
         seconds = time.perf_counter() - start
         d, motion = data.metric.nearest(form.model, data.motion)
-        usable = np.isfinite(d).all(1)
+        usable = np.all(np.isfinite(d), axis=1)
         if not usable[form.kept].all():
             notes.append(f"{name}: the parameters of {int((~usable[form.kept]).sum())} poses cannot be found.")
             if name == DEFAULT:
                 raise FittingError(notes[-1], hint="Check the poses' units.")
             continue
-        forms[name], codes[name], nearest[name] = form, d, motion
+        forms[name], parameters[name], nearest[name] = form, d, motion
         notes.append(f"{name}: fitted in {seconds:.1f} s; {int((~form.kept).sum())} frames left out as outliers.")
-    return _Fitted(forms, codes, nearest, tuple(notes))
+    return _Fitted(forms, parameters, nearest, tuple(notes))
 
 
 def _fit(data: TrainingData, shown: Mask, config: FittingConfig, nets: dict[int, Nlpca]) -> FittedForm:
@@ -156,19 +154,21 @@ def _fit(data: TrainingData, shown: Mask, config: FittingConfig, nets: dict[int,
 def _networks(
     data: TrainingData, config: FittingConfig, paper: FittedForm | None, tell: Callable[[int], None]
 ) -> list[Nlpca]:
-    """Return networks of 1..5 components; the last is the one behind the paper's model, if there is one."""
+    """Return networks of 1..5 components; the last is that of the paper's model, if there is one."""
     points = se3_log(data.motion) @ data.metric.twist_root()
     nets = []
     for count in range(1, COMPONENTS + 1):
         tell(count - 1)
-        known = count == COMPONENTS and isinstance(paper, PaperFit)
-        nets.append(paper.network_sum.net if known else train_nlpca(points, count, config.seed))
+        if count == COMPONENTS and isinstance(paper, PaperFit):
+            nets.append(paper.network_sum.net)
+        else:
+            nets.append(train_nlpca(points, count, config.seed))
     tell(COMPONENTS)
     return nets
 
 
 def _reconstruction(data: TrainingData, fitted: _Fitted, nets: list[Nlpca]) -> list[Distances]:
-    """Paper Fig. 12: every captured pose against what each model makes of it, trimmed frames included."""
+    """Paper Fig. 12: every captured pose against its reconstruction by each model, trimmed frames included."""
     root = data.metric.twist_root()
     points = se3_log(data.motion) @ root
     rebuilt = {
@@ -180,7 +180,7 @@ def _reconstruction(data: TrainingData, fitted: _Fitted, nets: list[Nlpca]) -> l
     rebuilt |= fitted.nearest
     found = []
     for name, motion in rebuilt.items():
-        known = np.isfinite(motion).all((1, 2))  # a gross outlier may have no nearest pose on a model
+        known = np.all(np.isfinite(motion), axis=(1, 2))  # a gross outlier may have no nearest pose on a model
         errors = data.metric.largest(motion[known], data.motion[known])
         found.append(Distances(RECONSTRUCTION, name, _LARGEST, errors))
     return found
@@ -202,7 +202,7 @@ def _synthesis(
     return found
 
 
-def _skull_outline(skull: Mesh | None, data: TrainingData, anatomy: Anatomy) -> Array:
+def _skull_outline(skull: Mesh | None, data: TrainingData, anatomy: SubjectAnatomy) -> Array:
     if skull is None:
         return np.empty((0, 2, 2))
     placed = Mesh(transform_points(anatomy.T_anatomical_skull, skull.vertices), skull.faces)
@@ -210,7 +210,8 @@ def _skull_outline(skull: Mesh | None, data: TrainingData, anatomy: Anatomy) -> 
 
 
 def _coverage(d: Array, bounds: Bounds, sentences: tuple[str, ...]) -> Coverage:
-    openings = np.linspace(*bounds.slices_box[0], _SLICES)
+    low, high = bounds.slices_box[0]
+    openings = np.linspace(low, high, _SLICES)
     at = np.zeros((_SLICES, 3))
     at[:, 0] = openings
     slices = np.stack([np.stack(bounds.slices.chord(at, axis), axis=1) for axis in (1, 2)])
@@ -219,7 +220,7 @@ def _coverage(d: Array, bounds: Bounds, sentences: tuple[str, ...]) -> Coverage:
 
 
 def _gaps(d: Array, bounds: Bounds, axis: int) -> Array:
-    """Return points (d1, d_axis) of the slice hull, the other parameter zero, that lie far from every captured pose."""
+    """Return points (d1, d_axis) of the slice hull, the other parameter zero, that are far from every captured pose."""
     first, second = (np.arange(low, high, _GRID_MM) for low, high in bounds.slices_box[[0, axis]])
     grid = np.zeros((len(first) * len(second), 3))
     grid[:, 0], grid[:, axis] = (part.ravel() for part in np.meshgrid(first, second))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
+from typing import Literal, get_args
 
 import numpy as np
 import scipy
@@ -12,29 +13,64 @@ from numpy.typing import ArrayLike, NDArray
 from jawusd.errors import EvaluatorError, FittingError
 from jawusd.evaluator import JawRig
 from jawusd.fitting.additive import fit_additive
-from jawusd.fitting.alpha_shape import alpha_shape
 from jawusd.fitting.anatomy_gate import AnatomyWarning, check_anatomy
 from jawusd.fitting.anchored import fit_anchored
-from jawusd.fitting.config import FittingConfig
+from jawusd.fitting.bounds import alpha_shapes, fit_slice_hull, valid_box
 from jawusd.fitting.coverage import PARAMETERS, missing_movements, shown_parameters
-from jawusd.fitting.data import Anatomy, Selection, TrainingData, select_poses, select_tracks
-from jawusd.fitting.holdout import FittedForm, seen_errors, unseen_errors
+from jawusd.fitting.data import Selection, SubjectAnatomy, TrainingData, select_poses, select_tracks
+from jawusd.fitting.error_table import ErrorTable, seen_errors, unseen_errors
+from jawusd.fitting.form import FittedForm
 from jawusd.fitting.pca import fit_pca
 from jawusd.fitting.screening import screened
-from jawusd.fitting.slice_hull import fit_slice_hull, valid_box
 from jawusd.formats.model import JawModel
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry.arrays import Array, Mask
 
 #: Called with the steps done and the steps in all.
 Progress = Callable[[int, int], None]
+Method = Literal["anchored", "additive", "paper", "pca"]
+ModelArrays = dict[str, Array | NDArray[np.int64]]
 
-_LARGEST_CODES = 2000
-# A measured pose is off the model beyond what nearly all trained poses and nearly all left-out ones keep: of the poses
-# of the take itself 99.5 % have to pass this limit and the bound together.
+_MOST_CAPTURED = 2000  # captured parameters that a model keeps
+# A measured pose is off the model beyond the residuals of nearly all trained and nearly all left-out poses: 99.5 % of
+# the poses of the take itself have to pass this limit and the bound together.
 _TRAINED_QUANTILE, _UNSEEN_QUANTILE = 99.8, 99.5
 _SMALLEST_RESIDUAL_LIMIT_MM = 0.1  # noise-free poses must not make every measured pose "off the model"
 _FEW_POSES = 100
+
+
+@dataclass(frozen=True)
+class FittingConfig:
+    """Choose the model and how it is checked.
+
+    Attributes:
+        literal: with method "paper", keep the paper's fixed grouping of components.
+        holdout_folds: contiguous parts of the take that are left out in turn to measure the error on unseen poses;
+            0 to skip.
+        trim_mad: frames farther from the model than the median by this many normalised median absolute deviations
+            count as tracking failures and are left out.
+        alpha: largest circumradius of the triangles of the paper's alpha shapes, range-normalised units.
+        starts: random starts of the networks of method "paper"; the best is kept.
+        seed: of the first start.
+    """
+
+    method: Method = "anchored"
+    literal: bool = False
+    holdout_folds: int = 5
+    trim_mad: float = 4.5
+    alpha: float = 0.23
+    starts: int = 4
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.method not in get_args(Method):
+            raise ValueError(f"method must be one of {', '.join(get_args(Method))}, got {self.method!r}")
+        if self.holdout_folds == 1 or self.holdout_folds < 0:
+            raise ValueError(f"holdout_folds must be 0 or at least 2, got {self.holdout_folds}")
+        if min(self.trim_mad, self.alpha) <= 0:
+            raise ValueError(f"trim_mad and alpha must be positive, got {self.trim_mad} and {self.alpha}")
+        if self.starts < 1:
+            raise ValueError(f"starts must be at least 1, got {self.starts}")
 
 
 def fit_model(
@@ -44,7 +80,7 @@ def fit_model(
     landmarks: ArrayLike,
     mandible_vertices: ArrayLike | None = None,
     T_rest: ArrayLike | None = None,
-    config: FittingConfig = FittingConfig(),  # noqa: B008 - frozen
+    config: FittingConfig = FittingConfig(),
     actor: str = "",
     progress: Progress | None = None,
 ) -> JawModel:
@@ -58,9 +94,6 @@ def fit_model(
         mandible_vertices: points whose motion is measured, mandible coordinates [mm], shape (V, 3); None: the
             landmarks.
         T_rest: T_skull_mandible of the closed bite, shape (4, 4); None when the scans lie in occlusion.
-        config: the method and its checks.
-        actor: name written into the model.
-        progress: told of the steps done.
 
     Returns:
         The model. `d` and `residual_mm` are those of the raw poses; `meta` holds the error tables [mm], the frames
@@ -70,7 +103,7 @@ def fit_model(
         FittingError: too few poses, no motion, poses that are not rigid, or parameters outside what a rig allows.
         ValueError: arrays of wrong shapes.
     """
-    anatomy = Anatomy.of(T_anatomical_skull, landmarks, mandible_vertices, T_rest)
+    anatomy = SubjectAnatomy.of(T_anatomical_skull, landmarks, mandible_vertices, T_rest)
     steps = config.holdout_folds + 2
     tell = progress or (lambda done, total: None)
     tell(0, steps)
@@ -92,33 +125,45 @@ def fit_model(
     if len(data) < _FEW_POSES:
         warnings.append(AnatomyWarning("few_poses", f"Only {len(data)} poses: the model interpolates coarsely."))
     form = fit_form(data, shown, config)
-    errors, uncertainty, unseen_mm = seen_errors(data, form), {}, np.zeros(0)
+    errors, unseen_mm = seen_errors(data, form), np.zeros(0)
+    uncertainty: dict[str, dict[str, float]] = {}
     if config.holdout_folds:
-        # The networks of "paper" start in the folds where the best of the full fit started, once.
-        again = replace(config, starts=1, seed=form.notes().get("seed", config.seed))
-        unseen, uncertainty, unseen_mm = unseen_errors(
+        # In the folds the networks of "paper" have one start: that of the best network of the full fit.
+        seed = form.notes.get("seed")
+        again = replace(config, starts=1, seed=seed if isinstance(seed, int) else config.seed)
+        errors["holdout"], uncertainty, unseen_mm = unseen_errors(
             data,
             form.kept,
             config.holdout_folds,
             lambda part: fit_form(part, shown, again),
             lambda fold: tell(fold + 1, steps),
         )
-        errors |= unseen
-    arrays, tolerance_mm = _arrays(data, form, anatomy, config)
-    warnings += [AnatomyWarning("take_lacks", sentence) for sentence in missing_movements(arrays["codes"], shown)]
-    model = _finish(arrays, tolerance_mm, unseen_mm, form, selection, frames, T, errors, warnings, config)
+    captured_d, _ = data.metric.nearest(form.model, data.motion[form.kept])
+    if not np.isfinite(captured_d).all():
+        raise FittingError("the parameters of some training poses cannot be found.", hint="Check the poses' units.")
+    kept_d = captured_d[:: -(-len(captured_d) // _MOST_CAPTURED)]
+    warnings += [AnatomyWarning("take_lacks", sentence) for sentence in missing_movements(kept_d, shown)]
+    hull, tolerance_mm = fit_slice_hull(captured_d)
+    arrays: ModelArrays = {
+        **form.arrays(),
+        **hull,
+        "T_anatomical_skull": anatomy.T_anatomical_skull,
+        "T_rest": anatomy.T_rest,
+        "incisor": data.incisor,
+        "landmarks": anatomy.landmarks,
+        "d_range": valid_box(hull),
+        **alpha_shapes(captured_d, config.alpha),
+        "codes": kept_d,
+        "margin_limit_mm": np.array(-tolerance_mm),
+    }
+    model = _finish(arrays, unseen_mm, form, selection, frames, T, errors, warnings, config)
     model.meta |= {"actor": actor, "uncertainty": uncertainty}
     tell(steps, steps)
     return model
 
 
 def fit_form(data: TrainingData, shown: Mask, config: FittingConfig) -> FittedForm:
-    """Fit the decoder of `config.method` alone, without bounds, checks and hold-out.
-
-    Args:
-        data: the training data.
-        shown: which parameters the data show, shape (3,).
-        config: the method.
+    """Fit the decoder of `config.method` alone to data that show some parameters (3,).
 
     Raises:
         FittingError: the method cannot be fitted to these data.
@@ -129,66 +174,36 @@ def fit_form(data: TrainingData, shown: Mask, config: FittingConfig) -> FittedFo
         return fit_additive(data, shown, config.trim_mad)
     if config.method == "pca":
         return fit_pca(data, shown)
-    from jawusd.fitting.paper import fit_paper  # torch: two seconds that the other methods need not wait
+    from jawusd.fitting.paper import fit_paper  # imports torch, which takes two seconds
 
     return fit_paper(data, shown, config.literal, config.starts, config.seed)
 
 
-def _arrays(
-    data: TrainingData, form: FittedForm, anatomy: Anatomy, config: FittingConfig
-) -> tuple[dict[str, Array], float]:
-    """Return all arrays but the limits of the verdicts, and how far out of bounds measured poses may lie [mm]."""
-    d, _ = data.metric.nearest(form.model, data.motion[form.kept])
-    if not np.isfinite(d).all():
-        raise FittingError("the parameters of some training poses cannot be found.", hint="Check the poses' units.")
-    hull, tolerance_mm = fit_slice_hull(d)
-    lateral, lateral_counts = alpha_shape(d[:, [0, 1]], config.alpha)
-    protrusion, protrusion_counts = alpha_shape(d[:, [0, 2]], config.alpha)
-    step = -(-len(d) // _LARGEST_CODES)
-    arrays = {
-        **form.arrays(),
-        **hull,
-        "T_anatomical_skull": anatomy.T_anatomical_skull,
-        "T_rest": anatomy.T_rest,
-        "incisor": data.incisor,
-        "landmarks": np.asarray(anatomy.landmarks, dtype=np.float64),
-        "d_range": valid_box(hull),
-        "polygon_d1d2": lateral,
-        "polygon_d1d2_counts": lateral_counts,
-        "polygon_d1d3": protrusion,
-        "polygon_d1d3_counts": protrusion_counts,
-        "codes": d[::step],
-    }
-    return arrays, tolerance_mm
-
-
 def _finish(
-    arrays: dict[str, Array],
-    tolerance_mm: float,
+    arrays: ModelArrays,
     unseen_mm: Array,
     form: FittedForm,
     selection: Selection,
     frames: NDArray[np.int64],
     T: Array,
-    errors: dict,
+    errors: dict[str, ErrorTable],
     warnings: list[AnatomyWarning],
     config: FittingConfig,
 ) -> JawModel:
     """Encode every captured pose with the evaluator and set the limits of the verdicts from the trained ones."""
-    limits = {"residual_limit_mm": np.array(1.0), "margin_limit_mm": np.array(0.0)}
-    meta = {
+    meta: dict[str, object] = {
         "kind": form.kind,
         "method": config.method,
         "config": asdict(config),
         "versions": {"numpy": np.__version__, "scipy": scipy.__version__},
         "errors": errors,
-        "fit": form.notes(),
+        "fit": form.notes,
         "warnings": [asdict(warning) for warning in warnings],
         "excluded_frames": selection.excluded,
         "trimmed_frames": selection.data.frames[~form.kept].tolist(),
     }
     try:
-        rig = JawRig({**arrays, **limits}, meta)
+        rig = JawRig({**arrays, "residual_limit_mm": np.array(1.0)}, meta)
     except EvaluatorError as error:
         advice = " ".join(warning.message for warning in warnings)
         raise FittingError(f"the poses give no usable model: {error}", hint=advice or None) from error
@@ -202,5 +217,4 @@ def _finish(
     meta["ranges_mm"] = {
         name: [float(reached[:, i].min()), float(reached[:, i].max())] for i, name in enumerate(PARAMETERS)
     }
-    arrays = {**arrays, "residual_limit_mm": np.array(limit), "margin_limit_mm": np.array(-tolerance_mm)}
-    return JawModel(arrays, frames, d, residual_mm, trained, meta)
+    return JawModel({**arrays, "residual_limit_mm": np.array(limit)}, frames, d, residual_mm, trained, meta)

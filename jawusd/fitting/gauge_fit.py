@@ -1,7 +1,8 @@
-"""The semantic gauge: choose the meaning of d1, d2, d3 so that each slider alone stays anatomical.
+"""The semantic gauge: define d1, d2, d3 so that moving each slider alone stays anatomical.
 
-A plain lateral slide at closed teeth carries the incisal point forward (gothic arch) and down (tooth guidance). Both
-are learned from the captured poses and put into the gauge, outside the regression of the poses.
+d1 follows the habitual opening path, where the incisal point is most often at each opening. A plain lateral slide at
+closed teeth carries the incisal point forward (gothic arch) and down (tooth guidance). All three are learned from the
+captured poses and put into the gauge, outside the regression of the poses.
 """
 
 from __future__ import annotations
@@ -11,11 +12,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from jawusd.evaluator.gauge import Gauge
-from jawusd.fitting.path import Path
 from jawusd.geometry.arrays import Array, Mask
 
-SOFTNESS_MM = 2.0  # rounding of the arch across d2 = 0: wide enough that a slider does not jerk there
+SOFTNESS_MM = 2.0  # rounding of the arch across d2 = 0, for smooth motion of the slider there
 FADE_MM = 14.0  # opening at which tooth guidance has faded to 1/e
+
+_PATH_DEGREE, _PATH_ITERATIONS, _PATH_RIDGE = 5, 40, 1e-5
+_SMALLEST_SPREAD_MM = 0.3  # residuals below this are never treated as outliers of the path
+#: Openings (1 to 99 %) below which there is no path: the motion is then a glide of closed teeth [mm].
+SMALLEST_OPENING_MM = 5.0
 
 _ROUNDS = 3
 _ITERATIONS = 60
@@ -34,10 +39,9 @@ _GRID = 33
 
 @dataclass(frozen=True)
 class GaugeFit:
-    """Hold a gauge, its check and how hard it had to be regularised.
+    """Hold a gauge, its check and its regularisation.
 
     Attributes:
-        gauge: the fitted gauge.
         smallest_minor: least principal minor of the Jacobian over the box (see `smallest_minor`).
         stiffness: factor on the ridge penalties, 1 unless the gauge folded at first; None: no glide surface at all.
     """
@@ -47,48 +51,72 @@ class GaugeFit:
     stiffness: float | None
 
 
-def path_gauge(path: Path) -> Gauge:
-    """Return the gauge with the habitual path and no glide surface."""
-    return Gauge(path.coefficients, path.scale_mm, path.limits, np.zeros(7), np.zeros(4), SOFTNESS_MM, FADE_MM)
+def path_gauge(coefficients: Array, scale_mm: float, limits: tuple[float, float]) -> Gauge:
+    """Return a gauge with a habitual path and no glide surface; arguments as in `Gauge`."""
+    return Gauge(coefficients, scale_mm, limits, np.zeros(7), np.zeros(4), SOFTNESS_MM, FADE_MM)
 
 
-def fit_gauge(displacement: Array, weights: Array, path: Path, shown: Mask) -> GaugeFit:
-    """Fit arch and glide surface to incisal displacements, stiffer and stiffer until the gauge is invertible.
+def fit_path(u: Array, weights: Array) -> Gauge:
+    """Fit x and z of the incisal displacement u (N, 3) [mm] as polynomials of the opening through the origin.
+
+    Iteratively reweighted least squares with the weight (1 + (r/s)^2)^-2, which follows the most frequent path
+    instead of the mean of all exercises; s is 1.4826 times the median absolute residual. Without opening in the data
+    the path is a straight line down.
+
+    Returns:
+        The gauge of the path alone.
+    """
+    opening = -u[:, 1]
+    if np.subtract(*np.percentile(opening, [99, 1])) < SMALLEST_OPENING_MM:
+        return path_gauge(np.zeros((2, _PATH_DEGREE)), SMALLEST_OPENING_MM, (0.0, SMALLEST_OPENING_MM))
+    scale = float(np.percentile(opening, 99.5))
+    basis = (opening / scale)[:, None] ** np.arange(1, _PATH_DEGREE + 1)
+    coefficients = np.stack([_robust_fit(basis, u[:, axis], weights) for axis in (0, 2)])
+    return path_gauge(coefficients, scale, (min(0.0, float(np.percentile(opening, 0.5))), scale))
+
+
+def _robust_fit(basis: Array, values: Array, weights: Array) -> Array:
+    ridge = _PATH_RIDGE * weights.sum() * np.eye(_PATH_DEGREE)
+    robust = weights.copy()
+    for _ in range(_PATH_ITERATIONS):
+        weighted = basis * robust[:, None]
+        coefficients = np.linalg.solve(weighted.T @ basis + ridge, weighted.T @ values)
+        residual = values - basis @ coefficients
+        spread = max(1.4826 * float(np.median(np.abs(residual))), _SMALLEST_SPREAD_MM)
+        robust = weights / (1 + (residual / spread) ** 2) ** 2
+    return coefficients
+
+
+def fit_gauge(u: Array, weights: Array, path: Gauge, shown: Mask) -> GaugeFit:
+    """Fit arch and glide surface to incisal displacements u (N, 3) [mm], with rising stiffness until invertible.
 
     Args:
-        displacement: incisal displacements of the frames [mm], shape (N, 3).
-        weights: frame weights, shape (N,).
-        path: the habitual opening path.
+        path: the gauge of the habitual path alone.
         shown: which of opening, laterotrusion, protrusion the data show, shape (3,).
 
     Returns:
-        The gauge; if no stiffness makes it invertible, the one of the path alone, which always is.
+        The gauge; if no stiffness makes it invertible, that of the path alone, which always is.
     """
     for stiffness in _STIFFNESSES:
-        gauge = _fit(displacement, weights, path_gauge(path), shown, stiffness)
-        minor = _smallest_minor_around(gauge, displacement)
+        gauge = _fit(u, weights, path, shown, stiffness)
+        minor = _smallest_minor_around(gauge, u)
         if minor >= SMALLEST_MINOR:
             return GaugeFit(gauge, minor, float(stiffness))
-    gauge = path_gauge(path)
-    return GaugeFit(gauge, _smallest_minor_around(gauge, displacement), None)
+    return GaugeFit(path, _smallest_minor_around(path, u), None)
 
 
-def _smallest_minor_around(gauge: Gauge, displacement: Array) -> float:
-    d = gauge.inverse(displacement)
+def _smallest_minor_around(gauge: Gauge, u: Array) -> float:
+    d = gauge.inverse(u)
     if not np.isfinite(d).all():
         return -np.inf
     return smallest_minor(gauge, np.stack([d.min(0) - _WIDER_MM, d.max(0) + _WIDER_MM], axis=1))
 
 
 def smallest_minor(gauge: Gauge, box: Array) -> float:
-    """Return the least principal minor of the Jacobian of (-y, x, z) by d on a dense grid over a box.
+    """Return the least principal minor of the Jacobian of (-y, x, z) by d on a dense grid over a box of d (3, 2) [mm].
 
     A map whose Jacobian has only positive principal minors on a box is one-to-one there (Gale & Nikaido 1965,
-    Math. Annalen 159:81); the determinant alone would not do.
-
-    Args:
-        gauge: the gauge.
-        box: lower and upper limits of d [mm], shape (3, 2).
+    Math. Annalen 159:81); a positive determinant alone is not sufficient.
     """
     axes = [np.linspace(low, high, _GRID) for low, high in box]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -100,7 +128,7 @@ def smallest_minor(gauge: Gauge, box: Array) -> float:
 
 
 def _fit(u: Array, weights: Array, gauge: Gauge, shown: Mask, stiffness: float) -> Gauge:
-    """Alternate between reading d off the gauge and fitting arch and drop to the d read off."""
+    """Alternate between inverting the gauge for d and fitting arch and drop to these d."""
     for _ in range(_ROUNDS):
         gauge = _with_arch(gauge, u, weights, shown, stiffness)
         gauge = _with_drop(gauge, u, weights, shown, stiffness)
@@ -108,10 +136,10 @@ def _fit(u: Array, weights: Array, gauge: Gauge, shown: Mask, stiffness: float) 
 
 
 def _with_arch(gauge: Gauge, u: Array, weights: Array, shown: Mask, stiffness: float) -> Gauge:
-    """Fit how far a lateral excursion carries the incisal point forward: the middle of the frames."""
+    """Fit the forward displacement of the incisal point in lateral excursions: the median of the frames."""
     if not shown[1]:
         return gauge
-    d1, d2, _ = _read_off(gauge, u).T
+    d1, d2, _ = np.nan_to_num(gauge.inverse(u)).T
     # The terms are linear in their coefficients, so the evaluator itself gives the columns.
     columns = np.stack([replace(gauge, glide_arch=row).arch(d1, d2)[0] for row in np.eye(7)], axis=-1)
     ahead = u[:, 2] - gauge.path(d1)[1]
@@ -122,8 +150,8 @@ def _with_arch(gauge: Gauge, u: Array, weights: Array, shown: Mask, stiffness: f
 
 
 def _with_drop(gauge: Gauge, u: Array, weights: Array, shown: Mask, stiffness: float) -> Gauge:
-    """Fit how far gliding teeth push the incisal point down: the lower edge of the frames."""
-    _, d2, d3 = _read_off(gauge, u).T
+    """Fit the downward displacement of the incisal point by gliding teeth: the lower edge of the frames."""
+    _, d2, d3 = np.nan_to_num(gauge.inverse(u)).T
     columns = np.stack([replace(gauge, glide_drop=row).drop(d2, d3)[0] for row in np.eye(4)], axis=-1)
     low = -u[:, 1] < _DROP_MAX_OPENING_MM
     side, front = (stiffness * _DROP_RIDGE * (1.0 if known else _UNKNOWN) for known in shown[1:])
@@ -132,14 +160,9 @@ def _with_drop(gauge: Gauge, u: Array, weights: Array, shown: Mask, stiffness: f
     return replace(gauge, glide_drop=drop)
 
 
-def _read_off(gauge: Gauge, u: Array) -> Array:
-    d = gauge.inverse(u)
-    return np.where(np.isfinite(d), d, 0.0)
-
-
 def _quantile_regression(columns: Array, values: Array, weights: Array, quantile: float, ridge: Array) -> Array:
     """Fit a conditional quantile by iteratively reweighted least squares (Koenker & Bassett 1978), with a ridge."""
-    coefficients = np.zeros(columns.shape[1])
+    coefficients: Array = np.zeros(columns.shape[1])
     if len(values) < _FEWEST_FRAMES:
         return coefficients
     penalty = np.diag(ridge * weights.sum())
@@ -147,5 +170,5 @@ def _quantile_regression(columns: Array, values: Array, weights: Array, quantile
         residual = values - columns @ coefficients
         side = np.where(residual > 0, quantile, 1 - quantile)
         weighted = columns * (weights * side / np.maximum(np.abs(residual), _RESIDUAL_FLOOR_MM))[:, None]
-        coefficients = np.linalg.solve(weighted.T @ columns + penalty, weighted.T @ values)
+        coefficients = np.asarray(np.linalg.solve(weighted.T @ columns + penalty, weighted.T @ values))
     return coefficients

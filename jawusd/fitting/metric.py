@@ -1,4 +1,4 @@
-"""How far apart two jaw poses are, in mm on the mandible.
+"""Distances between jaw poses, in mm on the mandible.
 
 Two rigid motions differ at a point x by (R_a - R_b) x + (t_a - t_b), which is affine in x. Its mean square over a set
 of points therefore needs only their mean and covariance, and its maximum is reached at a vertex of their convex hull.
@@ -23,7 +23,7 @@ class MandibleMetric:
     """Measure pose differences by the displacement of a set of mandible points.
 
     Attributes:
-        vectors: four homogeneous columns that stand for the points, their mean last (see `evaluator.encoding`),
+        vectors: four homogeneous columns that represent the points, their mean last (see `evaluator.distances`),
             shape (4, 4).
         extremes: vertices of the points' convex hull [mm], shape (H, 3).
     """
@@ -33,11 +33,7 @@ class MandibleMetric:
 
     @classmethod
     def of_points(cls, points: Array) -> MandibleMetric:
-        """Build the metric of mandible points at rest.
-
-        Args:
-            points: anatomical coordinates at rest [mm], shape (N, 3), N >= 3.
-        """
+        """Build the metric of mandible points at rest (N, 3), N >= 3, anatomical frame [mm]."""
         try:
             extremes = points[ConvexHull(points).vertices]
         except QhullError:  # fewer than four points, or all in one plane
@@ -68,15 +64,11 @@ class MandibleMetric:
         return d, make_transform(*model.decode(d))
 
     def best_rotation(self, target: Array, incisor: Array, at: Array) -> Array:
-        """Return the rotations that fit motions best when the incisal point is held (Kabsch 1976).
+        """Return the rotations (N, 3, 3) that fit motions (N, 4, 4) best with the incisal point fixed (Kabsch 1976).
 
         Args:
-            target: motions to fit, shape (N, 4, 4).
             incisor: incisal point at rest [mm], shape (3,).
-            at: where the incisal point is held [mm], shape (N, 3).
-
-        Returns:
-            Rotation matrices, shape (N, 3, 3).
+            at: its fixed places [mm], shape (N, 3).
         """
         R, t = _parts(target)
         mean, root = self.vectors[:3, 3], self.vectors[:3, :3]

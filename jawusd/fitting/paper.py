@@ -12,6 +12,7 @@ Twists enter in mandible-metric coordinates, which makes the result independent 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
 
@@ -20,9 +21,10 @@ import numpy as np
 from jawusd.errors import FittingError
 from jawusd.evaluator.curves import HermiteCurve
 from jawusd.evaluator.models import AdditiveModel
-from jawusd.fitting.curves import MEASURED, Curve, additive_arrays, in_millimetres
+from jawusd.fitting.curves import MEASURED, Curve, in_millimetres
 from jawusd.fitting.data import TrainingData
 from jawusd.fitting.error_table import pose_errors, summarise
+from jawusd.fitting.form import FittedForm
 from jawusd.fitting.nlpca import Nlpca, train_nlpca
 from jawusd.geometry import se3_exp, se3_log
 from jawusd.geometry.arrays import Array, Mask
@@ -67,14 +69,15 @@ class _Sum:
     seed: int
 
     def encode(self, points: Array) -> Array:
-        """Return the parameters (N, 3) the networks give for metric coordinates (N, 6), as published."""
+        """Return the parameters (N, 3) of metric coordinates (N, 6) by the networks, as published."""
         components = self.net.encode(points)
         return np.stack([part.encode(self.net, components) for part in self.parts], axis=1)
 
     def value(self, t: Array) -> Array:
         """Return metric coordinates (N, 6) for parameters (N, 3)."""
         once = self.net.decode(np.zeros((1, self.net.components)))
-        return sum(part.value(self.net, t[:, i])[0] for i, part in enumerate(self.parts)) - 2 * once
+        first, second, third = (part.value(self.net, t[:, i])[0] for i, part in enumerate(self.parts))
+        return first + second + third - 2 * once
 
     def rest(self, starts: Array) -> Array:
         """Return the parameters (3,) nearest to the closed bite, by damped Gauss-Newton from the best start (N, 3)."""
@@ -88,37 +91,20 @@ class _Sum:
         return t[0]
 
 
-@dataclass(frozen=True)
-class PaperFit:
-    """Hold a fitted model of the paper.
+@dataclass(frozen=True, eq=False)
+class PaperFit(FittedForm):
+    """Hold a fitted model of the paper, which trims nothing, and its networks.
 
     Attributes:
-        model: the decoder.
-        kept: all training frames, shape (N,); the paper trims nothing.
-        network_sum: the networks behind it.
         root: L (6, 6) of the metric coordinates log(M) @ L.
-        info: what the header says.
     """
 
-    model: AdditiveModel
-    kept: Mask
     network_sum: _Sum
     root: Array
-    info: dict
-    kind = "additive"
-
-    def arrays(self) -> dict[str, Array]:
-        """Return the model's own arrays."""
-        return additive_arrays(self.model)
-
-    def notes(self) -> dict:
-        """Return what the header says about the fit."""
-        return self.info
 
     def reconstruct_as_published(self, motion: Array) -> Array:
-        """Return what the networks make of motions (N, 4, 4): encoded by them, not projected; before any shift."""
-        points = se3_log(motion) @ self.root
-        return _motions(self.network_sum.value(self.network_sum.encode(points)), self.root)
+        """Return motions (N, 4, 4) encoded and decoded by the networks, not projected, before any shift."""
+        return _rebuilt(self.network_sum, motion, self.root)
 
 
 def fit_paper(
@@ -127,12 +113,11 @@ def fit_paper(
     """Fit the paper's model.
 
     Args:
-        data: the training data.
         shown: which parameters the data show, shape (3,).
         literal: keep the paper's groups (1), (2, 3), (4, 5) whatever the components turn out to mean.
         starts: networks trained from different starts; the sum with the smallest training error is kept.
         seed: of the first start.
-        nets: trained networks of five components by seed; used where there is one, completed by this call.
+        nets: trained networks of five components by seed; missing ones are added.
 
     Raises:
         FittingError: a parameter is not in the data, or no component moves the incisal point that way.
@@ -149,21 +134,24 @@ def fit_paper(
         if seed + start not in nets:
             nets[seed + start] = train_nlpca(points, COMPONENTS, seed + start)
     sums = [_network_sum(data, points, root, literal, seed + start, nets[seed + start]) for start in range(starts)]
-    best = min(sums, key=lambda found: _error(found, data, points, root))
+
+    def error(found: _Sum) -> float:
+        return float(data.metric.largest(_rebuilt(found, data.motion, root), data.motion).mean())
+
+    best = min(sums, key=error)
     if not literal:
-        best = _with_leftovers(best, data, points, root)
-    model, info = _curves(best, points, root, data)
-    info |= {"groups": [list(part.group) for part in best.parts], "seed": best.seed, "components": COMPONENTS}
-    fit = PaperFit(model, np.ones(len(data), dtype=bool), best, root, info)
-    info["train_errors_as_published"] = summarise(pose_errors(data, fit.reconstruct_as_published(data.motion)))
-    return fit
+        best = _with_leftovers(best, points, error)
+    model, notes = _curves(best, points, root, data)
+    notes |= {"groups": [list(part.group) for part in best.parts], "seed": best.seed, "components": COMPONENTS}
+    notes["train_errors_as_published"] = summarise(pose_errors(data, _rebuilt(best, data.motion, root)))
+    return PaperFit(model, np.ones(len(data), dtype=bool), notes, best, root)
 
 
 def _network_sum(data: TrainingData, points: Array, root: Array, literal: bool, seed: int, net: Nlpca) -> _Sum:
     groups = _LITERAL_GROUPS if literal else _groups_by_incisal_motion(net, points, root, data.incisor)
     components = net.encode(points)
-    parts = [_part(net, components, group, seed, _ALL_STAGES) for group in groups]
-    return _Sum(net, (parts[0], parts[1], parts[2]), seed)
+    first, second, third = (_part(net, components, group, seed, _ALL_STAGES) for group in groups)
+    return _Sum(net, (first, second, third), seed)
 
 
 def _part(net: Nlpca, components: Array, group: tuple[int, ...], seed: int, stages: int) -> _Part:
@@ -173,16 +161,15 @@ def _part(net: Nlpca, components: Array, group: tuple[int, ...], seed: int, stag
 
 
 def _groups_by_incisal_motion(net: Nlpca, points: Array, root: Array, incisor: Array) -> Groups:
-    """Return the components that open, shift and protrude most: their sweeps alone, in that order of choice."""
+    """Return the components that open, shift and protrude most when swept alone, chosen in that order."""
     components = net.encode(points)
-    reach = []
+    reach = np.zeros((net.components, 3))
     for index in range(net.components):
         ends = np.zeros((2, net.components))
         ends[:, index] = np.percentile(components[:, index], _SWEEP_PERCENT)
         M = _motions(net.decode(ends), root)
         at = M[:, :3, :3] @ incisor + M[:, :3, 3]
-        reach.append(np.abs(MEASURED @ (at[1] - at[0])))
-    reach = np.array(reach)
+        reach[index] = np.abs(MEASURED @ (at[1] - at[0]))
     chosen: list[int] = []
     for axis in range(3):
         free = [index for index in range(net.components) if index not in chosen]
@@ -190,7 +177,7 @@ def _groups_by_incisal_motion(net: Nlpca, points: Array, root: Array, incisor: A
     return (chosen[0],), (chosen[1],), (chosen[2],)
 
 
-def _with_leftovers(base: _Sum, data: TrainingData, points: Array, root: Array) -> _Sum:
+def _with_leftovers(base: _Sum, points: Array, error: Callable[[_Sum], float]) -> _Sum:
     """Try every left-over component in the lateral group, the protrusive group or none; return the best sum."""
     used = {part.group[0] for part in base.parts}
     left = [index for index in range(base.net.components) if index not in used]
@@ -203,12 +190,13 @@ def _with_leftovers(base: _Sum, data: TrainingData, points: Array, root: Array) 
         for group in groups:
             if group not in parts:
                 parts[group] = _part(base.net, components, group, base.seed, _SEARCH_STAGES)
-        candidates.append(_Sum(base.net, tuple(parts[group] for group in groups), base.seed))
-    return min(candidates, key=lambda found: _error(found, data, points, root))
+        first, second, third = (parts[group] for group in groups)
+        candidates.append(_Sum(base.net, (first, second, third), base.seed))
+    return min(candidates, key=error)
 
 
-def _curves(found: _Sum, points: Array, root: Array, data: TrainingData) -> tuple[AdditiveModel, dict]:
-    """Move the sum's rest to the closed bite and give its curves millimetres as parameters."""
+def _curves(found: _Sum, points: Array, root: Array, data: TrainingData) -> tuple[AdditiveModel, dict[str, object]]:
+    """Move the sum's rest to the closed bite and reparametrise its curves in mm; return notes beside the model."""
     encoded = found.encode(points)
     rest = found.rest(encoded)
     reached = encoded - rest
@@ -230,17 +218,22 @@ def _shifted(part: _Part, net: Nlpca, rest: float, root: Array) -> Curve:
     def curve(t: Array) -> tuple[Array, Array]:
         value, rate = part.value(net, t + rest)
         value = value - part.value(net, np.array([rest]))[0]
-        return np.linalg.solve(root.T, value.T).T, np.linalg.solve(root.T, rate.T).T
+        return _twists(value, root), _twists(rate, root)
 
     return curve
 
 
-def _error(found: _Sum, data: TrainingData, points: Array, root: Array) -> float:
-    return float(data.metric.largest(_motions(found.value(found.encode(points)), root), data.motion).mean())
+def _rebuilt(found: _Sum, motion: Array, root: Array) -> Array:
+    """Return motions (N, 4, 4) encoded and decoded by a sum."""
+    return _motions(found.value(found.encode(se3_log(motion) @ root)), root)
 
 
 def _motions(points: Array, root: Array) -> Array:
-    return se3_exp(np.linalg.solve(root.T, points.T).T)
+    return se3_exp(_twists(points, root))
+
+
+def _twists(points: Array, root: Array) -> Array:
+    return np.asarray(np.linalg.solve(root.T, points.T).T, dtype=np.float64)
 
 
 def _only(components: Array, group: tuple[int, ...]) -> Array:

@@ -1,42 +1,41 @@
-"""Poses that no jaw could take: found before a flexible model can bend itself to them.
+"""Screening of gross outliers before a flexible model is fitted.
 
-A tracking failure of centimetres lies alone in the space of poses, and a spline runs through whatever lies alone. A
+A tracking failure of centimetres is isolated in the space of poses, and a spline interpolates isolated points. A
 quadratic map from the incisal displacement to the rotation cannot: fitted by random sample consensus (Fischler & Bolles
-1981), it follows the many and misses the odd ones by as much as they are wrong.
+1981), it follows the majority, so that the residuals of the others equal their errors.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.fitting.data import Selection, TrainingData
 from jawusd.geometry import so3_log
-from jawusd.geometry.arrays import Array, Mask
+from jawusd.geometry.arrays import Array, Indices, Mask
 
-_FEWEST = 60  # poses among which odd ones stand out
+_FEWEST = 60  # poses needed to identify outliers
 _TRIALS, _SAMPLE = 300, 15  # random samples; each somewhat above the ten unknowns per component
-_CONSENSUS = 0.75  # share of the poses that has to agree
+_CONSENSUS = 0.75  # share of the poses that must agree
 _REFITS = 3
-# A jaw strays from the quadratic by a millimetre or two at its borders; failures that smooth models trim by themselves
-# are smaller than this [mm, rms over the mandible].
+# A jaw deviates from the quadratic by a millimetre or two at its borders; smaller failures are trimmed by the smooth
+# models themselves [mm, rms over the mandible].
 _TIMES, _FLOOR_MM = 8.0, 6.0
 REASON = "far from the other poses' smooth motion"
 
 
 def screened(selection: Selection) -> Selection:
-    """Return the selection without poses that lie centimetres off the motion of all others."""
-    odd = gross_outliers(selection.data)
-    if not odd.any():
+    """Return the selection without its gross outliers."""
+    outliers = gross_outliers(selection.data)
+    if not outliers.any():
         return selection
     used = selection.used.copy()
-    used[np.flatnonzero(used)[odd]] = False
-    excluded = {**selection.excluded, REASON: selection.data.frames[odd].tolist()}
-    return Selection(selection.data.select(~odd), used, excluded)
+    used[np.flatnonzero(used)[outliers]] = False
+    excluded = {**selection.excluded, REASON: selection.data.frames[outliers].tolist()}
+    return Selection(selection.data.select(~outliers), used, excluded)
 
 
 def gross_outliers(data: TrainingData) -> Mask:
-    """Tell which poses lie centimetres off a quadratic map that most agree with, shape (N,); none of fewer than 60."""
+    """Return which poses lie centimetres off the quadratic map of the majority, shape (N,); none of fewer than 60."""
     count = len(data)
     if count < _FEWEST:
         return np.zeros(count, dtype=bool)
@@ -65,6 +64,7 @@ def _quadratic(u: Array) -> Array:
     return np.column_stack([np.ones(len(x)), x, *pairs])
 
 
-def _residual(columns: NDArray, values: NDArray, rows: NDArray) -> Array:
+def _residual(columns: Array, values: Array, rows: Indices | Mask) -> Array:
+    """Return the residuals (N,) of a fit to some rows."""
     solution = np.linalg.lstsq(columns[rows], values[rows], rcond=1e-8)[0]
     return np.linalg.norm(values - columns @ solution, axis=1)

@@ -1,4 +1,4 @@
-"""Smoothing polyharmonic splines: r^3 kernels on spread-out centres plus a linear tail.
+"""Smoothing polyharmonic splines (r^3 kernels on spread-out centres plus a linear tail) and their regression.
 
 s(q) = sum_i w_i |q - c_i|^3 + L q - (the same at q = 0), with sum_i w_i = 0 and sum_i w_i c_i = 0, so that w^T K w is
 the bending energy of s (Duchon 1977; Wahba, Spline Models for Observational Data, 1990, section 2.4).
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from jawusd.geometry.arrays import Array
+from jawusd.geometry.arrays import Array, Indices, Mask
 
 _RANK = 1e-9  # singular values below this share of the largest count as zero
 _TIE_DIGITS = 9
@@ -19,16 +19,14 @@ _SAME_CENTRE = 1e-6  # normalised distance below which two points are one centre
 
 
 def farthest_points(points: Array, count: int) -> Array:
-    """Return up to `count` of the points, each the farthest from those before it (Gonzalez 1985).
+    """Return `count` of the points (N, D), each the farthest from those before it (Gonzalez 1985).
 
-    Args:
-        points: shape (N, D); the first taken is the one nearest the origin.
-        count: how many to take; fewer are returned when the points repeat.
+    The first is the one nearest the origin; fewer are returned when the points repeat.
     """
     chosen = [int(np.argmin((points**2).sum(1)))]
     distance = ((points - points[chosen[0]]) ** 2).sum(1)
     while len(chosen) < min(count, len(points)):
-        # Rounded, so that of points equally far, as on a grid, the same one is taken whatever frame they come from.
+        # Rounded, so that ties, as on a grid, are broken alike in every coordinate frame.
         farthest = int(np.argmax(np.round(distance, _TIE_DIGITS)))
         if distance[farthest] < _SAME_CENTRE**2:
             break
@@ -76,29 +74,36 @@ class SplineBasis:
 
 
 def ridge_solve(normal: Array, right: Array, penalty: Array) -> Array:
-    """Solve (normal + penalty) x = right for symmetric positive definite sums.
-
-    Returns:
-        x, of the shape of ``right``.
-    """
+    """Solve (normal + penalty) x = right for symmetric positive definite sums."""
     return cho_solve(cho_factor(normal + penalty, lower=True), right)
 
 
+def within(residual_mm: Array, trim_mad: float, floor_mm: float) -> Mask:
+    """Return which residuals (N,) exceed the median by no more than `trim_mad` normalised median absolute deviations.
+
+    Args:
+        trim_mad: number of deviations (1.4826 MAD, the standard deviation of a normal distribution).
+        floor_mm: residuals up to this are never trimmed.
+    """
+    middle = float(np.median(residual_mm))
+    spread = 1.4826 * float(np.median(np.abs(residual_mm - middle)))
+    return residual_mm <= max(middle + trim_mad * spread, floor_mm)
+
+
 def choose_smoothing(
-    columns: Array, values: Array, weights: Array, energy: Array, tail: Array, grid: Array, folds: Array, cap: float
+    columns: Array, values: Array, weights: Array, energy: Array, tail: Array, grid: Array, folds: Indices, cap: float
 ) -> float:
     """Return the smoothing factor with the smallest capped error on left-out folds.
 
     Args:
         columns: regression columns, shape (N, k).
-        values: values to predict, in units in which their Euclidean norm is the error [mm], shape (N, C).
-        weights: frame weights, shape (N,).
+        values: to predict, in units in which their Euclidean norm is the error [mm], shape (N, C).
         energy: bending energy, shape (k, k).
         tail: fixed part of the penalty, shape (k, k).
         grid: smoothing factors to try, ascending.
-        folds: fold number of each frame, shape (N,); contiguous blocks, since neighbours in time are nearly equal.
-            Rows with a negative one are never left out.
-        cap: errors above this [mm] count as this, so that outliers do not choose the smoothness.
+        folds: fold number of each frame, shape (N,): contiguous blocks, since neighbours in time are nearly equal;
+            rows with a negative one are never left out.
+        cap: largest error that counts [mm], so that outliers do not determine the smoothness.
     """
     weighted = columns * weights[:, None]
     total, right = weighted.T @ columns, weighted.T @ values

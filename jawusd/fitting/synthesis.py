@@ -1,4 +1,4 @@
-"""Paper Fig. 13: random poses of a model within its bounds, and how far they are from what was captured."""
+"""Paper Fig. 13: random poses of a model within its bounds, and their distances to the captured poses."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ from scipy.spatial import cKDTree
 from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.distances import carried
 from jawusd.evaluator.polygons import PolygonBound
-from jawusd.fitting.alpha_shape import alpha_shape
+from jawusd.fitting.bounds import PLANES, alpha_shapes, fit_slice_hull, valid_box
 from jawusd.fitting.metric import MandibleMetric
-from jawusd.fitting.slice_hull import fit_slice_hull, valid_box
 from jawusd.geometry.arrays import Array
 
 POSES = 1000
@@ -43,15 +42,14 @@ class Bounds:
     @classmethod
     def of(cls, d: Array, alpha: float) -> Bounds:
         """Build the bounds of captured parameters d (N, 3) [mm]; `alpha` as in `FittingConfig`."""
-        arrays, rings = {}, []
-        for name, axes in (("polygon_d1d2", [0, 1]), ("polygon_d1d3", [0, 2])):
-            vertices, counts = alpha_shape(d[:, axes], alpha)
-            arrays |= {name: vertices, f"{name}_counts": counts}
-            rings.append(tuple(np.split(vertices, np.cumsum(counts)[:-1])))
+        shapes = {name: np.asarray(values, dtype=np.float64) for name, values in alpha_shapes(d, alpha).items()}
+        lateral, protrusive = (
+            tuple(np.split(shapes[name], shapes[f"{name}_counts"].cumsum().astype(int)[:-1])) for name in PLANES
+        )
         hull, _ = fit_slice_hull(d)
         box = np.stack([d.min(0), d.max(0)], axis=1)
-        polygons = PolygonBound.from_arrays(arrays)
-        return cls(box, polygons, (rings[0], rings[1]), SliceHull.from_arrays(hull), valid_box(hull))
+        polygons = PolygonBound.from_arrays(shapes)
+        return cls(box, polygons, (lateral, protrusive), SliceHull.from_arrays(hull), valid_box(hull))
 
     def draw(self, rng: np.random.Generator) -> dict[str, Array]:
         """Return up to `POSES` parameters (n, 3) [mm] spread evenly over each bound, by its name."""
@@ -73,16 +71,7 @@ def _spread(box: Array, excess: Callable[[Array], Array], rng: np.random.Generat
 
 
 def distance_to_nearest(metric: MandibleMetric, motion: Array, captured: Array) -> Array:
-    """Return the largest vertex distance to the captured pose for which it is smallest.
-
-    Args:
-        metric: the mandible metric.
-        motion: poses, shape (n, 4, 4).
-        captured: captured poses, shape (N, 4, 4).
-
-    Returns:
-        Distances [mm], shape (n,).
-    """
+    """Return the largest vertex distance (n,) [mm] of motions (n, 4, 4) to the nearest captured one of (N, 4, 4)."""
     # The rms distance is Euclidean in these columns and never above the largest one, so that only captured poses
     # within the best known largest distance can be nearer.
     at, places = _columns(metric, motion), _columns(metric, captured)
@@ -96,15 +85,9 @@ def distance_to_nearest(metric: MandibleMetric, motion: Array, captured: Array) 
 
 
 def captured_reference(metric: MandibleMetric, captured: Array, folds: int) -> Array:
-    """Return for each captured pose the distance to the nearest one outside its own contiguous part of the take.
+    """Return the distance of each captured motion (N, 4, 4) to the nearest one outside its own part of the take [mm].
 
-    Args:
-        metric: the mandible metric.
-        captured: captured poses in the order of time, shape (N, 4, 4).
-        folds: number of parts.
-
-    Returns:
-        Distances [mm], shape (N,).
+    The motions are in the order of time; the take is divided into `folds` contiguous parts.
     """
     fold = np.arange(len(captured)) * folds // len(captured)
     parts = [distance_to_nearest(metric, captured[fold == k], captured[fold != k]) for k in range(folds)]

@@ -54,10 +54,11 @@ def do_experiments(
         FittingError: the poses cannot carry a model.
     """
     from jawusd.fitting import FittingConfig
-    from jawusd.fitting.data import Anatomy
+    from jawusd.fitting.data import SubjectAnatomy
     from jawusd.fitting.experiments import run_experiments
 
-    anatomy = Anatomy.of(subject.T_anatomical_skull, subject.landmarks, subject.measured_points(), subject.T_rest)
+    points = subject.measured_points()
+    anatomy = SubjectAnatomy.of(subject.T_anatomical_skull, subject.landmarks, points, subject.T_rest)
     return run_experiments(
         motion,
         anatomy,

@@ -1,7 +1,7 @@
-"""The mandible and the parts of the skull it meets: fossa and eminence, cheekbone, upper jaw bone.
+"""The mandible and the adjacent parts of the skull: fossa and eminence, cheekbone, upper jaw bone; without teeth.
 
-The bones carry no teeth of their own. The joint surfaces follow the person's kinematics: rolled along them, the
-condyles describe the paths of `jawusd.synthetic.kinematics`.
+The joint surfaces follow the person's kinematics: condyles that roll along them describe the paths of
+`jawusd.synthetic.kinematics`. All are in the scan frame [mm], in the closed bite.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numpy as np
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry.arrays import Array
 from jawusd.synthetic.kinematics import Joint, eminence
-from jawusd.synthetic.surfaces import Faces, grid_faces, loft, merged, outward
+from jawusd.synthetic.surfaces import Faces, grid_faces, loft, merged, outward, superellipse
 
 #: Half axes of a condyle [mm]: lateral, up, forward.
 CONDYLE_MM = np.array([9.0, 4.2, 4.8])
@@ -22,14 +22,7 @@ _AROUND = 24
 
 
 def build_mandible(joint: Joint) -> Mesh:
-    """Build the mandible without teeth: body, rami, coronoid processes, condyles; closed parts that overlap.
-
-    Args:
-        joint: positions of the condyles and the incisors.
-
-    Returns:
-        The bone in the scan frame, teeth in occlusion [mm].
-    """
+    """Build the mandible without teeth: body, rami, coronoid processes, condyles; closed parts that overlap."""
     parts = [_body(joint)]
     for side, centre in zip((1.0, -1.0), joint.condyles, strict=True):
         parts += [_ramus(joint, side, centre), _condyle(side, centre), _coronoid(side, centre)]
@@ -37,14 +30,7 @@ def build_mandible(joint: Joint) -> Mesh:
 
 
 def build_skull(joint: Joint) -> Mesh:
-    """Build the joint sockets, the cheekbones and the upper jaw bone; closed parts that overlap.
-
-    Args:
-        joint: positions and shapes of the joint surfaces.
-
-    Returns:
-        The bone in the scan frame [mm].
-    """
+    """Build the joint sockets, the cheekbones and the upper jaw bone; closed parts that overlap."""
     parts = [_maxilla(joint)]
     for k, side in enumerate((1.0, -1.0)):
         parts += [_socket(joint, k), _cheekbone(joint, k, side)]
@@ -52,15 +38,9 @@ def build_skull(joint: Joint) -> Mesh:
 
 
 def articular_surface(joint: Joint, side: int, slide_mm: Array) -> Array:
-    """Return the sagittal section of the socket's bone: the condyle's path moved out by the joint space.
+    """Return the sagittal section (y, z) of the socket's bone [mm], shape (..., 2), at forward slides (...).
 
-    Args:
-        joint: the joint.
-        side: 0 left, 1 right.
-        slide_mm: forward positions of the condyle [mm], shape (...).
-
-    Returns:
-        Height and depth (y, z) [mm], shape (..., 2).
+    It is the condyle's path moved out by the joint space; side 0 is left, 1 right.
     """
     step = 1e-4
     slope = (eminence(joint, side, slide_mm + step) - eminence(joint, side, slide_mm - step)) / (2 * step)
@@ -72,15 +52,12 @@ def articular_surface(joint: Joint, side: int, slide_mm: Array) -> Array:
 
 def _mesh(part: tuple[Array, Faces]) -> Mesh:
     vertices, faces = part
-    return Mesh(vertices, faces, np.tile(np.uint8(_BONE), (len(vertices), 1)))
+    return Mesh(vertices, faces, np.tile(np.array(_BONE, dtype=np.uint8), (len(vertices), 1)))
 
 
 def _ovals(centres: Array, half_x: Array, half_z: Array, squareness: float = 0.8) -> tuple[Array, Faces]:
     """Loft of level rounded rectangles: centres (R, 3), half sizes (R,) [mm]."""
-    angle = 2 * np.pi * np.arange(_AROUND) / _AROUND
-    c, s = np.cos(angle), np.sin(angle)
-    x = np.sign(c) * np.abs(c) ** squareness
-    z = np.sign(s) * np.abs(s) ** squareness
+    x, z = superellipse(2 * np.pi * np.arange(_AROUND) / _AROUND, squareness)
     offsets = np.stack([half_x[:, None] * x, np.zeros((len(centres), _AROUND)), half_z[:, None] * z], -1)
     return loft(centres[:, None] + offsets)
 
@@ -90,10 +67,7 @@ def _swept(path: Array, half_wide: Array, half_high: Array) -> tuple[Array, Face
     tangent = np.gradient(path, axis=0) * [1.0, 0.0, 1.0]
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     across = np.stack([tangent[:, 2], np.zeros(len(path)), -tangent[:, 0]], -1)
-    angle = 2 * np.pi * np.arange(_AROUND) / _AROUND
-    c, s = np.cos(angle), np.sin(angle)
-    wide = np.sign(c) * np.abs(c) ** 0.8
-    high = np.sign(s) * np.abs(s) ** 0.8
+    wide, high = superellipse(2 * np.pi * np.arange(_AROUND) / _AROUND, 0.8)
     rings = path[:, None] + half_wide[:, None, None] * wide[None, :, None] * across[:, None]
     rings[..., 1] += half_high[:, None] * high
     return loft(rings)
@@ -112,20 +86,18 @@ def _spline(knots: Array, values: Array, at: Array) -> Array:
 def _body(joint: Joint) -> tuple[Array, Faces]:
     """Return the horseshoe from ramus to ramus, below the lower gum."""
     x, y, z = joint.incisor
-    half = []  # x, middle height, z, half width, half height; from the chin to the left ramus
-    half.append([0.0, y - 24.0, z - 5.5, 5.5, 10.5])
-    half.append([13.0, y - 23.5, z - 8.5, 5.5, 10.0])
-    half.append([22.0, y - 22.0, z - 20.0, 5.5, 9.5])
-    half.append([28.0, y - 20.0, z - 36.0, 6.0, 9.5])
-    half.append([34.0, y - 16.5, z - 52.0, 6.0, 11.0])
-    half.append([41.0, y - 11.0, z - 66.0, 5.0, 12.0])
-    rows = np.array(half)
-    mirrored = rows[:0:-1] * [-1.0, 1.0, 1.0, 1.0, 1.0]
-    rows = np.concatenate([mirrored, rows])
-    rows[:, 0] += x
-    at = np.linspace(0.0, len(rows) - 1.0, 61)
-    rows = _spline(np.arange(len(rows), dtype=np.float64), rows, at)
-    return _swept(rows[:, :3], rows[:, 3], rows[:, 4])
+    # x, middle height, z, half width, half height; from the chin to the left ramus
+    half = np.array(
+        [
+            [0.0, y - 24.0, z - 5.5, 5.5, 10.5],
+            [13.0, y - 23.5, z - 8.5, 5.5, 10.0],
+            [22.0, y - 22.0, z - 20.0, 5.5, 9.5],
+            [28.0, y - 20.0, z - 36.0, 6.0, 9.5],
+            [34.0, y - 16.5, z - 52.0, 6.0, 11.0],
+            [41.0, y - 11.0, z - 66.0, 5.0, 12.0],
+        ]
+    )
+    return _horseshoe(half, x, 61)
 
 
 def _ramus(joint: Joint, side: float, centre: Array) -> tuple[Array, Faces]:
@@ -184,7 +156,7 @@ def _column(centre: Array, side: float, rows: Array, squareness: float = 0.8) ->
 
 
 def _socket(joint: Joint, k: int) -> tuple[Array, Faces]:
-    """Fossa, eminence and what lies in front of it, as a slab over the condyle."""
+    """Fossa, eminence and the bone in front of it, as a slab over the condyle."""
     slide = np.linspace(-7.0, 22.0, 40)
     section = articular_surface(joint, k, slide)
     behind = np.maximum(-3.0 - slide, 0.0)
@@ -217,7 +189,7 @@ def _socket(joint: Joint, k: int) -> tuple[Array, Faces]:
 
 
 def _cheekbone(joint: Joint, k: int, side: float) -> tuple[Array, Faces]:
-    """Arch from the socket forward to the cheek and in to the upper jaw bone."""
+    """Arch from the socket forward to the cheek and inward to the upper jaw bone."""
     x, y, z = joint.condyles[k]
     rows = np.array(
         [
@@ -240,6 +212,12 @@ def _maxilla(joint: Joint) -> tuple[Array, Faces]:
         [[0.0, y, -8.0, 4.5, 8.0], [11.0, y, -9.0, 5.0, 9.0], [21.0, y, -19.0, 6.0, 9.5],
          [26.0, y, -34.0, 6.0, 9.5], [28.0, y, -50.0, 5.0, 9.0]]
     )  # fmt: skip
+    return _horseshoe(half, 0.0, 49)
+
+
+def _horseshoe(half: Array, midline_x: float, count: int) -> tuple[Array, Faces]:
+    """Sweep ovals along a path given by its left half from the midline: rows of x, y, z, half width, half height."""
     rows = np.concatenate([half[:0:-1] * [-1.0, 1.0, 1.0, 1.0, 1.0], half])
-    rows = _spline(np.arange(len(rows), dtype=np.float64), rows, np.linspace(0.0, len(rows) - 1.0, 49))
+    rows[:, 0] += midline_x
+    rows = _spline(np.arange(len(rows), dtype=np.float64), rows, np.linspace(0.0, len(rows) - 1.0, count))
     return _swept(rows[:, :3], rows[:, 3], rows[:, 4])

@@ -1,4 +1,4 @@
-"""Write a whole synthetic capture: scans, videos, masks, boards, calibration, picks and the truth."""
+"""Write a synthetic capture: scans, videos, masks, boards, calibration, picks and the ground truth."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from jawusd.formats.atomic import write_bytes_atomic, write_npz_atomic, write_text_atomic
 from jawusd.formats.calibration import save_calibration
@@ -17,7 +17,7 @@ from jawusd.formats.mesh import Mesh
 from jawusd.geometry import LANDMARKS, Camera
 from jawusd.geometry.arrays import Array
 from jawusd.imaging.video_writer import VideoWriter
-from jawusd.synthetic.anatomy import Anatomy, build_anatomy
+from jawusd.synthetic.anatomy import PersonAnatomy, build_anatomy
 from jawusd.synthetic.masks import Outline, drawn_mask
 from jawusd.synthetic.person import Person
 from jawusd.synthetic.picks import SeenVertex, choose_picks
@@ -33,17 +33,17 @@ _OFFSETS = (0, 5, -3)
 _PICKS = 4
 _PICK_NOISE_PX = 1.0
 _PICTURES_PER_BOARD = 2
-# Sensor noise [grey levels of 255]; a few patterns are shifted about instead of drawing one per picture.
+# Sensor noise [grey levels of 255]; a few patterns are shifted at random instead of drawing one per picture.
 _SENSOR_NOISE = 1.3
 _NOISE_PATTERNS = 5
 
 
 @dataclass(frozen=True)
 class DemoConfig:
-    """What to record.
+    """Choose the person and the size of a synthetic capture.
 
     Attributes:
-        seed: another number is another person and another performance.
+        seed: of person and performance.
         frames: tracked frames at 24 per second.
         size_px: width and height of the pictures.
         boards: poses of the calibration board.
@@ -66,11 +66,9 @@ class DemoConfig:
 
 
 def write_demo(folder: str | os.PathLike[str], config: DemoConfig, progress: Progress | None = None) -> Path:
-    """Record a synthetic person into a capture folder.
+    """Record a synthetic person into a capture folder, replacing files of the same names.
 
     Args:
-        folder: where; files of the same names are replaced.
-        config: what to record.
         progress: called with pictures done and pictures in all.
 
     Returns:
@@ -83,7 +81,7 @@ def write_demo(folder: str | os.PathLike[str], config: DemoConfig, progress: Pro
     folder = Path(folder)
     person = Person(config.seed)
     cameras = build_cameras(config.size_px)
-    with Renderer(cameras) as renderer:  # first: without OpenGL there is no point in the rest
+    with Renderer(cameras) as renderer:  # fails early without OpenGL
         anatomy = build_anatomy(person)
         take = perform(person, anatomy.occlusion, config.frames, _OFFSETS, config.seed)
         recorder = _Recorder(folder, config, cameras, renderer, progress)
@@ -99,7 +97,7 @@ def write_demo(folder: str | os.PathLike[str], config: DemoConfig, progress: Pro
 
 
 class _Recorder:
-    """Draws every picture of a capture and writes the video files."""
+    """Draw every picture of a capture and write the video files."""
 
     def __init__(
         self, folder: Path, config: DemoConfig, cameras: list[Camera], renderer: Renderer, progress: Progress | None
@@ -124,17 +122,17 @@ class _Recorder:
         with contextlib.ExitStack() as stack:
             videos = [stack.enter_context(self._video("video", camera)) for camera in self._cameras]
             masks = [[stack.enter_context(self._mask(c, jaw)) for jaw in ("upper", "lower")] for c in self._cameras]
-            for row in range(len(take.phase)):
-                instant = take.first_instant + row
-                poses = scene.pose(take, row)
+            for index in range(len(take.phase)):
+                instant = take.first_instant + index
+                poses = scene.pose(take, index)
                 tracked = take.tracked[0] <= instant < take.tracked[1]
                 if instant == take.tracked[0]:
-                    self._pick(scene, take, row)
+                    self._pick(scene, take, index)
                 for k in range(len(self._cameras)):
                     if not 0 <= instant - _OFFSETS[k] < self._frames:
                         continue
-                    wobble = tuple(outline.next() for outline in outlines[k]) if tracked else None
-                    picture = scene.draw(k, take, row, poses, wobble)
+                    jitter = (outlines[k][0].next(), outlines[k][1].next()) if tracked else None
+                    picture = scene.draw(k, take, index, poses, jitter)
                     videos[k].write(self._noisy(picture, k))
                     for writer, coverage in zip(masks[k], (picture.upper, picture.lower), strict=True):
                         writer.write(drawn_mask(coverage, self._rng[k]) if tracked else black)
@@ -154,15 +152,15 @@ class _Recorder:
                     self._count()
         return poses
 
-    def _pick(self, scene: Scene, take: Take, row: int) -> None:
-        head = take.T_world_skull[row]
-        hiding = scene.occluders(take, row)
+    def _pick(self, scene: Scene, take: Take, index: int) -> None:
+        head = take.T_world_skull[index]
+        occluders = scene.occluders(take, index)
         rng = np.random.default_rng([self._config.seed, 0x91C])
         for jaw, arch, T in (
             ("upper", scene.anatomy.upper, head),
-            ("lower", scene.anatomy.lower, head @ take.T_skull_mandible[row]),
+            ("lower", scene.anatomy.lower, head @ take.T_skull_mandible[index]),
         ):
-            self.picks[jaw] = choose_picks(arch, T, self._cameras, hiding, _PICKS, _PICK_NOISE_PX, rng)
+            self.picks[jaw] = choose_picks(arch, T, self._cameras, occluders, _PICKS, _PICK_NOISE_PX, rng)
 
     def _video(self, kind: str, camera: Camera) -> VideoWriter:
         path = self._folder / kind / f"{camera.name}.mp4"
@@ -185,7 +183,7 @@ class _Recorder:
             self._progress(self._done, self._total)
 
 
-def _scans(anatomy: Anatomy) -> dict[str, Mesh]:
+def _scans(anatomy: PersonAnatomy) -> dict[str, Mesh]:
     return {
         "upper_teeth": anatomy.upper.mesh,
         "lower_teeth": anatomy.lower.mesh,
@@ -209,8 +207,8 @@ def _ply(mesh: Mesh) -> bytes:
     return header.encode() + vertices.tobytes() + faces.tobytes()
 
 
-def _truth(person: Person, cameras: list[Camera], take: Take, T_world_board: Array) -> dict[str, Array]:
-    """Everything a tracker should find, for the tracked frames."""
+def _truth(person: Person, cameras: list[Camera], take: Take, T_world_board: Array) -> dict[str, ArrayLike]:
+    """Return the ground truth of the tracked frames."""
     frames = np.arange(*take.tracked)
     rows = frames - take.first_instant
     upper = take.T_world_skull[rows]

@@ -1,4 +1,4 @@
-"""Rows of teeth with their gum: crowns set along an arch, and a scalloped gum that hides the crowns' bases.
+"""Dental arches: crowns set along a curve, and a scalloped gum that covers the crowns' bases.
 
 Everything is built with the occlusal side up (x left, y occlusal, z anterior) and mirrored in y for the upper jaw.
 """
@@ -17,7 +17,7 @@ from jawusd.synthetic.surfaces import Faces, loft, merged, outward
 from jawusd.synthetic.teeth import CrownForm, crown
 
 RED, GREEN, GREY = (215, 45, 40), (40, 190, 60), (150, 150, 150)
-# Depth of the contact points behind the incisal edges and buccal cusp tips [mm]; teeth are strung along them.
+# Depth of the contact points behind the incisal edges and buccal cusp tips [mm]; the teeth are aligned at them.
 _CONTACT_MM = 0.9
 _CONTACT_OVERLAP_MM = 0.22
 _BOUNDARY_MM = 2.5
@@ -30,12 +30,12 @@ _COLUMN_MM = 0.55
 
 @dataclass(frozen=True)
 class ArchShape:
-    """Form and position of one row of teeth.
+    """Form and position of one arch.
 
     Attributes:
-        quadratic_per_mm: the line of edges and buccal cusps runs back as a x^2 + b x^4: a [1/mm].
+        quadratic_per_mm: the line of edges and buccal cusps recedes by a x^2 + b x^4: a [1/mm].
         quartic_per_mm3: b [1/mm^3].
-        setback_mm: how far this line lies inside that curve.
+        setback_mm: distance of this line inside that curve.
         tips_mm: height of edge or highest cusp of each tooth, first incisor to second molar, left then right,
             shape (2, 7).
         midline_mm: x of the midline.
@@ -50,7 +50,7 @@ class ArchShape:
 
 @dataclass(frozen=True, eq=False)
 class DentalArch:
-    """One row of teeth with gum, scan frame.
+    """One arch with gum, scan frame.
 
     Attributes:
         mesh: crowns first, then gum; red, green and grey.
@@ -96,32 +96,28 @@ class _Line:
 
 
 def build_arch(forms: tuple[CrownForm, ...], shape: ArchShape, cusp_slope: float, upper: bool, seed: int) -> DentalArch:
-    """Build a row of teeth with gum.
+    """Build an arch with gum.
 
     Args:
         forms: tooth kinds from the first incisor to the second molar.
-        shape: form and position.
-        cusp_slope: steepness of the cusps, drop per mm.
+        cusp_slope: drop of the cusps per mm.
         upper: mirror it downwards.
-        seed: draws positions and irregularities of the teeth; the same seed gives the same teeth whatever the tips.
-
-    Returns:
-        The row in the scan frame.
+        seed: of positions and irregularities of the teeth, which do not depend on the tips.
     """
     rng = np.random.default_rng([seed, 0x7EE7, int(upper)])
     line = _Line(shape)
     centres = _centres(forms)
     parts, tooth, colors = [], [], []
-    for row, side in enumerate((1, -1)):
+    for half, side in enumerate((1, -1)):
         for k, form in enumerate(forms):
             local, faces = crown(form, cusp_slope, rng)
-            placed = _placed(local, form, line, side * centres[k], side, shape.tips_mm[row, k], rng)
+            placed = _placed(local, form, line, side * centres[k], side, shape.tips_mm[half, k], rng)
             parts.append((placed, outward(placed, faces)))
             colors.append(_crown_colors(local, form, k))
             tooth.append(np.full(len(local), side * (k + 1)))
     gum = _gum(forms, shape, line, np.concatenate([placed for placed, _ in parts]))
     parts.append(gum)
-    colors.append(np.tile(np.uint8(GREY), (len(gum[0]), 1)))
+    colors.append(np.tile(np.array(GREY, dtype=np.uint8), (len(gum[0]), 1)))
     tooth.append(np.zeros(len(gum[0])))
     vertices, faces = merged(parts)
     if upper:
@@ -154,7 +150,7 @@ def _placed(
 
 def _crown_colors(local: Array, form: CrownForm, k: int) -> NDArray[np.uint8]:
     """Red, and green on the facial side of the last millimetres of the six front teeth."""
-    colors = np.tile(np.uint8(RED), (len(local), 1))
+    colors = np.tile(np.array(RED, dtype=np.uint8), (len(local), 1))
     if k < 3:
         middle = form.tip_z_mm
         boundary = (local[:, 1] > local[:, 1].max() - _BOUNDARY_MM - form.tip_mm / 2) & (local[:, 2] > middle - 0.1)
@@ -163,13 +159,13 @@ def _crown_colors(local: Array, form: CrownForm, k: int) -> NDArray[np.uint8]:
 
 
 def _gum(forms: tuple[CrownForm, ...], shape: ArchShape, line: _Line, crowns: Array) -> tuple[Array, Faces]:
-    """Return a closed gum ridge: margins scalloped between the teeth, faces standing a little proud of the crowns."""
+    """Return a closed gum ridge: margins scalloped between the teeth, surface slightly outside the crowns."""
     half = _centres(forms)[-1] + forms[-1].width_mm / 2 + 2.5
     s = np.linspace(-half, half, int(2 * half / _COLUMN_MM))
     margin = _margin(forms, shape, s)
     crown_s, crown_n = line.coordinates(crowns[:, [0, 2]])
     facial, lingual = _crown_extent(s, margin, crown_s, crown_n, crowns[:, 1])
-    # near the crest the gum follows every crown, further down only the arch as a whole
+    # Near the crest the gum follows every crown, further down only the arch as a whole.
     follow = np.clip(1.0 + _GUM_SIDE[:, 1] / 5.0, 0.0, 1.0)
     sides = []
     for extent, sign in ((facial, 1.0), (lingual, -1.0)):
@@ -187,16 +183,13 @@ def _gum(forms: tuple[CrownForm, ...], shape: ArchShape, line: _Line, crowns: Ar
 
 def _margin(forms: tuple[CrownForm, ...], shape: ArchShape, s: Array) -> Array:
     """Height of the gum margin: the gum line at each tooth, papillae in between."""
-    centres = _centres(forms)
-    line, papilla, centre, half = [], [], [], []
-    for row, side in enumerate((1, -1)):
-        for k, form in enumerate(forms):
-            line.append(shape.tips_mm[row, k] - form.height_mm)
-            papilla.append(0.38 * form.height_mm if k < 3 else 0.30 * form.height_mm)
-            centre.append(side * centres[k])
-            half.append(form.width_mm / 2)
+    height = np.array([form.height_mm for form in forms])
+    centre = np.concatenate([side * _centres(forms) for side in (1, -1)])
     order = np.argsort(centre)
-    line, papilla, centre, half = (np.array(v)[order] for v in (line, papilla, centre, half))
+    centre = centre[order]
+    line = (shape.tips_mm - height).ravel()[order]
+    papilla = np.tile(np.where(np.arange(len(forms)) < 3, 0.38, 0.30) * height, 2)[order]
+    half = np.tile([form.width_mm / 2 for form in forms], 2)[order]
     tooth = np.abs(s[:, None] - centre).argmin(1)
     smooth_line = np.interp(s, centre, line)
     across = np.minimum(np.abs(s - centre[tooth]) / half[tooth], 1.0)
@@ -216,7 +209,7 @@ def _crown_extent(s: Array, margin: Array, crown_s: Array, crown_n: Array, crown
 
 
 def _averaged(values: Array, width: int) -> Array:
-    """Hann average along a row, edges repeated."""
+    """Hann average along the arch, edges repeated."""
     width += 1 - width % 2
     kernel = np.hanning(width + 2)[1:-1]
     return np.convolve(np.pad(values, width // 2, mode="edge"), kernel / kernel.sum(), "valid")

@@ -1,4 +1,4 @@
-"""The set of poses a synthetic person can take, and the distance of any pose from it.
+"""The set of possible poses of a synthetic person, and the distance of any pose to it.
 
 A pose is possible when it lies on the person's three-parameter manifold with controls inside their ranges. The nearest
 one is found by bounded Gauss-Newton steps from the best node of a coarse grid, on distances of mandible points.
@@ -18,7 +18,7 @@ PoseFunction = Callable[[Array, Array, Array], Array]
 _LOWER = np.array([0.0, -1.0, -1.0])
 _UPPER = np.array([1.0, 1.0, 1.0])
 _GRID = (13, 9, 9)
-# Poses on both sides of zero protrusion, where the manifold has a fold in its controls, need the most steps.
+# Poses near zero protrusion, where the manifold has a kink in its controls, need the most steps.
 _STEPS = 30
 _DIFFERENCE = 1e-5
 # At these poses the gradients of the controls differ by a factor of ten; the damping is relative to each.
@@ -33,7 +33,7 @@ class Envelope:
         """Prepare the grid of start values.
 
         Args:
-            pose: controls (...), (...), (...) to T_skull_mandible (..., 4, 4).
+            pose: opening, lateral, protrusion (...) to T_skull_mandible (..., 4, 4).
             points: mandible points [mm], shape (P, 3).
             exponent: None for independent ranges, p for |lateral|^p + max(protrusion, 0)^p <= 1.
         """
@@ -46,11 +46,7 @@ class Envelope:
         self._grid_points = self._moved(self._grid, self._few)
 
     def limit(self, controls: Array) -> Array:
-        """Bring controls into the ranges: clip, then pull lateral and protrusion back along their direction.
-
-        Returns:
-            Controls inside the ranges, of the same shape.
-        """
+        """Return controls (..., 3) inside the ranges: clipped, then lateral and protrusion scaled down together."""
         controls = np.clip(controls, _LOWER, _UPPER)
         if self._exponent is None:
             return controls
@@ -105,7 +101,7 @@ class Envelope:
         return controls, distance
 
     def _step(self, controls: Array, error: Array, damping: Array, bounded: bool) -> Array:
-        """One damped Gauss-Newton step; controls held by a bound they push against take no part in it."""
+        """One damped Gauss-Newton step; controls at a bound whose gradient points outwards are fixed."""
         now = self._moved(controls, self._points)
         jacobian = np.stack(
             [(self._moved(controls + _DIFFERENCE * e, self._points) - now) / _DIFFERENCE for e in np.eye(3)], -1

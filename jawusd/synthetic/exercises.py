@@ -36,14 +36,14 @@ _SCHEDULES: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Recording:
-    """A person's exercises.
+    """A person's exercises; poses are T_skull_mandible, shape (F, 4, 4).
 
     Attributes:
         controls: opening 0..1, lateral -1..1, protrusion -1..1, shape (F, 3).
         phase: name of the exercise of each frame, shape (F,).
-        T_manifold: poses of the controls alone, T_skull_mandible, shape (F, 4, 4).
-        T_true: poses with the small extra movements, shape (F, 4, 4).
-        T_noisy: `T_true` with tracking noise, shape (F, 4, 4).
+        T_manifold: poses of the controls alone.
+        T_true: poses with the small extra movements.
+        T_noisy: `T_true` with tracking noise.
     """
 
     controls: Array
@@ -57,15 +57,10 @@ def record(person: Person, n_frames: int, seed: int, kind: Kind = "training", no
     """Record a person doing exercises at 24 frames per second.
 
     Args:
-        person: who.
-        n_frames: number of frames; 833 is what the paper trained on.
-        seed: of this recording.
-        kind: "training": clinical exercises, chewing and speech; "hidden": another order, other sizes and wandering
-            through the whole envelope, for tests of what was learned from "training".
+        n_frames: number of frames; the paper trained on 833.
+        kind: "training": clinical exercises, chewing and speech; "hidden": another order, other sizes and random
+            motion through the whole envelope, for tests of models fitted to "training".
         noise_scale: multiplies the tracking noise.
-
-    Returns:
-        The recording.
 
     Raises:
         ValueError: unknown kind or less than one frame.
@@ -85,16 +80,13 @@ def record(person: Person, n_frames: int, seed: int, kind: Kind = "training", no
 def schedule(
     names: tuple[str, ...], n_frames: int, rng: np.random.Generator, tempo: float = 1.0
 ) -> tuple[Array, NDArray[np.str_]]:
-    """Join exercises until the frames are filled.
+    """Join exercises, repeated as needed, until the frames are filled.
 
     Args:
-        names: exercises, repeated as needed.
-        n_frames: number of frames.
-        rng: draws their sizes and speeds.
-        tempo: how much faster than usual the exercises are done; chewing and speech keep their speed.
+        tempo: factor on the speed of all exercises but chewing and speech.
 
     Returns:
-        controls with smoothed seams, shape (F, 3), and the exercise of each frame, shape (F,).
+        Controls with smoothed transitions, shape (F, 3), and the exercise of each frame, shape (F,).
 
     Raises:
         ValueError: less than one frame.
@@ -129,7 +121,7 @@ def _faster(curve: Array, tempo: float) -> Array:
 
 
 def smoothed(curves: Array) -> Array:
-    """Return the seven-frame Hann average along time, shape (F, n): muscles make no corners."""
+    """Return the seven-frame Hann average of curves (F, n) along time, since muscles move smoothly."""
     kernel = np.hanning(9)[1:-1]
     kernel = kernel / kernel.sum()
     padded = np.pad(curves, ((3, 3), (0, 0)), mode="edge")
@@ -137,7 +129,7 @@ def smoothed(curves: Array) -> Array:
 
 
 def _with_tracking_noise(person: Person, T: Array, rng: np.random.Generator, scale: float) -> Array:
-    """Turn and move each pose a little about the middle of the lower dental arch."""
+    """Rotate and translate each pose slightly about the middle of the lower dental arch."""
     centre = person.joint.incisor + [0.0, -3.0, -20.0]
     R = so3_exp(rng.normal(size=(len(T), 3)) * person.noise.tracking_rad * scale)
     shift = rng.normal(size=(len(T), 3)) * person.noise.tracking_mm * scale
@@ -158,12 +150,11 @@ def _border(n: int, turn: float, end: int) -> tuple[Array, Array]:
     """Trace a border: slide to one side closed, open along it, cross over and close along the other side.
 
     Args:
-        n: number of frames.
         turn: share of the closing in which the mandible crosses over.
         end: frames in which it returns to the middle.
 
     Returns:
-        opening 0..1 and excursion -1..1, shape (n,) each.
+        Opening 0..1 and excursion -1..1, shape (n,) each.
     """
     first, second = n // 5, int(0.4 * n)
     out, up, down = (np.arange(k) / k for k in (first, second, n - first - second))

@@ -17,9 +17,9 @@ from numpy.typing import ArrayLike
 from jawusd.geometry import make_transform, so3_exp
 from jawusd.geometry.arrays import Array
 
-# Pitch [rad] at which the tooth contact has let go of the mandible: one e-folding of its Gaussian fade.
+# Pitch [rad] of one e-folding of the Gaussian with which the tooth guidance fades out.
 _CONTACT_FADE_RAD = np.deg2rad(4.0)
-# Rounding [mm] of the corners in the tooth guidance: cusps are not knife edges.
+# Rounding [mm] of the corners in the tooth guidance, since cusps are blunt.
 _CUSP_ROUNDING_MM = 0.3
 
 
@@ -44,11 +44,11 @@ class Joint:
         slide_open_mm: forward slide at full opening.
         slide_limit_mm: forward slide at which a condyle is stopped.
         slide_early: share of the slide that follows the rotation from the first millimetre.
-        slide_onset: opening (0..1) by which that share has come up to speed.
+        slide_onset: opening (0..1) over which that share sets in.
         protrusion_max_mm: forward slide in full protrusion, closed.
         retrusion_max_mm: backward slide in full retrusion, closed.
-        hinge_share: share of the opening slide that retrusion takes back while the mouth is less than half open.
-        deviation_mm: sideways wander of the opening path: S-shaped and one-sided part, shape (2,).
+        hinge_share: share of the opening slide that retrusion reverses while the mouth is less than half open.
+        deviation_mm: sideways deviation of the opening path: S-shaped and one-sided part, shape (2,).
         protrusive_guidance: glide of the teeth: initial slope, later slope, transition [mm], shape (3,).
         lateral_guidance: same for lateral movements, shape (3,).
     """
@@ -89,12 +89,8 @@ class Joint:
 
 
 def smoothstep(x: ArrayLike) -> Array:
-    """Blend from 0 to 1 over 0..1 with zero end slopes, any shape.
-
-    Returns:
-        Values in 0..1, of the same shape.
-    """
-    x = np.clip(x, 0.0, 1.0)
+    """Blend from 0 to 1 over 0..1 with zero end slopes, any shape."""
+    x = np.clip(np.asarray(x, dtype=np.float64), 0.0, 1.0)
     return x * x * (3.0 - 2.0 * x)
 
 
@@ -104,7 +100,6 @@ def eminence(joint: Joint, side: int, slide_mm: ArrayLike, medial_mm: ArrayLike 
     The sagittal section is an S (concave fossa, slope, convex crest) in closed form, flat far in front and behind.
 
     Args:
-        joint: the joint.
         side: 0 left, 1 right.
         slide_mm: forward distance from rest, any shape.
         medial_mm: displacement towards the midline, same shape.
@@ -121,7 +116,6 @@ def joint_pose(
     """Return the mandible poses that put both condyles on their eminences.
 
     Args:
-        joint: the joint.
         pitch_rad: opening rotation about the condylar axis, shape (...).
         slides_mm: forward slide of the (left, right) condyle, shape (..., 2).
         shift_mm: shift of the condylar midpoint to the left, shape (...).
@@ -137,7 +131,7 @@ def joint_pose(
     distance = joint.condylar_distance_mm
     spread = np.full(pitch.shape, rest_axis[0])
     middle_x = (left[0] + right[0]) / 2 + shift
-    for _ in range(4):  # heights depend on the spread and back; each round gains two digits
+    for _ in range(4):  # heights and spread depend on each other; each round gains two digits
         y_left = left[1] + eminence(joint, 0, slides[..., 0], left[0] - middle_x - spread / 2) - lifts[..., 0]
         y_right = right[1] + eminence(joint, 1, slides[..., 1], middle_x - spread / 2 - right[0]) - lifts[..., 1]
         dy, dz = y_left - y_right, rest_axis[2] + slides[..., 0] - slides[..., 1]
@@ -154,10 +148,9 @@ def joint_pose(
 def controlled_pose(
     joint: Joint, opening: ArrayLike, lateral: ArrayLike, protrusion: ArrayLike, extra_mm: ArrayLike | None = None
 ) -> Array:
-    """Return mandible poses for controls; outside their ranges the ranges continue smoothly.
+    """Return mandible poses for controls, extrapolated smoothly outside their ranges.
 
     Args:
-        joint: the joint.
         opening: 0 closed .. 1 wide open, shape (...).
         lateral: -1 right .. 1 left, of the range at that opening, shape (...).
         protrusion: -1 retruded .. 1 protruded, of the range at that opening, shape (...).
@@ -219,7 +212,7 @@ def _slides(mean_mm: Array, difference_mm: Array, balancing: Array) -> Array:
 def _side_shift(joint: Joint, opening: Array, difference_mm: Array, balancing: Array) -> Array:
     """Shift of the condylar midpoint to the left [mm]: Bennett movement and the wander of the opening path."""
     size = np.abs(difference_mm)
-    # the balancing condyle's own path makes the Bennett angle: the right one in a movement to the left
+    # The Bennett angle is that of the balancing condyle's path: the right one in a movement to the left.
     tangent = np.tan(np.where(difference_mm > 0, joint.bennett_rad[1], joint.bennett_rad[0]))
     immediate = np.where(difference_mm > 0, joint.side_shift_mm[0], joint.side_shift_mm[1])
     bennett = tangent * balancing * size + immediate * np.tanh(size / 1.5) * (1.0 - smoothstep(opening / 0.6))

@@ -1,4 +1,4 @@
-"""Teeth masks as a person with a segmentation brush leaves them: wobbling outlines, small holes, specks."""
+"""Teeth masks with the defects of manual segmentation: jittering outlines, small holes, specks."""
 
 from __future__ import annotations
 
@@ -7,37 +7,32 @@ from numpy.typing import NDArray
 
 from jawusd.geometry.arrays import Array, Mask
 
-# Size of the wobble [px] and of its cells at a picture height of 1080; habits stay, the rest changes in some frames.
+# Size of the jitter [px] and of its cells at a picture height of 1080; a constant share, the rest correlated in time.
 _WOBBLE_PX, _CELL_PX = 0.7, 36.0
 _REFERENCE_HEIGHT = 1080.0
-_HABIT_SHARE = 0.5
+_CONSTANT_SHARE = 0.5
 _KEEP = 0.6
 _HOLE_CHANCE, _SPECK_CHANCE = 0.12, 0.08
 _FINE = 4
 
 
 class Outline:
-    """The wobble of one mask's outline over time, as a displacement field."""
+    """The jitter of one mask's outline over time, as a displacement field."""
 
     def __init__(self, size_px: tuple[int, int], rng: np.random.Generator) -> None:
-        """Start a wobble.
-
-        Args:
-            size_px: width and height of the masks.
-            rng: draws it.
-        """
+        """Start the jitter of masks of a width and height."""
         scale = size_px[1] / _REFERENCE_HEIGHT
         self._rng = rng
-        self._cells = tuple(int(np.ceil(s / (_CELL_PX * scale))) + 3 for s in size_px[::-1])
+        cells = tuple(int(np.ceil(s / (_CELL_PX * scale))) + 3 for s in size_px[::-1])
         self._amplitude_px = _WOBBLE_PX * scale
-        self._habit = rng.normal(size=(*self._cells, 2))
-        self._mood = rng.normal(size=(*self._cells, 2))
+        self._constant = rng.normal(size=(*cells, 2))
+        self._varying = rng.normal(size=(*cells, 2))
 
     def next(self) -> Array:
-        """Return the displacement field of the next frame [px], shape (rows, columns, 2), spread over the picture."""
-        fresh = self._rng.normal(size=self._mood.shape)
-        self._mood = _KEEP * self._mood + np.sqrt(1.0 - _KEEP**2) * fresh
-        field = np.sqrt(_HABIT_SHARE) * self._habit + np.sqrt(1.0 - _HABIT_SHARE) * self._mood
+        """Return the displacement field of the next frame [px], shape (rows, columns, 2), over the picture."""
+        fresh = self._rng.normal(size=self._varying.shape)
+        self._varying = _KEEP * self._varying + np.sqrt(1.0 - _KEEP**2) * fresh
+        field = np.sqrt(_CONSTANT_SHARE) * self._constant + np.sqrt(1.0 - _CONSTANT_SHARE) * self._varying
         field = _refined(_refined(field, 0), 1)
         return self._amplitude_px * field
 
@@ -55,15 +50,7 @@ def _refined(field: Array, axis: int) -> Array:
 
 
 def drawn_mask(coverage: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Turn the coverage of pixels into a mask, with now and then a small hole or speck.
-
-    Args:
-        coverage: 0..255, shape (h, w).
-        rng: draws holes and specks.
-
-    Returns:
-        Mask, 0 or 255, shape (h, w).
-    """
+    """Return a mask (h, w), 0 or 255, from the coverage (h, w), 0..255, at times with a small hole or speck."""
     mask = coverage > 127
     hole, speck = rng.random() < _HOLE_CHANCE, rng.random() < _SPECK_CHANCE
     place, radius = rng.random(2), rng.uniform(1.2, 3.5, 2) * len(mask) / _REFERENCE_HEIGHT * 1.5

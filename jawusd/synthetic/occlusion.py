@@ -1,4 +1,4 @@
-"""Contact of the two rows of teeth: vertical gaps between the occlusal surfaces in any pose."""
+"""Contact of the two arches: vertical gaps between the occlusal surfaces in any pose."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ _SAMPLES_PER_EDGE = 5
 
 
 class Occlusion:
-    """The under side of the upper crowns as a height map, and the lower crowns' vertices that may touch it."""
+    """The occlusal side of the upper crowns as a height map, and the vertices of the lower crowns."""
 
     def __init__(self, upper: DentalArch, lower: DentalArch) -> None:
-        """Map the upper crowns; both rows in the scan frame, in occlusion."""
+        """Map the upper crowns; both arches in the scan frame, in occlusion."""
         samples = _samples(upper)
         self._low = samples[:, [0, 2]].min(0)
         cells = np.floor((samples[:, [0, 2]] - self._low) / _CELL_MM).astype(int)
@@ -27,28 +27,21 @@ class Occlusion:
         self._tooth = lower.tooth
 
     def gaps(self, T_skull_mandible: ArrayLike) -> Array:
-        """Return the smallest vertical gap of each lower tooth to the upper crowns [mm], negative inside them.
+        """Return the smallest vertical gap of each lower tooth to the upper crowns [mm] in one pose (4, 4).
 
-        Args:
-            T_skull_mandible: one pose, shape (4, 4).
-
-        Returns:
-            Gaps of the teeth, left 1..7 then right 1..7, shape (2, 7); inf for a tooth below nothing.
+        Shape (2, 7), left 1..7 then right 1..7; negative inside a crown, inf for a tooth without an upper crown above.
         """
-        out = np.full((2, 7), np.inf)
-        for row, side in enumerate((1, -1)):
-            for k in range(7):
-                out[row, k] = self._gap(T_skull_mandible, self._points[self._tooth == side * (k + 1)])
-        return out
+        teeth = [[side * (k + 1) for k in range(7)] for side in (1, -1)]
+        return np.array([[self._gap(T_skull_mandible, self._points[self._tooth == k]) for k in half] for half in teeth])
 
     def gap(self, T_skull_mandible: ArrayLike) -> float:
-        """Return the smallest vertical gap between the rows of teeth [mm] in one pose (4, 4)."""
+        """Return the smallest vertical gap between the arches [mm] in one pose (4, 4)."""
         return self._gap(T_skull_mandible, self._points[self._tooth != 0])
 
     def _gap(self, T: ArrayLike, points: Array) -> float:
         moved = transform_points(T, points)
         cells = np.floor((moved[:, [0, 2]] - self._low) / _CELL_MM).astype(int)
-        inside = ((cells >= 0) & (cells < self._map.shape)).all(1)
+        inside = np.all((cells >= 0) & (cells < self._map.shape), axis=1)
         if not inside.any():
             return float("inf")
         return float((self._map[tuple(cells[inside].T)] - moved[inside, 1]).min())

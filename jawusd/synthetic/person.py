@@ -1,4 +1,4 @@
-"""A synthetic person: seeded joint parameters within human ranges, poses, and the truth about which poses are possible.
+"""A synthetic person: seeded joint parameters within human ranges, poses, and the exact set of possible poses.
 
 Ranges: opening and excursions after Hirsch et al. 2006 and Travers et al. 2000, condylar inclination and Bennett angle
 after Johnson and Winstanley 1997 and Cadiax studies, condylar travel after Muto and Kanazawa 1996.
@@ -64,11 +64,11 @@ def _draw_joint(rng: np.random.Generator) -> Joint:
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations of what the three controls do not explain.
+    """Standard deviations of tracking noise and of movements outside the three controls.
 
     Attributes:
-        tracking_mm: tracking noise at the middle of the dental arch, per axis, independent between frames.
-        tracking_rad: tracking noise of the rotation, per axis, independent between frames.
+        tracking_mm: at the middle of the dental arch, per axis, independent between frames.
+        tracking_rad: of the rotation, per axis, independent between frames.
         side_mm: side shift outside the three controls, smooth in time.
         lift_mm: lift of each condyle off its eminence, smooth in time.
     """
@@ -83,20 +83,14 @@ class Person:
     """One synthetic person, all numbers drawn from the seed.
 
     Attributes:
-        seed: the seed.
-        joint: parameters of the joint.
-        noise: sizes of tracking noise and extra movements.
-        landmarks: incisal point, left and right first molar, left and right condyle centre on the mandible, scan frame,
-            shape (5, 3), in the order of `jawusd.geometry.LANDMARKS`.
-        mandible_points: points spread over the whole mandible, scan frame, shape (42, 3); errors of poses are measured
-            on them.
+        landmarks: `jawusd.geometry.LANDMARKS` on the mandible, scan frame [mm], shape (5, 3).
+        mandible_points: points spread over the whole mandible for errors of poses, scan frame [mm], shape (42, 3).
     """
 
     def __init__(self, seed: int, envelope: EnvelopeKind = "box") -> None:
         """Draw a person.
 
         Args:
-            seed: any non-negative integer.
             envelope: "box": lateral and protrusive range do not depend on each other; "competing": a wide lateral
                 movement leaves less room for protrusion (|lateral|^1.3 + protrusion^1.3 <= 1).
 
@@ -114,59 +108,38 @@ class Person:
         self._envelope = Envelope(self.pose, self.mandible_points, exponent=1.3 if envelope == "competing" else None)
 
     def pose(self, opening: ArrayLike, lateral: ArrayLike, protrusion: ArrayLike) -> Array:
-        """Return mandible poses on the person's three-parameter manifold.
-
-        Args:
-            opening: 0 closed .. 1 wide open, shape (...).
-            lateral: -1 full right .. 1 full left, of the range at that opening, shape (...).
-            protrusion: -1 fully retruded .. 1 fully protruded, of the range at that opening, shape (...).
-
-        Returns:
-            T_skull_mandible, shape (..., 4, 4); the identity (closed bite) for zero controls.
-        """
+        """Return mandible poses (..., 4, 4) on the person's three-parameter manifold, see `controlled_pose`."""
         return controlled_pose(self.joint, opening, lateral, protrusion)
 
     def pose_with_extra(self, controls: ArrayLike, extra_mm: ArrayLike) -> Array:
-        """Return poses that also move outside the three controls.
+        """Return poses (..., 4, 4) with movements outside the three controls, see `controlled_pose`.
 
         Args:
             controls: opening, lateral, protrusion, shape (..., 3).
             extra_mm: side shift, lift of the left and of the right condyle, shape (..., 3).
-
-        Returns:
-            T_skull_mandible, shape (..., 4, 4).
         """
-        return controlled_pose(self.joint, *np.moveaxis(np.asarray(controls, dtype=np.float64), -1, 0), extra_mm)
+        opening, lateral, protrusion = np.moveaxis(np.asarray(controls, dtype=np.float64), -1, 0)
+        return controlled_pose(self.joint, opening, lateral, protrusion, extra_mm)
 
     def limit(self, controls: ArrayLike) -> Array:
-        """Bring controls into the envelope, shape (..., 3); what is inside stays.
-
-        Returns:
-            Controls inside, of the same shape.
-        """
+        """Return controls (..., 3) brought into the envelope; those inside are unchanged."""
         return self._envelope.limit(np.asarray(controls, dtype=np.float64))
 
     def nearest(self, T_skull_mandible: ArrayLike, bounded: bool = True) -> tuple[Array, Array]:
-        """Find the poses of the manifold nearest to given ones, in the rms distance of the mandible points.
+        """Find the poses of the manifold nearest to given ones (..., 4, 4), in the rms distance of the mandible points.
 
         Args:
-            T_skull_mandible: shape (..., 4, 4).
-            bounded: stay within the envelope; False lets the controls leave it (the floor of any three-parameter fit).
+            bounded: stay within the envelope; False gives the lower limit of the error of any three-parameter fit.
 
         Returns:
-            controls, shape (..., 3), and the largest distance of a mandible point [mm], shape (...).
+            Controls (..., 3), and the largest distance of a mandible point [mm], shape (...).
         """
         return self._envelope.nearest(np.asarray(T_skull_mandible, dtype=np.float64), bounded)
 
     def is_valid(self, T_skull_mandible: ArrayLike, tolerance_mm: float = 1.0) -> Mask:
-        """Tell which poses this person can take: no mandible point further than the tolerance from a possible pose.
+        """Return which poses (..., 4, 4) are possible: all mandible points within the tolerance of a possible pose.
 
-        Args:
-            T_skull_mandible: shape (..., 4, 4).
-            tolerance_mm: allowed distance [mm]; the extra movements alone reach 0.7.
-
-        Returns:
-            Verdicts, shape (...).
+        The extra movements alone reach 0.7 mm.
         """
         return self.nearest(T_skull_mandible)[1] <= tolerance_mm
 

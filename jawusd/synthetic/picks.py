@@ -1,4 +1,4 @@
-"""Picks that start the tracking: vertices of the teeth with the pixels where two cameras see them."""
+"""Picks that start the tracking: vertices of the teeth with their pixels in two cameras."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from jawusd.geometry.rays import meet_triangles
 from jawusd.synthetic.dental_arch import DentalArch
 from jawusd.synthetic.surfaces import vertex_normals
 
-# A pick lies this far inside the picture, and on a surface not turned away by more than about 70 degrees.
+# A pick lies this far inside the picture, and on a surface inclined to the ray by at most about 70 degrees.
 _BORDER_PX = 10.0
 _FACING = 0.35
 # Another surface this much nearer to the camera hides a point.
@@ -24,12 +24,7 @@ _TIPS_PER_TOOTH = 6
 
 @dataclass(frozen=True)
 class SeenVertex:
-    """A vertex and where two cameras see it.
-
-    Attributes:
-        vertex: index into the scan.
-        views: per camera its name and the pixel, x and y.
-    """
+    """A vertex of a scan and its pixels: (camera, x, y) of two cameras."""
 
     vertex: int
     views: tuple[tuple[str, float, float], ...]
@@ -44,22 +39,15 @@ def choose_picks(
     noise_px: float,
     rng: np.random.Generator,
 ) -> list[SeenVertex]:
-    """Choose well spread tips and corners of teeth that at least two cameras see.
+    """Choose `count` well spread tips and corners of teeth that are visible in at least two cameras.
 
     Args:
-        arch: the row of teeth.
-        T_world_arch: its pose, shape (4, 4).
-        cameras: the cameras.
-        occluders: what may hide the teeth, world coordinates; the row itself included.
-        count: how many.
+        T_world_arch: pose of the arch, shape (4, 4).
+        occluders: meshes that may hide the teeth, world coordinates; the arch itself included.
         noise_px: standard deviation of the picked pixels, per axis.
-        rng: draws the noise.
-
-    Returns:
-        `count` picks.
 
     Raises:
-        ValueError: fewer vertices are seen by two cameras.
+        ValueError: fewer vertices are visible in two cameras.
     """
     candidates = _tips(arch)
     points = transform_points(T_world_arch, arch.mesh.vertices[candidates])
@@ -103,9 +91,9 @@ def _seen(camera: Camera, points: Array, normals: Array, occluders: list[Mesh]) 
     facing[((pixels < _BORDER_PX) | (pixels > limit)).any(1)] = 0.0
     facing[facing < _FACING] = 0.0
     corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in occluders])
-    # a triangle can only hide a point if its corners, in the picture, do not all lie to one side of it
-    seen_at = camera.project_pinhole(corners)
-    low, high = seen_at.min(1), seen_at.max(1)
+    # A triangle can hide a point only if the bounding box of its corners in the picture contains the point.
+    pixels_of_corners = camera.project_pinhole(corners)
+    low, high = pixels_of_corners.min(1), pixels_of_corners.max(1)
     at = camera.project_pinhole(points)
     for i in np.flatnonzero(facing):
         if _hits(points[i], eye, corners[((low <= at[i]) & (at[i] <= high)).all(1)]):

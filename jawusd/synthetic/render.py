@@ -1,7 +1,7 @@
 """Render the synthetic scene with OpenGL: colour pictures and exact teeth masks through distorted lenses.
 
-The scene is drawn without distortion at a multiple of the picture's size; every pixel of the picture then looks up
-where its ray went. Straight edges of triangles thus bend as the lens bends them.
+The scene is drawn without distortion at a multiple of the picture's size; every pixel of the picture then samples it
+along its distorted ray, so that straight edges of triangles bend as in the lens.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from jawusd.synthetic.soft_tissue import Surface
 from jawusd.synthetic.surfaces import vertex_normals
 
 NEAR_MM, FAR_MM = 80.0, 700.0
-#: Labels of surfaces; everything but teeth hides teeth.
+#: Labels of surfaces; surfaces other than teeth occlude the teeth.
 OTHER, UPPER_TEETH, LOWER_TEETH = 0, 1, 2
 _NOTHING = 9.0
 _SCALE = 2
@@ -33,9 +33,8 @@ class Picture:
     """One rendered picture.
 
     Attributes:
-        color: shape (h, w, 3), uint8, sRGB-like.
-        upper: share of each pixel covered by visible upper teeth, shape (h, w), uint8, 0..255.
-        lower: same for the lower teeth.
+        color: sRGB-like, shape (h, w, 3).
+        upper, lower: share of each pixel covered by visible upper and lower teeth, 0..255, shape (h, w).
     """
 
     color: NDArray[np.uint8]
@@ -47,10 +46,7 @@ class Renderer:
     """Draw named surfaces through a set of cameras of one picture size; a context manager that frees the GL context."""
 
     def __init__(self, cameras: list[Camera]) -> None:
-        """Open a GL context without a window and prepare the cameras.
-
-        Args:
-            cameras: all of the same size.
+        """Open a GL context without a window and prepare the cameras, all of the same size.
 
         Raises:
             MissingDependencyError: there is no EGL or no driver for it.
@@ -71,7 +67,7 @@ class Renderer:
         self._make_targets()
         self._grain = self._grain_texture()
         self._bends = [self._bend_texture(camera) for camera in cameras]
-        self._wobbles: dict[str, moderngl.Texture] = {}
+        self._jitters: dict[str, moderngl.Texture] = {}
 
     def __enter__(self) -> Renderer:
         return self
@@ -80,18 +76,12 @@ class Renderer:
         self._gl.release()
 
     def add(self, name: str, surface: Surface, label: int = OTHER) -> None:
-        """Add a surface, or replace the one of that name.
-
-        Args:
-            name: its name.
-            surface: vertices in the part's own frame.
-            label: `UPPER_TEETH`, `LOWER_TEETH` or `OTHER`.
-        """
+        """Add or replace a surface in its own frame; the label is `UPPER_TEETH`, `LOWER_TEETH` or `OTHER`."""
         with self._gl:
             self._parts[name] = _Part(self._gl, self._scene_program, surface, label)
 
     def move(self, name: str, vertices: Array) -> None:
-        """Give a surface new vertex positions, shape (V, 3) [mm]."""
+        """Set the vertex positions (V, 3) [mm] of a surface."""
         with self._gl:
             self._parts[name].write(vertices)
 
@@ -101,30 +91,27 @@ class Renderer:
         T_world_part: dict[str, Array],
         T_world_head: ArrayLike,
         light: float = 1.0,
-        wobble_px: tuple[ArrayLike, ArrayLike] | None = None,
+        jitter_px: tuple[Array, Array] | None = None,
     ) -> Picture:
         """Draw a picture.
 
         Args:
             camera: index of the camera.
             T_world_part: poses of the surfaces to draw, (4, 4) each; others are left out.
-            T_world_head: pose of the skull, shape (4, 4); it says how deep in the mouth a point lies.
+            T_world_head: pose of the skull, shape (4, 4), for the depth of points in the mouth.
             light: brightness, 1 is normal.
-            wobble_px: displacement fields of the upper and the lower mask [px], shape (gh, gw, 2) each, spread over the
-                picture; None is zero.
-
-        Returns:
-            The picture.
+            jitter_px: displacement fields of the upper and the lower mask [px], shape (gh, gw, 2) each, stretched over
+                the picture; None is zero.
         """
         with self._gl:
             self._draw_scene(self._cameras[camera], T_world_part, T_world_head, light)
             self._draw_shadow(self._cameras[camera])
-            return self._draw_lens(camera, light, wobble_px)
+            return self._draw_lens(camera, light, jitter_px)
 
     def _draw_scene(self, view: Camera, T_world_part: dict[str, Array], T_world_head: ArrayLike, light: float) -> None:
         program = self._scene_program
-        program["clip_from_world"].write(_bytes((self._projection(view) @ view.T_cam_world).T))
-        program["head_from_world"].write(_bytes(se3_inverse(T_world_head).T))
+        _write(program, "clip_from_world", self._projection(view) @ view.T_cam_world)
+        _write(program, "head_from_world", se3_inverse(T_world_head))
         program["eye"] = tuple(view.centre_world())
         program["light"] = light
         self._grain.use(0)
@@ -134,7 +121,7 @@ class Renderer:
         self._scene.clear(0.0, 0.0, 0.0, _NOTHING, depth=1.0)
         for name, T in T_world_part.items():
             part = self._parts[name]
-            program["world_from_part"].write(_bytes(np.asarray(T).T))
+            _write(program, "world_from_part", T)
             program["label"] = float(part.label)
             part.vao.render()
         self._gl.disable(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
@@ -148,16 +135,16 @@ class Renderer:
         self._shadow.use()
         self._shadow_quad.render(moderngl.TRIANGLE_STRIP)
 
-    def _draw_lens(self, camera: int, light: float, wobble_px: tuple[ArrayLike, ArrayLike] | None) -> Picture:
+    def _draw_lens(self, camera: int, light: float, jitter_px: tuple[Array, Array] | None) -> Picture:
         program = self._lens_program
         still = np.zeros((2, 2, 2))
-        upper, lower = (still, still) if wobble_px is None else wobble_px
+        upper, lower = (still, still) if jitter_px is None else jitter_px
         textures = (
             ("scene", self._color),
             ("shadow", self._shadow_texture),
             ("bend_px", self._bends[camera]),
-            ("wobble_upper_px", self._wobble_texture("upper", upper)),
-            ("wobble_lower_px", self._wobble_texture("lower", lower)),
+            ("jitter_upper_px", self._jitter_texture("upper", upper)),
+            ("jitter_lower_px", self._jitter_texture("lower", lower)),
         )
         for unit, (name, texture) in enumerate(textures):
             texture.use(unit)
@@ -190,7 +177,7 @@ class Renderer:
         self._lens_quad = gl.vertex_array(self._lens_program, [(corners, "2f", "in_corner")])
 
     def _projection(self, view: Camera) -> Array:
-        """OpenGL clip matrix of the enlarged, widened pinhole picture, first row at the top."""
+        """Return the OpenGL clip matrix of the enlarged, widened pinhole picture, first row at the top."""
         (width, height), m = self._scene_size, self._margin
         K = np.diag([_SCALE, _SCALE, 1.0]) @ view.K  # centres of pixels stay centres of scene pixels
         out = np.zeros((4, 4))
@@ -205,22 +192,22 @@ class Renderer:
         """Displacement from recorded to pinhole pixels on a coarse grid; so smooth that linear reading is exact."""
         width, height = self._size
         columns, rows = -(-width // _BEND_STEP_PX), -(-height // _BEND_STEP_PX)
-        # texel centres, in pixels of the picture
+        # Texel centres, in pixels of the picture.
         x = (np.arange(columns) + 0.5) * width / columns - 0.5
         y = (np.arange(rows) + 0.5) * height / rows - 0.5
         pixels = np.stack(np.meshgrid(x, y), -1)
         return self._vector_texture(camera.undistort_pixels(pixels) - pixels)
 
-    def _wobble_texture(self, name: str, field: ArrayLike) -> moderngl.Texture:
+    def _jitter_texture(self, name: str, field: ArrayLike) -> moderngl.Texture:
         field = np.asarray(field, dtype=np.float32)
-        texture = self._wobbles.get(name)
+        texture = self._jitters.get(name)
         if texture is None or texture.size != (field.shape[1], field.shape[0]):
             if texture is not None:
                 texture.release()
-            self._wobbles[name] = self._vector_texture(field)
+            self._jitters[name] = self._vector_texture(field)
         else:
             texture.write(field.tobytes())
-        return self._wobbles[name]
+        return self._jitters[name]
 
     def _grain_texture(self) -> moderngl.Texture3D:
         """Periodic smooth noise and its gradient in a cube, for the grain of skin."""
@@ -271,14 +258,21 @@ class _Part:
         self._moving.write(_bytes(np.concatenate([vertices, normals], axis=1)))
 
 
+def _write(program: moderngl.Program, name: str, matrix: Array) -> None:
+    """Set a matrix of a program, which GL stores column by column."""
+    uniform = program[name]
+    if isinstance(uniform, moderngl.Uniform):
+        uniform.write(_bytes(matrix.T))
+
+
 def _bytes(array: ArrayLike) -> bytes:
     return np.ascontiguousarray(array, dtype=np.float32).tobytes()
 
 
 def _context() -> moderngl.Context:
-    """Open a GL 3.3 context on EGL, which needs no display."""
+    """Return a GL 3.3 context on EGL, which needs no display."""
     try:
-        context = moderngl.create_standalone_context(backend="egl", require=330)
+        context = moderngl.create_standalone_context(backend="egl", require=330)  # type: ignore[arg-type]  # backend is a name
     except Exception as error:  # moderngl raises bare exceptions with the loader's text
         raise MissingDependencyError(
             f"rendering needs OpenGL 3.3 through EGL, which did not start ({error}).",

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import transform_points
 from jawusd.geometry.arrays import Array
-from jawusd.synthetic.anatomy import Anatomy
+from jawusd.synthetic.anatomy import PersonAnatomy
 from jawusd.synthetic.dental_arch import DentalArch
 from jawusd.synthetic.person import Person
 from jawusd.synthetic.render import LOWER_TEETH, UPPER_TEETH, Picture, Renderer
@@ -24,38 +23,26 @@ _CANINE_TINT = np.array([0.975, 0.955, 0.91])
 class Scene:
     """All surfaces of one person, ready to be drawn."""
 
-    def __init__(self, person: Person, anatomy: Anatomy, renderer: Renderer) -> None:
-        """Give the renderer the person's surfaces.
-
-        Args:
-            person: who.
-            anatomy: that person's teeth.
-            renderer: draws them.
-        """
+    def __init__(self, person: Person, anatomy: PersonAnatomy, renderer: Renderer) -> None:
+        """Add the person's surfaces to the renderer."""
         self._renderer = renderer
         self.anatomy = anatomy
         self._face = Face(person.joint.incisor)
-        self._still = LipState(8.2, 8.2, 27.5, 0.0)
         for name, arch, label in (("upper", anatomy.upper, UPPER_TEETH), ("lower", anatomy.lower, LOWER_TEETH)):
             crowns, gum = _arch_surfaces(arch)
             renderer.add(f"{name} teeth", crowns, label)
             renderer.add(f"{name} gum", gum)
         face = self._face
-        vertices = face.posed(self._still, np.eye(4))
+        vertices = face.posed(LipState(8.2, 8.2, 27.5, 0.0), np.eye(4))
         renderer.add("face", Surface(vertices, face.faces, face.colors, face.gloss, face.skin, face.inside))
         renderer.add("palate", palate())
         renderer.add("tongue", tongue(0.0, 0.0, 0.0))
 
-    def pose(self, take: Take, row: int) -> dict[str, Array]:
-        """Shape lips and tongue for an instant and return the surfaces' poses T_world_part, (4, 4) each.
-
-        Args:
-            take: the performance.
-            row: instant, counted from the take's first one.
-        """
-        T_jaw, head = take.T_skull_mandible[row], take.T_world_skull[row]
-        self._renderer.move("face", self._face.posed(take.lips[row], T_jaw))
-        self._renderer.move("tongue", tongue(*take.tongue_mm[row]).vertices)
+    def pose(self, take: Take, index: int) -> dict[str, Array]:
+        """Shape lips and tongue for an instant of a take and return the surfaces' poses T_world_part, (4, 4) each."""
+        T_jaw, head = take.T_skull_mandible[index], take.T_world_skull[index]
+        self._renderer.move("face", self._face.posed(take.lips[index], T_jaw))
+        self._renderer.move("tongue", tongue(*take.tongue_mm[index]).vertices)
         jaw = head @ T_jaw
         return {
             "upper teeth": head, "upper gum": head, "palate": head, "face": head,
@@ -63,26 +50,26 @@ class Scene:
         }  # fmt: skip
 
     def draw(
-        self, camera: int, take: Take, row: int, poses: dict[str, Array], wobble_px: tuple[ArrayLike, ArrayLike] | None
+        self, camera: int, take: Take, index: int, poses: dict[str, Array], jitter_px: tuple[Array, Array] | None
     ) -> Picture:
-        """Draw an instant; `poses` as returned by `pose` for the same row, `wobble_px` as for `Renderer.render`."""
-        return self._renderer.render(camera, poses, take.T_world_skull[row], float(take.light[row]), wobble_px)
+        """Draw an instant; `poses` as returned by `pose` for it, `jitter_px` as for `Renderer.render`."""
+        return self._renderer.render(camera, poses, take.T_world_skull[index], float(take.light[index]), jitter_px)
 
-    def occluders(self, take: Take, row: int) -> list[Mesh]:
+    def occluders(self, take: Take, index: int) -> list[Mesh]:
         """Return everything that can hide a tooth at an instant, in world coordinates [mm]."""
-        T_jaw, head = take.T_skull_mandible[row], take.T_world_skull[row]
-        licking = tongue(*take.tongue_mm[row])
+        T_jaw, head = take.T_skull_mandible[index], take.T_world_skull[index]
+        tongue_now = tongue(*take.tongue_mm[index])
         parts = (
             (head, self.anatomy.upper.mesh),
             (head @ T_jaw, self.anatomy.lower.mesh),
-            (head, Mesh(self._face.posed(take.lips[row], T_jaw), self._face.faces)),
-            (head @ T_jaw, Mesh(licking.vertices, licking.faces)),
+            (head, Mesh(self._face.posed(take.lips[index], T_jaw), self._face.faces)),
+            (head @ T_jaw, Mesh(tongue_now.vertices, tongue_now.faces)),
         )
         return [Mesh(transform_points(T, mesh.vertices), mesh.faces) for T, mesh in parts]
 
 
 def _arch_surfaces(arch: DentalArch) -> tuple[Surface, Surface]:
-    """Crowns and gum of a row of teeth with the colours of life."""
+    """Crowns and gum of an arch in natural colours."""
     tooth = arch.tooth != 0
     first_gum = int(np.argmin(tooth))
     vertices, faces = arch.mesh.vertices, arch.mesh.faces

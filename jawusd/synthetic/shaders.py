@@ -116,8 +116,8 @@ in vec2 at;
 uniform sampler2D scene;
 uniform sampler2D shadow;
 uniform sampler2D bend_px;        // pinhole minus recorded pixel
-uniform sampler2D wobble_upper_px;
-uniform sampler2D wobble_lower_px;
+uniform sampler2D jitter_upper_px;
+uniform sampler2D jitter_lower_px;
 uniform vec2 size_px;
 uniform vec2 to_scene;            // scene pixel = x * pixel + y
 uniform vec2 scene_size_px;
@@ -130,8 +130,8 @@ void main() {
     vec2 ideal = pixel + texture(bend_px, at).rg;
     vec3 total = vec3(0.0);
     vec2 covered = vec2(0.0);
-    vec2 shift_upper = texture(wobble_upper_px, at).rg;
-    vec2 shift_lower = texture(wobble_lower_px, at).rg;
+    vec2 shift_upper = texture(jitter_upper_px, at).rg;
+    vec2 shift_lower = texture(jitter_lower_px, at).rg;
     // one scene pixel lies on the ray, its neighbours half a picture pixel away: weights 1 2 1 in both directions
     for (int j = -1; j <= 1; ++j) for (int i = -1; i <= 1; ++i) {
         float weight = float((2 - abs(i)) * (2 - abs(j))) / 16.0;

@@ -1,4 +1,4 @@
-"""Lips, face, mouth lining, palate and tongue: what surrounds and hides the teeth in pictures.
+"""Lips, face, mouth lining, palate and tongue, which surround and occlude the teeth in pictures.
 
 The face is one grid of rings around the mouth, from the throat over the lining of the cheeks and the lips to the
 edge of the face. It is built in the scan frame for the closed bite and follows the mandible by linear blend skinning.
@@ -48,13 +48,13 @@ _LIP = np.array(
 
 @dataclass(frozen=True)
 class LipState:
-    """How the lips are held.
+    """The shape of the lips.
 
     Attributes:
         upper_mm: height of the middle of the upper lip's edge over the upper incisal edge.
         lower_mm: depth of the middle of the lower lip's edge below the lower incisal edge, moving with the jaw.
         width_mm: half distance between the corners.
-        slant: one side of the mouth drawn higher: rise per mm to the left.
+        slant: rise of the mouth per mm to the left.
     """
 
     upper_mm: float
@@ -73,7 +73,7 @@ class Surface:
         colors: linear diffuse reflectance, shape (V, 3), 0..1.
         gloss: strength of the highlight, shape (V,), 0..1.
         skin: 1 where the surface has the grain of skin, 0 elsewhere, shape (V,).
-        inside: 1 for what lies in the mouth and gets little light at depth, shape (V,).
+        inside: 1 in the mouth, where surfaces get less light with depth, shape (V,).
     """
 
     vertices: Array
@@ -88,15 +88,11 @@ class Face:
     """Face, lips and mouth lining of one person as a grid of rings around the mouth."""
 
     def __init__(self, lower_incisor: Array) -> None:
-        """Prepare the grid.
-
-        Args:
-            lower_incisor: lower incisal point in occlusion, scan frame [mm], shape (3,).
-        """
+        """Prepare the grid for a lower incisal point (3,) in occlusion, scan frame [mm]."""
         self._incisor_y = float(lower_incisor[1])
         angle = 2 * np.pi * (np.arange(_COLUMNS) + 0.5) / _COLUMNS
         self._cos, self._sin = np.cos(angle), np.sin(angle)
-        # the lower lip rides on the jaw, the corners go along by a third
+        # The lower lip moves with the jaw, the corners by a third.
         self._follow = smoothstep((0.35 - self._sin) / 0.95)
         lining_rows, lip_rows = 4, len(_LIP)
         self.rows = lining_rows + lip_rows + _SKIN_ROWS
@@ -120,7 +116,7 @@ class Face:
         edge = self._edge(lips)
         outwards = np.stack([self._cos * 0.8, self._sin], -1)
         outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
-        # at the corners the red is narrow, in the middle of the lower lip widest
+        # The red is narrow at the corners and widest in the middle of the lower lip.
         size = (0.45 + 0.55 * np.abs(self._sin) ** 0.7) * np.where(self._sin < 0, 1.1, 0.95)
         base = _skin_depth(edge[:, 0], edge[:, 1]) - 4.2 - 1.5 * self._cos**8
         lip_rows = []
@@ -132,15 +128,7 @@ class Face:
         return np.concatenate([self._lining(lip[0]), lip, _rounded(self._skin_grid(lip[-1]))])
 
     def posed(self, lips: LipState, T_skull_mandible: ArrayLike) -> Array:
-        """Return the vertices in the skull frame, following the jaw.
-
-        Args:
-            lips: how the lips are held.
-            T_skull_mandible: jaw pose, shape (4, 4).
-
-        Returns:
-            Vertices [mm], shape (rows * columns, 3).
-        """
+        """Return the vertices (rows * columns, 3) in the skull frame [mm] for a jaw pose (4, 4)."""
         rest = self.rest(lips)
         reach = np.ones(self.rows)
         reach[-_SKIN_ROWS:] = np.linspace(1.0, 0.75, _SKIN_ROWS)
@@ -157,7 +145,7 @@ class Face:
         shape = np.abs(self._sin) ** 0.8
         y = middle + np.where(self._sin > 0, upper, -lower) * shape
         x = lips.width_mm * np.sign(self._cos) * np.abs(self._cos) ** 0.9
-        # cupid's bow
+        # The notch in the middle of the upper lip.
         y = y - 0.9 * np.exp(-((x / 4.0) ** 2)) * (self._sin > 0)
         return np.stack([x, y + lips.slant * x], -1)
 
@@ -177,7 +165,7 @@ class Face:
         share = (np.arange(1, _SKIN_ROWS + 1) / _SKIN_ROWS)[:, None, None] ** 1.35
         xy = border[None, :, :2] + share * (far - border[:, :2])
         z = _skin_depth(xy[..., 0], xy[..., 1])
-        # the first rows run smoothly out of the lip's bulge
+        # The first rows continue the lip smoothly.
         offset = border[:, 2] - _skin_depth(border[:, 0], border[:, 1])
         z = z + offset * np.exp(-((share[..., 0] / 0.10) ** 1.5))
         return np.concatenate([xy, z[..., None]], -1)
@@ -192,11 +180,11 @@ def _rounded(rings: Array) -> Array:
 
 def _skin_depth(x: Array, y: Array) -> Array:
     """Depth z [mm] of the skin over the frontal plane, any shape."""
-    # an averaged polygon has no visible corners
+    # Averaging hides the corners of the polygon.
     middle = np.mean([np.interp(y + shift, *_PROFILE.T) for shift in (-4.0, -2.0, 0.0, 2.0, 4.0)], axis=0)
     chin = smoothstep((-22.0 - y) / 20.0)
     z = middle - (0.0138 + 0.0045 * chin) * x**2 - 1.1e-6 * x**4
-    # groove below the nose with its ridges, wings of the nose, folds from nose to mouth
+    # The groove below the nose with its ridges, the nose, the folds from nose to mouth.
     lip = np.exp(-(((y - 17.0) / 7.5) ** 2))
     z = z + lip * (0.7 * np.exp(-(((np.abs(x) - 5.0) / 2.6) ** 2)) - 0.8 * np.exp(-((x / 3.0) ** 2)))
     z = z + 15.0 * np.exp(-((x / 12.5) ** 2)) * smoothstep((y - 21.0) / 13.0)
@@ -221,13 +209,7 @@ def palate() -> Surface:
 
 
 def tongue(forward_mm: float, up_mm: float, side_mm: float) -> Surface:
-    """Return the tongue on the floor of the mouth, mandible frame.
-
-    Args:
-        forward_mm: how far it is put forward from rest.
-        up_mm: how far its tip is raised.
-        side_mm: shift of the tip to the left.
-    """
+    """Return the tongue on the floor of the mouth, mandible frame: advanced, its tip raised and moved to the left."""
     around, along = 40, 26
     u = 2 * np.pi * np.arange(around) / around
     t = np.linspace(0.0, 1.0, along)

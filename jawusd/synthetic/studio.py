@@ -1,4 +1,4 @@
-"""Where the synthetic person sits: three cameras about 200 mm from the mouth, a chessboard, a light."""
+"""The studio of the synthetic person: three cameras about 200 mm from the mouth, and a chessboard."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from jawusd.geometry.arrays import Array
 from jawusd.synthetic.soft_tissue import Surface
 from jawusd.synthetic.surfaces import grid_faces
 
-#: The scan frame to the world (the frame of the first camera: x right, y down, z forward) with the head still.
+#: The scan frame to the world (the frame of the first camera: x right, y down, z forward) with the head at rest.
 T_WORLD_SCAN = make_transform(np.diag([1.0, -1.0, -1.0]), [0.0, -14.0, 214.0])
 BOARD_COLUMNS, BOARD_ROWS, SQUARE_MM = 9, 6, 8.0
 # Focal length over picture width, and per camera: direction from the mouth [deg left, deg up], radial and tangential
@@ -23,17 +23,13 @@ _CAMERAS = (
 
 
 def build_cameras(size_px: tuple[int, int]) -> list[Camera]:
-    """Return the three cameras; the world is the frame of the first one.
-
-    Args:
-        size_px: width and height of the pictures.
-    """
+    """Return the three cameras; the world is the frame of the first one."""
     width, height = size_px
     target = (T_WORLD_SCAN @ [0.0, -14.0, -6.0, 1.0])[:3]
     cameras = []
     for k, ((left, up), distortion, shift, zoom) in enumerate(_CAMERAS):
         a, b = np.deg2rad([left, up])
-        # seen from the first camera the subject's left is the right side of the picture
+        # The subject's left is on the right side of the first camera's picture.
         turn = so3_exp([0.0, -a, 0.0]) @ so3_exp([-b, 0.0, 0.0])
         T_world_cam = np.eye(4)
         if k:
@@ -67,19 +63,11 @@ def board() -> Surface:
 
 
 def board_poses(n: int, rng: np.random.Generator) -> Array:
-    """Draw poses of the board where the mouth will be, in view of all cameras.
-
-    Args:
-        n: number of poses.
-        rng: draws them.
-
-    Returns:
-        T_world_board, shape (n, 4, 4).
-    """
+    """Return n random poses T_world_board (n, 4, 4) near the place of the mouth, in view of all cameras."""
     centre = (T_WORLD_SCAN @ [0.0, -12.0, -10.0, 1.0])[:3]
     tilt = rng.uniform(-1.0, 1.0, (n, 3)) * np.deg2rad([24.0, 22.0, 14.0])
     shift = rng.uniform(-1.0, 1.0, (n, 3)) * [14.0, 8.0, 18.0]
     R = so3_exp(tilt)
-    # every other time the board is held the other way round
+    # Every second pose is turned by 180 degrees.
     R[1::2] = R[1::2] @ np.diag([-1.0, -1.0, 1.0])
     return make_transform(R, centre + shift)

@@ -13,16 +13,7 @@ Faces = NDArray[np.int32]
 
 
 def grid_faces(rows: int, columns: int, closed: bool) -> Faces:
-    """Triangulate a grid of vertices numbered row by row.
-
-    Args:
-        rows: number of rows.
-        columns: number of columns.
-        closed: join the last column to the first.
-
-    Returns:
-        Faces, shape (F, 3).
-    """
+    """Return the faces (F, 3) of a grid numbered row by row; `closed` joins the last column to the first."""
     i, j = np.meshgrid(np.arange(rows - 1), np.arange(columns if closed else columns - 1), indexing="ij")
     k = (j + 1) % columns
     a, b, c, d = i * columns + j, i * columns + k, (i + 1) * columns + j, (i + 1) * columns + k
@@ -30,13 +21,10 @@ def grid_faces(rows: int, columns: int, closed: bool) -> Faces:
 
 
 def loft(rings: Array) -> tuple[Array, Faces]:
-    """Join stacked rings to a closed mesh; the first and the last ring are closed with a fan.
-
-    Args:
-        rings: ring points [mm], shape (R, A, 3).
+    """Join stacked rings (R, A, 3) [mm] to a closed mesh with fans at both ends.
 
     Returns:
-        vertices, shape (R A + 2, 3), and faces with outward winding, shape (F, 3).
+        Vertices (R A + 2, 3) and faces (F, 3) with outward winding.
     """
     n_rings, around, _ = rings.shape
     vertices = np.concatenate([rings.reshape(-1, 3), rings[[0, -1]].mean(1)])
@@ -52,23 +40,25 @@ def loft(rings: Array) -> tuple[Array, Faces]:
 
 
 def outward(vertices: Array, faces: Faces) -> Faces:
-    """Return the faces of a closed mesh turned so that its signed volume is positive."""
+    """Return the faces of a closed mesh wound so that its signed volume is positive."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     return faces if np.einsum("ij,ij->", a, np.cross(b, c)) > 0 else faces[:, ::-1].copy()
 
 
 def merged(parts: Iterable[tuple[Array, Faces]]) -> tuple[Array, Faces]:
-    """Put meshes (vertices (V, 3), faces (F, 3)) into one.
-
-    Returns:
-        Vertices (V, 3) and faces (F, 3) of the whole.
-    """
+    """Return meshes, each vertices (V, 3) and faces (F, 3), as one."""
     vertices, faces, count = [], [], 0
     for v, f in parts:
         vertices.append(v)
         faces.append(f + count)
         count += len(v)
     return np.concatenate(vertices), np.concatenate(faces).astype(np.int32)
+
+
+def superellipse(angle: Array, squareness: float) -> tuple[Array, Array]:
+    """Return the coordinates of a unit superellipse over the angle."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.sign(c) * np.abs(c) ** squareness, np.sign(s) * np.abs(s) ** squareness
 
 
 def vertex_normals(vertices: Array, faces: Faces) -> Array:

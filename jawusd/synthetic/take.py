@@ -1,4 +1,4 @@
-"""What happens in front of the cameras: jaw, head, lips, tongue and light at every instant of a take."""
+"""A performance in front of the cameras: jaw, head, lips, tongue and light at every instant of a take."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.geometry import make_transform, so3_exp
-from jawusd.geometry.arrays import Array
+from jawusd.geometry.arrays import Array, Mask
 from jawusd.synthetic.anatomy import lifted_bite
 from jawusd.synthetic.exercises import schedule, smooth_noise, smoothed
 from jawusd.synthetic.kinematics import smoothstep
@@ -18,7 +18,7 @@ from jawusd.synthetic.soft_tissue import LipState
 from jawusd.synthetic.studio import T_WORLD_SCAN
 
 FPS = 24.0
-#: Frames before the first and after the last tracked one; the flashes lie there.
+#: Frames before the first and after the last tracked one, which contain the flashes.
 LEAD, TAIL = 20, 16
 #: Frames of the slightly open mouth and of the closed bite at the start of the tracked part.
 OPEN_HOLD, REST_HOLD = 10, 12
@@ -37,7 +37,7 @@ class Take:
     """A performance, sampled at the instants of the reference camera's frames.
 
     Attributes:
-        first_instant: reference frame number of the first row; negative when another camera started earlier.
+        first_instant: reference frame number of the first instant; negative when another camera started earlier.
         tracked: first and one past the last reference frame to be tracked.
         rest_frame: reference frame with the teeth in occlusion.
         dark: dark intervals [first, last) in reference frames, shape (2, 2).
@@ -45,7 +45,7 @@ class Take:
         phase: name of the exercise, shape (I,).
         T_skull_mandible: shape (I, 4, 4).
         T_world_skull: shape (I, 4, 4).
-        lips: how the lips are held, one per instant.
+        lips: one per instant.
         tongue_mm: forward, up, left, shape (I, 3).
         light: brightness, shape (I,).
     """
@@ -64,25 +64,21 @@ class Take:
 
 
 def perform(person: Person, occlusion: Occlusion, frames: int, offsets: tuple[int, ...], seed: int) -> Take:
-    """Let a person perform the exercises.
+    """Return the exercises of a person as a take.
 
     Args:
-        person: who.
-        occlusion: contact of the teeth; closed movements are guided by it.
+        occlusion: contact of the teeth, which guides closed movements.
         frames: number of tracked frames, more than the two holds at the start.
         offsets: of the cameras; all their frames are covered.
-        seed: draws exercises, head motion, lips and tongue.
-
-    Returns:
-        The take.
+        seed: of exercises, head motion, lips and tongue.
     """
     rng = np.random.default_rng([seed, 0x7A6E])
     first = min(0, *offsets)
     n = LEAD + frames + TAIL + max(0, *offsets) - first
-    start = LEAD - first  # row of the first tracked frame
-    controls, phase, quiet = _controls(person, frames, start, n, rng)
+    start = LEAD - first  # index of the first tracked frame
+    controls, phase, held = _controls(person, frames, start, n, rng)
     extra_mm = smooth_noise(rng, n, 8.0, 3) * [person.noise.side_mm, person.noise.lift_mm, person.noise.lift_mm]
-    extra_mm *= 1.0 - quiet[:, None]
+    extra_mm *= 1.0 - held[:, None]
     controls = lifted_bite(person, occlusion, controls, extra_mm)
     T_jaw = person.pose_with_extra(controls, extra_mm)
     dark = np.array([[_FLASH_START, 0], [LEAD + frames + TAIL - _FLASH_BEFORE_END, 0]])
@@ -107,7 +103,7 @@ def perform(person: Person, occlusion: Occlusion, frames: int, offsets: tuple[in
 
 def _controls(
     person: Person, frames: int, start: int, n: int, rng: np.random.Generator
-) -> tuple[Array, NDArray[np.str_], Array]:
+) -> tuple[Array, NDArray[np.str_], Mask]:
     """Return controls and phase of every instant, and where the jaw is held still (1) at the closed bite."""
     exercises = frames - OPEN_HOLD - REST_HOLD
     curves, names = schedule(_EXERCISES, exercises, rng, tempo=1.5)
@@ -116,9 +112,9 @@ def _controls(
     rest = np.zeros((REST_HOLD, 3))
     tail = np.tile(still, (n - len(head) - REST_HOLD - exercises, 1))
     controls = smoothed(np.concatenate([head, rest, curves, tail]))
-    quiet = np.concatenate([np.zeros(len(head)), np.ones(REST_HOLD), np.zeros(exercises + len(tail))])
+    resting = np.concatenate([np.zeros(len(head)), np.ones(REST_HOLD), np.zeros(exercises + len(tail))])
     phase = np.array(["open"] * len(head) + ["rest"] * REST_HOLD + list(names) + ["open"] * len(tail))
-    held = smoothed(quiet[:, None])
+    held = smoothed(resting[:, None])
     unintended = smooth_noise(rng, n, 10.0, 3) * [0.006, 0.03, 0.03] * (1.0 - np.minimum(1.0, 4.0 * held))
     return person.limit(controls + unintended), phase, held[:, 0] > 0.02
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.geometry.arrays import Array
-from jawusd.synthetic.surfaces import loft
+from jawusd.synthetic.surfaces import loft, superellipse
 
 #: Crown below the gum line [mm]; hidden by the gum.
 ROOT_MM = 2.5
@@ -33,8 +33,8 @@ class CrownForm:
         depth_mm: facio-lingual.
         height_mm: gum line to the highest cusp or the edge.
         torque_deg: tilt of the occlusal end towards the facial side.
-        cusps: for premolars and molars, per cusp x and z as shares of half the width and depth and how much lower than
-            the highest one it is [mm]; empty for incisors and canines.
+        cusps: of premolars and molars: x and z as shares of half the width and depth, and the depth below the highest
+            cusp [mm]; empty for incisors and canines.
         tip_mm: height of a canine's tip over its shoulders; 0 for the others.
     """
 
@@ -91,7 +91,7 @@ _BACK_LINGUAL = (-0.72, -0.82, -0.98, -1.06, -0.98, -0.68)
 def _bezier(control: tuple[float, ...], t: Array) -> Array:
     """Evaluate a scalar Bezier curve at t in 0..1, any shape."""
     n = len(control) - 1
-    return sum(c * comb(n, i) * t**i * (1.0 - t) ** (n - i) for i, c in enumerate(control))
+    return sum((c * comb(n, i) * t**i * (1.0 - t) ** (n - i) for i, c in enumerate(control)), np.zeros_like(t))
 
 
 def _relative_width(control: tuple[float, ...], t: Array) -> Array:
@@ -100,30 +100,19 @@ def _relative_width(control: tuple[float, ...], t: Array) -> Array:
 
 
 def crown(form: CrownForm, cusp_slope: float, rng: np.random.Generator) -> tuple[Array, NDArray[np.int32]]:
-    """Build one crown with small individual irregularities.
-
-    Args:
-        form: kind of tooth.
-        cusp_slope: steepness of the cusps of premolars and molars, drop per mm.
-        rng: draws the irregularities.
+    """Build one crown with small individual irregularities; `cusp_slope` is the drop of back teeth's cusps per mm.
 
     Returns:
-        vertices (V, 3) in the crown frame [mm] and outward counter-clockwise faces (F, 3) of a closed mesh.
+        Vertices (V, 3) in the crown frame [mm] and outward counter-clockwise faces (F, 3) of a closed mesh.
     """
     angle = 2 * np.pi * (np.arange(_AROUND) + 0.5) / _AROUND
     rings = _back_rings(form, angle, cusp_slope) if form.cusps else _front_rings(form, angle, rng)
     return loft(rings)
 
 
-def _section(angle: Array, squareness: float) -> tuple[Array, Array]:
-    """Return a unit superellipse: x and z over the angle."""
-    c, s = np.cos(angle), np.sin(angle)
-    return np.sign(c) * np.abs(c) ** squareness, np.sign(s) * np.abs(s) ** squareness
-
-
 def _front_rings(form: CrownForm, angle: Array, rng: np.random.Generator) -> Array:
     """Rings of an incisor or canine from root to edge, shape (R, A, 3)."""
-    x, z = _section(angle, 0.78)
+    x, z = superellipse(angle, 0.78)
     low, high = -ROOT_MM, form.height_mm - _EDGE_ROUNDING_MM
     t = np.linspace(0.0, 1.0, _SIDE_RINGS + 1)
     half = 0.5 * form.width_mm * _relative_width(_FRONT_WIDTH, t)
@@ -146,7 +135,7 @@ def _front_rings(form: CrownForm, angle: Array, rng: np.random.Generator) -> Arr
 
 
 def _edge_drop(form: CrownForm, X: Array, rng: np.random.Generator) -> Array:
-    """How far the edge lies below its highest point [mm]: rounded corners, a canine's shoulders, a worn tilt."""
+    """Depth of the edge below its highest point [mm]: rounded corners, a canine's shoulders, a worn tilt."""
     relative = X / (0.5 * form.width_mm)
     tilt = 0.15 * rng.uniform(-1.0, 1.0) * relative
     if form.tip_mm:
@@ -158,7 +147,7 @@ def _edge_drop(form: CrownForm, X: Array, rng: np.random.Generator) -> Array:
 
 def _back_rings(form: CrownForm, angle: Array, cusp_slope: float) -> Array:
     """Rings of a premolar or molar from root over the rim to the middle of the occlusal surface, shape (R, A, 3)."""
-    x, z = _section(angle, 0.70)
+    x, z = superellipse(angle, 0.70)
     t = np.linspace(0.0, 1.0, _SIDE_RINGS + 1)
     half = 0.5 * form.width_mm * _relative_width(_BACK_WIDTH, t)
     facial, lingual = (0.5 * form.depth_mm * _bezier(c, t) for c in (_BACK_FACIAL, _BACK_LINGUAL))
@@ -173,7 +162,7 @@ def _back_rings(form: CrownForm, angle: Array, cusp_slope: float) -> Array:
 
 
 def _occlusal(form: CrownForm, X: Array, Z: Array, slope: float) -> Array:
-    """Height of the occlusal surface: rounded cones, so that ridges and grooves form between the cusps."""
+    """Height of the occlusal surface: the smooth maximum of rounded cones forms ridges and grooves between cusps."""
     k = _CUSP_SHARPNESS_PER_MM
     heights = []
     for x, z, lower in form.cusps:

@@ -22,7 +22,7 @@ from model_peers import PEERS  # noqa: E402
 
 from jawusd.evaluator import JawRig  # noqa: E402
 from jawusd.fitting import FittingConfig, fit_model  # noqa: E402
-from jawusd.fitting.data import Anatomy, TrainingData, select_poses  # noqa: E402
+from jawusd.fitting.data import SubjectAnatomy, TrainingData, select_poses  # noqa: E402
 from jawusd.fitting.paper import fit_paper  # noqa: E402
 from jawusd.geometry import make_transform, random_rotation, se3_exp, transform_points  # noqa: E402
 from jawusd.synthetic.exercises import record  # noqa: E402
@@ -59,9 +59,9 @@ class Subject:
         )
         return JawRig(model.arrays, model.meta), model, time.process_time() - start
 
-    def training(self) -> tuple[Anatomy, TrainingData]:
+    def training(self) -> tuple[SubjectAnatomy, TrainingData]:
         """Return the training take as fitting sees it."""
-        anatomy = Anatomy.of(self.T_anatomical_skull, self.person.landmarks, self.person.mandible_points, None)
+        anatomy = SubjectAnatomy.of(self.T_anatomical_skull, self.person.landmarks, self.person.mandible_points, None)
         return anatomy, select_poses(np.arange(TRAINING), self.take(), anatomy).data
 
     def error(self, rig: JawRig, T: np.ndarray) -> np.ndarray:

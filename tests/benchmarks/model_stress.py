@@ -25,8 +25,8 @@ from model import SEED_TRAINING, TRAINING, Subject, row  # noqa: E402
 from jawusd.evaluator import JawRig  # noqa: E402
 from jawusd.fitting import FittingConfig, fit_model  # noqa: E402
 from jawusd.fitting.anchored import fit_anchored  # noqa: E402
-from jawusd.fitting.data import Anatomy, TrainingData, select_poses, select_tracks  # noqa: E402
-from jawusd.fitting.holdout import FittedForm  # noqa: E402
+from jawusd.fitting.data import SubjectAnatomy, TrainingData, select_poses, select_tracks  # noqa: E402
+from jawusd.fitting.form import FittedForm  # noqa: E402
 from jawusd.fitting.nlpca import train_nlpca  # noqa: E402
 from jawusd.fitting.paper import fit_paper  # noqa: E402
 from jawusd.formats.capture import load_capture  # noqa: E402
@@ -123,7 +123,8 @@ def networks(count: int, starts: int) -> None:
     for seed in range(count):
         subject = Subject(seed)
         T = record(subject.person, TRAINING, SEED_TRAINING).T_noisy
-        anatomy = Anatomy.of(subject.T_anatomical_skull, subject.person.landmarks, subject.person.mandible_points, None)
+        person = subject.person
+        anatomy = SubjectAnatomy.of(subject.T_anatomical_skull, person.landmarks, person.mandible_points, None)
         data = select_poses(np.arange(len(T)), T, anatomy).data
         root = data.metric.twist_root()
         points = se3_log(data.motion) @ root
@@ -144,7 +145,7 @@ def recorded(folder: Path, tracks: Path | None, starts: int) -> None:
     meshes = load_meshes(capture)
     found = find_anatomy(capture, meshes)
     bone = meshes.get("mandible", meshes["lower_teeth"])
-    anatomy = Anatomy.of(found.T_anatomical_skull, found.landmarks, bone.vertices, None)
+    anatomy = SubjectAnatomy.of(found.T_anatomical_skull, found.landmarks, bone.vertices, None)
     with np.load(capture.folder / "truth" / "truth.npz") as archive:
         frames, true, phase = archive["frames"], archive["T_upper_lower"], archive["phase"]
     noisy = with_tracking_noise(true, found.landmarks[0] + BELOW_INCISOR)
@@ -164,7 +165,7 @@ def recorded(folder: Path, tracks: Path | None, starts: int) -> None:
                 row(f"anchored, {kind} left out", left_out(data, np.where(phase[rows] == kind, 0, -1), anchored))
         literal = fit_paper(data, ALL_SHOWN, True, starts, 0)
         row("paper --literal, train", errors(literal, data))
-        again = partial(fit_paper, shown=ALL_SHOWN, literal=True, starts=1, seed=literal.info["seed"])
+        again = partial(fit_paper, shown=ALL_SHOWN, literal=True, starts=1, seed=literal.notes["seed"])
         row("paper --literal, five parts left out", left_out(data, folds, again))
 
 

@@ -10,7 +10,7 @@ from jawusd.errors import FittingError
 from jawusd.evaluator import JawRig
 from jawusd.fitting import FittingConfig, fit_model
 from jawusd.fitting.curves import in_millimetres
-from jawusd.fitting.data import Anatomy, select_poses
+from jawusd.fitting.data import SubjectAnatomy, select_poses
 from jawusd.fitting.metric import MandibleMetric
 from jawusd.fitting.nlpca import train_nlpca
 from jawusd.fitting.paper import fit_paper
@@ -35,7 +35,7 @@ def take(person):
 @pytest.fixture(scope="module")
 def data(person, take):
     T_anatomical_skull = make_transform(np.eye(3), -person.landmarks[0])
-    anatomy = Anatomy.of(T_anatomical_skull, person.landmarks, person.mandible_points, None)
+    anatomy = SubjectAnatomy.of(T_anatomical_skull, person.landmarks, person.mandible_points, None)
     return select_poses(np.arange(len(take)), take, anatomy).data
 
 
@@ -66,7 +66,7 @@ def test_pca_recovers_a_linear_subspace_exactly(data):
     linear = replace(data, motion=se3_exp(codes @ basis), frames=np.arange(500), weights=np.ones(500))
     fitted = fit_pca(linear, ALL_SHOWN)
     assert mean_error(linear, fitted) < 1e-6
-    assert fitted.singular_values_mm[3] < 1e-9 < fitted.singular_values_mm[2]
+    assert fitted.notes["singular_values_mm"][3] < 1e-9 < fitted.notes["singular_values_mm"][2]
 
 
 def test_pca_parameters_are_incisal_millimetres_at_first_order(data):
@@ -173,10 +173,10 @@ def test_paper_model_counts_the_constant_once(published):
 
 def test_grouping_by_incisal_motion_beats_the_fixed_groups(published):
     few, fits = published
-    assert fits[True].info["groups"] == [[0], [1, 2], [3, 4]]
+    assert fits[True].notes["groups"] == [[0], [1, 2], [3, 4]]
     assert mean_error(few, fits[False]) < 0.9
-    literal = fits[True].info["train_errors_as_published"]["mandible"]["mean"]
-    assert fits[False].info["train_errors_as_published"]["mandible"]["mean"] < literal
+    literal = fits[True].notes["train_errors_as_published"]["mandible"]["mean"]
+    assert fits[False].notes["train_errors_as_published"]["mandible"]["mean"] < literal
 
 
 def test_paper_model_rests_at_the_closed_bite(published):
@@ -184,7 +184,7 @@ def test_paper_model_rests_at_the_closed_bite(published):
     for fitted in fits.values():
         R, t = fitted.model.decode(np.zeros((1, 3)))
         assert np.abs(R - np.eye(3)).max() < 1e-12 and np.abs(t).max() < 1e-9
-        assert fitted.info["rest_offset_mm"] < 1.0
+        assert fitted.notes["rest_offset_mm"] < 1.0
 
 
 def test_a_component_that_collapsed_is_named():

@@ -5,7 +5,7 @@ import pytest
 
 from jawusd.fitting.anchored import fit_anchored
 from jawusd.fitting.condylar import CondylarGuidance
-from jawusd.fitting.data import Anatomy, select_poses
+from jawusd.fitting.data import SubjectAnatomy, select_poses
 from jawusd.geometry import make_transform, so3_exp, so3_log
 from jawusd.synthetic.exercises import record
 from jawusd.synthetic.person import Person
@@ -58,7 +58,7 @@ def test_positions_out_of_the_condyles_reach_are_refused(captured):
 def test_border_movements_are_foretold_by_the_other_exercises():
     person = Person(3)
     take = record(person, 833, 1)
-    anatomy = Anatomy.of(
+    anatomy = SubjectAnatomy.of(
         make_transform(np.eye(3), -person.landmarks[0]), person.landmarks, person.mandible_points, None
     )
     data = select_poses(np.arange(833), take.T_noisy, anatomy).data

@@ -8,7 +8,7 @@ from jawusd.evaluator import JawRig
 from jawusd.fitting import FittingConfig, fit_model
 from jawusd.fitting.anatomy_gate import check_anatomy
 from jawusd.fitting.coverage import missing_movements, shown_parameters
-from jawusd.fitting.data import Anatomy, select_poses, select_tracks
+from jawusd.fitting.data import SubjectAnatomy, select_poses, select_tracks
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import make_transform, random_rotation, se3_exp, so3_exp, transform_points
 from jawusd.synthetic.exercises import record
@@ -28,7 +28,7 @@ def take(person):
 @pytest.fixture(scope="module")
 def anatomy(person):
     to_anatomical = make_transform(np.eye(3), -person.landmarks[0])
-    return Anatomy.of(to_anatomical, person.landmarks, person.mandible_points, None)
+    return SubjectAnatomy.of(to_anatomical, person.landmarks, person.mandible_points, None)
 
 
 def tracks_of(T, covariance=None):
@@ -92,7 +92,7 @@ def test_uncertainty_over_the_mandible_is_that_of_drawn_poses(person, take, anat
 def test_motion_starts_at_the_closed_bite_in_anatomical_axes(person):
     rng = np.random.default_rng(2)
     A, rest = (make_transform(random_rotation(rng), rng.normal(size=3) * 50) for _ in range(2))
-    anatomy = Anatomy.of(A, person.landmarks, None, rest)
+    anatomy = SubjectAnatomy.of(A, person.landmarks, None, rest)
     np.testing.assert_allclose(anatomy.motion(rest), np.eye(4), atol=1e-12)
     T = se3_exp(rng.normal(size=6) * 0.1) @ rest
     at_rest = anatomy.at_rest(person.landmarks)
@@ -120,7 +120,7 @@ def codes(person, T, change=None):
     landmarks = person.landmarks
     if change is not None:
         to_anatomical, landmarks = change(to_anatomical, landmarks)
-    anatomy = Anatomy.of(to_anatomical, landmarks, person.mandible_points, None)
+    anatomy = SubjectAnatomy.of(to_anatomical, landmarks, person.mandible_points, None)
     return [warning.code for warning in check_anatomy(select_poses(np.arange(len(T)), T, anatomy).data, anatomy)]
 
 

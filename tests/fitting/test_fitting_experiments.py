@@ -9,7 +9,7 @@ import trimesh
 
 from jawusd.fitting import FittingConfig, experiments, paper
 from jawusd.fitting.condyle_paths import condyle_paths, path_distances, principal_opening, sagittal_section
-from jawusd.fitting.data import Anatomy, select_poses
+from jawusd.fitting.data import SubjectAnatomy, select_poses
 from jawusd.fitting.experiments import MODELS, run_experiments
 from jawusd.fitting.nlpca import train_nlpca
 from jawusd.fitting.synthesis import BOX, POLYGONS, POSES, SLICES, Bounds, captured_reference, distance_to_nearest
@@ -35,7 +35,8 @@ def poses(person):
 
 @pytest.fixture(scope="module")
 def anatomy(person):
-    return Anatomy.of(make_transform(np.eye(3), -person.landmarks[0]), person.landmarks, person.mandible_points, None)
+    to_anatomical = make_transform(np.eye(3), -person.landmarks[0])
+    return SubjectAnatomy.of(to_anatomical, person.landmarks, person.mandible_points, None)
 
 
 @pytest.fixture(scope="module")

@@ -6,8 +6,8 @@ import pytest
 from jawusd.errors import FittingError
 from jawusd.evaluator import JawRig
 from jawusd.fitting import FittingConfig, fit_model
-from jawusd.fitting.data import Anatomy, select_poses
-from jawusd.fitting.holdout import unseen_errors
+from jawusd.fitting.data import SubjectAnatomy, select_poses
+from jawusd.fitting.error_table import unseen_errors
 from jawusd.fitting.pca import fit_pca
 from jawusd.formats.model import load_model, save_model
 from jawusd.geometry import LANDMARKS, make_transform, random_rotation, se3_exp, so3_exp, transform_point
@@ -95,7 +95,7 @@ def test_predicted_uncertainty_covers_errors_on_unseen_exercises(person, model, 
 
 
 def test_left_out_frames_are_left_out(person, take):
-    anatomy = Anatomy.of(make_transform(np.eye(3), -person.landmarks[0]), person.landmarks, None, None)
+    anatomy = SubjectAnatomy.of(make_transform(np.eye(3), -person.landmarks[0]), person.landmarks, None, None)
     data = select_poses(np.arange(300), take[:300], anatomy).data
     seen = []
 

@@ -12,14 +12,11 @@ from shapely import MultiPoint, Point, Polygon
 from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.models import AdditiveModel
 from jawusd.fitting import gauge_fit
-from jawusd.fitting.alpha_shape import alpha_shape
+from jawusd.fitting.bounds import alpha_shape, fit_slice_hull, valid_box
 from jawusd.fitting.curves import straight
-from jawusd.fitting.gauge_fit import SMALLEST_MINOR, fit_gauge, path_gauge, smallest_minor
+from jawusd.fitting.gauge_fit import SMALLEST_MINOR, fit_gauge, fit_path, path_gauge, smallest_minor
 from jawusd.fitting.metric import MandibleMetric
-from jawusd.fitting.path import Path, fit_path
-from jawusd.fitting.slice_hull import fit_slice_hull, valid_box
-from jawusd.fitting.spline import SplineBasis, choose_smoothing, farthest_points, ridge_solve
-from jawusd.fitting.trimming import within
+from jawusd.fitting.spline import SplineBasis, choose_smoothing, farthest_points, ridge_solve, within
 from jawusd.geometry import make_transform, se3_exp, transform_points
 
 
@@ -66,7 +63,8 @@ def test_best_rotation_is_that_of_scipy(points):
 def test_nearest_pose_is_that_of_scipy(points):
     rng = np.random.default_rng(5)
     metric = MandibleMetric.of_points(points)
-    curves = tuple(straight(rng.normal(size=6) * [0.02, 0.02, 0.02, 1, 1, 1], (-10.0, 10.0)) for _ in range(3))
+    ends = np.array([-10.0, 10.0])
+    curves = tuple(straight(rng.normal(size=6) * [0.02, 0.02, 0.02, 1, 1, 1], ends) for _ in range(3))
     model = AdditiveModel(curves, np.zeros(3), np.array([[-10.0, 10.0]] * 3))
     target = make_transform(*model.decode(rng.normal(size=(4, 3)) * 3)) @ se3_exp(rng.normal(size=(4, 6)) * 0.01)
     d, motion = metric.nearest(model, target)
@@ -152,16 +150,16 @@ def test_path_follows_the_habit_not_the_excursions():
     habit_z = -0.3 * opening - 0.004 * opening**2
     u = np.stack([0.02 * opening, -opening, habit_z], axis=1) + rng.normal(size=(800, 3)) * 0.05
     u[rng.random(800) < 0.3, 2] += 6.0
-    gx, gz, _, _ = path_gauge(fit_path(u, np.ones(800))).path(np.linspace(2, 38, 20))
+    gx, gz, _, _ = fit_path(u, np.ones(800)).path(np.linspace(2, 38, 20))
     at = np.linspace(2, 38, 20)
     np.testing.assert_allclose(gx, 0.02 * at, atol=0.1)
     np.testing.assert_allclose(gz, -0.3 * at - 0.004 * at**2, atol=0.25)
 
 
 def example_gauge(drop=0.4):
-    path = Path(np.array([[1.0, 0, 0, 0, 0], [-8.0, -4.0, 0, 0, 0]]), 40.0, (0.0, 40.0))
+    path = path_gauge(np.array([[1.0, 0, 0, 0, 0], [-8.0, -4.0, 0, 0, 0]]), 40.0, (0.0, 40.0))
     arch = np.array([0.5, -0.3, 0, 0, 0, 0, 0])
-    return path, replace(path_gauge(path), glide_arch=arch, glide_drop=np.array([drop, drop, 0, 0]))
+    return path, replace(path, glide_arch=arch, glide_drop=np.array([drop, drop, 0, 0]))
 
 
 def test_gauge_is_found_again_from_its_own_displacements():

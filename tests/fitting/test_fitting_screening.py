@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jawusd.fitting import FittingConfig, fit_model
-from jawusd.fitting.data import Anatomy, select_poses
+from jawusd.fitting.data import SubjectAnatomy, select_poses
 from jawusd.fitting.screening import REASON, gross_outliers, screened
 from jawusd.geometry import make_transform, se3_exp
 from jawusd.synthetic.exercises import record
@@ -19,7 +19,7 @@ def person():
 @pytest.fixture(scope="module")
 def anatomy(person):
     to_anatomical = make_transform(np.eye(3), -person.landmarks[0])
-    return Anatomy.of(to_anatomical, person.landmarks, person.mandible_points, None)
+    return SubjectAnatomy.of(to_anatomical, person.landmarks, person.mandible_points, None)
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from jawusd.geometry import anatomical_frame, find_landmarks, transform_points
-from jawusd.synthetic.anatomy import Anatomy, build_anatomy, lifted_bite
+from jawusd.synthetic.anatomy import PersonAnatomy, build_anatomy, lifted_bite
 from jawusd.synthetic.bones import JOINT_SPACE_MM
 from jawusd.synthetic.dental_arch import GREEN, GREY, RED, DentalArch
 from jawusd.synthetic.person import Person
@@ -14,7 +14,7 @@ SEEDS = (0, 3)
 
 
 @pytest.fixture(scope="module")
-def people() -> list[tuple[Person, Anatomy]]:
+def people() -> list[tuple[Person, PersonAnatomy]]:
     return [(Person(seed), build_anatomy(Person(seed))) for seed in SEEDS]
 
 
@@ -22,7 +22,7 @@ def _crowns(arch: DentalArch) -> np.ndarray:
     return arch.mesh.vertices[arch.tooth != 0]
 
 
-def test_meshes_are_closed_and_turned_outward(people: list[tuple[Person, Anatomy]]) -> None:
+def test_meshes_are_closed_and_turned_outward(people: list[tuple[Person, PersonAnatomy]]) -> None:
     for _, anatomy in people:
         for mesh in (anatomy.upper.mesh, anatomy.lower.mesh, anatomy.mandible, anatomy.skull):
             solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
@@ -32,7 +32,7 @@ def test_meshes_are_closed_and_turned_outward(people: list[tuple[Person, Anatomy
                 assert part.is_watertight and part.is_winding_consistent and part.volume > 0
 
 
-def test_scans_have_the_promised_size_and_colours(people: list[tuple[Person, Anatomy]]) -> None:
+def test_scans_have_the_promised_size_and_colours(people: list[tuple[Person, PersonAnatomy]]) -> None:
     for _, anatomy in people:
         for arch in (anatomy.upper, anatomy.lower):
             assert 10_000 <= len(arch.mesh.faces) <= 30_000
@@ -45,7 +45,7 @@ def test_scans_have_the_promised_size_and_colours(people: list[tuple[Person, Ana
             assert set(np.abs(arch.tooth[boundary])) == {1, 2, 3}
 
 
-def test_origin_and_axes_are_those_of_the_scan_frame(people: list[tuple[Person, Anatomy]]) -> None:
+def test_origin_and_axes_are_those_of_the_scan_frame(people: list[tuple[Person, PersonAnatomy]]) -> None:
     for _, anatomy in people:
         upper, lower = _crowns(anatomy.upper), _crowns(anatomy.lower)
         front = upper[np.abs(upper[:, 0]) < 8]
@@ -56,7 +56,7 @@ def test_origin_and_axes_are_those_of_the_scan_frame(people: list[tuple[Person, 
         np.testing.assert_allclose(T_anatomical_skull[:3, :3], np.eye(3), atol=0.05)
 
 
-def test_landmarks_found_on_the_meshes_are_the_persons_own(people: list[tuple[Person, Anatomy]]) -> None:
+def test_landmarks_found_on_the_meshes_are_the_persons_own(people: list[tuple[Person, PersonAnatomy]]) -> None:
     for person, anatomy in people:
         upper, lower = _crowns(anatomy.upper), _crowns(anatomy.lower)
         found = find_landmarks(lower, anatomy.mandible.vertices, anatomical_frame(upper, lower))
@@ -64,14 +64,14 @@ def test_landmarks_found_on_the_meshes_are_the_persons_own(people: list[tuple[Pe
         assert distance[0] < 0.6 and (distance[3:] < 1.0).all() and (distance[1:3] < 3.0).all()
 
 
-def test_teeth_meet_in_occlusion_without_cutting(people: list[tuple[Person, Anatomy]]) -> None:
+def test_teeth_meet_in_occlusion_without_cutting(people: list[tuple[Person, PersonAnatomy]]) -> None:
     for _, anatomy in people:
         gaps = anatomy.occlusion.gaps(np.eye(4))
         assert gaps.min() > 0.0
         assert (gaps[:, 3:] < 0.25).all()  # every back tooth has its contact
 
 
-def test_gum_hides_the_crown_bases(people: list[tuple[Person, Anatomy]]) -> None:
+def test_gum_hides_the_crown_bases(people: list[tuple[Person, PersonAnatomy]]) -> None:
     for _, anatomy in people:
         for arch, up in ((anatomy.upper, 1.0), (anatomy.lower, -1.0)):
             gum = arch.mesh.vertices[arch.tooth == 0] * [1, up, 1]
@@ -82,7 +82,7 @@ def test_gum_hides_the_crown_bases(people: list[tuple[Person, Anatomy]]) -> None
                 assert near[:, 1].min() < base[1] - 1.5 and near[:, 1].max() > base[1] + 3
 
 
-def test_sockets_follow_the_condylar_paths(people: list[tuple[Person, Anatomy]]) -> None:
+def test_sockets_follow_the_condylar_paths(people: list[tuple[Person, PersonAnatomy]]) -> None:
     for person, anatomy in people:
         bone = anatomy.skull.vertices
         opening = np.linspace(0.0, 1.0, 9)
@@ -94,7 +94,7 @@ def test_sockets_follow_the_condylar_paths(people: list[tuple[Person, Anatomy]])
                 assert distance == pytest.approx(JOINT_SPACE_MM, abs=0.5)
 
 
-def test_condylar_heads_sit_on_the_condyles(people: list[tuple[Person, Anatomy]]) -> None:
+def test_condylar_heads_sit_on_the_condyles(people: list[tuple[Person, PersonAnatomy]]) -> None:
     for person, anatomy in people:
         for centre in person.joint.condyles:
             head = anatomy.mandible.vertices[np.linalg.norm(anatomy.mandible.vertices - centre, axis=1) < 12]
@@ -116,7 +116,7 @@ def test_lifted_bite_removes_collisions_and_little_else() -> None:
     assert (lifted[:, 0] - controls[:, 0]).max() < 0.05
 
 
-def test_same_seed_same_person_other_seed_another(people: list[tuple[Person, Anatomy]]) -> None:
+def test_same_seed_same_person_other_seed_another(people: list[tuple[Person, PersonAnatomy]]) -> None:
     again = build_anatomy(Person(SEEDS[0])).upper.mesh.vertices
     np.testing.assert_array_equal(again, people[0][1].upper.mesh.vertices)
     assert np.abs(people[1][1].upper.mesh.vertices - again).max() > 0.3

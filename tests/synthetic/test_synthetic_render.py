@@ -94,7 +94,7 @@ def _miss(outline: np.ndarray, share: np.ndarray) -> list[float]:
     return [*shift, (share.sum() - abs(area)) / length]
 
 
-def test_nearer_surfaces_hide_teeth_and_wobble_moves_outlines(studio: Studio) -> None:
+def test_nearer_surfaces_hide_teeth_and_jitter_moves_outlines(studio: Studio) -> None:
     renderer, cameras = studio()
     renderer.add("tooth", _square(9.0, 0.5), render.LOWER_TEETH)
     renderer.add("lip", _square(5.0, 0.5))
@@ -107,7 +107,7 @@ def test_nearer_surfaces_hide_teeth_and_wobble_moves_outlines(studio: Studio) ->
     assert alone.sum() - hidden.sum() == pytest.approx((10 * focal / 200) ** 2, rel=0.02)
     assert behind.sum() == pytest.approx((18 * focal / 200) ** 2, rel=0.02)
     shift = np.broadcast_to([3.0, 0.0], (4, 4, 2))
-    moved = renderer.render(0, {"tooth": far}, np.eye(4), wobble_px=(np.zeros((2, 2, 2)), shift)).lower / 255.0
+    moved = renderer.render(0, {"tooth": far}, np.eye(4), jitter_px=(np.zeros((2, 2, 2)), shift)).lower / 255.0
     np.testing.assert_allclose(moved[:, :-3], alone[:, 3:], atol=0.01)
 
 

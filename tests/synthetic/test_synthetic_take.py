@@ -1,11 +1,11 @@
-"""The performance in front of the cameras, the wobble of the masks and the choice of picks."""
+"""The performance in front of the cameras, the jitter of the masks and the choice of picks."""
 
 import numpy as np
 import pytest
 
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import se3_inverse, se3_log, transform_point, transform_points
-from jawusd.synthetic.anatomy import Anatomy, build_anatomy
+from jawusd.synthetic.anatomy import PersonAnatomy, build_anatomy
 from jawusd.synthetic.masks import Outline, drawn_mask
 from jawusd.synthetic.person import Person
 from jawusd.synthetic.picks import choose_picks
@@ -17,12 +17,12 @@ PERSON = Person(0)
 
 
 @pytest.fixture(scope="module")
-def anatomy() -> Anatomy:
+def anatomy() -> PersonAnatomy:
     return build_anatomy(PERSON)
 
 
 @pytest.fixture(scope="module")
-def take(anatomy: Anatomy) -> Take:
+def take(anatomy: PersonAnatomy) -> Take:
     return perform(PERSON, anatomy.occlusion, 240, (0, 5, -3), 1)
 
 
@@ -56,7 +56,7 @@ def test_the_exercises_cover_the_envelope(take: Take) -> None:
     assert opening.max() > 0.8 and np.ptp(lateral) > 1.5 and protrusion.max() > 0.7 and protrusion.min() < -0.4
 
 
-def test_teeth_never_run_into_each_other(take: Take, anatomy: Anatomy) -> None:
+def test_teeth_never_run_into_each_other(take: Take, anatomy: PersonAnatomy) -> None:
     assert min(anatomy.occlusion.gap(T) for T in take.T_skull_mandible) > -0.02
 
 
@@ -94,7 +94,7 @@ def test_surfaces_of_the_mouth_have_sound_faces() -> None:
         assert surface.colors.shape == surface.vertices.shape
 
 
-def test_outline_wobble_has_the_stated_size_and_habits() -> None:
+def test_outline_jitter_has_the_stated_size_and_constant_share() -> None:
     outline = Outline((1920, 1080), np.random.default_rng(0))
     fields = np.stack([outline.next() for _ in range(60)])
     assert fields.std() == pytest.approx(0.7, rel=0.06)
@@ -121,12 +121,12 @@ def test_drawn_masks_are_binary_with_rare_small_blemishes() -> None:
     assert not drawn_mask(np.zeros_like(coverage), rng).any()
 
 
-def _occluders(anatomy: Anatomy, T_jaw: np.ndarray) -> list[Mesh]:
+def _occluders(anatomy: PersonAnatomy, T_jaw: np.ndarray) -> list[Mesh]:
     parts = ((T_WORLD_SCAN, anatomy.upper.mesh), (T_WORLD_SCAN @ T_jaw, anatomy.lower.mesh))
     return [Mesh(transform_points(T, mesh.vertices), mesh.faces) for T, mesh in parts]
 
 
-def test_picks_are_spread_tips_near_their_projections(anatomy: Anatomy) -> None:
+def test_picks_are_spread_tips_near_their_projections(anatomy: PersonAnatomy) -> None:
     cameras = build_cameras((1280, 720))
     T_jaw = PERSON.pose(0.2, 0.0, 0.0)
     rng = np.random.default_rng(0)
@@ -141,7 +141,7 @@ def test_picks_are_spread_tips_near_their_projections(anatomy: Anatomy) -> None:
             assert 0 < np.abs(miss).max() < 5
 
 
-def test_hidden_teeth_cannot_be_picked(anatomy: Anatomy) -> None:
+def test_hidden_teeth_cannot_be_picked(anatomy: PersonAnatomy) -> None:
     cameras = build_cameras((1280, 720))
     wall = np.array([[-90, -90, 150], [90, -90, 150], [-90, 90, 150], [90, 90, 150.0]])
     everything = [*_occluders(anatomy, np.eye(4)), Mesh(wall, np.array([[0, 1, 2], [1, 3, 2]], np.int32))]

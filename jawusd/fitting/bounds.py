@@ -1,0 +1,153 @@
+"""The bounds of captured parameters: the paper's alpha shapes, and the slice hull, which is the default.
+
+Alpha shapes of (d1, d2) and (d1, d3): a Delaunay triangle belongs to the shape when its circumradius is at most alpha,
+after both axes were divided by the captured range (Edelsbrunner, Kirkpatrick & Seidel 1983 with r = alpha). The paper's
+alpha of 0.12 is in units of its network's components, whose ranges it does not print.
+
+Slice hull: for every opening a convex section of (laterotrusion, protrusion), in mm. A tight alpha shape in three
+dimensions is hollow: captured border movements leave the inside of the envelope empty. Sections of the envelope at one
+opening are close to convex, so the support function of the captured poses near that opening, smoothed over the opening,
+encloses it with few numbers. It lies close around the captured poses, so that every pose a slider reaches is
+anatomical; how much farther a measured pose may lie is estimated from frames left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import Delaunay, QhullError
+from shapely import MultiPoint, Polygon, polygons, union_all
+from shapely.geometry.polygon import orient
+
+from jawusd.evaluator.bounds import SliceHull
+from jawusd.geometry.arrays import Array
+
+#: Names and columns of d of the planes of the alpha shapes.
+PLANES = {"polygon_d1d2": [0, 1], "polygon_d1d3": [0, 2]}
+
+_SMALLEST_RANGE_MM = 0.5  # ranges below this are noise, not motion; dividing by them would blow the noise up
+_SLIVER = 1e-12  # twice the smallest area of a triangle, in normalised units
+_THIN = 0.02  # width given to shapes of points on a line, normalised units
+
+DIRECTIONS = 16
+KNOTS = 48
+SOFTNESS_MM = 0.1
+
+_PROTRUSION_STRETCH = 1.6  # directions are spread evenly after stretching protrusion, the shorter axis, by this
+_WINDOW_MM = 3.5  # frames within this opening of a section shape it,
+_FEWEST_IN_WINDOW = 12  # or this many nearest ones where there are fewer
+_TAPER = 0.35  # reach lost, relative to the section's middle, by a frame at the edge of the window
+_KERNEL_KNOTS = 1.0  # sd of the smoothing over the opening, in knots
+_FOLDS, _BLOCK = 5, 50  # left-out blocks of about one exercise each [frames]
+# The soft maximum of all half-spaces at once is SOFTNESS_MM * log(DIRECTIONS + 2) = 0.29 mm above the largest one: with
+# less margin, a section without extent (a direction the data do not show) would contain nothing.
+_MARGIN_MM = 0.38
+_CONTACT_TOLERANCE_MM = 0.05  # how far below the captured openings the hull reaches
+_FRAMES_PER_SLIP = 400  # one frame in this many may lie beyond closed teeth, by noise
+_SHORTEST_RANGE_MM = 1.0
+_TOLERANCE_QUANTILE, _LARGEST_TOLERANCE_MM = 0.95, 1.0
+
+
+def alpha_shapes(d: Array, alpha: float) -> dict[str, Array | NDArray[np.int64]]:
+    """Return the `polygon_*` arrays of a model for captured parameters (N, 3) [mm]; `alpha` as in `alpha_shape`."""
+    arrays: dict[str, Array | NDArray[np.int64]] = {}
+    for name, columns in PLANES.items():
+        arrays[name], arrays[f"{name}_counts"] = alpha_shape(d[:, columns], alpha)
+    return arrays
+
+
+def alpha_shape(points: Array, alpha: float) -> tuple[Array, NDArray[np.int64]]:
+    """Return the outer rings of an alpha shape of points (N, 2) [mm].
+
+    Args:
+        alpha: largest circumradius of a triangle, in range-normalised units.
+
+    Returns:
+        Vertices of all rings [mm], shape (P, 2), each ring open (its first vertex is not repeated), counter-clockwise,
+        largest first; and the number of vertices of each ring, shape (k,).
+    """
+    low = points.min(0)
+    unit = np.maximum(np.ptp(points, axis=0), _SMALLEST_RANGE_MM)
+    normalised = (points - low) / unit
+    try:
+        corners = normalised[Delaunay(normalised).simplices]
+        shape = union_all(polygons(corners[_circumradius(corners) <= alpha]))
+    except QhullError:  # all points on one line
+        shape = Polygon()
+    if shape.is_empty:
+        shape = MultiPoint(normalised).convex_hull.buffer(_THIN, join_style="mitre", cap_style="square")
+    parts = sorted(getattr(shape, "geoms", [shape]), key=lambda part: -part.area)
+    rings = [np.asarray(orient(part).exterior.coords)[:-1] for part in parts if isinstance(part, Polygon)]
+    return np.concatenate(rings) * unit + low, np.array([len(ring) for ring in rings])
+
+
+def _circumradius(corners: Array) -> Array:
+    """Return the circumradii of triangles, shape (T, 3, 2) -> (T,): product of the sides over four times the area."""
+    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)
+    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    doubled_area = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    return np.where(doubled_area > _SLIVER, sides.prod(1) / np.maximum(2 * doubled_area, _SLIVER), np.inf)
+
+
+def fit_slice_hull(d: Array) -> tuple[dict[str, Array], float]:
+    """Build the slice hull of captured parameters (N, 3) [mm] in the order of time.
+
+    Returns:
+        The `slice_*` arrays of a model; and how far outside of it measured poses may lie [mm]: the 95 % quantile over
+        frames left out, as other exercises go a little farther than those captured.
+    """
+    blocks = np.arange(len(d)) // min(_BLOCK, max(1, len(d) // _FOLDS)) % _FOLDS
+    excess = [SliceHull.from_arrays(_hull(d[blocks != k])).excess(d[blocks == k]) for k in range(_FOLDS)]
+    tolerance = np.quantile(np.concatenate(excess), _TOLERANCE_QUANTILE)
+    return _hull(d), float(np.clip(tolerance, 0.0, _LARGEST_TOLERANCE_MM))
+
+
+def valid_box(arrays: Mapping[str, Array]) -> Array:
+    """Return the axis-parallel box of d [mm], shape (3, 2), that contains the slice hull of the `slice_*` arrays."""
+    reach, directions, d1 = arrays["slice_support"].max(0), arrays["slice_directions"], arrays["slice_d1"]
+    ends = [sign * reach[np.argmax(sign * directions[:, axis])] for axis in (0, 1) for sign in (-1, 1)]
+    box = np.array([[d1[0], d1[-1]], ends[:2], ends[2:]])
+    return box + arrays["slice_margin_mm"] * np.array([-1.0, 1.0])
+
+
+def _hull(d: Array) -> dict[str, Array]:
+    angle = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
+    directions = np.stack([np.cos(angle), np.sin(angle) * _PROTRUSION_STRETCH], axis=-1)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    # The margin also extends the hull beyond closed teeth: subtract it there.
+    closed = float(np.sort(d[:, 0])[len(d) // _FRAMES_PER_SLIP])
+    low, high = closed + _MARGIN_MM - _CONTACT_TOLERANCE_MM, float(d[:, 0].max())
+    knots = np.linspace(low, max(high, low + _SHORTEST_RANGE_MM), KNOTS)
+    reach = d[:, 1:] @ directions.T
+    support = _smoothed(np.stack([_section(np.abs(d[:, 0] - knot) / _WINDOW_MM, reach) for knot in knots]))
+    return {
+        "slice_d1": knots,
+        "slice_directions": directions,
+        "slice_support": support,
+        "slice_softness_mm": np.array(SOFTNESS_MM),
+        "slice_margin_mm": np.array(_MARGIN_MM),
+    }
+
+
+def _section(distance: Array, reach: Array) -> Array:
+    """Return the support values (K,) of one section [mm].
+
+    Args:
+        distance: of the frames in opening, in windows, shape (N,).
+        reach: of the frames along each direction [mm], shape (N, K).
+    """
+    order = np.argsort(distance, kind="stable")
+    count = max(int((distance < 1.0).sum()), min(_FEWEST_IN_WINDOW, len(distance)))
+    near = order[:count]
+    far = np.minimum(distance[near], 1.0)[:, None]
+    middle = np.median(reach[near], axis=0)
+    return (middle + (reach[near] - middle) * (1 - _TAPER * far**2)).max(0)
+
+
+def _smoothed(support: Array) -> Array:
+    half = int(np.ceil(3 * _KERNEL_KNOTS))
+    kernel = np.exp(-0.5 * (np.arange(-half, half + 1) / _KERNEL_KNOTS) ** 2)
+    padded = np.pad(support, ((half, half), (0, 0)), mode="edge")
+    return np.stack([np.convolve(column, kernel / kernel.sum(), mode="valid") for column in padded.T], axis=-1)
