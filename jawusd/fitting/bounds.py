@@ -16,7 +16,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import Delaunay, QhullError
 from shapely import MultiPoint, Polygon, polygons, union_all
 from shapely.geometry.polygon import orient
@@ -50,15 +49,15 @@ _SHORTEST_RANGE_MM = 1.0
 _TOLERANCE_QUANTILE, _LARGEST_TOLERANCE_MM = 0.95, 1.0
 
 
-def alpha_shapes(d: Array, alpha: float) -> dict[str, Array | NDArray[np.int64]]:
+def alpha_shapes(d: Array, alpha: float) -> dict[str, Array]:
     """Return the `polygon_*` arrays of a model for captured parameters (N, 3) [mm]; `alpha` as in `alpha_shape`."""
-    arrays: dict[str, Array | NDArray[np.int64]] = {}
+    arrays: dict[str, Array] = {}
     for name, columns in PLANES.items():
         arrays[name], arrays[f"{name}_counts"] = alpha_shape(d[:, columns], alpha)
     return arrays
 
 
-def alpha_shape(points: Array, alpha: float) -> tuple[Array, NDArray[np.int64]]:
+def alpha_shape(points: Array, alpha: float) -> tuple[Array, Array]:
     """Return the outer rings of an alpha shape of points (N, 2) [mm].
 
     Args:
@@ -66,7 +65,7 @@ def alpha_shape(points: Array, alpha: float) -> tuple[Array, NDArray[np.int64]]:
 
     Returns:
         Vertices of all rings [mm], shape (P, 2), each ring open (its first vertex is not repeated), counter-clockwise,
-        largest first; and the number of vertices of each ring, shape (k,).
+        largest first; and the number of vertices of each ring (integers), shape (k,).
     """
     low = points.min(0)
     unit = np.maximum(np.ptp(points, axis=0), _SMALLEST_RANGE_MM)

@@ -29,7 +29,6 @@ from jawusd.geometry.arrays import Array, Mask
 #: Called with the steps done and the steps in all.
 Progress = Callable[[int, int], None]
 Method = Literal["anchored", "additive", "paper", "pca"]
-ModelArrays = dict[str, Array | NDArray[np.int64]]
 
 _MOST_CAPTURED = 2000  # captured parameters that a model keeps
 # A measured pose is off the model beyond the residuals of nearly all trained and nearly all left-out poses: 99.5 % of
@@ -144,7 +143,7 @@ def fit_model(
     kept_d = captured_d[:: -(-len(captured_d) // _MOST_CAPTURED)]
     warnings += [AnatomyWarning("take_lacks", sentence) for sentence in missing_movements(kept_d, shown)]
     hull, tolerance_mm = fit_slice_hull(captured_d)
-    arrays: ModelArrays = {
+    arrays: dict[str, Array] = {
         **form.arrays(),
         **hull,
         "T_anatomical_skull": anatomy.T_anatomical_skull,
@@ -180,7 +179,7 @@ def fit_form(data: TrainingData, shown: Mask, config: FittingConfig) -> FittedFo
 
 
 def _finish(
-    arrays: ModelArrays,
+    arrays: dict[str, Array],
     unseen_mm: Array,
     form: FittedForm,
     selection: Selection,

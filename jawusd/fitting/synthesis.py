@@ -42,10 +42,8 @@ class Bounds:
     @classmethod
     def of(cls, d: Array, alpha: float) -> Bounds:
         """Build the bounds of captured parameters d (N, 3) [mm]; `alpha` as in `FittingConfig`."""
-        shapes = {name: np.asarray(values, dtype=np.float64) for name, values in alpha_shapes(d, alpha).items()}
-        lateral, protrusive = (
-            tuple(np.split(shapes[name], shapes[f"{name}_counts"].cumsum().astype(int)[:-1])) for name in PLANES
-        )
+        shapes = alpha_shapes(d, alpha)
+        lateral, protrusive = (tuple(np.split(shapes[name], shapes[f"{name}_counts"].cumsum()[:-1])) for name in PLANES)
         hull, _ = fit_slice_hull(d)
         box = np.stack([d.min(0), d.max(0)], axis=1)
         polygons = PolygonBound.from_arrays(shapes)

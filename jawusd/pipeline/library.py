@@ -116,7 +116,7 @@ def plot_ranges(entries: Sequence[Mapping[str, Any]], folder: Path, force: bool)
         MissingDependencyError: matplotlib is not installed.
         OutputError: a file exists already, or cannot be written.
     """
-    from jawusd.report.people import RANGES, draw_ranges
+    from jawusd.report.ranges import RANGES, draw_ranges
 
     for suffix in (".png", ".svg"):
         if (folder / (RANGES + suffix)).exists() and not force:

@@ -1,4 +1,4 @@
-"""Write the report of a build as one HTML file that needs nothing else: no network, no other file."""
+"""Write the report of a build as one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ from importlib import resources
 import jinja2
 import numpy as np
 from markupsafe import Markup
+from numpy.typing import NDArray
 
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.experiments import Experiments
 from jawusd.formats.report import ReportData
 from jawusd.formats.tracks import LOST, LostReason
+from jawusd.report.facts import model_facts, sync_facts, tracks_facts
 from jawusd.report.figures import (
     condyle_figure,
     coverage_figure,
@@ -21,9 +23,9 @@ from jawusd.report.figures import (
     reconstruction_figure,
     synthesis_figure,
 )
-from jawusd.report.inline import inline_svg
 from jawusd.report.ranges import human_ranges
 from jawusd.report.replay import replay_data
+from jawusd.report.style import inline_svg
 from jawusd.report.timeline import model_figure, tracking_figure
 from jawusd.report.verdicts import MARKS, WORDS, judge, overall
 
@@ -32,11 +34,7 @@ _PLACES = ("mandible", "incisor", "molar_left", "molar_right", "condyle_left", "
 
 
 def write_document(path: str | os.PathLike[str], data: ReportData) -> None:
-    """Write the report.
-
-    Args:
-        path: the HTML file.
-        data: what it shows.
+    """Write the report to an HTML file.
 
     Raises:
         OutputError: the file cannot be written.
@@ -45,7 +43,7 @@ def write_document(path: str | os.PathLike[str], data: ReportData) -> None:
 
 
 def document(data: ReportData) -> str:
-    """Return the report as HTML; everything that comes from files is escaped."""
+    """Return the report as HTML; all content of files is escaped."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("jawusd.report", "page"),
         autoescape=True,
@@ -75,7 +73,7 @@ def document(data: ReportData) -> str:
 
 
 def _own(name: str) -> Markup:
-    """Return a file of the package as it is; only our own text may pass unescaped."""
+    """Return a file of the package unescaped."""
     return Markup(resources.files("jawusd.report").joinpath("page", name).read_text(encoding="utf-8"))
 
 
@@ -101,14 +99,14 @@ def _experiment_figures(found: Experiments) -> dict[str, Markup]:
     return {key: inline_svg(figure, key, words) for key, (figure, words) in figures.items()}
 
 
-def _error_tables(data: ReportData) -> list[tuple[str, str, list[tuple[str, dict]]]]:
-    """Return (short name, what it is, rows (place, figures)) per table."""
+def _error_tables(data: ReportData) -> list[tuple[str, str, list[tuple[str, dict[str, float]]]]]:
+    """Return (short name, description, rows (place, figures)) per table."""
     names = {
         "train": ("fit", "poses the model was fitted to"),
         "holdout": ("held out", "poses in parts of the take left out of the fit, each in turn"),
         "trimmed": ("outliers", "poses that the fit left out as outliers"),
     }
-    tables = data.model.meta.get("errors", {})
+    tables = model_facts(data).get("errors", {})
     return [
         (*names[key], [(place, tables[key][place]) for place in _PLACES if place in tables[key]])
         for key in names
@@ -117,22 +115,22 @@ def _error_tables(data: ReportData) -> list[tuple[str, str, list[tuple[str, dict
 
 
 def _frame_lists(data: ReportData) -> list[tuple[str, int, str]]:
-    """Return (reason, count, frames as text) of frames that were lost, helped, or kept out of the model."""
-    tracks, meta = data.tracks, data.model.meta
-    lists = {"lost by the tracker": tracks.frames[(tracks.status == LOST).any(1)]}
+    """Return (reason, count, frames as text) of frames that were lost, aided, or left out of the model."""
+    tracks, meta = data.tracks, model_facts(data)
+    lists = {"lost by the tracker": tracks.frames[np.any(tracks.status == LOST, axis=1)]}
     for arch, name in enumerate(("upper", "lower")):
         for reason in list(LostReason)[1:]:
             chosen = (tracks.status[:, arch] == LOST) & (tracks.lost_reason[:, arch] == reason)
             if chosen.any():
                 lists[f"lost, {name} arch: {reason}"] = tracks.frames[chosen]
     lists["tracked with the model's help"] = tracks.frames[tracks.prior_aided]
-    for reason, frames in meta.get("excluded_frames", {}).items():
-        lists[f"kept out of the fit: {reason}"] = frames
-    lists["left out of the fit as outliers"] = meta.get("trimmed_frames", [])
-    return [(reason, len(frames), _spans(np.asarray(frames, dtype=np.int64))) for reason, frames in lists.items()]
+    for why, frames in meta.get("excluded_frames", {}).items():
+        lists[f"kept out of the fit: {why}"] = np.asarray(frames, dtype=np.int64)
+    lists["left out of the fit as outliers"] = np.asarray(meta.get("trimmed_frames", []), dtype=np.int64)
+    return [(reason, len(frames), _spans(frames)) for reason, frames in lists.items()]
 
 
-def _spans(frames: np.ndarray) -> str:
+def _spans(frames: NDArray[np.int64]) -> str:
     """Return frame numbers with neighbours joined: 3-7, 9."""
     if not len(frames):
         return ""
@@ -144,13 +142,15 @@ def _spans(frames: np.ndarray) -> str:
 
 
 def _start(data: ReportData) -> str:
-    """Say how the tracking began."""
-    start = data.tracks.meta.get("start", {})
+    """Return how the tracking started."""
+    start = tracks_facts(data).get("start", {})
     if not start:
         return "not recorded"
     text = f"by {start.get('by')}, on frame {start.get('frame')}"
     left_out = [
-        f"{row}: {', '.join(map(str, numbers))}" for row, numbers in start.get("picks_left_out", {}).items() if numbers
+        f"{arch}: {', '.join(map(str, numbers))}"
+        for arch, numbers in start.get("picks_left_out", {}).items()
+        if numbers
     ]
     if left_out:
         text += f"; picks that did not fit were left out ({'; '.join(left_out)})"
@@ -158,8 +158,8 @@ def _start(data: ReportData) -> str:
 
 
 def _cameras(data: ReportData) -> list[dict[str, str]]:
-    """Return a row per camera: what it gave, and what the take corrected."""
-    meta = data.tracks.meta
+    """Return a table row per camera: its footage and masks, and corrections of its calibration."""
+    meta, offsets = tracks_facts(data), sync_facts(data).get("offsets", {})
     known = {camera.name: camera for camera in data.cameras}
     extrinsics = meta.get("extrinsics", {})
     rows = []
@@ -179,7 +179,7 @@ def _cameras(data: ReportData) -> list[dict[str, str]]:
                 "name": name,
                 "video": facts.video if facts else "",
                 "size": f"{facts.size_px[0]} \u00d7 {facts.size_px[1]}" if facts else "",
-                "offset": _signed(data.sync.get("offsets", {}).get(name), "d"),
+                "offset": _signed(offsets.get(name), "d"),
                 "delay": _signed(meta.get("delays_frames", {}).get(name), ".3f"),
                 "masks": f"{100 * masks.mean():.1f} %",
                 "calibration": "; ".join(notes),

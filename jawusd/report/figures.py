@@ -15,24 +15,17 @@ from jawusd.report.style import BLACK, BLUE, GREEN, GREY, ORANGE, PALE, SKY, VER
 
 FIGURES = ("fig5_condyle_path", "fig12_reconstruction", "fig13_synthesis", "coverage")
 
-_HEADS = (PALE, SKY, BLUE, BLACK)  # closed to wide open
+_HEADS = (PALE, SKY, BLUE, BLACK)  # colours of the condyle from closed to wide open
 _BINS = 40
-_SCALE_QUANTILE = 0.8  # of the models' 95 % quantiles: where the axis of all histograms ends
+_SCALE_QUANTILE = 0.8  # of the models' 95 % quantiles: the end of the axis of all histograms
 _BONES_MM, _CLOSE_MM = 12.0, 1.5  # shown around the paths
 _FEW_MM = 1.0  # the smallest range of a histogram
-_MANY = 2500  # points; more of them are drawn as a picture, or the drawing grows to megabytes
+_MANY = 2500  # points; more of them are rasterised to limit the file size
 _MOVES = ("opening d1", "laterotrusion d2", "protrusion d3")
 
 
 def draw_experiments(found: Experiments, folder: Path) -> list[Path]:
-    """Draw all figures into a folder, as PNG and SVG.
-
-    Args:
-        found: the results.
-        folder: where the files go; made if missing.
-
-    Returns:
-        The files written, see `FIGURES`.
+    """Draw all `FIGURES` into a folder, as PNG and SVG; return the files.
 
     Raises:
         OutputError: a file cannot be written.
@@ -81,7 +74,7 @@ def _draw_path(axis: Axes, path: CondylePath, captured: Array) -> None:
 
 
 def _frame(axis: Axes, found: Experiments, around_mm: float) -> None:
-    """Show the same square in every panel of a row: captured condyles and all paths, and so much around them."""
+    """Show the same square in every panel: captured condyles and all paths with a margin."""
     drawn = [found.captured_condyles[0], *(path.points[0] for path in found.condyle_paths)]
     points = np.concatenate(drawn)[:, [2, 1]]
     middle = 0.5 * (points.min(0) + points.max(0))
@@ -93,13 +86,13 @@ def _frame(axis: Axes, found: Experiments, around_mm: float) -> None:
 
 
 def parameter_figure(found: Experiments) -> Figure:
-    """Draw where the left condyle goes when each parameter moves alone: the linear model against the default one.
+    """Draw the path of the left condyle when each parameter moves alone: the linear model against the default one.
 
     After paper Figs. 5 and 6; above seen from the side, below from above, one column per parameter.
     """
     figure, axes = new_figure(11.0, 7.6, 2, 3)
     captured = found.captured_condyles[0]
-    # (horizontal, vertical) coordinate of each row, and what the axes are called
+    # (horizontal, vertical) coordinate of each row, and the names of the axes
     views = (((2, 1), "forward [mm]", "up [mm]"), ((0, 2), "to the left [mm]", "forward [mm]"))
     for row, ((h, v), across, along) in enumerate(views):
         for column in range(3):
@@ -154,19 +147,21 @@ def _histograms(
     columns = min(columns, len(samples))
     rows = -(-len(samples) // columns)
     figure, axes = new_figure(11.0, 1.9 * rows + 0.6, rows, columns, sharex=True, sharey=True)
-    # One scale for all; the long tail of one model must not squeeze the others, so what lies beyond is counted.
+    # One scale for all that is not dominated by the long tail of one model; values beyond it are counted.
     end = max(_FEW_MM, float(np.quantile([np.percentile(one.values_mm, 95) for one in samples], _SCALE_QUANTILE)))
-    bins = np.linspace(0.0, end, _BINS + 1)
+    bins = np.linspace(0.0, end, _BINS + 1).tolist()
     for axis, one, label in zip(axes, samples, labels, strict=False):
-        values, row = one.values_mm, one.row()
+        values = one.values_mm
+        mean = float(values.mean())
         axis.hist(values, bins=bins, weights=_shares(values), color=BLUE)
         if reference is not None:
             known = reference.values_mm
             axis.hist(known, bins=bins, weights=_shares(known), histtype="step", color=BLACK, lw=0.9)
-        if row["mean_mm"] < end:
-            axis.axvline(row["mean_mm"], color=VERMILION, lw=1.5)
+        if mean < end:
+            axis.axvline(mean, color=VERMILION, lw=1.5)
         axis.set_title(label)
-        lines = [f"{key} {row[f'{key}_mm']:.2f} mm" for key in ("mean", "p95", "max")]
+        figures = (("mean", mean), ("p95", np.percentile(values, 95)), ("max", values.max()))
+        lines = [f"{name} {value:.2f} mm" for name, value in figures]
         lines.append(f"{int((values > end).sum())} of {len(values)} beyond the axis")
         box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0}
         axis.text(0.98, 0.96, "\n".join(lines), transform=axis.transAxes, ha="right", va="top", fontsize=8, bbox=box)

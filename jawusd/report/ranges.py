@@ -1,33 +1,40 @@
-"""How far this jaw went, beside what is known of other people."""
+"""Ranges of motion: of one person beside published ones, and of many actors side by side."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
+from jawusd.evaluator.frames import RigFrames
 from jawusd.formats.model import JawModel
 from jawusd.formats.tracks import Tracks
-from jawusd.geometry import se3_inverse, so3_log, transform_point, transform_points
+from jawusd.geometry import make_transform, so3_log, transform_point, transform_points
 from jawusd.geometry.arrays import Array
+from jawusd.report.style import BLACK, BLUE, GREEN, SKY, new_figure, save_figure
 from jawusd.report.verdicts import GOOD, LOOK
 
-_QUANTILE = 99.5  # one odd frame is no range of motion
-_NEAR_CLOSED_MM = 5.0  # openings in which protrusion is read off, as clinicians do
+_QUANTILE = 99.5  # robust to single outliers
+_NEAR_CLOSED_MM = 5.0  # openings up to which protrusion is measured, as in clinics
+
+
+RANGES = "ranges"  # name of the files with many actors
+
+_PARAMETERS = {
+    "opening": ("opening d1", BLUE),
+    "laterotrusion": ("laterotrusion d2, + left", GREEN),
+    "protrusion": ("protrusion d3, + forward", SKY),
+}
+_ROW_IN, _MARGINS_IN = 0.22, 0.9
+_MOST_ROWS = 400  # a taller picture cannot be opened
 
 
 @dataclass(frozen=True)
 class RangeRow:
-    """Compare one range.
-
-    Attributes:
-        name: what was measured.
-        found: this person's, with its unit.
-        usual: of about 95 % of people, with its unit.
-        source: of the published numbers.
-        remark: the comparison in words.
-        grade: "good" or "look".
-    """
+    """Compare the range of one movement with that of about 95 % of people, in words; the grade is "good" or "look"."""
 
     name: str
     found: str
@@ -55,37 +62,15 @@ _REFERENCE = {
 
 
 def human_ranges(tracks: Tracks, model: JawModel) -> list[RangeRow]:
-    """Measure the ranges of the poses that shaped the model; empty if there are none.
-
-    Returns:
-        One row per movement.
-    """
-    motion, landmarks = captured_motion(tracks, model)
-    if not len(motion):
+    """Measure the ranges of the poses that the model was fitted to, a row per movement; none without poses."""
+    T = tracks.raw_T_upper_lower
+    used = np.isin(tracks.frames, model.frames[model.trained]) & np.all(np.isfinite(T), axis=(1, 2))
+    if not used.any():
         return []
-    found = _measured(motion, landmarks)
+    frames = RigFrames(model.arrays["T_anatomical_skull"], model.arrays["T_rest"])
+    motion = make_transform(*frames.motions(T[used]))
+    found = _measured(motion, transform_points(frames.closed, model.arrays["landmarks"]))
     return [_row(name, value) for name, value in zip(_REFERENCE, found, strict=True)]
-
-
-def captured_motion(tracks: Tracks, model: JawModel) -> tuple[Array, Array]:
-    """Return the motions away from the closed bite that shaped the model, and the landmarks in it.
-
-    Returns:
-        Motions (N, 4, 4) and landmarks (5, 3) [mm], anatomical frame.
-    """
-    used = np.isin(tracks.frames, model.frames[model.trained]) & np.isfinite(tracks.raw_T_upper_lower).all((1, 2))
-    return anatomical_motion(tracks.raw_T_upper_lower[used], model), rest_points(model, model.arrays["landmarks"])
-
-
-def anatomical_motion(T_skull_mandible: Array, model: JawModel) -> Array:
-    """Return motions away from the closed bite, anatomical frame, of poses (N, 4, 4)."""
-    A, rest = model.arrays["T_anatomical_skull"], model.arrays["T_rest"]
-    return A @ T_skull_mandible @ se3_inverse(A @ rest)
-
-
-def rest_points(model: JawModel, points: Array) -> Array:
-    """Return mandible points (N, 3) [mm] in the closed bite, anatomical frame."""
-    return transform_points(model.arrays["T_anatomical_skull"] @ model.arrays["T_rest"], points)
 
 
 def _measured(motion: Array, landmarks: Array) -> list[float]:
@@ -106,3 +91,37 @@ def _row(name: str, value: float) -> RangeRow:
     else:
         remark, grade = "usual", GOOD
     return RangeRow(name, f"{value:.1f} {unit}", f"{low:g} to {high:g} {unit}", source, remark, grade)
+
+
+def draw_ranges(people: Sequence[tuple[str, dict[str, list[float]]]], folder: Path) -> list[Path]:
+    """Draw the ranges of actors, see `ranges_figure`, into a folder as PNG and SVG; return the files.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    return save_figure(ranges_figure(people), folder, RANGES)
+
+
+def ranges_figure(people: Sequence[tuple[str, dict[str, list[float]]]]) -> Figure:
+    """Draw the ranges of actors as bars, one row per actor, one column per parameter.
+
+    Args:
+        people: name of each actor, and lowest and highest value [mm] by "opening", "laterotrusion", "protrusion"; the
+            first 400 are drawn.
+    """
+    shown = list(people)[:_MOST_ROWS]
+    figure, axes = new_figure(9.0, _MARGINS_IN + _ROW_IN * max(len(shown), 2), 1, 3, sharey=True)
+    rows = range(len(shown))
+    for axis, (key, (title, color)) in zip(axes, _PARAMETERS.items(), strict=True):
+        ends = [ranges[key] for _, ranges in shown]
+        axis.barh(rows, [high - low for low, high in ends], left=[low for low, _ in ends], color=color, height=0.7)
+        axis.axvline(0.0, color=BLACK, lw=0.8)
+        axis.set(title=title, xlabel="[mm]")
+    axes[0].set_yticks(rows, [_literal(name) for name, _ in shown])
+    axes[0].invert_yaxis()
+    return figure
+
+
+def _literal(name: str) -> str:
+    """Return a name escaped for matplotlib, in which a dollar sign starts a formula."""
+    return name[:30].replace("$", r"\$")

@@ -1,27 +1,28 @@
-"""The data of the page's 3-D replay: small meshes and the poses of the take, packed as text."""
+"""The data of the page's 3-D replay: small meshes and the poses of the take, encoded as text."""
 
 from __future__ import annotations
 
 import base64
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from jawusd.evaluator import JawRig
-from jawusd.formats.mesh import Mesh
+from jawusd.evaluator.frames import RigFrames
 from jawusd.formats.report import ReplayPart, ReportData
 from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, Tracks
+from jawusd.geometry import make_transform, transform_points
 from jawusd.geometry.arrays import Array
-from jawusd.report.ranges import anatomical_motion, rest_points
+from jawusd.report.facts import model_facts
 
-#: What the page calls the states of a frame.
+#: Names of the states of a frame in the page.
 STATES = ("tracked", "recovered after a loss", "tracked without a camera", "lost", "tracked with the model's help")
 _MOST_FRAMES = 6000  # longer takes are replayed with every second, third ... frame
 _DEFAULT_FPS = 24.0
 
 
-def replay_data(data: ReportData) -> dict | None:
-    """Return what replay.js reads, JSON-able; None without meshes or frames.
+def replay_data(data: ReportData) -> dict[str, object] | None:
+    """Return the JSON-able input of replay.js; None without meshes or frames.
 
     Poses are motions away from the closed bite in the anatomical frame, the upper 3 x 4 part row by row; meshes are
     16-bit steps from their lowest corner.
@@ -33,21 +34,22 @@ def replay_data(data: ReportData) -> dict | None:
     rows = np.arange(0, len(tracks.frames), step)
     d = _parameters_at(tracks.frames[rows], data)
     fitted = np.full((len(rows), 4, 4), np.nan)
-    known = np.isfinite(d).all(1)
+    known = np.all(np.isfinite(d), axis=1)
     fitted[known] = JawRig(model.arrays, model.meta).pose(d[known])
-    # The view holds the jaw; a braincase may reach beyond it.
+    # The view is fitted to the jaw without the skull.
     jaw = [part.mesh.vertices for part in data.parts if part.name != "skull"] or [data.parts[0].mesh.vertices]
     low, high = np.concatenate(jaw).min(0), np.concatenate(jaw).max(0)
-    landmarks = rest_points(model, model.arrays["landmarks"])
+    frames = RigFrames(model.arrays["T_anatomical_skull"], model.arrays["T_rest"])
+    landmarks = transform_points(frames.closed, model.arrays["landmarks"])
     return {
         "parts": [_packed(part) for part in data.parts],
-        "captured": _poses(anatomical_motion(tracks.T_upper_lower[rows], model)),
-        "fitted": _poses(anatomical_motion(fitted, model)),
+        "captured": _poses(frames, tracks.T_upper_lower[rows]),
+        "fitted": _poses(frames, fitted),
         "d": _text(d.astype("<f4")),
         "frames": _text(tracks.frames[rows].astype("<i4")),
         "state": _text(_states(tracks)[rows]),
         "states": list(STATES),
-        "fps": float(model.meta.get("fps") or _DEFAULT_FPS) / step,
+        "fps": float(model_facts(data).get("fps") or _DEFAULT_FPS) / step,
         "centre": (0.5 * (low + high)).round(2).tolist(),
         "radius": round(float(np.linalg.norm(high - low)) / 2, 2),
         "traced": landmarks[[0, 3, 4]].round(3).tolist(),
@@ -64,17 +66,18 @@ def _parameters_at(frames: NDArray[np.int64], data: ReportData) -> Array:
 def _states(tracks: Tracks) -> NDArray[np.uint8]:
     state = np.zeros(len(tracks.frames), np.uint8)
     for value, code in ((RECOVERED, 1), (PARTIAL, 2), (LOST, 3)):
-        state[(tracks.status == value).any(1)] = code
+        state[np.any(tracks.status == value, axis=1)] = code
     state[tracks.prior_aided & (state != 3)] = 4
     return state
 
 
-def _poses(motion: Array) -> str:
+def _poses(frames: RigFrames, T_skull_mandible: Array) -> str:
+    motion = make_transform(*frames.motions(T_skull_mandible))
     return _text(motion[:, :3].reshape(len(motion), 12).astype("<f4"))
 
 
-def _packed(part: ReplayPart) -> dict:
-    mesh: Mesh = part.mesh
+def _packed(part: ReplayPart) -> dict[str, object]:
+    mesh = part.mesh
     if len(mesh.vertices) > np.iinfo(np.uint16).max:
         raise ValueError(f"a mesh of the replay has {len(mesh.vertices)} vertices, at most 65535 are allowed")
     low = mesh.vertices.min(0)
@@ -84,5 +87,5 @@ def _packed(part: ReplayPart) -> dict:
     return {"name": part.name, "kind": part.kind, "moves": part.moves, "low": low.tolist(), "step": step, **packed}
 
 
-def _text(values: NDArray) -> str:
+def _text(values: ArrayLike) -> str:
     return base64.b64encode(np.ascontiguousarray(values).tobytes()).decode("ascii")

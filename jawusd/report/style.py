@@ -1,22 +1,28 @@
-"""How figures look: one palette that colour-blind people can tell apart, quiet axes, PNG and SVG."""
+"""The style of figures: one palette for all kinds of colour vision, plain axes; files, and SVG inside a page."""
 
 from __future__ import annotations
 
 import io
+import re
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import matplotlib
+from markupsafe import Markup, escape
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jawusd.formats.atomic import write_bytes_atomic
 
+if TYPE_CHECKING:
+    from matplotlib.typing import RcKeyType
+
 # Okabe & Ito, "Color Universal Design" (2008).
 BLACK, ORANGE, SKY, GREEN, BLUE, VERMILION = "#000000", "#E69F00", "#56B4E9", "#009E73", "#0072B2", "#D55E00"
 GREY, PALE = "#777777", "#C8C8C8"
 
-#: What figures are made and saved with.
-SETTINGS = {
+#: Matplotlib's settings for making and saving figures.
+SETTINGS: dict[RcKeyType, object] = {
     "font.size": 9,
     "axes.titlesize": 9,
     "axes.spines.top": False,
@@ -24,22 +30,36 @@ SETTINGS = {
     "svg.fonttype": "none",
     "svg.hashsalt": "jawusd",  # the same picture gives the same file
 }
-_DPI = 150
+DPI, _INLINE_DPI = 150, 110
+_PX_PER_PT = 4 / 3
+# Names of the colours in the page's style sheet; white is the background of text.
+_THEMED = {
+    BLACK: "ink",
+    "#ffffff": "paper",
+    GREY: "grey",
+    PALE: "pale",
+    BLUE: "blue",
+    SKY: "sky",
+    GREEN: "green",
+    ORANGE: "orange",
+    VERMILION: "vermilion",
+}
 
 
 def new_figure(
-    width_in: float, height_in: float, rows: int, columns: int, **options: object
+    width_in: float,
+    height_in: float,
+    rows: int,
+    columns: int,
+    *,
+    sharex: bool = False,
+    sharey: bool = False,
+    height_ratios: list[float] | None = None,
 ) -> tuple[Figure, list[Axes]]:
-    """Return a figure outside any window system, and its axes row by row.
-
-    Args:
-        width_in, height_in: size [inches].
-        rows, columns: of axes.
-        options: of `Figure.subplots`.
-    """
+    """Return a figure outside any window system, and its axes row by row; options as in `Figure.subplots`."""
     with matplotlib.rc_context(SETTINGS):
         figure = Figure(figsize=(width_in, height_in), layout="constrained")
-        axes = figure.subplots(rows, columns, squeeze=False, **options)
+        axes = figure.subplots(rows, columns, squeeze=False, sharex=sharex, sharey=sharey, height_ratios=height_ratios)
     return figure, list(axes.ravel())
 
 
@@ -49,11 +69,40 @@ def save_figure(figure: Figure, folder: Path, name: str) -> list[Path]:
     Raises:
         OutputError: a file cannot be written.
     """
-    files = []
-    with matplotlib.rc_context(SETTINGS):
-        for suffix, metadata in (("png", {"Software": None}), ("svg", {"Date": None})):
-            drawn = io.BytesIO()
-            figure.savefig(drawn, format=suffix, dpi=_DPI, metadata=metadata)
-            files.append(folder / f"{name}.{suffix}")
-            write_bytes_atomic(files[-1], drawn.getvalue())
+    files = [folder / f"{name}.png", folder / f"{name}.svg"]
+    for file in files:
+        write_bytes_atomic(file, figure_bytes(figure, file.suffix[1:], DPI))
     return files
+
+
+def figure_bytes(figure: Figure, kind: str, dpi: int, *, transparent: bool = False) -> bytes:
+    """Return a figure as a file of a kind, without dates and versions, so that equal figures give equal bytes."""
+    drawn = io.BytesIO()
+    metadata = {"Software": None} if kind == "png" else {"Date": None}
+    with matplotlib.rc_context(SETTINGS):
+        figure.savefig(drawn, format=kind, dpi=dpi, transparent=transparent, metadata=metadata)
+    return drawn.getvalue()
+
+
+def inline_svg(figure: Figure, key: str, words: str) -> Markup:
+    """Return a figure as an SVG element for a page, without references to other files, in the page's colours.
+
+    Args:
+        key: prefix of all ids of this figure; unique in the page.
+        words: alternative text.
+    """
+    text = figure_bytes(figure, "svg", _INLINE_DPI, transparent=True).decode()
+    text = text[text.index("<svg") :]
+    # Not needed inside a page, and the style would apply outside of the figure.
+    text = re.sub(r"<metadata>.*?</metadata>|<style[^>]*>.*?</style>", "", text, flags=re.DOTALL)
+    head, body = text.split(">", 1)
+    width = float(head.split('width="', 1)[1].split('pt"', 1)[0])
+    view = 'viewBox="' + head.split('viewBox="', 1)[1].split('"', 1)[0] + '"'
+    body = body.replace("xlink:href=", "href=")
+    body = re.sub(r'\bid="([^"]*)"', rf'id="{key}-\1"', body)
+    body = re.sub(r"url\(#([^)]*)\)", rf"url(#{key}-\1)", body)
+    body = re.sub(r'href="#([^"]*)"', rf'href="#{key}-\1"', body)
+    for color, name in _THEMED.items():
+        body = re.sub(re.escape(color), f"var(--{name})", body, flags=re.IGNORECASE)
+    size = f'style="max-width: {_PX_PER_PT * width:.0f}px"'
+    return Markup(f'<svg class="plot" role="img" aria-label="{escape(words)}" {size} {view}>{body}')

@@ -1,24 +1,21 @@
-"""Draw how cameras were aligned in time: brightness against frames, as recorded and after alignment."""
+"""Draw the alignment of cameras in time: brightness against frames, as recorded and aligned."""
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from pathlib import Path
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jawusd.formats.atomic import write_bytes_atomic
 from jawusd.formats.light_curve import LightCurve
-from jawusd.report.style import BLACK, BLUE, GREEN, GREY, ORANGE, SETTINGS, SKY, VERMILION, new_figure
+from jawusd.report.style import BLACK, BLUE, DPI, GREEN, GREY, ORANGE, SKY, VERMILION, figure_bytes, new_figure
 
 _COLOURS = (BLUE, ORANGE, GREEN, VERMILION, SKY, BLACK, GREY)
 _AROUND_FRAMES = 12  # shown before and after a flash
 _APART_FRAMES = 48  # steps farther apart belong to different flashes
-_DPI = 150
 
 
 def draw_sync(curves: Mapping[str, LightCurve], offsets: Mapping[str, int] | None, title: str, path: Path) -> None:
@@ -27,22 +24,18 @@ def draw_sync(curves: Mapping[str, LightCurve], offsets: Mapping[str, int] | Non
     Args:
         curves: by camera name.
         offsets: frame k of a camera shows the instant of frame k + offset of the reference camera; None if they are not
-            known, for a picture of the clips as recorded alone.
-        title: how the offsets were found, or why not.
-        path: file to write; its suffix is the kind.
+            known, for a picture of the clips as recorded only.
 
     Raises:
         OutputError: the file cannot be written.
     """
-    drawn = io.BytesIO()
-    with matplotlib.rc_context(SETTINGS):
-        sync_figure(curves, offsets, title).savefig(drawn, format=path.suffix.lower().lstrip("."), dpi=_DPI)
-    write_bytes_atomic(path, drawn.getvalue())
+    kind = path.suffix.lower().lstrip(".")
+    write_bytes_atomic(path, figure_bytes(sync_figure(curves, offsets, title), kind, DPI))
 
 
 def sync_figure(curves: Mapping[str, LightCurve], offsets: Mapping[str, int] | None, title: str) -> Figure:
     """Return the figure of `draw_sync`: a row as recorded and, with offsets, one after alignment."""
-    rows = [("as recorded", "frame of each camera", dict.fromkeys(curves, 0))]
+    rows: list[tuple[str, str, Mapping[str, int]]] = [("as recorded", "frame of each camera", dict.fromkeys(curves, 0))]
     if offsets is not None:
         rows.append(("aligned", "frame of the reference camera", offsets))
     flashes = [_flashes(curves, shifts) for _, _, shifts in rows]
@@ -81,7 +74,7 @@ def _draw_curves(axis: Axes, curves: Mapping[str, LightCurve], shifts: Mapping[s
 
 
 def _flashes(curves: Mapping[str, LightCurve], shifts: Mapping[str, int]) -> list[tuple[float, float]]:
-    """Return where the first and the last flash of all cameras are [frames]; none without a sudden change."""
+    """Return the spans of the first and the last flash of all cameras [frames]; none without a sudden change."""
     steps = np.sort(np.concatenate([np.append(c.off_frames, c.on_frames) + shifts[name] for name, c in curves.items()]))
     if not len(steps):
         return []

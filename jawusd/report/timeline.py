@@ -1,4 +1,4 @@
-"""Figures over the frames of a take: how it was tracked, and what the model makes of it."""
+"""Figures over the frames of a take: its tracking, and the model's parameters and errors."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ def tracking_figure(tracks: Tracks) -> Figure:
 
 
 def model_figure(model: JawModel) -> Figure:
-    """Draw the parameters of every frame, and how far model and bounds are from what was captured."""
+    """Draw the parameters of every frame, their distances to the model and their margins."""
     rig = JawRig(model.arrays, model.meta)
-    known = np.isfinite(model.d).all(1)
+    known = np.all(np.isfinite(model.d), axis=1)
     margin = np.full(len(model.d), np.nan)
     margin[known] = rig.margin(model.d[known])
     figure, axes = new_figure(11.0, 5.6, 3, 1, sharex=True, height_ratios=[1.5, 1, 1])
@@ -69,12 +69,12 @@ def model_figure(model: JawModel) -> Figure:
 
 
 def _draw_state(axis: Axes, tracks: Tracks) -> None:
-    """Draw a lane per state; in each the upper teeth above the lower, so that it reads without colour."""
+    """Draw a lane per state, in each the upper teeth above the lower, so that it is legible without colour."""
     states = [tracks.status == value for value in (TRACKED, RECOVERED, PARTIAL, LOST)]
     states.append(np.repeat(tracks.prior_aided[:, None], 2, axis=1))
     for lane, (has, color) in enumerate(zip(states, _LANE_COLORS, strict=True)):
-        for row, low in ((0, 0.04), (1, -0.4)):
-            runs = _runs(tracks.frames, has[:, row])
+        for arch, low in ((0, 0.04), (1, -0.4)):
+            runs = _runs(tracks.frames, has[:, arch])
             axis.broken_barh(runs, (low - lane, 0.36), facecolors=color, edgecolors=color, linewidth=0.8)
         axis.axhline(-lane - 0.5, color=GREY, lw=0.4)
     shares = [f"{name}  {int(has.any(1).sum())}" for name, has in zip(_LANES, states, strict=True)]
@@ -84,7 +84,7 @@ def _draw_state(axis: Axes, tracks: Tracks) -> None:
 
 
 def _runs(frames: NDArray[np.int64], has: Mask) -> list[tuple[float, float]]:
-    """Return the spans (start, width) of frames in a row that have something."""
+    """Return the spans (start, width) of consecutive frames with a property."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], has, [False]]).astype(np.int8)))
     spans = zip(edges[::2], edges[1::2], strict=True)
     return [(float(frames[a]) - 0.5, float(frames[b - 1] - frames[a]) + 1.0) for a, b in spans]
@@ -92,17 +92,17 @@ def _runs(frames: NDArray[np.int64], has: Mask) -> list[tuple[float, float]]:
 
 def _mean_of_known(values: Array, axis: int) -> Array:
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # a frame without any mask has no mean, and shows none
+        warnings.simplefilter("ignore", RuntimeWarning)  # frames without any mask have no mean
         return np.nanmean(values, axis=axis)
 
 
 def _farther(a: Array, b: Array) -> Array:
-    """Return of two values the one farther from zero, known before unknown."""
+    """Return the value of two that is farther from zero and not NaN."""
     return np.where(np.isnan(a) | (np.abs(b) > np.abs(a)), b, a)
 
 
-def _thinned(frames: NDArray[np.int64], values: Array, keep: Callable) -> tuple[Array, Array]:
-    """Return at most `_COLUMNS` points, of every few frames the one `keep` chooses."""
+def _thinned(frames: NDArray[np.int64], values: Array, keep: Callable[[Array, Array], Array]) -> tuple[Array, Array]:
+    """Return at most `_COLUMNS` points, reducing every few frames by `keep`."""
     step = -(-len(frames) // _COLUMNS)
     if step <= 1:
         return frames.astype(np.float64), values

@@ -1,4 +1,4 @@
-"""Judge a build, stage by stage, in plain words and with the thresholds."""
+"""Verdicts on the stages of a build, in plain words and with the thresholds."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ import numpy as np
 from jawusd.evaluator import JawRig
 from jawusd.formats.report import ReportData
 from jawusd.formats.tracks import LOST, RECOVERED, Tracks
+from jawusd.report.facts import model_facts, sync_facts, tracks_facts
 
-#: Grades, the best first; "open" is what cannot be judged.
+#: Grades, the best first; "open" means that there is nothing to judge.
 GOOD, LOOK, BAD, OPEN = "good", "look", "bad", "open"
 WORDS = {GOOD: "good", LOOK: "have a look", BAD: "not good", OPEN: "not judged"}
 MARKS = {GOOD: "\u2714", LOOK: "!", BAD: "\u2716", OPEN: "?"}
@@ -19,20 +20,13 @@ MARKS = {GOOD: "\u2714", LOOK: "!", BAD: "\u2716", OPEN: "?"}
 # Yang et al. (2019): mask left uncovered on average, and the mean and worst reconstruction error of their Fig. 12.
 _PAPER_COVERAGE_PERCENT, _PAPER_MEAN_MM, _PAPER_WORST_MM = 0.754, 1.73, 7.22
 _EXERCISES = "full opening, slides to both sides and protrusion, closed and half open"
-_LACKING = {"take_lacks", "not_shown"}  # the fit says what the take does not show, or shows too little of
+_LACKING = {"take_lacks", "not_shown"}  # warnings of the fit about movements that are missing or too small
 _MISTAKES = {"scan_units", "pose_units", "front_back_flip", "left_right_flip", "upside_down", "swapped_jaws"}
 
 
 @dataclass(frozen=True)
 class Check:
-    """Judge one figure.
-
-    Attributes:
-        name: what was looked at.
-        found: the figure with its unit.
-        limit: what is good, and what is just acceptable.
-        grade: one of `WORDS`.
-    """
+    """Judge one figure: its value with unit, the limits of good and acceptable, a grade of `WORDS`."""
 
     name: str
     found: str
@@ -42,14 +36,7 @@ class Check:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Judge one stage.
-
-    Attributes:
-        stage: its name.
-        sentence: the verdict in plain words.
-        checks: what it rests on.
-        grade: the worst grade of the checks; what is not judged does not count.
-    """
+    """Judge one stage in a sentence; the grade is the worst of the checks, those not judged excluded."""
 
     stage: str
     sentence: str
@@ -92,15 +79,15 @@ def _verdict(stage: str, checks: list[Check], sentences: dict[str, str]) -> Verd
 
 
 def _sync(data: ReportData) -> Verdict:
-    delays = data.tracks.meta.get("delays_frames", {})
+    delays, sync = tracks_facts(data).get("delays_frames", {}), sync_facts(data)
     rest = max((abs(float(value)) for value in delays.values()), default=np.nan)
     if len(data.tracks.camera_names) == 1:
         return Verdict("sync", "There is one camera: nothing to align in time.", (), GOOD)
     checks = [_below("offset that the teeth themselves show beyond the whole frames", rest, 0.6, 1.0, "frames")]
-    if "confidence" in data.sync:
-        least = min(float(value) for value in data.sync["confidence"].values())
+    if "confidence" in sync:
+        least = min(float(value) for value in sync["confidence"].values())
         checks.append(_share("flashes or sounds that both cameras show", least, 0.8, 0.5))
-    method = str(data.sync.get("method", "not known"))
+    method = str(sync.get("method", "not known"))
     if method == "taken as simultaneous":
         checks.append(Check("how the cameras were aligned", method, "flash, sound or given offsets", LOOK))
     return _verdict(
@@ -120,7 +107,7 @@ def _track(tracks: Tracks) -> Verdict:
     sigma = np.full(5, np.nan)
     if tracked.any():
         sigma = np.median(tracks.sigma_mm[tracked], axis=0)
-    helped = (tracks.status == RECOVERED).any(1) | tracks.prior_aided
+    helped = np.any(tracks.status == RECOVERED, axis=1) | tracks.prior_aided
     residual = tracks.residual_px[(tracks.status != LOST) & np.isfinite(tracks.residual_px)]
     checks = [
         _share("frames tracked", float(tracked.mean()), 0.98, 0.9),
@@ -148,24 +135,24 @@ def _track(tracks: Tracks) -> Verdict:
 
 
 def _fit(data: ReportData) -> Verdict:
-    meta = data.model.meta
+    meta = model_facts(data)
     errors = meta.get("errors", {})
     table = errors.get("holdout") or errors.get("train") or {}
     kind = "poses held out of the fit" if errors.get("holdout") else "poses of the fit"
-    row = table.get("mandible", {})
+    mandible = table.get("mandible", {})
     out = sum(map(len, meta.get("excluded_frames", {}).values())) + len(meta.get("trimmed_frames", []))
     count = max(len(data.model.frames), 1)
     checks = [
         _below(
             f"error of {kind}, mean of the largest vertex distance (the paper, its own poses: {_PAPER_MEAN_MM} mm)",
-            float(row.get("mean", np.nan)),
+            float(mandible.get("mean", np.nan)),
             0.6,
             _PAPER_MEAN_MM,
             "mm",
         ),
         _below(
             f"error of {kind}, worst frame (the paper, its own poses: {_PAPER_WORST_MM} mm)",
-            float(row.get("max", np.nan)),
+            float(mandible.get("max", np.nan)),
             3.0,
             _PAPER_WORST_MM,
             "mm",
@@ -190,20 +177,20 @@ def _fit(data: ReportData) -> Verdict:
 
 
 def _bounds(data: ReportData) -> Verdict:
-    model = data.model
+    model, meta = data.model, model_facts(data)
     rig = JawRig(model.arrays, model.meta)
-    used = model.trained & np.isfinite(model.d).all(1)
+    used = model.trained & np.all(np.isfinite(model.d), axis=1)
     inside = rig.margin(model.d[used]) >= rig.limits.margin_mm if used.any() else np.zeros(1, bool)
     checks = [_share("captured poses that the bounds call valid", float(inside.mean()), 0.97, 0.9)]
     synthesis = data.experiments.of("synthesis") if data.experiments else []
     known = next((one for one in synthesis if one.model.startswith("captured")), None)
-    drawn = next((one for one in synthesis if one.model == model.meta.get("method") and "slice" in one.quantity), None)
+    drawn = next((one for one in synthesis if one.model == meta.get("method") and "slice" in one.quantity), None)
     if known is not None and drawn is not None and len(known.values_mm):
         ratio = float(np.median(drawn.values_mm) / max(np.median(known.values_mm), 1e-9))
         checks.append(
             _below("random valid poses: distance to the take, against captured ones left out", ratio, 3.0, 6.0, "times")
         )
-    lacks = [w["message"] for w in model.meta.get("warnings", []) if w["code"] in _LACKING]
+    lacks = [w["message"] for w in meta.get("warnings", []) if w["code"] in _LACKING]
     checks += [Check("captured movements", sentence, _EXERCISES, LOOK) for sentence in lacks]
     if not lacks:
         checks.append(Check("captured movements", "nothing missing", _EXERCISES, GOOD))

@@ -14,7 +14,12 @@ _MOST_WORST = 12
 _WIDTH, _HEIGHT = 330, 170
 _LEFT, _RIGHT, _TOP, _BOTTOM = 30, 8, 20, 26
 _TEXT = 'font-family="sans-serif" font-size="11" fill="currentColor"'
-_STATUS = {LOST: "lost", TRACKED: "tracked", RECOVERED: "found again", PARTIAL: "tracked without one camera"}
+_STATUS: dict[int, str] = {
+    LOST: "lost",
+    TRACKED: "tracked",
+    RECOVERED: "found again",
+    PARTIAL: "tracked without one camera",
+}
 _COLORS = (ORANGE, BLUE)  # upper, lower, as the outlines in the pictures
 
 

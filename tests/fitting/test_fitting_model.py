@@ -105,10 +105,10 @@ def test_left_out_frames_are_left_out(person, take):
 
     kept = np.ones(300, bool)
     kept[10:20] = False
-    tables, _, _ = unseen_errors(data, kept, 3, refit, lambda fold: None)
+    table, _, _ = unseen_errors(data, kept, 3, refit, lambda fold: None)
     for fold, frames in enumerate(seen):
         np.testing.assert_array_equal(frames, np.setdiff1d(np.arange(300), np.arange(100 * fold, 100 * fold + 100)))
-    assert tables["holdout"]["mandible"]["frames"] == 290
+    assert table["mandible"]["frames"] == 290
 
 
 def test_closed_bite_is_zero(rig):

@@ -1,0 +1,70 @@
+"""The JSON headers of a build's files as the report reads them; written by the sync stage, tracking and fitting."""
+
+from __future__ import annotations
+
+from typing import TypedDict, cast
+
+from jawusd.formats.report import ReportData
+
+ErrorTable = dict[str, dict[str, float]]
+
+
+class SyncFacts(TypedDict, total=False):
+    """What the sync stage found, by camera."""
+
+    method: str
+    offsets: dict[str, int]
+    confidence: dict[str, float]
+
+
+class StartFacts(TypedDict, total=False):
+    """How the tracking started."""
+
+    by: str
+    frame: int
+    picks_left_out: dict[str, list[int]]
+    scan_findings: list[str]
+
+
+class ExtrinsicsFacts(TypedDict, total=False):
+    """How tracking corrected the cameras' poses, by camera."""
+
+    corrected: bool
+    turns_deg: dict[str, list[float]]
+    moves_mm: dict[str, list[float]]
+
+
+class TracksFacts(TypedDict, total=False):
+    """The header of tracks."""
+
+    start: StartFacts
+    extrinsics: ExtrinsicsFacts
+    calibration_rescaled_px: dict[str, tuple[tuple[int, int], tuple[int, int]]]
+    delays_frames: dict[str, float]
+
+
+class ModelFacts(TypedDict, total=False):
+    """The header of a model."""
+
+    method: str
+    fps: float
+    errors: dict[str, ErrorTable]
+    uncertainty: ErrorTable
+    excluded_frames: dict[str, list[int]]
+    trimmed_frames: list[int]
+    warnings: list[dict[str, str]]
+
+
+def sync_facts(data: ReportData) -> SyncFacts:
+    """Return the result of the sync stage."""
+    return cast(SyncFacts, data.sync)
+
+
+def tracks_facts(data: ReportData) -> TracksFacts:
+    """Return the header of the tracks."""
+    return cast(TracksFacts, data.tracks.meta)
+
+
+def model_facts(data: ReportData) -> ModelFacts:
+    """Return the header of the model."""
+    return cast(ModelFacts, data.model.meta)
