@@ -47,3 +47,13 @@ class RigFrames:
         """Return rotation (n, 3, 3) and translation (n, 3) [mm] of the motions of poses (n, 4, 4)."""
         M = (T_skull_mandible.reshape(-1, 16) @ self._to_motion).reshape(-1, 4, 4)
         return M[:, :3, :3], M[:, :3, 3]
+
+
+def motions_of_poses(T_skull_mandible: Array, T_anatomical_skull: Array, T_rest: Array) -> Array:
+    """Return the motions ``M = A T rest^-1 A^-1`` away from the closed bite of poses, both of shape (..., 4, 4)."""
+    return T_anatomical_skull @ T_skull_mandible @ se3_inverse(T_anatomical_skull @ T_rest)
+
+
+def poses_of_motions(motion: Array, T_anatomical_skull: Array, T_rest: Array) -> Array:
+    """Return the poses T_skull_mandible of motions away from the closed bite, both of shape (..., 4, 4)."""
+    return se3_inverse(T_anatomical_skull) @ motion @ T_anatomical_skull @ T_rest

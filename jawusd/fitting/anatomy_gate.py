@@ -82,7 +82,7 @@ def _unit_mistake(data: TrainingData, anatomy: SubjectAnatomy) -> AnatomyWarning
 
 def _condyle_travel(data: TrainingData, anatomy: SubjectAnatomy, factor: float) -> float:
     """Return how far the middle between the condyles moves [mm] with the poses' translations scaled."""
-    T = anatomy.frames.poses(data.motion)
+    T = anatomy.poses(data.motion)
     T[:, :3, 3] *= factor
     moved = displacement(anatomy.motion(T), data.landmarks[3:].mean(0))
     return float(np.percentile(np.linalg.norm(moved, axis=-1), 90))

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jawusd.errors import FittingError
-from jawusd.evaluator.frames import RigFrames
+from jawusd.evaluator.frames import motions_of_poses, poses_of_motions
 from jawusd.fitting.metric import MandibleMetric
 from jawusd.formats.tracks import LOST, Tracks
-from jawusd.geometry import LANDMARKS, hat, make_transform, orthonormalise, rigidity_defect, transform_points
+from jawusd.geometry import LANDMARKS, hat, orthonormalise, rigidity_defect, transform_points
 from jawusd.geometry.arrays import Array, Mask
 
 #: How far real jaws deviate from a three-parameter model: smaller tracking errors hardly matter [mm].
@@ -60,18 +60,17 @@ class SubjectAnatomy:
             np.eye(4) if T_rest is None else _array(T_rest, (4, 4), "T_rest"),
         )
 
-    @property
-    def frames(self) -> RigFrames:
-        """Return the conversion between poses and motions away from the closed bite."""
-        return RigFrames(self.T_anatomical_skull, self.T_rest)
-
     def at_rest(self, points: Array) -> Array:
         """Return mandible points (N, 3) in the closed bite, anatomical coordinates [mm]."""
-        return transform_points(self.frames.closed, points)
+        return transform_points(self.T_anatomical_skull @ self.T_rest, points)
 
     def motion(self, T_skull_mandible: Array) -> Array:
         """Return motions away from the closed bite, anatomical frame, of poses; both of shape (..., 4, 4)."""
-        return make_transform(*self.frames.motions(T_skull_mandible)).reshape(T_skull_mandible.shape)
+        return motions_of_poses(T_skull_mandible, self.T_anatomical_skull, self.T_rest)
+
+    def poses(self, motion: Array) -> Array:
+        """Return the poses T_skull_mandible of motions; both of shape (..., 4, 4)."""
+        return poses_of_motions(motion, self.T_anatomical_skull, self.T_rest)
 
 
 @dataclass(frozen=True)

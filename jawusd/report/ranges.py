@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from jawusd.evaluator.frames import RigFrames
+from jawusd.evaluator.frames import motions_of_poses
 from jawusd.formats.model import JawModel
 from jawusd.formats.tracks import Tracks
-from jawusd.geometry import make_transform, so3_log, transform_point, transform_points
+from jawusd.geometry import so3_log, transform_point, transform_points
 from jawusd.geometry.arrays import Array
 from jawusd.report.style import BLACK, BLUE, GREEN, SKY, new_figure, save_figure
 from jawusd.report.verdicts import GOOD, LOOK
@@ -67,9 +67,8 @@ def human_ranges(tracks: Tracks, model: JawModel) -> list[RangeRow]:
     used = np.isin(tracks.frames, model.frames[model.trained]) & np.all(np.isfinite(T), axis=(1, 2))
     if not used.any():
         return []
-    frames = RigFrames(model.arrays["T_anatomical_skull"], model.arrays["T_rest"])
-    motion = make_transform(*frames.motions(T[used]))
-    found = _measured(motion, transform_points(frames.closed, model.arrays["landmarks"]))
+    A, rest = model.arrays["T_anatomical_skull"], model.arrays["T_rest"]
+    found = _measured(motions_of_poses(T[used], A, rest), transform_points(A @ rest, model.arrays["landmarks"]))
     return [_row(name, value) for name, value in zip(_REFERENCE, found, strict=True)]
 
 

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jawusd.evaluator import JawRig
-from jawusd.evaluator.frames import RigFrames
+from jawusd.evaluator.frames import motions_of_poses
 from jawusd.formats.report import ReplayPart, ReportData
 from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, Tracks
-from jawusd.geometry import make_transform, transform_points
+from jawusd.geometry import transform_points
 from jawusd.geometry.arrays import Array
 from jawusd.report.facts import model_facts
 
@@ -39,12 +39,12 @@ def replay_data(data: ReportData) -> dict[str, object] | None:
     # The view is fitted to the jaw without the skull.
     jaw = [part.mesh.vertices for part in data.parts if part.name != "skull"] or [data.parts[0].mesh.vertices]
     low, high = np.concatenate(jaw).min(0), np.concatenate(jaw).max(0)
-    frames = RigFrames(model.arrays["T_anatomical_skull"], model.arrays["T_rest"])
-    landmarks = transform_points(frames.closed, model.arrays["landmarks"])
+    A, rest = model.arrays["T_anatomical_skull"], model.arrays["T_rest"]
+    landmarks = transform_points(A @ rest, model.arrays["landmarks"])
     return {
         "parts": [_packed(part) for part in data.parts],
-        "captured": _poses(frames, tracks.T_upper_lower[rows]),
-        "fitted": _poses(frames, fitted),
+        "captured": _poses(motions_of_poses(tracks.T_upper_lower[rows], A, rest)),
+        "fitted": _poses(motions_of_poses(fitted, A, rest)),
         "d": _text(d.astype("<f4")),
         "frames": _text(tracks.frames[rows].astype("<i4")),
         "state": _text(_states(tracks)[rows]),
@@ -71,8 +71,7 @@ def _states(tracks: Tracks) -> NDArray[np.uint8]:
     return state
 
 
-def _poses(frames: RigFrames, T_skull_mandible: Array) -> str:
-    motion = make_transform(*frames.motions(T_skull_mandible))
+def _poses(motion: Array) -> str:
     return _text(motion[:, :3].reshape(len(motion), 12).astype("<f4"))
 
 
