@@ -24,25 +24,15 @@ _BLUR_RATIO, _BLUR_LIMITS_PX = 1.5, (4.0, 8.0)
 
 @dataclass(frozen=True, eq=False)
 class Sightings:
-    """Hold where the board's corners were seen.
+    """Hold where the board's corners were seen."""
 
-    Attributes:
-        names: camera names, C of them.
-        sizes_px: picture (width, height) per camera.
-        numbers: picture number of each view, shape (V,).
-        corners_px: pixel of each corner, NaN where not seen, shape (C, V, N, 2).
-        blurred: per camera the numbers of pictures refused because of blur.
-        missed: per camera the numbers of pictures in which no board was found.
-        notes: what a person should know of the clips.
-    """
-
-    names: tuple[str, ...]
-    sizes_px: tuple[tuple[int, int], ...]
-    numbers: NDArray[np.int64]
-    corners_px: Array
-    blurred: dict[str, list[int]]
-    missed: dict[str, list[int]]
-    notes: tuple[str, ...]
+    names: tuple[str, ...]  # camera names, C of them
+    sizes_px: tuple[tuple[int, int], ...]  # picture (width, height) per camera
+    numbers: NDArray[np.int64]  # picture number of each view, shape (V,)
+    corners_px: Array  # pixel of each corner, NaN where not seen, shape (C, V, N, 2)
+    blurred: dict[str, list[int]]  # per camera the numbers of pictures refused because of blur
+    missed: dict[str, list[int]]  # per camera the numbers of pictures in which no board was found
+    notes: tuple[str, ...]  # what a person should know of the clips
 
 
 def board_points(boards: Boards) -> Array:

@@ -29,27 +29,16 @@ _FEWEST_CORNERS = 6  # left of a view; else the view is dropped
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """Hold the result of the adjustment.
+    """Hold the result of the adjustment."""
 
-    Attributes:
-        K: intrinsic matrices [px], shape (C, 3, 3).
-        distortion: k1 and k2, shape (C, 2).
-        T_cam_world: world (the first camera) to camera [mm], shape (C, 4, 4).
-        T_world_board: board to world [mm], shape (V, 4, 4).
-        corners_px: the corners used, NaN where not, shape (C, V, N, 2).
-        residuals_px: projected minus seen, NaN where not seen, shape (C, V, N, 2).
-        parameters: the cameras' share of the unknowns, see `camera_from`, shape (12 C - 6,).
-        covariance: of these parameters, shape (12 C - 6, 12 C - 6).
-    """
-
-    K: Array
-    distortion: Array
-    T_cam_world: Array
-    T_world_board: Array
-    corners_px: Array
-    residuals_px: Array
-    parameters: Array
-    covariance: Array
+    K: Array  # intrinsic matrices [px], shape (C, 3, 3)
+    distortion: Array  # k1 and k2, shape (C, 2)
+    T_cam_world: Array  # world (the first camera) to camera [mm], shape (C, 4, 4)
+    T_world_board: Array  # board to world [mm], shape (V, 4, 4)
+    corners_px: Array  # the corners used, NaN where not, shape (C, V, N, 2)
+    residuals_px: Array  # projected minus seen, NaN where not seen, shape (C, V, N, 2)
+    parameters: Array  # the cameras' share of the unknowns, see `camera_from`, shape (12 C - 6,)
+    covariance: Array  # of these parameters, shape (12 C - 6, 12 C - 6)
 
 
 def adjust(start: FirstGuess, points_mm: Array) -> Bundle:

@@ -45,28 +45,17 @@ class CameraFigures(TypedDict):
 
 @dataclass(frozen=True)
 class CalibrationReport:
-    """Say how good a calibration is.
-
-    Attributes:
-        cameras: per camera.
-        views: board poses used.
-        board_shape: error of distances between triangulated corners near the mouth, on the very pictures used.
-        expected_shape_mm: mean error of distances in the mouth volume expected from the corners' scatter.
-        mouth_mm: middle of the mouth in the world, and from what it is known.
-        scale: what the teeth say of the board's square size.
-        advice: what to do better, one sentence each.
-        notes: what was assumed.
-    """
+    """Say how good a calibration is."""
 
     cameras: dict[str, CameraFigures]
-    views: int
-    board_shape: ShapeError
-    expected_shape_mm: float
-    mouth_mm: tuple[float, float, float]
+    views: int  # board poses used
+    board_shape: ShapeError  # error of distances between triangulated corners near the mouth, on the very pictures used
+    expected_shape_mm: float  # mean error of distances in the mouth volume expected from the corners' scatter
+    mouth_mm: tuple[float, float, float]  # middle of the mouth in the world, and from what it is known
     mouth_from: str
-    scale: ScaleCheck
-    advice: tuple[str, ...]
-    notes: tuple[str, ...]
+    scale: ScaleCheck  # what the teeth say of the board's square size
+    advice: tuple[str, ...]  # what to do better, one sentence each
+    notes: tuple[str, ...]  # what was assumed
 
     def as_dict(self) -> dict[str, object]:
         """Return the report as plain data."""

@@ -25,21 +25,13 @@ _INTRINSIC_FLAGS = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
 
 @dataclass(frozen=True, eq=False)
 class FirstGuess:
-    """Hold a start for the bundle adjustment.
+    """Hold a start for the bundle adjustment."""
 
-    Attributes:
-        K: intrinsic matrices [px], shape (C, 3, 3).
-        distortion: k1 and k2 per camera, shape (C, 2).
-        T_cam_world: world (the first camera) to camera [mm], shape (C, 4, 4).
-        T_world_board: board to world [mm], NaN for views that fit nothing, shape (V, 4, 4).
-        corners_px: corners in one common order, NaN where unseen or inconsistent, shape (C, V, N, 2).
-    """
-
-    K: Array
-    distortion: Array
-    T_cam_world: Array
-    T_world_board: Array
-    corners_px: Array
+    K: Array  # intrinsic matrices [px], shape (C, 3, 3)
+    distortion: Array  # k1 and k2 per camera, shape (C, 2)
+    T_cam_world: Array  # world (the first camera) to camera [mm], shape (C, 4, 4)
+    T_world_board: Array  # board to world [mm], NaN for views that fit nothing, shape (V, 4, 4)
+    corners_px: Array  # corners in one common order, NaN where unseen or inconsistent, shape (C, V, N, 2)
 
 
 def guess_cameras(

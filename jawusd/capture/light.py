@@ -29,49 +29,30 @@ _BETWEEN_FRAMES = 0.15  # a fraction of a frame this small is noise
 
 @dataclass(frozen=True)
 class Step:
-    """Mark one sudden change of brightness.
+    """Mark one sudden change of brightness."""
 
-    Attributes:
-        time_frames: when, in frames of the camera's video; k = as the exposure of frame k begins.
-        rising: the light goes on; else off.
-        slack_frames: how much earlier it may have been, because the pictures before it are missing.
-    """
-
-    time_frames: float
-    rising: bool
-    slack_frames: float = 0.0
+    time_frames: float  # when, in frames of the camera's video; k = as the exposure of frame k begins
+    rising: bool  # the light goes on; else off
+    slack_frames: float = 0.0  # how much earlier it may have been, because the pictures before it are missing
 
 
 @dataclass(frozen=True)
 class Offset:
-    """Say how one camera lies in time: its frame k shows the instant of frame k + frames of the reference camera.
+    """Say how one camera lies in time: its frame k shows the instant of frame k + frames of the reference camera."""
 
-    Attributes:
-        frames: the offset in whole frames.
-        exact_frames: the same with its estimated fraction.
-        spread_frames: largest deviation of a matched step from exact_frames; 0 by sound.
-        matched_steps: number of steps found in both cameras; 0 by sound.
-        confidence: share of the steps of both cameras that have a partner, or what `SoundMatch` says; 0 .. 1.
-    """
-
-    frames: int
-    exact_frames: float
-    spread_frames: float
-    matched_steps: int
-    confidence: float
+    frames: int  # the offset in whole frames
+    exact_frames: float  # the same with its estimated fraction
+    spread_frames: float  # largest deviation of a matched step from exact_frames; 0 by sound
+    matched_steps: int  # number of steps found in both cameras; 0 by sound
+    confidence: float  # share of the steps of both cameras that have a partner, or what `SoundMatch` says; 0 .. 1
 
 
 @dataclass(frozen=True)
 class Flashes:
-    """Hold the steps of one video.
+    """Hold the steps of one video."""
 
-    Attributes:
-        steps: in order of time.
-        reason: why they are too few to align by, else "".
-    """
-
-    steps: list[Step]
-    reason: str = ""
+    steps: list[Step]  # in order of time
+    reason: str = ""  # why they are too few to align by, else ""
 
 
 def find_steps(brightness: Array, first_frame: int = 0) -> list[Step]:

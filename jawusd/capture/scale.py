@@ -20,17 +20,11 @@ _SIGMAS = 4.0
 
 @dataclass(frozen=True)
 class ScaleCheck:
-    """Compare the size of the teeth as the cameras see them with the scan.
+    """Compare the size of the teeth as the cameras see them with the scan."""
 
-    Attributes:
-        ratio: seen / scanned, None if unknown.
-        sigma: its standard error.
-        reason: why it is unknown, else "".
-    """
-
-    ratio: float | None
-    sigma: float | None
-    reason: str = ""
+    ratio: float | None  # seen / scanned, None if unknown
+    sigma: float | None  # its standard error
+    reason: str = ""  # why it is unknown, else ""
 
 
 def triangulated_picks(

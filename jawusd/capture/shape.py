@@ -19,19 +19,12 @@ _POINTS = 150
 
 @dataclass(frozen=True)
 class ShapeError:
-    """Sum up errors of distances between points [mm].
+    """Sum up errors of distances between points [mm]."""
 
-    Attributes:
-        mean: mean absolute error.
-        p95: its 95th percentile.
-        max: the largest.
-        distances: how many were compared; 0 = no corner near the mouth was seen by two cameras.
-    """
-
-    mean: float
-    p95: float
-    max: float
-    distances: int
+    mean: float  # mean absolute error
+    p95: float  # its 95th percentile
+    max: float  # the largest
+    distances: int  # how many were compared; 0 = no corner near the mouth was seen by two cameras
 
 
 def mouth_centre(cameras: list[Camera], bootstrap: Bootstrap | None, T_world_board: Array) -> tuple[Array, str]:

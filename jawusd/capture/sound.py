@@ -24,15 +24,10 @@ _SECOND_PEAK = 0.7  # of the highest; more is a rhythm that fits several ways
 
 
 class SoundMatch(NamedTuple):
-    """Say how two sounds lie in time.
+    """Say how two sounds lie in time."""
 
-    Attributes:
-        delay_s: time of an event in the reference's file minus that in the other's [s].
-        confidence: 1 minus the height of the second peak over that of the first, 0 .. 1.
-    """
-
-    delay_s: float
-    confidence: float
+    delay_s: float  # time of an event in the reference's file minus that in the other's [s]
+    confidence: float  # 1 minus the height of the second peak over that of the first, 0 .. 1
 
 
 def match_sounds(sound: Sound, reference: Sound) -> SoundMatch:

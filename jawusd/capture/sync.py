@@ -29,19 +29,12 @@ _EARLY_S = 2.0  # people stop their cameras one after the other
 
 @dataclass(frozen=True)
 class Alignment:
-    """Hold the offsets of all cameras of a capture.
+    """Hold the offsets of all cameras of a capture."""
 
-    Attributes:
-        reference: the camera that counts the frames.
-        cameras: the offset per camera, in the order of the capture.
-        method: "light flash" or "sound".
-        notes: what a person should know of the clips.
-    """
-
-    reference: str
-    cameras: dict[str, Offset]
-    method: str = "light flash"
-    notes: tuple[str, ...] = ()
+    reference: str  # the camera that counts the frames
+    cameras: dict[str, Offset]  # the offset per camera, in the order of the capture
+    method: str = "light flash"  # "light flash" or "sound"
+    notes: tuple[str, ...] = ()  # what a person should know of the clips
 
     @property
     def offsets(self) -> dict[str, int]:

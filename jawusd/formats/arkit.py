@@ -34,20 +34,14 @@ _MAX_BYTES = 1 << 30
 
 @dataclass(frozen=True, eq=False)
 class FaceCapture:
-    """Hold the jaw's weights of a face capture.
+    """Hold the jaw's weights of a face capture."""
 
-    Attributes:
-        frames: frames after the first row, increasing, fractions kept, shape (F,).
-        weights: JawOpen, JawLeft, JawRight, JawForward, nominally 0 .. 1, NaN without a face, shape (F, 4). Left is
-            the subject's left.
-        fps: frames per second.
-        timecode: that of the first row, as written.
-    """
-
-    frames: Array
+    frames: Array  # frames after the first row, increasing, fractions kept, shape (F,)
+    # JawOpen, JawLeft, JawRight, JawForward, nominally 0 .. 1, NaN without a face, shape (F, 4). Left is the subject's
+    # left.
     weights: Array
-    fps: float
-    timecode: str
+    fps: float  # frames per second
+    timecode: str  # that of the first row, as written
 
 
 def read_arkit(path: str | os.PathLike[str], fps: float | None = None) -> FaceCapture:

@@ -26,15 +26,10 @@ _NAME = re.compile(r"[A-Za-z0-9_\-][A-Za-z0-9_\-. ]*")
 
 @dataclass(frozen=True)
 class ListedCapture:
-    """Name one capture of a list.
+    """Name one capture of a list."""
 
-    Attributes:
-        path: capture.toml or its folder, absolute; it need not exist.
-        name: of the folder that its results go to, unlike all others of the list.
-    """
-
-    path: Path
-    name: str
+    path: Path  # capture.toml or its folder, absolute; it need not exist
+    name: str  # of the folder that its results go to, unlike all others of the list
 
 
 def load_capture_list(path: str | os.PathLike[str]) -> list[ListedCapture]:

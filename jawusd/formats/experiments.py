@@ -17,19 +17,12 @@ TABLE_COLUMNS = ("experiment", "model", "quantity", "count", "mean_mm", "median_
 
 @dataclass(frozen=True, eq=False)
 class Distances:
-    """Name a set of distances.
+    """Name a set of distances."""
 
-    Attributes:
-        experiment: "condyle path", "reconstruction" or "synthesis": paper Figs. 5, 12 and 13.
-        model: whose.
-        quantity: what was measured.
-        values_mm: one distance per pose or point of a path [mm], shape (N,).
-    """
-
-    experiment: str
+    experiment: str  # "condyle path", "reconstruction" or "synthesis": paper Figs. 5, 12 and 13
     model: str
-    quantity: str
-    values_mm: Array
+    quantity: str  # what was measured
+    values_mm: Array  # one distance per pose or point of a path [mm], shape (N,)
 
     def row(self) -> dict[str, str | int | float]:
         """Return the distances as one row of the table, keys `TABLE_COLUMNS`."""
@@ -42,86 +35,56 @@ class Distances:
 
 @dataclass(frozen=True, eq=False)
 class CondylePath:
-    """Hold the opening movement of one model at the condyles, anatomical frame.
-
-    Attributes:
-        model: whose.
-        opening_mm: vertical opening at the incisal point [mm], shape (K,).
-        points: centres of the left and right condyle [mm], shape (2, K, 3).
-        heads: outline of the left condyle in the sagittal plane through its centre at some openings: segments
-            (z, y) [mm], each of shape (S, 2, 2); empty without a mandible mesh.
-    """
+    """Hold the opening movement of one model at the condyles, anatomical frame."""
 
     model: str
-    opening_mm: Array
-    points: Array
+    opening_mm: Array  # vertical opening at the incisal point [mm], shape (K,)
+    points: Array  # centres of the left and right condyle [mm], shape (2, K, 3)
+    # outline of the left condyle in the sagittal plane through its centre at some openings: segments (z, y) [mm], each
+    # of shape (S, 2, 2); empty without a mandible mesh
     heads: tuple[Array, ...]
 
 
 @dataclass(frozen=True, eq=False)
 class ParameterPath:
-    """Hold where the left condyle goes when one parameter of a model moves alone, anatomical frame.
-
-    Attributes:
-        model: whose.
-        parameter: 0 opening, 1 laterotrusion, 2 protrusion.
-        values_mm: of the parameter [mm], shape (K,).
-        points: centre of the left condyle [mm], shape (K, 3).
-    """
+    """Hold where the left condyle goes when one parameter of a model moves alone, anatomical frame."""
 
     model: str
-    parameter: int
-    values_mm: Array
-    points: Array
+    parameter: int  # 0 opening, 1 laterotrusion, 2 protrusion
+    values_mm: Array  # of the parameter [mm], shape (K,)
+    points: Array  # centre of the left condyle [mm], shape (K, 3)
 
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """Show which part of the envelope was captured, in the parameters d of the default model.
+    """Show which part of the envelope was captured, in the parameters d of the default model."""
 
-    Attributes:
-        d: captured poses [mm], shape (N, 3).
-        outlines: rings of the paper's bounds in (d1, d2) and (d1, d3) [mm], each ring (n, 2).
-        slices_d1: openings [mm], shape (K,).
-        slices: valid d2 and d3 [mm] of the slice hull on the habitual path there, lowest and highest, shape (2, K, 2).
-        gaps: points (d1, d2) and (d1, d3) [mm] inside the slice hull far from every captured pose, each (G, 2).
-        sentences: what to record next.
-    """
-
-    d: Array
+    d: Array  # captured poses [mm], shape (N, 3)
+    # rings of the paper's bounds in (d1, d2) and (d1, d3) [mm], each ring (n, 2)
     outlines: tuple[tuple[Array, ...], tuple[Array, ...]]
-    slices_d1: Array
+    slices_d1: Array  # openings [mm], shape (K,)
+    # valid d2 and d3 [mm] of the slice hull on the habitual path there, lowest and highest, shape (2, K, 2)
     slices: Array
+    # points (d1, d2) and (d1, d3) [mm] inside the slice hull far from every captured pose, each (G, 2)
     gaps: tuple[Array, Array]
-    sentences: tuple[str, ...]
+    sentences: tuple[str, ...]  # what to record next
 
 
 @dataclass(frozen=True, eq=False)
 class Experiments:
-    """Hold the results.
-
-    Attributes:
-        actor: whose jaw.
-        frames: number of captured poses that were used.
-        captured_condyles: centres of the left and right condyle in all captured poses, anatomical frame [mm], shape
-            (2, N, 3).
-        skull: outline of the skull beside the left condyle: segments (z, y) [mm], shape (S, 2, 2).
-        condyle_paths: one per model.
-        distances: everything measured, in the order of the table.
-        coverage: captured part of the envelope.
-        notes: how many frames each model left out; models that could not be fitted, and why; what was not asked for.
-        parameter_paths: of the linear and the default model, for each parameter.
-    """
+    """Hold the results."""
 
     actor: str
-    frames: int
+    frames: int  # number of captured poses that were used
+    # centres of the left and right condyle in all captured poses, anatomical frame [mm], shape (2, N, 3)
     captured_condyles: Array
-    skull: Array
-    condyle_paths: tuple[CondylePath, ...]
-    distances: tuple[Distances, ...]
-    coverage: Coverage
+    skull: Array  # outline of the skull beside the left condyle: segments (z, y) [mm], shape (S, 2, 2)
+    condyle_paths: tuple[CondylePath, ...]  # one per model
+    distances: tuple[Distances, ...]  # everything measured, in the order of the table
+    coverage: Coverage  # captured part of the envelope
+    # how many frames each model left out; models that could not be fitted, and why; what was not asked for
     notes: tuple[str, ...]
-    parameter_paths: tuple[ParameterPath, ...] = ()
+    parameter_paths: tuple[ParameterPath, ...] = ()  # of the linear and the default model, for each parameter
 
     def of(self, experiment: str) -> list[Distances]:
         """Return the distances of one experiment."""

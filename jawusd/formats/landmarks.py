@@ -29,15 +29,10 @@ _RIGID_TOLERANCE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class LandmarkFile:
-    """Hold the file.
+    """Hold the file."""
 
-    Attributes:
-        landmarks: in the order of `geometry.LANDMARKS` [mm], shape (5, 3).
-        T_anatomical_skull: the file's frame to the anatomical frame, shape (4, 4), or None.
-    """
-
-    landmarks: Array
-    T_anatomical_skull: Array | None
+    landmarks: Array  # in the order of `geometry.LANDMARKS` [mm], shape (5, 3)
+    T_anatomical_skull: Array | None  # the file's frame to the anatomical frame, shape (4, 4), or None
 
 
 def load_landmarks(path: str | os.PathLike[str]) -> LandmarkFile:

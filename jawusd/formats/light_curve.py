@@ -12,17 +12,11 @@ from jawusd.geometry.arrays import Array
 
 @dataclass(frozen=True, eq=False)
 class LightCurve:
-    """Hold the brightness of one clip.
+    """Hold the brightness of one clip."""
 
-    Attributes:
-        times_s: presentation time of every picture after the first one [s], shape (n,).
-        frames: its frame on the clip's even grid, shape (n,).
-        brightness: its mean brightness, 0 .. 255, shape (n,).
-        off_frames, on_frames: when the light suddenly went off, and on [frames], shapes (a,), (b,).
-    """
-
-    times_s: Array
-    frames: NDArray[np.int64]
-    brightness: Array
+    times_s: Array  # presentation time of every picture after the first one [s], shape (n,)
+    frames: NDArray[np.int64]  # its frame on the clip's even grid, shape (n,)
+    brightness: Array  # its mean brightness, 0 .. 255, shape (n,)
+    # when the light suddenly went off, and on [frames], shapes (a,), (b,)
     off_frames: Array
     on_frames: Array

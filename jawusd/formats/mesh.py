@@ -19,17 +19,11 @@ _FEWEST_PAINTED = 0.01  # share of the vertices; a handful of reddish ones is no
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Hold a triangle mesh.
+    """Hold a triangle mesh."""
 
-    Attributes:
-        vertices: positions [mm], shape (V, 3), float64.
-        faces: vertex indices, counter-clockwise seen from outside, shape (F, 3), int32.
-        colors: red, green, blue per vertex, shape (V, 3), uint8, or None.
-    """
-
-    vertices: Array
-    faces: NDArray[np.int32]
-    colors: NDArray[np.uint8] | None = None
+    vertices: Array  # positions [mm], shape (V, 3), float64
+    faces: NDArray[np.int32]  # vertex indices, counter-clockwise seen from outside, shape (F, 3), int32
+    colors: NDArray[np.uint8] | None = None  # red, green, blue per vertex, shape (V, 3), uint8, or None
 
     def __post_init__(self) -> None:
         vertices = np.ascontiguousarray(self.vertices, dtype=np.float64)

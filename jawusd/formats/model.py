@@ -23,22 +23,14 @@ _CAPTURED = ("captured_frames", "captured_d", "captured_residual_mm", "captured_
 
 @dataclass(eq=False)
 class JawModel:
-    """Hold a fitted model and what it says of the captured poses.
+    """Hold a fitted model and what it says of the captured poses."""
 
-    Attributes:
-        arrays: the decoder's named arrays, see `jawusd.evaluator`.
-        frames: captured frame numbers, shape (F,).
-        d: parameters of the captured poses [mm], NaN where the frame was lost, shape (F, 3).
-        residual_mm: rms landmark distance of pose and model [mm], NaN where lost, shape (F,).
-        trained: the frame took part in the fit, shape (F,).
-        meta: kind, method, actor, error tables, warnings, configuration, versions, hashes.
-    """
-
-    arrays: dict[str, Array]
-    frames: NDArray[np.int64]
-    d: Array
-    residual_mm: Array
-    trained: Mask
+    arrays: dict[str, Array]  # the decoder's named arrays, see `jawusd.evaluator`
+    frames: NDArray[np.int64]  # captured frame numbers, shape (F,)
+    d: Array  # parameters of the captured poses [mm], NaN where the frame was lost, shape (F, 3)
+    residual_mm: Array  # rms landmark distance of pose and model [mm], NaN where lost, shape (F,)
+    trained: Mask  # the frame took part in the fit, shape (F,)
+    # kind, method, actor, error tables, warnings, configuration, versions, hashes
     meta: dict[str, object] = field(default_factory=dict)
 
 

@@ -13,98 +13,56 @@ from jawusd.formats.tracks import Tracks
 
 @dataclass(frozen=True)
 class CameraFacts:
-    """Say what one camera gave.
-
-    Attributes:
-        name: of the camera.
-        video: file name of the footage, "" without any.
-        masks: file names of the masks, "" without any.
-        size_px: (width, height) of the recorded pictures.
-    """
+    """Say what one camera gave."""
 
     name: str
-    video: str
-    masks: str
-    size_px: tuple[int, int]
+    video: str  # file name of the footage, "" without any
+    masks: str  # file names of the masks, "" without any
+    size_px: tuple[int, int]  # (width, height) of the recorded pictures
 
 
 @dataclass(frozen=True, eq=False)
 class Overlay:
-    """Hold one frame of the footage with the tracked scans drawn over it, all cameras side by side.
+    """Hold one frame of the footage with the tracked scans drawn over it, all cameras side by side."""
 
-    Attributes:
-        frame: of the reference camera.
-        reason: why this frame is shown.
-        jpeg: the picture, a JPEG file.
-    """
-
-    frame: int
-    reason: str
-    jpeg: bytes
+    frame: int  # of the reference camera
+    reason: str  # why this frame is shown
+    jpeg: bytes  # the picture, a JPEG file
 
 
 @dataclass(frozen=True, eq=False)
 class ReplayPart:
-    """Hold a mesh of the replay.
+    """Hold a mesh of the replay."""
 
-    Attributes:
-        name: for people.
-        kind: "bone", "tooth" or "gum": how it is coloured.
-        moves: it belongs to the mandible.
-        mesh: decimated, anatomical frame, at the closed bite [mm].
-    """
-
-    name: str
-    kind: str
-    moves: bool
-    mesh: Mesh
+    name: str  # shown to people
+    kind: str  # "bone", "tooth" or "gum": how it is coloured
+    moves: bool  # it belongs to the mandible
+    mesh: Mesh  # decimated, anatomical frame, at the closed bite [mm]
 
 
 @dataclass(frozen=True)
 class RigFacts:
-    """Say what was found out about the rig files.
+    """Say what was found out about the rig files."""
 
-    Attributes:
-        table_error_mm: largest vertex distance of the sampled decoder to the exact model [mm].
-        findings: what the validators say, "severity: message"; empty when all is well.
-    """
-
-    table_error_mm: float
-    findings: tuple[str, ...]
+    table_error_mm: float  # largest vertex distance of the sampled decoder to the exact model [mm]
+    findings: tuple[str, ...]  # what the validators say, "severity: message"; empty when all is well
 
 
 @dataclass(frozen=True, eq=False)
 class ReportData:
-    """Hold what the report shows.
-
-    Attributes:
-        actor: whose jaw.
-        tracks: the final tracks.
-        model: the fitted model.
-        sync: result of the sync stage: `offsets`, `method` and what it says of its confidence.
-        cameras: empty where the capture is not at hand.
-        inferred: what was derived instead of being given.
-        seconds: per stage [s].
-        hashes: SHA-256 by file name of the build.
-        versions: by package.
-        rig: what was found out about the rig files.
-        experiments: the paper's experiments, None if they could not be done.
-        overlays: frames of the footage, the worst first.
-        parts: meshes of the replay.
-        left_out: what the report does not show, and why.
-    """
+    """Hold what the report shows."""
 
     actor: str
     tracks: Tracks
     model: JawModel
-    sync: Mapping[str, object]
-    cameras: tuple[CameraFacts, ...]
-    inferred: tuple[str, ...]
-    seconds: Mapping[str, float]
-    hashes: Mapping[str, str]
-    versions: Mapping[str, str]
+    sync: Mapping[str, object]  # result of the sync stage: `offsets`, `method` and what it says of its confidence
+    cameras: tuple[CameraFacts, ...]  # empty where the capture is not at hand
+    inferred: tuple[str, ...]  # what was derived instead of being given
+    seconds: Mapping[str, float]  # per stage [s]
+    hashes: Mapping[str, str]  # SHA-256 by file name of the build
+    versions: Mapping[str, str]  # by package
     rig: RigFacts
-    experiments: Experiments | None
-    overlays: tuple[Overlay, ...]
+    experiments: Experiments | None  # the paper's experiments, None if they could not be done
+    overlays: tuple[Overlay, ...]  # frames of the footage, the worst first
     parts: tuple[ReplayPart, ...]
-    left_out: tuple[str, ...]
+    left_out: tuple[str, ...]  # what the report does not show, and why

@@ -18,21 +18,13 @@ _ALLOWED_COEFFICIENTS = (0, 4, 5, 8)
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """Describe one calibrated camera.
+    """Describe one calibrated camera."""
 
-    Attributes:
-        name: the camera's name in the capture.
-        size_px: image width and height [px].
-        K: intrinsic matrix [px], shape (3, 3).
-        distortion: OpenCV coefficients, shape (0,), (4,), (5,) or (8,).
-        T_cam_world: world to camera (x right, y down, z forward) [mm], shape (4, 4).
-    """
-
-    name: str
-    size_px: tuple[int, int]
-    K: Array
-    distortion: Array
-    T_cam_world: Array
+    name: str  # the camera's name in the capture
+    size_px: tuple[int, int]  # image width and height [px]
+    K: Array  # intrinsic matrix [px], shape (3, 3)
+    distortion: Array  # OpenCV coefficients, shape (0,), (4,), (5,) or (8,)
+    T_cam_world: Array  # world to camera (x right, y down, z forward) [mm], shape (4, 4)
 
     def __post_init__(self) -> None:
         for field, shape in (("K", (3, 3)), ("T_cam_world", (4, 4))):

@@ -13,17 +13,11 @@ from jawusd.errors import CaptureError
 
 
 class Sound(NamedTuple):
-    """Hold the sound of a file.
+    """Hold the sound of a file."""
 
-    Attributes:
-        samples: one channel, shape (n,).
-        rate_hz: samples per second.
-        start_s: presentation time of the first sample in the file [s].
-    """
-
-    samples: NDArray[np.float32]
-    rate_hz: int
-    start_s: float
+    samples: NDArray[np.float32]  # one channel, shape (n,)
+    rate_hz: int  # samples per second
+    start_s: float  # presentation time of the first sample in the file [s]
 
 
 def read_sound(path: str | os.PathLike[str], rate_hz: int) -> Sound | None:

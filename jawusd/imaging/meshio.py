@@ -94,17 +94,11 @@ def _checked(
 
 
 class Winding(NamedTuple):
-    """Say how the triangles of a mesh are turned.
+    """Say how the triangles of a mesh are turned."""
 
-    Attributes:
-        closed: every edge is shared by exactly two triangles that run along it in opposite directions.
-        outward: triangles are counter-clockwise seen from outside; a strong hint only, unless the mesh is closed.
-        volume_mm3: signed volume, positive if outward.
-    """
-
-    closed: bool
-    outward: bool
-    volume_mm3: float
+    closed: bool  # every edge is shared by exactly two triangles that run along it in opposite directions
+    outward: bool  # triangles are counter-clockwise seen from outside; a strong hint only, unless the mesh is closed
+    volume_mm3: float  # signed volume, positive if outward
 
 
 def winding(mesh: Mesh) -> Winding:

@@ -28,17 +28,11 @@ _MARGIN = 0.25  # of the teeth's extent, left around them in a tile
 
 @dataclass(frozen=True, eq=False)
 class PlacedScan:
-    """Hold a teeth scan where it was tracked.
+    """Hold a teeth scan where it was tracked."""
 
-    Attributes:
-        mesh: the scan [mm]; its gum hides what lies behind and is not painted.
-        T_world_scan: its pose, shape (4, 4); NaN leaves the scan out.
-        colour: red, green, blue.
-    """
-
-    mesh: Mesh
-    T_world_scan: Array
-    colour: tuple[int, int, int]
+    mesh: Mesh  # the scan [mm]; its gum hides what lies behind and is not painted
+    T_world_scan: Array  # its pose, shape (4, 4); NaN leaves the scan out
+    colour: tuple[int, int, int]  # red, green, blue
 
 
 def draw_overlay(

@@ -27,17 +27,11 @@ _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
 
 @dataclass(frozen=True, eq=False)
 class VideoFrame:
-    """One decoded picture.
+    """One decoded picture."""
 
-    Attributes:
-        index: number in order of presentation, the first is 0.
-        time_s: presentation time after the first picture [s].
-        image: (h, w) gray, (h, w, 3) RGB or (h, w, 4) RGBA, uint8, 0..255, read-only.
-    """
-
-    index: int
-    time_s: float
-    image: NDArray[np.uint8]
+    index: int  # number in order of presentation, the first is 0
+    time_s: float  # presentation time after the first picture [s]
+    image: NDArray[np.uint8]  # (h, w) gray, (h, w, 3) RGB or (h, w, 4) RGBA, uint8, 0..255, read-only
 
 
 class Video:

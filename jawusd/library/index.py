@@ -38,31 +38,19 @@ Loader = Callable[[Path], JawRig]
 
 @dataclass(frozen=True)
 class Entry:
-    """What the index knows of one rig.
+    """What the index knows of one rig."""
 
-    Attributes:
-        path: of the rig's file, relative to the folder, with slashes.
-        actor: name of the person.
-        kind: form of the model.
-        content: SHA-256 of the rig's files.
-        ranges_mm: lowest and highest value of each parameter.
-        landmarks_mm: in the person's own landmark frame (occlusal plane, origin at the lower incisal point).
-        condylar_distance_mm: between the condyle centres.
-        condyle_incisor_mm: from the middle between the condyles to the incisal point.
-        errors_mm: the model's error tables, as its header has them.
-        not_shown: the person's capture lacks a movement: of no use for others.
-    """
-
-    path: str
-    actor: str
-    kind: str
-    content: str
-    ranges_mm: dict[str, list[float]]
+    path: str  # of the rig's file, relative to the folder, with slashes
+    actor: str  # name of the person
+    kind: str  # form of the model
+    content: str  # SHA-256 of the rig's files
+    ranges_mm: dict[str, list[float]]  # lowest and highest value of each parameter
+    # in the person's own landmark frame (occlusal plane, origin at the lower incisal point)
     landmarks_mm: dict[str, list[float]]
-    condylar_distance_mm: float
-    condyle_incisor_mm: float
-    errors_mm: dict[str, object]
-    not_shown: bool
+    condylar_distance_mm: float  # between the condyle centres
+    condyle_incisor_mm: float  # from the middle between the condyles to the incisal point
+    errors_mm: dict[str, object]  # the model's error tables, as its header has them
+    not_shown: bool  # the person's capture lacks a movement: of no use for others
 
     def landmarks(self) -> Array:
         """Return the landmarks in the order of `LANDMARKS` [mm], shape (5, 3)."""
@@ -71,19 +59,12 @@ class Entry:
 
 @dataclass(frozen=True)
 class Library:
-    """A scanned folder.
+    """A scanned folder."""
 
-    Attributes:
-        folder: the folder, resolved.
-        entries: its rigs, by path.
-        skipped: files that could not be read, by path, and why.
-        reread: how many rigs were new or had changed.
-    """
-
-    folder: Path
-    entries: tuple[Entry, ...]
-    skipped: dict[str, str]
-    reread: int
+    folder: Path  # the folder, resolved
+    entries: tuple[Entry, ...]  # its rigs, by path
+    skipped: dict[str, str]  # files that could not be read, by path, and why
+    reread: int  # how many rigs were new or had changed
 
     def find(self, name: str) -> Entry:
         """Return the rig of a person, by name or by path.

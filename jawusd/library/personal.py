@@ -26,13 +26,10 @@ _FEWEST_DONORS = 2  # with two persons each can be predicted from the other
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """What leaving one person out says of the error.
+    """What leaving one person out says of the error."""
 
-    Attributes:
-        errors_mm: by name of the person left out, the landmark errors [mm], shape (K, 5), at equal shares of the
-            ranges: both the shape of the motion and the ranges count.
-    """
-
+    # by name of the person left out, the landmark errors [mm], shape (K, 5), at equal shares of the ranges: both the
+    # shape of the motion and the ranges count
     errors_mm: dict[str, Array]
 
     def pooled(self) -> Array:
@@ -66,31 +63,22 @@ class Expected:
 
 @dataclass(frozen=True, eq=False)
 class Learned:
-    """What a library says of itself.
+    """What a library says of itself."""
 
-    Attributes:
-        bandwidth_mm: landmark distance over which a person's weight falls by exp(-1/2), inf when all count alike; None
-            when the closest person alone counts.
-        expected: error to be expected; None when the library has a single person.
-    """
-
+    # landmark distance over which a person's weight falls by exp(-1/2), inf when all count alike; None when the closest
+    # person alone counts
     bandwidth_mm: float | None
-    expected: Expected | None
+    expected: Expected | None  # error to be expected; None when the library has a single person
 
 
 @dataclass(frozen=True, eq=False)
 class PersonalMotion:
-    """Hold the motion made for a person.
+    """Hold the motion made for a person."""
 
-    Attributes:
-        poses: T_skull_mandible in the frame of the landmarks, the identity with the teeth together, shape (N, 4, 4).
-        weights: how much each library person counts; they sum to 1.
-        learned: what the weights and the expected error come from.
-    """
-
+    # T_skull_mandible in the frame of the landmarks, the identity with the teeth together, shape (N, 4, 4)
     poses: Array
-    weights: dict[str, float]
-    learned: Learned
+    weights: dict[str, float]  # how much each library person counts; they sum to 1
+    learned: Learned  # what the weights and the expected error come from
 
 
 def leave_one_out(donors: Sequence[Donor], *, closest: bool = False) -> Learned:

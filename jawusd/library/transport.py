@@ -19,15 +19,10 @@ from jawusd.geometry.arrays import Array
 
 @dataclass(frozen=True, eq=False)
 class Donor:
-    """One person of a library.
+    """One person of a library."""
 
-    Attributes:
-        name: of the person, for reports.
-        rig: the person's rig.
-    """
-
-    name: str
-    rig: JawRig
+    name: str  # of the person, for reports
+    rig: JawRig  # the person's rig
 
     @property
     def landmarks(self) -> Array:

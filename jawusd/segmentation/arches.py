@@ -21,15 +21,10 @@ _ARCH_BLUR_PX = 0.8  # softens the border between the arches to fractions of a p
 
 @dataclass(frozen=True, eq=False)
 class Seeds:
-    """Hold what a person said about a working picture.
+    """Hold what a person said about a working picture."""
 
-    Attributes:
-        known: where something is said about each arch, shape (2, h, w).
-        share: of tooth there, shape (2, h, w).
-    """
-
-    known: Mask
-    share: NDArray[np.float32]
+    known: Mask  # where something is said about each arch, shape (2, h, w)
+    share: NDArray[np.float32]  # of tooth there, shape (2, h, w)
 
     def pinned(self, shares: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return shares of both arches, shape (2, h, w), replaced by what a person said where something is said."""
@@ -66,7 +61,7 @@ def cut_arches(
     reach_mm: float,
     seeds: Seeds | None = None,
 ) -> NDArray[np.float32]:
-    """Segment a picture; return the shares of both arches, 0 .. 1, shape (2, h, w).
+    """Segment a picture; return the shares of both arches, 0 .. 1, shape (2, h, w)
 
     Args:
         rgb: the picture, shape (h, w, 3).

@@ -20,14 +20,10 @@ _FAR_BLUR_PX = 2.0  # finds the nearer arch for pixels that have become teeth
 
 @dataclass(frozen=True, eq=False)
 class _Sides:
-    """Hold what the colours on both sides of the border say about every pixel.
+    """Hold what the colours on both sides of the border say about every pixel."""
 
-    Attributes:
-        share: of tooth, half way between the sides 0.5, shape (h, w).
-        contrast: standard deviations between the sides, 0 where one of them is not near, shape (h, w).
-    """
-
-    share: NDArray[np.float32]
+    share: NDArray[np.float32]  # of tooth, half way between the sides 0.5, shape (h, w)
+    # standard deviations between the sides, 0 where one of them is not near, shape (h, w)
     contrast: NDArray[np.float32]
 
 

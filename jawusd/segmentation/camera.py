@@ -26,25 +26,17 @@ _EVERY = 20  # vertices of a crown to one that tells where it is
 
 @dataclass(frozen=True, eq=False)
 class Segment:
-    """Hold both arches in one picture.
+    """Hold both arches in one picture."""
 
-    Attributes:
-        camera: the pinhole camera of the window.
-        masks: shares of the upper and lower arch, 255 = all, uint8, shape (2, h, w).
-        present: which arches are in sight at all, shape (2,).
-        contrast: how far colours change for the better at the outline, per arch, -1 .. 1; NaN where there is none.
-        unexpected: how much of each arch's mask is not where the crowns were expected, as a share; NaN without a mask.
-        outline: pixels of each arch's outline that show in the picture, that do not, and that border the other arch,
-            shape (2, 3).
-        window, expected: what was segmented, and what was expected there.
-    """
-
-    camera: Camera
-    masks: NDArray[np.uint8]
-    present: Mask
-    contrast: Array
+    camera: Camera  # the pinhole camera of the window
+    masks: NDArray[np.uint8]  # shares of the upper and lower arch, 255 = all, uint8, shape (2, h, w)
+    present: Mask  # which arches are in sight at all, shape (2,)
+    contrast: Array  # how far colours change for the better at the outline, per arch, -1 .. 1; NaN where there is none.
+    # how much of each arch's mask is not where the crowns were expected, as a share; NaN without a mask
     unexpected: Array
+    # pixels of each arch's outline that show in the picture, that do not, and that border the other arch, shape (2, 3)
     outline: NDArray[np.int64]
+    # what was segmented, and what was expected there
     window: Window
     expected: Expectation
 

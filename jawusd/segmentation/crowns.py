@@ -18,17 +18,11 @@ OTHER, UPPER, LOWER = 0, 1, 2
 
 @dataclass(frozen=True, eq=False)
 class ScanSurface:
-    """Hold one arch ready to be drawn.
+    """Hold one arch ready to be drawn."""
 
-    Attributes:
-        vertices: scan coordinates [mm], shape (V, 3).
-        crown_faces: faces of the teeth, int32, shape (F, 3).
-        gum_faces: faces that only hide what lies behind them, int32, shape (G, 3).
-    """
-
-    vertices: Array
-    crown_faces: NDArray[np.int32]
-    gum_faces: NDArray[np.int32]
+    vertices: Array  # scan coordinates [mm], shape (V, 3)
+    crown_faces: NDArray[np.int32]  # faces of the teeth, int32, shape (F, 3)
+    gum_faces: NDArray[np.int32]  # faces that only hide what lies behind them, int32, shape (G, 3)
 
     @classmethod
     def of(cls, mesh: Mesh) -> ScanSurface:
@@ -43,14 +37,10 @@ class ScanSurface:
 
 @dataclass(frozen=True, eq=False)
 class Expectation:
-    """Hold what is expected where in a picture; px are pixels of that picture.
+    """Hold what is expected where in a picture; px are pixels of that picture."""
 
-    Attributes:
-        labels: OTHER, UPPER or LOWER where that arch's crowns are nearest, shape (h, w).
-        inside_px: signed distance to the outline of each arch's visible crowns, positive inside, shape (2, h, w).
-    """
-
-    labels: NDArray[np.uint8]
+    labels: NDArray[np.uint8]  # OTHER, UPPER or LOWER where that arch's crowns are nearest, shape (h, w)
+    # signed distance to the outline of each arch's visible crowns, positive inside, shape (2, h, w)
     inside_px: NDArray[np.float32]
 
 

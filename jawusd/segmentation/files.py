@@ -42,17 +42,12 @@ def write_mask(path: Path, mask: NDArray[np.uint8]) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Key:
-    """Hold what a person drew for one arch in one picture.
+    """Hold what a person drew for one arch in one picture."""
 
-    Attributes:
-        mask: 255 = tooth, (H, W) uint8.
-        known: 255 where the mask holds, (H, W) uint8: everywhere in a finished mask, else under strokes.
-        finished: whether it holds everywhere.
-    """
-
-    mask: NDArray[np.uint8]
+    mask: NDArray[np.uint8]  # 255 = tooth, (H, W) uint8
+    # 255 where the mask holds, (H, W) uint8: everywhere in a finished mask, else under strokes
     known: NDArray[np.uint8]
-    finished: bool
+    finished: bool  # whether it holds everywhere
 
 
 class KeyMasks:

@@ -34,20 +34,14 @@ class LearnedNumbers(TypedDict):
 
 @dataclass(frozen=True, eq=False)
 class Example:
-    """Hold a picture with finished masks.
+    """Hold a picture with finished masks."""
 
-    Attributes:
-        window, expected: the picture, and where crowns are expected in it.
-        drawn: shares of both arches, shape (2, h, w).
-        colours: the colours of its camera.
-        px_per_mm: resolution of the picture.
-    """
-
+    # the picture, and where crowns are expected in it
     window: Window
     expected: Expectation
-    drawn: NDArray[np.float32]
-    colours: ColourModel
-    px_per_mm: float
+    drawn: NDArray[np.float32]  # shares of both arches, shape (2, h, w)
+    colours: ColourModel  # the colours of its camera
+    px_per_mm: float  # resolution of the picture
 
     def cut(self, config: SegmentationConfig) -> NDArray[np.float32]:
         """Return the shares of both arches, shape (2, h, w), that are found without the drawn masks."""

@@ -17,17 +17,11 @@ _NODE_PX = 8  # spacing of undistorted positions; the lens is smooth in between
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """Hold a part of a working picture.
+    """Hold a part of a working picture."""
 
-    Attributes:
-        camera: the pinhole camera of the part.
-        rgb: its pixels, 8 bit, shape (h, w, 3).
-        corner: its first column and row in the working picture [px].
-    """
-
-    camera: Camera
-    rgb: NDArray[np.uint8]
-    corner: tuple[int, int]
+    camera: Camera  # the pinhole camera of the part
+    rgb: NDArray[np.uint8]  # its pixels, 8 bit, shape (h, w, 3)
+    corner: tuple[int, int]  # its first column and row in the working picture [px]
 
 
 class PictureFrame:
