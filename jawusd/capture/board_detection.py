@@ -32,11 +32,10 @@ def detector(boards: Boards) -> Search:
 
 
 def shown_instead(images: Sequence[NDArray[np.uint8]], boards: Boards, missed: bool) -> str | None:
-    """Return which board pictures show if it is not the one described; None if nothing speaks against that one.
+    """Return which board gray pictures (h, w) show if it is not the one described; None if it may well be that one.
 
     Args:
-        images: gray pictures, shape (h, w) each.
-        missed: that one is not found in most of the clip's pictures, so markers that never show may not exist.
+        missed: the one described is not found in most of the clip's pictures, so markers that never show may not exist.
     """
     plain: Counter[tuple[int, int]] = Counter()
     for image in images:
@@ -127,15 +126,13 @@ def _marker_count(boards: Boards) -> int:
 
 
 def edge_width_px(image: NDArray[np.uint8], corners_px: Array, cols: int) -> float:
-    """Return the 10 to 90 % width of a chessboard's edges from its gradient energy.
+    """Return the 10 to 90 % width of a chessboard's edges in a gray picture (h, w) from its gradient energy.
 
     A step of contrast C blurred by a Gaussian of sigma has the gradient energy C^2 / (2 sigma sqrt(pi)) per length of
     edge; a chessboard with cell sides a and b has (|a| + |b|) / |a x b| of edge per area.
 
     Args:
-        image: gray picture, shape (h, w).
-        corners_px: found corners row by row, NaN where not seen, shape (N, 2).
-        cols: corners per row.
+        corners_px: found corners row by row, `cols` in each, NaN where not seen, shape (N, 2).
     """
     grid = corners_px.reshape(-1, cols, 2)
     along, down = np.nanmean(np.diff(grid, axis=1), axis=(0, 1)), np.nanmean(np.diff(grid, axis=0), axis=(0, 1))

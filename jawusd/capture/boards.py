@@ -55,10 +55,7 @@ def board_symmetries(boards: Boards) -> list[NDArray[np.int64]]:
 
 
 def find_boards(names: tuple[str, ...], boards: Boards, progress: Callable[[int, int], None]) -> Sightings:
-    """Choose sharp pictures of the boards and find the corners in them.
-
-    Args:
-        boards: the board, and one video or numbered picture pattern per camera.
+    """Choose sharp pictures of the boards, which give a clip per camera, and find the corners in them.
 
     Raises:
         CalibrationError: the clips share no pictures, show no board, or a board with other counts.

@@ -42,14 +42,10 @@ class Bundle:
 
 
 def adjust(start: FirstGuess, points_mm: Array) -> Bundle:
-    """Adjust, drop corners that fit far worse than the others, and adjust again.
-
-    Args:
-        start: cameras, board poses and corners in one order.
-        points_mm: corners on the board, shape (N, 3).
+    """Adjust, drop corners that fit far worse than the others, and adjust again; points_mm (N, 3) are on the board.
 
     Raises:
-        CalibrationError: the adjustment does not settle.
+        CalibrationError: the adjustment does not converge.
     """
     corners = start.corners_px.copy()
     corners[:, ~np.isfinite(start.T_world_board[:, 0, 0])] = np.nan

@@ -56,14 +56,11 @@ class Flashes:
 
 
 def find_steps(brightness: Array, first_frame: int = 0) -> list[Step]:
-    """Find the frames at which the light goes off or on.
+    """Return when the light goes off or on, in order of time; nothing if brightness changes by less than a flash does.
 
     Args:
-        brightness: mean brightness of successive pictures, 0..255, shape (n,).
+        brightness: mean brightness of successive pictures, 0 .. 255, shape (n,).
         first_frame: frame number of the first one.
-
-    Returns:
-        The steps in order of time; none if the brightness changes by less than a flash does.
     """
     if len(brightness) < 2 or brightness.max() - brightness.min() < _CONTRAST * brightness.max():
         return []
@@ -148,12 +145,7 @@ def _aligned(steps: list[Step], reference: list[Step], offset: int) -> tuple[lis
 
 
 def on_grid(steps: list[Step], numbers: NDArray[np.int64]) -> list[Step]:
-    """Return steps counted in pictures with their time on the grid of frames.
-
-    Args:
-        steps: of a video, their times in pictures.
-        numbers: frame number of each picture, shape (n,).
-    """
+    """Return steps timed in pictures, timed on the grid of frames instead; numbers (n,) are the pictures' frames."""
     out = []
     for step in steps:
         nearest = round(step.time_frames)

@@ -52,8 +52,7 @@ def check_scale(
     """Compare the spread of the picks in space with that on the scans (Umeyama 1991).
 
     Args:
-        cameras: calibrated with the board.
-        bootstrap: the picks, if any; at one instant per view.
+        bootstrap: the picks, at one instant in all views.
         scans: vertices [mm] by "upper" and "lower", shape (n, 3).
         square_mm: the square size taken, named in the error.
 
@@ -82,12 +81,7 @@ def check_scale(
 
 
 def judged_scale(ratio: float, sigma: float, square_mm: float) -> ScaleCheck:
-    """Return a measured size of the teeth if it confirms the squares, or tells too little.
-
-    Args:
-        ratio: seen / scanned.
-        sigma: its standard error.
-        square_mm: the square size taken.
+    """Return a measured size of the teeth (seen / scanned) if it confirms the squares or is too uncertain to tell.
 
     Raises:
         CalibrationError: the teeth come out with another size than the scan's.

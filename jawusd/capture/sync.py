@@ -75,11 +75,7 @@ def align_videos(videos: Mapping[str, Path], reference: str, *, by_light: bool =
     """Find the light flashes in all videos and align them with those of the reference camera.
 
     Only the beginning and the end of each video are decoded, more of it only while no flash is found. If a video shows
-    no flash and all have sound, the sound aligns them.
-
-    Args:
-        reference: the camera that counts the frames.
-        by_light: look for flashes at all.
+    no flash, or without `by_light`, and all have sound, the sound aligns them.
 
     Raises:
         SyncError: neither flash nor sound, rates that differ, or steps that do not fit together.

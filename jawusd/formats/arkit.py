@@ -45,11 +45,9 @@ class FaceCapture:
 
 
 def read_arkit(path: str | os.PathLike[str], fps: float | None = None) -> FaceCapture:
-    """Read a face capture.
+    """Read a face capture of Live Link Face.
 
-    Args:
-        fps: rate at which the time codes count; found from them if None, which takes a capture that passes at least
-            one full second.
+    Without `fps`, the rate at which the time codes count is found from them; the capture must pass a full second then.
 
     Raises:
         FormatError: not such a table; a value that is no finite number, a time code that does not follow the one

@@ -21,13 +21,9 @@ _UNFINISHED = ".jawusd-tmp-"
 
 @contextlib.contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Give a temporary path in the same folder and move it over `path` when the block ends well.
+    """Yield a temporary path beside `path`, of the same suffix, and rename it to `path` when the block ends well.
 
-    Args:
-        path: the file to be written; its folder is made if missing.
-
-    Yields:
-        A path with the same suffix; write the file there.
+    A missing folder is made.
 
     Raises:
         OutputError: the folder cannot be written, or the disk is full.
@@ -57,10 +53,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def scratch_folder(beside: str | os.PathLike[str]) -> Iterator[Path]:
-    """Give a temporary folder beside a file that is going to be written; it goes when the block ends.
-
-    Args:
-        beside: the file; its folder is made if missing.
+    """Yield a temporary folder beside a file that is going to be written, and delete it at the end of the block.
 
     Raises:
         OutputError: the folder cannot be written.

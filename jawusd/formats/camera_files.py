@@ -41,14 +41,11 @@ _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def load_cameras_file(path: str | os.PathLike[str], unit_mm: float = 1.0) -> list[Camera]:
-    """Read cameras of any known kind of calibration.
+    """Read cameras of any known kind of calibration, in the file's order: lengths in mm, OpenCV axes and pixels.
 
     Args:
         path: aniposelib TOML, a COLMAP text model (its folder or one of its files) or nerfstudio's transforms.json.
         unit_mm: length of the file's unit [mm].
-
-    Returns:
-        Cameras in the file's order, lengths in mm, OpenCV axes and pixels.
 
     Raises:
         CalibrationError: a value is missing or wrong, or the camera model is not supported.
@@ -72,13 +69,10 @@ def calibration_files(path: Path) -> list[Path]:
 
 
 def load_colmap(folder: str | os.PathLike[str]) -> list[Camera]:
-    """Read a COLMAP text model.
+    """Read a COLMAP text model; return the cameras by name, in the model's unit.
 
     An image in a folder is named after it (`cam0/0001.png` is cam0), else after its file (`cam0.png`). Several images
     of one camera must share its pose: the cameras of a capture stand still.
-
-    Returns:
-        Cameras by name, in the model's unit.
 
     Raises:
         CalibrationError: see `load_cameras_file`.
@@ -109,10 +103,7 @@ def load_colmap(folder: str | os.PathLike[str]) -> list[Camera]:
 
 
 def load_nerfstudio(path: str | os.PathLike[str]) -> list[Camera]:
-    """Read nerfstudio's transforms.json; names as in `load_colmap`.
-
-    Returns:
-        Cameras by name, in the file's unit before its `applied_scale`.
+    """Read nerfstudio's transforms.json; return the cameras by name, in the file's unit before its `applied_scale`.
 
     Raises:
         CalibrationError: see `load_cameras_file`.

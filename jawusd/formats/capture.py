@@ -219,10 +219,7 @@ class Capture(_Strict):
 
 
 def load_capture(path: str | os.PathLike[str], *, allow_outside: bool = False) -> Capture:
-    """Read a capture description.
-
-    Args:
-        path: `capture.toml`, or the folder that holds it.
+    """Read `capture.toml`, given itself or by its folder; the paths of the capture are absolute.
 
     Raises:
         FormatError: not such a file; the message names the key.

@@ -17,10 +17,7 @@ _TABLE = "bootstrap"
 
 
 def write_bootstrap(path: str | os.PathLike[str], picks: Bootstrap, expected: Bootstrap | None) -> None:
-    """Replace `[bootstrap]` of a capture.toml, or add it.
-
-    Args:
-        expected: the picks that were read from the file before; None if it had none.
+    """Replace `[bootstrap]` of a capture.toml, or add it, if its picks are still the expected ones.
 
     Raises:
         FormatError: the file is not TOML.

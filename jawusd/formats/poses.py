@@ -111,15 +111,12 @@ def _frames(columns: dict[str, list[str]], name: str, path: Path) -> NDArray[np.
 def read_poses(
     path: str | os.PathLike[str], columns: Mapping[str, str] | None = None
 ) -> tuple[NDArray[np.int64], Array]:
-    """Read jaw poses from CSV or JSON.
+    """Read jaw poses from CSV or JSON: frame numbers (F,) and T_skull_mandible (F, 4, 4).
 
     Args:
         path: table with matrix or quaternion columns, see the module; the last matrix row may be left out.
-        columns: how the file calls columns that are not named as in the module, e.g. {"tx": "X"}; without a frame
+        columns: names in the file of columns that are not named as in the module, e.g. {"tx": "X"}; without a frame
             column its rows are then numbered from 0.
-
-    Returns:
-        Frame numbers (F,) and T_skull_mandible (F, 4, 4).
 
     Raises:
         FormatError: columns missing, a value that is not a finite number, or a matrix that is not rigid.
@@ -168,13 +165,7 @@ def _checked_rigid(T: Array, path: Path) -> Array:
 
 
 def read_parameters(path: str | os.PathLike[str]) -> tuple[NDArray[np.int64], Array]:
-    """Read parameters d from CSV or JSON.
-
-    Args:
-        path: table with the columns frame, d1, d2, d3 [mm].
-
-    Returns:
-        Frame numbers (F,) and d [mm] (F, 3).
+    """Read frame numbers (F,) and parameters d [mm] (F, 3) from CSV or JSON.
 
     Raises:
         FormatError: columns missing, or a value that is not a finite number.
@@ -198,11 +189,7 @@ def table_columns(path: str | os.PathLike[str]) -> tuple[str, ...]:
 
 
 def write_poses(path: str | os.PathLike[str], frames: NDArray[np.int64], T: Array) -> None:
-    """Write jaw poses as CSV with matrix columns, atomically and with all digits.
-
-    Args:
-        frames: frame numbers, shape (F,).
-        T: T_skull_mandible, shape (F, 4, 4).
+    """Write T_skull_mandible (F, 4, 4) of frames (F,) as CSV with matrix columns, atomically and with all digits.
 
     Raises:
         OutputError: the file cannot be written.
@@ -222,11 +209,7 @@ def write_parameters(path: str | os.PathLike[str], frames: NDArray[np.int64], d:
 def write_table(
     path: str | os.PathLike[str], header: tuple[str, ...], frames: NDArray[np.int64], values: Array
 ) -> None:
-    """Write a CSV table of one frame column and numbers, atomically.
-
-    Args:
-        header: column names, the frame's first.
-        values: numbers, shape (F, len(header) - 1).
+    """Write frames (F,) and values (F, len(header) - 1) as CSV, atomically; the header's first column is the frame.
 
     Raises:
         OutputError: the file cannot be written.

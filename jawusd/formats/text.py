@@ -8,10 +8,7 @@ from jawusd.errors import FormatError
 
 
 def read_text(path: Path, most_bytes: int, encoding: str = "utf-8") -> str:
-    """Return what a text file holds.
-
-    Args:
-        encoding: "utf-8", or "utf-8-sig" where spreadsheets put a byte order mark in front.
+    """Return what a text file holds; the encoding "utf-8-sig" drops the byte order mark that spreadsheets write.
 
     Raises:
         FormatError: missing, too large or not UTF-8.

@@ -21,10 +21,7 @@ class Sound(NamedTuple):
 
 
 def read_sound(path: str | os.PathLike[str], rate_hz: int) -> Sound | None:
-    """Read the first sound track of a file.
-
-    Returns:
-        The sound, or None if the file carries none.
+    """Return the first sound track of a file, None if it carries none.
 
     Raises:
         CaptureError: the file or its sound cannot be decoded.

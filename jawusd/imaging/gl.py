@@ -138,15 +138,7 @@ class GlCounter:
         *,
         cull: bool = False,
     ) -> None:
-        """Copy the scan to the device; arguments as for `pixel_counts.RasterCounter`.
-
-        Args:
-            context: from `open_context`.
-            vertices: scan coordinates [mm], shape (V, 3).
-            plain_faces: teeth without the boundary of interest, shape (F, 3).
-            boundary_faces: the boundary of interest, shape (B, 3).
-            cull: leave out faces turned away.
-        """
+        """Copy the scan to the device of an `open_context`; other arguments as for `pixel_counts.RasterCounter`."""
         self._gl = context
         self._flags = moderngl.CULL_FACE if cull else moderngl.NOTHING
         self._stack = contextlib.ExitStack()
@@ -193,14 +185,7 @@ class GlCounter:
         self._to_clip = to_clip @ np.asarray(matrices, np.float64)
 
     def counts(self, poses: Array) -> NDArray[np.int64]:
-        """Count the disagreeing pixels of poses, as `pixel_counts.RasterCounter.counts` does.
-
-        Args:
-            poses: T_world_scan, shape (N, 4, 4).
-
-        Returns:
-            E_SP and E_BND, shape (N, C, 2).
-        """
+        """Return the counts of poses, as `pixel_counts.RasterCounter.counts` does, shape (N, C, 2)."""
         width, height, views = self._shown().size
         most = max(1, min(self._most_layers, _MOST_PIXELS // (width * height)) // views)
         parts = [self._count_part(poses[k : k + most]) for k in range(0, len(poses), most)]

@@ -38,12 +38,7 @@ class PngMasks:
     """
 
     def __init__(self, pattern: Path, size_px: tuple[int, int] | None, labels: LabelValues | None = None) -> None:
-        """Find the files.
-
-        Args:
-            pattern: name with one %d or %06d.
-            size_px: (width, height) all must have, None for any.
-            labels: values of label images; None where a picture shows one arch.
+        """Find the files of a pattern with one %d or %06d, all of one (width, height) unless `size_px` is None.
 
         Raises:
             CaptureError: the folder is missing or holds no such file, or all are opaque pictures.

@@ -71,14 +71,9 @@ class MaskReader:
         self._ahead: _Ahead | None = None
 
     def read(self, frame: int) -> MaskImage | None:
-        """Return the mask of a frame of the camera.
+        """Return the mask (h, w) of a frame of the camera, prepared: 255 = tooth, 0 = not, soft edges in between.
 
-        Args:
-            frame: frame number; numbers outside the video are allowed.
-
-        Returns:
-            (h, w) uint8, 255 = tooth, 0 = not (soft edges in between stay), or what `prepare` makes of it; None where
-            the frame is not segmented: no picture, or a black one.
+        None where the frame is not segmented: outside the video, no picture, or a black one.
 
         Raises:
             CaptureError: the picture cannot be decoded, has the wrong size, or is no mask.

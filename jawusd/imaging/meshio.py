@@ -22,14 +22,11 @@ _UNITS_MM = {"metres": 1000.0, "centimetres": 10.0, "inches": 25.4, "micrometres
 
 
 def load_mesh(path: str | os.PathLike[str], kind: Literal["scan", "bone"] = "scan") -> Mesh:
-    """Read a triangle mesh, its vertices in the order of the file.
+    """Read a triangle mesh [mm] from PLY, STL or OBJ, its vertices in the order of the file.
 
     Larger polygons are cut into triangles; STL files, which share no vertices, give three per triangle. Materials and
     textures are not read. A closed mesh that is inside out has its triangles turned; open ones stay as they are.
-
-    Args:
-        path: PLY, STL or OBJ file, lengths in mm.
-        kind: "scan" for teeth, "bone" for mandible and skull; they differ in the size that is believed.
+    The kind, teeth scan or bone, sets which sizes are accepted.
 
     Raises:
         CaptureError: the file is missing or damaged, holds no triangles or coordinates that are not finite, or is of

@@ -38,11 +38,7 @@ class PlacedScan:
 def draw_overlay(
     image: NDArray[np.uint8], camera: Camera, scans: Sequence[PlacedScan], *, fill: float = 0.3
 ) -> NDArray[np.uint8]:
-    """Return a copy of a picture with the visible crowns tinted and outlined.
-
-    Args:
-        image: (h, w, 3) RGB, of the camera's size; recorded pictures are drawn on with their distortion.
-        fill: opacity of the tint, 0 .. 1; the outline is opaque.
+    """Return a copy of a recorded picture (h, w, 3) RGB with the visible crowns tinted (opacity `fill`) and outlined.
 
     Raises:
         ValueError: the picture has not the camera's size.
@@ -72,16 +68,14 @@ def tracking_sheet(
     *,
     tile_px: tuple[int, int] = (480, 270),
 ) -> NDArray[np.uint8]:
-    """Return one picture with a row per frame and a column per camera, cut to the teeth and captioned.
+    """Return one RGB picture with a row per frame and a column per camera, cut to the teeth and captioned.
+
+    A tile is gray where the camera has no picture, without tint where the jaw was lost.
 
     Args:
         frames: frames of the reference camera, all of them in tracks.
         offsets: whole-frame offset per camera name, see `capture.sync`.
         tile_px: (width, height) of a tile.
-
-    Returns:
-        RGB, (rows, columns, 3) uint8. A tile is gray where the camera has no picture, without tint where the jaw
-        was lost.
 
     Raises:
         ValueError: a frame is not in tracks.

@@ -101,14 +101,9 @@ class RasterCounter:
         self._free = np.stack([pack_bits(mask) for mask in free])
 
     def counts(self, poses: Array) -> NDArray[np.int64]:
-        """Count the disagreeing pixels of poses.
+        """Return the disagreeing pixels of T_world_scan (N, 4, 4), shape (N, C, 2).
 
-        Args:
-            poses: T_world_scan, shape (N, 4, 4).
-
-        Returns:
-            Mask pixels that the scan does not cover (E_SP, eq. 8) and boundary pixels outside `free` (E_BND, eq. 9),
-            shape (N, C, 2).
+        They are mask pixels that the scan does not cover (E_SP, eq. 8) and boundary pixels outside `free` (E_BND, 9).
         """
         matrices = np.einsum("cij,njk->ncik", self._matrices, poses).reshape(-1, 3, 4).astype(np.float32)
         counts = np.empty((len(matrices), 2), np.int64)

@@ -21,12 +21,7 @@ class Timeline:
     """
 
     def __init__(self, times_s: Array, fps: float) -> None:
-        """Fit the grid.
-
-        Args:
-            times_s: presentation times after the first picture [s], increasing, shape (n,).
-            fps: the file's own average rate, taken where two pictures do not tell more.
-        """
+        """Fit the grid to presentation times (n,) [s]; the file's average rate is used for one or two pictures."""
         self.numbers, self.rate = _grid(times_s, fps)
         self.count = int(self.numbers[-1]) + 1
         # Of two pictures in one frame, the first counts.

@@ -69,10 +69,7 @@ class VideoWriter:
         return self
 
     def write(self, image: NDArray[np.uint8]) -> None:
-        """Append a picture.
-
-        Args:
-            image: (h, w) gray, or (h, w, 3) RGB for H.264; uint8, 0..255.
+        """Append a picture: (h, w) gray, or (h, w, 3) RGB for H.264; uint8.
 
         Raises:
             ValueError: the picture's shape or type does not fit.

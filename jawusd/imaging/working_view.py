@@ -40,10 +40,7 @@ class WorkingView:
     """
 
     def __init__(self, source: Camera, size_px: tuple[int, int]) -> None:
-        """Prepare the maps.
-
-        Args:
-            size_px: (width, height) of the working pictures, no larger than the recorded ones.
+        """Prepare the maps to working pictures of size_px (width, height).
 
         Raises:
             ValueError: the working size is larger than the recorded one, or empty.
@@ -65,13 +62,9 @@ class WorkingView:
         self._reach_px = float(max(steps)) + 1
 
     def mask(self, mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Bring a mask to the working size; touches only the surroundings of what is not black.
+        """Return the covered share of each working pixel, 255 = all, (h, w), of a recorded mask (H, W).
 
-        Args:
-            mask: (H, W) uint8 as recorded.
-
-        Returns:
-            (h, w) uint8, the share of each working pixel that is covered, 255 = all.
+        Only the surroundings of what is not black are touched.
 
         Raises:
             ValueError: the mask has not the size of the recorded pictures.
@@ -85,13 +78,7 @@ class WorkingView:
         return out
 
     def picture(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Bring a whole picture to the working size.
-
-        Args:
-            image: (H, W) or (H, W, 3) uint8 as recorded.
-
-        Returns:
-            (h, w) or (h, w, 3) uint8; black where the recorded picture has nothing.
+        """Return a recorded picture, (H, W) or (H, W, 3), at the working size; black where nothing was recorded.
 
         Raises:
             ValueError: the picture has not the size of the recorded ones.
@@ -101,14 +88,7 @@ class WorkingView:
         return self._averaged(image, (slice(0, height), slice(0, width)))
 
     def part(self, image: NDArray[np.uint8], window: Slices) -> NDArray[np.uint8]:
-        """Bring a part of a picture to the working size.
-
-        Args:
-            image: (H, W) or (H, W, 3) uint8 as recorded.
-            window: rows and columns of the working picture, with start and stop inside it.
-
-        Returns:
-            That part of what `picture` returns.
+        """Return the part of `picture` at rows and columns whose start and stop lie inside it.
 
         Raises:
             ValueError: the picture has not the size of the recorded ones.

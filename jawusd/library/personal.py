@@ -82,10 +82,9 @@ class PersonalMotion:
 
 
 def leave_one_out(donors: Sequence[Donor], *, closest: bool = False) -> Learned:
-    """Predict every person of a library from the others, and choose how fast likeness counts.
+    """Predict every person of a library from the others, and choose how fast weights fall with landmark distance.
 
     Args:
-        donors: the persons, by different names.
         closest: use the person with the most similar landmarks instead of an average.
 
     Raises:
@@ -117,7 +116,7 @@ def personal_motion(donors: Sequence[Donor], target: Array, learned: Learned) ->
 
     Args:
         target: the person's landmarks with the teeth together [mm], shape (5, 3), in the order of `LANDMARKS`.
-        learned: what `leave_one_out` says of these donors.
+        learned: what `leave_one_out` returns for these donors.
     """
     weights = _weights(donors, target, learned.bandwidth_mm)
     used = [(donor, weight) for donor, weight in zip(donors, weights, strict=True) if weight > 0]

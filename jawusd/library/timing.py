@@ -20,15 +20,10 @@ STILL_MM = 1e-6  # a smaller step of the original has no direction
 
 
 def follow(original: Array, carried: Array, least: float) -> Array:
-    """Return the curve nearest to a carried one that rises and falls where the original does.
+    """Return the curve [mm] (F,) nearest to a carried one that rises and falls where the original (F,) does.
 
     Args:
-        original: values [mm], shape (F,).
-        carried: the curve wanted [mm], shape (F,).
         least: smallest step of the result for a step of 1 mm of the original, > 0: keeps peaks from becoming plateaus.
-
-    Returns:
-        Values [mm], shape (F,).
     """
     steps = np.diff(original)
     still = np.flatnonzero(np.abs(steps) < STILL_MM) + 1

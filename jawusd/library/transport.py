@@ -41,25 +41,17 @@ def condyle_incisor_mm(landmarks: Array) -> float:
 
 
 def landmark_distance_mm(a: Array, b: Array) -> float:
-    """Return how unlike two persons' landmarks are: the rms distance [mm] left by the best rigid fit.
-
-    Args:
-        a: landmarks of one person [mm], shape (5, 3), in any frame.
-        b: landmarks of the other [mm], shape (5, 3).
-    """
+    """Return the rms distance [mm] that the best rigid fit leaves between two persons' landmarks (5, 3) [mm]."""
     left = transform_points(rigid_fit(a, b), a) - b
     return float(np.sqrt((left**2).sum(axis=1).mean()))
 
 
 def displacements(donor: Donor, target: Array, shares: Array) -> Array:
-    """Return how the target's landmarks move when a donor's motion is carried over.
+    """Return how the target's landmarks move when a donor's motion is carried over, target's frame [mm], (K, 5, 3).
 
     Args:
         target: the other person's landmarks with the teeth together [mm], shape (5, 3).
         shares: parameters as shares of the ranges, see `JawRig.normalized`, shape (K, 3).
-
-    Returns:
-        Displacements in the target's frame [mm], shape (K, 5, 3).
     """
     rest = donor.landmarks
     d = donor.rig.denormalized(shares)
@@ -72,15 +64,7 @@ def displacements(donor: Donor, target: Array, shares: Array) -> Array:
 
 
 def poses_of_landmarks(rest: Array, moved: Array) -> Array:
-    """Return the rigid motions that bring landmarks nearest to displaced ones (Kabsch 1976).
-
-    Args:
-        rest: landmarks with the teeth together [mm], shape (P, 3).
-        moved: where they should go [mm], shape (K, P, 3).
-
-    Returns:
-        Motions, shape (K, 4, 4).
-    """
+    """Return the rigid motions (K, 4, 4) that bring landmarks (P, 3) nearest to others (K, P, 3) (Kabsch 1976)."""
     p, q = rest.mean(axis=0), moved.mean(axis=1)
     U, _, Vt = np.linalg.svd(np.swapaxes(moved - q[:, None], 1, 2) @ (rest - p))
     sign = np.ones((len(moved), 3))

@@ -61,13 +61,12 @@ def cut_arches(
     reach_mm: float,
     seeds: Seeds | None = None,
 ) -> NDArray[np.float32]:
-    """Segment a picture; return the shares of both arches, 0 .. 1, shape (2, h, w)
+    """Segment a picture (h, w, 3); return the shares of both arches, 0 .. 1, shape (2, h, w).
 
     Args:
-        rgb: the picture, shape (h, w, 3).
         expected: where the crowns are expected in it.
         reach_mm: how far teeth may lie outside their projection.
-        seeds: what a person said, which no colour overcomes.
+        seeds: what a person drew, which no colour overrides.
     """
     inside = expected.inside_px / px_per_mm
     odds = doubted_odds(rgb, model, config)
@@ -98,12 +97,8 @@ def part_arches(
 ) -> NDArray[np.float32]:
     """Return the shares of both arches, shape (2, h, w), with the border between them drawn by edges among teeth alone.
 
-    Teeth over teeth show a far weaker edge than teeth over lips. Beside the latter it would count for nothing: the
-    border would stay where it was expected, and poses would follow their own prediction.
-
-    Args:
-        shares: of both arches, shape (2, h, w); their sum is kept.
-        rgb, expected, config, px_per_mm: as for `cut_arches`.
+    The sum of both is kept. Teeth over teeth show a far weaker edge than teeth over lips. Beside the latter it would
+    count for nothing: the border would stay where it was expected, and poses would follow their own prediction.
     """
     inside = expected.inside_px / px_per_mm
     teeth = shares.sum(0)

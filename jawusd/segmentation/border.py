@@ -30,20 +30,13 @@ class _Sides:
 def settle_borders(
     shares: NDArray[np.float32], rgb: NDArray[np.uint8], config: SegmentationConfig, px_per_mm: float
 ) -> tuple[NDArray[np.float32], Mask]:
-    """Tell teeth from surroundings once more, along their border, by the colours on either side right there.
+    """Return shares (2, h, w) with soft borders, half at the outline, and where a border would show, shape (h, w).
 
-    Colours learned over the take decide what is tooth; where exactly it ends they decide badly, as the middle between
-    two colours differs from place to place. Fisher's discriminant between the means on both sides, weighed by how much
+    Teeth are told from surroundings once more, along their border, by the colours on either side right there. Colours
+    learned over the take decide what is tooth; where exactly it ends they decide badly, as the middle between two
+    colours differs from place to place. Fisher's discriminant between the means on both sides, weighted by how much
     colours spread on one side, finds it (the local region statistics of Lankton & Tannenbaum 2008). Where the sides do
-    not differ the border stays, and what has such a border most of the way round is no tooth.
-
-    Args:
-        shares: of the upper and lower arch, shape (2, h, w).
-        rgb: the picture, shape (h, w, 3).
-        px_per_mm: resolution of the picture.
-
-    Returns:
-        Shares with soft borders, half at the outline, shape (2, h, w); and where a border would show, shape (h, w).
+    not differ the border stays, and a part with such a border most of the way round is no tooth.
     """
     colours = _blurred(shadeless(rgb), config.border_blur_px)
     band, window = config.border_band_mm * px_per_mm, 2 * round(config.border_side_mm * px_per_mm) + 1

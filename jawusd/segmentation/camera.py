@@ -49,12 +49,7 @@ class CameraSegmenter:
     """
 
     def __init__(self, source: Camera, meshes: Sequence[Mesh], poses: Array, config: SegmentationConfig) -> None:
-        """Prepare for a take.
-
-        Args:
-            meshes: upper and lower teeth scan [mm].
-            poses: T_world_upper, T_world_lower at some time of the take, shape (2, 4, 4).
-        """
+        """Prepare for a take with upper and lower scan; poses (2, 4, 4) are those of both scans in the world at some time."""
         self._config = config
         upper, lower = meshes
         self._scans = ScanSurface.of(upper), ScanSurface.of(lower)
@@ -73,16 +68,12 @@ class CameraSegmenter:
         turn: int,
         keys: Sequence[Key | None] = (None, None),
     ) -> Segment | None:
-        """Segment a picture.
+        """Segment a picture (H, W, 3) RGB as recorded; None if the teeth are out of sight.
 
         Args:
-            image: (H, W, 3) RGB as recorded.
             poses: T_world_upper, T_world_lower as expected, shape (2, 4, 4).
             turn: 0 for predicted poses, then 1 and so on as they get better.
-            keys: what a person drew for each arch, or None.
-
-        Returns:
-            What was found; None if the teeth are out of sight.
+            keys: what a person drew for each arch.
         """
         c = self._config
         window = self._frame.window(image, self._around(poses), c.margin_mm)
@@ -111,18 +102,11 @@ class CameraSegmenter:
         return [self._frame.recorded(mask.astype(np.float32) / 255, segment.window) for mask in segment.masks]
 
     def agreement(self, image: NDArray[np.uint8], guesses: Array) -> Array:
-        """Return how well the colours of a picture agree with crowns in guessed poses, without cutting anything.
+        """Return how well the colours of a picture agree with crowns in guessed poses (N, 2, 4, 4), without cutting.
 
-        The sum over the crowns in sight of the log-odds that colours alone give, at a coarse resolution. Lips may hide
-        crowns, so what does not look like teeth under them counts little; teeth that a guess leaves bare cost it all
-        that they would have counted.
-
-        Args:
-            image: (H, W, 3) RGB as recorded.
-            guesses: T_world_upper, T_world_lower, shape (N, 2, 4, 4).
-
-        Returns:
-            Log-odds summed [working pixels], shape (N,); zeros before any colours were learned.
+        The sum [working pixels] over the crowns in sight of the log-odds that colours alone give, at a coarse
+        resolution, shape (N,); zeros before any colours were learned. Lips may hide crowns, so pixels under them that
+        do not look like teeth count little; teeth that a guess leaves bare cost it all that they would have counted.
         """
         c = self._config
         around = np.concatenate([self._around(poses) for poses in guesses])
@@ -142,11 +126,7 @@ class CameraSegmenter:
     def study(self, image: NDArray[np.uint8], poses: Array, keys: Sequence[Key | None]) -> Example | None:
         """Learn the colours of a picture for which a person drew, and return it as an example.
 
-        Args:
-            image, poses, keys: as for `segment`, the poses aligned.
-
-        Returns:
-            The picture with its masks; None if they are not finished, or the teeth out of sight.
+        The poses are aligned ones. None if the masks are not finished, or the teeth out of sight.
         """
         window = self._frame.window(image, self._around(poses), self._config.margin_mm)
         if window is None:

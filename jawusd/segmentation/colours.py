@@ -31,25 +31,14 @@ class ColourModel:
     """
 
     def __init__(self, memory: float) -> None:
-        """Start without any colours.
-
-        Args:
-            memory: frames over which colours are remembered.
-        """
+        """Start without any colours; `memory` is the number of frames over which they are remembered."""
         self._keep = 1.0 - 1.0 / memory
         self._under = np.zeros((_BINS,) * 3)
         self._beyond = np.zeros((_BINS,) * 3)
         self._table: NDArray[np.float32] | None = None
 
     def learn(self, rgb: NDArray[np.uint8], under: Mask, beyond: Mask, weight: float = 1.0) -> None:
-        """Update the histograms with a picture.
-
-        Args:
-            rgb: (h, w, 3) 8-bit RGB.
-            under: pixels well inside projected crowns, shape (h, w).
-            beyond: pixels well outside all of them, shape (h, w).
-            weight: of the picture [frames].
-        """
+        """Update the histograms with a picture (h, w, 3): pixels (h, w) well inside and outside projected crowns."""
         index = _bins(rgb)
         for counts, where in ((self._under, under), (self._beyond, beyond)):
             new = np.bincount(index[where], minlength=_BINS**3).reshape(counts.shape)

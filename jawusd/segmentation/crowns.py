@@ -45,13 +45,7 @@ class Expectation:
 
 
 def expect_crowns(scans: tuple[ScanSurface, ScanSurface], poses: Array, camera: Camera) -> Expectation:
-    """Draw both arches as a pinhole camera sees them.
-
-    Args:
-        scans: upper and lower arch.
-        poses: T_world_upper, T_world_lower, shape (2, 4, 4).
-        camera: camera of the working picture, without distortion.
-    """
+    """Draw both arches in poses (2, 4, 4), T_world_upper and T_world_lower, as a pinhole camera sees them."""
     labels = draw_crowns(scans, poses, camera)
     return Expectation(labels, np.stack([_signed_distance(labels == label) for label in (UPPER, LOWER)]))
 

@@ -83,18 +83,16 @@ def cut_three_ways(
     free: Mask,
     steps: int,
 ) -> NDArray[np.float32]:
-    """Minimise label costs plus the weighted length of the borders between labels.
+    """Return the shares of the labels, not negative, sum 1, shape (3, h, w), of the cheapest cut.
 
-    The convex relaxation of the Potts model with separate labels (Zach et al. 2008), links to the right and down.
+    The cost is that of the labels plus the weighted length of the borders between them: the convex relaxation of the
+    Potts model with separate labels (Zach et al. 2008), links to the right and down.
 
     Args:
         cost: cost of each label per pixel, shape (3, h, w).
         edge: price of a border between a pixel and its right and lower neighbour, shape (2, h, w).
         start: first guess of the shares, shape (3, h, w).
         free: pixels whose label is open, shape (h, w); the others keep the first guess.
-
-    Returns:
-        Shares of the labels, not negative, sum 1, shape (3, h, w).
     """
     u = np.ascontiguousarray(start, np.float32).copy()
     spans = np.zeros((cost.shape[1], 2), np.int64)

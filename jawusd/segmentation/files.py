@@ -58,11 +58,7 @@ class KeyMasks:
     """
 
     def __init__(self, folder: Path | None, sizes_px: dict[str, tuple[int, int]]) -> None:
-        """Find the pictures.
-
-        Args:
-            folder: holds CAMERA/upper/%06d.png and CAMERA/lower/%06d.png, any of them; None for none at all.
-            sizes_px: (width, height) of the pictures of every camera.
+        """Find the pictures CAMERA/upper/%06d.png and CAMERA/lower/%06d.png of a folder; None holds none.
 
         Raises:
             CaptureError: the folder is missing or holds nothing for these cameras.

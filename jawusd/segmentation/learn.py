@@ -60,12 +60,7 @@ def cut_picture(
 ) -> tuple[NDArray[np.float32], Mask]:
     """Cut both arches out of a picture, settle their borders and keep what a person drew.
 
-    Args:
-        window, expected: the picture, and where crowns are expected in it.
-        reach_mm: how far teeth may lie outside their projection.
-
-    Returns:
-        Shares of both arches, shape (2, h, w), and where borders show, shape (h, w).
+    Returns the shares of both arches, shape (2, h, w), and where borders show, shape (h, w).
     """
     shares = cut_arches(window.rgb, expected, colours, config, px_per_mm, reach_mm, seeds)
     shares, clear = settle_borders(shares, window.rgb, config, px_per_mm)
@@ -75,11 +70,7 @@ def cut_picture(
 
 
 def learn_numbers(examples: Sequence[Example], config: SegmentationConfig) -> tuple[SegmentationConfig, LearnedNumbers]:
-    """Choose the numbers with which the masks agree best with drawn ones, one number after the other, and what changed.
-
-    Args:
-        examples: pictures with finished masks.
-    """
+    """Choose the numbers, one after the other, whose masks agree best with drawn ones; return what changed too."""
     best, cuts = config, [example.cut(config) for example in examples]
     before = least = _disagreement(examples, cuts)
     for trial in _trials(config):

@@ -28,12 +28,7 @@ class PictureFrame:
     """Cut windows around the teeth out of one camera's pictures."""
 
     def __init__(self, source: Camera, centre_world: Array, px_per_mm: float) -> None:
-        """Choose the working size.
-
-        Args:
-            centre_world: where the teeth are [mm], shape (3,).
-            px_per_mm: resolution there; pictures are never enlarged.
-        """
+        """Choose the working size by the resolution at the teeth, at centre_world (3,) [mm]; never enlarge."""
         recorded = float(np.sqrt(source.K[0, 0] * source.K[1, 1]) / source.depth(centre_world))
         scale = min(1.0, px_per_mm / recorded)
         self.px_per_mm = recorded * scale
@@ -43,12 +38,7 @@ class PictureFrame:
         self._back = _positions(source, self._working.camera)
 
     def window(self, image: NDArray[np.uint8], points_world: Array, margin_mm: float) -> Window | None:
-        """Return what surrounds some world points [mm], shape (N, 3), in a recorded RGB picture; None if out of sight.
-
-        Args:
-            image: (H, W, 3) RGB as recorded.
-            margin_mm: left around them.
-        """
+        """Return what surrounds world points (N, 3) [mm] in a recorded RGB picture (H, W, 3); None if out of sight."""
         camera = self._working.camera
         seen = camera.project_pinhole(points_world[camera.depth(points_world) > 0])
         if not len(seen):

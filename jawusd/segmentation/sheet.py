@@ -21,10 +21,7 @@ _MARGIN = 0.15  # of the teeth's extent, left around them
 
 
 def write_sheet(path: Path, shown: Sequence[tuple[str, int, str]], videos: Mapping[str, Path], folder: Path) -> None:
-    """Write a PNG with a tile per mask, upper and lower arch outlined.
-
-    Args:
-        shown: camera, its own frame and a remark, tile after tile.
+    """Write a PNG with a tile per (camera, its own frame, remark), upper and lower arch outlined.
 
     Raises:
         CaptureError: a picture or mask cannot be decoded.

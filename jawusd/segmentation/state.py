@@ -37,13 +37,9 @@ class ColourStates:
         write_bytes_atomic(self._folder / _FILES[frame % 2], buffer.getvalue())
 
     def take_up(self, done: int, step: int) -> int | None:
-        """Restore the latest colours saved up to a frame that is done.
+        """Restore the latest colours saved up to a frame that is done; step is 1 or -1, forwards or backwards.
 
-        Args:
-            step: 1 or -1, forwards or backwards.
-
-        Returns:
-            The frame after which they were saved; None if there are none to resume from.
+        Returns the frame after which they were saved; None if there are none to resume from.
         """
         for frame in (done, done - step):
             path = self._folder / _FILES[frame % 2]
