@@ -49,7 +49,7 @@ class CameraSegmenter:
     """
 
     def __init__(self, source: Camera, meshes: Sequence[Mesh], poses: Array, config: SegmentationConfig) -> None:
-        """Prepare for a take with upper and lower scan; poses (2, 4, 4) are those of both scans in the world at some time."""
+        """Prepare for a take with the upper and lower scan, and their poses (2, 4, 4) in the world at some time."""
         self._config = config
         upper, lower = meshes
         self._scans = ScanSurface.of(upper), ScanSurface.of(lower)
