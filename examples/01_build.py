@@ -8,7 +8,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from jawusd.pipeline.build import BuildOptions, build_rig
+from jawusd.pipeline.build import BuildOptions, build
 
 HOLDOUT_LIMIT_MM = 1.0  # distance of the farthest mandible vertex, mean over poses the model was not fitted to
 
@@ -26,7 +26,7 @@ def main() -> int:
     parser.add_argument("-o", "--out", type=Path, default=Path("out"))
     parser.add_argument("--resume", action="store_true", help="Continue an earlier build in the folder.")
     options = parser.parse_args()
-    summary = build_rig(options.capture, options.out, BuildOptions(resume=options.resume), show)
+    summary = build(options.capture, options.out, BuildOptions(resume=options.resume), show)
     tracked, fitted = summary["track"], summary["fit"]
     print(f"tracked {tracked['tracked']} of {tracked['frames']} frames, lost {tracked['lost'] or 'none'}")
     for name, (low, high) in fitted["ranges_mm"].items():

@@ -16,9 +16,9 @@ import numpy as np
 import jawusd
 from jawusd.formats.capture import load_capture
 from jawusd.geometry import make_transform, so3_exp, transform_points, wxyz_from_matrix
-from jawusd.pipeline.stages import bake_meshes, fit_subject, read_motion
-from jawusd.pipeline.subject import subject_of_capture
-from jawusd.pipeline.trajectories import TrajectoryOptions
+from jawusd.pipeline.bake import bake_subject
+from jawusd.pipeline.fit import TrajectoryOptions, fit_subject, read_motion
+from jawusd.pipeline.prepare import subject_of_capture
 
 CAPTURE = Path(__file__).parent / "capture"
 COLUMNS = {"frame": "Frame", "tx": "X", "ty": "Y", "tz": "Z", "qw": "W", "qx": "I", "qy": "J", "qz": "K"}
@@ -37,10 +37,6 @@ def write_clip_table(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return frames, T
 
 
-def quiet(stage: str, done: int, total: int) -> None:
-    """Say nothing of the progress."""
-
-
 def main() -> None:
     """Write the table, import it, fit, bake, compare."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -52,11 +48,11 @@ def main() -> None:
 
     motion = read_motion(table, TrajectoryOptions(columns=COLUMNS, length_unit="m", rest_frame=REST_FRAME))
     subject = subject_of_capture(load_capture(CAPTURE))
-    model = fit_subject(subject, motion, "anchored", quiet)
-    bake_meshes(subject.bones, subject.name, subject.fps, model, options.out, quiet)
+    model = fit_subject(subject, motion)
+    bake_subject(subject, model, options.out)
     rig = jawusd.load(options.out / "actor.usda")
     print(f"{table}: {len(frames)} poses; opening up to {rig.arrays['d_range'][0, 1]:.1f} mm")
-    points = subject.bones["mandible"].vertices[::20]
+    points = subject.meshes["mandible"].vertices[::20]
     away = transform_points(rig.pose(rig.encode(T_true)[0]), points) - transform_points(T_true, points)
     error_mm = np.linalg.norm(away, axis=-1).mean(axis=1)
     print(f"rig against the truth: {error_mm.mean():.2f} mm over the mandible, worst frame {error_mm.max():.2f}")

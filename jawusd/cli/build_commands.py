@@ -1,4 +1,4 @@
-"""Commands from a capture to a rig: build and its single stages."""
+"""Commands from a capture to a rig: build, of one capture or many, and its single stages."""
 
 from __future__ import annotations
 
@@ -8,36 +8,27 @@ from typing import Annotated
 
 import typer
 
-from jawusd.cli.output import emit, progress, refuse_existing
-from jawusd.cli.subject_options import (
+from jawusd.cli.options import (
+    CaptureArg,
     CaptureOption,
     ColumnsOption,
+    Force,
     GroupOption,
     InvertOption,
+    Json,
     LandmarksOption,
     LengthUnit,
     LowerOption,
     MandibleOption,
+    Method,
+    Outside,
     RestOption,
     UnitOption,
     UpperOption,
     subject_given,
     trajectory_options,
 )
-
-Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
-Force = Annotated[bool, typer.Option("--force", help="Overwrite an existing output.")]
-Outside = Annotated[bool, typer.Option("--allow-outside", help="Let paths in the capture leave its folder.")]
-CaptureArg = Annotated[Path, typer.Argument(help="capture.toml, or the folder that holds it.", show_default=False)]
-
-
-class Method(StrEnum):
-    """Name the jaw models."""
-
-    anchored = "anchored"
-    additive = "additive"
-    paper = "paper"
-    pca = "pca"
+from jawusd.cli.output import emit, progress, refuse_existing
 
 
 class Solver(StrEnum):
@@ -58,13 +49,7 @@ SolverOption = Annotated[Solver, typer.Option(help="How to track: paper is slowe
 BackendOption = Annotated[Backend, typer.Option(help="Where --solver paper draws; gl needs OpenGL 4.3 (EGL).")]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands of this module."""
-    app.command("build")(build)
-    app.command("track")(track)
-    app.command("fit")(fit)
-    app.command("bake")(bake)
-    app.command("demo")(demo)
+Jobs = Annotated[int, typer.Option(min=1, max=64, help="Threads that draw and compare.")]
 
 
 def build(
@@ -75,21 +60,20 @@ def build(
     backend: BackendOption = Backend.cpu,
     resume: Annotated[bool, typer.Option("--resume", help="Continue an earlier build in this folder.")] = False,
     fresh: Annotated[bool, typer.Option("--fresh", help="Delete an earlier build in this folder first.")] = False,
-    jobs: Annotated[int, typer.Option(min=1, max=64, help="Threads that draw and compare.")] = 2,
+    jobs: Jobs = 2,
     allow_outside: Outside = False,
     as_json: Json = False,
 ) -> None:
     """Turn a capture into a rig: calibrate and segment if need be, sync, track, fit, track hard frames again, bake."""
-    from jawusd.pipeline.build import BuildOptions, build_rig
-    from jawusd.pipeline.summary import build_lines
+    from jawusd.pipeline import build as stages
 
     _check_backend(solver, backend)
-    options = BuildOptions(
+    options = stages.BuildOptions(
         model.value, solver.value, backend.value, jobs=jobs, resume=resume, fresh=fresh, allow_outside=allow_outside
     )
     with progress() as report:
-        summary = build_rig(capture, out, options, report)
-    emit(summary, as_json, lambda: build_lines(summary))
+        summary = stages.build(capture, out, options, report)
+    emit(summary, as_json, lambda: stages.build_lines(summary))
 
 
 def track(
@@ -104,34 +88,38 @@ def track(
     overlay: Annotated[
         Path | None, typer.Option(help="Folder for videos with the tracked scans over the footage.", show_default=False)
     ] = None,
-    jobs: Annotated[int, typer.Option(min=1, max=64, help="Threads that draw and compare.")] = 2,
+    jobs: Jobs = 2,
     force: Force = False,
     allow_outside: Outside = False,
     as_json: Json = False,
 ) -> None:
     """Track both rows of teeth through the masks."""
     from jawusd.formats.model import load_model
-    from jawusd.formats.tracks import save_tracks
-    from jawusd.pipeline.overlay import overlay_files, write_overlay
+    from jawusd.pipeline import track as stage
+    from jawusd.pipeline.media import overlay_files
     from jawusd.pipeline.prepare import open_capture
-    from jawusd.pipeline.stages import aid_teeth, sync_cameras, track_teeth
-    from jawusd.pipeline.summary import track_lines, track_summary
 
     _check_backend(solver, backend)
     refuse_existing(out, force)
     model = load_model(prior) if prior else None
     opened = open_capture(capture, allow_outside=allow_outside)
-    for path in overlay_files(opened, overlay) if overlay else ():
+    drawn = overlay_files(opened, overlay) if overlay else []
+    for path in drawn:
         refuse_existing(path, force)
     with progress() as report:
-        offsets = sync_cameras(opened, report)["offsets"]
-        tracks = track_teeth(opened, offsets, jobs, report, solver.value, backend.value)
-        if model is not None:
-            tracks = aid_teeth(opened, offsets, tracks, model, jobs, report)
-        save_tracks(out, tracks)
-        drawn = write_overlay(opened, offsets, tracks, overlay, report) if overlay else []
-    summary = {**track_summary(tracks), "file": str(out), "overlay": [str(path) for path in drawn]}
-    emit(summary, as_json, lambda: track_lines(summary))
+        tracks = stage.track(
+            opened,
+            out,
+            solver=solver.value,
+            backend=backend.value,
+            model=model,
+            overlay=overlay,
+            jobs=jobs,
+            progress=report,
+        )
+    summary = stage.track_summary(tracks)
+    found = {**summary, "file": str(out), "overlay": [str(path) for path in drawn]}
+    emit(found, as_json, lambda: stage.track_lines(summary))
 
 
 def _check_backend(solver: Solver, backend: Backend) -> None:
@@ -162,17 +150,17 @@ def fit(
 ) -> None:
     """Fit a three-parameter jaw model to tracked or given poses."""
     from jawusd.formats.model import save_model
-    from jawusd.pipeline.stages import about, fit_subject, read_motion
-    from jawusd.pipeline.summary import fit_lines, fit_summary
+    from jawusd.pipeline.fit import fit_lines, fit_subject, fit_summary, read_motion
+    from jawusd.pipeline.prepare import naming_file
 
     refuse_existing(out, force)
     motion = read_motion(poses, trajectory_options(columns, length_unit, invert, rest_frame, group))
     subject = subject_given(poses.stem, capture, upper_teeth, lower_teeth, mandible, landmarks, allow_outside)
-    with progress() as report, about(poses):
+    with progress() as report, naming_file(poses):
         fitted = fit_subject(subject, motion, model.value, report)
     save_model(out, fitted)
-    summary = {**fit_summary(fitted), "file": str(out)}
-    emit(summary, as_json, lambda: fit_lines(summary))
+    summary = fit_summary(fitted)
+    emit({**summary, "file": str(out)}, as_json, lambda: fit_lines(summary))
 
 
 def bake(
@@ -190,8 +178,7 @@ def bake(
 ) -> None:
     """Write the OpenUSD rig of a model, with the meshes of a capture or loose scans."""
     from jawusd.formats.model import load_model
-    from jawusd.pipeline.stages import bake_meshes
-    from jawusd.pipeline.subject import check_same_jaw
+    from jawusd.pipeline.bake import bake_subject, check_same_jaw
 
     refuse_existing(out / "actor.usda", force)
     loaded = load_model(model)
@@ -199,7 +186,7 @@ def bake(
     subject = subject_given(name, capture, upper_teeth, lower_teeth, mandible, None, allow_outside)
     check_same_jaw(subject, loaded)
     with progress() as report:
-        files = bake_meshes(subject.bones, subject.name, subject.fps or fps, loaded, out, report, table)
+        files = bake_subject(subject, loaded, out, report, fps=fps, table_size=table)
     emit({"files": files}, as_json, lambda: [str(path) for path in files])
 
 
@@ -210,9 +197,67 @@ def demo(
     force: Force = False,
 ) -> None:
     """Render a synthetic capture with known truth: a made-up person in front of three cameras."""
-    from jawusd.pipeline.stages import write_demo_capture
+    from functools import partial
+
+    from jawusd.errors import explain_missing_packages
+
+    with explain_missing_packages("demo"):
+        from jawusd.synthetic.capture_writer import DemoConfig, write_demo
 
     refuse_existing(out / "capture.toml", force)
     with progress() as report:
-        path = write_demo_capture(out, seed, frames, report)
-    typer.echo(str(path))
+        write_demo(out, DemoConfig(seed=seed, frames=frames), progress=partial(report, "demo"))
+    typer.echo(str(out / "capture.toml"))
+
+
+def build_many(
+    captures: Annotated[
+        Path,
+        typer.Argument(
+            metavar="LIST", help="Text with one capture a line: PATH, or PATH, NAME of its folder.", show_default=False
+        ),
+    ],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the rigs' folders.", show_default=False)],
+    model: Annotated[Method, typer.Option(help="Form of the jaw models.")] = Method.anchored,
+    cluster: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS",
+            help="Dask scheduler to use, as tcp://host:8786; its workers need jawusd and the same paths. "
+            "Without: processes of this machine.",
+            show_default=False,
+        ),
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(min=1, max=1024, help="Processes of this machine; one per core else.", show_default=False),
+    ] = None,
+    retries: Annotated[
+        int, typer.Option(min=0, max=100, help="How often to start over when a process of this machine dies.")
+    ] = 3,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue earlier builds in this folder.")] = False,
+    fresh: Annotated[bool, typer.Option("--fresh", help="Delete earlier builds in this folder first.")] = False,
+    jobs: Annotated[int, typer.Option(min=1, max=64, help="Threads of each build.")] = 1,
+    allow_outside: Outside = False,
+    as_json: Json = False,
+) -> None:
+    """Build many captures, one process each; one that fails stops no other. Exit code 1 if any failed."""
+    from dataclasses import asdict
+
+    from jawusd.formats.capture_list import load_capture_list
+    from jawusd.pipeline import many
+    from jawusd.pipeline.build import BuildOptions
+
+    if cluster is not None and workers is not None:
+        raise typer.BadParameter("--workers are processes of this machine; a --cluster has its own.")
+    build = BuildOptions(model.value, jobs=jobs, resume=resume, fresh=fresh, allow_outside=allow_outside)
+    outcomes = many.build_many(
+        load_capture_list(captures),
+        out,
+        many.ManyOptions(build, cluster, workers, retries),
+        lambda line: typer.echo(line, err=True),
+    )
+    data = {"folder": str(out), "builds": [asdict(outcome) for outcome in outcomes]}
+    emit(data, as_json, lambda: many.outcome_lines(outcomes))
+    if any(outcome.status == many.FAILED for outcome in outcomes):
+        raise typer.Exit(1)

@@ -1,21 +1,19 @@
-"""Commands that bring the cameras of a capture together: calibrate and sync."""
+"""Commands on the footage of a capture: calibrate, sync, segment and plates."""
 
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from jawusd.cli.build_commands import CaptureArg, Force, Json, Outside
+from jawusd.cli.options import CaptureArg, Force, Json, Outside
 from jawusd.cli.output import emit, plain, progress, refuse_existing
 
-
-def register(app: typer.Typer) -> None:
-    """Add the commands of this module."""
-    app.command("calibrate")(calibrate)
-    app.command("sync")(sync)
+if TYPE_CHECKING:
+    from jawusd.pipeline.calibrate import SyncResult
 
 
 def calibrate(
@@ -30,7 +28,7 @@ def calibrate(
 ) -> None:
     """Calibrate the cameras from clips of a chessboard or ChArUco board, and say how far the result can be trusted."""
     from jawusd.formats.atomic import write_text_atomic
-    from jawusd.pipeline.calibration import calibrate_boards, calibration_lines
+    from jawusd.pipeline.calibrate import calibrate_boards, calibration_lines
     from jawusd.pipeline.prepare import open_capture
 
     for path in (out, report_file):
@@ -38,10 +36,11 @@ def calibrate(
             refuse_existing(path, force)
     opened = open_capture(capture, allow_outside=allow_outside)
     with progress() as report:
-        summary = {**calibrate_boards(opened, out, report), "file": str(out)}
+        summary = calibrate_boards(opened, out, report)
+    found = {**summary, "file": str(out)}
     if report_file is not None:
-        write_text_atomic(report_file, json.dumps(plain(summary), indent=1) + "\n")
-    emit(summary, as_json, lambda: [*calibration_lines(summary), str(out)])
+        write_text_atomic(report_file, json.dumps(plain(found), indent=1) + "\n")
+    emit(found, as_json, lambda: [*calibration_lines(summary), str(out)])
 
 
 def sync(
@@ -65,9 +64,15 @@ def sync(
 ) -> None:
     """Find the frame offsets between cameras from light flashes, else from their sound."""
     from jawusd.errors import SyncError
+    from jawusd.pipeline.calibrate import (
+        PLOT_SUFFIXES,
+        light_curves,
+        sync_cameras,
+        sync_videos,
+        write_light_curves,
+        write_sync_plot,
+    )
     from jawusd.pipeline.prepare import open_capture
-    from jawusd.pipeline.stages import sync_cameras, sync_videos
-    from jawusd.pipeline.sync_files import PLOT_SUFFIXES, light_curves, write_light_curves, write_sync_plot
 
     if plot is not None and plot.suffix.lower() not in PLOT_SUFFIXES:
         raise typer.BadParameter(f"--plot {plot} must end in {' or '.join(PLOT_SUFFIXES)}.")
@@ -95,9 +100,9 @@ def sync(
             write_light_curves(curves, found)
         if plot is not None:
             write_sync_plot(plot, found, result)
-    if failure is not None:
-        raise failure
-    emit(result, as_json, lambda: _sync_lines(result))
+    if result is None:
+        raise failure or SyncError("the cameras could not be aligned")
+    emit(result, as_json, partial(_sync_lines, result))
 
 
 def _named(clips: list[Path]) -> dict[str, Path]:
@@ -109,10 +114,83 @@ def _named(clips: list[Path]) -> dict[str, Path]:
     return named
 
 
-def _sync_lines(result: dict) -> list[str]:
+def _sync_lines(result: SyncResult) -> list[str]:
     exact, sure = result.get("exact_frames", {}), result.get("confidence", {})
     lines = [f"by {result['method']}:"]
     for name, offset in result["offsets"].items():
         more = f" (exactly {exact[name]:+.2f}, confidence {sure[name]:.2f})" if name in exact else ""
         lines.append(f"  {name}: {offset:+d} frames{more}")
     return lines + [f"  note: {note}" for note in result.get("notes", [])]
+
+
+def segment(
+    capture: CaptureArg,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the masks.")] = Path("masks"),
+    keys: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder with what you drew for some frames: CAMERA/upper/000123.png, CAMERA/lower/000123.png. "
+            "Finished masks, 255 on teeth and 0 elsewhere, also teach how you draw; "
+            "or strokes: 255 on teeth, 0 on anything else, 128 where you say nothing.",
+            show_default=False,
+        ),
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Keep the frames finished before.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite existing masks.")] = False,
+    jobs: Annotated[int, typer.Option(min=1, max=64, help="Threads that segment and align.")] = 2,
+    allow_outside: Outside = False,
+    as_json: Json = False,
+) -> None:
+    """Make masks of both rows of teeth from the videos, starting from the picks."""
+    from jawusd.pipeline.calibrate import sync_cameras
+    from jawusd.pipeline.prepare import open_capture
+    from jawusd.pipeline.segment import SegmentOptions, segment_teeth
+    from jawusd.pipeline.segment_record import RECORD, segment_lines, write_summary
+
+    if not resume:
+        _refuse_masks(out, out / RECORD, force)
+    opened = open_capture(capture, allow_outside=allow_outside)
+    with progress() as report:
+        offsets = sync_cameras(opened, report)["offsets"]
+        entries = segment_teeth(opened, offsets, out, SegmentOptions(keys, resume, jobs), report)
+        summary = write_summary(opened, entries, out)
+    emit(summary, as_json, lambda: segment_lines(summary))
+
+
+def _refuse_masks(folder: Path, record: Path, force: bool) -> None:
+    """Refuse a folder that holds anything, unless forced; the masks in it may be drawn by hand.
+
+    Raises:
+        OutputError: it does.
+    """
+    from jawusd.errors import OutputError
+
+    if force or not folder.exists() or not any(folder.iterdir()):
+        return
+    hint = "Name another folder, or overwrite with --force."
+    if record.exists():
+        hint = "Continue with --resume, overwrite with --force, or name another folder."
+    raise OutputError("exists and is not empty.", path=folder, hint=hint)
+
+
+def plates(
+    capture: CaptureArg,
+    rig: Annotated[Path, typer.Argument(help="Folder of the rig built from it.", show_default=False)],
+    force: Force = False,
+    allow_outside: Outside = False,
+    as_json: Json = False,
+) -> None:
+    """Write the footage without lens distortion where the rig's cameras.usda says, numbered by its time codes."""
+    from jawusd.formats.tracks import load_tracks
+    from jawusd.pipeline.calibrate import sync_cameras
+    from jawusd.pipeline.media import write_plates
+    from jawusd.pipeline.prepare import open_capture
+
+    refuse_existing(rig / "plates", force)
+    frames = load_tracks(rig / "tracks.npz").frames
+    opened = open_capture(capture, allow_outside=allow_outside)
+    with progress() as report:
+        offsets = sync_cameras(opened, report)["offsets"]
+        patterns = write_plates(opened, offsets, frames, rig, report)
+    found = {"folder": str(rig), "frames": [int(frames[0]), int(frames[-1])], "plates": patterns}
+    emit(found, as_json, lambda: [str(rig / pattern) for pattern in patterns])

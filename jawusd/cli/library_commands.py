@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from jawusd.cli.options import Force, Json
 from jawusd.cli.output import emit, progress, refuse_existing
 
 if TYPE_CHECKING:
     from jawusd.library.index import Entry, Library
-
-Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
-Force = Annotated[bool, typer.Option("--force", help="Overwrite an existing output.")]
 
 
 class Use(StrEnum):
@@ -22,12 +21,6 @@ class Use(StrEnum):
 
     average = "average"
     closest = "closest"
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands of this module."""
-    app.command("retarget")(retarget)
-    app.command("library")(library)
 
 
 def retarget(
@@ -53,10 +46,10 @@ def retarget(
     as_json: Json = False,
 ) -> None:
     """Carry a motion to another rig, or make a rig for a person from landmarks and a library."""
-    moving, person = (anim, source, target), (landmarks, library_folder)
-    if all(moving) and not any(person):
+    others = (landmarks, library_folder)
+    if anim and source and target and not any(others):
         _retarget_motion(anim, source, target, fps, out or Path("retargeted.usdc"), force, as_json)
-    elif all(person) and not any((*moving, fps)):
+    elif landmarks and library_folder and not any((anim, source, target, fps)):
         _personal(landmarks, library_folder, use, out or Path("model.npz"), force, as_json)
     else:
         raise typer.BadParameter("give either ANIM, --from and --to, or --landmarks and --library.")
@@ -78,12 +71,12 @@ def _retarget_motion(
     motion, report = carried_over(source, anim, taker)
     rate = fps or motion.fps or describe(target)["fps"]
     write_animation(out, target, motion.frames, motion.d, rate, rig=taker)
-    result = {"file": str(out), "fps": rate, **report}
-    emit(result, as_json, lambda: carried_over_lines(result))
+    emit({"file": str(out), "fps": rate, **report}, as_json, lambda: carried_over_lines(report, out, rate))
 
 
 def _personal(landmarks: Path, folder: Path, use: Use, out: Path, force: bool, as_json: bool) -> None:
     from jawusd.formats.model import save_model
+    from jawusd.pipeline.fit import fit_summary
     from jawusd.pipeline.library import open_library, personal_rig
 
     refuse_existing(out, force)
@@ -91,25 +84,18 @@ def _personal(landmarks: Path, folder: Path, use: Use, out: Path, force: bool, a
     with progress() as report:
         made = personal_rig(landmarks, opened, closest=use is Use.closest, name=landmarks.stem, progress=report)
     save_model(out, made.model)
-    meta = made.model.meta
-    result = {
-        "file": str(out),
-        "use": use.value,
-        **meta["personal"],
-        "ranges_mm": meta["ranges_mm"],
-        "not_used": [*made.left_out, *opened.skipped],
-        "warnings": meta["warnings"],
-    }
-    emit(result, as_json, lambda: _personal_lines(result))
+    known, weights = fit_summary(made.model), made.motion.weights
+    ranges, warnings, not_used = known["ranges_mm"], known["warnings"], [*made.left_out, *opened.skipped]
 
+    def lines() -> list[str]:
+        found = [str(out), *(f"  {name}: {low:.1f} .. {high:.1f} mm" for name, (low, high) in ranges.items())]
+        heaviest = sorted(weights.items(), key=lambda item: -item[1])
+        found += [f"  from {name}: {weight:.0%}" for name, weight in heaviest]
+        found += [f"  not used: {name}" for name in not_used]
+        return found + [f"  {warning['code']}: {warning['message']}" for warning in warnings]
 
-def _personal_lines(result: dict[str, Any]) -> list[str]:
-    lines = [str(result["file"])]
-    lines += [f"  {name}: {low:.1f} .. {high:.1f} mm" for name, (low, high) in result["ranges_mm"].items()]
-    heaviest = sorted(result["weights"].items(), key=lambda item: -item[1])
-    lines += [f"  from {name}: {weight:.0%}" for name, weight in heaviest]
-    lines += [f"  not used: {name}" for name in result["not_used"]]
-    return lines + [f"  {warning['code']}: {warning['message']}" for warning in result["warnings"]]
+    rest = {"ranges_mm": ranges, "not_used": not_used, "warnings": warnings}
+    emit({"file": str(out), "use": use.value, **made.header, **rest}, as_json, lines)
 
 
 def library(
@@ -126,6 +112,8 @@ def library(
     as_json: Json = False,
 ) -> None:
     """Keep many actors: bring the index library.json up to date, list, search, compare and plot."""
+    from dataclasses import asdict
+
     from jawusd.pipeline.library import add_rig, open_library, plot_ranges
 
     if compare is not None and (search, like, plot) != (None, None, None):
@@ -137,45 +125,38 @@ def library(
     opened = open_library(folder)
     if compare is not None:
         first, second = (opened.find(who) for who in compare)
-        compared = _compared(first, second)
-        emit(compared, as_json, lambda: _compare_lines(compared))
+        _compare(first, second, as_json)
         return
-    listed = _listed(opened, search, like)
-    listed["plots"] = [] if plot is None else [str(path) for path in plot_ranges(listed["rigs"], plot, force)]
-    emit(listed, as_json, lambda: _library_lines(listed))
-
-
-def _listed(opened: Library, search: str | None, like: Path | None) -> dict[str, Any]:
-    from dataclasses import asdict
-
-    rigs = [asdict(entry) for entry in (opened.entries if search is None else opened.search(search))]
+    entries = opened.entries if search is None else opened.search(search)
+    apart_mm: dict[str, float] = {}
     if like is not None:
         from jawusd.formats.landmarks import load_landmarks
         from jawusd.library.transport import landmark_distance_mm
 
-        wanted, marks = load_landmarks(like).landmarks, {entry.path: entry.landmarks() for entry in opened.entries}
-        for rig in rigs:
-            rig["landmark_distance_mm"] = landmark_distance_mm(marks[rig["path"]], wanted)
-        rigs.sort(key=lambda rig: rig["landmark_distance_mm"])
-    return {"folder": str(opened.folder), "reread": opened.reread, "rigs": rigs, "skipped": opened.skipped}
+        wanted = load_landmarks(like).landmarks
+        apart_mm = {entry.path: landmark_distance_mm(entry.landmarks(), wanted) for entry in entries}
+        entries = tuple(sorted(entries, key=lambda entry: apart_mm[entry.path]))
+    plots = [] if plot is None else [str(path) for path in plot_ranges(entries, plot, force)]
+    rigs = [asdict(entry) | ({"landmark_distance_mm": apart_mm[entry.path]} if apart_mm else {}) for entry in entries]
+    listed = {"folder": str(opened.folder), "reread": opened.reread, "rigs": rigs, "skipped": opened.skipped}
+    emit({**listed, "plots": plots}, as_json, lambda: [*_library_lines(opened, entries, apart_mm), *plots])
 
 
-def _library_lines(listed: dict[str, Any]) -> list[str]:
+def _library_lines(opened: Library, entries: Sequence[Entry], apart_mm: Mapping[str, float]) -> list[str]:
     from jawusd.library.index import PARAMETERS
 
     lines = [f"{'actor':<20}{'opening':>9}{'right':>8}{'left':>7}{'back':>7}{'forward':>9}{'condyles':>10}  file [mm]"]
-    for rig in listed["rigs"]:
-        (_, opening), (right, left), (back, forward) = (rig["ranges_mm"][name] for name in PARAMETERS)
-        row = f"{rig['actor'][:19]:<20}{opening:9.1f}{right:8.1f}{left:7.1f}{back:7.1f}{forward:9.1f}"
-        alike = f"  unlike by {rig['landmark_distance_mm']:.1f} mm" if "landmark_distance_mm" in rig else ""
-        partial = "  lacks a movement" if rig["not_shown"] else ""
-        lines.append(f"{row}{rig['condylar_distance_mm']:10.1f}  {rig['path']}{alike}{partial}")
-    lines.append(f"{len(listed['rigs'])} rigs, {listed['reread']} of the folder's new or changed")
-    lines += [f"skipped {path}: {why}" for path, why in listed["skipped"].items()]
-    return lines + listed["plots"]
+    for entry in entries:
+        (_, opening), (right, left), (back, forward) = (entry.ranges_mm[name] for name in PARAMETERS)
+        row = f"{entry.actor[:19]:<20}{opening:9.1f}{right:8.1f}{left:7.1f}{back:7.1f}{forward:9.1f}"
+        alike = f"  unlike by {apart_mm[entry.path]:.1f} mm" if apart_mm else ""
+        partial = "  lacks a movement" if entry.not_shown else ""
+        lines.append(f"{row}{entry.condylar_distance_mm:10.1f}  {entry.path}{alike}{partial}")
+    lines.append(f"{len(entries)} rigs, {opened.reread} of the folder's new or changed")
+    return lines + [f"skipped {path}: {why}" for path, why in opened.skipped.items()]
 
 
-def _compared(first: Entry, second: Entry) -> dict[str, Any]:
+def _compare(first: Entry, second: Entry, as_json: bool) -> None:
     from jawusd.library.index import PARAMETERS
     from jawusd.library.transport import landmark_distance_mm
 
@@ -188,19 +169,18 @@ def _compared(first: Entry, second: Entry) -> dict[str, Any]:
         }
 
     a, b = numbers(first), numbers(second)
-    rows = {key: {"first": a[key], "second": b[key], "difference": b[key] - a[key]} for key in a}
-    return {
+    apart_mm = landmark_distance_mm(first.landmarks(), second.landmarks())
+
+    def lines() -> list[str]:
+        head = f"{'[mm]':<22}{first.actor[:15]:>16}{second.actor[:15]:>16}{'difference':>12}"
+        rows = [f"{key:<22}{a[key]:16.2f}{b[key]:16.2f}{b[key] - a[key]:+12.2f}" for key in a]
+        return [head, *rows, f"landmarks differ by {apart_mm:.2f} mm rms after the best rigid fit"]
+
+    compared = {
         "first": first.path,
         "second": second.path,
         "actors": [first.actor, second.actor],
-        "landmark_distance_mm": landmark_distance_mm(first.landmarks(), second.landmarks()),
-        "measures_mm": rows,
+        "landmark_distance_mm": apart_mm,
+        "measures_mm": {key: {"first": a[key], "second": b[key], "difference": b[key] - a[key]} for key in a},
     }
-
-
-def _compare_lines(compared: dict[str, Any]) -> list[str]:
-    first, second = compared["actors"]
-    lines = [f"{'[mm]':<22}{first[:15]:>16}{second[:15]:>16}{'difference':>12}"]
-    for name, row in compared["measures_mm"].items():
-        lines.append(f"{name:<22}{row['first']:16.2f}{row['second']:16.2f}{row['difference']:+12.2f}")
-    return [*lines, f"landmarks differ by {compared['landmark_distance_mm']:.2f} mm rms after the best rigid fit"]
+    emit(compared, as_json, lines)

@@ -6,17 +6,7 @@ import sys
 
 import typer
 
-from jawusd.cli import (
-    build_commands,
-    capture_commands,
-    library_commands,
-    many_commands,
-    plate_commands,
-    report_commands,
-    rig_commands,
-    segment_commands,
-    view_commands,
-)
+from jawusd.cli import build_commands, capture_commands, library_commands, report_commands, rig_commands
 from jawusd.errors import JawusdError, explain_missing_packages
 
 app = typer.Typer(
@@ -27,15 +17,29 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-build_commands.register(app)
-many_commands.register(app)
-capture_commands.register(app)
-segment_commands.register(app)
-rig_commands.register(app)
-library_commands.register(app)
-plate_commands.register(app)
-report_commands.register(app)
-view_commands.register(app)
+for _command in (
+    build_commands.build,
+    build_commands.track,
+    build_commands.fit,
+    build_commands.bake,
+    build_commands.demo,
+    build_commands.build_many,
+    capture_commands.calibrate,
+    capture_commands.sync,
+    capture_commands.segment,
+    rig_commands.info,
+    rig_commands.pose,
+    rig_commands.encode,
+    rig_commands.validate,
+    rig_commands.ik,
+    rig_commands.animate,
+    library_commands.retarget,
+    library_commands.library,
+    capture_commands.plates,
+    report_commands.report,
+    report_commands.view,
+):
+    app.command()(_command)
 
 #: Exit code of a run stopped with Ctrl+C, as shells report it.
 INTERRUPTED = 130

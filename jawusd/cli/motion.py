@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 
@@ -12,23 +12,26 @@ from jawusd.errors import FormatError
 from jawusd.formats.arkit import read_arkit
 from jawusd.formats.keys import FARTHEST_FRAME, MOST_FRAMES, load_keys
 from jawusd.formats.poses import read_parameters, read_poses, table_columns
+from jawusd.geometry.arrays import Array
 
 if TYPE_CHECKING:
     from jawusd.evaluator import JawRig
 
+_USD = (".usd", ".usda", ".usdc", ".usdz")
+
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class AuthoredMotion:
     """Hold a motion as it was read.
 
     Attributes:
         frames: frame numbers (F,), increasing.
-        d: parameters (F, 3) [mm], NaN in frames that say nothing.
+        d: parameters (F, 3) [mm], NaN in frames without parameters.
         fps: frames per second, None where the source does not know.
     """
 
-    frames: np.ndarray
-    d: np.ndarray
+    frames: Array
+    d: Array
     fps: float | None
 
     def __post_init__(self) -> None:
@@ -43,11 +46,44 @@ class Motion:
             )
 
 
-def read_motion(rig: JawRig, source: Path) -> Motion:
+class Clamped(TypedDict):
+    """Say what became of a motion kept inside the bound; sizes over the clamped frames [mm].
+
+    Attributes:
+        frames: first and last.
+        lost: frames without parameters.
+        clamped: frames that lay outside.
+    """
+
+    frames: list[float]
+    lost: int
+    clamped: int
+    largest_clamp_mm: float
+    mean_clamp_mm: float
+
+
+class CarriedOver(TypedDict):
+    """Say what became of a motion carried to another rig; sizes from equal shares of the ranges [mm].
+
+    Attributes:
+        frames: first and last.
+        samples, lost, valid: how many there are, are without parameters, and lie inside the bound.
+        clamped: samples that lay outside the bound at equal shares.
+    """
+
+    frames: list[float]
+    samples: int
+    lost: int
+    valid: int
+    clamped: int
+    mean_move_mm: float
+    largest_move_mm: float
+
+
+def read_motion(rig: JawRig, source: Path) -> AuthoredMotion:
     """Read keys, parameters or poses. Keys are interpolated to every whole frame; poses are encoded.
 
     Args:
-        rig: the rig they are for.
         source: keys.json, or a CSV or JSON table of d or of poses.
 
     Raises:
@@ -55,25 +91,24 @@ def read_motion(rig: JawRig, source: Path) -> Motion:
     """
     if source.suffix.lower() == ".json" and source.read_bytes().lstrip()[:1] == b"{":
         keys = load_keys(source)
-        frames, d = keys.arrays()
-        at = np.unique(np.concatenate([np.arange(np.ceil(frames[0]), np.floor(frames[-1]) + 1), frames]))
-        return Motion(at, rig.interpolate(frames, d, at, method=keys.interpolation), keys.fps)
+        key_frames, key_d = keys.arrays()
+        at = np.unique(np.concatenate([np.arange(np.ceil(key_frames[0]), np.floor(key_frames[-1]) + 1), key_frames]))
+        return AuthoredMotion(at, rig.interpolate(key_frames, key_d, at, method=keys.interpolation), keys.fps)
     if "d1" in table_columns(source):
         frames, d = read_parameters(source)
     else:
         frames, T = read_poses(source)
         d, _ = rig.encode(T)
-    return Motion(frames.astype(np.float64), d, None)
+    return AuthoredMotion(frames.astype(np.float64), d, None)
 
 
-def read_face(rig: JawRig, source: Path, fps: float | None) -> Motion:
+def read_face(rig: JawRig, source: Path, fps: float | None) -> AuthoredMotion:
     """Read the jaw of an ARKit face capture, its weights taken as shares of the person's own ranges.
 
     JawOpen 1 is the full opening; JawLeft less JawRight, and JawForward, are shares of the reach to that side at that
     opening. Left is the subject's left.
 
     Args:
-        rig: the rig it is for.
         source: CSV of Live Link Face.
         fps: rate of the time codes, None to find it from them.
 
@@ -85,44 +120,32 @@ def read_face(rig: JawRig, source: Path, fps: float | None) -> Motion:
     d = rig.denormalized(np.stack([opening, left - right, forward], axis=1))
     if not np.isfinite(d).any():
         raise FormatError("no row has a face (BlendShapeCount is 0 in all of them).", path=source)
-    return Motion(capture.frames, d, capture.fps)
+    return AuthoredMotion(capture.frames, d, capture.fps)
 
 
-def kept_inside(rig: JawRig, motion: Motion) -> tuple[Motion, dict[str, Any]]:
-    """Move parameters to the nearest valid ones where they lie outside the bound.
-
-    Args:
-        rig: the rig.
-        motion: a motion of it.
-
-    Returns:
-        The valid motion, and what is to be said of it: `frames`, `lost`, `clamped`, and over the clamped frames
-        `largest_clamp_mm` and `mean_clamp_mm`.
-    """
+def kept_inside(rig: JawRig, motion: AuthoredMotion) -> tuple[AuthoredMotion, Clamped]:
+    """Move parameters to the nearest valid ones where they lie outside the bound."""
     outside = rig.margin(motion.d) < float(rig.arrays["margin_limit_mm"])
     kept = motion.d.copy()
     kept[outside] = rig.project(motion.d[outside])
     moved_mm = np.linalg.norm(kept - motion.d, axis=1)[outside]
-    report = {
+    report: Clamped = {
         "frames": [float(motion.frames[0]), float(motion.frames[-1])],
         "lost": int(np.isnan(kept).any(axis=1).sum()),
         "clamped": int(outside.sum()),
         "largest_clamp_mm": float(moved_mm.max(initial=0.0)),
         "mean_clamp_mm": float(moved_mm.mean()) if moved_mm.size else 0.0,
     }
-    return Motion(motion.frames, kept, motion.fps), report
+    return AuthoredMotion(motion.frames, kept, motion.fps), report
 
 
-def carried_over(giver: Path, source: Path, taker: JawRig) -> tuple[Motion, dict[str, Any]]:
+def carried_over(giver: Path, source: Path, taker: JawRig) -> tuple[AuthoredMotion, CarriedOver]:
     """Read a motion of one rig and carry it to another, see `pipeline.library.retarget`.
 
     Args:
         giver: rig the motion was made for.
         source: an animation layer, keys, or a table of d or of poses.
         taker: the rig that shall move.
-
-    Returns:
-        The motion of the taker, and what is to be said of it.
 
     Raises:
         FormatError: no such motion or rig.
@@ -135,43 +158,55 @@ def carried_over(giver: Path, source: Path, taker: JawRig) -> tuple[Motion, dict
     carried = retarget(rig, taker, motion.frames, motion.d)
     known = np.isfinite(carried.d).all(axis=1)
     moved_mm = carried.moved_mm[known]
-    report = {
+    report: CarriedOver = {
         "frames": [float(carried.frames[0]), float(carried.frames[-1])],
-        "samples": len(known),
+        "samples": int(known.size),
         "lost": int((~known).sum()),
         "valid": int(taker.validate_parameters(carried.d[known]).valid.sum()),
         "clamped": int(carried.outside.sum()),
         "mean_move_mm": float(moved_mm.mean()),
         "largest_move_mm": float(moved_mm.max()),
     }
-    return Motion(carried.frames, carried.d, motion.fps), report
+    return AuthoredMotion(carried.frames, carried.d, motion.fps), report
 
 
-def _motion_of(rig: JawRig, path: Path) -> Motion:
+def _motion_of(rig: JawRig, path: Path) -> AuthoredMotion:
     """Return a motion of a rig: samples of d of a stage, its transforms where it has none, or a table."""
     from jawusd.rig.motion_read import read_parameters_of_stage, read_poses_of_stage
     from jawusd.rig.read import open_stage
 
-    if path.suffix.lower() not in (".usd", ".usda", ".usdc", ".usdz"):
+    if path.suffix.lower() not in _USD:
         return read_motion(rig, path)
     sampled = read_parameters_of_stage(path)
     if sampled is not None:
-        return Motion(*sampled)
+        return AuthoredMotion(*sampled)
     frames, poses = read_poses_of_stage(path)
     rate = float(open_stage(path).GetTimeCodesPerSecond())
-    return Motion(frames.astype(np.float64), rig.encode(poses)[0], rate)
+    return AuthoredMotion(frames.astype(np.float64), rig.encode(poses)[0], rate)
 
 
-def carried_over_lines(result: dict[str, Any]) -> list[str]:
-    """Return what to print of a motion carried over: the report of `carried_over`, with `file` and `fps`."""
+def clamped_lines(result: Clamped, out: Path, fps: float) -> list[str]:
+    """Return the report of `kept_inside` as text."""
+    first, last = result["frames"]
+    lines = [f"{out}: frames {first:g} .. {last:g} at {fps:g} fps", *_lost_line(result["lost"])]
+    if result["clamped"]:
+        moved = f"moved by {result['mean_clamp_mm']:.2f} mm on average, {result['largest_clamp_mm']:.2f} mm at most"
+        lines.append(f"{result['clamped']} frames lay outside the bound, {moved}")
+    return lines
+
+
+def _lost_line(lost: int) -> list[str]:
+    return [f"{lost} frames say nothing and were bridged"] if lost else []
+
+
+def carried_over_lines(result: CarriedOver, out: Path, fps: float) -> list[str]:
+    """Return the report of `carried_over` as text."""
     first, last = result["frames"]
     known = result["samples"] - result["lost"]
     lines = [
-        f"{result['file']}: frames {first:g} .. {last:g} at {result['fps']:g} fps, "
-        f"{result['valid']} of {known} samples valid"
+        f"{out}: frames {first:g} .. {last:g} at {fps:g} fps, {result['valid']} of {known} samples valid",
+        *_lost_line(result["lost"]),
     ]
-    if result["lost"]:
-        lines.append(f"{result['lost']} frames say nothing and were bridged")
     if result["clamped"]:
         lines.append(f"{result['clamped']} samples lay outside the bound at equal shares of the ranges")
     if result["largest_move_mm"] > 0.005:

@@ -5,23 +5,21 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import typer
 
 from jawusd.errors import OutputError
 
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import TaskID
 
-def emit(data: dict[str, Any], as_json: bool, lines: Callable[[], list[str]]) -> None:
-    """Print a result as one JSON object or as lines for people.
 
-    Args:
-        data: JSON-able result; NaN becomes null.
-        as_json: print `data`.
-        lines: gives the text lines otherwise.
-    """
+def emit(data: Mapping[str, object], as_json: bool, lines: Callable[[], list[str]]) -> None:
+    """Print a result as one JSON object, or else as lines for people."""
     if as_json:
         typer.echo(json.dumps(plain(data), indent=1))
     else:
@@ -29,7 +27,7 @@ def emit(data: dict[str, Any], as_json: bool, lines: Callable[[], list[str]]) ->
             typer.echo(line)
 
 
-def plain(value: Any) -> Any:
+def plain(value: object) -> object:
     """Return a value with numpy types turned into JSON's and NaN into null."""
     if hasattr(value, "tolist"):
         value = value.tolist()
@@ -53,18 +51,8 @@ def refuse_existing(path: Path, force: bool) -> None:
 
 
 @contextlib.contextmanager
-def progress(quiet: bool = False) -> Iterator[Callable[[str, int, int], None]]:
-    """Show the progress of long work on stderr.
-
-    Args:
-        quiet: show nothing.
-
-    Yields:
-        A function (stage, done, total) to call as work proceeds.
-    """
-    if quiet:
-        yield lambda stage, done, total: None
-        return
+def progress() -> Iterator[Callable[[str, int, int], None]]:
+    """Show the progress of long work on stderr; yields a function (stage, done, total) to call as work proceeds."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -87,7 +75,7 @@ def progress(quiet: bool = False) -> Iterator[Callable[[str, int, int], None]]:
         yield _plain_progress(console)
         return
     with Progress(*columns, console=console) as bars:
-        tasks: dict[str, Any] = {}
+        tasks: dict[str, TaskID] = {}
 
         def report(stage: str, done: int, total: int) -> None:
             if stage not in tasks:
@@ -97,7 +85,7 @@ def progress(quiet: bool = False) -> Iterator[Callable[[str, int, int], None]]:
         yield report
 
 
-def _plain_progress(console: Any) -> Callable[[str, int, int], None]:
+def _plain_progress(console: Console) -> Callable[[str, int, int], None]:
     """Return a reporter for log files: a line per stage and per tenth of it."""
     last: dict[str, int] = {}
 

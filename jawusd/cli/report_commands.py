@@ -1,36 +1,33 @@
-"""The command that reports on a finished build or on tracks."""
+"""Commands to look at a finished build: its report, the paper's experiments, and the viewer."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from jawusd.cli.output import emit, progress, refuse_existing
-from jawusd.cli.subject_options import (
+from jawusd.cli.options import (
     CaptureOption,
     ColumnsOption,
     GroupOption,
     InvertOption,
+    Json,
     LandmarksOption,
     LengthUnit,
     LowerOption,
     MandibleOption,
+    Outside,
     RestOption,
     UnitOption,
     UpperOption,
     subject_given,
     trajectory_options,
 )
+from jawusd.cli.output import emit, progress, refuse_existing
 
 if TYPE_CHECKING:
-    from jawusd.pipeline.trajectories import TrajectoryOptions
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands of this module."""
-    app.command("report")(report)
+    from jawusd.viewer.server import PageServer
 
 
 def report(
@@ -55,60 +52,104 @@ def report(
     group: GroupOption = None,
     starts: Annotated[int, typer.Option(min=1, max=64, help="Random starts of the paper's networks.")] = 2,
     force: Annotated[bool, typer.Option("--force", help="Overwrite existing figures.")] = False,
-    allow_outside: Annotated[
-        bool, typer.Option("--allow-outside", help="Let paths in the capture leave its folder.")
-    ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+    allow_outside: Outside = False,
+    as_json: Json = False,
 ) -> None:
     """Write report.html of a finished build anew; or repeat the paper's experiments on a take (figures and table)."""
     options = trajectory_options(columns, length_unit, invert, rest_frame, group)
-    given = (capture, upper_teeth, lower_teeth, mandible, landmarks)
     if not experiments:
         if not source.is_dir():
             raise typer.BadParameter("poses have no report: add --experiments for the paper's experiments on them.")
-        _report_build(source, capture, None, allow_outside, as_json)
+        _report_build(source, capture, allow_outside, as_json)
         return
     if out is None and not source.is_dir():
         raise typer.BadParameter("name the folder of the figures with -o.", param_hint="--out")
-    _report_experiments(source, out, given, options, starts, force, allow_outside, as_json)
-
-
-def _report_build(folder: Path, capture: Path | None, found: Any, allow_outside: bool, as_json: bool) -> None:
-    from jawusd.pipeline.report import report_build
-
-    with progress() as tell:
-        summary = report_build(folder, capture, tell, found, allow_outside=allow_outside)
-    emit(summary, as_json, lambda: [summary["file"]])
-
-
-def _report_experiments(
-    source: Path,
-    out: Path | None,
-    given: tuple[Path | None, ...],
-    options: TrajectoryOptions,
-    starts: int,
-    force: bool,
-    allow_outside: bool,
-    as_json: bool,
-) -> None:
-    from jawusd.pipeline.experiments import do_experiments, draw_experiments, experiment_files, experiment_lines
-    from jawusd.pipeline.report import fitted_poses, is_build, report_build
-    from jawusd.pipeline.stages import about, read_motion
-    from jawusd.pipeline.subject import subject_of_build
+    from jawusd.pipeline.fit import read_motion
+    from jawusd.pipeline.prepare import naming_file, subject_of_build
+    from jawusd.pipeline.report import (
+        do_experiments,
+        draw_experiments,
+        experiment_files,
+        experiment_lines,
+        fitted_poses,
+        is_build,
+        report_build,
+    )
 
     folder = out or source / "experiments"
     for path in experiment_files(folder):
         refuse_existing(path, force)
     poses = fitted_poses(source) if source.is_dir() else source
     motion = read_motion(poses, options)
-    if source.is_dir() and not any(given):
+    if source.is_dir() and not any((capture, upper_teeth, lower_teeth, mandible, landmarks)):
         subject = subject_of_build(source)
     else:
-        subject = subject_given(source.stem, *given, allow_outside)
-    with progress() as tell, about(poses):
+        subject = subject_given(source.stem, capture, upper_teeth, lower_teeth, mandible, landmarks, allow_outside)
+    with progress() as tell, naming_file(poses):
         found = do_experiments(subject, motion, starts, tell)
         summary = draw_experiments(found, folder)
         if is_build(source):
-            page = report_build(source, given[0], tell, found, allow_outside=allow_outside)
+            page = report_build(source, capture, tell, found, allow_outside=allow_outside)
             summary["files"].append(Path(page["file"]))
     emit(summary, as_json, lambda: experiment_lines(summary))
+
+
+def _report_build(folder: Path, capture: Path | None, allow_outside: bool, as_json: bool) -> None:
+    from jawusd.pipeline.report import report_build
+
+    with progress() as tell:
+        summary = report_build(folder, capture, tell, allow_outside=allow_outside)
+    emit(summary, as_json, lambda: [summary["file"]])
+
+
+def view(
+    rig: Annotated[
+        Path,
+        typer.Argument(
+            help="A rig (actor.usda, another layer of it, or its folder) or a capture (capture.toml or its folder).",
+            metavar="RIG|CAPTURE",
+            show_default=False,
+        ),
+    ],
+    tracks: Annotated[
+        Path | None,
+        typer.Option(
+            help="Poses to draw over a capture's footage: the folder of its build, or tracks.npz.", show_default=False
+        ),
+    ] = None,
+    host: Annotated[str, typer.Option(help="Address to listen on; the default is reached from this machine.")] = (
+        "127.0.0.1"
+    ),
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port; the next free one if it is taken.")] = 8080,
+    browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open a browser.")] = True,
+    allow_outside: Outside = False,
+) -> None:
+    """See a rig in the browser, drag it, key it; or a capture's footage, to judge its poses and to set its picks."""
+    import webbrowser
+
+    from jawusd.pipeline.view import is_capture, open_capture_viewer, open_viewer
+    from jawusd.viewer.server import is_loopback
+
+    capture = is_capture(rig)
+    if tracks is not None and not capture:
+        raise typer.BadParameter("--tracks belongs to a capture; a rig has its own poses.")
+    if not is_loopback(host):
+        may = "write picks into the capture" if capture else "write animations beside the rig"
+        typer.echo(
+            f"jawusd: warning: listening on {host}: whoever reaches this address sees this person's jaw, without a "
+            f"password, and may {may}. `ssh -L 8080:localhost:8080` works without --host.",
+            err=True,
+        )
+    viewer: PageServer
+    if capture:
+        with progress() as report:
+            viewer = open_capture_viewer(rig, tracks, host, port, report, allow_outside=allow_outside)
+    else:
+        viewer = open_viewer(rig, host, port)
+    try:
+        typer.echo(f"{viewer.url}  (Ctrl+C stops)")
+        if browser:
+            webbrowser.open(viewer.url)
+        viewer.wait()
+    except KeyboardInterrupt:
+        viewer.stop()

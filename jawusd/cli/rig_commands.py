@@ -2,36 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from jawusd.cli.options import Force, Json, RigArg
 from jawusd.cli.output import emit, refuse_existing
 
 if TYPE_CHECKING:
     import numpy as np
+    from numpy.typing import NDArray
 
     from jawusd.evaluator import JawRig
+    from jawusd.geometry.arrays import Array
+    from jawusd.rig.read import Description
 
-Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
-Force = Annotated[bool, typer.Option("--force", help="Overwrite an existing output.")]
-RigArg = Annotated[Path, typer.Argument(help="actor.usda, another layer of it, or model.npz.", show_default=False)]
 Triple = tuple[float, float, float]
 
 #: Exit code of a "no": an invalid pose, a rig with errors.
 NO = 1
 _USD = (".usd", ".usda", ".usdc", ".usdz")
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands of this module."""
-    app.command("info")(info)
-    app.command("pose")(pose)
-    app.command("encode")(encode)
-    app.command("validate")(validate)
-    app.command("ik")(ik)
-    app.command("animate")(animate)
 
 
 def info(
@@ -46,11 +39,15 @@ def info(
     from jawusd.rig import describe
 
     if rig.suffix == ".npz" and is_tracks(rig):
-        from jawusd.pipeline.summary import frame_lines, frame_summary, track_lines, track_summary
+        from jawusd.pipeline.track import frame_lines, frame_summary, track_lines, track_summary
 
         tracks = load_tracks(rig)
-        told = track_summary(tracks) if frame is None else frame_summary(tracks, frame)
-        emit(told, as_json, lambda: track_lines(told) if frame is None else frame_lines(told))
+        if frame is None:
+            take = track_summary(tracks)
+            emit(take, as_json, lambda: track_lines(take))
+        else:
+            one = frame_summary(tracks, frame)
+            emit(one, as_json, lambda: frame_lines(one))
         return
     if frame is not None:
         raise typer.BadParameter("--frame belongs to tracks.npz.")
@@ -58,7 +55,7 @@ def info(
     emit(found, as_json, lambda: _info_lines(found))
 
 
-def _info_lines(found: dict[str, Any]) -> list[str]:
+def _info_lines(found: Description) -> list[str]:
     lines = [
         f"actor {found['actor']}, format {found['format_version']}, prim {found['prim']}",
         f"model: {found['model']['kind']} ({found['model']['method']}), onnx: {', '.join(found['onnx']) or 'none'}",
@@ -83,27 +80,25 @@ def pose(
 ) -> None:
     """Print the jaw pose of parameters d: 4x4 matrix, twist, landmarks, margin to the bound."""
     import jawusd
-    from jawusd.geometry import transform_points
+    from jawusd.geometry import LANDMARKS, transform_points
 
     loaded = jawusd.load(rig)
     _check_finite(d, "--d")
     T = loaded.pose(d)
     margin = float(loaded.margin(d))
-    result = {
-        "d": list(d),
-        "T_skull_mandible": T,
-        "twist": loaded.twist(d),
-        "landmarks_mm": dict(zip(_landmark_names(), transform_points(T, loaded.arrays["landmarks"]), strict=True)),
-        "margin_mm": margin,
-        "valid": margin >= float(loaded.arrays["margin_limit_mm"]),
-    }
-    emit(result, as_json, lambda: _pose_lines(result))
+    twist, valid = loaded.twist(d), margin >= float(loaded.arrays["margin_limit_mm"])
+    landmarks = dict(zip(LANDMARKS, transform_points(T, loaded.arrays["landmarks"]), strict=True))
 
+    def lines() -> list[str]:
+        rows = [" ".join(f"{value:12.6f}" for value in row) for row in T]
+        found = ["T_skull_mandible [mm]", *(f"  {row}" for row in rows)]
+        found.append("twist (omega rad, v mm): " + " ".join(f"{value:.6f}" for value in twist))
+        for name, place in landmarks.items():
+            found.append(f"  {name}: " + " ".join(f"{value:.3f}" for value in place) + " mm")
+        return [*found, f"margin {margin:.3f} mm: {'inside' if valid else 'OUTSIDE'} the bound"]
 
-def _landmark_names() -> tuple[str, ...]:
-    from jawusd.geometry import LANDMARKS
-
-    return LANDMARKS
+    result = {"T_skull_mandible": T, "twist": twist, "landmarks_mm": landmarks, "margin_mm": margin, "valid": valid}
+    emit({"d": list(d), **result}, as_json, lines)
 
 
 def _check_finite(values: Triple, option: str) -> None:
@@ -113,17 +108,7 @@ def _check_finite(values: Triple, option: str) -> None:
         raise typer.BadParameter("values must be finite", param_hint=option)
 
 
-def _pose_lines(result: dict[str, Any]) -> list[str]:
-    rows = [" ".join(f"{value:12.6f}" for value in row) for row in result["T_skull_mandible"]]
-    lines = ["T_skull_mandible [mm]", *(f"  {row}" for row in rows)]
-    lines.append("twist (omega rad, v mm): " + " ".join(f"{value:.6f}" for value in result["twist"]))
-    for name, place in result["landmarks_mm"].items():
-        lines.append(f"  {name}: " + " ".join(f"{value:.3f}" for value in place) + " mm")
-    word = "inside" if result["valid"] else "OUTSIDE"
-    return [*lines, f"margin {result['margin_mm']:.3f} mm: {word} the bound"]
-
-
-def _read_poses(path: Path) -> tuple[np.ndarray, np.ndarray]:
+def _read_poses(path: Path) -> tuple[NDArray[np.int64], Array]:
     """Return frames (F,) and poses (F, 4, 4) of a table or a tracks file."""
     from jawusd.formats.poses import read_poses
     from jawusd.formats.tracks import load_tracks
@@ -154,16 +139,12 @@ def encode(
     values = np.column_stack([d, residual_mm])
     write_table(out, ("frame", *PARAMETER_COLUMNS, "residual_mm"), frames[known], values[known])
     residual = residual_mm[known]
-    result = {
-        "file": str(out),
-        "poses": len(T),
-        "encoded": int(known.sum()),
-        "residual_mm": {
-            "mean": float(residual.mean()) if residual.size else None,
-            "max": float(residual.max()) if residual.size else None,
-        },
+    size = {
+        "mean": float(residual.mean()) if residual.size else None,
+        "max": float(residual.max()) if residual.size else None,
     }
-    emit(result, as_json, lambda: [f"{out}: {result['encoded']} of {len(T)} poses, residual {result['residual_mm']}"])
+    result = {"file": str(out), "poses": len(T), "encoded": int(known.sum()), "residual_mm": size}
+    emit(result, as_json, lambda: [f"{out}: {result['encoded']} of {len(T)} poses, residual {size}"])
 
 
 def validate(
@@ -197,13 +178,13 @@ def validate(
         raise typer.Exit(NO)
 
 
-def _verdict_lines(rows: list[dict[str, Any]], invalid: int) -> list[str]:
+def _verdict_lines(rows: Sequence[Mapping[str, object]], invalid: int) -> list[str]:
     shown = "frame {frame}: {reason} (residual {residual_mm:.2f} mm, margin {margin_mm:.2f} mm)"
     lines = [shown.format(**row) for row in rows if not row["valid"]]
     return [*lines, f"{len(rows) - invalid} of {len(rows)} poses are valid"]
 
 
-def _poses_or_parameters(rig: JawRig, path: Path) -> tuple[np.ndarray, np.ndarray]:
+def _poses_or_parameters(rig: JawRig, path: Path) -> tuple[NDArray[np.int64], Array]:
     from jawusd.formats.poses import read_parameters, table_columns
 
     if path.suffix.lower() in _USD:
@@ -283,7 +264,16 @@ def animate(
     import numpy as np
 
     import jawusd
-    from jawusd.cli.motion import carried_over, carried_over_lines, kept_inside, read_face, read_motion
+    from jawusd.cli.motion import (
+        CarriedOver,
+        Clamped,
+        carried_over,
+        carried_over_lines,
+        clamped_lines,
+        kept_inside,
+        read_face,
+        read_motion,
+    )
     from jawusd.rig import describe, write_animation, write_splines
 
     if (source is None) == (arkit is None):
@@ -293,27 +283,21 @@ def animate(
     for path in filter(None, (out, splines)):
         refuse_existing(path, force)
     loaded = jawusd.load(rig)
-    if retarget_from is not None:
+    report: Clamped | CarriedOver
+    lines: Callable[[Path, float], list[str]]
+    if source is not None and retarget_from is not None:
         motion, report = carried_over(retarget_from, source, loaded)
+        lines = partial(carried_over_lines, report)
     else:
-        motion, report = kept_inside(
-            loaded, read_motion(loaded, source) if arkit is None else read_face(loaded, arkit, fps)
-        )
+        if source is not None:
+            motion = read_motion(loaded, source)
+        elif arkit is not None:
+            motion = read_face(loaded, arkit, fps)
+        motion, report = kept_inside(loaded, motion)
+        lines = partial(clamped_lines, report)
     rate = fps or motion.fps or describe(rig)["fps"]
     write_animation(out, rig, motion.frames, motion.d, rate)
     if splines is not None:
         known = np.isfinite(motion.d).all(axis=1)
         write_splines(splines, out, motion.frames[known], motion.d[known], rate)
-    result = {"file": str(out), "fps": rate, **report}
-    emit(result, as_json, lambda: (_animate_lines if retarget_from is None else carried_over_lines)(result))
-
-
-def _animate_lines(result: dict[str, Any]) -> list[str]:
-    first, last = result["frames"]
-    lines = [f"{result['file']}: frames {first:g} .. {last:g} at {result['fps']:g} fps"]
-    if result["lost"]:
-        lines.append(f"{result['lost']} frames say nothing and were bridged")
-    if result["clamped"]:
-        moved = f"moved by {result['mean_clamp_mm']:.2f} mm on average, {result['largest_clamp_mm']:.2f} mm at most"
-        lines.append(f"{result['clamped']} frames lay outside the bound, {moved}")
-    return lines
+    emit({"file": str(out), "fps": rate, **report}, as_json, lambda: lines(out, rate))

@@ -4,21 +4,29 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NotRequired, TypedDict, TypeVar, cast
 
 from jawusd import __version__
 from jawusd.errors import OutputError, explain_missing_packages
 from jawusd.formats.capture import Capture
 from jawusd.formats.model import load_model, save_model
 from jawusd.formats.tracks import load_tracks, save_tracks
-from jawusd.pipeline.calibration import calibrate_boards
-from jawusd.pipeline.prepare import input_hashes, open_capture, rescaled_cameras
+from jawusd.pipeline.bake import bake_subject, write_take
+from jawusd.pipeline.calibrate import (
+    CalibrationSummary,
+    SyncResult,
+    calibrate_boards,
+    calibration_lines,
+    sync_cameras,
+)
+from jawusd.pipeline.fit import FitSummary, fit_lines, fit_subject, fit_summary
+from jawusd.pipeline.prepare import input_hashes, naming_file, open_capture, rescaled_cameras, subject_of_capture
 from jawusd.pipeline.report import BuildFacts, missing_packages, where, write_build_report
-from jawusd.pipeline.segment import SegmentOptions, with_masks
-from jawusd.pipeline.segment_summary import delete_masks, segment_capture
-from jawusd.pipeline.stages import aid_teeth, bake_files, fit_jaw, sync_cameras, track_teeth, write_take
+from jawusd.pipeline.segment import SegmentOptions, segment_capture, with_masks
+from jawusd.pipeline.segment_record import SegmentSummary, delete_masks, segment_lines
 from jawusd.pipeline.state import (
     BUILD_FILE,
     CALIBRATION,
@@ -29,10 +37,13 @@ from jawusd.pipeline.state import (
     StageRecord,
     hash_value,
     locked,
+    no_progress,
 )
-from jawusd.pipeline.summary import fit_summary, track_summary
+from jawusd.pipeline.track import TrackSummary, first_pass, model_pass, track_lines, track_summary
 
 MASKS = "masks"  # folder of the masks made when the capture names none
+
+R = TypeVar("R", bound=Mapping[str, object])
 
 
 @dataclass(frozen=True)
@@ -58,25 +69,56 @@ class BuildOptions:
     allow_outside: bool = False
 
 
+class ReportSummary(TypedDict):
+    """Say where the capture lies seen from the rig, and the report's file, or what is missing to write one."""
+
+    capture: str
+    file: NotRequired[str]
+    missing: NotRequired[str]
+
+
+class BuildSummary(TypedDict):
+    """Hold what a build found.
+
+    Attributes:
+        files: names of all files written, relative to the folder.
+        seconds: per stage, also of those reused.
+        reused: stages kept from an earlier build.
+        calibrate, segment: None if the capture names a calibration, or masks.
+        track: of the final tracks.
+    """
+
+    capture: str
+    folder: str
+    files: list[str]
+    seconds: dict[str, float]
+    reused: list[str]
+    calibrate: CalibrationSummary | None
+    sync: SyncResult
+    segment: SegmentSummary | None
+    track: TrackSummary
+    fit: FitSummary
+    report: ReportSummary
+
+
 @explain_missing_packages()
-def build_rig(
-    capture_path: str | os.PathLike[str], out: str | os.PathLike[str], options: BuildOptions, progress: Progress
-) -> dict:
+def build(
+    capture: Capture | str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    options: BuildOptions = BuildOptions(),
+    progress: Progress | None = None,
+) -> BuildSummary:
     """Build a rig from a capture.
 
     Args:
-        capture_path: capture.toml or its folder.
+        capture: the capture, its capture.toml or the folder that holds it.
         out: the rig's folder.
-        options: how to build.
-        progress: told of every stage.
-
-    Returns:
-        Summary: files, seconds per stage, tracking and model error tables, what was inferred, warnings.
+        progress: called with (stage, done, total) as work proceeds.
 
     Raises:
         JawusdError: one of its kinds; stages finished before stay valid for `resume`.
     """
-    capture = open_capture(capture_path, allow_outside=options.allow_outside)
+    capture = open_capture(capture, allow_outside=options.allow_outside)
     folder = Path(out)
     check_folder(folder, options)
     with locked(folder):
@@ -84,15 +126,11 @@ def build_rig(
         if options.fresh:
             state.clear()
             delete_masks(folder / MASKS)
-        return _Build(capture, folder, options, state, progress).run()
+        return _Build(capture, folder, options, state, progress or no_progress).run()
 
 
 def check_folder(folder: Path, options: BuildOptions) -> None:
     """Check that a build may go to a folder.
-
-    Args:
-        folder: where the build shall go.
-        options: says whether to resume or to start afresh.
 
     Raises:
         OutputError: it is a file, or holds other files, or a build that is neither to be continued nor deleted.
@@ -119,7 +157,8 @@ class _Build:
         self.state, self.progress = state, progress
         self.reused: list[str] = []
 
-    def run(self) -> dict:
+    def run(self) -> BuildSummary:
+        """Run the stages in order, or reuse them."""
         calibrate = self._calibrated()
         capture, options = self.capture, self.options
         videos = input_hashes(capture, ["videos"])
@@ -153,11 +192,12 @@ class _Build:
         missing = missing_packages()
         inputs = self._inputs([], bake.outputs, bake.inputs, videos, sync.result, missing)
         report = self._stage("report", inputs, lambda: self._report(missing))
-        finished = [made for made in (calibrate, segment, track, fit, aid, bake, report) if made]
+        stages = (calibrate, segment, track, fit, aid, bake, report)
+        outputs = {name for stage in stages if stage for name in stage.outputs}
         return {
             "capture": capture.name,
             "folder": str(self.folder),
-            "files": sorted({name for record in finished for name in record.outputs}),
+            "files": sorted(outputs),
             "seconds": {name: record.seconds for name, record in self.state.stages.items()},
             "reused": self.reused,
             "calibrate": calibrate.result if calibrate else None,
@@ -171,17 +211,18 @@ class _Build:
     def _inputs(self, parts: Iterable[str], *values: object) -> str:
         return hash_value([input_hashes(self.capture, parts), *values, __version__])
 
-    def _stage(self, name: str, inputs: str, work: Callable[[], tuple[list[Path], dict]]) -> StageRecord:
+    def _stage(self, name: str, inputs: str, work: Callable[[], tuple[list[Path], R]]) -> StageRecord[R]:
         record = self.state.valid(name, inputs)
         if record is not None:
             self.reused.append(name)
             self.progress(name, 1, 1)
-            return record
+            # build.json is what this stage wrote: its hash was checked when it was read.
+            return cast("StageRecord[R]", record)
         start = time.perf_counter()
         outputs, result = work()
         return self.state.finish(name, inputs, outputs, time.perf_counter() - start, result)
 
-    def _calibrated(self) -> StageRecord | None:
+    def _calibrated(self) -> StageRecord[CalibrationSummary] | None:
         """Calibrate from the boards if the capture names no calibration but has boards."""
         capture = self.capture
         if capture.calibration is not None or capture.boards is None:
@@ -199,7 +240,7 @@ class _Build:
         self.capture = capture.model_copy(update={"calibration": path, "calibration_unit_mm": 1.0})
         return record
 
-    def _segmented(self, offsets: dict[str, int], videos: dict[str, str]) -> StageRecord | None:
+    def _segmented(self, offsets: dict[str, int], videos: dict[str, str]) -> StageRecord[SegmentSummary] | None:
         """Make masks from the videos if the capture names none.
 
         The masks themselves are no outputs of the record: they may be edited, and tracking starts over if they are.
@@ -219,39 +260,66 @@ class _Build:
         self.capture = with_masks(capture, folder)
         return record
 
-    def _sync(self) -> tuple[list[Path], dict]:
+    def _sync(self) -> tuple[list[Path], SyncResult]:
         return [], sync_cameras(self.capture, self.progress)
 
-    def _track(self, offsets: dict[str, int]) -> tuple[list[Path], dict]:
+    def _track(self, offsets: dict[str, int]) -> tuple[list[Path], TrackSummary]:
         options = self.options
-        tracks = track_teeth(self.capture, offsets, options.jobs, self.progress, options.solver, options.backend)
+        tracks = first_pass(self.capture, offsets, options.jobs, self.progress, options.solver, options.backend)
         path = self.folder / FIRST_PASS
         save_tracks(path, tracks)
         return [path], track_summary(tracks)
 
-    def _fit(self) -> tuple[list[Path], dict]:
+    def _fit(self) -> tuple[list[Path], FitSummary]:
         tracks = load_tracks(self.folder / FIRST_PASS)
-        model = fit_jaw(self.capture, tracks, self.options.model, self.progress)
+        with naming_file(self.capture.folder / "capture.toml"):
+            subject = subject_of_capture(self.capture)
+            model = fit_subject(subject, tracks, self.options.model, self.progress)
         path = self.folder / "model.npz"
         save_model(path, model)
         return [path], fit_summary(model)
 
-    def _aid(self, offsets: dict[str, int]) -> tuple[list[Path], dict]:
+    def _aid(self, offsets: dict[str, int]) -> tuple[list[Path], TrackSummary]:
         first, model = load_tracks(self.folder / FIRST_PASS), load_model(self.folder / "model.npz")
-        tracks = aid_teeth(self.capture, offsets, first, model, self.options.jobs, self.progress)
+        tracks = model_pass(self.capture, offsets, first, model, self.options.jobs, self.progress)
         path = self.folder / "tracks.npz"
         save_tracks(path, tracks)
         return [path], track_summary(tracks)
 
-    def _bake(self) -> tuple[list[Path], dict]:
-        files = bake_files(self.capture, load_model(self.folder / "model.npz"), self.folder, self.progress)
+    def _bake(self) -> tuple[list[Path], dict[str, object]]:
+        subject, model = subject_of_capture(self.capture), load_model(self.folder / "model.npz")
+        files = bake_subject(subject, model, self.folder, self.progress)
         take = write_take(self.capture, load_tracks(self.folder / "tracks.npz"), self.folder)
         return [*files, *take], {}
 
-    def _report(self, missing: str | None) -> tuple[list[Path], dict]:
+    def _report(self, missing: str | None) -> tuple[list[Path], ReportSummary]:
         place = where(self.capture, self.folder)
         if missing is not None:
             # The rig is complete without; the summary says what is missing and how to get it.
             return [], {"capture": place, "missing": missing}
         path = write_build_report(self.folder, BuildFacts(self.state.stages, self.capture), self.progress)
         return [path], {"capture": place, "file": path.name}
+
+
+def build_lines(summary: BuildSummary) -> list[str]:
+    """Return the summary of a build as text."""
+    offsets = ", ".join(f"{name} {offset:+d}" for name, offset in summary["sync"]["offsets"].items())
+    lines = []
+    if summary["calibrate"]:
+        lines += [
+            "the capture names no calibration: made one from its boards",
+            *calibration_lines(summary["calibrate"]),
+        ]
+    lines += [f"sync ({summary['sync']['method']}): {offsets} frames"]
+    lines += [f"  note: {note}" for note in summary["sync"].get("notes", [])]
+    if summary["segment"]:
+        lines += ["the capture names no masks: made them from its videos", *segment_lines(summary["segment"])]
+    lines += track_lines(summary["track"])
+    lines += fit_lines(summary["fit"])
+    seconds = ", ".join(
+        f"{name} {'kept' if name in summary['reused'] else f'{value:.1f} s'}"
+        for name, value in summary["seconds"].items()
+    )
+    report = summary["report"]
+    shown = f"{summary['folder']}/{report['file']}" if "file" in report else f"none: {report['missing']}"
+    return [*lines, f"time: {seconds}", f"rig: {summary['folder']}/actor.usda", f"report: {shown}"]

@@ -6,8 +6,9 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import cast
 
 import numpy as np
 
@@ -16,25 +17,23 @@ from jawusd.evaluator import JawRig, load
 from jawusd.evaluator.sections import SMALLEST_REACH_MM
 from jawusd.formats.model import JawModel, load_model, save_model
 from jawusd.geometry.arrays import Array, Mask
-from jawusd.library.index import MODEL_FILE, Library, load_donors, scan_library
+from jawusd.library.index import MODEL_FILE, Entry, Library, load_donors, scan_library
 from jawusd.library.personal import PersonalMotion, leave_one_out, personal_motion
 from jawusd.library.timing import follow
-from jawusd.pipeline.stages import Progress
-from jawusd.pipeline.subject import Subject, subject_of_landmarks
+from jawusd.pipeline.fit import fit_summary
+from jawusd.pipeline.prepare import Subject, subject_of_landmarks
+from jawusd.pipeline.state import Progress
 
-# A step of a motion carried over is at least so much of the source's, by the ratio of the ranges.
+# Smallest step of a motion carried over, as a share of the source's step scaled by the ratio of the ranges.
 _SLOWEST = 0.1
-_ROUNDS = 10  # of timing and bound in turns; most motions need one or two
+_ROUNDS = 10  # of timing and bound alternating; most motions need one or two
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 
 @explain_missing_packages()
 def load_any_rig(path: Path) -> JawRig:
-    """Read a rig from `model.npz` with numpy alone, or from USD.
-
-    Args:
-        path: `model.npz`, or any layer that carries the rig.
+    """Read a rig from `model.npz` with numpy alone, or from any USD layer that carries it.
 
     Raises:
         JawusdError: it is no rig.
@@ -48,25 +47,16 @@ def load_any_rig(path: Path) -> JawRig:
 
 
 def open_library(folder: str | os.PathLike[str]) -> Library:
-    """Scan a library and bring its index up to date; see `library.index.scan_library`.
-
-    Args:
-        folder: with a subfolder per person.
-    """
+    """Scan a folder with a subfolder per person and bring its index up to date; see `library.index.scan_library`."""
     return scan_library(folder, load_any_rig)
 
 
 def add_rig(folder: str | os.PathLike[str], source: Path, name: str | None, force: bool) -> Path:
-    """Copy a rig into a library, as the model file `NAME/model.npz`.
+    """Copy a rig into a library, as the model file `NAME/model.npz`, and return that file.
 
     Args:
-        folder: the library; made if missing.
-        source: a rig or a model file.
         name: of the person and the subfolder; None: as the rig says.
         force: overwrite a person of that name.
-
-    Returns:
-        The file written.
 
     Raises:
         FormatError: not a rig, or a name that makes no folder.
@@ -101,16 +91,8 @@ def _as_model(rig: JawRig, source: Path, name: str) -> JawModel:
 
 
 @explain_missing_packages()
-def plot_ranges(entries: Sequence[Mapping[str, Any]], folder: Path, force: bool) -> list[Path]:
-    """Draw the ranges of persons of a library side by side, as PNG and SVG.
-
-    Args:
-        entries: their entries in the index, as `library.index.Entry` names the fields.
-        folder: where the files go; made if missing.
-        force: overwrite them.
-
-    Returns:
-        The files written.
+def plot_ranges(entries: Sequence[Entry], folder: Path, force: bool) -> list[Path]:
+    """Draw the ranges of persons of a library side by side, as PNG and SVG, and return the files.
 
     Raises:
         MissingDependencyError: matplotlib is not installed.
@@ -121,7 +103,7 @@ def plot_ranges(entries: Sequence[Mapping[str, Any]], folder: Path, force: bool)
     for suffix in (".png", ".svg"):
         if (folder / (RANGES + suffix)).exists() and not force:
             raise OutputError("exists already.", path=folder / (RANGES + suffix), hint="Overwrite with --force.")
-    return draw_ranges([(entry["actor"], entry["ranges_mm"]) for entry in entries], folder)
+    return draw_ranges([(entry.actor, entry.ranges_mm) for entry in entries], folder)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,26 +114,25 @@ class PersonalRig:
         model: the fitted model.
         motion: what it was fitted to.
         left_out: library persons not used, their captures lack a movement.
+        header: what the model's header says of its making.
     """
 
     model: JawModel
     motion: PersonalMotion
     left_out: tuple[str, ...]
+    header: Mapping[str, object]
 
 
 def personal_rig(landmarks: Path, library: Library, *, closest: bool, name: str, progress: Progress) -> PersonalRig:
     """Make a rig for somebody without a capture, from landmarks and a library.
 
     The motion of the library's persons is carried over to the landmarks and averaged (see `library.personal`), and the
-    anchored model is fitted to it. Its header says what the leave-one-out over the library lets expect; measured poses
-    may lie as far from the model as that.
+    anchored model is fitted to it. Its header states the error to be expected, from leave-one-out over the library;
+    measured poses may lie as far from the model as that.
 
     Args:
         landmarks: file of format jawusd-landmarks/1.
-        library: the library.
         closest: take the motion of the person with the most similar landmarks instead of the average.
-        name: of the new person.
-        progress: told of the work.
 
     Raises:
         FormatError: not such a file.
@@ -163,17 +144,13 @@ def personal_rig(landmarks: Path, library: Library, *, closest: bool, name: str,
     motion = personal_motion(donors, subject.landmarks, leave_one_out(donors, closest=closest))
     progress("carry", 1, 1)
     model = fit_personal(subject, motion, progress)
-    return PersonalRig(model, motion, tuple(entry.path for entry in library.entries if entry.not_shown))
+    left_out = tuple(entry.path for entry in library.entries if entry.not_shown)
+    return PersonalRig(model, motion, left_out, cast("Mapping[str, object]", model.meta["personal"]))  # of fit_personal
 
 
 @explain_missing_packages()
 def fit_personal(subject: Subject, motion: PersonalMotion, progress: Progress) -> JawModel:
-    """Fit the anchored model to a motion carried over, and say in its header what it is worth.
-
-    Args:
-        subject: the person, of landmarks alone.
-        motion: what `library.personal` made for the person.
-        progress: told of the work.
+    """Fit the anchored model to the motion carried over to a person, and state the expected error in its header.
 
     Raises:
         FittingError: see `fitting.fit_model`.
@@ -186,7 +163,7 @@ def fit_personal(subject: Subject, motion: PersonalMotion, progress: Progress) -
         landmarks=subject.landmarks,
         config=FittingConfig(holdout_folds=0),  # frames left out are poses of the library, not of this person
         actor=subject.name,
-        progress=lambda done, total: progress("fit", done, total),
+        progress=partial(progress, "fit"),
     )
     model.meta["inferred"] = list(subject.inferred)
     expected = motion.learned.expected
@@ -196,9 +173,10 @@ def fit_personal(subject: Subject, motion: PersonalMotion, progress: Progress) -
         "expected_error_mm": None if expected is None else expected.summary(),
         "fit_to_carried_motion_mm": model.meta["errors"],
     }
-    # How well the model follows the motion it was given says nothing of the person: nobody measured that one.
+    # The model's error on the motion it was given says nothing about the person, whose motion was not measured.
     model.meta["errors"] = {} if expected is None else {"expected": expected.table()}
-    model.meta["warnings"].append({"code": "personal", "message": _caution(motion)})
+    caution = {"code": "personal", "message": _caution(motion)}
+    model.meta["warnings"] = [*fit_summary(model)["warnings"], caution]
     if expected is not None:
         limit = np.maximum(model.arrays["residual_limit_mm"], expected.summary()["mean"])
         model.arrays["residual_limit_mm"] = limit
@@ -242,13 +220,11 @@ def retarget(source: JawRig, target: JawRig, frames: Array, d: Array) -> Retarge
 
     Between two samples a motion is linear in d, and shares are not: whole frames in between become samples too. Equal
     shares alone would move peaks by some frames and may leave the bound: the motion is made to rise and fall with the
-    source (see `library.timing`) and brought inside, in turns.
+    source (see `library.timing`) and brought inside, alternately.
 
     Args:
-        source: whose motion it is.
-        target: who shall move.
-        frames: increasing frame numbers (F,).
-        d: parameters of the source (F, 3) [mm], NaN where lost.
+        frames: increasing frame numbers, shape (F,).
+        d: parameters of the source [mm], NaN where lost, shape (F, 3).
 
     Raises:
         EvaluatorError: no frame has parameters.

@@ -1,11 +1,15 @@
-"""Many captures: one build each on the workers of a cluster, and one table of how they went."""
+"""Many captures: one build each on worker processes or a Dask cluster, and one table of how they went."""
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import csv
 import io
 import json
+import logging
+import signal
+import tempfile
 import time
 import traceback
 import uuid
@@ -13,24 +17,39 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 
+import dask
 from dask.system import CPU_COUNT
-from distributed import Client, Future, as_completed, get_worker, wait
+from distributed import (
+    Client,
+    Future,
+    LocalCluster,
+    Security,
+    Worker,
+    WorkerPlugin,
+    as_completed,
+    get_worker,
+    wait,
+)
+from distributed.comm import connect
+from distributed.utils import silence_logging_cmgr
 
-from jawusd.errors import JawusdError, OutputError
+from jawusd import __version__
+from jawusd.errors import ClusterError, JawusdError
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.capture_list import ListedCapture
-from jawusd.pipeline.build import BuildOptions, build_rig, check_folder
-from jawusd.pipeline.cluster import check_workers, existing_cluster, local_cluster
-from jawusd.pipeline.state import Progress
+from jawusd.pipeline.build import BuildOptions, FitSummary, build, check_folder
+from jawusd.pipeline.state import Progress, make_folder
 
 SUMMARY_JSON, SUMMARY_CSV = "builds.json", "builds.csv"
 BUILT, KEPT, FAILED, STOPPED = "built", "kept", "failed", "stopped"
 
-#: Told one line of text whenever there is something to tell.
+#: Called with one line of text whenever something has happened.
 Tell = Callable[[str], None]
 
 _TELL_SECONDS = 10.0  # between two lines about one stage of one capture
 _STOP_SECONDS = 15.0  # that builds have to end by themselves
+CONNECT_SECONDS = 10
+_LOOPBACK = "127.0.0.1"
 
 # Runs that were called off; a worker may serve several.
 _called_off: set[str] = set()
@@ -66,7 +85,7 @@ class Outcome:
         name: of its folder.
         capture: its path.
         status: "built", "kept" (nothing had changed since an earlier build), "failed" or "stopped".
-        frames, tracked: how many, and how many of them with both rows.
+        frames, tracked: how many, and how many of them with both arches.
         model_mm: mean over the frames of the largest distance of a mandible vertex from the model.
         holdout_mm: the same for frames that were left out of the fit.
         sigma_incisor_mm: expected error of tracking at the incisal point, median.
@@ -92,10 +111,7 @@ def build_many(captures: Sequence[ListedCapture], root: Path, options: ManyOptio
     The table of outcomes is written to builds.json and builds.csv, also when the work is interrupted.
 
     Args:
-        captures: what to build.
         root: gets a folder for each, by its name; every worker must see it by the same path.
-        options: how.
-        tell: told of what happens.
 
     Returns:
         The outcomes in the order of the captures.
@@ -107,7 +123,7 @@ def build_many(captures: Sequence[ListedCapture], root: Path, options: ManyOptio
     root = root.resolve()
     for item in captures:
         check_folder(root / item.name, options.build)
-    _make(root)
+    make_folder(root)
     if options.cluster is None:
         cluster = local_cluster(options.workers or min(CPU_COUNT, len(captures)), options.retries)
     else:
@@ -135,13 +151,6 @@ def outcome_lines(outcomes: Sequence[Outcome]) -> list[str]:
         cells = "  ".join(f"{'-' if value is None else format(value, form):>{w}}" for value, w, form in figures)
         lines.append(f"{o.name:<{width}}  {o.status:<7}  {cells}")
     return lines + [f"{o.name}: {o.error}" for o in outcomes if o.error]
-
-
-def _make(root: Path) -> None:
-    try:
-        root.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"cannot write here: {error.strerror}.", path=root) from error
 
 
 def _run(
@@ -181,7 +190,7 @@ def _call_off(run: str) -> None:
     _called_off.add(run)
 
 
-def _outcome(future: Future, item: ListedCapture) -> Outcome:
+def _outcome(future: Future[Outcome], item: ListedCapture) -> Outcome:
     if future.status == "finished":
         return future.result()
     error = future.exception() if future.status == "error" else None
@@ -195,30 +204,30 @@ def _build_one(run: str, item: ListedCapture, folder: str, options: BuildOptions
     """Build one capture; runs on a worker."""
     outcome = Outcome(item.name, str(item.path), FAILED)
     try:
-        summary = build_rig(item.path, folder, options, _progress(run, item.name))
+        summary = build(item.path, folder, options, _progress(run, item.name))
     except _CalledOffError:
         return replace(outcome, status=STOPPED)
     except JawusdError as error:
         return replace(outcome, error=str(error))
-    except Exception as error:  # a fault of jawusd in one build is no reason to lose the others
+    except Exception as error:  # a fault in one build must not lose the others
         place = traceback.extract_tb(error.__traceback__)[-1]
         where = f"{Path(place.filename).name}, line {place.lineno}"
         return replace(outcome, error=f"unexpected {type(error).__name__} in {where}: {error}")
-    track, errors = summary["track"], summary["fit"].get("errors", {})
+    track, fit = summary["track"], summary["fit"]
     return replace(
         outcome,
         status=KEPT if set(summary["seconds"]) <= set(summary["reused"]) else BUILT,
         frames=track["frames"],
         tracked=track["tracked"],
-        model_mm=_mean_mm(errors, "train"),
-        holdout_mm=_mean_mm(errors, "holdout"),
+        model_mm=_mean_mm(fit, "train"),
+        holdout_mm=_mean_mm(fit, "holdout"),
         sigma_incisor_mm=track["sigma_mm"].get("incisor"),
         seconds=round(sum(summary["seconds"].values()), 1),
     )
 
 
-def _mean_mm(errors: dict, table: str) -> float | None:
-    return errors.get(table, {}).get("mandible", {}).get("mean")
+def _mean_mm(fit: FitSummary, table: str) -> float | None:
+    return fit.get("errors", {}).get(table, {}).get("mandible", {}).get("mean")
 
 
 def _progress(run: str, name: str) -> Progress:
@@ -245,3 +254,94 @@ def _write(root: Path, outcomes: Sequence[Outcome]) -> None:
     table.writeheader()
     table.writerows(rows)
     write_text_atomic(root / SUMMARY_CSV, text.getvalue())
+
+
+class _IgnoreInterrupt(WorkerPlugin):
+    """Leave Ctrl-C, which a terminal sends to all processes, to the one that started them."""
+
+    def setup(self, worker: Worker) -> None:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+@contextlib.contextmanager
+def local_cluster(workers: int, retries: int) -> Iterator[Client]:
+    """Start worker processes of one thread each that listen to this machine alone, and yield a client of them.
+
+    None is left when the block ends.
+
+    Args:
+        retries: how often work is given to another worker when one died over it.
+    """
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": retries}),
+        tempfile.TemporaryDirectory(prefix="jawusd-") as scratch,
+        LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=True,
+            host=_LOOPBACK,
+            # No dashboard; without an address of its own the server for it would insist on one port.
+            dashboard_address=f"{_LOOPBACK}:0",
+            scheduler_kwargs={"dashboard": False},
+            memory_limit=0,  # what a build needs does not depend on the share of memory; the system limits it
+            silence_logs=logging.CRITICAL,
+            local_directory=scratch,
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        client.register_plugin(_IgnoreInterrupt())
+        yield client
+
+
+@contextlib.contextmanager
+def existing_cluster(address: str) -> Iterator[Client]:
+    """Connect to a scheduler at an address such as "tcp://host:8786", and yield a client of it.
+
+    Raises:
+        ClusterError: nothing answers there, or it has no worker.
+    """
+    try:
+        asyncio.run(_greet(address))
+    except (OSError, ValueError, TypeError, MemoryError) as error:
+        raise ClusterError(
+            f"no scheduler answers at {address} ({str(error) or 'something listens and says nothing'}).",
+            hint="Start one with: dask scheduler, and workers with: dask worker ADDRESS --nthreads 1",
+        ) from error
+    with silence_logging_cmgr(logging.CRITICAL), Client(address, timeout=CONNECT_SECONDS) as client:
+        try:
+            client.wait_for_workers(1, timeout=CONNECT_SECONDS)
+        except TimeoutError as error:
+            raise ClusterError(
+                f"the scheduler at {address} has no worker.", hint="Start some with: dask worker ADDRESS --nthreads 1"
+            ) from error
+        yield client
+
+
+async def _greet(address: str) -> None:
+    """Exchange greetings with a scheduler; a client would wait for ever where something listens but does not answer."""
+    arguments = Security().get_connection_args("client")
+    async with asyncio.timeout(CONNECT_SECONDS + 1):
+        comm = await connect(address, timeout=CONNECT_SECONDS, **arguments)
+        await comm.close()
+
+
+def check_workers(client: Client, folder: Path) -> None:
+    """Check that every worker runs this version of jawusd and sees the output folder.
+
+    Raises:
+        ClusterError: a worker cannot build here.
+    """
+    for address, answer in client.run(_look, str(folder), on_error="return").items():
+        if isinstance(answer, Exception):
+            raise ClusterError(f"worker {address} cannot run jawusd ({type(answer).__name__}: {answer}).")
+        version, sees_folder = answer
+        if version != __version__:
+            raise ClusterError(f"worker {address} has jawusd {version}, here it is {__version__}.")
+        if not sees_folder:
+            raise ClusterError(
+                f"worker {address} does not see {folder}.", hint="Use a folder that all machines share, by one path."
+            )
+
+
+def _look(folder: str) -> tuple[str, bool]:
+    return __version__, Path(folder).is_dir()

@@ -1,55 +1,52 @@
-"""Load what a capture names and bring it into one shape: cameras, meshes, anatomy."""
+"""Load what a capture names and bring it into one shape: cameras, meshes, and the person with axes and landmarks."""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jawusd.errors import CalibrationError, CaptureError, explain_missing_packages
+from jawusd.errors import CalibrationError, CaptureError, JawusdError, explain_missing_packages
 from jawusd.formats.camera_files import calibration_files, load_cameras_file
 from jawusd.formats.capture import CameraSource, Capture, load_capture
+from jawusd.formats.landmarks import load_landmarks
 from jawusd.formats.mesh import Mesh, tooth_labels
+from jawusd.formats.model import load_model
 from jawusd.formats.tracks import Tracks
-from jawusd.geometry import LANDMARKS, Camera, anatomical_frame, find_landmarks
+from jawusd.geometry import LANDMARKS, Camera, anatomical_frame, find_landmarks, landmark_frame
 from jawusd.geometry.arrays import Array
 from jawusd.pipeline.state import hash_files
 
 BONES = ("mandible", "skull")
 MESHES = ("upper_teeth", "lower_teeth", *BONES)
 
-
-@dataclass(frozen=True, eq=False)
-class Anatomy:
-    """Place the person: axes and landmarks.
-
-    Attributes:
-        T_anatomical_skull: scan frame to anatomical frame, shape (4, 4).
-        landmarks: `geometry.LANDMARKS` in the mandible frame [mm], shape (5, 3).
-        inferred: what was derived from the scans instead of being given.
-    """
-
-    T_anatomical_skull: Array
-    landmarks: Array
-    inferred: tuple[str, ...]
+Size = tuple[int, int]
 
 
-def open_capture(path: str | os.PathLike[str], *, allow_outside: bool = False) -> Capture:
-    """Read a capture and check that its calibration names its cameras.
+@contextlib.contextmanager
+def naming_file(path: Path) -> Iterator[None]:
+    """Name a file in the errors of stages that know only its content."""
+    try:
+        yield
+    except JawusdError as error:
+        if error.path is None:
+            error.path = str(path)
+        raise
+
+
+def open_capture(capture: Capture | str | os.PathLike[str], *, allow_outside: bool = False) -> Capture:
+    """Return a capture, read if it is given as capture.toml or its folder; see `formats.capture.load_capture`.
 
     Args:
-        path: capture.toml or its folder.
         allow_outside: let paths in the capture leave its folder.
-
-    Raises:
-        FormatError, CaptureError: see `formats.capture.load_capture`.
     """
-    return load_capture(path, allow_outside=allow_outside)
+    return capture if isinstance(capture, Capture) else load_capture(capture, allow_outside=allow_outside)
 
 
 @explain_missing_packages()
@@ -66,22 +63,26 @@ def load_cameras(capture: Capture) -> list[Camera]:
     return [_at_recorded_size(camera, capture, source) for camera, source in _calibrated(capture)]
 
 
-@explain_missing_packages()
-def rescaled_cameras(capture: Capture) -> dict[str, tuple[tuple[int, int], tuple[int, int]]]:
+def rescaled_cameras(capture: Capture) -> dict[str, tuple[Size, Size]]:
     """Return the sizes (width, height) [px] calibrated and recorded, by the name of each camera where they differ.
-
-    Args:
-        capture: names calibration and videos.
 
     Raises:
         CalibrationError, CaptureError: as `load_cameras`.
     """
-    pairs = [(camera, _at_recorded_size(camera, capture, source)) for camera, source in _calibrated(capture)]
-    return {a.name: (tuple(a.size_px), tuple(b.size_px)) for a, b in pairs if tuple(a.size_px) != tuple(b.size_px)}
+    sizes = {
+        camera.name: (_size(camera), _size(recorded))
+        for (camera, _), recorded in zip(_calibrated(capture), load_cameras(capture), strict=True)
+    }
+    return {name: (was, now) for name, (was, now) in sizes.items() if was != now}
+
+
+def _size(camera: Camera) -> Size:
+    width, height = camera.size_px
+    return int(width), int(height)
 
 
 def tracked_cameras(cameras: Sequence[Camera], tracks: Tracks) -> list[Camera]:
-    """Return the cameras the poses of tracks belong to: as loaded but for what the take itself corrected."""
+    """Return the cameras that the poses of tracks belong to: the calibrated ones with the take's own corrections."""
     from jawusd.tracking.sequence.extrinsics import corrected_cameras
 
     return corrected_cameras(cameras, tracks.meta)
@@ -116,7 +117,7 @@ def _at_recorded_size(camera: Camera, capture: Capture, source: CameraSource) ->
         recorded = mask_size_px(path)
     else:
         return camera
-    width, height = camera.size_px
+    width, height = _size(camera)
     if tuple(recorded) == (width, height):
         return camera
     # One pixel is what rounding of a scaled height makes.
@@ -131,35 +132,62 @@ def _at_recorded_size(camera: Camera, capture: Capture, source: CameraSource) ->
     return camera.scaled(recorded)
 
 
-@explain_missing_packages()
 def load_meshes(capture: Capture) -> dict[str, Mesh]:
-    """Read the scans and bones of a capture, by the names of `MESHES`; optional ones may be absent.
-
-    Returns:
-        Meshes in the scan frame [mm].
+    """Read the scans and bones of a capture, by the names of `MESHES` [mm, scan frame]; bones may be absent.
 
     Raises:
         CaptureError: a mesh is damaged, or of a size that cannot be in mm.
     """
+    paths = {name: getattr(capture.scans, name) for name in MESHES}
+    return read_meshes({name: path for name, path in paths.items() if path is not None})
+
+
+@explain_missing_packages()
+def read_meshes(files: Mapping[str, Path]) -> dict[str, Mesh]:
+    """Read mesh files by the names of `MESHES`; raises as `load_meshes`."""
     from jawusd.imaging.meshio import load_mesh
 
-    paths = {name: getattr(capture.scans, name) for name in MESHES}
-    return {
-        name: load_mesh(path, kind="scan" if name.endswith("teeth") else "bone")
-        for name, path in paths.items()
-        if path is not None
-    }
+    return {name: load_mesh(path, kind="bone" if name in BONES else "scan") for name, path in files.items()}
 
 
-def find_anatomy(capture: Capture, meshes: dict[str, Mesh]) -> Anatomy:
-    """Return the anatomical frame and the landmarks of a capture, given ones before derived ones.
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """Hold what fitting and reports need to know of a person.
+
+    Attributes:
+        name: of the person or the capture.
+        T_anatomical_skull: scan frame to anatomical frame, shape (4, 4).
+        landmarks: `geometry.LANDMARKS` in the mandible frame [mm], shape (5, 3).
+        meshes: by the names of `MESHES`, scan frame [mm]; may be empty.
+        fps: frames per second of the poses, None if not known.
+        T_rest: T_skull_mandible of the closed bite, shape (4, 4).
+        inferred: what was derived instead of being given.
+    """
+
+    name: str
+    T_anatomical_skull: Array
+    landmarks: Array
+    meshes: Mapping[str, Mesh]
+    fps: float | None = None
+    T_rest: Array = field(default_factory=lambda: np.eye(4))
+    inferred: tuple[str, ...] = ()
+
+    def measured_points(self) -> Array | None:
+        """Return the points whose motion is measured [mm], shape (V, 3): mandible, else lower teeth, else None."""
+        for name in ("mandible", "lower_teeth"):
+            if name in self.meshes:
+                return self.meshes[name].vertices
+        return None
+
+
+def subject_of_capture(capture: Capture, meshes: Mapping[str, Mesh] | None = None) -> Subject:
+    """Return the person of a capture; axes and landmarks that it does not give are derived from the scans.
 
     Args:
-        capture: may give axes and landmarks.
-        meshes: see `load_meshes`.
+        meshes: what `load_meshes` returned, if they are loaded already.
 
     Raises:
-        CaptureError: a landmark has an unknown name, or the scans are swapped or not in occlusion.
+        CaptureError: a landmark has an unknown name, or the scans are damaged, swapped or not in occlusion.
     """
     named = capture.anatomy.landmarks or {}
     unknown = sorted(set(named) - set(LANDMARKS))
@@ -168,46 +196,85 @@ def find_anatomy(capture: Capture, meshes: dict[str, Mesh]) -> Anatomy:
             f'[anatomy.landmarks] names "{unknown[0]}", known are {", ".join(LANDMARKS)}.',
             path=capture.folder / "capture.toml",
         )
-    return measure_anatomy(meshes, capture.anatomy.T_anatomical_skull, named)
+    meshes = load_meshes(capture) if meshes is None else meshes
+    return _measured(capture.name, meshes, capture.fps, capture.anatomy.T_anatomical_skull, named)
 
 
-@explain_missing_packages()
-def measure_anatomy(meshes: Mapping[str, Mesh], given: ArrayLike | None, named: Mapping[str, ArrayLike]) -> Anatomy:
-    """Derive from the scans what is not given.
+def subject_of_scans(files: Mapping[str, Path], name: str) -> Subject:
+    """Return the person of loose scans in one frame, teeth in occlusion.
 
     Args:
-        meshes: by the names of `MESHES`, both rows of teeth among them.
-        given: T_anatomical_skull, shape (4, 4), or None.
-        named: landmarks in the mandible frame [mm] by the names of `geometry.LANDMARKS`, shape (3,) each.
+        files: mesh files by the names of `MESHES`; both teeth scans are needed.
 
     Raises:
-        CaptureError: the scans are swapped or not in occlusion.
+        CaptureError: a mesh is damaged or not in mm, or the scans are swapped or not in occlusion.
     """
-    crowns = {name: mesh.vertices[tooth_labels(mesh) > 0] for name, mesh in meshes.items() if "teeth" in name}
+    return _measured(name, read_meshes(files), None, None, {})
+
+
+def _measured(
+    name: str, meshes: Mapping[str, Mesh], fps: float | None, axes: ArrayLike | None, named: Mapping[str, ArrayLike]
+) -> Subject:
+    """Derive T_anatomical_skull from the scans unless `axes` gives it, and the landmarks that are not in `named`."""
+    crowns = {key: mesh.vertices[tooth_labels(mesh) > 0] for key, mesh in meshes.items() if "teeth" in key}
     inferred = []
-    if given is None:
+    if axes is None:
         T_anatomical_skull = anatomical_frame(crowns["upper_teeth"], crowns["lower_teeth"])
         inferred.append("anatomical axes, from the scans")
     else:
-        T_anatomical_skull = np.array(given, dtype=np.float64)
+        T_anatomical_skull = np.array(axes, dtype=np.float64)
     bone = meshes.get("mandible")
     landmarks = find_landmarks(crowns["lower_teeth"], None if bone is None else bone.vertices, T_anatomical_skull)
-    for index, name in enumerate(LANDMARKS):
-        if name in named:
-            landmarks[index] = named[name]
+    for index, landmark in enumerate(LANDMARKS):
+        if landmark in named:
+            landmarks[index] = named[landmark]
         else:
             source = "from the scans"
-            if name.startswith("condyle"):
+            if landmark.startswith("condyle"):
                 source = "from the mandible mesh" if bone is not None else "at mean adult places: there is no mandible"
-            inferred.append(f"{name}, {source}")
-    return Anatomy(T_anatomical_skull, landmarks, tuple(inferred))
+            inferred.append(f"{landmark}, {source}")
+    return Subject(name, T_anatomical_skull, landmarks, meshes, fps, inferred=tuple(inferred))
+
+
+def subject_of_landmarks(path: str | os.PathLike[str], name: str) -> Subject:
+    """Return the person of a file of format jawusd-landmarks/1; errors are measured at the landmarks then.
+
+    Raises:
+        FormatError: see `formats.landmarks.load_landmarks`.
+    """
+    given = load_landmarks(path)
+    if given.T_anatomical_skull is not None:
+        return Subject(name, given.T_anatomical_skull, given.landmarks, {})
+    inferred = ("anatomical axes, from the landmarks",)
+    return Subject(name, landmark_frame(given.landmarks), given.landmarks, {}, inferred=inferred)
+
+
+@explain_missing_packages()
+def subject_of_build(folder: Path) -> Subject:
+    """Return the person of a finished build: its model, and the meshes of its rig.
+
+    Raises:
+        FormatError: there is no model.
+        RigError: there is no geometry.
+    """
+    from jawusd.rig.geo import read_geometry
+
+    model = load_model(folder / "model.npz")
+    fps = model.meta.get("fps")
+    return Subject(
+        str(model.meta.get("actor") or folder.resolve().name),
+        np.asarray(model.arrays["T_anatomical_skull"], dtype=np.float64),
+        np.asarray(model.arrays["landmarks"], dtype=np.float64),
+        read_geometry(folder / "geo.usdc"),
+        float(fps) if isinstance(fps, int | float) else None,
+        np.asarray(model.arrays["T_rest"], dtype=np.float64),
+    )
 
 
 def input_files(capture: Capture, names: Iterable[str]) -> dict[str, list[Path]]:
     """Return the files behind parts of a capture, for hashing, by the part they play.
 
     Args:
-        capture: the capture.
         names: any of "teeth", "mandible", "skull", "boards", "calibration", "masks", "videos".
     """
     parts: dict[str, list[Path]] = {}
@@ -224,16 +291,13 @@ def input_files(capture: Capture, names: Iterable[str]) -> dict[str, list[Path]]
             parts |= {f"video {camera.name}": [camera.video] for camera in capture.cameras if camera.video is not None}
         elif name == "masks":
             for camera in capture.cameras:
-                rows = {camera.masks.upper: "upper", camera.masks.lower: "lower"} if camera.masks else {}
-                parts |= {f"masks {camera.name} {row}": _sequence_files(path) for path, row in rows.items()}
+                arches = {camera.masks.upper: "upper", camera.masks.lower: "lower"} if camera.masks else {}
+                parts |= {f"masks {camera.name} {arch}": _sequence_files(path) for path, arch in arches.items()}
     return {part: [path for path in files if path.is_file()] for part, files in parts.items()}
 
 
 def input_hashes(capture: Capture, names: Iterable[str]) -> dict[str, str]:
-    """Return the content hashes of parts of a capture.
-
-    Args:
-        capture, names: see `input_files`.
+    """Return the content hashes of parts of a capture; see `input_files`.
 
     Raises:
         CaptureError: a file cannot be read.

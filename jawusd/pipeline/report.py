@@ -1,35 +1,63 @@
-"""Gather what a build found, and write its report."""
+"""Gather what a build found and write its report, and repeat the paper's experiments on a take."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from importlib import metadata
 from pathlib import Path
-from typing import TypeVar
+from typing import TypedDict, TypeVar
 
 from jawusd import __version__
 from jawusd.errors import FormatError, JawusdError, MissingDependencyError, explain_missing_packages
 from jawusd.formats.capture import Capture
-from jawusd.formats.experiments import Experiments
+from jawusd.formats.experiments import Experiments, save_table
 from jawusd.formats.model import load_model
 from jawusd.formats.report import CameraFacts, Overlay, ReportData, RigFacts
 from jawusd.formats.tracks import Tracks, load_tracks
-from jawusd.pipeline.experiments import do_experiments
-from jawusd.pipeline.prepare import load_cameras, open_capture
-from jawusd.pipeline.report_media import draw_worst_frames, replay_parts
-from jawusd.pipeline.state import BUILD_FILE, CALIBRATION, FIRST_PASS, BuildState, Progress, StageRecord, locked
-from jawusd.pipeline.subject import subject_of_build
+from jawusd.pipeline.fit import Poses, fit_summary
+from jawusd.pipeline.media import draw_worst_frames, replay_parts
+from jawusd.pipeline.prepare import Subject, load_cameras, open_capture, subject_of_build
+from jawusd.pipeline.state import (
+    BUILD_FILE,
+    CALIBRATION,
+    FIRST_PASS,
+    BuildState,
+    Progress,
+    Stages,
+    locked,
+    no_progress,
+)
 
 T = TypeVar("T")
 
 REPORT_FILE = "report.html"
+TABLE_FILE = "experiments.csv"
 _PACKAGES = ("numpy", "scipy", "numba", "usd-core", "opencv-contrib-python-headless")
 _NETWORKS = (
     "The paper's own models (NLPCA) take about a minute to train: `jawusd report DIR --experiments` adds them to the "
     "figures."
 )
+
+
+class ReportResult(TypedDict):
+    """Name the report written, and its size [bytes]."""
+
+    file: str
+    bytes: int
+
+
+class ExperimentsSummary(TypedDict):
+    """Hold the table of the experiments, sentences about what the capture lacks, notes, and the files written."""
+
+    actor: str
+    frames: int
+    table: list[dict[str, str | int | float]]
+    coverage: list[str]
+    notes: list[str]
+    files: list[Path]
 
 
 @dataclass(frozen=True)
@@ -42,7 +70,7 @@ class BuildFacts:
         why_not: why there is no capture.
     """
 
-    stages: Mapping[str, StageRecord]
+    stages: Stages
     capture: Capture | None
     why_not: str = ""
 
@@ -51,16 +79,10 @@ class BuildFacts:
 def write_build_report(
     folder: Path, facts: BuildFacts, progress: Progress, experiments: Experiments | None = None
 ) -> Path:
-    """Write report.html of a finished build.
+    """Write report.html of a finished build and return its path.
 
     Args:
-        folder: of the rig.
-        facts: what the build left behind.
-        progress: told of the work.
         experiments: already done in full; without them those that take seconds are done.
-
-    Returns:
-        The file.
 
     Raises:
         MissingDependencyError: matplotlib or jinja2 is not installed.
@@ -78,7 +100,7 @@ def write_build_report(
         experiments = _attempt(
             "experiments",
             left_out,
-            lambda: do_experiments(subject, load_tracks(fitted_poses(folder)), 1, lambda *_: None, quick=True),
+            lambda: do_experiments(subject, load_tracks(fitted_poses(folder)), 1, no_progress, quick=True),
         )
         left_out.append(_NETWORKS)
     if describe(folder / "actor.usda")["placeholders"]:
@@ -86,14 +108,13 @@ def write_build_report(
     progress("report", 1, 4)
     overlays = _attempt("pictures of the footage", left_out, lambda: _overlays(facts, tracks)) or ()
     progress("report", 2, 4)
-    sync = facts.stages["sync"].result if "sync" in facts.stages else {}
     data = ReportData(
         actor=subject.name,
         tracks=tracks,
         model=model,
-        sync=sync,
+        sync=facts.stages["sync"].result if "sync" in facts.stages else {},
         cameras=_attempt("cameras", left_out, lambda: _cameras(facts)) or (),
-        inferred=tuple(model.meta.get("inferred", ())),
+        inferred=tuple(fit_summary(model).get("inferred", ())),
         seconds={name: record.seconds for name, record in facts.stages.items() if name != "report"},
         hashes=_hashes(facts.stages),
         versions=_versions(),
@@ -116,18 +137,13 @@ def report_build(
     experiments: Experiments | None = None,
     *,
     allow_outside: bool = False,
-) -> dict:
-    """Write the report of a finished build anew.
+) -> ReportResult:
+    """Write the report of a finished build again.
 
     Args:
-        folder: of the rig.
         capture: capture.toml or its folder; without it, where the build says it was.
-        progress: told of the work.
         experiments: as for `write_build_report`.
         allow_outside: let paths in the capture leave its folder.
-
-    Returns:
-        `file` and its size, `bytes`.
 
     Raises:
         FormatError: not the folder of a build, or a damaged one.
@@ -158,11 +174,7 @@ def is_build(folder: Path) -> bool:
 
 
 def fitted_poses(folder: Path) -> Path:
-    """Return the tracks of a build that its model was fitted to: the first pass, without the model's help.
-
-    Args:
-        folder: of the build.
-    """
+    """Return the tracks of a build that its model was fitted to: the first pass, without the model as a prior."""
     first = folder / FIRST_PASS
     return first if first.is_file() else folder / "tracks.npz"
 
@@ -185,9 +197,7 @@ def build_facts(folder: Path, state: BuildState, capture: Capture | None, *, all
     """Return what a build left behind, with the capture it came from if that is where it was.
 
     Args:
-        folder: of the build.
-        state: its record of stages.
-        capture: the capture, None to look where it was.
+        capture: None to look where it was.
         allow_outside: let paths in the capture leave its folder.
     """
     if capture is not None:
@@ -204,12 +214,7 @@ def build_facts(folder: Path, state: BuildState, capture: Capture | None, *, all
 
 
 def calibrated(capture: Capture, folder: Path) -> Capture:
-    """Return the capture with the calibration that the build made from its boards, if it names none.
-
-    Args:
-        capture: as it was read.
-        folder: of the build.
-    """
+    """Return the capture with the calibration that the build made from its boards, if it names none."""
     made = folder / CALIBRATION
     if capture.calibration is not None or not made.is_file():
         return capture
@@ -237,8 +242,13 @@ def _attempt(what: str, left_out: list[str], work: Callable[[], T]) -> T | None:
 def _overlays(facts: BuildFacts, tracks: Tracks) -> tuple[Overlay, ...]:
     if facts.capture is None:
         raise FormatError(facts.why_not)
-    offsets = facts.stages["sync"].result["offsets"]
-    return draw_worst_frames(facts.capture, offsets, tracks)
+    return draw_worst_frames(facts.capture, recorded_offsets(facts.stages), tracks)
+
+
+def recorded_offsets(stages: Stages) -> dict[str, int]:
+    """Return the frame offset of every camera as a build found it; empty if it did not come that far."""
+    offsets = stages["sync"].result["offsets"] if "sync" in stages else {}
+    return {str(name): int(offset) for name, offset in offsets.items()} if isinstance(offsets, dict) else {}
 
 
 def _cameras(facts: BuildFacts) -> tuple[CameraFacts, ...]:
@@ -264,7 +274,7 @@ def _rig_facts(folder: Path) -> RigFacts:
     return RigFacts(error_mm, tuple(f"{finding.severity}: {finding.message}" for finding in found))
 
 
-def _hashes(stages: Mapping[str, StageRecord]) -> dict[str, str]:
+def _hashes(stages: Stages) -> dict[str, str]:
     found = {name: value for key, record in stages.items() if key != "report" for name, value in record.outputs.items()}
     return dict(sorted(found.items()))
 
@@ -277,3 +287,76 @@ def _versions() -> dict[str, str]:
         except metadata.PackageNotFoundError:
             found[name] = "not installed"
     return found
+
+
+@explain_missing_packages()
+def do_experiments(
+    subject: Subject, motion: Tracks | Poses, starts: int, progress: Progress, *, quick: bool = False
+) -> Experiments:
+    """Do the paper's experiments.
+
+    Args:
+        starts: random starts of the paper's networks.
+        quick: leave out what takes minutes: the networks and the paper's model.
+
+    Raises:
+        FittingError: the poses cannot carry a model.
+    """
+    from jawusd.fitting import FittingConfig
+    from jawusd.fitting.data import SubjectAnatomy
+    from jawusd.fitting.experiments import run_experiments
+
+    points = subject.measured_points()
+    anatomy = SubjectAnatomy.of(subject.T_anatomical_skull, subject.landmarks, points, subject.T_rest)
+    return run_experiments(
+        motion,
+        anatomy,
+        bones=subject.meshes,
+        config=FittingConfig(starts=starts),
+        actor=subject.name,
+        quick=quick,
+        progress=partial(progress, "experiments"),
+    )
+
+
+@explain_missing_packages()
+def draw_experiments(found: Experiments, folder: Path) -> ExperimentsSummary:
+    """Write the figures and the table of the experiments into a folder, which is made if missing.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    from jawusd.report import figures
+
+    files = figures.draw_experiments(found, folder)
+    table = found.table()
+    save_table(folder / TABLE_FILE, table)
+    return {
+        "actor": found.actor,
+        "frames": found.frames,
+        "table": table,
+        "coverage": list(found.coverage.sentences),
+        "notes": list(found.notes),
+        "files": [*files, folder / TABLE_FILE],
+    }
+
+
+@explain_missing_packages()
+def experiment_files(folder: Path) -> list[Path]:
+    """Return the files that `draw_experiments` writes into a folder."""
+    from jawusd.report.figures import FIGURES
+
+    return [folder / f"{name}.{suffix}" for name in FIGURES for suffix in ("png", "svg")] + [folder / TABLE_FILE]
+
+
+def experiment_lines(summary: ExperimentsSummary) -> list[str]:
+    """Return the result of `draw_experiments` as text."""
+    heads = ("mean", "median", "p95", "max")
+    lines = [f"{summary['actor']}: {summary['frames']} captured poses; distances [mm]"]
+    lines.append(f"{'experiment':<16}{'model':<30}{'quantity':<32}{'count':>6}" + "".join(f"{h:>9}" for h in heads))
+    for row in summary["table"]:
+        figures = "".join(f"{row[f'{head}_mm']:9.3f}" for head in heads)
+        lines.append(f"{row['experiment']:<16}{row['model']:<30}{row['quantity']:<32}{row['count']:>6}{figures}")
+    lines += [f"note: {note}" for note in summary["notes"]]
+    lines += [f"coverage: {sentence}" for sentence in summary["coverage"] or ["no exercise is missing."]]
+    return lines + [str(path) for path in summary["files"]]

@@ -6,9 +6,11 @@ import contextlib
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict, dataclass, field
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Generic, TypeVar
 
 from jawusd.errors import FormatError, OutputError
 from jawusd.formats.atomic import clear_unfinished, write_text_atomic
@@ -25,15 +27,12 @@ _CHUNK_BYTES = 1 << 20
 Progress = Callable[[str, int, int], None]
 
 
+def no_progress(stage: str, done: int, total: int) -> None:
+    """Ignore the progress of work."""
+
+
 def hash_files(paths: Iterable[Path]) -> str:
-    """Return the SHA-256 of files' names and contents, in the given order.
-
-    Args:
-        paths: the files.
-
-    Raises:
-        OSError: a file cannot be read.
-    """
+    """Return the SHA-256 of files' names and contents, in the given order; raises OSError for an unreadable file."""
     total = hashlib.sha256()
     for path in paths:
         total.update(path.name.encode() + b"\0")
@@ -49,38 +48,41 @@ def hash_value(value: object) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True, default=str).encode()).hexdigest()
 
 
-@dataclass
-class StageRecord:
+R = TypeVar("R", bound=Mapping[str, object])
+R_co = TypeVar("R_co", bound=Mapping[str, object], covariant=True)
+
+
+@dataclass(frozen=True)
+class StageRecord(Generic[R_co]):
     """Record one finished stage.
 
     Attributes:
         inputs: hash of everything the stage read: files, configuration, results of earlier stages.
         outputs: hash by file name, relative to the folder.
-        seconds: how long it took [s].
         result: small results that later stages or reports need.
     """
 
     inputs: str
     outputs: dict[str, str]
     seconds: float
-    result: dict = field(default_factory=dict)
+    result: R_co
+
+
+#: Finished stages by name.
+Stages = Mapping[str, StageRecord[Mapping[str, object]]]
 
 
 class BuildState:
-    """Keep the record of finished stages of one output folder.
-
-    Args:
-        folder: the output folder.
-    """
+    """Keep the record of finished stages of one output folder."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.stages: dict[str, StageRecord] = {}
+        self.stages: dict[str, StageRecord[Mapping[str, object]]] = {}
         path = folder / BUILD_FILE
         if path.exists():
             self.stages = _read(path)
 
-    def valid(self, stage: str, inputs: str) -> StageRecord | None:
+    def valid(self, stage: str, inputs: str) -> StageRecord[Mapping[str, object]] | None:
         """Return the record of a stage if its inputs and its files on disk are unchanged."""
         record = self.stages.get(stage)
         if record is None or record.inputs != inputs:
@@ -91,25 +93,19 @@ class BuildState:
                 return None
         return record
 
-    def finish(self, stage: str, inputs: str, outputs: Iterable[Path], seconds: float, result: dict) -> StageRecord:
-        """Record a stage whose output files are complete, and write build.json.
-
-        Args:
-            stage: its name.
-            inputs: hash of what it read.
-            outputs: the files it wrote.
-            seconds: how long it took [s].
-            result: what it found, as JSON has it.
+    def finish(self, stage: str, inputs: str, outputs: Iterable[Path], seconds: float, result: R) -> StageRecord[R]:
+        """Record a stage whose output files are complete, and write build.json; see `StageRecord`.
 
         Raises:
             OutputError: build.json cannot be written.
         """
         hashes = {str(path.relative_to(self.folder)): hash_files([path]) for path in outputs}
-        self.stages[stage] = StageRecord(inputs, hashes, round(seconds, 3), result)
+        record = StageRecord(inputs, hashes, round(seconds, 3), result)
+        self.stages[stage] = record
         stages = json.loads(json.dumps({name: asdict(record) for name, record in self.stages.items()}))
         data = {"format": f"{FAMILY}/{VERSION}", "stages": stages, "sha256": hash_value(stages)}
         write_text_atomic(self.folder / BUILD_FILE, json.dumps(data, indent=1, sort_keys=True) + "\n")
-        return self.stages[stage]
+        return record
 
     def clear(self) -> None:
         """Delete what earlier builds wrote here, and nothing else."""
@@ -123,11 +119,11 @@ class BuildState:
         self.stages = {}
 
 
-def _read(path: Path) -> dict[str, StageRecord]:
+def _read(path: Path) -> dict[str, StageRecord[Mapping[str, object]]]:
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
         check_format(data.get("format"), FAMILY, VERSION, path)
-        # Results are used without a look at every value in them: nothing may have changed since they were written.
+        # The values of results are not checked one by one; the hash shows that they are what jawusd wrote.
         if data["sha256"] != hash_value(data["stages"]):
             raise ValueError("changed since it was written")
         return {str(name): StageRecord(**record) for name, record in data["stages"].items()}
@@ -135,6 +131,18 @@ def _read(path: Path) -> dict[str, StageRecord]:
         raise FormatError(
             f"is damaged ({error}).", path=path, hint="Delete it, or build with --fresh into a new folder."
         ) from error
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder that may exist.
+
+    Raises:
+        OutputError: it cannot be made.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot write here: {error.strerror}.", path=path) from error
 
 
 @contextlib.contextmanager
@@ -146,8 +154,8 @@ def locked(folder: Path) -> Iterator[None]:
     Raises:
         OutputError: the folder cannot be written, or another build holds it.
     """
+    make_folder(folder)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         handle = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT, 0o644)
     except OSError as error:
         raise OutputError(f"cannot write here: {error.strerror}.", path=folder) from error
@@ -165,7 +173,7 @@ def locked(folder: Path) -> Iterator[None]:
 def _try_lock(handle: int) -> bool:
     """Take the operating system's lock on an open file; the system frees it when the process dies."""
     try:
-        if os.name == "nt":
+        if sys.platform == "win32":
             import msvcrt
 
             msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)

@@ -1,46 +1,58 @@
-"""Give the viewer an actor: its evaluator, meshes for a screen, and its motions."""
+"""Give the viewer an actor, with its motions, or a capture, with the teeth drawn over its footage and its picks."""
 
 from __future__ import annotations
 
 import os
 import re
+from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from jawusd.errors import FormatError, OutputError, RigError, explain_missing_packages
 from jawusd.evaluator import JawRig
-from jawusd.formats.mesh import Mesh
-from jawusd.formats.tracks import load_tracks
-from jawusd.geometry.arrays import Mask
+from jawusd.formats.capture import Bootstrap, Capture
+from jawusd.formats.capture_edit import write_bootstrap
+from jawusd.formats.mesh import Mesh, crown_face_mask
+from jawusd.formats.tracks import Tracks, load_tracks
+from jawusd.geometry import Camera
+from jawusd.geometry.arrays import Array, Mask
+from jawusd.pipeline.bake import DEFAULT_FPS
+from jawusd.pipeline.calibrate import sync_cameras
+from jawusd.pipeline.media import GRAY, open_videos
+from jawusd.pipeline.prepare import load_cameras, load_meshes, open_capture, subject_of_capture, tracked_cameras
+from jawusd.pipeline.report import calibrated, is_build, recorded_offsets
+from jawusd.pipeline.state import BuildState, Progress
 
 if TYPE_CHECKING:
+    from jawusd.imaging.frame_reader import FrameReader
+    from jawusd.imaging.video import Video
     from jawusd.viewer.motion import Clip
-    from jawusd.viewer.server import Viewer
-    from jawusd.viewer.viewed import ViewedActor
+    from jawusd.viewer.server import CaptureViewer, Viewer
+    from jawusd.viewer.viewed import Look, ViewedActor, ViewedCapture
 
-#: What the motion that was captured is called among the motions of an actor.
+CAPTURE_FILE = "capture.toml"
+#: Name of the captured motion among the motions of an actor.
 CAPTURED = "captured take"
 
 _TRACKS = "tracks.npz"
 _ANIMATION = re.compile(r"anim[A-Za-z0-9_-]{0,100}\.usd[ac]?")
-_MOST_FACES = 8_000  # per mesh: what a browser without a graphics card still turns fluently
-_DEFAULT_FPS = 24.0
+_MOST_FACES = 8_000  # per mesh: what a browser without a graphics card still turns smoothly
+_SPECKS_PERCENT = 0.5
+_FILL: dict[Look, float] = {"outlines": 0.0, "tinted": 0.3}
 
 
 @explain_missing_packages()
 def open_viewer(path: str | os.PathLike[str], host: str, port: int) -> Viewer:
-    """Serve the rig at a path to browsers; see `viewed_actor` and `Viewer` for what it raises.
-
-    Args:
-        path: `actor.usda`, another layer or package that carries the rig, or the folder of a build.
-        host: address to listen on.
-        port: port to listen on.
+    """Serve the rig at a path to browsers; see `viewed_actor` for what it raises.
 
     Raises:
         MissingDependencyError: the viewer is not installed.
+        OutputError: the address cannot be listened on.
     """
     from jawusd.viewer.server import Viewer
 
@@ -51,7 +63,7 @@ def viewed_actor(path: str | os.PathLike[str]) -> ViewedActor:
     """Read what the viewer shows of a rig.
 
     Args:
-        path: as for `open_viewer`.
+        path: `actor.usda`, another layer or package that carries the rig, or the folder of a build.
 
     Raises:
         FormatError: not a rig, or one without geometry.
@@ -71,22 +83,19 @@ def viewed_actor(path: str | os.PathLike[str]) -> ViewedActor:
         rig=rig,
         meshes=screen_meshes(path),
         placeholders=frozenset(read_placeholders(path)),
-        fps=float(about["fps"] or _DEFAULT_FPS),
+        fps=float(about["fps"] or DEFAULT_FPS),
         folder=path.parent,
         clip_names=partial(motion_names, path.parent),
-        load_clip=partial(load_motion, path.parent, rig, float(about["fps"] or _DEFAULT_FPS)),
+        load_clip=partial(load_motion, path.parent, rig, float(about["fps"] or DEFAULT_FPS)),
         save_layer=partial(save_motion, path, rig),
     )
 
 
 def screen_meshes(path: Path) -> dict[str, Mesh]:
-    """Return the meshes of a rig by the viewer's names, teeth and gum apart, coarse enough; placeholders too.
-
-    Args:
-        path: any layer of the rig.
+    """Return the meshes of a rig by the viewer's names, teeth and gum apart, decimated; placeholders too.
 
     Raises:
-        RigError: there is nothing to take hold of.
+        RigError: there is no mesh that moves.
     """
     from jawusd.rig.geo import read_geometry, read_gum, read_placeholders
     from jawusd.viewer.decimate import for_view
@@ -105,14 +114,11 @@ def screen_meshes(path: Path) -> dict[str, Mesh]:
 
 
 def part_of(mesh: Mesh, chosen: Mask) -> Mesh:
-    """Return some faces (F,) of a mesh, with the vertices they use.
-
-    Args:
-        mesh: the whole.
-        chosen: which faces, shape (F,).
-    """
+    """Return the chosen faces, a mask of shape (F,), of a mesh with the vertices they use."""
     used, faces = np.unique(mesh.faces[chosen], return_inverse=True)
-    return Mesh(mesh.vertices[used], faces.reshape(-1, 3), None if mesh.colors is None else mesh.colors[used])
+    return Mesh(
+        mesh.vertices[used], faces.reshape(-1, 3).astype(np.int32), None if mesh.colors is None else mesh.colors[used]
+    )
 
 
 def motion_names(folder: Path) -> tuple[str, ...]:
@@ -125,10 +131,7 @@ def load_motion(folder: Path, rig: JawRig, fps: float, name: str) -> Clip:
     """Read one of `motion_names`, as the nearest parameters of its poses.
 
     Args:
-        folder: of the actor.
-        rig: its evaluator.
         fps: frames per second of the take.
-        name: of the motion.
 
     Raises:
         FormatError: there is no such motion, or it cannot be read.
@@ -154,11 +157,7 @@ def save_motion(actor: Path, rig: JawRig, name: str, clip: Clip, overwrite: bool
     """Write a motion as an animation layer beside an actor.
 
     Args:
-        actor: the layer it animates.
-        rig: its evaluator.
         name: of the file, anim... .usda or .usdc, without a folder.
-        clip: the motion.
-        overwrite: replace a file that is there.
 
     Raises:
         OutputError: the name is not allowed or taken, or the file cannot be written.
@@ -174,3 +173,180 @@ def save_motion(actor: Path, rig: JawRig, name: str, clip: Clip, overwrite: bool
         raise OutputError("exists already.", path=target, hint="Choose another name, or tick overwrite.")
     write_animation(target, actor, clip.frames, clip.d, clip.fps, rig=rig)
     return target
+
+
+def is_capture(path: Path) -> bool:
+    """Tell whether a path is a capture, and not a rig."""
+    return path.suffix == ".toml" or (path / CAPTURE_FILE).is_file()
+
+
+@explain_missing_packages()
+def open_capture_viewer(
+    path: str | os.PathLike[str],
+    tracks: Path | None,
+    host: str,
+    port: int,
+    progress: Progress,
+    *,
+    allow_outside: bool = False,
+) -> CaptureViewer:
+    """Serve a capture to browsers; parameters and errors as for `viewed_capture`.
+
+    Raises:
+        MissingDependencyError: the viewer is not installed.
+    """
+    from jawusd.viewer.server import CaptureViewer
+
+    return CaptureViewer(viewed_capture(path, tracks, progress, allow_outside=allow_outside), host, port)
+
+
+def viewed_capture(
+    path: str | os.PathLike[str], tracks: Path | None, progress: Progress, *, allow_outside: bool = False
+) -> ViewedCapture:
+    """Read what the viewer shows of a capture.
+
+    Args:
+        path: capture.toml or its folder.
+        tracks: folder of a build made from it, or its tracks.npz; None shows the footage alone.
+        allow_outside: let paths in the capture leave its folder.
+
+    Raises:
+        FormatError: the capture or the tracks cannot be read, or the tracks are of other cameras.
+        CaptureError: there is no footage, or a file cannot be decoded.
+        SyncError: the cameras cannot be aligned in time.
+    """
+    from jawusd.imaging.frame_reader import FrameReader
+    from jawusd.viewer.viewed import ViewedCapture
+
+    path = Path(path)
+    capture = open_capture(path, allow_outside=allow_outside)
+    build = tracks if tracks is not None and is_build(tracks) else None
+    if build is not None:
+        capture = calibrated(capture, build)
+    poses = _poses(capture, tracks)
+    videos = open_videos(capture)
+    cameras = [] if capture.calibration is None else load_cameras(capture)
+    if poses is not None:
+        cameras = tracked_cameras(cameras, poses)
+    meshes = load_meshes(capture)
+    offsets = _offsets(capture, build, progress)
+    footage = _Footage(
+        capture=capture,
+        readers={name: FrameReader(video) for name, video in videos.items()},
+        cameras={camera.name: camera for camera in cameras},
+        offsets=offsets,
+        scans={arch: meshes[f"{arch}_teeth"] for arch in ("upper", "lower")},
+    )
+    return ViewedCapture(
+        name=capture.name,
+        fps=capture.fps,
+        frames=_frames(capture, poses, videos, offsets),
+        offsets=offsets,
+        sizes_px={name: video.size_px for name, video in videos.items()},
+        cameras=footage.cameras,
+        scans=footage.scans,
+        crowns={arch: crown_face_mask(mesh) for arch, mesh in footage.scans.items()},
+        T_anatomical_skull=subject_of_capture(capture, meshes).T_anatomical_skull,
+        tracks=poses,
+        picks=capture.bootstrap,
+        picture=footage.picture,
+        teeth_region=footage.teeth_region,
+        poses_of_picks=footage.poses_of_picks,
+        save_picks=partial(write_bootstrap, path / CAPTURE_FILE if path.is_dir() else path),
+    )
+
+
+def _poses(capture: Capture, tracks: Path | None) -> Tracks | None:
+    if tracks is None:
+        return None
+    found = load_tracks(tracks / _TRACKS if tracks.is_dir() else tracks)
+    names = [camera.name for camera in capture.cameras]
+    if list(found.camera_names) != names:
+        raise FormatError(
+            f"is of the cameras {', '.join(found.camera_names)}; the capture has {', '.join(names)}.",
+            path=tracks,
+            hint="Name the build of this capture.",
+        )
+    return found
+
+
+def _offsets(capture: Capture, build: Path | None, progress: Progress) -> dict[str, int]:
+    """Return the frame offsets the build found, else find them."""
+    if build is not None:
+        found = recorded_offsets(BuildState(build).stages)
+        if found:
+            return found
+    return sync_cameras(capture, progress)["offsets"]
+
+
+def _frames(
+    capture: Capture, poses: Tracks | None, videos: Mapping[str, Video], offsets: Mapping[str, int]
+) -> tuple[int, int]:
+    """Return the first and the last frame of the reference camera to step through."""
+    if poses is not None and len(poses.frames):
+        return int(poses.frames[0]), int(poses.frames[-1])
+    if capture.frames is not None:
+        return capture.frames[0], capture.frames[1] - 1
+    # From the first picture of any camera to the last.
+    return (
+        max(0, min(offsets[name] for name in videos)),
+        max(offsets[name] + video.timeline.count - 1 for name, video in videos.items()),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Footage:
+    """Provide pictures, regions and poses of a capture to pages; safe to use from several threads."""
+
+    capture: Capture
+    readers: Mapping[str, FrameReader]
+    cameras: Mapping[str, Camera]
+    offsets: Mapping[str, int]
+    scans: Mapping[str, Mesh]
+
+    def picture(self, name: str, frame: int, poses: tuple[Array, Array] | None, look: Look) -> NDArray[np.uint8]:
+        """Return a camera's picture at a frame of the reference camera, with the teeth drawn over it."""
+        from jawusd.imaging.overlay import LOWER_COLOUR, UPPER_COLOUR, PlacedScan, draw_overlay
+
+        reader = self.readers[name]
+        own = reader.video.timeline.picture(frame - self.offsets[name])
+        if own is None:
+            width, height = reader.video.size_px
+            return np.full((height, width, 3), GRAY, np.uint8)
+        image = reader.picture(own)
+        if poses is None or look == "footage" or name not in self.cameras:
+            return image
+        colours = UPPER_COLOUR, LOWER_COLOUR
+        placed = [PlacedScan(*scan) for scan in zip(self.scans.values(), poses, colours, strict=True)]
+        return draw_overlay(image, self.cameras[name], placed, fill=_FILL[look])
+
+    def teeth_region(self, name: str, frame: int) -> tuple[float, float, float, float] | None:
+        """Return left, top, right and bottom [px] of the masks of a camera at a frame, None without any."""
+        from jawusd.imaging.masks import open_masks
+
+        source = next(camera for camera in self.capture.cameras if camera.name == name)
+        if source.masks is None:
+            return None
+        seen = []
+        for reader in open_masks(source, self.readers[name].video.size_px):
+            with reader as masks:
+                mask = masks.read(frame - self.offsets[name])
+            if mask is not None:
+                y, x = np.nonzero(mask > 127)
+                seen.append(np.column_stack([x, y]))
+        if not any(map(len, seen)):
+            return None
+        # Specks far from the teeth do not count.
+        low, high = np.percentile(np.vstack(seen), (_SPECKS_PERCENT, 100 - _SPECKS_PERCENT), axis=0)
+        return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+
+    def poses_of_picks(self, picks: Bootstrap) -> tuple[tuple[Array, Array], list[str]]:
+        """Return the poses that agree with picks, and the names of those that do not fit."""
+        from jawusd.tracking.initialization.bootstrap import pose_from_picks
+
+        poses, wrong = [], []
+        for arch, mesh in self.scans.items():
+            pose, bad = pose_from_picks(getattr(picks, arch), mesh.vertices, self.cameras, arch)
+            poses.append(pose)
+            wrong += [f"{arch[0].upper()}{number}" for number in bad]
+        return (poses[0], poses[1]), wrong

@@ -113,4 +113,4 @@ class TrackingConfig:
 #: For masks that jawusd made. They vary more from frame to frame than drawn ones: outlines get rougher as lips close,
 #: and what looks lost by the rules for drawn masks is not. A pose given up for nothing is a frame without a jaw, and
 #: while masks are made it leaves the next ones without a guide.
-FOR_MADE_MASKS = TrackingConfig(suspect_residual=3.0, suspect_score=0.25)
+FOR_AUTO_MASKS = TrackingConfig(suspect_residual=3.0, suspect_score=0.25)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.formats.coverage import uncovered_percent, worst_frames
 from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, TRACKED, Tracks
 from jawusd.geometry.arrays import Array
 from jawusd.viewer.plots import BLUE, GREY, ORANGE, VERMILION, svg_definition
 
-_APART_S = 0.5  # neighbouring frames show the same problem
 _MOST_WORST = 12
 _WIDTH, _HEIGHT = 330, 170
 _LEFT, _RIGHT, _TOP, _BOTTOM = 30, 8, 20, 26
@@ -23,27 +23,10 @@ _STATUS: dict[int, str] = {
 _COLORS = (ORANGE, BLUE)  # upper, lower, as the outlines in the pictures
 
 
-def uncovered_percent(tracks: Tracks) -> Array:
-    """Return the mask area left uncovered per frame and arch, mean over the used masks [%], shape (F, 2); NaN: none."""
-    value = np.where(tracks.masks_used, tracks.coverage_error, np.nan)
-    known = np.isfinite(value)
-    total = np.where(known, value, 0.0).sum(axis=2)
-    return 100 * np.divide(total, known.sum(axis=2), out=np.full(total.shape, np.nan), where=known.any(axis=2))
-
-
-def worst_frames(tracks: Tracks, fps: float) -> list[int]:
+def frames_to_inspect(tracks: Tracks, fps: float) -> list[int]:
     """Return frames to inspect, the worst first, no two within half a second: lost ones, then by coverage."""
-    badness = np.nan_to_num(uncovered_percent(tracks), nan=-1.0).max(axis=1)
-    badness = np.where(tracks.tracked(), badness, np.inf)
-    apart = max(round(_APART_S * fps), 1)
-    found: list[int] = []
-    for index in np.argsort(-badness, kind="stable"):
-        frame = int(tracks.frames[index])
-        if len(found) == _MOST_WORST or badness[index] < 0:
-            break
-        if all(abs(frame - other) >= apart for other in found):
-            found.append(frame)
-    return found
+    badness = np.where(tracks.tracked(), np.fmax.reduce(uncovered_percent(tracks), axis=1), np.inf)
+    return [int(tracks.frames[index]) for index in worst_frames(badness, tracks.frames, fps, _MOST_WORST)]
 
 
 def frame_words(tracks: Tracks, frame: int) -> str:

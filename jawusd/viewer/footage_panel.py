@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import viser
 
-from jawusd.viewer.coverage import CoveragePlot, frame_words, worst_frames
+from jawusd.viewer.coverage import CoveragePlot, frame_words, frames_to_inspect
 from jawusd.viewer.plots import plot_seek
 from jawusd.viewer.viewed import Look, ViewedCapture
 from jawusd.viewer.widgets import Choice, add_dark_checkbox, assign, guarded, small_text
@@ -37,7 +37,7 @@ class FootagePanel:
         self.view = next(iter(capture.sizes_px))
         self.frame = capture.picks.frame if capture.tracks is None and capture.picks else capture.frames[0]
         self.frame = min(max(self.frame, capture.frames[0]), capture.frames[1])
-        self.worst = [] if capture.tracks is None else worst_frames(capture.tracks, capture.fps)
+        self.worst = [] if capture.tracks is None else frames_to_inspect(capture.tracks, capture.fps)
         gui = client.gui
         views = (*capture.sizes_px, *([SPACE] if capture.cameras else []))
         self.views = gui.add_button_group("view", views)

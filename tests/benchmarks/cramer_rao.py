@@ -18,7 +18,7 @@ import numpy as np
 from jawusd.formats.capture import load_capture
 from jawusd.formats.tracks import load_tracks
 from jawusd.geometry import LANDMARKS, mandible_metric, relative_pose, transform_point, transform_points
-from jawusd.pipeline.prepare import find_anatomy, load_cameras, load_meshes
+from jawusd.pipeline.prepare import load_cameras, load_meshes, subject_of_capture
 from jawusd.tracking import TrackingConfig
 from jawusd.tracking.contour.quality import landmark_sigmas, relative_covariance, residual_px, twist_covariance
 from jawusd.tracking.contour.scan import prepare_scan
@@ -46,7 +46,7 @@ def main() -> None:
     with np.load(capture.folder / "truth" / "truth.npz", allow_pickle=False) as archive:
         truth = {name: archive[name] for name in archive.files}
     offsets = dict(zip(truth["camera_names"].tolist(), truth["offsets"].tolist(), strict=True))
-    landmarks = find_anatomy(capture, meshes).landmarks
+    landmarks = subject_of_capture(capture, meshes).landmarks
     scans = [prepare_scan(meshes[f"{row}_teeth"], row) for row in ROWS]
     exact = np.stack([truth[f"T_world_{row}"] for row in ROWS], axis=1)
     at = {int(frame): k for k, frame in enumerate(truth["frames"])}

@@ -32,7 +32,7 @@ from jawusd.fitting.paper import fit_paper  # noqa: E402
 from jawusd.formats.capture import load_capture  # noqa: E402
 from jawusd.formats.tracks import load_tracks  # noqa: E402
 from jawusd.geometry import LANDMARKS, make_transform, se3_exp, se3_log, so3_exp, transform_point  # noqa: E402
-from jawusd.pipeline.prepare import find_anatomy, load_meshes  # noqa: E402
+from jawusd.pipeline.prepare import load_meshes, subject_of_capture  # noqa: E402
 from jawusd.synthetic.exercises import record  # noqa: E402
 
 ALL_SHOWN = np.ones(3, dtype=bool)
@@ -143,7 +143,7 @@ def recorded(folder: Path, tracks: Path | None, starts: int) -> None:
     """Print the tables of a capture with truth."""
     capture = load_capture(folder)
     meshes = load_meshes(capture)
-    found = find_anatomy(capture, meshes)
+    found = subject_of_capture(capture, meshes)
     bone = meshes.get("mandible", meshes["lower_teeth"])
     anatomy = SubjectAnatomy.of(found.T_anatomical_skull, found.landmarks, bone.vertices, None)
     with np.load(capture.folder / "truth" / "truth.npz") as archive:

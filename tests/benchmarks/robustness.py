@@ -28,7 +28,7 @@ from jawusd.formats.capture import load_capture
 from jawusd.formats.mesh import tooth_labels
 from jawusd.formats.tracks import TRACKED, Tracks, load_tracks, save_tracks
 from jawusd.geometry import LANDMARKS, mandible_metric, transform_points
-from jawusd.pipeline.prepare import find_anatomy, load_cameras, load_meshes
+from jawusd.pipeline.prepare import load_cameras, load_meshes, subject_of_capture
 from jawusd.tracking import track_capture
 
 LARGE_SIGMA_MM = 0.25  # half of what no unflagged frame may miss by
@@ -54,7 +54,7 @@ class Scorer:
         self.meshes = load_meshes(self.capture)
         scans = [self.meshes[f"{row}_teeth"] for row in ROWS]
         self.crowns = [scan.vertices[tooth_labels(scan) > 0][::20] for scan in scans]
-        self.landmarks = find_anatomy(self.capture, self.meshes).landmarks
+        self.landmarks = subject_of_capture(self.capture, self.meshes).landmarks
         with np.load(self.capture.folder / "truth" / "truth.npz", allow_pickle=False) as archive:
             self.truth = {name: archive[name] for name in archive.files}
         names, offsets = self.truth["camera_names"].tolist(), self.truth["offsets"].tolist()

@@ -89,7 +89,7 @@ def _write_looped(folder: Path, pictures: list[np.ndarray], frames: int, first: 
 
 def cost_of_build(capture: str, out: str) -> dict:
     """Build here and return processor seconds and peak memory [MB] by stage."""
-    from jawusd.pipeline.build import BuildOptions, build_rig
+    from jawusd.pipeline.build import BuildOptions, build
 
     seconds: dict[str, float] = {}
     peaks: dict[str, float] = {}
@@ -100,7 +100,7 @@ def cost_of_build(capture: str, out: str) -> dict:
         peaks[now["stage"]] = max(peaks.get(now["stage"], 0.0), _peak_mb())
         now.update(stage=stage, clock=time.process_time())
 
-    summary = build_rig(capture, out, BuildOptions(jobs=1), note)
+    summary = build(capture, out, BuildOptions(jobs=1), note)
     note("", 0, 0)
     sizes = {path.name: path.stat().st_size for path in Path(out).iterdir()}
     return {"seconds": seconds, "peaks": peaks, "sizes": sizes, "tracked": summary["track"]["tracked"]}

@@ -16,7 +16,7 @@ from jawusd.formats.mesh import tooth_labels
 from jawusd.formats.tracks import load_tracks
 from jawusd.geometry import LANDMARKS, se3_inverse, se3_log, transform_points
 from jawusd.imaging.meshio import load_mesh
-from jawusd.pipeline.prepare import find_anatomy, load_meshes
+from jawusd.pipeline.prepare import load_meshes, subject_of_capture
 
 
 def row(name: str, distance_mm: np.ndarray) -> str:
@@ -45,7 +45,7 @@ def main() -> None:
         found, exact = getattr(tracks, f"T_world_{name}")[known], truth[f"T_world_{name}"][rows]
         gap = transform_points(found, crown) - transform_points(exact, crown)
         print(row(f"{name} teeth, mean over vertices", np.linalg.norm(gap, axis=-1).mean(-1)))
-    landmarks = find_anatomy(capture, load_meshes(capture)).landmarks
+    landmarks = subject_of_capture(capture, load_meshes(capture)).landmarks
     exact = truth["T_upper_lower"][rows]
     for kind in ("raw_", ""):
         found = getattr(tracks, f"{kind}T_upper_lower")[known]

@@ -19,10 +19,11 @@ from jawusd.formats.capture import Capture, load_capture
 from jawusd.geometry import LANDMARKS, se3_inverse, transform_point
 from jawusd.imaging.masks import MaskReader
 from jawusd.imaging.video import Video
-from jawusd.pipeline.prepare import find_anatomy, load_meshes
+from jawusd.pipeline.calibrate import sync_cameras
+from jawusd.pipeline.prepare import load_meshes, subject_of_capture
 from jawusd.pipeline.segment import SegmentOptions, segment_teeth, with_masks
-from jawusd.pipeline.segment_summary import write_summary
-from jawusd.pipeline.stages import sync_cameras, track_teeth
+from jawusd.pipeline.segment_record import write_summary
+from jawusd.pipeline.track import first_pass
 
 
 def hidden(capture: Capture, frames: int | None) -> Capture:
@@ -103,13 +104,13 @@ def main() -> None:
     for row in ("upper", "lower"):
         shares = [share for key, values in found.items() if key[1] == row for share in values.values()]
         print(f"all  {row:<6} overlap: median {np.median(shares):.3f}")
-    landmark = find_anatomy(capture, load_meshes(capture)).landmarks[LANDMARKS.index("incisor")]
+    landmark = subject_of_capture(capture, load_meshes(capture)).landmarks[LANDMARKS.index("incisor")]
     frames = np.array(sorted(entries))
     poses = np.array([entries[frame]["poses"] for frame in frames])
     print(f"{'incisal point [mm]':<34}{'':<15}" + "".join(f"{name:>9}" for name in ("mean", "p95", "max")))
     report("while segmenting", incisor_error(truth, landmark, frames, se3_inverse(poses[:, 0]) @ poses[:, 1]))
     if not options.no_track:
-        tracks = track_teeth(with_masks(capture, folder), offsets, options.jobs, quiet)
+        tracks = first_pass(with_masks(capture, folder), offsets, options.jobs, quiet)
         report("from the masks, raw", incisor_error(truth, landmark, tracks.frames, tracks.raw_T_upper_lower))
         report("from the masks, final", incisor_error(truth, landmark, tracks.frames, tracks.T_upper_lower))
     worth = {}

@@ -91,7 +91,7 @@ def run_setup(path: Path, setup: Setup, windows: int, length: int) -> dict:
     from jawusd.formats.capture import load_capture
     from jawusd.formats.mesh import tooth_labels
     from jawusd.geometry import transform_points
-    from jawusd.pipeline.prepare import find_anatomy, load_cameras, load_meshes
+    from jawusd.pipeline.prepare import load_cameras, load_meshes, subject_of_capture
     from jawusd.tracking import track_capture
     from jawusd.tracking.contour.solver import ContourSolver
     from jawusd.tracking.paper import take as paper_take
@@ -104,7 +104,7 @@ def run_setup(path: Path, setup: Setup, windows: int, length: int) -> dict:
     offsets = dict(zip(truth["camera_names"].tolist(), truth["offsets"].tolist(), strict=True))
     scans = [meshes[f"{row}_teeth"] for row in ROWS]
     watch = Watch(*((paper_take, "solve_paper") if setup.solver == "paper" else (ContourSolver, "solve")))
-    landmarks = find_anatomy(capture, meshes).landmarks
+    landmarks = subject_of_capture(capture, meshes).landmarks
     config = replace(PaperConfig(), other_row_hides=setup.other_row_hides)
     times: list[list[float]] = []
     errors: dict[str, list[float]] = {row: [] for row in ROWS}

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from jawusd.formats.model import load_model
 from jawusd.formats.poses import write_poses
 from jawusd.geometry import LANDMARKS, make_transform
-from jawusd.pipeline.experiments import TABLE_FILE
+from jawusd.pipeline.report import TABLE_FILE
 from jawusd.synthetic.exercises import record
 from jawusd.synthetic.person import Person
 

@@ -14,7 +14,7 @@ from package_copy import ROOT
 
 from jawusd import __version__
 from jawusd.cli.main import app
-from jawusd.pipeline.summary import build_lines
+from jawusd.pipeline.build import build_lines
 
 README = (ROOT / "README.md").read_text()
 COMMANDS = typer.main.get_command(app).commands

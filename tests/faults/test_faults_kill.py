@@ -35,7 +35,7 @@ def stub(number, name):
 for number, name in enumerate(("sync", "track", "fit", "aid", "bake", "report")):
     stub(number, name)
 print("ready", flush=True)
-build.build_rig(sys.argv[1], sys.argv[2], build.BuildOptions(resume=True), lambda *_: None)
+build.build(sys.argv[1], sys.argv[2], build.BuildOptions(resume=True), lambda *_: None)
 """
 
 

@@ -7,7 +7,7 @@ import pytest
 from package_copy import ROOT
 
 from jawusd.pipeline import build
-from jawusd.pipeline.build import BuildOptions, build_rig
+from jawusd.pipeline.build import BuildOptions
 from jawusd.pipeline.prepare import input_files, open_capture
 
 EXAMPLE = ROOT / "examples" / "capture"
@@ -45,7 +45,7 @@ def rebuilt(monkeypatch, tmp_path, capture):
 
     def run(**options):
         ran.clear()
-        build_rig(capture, tmp_path / "out", BuildOptions(resume=True, **options), lambda *_: None)
+        build.build(capture, tmp_path / "out", BuildOptions(resume=True, **options), lambda *_: None)
         return list(ran)
 
     return run

@@ -18,7 +18,7 @@ from jawusd.errors import CalibrationError, CaptureError, JawusdError, OutputErr
 from jawusd.formats.calibration import load_calibration
 from jawusd.formats.tracks import load_tracks
 from jawusd.geometry import transform_points
-from jawusd.pipeline.build import BuildOptions, build_rig
+from jawusd.pipeline.build import BuildOptions, build
 from jawusd.pipeline.prepare import load_cameras, open_capture, rescaled_cameras
 from jawusd.rig.validate import validate_stage
 
@@ -122,8 +122,8 @@ def test_the_report_shows_the_take_and_stays_small(built):
 def test_a_second_build_needs_a_word_and_resume_reuses_everything(built):
     out, _ = built
     with pytest.raises(OutputError, match="--resume"):
-        build_rig(EXAMPLE, out, BuildOptions(), quiet)
-    again = build_rig(EXAMPLE, out, BuildOptions(resume=True), quiet)
+        build(EXAMPLE, out, BuildOptions(), quiet)
+    again = build(EXAMPLE, out, BuildOptions(resume=True), quiet)
     assert again["reused"] == ["sync", "track", "fit", "aid", "bake", "report"]
 
 
@@ -131,7 +131,7 @@ def test_resume_redoes_only_what_depends_on_a_change(built, tmp_path):
     out = tmp_path / "copy"
     shutil.copytree(built[0], out)
     (out / "model.npz").unlink()
-    again = build_rig(EXAMPLE, out, BuildOptions(resume=True), quiet)
+    again = build(EXAMPLE, out, BuildOptions(resume=True), quiet)
     assert again["reused"][:2] == ["sync", "track"] and "fit" not in again["reused"]
     assert (out / "model.npz").read_bytes() == (built[0] / "model.npz").read_bytes()
 
@@ -238,7 +238,7 @@ def truncated_video(folder):
 def test_each_broken_capture_is_one_clear_error(capture, tmp_path, damage, error, words):
     damage(capture)
     with pytest.raises(error, match=words) as caught:
-        build_rig(capture, tmp_path / "out", BuildOptions(), quiet)
+        build(capture, tmp_path / "out", BuildOptions(), quiet)
     assert isinstance(caught.value, JawusdError) and str(capture) in str(caught.value)
     left = {path.name for path in (tmp_path / "out").iterdir()} if (tmp_path / "out").exists() else set()
     assert left <= {"build.json", ".jawusd-lock"}
@@ -259,7 +259,7 @@ def test_calibration_at_another_size_of_the_same_shape_is_scaled(capture):
 def test_an_output_folder_with_other_files_is_left_alone(tmp_path):
     (tmp_path / "mine.txt").write_text("precious")
     with pytest.raises(OutputError, match="not empty"):
-        build_rig(EXAMPLE, tmp_path, BuildOptions(), quiet)
+        build(EXAMPLE, tmp_path, BuildOptions(), quiet)
     assert os.listdir(tmp_path) == ["mine.txt"]
 
 

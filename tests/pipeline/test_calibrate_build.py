@@ -14,10 +14,9 @@ from jawusd.cli.main import app
 from jawusd.errors import CalibrationError
 from jawusd.formats.calibration import load_calibration
 from jawusd.geometry import triangulate
-from jawusd.pipeline.build import BuildOptions, build_rig
-from jawusd.pipeline.calibration import calibrate_boards, calibration_lines
+from jawusd.pipeline.build import BuildOptions, build, build_lines
+from jawusd.pipeline.calibrate import calibrate_boards, calibration_lines
 from jawusd.pipeline.prepare import input_files, load_cameras, open_capture
-from jawusd.pipeline.summary import build_lines
 
 EXAMPLE = ROOT / "examples" / "capture"
 
@@ -53,7 +52,7 @@ def calibrated(capture, tmp_path_factory):
     out = tmp_path_factory.mktemp("build") / "actor"
     told = []
     with pytest.raises(Reached):
-        build_rig(capture, out, BuildOptions(), stop_at("track", told))
+        build(capture, out, BuildOptions(), stop_at("track", told))
     return out, told
 
 
@@ -87,14 +86,14 @@ def test_a_resumed_build_keeps_the_calibration_until_the_boards_change(capture, 
     shutil.copytree(calibrated[0], out)
     told = []
     with pytest.raises(Reached):
-        build_rig(capture, out, BuildOptions(resume=True), stop_at("track", told))
+        build(capture, out, BuildOptions(resume=True), stop_at("track", told))
     assert [entry for entry in told if entry[0] == "calibrate"] == [("calibrate", 1, 1)]
     changed = tmp_path / "changed"
     shutil.copytree(capture, changed)
     text = (changed / "capture.toml").read_text()
     (changed / "capture.toml").write_text(text.replace("square_mm = 8.0", "square_mm = 8.1"))
     with pytest.raises(Reached):
-        build_rig(changed, out, BuildOptions(resume=True), stop_at("calibrate", []))
+        build(changed, out, BuildOptions(resume=True), stop_at("calibrate", []))
 
 
 def test_a_fresh_build_deletes_the_masks_an_earlier_one_made(capture, tmp_path):
@@ -103,7 +102,7 @@ def test_a_fresh_build_deletes_the_masks_an_earlier_one_made(capture, tmp_path):
     made.touch()
     (tmp_path / "actor" / "masks" / "segment.jsonl").write_text("{}\n")
     with pytest.raises(Reached):
-        build_rig(capture, tmp_path / "actor", BuildOptions(fresh=True), stop_at("calibrate", []))
+        build(capture, tmp_path / "actor", BuildOptions(fresh=True), stop_at("calibrate", []))
     assert not (tmp_path / "actor" / "masks").exists()
 
 

@@ -20,8 +20,8 @@ from typer.testing import CliRunner
 from jawusd.cli.main import app
 from jawusd.errors import CaptureError, ClusterError, OutputError
 from jawusd.formats.capture_list import ListedCapture
-from jawusd.pipeline import cluster, many
-from jawusd.pipeline.build import BuildOptions, build_rig
+from jawusd.pipeline import many
+from jawusd.pipeline.build import BuildOptions, build
 from jawusd.pipeline.many import Outcome, build_many, outcome_lines
 
 FRAMES = 30
@@ -84,7 +84,7 @@ def test_a_killed_worker_and_a_bad_capture_leave_the_rest_as_serial_builds_make_
     assert [row["status"] for row in builds.values()] == ["built", "failed", "built"]
     assert builds["first"]["frames"] == builds["first"]["tracked"] == FRAMES
     assert "no such" in builds["nowhere"]["error"] and not (shoot / "out" / "nowhere").exists()
-    build_rig(shoot / "take", shoot / "serial", BuildOptions(), lambda *_: None)
+    build(shoot / "take", shoot / "serial", BuildOptions(), lambda *_: None)
     serial = results(shoot / "serial")
     assert len(serial) > 50
     for name in ("first", "second"):
@@ -114,7 +114,7 @@ def here():
 
 
 def made_up_build(path, folder, options, progress):
-    """Stand in for `build_rig`: the name of the capture says what happens."""
+    """Stand in for `build`: the name of the capture says what happens."""
     progress("track", 1, 2)
     if path.name == "bad":
         raise CaptureError("is bad.", path=path)
@@ -137,7 +137,7 @@ def listed(tmp_path, *names):
 
 
 def test_every_way_a_build_can_go_is_one_row(here, tmp_path, monkeypatch):
-    monkeypatch.setattr(many, "build_rig", made_up_build)
+    monkeypatch.setattr(many, "build", made_up_build)
     options = many.ManyOptions(BuildOptions(), cluster=here)
     told = []
     found = build_many(listed(tmp_path, "bad", "fault", "kept", "good"), tmp_path / "out", options, told.append)
@@ -154,7 +154,7 @@ def test_every_way_a_build_can_go_is_one_row(here, tmp_path, monkeypatch):
 
 
 def test_an_interrupted_run_calls_its_builds_off(here, tmp_path, monkeypatch):
-    monkeypatch.setattr(many, "build_rig", made_up_build)
+    monkeypatch.setattr(many, "build", made_up_build)
 
     def interrupt(line):
         if line.startswith("[1/3]"):
@@ -171,7 +171,7 @@ def test_an_interrupted_run_calls_its_builds_off(here, tmp_path, monkeypatch):
 
 
 def test_a_folder_with_a_build_needs_a_word(here, tmp_path, monkeypatch):
-    monkeypatch.setattr(many, "build_rig", made_up_build)
+    monkeypatch.setattr(many, "build", made_up_build)
     (tmp_path / "out" / "good").mkdir(parents=True)
     (tmp_path / "out" / "good" / "build.json").write_text("{}")
     captures = listed(tmp_path, "other", "good")
@@ -183,13 +183,13 @@ def test_a_folder_with_a_build_needs_a_word(here, tmp_path, monkeypatch):
 
 
 def test_local_workers_listen_to_this_machine_alone_and_a_deadly_capture_is_given_up():
-    with cluster.local_cluster(workers=1, retries=0) as client:
+    with many.local_cluster(workers=1, retries=0) as client:
         me = psutil.Process()
         heard = [c for p in (me, *me.children(recursive=True)) for c in p.net_connections() if c.status == "LISTEN"]
         assert {c.laddr.ip for c in heard} == {"127.0.0.1"}
-        cluster.check_workers(client, ROOT)
+        many.check_workers(client, ROOT)
         with pytest.raises(ClusterError, match="does not see"):
-            cluster.check_workers(client, ROOT / "missing")
+            many.check_workers(client, ROOT / "missing")
         future = client.submit(os._exit, 1)
         future.exception(timeout=60)
         outcome = many._outcome(future, ListedCapture(ROOT, "x"))
@@ -203,12 +203,12 @@ def silent():
 
 
 def test_a_scheduler_that_does_not_answer_is_one_clear_error(monkeypatch, tmp_path):
-    monkeypatch.setattr(cluster, "CONNECT_SECONDS", 1)
+    monkeypatch.setattr(many, "CONNECT_SECONDS", 1)
     listener, address = silent()
     with (
         listener,
         pytest.raises(ClusterError, match=f"no scheduler answers at {address}"),
-        cluster.existing_cluster(address),
+        many.existing_cluster(address),
     ):
         pass
     (tmp_path / "list.txt").write_text("capture\n")
@@ -219,19 +219,19 @@ def test_a_scheduler_that_does_not_answer_is_one_clear_error(monkeypatch, tmp_pa
 
 
 def test_a_scheduler_without_workers_is_one_clear_error(monkeypatch):
-    monkeypatch.setattr(cluster, "CONNECT_SECONDS", 1)
+    monkeypatch.setattr(many, "CONNECT_SECONDS", 1)
     with (
         LocalCluster(n_workers=0, **INSIDE) as empty,
         pytest.raises(ClusterError, match="has no worker"),
-        cluster.existing_cluster(empty.scheduler_address),
+        many.existing_cluster(empty.scheduler_address),
     ):
         pass
 
 
 def test_workers_of_another_version_are_refused(here, monkeypatch):
-    monkeypatch.setattr(cluster, "_look", lambda folder: ("0.0.1", True))
-    with cluster.existing_cluster(here) as client, pytest.raises(ClusterError, match=r"has jawusd 0\.0\.1"):
-        cluster.check_workers(client, ROOT)
+    monkeypatch.setattr(many, "_look", lambda folder: ("0.0.1", True))
+    with many.existing_cluster(here) as client, pytest.raises(ClusterError, match=r"has jawusd 0\.0\.1"):
+        many.check_workers(client, ROOT)
 
 
 def test_without_dask_the_command_names_its_extra():

@@ -14,7 +14,7 @@ from jawusd.formats.calibration import save_calibration
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import Camera, make_transform, relative_pose
 from jawusd.imaging.video_writer import VideoWriter
-from jawusd.pipeline.overlay import overlay_files, write_overlay
+from jawusd.pipeline.media import overlay_files, write_overlay
 from jawusd.pipeline.prepare import open_capture
 
 SIZE = (240, 180)

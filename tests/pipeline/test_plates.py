@@ -11,7 +11,7 @@ import pytest
 from jawusd.formats.calibration import save_calibration
 from jawusd.geometry import Camera, make_transform
 from jawusd.imaging.video_writer import VideoWriter
-from jawusd.pipeline.plates import write_plates
+from jawusd.pipeline.media import write_plates
 from jawusd.pipeline.prepare import open_capture
 from jawusd.rig.cameras import PLATE
 

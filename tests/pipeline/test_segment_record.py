@@ -9,10 +9,16 @@ from package_copy import ROOT
 from jawusd.errors import FormatError
 from jawusd.formats.capture import load_capture
 from jawusd.formats.tracks import LOST, TRACKED
-from jawusd.pipeline.journal import FILE, Journal
-from jawusd.pipeline.made_masks import SUMMARY
-from jawusd.pipeline.segment import LEARNED
-from jawusd.pipeline.segment_summary import delete_masks, segment_lines, summarise, write_summary
+from jawusd.pipeline.segment_record import (
+    LEARNED,
+    RECORD,
+    SUMMARY,
+    Journal,
+    delete_masks,
+    segment_lines,
+    summarise,
+    write_summary,
+)
 
 POSES = np.stack([np.eye(4)] * 2).tolist()
 
@@ -60,7 +66,7 @@ def test_a_line_cut_short_is_forgotten(tmp_path):
     journal = Journal(tmp_path, "a", resume=False)
     journal.add(7, {"poses": POSES})
     journal.add(8, {"poses": POSES})
-    path = tmp_path / FILE
+    path = tmp_path / RECORD
     path.write_text(path.read_text()[:-20])
     assert sorted(Journal(tmp_path, "a", resume=True).entries) == [7]
     assert all(json.loads(line) for line in path.read_text().splitlines())

@@ -11,9 +11,8 @@ from jawusd.formats.capture import load_capture
 from jawusd.formats.tracks import PARTIAL, TRACKED
 from jawusd.imaging.overlay import LOWER_COLOUR, UPPER_COLOUR
 from jawusd.pipeline import segment
-from jawusd.pipeline.journal import FILE
-from jawusd.pipeline.segment import LEARNED, SegmentOptions, segment_teeth, with_masks
-from jawusd.pipeline.segment_summary import write_summary
+from jawusd.pipeline.segment import SegmentOptions, segment_teeth, with_masks
+from jawusd.pipeline.segment_record import LEARNED, RECORD, write_summary
 from jawusd.segmentation.files import mask_path, write_mask
 from jawusd.segmentation.sheet import write_sheet
 from jawusd.tracking.sequence.guided import GuidedTracker
@@ -63,7 +62,7 @@ def test_work_taken_up_gives_the_masks_of_work_never_stopped(take, undisturbed, 
     assert [(stage, finished) for stage, finished, _ in done] == [("segment", k + 1) for k in range(FRAMES)]
     with pytest.raises(Stopped):
         run(take, tmp_path, stop_at=3)
-    journal = tmp_path / FILE
+    journal = tmp_path / RECORD
     if torn:  # the last line of the record did not reach the disk
         journal.write_bytes(journal.read_bytes()[:-40])
     again, _ = run(take, tmp_path)
@@ -131,7 +130,7 @@ def test_frames_in_which_the_jaw_went_astray_are_done_anew(
         return replace(record, solution=solution, status=np.array([TRACKED, PARTIAL], np.int8))
 
     monkeypatch.setattr(GuidedTracker, "_one", gone_astray)
-    monkeypatch.setattr(segment, "_ASTRAY_FRAMES", most)
+    monkeypatch.setattr(segment, "_MOST_REDONE", most)
     entries, _ = run(take, tmp_path)
     assert astray == [first + k for k in wrong]
     for frame, entry in undisturbed[1].items():

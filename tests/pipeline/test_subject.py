@@ -12,8 +12,13 @@ from package_copy import ROOT
 from jawusd.errors import CaptureError, FormatError, RigError
 from jawusd.formats.model import JawModel, save_model
 from jawusd.geometry import LANDMARKS, landmark_frame
-from jawusd.pipeline.prepare import open_capture
-from jawusd.pipeline.subject import subject_of_build, subject_of_capture, subject_of_landmarks, subject_of_scans
+from jawusd.pipeline.prepare import (
+    open_capture,
+    subject_of_build,
+    subject_of_capture,
+    subject_of_landmarks,
+    subject_of_scans,
+)
 from jawusd.rig.bake import bake_rig
 
 SCANS = {name: ROOT / "examples" / "capture" / "scans" / f"{name}.ply" for name in ("upper_teeth", "lower_teeth")}
@@ -57,7 +62,7 @@ def test_loose_scans_say_the_same_as_the_capture_they_belong_to():
     np.testing.assert_array_equal(loose.T_rest, np.eye(4))
     assert len(loose.measured_points()) == len(capture.measured_points())
     without = subject_of_scans(SCANS, "someone")
-    np.testing.assert_array_equal(without.measured_points(), without.bones["lower_teeth"].vertices)
+    np.testing.assert_array_equal(without.measured_points(), without.meshes["lower_teeth"].vertices)
     assert any("mean adult places" in text for text in without.inferred)
 
 

@@ -14,7 +14,7 @@ from jawusd.formats.calibration import save_calibration
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import load_tracks
 from jawusd.geometry import transform_point
-from jawusd.pipeline.summary import track_lines, track_summary
+from jawusd.pipeline.track import track_lines, track_summary
 
 ROWS = ("upper", "lower")
 CAMERAS = make_cameras((30.0, -30.0))

@@ -10,9 +10,7 @@ from scipy.spatial.transform import Rotation
 from jawusd.errors import FormatError, MissingDependencyError
 from jawusd.formats.poses import write_poses
 from jawusd.geometry import se3_exp
-from jawusd.pipeline.hdf5 import RAW_GROUP, read_hdf5
-from jawusd.pipeline.stages import read_motion
-from jawusd.pipeline.trajectories import TrajectoryOptions, read_trajectory
+from jawusd.pipeline.fit import RAW_GROUP, TrajectoryOptions, read_hdf5, read_motion, read_trajectory
 
 COUNT = 8
 

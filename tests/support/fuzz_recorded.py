@@ -37,8 +37,8 @@ def _model(folder, kind):
 
 
 def read_tracks(place, path):
-    from jawusd.pipeline.stages import read_motion
-    from jawusd.pipeline.summary import track_summary
+    from jawusd.pipeline.fit import read_motion
+    from jawusd.pipeline.track import track_summary
 
     tracks = read_motion(path)
     tracks.tracked()
@@ -48,7 +48,7 @@ def read_tracks(place, path):
 def read_model(place, path):
     from jawusd.evaluator import JawRig, load
     from jawusd.formats.model import load_model
-    from jawusd.pipeline.summary import fit_summary
+    from jawusd.pipeline.fit import fit_summary
 
     rig = load(path)
     model = load_model(path)
@@ -109,14 +109,14 @@ def face_reader(rig):
 
 
 def read_foreign(place, path):
-    from jawusd.pipeline.trajectories import TrajectoryOptions, read_trajectory
+    from jawusd.pipeline.fit import TrajectoryOptions, read_trajectory
 
     names = {"frame": "Zeit", "tx": "X", "ty": "Y", "tz": "Z", "qw": "W", "qx": "A", "qy": "B", "qz": "C"}
     read_trajectory(path, TrajectoryOptions(names, "cm", True, 0))
 
 
 def read_landmarks(place, path):
-    from jawusd.pipeline.subject import subject_of_landmarks
+    from jawusd.pipeline.prepare import subject_of_landmarks
 
     subject_of_landmarks(path, "x")
 
@@ -139,7 +139,7 @@ def write_hdf5(folder):
 
 
 def read_hdf5(place, path):
-    from jawusd.pipeline.trajectories import TrajectoryOptions, read_trajectory
+    from jawusd.pipeline.fit import TrajectoryOptions, read_trajectory
 
     read_trajectory(path, TrajectoryOptions(rest_frame=0))
 
@@ -183,7 +183,7 @@ def read_build(place, path):
 
 
 def write_journal(folder):
-    from jawusd.pipeline.journal import Journal
+    from jawusd.pipeline.segment_record import Journal
 
     folder.mkdir(parents=True)
     journal = Journal(folder, "a", False)
@@ -196,8 +196,7 @@ def write_journal(folder):
 
 
 def read_journal(place, path):
-    from jawusd.pipeline.journal import Journal
-    from jawusd.pipeline.segment_summary import summarise
+    from jawusd.pipeline.segment_record import Journal, summarise
 
     journal = Journal(place, "a", True)
     for frame in journal.entries:

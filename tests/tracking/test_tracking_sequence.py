@@ -10,7 +10,7 @@ from small_take import CAMERAS, LANDMARKS, MESHES, ROWS, START, errors_mm, make_
 
 from jawusd.errors import TrackingError
 from jawusd.formats.tracks import LOST, load_tracks, save_tracks
-from jawusd.pipeline.summary import track_lines, track_summary
+from jawusd.pipeline.track import track_lines, track_summary
 from jawusd.tracking import track_capture
 
 FRAMES = 10

@@ -16,7 +16,7 @@ from jawusd.errors import CaptureError, FormatError
 from jawusd.formats.capture import load_capture
 from jawusd.formats.tracks import LOST, PARTIAL, TRACKED, Tracks, save_tracks
 from jawusd.geometry import transform_point, transform_points
-from jawusd.pipeline.view_capture import viewed_capture
+from jawusd.pipeline.view import viewed_capture
 from jawusd.viewer.capture_page import CapturePage
 from jawusd.viewer.server import CaptureViewer
 

@@ -15,7 +15,7 @@ from package_copy import ROOT
 from jawusd.formats.capture import load_capture
 from jawusd.formats.tracks import load_tracks
 from jawusd.geometry import transform_point, transform_points
-from jawusd.pipeline.view_capture import open_capture_viewer
+from jawusd.pipeline.view import open_capture_viewer
 
 EXAMPLE = ROOT / "examples" / "capture"
 FIRST, STOP = 20, 90

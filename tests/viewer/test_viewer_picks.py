@@ -5,10 +5,11 @@ import pytest
 import trimesh
 
 from jawusd.formats.capture import Bootstrap
+from jawusd.formats.coverage import uncovered_percent
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import LOST, TRACKED, Tracks
 from jawusd.geometry import make_transform, random_rotation, transform_points
-from jawusd.viewer.coverage import CoveragePlot, frame_words, uncovered_percent, worst_frames
+from jawusd.viewer.coverage import CoveragePlot, frame_words, frames_to_inspect
 from jawusd.viewer.picking_layout import FOV_RAD, PickingLayout, eye_to_see, hit_vertex, region_around
 from jawusd.viewer.picks import PickBook
 
@@ -145,8 +146,8 @@ def made_up_tracks(count=100):
 
 def test_worst_frames_are_the_lost_and_the_badly_covered_ones():
     tracks = made_up_tracks()
-    assert worst_frames(tracks, 24.0)[:2] == [140, 120]
-    apart = np.diff(sorted(worst_frames(tracks, 24.0)))
+    assert frames_to_inspect(tracks, 24.0)[:2] == [140, 120]
+    apart = np.diff(sorted(frames_to_inspect(tracks, 24.0)))
     assert apart.min() >= 12
     percent = uncovered_percent(tracks)
     assert percent[20, 1] == pytest.approx(8.0) and percent[60, 0] == pytest.approx(0.5)

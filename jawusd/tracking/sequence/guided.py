@@ -15,7 +15,7 @@ from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import LOST, TRACKED
 from jawusd.geometry import Camera, se3_exp, se3_inverse, se3_log, transform_points
 from jawusd.geometry.arrays import Array
-from jawusd.tracking.config import FOR_MADE_MASKS, TrackingConfig
+from jawusd.tracking.config import FOR_AUTO_MASKS, TrackingConfig
 from jawusd.tracking.contour.frame_record import FrameRecord, FrameSummary
 from jawusd.tracking.contour.quality import uncovered_px
 from jawusd.tracking.contour.scan import prepare_scan
@@ -80,7 +80,7 @@ class GuidedTracker:
         Raises:
             TrackingError: a scan cannot be tracked.
         """
-        self._config = config or FOR_MADE_MASKS
+        self._config = config or FOR_AUTO_MASKS
         self._meshes = {"upper": upper, "lower": lower}
         scans = [prepare_scan(mesh, row) for row, mesh in self._meshes.items()]
         self._solver = ContourSolver(scans, self._config, executor)

@@ -1,4 +1,4 @@
-"""Options that say whose jaw it is and how a file of poses is written: shared by `fit` and `report`."""
+"""Arguments and options that several commands share, and what is read from them."""
 
 from __future__ import annotations
 
@@ -9,8 +9,17 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from jawusd.pipeline.subject import Subject
-    from jawusd.pipeline.trajectories import TrajectoryOptions
+    from jawusd.pipeline.fit import TrajectoryOptions
+    from jawusd.pipeline.prepare import Subject
+
+
+class Method(StrEnum):
+    """Name the jaw models."""
+
+    anchored = "anchored"
+    additive = "additive"
+    paper = "paper"
+    pca = "pca"
 
 
 class LengthUnit(StrEnum):
@@ -21,6 +30,13 @@ class LengthUnit(StrEnum):
     m = "m"
 
 
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+Force = Annotated[bool, typer.Option("--force", help="Overwrite an existing output.")]
+Outside = Annotated[bool, typer.Option("--allow-outside", help="Let paths in the capture leave its folder.")]
+CaptureArg = Annotated[Path, typer.Argument(help="capture.toml, or the folder that holds it.", show_default=False)]
+RigArg = Annotated[Path, typer.Argument(help="actor.usda, another layer of it, or model.npz.", show_default=False)]
+
+# whose jaw it is
 CaptureOption = Annotated[Path | None, typer.Option(help="The capture: gives scans and landmarks.", show_default=False)]
 UpperOption = Annotated[
     Path | None, typer.Option(help="Scan of the upper teeth, instead of a capture.", show_default=False)
@@ -32,6 +48,8 @@ MandibleOption = Annotated[Path | None, typer.Option(help="Mesh of the mandible,
 LandmarksOption = Annotated[
     Path | None, typer.Option(help="Landmarks (JSON), instead of a capture or scans.", show_default=False)
 ]
+
+# how a file of poses is written
 ColumnsOption = Annotated[
     str | None,
     typer.Option(
@@ -56,7 +74,7 @@ def trajectory_options(
     Raises:
         typer.BadParameter: a column map that cannot be read.
     """
-    from jawusd.pipeline.trajectories import TrajectoryOptions
+    from jawusd.pipeline.fit import TrajectoryOptions
 
     return TrajectoryOptions(_column_map(columns), length_unit.value, invert, rest_frame, group)
 
@@ -90,22 +108,19 @@ def subject_given(
     landmarks: Path | None,
     allow_outside: bool,
 ) -> Subject:
-    """Return the person that the options describe.
+    """Return the person that the options describe: by a capture, both scans, or landmarks.
 
     Args:
         name: of a person without a capture.
-        capture, upper_teeth, lower_teeth, mandible, landmarks: one of capture, both scans, or landmarks.
-        allow_outside: let paths in the capture leave its folder.
 
     Raises:
         typer.BadParameter: none or several of them.
         JawusdError: what the files raise.
     """
-    from jawusd.pipeline.prepare import open_capture
-    from jawusd.pipeline.subject import subject_of_capture, subject_of_landmarks, subject_of_scans
+    from jawusd.pipeline.prepare import open_capture, subject_of_capture, subject_of_landmarks, subject_of_scans
 
-    scans = {"upper_teeth": upper_teeth, "lower_teeth": lower_teeth, "mandible": mandible}
-    scans = {key: path for key, path in scans.items() if path is not None}
+    files = {"upper_teeth": upper_teeth, "lower_teeth": lower_teeth, "mandible": mandible}
+    scans = {key: path for key, path in files.items() if path is not None}
     if sum((capture is not None, bool(scans), landmarks is not None)) != 1:
         raise typer.BadParameter("give either --capture, or --upper-teeth and --lower-teeth, or --landmarks.")
     if capture is not None:

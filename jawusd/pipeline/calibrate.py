@@ -1,0 +1,262 @@
+"""Bring the cameras of a capture together: calibration from its boards, and frame offsets."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, NotRequired, TypedDict, cast
+
+from jawusd.errors import SyncError, TrackingError, explain_missing_packages
+from jawusd.formats.atomic import write_text_atomic
+from jawusd.formats.calibration import save_calibration
+from jawusd.formats.capture import Capture
+from jawusd.formats.light_curve import LightCurve
+from jawusd.formats.mesh import Mesh
+from jawusd.geometry import Camera
+from jawusd.pipeline.prepare import load_meshes, naming_file
+from jawusd.pipeline.state import Progress
+
+if TYPE_CHECKING:
+    from jawusd.capture.scale import ScaleCheck
+    from jawusd.capture.sync import Alignment
+
+PLOT_SUFFIXES = (".png", ".svg")
+
+_LISTED = 10
+_SIZE_SIGMA = 0.005  # of the teeth's size measured from masks
+
+
+class CameraReport(TypedDict):
+    """Say how well one camera is calibrated; picture numbers under `blurred` and `missed`."""
+
+    views: int
+    rms_px: float
+    coverage: float
+    blurred: list[int]
+    missed: list[int]
+
+
+class ShapeReport(TypedDict):
+    """Sum up the errors of distances on the boards [mm]."""
+
+    distances: int
+    mean: float
+    p95: float
+    max: float
+
+
+class ScaleReport(TypedDict):
+    """Compare the size of the teeth as seen with their scans; see `capture.scale.ScaleCheck`."""
+
+    ratio: float | None
+    sigma: float | None
+    reason: str
+
+
+class CalibrationSummary(TypedDict):
+    """Hold `capture.calibrate.CalibrationReport` as plain data."""
+
+    cameras: dict[str, CameraReport]
+    views: int
+    board_shape: ShapeReport
+    expected_shape_mm: float
+    mouth_mm: tuple[float, float, float]
+    mouth_from: str
+    scale: ScaleReport
+    advice: list[str]
+    notes: list[str]
+
+
+class SyncResult(TypedDict):
+    """Hold the frame offset of every camera to the reference camera [frames], and what the method says of it."""
+
+    offsets: dict[str, int]
+    method: str
+    reference: NotRequired[str]
+    exact_frames: NotRequired[dict[str, float]]
+    confidence: NotRequired[dict[str, float]]
+    notes: NotRequired[list[str]]
+
+
+@explain_missing_packages()
+def calibrate_boards(capture: Capture, out: Path, progress: Progress) -> CalibrationSummary:
+    """Calibrate the cameras from the boards of a capture and write the calibration as aniposelib TOML.
+
+    Raises:
+        CalibrationError: the boards do not carry a calibration.
+        CaptureError: a clip or scan cannot be read.
+        OutputError: the file cannot be written.
+    """
+    from jawusd.capture.calibrate import calibrate_capture
+
+    with naming_file(capture.folder / "capture.toml"):
+        meshes = load_meshes(capture)
+        scans = {jaw: meshes[f"{jaw}_teeth"].vertices for jaw in ("upper", "lower")}
+        cameras, report = calibrate_capture(
+            capture,
+            scans,
+            partial(progress, "calibrate"),
+            lambda cameras, by_picks: _scale_by_masks(capture, meshes, cameras, by_picks, progress),
+        )
+    save_calibration(out, cameras)
+    return cast(CalibrationSummary, asdict(report))  # asdict forgets the types of fields
+
+
+def _scale_by_masks(
+    capture: Capture, meshes: Mapping[str, Mesh], cameras: list[Camera], by_picks: ScaleCheck, progress: Progress
+) -> ScaleCheck:
+    """Return the size of the teeth as the masks show it.
+
+    Raises:
+        CalibrationError: the teeth come out with another size than their scans.
+    """
+    from jawusd.capture.scale import ScaleCheck, judged_scale
+    from jawusd.tracking.initialization.scale_search import seen_size
+
+    if capture.boards is None or sum(camera.masks is not None for camera in capture.cameras) < 2:
+        return ScaleCheck(None, None, f"{by_picks.reason}, nor masks of two cameras to search the teeth in")
+    scans = [meshes[f"{jaw}_teeth"] for jaw in ("upper", "lower")]
+    progress("size of the teeth", 0, 1)
+    try:
+        offsets = sync_cameras(capture, progress)["offsets"]
+        ratio = seen_size(capture, cameras, offsets, scans)
+    except (SyncError, TrackingError) as error:
+        why = f"{by_picks.reason}, and the teeth could not be searched in the masks ({error.statement().rstrip('.')})"
+        return ScaleCheck(None, None, why)
+    progress("size of the teeth", 1, 1)
+    return judged_scale(ratio, _SIZE_SIGMA, capture.boards.square_mm)
+
+
+def calibration_lines(report: CalibrationSummary) -> list[str]:
+    """Return a calibration report as text."""
+    lines = [f"calibrated from {report['views']} views of the board"]
+    for name, camera in report["cameras"].items():
+        line = (
+            f"  {name}: {camera['rms_px']:.3f} px rms, {camera['views']} views, {camera['coverage']:.0%} of the picture"
+        )
+        lines.append(line + _listed("blurred", camera["blurred"]) + _listed("missed", camera["missed"]))
+    shape = report["board_shape"]
+    if shape["distances"]:
+        lines.append(
+            f"  distances on the boards near the mouth: wrong by {shape['mean']:.4f} mm (mean), {shape['p95']:.4f} "
+            f"(p95), {shape['max']:.4f} (max)"
+        )
+    lines.append(
+        f"  distances in the mouth, expected from the scatter of the corners: {report['expected_shape_mm']:.4f} mm "
+        f"(mean); middle of the mouth from {report['mouth_from']}"
+    )
+    if (ratio := report["scale"]["ratio"]) is not None:
+        lines.append(f"  the teeth confirm the board's size: seen {ratio:.4f} times (+-{report['scale']['sigma']:.4f})")
+    return lines + [f"  note: {note}" for note in report["notes"]] + [f"  advice: {text}" for text in report["advice"]]
+
+
+def _listed(word: str, numbers: Sequence[int]) -> str:
+    if not numbers:
+        return ""
+    more = f" and {len(numbers) - _LISTED} more" if len(numbers) > _LISTED else ""
+    return f"; {word}: {', '.join(map(str, numbers[:_LISTED]))}{more}"
+
+
+@explain_missing_packages()
+def sync_cameras(capture: Capture, progress: Progress) -> SyncResult:
+    """Return the frame offset of every camera to the reference camera.
+
+    Raises:
+        SyncError: no flash was found, or the flashes of two cameras do not match.
+    """
+    progress("sync", 0, 1)
+    if capture.sync.offsets is not None:
+        result = SyncResult(offsets=dict(capture.sync.offsets), method="given in the capture")
+    elif len(capture.cameras) == 1 or any(camera.video is None for camera in capture.cameras):
+        # Masks alone carry no flash; numbered alike they are taken as simultaneous, and the report says so.
+        result = SyncResult(offsets={camera.name: 0 for camera in capture.cameras}, method="taken as simultaneous")
+    else:
+        from jawusd.capture.sync import estimate_offsets
+
+        with naming_file(capture.folder / "capture.toml"):
+            result = _sync_result(estimate_offsets(capture))
+    progress("sync", 1, 1)
+    return result
+
+
+@explain_missing_packages()
+def sync_videos(videos: Mapping[str, Path], reference: str, progress: Progress) -> SyncResult:
+    """Return the frame offset of every clip to the reference, as `sync_cameras` does for a capture.
+
+    Args:
+        videos: clips by the names of their cameras.
+        reference: the camera that the others are aligned with.
+
+    Raises:
+        SyncError, CaptureError: see `capture.sync.align_videos`.
+    """
+    from jawusd.capture.sync import align_videos
+
+    progress("sync", 0, 1)
+    result = _sync_result(align_videos(videos, reference))
+    progress("sync", 1, 1)
+    return result
+
+
+def _sync_result(alignment: Alignment) -> SyncResult:
+    return SyncResult(
+        offsets=alignment.offsets,
+        reference=alignment.reference,
+        method=alignment.method,
+        exact_frames={name: offset.exact_frames for name, offset in alignment.cameras.items()},
+        confidence=alignment.confidence,
+        notes=list(alignment.notes),
+    )
+
+
+@explain_missing_packages()
+def light_curves(videos: Mapping[str, Path], progress: Progress) -> dict[str, LightCurve]:
+    """Return the brightness of every picture of every video, by camera; decodes all of them.
+
+    Raises:
+        CaptureError: a video cannot be read.
+    """
+    from jawusd.capture.sync import light_curve
+
+    found: dict[str, LightCurve] = {}
+    for name, video in videos.items():
+        progress("brightness", len(found), len(videos))
+        found[name] = light_curve(video)
+    progress("brightness", len(videos), len(videos))
+    return found
+
+
+def write_light_curves(path: Path, curves: Mapping[str, LightCurve]) -> None:
+    """Write the mean brightness of every picture as CSV: camera, picture, time_s, brightness.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    lines = ["camera,picture,time_s,brightness"]
+    for name, curve in curves.items():
+        pictures = enumerate(zip(curve.times_s, curve.brightness))
+        lines += [f"{name},{k},{time_s:.6f},{mean:.3f}" for k, (time_s, mean) in pictures]
+    write_text_atomic(path, "\n".join([*lines, ""]))
+
+
+@explain_missing_packages()
+def write_sync_plot(path: Path, curves: Mapping[str, LightCurve], result: SyncResult | None) -> None:
+    """Draw the brightness of all clips before and after they were aligned, as .png or .svg.
+
+    Args:
+        result: None if the cameras could not be aligned.
+
+    Raises:
+        OutputError: the file cannot be written.
+        MissingDependencyError: matplotlib is not installed.
+    """
+    from jawusd.report.sync_plot import draw_sync
+
+    title, offsets = "the cameras could not be aligned", None
+    if result is not None:
+        offsets = result["offsets"]
+        listed = ", ".join(f"{name} {offsets[name]:+d}" for name in curves)
+        title = f"aligned ({result['method']}): {listed} frames"
+    draw_sync(curves, offsets, title, path)

@@ -1,0 +1,278 @@
+"""Fit a jaw model to tracks, or to poses of other programs, which are brought to T_skull_mandible in mm first.
+
+Poses of jaw-tracking-system (PyPI `jaw-tracking-system`, Mueller et al.), an optical marker system, come as HDF5.
+Layout, as its `store_transformations` writes it (version 1.1): one group per trajectory, by default
+`T_model_origin_mand_landmark_t` and, smoothed, `T_model_origin_mand_landmark_t_smooth`, with the data sets
+`translations` (N, 3) and `rotations`, scalar-first quaternions (N, 4) or matrices (N, 3, 3), and the attributes `unit`
+("mm" or "m", of the translations) and `sample_rate` [Hz]. Files cut by its `split_hdf5_by_sub_experiments` add
+`transformations` (N, 4, 4) and write their `rotations` scalar-last, so `transformations` is read where there is one. A
+trajectory maps the frame of mandibular landmarks, which is digitised on the teeth, to the frame of the upper model.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, TypedDict, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.errors import FormatError, explain_missing_packages
+from jawusd.formats.model import JawModel
+from jawusd.formats.poses import read_poses
+from jawusd.formats.tracks import Tracks, load_tracks
+from jawusd.geometry import make_transform, matrix_from_wxyz, rigidity_defect, se3_inverse
+from jawusd.geometry.arrays import Array
+from jawusd.pipeline.prepare import Subject
+from jawusd.pipeline.state import Progress, no_progress
+
+if TYPE_CHECKING:
+    import h5py
+
+    from jawusd.fitting.config import Method
+
+#: Frame numbers (F,) and T_skull_mandible [mm] (F, 4, 4), NaN where there is no pose.
+Poses = tuple[NDArray[np.int64], Array]
+
+HDF5_SUFFIXES = (".h5", ".hdf5")
+RAW_GROUP = "T_model_origin_mand_landmark_t"
+LENGTH_UNITS_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
+
+_HDF5_UNITS_MM = {"mm": 1.0, "m": 1000.0}
+_RIGID_TOLERANCE = 1e-3
+_MOST_NUMBERS = 16_000_000  # a million 4 x 4 matrices
+
+
+@dataclass(frozen=True)
+class TrajectoryOptions:
+    """Say how a file of poses is written.
+
+    Attributes:
+        columns: our column names to the file's, see `formats.poses.read_poses`; tables only.
+        length_unit: of the translations, a key of `LENGTH_UNITS_MM`; tables only, HDF5 files name theirs.
+        invert: the poses map skull to mandible.
+        rest_frame: a frame with the teeth in occlusion: the jaw is measured from there, so that the file's mandible
+            frame may lie anywhere on the mandible; None: the poses are identity in occlusion.
+        group: the trajectory of an HDF5 file; None: its raw one.
+    """
+
+    columns: Mapping[str, str] = field(default_factory=dict)
+    length_unit: str = "mm"
+    invert: bool = False
+    rest_frame: int | None = None
+    group: str | None = None
+
+
+class FitSummary(TypedDict, total=False):
+    """Hold what a person should know of a model: its errors [mm], ranges and warnings."""
+
+    method: str
+    kind: str
+    errors: dict[str, dict[str, dict[str, float]]]
+    ranges_mm: dict[str, tuple[float, float]]
+    warnings: list[dict[str, str]]
+    inferred: list[str]
+    trimmed_frames: list[int]
+
+
+@explain_missing_packages()
+def fit_subject(
+    subject: Subject, motion: Tracks | Poses, method: str = "anchored", progress: Progress = no_progress
+) -> JawModel:
+    """Fit the jaw model of a person.
+
+    Args:
+        method: "anchored", "additive", "paper" or "pca".
+
+    Raises:
+        FittingError: the poses cannot carry a model.
+    """
+    from jawusd.fitting import FittingConfig, fit_model
+
+    model = fit_model(
+        motion,
+        T_anatomical_skull=subject.T_anatomical_skull,
+        landmarks=subject.landmarks,
+        mandible_vertices=subject.measured_points(),
+        T_rest=subject.T_rest,
+        config=FittingConfig(method=cast("Method", method)),  # which checks the name
+        actor=subject.name,
+        progress=partial(progress, "fit"),
+    )
+    model.meta["inferred"] = list(subject.inferred)
+    if subject.fps is not None:
+        model.meta["fps"] = subject.fps
+    return model
+
+
+def fit_summary(model: JawModel) -> FitSummary:
+    """Sum up a model."""
+    found = {key: model.meta[key] for key in FitSummary.__annotations__ if key in model.meta}
+    return cast(FitSummary, found)  # JSON
+
+
+def fit_lines(summary: FitSummary) -> list[str]:
+    """Return `fit_summary` as text."""
+    lines = [f"model: {summary.get('method')}; largest distance per pose [mm]:  mean  median     p95     max"]
+    for table, places in summary.get("errors", {}).items():
+        for place, figures in places.items():
+            values = "".join(f"{figures[key]:8.3f}" for key in ("mean", "median", "p95", "max"))
+            lines.append(f"  {table:<8} {place:<28}{values}")
+    if frames := summary.get("trimmed_frames"):
+        lines.append(f"  frames left out as outliers: {', '.join(map(str, frames))}")
+    return lines + [f"  warning: {warning['message']}" for warning in summary.get("warnings", [])]
+
+
+def read_motion(path: str | os.PathLike[str], options: TrajectoryOptions | None = None) -> Tracks | Poses:
+    """Read tracks from tracks.npz, or poses from any other file; see `read_trajectory`.
+
+    Raises:
+        FormatError: not such a file, or options given for tracks.
+        MissingDependencyError: HDF5 without h5py.
+    """
+    if Path(path).suffix != ".npz":
+        return read_trajectory(path, options or TrajectoryOptions())
+    if options not in (None, TrajectoryOptions()):
+        raise FormatError("are tracks; columns, units and rest frame are for poses from elsewhere.", path=path)
+    return load_tracks(path)
+
+
+def read_trajectory(path: str | os.PathLike[str], options: TrajectoryOptions) -> Poses:
+    """Read poses from a CSV or JSON table, or from HDF5 (.h5, .hdf5) of jaw-tracking-system.
+
+    Raises:
+        FormatError: not such a file; an option that does not suit it; the rest frame is missing or has no pose.
+        MissingDependencyError: HDF5 without h5py.
+    """
+    path = Path(path)
+    if path.suffix.lower() in HDF5_SUFFIXES:
+        if options.rest_frame is None:
+            raise FormatError(
+                "its poses are those of landmarks on the mandible, not of a scan.",
+                path=path,
+                hint="Name a frame (counted from 0) with the teeth in occlusion with --rest-frame.",
+            )
+        frames, T = read_hdf5(path, options.group)
+    else:
+        frames, T = read_poses(path, options.columns)
+        T[:, :3, 3] *= LENGTH_UNITS_MM[options.length_unit]
+    if options.invert:
+        T = se3_inverse(T)
+    if options.rest_frame is not None:
+        T = T @ se3_inverse(_pose_at(frames, T, options.rest_frame, path))
+    return frames, T
+
+
+def _pose_at(frames: NDArray[np.int64], T: Array, wanted: int, path: Path) -> Array:
+    rows = np.flatnonzero(frames == wanted)
+    if not rows.size:
+        between = f"; it has {frames.min()} to {frames.max()}" if len(frames) else ""
+        raise FormatError(f"has no frame {wanted}{between}.", path=path)
+    found = T[rows[0]]
+    if not np.isfinite(found).all():
+        raise FormatError(f"frame {wanted} has no pose.", path=path, hint="Name another frame in occlusion.")
+    return found
+
+
+@explain_missing_packages()
+def read_hdf5(path: str | os.PathLike[str], group: str | None = None) -> Poses:
+    """Read a trajectory of jaw-tracking-system: the landmark frame in the model frame, frames numbered from 0.
+
+    Args:
+        group: which trajectory; None: the raw one, or the only one.
+
+    Raises:
+        FormatError: not such a file, no such group, data sets of wrong shapes, or poses that are not rigid.
+        MissingDependencyError: h5py is not installed.
+    """
+    import h5py
+
+    path = Path(path)
+    if not path.is_file():
+        raise FormatError("there is no such file.", path=path)
+    try:
+        with h5py.File(path, "r") as file:
+            inside = [name for name in file if isinstance(file.get(name, getlink=True), h5py.HardLink)]
+            groups = [name for name in inside if isinstance(file[name], h5py.Group) and "translations" in file[name]]
+            name = _chosen(groups, group, path)
+            held = {key: _data(file[name], key, name, path) for key in ("translations", "rotations", "transformations")}
+            unit = file[name].attrs.get("unit", "mm")
+    # h5py raises many kinds of errors for damaged files.
+    except (OSError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, MemoryError) as error:
+        raise FormatError(f"is not an HDF5 file that can be read ({error!s:.200}).", path=path) from error
+    unit = unit.decode(errors="replace") if isinstance(unit, bytes) else str(unit)
+    if unit not in _HDF5_UNITS_MM:
+        raise FormatError(f'group "{name}": unit is "{unit}", known are {", ".join(_HDF5_UNITS_MM)}.', path=path)
+    T = _poses(held, name, path)
+    T[:, :3, 3] *= _HDF5_UNITS_MM[unit]
+    return np.arange(len(T)), _checked(T, name, path)
+
+
+def _chosen(groups: list[str], wanted: str | None, path: Path) -> str:
+    known = ", ".join(groups) or "none"
+    if wanted is None:
+        if RAW_GROUP in groups:
+            return RAW_GROUP
+        if len(groups) == 1:
+            return groups[0]
+        raise FormatError(
+            f"has the trajectories: {known}.", path=path, hint="Name one of them with --group." if groups else None
+        )
+    if wanted not in groups:
+        raise FormatError(f'has no trajectory "{wanted}"; it has {known}.', path=path)
+    return wanted
+
+
+def _data(group: h5py.Group, key: str, name: str, path: Path) -> Array | None:
+    if key not in group:
+        return None
+    link = group.get(key, getlink=True)
+    held = group[key] if type(link).__name__ == "HardLink" else None
+    if held is None or getattr(held, "external", None) or getattr(held, "is_virtual", False):
+        raise FormatError(f'group "{name}": "{key}" lies elsewhere, it must be in the file itself.', path=path)
+    if not hasattr(held, "shape") or held.dtype.kind not in "fiu" or not held.shape or held.size > _MOST_NUMBERS:
+        raise FormatError(f'group "{name}": "{key}" is not an array of at most {_MOST_NUMBERS} numbers.', path=path)
+    return np.asarray(held[()], dtype=np.float64)
+
+
+def _poses(held: dict[str, Array | None], name: str, path: Path) -> Array:
+    """Return the poses (F, 4, 4) of the data sets, translations in the file's unit."""
+    whole, t, rotations = held["transformations"], held["translations"], held["rotations"]
+    if whole is not None:
+        if whole.ndim != 3 or whole.shape[1:] != (4, 4):
+            raise FormatError(f'group "{name}": "transformations" has shape {whole.shape}, not (N, 4, 4).', path=path)
+        return whole
+    if rotations is None or t is None:
+        raise FormatError(f'group "{name}" has no "rotations".', path=path)
+    if t.ndim != 2 or t.shape[1] != 3:
+        raise FormatError(f'group "{name}": "translations" has shape {t.shape}, expected (N, 3).', path=path)
+    count = len(t)
+    if rotations.shape == (count, 3, 3):
+        return make_transform(rotations, t)
+    if rotations.shape != (count, 4):
+        raise FormatError(
+            f'group "{name}": "rotations" has shape {rotations.shape}, expected ({count}, 4) or ({count}, 3, 3).',
+            path=path,
+        )
+    norm = np.linalg.norm(rotations, axis=1)
+    if (norm < 1e-6).any():
+        raise FormatError(f'group "{name}", row {int(norm.argmin()) + 1}: the quaternion is zero.', path=path)
+    return make_transform(matrix_from_wxyz(rotations), t)
+
+
+def _checked(T: Array, name: str, path: Path) -> Array:
+    T[~np.isfinite(T).all((1, 2))] = np.nan
+    present = np.flatnonzero(np.isfinite(T[:, 0, 0]))
+    defect = rigidity_defect(T[present])
+    if defect.size and defect.max() > _RIGID_TOLERANCE:
+        row = int(present[defect.argmax()])
+        raise FormatError(
+            f'group "{name}", row {row + 1}: the pose is not rigid (off by {defect.max():.2g}, allowed '
+            f"{_RIGID_TOLERANCE:g}).",
+            path=path,
+        )
+    return T

@@ -1,0 +1,247 @@
+"""Pictures and meshes for people and DCCs: scans over the footage (paper figs. 10, 11), plates, the report's replay."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.errors import CaptureError, FormatError, explain_missing_packages
+from jawusd.formats.capture import Capture
+from jawusd.formats.coverage import uncovered_percent, worst_frames
+from jawusd.formats.mesh import Mesh
+from jawusd.formats.model import JawModel
+from jawusd.formats.report import Overlay, ReplayPart
+from jawusd.formats.tracks import Tracks
+from jawusd.geometry import Camera, transform_points
+from jawusd.pipeline.prepare import load_cameras, load_meshes, tracked_cameras
+from jawusd.pipeline.state import Progress, make_folder
+
+if TYPE_CHECKING:
+    from jawusd.imaging.video import Video
+
+SHEET = "contact_sheet.png"
+GRAY = 60  # where a camera has no picture
+_SHEET_FRAMES = 6
+_CRF = 20  # H.264 quality for looking at, half the time of an archive
+_UNCOVERED, _UNCERTAIN = 3, 2  # frames shown for either reason; one typical frame is added, to compare with
+_MOST_CAMERAS = 4
+_TILE_PX = (400, 225)
+_QUALITY = 82
+_MOST_FACES = 6000  # per mesh of the report
+
+
+@explain_missing_packages()
+def open_videos(capture: Capture) -> dict[str, Video]:
+    """Return the videos of a capture by the names of their cameras.
+
+    Raises:
+        CaptureError: no camera has a video, or one cannot be decoded.
+    """
+    from jawusd.imaging.video import Video
+
+    sources = {source.name: source.video for source in capture.cameras if source.video}
+    if not sources:
+        raise CaptureError(
+            "no camera has a video, so there is no footage.",
+            path=capture.folder / "capture.toml",
+            hint="Name the footage there (video = ...).",
+        )
+    return {name: Video(path) for name, path in sources.items()}
+
+
+def open_footage(capture: Capture, tracks: Tracks | None = None) -> tuple[dict[str, Camera], dict[str, Video]]:
+    """Return the calibrated cameras of a capture, and the videos of those that have one, by name.
+
+    Args:
+        tracks: cameras as these corrected them.
+
+    Raises:
+        CaptureError: no camera has a video, or one cannot be decoded.
+        CalibrationError: a video has another shape than its camera's calibration.
+    """
+    cameras = load_cameras(capture)
+    placed = cameras if tracks is None else tracked_cameras(cameras, tracks)
+    return {camera.name: camera for camera in placed}, open_videos(capture)
+
+
+def overlay_files(capture: Capture, folder: Path) -> list[Path]:
+    """Return the files `write_overlay` writes: a video per camera that has one, and the contact sheet."""
+    return [folder / f"{camera.name}.mp4" for camera in capture.cameras if camera.video] + [folder / SHEET]
+
+
+@explain_missing_packages()
+def write_overlay(
+    capture: Capture, offsets: Mapping[str, int], tracks: Tracks, folder: Path, progress: Progress
+) -> list[Path]:
+    """Write per camera an H.264 video of the tracked frames with both scans drawn over them, and a contact sheet.
+
+    The videos run in step: where a camera has no picture they are gray. Lost arches are not drawn. Files of the same
+    name are overwritten. Returns `overlay_files`.
+
+    Args:
+        offsets: frame offset by camera.
+
+    Raises:
+        CaptureError: no camera has a video, or one cannot be decoded.
+        CalibrationError: a video has another shape than its camera's calibration.
+        OutputError: the files cannot be written.
+    """
+    from jawusd.imaging.overlay import save_png, tracking_sheet
+    from jawusd.imaging.video_writer import VideoWriter
+
+    cameras, videos = open_footage(capture, tracks)
+    meshes = load_meshes(capture)
+    upper, lower = meshes["upper_teeth"], meshes["lower_teeth"]
+    make_folder(folder)
+    done, total = 0, len(videos) * len(tracks.frames)
+    for name, video in videos.items():
+        width, height = (side // 2 * 2 for side in video.size_px)  # H.264 halves the colours
+        writer = VideoWriter(folder / f"{name}.mp4", (width, height), capture.fps, quality_crf=_CRF)
+        with writer as out:
+            for image in _drawn(tracks, video, offsets[name], cameras[name], upper, lower):
+                out.write(image[:height, :width])
+                done += 1
+                progress("overlay", done, total)
+    shown = np.unique(np.linspace(0, len(tracks.frames) - 1, _SHEET_FRAMES).round().astype(int))
+    sheet = tracking_sheet(
+        tracks, tracks.frames[shown].tolist(), [cameras[name] for name in videos], videos, offsets, upper, lower
+    )
+    save_png(folder / SHEET, sheet)
+    return overlay_files(capture, folder)
+
+
+def _drawn(
+    tracks: Tracks, video: Video, offset: int, camera: Camera, upper: Mesh, lower: Mesh
+) -> Iterator[NDArray[np.uint8]]:
+    """Yield the picture of every tracked frame, (h, w, 3) RGB."""
+    from jawusd.imaging.overlay import LOWER_COLOUR, UPPER_COLOUR, PlacedScan, draw_overlay
+
+    wanted = [video.timeline.picture(frame - offset) for frame in tracks.frames.tolist()]
+    for index, image in enumerate(video.pictures(wanted, colour="rgb")):
+        if image is None:
+            yield np.full((camera.size_px[1], camera.size_px[0], 3), GRAY, np.uint8)
+            continue
+        scans = [
+            PlacedScan(upper, tracks.T_world_upper[index], UPPER_COLOUR),
+            PlacedScan(lower, tracks.T_world_lower[index], LOWER_COLOUR),
+        ]
+        yield draw_overlay(image, camera, scans)
+
+
+def draw_worst_frames(capture: Capture, offsets: Mapping[str, int], tracks: Tracks) -> tuple[Overlay, ...]:
+    """Draw the scans over the footage where they fit it worst, and once where they fit as usual; the worst first.
+
+    Args:
+        offsets: frame offset by camera.
+
+    Raises:
+        CaptureError: no camera has a video, or one cannot be decoded.
+        CalibrationError: a video has another shape than its camera's calibration.
+        FormatError: the tracks are of another capture.
+    """
+    from jawusd.imaging.overlay import encode_jpeg, tracking_sheet
+
+    if list(tracks.camera_names) != [camera.name for camera in capture.cameras]:
+        raise FormatError(f"the capture has other cameras than the tracks ({', '.join(tracks.camera_names)}).")
+    cameras, videos = open_footage(capture, tracks)
+    shown = [cameras[name] for name in videos][:_MOST_CAMERAS]
+    meshes = load_meshes(capture)
+    scans = meshes["upper_teeth"], meshes["lower_teeth"]
+    found = []
+    for index, reason in chosen_frames(tracks, capture.fps):
+        frame = int(tracks.frames[index])
+        sheet = tracking_sheet(tracks, [frame], shown, videos, offsets, *scans, tile_px=_TILE_PX)
+        found.append(Overlay(frame, reason, encode_jpeg(sheet, _QUALITY)))
+    return tuple(found)
+
+
+def chosen_frames(tracks: Tracks, fps: float) -> list[tuple[int, str]]:
+    """Return indices of frames to look at, each with the reason, the worst first."""
+    tracked = tracks.tracked()
+    uncovered = np.where(tracked, np.fmax.reduce(uncovered_percent(tracks), axis=1), np.nan)
+    sigma_mm = np.where(tracked, tracks.sigma_mm.max(axis=1), np.nan)
+    found: list[tuple[int, str]] = []
+    for values, count, words in (
+        (uncovered, _UNCOVERED, "{:.2f} % of the worse arch's masks left uncovered"),
+        (sigma_mm, _UNCERTAIN, "expected error of {:.2f} mm at the worst landmark"),
+    ):
+        worst = worst_frames(values, tracks.frames, fps, count, [index for index, _ in found])
+        found += [(index, words.format(values[index])) for index in worst]
+    known = np.flatnonzero(np.isfinite(uncovered))
+    if len(known):
+        usual = known[np.argsort(uncovered[known])[len(known) // 2]]
+        found.append((int(usual), f"a usual one, {uncovered[usual]:.2f} % of the worse arch's masks left uncovered"))
+    return found
+
+
+@explain_missing_packages()
+def write_plates(
+    capture: Capture, offsets: Mapping[str, int], frames: NDArray[np.int64], folder: Path, progress: Progress
+) -> list[str]:
+    """Write one JPEG per frame and camera, where `cameras.usda` says they are, numbered by its time codes.
+
+    Args:
+        offsets: frame offset by camera.
+        frames: frames of the reference camera, increasing, shape (F,). Where a camera has no picture there is
+            no plate.
+        folder: the rig's folder.
+
+    Returns:
+        The file pattern of every camera, below the folder.
+
+    Raises:
+        CaptureError: no camera has a video, or one cannot be decoded.
+        CalibrationError: a video has another shape than its camera's calibration.
+        OutputError: the files cannot be written.
+    """
+    from jawusd.imaging.plates import PlateWriter
+    from jawusd.rig.cameras import PLATE
+
+    cameras, videos = open_footage(capture)
+    done, total = 0, len(videos) * len(frames)
+    for name, video in videos.items():
+        plates = PlateWriter(cameras[name])
+        files = str(folder / PLATE.format(name=name))
+        make_folder(Path(files).parent)
+        wanted = [video.timeline.picture(frame - offsets[name]) for frame in frames.tolist()]
+        for frame, image in zip(frames.tolist(), video.pictures(wanted, colour="rgb")):
+            if image is not None:
+                plates.write(files % frame, image)
+            done += 1
+            progress("plates", done, total)
+    return [PLATE.format(name=name) for name in videos]
+
+
+def replay_parts(folder: Path, model: JawModel) -> tuple[ReplayPart, ...]:
+    """Return the meshes of a rig thinned for the page, anatomical frame, in the closed bite [mm].
+
+    Raises:
+        RigError: there is no geometry.
+    """
+    from jawusd.rig.geo import read_geometry, read_gum
+
+    path = folder / "geo.usdc"
+    meshes, gums = read_geometry(path), read_gum(path)
+    A, rest = model.arrays["T_anatomical_skull"], model.arrays["T_rest"]
+    found = []
+    for name, mesh in meshes.items():
+        moves = name in ("mandible", "lower_teeth")
+        place = A @ rest if moves else A
+        gum = gums.get(name, np.zeros(len(mesh.faces), bool))
+        kind = "tooth" if name.endswith("teeth") else "bone"
+        for part, faces in ((kind, mesh.faces[~gum]), ("gum", mesh.faces[gum])):
+            if len(faces):
+                small = _small(Mesh(mesh.vertices, faces))
+                placed = Mesh(transform_points(place, small.vertices), small.faces)
+                found.append(ReplayPart(name, part, moves, placed))
+    return tuple(found)
+
+
+def _small(mesh: Mesh) -> Mesh:
+    from jawusd.imaging.decimation import decimated
+
+    return Mesh(*decimated(mesh.vertices, mesh.faces, min(_MOST_FACES, len(mesh.faces))))

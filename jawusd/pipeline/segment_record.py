@@ -1,0 +1,334 @@
+"""What segmentation leaves beside its masks: a line per finished frame, and which masks can be trusted.
+
+The record grows by one line per frame, so that interrupted work can be resumed. The summary holds a confidence per
+frame and camera, and the frames to be looked at, worst first.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import NotRequired, TypedDict
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.errors import FormatError, OutputError, explain_missing_packages
+from jawusd.formats.atomic import write_text_atomic
+from jawusd.formats.capture import Capture
+from jawusd.formats.text import read_text
+from jawusd.formats.tracks import LOST
+from jawusd.geometry.arrays import Array
+from jawusd.pipeline.state import hash_value
+
+RECORD, SUMMARY, SHEET, LEARNED = "segment.jsonl", "segment.json", "look_at_these.png", "learned.json"
+FORMAT = "jawusd-segment/1"
+_MAX_LEARNED_BYTES = 1 << 20
+# Below this confidence a mask is to be looked at: a symptom at twice its usual spread.
+_DOUBTFUL = 0.5
+# Symptoms of a bad mask and the sign that makes more worse; each is judged by its distance from the take's usual value.
+_SYMPTOMS = {"contrast": -1.0, "unexpected": 1.0, "residual_px": 1.0, "uncovered": 1.0}
+_LEAST_SPREAD = {"contrast": 0.03, "unexpected": 0.01, "residual_px": 0.05, "uncovered": 0.01}
+_USUAL_OFF = 3.0  # spreads at which a symptom alone brings the confidence to one half
+# How far off an outline may well be [px of the working picture] where it shows in the picture, where it does not, and
+# between the arches; over the mask's area that gives the share of the mask that may be wrong. Small masks and masks
+# without edges in the picture stand out in all cameras alike, so all are judged together, and more strictly.
+_OUTLINE_PX = (0.4, 2.0, 0.6)
+_OUTLINE, _OUTLINE_SPREAD, _OUTLINE_OFF = "outline", 0.01, 1.5
+_SHEET_FRAMES = 12
+
+Pair = list[float | None]
+
+
+class CameraEntry(TypedDict):
+    """Hold what is known about one camera's masks of a frame; pairs are (upper, lower), None without a mask."""
+
+    frame: int
+    contrast: Pair
+    pixels: list[int]
+    outline: list[list[int]]
+    unexpected: Pair
+    residual_px: Pair
+    uncovered: Pair
+
+
+class TrackEntry(TypedDict):
+    """Hold the fields of `FrameSummary` that tell a good frame from a bad one."""
+
+    used: list[list[bool]]
+    coverage: list[Pair]
+    score_px: list[Pair]
+    residual_px: Pair
+
+
+class FrameEntry(TypedDict):
+    """Hold what is known about a finished frame: T_world_upper and T_world_lower, their status, masks and tracking."""
+
+    poses: list[list[list[float]]]
+    status: list[int]
+    cameras: dict[str, CameraEntry]
+    track: TrackEntry
+    again: NotRequired[bool]
+
+
+class MaskConfidence(TypedDict):
+    """Hold the confidence 0 .. 1 in the worse of the two masks of a picture, and the reason."""
+
+    frame: int
+    camera: str
+    own_frame: int
+    confidence: float
+    row: str
+    reason: str
+
+
+class Learned(TypedDict):
+    """Hold what drawn masks taught: pictures drawn, and the disagreement with them before and after."""
+
+    pictures: int
+    disagreement: list[float]
+
+
+class SegmentSummary(TypedDict):
+    """Hold segment.json."""
+
+    format: str
+    capture: str
+    masks: dict[str, dict[str, str]]
+    frames: int
+    learned: Learned | None
+    look_at: list[MaskConfidence]
+    sheet: str | None
+    confidence: NotRequired[list[MaskConfidence]]
+
+
+def has_auto_masks(capture: Capture) -> bool:
+    """Tell whether the masks of a capture lie where `jawusd segment` wrote them, as CAMERA/upper/000123.png."""
+    masks = [path for camera in capture.cameras if camera.masks for path in (camera.masks.upper, camera.masks.lower)]
+    return bool(masks) and all(len(path.parents) > 2 and (path.parents[2] / SUMMARY).is_file() for path in masks)
+
+
+class Journal:
+    """Hold what is known about finished frames, in memory and in a file of JSON lines."""
+
+    def __init__(self, folder: Path, inputs: str, resume: bool) -> None:
+        """Start with no frames, or with those finished from the same inputs.
+
+        Args:
+            inputs: hash of everything the work depends on.
+            resume: keep what is there if it came from these inputs.
+
+        Raises:
+            OutputError: the folder cannot be written, or the file not read.
+        """
+        self._path = folder / RECORD
+        self.entries: dict[int, FrameEntry] = {}
+        self._head = json.dumps({"inputs": inputs})
+        lines = _lines(self._path) if resume else []
+        if lines and lines[0] == self._head:
+            self.entries = dict(entry for line in lines[1:] if (entry := _entry(line)) is not None)
+        self.drop(())
+
+    def add(self, frame: int, entry: FrameEntry) -> None:
+        """Record a finished frame.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        line = _line(frame, entry)
+        self.entries[frame] = json.loads(line)["entry"]
+        try:
+            with open(self._path, "a", encoding="utf-8") as handle:
+                handle.write(line + "\n")
+        except OSError as error:
+            raise OutputError(f"cannot be written: {error.strerror}.", path=self._path) from error
+
+    def drop(self, frames: Iterable[int]) -> None:
+        """Forget frames.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        for frame in frames:
+            del self.entries[frame]
+        kept = [self._head, *(_line(frame, entry) for frame, entry in self.entries.items())]
+        write_text_atomic(self._path, "\n".join(kept) + "\n")
+
+    def known(self, frame: int) -> tuple[Array, NDArray[np.int8]]:
+        """Return T_world_upper and T_world_lower, shape (2, 4, 4), and status, shape (2,), of a frame."""
+        entry = self.entries[frame]
+        return np.array(entry["poses"], np.float64), np.array(entry["status"], np.int8)
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        return path.read_text(encoding="utf-8", errors="replace").splitlines() if path.exists() else []
+    except OSError as error:
+        raise OutputError(f"cannot be read: {error.strerror}.", path=path) from error
+
+
+def _line(frame: int, entry: FrameEntry) -> str:
+    data = json.loads(json.dumps({"frame": frame, "entry": _without_nan(entry)}))
+    return json.dumps({**data, "sha256": hash_value(data)})
+
+
+def _without_nan(value: object) -> object:
+    if isinstance(value, dict):
+        return {key: _without_nan(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_without_nan(item) for item in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def _entry(line: str) -> tuple[int, FrameEntry] | None:
+    """Return a line's frame and entry; None for a line that was cut short when the work was stopped, or damaged."""
+    try:
+        data = json.loads(line)
+        known = data.pop("sha256")
+        return (data["frame"], data["entry"]) if known == hash_value(data) else None
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return None
+
+
+def summarise(entries: Mapping[int, FrameEntry]) -> list[MaskConfidence]:
+    """Return the confidence of every picture's masks, in order of frames and cameras."""
+    keys = [(frame, name) for frame in sorted(entries) for name in entries[frame]["cameras"]]
+    found = [entries[frame]["cameras"][name] for frame, name in keys]
+    cameras = np.array([name for _, name in keys])
+    everywhere = np.full(len(keys), "")
+    measured = {
+        "contrast": _pairs([entry["contrast"] for entry in found]),
+        "unexpected": _pairs([entry["unexpected"] for entry in found]),
+        "residual_px": _pairs([entry["residual_px"] for entry in found]),
+        "uncovered": _pairs([entry["uncovered"] for entry in found]),
+    }
+    parts = [_off(sign * measured[name], cameras, _LEAST_SPREAD[name]) for name, sign in _SYMPTOMS.items()]
+    parts.append(_off(_outline_doubt(found), everywhere, _OUTLINE_SPREAD) * (_USUAL_OFF / _OUTLINE_OFF))
+    off = np.stack(parts, axis=-1)  # (N, 2, S)
+    lost = np.array([[state == LOST for state in entries[frame]["status"]] for frame, _ in keys])
+    doubt = np.where(lost, np.inf, np.maximum(off, 0).max(-1) / _USUAL_OFF)
+    rows: list[MaskConfidence] = []
+    for k, (frame, name) in enumerate(keys):
+        worse = int(doubt[k].argmax())
+        rows.append(
+            {
+                "frame": frame,
+                "camera": name,
+                "own_frame": found[k]["frame"],
+                "confidence": round(float(1 / (1 + doubt[k, worse] ** 2)), 3),
+                "row": ("upper", "lower")[worse],
+                "reason": "lost" if lost[k, worse] else (*_SYMPTOMS, _OUTLINE)[int(off[k, worse].argmax())],
+            }
+        )
+    return rows
+
+
+def _pairs(values: Sequence[Pair]) -> Array:
+    """Return pairs as an array, shape (N, 2), NaN for None."""
+    return np.array(values, np.float64)
+
+
+def _outline_doubt(found: Sequence[CameraEntry]) -> Array:
+    """Return the share of every mask that may be wrong, NaN without a mask, shape (N, 2)."""
+    outline = np.array([entry["outline"] for entry in found], np.float64)
+    area = np.array([entry["pixels"] for entry in found], np.float64)
+    return np.where(area > 0, outline @ np.array(_OUTLINE_PX) / np.maximum(area, 1), np.nan)
+
+
+def _off(values: Array, groups: NDArray[np.str_], least_spread: float) -> Array:
+    """Return how many spreads values, shape (N, 2), lie above the median of their group and arch, shape (N, 2)."""
+    out = np.zeros_like(values)
+    for group in np.unique(groups):
+        of = groups == group
+        for arch in (0, 1):
+            seen = values[of, arch][np.isfinite(values[of, arch])]
+            if len(seen):
+                middle = np.median(seen)
+                spread = max(1.4826 * float(np.median(np.abs(seen - middle))), least_spread)
+                out[of, arch] = np.nan_to_num((values[of, arch] - middle) / spread)
+    return out
+
+
+@explain_missing_packages()
+def write_summary(capture: Capture, entries: Mapping[int, FrameEntry], folder: Path) -> SegmentSummary:
+    """Write segment.json, and thumbnails of the worst masks if any are to be looked at.
+
+    Args:
+        folder: holds the masks.
+
+    Raises:
+        CaptureError: a picture or mask cannot be read.
+        FormatError: what was learned from drawn masks cannot be read.
+        OutputError: a file cannot be written.
+    """
+    rows = summarise(entries)
+    doubtful = sorted((row for row in rows if row["confidence"] < _DOUBTFUL), key=lambda row: row["confidence"])
+    videos = {camera.name: camera.video for camera in capture.cameras if camera.video is not None}
+    summary: SegmentSummary = {
+        "format": FORMAT,
+        "capture": capture.name,
+        "masks": {name: {arch: f"{name}/{arch}/%06d.png" for arch in ("upper", "lower")} for name in videos},
+        "frames": len(entries),
+        "learned": _learned(folder / LEARNED),
+        "look_at": doubtful,
+        "sheet": SHEET if doubtful else None,
+        "confidence": rows,
+    }
+    write_text_atomic(folder / SUMMARY, json.dumps(summary, indent=1) + "\n")
+    if doubtful:
+        from jawusd.segmentation.sheet import write_sheet
+
+        worst = [(row["camera"], row["own_frame"], row["reason"]) for row in doubtful[:_SHEET_FRAMES]]
+        write_sheet(folder / SHEET, worst, videos, folder)
+    return summary
+
+
+def _learned(path: Path) -> Learned | None:
+    """Return what was learned from drawn masks, None if nothing was."""
+    if not path.exists():
+        return None
+    try:
+        learned = json.loads(read_text(path, _MAX_LEARNED_BYTES))
+        first, last = (float(value) for value in learned["disagreement"])
+        return {**learned, "pictures": int(learned["pictures"]), "disagreement": [first, last]}
+    except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
+        hint = "Segment again without --resume, or build with --fresh."
+        raise FormatError(f"is not what `jawusd segment` wrote ({error}).", path=path, hint=hint) from error
+
+
+@explain_missing_packages()
+def delete_masks(folder: Path) -> None:
+    """Delete the masks that were made in a folder, what was said of them, and folders left empty.
+
+    Files of other names stay, and so does everything in a folder that segmentation did not write to.
+    """
+    if not (folder / RECORD).is_file():
+        return
+    from jawusd.segmentation.state import state_files
+
+    for path in (*state_files(folder), *(folder / name for name in (RECORD, SUMMARY, SHEET, LEARNED))):
+        path.unlink(missing_ok=True)
+    for path in [*folder.glob("*/upper/*.png"), *folder.glob("*/lower/*.png")]:
+        # A link may lead out of the folder.
+        if path.stem.isdigit() and path.resolve().is_relative_to(folder.resolve()):
+            path.unlink()
+    for path in [*folder.glob("*/upper"), *folder.glob("*/lower"), *folder.glob("*"), folder]:
+        with contextlib.suppress(OSError):  # not empty, or no folder
+            path.rmdir()
+
+
+def segment_lines(summary: SegmentSummary) -> list[str]:
+    """Return the summary for people."""
+    doubtful = summary["look_at"]
+    lines = [f"{summary['frames']} frames segmented in {len(summary['masks'])} cameras"]
+    if learned := summary.get("learned"):
+        before, after = (f"{100 * value:.1f} %" for value in learned["disagreement"])
+        lines.append(f"learned from {learned['pictures']} drawn pictures: disagreement {before} before, {after} after")
+    if doubtful:
+        lines.append(f"{len(doubtful)} masks to look at, worst first (thumbnails in {summary['sheet']}):")
+    for row in doubtful[:_SHEET_FRAMES]:
+        where = f"  {row['camera']} frame {row['own_frame']:>5}  {row['row']:<5}"
+        lines.append(f"{where}  confidence {row['confidence']:.2f}  {row['reason']}")
+    return lines
