@@ -48,6 +48,41 @@ class Operations(Protocol[N, Table]):
         """Return a row as `width` separate numbers."""
 
 
+S = TypeVar("S", bound="Symbol")
+
+
+class Symbol:
+    """A number that stands for a value of a program: each operator adds an operation to that program."""
+
+    def operation(self: S, name: str, *operands: S | float) -> S:
+        """Add "Add", "Subtract", "Multiply" or "Divide", applied to two operands."""
+        raise NotImplementedError
+
+    def __add__(self: S, other: S | float) -> S:
+        return self.operation("Add", self, other)
+
+    def __radd__(self: S, other: float) -> S:
+        return self.operation("Add", other, self)
+
+    def __sub__(self: S, other: S | float) -> S:
+        return self.operation("Subtract", self, other)
+
+    def __rsub__(self: S, other: float) -> S:
+        return self.operation("Subtract", other, self)
+
+    def __mul__(self: S, other: S | float) -> S:
+        return self.operation("Multiply", self, other)
+
+    def __rmul__(self: S, other: float) -> S:
+        return self.operation("Multiply", other, self)
+
+    def __truediv__(self: S, other: S | float) -> S:
+        return self.operation("Divide", self, other)
+
+    def __neg__(self: S) -> S:
+        return self.operation("Multiply", self, -1.0)
+
+
 class FloatOperations:
     """`Operations` on Python's floats."""
 

@@ -69,7 +69,7 @@ def viewed_actor(path: str | os.PathLike[str]) -> ViewedActor:
         FormatError: not a rig, or one without geometry.
         RigError: not a USD file.
     """
-    from jawusd.rig.geo import read_placeholders
+    from jawusd.rig.geo import read_geometry
     from jawusd.rig.read import describe, load_rig
     from jawusd.viewer.viewed import ViewedActor
 
@@ -82,7 +82,7 @@ def viewed_actor(path: str | os.PathLike[str]) -> ViewedActor:
         name=str(about["actor"] or path.stem),
         rig=rig,
         meshes=screen_meshes(path),
-        placeholders=frozenset(read_placeholders(path)),
+        placeholders=frozenset(read_geometry(path, placeholders=True)),
         fps=float(about["fps"] or DEFAULT_FPS),
         folder=path.parent,
         clip_names=partial(motion_names, path.parent),
@@ -97,10 +97,10 @@ def screen_meshes(path: Path) -> dict[str, Mesh]:
     Raises:
         RigError: there is no mesh that moves.
     """
-    from jawusd.rig.geo import read_geometry, read_gum, read_placeholders
+    from jawusd.rig.geo import read_geometry, read_gum
     from jawusd.viewer.decimate import for_view
 
-    meshes, gum = read_geometry(path) | read_placeholders(path), read_gum(path)
+    meshes, gum = read_geometry(path) | read_geometry(path, placeholders=True), read_gum(path)
     if not {"mandible", "lower_teeth"} & set(meshes):
         raise RigError("has no mandible to look at.", path=path)
     parted: dict[str, Mesh] = {}

@@ -2,10 +2,10 @@
 
     blender -b -P blender_nodes.py -- actor/anim_capture.usdc jaw.blend
 
-Needs `jawusd_reader.py` beside it. The file holds no scripts and works where scripts are switched off. The nodes are
-generated from the exact model, evaluated in Blender's single precision; the sliders lie on the mandible's mesh, in the
-modifier "Jaw", and the other meshes of the mandible follow them. The nodes move vertices, the objects stay at rest.
-Slider limits are those of the whole range: what is valid at an opening only the add-on can show.
+Needs `jawusd_reader.py` beside it. The file holds no scripts and works where scripts are switched off. The nodes
+compute the exact model in Blender's single precision. The sliders are inputs of the modifier "Jaw" on the mandible's
+mesh; drivers copy them to its other meshes. The nodes move vertices, not objects. Slider limits are those of the whole
+range; only the add-on shows what is valid at an opening.
 """
 
 from __future__ import annotations
@@ -22,10 +22,9 @@ if TYPE_CHECKING:
 
 sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
 import jawusd_reader
-from jawusd_reader import Rows, Triple, dot, long_angle_series, triple
+from jawusd_reader import PARAMETERS, Rows, Triple, dot, long_angle_series, triple
 
 MODIFIER = "Jaw"
-SLIDERS = ("d1", "d2", "d3")
 _LABELS = ("Opening", "Laterotrusion", "Protrusion")
 _TABLES = "JawTables"
 
@@ -34,14 +33,14 @@ def make_file(usd: str, blend: str) -> None:
     """Write a Blender file with the rig of a USD file, its captured motion as keys of the sliders.
 
     Args:
-        usd: any file that holds one rig and its meshes, `actor.usda`, an animation of it or `actor.usdz`.
-        blend: the file to write.
+        usd: Any file that holds one rig and its meshes, `actor.usda`, an animation of it or `actor.usdz`.
+        blend: The file to write.
 
     Raises:
-        jawusd_reader.ReaderError: there is not one rig with a mandible.
+        jawusd_reader.ReaderError: There is not exactly one rig, or it has no mandible.
     """
     bpy.ops.wm.read_homefile(use_empty=True)
-    _find_pxr()
+    jawusd_reader.find_blender_pxr(bpy.utils.resource_path)
     from pxr import Usd
 
     stage = Usd.Stage.Open(usd)
@@ -66,7 +65,7 @@ def add_sliders(rig: jawusd_reader.Rig, meshes: Sequence[bpy.types.Object], prim
         modifier = mesh.modifiers.new(MODIFIER, "NODES")
         modifier.node_group = group
     first = meshes[0]
-    for name, identifier in zip(SLIDERS, inputs):
+    for name, identifier in zip(PARAMETERS, inputs):
         path = f'modifiers["{MODIFIER}"]["{identifier}"]'
         attribute = prim.GetAttribute(f"jaw:{name}")
         first.modifiers[MODIFIER][identifier] = float(attribute.Get() or 0.0)
@@ -85,15 +84,6 @@ def add_sliders(rig: jawusd_reader.Rig, meshes: Sequence[bpy.types.Object], prim
             for curve in [curve for bag in strip.channelbags for curve in bag.fcurves]:
                 for point in curve.keyframe_points:
                     point.interpolation = "LINEAR"
-
-
-def _find_pxr() -> None:
-    """Make Blender's own pxr importable where it is not: in Blender as a Python module."""
-    version = f"python{sys.version_info[0]}.{sys.version_info[1]}"
-    for kind in ("LOCAL", "SYSTEM"):
-        folder = os.path.join(bpy.utils.resource_path(kind), "python", "lib", version, "site-packages")
-        if os.path.isdir(os.path.join(folder, "pxr")) and folder not in sys.path:
-            sys.path.append(folder)
 
 
 def _mandible_meshes(prim: Usd.Prim) -> list[bpy.types.Object]:
@@ -118,7 +108,7 @@ def _node_group(rig: jawusd_reader.Rig) -> tuple[bpy.types.NodeTree, list[str]]:
     group.is_modifier = True
     group.interface.new_socket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
     identifiers = []
-    for name, label, (low, high) in zip(SLIDERS, _LABELS, rig.d_range):
+    for name, label, (low, high) in zip(PARAMETERS, _LABELS, rig.d_range):
         socket = group.interface.new_socket(name, in_out="INPUT", socket_type="NodeSocketFloat")
         socket.min_value, socket.max_value = low, high
         socket.description = f"{label} [mm]"
@@ -126,7 +116,7 @@ def _node_group(rig: jawusd_reader.Rig) -> tuple[bpy.types.NodeTree, list[str]]:
     group.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
     nodes = _Nodes(group)
     given = group.nodes.new("NodeGroupInput")
-    d = triple([_Number(nodes, given.outputs[name]) for name in SLIDERS])
+    d = triple([_Number(nodes, given.outputs[name]) for name in PARAMETERS])
     motion = rig.formula.motion(d, {name: nodes.store(name, rows) for name, rows in rig.formula.tables.items()}, nodes)
     closed = _image(rig.matrices[1], triple(nodes.separated(nodes.node("GeometryNodeInputPosition").outputs[0])))
     setter = group.nodes.new("GeometryNodeSetPosition")
@@ -146,33 +136,15 @@ def _image(T: Rows, p: Triple[_Number]) -> Triple[_Number]:
     return triple([dot(p, triple(row[:3])) + row[3] for row in T[:3]])
 
 
-class _Number:
+class _Number(jawusd_reader.Symbol):
     """A socket with operators, each of which adds a node."""
 
     def __init__(self, nodes: _Nodes, socket: bpy.types.NodeSocket) -> None:
         self.nodes, self.socket = nodes, socket
 
-    def __add__(self, other: _Number | float) -> _Number:
-        return self.nodes.math("ADD", self, other)
-
-    __radd__ = __add__
-
-    def __sub__(self, other: _Number | float) -> _Number:
-        return self.nodes.math("SUBTRACT", self, other)
-
-    def __rsub__(self, other: float) -> _Number:
-        return self.nodes.math("SUBTRACT", other, self)
-
-    def __mul__(self, other: _Number | float) -> _Number:
-        return self.nodes.math("MULTIPLY", self, other)
-
-    __rmul__ = __mul__
-
-    def __truediv__(self, other: _Number | float) -> _Number:
-        return self.nodes.math("DIVIDE", self, other)
-
-    def __neg__(self) -> _Number:
-        return self.nodes.math("MULTIPLY", self, -1.0)
+    def operation(self, name: str, *operands: _Number | float) -> _Number:
+        """Add an arithmetic node."""
+        return self.nodes.math(name.upper(), *operands)
 
 
 class _Table(NamedTuple):

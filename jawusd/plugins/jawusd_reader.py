@@ -16,7 +16,9 @@ from __future__ import annotations
 import ast
 import json
 import math
+import os
 import struct
+import sys
 import zipfile
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
@@ -32,6 +34,8 @@ if TYPE_CHECKING:
 Pair = tuple[float, float]
 FORMAT_VERSION = 1
 SCHEMA = "JawRigAPI"
+PARAMETERS = ("d1", "d2", "d3")
+LABELS = ("Opening [mm]", "Laterotrusion [mm], + left", "Protrusion [mm], + forward")
 
 _NOT_NEEDED = ("codes", "polygon_", "residual_limit_mm", "margin_limit_mm")
 _SEARCH_STEPS = 60
@@ -71,6 +75,16 @@ def find_rigs(stage: Usd.Stage) -> list[Usd.Prim]:
     """Return the prims of a stage that carry a rig, by their raw metadata: no plugin is needed."""
     applied = [(prim, prim.GetMetadata("apiSchemas")) for prim in stage.Traverse()]
     return [prim for prim, names in applied if names is not None and SCHEMA in names.GetAddedOrExplicitItems()]
+
+
+def find_blender_pxr(resource_path: Callable[[str], str]) -> None:
+    """Make Blender's own pxr importable where Blender runs as a Python module, given `bpy.utils.resource_path`."""
+    version = f"python{sys.version_info[0]}.{sys.version_info[1]}"
+    for kind in ("LOCAL", "SYSTEM"):
+        base = resource_path(kind)
+        folder = os.path.join(base, "python", "lib", version, "site-packages")
+        if base and os.path.isdir(os.path.join(folder, "pxr")) and folder not in sys.path:
+            sys.path.append(folder)
 
 
 def from_prim(prim: Usd.Prim) -> Rig:

@@ -26,13 +26,12 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import jawusd_reader
+from jawusd_reader import LABELS, PARAMETERS
 
 if TYPE_CHECKING:
     import hou
     import unreal
 
-PARAMETERS = ("d1", "d2", "d3")
-_LABELS = ("Opening [mm]", "Laterotrusion [mm], + left", "Protrusion [mm], + forward")
 Rows = Sequence[Sequence[float]]
 
 
@@ -56,7 +55,7 @@ def maya_controls(rig: jawusd_reader.Rig, name: str = "jaw_controls") -> str:
     from maya import cmds
 
     group = cmds.group(empty=True, name=name)
-    for parameter, label, (low, high) in zip(PARAMETERS, _LABELS, rig.d_range):
+    for parameter, label, (low, high) in zip(PARAMETERS, LABELS, rig.d_range):
         cmds.addAttr(
             group,
             longName=parameter,
@@ -84,7 +83,7 @@ def houdini_controls(rig: jawusd_reader.Rig, node: hou.Node) -> None:
     import hou
 
     group = node.parmTemplateGroup()
-    for parameter, label, (low, high) in zip(PARAMETERS, _LABELS, rig.d_range):
+    for parameter, label, (low, high) in zip(PARAMETERS, LABELS, rig.d_range):
         group.append(hou.FloatParmTemplate(parameter, label, 1, min=low, max=high))
     node.setParmTemplateGroup(group)
 

@@ -158,25 +158,16 @@ def corner_normals(mesh: Mesh) -> Array:
 
 
 @blames_file(0)
-def read_geometry(path: str | os.PathLike[str]) -> dict[str, Mesh]:
-    """Read the meshes of `geo.usdc`.
+def read_geometry(path: str | os.PathLike[str], *, placeholders: bool = False) -> dict[str, Mesh]:
+    """Read the meshes of `geo.usdc`: those of anatomy, or the placeholders.
 
     Returns:
         Meshes by the names of `MESH_PATHS`, skull ones in the skull frame, mandible ones in the mandible frame
-        [mm], with the layer's single precision. Meshes the rig lacks are missing, and so is a placeholder.
+        [mm], with the layer's single precision. Meshes the rig lacks are missing.
 
     Raises:
         RigError: Not a USD file, or a mesh that is not made of triangles.
     """
-    return _read(path, placeholders=False)
-
-
-def read_placeholders(path: str | os.PathLike[str]) -> dict[str, Mesh]:
-    """Return the placeholders, as `read_geometry` does the other meshes."""
-    return _read(path, placeholders=True)
-
-
-def _read(path: str | os.PathLike[str], *, placeholders: bool) -> dict[str, Mesh]:
     stage = open_stage(path)
     found = {}
     for name, prim_path in MESH_PATHS.items():

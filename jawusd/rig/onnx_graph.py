@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from onnx import TensorProto, helper, numpy_helper
 
 from jawusd.evaluator.formula import long_angle_series, polynomial
-from jawusd.evaluator.operations import triple
+from jawusd.evaluator.operations import Symbol, triple
 from jawusd.geometry.arrays import Array
 from jawusd.geometry.rodrigues import Triple, angle_quotients
 
@@ -21,41 +21,21 @@ _BERNOULLI = (1 / 6, 1 / 30, 1 / 42, 1 / 30, 5 / 66, 691 / 2730, 7 / 6, 3617 / 5
 # Below this squared angle the closed forms lose digits in float32 to cancellation, above it the series would.
 _SERIES_BELOW_RAD2 = 0.25
 
+_ARITHMETIC = {"Add": "Add", "Subtract": "Sub", "Multiply": "Mul", "Divide": "Div"}
+
 FloatType = type[np.float32] | type[np.float64]
 
 
 @dataclass(frozen=True)
-class Value:
+class Value(Symbol):
     """A value of a graph: a column (n, 1), or a wide number (n, m), see `jawusd.evaluator.operations`."""
 
     graph: Graph = field(repr=False)
     name: str
 
-    def __add__(self, other: Value | float) -> Value:
-        return self.graph.op("Add", self, other)
-
-    def __radd__(self, other: float) -> Value:
-        return self.graph.op("Add", other, self)
-
-    def __sub__(self, other: Value | float) -> Value:
-        return self.graph.op("Sub", self, other)
-
-    def __rsub__(self, other: float) -> Value:
-        return self.graph.op("Sub", other, self)
-
-    def __mul__(self, other: Value | float) -> Value:
-        return self.graph.op("Mul", self, other)
-
-    def __rmul__(self, other: float) -> Value:
-        return self.graph.op("Mul", other, self)
-
-    def __truediv__(self, other: Value | float) -> Value:
-        return (
-            self.graph.op("Mul", self, 1.0 / other) if isinstance(other, float) else self.graph.op("Div", self, other)
-        )
-
-    def __neg__(self) -> Value:
-        return self.graph.op("Neg", self)
+    def operation(self, name: str, *operands: Value | float) -> Value:
+        """Add an arithmetic operator."""
+        return self.graph.op(_ARITHMETIC[name], *operands)
 
     def __matmul__(self, matrix: ArrayLike) -> Value:
         """Return rows (n, k) times a constant matrix (k, m)."""

@@ -20,8 +20,9 @@ def test_zip_holds_manifest_modules_and_reader(tmp_path):
         for name in names - {"blender_manifest.toml"}:
             for node in ast.walk(ast.parse(archive.read(name))):
                 if isinstance(node, ast.ImportFrom) and node.level == 1:
-                    assert {f"{alias.name}.py" for alias in node.names} <= names
-                if isinstance(node, ast.Import | ast.ImportFrom):
+                    modules = [node.module] if node.module else [alias.name for alias in node.names]
+                    assert {f"{module}.py" for module in modules} <= names
+                elif isinstance(node, ast.Import | ast.ImportFrom):
                     assert not (getattr(node, "module", None) or "").startswith("jawusd"), name
 
 

@@ -1,30 +1,17 @@
-"""Blender add-on: a USD file with a jaw rig arrives with three sliders, live ranges and keys.
+"""Blender add-on: an imported USD file with a jaw rig gets three sliders, live ranges and keys.
 
 The extension is built by `python -m jawusd.plugins FILE.zip`, which puts `jawusd_reader.py` beside these modules.
 """
 
 from __future__ import annotations
 
-import os
-import sys
-
 import bpy
 
-from . import jaw, panel
-
-
-def _add_pxr_path() -> None:
-    """Make Blender's own pxr importable where it is not: in Blender as a Python module."""
-    version = f"python{sys.version_info[0]}.{sys.version_info[1]}"
-    for kind in ("LOCAL", "SYSTEM"):
-        base = bpy.utils.resource_path(kind)
-        folder = os.path.join(base, "python", "lib", version, "site-packages")
-        if base and os.path.isdir(os.path.join(folder, "pxr")) and folder not in sys.path:
-            sys.path.append(folder)
+from . import jaw, jawusd_reader, panel
 
 
 class JawUsdHook(bpy.types.USDHook):
-    """Turn the rigs of an imported stage into live ones."""
+    """Add sliders and drivers to the rigs of an imported stage."""
 
     bl_idname = "jawusd_hook"
     bl_label = "jawusd jaw rigs"
@@ -36,9 +23,9 @@ class JawUsdHook(bpy.types.USDHook):
 
 
 def register() -> None:
-    """Register the hook, the panel and what keeps rigs alive in reopened files."""
-    _add_pxr_path()
-    # Blender aborts when a hook is registered and pxr cannot be imported; better fail here
+    """Register the hook, the panel and the handlers that restore rigs in reopened files."""
+    jawusd_reader.find_blender_pxr(bpy.utils.resource_path)
+    # Blender aborts when a hook is registered and pxr cannot be imported: fail before
     import pxr.Usd  # noqa: F401
 
     bpy.utils.register_class(JawUsdHook)
@@ -47,7 +34,7 @@ def register() -> None:
 
 
 def unregister() -> None:
-    """Take everything back."""
+    """Remove them."""
     jaw.unregister()
     panel.unregister()
     bpy.utils.unregister_class(JawUsdHook)

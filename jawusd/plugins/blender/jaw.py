@@ -1,4 +1,4 @@
-"""Live jaw rigs in a scene: drivers of the mandible, ranges that follow the opening, keys from the file."""
+"""Jaw rigs in a scene: drivers of the mandible, slider ranges that follow the opening, keys from the file."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING
 import bpy
 
 from . import jawusd_reader
+from .jawusd_reader import LABELS, PARAMETERS
 
 if TYPE_CHECKING:
     from pxr import Sdf, Usd
 
 PrimMap = Mapping["Sdf.Path", list[bpy.types.ID]]  # prim path to the objects and data made from it
 
-SLIDERS = ("d1", "d2", "d3")
-LABELS = ("Opening [mm]", "Laterotrusion [mm], + left", "Protrusion [mm], + forward")
 _STORE, _ACTOR, _FPS = "jawusd_rig", "jawusd_actor", "jawusd_fps"
 _FUNCTION = "jawusd_channel"
 _CHANNELS = (("location", 3), ("rotation_quaternion", 4))
@@ -29,7 +28,7 @@ _parameters: dict[str, tuple[float, float, float]] = {}  # by actor, as last see
 
 
 def link_rigs(stage: Usd.Stage, prim_map: PrimMap) -> bool:
-    """Make the rigs of an imported stage live; return whether there is one."""
+    """Add sliders, drivers and keys to the rigs of an imported stage; return whether there is one."""
     prims = jawusd_reader.find_rigs(stage)
     for prim in prims:
         mandible_path = prim.GetRelationship("jaw:mandible").GetTargets()[0]
@@ -41,7 +40,7 @@ def link_rigs(stage: Usd.Stage, prim_map: PrimMap) -> bool:
         rig = jawusd_reader.from_prim(prim)
         actor[_STORE] = rig.to_json()
         actor[_FPS] = stage.GetTimeCodesPerSecond()
-        _add_sliders(actor, rig, [prim.GetAttribute(f"jaw:{name}").Get() or 0.0 for name in SLIDERS])
+        _add_sliders(actor, rig, [prim.GetAttribute(f"jaw:{name}").Get() or 0.0 for name in PARAMETERS])
         _drive(mandible, actor)
         _key(actor, prim)
         update_ranges(actor)
@@ -64,10 +63,10 @@ def rig_of(actor: bpy.types.Object) -> jawusd_reader.Rig:
 def update_ranges(actor: bpy.types.Object) -> None:
     """Set the slider limits of d2 and d3 to what is valid at the present d1, with the other one as it is."""
     rig = rig_of(actor)
-    d1, d2, d3 = (actor[name] for name in SLIDERS)
+    d1, d2, d3 = (actor[name] for name in PARAMETERS)
     _parameters[actor.name_full] = (d1, d2, d3)
     # along each axis through the present value of the other; where that leaves nothing, through the path itself
-    for name, found, fallback in zip(SLIDERS[1:], rig.ranges(d1, d2, d3), rig.ranges(d1)):
+    for name, found, fallback in zip(PARAMETERS[1:], rig.ranges(d1, d2, d3), rig.ranges(d1)):
         low, high = found if found[0] == found[0] else fallback
         if low == low:
             actor.id_properties_ui(name).update(min=low, max=high, soft_min=low, soft_max=high)
@@ -87,7 +86,7 @@ def _object_of(prim_map: PrimMap, path: Sdf.Path) -> bpy.types.Object | None:
 
 
 def _add_sliders(actor: bpy.types.Object, rig: jawusd_reader.Rig, values: list[float]) -> None:
-    for name, label, value, (low, high) in zip(SLIDERS, LABELS, values, rig.d_range):
+    for name, label, value, (low, high) in zip(PARAMETERS, LABELS, values, rig.d_range):
         actor[name] = float(value)
         ui = actor.id_properties_ui(name)
         ui.update(min=low, max=high, soft_min=low, soft_max=high, description=label, precision=2)
@@ -107,7 +106,7 @@ def _drive(mandible: bpy.types.Object, actor: bpy.types.Object) -> None:
             driver = mandible.driver_add(path, index).driver
             driver.type = "SCRIPTED"
             driver.use_self = True
-            for name in SLIDERS:
+            for name in PARAMETERS:
                 variable = driver.variables.new()
                 variable.name = name
                 variable.targets[0].id = actor
@@ -117,8 +116,8 @@ def _drive(mandible: bpy.types.Object, actor: bpy.types.Object) -> None:
 
 
 def _key(actor: bpy.types.Object, prim: Usd.Prim) -> None:
-    """Give the sliders the samples of the file as keys, linear between them as the file means them."""
-    for name in SLIDERS:
+    """Give the sliders the samples of the file as linearly interpolated keys."""
+    for name in PARAMETERS:
         attribute = prim.GetAttribute(f"jaw:{name}")
         times = attribute.GetTimeSamples()
         for time in times:
@@ -153,7 +152,7 @@ def _channel(mandible: bpy.types.Object, d1: float, d2: float, d3: float, channe
 
 @bpy.app.handlers.persistent
 def _install(*_: object) -> None:
-    """Make the driver function known; Blender forgets it with every file it opens."""
+    """Register the driver function, which Blender drops with every file it opens."""
     bpy.app.driver_namespace[_FUNCTION] = _channel
     _poses.clear()
     _parameters.clear()
@@ -163,7 +162,7 @@ def _install(*_: object) -> None:
 def _follow(*_: object) -> None:
     """Update the ranges of every actor whose sliders have moved."""
     for actor in actors():
-        if _parameters.get(actor.name_full) != tuple(actor[name] for name in SLIDERS):
+        if _parameters.get(actor.name_full) != tuple(actor[name] for name in PARAMETERS):
             update_ranges(actor)
 
 

@@ -6,7 +6,7 @@ from example_rig import FPS, example_meshes, example_motion, example_rig
 
 from jawusd.errors import RigError
 from jawusd.rig.bake import bake_rig
-from jawusd.rig.geo import read_geometry, read_placeholders
+from jawusd.rig.geo import read_geometry
 
 
 def bake(folder, meshes):
@@ -27,7 +27,7 @@ def test_meshes_come_back_in_single_precision(tmp_path):
 def test_a_placeholder_is_no_bone(tmp_path):
     meshes = {name: mesh for name, mesh in example_meshes().items() if name != "mandible"}
     path = bake(tmp_path, meshes)
-    assert "mandible" not in read_geometry(path) and set(read_placeholders(path)) == {"mandible"}
+    assert "mandible" not in read_geometry(path) and set(read_geometry(path, placeholders=True)) == {"mandible"}
 
 
 def test_what_is_no_geometry_is_refused(tmp_path):
