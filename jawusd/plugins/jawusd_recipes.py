@@ -26,7 +26,6 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import jawusd_reader
-from jawusd_reader import LABELS, PARAMETERS
 
 if TYPE_CHECKING:
     import hou
@@ -55,7 +54,7 @@ def maya_controls(rig: jawusd_reader.Rig, name: str = "jaw_controls") -> str:
     from maya import cmds
 
     group = cmds.group(empty=True, name=name)
-    for parameter, label, (low, high) in zip(PARAMETERS, LABELS, rig.d_range):
+    for parameter, label, (low, high) in zip(jawusd_reader.PARAMETERS, jawusd_reader.LABELS, rig.d_range):
         cmds.addAttr(
             group,
             longName=parameter,
@@ -73,7 +72,7 @@ def maya_bake(rig: jawusd_reader.Rig, controls: str, mandible: str, first: int, 
     from maya import cmds
 
     for frame in range(first, last + 1):
-        d = [cmds.getAttr(f"{controls}.{parameter}", time=frame) for parameter in PARAMETERS]
+        d = [cmds.getAttr(f"{controls}.{parameter}", time=frame) for parameter in jawusd_reader.PARAMETERS]
         cmds.xform(mandible, matrix=row_matrix(rig.pose(*d), scale), objectSpace=True)
         cmds.setKeyframe(mandible, attribute=["translate", "rotate"], time=frame)
 
@@ -83,7 +82,7 @@ def houdini_controls(rig: jawusd_reader.Rig, node: hou.Node) -> None:
     import hou
 
     group = node.parmTemplateGroup()
-    for parameter, label, (low, high) in zip(PARAMETERS, LABELS, rig.d_range):
+    for parameter, label, (low, high) in zip(jawusd_reader.PARAMETERS, jawusd_reader.LABELS, rig.d_range):
         group.append(hou.FloatParmTemplate(parameter, label, 1, min=low, max=high))
     node.setParmTemplateGroup(group)
 
@@ -95,7 +94,7 @@ def houdini_bake(
     import hou
 
     for frame in range(first, last + 1):
-        d = [controls.parm(parameter).evalAtFrame(frame) for parameter in PARAMETERS]
+        d = [controls.parm(parameter).evalAtFrame(frame) for parameter in jawusd_reader.PARAMETERS]
         matrix = hou.Matrix4(row_matrix(rig.pose(*d), scale))
         for name, values in (("t", matrix.extractTranslates()), ("r", matrix.extractRotates())):
             for parm, value in zip(mandible.parmTuple(name), values):

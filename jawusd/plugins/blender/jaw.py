@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import bpy
 
 from . import jawusd_reader
-from .jawusd_reader import LABELS, PARAMETERS
 
 if TYPE_CHECKING:
     from pxr import Sdf, Usd
@@ -40,7 +39,7 @@ def link_rigs(stage: Usd.Stage, prim_map: PrimMap) -> bool:
         rig = jawusd_reader.from_prim(prim)
         actor[_STORE] = rig.to_json()
         actor[_FPS] = stage.GetTimeCodesPerSecond()
-        _add_sliders(actor, rig, [prim.GetAttribute(f"jaw:{name}").Get() or 0.0 for name in PARAMETERS])
+        _add_sliders(actor, rig, [prim.GetAttribute(f"jaw:{name}").Get() or 0.0 for name in jawusd_reader.PARAMETERS])
         _drive(mandible, actor)
         _key(actor, prim)
         update_ranges(actor)
@@ -63,10 +62,10 @@ def rig_of(actor: bpy.types.Object) -> jawusd_reader.Rig:
 def update_ranges(actor: bpy.types.Object) -> None:
     """Set the slider limits of d2 and d3 to what is valid at the present d1, with the other one as it is."""
     rig = rig_of(actor)
-    d1, d2, d3 = (actor[name] for name in PARAMETERS)
+    d1, d2, d3 = (actor[name] for name in jawusd_reader.PARAMETERS)
     _parameters[actor.name_full] = (d1, d2, d3)
     # along each axis through the present value of the other; where that leaves nothing, through the path itself
-    for name, found, fallback in zip(PARAMETERS[1:], rig.ranges(d1, d2, d3), rig.ranges(d1)):
+    for name, found, fallback in zip(jawusd_reader.PARAMETERS[1:], rig.ranges(d1, d2, d3), rig.ranges(d1)):
         low, high = found if found[0] == found[0] else fallback
         if low == low:
             actor.id_properties_ui(name).update(min=low, max=high, soft_min=low, soft_max=high)
@@ -86,7 +85,7 @@ def _object_of(prim_map: PrimMap, path: Sdf.Path) -> bpy.types.Object | None:
 
 
 def _add_sliders(actor: bpy.types.Object, rig: jawusd_reader.Rig, values: list[float]) -> None:
-    for name, label, value, (low, high) in zip(PARAMETERS, LABELS, values, rig.d_range):
+    for name, label, value, (low, high) in zip(jawusd_reader.PARAMETERS, jawusd_reader.LABELS, values, rig.d_range):
         actor[name] = float(value)
         ui = actor.id_properties_ui(name)
         ui.update(min=low, max=high, soft_min=low, soft_max=high, description=label, precision=2)
@@ -106,7 +105,7 @@ def _drive(mandible: bpy.types.Object, actor: bpy.types.Object) -> None:
             driver = mandible.driver_add(path, index).driver
             driver.type = "SCRIPTED"
             driver.use_self = True
-            for name in PARAMETERS:
+            for name in jawusd_reader.PARAMETERS:
                 variable = driver.variables.new()
                 variable.name = name
                 variable.targets[0].id = actor
@@ -117,7 +116,7 @@ def _drive(mandible: bpy.types.Object, actor: bpy.types.Object) -> None:
 
 def _key(actor: bpy.types.Object, prim: Usd.Prim) -> None:
     """Give the sliders the samples of the file as linearly interpolated keys."""
-    for name in PARAMETERS:
+    for name in jawusd_reader.PARAMETERS:
         attribute = prim.GetAttribute(f"jaw:{name}")
         times = attribute.GetTimeSamples()
         for time in times:
@@ -162,7 +161,7 @@ def _install(*_: object) -> None:
 def _follow(*_: object) -> None:
     """Update the ranges of every actor whose sliders have moved."""
     for actor in actors():
-        if _parameters.get(actor.name_full) != tuple(actor[name] for name in PARAMETERS):
+        if _parameters.get(actor.name_full) != tuple(actor[name] for name in jawusd_reader.PARAMETERS):
             update_ranges(actor)
 
 

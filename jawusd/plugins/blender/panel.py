@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from . import jaw
-from .jawusd_reader import LABELS, PARAMETERS
+from . import jaw, jawusd_reader
 
 
 class JAWUSD_OT_key(bpy.types.Operator):
@@ -20,7 +19,7 @@ class JAWUSD_OT_key(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Insert the keys."""
-        for name in PARAMETERS:
+        for name in jawusd_reader.PARAMETERS:
             bpy.data.objects[self.actor].keyframe_insert(f'["{name}"]')
         return {"FINISHED"}
 
@@ -43,9 +42,9 @@ class JAWUSD_PT_sliders(bpy.types.Panel):
         for actor in jaw.actors():
             box = self.layout.box()
             box.label(text=actor.name)
-            for name, label in zip(PARAMETERS, LABELS):
+            for name, label in zip(jawusd_reader.PARAMETERS, jawusd_reader.LABELS):
                 box.prop(actor, f'["{name}"]', text=label)
-            margin = jaw.rig_of(actor).margin(*(actor[name] for name in PARAMETERS))
+            margin = jaw.rig_of(actor).margin(*(actor[name] for name in jawusd_reader.PARAMETERS))
             word = "inside" if margin >= 0 else "OUTSIDE"
             box.label(text=f"{word} the bounds by {abs(margin):.1f} mm", icon="INFO" if margin >= 0 else "ERROR")
             captured, shown = actor.get("jawusd_fps"), context.scene.render.fps / context.scene.render.fps_base
