@@ -111,7 +111,7 @@ def _pose(rig: JawRig, options: argparse.Namespace) -> int:
 
 def _encode(rig: JawRig, options: argparse.Namespace) -> int:
     frames, T = _read_poses(options.poses)
-    d, residual_mm = rig.encode(T, bounds=options.bounds)
+    d, residual_mm = rig.encode(T, inside=options.bounds)
     rows = [[frame, *x, r] for frame, x, r in zip(frames, d.tolist(), residual_mm.tolist())]
     _print_rows(["frame", "d1", "d2", "d3", "residual_mm"], rows, as_json=options.json)
     return 0

@@ -19,6 +19,74 @@ _LARGEST = 1e9  # [mm, rad]: far beyond any jaw, and squares and their sums stil
 _RISING = ("slice_d1", "path_limits", "curve1_knots", "curve2_knots", "curve3_knots")
 
 
+class RigArrays:
+    """The arrays and the header of a rig.
+
+    Attributes:
+        arrays: Named arrays, read-only; `jawusd.evaluator.schema` lists them.
+        meta: The header that came with them.
+    """
+
+    def __init__(self, arrays: Mapping[str, ArrayLike], meta: Mapping[str, object]) -> None:
+        """Check and keep both.
+
+        Raises:
+            EvaluatorError: an unknown kind, or an array missing, of a wrong shape, not finite or out of range.
+        """
+        self.meta = dict(meta)
+        self.arrays = checked_arrays(arrays, str(meta.get("kind")))
+
+    def __repr__(self) -> str:
+        low, high = self.d_range.T
+        ranges = ", ".join(f"d{i} {a:.1f} to {b:.1f}" for i, (a, b) in enumerate(zip(low, high), start=1))
+        return f"<JawRig {self.actor or 'without a name'}, {self.kind}, {ranges} mm>"
+
+    @property
+    def kind(self) -> str:
+        """The kind of model, "anchored" or "additive"."""
+        return str(self.meta["kind"])
+
+    @property
+    def actor(self) -> str:
+        """The person's name, empty if the rig has none."""
+        return str(self.meta.get("actor") or "")
+
+    @property
+    def method(self) -> str:
+        """The method that fitted the model, empty if the rig does not say."""
+        return str(self.meta.get("method") or "")
+
+    @property
+    def T_anatomical_skull(self) -> Array:
+        """Skull to anatomical coordinates (x left, y up, z anterior), shape (4, 4)."""
+        return self.arrays["T_anatomical_skull"]
+
+    @property
+    def T_rest(self) -> Array:
+        """T_skull_mandible of the closed bite, shape (4, 4)."""
+        return self.arrays["T_rest"]
+
+    @property
+    def landmarks(self) -> Array:
+        """Landmarks of the mandible [mm], mandible frame, shape (n, 3)."""
+        return self.arrays["landmarks"]
+
+    @property
+    def incisor(self) -> Array:
+        """The lower incisal point at rest [mm], anatomical frame, shape (3,)."""
+        return self.arrays["incisor"]
+
+    @property
+    def d_range(self) -> Array:
+        """The box around the valid parameters [mm], rows (low, high), shape (3, 2)."""
+        return self.arrays["d_range"]
+
+    @property
+    def captured_d(self) -> Array:
+        """Parameters of the captured poses [mm], shape (n, 3)."""
+        return self.arrays["codes"]
+
+
 def checked_arrays(arrays: Mapping[str, ArrayLike], kind: str) -> dict[str, Array]:
     """Return read-only float64 arrays of a rig of the given kind, and nothing else.
 

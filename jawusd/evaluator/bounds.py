@@ -4,7 +4,7 @@ Every opening d1 has a convex section in (d2, d3), the half-planes ``n_k . (d2, 
 to the captured openings. The half-spaces are joined by a soft maximum,
 
     v_k = n_k . (d2, d3) - h_k(d1),   v_low = d1_first - d1,   v_high = d1 - d1_last,
-    excess(d) = softness log sum exp(v / softness) - margin_mm,
+    distance(d) = softness log sum exp(v / softness) - offset_mm,
 
 which is negative inside, close to the distance in mm near the boundary, and smooth everywhere.
 """
@@ -34,13 +34,13 @@ class SliceHull:
         supports: h_k(d1) [mm], constant outside the captured openings.
         directions: Unit normals n_k in (d2, d3), shape (K, 2), pointing all around.
         softness_mm: Radius of the rounding where half-spaces meet.
-        margin_mm: Distance by which the bound is wider than its supports.
+        offset_mm: Distance by which the bound is wider than its supports.
     """
 
     supports: HermiteCurve
     directions: Array
     softness_mm: float
-    margin_mm: float
+    offset_mm: float
     _gradients: Array = field(init=False, repr=False)
     _first: float = field(init=False, repr=False)
     _last: float = field(init=False, repr=False)
@@ -65,46 +65,46 @@ class SliceHull:
             supports=HermiteCurve(knots, values, slopes),
             directions=np.asarray(arrays["slice_directions"], dtype=float),
             softness_mm=float(arrays["slice_softness_mm"]),
-            margin_mm=float(arrays["slice_margin_mm"]),
+            offset_mm=float(arrays["slice_margin_mm"]),
         )
 
-    def excess(self, d: Array) -> Array:
+    def signed_distance(self, d: Array) -> Array:
         """Return how far outside d (n, 3) lies [mm], shape (n,); negative inside."""
         return self._joined(d, self.supports.value(d[:, 0]))[0]
 
-    def excess_gradient(self, d: Array) -> tuple[Array, Array]:
-        """Return the excess (n,) [mm] and its gradient by d, shape (n, 3)."""
+    def signed_distance_gradient(self, d: Array) -> tuple[Array, Array]:
+        """Return the signed distance (n,) [mm] and its gradient by d, shape (n, 3)."""
         reach, reach_1 = self.supports.value_and_slope(d[:, 0])
-        excess, weights = self._joined(d, reach)
+        distance, weights = self._joined(d, reach)
         gradient = weights @ self._gradients
         gradient[:, 0] -= np.einsum("nk,nk->n", weights[:, :-2], reach_1)
-        return excess, gradient
+        return distance, gradient
 
-    def excess_curvature(self, d: Array) -> tuple[Array, Array, Array]:
-        """Return excess (n,), gradient (n, 3) and the rounding's part of the Hessian, shape (n, 3, 3) [1/mm].
+    def signed_distance_curvature(self, d: Array) -> tuple[Array, Array, Array]:
+        """Return signed distance (n,), gradient (n, 3) and the rounding's part of the Hessian, shape (n, 3, 3) [1/mm].
 
         The rest of the Hessian, the bending of the supports along d1, is left out: what is returned is never
         indefinite, which keeps the steps of a solver pointing downhill.
         """
         reach, reach_1 = self.supports.value_and_slope(d[:, 0])
-        excess, weights = self._joined(d, reach)
+        distance, weights = self._joined(d, reach)
         slopes = np.empty((len(d), *self._gradients.shape))
         slopes[:] = self._gradients
         slopes[:, :-2, 0] = -reach_1
         gradient = (weights[:, None, :] @ slopes)[:, 0]
         slopes -= gradient[:, None, :]
         curvature = np.swapaxes(slopes, 1, 2) @ (slopes * (weights / self.softness_mm)[:, :, None])
-        return excess, gradient, curvature
+        return distance, gradient, curvature
 
     def chord(self, d: Array, axis: int) -> tuple[Array, Array]:
         """Return the ends [mm] of the valid stretch through d (n, 3) along axis 1 or 2; NaN where there is none."""
         return self._chord_end(d, axis, -1.0), self._chord_end(d, axis, 1.0)
 
     def _chord_end(self, d: Array, axis: int, sign: float) -> Array:
-        # Newton from the corner of the sharp polygon, which contains the soft one: the excess is convex along the
-        # line, so the search runs inwards without overshooting, and turns back only if the line misses the section.
+        # Newton from the corner of the sharp polygon, which contains the soft one: the signed distance is convex along
+        # the line, so the search runs inwards without overshooting, and turns back only if the line misses the section.
         along, across = self.directions[:, axis - 1], self.directions[:, 2 - axis]
-        room = self.supports.value(d[:, 0]) + self.margin_mm - d[:, 3 - axis, None] * across
+        room = self.supports.value(d[:, 0]) + self.offset_mm - d[:, 3 - axis, None] * across
         facing = along * sign > 0
         x = sign * np.min(room[:, facing] / np.abs(along[facing]), axis=1)
         point = d.copy()
@@ -112,12 +112,12 @@ class SliceHull:
         end = np.full(len(d), np.nan)
         for _ in range(_NEWTON_ITERATIONS):
             point[active, axis] = x[active]
-            excess, gradient = self.excess_gradient(point[active])
+            distance, gradient = self.signed_distance_gradient(point[active])
             slope = gradient[:, axis]
-            done = np.abs(excess) <= _ROOT_TOLERANCE_MM
+            done = np.abs(distance) <= _ROOT_TOLERANCE_MM
             end[active[done]] = x[active[done]]
             onward = ~done & (slope * sign > 0)
-            x[active[onward]] -= excess[onward] / slope[onward]
+            x[active[onward]] -= distance[onward] / slope[onward]
             active = active[onward]
             if not active.size:
                 break
@@ -125,7 +125,7 @@ class SliceHull:
 
     def candidates(self) -> Array:
         """Return points (n, 3) [mm] spread over the valid volume, dense near its surface: starts for searches."""
-        reach = self.margin_mm - self.softness_mm  # at the very ends the rounding leaves no section
+        reach = self.offset_mm - self.softness_mm  # at the very ends the rounding leaves no section
         low, high = self._first - reach, self._last + reach
         points = []
         for d1 in np.linspace(low, high, _CANDIDATE_SLICES):
@@ -137,11 +137,11 @@ class SliceHull:
             section = np.concatenate([[centre], *(centre + radius * reach for radius in _CANDIDATE_RADII)])
             points.append(np.column_stack([np.full(len(section), d1), section]))
         found = np.concatenate([np.empty((0, 3)), *points])
-        return found[self.excess(found) <= 0]
+        return found[self.signed_distance(found) <= 0]
 
     def _sharp_outline(self, d1: float) -> Array:
         """Return the corners (n, 2) of the section's unrounded polygon at d1, in order of angle."""
-        reach = self.supports.value(np.array([d1]))[0] + self.margin_mm
+        reach = self.supports.value(np.array([d1]))[0] + self.offset_mm
         i, j = np.triu_indices(len(self.directions), 1)
         a, b = self.directions[i], self.directions[j]
         cross = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
@@ -155,7 +155,7 @@ class SliceHull:
         return corners[np.argsort(np.arctan2(from_centre[:, 1], from_centre[:, 0]))]
 
     def _joined(self, d: Array, reach: Array) -> tuple[Array, Array]:
-        """Return the excess (n,) [mm] and the share (n, K + 2) of each half-space in it, for supports (n, K)."""
+        """Return the signed distance (n,) [mm] and the weight (n, K + 2) of each half-space, for supports (n, K)."""
         v = np.empty((len(d), len(self.directions) + 2))
         np.matmul(d[:, 1:], self.directions.T, out=v[:, :-2])
         v[:, :-2] -= reach
@@ -167,4 +167,4 @@ class SliceHull:
         np.exp(v, out=v)
         total = v.sum(axis=1)
         v /= total[:, None]
-        return peak + self.softness_mm * np.log(total) - self.margin_mm, v
+        return peak + self.softness_mm * np.log(total) - self.offset_mm, v

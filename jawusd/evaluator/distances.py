@@ -45,6 +45,19 @@ def carried(R: Array, t: Array, vectors: Array) -> Array:
     return R @ vectors[:3] + t[:, :, None] * vectors[3]
 
 
+def point_velocities(R: Array, t: Array, S: Array, points: Array) -> Array:
+    """Return the derivatives (n, p, 3, 3) of the images of points (p, 3) [mm] by d.
+
+    Args:
+        R: Rotations, shape (n, 3, 3).
+        t: Translations [mm], shape (n, 3).
+        S: Their spatial derivatives, see `jawusd.evaluator.models`, shape (n, 6, 3).
+        points: Points before the motion.
+    """
+    image = points @ np.swapaxes(R, 1, 2) + t[:, None]
+    return np.cross(S[:, None, :3], image[..., None], axis=2) + S[:, None, 3:]
+
+
 def distance_residual(derivative: Derivative, vectors: Array, target: Array) -> Residual:
     """Return, for `minimise`, how far motions leave the vectors (4, m) from their targets (n, 3, m)."""
     count = vectors.shape[1]

@@ -6,72 +6,60 @@ their mean c and scatter ``mean (l_k - c)(l_k - c)^T = B B^T`` it is exactly
     residual_mm^2 = |(T - T') (c, 1)|^2 + sum_j |(T - T') (b_j, 0)|^2,
 
 so four vectors carry any number of landmarks. Encoding minimises it by damped Gauss-Newton with the model's analytic
-derivatives, from the parameters read off the model itself.
+derivatives, starting at the parameters read off the model.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from jawusd.evaluator.bounds import SliceHull
-from jawusd.evaluator.distances import carried, distance_residual, landmark_vectors
+from jawusd.evaluator.distances import carried, distance_residual
 from jawusd.evaluator.frames import RigFrames
 from jawusd.evaluator.models import AnchoredModel, JawModelForm
-from jawusd.evaluator.reach import Reach
 from jawusd.evaluator.solver import minimise
 from jawusd.geometry.arrays import Array, Indices
-from jawusd.geometry.se3 import make_transform, se3_inverse, se3_left_jacobian_inverse, se3_log, transform_points
+from jawusd.geometry.se3 import make_transform, se3_inverse, se3_left_jacobian_inverse, se3_log
+
+
+class Encoding(NamedTuple):
+    """What `JawRig.encode` found: d [mm], shape (..., 3), and residual_mm, shape (...)."""
+
+    d: Array
+    residual_mm: Array
 
 
 class Encoder:
-    """Encode poses with one model.
+    """Encode poses with one model, in numpy.
 
     Args:
         model: The jaw model.
         frames: Of the rig.
-        bound: The valid volume.
-        reach: Searches inside it.
-        landmarks: Landmarks of the mandible [mm], mandible frame, shape (n, 3).
+        vectors: The four vectors that stand for the landmarks, see `distances.landmark_vectors`.
     """
 
-    def __init__(
-        self, model: JawModelForm, frames: RigFrames, bound: SliceHull, reach: Reach, landmarks: Array
-    ) -> None:
-        self._model, self._frames, self._bound, self._reach = model, frames, bound, reach
-        self._vectors = landmark_vectors(transform_points(frames.T_anatomical_mandible_rest, landmarks))
+    def __init__(self, model: JawModelForm, frames: RigFrames, vectors: Array) -> None:
+        self._model, self._frames, self._vectors = model, frames, vectors
 
-    def encode(self, T: Array, *, bounded: bool) -> tuple[Array, Array]:
+    def encode(self, T: Array) -> tuple[Array, Array]:
         """Return the d (n, 3) nearest to poses T_skull_mandible (n, 4, 4), and the residuals (n,) [mm]."""
-        R, t = self._frames.motions(T)
-        d = self._nearest(R, t)
-        out = np.flatnonzero(self._bound.excess(d) > 0) if bounded else ()
-        if len(out):
-            d[out] = self._reach.best_pull(self._vectors, carried(R[out], t[out], self._vectors))
-        return d, self._residual_mm(d, R, t)
+        d = self.nearest(T)
+        return d, self.residual_mm(d, T)
 
-    def encode_weighted(self, T: Array, whitening: Array, *, bounded: bool) -> tuple[Array, Array]:
-        """Return the most likely d (n, 3) of noisy poses: the least ``|W xi|^2`` with ``T = exp(xi) pose(d)``.
+    def targets(self, T: Array) -> Array:
+        """Return where poses T_skull_mandible (n, 4, 4) carry the vectors, anatomical frame, shape (n, 3, 4)."""
+        return carried(*self._frames.motions(T), self._vectors)
 
-        Args:
-            T: Poses T_skull_mandible, shape (n, 4, 4).
-            whitening: W with ``W^T W`` the inverse covariance of xi, (omega, v), skull frame, shape (n, 6, 6).
-            bounded: Search only inside the bound.
-
-        Returns:
-            d [mm], shape (n, 3), and the residuals [mm], shape (n,).
-        """
-        R, t = self._frames.motions(T)
-        start = self._nearest(R, t)
-        start[np.isnan(whitening).any(axis=(1, 2))] = np.nan
-        start = self._reach.nearest(start) if bounded else start
-        d = self._most_likely(R, t, whitening @ self._frames.adjoint, start, self._bound if bounded else None)
-        return d, self._residual_mm(d, R, t)
-
-    def _residual_mm(self, d: Array, R: Array, t: Array) -> Array:
-        difference = carried(*self._model.decode(d), self._vectors) - carried(R, t, self._vectors)
+    def residual_mm(self, d: Array, T: Array) -> Array:
+        """Return the landmark distances (n,) [mm] between the poses of d (n, 3) and T (n, 4, 4)."""
+        difference = carried(*self._model.decode(d), self._vectors) - self.targets(T)
         return np.sqrt(np.einsum("nij,nij->n", difference, difference))
 
-    def _nearest(self, R: Array, t: Array) -> Array:
+    def nearest(self, T: Array) -> Array:
+        """Return the d (n, 3) nearest to poses T_skull_mandible (n, 4, 4)."""
+        R, t = self._frames.motions(T)
         model, target = self._model, carried(R, t, self._vectors)
         if isinstance(model, AnchoredModel):
             # the nearest pose does not depend on the chart: searching over the incisal displacement spares the gauge
@@ -80,8 +68,17 @@ class Encoder:
         residual = distance_residual(model.decode_derivative, self._vectors, target)
         return minimise(residual, model.read_off(R, t))
 
-    def _most_likely(self, R: Array, t: Array, whitening: Array, start: Array, bound: SliceHull | None) -> Array:
-        measured = make_transform(R, t)
+    def most_likely(self, T: Array, whitening: Array, start: Array, bound: SliceHull | None) -> Array:
+        """Return the most likely d (n, 3) of noisy poses: the least ``|W xi|^2`` with ``T = exp(xi) pose(d)``.
+
+        Args:
+            T: Poses T_skull_mandible, shape (n, 4, 4).
+            whitening: W with ``W^T W`` the inverse covariance of xi, (omega, v), skull frame, shape (n, 6, 6).
+            start: First d [mm], shape (n, 3); inside the bound, if there is one. NaN gives NaN.
+            bound: Where d must stay.
+        """
+        measured = make_transform(*self._frames.motions(T))
+        whitening = whitening @ self._frames.adjoint
 
         def residual(d: Array, rows: Indices) -> tuple[Array, Array]:
             R_d, t_d, S = self._model.decode_derivative(d)
@@ -99,11 +96,11 @@ def whitening_of(covariance: Array) -> Array:
     Raises:
         ValueError: a covariance is not positive definite.
     """
-    lost = np.isnan(covariance).any(axis=(1, 2))
+    lost = np.asarray(np.isnan(covariance).any(axis=(1, 2)))
     try:
         factor = np.linalg.cholesky(np.where(lost[:, None, None], np.eye(6), covariance))
     except np.linalg.LinAlgError as error:
         raise ValueError("covariance must be positive definite") from error
-    whitening = np.linalg.inv(factor)
+    whitening = np.asarray(np.linalg.inv(factor), dtype=np.float64)
     whitening[lost] = np.nan
     return whitening

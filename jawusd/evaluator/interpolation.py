@@ -17,6 +17,19 @@ _MOST_WAYPOINT_ROUNDS = 8
 _ROUNDING_MM = 1e-9
 
 
+def interpolated(frames: Array, keys: Array, at: Array, method: str, bound: SliceHull) -> Array:
+    """Return d (m, 3) [mm] at times ``at`` between keys (k, 3), "linear" or "smooth"; constant outside the keys.
+
+    Raises:
+        ValueError: another method.
+    """
+    if method == "linear":
+        return interpolate_linear(frames, keys, at)
+    if method == "smooth":
+        return interpolate_smooth(frames, keys, at, bound)
+    raise ValueError(f'method must be "linear" or "smooth", got {method!r}')
+
+
 def interpolate_linear(frames: Array, keys: Array, at: Array) -> Array:
     """Return d (m, 3) [mm] at times ``at`` on straight lines between keys (k, 3); constant outside the keys."""
     return np.stack([np.interp(at, frames, column) for column in keys.T], axis=1)
@@ -33,7 +46,7 @@ def interpolate_smooth(frames: Array, keys: Array, at: Array, bound: SliceHull) 
     if len(keys) == 1:
         return np.broadcast_to(keys, (len(at), 3)).copy()
     frames, keys = _with_waypoints(frames, keys, bound)
-    tangents = _catmull_rom(frames, keys)
+    tangents = _tangents(frames, keys)
     scale = np.ones(len(keys))
     guarded = _guarded(keys, bound)
     for level in _TANGENT_SCALES[1:]:
@@ -47,7 +60,7 @@ def interpolate_smooth(frames: Array, keys: Array, at: Array, bound: SliceHull) 
     return curve.value(np.clip(at, frames[0], frames[-1]))
 
 
-def _catmull_rom(frames: Array, keys: Array) -> Array:
+def _tangents(frames: Array, keys: Array) -> Array:
     # finite differences for uneven frames; flat at both ends, where the motion starts and stops
     tangents = np.zeros_like(keys)
     step = np.diff(frames)[:, None]
@@ -58,7 +71,7 @@ def _catmull_rom(frames: Array, keys: Array) -> Array:
 
 def _guarded(keys: Array, bound: SliceHull) -> Mask:
     """Tell which pieces have both keys inside: only those can be kept inside."""
-    inside = bound.excess(keys) <= _ROUNDING_MM
+    inside = bound.signed_distance(keys) <= _ROUNDING_MM
     return inside[:-1] & inside[1:]
 
 
@@ -66,8 +79,8 @@ def _leaves(value: Callable[[Array], Array], frames: Array, bound: SliceHull) ->
     """Tell which pieces of a curve leave the bound, by samples that crowd towards the keys."""
     s = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, _SAMPLES))
     times = frames[:-1, None] + s * np.diff(frames)[:, None]
-    excess = bound.excess(value(times.ravel())).reshape(times.shape)
-    return (excess > _ROUNDING_MM).any(axis=1)
+    distance = bound.signed_distance(value(times.ravel())).reshape(times.shape)
+    return np.asarray((distance > _ROUNDING_MM).any(axis=1))
 
 
 def _with_waypoints(frames: Array, keys: Array, bound: SliceHull) -> tuple[Array, Array]:
@@ -87,10 +100,10 @@ def _with_waypoints(frames: Array, keys: Array, bound: SliceHull) -> tuple[Array
 
 def _sunk(points: Array, bound: SliceHull) -> Array:
     """Return the points moved down the gradient of the bound, past its surface by as much as they were outside."""
-    depth = -np.maximum(bound.excess(points), 0.01)
+    depth = -np.maximum(bound.signed_distance(points), 0.01)
     points = points.copy()
     for _ in range(20):
-        excess, normal = bound.excess_gradient(points)
+        distance, normal = bound.signed_distance_gradient(points)
         squared = np.maximum(np.einsum("ni,ni->n", normal, normal), 1e-6)
-        points -= (np.maximum(excess - depth, 0.0) / squared)[:, None] * normal
+        points -= (np.maximum(distance - depth, 0.0) / squared)[:, None] * normal
     return points

@@ -30,10 +30,10 @@ class PolygonBound:
             _edges(arrays["polygon_d1d3"], arrays["polygon_d1d3_counts"]),
         )
 
-    def excess(self, d: Array) -> Array:
+    def signed_distance(self, d: Array) -> Array:
         """Return how far outside the worse of the two outlines d (n, 3) lies [mm], shape (n,); negative inside."""
-        lateral = _signed_distance(d[:, [0, 1]], self.opening_lateral)
-        return np.maximum(lateral, _signed_distance(d[:, [0, 2]], self.opening_protrusion))
+        lateral = _distance_to_edges(d[:, [0, 1]], self.opening_lateral)
+        return np.maximum(lateral, _distance_to_edges(d[:, [0, 2]], self.opening_protrusion))
 
 
 def _edges(vertices: Array, counts: Array) -> Array:
@@ -42,7 +42,7 @@ def _edges(vertices: Array, counts: Array) -> Array:
     return np.concatenate([np.stack([ring, np.roll(ring, -1, axis=0)], axis=1) for ring in rings])
 
 
-def _signed_distance(points: Array, edges: Array) -> Array:
+def _distance_to_edges(points: Array, edges: Array) -> Array:
     """Return the distance (n,) of points (n, 2) to the edges, negative inside by the even-odd rule; NaN for NaN."""
     start, along = edges[:, 0], edges[:, 1] - edges[:, 0]
     x, y = points[:, 0, None], points[:, 1, None]

@@ -2,34 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from functools import partial
-from typing import Any, Literal
+from collections.abc import Callable, Mapping
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from jawusd.evaluator import sections
-from jawusd.evaluator.arrays import checked_arrays
+from jawusd.evaluator.arrays import RigArrays
+from jawusd.evaluator.batching import as_keys, as_points, as_rows, in_chunks, rows_of
 from jawusd.evaluator.bounds import SliceHull
-from jawusd.evaluator.distances import carried, handle_vectors
-from jawusd.evaluator.encoding import Encoder, whitening_of
+from jawusd.evaluator.distances import carried, handle_vectors, point_velocities
+from jawusd.evaluator.encoding import Encoder, Encoding, whitening_of
 from jawusd.evaluator.frames import RigFrames
-from jawusd.evaluator.interpolation import interpolate_linear, interpolate_smooth
+from jawusd.evaluator.interpolation import interpolated
+from jawusd.evaluator.kernels import Kernels, NumpyKernels, RigParts
 from jawusd.evaluator.models import model_from_arrays
 from jawusd.evaluator.polygons import PolygonBound
-from jawusd.evaluator.reach import Reach, nearest_distance
-from jawusd.evaluator.rows import as_keys, as_points, as_rows, in_chunks
-from jawusd.evaluator.verdicts import RIGID_TOLERANCE, Limits, Verdicts, judge, too_fast
+from jawusd.evaluator.search import BoundedSearch, IkResult, nearest_distance
+from jawusd.evaluator.sections import Ranges
+from jawusd.evaluator.verdicts import Limits, Verdicts, too_fast
 from jawusd.geometry.arrays import Array
-from jawusd.geometry.se3 import rigidity_defect, transform_points
+from jawusd.geometry.se3 import transform_points
 
 BoundName = Literal["slices", "polygons"]
 
-_SINGLE_LIMIT_MM = 1e4  # beyond, the float path might raise where the array path gives infinities
+_SINGLE_LIMIT_MM = 1e4  # beyond, functions of one d might raise where those of rows give infinities
 
 
-class JawRig:
+class JawRig(RigArrays):
     """One person's jaw: pure functions from d = (opening, laterotrusion, protrusion) [mm] to poses and back.
 
     ``pose(d) = A^-1 M(d) A rest`` with A = T_anatomical_skull and rest = T_skull_mandible of the closed bite;
@@ -39,78 +40,65 @@ class JawRig:
     row with a NaN or infinity gives NaN. Rigs have no state: share them between threads, pickle them, fork.
 
     Attributes:
-        arrays: The named arrays the rig was made from, read-only.
-        meta: The header that came with them.
+        model: The function from d to motions.
+        bound: The slice bound.
+        polygons: The paper's bound.
         limits: Thresholds of `validate` stored in the rig.
+        kernels: What computes rows.
     """
 
-    def __init__(self, arrays: Mapping[str, ArrayLike], meta: Mapping[str, Any]) -> None:
+    def __init__(
+        self,
+        arrays: Mapping[str, ArrayLike],
+        meta: Mapping[str, object],
+        *,
+        kernels: Callable[[RigParts], Kernels] = NumpyKernels,
+    ) -> None:
         """Build the rig.
 
         Args:
             arrays: Named arrays of a model of format jawusd-model/1; others are left out.
             meta: Its header; ``meta["kind"]`` is "anchored" or "additive".
+            kernels: What computes rows; `jawusd.fast` has a faster implementation.
 
         Raises:
             EvaluatorError: an unknown kind, or an array missing, of a wrong shape, not finite or out of range.
         """
-        self.meta = dict(meta)
-        self.arrays = checked_arrays(arrays, str(meta.get("kind")))
+        super().__init__(arrays, meta)
         self.model = model_from_arrays(self.arrays)
         self.bound = SliceHull.from_arrays(self.arrays)
         self.polygons = PolygonBound.from_arrays(self.arrays)
-        self._opening_mm = float(self.arrays["d_range"][0, 1])
         self.limits = Limits(float(self.arrays["residual_limit_mm"]), float(self.arrays["margin_limit_mm"]))
-        self._frames = RigFrames(self.arrays["T_anatomical_skull"], self.arrays["T_rest"], self.model.single.anchor)
-        self._reach = Reach(self.model, self.bound)
-        self._encoder = Encoder(self.model, self._frames, self.bound, self._reach, self.arrays["landmarks"])
+        self._frames = RigFrames(self.T_anatomical_skull, self.T_rest, self.model.single.anchor)
+        parts = RigParts(self.model, self.bound, self._frames, self.landmarks)
+        self._make_kernels, self.kernels = kernels, kernels(parts)
+        self._search = BoundedSearch(self.model, self.bound, self.kernels)
+        self._vectors = parts.vectors()
+        self._encoder = Encoder(self.model, self._frames, self._vectors)
 
-    def __reduce__(self) -> tuple:
-        return (JawRig, ({name: np.array(value) for name, value in self.arrays.items()}, self.meta))
+    def __reduce__(self) -> tuple[object, ...]:
+        arrays = {name: np.array(value) for name, value in self.arrays.items()}
+        return _rebuilt, (arrays, self.meta, self._make_kernels)
 
     def pose(self, d: ArrayLike) -> Array:
-        """Return the pose T_skull_mandible for jaw parameters d.
-
-        Args:
-            d: Jaw parameters [mm], shape (..., 3).
-
-        Returns:
-            Poses, shape (..., 4, 4).
-        """
+        """Return the poses T_skull_mandible (..., 4, 4) for jaw parameters d (..., 3) [mm]."""
         d = np.asarray(d, dtype=np.float64)
         if d.shape == (3,):
             d1, d2, d3 = d.tolist()
             if abs(d1) + abs(d2) + abs(d3) < _SINGLE_LIMIT_MM:  # False for NaN
-                return self._frames.pose(self.model.single.motion(d1, d2, d3))
-        rows, batch = as_rows(d, (3,), "d")
-        return in_chunks(self._poses, rows).reshape(*batch, 4, 4)
-
-    def _poses(self, d: Array) -> Array:
-        return self._frames.poses(self.model.motion(d))
+                return self.kernels.pose(d1, d2, d3)
+        rows, batch = rows_of(d, (3,), "d")
+        return self.kernels.poses(rows).reshape(*batch, 4, 4)
 
     def twist(self, d: ArrayLike) -> Array:
-        """Return the twist log(pose(d) rest^-1) in the skull frame.
-
-        Args:
-            d: Jaw parameters [mm], shape (..., 3).
-
-        Returns:
-            Twists (omega [rad], v [mm]), shape (..., 6).
-        """
-        rows, batch = as_rows(d, (3,), "d")
-        return in_chunks(lambda d: self.model.log(d) @ self._frames.adjoint.T, rows).reshape(*batch, 6)
+        """Return the twists (omega [rad], v [mm]) log(pose(d) rest^-1), skull frame, (..., 6), of d (..., 3) [mm]."""
+        rows, batch = rows_of(d, (3,), "d")
+        return self.kernels.twists(rows).reshape(*batch, 6)
 
     def jacobian(self, d: ArrayLike) -> Array:
-        """Return the derivative of `twist` by d.
-
-        Args:
-            d: Jaw parameters [mm], shape (..., 3).
-
-        Returns:
-            Jacobians, [rad/mm] in the rows of omega, [mm/mm] in those of v, shape (..., 6, 3).
-        """
-        rows, batch = as_rows(d, (3,), "d")
-        return in_chunks(lambda d: self._frames.adjoint @ self.model.log_jacobian(d), rows).reshape(*batch, 6, 3)
+        """Return the derivative (..., 6, 3) of `twist` by d (..., 3) [mm]: [rad/mm] for omega, [mm/mm] for v."""
+        rows, batch = rows_of(d, (3,), "d")
+        return self.kernels.jacobians(rows).reshape(*batch, 6, 3)
 
     def point_jacobian(self, d: ArrayLike, p_mandible: ArrayLike) -> Array:
         """Return the derivative by d of where points of the mandible are in the skull frame.
@@ -127,42 +115,54 @@ class JawRig:
         at_rest = transform_points(self._frames.T_anatomical_mandible_rest, points.reshape(-1, 3))
 
         def derivative(d: Array) -> Array:
-            R, t, S = self.model.decode_derivative(d)
-            image = at_rest @ np.swapaxes(R, 1, 2) + t[:, None]
-            moved = np.cross(S[:, None, :3], image[..., None], axis=2) + S[:, None, 3:]
-            return self._frames.T_skull_anatomical[:3, :3] @ moved
+            velocities = point_velocities(*self.model.decode_derivative(d), at_rest)
+            return self._frames.T_skull_anatomical[:3, :3] @ velocities
 
         return in_chunks(derivative, rows).reshape(*batch, *points.shape, 3)
 
     def encode(
-        self, T_skull_mandible: ArrayLike, *, bounds: bool = False, covariance: ArrayLike | None = None
-    ) -> tuple[Array, Array]:
+        self, T_skull_mandible: ArrayLike, *, inside: bool = False, covariance: ArrayLike | None = None
+    ) -> Encoding:
         """Return the jaw parameters whose pose is nearest to each given one.
 
         Nearest by ``residual_mm``, the root of the mean squared distance of the rig's landmarks between the two poses.
 
         Args:
-            T_skull_mandible: Poses, shape (..., 4, 4).
-            bounds: Search only inside the bound.
+            T_skull_mandible: Poses, shape (..., 4, 4). Of a matrix that is not quite rigid, the images of the
+                landmarks are what is matched.
+            inside: Search only inside the bound.
             covariance: If given, return the most likely instead of the nearest parameters of noisy poses: covariance
                 of xi, (omega [rad], v [mm]) in the skull frame, with ``T_true = exp(xi) T``, shape (..., 6, 6) or
                 (6, 6).
 
-        Returns:
-            d [mm], shape (..., 3), and residual_mm, shape (...). Of a matrix that is not quite rigid, the images of
-            the landmarks are what is matched.
-
         Raises:
             ValueError: wrong shapes, or a covariance that is not positive definite.
         """
+        if covariance is not None:
+            return self._encode_weighted(T_skull_mandible, covariance, inside)
+        rows, batch = rows_of(T_skull_mandible, (4, 4), "T_skull_mandible")
+        d, residual_mm = self.kernels.encode(rows)
+        out = np.flatnonzero(self.kernels.margins(d) < 0) if inside else ()
+        if len(out):
+            targets = self._encoder.targets(rows[out])
+            d[out] = in_chunks(lambda target: self._search.solve_ik_multistart(self._vectors, target), targets)
+            residual_mm[out] = in_chunks(self._encoder.residual_mm, d[out], rows[out])
+        return Encoding(d.reshape(*batch, 3), residual_mm.reshape(batch))
+
+    def _encode_weighted(self, T_skull_mandible: ArrayLike, covariance: ArrayLike, inside: bool) -> Encoding:
         rows, batch = as_rows(T_skull_mandible, (4, 4), "T_skull_mandible")
-        if covariance is None:
-            d, residual_mm = in_chunks(partial(self._encoder.encode, bounded=bounds), rows)
-        else:
-            spread = np.broadcast_to(np.asarray(covariance, dtype=np.float64), (*batch, 6, 6))
-            whitening = whitening_of(as_rows(spread, (6, 6), "covariance")[0])
-            d, residual_mm = in_chunks(partial(self._encoder.encode_weighted, bounded=bounds), rows, whitening)
-        return d.reshape(*batch, 3), residual_mm.reshape(batch)
+        spread = np.broadcast_to(np.asarray(covariance, dtype=np.float64), (*batch, 6, 6))
+        whitening = whitening_of(as_rows(spread, (6, 6), "covariance")[0])
+        start, _ = self.kernels.encode(rows)
+        start[np.isnan(whitening).any(axis=(1, 2))] = np.nan
+
+        def encode(T: Array, whitening: Array, start: Array) -> tuple[Array, Array]:
+            first = self._search.nearest(start) if inside else start
+            d = self._encoder.most_likely(T, whitening, first, self.bound if inside else None)
+            return d, self._encoder.residual_mm(d, T)
+
+        d, residual_mm = in_chunks(encode, rows, whitening, start)
+        return Encoding(d.reshape(*batch, 3), residual_mm.reshape(batch))
 
     def margin(self, d: ArrayLike, *, bound: BoundName = "slices") -> Array:
         """Return the signed distance of d to the bound [mm]: positive inside, finite and smooth outside.
@@ -175,18 +175,21 @@ class JawRig:
         Returns:
             Margins [mm], shape (...).
         """
-        rows, batch = as_rows(d, (3,), "d")
-        return -in_chunks(self._bound(bound).excess, rows).reshape(batch)
-
-    def _bound(self, name: BoundName) -> SliceHull | PolygonBound:
-        if name not in ("slices", "polygons"):
-            raise ValueError(f'bound must be "slices" or "polygons", got {name!r}')
-        return self.bound if name == "slices" else self.polygons
+        if _checked(bound) == "polygons":
+            rows, batch = as_rows(d, (3,), "d")
+            return -in_chunks(self.polygons.signed_distance, rows).reshape(batch)
+        d = np.asarray(d, dtype=np.float64)
+        if d.shape == (3,):
+            d1, d2, d3 = d.tolist()
+            if abs(d1) + abs(d2) + abs(d3) < _SINGLE_LIMIT_MM:  # False for NaN
+                return np.array(self.kernels.margin(d1, d2, d3))
+        rows, batch = rows_of(d, (3,), "d")
+        return self.kernels.margins(rows).reshape(batch)
 
     def margin_gradient(self, d: ArrayLike) -> Array:
         """Return the derivative of `margin` (slice bound) by d [mm/mm], shape (..., 3), for d (..., 3) [mm]."""
-        rows, batch = as_rows(d, (3,), "d")
-        return -in_chunks(lambda d: self.bound.excess_gradient(d)[1], rows).reshape(*batch, 3)
+        rows, batch = rows_of(d, (3,), "d")
+        return self.kernels.margin_gradients(rows).reshape(*batch, 3)
 
     def project(self, d: ArrayLike) -> Array:
         """Return the nearest valid jaw parameters: d itself inside the bound, else the nearest point with margin >= 0.
@@ -201,7 +204,7 @@ class JawRig:
             EvaluatorError: the bound of the rig is empty.
         """
         rows, batch = as_rows(d, (3,), "d")
-        return in_chunks(self._reach.nearest, rows).reshape(*batch, 3)
+        return in_chunks(self._search.nearest, rows).reshape(*batch, 3)
 
     def validate(
         self,
@@ -221,7 +224,7 @@ class JawRig:
             margin_limit_mm: Smallest margin; the rig's own if None.
             bound: Which bound, see `margin`.
             times_s: Times of the poses along the last batch axis, shape (F,); needed for a speed limit.
-            speed_limit_mm_s: Largest speed of a landmark between consecutive poses; None asks no question.
+            speed_limit_mm_s: Largest speed of a landmark between consecutive poses; None disables the check.
 
         Returns:
             Verdicts of the batch shape.
@@ -229,13 +232,9 @@ class JawRig:
         Raises:
             ValueError: wrong shapes, or a speed limit without rising times.
         """
-        rows, batch = as_rows(T_skull_mandible, (4, 4), "T_skull_mandible")
-        finite = np.isfinite(rows).all(axis=(1, 2))
-        rigid = in_chunks(rigidity_defect, np.where(finite[:, None, None], rows, np.eye(4))) <= RIGID_TOLERANCE
-        rows = np.where((finite & rigid)[:, None, None], rows, np.nan)
-        d, residual_mm = in_chunks(partial(self._encoder.encode, bounded=False), rows)
+        rows, batch = rows_of(T_skull_mandible, (4, 4), "T_skull_mandible")
         limits = self.limits.replaced(residual_limit_mm, margin_limit_mm, speed_limit_mm_s)
-        verdicts = judge(finite, rigid, residual_mm, self.margin(d, bound=bound), d, limits)
+        verdicts = self._within(self.kernels.judge_poses(rows, limits), bound, limits)
         return self._with_speed(verdicts, rows, batch, times_s, limits)
 
     def validate_parameters(
@@ -249,31 +248,29 @@ class JawRig:
     ) -> Verdicts:
         """Judge jaw parameters d (..., 3) [mm] as `validate` does poses; the residual is 0.
 
-        Args:
-            d: Jaw parameters [mm], shape (..., 3).
-            margin_limit_mm: Smallest margin; the rig's own if None.
-            bound: Which bound, see `margin`.
-            times_s: Times along the last batch axis, shape (F,); needed for a speed limit.
-            speed_limit_mm_s: Largest speed of a landmark; None asks no question.
-
         Raises:
             ValueError: wrong shapes, or a speed limit without rising times.
         """
-        rows, batch = as_rows(d, (3,), "d")
-        finite = np.isfinite(rows[:, 0])
+        rows, batch = rows_of(d, (3,), "d")
         limits = self.limits.replaced(None, margin_limit_mm, speed_limit_mm_s)
-        residual_mm = np.where(finite, 0.0, np.nan)
-        verdicts = judge(finite, np.ones_like(finite), residual_mm, self.margin(rows, bound=bound), rows, limits)
-        poses = None if speed_limit_mm_s is None else in_chunks(self._poses, rows)
+        verdicts = self._within(self.kernels.judge_parameters(rows, limits), bound, limits)
+        poses = rows if speed_limit_mm_s is None else self.kernels.poses(rows)
         return self._with_speed(verdicts, poses, batch, times_s, limits)
 
+    def _within(self, verdicts: Verdicts, bound: BoundName, limits: Limits) -> Verdicts:
+        """Return the verdicts on rows with regard to a bound, given those with regard to the slice bound."""
+        if _checked(bound) == "slices":
+            return verdicts
+        return verdicts.with_margin(self.margin(verdicts.d, bound=bound), limits)
+
     def _with_speed(
-        self, verdicts: Verdicts, poses: Array | None, batch: tuple[int, ...], times_s: ArrayLike | None, limits: Limits
+        self, verdicts: Verdicts, poses: Array, batch: tuple[int, ...], times_s: ArrayLike | None, limits: Limits
     ) -> Verdicts:
-        """Return the verdicts in batch shape, frames reached too fast marked if there is a speed limit."""
+        """Return the verdicts in batch shape; frames reached too fast are marked if there is a speed limit."""
         fast = np.zeros(batch, dtype=bool)
         if limits.speed_mm_s is not None:
-            positions = transform_points(poses, self.arrays["landmarks"]).reshape(*batch, -1, 3)
+            measured = np.where(verdicts.measured()[:, None, None], poses, np.nan)
+            positions = transform_points(measured, self.landmarks[None]).reshape(*batch, -1, 3)
             fast = too_fast(positions, times_s, limits.speed_mm_s)
         return verdicts.finished(batch, fast)
 
@@ -284,7 +281,7 @@ class JawRig:
         start: ArrayLike | None = None,
         *,
         weights: ArrayLike | None = None,
-    ) -> tuple[Array, Array]:
+    ) -> IkResult:
         """Return the valid jaw parameters that bring points of the mandible nearest to targets (Yang et al. eq. 10).
 
         Args:
@@ -296,28 +293,27 @@ class JawRig:
             weights: Of the handles, shape (H,), >= 0 and not all zero; equal if None.
 
         Returns:
-            d [mm], shape (..., 3), never outside the bound, and the root of the weighted mean squared distance [mm]
-            left between handles and targets, shape (...).
+            d, never outside the bound, and the root of the weighted mean squared distance between handles and targets.
 
         Raises:
             ValueError: wrong shapes or weights.
             EvaluatorError: the bound of the rig is empty.
         """
         handles = as_points(p_mandible, "p_mandible")
-        vectors = handle_vectors(
-            transform_points(self._frames.T_anatomical_mandible_rest, handles.reshape(-1, 3)), weights
-        )
+        at_rest = transform_points(self._frames.T_anatomical_mandible_rest, handles.reshape(-1, 3))
+        vectors = handle_vectors(at_rest, weights)
         targets, batch = as_rows(p_skull, handles.shape, "p_skull")
         targets = targets.reshape(len(targets), vectors.shape[1], 3)
         scaled = np.swapaxes(transform_points(self._frames.T_anatomical_skull, targets), 1, 2) * vectors[3]
         if start is None:
-            d = in_chunks(lambda target: self._reach.best_pull(vectors, target), scaled)
+            d = in_chunks(lambda target: self._search.solve_ik_multistart(vectors, target), scaled)
         else:
             given, _ = as_rows(np.broadcast_to(np.asarray(start, float), (*batch, 3)), (3,), "start")
-            first = in_chunks(self._reach.nearest, given)
-            d = in_chunks(lambda target, d: self._reach.pull(vectors, target, d), scaled, first)
+            first = in_chunks(self._search.nearest, given)
+            d = in_chunks(lambda target, d: self._search.solve_ik(vectors, target, d), scaled, first)
         left = carried(*self.model.decode(d), vectors) - scaled
-        return d.reshape(*batch, 3), np.sqrt(np.einsum("nij,nij->n", left, left)).reshape(batch)
+        distance_mm = np.sqrt(np.einsum("nij,nij->n", left, left))
+        return IkResult(d.reshape(*batch, 3), distance_mm.reshape(batch))
 
     def interpolate(
         self,
@@ -343,15 +339,10 @@ class JawRig:
         """
         frames, keys = as_keys(frames, d_keys)
         times, batch = as_rows(np.asarray(at, dtype=np.float64)[..., None], (1,), "at")
-        if method == "linear":
-            d = interpolate_linear(frames, keys, times[:, 0])
-        elif method == "smooth":
-            d = interpolate_smooth(frames, keys, times[:, 0], self.bound)
-        else:
-            raise ValueError(f'method must be "linear" or "smooth", got {method!r}')
+        d = interpolated(frames, keys, times[:, 0], method, self.bound)
         return d.reshape(*batch, 3)
 
-    def ranges(self, d1: ArrayLike, d2: ArrayLike = 0.0, d3: ArrayLike = 0.0) -> tuple[Array, Array, Array, Array]:
+    def ranges(self, d1: ArrayLike, d2: ArrayLike = 0.0, d3: ArrayLike = 0.0) -> Ranges:
         """Return how far d2 and d3 can each go alone from (d1, d2, d3).
 
         Args:
@@ -360,13 +351,12 @@ class JawRig:
             d3: Protrusion [mm] at which d2 is moved.
 
         Returns:
-            d2min, d2max, d3min, d3max [mm], each (...); NaN where the section has no point on that line.
+            The ends [mm]; NaN where the section has no point on that line.
         """
         d = np.stack(np.broadcast_arrays(*(np.asarray(x, dtype=np.float64) for x in (d1, d2, d3))), axis=-1)
         rows, batch = as_rows(d, (3,), "d")
-        ends = in_chunks(lambda d: (*self.bound.chord(d, 1), *self.bound.chord(d, 2)), rows)
-        low2, high2, low3, high3 = (end.reshape(batch) for end in ends)
-        return low2, high2, low3, high3
+        ends = [in_chunks(lambda d, axis=axis: self.bound.chord(d, axis), rows) for axis in (1, 2)]
+        return Ranges(*(end.reshape(batch) for pair in ends for end in pair))
 
     def normalized(self, d: ArrayLike) -> Array:
         """Return d as shares of this person's ranges, for carrying motion to another person.
@@ -381,14 +371,26 @@ class JawRig:
             Shares, shape (..., 3): 1 is the full range.
         """
         rows, batch = as_rows(d, (3,), "d")
-        return in_chunks(lambda d: sections.normalized(self.bound, self._opening_mm, d), rows).reshape(*batch, 3)
+        return in_chunks(lambda d: sections.normalized(self.bound, self.d_range, d), rows).reshape(*batch, 3)
 
     def denormalized(self, shares: ArrayLike) -> Array:
         """Return the jaw parameters [mm], shape (..., 3), of shares (..., 3): the inverse of `normalized`."""
         rows, batch = as_rows(shares, (3,), "shares")
-        return in_chunks(lambda n: sections.denormalized(self.bound, self._opening_mm, n), rows).reshape(*batch, 3)
+        return in_chunks(lambda n: sections.denormalized(self.bound, self.d_range, n), rows).reshape(*batch, 3)
 
     def captured_distance(self, d: ArrayLike) -> Array:
         """Return the distance [mm] (...) of d (..., 3) [mm] to the nearest captured pose, in d; inf without any."""
         rows, batch = as_rows(d, (3,), "d")
-        return in_chunks(lambda d: nearest_distance(self.arrays["codes"], d), rows).reshape(batch)
+        return in_chunks(lambda d: nearest_distance(self.captured_d, d), rows).reshape(batch)
+
+
+def _rebuilt(
+    arrays: Mapping[str, ArrayLike], meta: Mapping[str, object], kernels: Callable[[RigParts], Kernels]
+) -> JawRig:
+    return JawRig(arrays, meta, kernels=kernels)
+
+
+def _checked(name: BoundName) -> BoundName:
+    if name not in ("slices", "polygons"):
+        raise ValueError(f'bound must be "slices" or "polygons", got {name!r}')
+    return name

@@ -33,16 +33,16 @@ _IDENTITY = np.eye(3)
 
 
 class Bound(Protocol):
-    """A smooth bound: negative excess inside."""
+    """A smooth bound: negative inside."""
 
-    def excess(self, d: Array) -> Array:
-        """Return the excess (n,) [mm] at d (n, 3)."""
+    def signed_distance(self, d: Array) -> Array:
+        """Return the signed distance (n,) [mm] at d (n, 3)."""
 
-    def excess_gradient(self, d: Array) -> tuple[Array, Array]:
-        """Return excess (n,) and gradient (n, 3)."""
+    def signed_distance_gradient(self, d: Array) -> tuple[Array, Array]:
+        """Return signed distance (n,) and gradient (n, 3)."""
 
-    def excess_curvature(self, d: Array) -> tuple[Array, Array, Array]:
-        """Return excess (n,), gradient (n, 3) and positive semidefinite curvature (n, 3, 3)."""
+    def signed_distance_curvature(self, d: Array) -> tuple[Array, Array, Array]:
+        """Return signed distance (n,), gradient (n, 3) and positive semidefinite curvature (n, 3, 3)."""
 
 
 def minimise(
@@ -75,16 +75,16 @@ def minimise(
     x[rows[~measured]] = np.nan
     rows, r, J = _picked(measured, rows, r, J)
     damping = np.full(len(rows), START_DAMPING)
-    pressure = np.zeros(len(rows)) if bound is None else _first_pressure(bound, x[rows], r, J)
+    multiplier = np.zeros(len(rows)) if bound is None else _first_multiplier(bound, x[rows], r, J)
     for _ in range(iterations):
         if bound is None:
             step = -solve_symmetric(_damped(np.swapaxes(J, 1, 2) @ J, damping), _gradient(J, r))
         else:
-            step, pressure = _bounded_step(bound, x[rows], r, J, damping, pressure)
+            step, multiplier = _bounded_step(bound, x[rows], r, J, damping, multiplier)
         moving = (np.abs(step) > tolerance_mm).any(axis=1) & (damping < LARGEST_DAMPING)
         if bound is None:
             x[rows] += np.where(moving[:, None], 0.0, step)  # the last step costs nothing and doubles the digits
-        rows, r, J, damping, pressure, step = _picked(moving, rows, r, J, damping, pressure, step)
+        rows, r, J, damping, multiplier, step = _picked(moving, rows, r, J, damping, multiplier, step)
         if not rows.size:
             break
         trial, allowed = x[rows] + step, True
@@ -138,25 +138,25 @@ def _damped(A: Array, damping: Array) -> Array:
     return A + amount[:, None, None] * _IDENTITY
 
 
-def _first_pressure(bound: Bound, x: Array, r: Array, J: Array) -> Array:
+def _first_multiplier(bound: Bound, x: Array, r: Array, J: Array) -> Array:
     """Return the bound's multiplier at the start: how hard the cost presses against it where x lies on it."""
-    excess, normal = bound.excess_gradient(x)
+    distance, normal = bound.signed_distance_gradient(x)
     squared = np.maximum(np.einsum("ni,ni->n", normal, normal), LEAST_SLOPE)
     press = -np.einsum("ni,ni->n", normal, _gradient(J, r)) / squared
-    return np.where(excess > -TOUCHING_MM, np.maximum(press, 0.0), 0.0)
+    return np.where(distance > -TOUCHING_MM, np.maximum(press, 0.0), 0.0)
 
 
-def _bounded_step(bound: Bound, x: Array, r: Array, J: Array, damping: Array, pressure: Array) -> tuple[Array, Array]:
+def _bounded_step(bound: Bound, x: Array, r: Array, J: Array, damping: Array, multiplier: Array) -> tuple[Array, Array]:
     """Return the step of the quadratic model under the linearised bound, and the bound's multiplier."""
-    excess, normal, curvature = bound.excess_curvature(x)
-    A = _damped(np.swapaxes(J, 1, 2) @ J + pressure[:, None, None] * curvature, damping)
+    distance, normal, curvature = bound.signed_distance_curvature(x)
+    A = _damped(np.swapaxes(J, 1, 2) @ J + multiplier[:, None, None] * curvature, damping)
     step = -solve_symmetric(A, _gradient(J, r))
-    over = excess + np.einsum("ni,ni->n", normal, step)
+    over = distance + np.einsum("ni,ni->n", normal, step)
     inward = solve_symmetric(A, normal)
-    pressure = np.maximum(over, 0.0) / np.einsum("ni,ni->n", normal, inward)
-    step -= pressure[:, None] * inward
+    multiplier = np.maximum(over, 0.0) / np.einsum("ni,ni->n", normal, inward)
+    step -= multiplier[:, None] * inward
     length = np.sqrt(np.einsum("ni,ni->n", step, step))
-    return step * np.minimum(1.0, LONGEST_STEP_MM / np.maximum(length, 1e-300))[:, None], pressure
+    return step * np.minimum(1.0, LONGEST_STEP_MM / np.maximum(length, 1e-300))[:, None], multiplier
 
 
 def pulled_inside(bound: Bound, x: Array) -> tuple[Array, Mask]:
@@ -164,12 +164,12 @@ def pulled_inside(bound: Bound, x: Array) -> tuple[Array, Mask]:
     inside = np.zeros(len(x), dtype=bool)
     rows = np.arange(len(x))
     for _ in range(PULL_BACKS):
-        excess, normal = bound.excess_gradient(x[rows])
-        out = excess > 0
+        distance, normal = bound.signed_distance_gradient(x[rows])
+        out = distance > 0
         inside[rows[~out]] = True
-        rows, excess, normal = _picked(out, rows, excess, normal)
+        rows, distance, normal = _picked(out, rows, distance, normal)
         if not rows.size:
             break
         squared = np.maximum(np.einsum("ni,ni->n", normal, normal), LEAST_SLOPE)
-        x[rows] -= ((PULL * excess + INSIDE_MM) / squared)[:, None] * normal
+        x[rows] -= ((PULL * distance + INSIDE_MM) / squared)[:, None] * normal
     return x, inside

@@ -7,8 +7,8 @@ from bisect import bisect_right
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jawusd.evaluator.batching import as_rows, in_chunks
 from jawusd.evaluator.motions import motions_from_twists
-from jawusd.evaluator.rows import as_rows, in_chunks
 from jawusd.evaluator.single import motion_matrix, motion_of_twist
 from jawusd.geometry.arrays import Array, Indices
 
@@ -21,33 +21,33 @@ class SampledTable:
     Parameters outside the grid are clamped to it.
 
     Attributes:
-        knots: Rising sample positions of d1, d2, d3 [mm], three arrays of length >= 2.
+        grid_axes: Rising sample positions of d1, d2, d3 [mm], three arrays of length >= 2.
         T_rest: T_skull_mandible of the closed bite, shape (4, 4).
     """
 
-    def __init__(self, knots: tuple[ArrayLike, ArrayLike, ArrayLike], twists: ArrayLike, T_rest: ArrayLike) -> None:
+    def __init__(self, grid_axes: tuple[ArrayLike, ArrayLike, ArrayLike], twists: ArrayLike, T_rest: ArrayLike) -> None:
         """Build the table.
 
         Args:
-            knots: Sample positions of d1, d2, d3 [mm], rising.
+            grid_axes: Sample positions of d1, d2, d3 [mm], rising.
             twists: Twists (omega [rad], v [mm]), skull frame, shape (n1, n2, n3, 6).
             T_rest: T_skull_mandible of the closed bite, shape (4, 4).
 
         Raises:
-            ValueError: shapes that do not fit, or knots that do not rise.
+            ValueError: shapes that do not fit, or positions that do not rise.
         """
-        self.knots = tuple(np.array(axis, dtype=np.float64) for axis in knots)
+        self.grid_axes = tuple(np.array(axis, dtype=np.float64) for axis in grid_axes)
         self.T_rest = np.array(T_rest, dtype=np.float64)
         twists = np.asarray(twists, dtype=np.float64)
-        counts = tuple(len(axis) for axis in self.knots)
+        counts = tuple(len(axis) for axis in self.grid_axes)
         if twists.shape != (*counts, 6) or self.T_rest.shape != (4, 4):
             raise ValueError(f"twists must have shape {(*counts, 6)} and T_rest (4, 4), got {twists.shape}")
-        if len(counts) != 3 or any(len(axis) < 2 or (np.diff(axis) <= 0).any() for axis in self.knots):
-            raise ValueError("knots must be three rising arrays of at least two positions")
+        if len(counts) != 3 or any(len(axis) < 2 or (np.diff(axis) <= 0).any() for axis in self.grid_axes):
+            raise ValueError("grid_axes must be three rising arrays of at least two positions")
         # neighbours along d3 side by side: half as many places in memory to visit
         self._pairs = np.concatenate([twists[:, :, :-1], twists[:, :, 1:]], axis=3)
         self._flat = self._pairs.reshape(-1, 12)
-        self._positions = tuple(axis.tolist() for axis in self.knots)
+        self._positions = tuple(axis.tolist() for axis in self.grid_axes)
 
     def twist(self, d: ArrayLike) -> Array:
         """Return the interpolated twists (omega [rad], v [mm]), shape (..., 6), at d (..., 3) [mm]."""
@@ -70,7 +70,7 @@ class SampledTable:
         return T
 
     def _twists(self, d: Array) -> Array:
-        (i, a), (j, b), (k, c) = (_located(axis, d[:, column]) for column, axis in enumerate(self.knots))
+        (i, a), (j, b), (k, c) = (_located(axis, d[:, column]) for column, axis in enumerate(self.grid_axes))
         _, n2, n3, _ = self._pairs.shape
         corner = (i * n2 + j) * n3 + k
         a, b = a[:, None], b[:, None]

@@ -1,4 +1,4 @@
-"""Verdicts: may a jaw be in this pose, and if not, why and by how many millimetres."""
+"""Verdicts: whether a pose is possible, and if not, why and by how many millimetres."""
 
 from __future__ import annotations
 
@@ -27,6 +27,9 @@ class Reason(IntFlag):
     OUTSIDE_BOUNDS = 8
     TOO_FAST = 16
 
+    def __str__(self) -> str:
+        return self.name or "VALID"
+
     @property
     def words(self) -> str:
         """The reasons in plain words, joined by commas."""
@@ -48,7 +51,7 @@ class Verdicts:
 
     Attributes:
         valid: No reason against the pose, bool, shape (...).
-        reason: `Reason` flags, uint8, shape (...).
+        reason: `Reason` flags, uint8, shape (...); ``Reason(int(code))`` names them, `words` spells them out.
         residual_mm: rms landmark distance to the nearest pose of the model, shape (...); NaN if not finite or rigid.
         margin_mm: Signed distance of d to the bound, > 0 inside, shape (...); NaN if not finite or rigid.
         d: Nearest jaw parameters [mm], shape (..., 3); NaN if not finite or rigid.
@@ -59,6 +62,16 @@ class Verdicts:
     residual_mm: Array
     margin_mm: Array
     d: Array
+
+    def measured(self) -> Mask:
+        """Tell which poses were compared with the model: those that are finite and rigid."""
+        return (self.reason & (Reason.NOT_FINITE | Reason.NOT_RIGID).value) == 0
+
+    def with_margin(self, margin_mm: Array, limits: Limits) -> Verdicts:
+        """Return the verdicts with the margins (n,) to another bound in place of theirs."""
+        reason = self.reason & ~np.uint8(Reason.OUTSIDE_BOUNDS.value)
+        reason[self.measured() & _outside(margin_mm, limits)] |= Reason.OUTSIDE_BOUNDS.value
+        return Verdicts(reason == 0, reason, self.residual_mm, margin_mm, self.d)
 
     def finished(self, batch: tuple[int, ...], fast: Mask) -> Verdicts:
         """Return the verdicts in a batch shape, with the frames marked in ``fast`` (of that shape) too fast."""
@@ -78,7 +91,7 @@ class Limits:
     Attributes:
         residual_mm: Largest landmark distance to the model.
         margin_mm: Smallest margin.
-        speed_mm_s: Largest speed of any landmark between consecutive poses; None asks no question.
+        speed_mm_s: Largest speed of any landmark between consecutive poses; None disables the check.
     """
 
     residual_mm: float
@@ -94,7 +107,7 @@ class Limits:
         )
 
 
-def judge(finite: Array, rigid: Array, residual_mm: Array, margin_mm: Array, d: Array, limits: Limits) -> Verdicts:
+def judge(finite: Mask, rigid: Mask, residual_mm: Array, margin_mm: Array, d: Array, limits: Limits) -> Verdicts:
     """Return the verdicts (n rows) for measurements and thresholds."""
     reason = np.zeros(len(finite), dtype=np.uint8)
     reason[~finite] |= Reason.NOT_FINITE.value
@@ -102,8 +115,12 @@ def judge(finite: Array, rigid: Array, residual_mm: Array, margin_mm: Array, d: 
     measured = finite & rigid
     # `not <=` so that a pose the model cannot measure (NaN) is refused
     reason[measured & ~(residual_mm <= limits.residual_mm)] |= Reason.OFF_MODEL.value
-    reason[measured & ~(margin_mm >= limits.margin_mm - ROUNDING_MM)] |= Reason.OUTSIDE_BOUNDS.value
+    reason[measured & _outside(margin_mm, limits)] |= Reason.OUTSIDE_BOUNDS.value
     return Verdicts(reason == 0, reason, residual_mm, margin_mm, d)
+
+
+def _outside(margin_mm: Array, limits: Limits) -> Mask:
+    return ~(margin_mm >= limits.margin_mm - ROUNDING_MM)
 
 
 def too_fast(positions: Array, times_s: ArrayLike | None, limit_mm_s: float) -> Mask:

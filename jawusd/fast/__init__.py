@@ -8,15 +8,16 @@ except ModuleNotFoundError as error:
     raise MissingDependencyError("jawusd.fast needs numba.", hint="pip install 'jawusd[fast]'") from error
 
 from jawusd.evaluator import JawRig
-from jawusd.fast.rig import FastRig
-from jawusd.fast.table import FastTable
+from jawusd.fast.kernels import CompiledKernels
 
-__all__ = ["FastRig", "FastTable", "accelerate"]
+__all__ = ["accelerate"]
 
 
-def accelerate(rig: JawRig) -> FastRig:
+def accelerate(rig: JawRig) -> JawRig:
     """Return the rig with its most used functions compiled: the same results to 1e-10.
 
     The first use after an installation compiles for about a minute; the code is kept on disk.
     """
-    return rig if isinstance(rig, FastRig) else FastRig(rig.arrays, rig.meta)
+    if isinstance(rig.kernels, CompiledKernels):
+        return rig
+    return JawRig(rig.arrays, rig.meta, kernels=CompiledKernels)

@@ -25,7 +25,7 @@ from jawusd.evaluator.solver import (
     TOLERANCE_MM,
     TOUCHING_MM,
 )
-from jawusd.fast.hull import excess_curvature, excess_gradient
+from jawusd.fast.hull import signed_distance_curvature, signed_distance_gradient
 from jawusd.fast.motion import motion_by_displacement, motion_derivative
 from jawusd.fast.packing import SIDES
 from jawusd.fast.rigid import device, solve
@@ -139,9 +139,9 @@ def descend_inside(model, bound, problem, x, w, n, edge):
         x[:] = np.nan
         return np.nan
     damping = START_DAMPING
-    pressure = _first_pressure(bound, x, n.g, edge)
+    multiplier = _first_multiplier(bound, x, n.g, edge)
     for _ in range(ITERATIONS):
-        pressure = _bounded_step(bound, x, damping, pressure, n, edge)
+        multiplier = _bounded_step(bound, x, damping, multiplier, n, edge)
         if _settled(n.step) or damping >= LARGEST_DAMPING:
             return cost
         for i in range(3):
@@ -176,37 +176,37 @@ def _dot(a, b):
 
 
 @device
-def _first_pressure(bound, x, g, edge):
-    found = excess_gradient(bound, x[0], x[1], x[2], edge.v, edge.gradient)
+def _first_multiplier(bound, x, g, edge):
+    found = signed_distance_gradient(bound, x[0], x[1], x[2], edge.v, edge.gradient)
     press = -_dot(edge.gradient, g) / max(_dot(edge.gradient, edge.gradient), LEAST_SLOPE)
     return max(press, 0.0) if found > -TOUCHING_MM else 0.0
 
 
 @device
-def _bounded_step(bound, x, damping, pressure, n, edge):
+def _bounded_step(bound, x, damping, multiplier, n, edge):
     """Write the step of the quadratic model under the linearised bound; return the bound's multiplier."""
-    found = excess_curvature(bound, x[0], x[1], x[2], edge.v, edge.gradient, edge.curvature)
+    found = signed_distance_curvature(bound, x[0], x[1], x[2], edge.v, edge.gradient, edge.curvature)
     for i in range(3):
         for k in range(3):
-            n.A_trial[i, k] = n.A[i, k] + pressure * edge.curvature[i, k]
+            n.A_trial[i, k] = n.A[i, k] + multiplier * edge.curvature[i, k]
     _damp(n.A_trial, damping, n.damped)
     solve(n.damped, n.g, n.step)
     solve(n.damped, edge.gradient, n.inward)
     over = found - _dot(edge.gradient, n.step)
-    pressure = max(over, 0.0) / _dot(edge.gradient, n.inward)
+    multiplier = max(over, 0.0) / _dot(edge.gradient, n.inward)
     for i in range(3):
-        n.step[i] = -n.step[i] - pressure * n.inward[i]
+        n.step[i] = -n.step[i] - multiplier * n.inward[i]
     shrink = min(1.0, LONGEST_STEP_MM / max(sqrt(_dot(n.step, n.step)), 1e-300))
     for i in range(3):
         n.step[i] *= shrink
-    return pressure
+    return multiplier
 
 
 @device
 def _pulled_back(bound, x, edge):
     """Move x (3,) down the gradient until just inside; tell whether it got there."""
     for _ in range(PULL_BACKS):
-        found = excess_gradient(bound, x[0], x[1], x[2], edge.v, edge.gradient)
+        found = signed_distance_gradient(bound, x[0], x[1], x[2], edge.v, edge.gradient)
         if not found > 0.0:
             return True
         pull = (PULL * found + INSIDE_MM) / max(_dot(edge.gradient, edge.gradient), LEAST_SLOPE)

@@ -26,7 +26,7 @@ def _support_piece(bound, d1):
 
 
 @device
-def excess(bound, d1, d2, d3, v):
+def signed_distance(bound, d1, d2, d3, v):
     """Return how far outside d lies [mm]; leave the shares of the half-planes in v and return those of both ends."""
     sides, rounding = int(bound[SIDES]), bound[ROUNDING]
     c, s, first, last = _support_piece(bound, d1)
@@ -55,9 +55,9 @@ def _share(x):
 
 
 @device
-def excess_gradient(bound, d1, d2, d3, v, gradient):
-    """Return the excess [mm]; write its gradient (3,)."""
-    out, low, high = excess(bound, d1, d2, d3, v)
+def signed_distance_gradient(bound, d1, d2, d3, v, gradient):
+    """Return the signed distance [mm]; write its gradient (3,)."""
+    out, low, high = signed_distance(bound, d1, d2, d3, v)
     _weigh(bound, d1, low, high, v, gradient)
     return out
 
@@ -78,9 +78,9 @@ def _weigh(bound, d1, low, high, v, gradient):
 
 
 @device
-def excess_curvature(bound, d1, d2, d3, v, gradient, curvature):
-    """Return the excess [mm]; write its gradient (3,) and the rounding's part of its Hessian (3, 3) [1/mm]."""
-    out, low, high = excess(bound, d1, d2, d3, v)
+def signed_distance_curvature(bound, d1, d2, d3, v, gradient, curvature):
+    """Return the signed distance [mm]; write its gradient (3,) and the rounding's part of its Hessian (3, 3) [1/mm]."""
+    out, low, high = signed_distance(bound, d1, d2, d3, v)
     _weigh(bound, d1, low, high, v, gradient)
     sides = int(bound[SIDES])
     c, s, _, _ = _support_piece(bound, d1)

@@ -73,7 +73,7 @@ def packed_model(model: JawModelForm, frames: RigFrames, vectors: Array) -> Arra
 
 def packed_bound(bound: SliceHull) -> Array:
     """Return the numbers of a bound."""
-    head = [[bound.softness_mm, bound.margin_mm, len(bound.directions)], bound.directions.T]
+    head = [[bound.softness_mm, bound.offset_mm, len(bound.directions)], bound.directions.T]
     return _joined([*head, _curve(bound.supports)])
 
 

@@ -11,9 +11,9 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from jawusd.evaluator.rows import LARGEST
+from jawusd.evaluator.batching import LARGEST
 from jawusd.fast.descent import Problem, descend_inside, edge_scratch, normal_scratch
-from jawusd.fast.hull import excess, excess_gradient
+from jawusd.fast.hull import signed_distance, signed_distance_gradient
 from jawusd.fast.motion import logarithm, logarithm_derivative, pose, scratch
 from jawusd.fast.packing import ADJOINT
 from jawusd.fast.rigid import device
@@ -86,7 +86,7 @@ def jacobians(model, d, out):
 @compiled("f8(f8[::1], f8, f8, f8)")
 def single_margin(bound, d1, d2, d3):
     """Return the margin [mm] of one d [mm]."""
-    return -excess(bound, d1, d2, d3, hull_scratch(bound))[0]
+    return -signed_distance(bound, d1, d2, d3, hull_scratch(bound))[0]
 
 
 @compiled("void(f8[::1], f8[:,::1], f8[::1])")
@@ -96,7 +96,7 @@ def margins(bound, d, out):
     for row in range(len(d)):
         out[row] = np.nan
         if usable(d[row, 0], d[row, 1], d[row, 2]):
-            out[row] = -excess(bound, d[row, 0], d[row, 1], d[row, 2], v)[0]
+            out[row] = -signed_distance(bound, d[row, 0], d[row, 1], d[row, 2], v)[0]
 
 
 @compiled("void(f8[::1], f8[:,::1], f8[:,::1])")
@@ -105,7 +105,7 @@ def margin_gradients(bound, d, out):
     v = hull_scratch(bound)
     for row in range(len(d)):
         if usable(d[row, 0], d[row, 1], d[row, 2]):
-            excess_gradient(bound, d[row, 0], d[row, 1], d[row, 2], v, out[row])
+            signed_distance_gradient(bound, d[row, 0], d[row, 1], d[row, 2], v, out[row])
             for i in range(3):
                 out[row, i] = -out[row, i]
         else:
@@ -139,7 +139,7 @@ def parameter_judgements(bound, d, margin_limit_mm, residual_mm, margin_mm, reas
     for row in range(len(d)):
         residual_mm[row], margin_mm[row], reason[row] = np.nan, np.nan, NOT_FINITE
         if usable(d[row, 0], d[row, 1], d[row, 2]):
-            margin = -excess(bound, d[row, 0], d[row, 1], d[row, 2], v)[0]
+            margin = -signed_distance(bound, d[row, 0], d[row, 1], d[row, 2], v)[0]
             residual_mm[row], margin_mm[row], reason[row] = 0.0, margin, outside(margin, margin_limit_mm)
 
 

@@ -7,11 +7,11 @@ from math import sqrt
 
 import numpy as np
 
-from jawusd.evaluator.rows import LARGEST
+from jawusd.evaluator.batching import LARGEST
 from jawusd.evaluator.verdicts import RIGID_TOLERANCE, ROUNDING_MM, Reason
 from jawusd.fast.descent import DISPLACEMENT, PARAMETERS, Problem, descend, normal_scratch
 from jawusd.fast.forms import parameters_at
-from jawusd.fast.hull import excess
+from jawusd.fast.hull import signed_distance
 from jawusd.fast.motion import motion, scratch
 from jawusd.fast.packing import COUNT, FROM_CLOSED, GRID, INCISOR, SIDES, STARTS, TO_ANATOMICAL, VECTORS
 from jawusd.fast.rigid import device
@@ -131,7 +131,7 @@ def judge(model, bound, T, residual_limit, margin_limit, e, v):
     if not rigid(T):
         return _NOT_RIGID, np.nan, np.nan
     residual = encode(model, T, e)
-    out, _, _ = excess(bound, e.x[0], e.x[1], e.x[2], v)
+    out, _, _ = signed_distance(bound, e.x[0], e.x[1], e.x[2], v)
     reason = 0 if residual <= residual_limit else _OFF_MODEL
     return reason | outside(-out, margin_limit), residual, -out
 

@@ -98,7 +98,7 @@ def fit_slice_hull(d: Array) -> tuple[dict[str, Array], float]:
         frames left out, as other exercises go a little farther than those captured.
     """
     blocks = np.arange(len(d)) // min(_BLOCK, max(1, len(d) // _FOLDS)) % _FOLDS
-    excess = [SliceHull.from_arrays(_hull(d[blocks != k])).excess(d[blocks == k]) for k in range(_FOLDS)]
+    excess = [SliceHull.from_arrays(_hull(d[blocks != k])).signed_distance(d[blocks == k]) for k in range(_FOLDS)]
     tolerance = np.quantile(np.concatenate(excess), _TOLERANCE_QUANTILE)
     return _hull(d), float(np.clip(tolerance, 0.0, _LARGEST_TOLERANCE_MM))
 

@@ -224,7 +224,7 @@ def _gaps(d: Array, bounds: Bounds, axis: int) -> Array:
     first, second = (np.arange(low, high, _GRID_MM) for low, high in bounds.slices_box[[0, axis]])
     grid = np.zeros((len(first) * len(second), 3))
     grid[:, 0], grid[:, axis] = (part.ravel() for part in np.meshgrid(first, second))
-    grid = grid[bounds.slices.excess(grid) <= 0][:, [0, axis]]
+    grid = grid[bounds.slices.signed_distance(grid) <= 0][:, [0, axis]]
     scale = _FAR_MM[[0, axis]]
     far = np.array([((((d[:, [0, axis]] - point) / scale) ** 2).sum(1) > 1).all() for point in grid], dtype=bool)
     return grid[far]

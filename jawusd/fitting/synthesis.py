@@ -53,8 +53,8 @@ class Bounds:
         """Return up to `POSES` parameters (n, 3) [mm] spread evenly over each bound, by its name."""
         return {
             BOX: _spread(self.box, lambda d: np.full(len(d), -1.0), rng),
-            POLYGONS: _spread(self.box, self.polygons.excess, rng),
-            SLICES: _spread(self.slices_box, self.slices.excess, rng),
+            POLYGONS: _spread(self.box, self.polygons.signed_distance, rng),
+            SLICES: _spread(self.slices_box, self.slices.signed_distance, rng),
         }
 
 

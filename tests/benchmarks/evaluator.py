@@ -33,7 +33,7 @@ from example_model import example_arrays, example_meta  # noqa: E402
 
 from jawusd import evaluator  # noqa: E402
 from jawusd.evaluator.table import SampledTable  # noqa: E402
-from jawusd.fast import FastTable, accelerate  # noqa: E402
+from jawusd.fast import accelerate  # noqa: E402
 from jawusd.geometry.se3 import se3_exp, transform_points  # noqa: E402
 from jawusd.geometry.so3 import so3_exp  # noqa: E402
 
@@ -108,7 +108,7 @@ def peers(rig: evaluator.JawRig, d: np.ndarray) -> dict[str, Callable[[], object
     }
 
 
-def callers(rig: evaluator.JawRig, table: SampledTable, d: np.ndarray) -> dict[str, Callable[[], object]]:
+def callers(rig: evaluator.JawRig, table: SampledTable | None, d: np.ndarray) -> dict[str, Callable[[], object]]:
     """Return one call per function for these parameters; a single one is passed as shape (3,)."""
     single = len(d) == 1
     T = rig.pose(d)
@@ -119,7 +119,6 @@ def callers(rig: evaluator.JawRig, table: SampledTable, d: np.ndarray) -> dict[s
     noisy = se3_exp(np.full(6, [0.003] * 3 + [0.2] * 3)) @ pose
     rows = {
         "pose, exact model": lambda: rig.pose(x),
-        "pose, table": lambda: table.pose(x),
         "jacobian": lambda: rig.jacobian(x),
         "margin": lambda: rig.margin(x),
         "margin gradient": lambda: rig.margin_gradient(x),
@@ -129,6 +128,8 @@ def callers(rig: evaluator.JawRig, table: SampledTable, d: np.ndarray) -> dict[s
         "project": lambda: rig.project(x * 1.4),
         "ik, three handles": lambda: rig.ik(handles, goal, start=start),
     }
+    if table is not None:
+        rows["pose, table"] = lambda: table.pose(x)
     if len(d) > 1000:
         del rows["project"], rows["ik, three handles"]
     return rows
@@ -137,7 +138,7 @@ def callers(rig: evaluator.JawRig, table: SampledTable, d: np.ndarray) -> dict[s
 def timings(rigs: dict[str, evaluator.JawRig]) -> dict[str, dict[int, float]]:
     """Return seconds per call by row and batch size; rows of a rig carry its name."""
     plain = rigs["numpy"]
-    tables = {"numpy": SampledTable(*sampled(plain)), "fast": FastTable(*sampled(plain))}
+    table = SampledTable(*sampled(plain))
     rng = np.random.default_rng(1)
     inside = plain.project(rng.uniform(*plain.arrays["d_range"].T, (2000, 3)))
     found: dict[str, dict[int, float]] = {}
@@ -145,7 +146,9 @@ def timings(rigs: dict[str, evaluator.JawRig]) -> dict[str, dict[int, float]]:
         d = np.resize(inside, (size, 3))
         calls = peers(plain, d)
         for kind, rig in rigs.items():
-            calls |= {f"{name} [{kind}]": call for name, call in callers(rig, tables[kind], d).items()}
+            calls |= {
+                f"{name} [{kind}]": call for name, call in callers(rig, table if kind == "numpy" else None, d).items()
+            }
         for name, call in calls.items():
             if size == 1:
                 found.setdefault(f"{REFERENCE} beside {name}", {})[1] = seconds(calls[REFERENCE])
@@ -196,7 +199,7 @@ def checks(rigs: dict[str, evaluator.JawRig], table: dict[str, dict[int, float]]
     """Print what the bars are about."""
     bars = {
         "numpy": {"exact": 8, "table": 3, "exact rate": 0.4, "table rate": 1.5, "encode rate": 0.03},
-        "fast": {"exact": 1, "table": 1, "exact rate": 1.5, "table rate": 5, "encode rate": 0.1},
+        "fast": {"exact": 1, "exact rate": 1.5, "encode rate": 0.1},
     }
     dragged = drags(rigs)
     for kind, bar in bars.items():
@@ -211,9 +214,7 @@ def checks(rigs: dict[str, evaluator.JawRig], table: dict[str, dict[int, float]]
         excess_mm, drag_ms = dragged[kind]
         rows = [
             ("one pose, exact / onnxruntime call", ratio("pose, exact model"), f"<= {bar['exact']}"),
-            ("one pose, table / onnxruntime call", ratio("pose, table"), f"<= {bar['table']}"),
             ("100,000 poses, exact [M/s]", rate("pose, exact model"), f">= {bar['exact rate']}"),
-            ("100,000 poses, table [M/s]", rate("pose, table"), f">= {bar['table rate']}"),
             ("100,000 margins [M/s]", rate("margin"), ">= 1.5"),
             ("100,000 verdicts of d [M/s]", rate("validate parameters"), ">= 1.5"),
             ("100,000 encodings [M/s]", rate("encode"), f">= {bar['encode rate']}"),
@@ -221,7 +222,10 @@ def checks(rigs: dict[str, evaluator.JawRig], table: dict[str, dict[int, float]]
             ("IK of three handles, one drag [ms]", drag_ms, "<= 1"),
             ("IK, worst of 1,000 drags over brute force [mm]", excess_mm, "<= 0"),
         ]
-        if kind == "fast":
+        if kind == "numpy":
+            rows.append(("one pose, table / onnxruntime call", ratio("pose, table"), f"<= {bar['table']}"))
+            rows.append(("100,000 poses, table [M/s]", rate("pose, table"), f">= {bar['table rate']}"))
+        else:
             rows.append(("verdict on one pose [us]", 1e6 * table["validate poses [fast]"][1], "<= 30"))
         for text, found, wanted in rows:
             print(f"{kind:6} {text:50}{found:12.3g}   bar {wanted}")

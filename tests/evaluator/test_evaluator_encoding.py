@@ -73,7 +73,7 @@ def test_bounded_encode_stays_inside_and_is_the_best_there(rig):
     """Inside the bound nothing changes; outside, SLSQP under the same bound finds nothing nearer."""
     d, T = noisy_poses(rig, 60, 5)
     free, free_mm = rig.encode(T)
-    bounded, bounded_mm = rig.encode(T, bounds=True)
+    bounded, bounded_mm = rig.encode(T, inside=True)
     assert (rig.margin(bounded) >= -1e-12).all()
     inside = rig.margin(free) >= 0
     assert inside.any() and not inside.all()
@@ -141,7 +141,7 @@ def test_covariance_rows_with_nan_give_nan_and_bad_ones_are_refused(rig):
 
 def test_weighted_encode_with_bounds_stays_inside(rig):
     _, T = noisy_poses(rig, 60, 8)
-    d, _ = rig.encode(T, bounds=True, covariance=np.diag([1e-5] * 3 + [0.1] * 3))
+    d, _ = rig.encode(T, inside=True, covariance=np.diag([1e-5] * 3 + [0.1] * 3))
     assert (rig.margin(d) >= -1e-12).all()
 
 
@@ -149,7 +149,7 @@ def test_poses_with_nan_give_nan(rig):
     _, T = noisy_poses(rig, 4, 9)
     T[2, 1, 3] = np.nan
     for bounds in (False, True):
-        d, residual_mm = rig.encode(T, bounds=bounds)
+        d, residual_mm = rig.encode(T, inside=bounds)
         assert np.isnan(d[2]).all() and np.isnan(residual_mm[2])
         assert np.isfinite(d[[0, 1, 3]]).all()
 

@@ -5,7 +5,7 @@ import pytest
 from brute_force_ik import brute_force_ik
 from example_model import example_arrays, example_meta
 
-from jawusd.evaluator import JawRig, reach
+from jawusd.evaluator import JawRig, search
 
 RIGS = {kind: JawRig(example_arrays(kind), example_meta(kind)) for kind in ("anchored", "additive")}
 
@@ -61,7 +61,7 @@ def test_a_far_throw_finds_the_better_side_of_a_ripple(kind, monkeypatch):
     found, distance_mm = rig.ik(points, targets, start=start)
     assert (rig.margin(found) >= -1e-12).all()
     assert (distance_mm <= brute_mm + 1e-9).all()
-    monkeypatch.setattr(reach, "_LONGEST_DRAG_MM", np.inf)
+    monkeypatch.setattr(search, "_LONGEST_DRAG_MM", np.inf)
     _, distance_mm = rig.ik(points, targets, start=start)
     assert (distance_mm > brute_mm + 0.01).any()
 

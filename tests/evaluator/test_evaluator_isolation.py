@@ -57,7 +57,7 @@ def test_a_rig_works_where_only_numpy_can_be_imported():
         "from jawusd.evaluator import JawRig\n"
         "rig = JawRig(example_arrays(), example_meta())\n"
         "T = rig.pose([[20.0, 2.0, 1.0]])\n"
-        "d, _ = rig.encode(T, bounds=True)\n"
+        "d, _ = rig.encode(T, inside=True)\n"
         "assert rig.validate(T).valid.all()\n"
         "rig.ik([0, 0, 0], [1, 2, 3]); rig.interpolate([0, 1], [[0, 0, 0], [5, 0, 0]], 0.5, 'smooth')\n"
         "print(abs(d - [20.0, 2.0, 1.0]).max() < 1e-8)\n"

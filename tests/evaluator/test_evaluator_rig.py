@@ -79,9 +79,9 @@ def test_wrong_shapes_are_refused(rig, name):
 @pytest.mark.parametrize("shape", SHAPES)
 def test_encode_takes_any_batch_shape(rig, shape, bounds):
     T = rig.pose(random_d(rig, shape))
-    d, residual_mm = rig.encode(T, bounds=bounds)
+    d, residual_mm = rig.encode(T, inside=bounds)
     assert d.shape == (*shape, 3) and residual_mm.shape == shape
-    d, residual_mm = rig.encode(T, bounds=bounds, covariance=np.eye(6))
+    d, residual_mm = rig.encode(T, inside=bounds, covariance=np.eye(6))
     assert d.shape == (*shape, 3) and residual_mm.shape == shape
 
 

@@ -10,8 +10,8 @@ import pytest
 from example_model import example_arrays, example_meta
 
 import jawusd
-from jawusd.evaluator import JawRig
-from jawusd.fast import FastRig
+from jawusd.evaluator.kernels import NumpyKernels
+from jawusd.fast.kernels import CompiledKernels
 
 # refuses numba as an interpreter without it does
 WITHOUT_NUMBA = """
@@ -43,7 +43,7 @@ def run(code, *arguments):
 
 def test_fast_gives_a_compiled_rig_and_plain_does_not(model):
     fast, plain = jawusd.load(model, fast=True), jawusd.load(model)
-    assert type(fast) is FastRig and type(plain) is JawRig
+    assert type(fast.kernels) is CompiledKernels and type(plain.kernels) is NumpyKernels
     np.testing.assert_allclose(fast.pose([20.0, 1.0, 1.0]), plain.pose([20.0, 1.0, 1.0]), atol=1e-10)
 
 

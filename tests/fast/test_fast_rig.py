@@ -14,7 +14,8 @@ from example_model import example_arrays, example_meta
 from scipy.optimize import least_squares
 
 from jawusd.evaluator import JawRig, Reason
-from jawusd.fast import FastRig, accelerate, rows
+from jawusd.fast import accelerate, rows
+from jawusd.fast.kernels import CompiledKernels
 from jawusd.geometry.se3 import se3_exp, transform_points
 
 RIGS = {kind: JawRig(example_arrays(kind), example_meta(kind)) for kind in ("anchored", "additive")}
@@ -170,7 +171,7 @@ def test_encode_is_as_near_as_scipy_finds(fast):
 def test_encode_inside_the_bound_is_as_near_as_the_plain_rig_finds(rig, fast):
     """Searches along the bound end a step of 1e-6 mm from the bottom: parameters agree to that, residuals closer."""
     T = noisy_poses(rig, (200,), seed=3)
-    (found, left_mm), (expected, expected_mm) = fast.encode(T, bounds=True), rig.encode(T, bounds=True)
+    (found, left_mm), (expected, expected_mm) = fast.encode(T, inside=True), rig.encode(T, inside=True)
     np.testing.assert_allclose(left_mm, expected_mm, rtol=0, atol=1e-9)
     np.testing.assert_allclose(found, expected, rtol=0, atol=2e-6)
     assert (fast.margin(found) >= -1e-12).all()
@@ -246,13 +247,13 @@ def test_results_do_not_share_memory(fast):
 def test_compiled_functions_refuse_other_types(fast):
     """Or they would be compiled anew, for seconds, inside somebody's playback."""
     with pytest.raises(TypeError):
-        rows.poses(fast._numbers, np.zeros((2, 3), dtype=np.float32), np.empty((2, 4, 4)))
+        rows.poses(fast.kernels._model, np.zeros((2, 3), dtype=np.float32), np.empty((2, 4, 4)))
 
 
 def test_rig_pickles_and_evaluates_in_threads(kind, fast):
     d, T = random_d(fast, (32, 50)), noisy_poses(fast, (32, 50))
     copy = pickle.loads(pickle.dumps(fast))
-    assert type(copy) is FastRig
+    assert type(copy.kernels) is CompiledKernels
     with ThreadPoolExecutor(4) as pool:
         poses, codes = list(pool.map(copy.pose, d)), list(pool.map(lambda each: copy.encode(each)[0], T))
     np.testing.assert_array_equal(poses, [fast.pose(x) for x in d])
@@ -265,8 +266,9 @@ def test_rig_works_in_a_forked_process():
         "import multiprocessing, sys\n"
         "import numpy as np\n"
         "from example_model import example_arrays, example_meta\n"
-        "from jawusd.fast import FastRig\n"
-        "rig = FastRig(example_arrays(), example_meta())\n"
+        "from jawusd.evaluator import JawRig\n"
+        "from jawusd.fast import accelerate\n"
+        "rig = accelerate(JawRig(example_arrays(), example_meta()))\n"
         "d = rig.project(np.array([[20.0, 2.0, 1.0], [5.0, 0.0, 0.0]]))\n"
         "with multiprocessing.get_context('fork').Pool(2) as pool:\n"
         "    assert (pool.map(rig.pose, d) == rig.pose(d)).all()\n"

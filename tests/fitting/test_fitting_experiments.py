@@ -89,7 +89,7 @@ def test_random_parameters_fill_each_bound_and_nothing_else():
         shape = shapely.union_all([shapely.Polygon(ring) for ring in rings]).buffer(1e-9)
         assert shapely.contains_xy(shape, drawn[POLYGONS][:, 0], drawn[POLYGONS][:, axis]).all()
         assert not shapely.contains_xy(shape, drawn[BOX][:, 0], drawn[BOX][:, axis]).all()
-    assert (bounds.slices.excess(drawn[SLICES]) <= 0).all()
+    assert (bounds.slices.signed_distance(drawn[SLICES]) <= 0).all()
     # Uniform: the box is not filled from the middle or the edge alone.
     assert np.abs(drawn[BOX].mean(0) - bounds.box.mean(1)).max() < 0.05 * np.ptp(bounds.box, axis=1).max()
 

@@ -256,12 +256,12 @@ def test_slice_hull_contains_the_captured_and_rejects_the_far():
     rng = np.random.default_rng(19)
     arrays, _ = fit_slice_hull(envelope(rng, 1200))
     bound = SliceHull.from_arrays(arrays)
-    assert (bound.excess(envelope(rng, 2000)) < 0).mean() > 0.95
+    assert (bound.signed_distance(envelope(rng, 2000)) < 0).mean() > 0.95
     outside = envelope(rng, 2000)
     outside[:, 1:] = (outside[:, 1:] - [0, 2]) / np.linalg.norm((outside[:, 1:] - [0, 2]) / [10, 6], axis=1)[:, None]
     outside[:, 1:] = outside[:, 1:] * 1.5 + [0, 2]
-    assert (bound.excess(outside) > 0).mean() > 0.95
-    assert bound.excess(np.array([[-2.0, 0, 2]])) > 0  # teeth cannot close further
+    assert (bound.signed_distance(outside) > 0).mean() > 0.95
+    assert bound.signed_distance(np.array([[-2.0, 0, 2]])) > 0  # teeth cannot close further
 
 
 def test_box_contains_everything_within_the_bound():
@@ -270,7 +270,7 @@ def test_box_contains_everything_within_the_bound():
     box = valid_box(arrays)
     wide = box + np.array([-5.0, 5.0])
     d = wide[:, 0] + (wide[:, 1] - wide[:, 0]) * rng.random((20000, 3))
-    d = d[SliceHull.from_arrays(arrays).excess(d) < 0]
+    d = d[SliceHull.from_arrays(arrays).signed_distance(d) < 0]
     assert len(d) > 500
     assert (d >= box[:, 0]).all() and (d <= box[:, 1]).all()
 
@@ -288,4 +288,4 @@ def test_tolerance_grows_with_what_a_left_out_exercise_adds():
 def test_flat_section_still_contains_its_frames():
     d = np.zeros((100, 3))
     d[:, 0] = np.linspace(0, 40, 100)
-    assert (SliceHull.from_arrays(fit_slice_hull(d)[0]).excess(d) < 0).all()
+    assert (SliceHull.from_arrays(fit_slice_hull(d)[0]).signed_distance(d) < 0).all()

@@ -157,7 +157,7 @@ def _starts(tracks: Tracks, jaw: JawRig, measured: Mask) -> Array:
     the head moves evenly from the last pose to the next.
     """
     frames = tracks.frames.astype(np.float64)
-    d = jaw.interpolate(frames[measured], jaw.encode(tracks.raw_T_upper_lower[measured], bounds=True)[0], frames)
+    d = jaw.interpolate(frames[measured], jaw.encode(tracks.raw_T_upper_lower[measured], inside=True)[0], frames)
     relative = jaw.pose(d)
     upper, lower = tracks.T_world_upper.copy(), tracks.T_world_lower.copy()
     known = np.isfinite(upper).all((1, 2))

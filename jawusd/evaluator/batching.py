@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,26 +15,11 @@ CHUNK_ROWS = 2048
 LARGEST = 1e9  # 1,000 km: no jaw, and squares and cubes of it still fit a float
 
 
-def as_rows(values: ArrayLike, tail: tuple[int, ...], name: str) -> tuple[Array, tuple[int, ...]]:
+def rows_of(values: ArrayLike, tail: tuple[int, ...], name: str) -> tuple[Array, tuple[int, ...]]:
     """Return values as float64 rows (n, *tail) and the batch shape.
-
-    Rows with a value that is not finite, or above 1e9, become all NaN.
 
     Raises:
         ValueError: the trailing axes are not ``tail``.
-    """
-    rows, batch = in_rows(values, tail, name)
-    finite = (np.abs(rows) < LARGEST).all(axis=tuple(range(1, rows.ndim)))  # False for NaN
-    if not finite.all():
-        rows = np.where(finite.reshape(-1, *(1,) * len(tail)), rows, np.nan)
-    return rows, batch
-
-
-def in_rows(values: ArrayLike, tail: tuple[int, ...], name: str) -> tuple[Array, tuple[int, ...]]:
-    """Return what `as_rows` does, rows that are not finite as they are.
-
-    Raises:
-        ValueError: values of another shape.
     """
     values = np.asarray(values, dtype=np.float64)
     batch = values.shape[: values.ndim - len(tail)]
@@ -44,8 +29,26 @@ def in_rows(values: ArrayLike, tail: tuple[int, ...], name: str) -> tuple[Array,
     return rows, batch
 
 
-def in_chunks(function: Callable[..., Any], *rows: Array) -> Any:
-    """Return ``function(*rows)``, an array or a tuple of arrays, computed in pieces of `CHUNK_ROWS` rows.
+def usable_rows(rows: Array) -> Array:
+    """Return the rows (n, ...); those with a value that is not finite, or above 1e9, become all NaN."""
+    usable = np.asarray((np.abs(rows) < LARGEST).all(axis=tuple(range(1, rows.ndim))))  # False for NaN
+    if usable.all():
+        return rows
+    return np.where(usable.reshape(-1, *(1,) * (rows.ndim - 1)), rows, np.nan)
+
+
+def as_rows(values: ArrayLike, tail: tuple[int, ...], name: str) -> tuple[Array, tuple[int, ...]]:
+    """Return `rows_of` values, made `usable_rows`, and the batch shape."""
+    rows, batch = rows_of(values, tail, name)
+    return usable_rows(rows), batch
+
+
+@overload
+def in_chunks(function: Callable[..., Array], *rows: Array) -> Array: ...
+@overload
+def in_chunks(function: Callable[..., tuple[Array, Array]], *rows: Array) -> tuple[Array, Array]: ...
+def in_chunks(function: Callable[..., Array | tuple[Array, Array]], *rows: Array) -> Array | tuple[Array, ...]:
+    """Return ``function(*rows)``, an array or two, computed in pieces of `CHUNK_ROWS` rows.
 
     Temporary memory stays the same however many rows there are.
     """
@@ -55,7 +58,7 @@ def in_chunks(function: Callable[..., Any], *rows: Array) -> Any:
     parts = [function(*(each[i : i + CHUNK_ROWS] for each in rows)) for i in range(0, count, CHUNK_ROWS)]
     if isinstance(parts[0], tuple):
         return tuple(np.concatenate(part) for part in zip(*parts))
-    return np.concatenate(parts)
+    return np.concatenate([np.asarray(part) for part in parts])
 
 
 def as_points(points: ArrayLike, name: str) -> Array:

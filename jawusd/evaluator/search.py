@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from jawusd.errors import EvaluatorError
+from jawusd.evaluator.batching import in_chunks
 from jawusd.evaluator.bounds import SliceHull
-from jawusd.evaluator.distances import distance_residual
+from jawusd.evaluator.kernels import Kernels
 from jawusd.evaluator.models import JawModelForm
-from jawusd.evaluator.rows import in_chunks
-from jawusd.evaluator.solver import Residual, minimise, pulled_inside
+from jawusd.evaluator.solver import pulled_inside
 from jawusd.geometry.arrays import Array, Indices
 
 # (row numbers (k,), starts (k, 3)) -> bottoms (k, 3) and squared residuals (k,)
@@ -20,23 +21,26 @@ Search = Callable[[Indices, Array], tuple[Array, Array]]
 
 _MOST_VALLEYS = 4
 _RIPPLE_STEPS = (-2.0, -1.0, 1.0, 2.0)
-_LONGEST_DRAG_MM = 3.0  # movement in d between two events of a drag; what goes further may as well change valleys
+_LONGEST_DRAG_MM = 3.0  # movement in d between two events of a drag; a longer one may change valleys
 _SCAN_ROWS = 64  # rows compared with all candidates at once: 64 x 6,000 distances are 3 MB
 
 
-class Reach:
-    """Where the jaw can go, scanned once for the starts of searches.
+class IkResult(NamedTuple):
+    """What `JawRig.ik` found: d [mm], shape (..., 3), and the distance [mm] left, shape (...)."""
+
+    d: Array
+    distance_mm: Array
+
+
+class BoundedSearch:
+    """Searches inside the bound, started from points of a scan of the valid volume that is made once.
 
     Sections at one opening are convex, but the valid volume as a whole is not: along d1 a search may have several
     valleys, so one is started in each of the deepest.
-
-    Args:
-        model: The jaw model.
-        bound: The valid volume.
     """
 
-    def __init__(self, model: JawModelForm, bound: SliceHull) -> None:
-        self._model, self._bound = model, bound
+    def __init__(self, model: JawModelForm, bound: SliceHull, kernels: Kernels) -> None:
+        self._model, self._bound, self._kernels = model, bound, kernels
 
     @cached_property
     def _scan(self) -> _Scan:
@@ -54,14 +58,16 @@ class Reach:
             EvaluatorError: the valid volume is empty.
         """
         valid = d.copy()
-        out = np.flatnonzero(self._bound.excess(d) > 0)
+        out = np.flatnonzero(self._bound.signed_distance(d) > 0)
         if not out.size:
             return valid
         wanted = d[out]
-        valid[out], _ = self._best(lambda rows, first: self._approach(wanted[rows], first), self._scan.points, wanted)
+        valid[out], _ = self._best(
+            lambda rows, first: self._kernels.approach(wanted[rows], first), self._scan.points, wanted
+        )
         return valid
 
-    def best_pull(self, vectors: Array, target: Array) -> Array:
+    def solve_ik_multistart(self, vectors: Array, target: Array) -> Array:
         """Return the valid d (n, 3) [mm] that bring the vectors (4, m) nearest to the targets (n, 3, m).
 
         Args:
@@ -71,30 +77,32 @@ class Reach:
         Raises:
             EvaluatorError: the valid volume is empty.
         """
-        return self._best_pull(vectors, target)[0]
+        return self._multistart(vectors, target)[0]
 
-    def pull(self, vectors: Array, target: Array, start: Array) -> Array:
-        """Return what `best_pull` does, but only the bottom of the valley that start (n, 3) [mm] lies in.
+    def solve_ik(self, vectors: Array, target: Array, start: Array) -> Array:
+        """Return what `solve_ik_multistart` does, but only the bottom of the valley that start (n, 3) [mm] lies in.
 
-        Short steps keep the search in that valley, which is what makes dragging continuous. A start from which they
-        lead far away is no drag: there the better of that bottom and of `best_pull` is returned.
+        Short steps keep the search in that valley, which makes dragging continuous. Where the result lies far from its
+        start, which is then no drag, the better of it and of `solve_ik_multistart` is returned.
         """
-        found, left = self._pull(vectors, target, start)
+        found, left = self._kernels.solve_ik(vectors, target, start)
         far = np.flatnonzero(np.linalg.norm(found - start, axis=1) > _LONGEST_DRAG_MM)
         if far.size:
-            best, least = self._best_pull(vectors, target[far])
+            best, least = self._multistart(vectors, target[far])
             better = least < left[far]
             found[far[better]] = best[better]
         return found
 
-    def _best_pull(self, vectors: Array, target: Array) -> tuple[Array, Array]:
+    def _multistart(self, vectors: Array, target: Array) -> tuple[Array, Array]:
         """Return the bottoms (n, 3) [mm] of the deepest valleys, and the squared distances left (n,)."""
         images = self._scan.images(vectors)
         wanted = target.reshape(len(target), images.shape[1])
-        best, least = self._best(lambda rows, first: self._pull(vectors, target[rows], first), images, wanted)
+        best, least = self._best(
+            lambda rows, first: self._kernels.solve_ik(vectors, target[rows], first), images, wanted
+        )
         first, inside = pulled_inside(self._bound, (best[:, None] + self._ripples).reshape(-1, 3))
         first[~inside] = np.nan
-        found, left = self._pull(vectors, np.repeat(target, len(self._ripples), axis=0), first)
+        found, left = self._kernels.solve_ik(vectors, np.repeat(target, len(self._ripples), axis=0), first)
         left = np.where(np.isnan(left), np.inf, left).reshape(len(best), len(self._ripples))
         choice = left.argmin(axis=1)
         each = np.arange(len(best))
@@ -107,24 +115,6 @@ class Reach:
         """Steps (r, 3) [mm] to either side across ripples of the bound, which are as long as its knots lie apart."""
         spacing_mm = np.diff(self._bound.supports.knots).mean()
         return np.array([[step * spacing_mm, 0.0, 0.0] for step in _RIPPLE_STEPS])
-
-    def _pull(self, vectors: Array, target: Array, start: Array) -> tuple[Array, Array]:
-        """Return the bottoms (n, 3) [mm] of the valleys the starts lie in, and the squared distances left (n,)."""
-        return self._bottom(distance_residual(self._model.decode_derivative, vectors, target), start)
-
-    def _approach(self, wanted: Array, start: Array) -> tuple[Array, Array]:
-        """Return the points (n, 3) [mm] nearest to those wanted (n, 3), and their squared distances (n,)."""
-        identity = np.eye(3)
-
-        def residual(x: Array, rows: Indices) -> tuple[Array, Array]:
-            return x - wanted[rows], np.broadcast_to(identity, (len(x), 3, 3))
-
-        return self._bottom(residual, start)
-
-    def _bottom(self, residual: Residual, start: Array) -> tuple[Array, Array]:
-        found = minimise(residual, start, self._bound)
-        r, _ = residual(found, np.arange(len(found)))
-        return found, np.einsum("nm,nm->n", r, r)
 
     def _best(self, search: Search, features: Array, wanted: Array) -> tuple[Array, Array]:
         """Return the best d (n, 3) [mm] over searches from every valley, and the squared residuals (n,).

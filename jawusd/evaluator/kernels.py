@@ -1,0 +1,173 @@
+"""What a rig computes over rows: one interface, so that numpy and compiled code can stand in for each other.
+
+Rows are float64 arrays of any values; rows with a value that is not finite, or above 1e9, give NaN.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from jawusd.evaluator.batching import in_chunks, usable_rows
+from jawusd.evaluator.bounds import SliceHull
+from jawusd.evaluator.distances import distance_residual, landmark_vectors
+from jawusd.evaluator.encoding import Encoder
+from jawusd.evaluator.frames import RigFrames
+from jawusd.evaluator.models import JawModelForm
+from jawusd.evaluator.solver import Residual, minimise
+from jawusd.evaluator.verdicts import RIGID_TOLERANCE, Limits, Verdicts, judge
+from jawusd.geometry.arrays import Array, Indices
+from jawusd.geometry.se3 import rigidity_defect, transform_points
+
+
+@dataclass(frozen=True)
+class RigParts:
+    """What kernels are made of.
+
+    Attributes:
+        model: The jaw model.
+        bound: The valid volume.
+        frames: Of the rig.
+        landmarks: Landmarks of the mandible [mm], mandible frame, shape (n, 3).
+    """
+
+    model: JawModelForm
+    bound: SliceHull
+    frames: RigFrames
+    landmarks: Array
+
+    def vectors(self) -> Array:
+        """Return the homogeneous vectors (4, 4) that stand for the landmarks, anatomical frame [mm]."""
+        return landmark_vectors(transform_points(self.frames.T_anatomical_mandible_rest, self.landmarks))
+
+
+class Kernels(Protocol):
+    """The functions of a rig that are computed row by row."""
+
+    def pose(self, d1: float, d2: float, d3: float) -> Array:
+        """Return T_skull_mandible (4, 4) of one d [mm], finite and below 1e4."""
+
+    def margin(self, d1: float, d2: float, d3: float) -> float:
+        """Return the margin [mm] of one d [mm], finite and below 1e4."""
+
+    def poses(self, d: Array) -> Array:
+        """Return the poses T_skull_mandible (n, 4, 4) of d (n, 3) [mm]."""
+
+    def twists(self, d: Array) -> Array:
+        """Return the twists (n, 6) log(pose(d) rest^-1), skull frame, of d (n, 3) [mm]."""
+
+    def jacobians(self, d: Array) -> Array:
+        """Return the derivatives (n, 6, 3) of the twists by d (n, 3) [mm]."""
+
+    def margins(self, d: Array) -> Array:
+        """Return the margins (n,) [mm] of d (n, 3) [mm]."""
+
+    def margin_gradients(self, d: Array) -> Array:
+        """Return the derivatives (n, 3) of the margins by d (n, 3) [mm]."""
+
+    def encode(self, T: Array) -> tuple[Array, Array]:
+        """Return the d (n, 3) [mm] nearest to poses T_skull_mandible (n, 4, 4), and the residuals (n,) [mm]."""
+
+    def judge_poses(self, T: Array, limits: Limits) -> Verdicts:
+        """Return verdicts on poses T_skull_mandible (n, 4, 4); the limit of speed is not looked at."""
+
+    def judge_parameters(self, d: Array, limits: Limits) -> Verdicts:
+        """Return verdicts on d (n, 3) [mm], all with the residual 0; the limit of speed is not looked at."""
+
+    def approach(self, wanted: Array, start: Array) -> tuple[Array, Array]:
+        """Search inside the bound for the points nearest to those wanted.
+
+        Args:
+            wanted: d [mm], shape (n, 3).
+            start: Where to start, inside the bound, shape (n, 3).
+
+        Returns:
+            The bottoms (n, 3) [mm] of the valleys the starts lie in, and the squared distances (n,).
+        """
+
+    def solve_ik(self, vectors: Array, targets: Array, start: Array) -> tuple[Array, Array]:
+        """Search inside the bound for the motions that carry homogeneous vectors nearest to their targets.
+
+        Args:
+            vectors: Points of the mandible at rest, anatomical frame [mm], scaled by their weights, shape (4, m).
+            targets: Where they should go, scaled alike, shape (n, 3, m).
+            start: d [mm] inside the bound, shape (n, 3).
+
+        Returns:
+            The bottoms (n, 3) [mm] of the valleys the starts lie in, and the squared distances left (n,).
+        """
+
+
+class NumpyKernels:
+    """`Kernels` in numpy, by chunks of rows."""
+
+    def __init__(self, parts: RigParts) -> None:
+        self._model, self._bound, self._frames = parts.model, parts.bound, parts.frames
+        self._single = parts.model.single
+        self._encoder = Encoder(parts.model, parts.frames, parts.vectors())
+
+    def pose(self, d1: float, d2: float, d3: float) -> Array:
+        """Return T_skull_mandible (4, 4) of one d [mm]."""
+        return self._frames.pose(self._single.motion(d1, d2, d3))
+
+    def margin(self, d1: float, d2: float, d3: float) -> float:
+        """Return the margin [mm] of one d [mm]."""
+        return -float(self._bound.signed_distance(np.array([(d1, d2, d3)]))[0])
+
+    def poses(self, d: Array) -> Array:
+        """Return the poses T_skull_mandible (n, 4, 4) of d (n, 3) [mm]."""
+        return in_chunks(lambda d: self._frames.poses(self._model.motion(d)), usable_rows(d))
+
+    def twists(self, d: Array) -> Array:
+        """Return the twists (n, 6) log(pose(d) rest^-1), skull frame, of d (n, 3) [mm]."""
+        return in_chunks(lambda d: self._model.log(d) @ self._frames.adjoint.T, usable_rows(d))
+
+    def jacobians(self, d: Array) -> Array:
+        """Return the derivatives (n, 6, 3) of the twists by d (n, 3) [mm]."""
+        return in_chunks(lambda d: self._frames.adjoint @ self._model.log_jacobian(d), usable_rows(d))
+
+    def margins(self, d: Array) -> Array:
+        """Return the margins (n,) [mm] of d (n, 3) [mm]."""
+        return -in_chunks(self._bound.signed_distance, usable_rows(d))
+
+    def margin_gradients(self, d: Array) -> Array:
+        """Return the derivatives (n, 3) of the margins by d (n, 3) [mm]."""
+        return -in_chunks(lambda d: self._bound.signed_distance_gradient(d)[1], usable_rows(d))
+
+    def encode(self, T: Array) -> tuple[Array, Array]:
+        """Return the d (n, 3) [mm] nearest to poses T_skull_mandible (n, 4, 4), and the residuals (n,) [mm]."""
+        return in_chunks(self._encoder.encode, usable_rows(T))
+
+    def judge_poses(self, T: Array, limits: Limits) -> Verdicts:
+        """Return verdicts on poses T_skull_mandible (n, 4, 4)."""
+        T = usable_rows(T)
+        finite = np.asarray(np.isfinite(T).all(axis=(1, 2)))
+        rigid = in_chunks(rigidity_defect, np.where(finite[:, None, None], T, np.eye(4))) <= RIGID_TOLERANCE
+        d, residual_mm = self.encode(np.where((finite & rigid)[:, None, None], T, np.nan))
+        return judge(finite, rigid, residual_mm, self.margins(d), d, limits)
+
+    def judge_parameters(self, d: Array, limits: Limits) -> Verdicts:
+        """Return verdicts on d (n, 3) [mm]."""
+        d = usable_rows(d)
+        finite = np.isfinite(d[:, 0])
+        return judge(finite, np.ones_like(finite), np.where(finite, 0.0, np.nan), self.margins(d), d, limits)
+
+    def approach(self, wanted: Array, start: Array) -> tuple[Array, Array]:
+        """Return the points (n, 3) [mm] inside nearest to those wanted, and the squared distances (n,)."""
+        identity = np.eye(3)
+
+        def residual(x: Array, rows: Indices) -> tuple[Array, Array]:
+            return x - wanted[rows], np.broadcast_to(identity, (len(x), 3, 3))
+
+        return self._bottom(residual, start)
+
+    def solve_ik(self, vectors: Array, targets: Array, start: Array) -> tuple[Array, Array]:
+        """Return the d (n, 3) [mm] inside that carry vectors nearest to targets, and the squared distances (n,)."""
+        return self._bottom(distance_residual(self._model.decode_derivative, vectors, targets), start)
+
+    def _bottom(self, residual: Residual, start: Array) -> tuple[Array, Array]:
+        found = minimise(residual, start, self._bound)
+        r, _ = residual(found, np.arange(len(found)))
+        return found, np.einsum("nm,nm->n", r, r)

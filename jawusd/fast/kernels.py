@@ -1,0 +1,99 @@
+"""`jawusd.evaluator.kernels.Kernels`, compiled."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jawusd.evaluator.batching import usable_rows
+from jawusd.evaluator.kernels import RigParts
+from jawusd.evaluator.verdicts import Limits, Verdicts
+from jawusd.fast import rows
+from jawusd.fast.descent import PARAMETERS, POINT
+from jawusd.fast.packing import packed_bound, packed_model
+from jawusd.geometry.arrays import Array
+
+
+class CompiledKernels:
+    """The rows of a rig in machine code: the same results as in numpy, to 1e-10."""
+
+    def __init__(self, parts: RigParts) -> None:
+        self._model = packed_model(parts.model, parts.frames, parts.vectors())
+        self._hull = packed_bound(parts.bound)
+
+    def pose(self, d1: float, d2: float, d3: float) -> Array:
+        """Return T_skull_mandible (4, 4) of one d [mm]."""
+        return rows.single_pose(self._model, d1, d2, d3)
+
+    def margin(self, d1: float, d2: float, d3: float) -> float:
+        """Return the margin [mm] of one d [mm]."""
+        return rows.single_margin(self._hull, d1, d2, d3)
+
+    def poses(self, d: Array) -> Array:
+        """Return the poses T_skull_mandible (n, 4, 4) of d (n, 3) [mm]."""
+        out = np.empty((len(d), 4, 4))
+        rows.poses(self._model, _owned(d), out)
+        return out
+
+    def twists(self, d: Array) -> Array:
+        """Return the twists (n, 6), skull frame, of d (n, 3) [mm]."""
+        out = np.empty((len(d), 6))
+        rows.twists(self._model, _owned(d), out)
+        return out
+
+    def jacobians(self, d: Array) -> Array:
+        """Return the derivatives (n, 6, 3) of the twists by d (n, 3) [mm]."""
+        out = np.empty((len(d), 6, 3))
+        rows.jacobians(self._model, _owned(d), out)
+        return out
+
+    def margins(self, d: Array) -> Array:
+        """Return the margins (n,) [mm] of d (n, 3) [mm]."""
+        out = np.empty(len(d))
+        rows.margins(self._hull, _owned(d), out)
+        return out
+
+    def margin_gradients(self, d: Array) -> Array:
+        """Return the derivatives (n, 3) of the margins by d (n, 3) [mm]."""
+        out = np.empty((len(d), 3))
+        rows.margin_gradients(self._hull, _owned(d), out)
+        return out
+
+    def encode(self, T: Array) -> tuple[Array, Array]:
+        """Return the d (n, 3) [mm] nearest to poses T_skull_mandible (n, 4, 4), and the residuals (n,) [mm]."""
+        d, residual_mm = np.empty((len(T), 3)), np.empty(len(T))
+        rows.encodings(self._model, _owned(T), d, residual_mm)
+        return d, residual_mm
+
+    def judge_poses(self, T: Array, limits: Limits) -> Verdicts:
+        """Return verdicts on poses T_skull_mandible (n, 4, 4)."""
+        count, (residual_limit, margin_limit) = len(T), (limits.residual_mm, limits.margin_mm)
+        d, residual_mm, margin_mm = np.empty((count, 3)), np.empty(count), np.empty(count)
+        reason = np.empty(count, dtype=np.uint8)
+        found = d, residual_mm, margin_mm, reason
+        rows.judgements(self._model, self._hull, _owned(T), residual_limit, margin_limit, *found)
+        return Verdicts(reason == 0, reason, residual_mm, margin_mm, d)
+
+    def judge_parameters(self, d: Array, limits: Limits) -> Verdicts:
+        """Return verdicts on d (n, 3) [mm]."""
+        d = usable_rows(d)  # NaN where not finite: they are part of the verdicts
+        residual_mm, margin_mm, reason = np.empty(len(d)), np.empty(len(d)), np.empty(len(d), dtype=np.uint8)
+        rows.parameter_judgements(self._hull, _owned(d), limits.margin_mm, residual_mm, margin_mm, reason)
+        return Verdicts(reason == 0, reason, residual_mm, margin_mm, d)
+
+    def approach(self, wanted: Array, start: Array) -> tuple[Array, Array]:
+        """Return the points (n, 3) [mm] inside nearest to those wanted, and the squared distances (n,)."""
+        return self._descended(POINT, np.empty((4, 0)), wanted[:, :, None], start)
+
+    def solve_ik(self, vectors: Array, targets: Array, start: Array) -> tuple[Array, Array]:
+        """Return the d (n, 3) [mm] inside that carry vectors nearest to targets, and the squared distances (n,)."""
+        return self._descended(PARAMETERS, np.ascontiguousarray(vectors), targets, start)
+
+    def _descended(self, chart: int, vectors: Array, targets: Array, start: Array) -> tuple[Array, Array]:
+        found, cost = np.array(start, order="C"), np.empty(len(start))
+        rows.descents(self._model, self._hull, chart, vectors, _owned(targets), found, cost)
+        return found, cost
+
+
+def _owned(values: Array) -> Array:
+    """Return the values, copied unless they are contiguous, aligned and writable, as compiled code takes them."""
+    return values if values.flags.carray else np.array(values, order="C")
