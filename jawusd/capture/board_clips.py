@@ -45,7 +45,7 @@ class BoardClip:
         return self._video is not None
 
     def pictures(self, wanted: list[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-        """Yield (number, gray picture) of the wanted ones, in order.
+        """Yield (number, gray picture) of the given numbers, in order.
 
         Raises:
             CalibrationError: a picture has another size than the first.

@@ -15,7 +15,7 @@ from jawusd.geometry.arrays import Array
 
 Search = Callable[[NDArray[np.uint8]], Array | None]
 
-_TIMES, _FEW_MARKERS = 2, 4  # pictures that must agree on another board; markers by which one is believed
+_TIMES, _FEW_MARKERS = 2, 4  # pictures that must agree on another board; fewest markers in each
 _FEWEST_CORNERS = 8  # of a ChArUco board; fewer do not fix its pose
 # The corner is refined in a window of this share of a cell: larger ones reach blur and lens, smaller ones only noise.
 _WINDOW_SHARE, _WINDOW_PX = 0.12, (3, 12)

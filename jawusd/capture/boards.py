@@ -32,7 +32,7 @@ class Sightings:
     corners_px: Array  # pixel of each corner, NaN where not seen, shape (C, V, N, 2)
     blurred: dict[str, list[int]]  # per camera the numbers of pictures refused because of blur
     missed: dict[str, list[int]]  # per camera the numbers of pictures in which no board was found
-    notes: tuple[str, ...]  # what a person should know of the clips
+    notes: tuple[str, ...]  # remarks on the clips for the user
 
 
 def board_points(boards: Boards) -> Array:

@@ -92,7 +92,7 @@ class _Problem:
         self.corners_px, self.points_mm = corners_px[:, self.views], points_mm
         self.cameras = len(corners_px)
         self.seen = np.isfinite(self.corners_px[..., 0])
-        # Where each camera's view stands among the residuals.
+        # The first residual of each camera's view.
         self.blocks = [(c, v) for c in range(self.cameras) for v in range(len(self.views)) if self.seen[c, v].any()]
 
     def pack(self, start: FirstGuess) -> Array:

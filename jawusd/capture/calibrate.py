@@ -18,7 +18,7 @@ from jawusd.formats.capture import Capture
 from jawusd.geometry import Camera
 from jawusd.geometry.arrays import Array
 
-#: Called with the cameras and why picks do not tell the scale.
+#: Called with the cameras and the reason why the picks give no scale.
 MeasureScale = Callable[[list[Camera], ScaleCheck], ScaleCheck]
 
 _ENOUGH_VIEWS = 40  # a quarter of the shape error of 20
@@ -53,7 +53,7 @@ class CalibrationReport:
     expected_shape_mm: float  # mean error of distances in the mouth volume expected from the corners' scatter
     mouth_mm: tuple[float, float, float]  # middle of the mouth in the world, and from what it is known
     mouth_from: str
-    scale: ScaleCheck  # what the teeth say of the board's square size
+    scale: ScaleCheck  # the board's square size, checked against the teeth
     advice: tuple[str, ...]  # what to do better, one sentence each
     notes: tuple[str, ...]  # what was assumed
 
@@ -72,7 +72,7 @@ def calibrate_capture(
 
     Args:
         scans: vertices of the teeth scans [mm] by "upper" and "lower", shape (n, 3); picks refer to them.
-        scale_without_picks: measures the size of the teeth with the cameras found, where picks do not tell.
+        scale_without_picks: measures the size of the teeth with the calibrated cameras if the picks do not suffice.
 
     Raises:
         CalibrationError: there are no boards, or they do not carry a calibration.

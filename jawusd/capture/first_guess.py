@@ -1,4 +1,4 @@
-"""Start the calibration: intrinsics per camera, then where the cameras stand, from single views of the board.
+"""Start the calibration: intrinsics per camera, then the cameras' poses, from single views of the board.
 
 A detector may list a symmetric board's corners in another order in every picture. Each order is a board turned in its
 plane; the relative pose of two fixed cameras is the same in all views only where both list the same corner first, so
@@ -63,7 +63,7 @@ def guess_cameras(
     for v in range(views):
         seen = [c for c in range(count) if np.isfinite(T_cam_board[c, v, 0, 0])]
         agreed: list[tuple[int, int]] = []
-        for first in seen:  # the camera that most others agree with tells the board's pose
+        for first in seen:  # the board's pose is taken from the camera that most others agree with
             T = se3_inverse(T_cam_world[first]) @ T_cam_board[first, v]
             found = [
                 (c, s)

@@ -18,11 +18,11 @@ from jawusd.geometry.arrays import Array
 from jawusd.imaging.video import Video
 
 _FIRST_WINDOW_S = 4.0  # searched at either end; doubled until a flash is found
-_SPARSE = 8  # every 8th pixel in both directions tells the mean brightness
+_SPARSE = 8  # the mean brightness is that of every 8th pixel in both directions
 _CONTRAST = 0.3  # share of the brightness a flash must change; moving people change a few per cent
 _ABRUPT_FRAMES = 3  # a lamp is off or on within this many frames
 _TOLERANCE_FRAMES = 1.0  # steps this close are the same step
-_DROPPED_S = 0.5  # steps that fit with an offset this different tell of lost frames
+_DROPPED_S = 0.5  # steps that fit with an offset this different mean lost frames
 _FEWEST_STEPS = 2
 _BETWEEN_FRAMES = 0.15  # a fraction of a frame this small is noise
 
@@ -32,7 +32,7 @@ class Step:
     """Mark one sudden change of brightness."""
 
     time_frames: float  # when, in frames of the camera's video; k = as the exposure of frame k begins
-    rising: bool  # the light goes on; else off
+    rising: bool  # whether the light goes on, not off
     slack_frames: float = 0.0  # how much earlier it may have been, because the pictures before it are missing
 
 
@@ -44,7 +44,7 @@ class Offset:
     exact_frames: float  # the same with its estimated fraction
     spread_frames: float  # largest deviation of a matched step from exact_frames; 0 by sound
     matched_steps: int  # number of steps found in both cameras; 0 by sound
-    confidence: float  # share of the steps of both cameras that have a partner, or what `SoundMatch` says; 0 .. 1
+    confidence: float  # share of the steps of both cameras that have a partner, or that of `SoundMatch`; 0 .. 1
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ def _aligned(steps: list[Step], reference: list[Step], offset: int) -> tuple[lis
                 break
     if not pairs:
         return [], 0.0, float(offset)
-    # Only the pairs that know best tell the offset.
+    # Only the most exact pairs give the offset.
     best = np.array(differences)[np.array(slacks) == min(slacks)]
     exact = float(np.median(best))
     return pairs, float(np.abs(best - exact).max()), exact
@@ -151,7 +151,7 @@ def on_grid(steps: list[Step], numbers: NDArray[np.int64]) -> list[Step]:
         nearest = round(step.time_frames)
         between = abs(step.time_frames - nearest) < _BETWEEN_FRAMES and 0 < nearest < len(numbers)
         picture = nearest if between else min(int(step.time_frames), len(numbers) - 1)
-        # Between two pictures the step is anywhere in the gap; within one, that picture's brightness tells.
+        # Between two pictures the step is anywhere in the gap; within one, it follows from that picture's brightness.
         gap = float(numbers[picture] - numbers[picture - 1] - 1) if between else 0.0
         out.append(Step(float(numbers[picture]) + step.time_frames - picture, step.rising, max(0.0, gap)))
     return out

@@ -14,7 +14,7 @@ from jawusd.geometry import Camera, triangulate
 from jawusd.geometry.arrays import Array
 
 _FEWEST_PICKS = 3  # per jaw
-_TOLERANCE = 0.03  # picks tell the scale to about half a per cent
+_TOLERANCE = 0.03  # picks give the scale to about half a per cent
 _SIGMAS = 4.0
 
 

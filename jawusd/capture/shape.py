@@ -62,7 +62,7 @@ def board_shape_error(cameras: list[Camera], bundle: Bundle, points_mm: Array, c
 
 
 def expected_shape_error(cameras: list[Camera], bundle: Bundle, centre_mm: Array) -> float:
-    """Return the mean error of distances in the mouth volume [mm] when the cameras err as their covariance says.
+    """Return the mean error of distances in the mouth volume [mm] when the cameras err by their covariance.
 
     Points of the volume are seen with the calibrated cameras and triangulated with cameras drawn from the covariance.
     What the model leaves out (bent boards, other lens terms, rolling shutters) is not in it.

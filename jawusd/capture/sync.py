@@ -34,7 +34,7 @@ class Alignment:
     reference: str  # the camera that counts the frames
     cameras: dict[str, Offset]  # the offset per camera, in the order of the capture
     method: str = "light flash"  # "light flash" or "sound"
-    notes: tuple[str, ...] = ()  # what a person should know of the clips
+    notes: tuple[str, ...] = ()  # remarks on the clips for the user
 
     @property
     def offsets(self) -> dict[str, int]:
@@ -51,7 +51,7 @@ def estimate_offsets(capture: Capture) -> Alignment:
     """Align the cameras of a capture by the light flashes or the sound of their videos; see `align_videos`.
 
     Raises:
-        SyncError: a camera has no video, or neither flashes nor sound tell.
+        SyncError: a camera has no video, or there are neither flashes nor sound to align by.
         CaptureError: a video cannot be read.
     """
     videos = {camera.name: camera.video for camera in capture.cameras if camera.video is not None}

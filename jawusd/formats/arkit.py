@@ -118,7 +118,7 @@ def _rate(seconds: NDArray[np.int64], inside: Array, lines: list[int], fps: floa
     top = int(np.argmax(inside))
     highest = math.floor(inside[top])
     if fps is None:
-        # The first and the last second are cut: where counting starts over only those between them tell.
+        # The first and the last second are incomplete: only those between them show where counting starts over.
         whole = (seconds > seconds[0]) & (seconds < seconds[-1])
         rates = [rate for rate in _RATES if rate > highest]
         if not whole.any() or not rates:

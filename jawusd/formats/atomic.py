@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from jawusd.errors import OutputError
 
-# Every unfinished file and folder starts like this: what a killed run leaves behind can be told and cleared away.
+# Prefix of every unfinished file and folder, by which what a killed run leaves behind is recognised and deleted.
 _UNFINISHED = ".jawusd-tmp-"
 
 

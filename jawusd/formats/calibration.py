@@ -14,7 +14,7 @@ import numpy as np
 
 from jawusd.errors import CalibrationError
 from jawusd.formats.atomic import write_text_atomic
-from jawusd.formats.toml import read_toml
+from jawusd.formats.text import read_toml
 from jawusd.geometry import Camera, make_transform, rigidity_defect, so3_exp, so3_log
 from jawusd.geometry.arrays import Array
 

@@ -1,4 +1,4 @@
-"""Calibrations of other programs, told apart by their names: aniposelib TOML, COLMAP text, nerfstudio JSON.
+"""Calibrations of other programs, recognised by their names: aniposelib TOML, COLMAP text, nerfstudio JSON.
 
 COLMAP: `cameras.txt` and `images.txt` (https://colmap.github.io/format.html); rotation (w, x, y, z) and translation
 take world to camera. nerfstudio: `transforms.json` (https://docs.nerf.studio/quickstart/data_conventions.html);
@@ -203,7 +203,7 @@ def _nerfstudio_lens(path: Path, values: dict[str, object], where: str) -> tuple
             raise CalibrationError(f'{where} has no number "{key}".', path=path)
         found[key] = float(value)
     if found["k4"] != 0:
-        # nerfstudio's k4 is a fourth power of r^2; OpenCV's fourth coefficient stands in a denominator.
+        # nerfstudio's k4 is a fourth power of r^2; OpenCV's fourth coefficient is in a denominator.
         raise CalibrationError(f"{where} has k4 = {found['k4']:g}, allowed is 0.", path=path)
     K = _matrix(path, where, found["fl_x"], found["fl_y"], found["cx"], found["cy"])
     lens = np.array([found[key] for key in ("k1", "k2", "p1", "p2", "k3")])

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from jawusd.errors import CaptureError, FormatError, UnitsError
 from jawusd.formats.npz import check_format
-from jawusd.formats.toml import read_toml
+from jawusd.formats.text import read_toml
 from jawusd.geometry import rigidity_defect
 
 FAMILY, VERSION = "jawusd-capture", 1

@@ -107,7 +107,7 @@ def _statements(text: str) -> Iterator[list[str]]:
         try:
             tomllib.loads("".join(pending))
         except tomllib.TOMLDecodeError:
-            continue  # the value goes on in the next line
+            continue  # the value continues in the next line
         yield pending
         pending = []
     if pending:
@@ -130,7 +130,7 @@ def _after(lines: list[str]) -> list[str]:
 
 
 def _check(before: str, after: str, picks: Bootstrap) -> None:
-    """Compare what the two texts say.
+    """Compare the contents of two texts.
 
     Raises:
         ValueError: more than the picks has changed.

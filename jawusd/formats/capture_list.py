@@ -45,7 +45,7 @@ def load_capture_list(path: str | os.PathLike[str]) -> list[ListedCapture]:
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         item = _listed(line, folder, path, number)
-        # Some file systems do not tell upper from lower case.
+        # Some file systems ignore case.
         earlier = lines.setdefault(item.name.casefold(), number)
         if earlier != number:
             raise FormatError(

@@ -82,7 +82,7 @@ class Experiments:
     condyle_paths: tuple[CondylePath, ...]  # one per model
     distances: tuple[Distances, ...]  # everything measured, in the order of the table
     coverage: Coverage  # captured part of the envelope
-    # how many frames each model left out; models that could not be fitted, and why; what was not asked for
+    # how many frames each model left out; models that could not be fitted, and why; what was not requested
     notes: tuple[str, ...]
     parameter_paths: tuple[ParameterPath, ...] = ()  # of the linear and the default model, for each parameter
 

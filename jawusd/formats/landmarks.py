@@ -11,7 +11,6 @@ optional.
 
 from __future__ import annotations
 
-import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,11 +19,13 @@ import numpy as np
 
 from jawusd.errors import FormatError, UnitsError
 from jawusd.formats.npz import check_format
+from jawusd.formats.text import parse_json, read_text
 from jawusd.geometry import LANDMARKS, rigidity_defect
 from jawusd.geometry.arrays import Array
 
 FAMILY, VERSION = "jawusd-landmarks", 1
 _RIGID_TOLERANCE = 1e-6
+_MAX_BYTES = 1 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,12 +45,7 @@ def load_landmarks(path: str | os.PathLike[str]) -> LandmarkFile:
         UnitsError: lengths not in mm.
     """
     path = Path(path)
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise FormatError("there is no such file.", path=path) from error
-    except (OSError, ValueError, RecursionError) as error:
-        raise FormatError(f"is not JSON ({error}).", path=path) from error
+    data = parse_json(read_text(path, _MAX_BYTES), path)
     if not isinstance(data, dict):
         raise FormatError("must be a JSON object.", path=path)
     check_format(data.get("format"), FAMILY, VERSION, path)

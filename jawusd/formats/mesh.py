@@ -11,10 +11,10 @@ from jawusd.geometry.arrays import Array, Mask
 
 GUM, TOOTH, BOUNDARY = 0, 1, 2
 
-# How far red or green must stand out from the other channels (of 255) to be a label: painted labels stand out by more
-# (pure red by 255), the gum of photographic scan textures, such as (200, 110, 110), by less.
+# How far red or green must exceed the other channels (of 255) to be a label: painted labels exceed them by more (pure
+# red by 255), the gum of photographic scan textures, such as (200, 110, 110), by less.
 _PAINT_CONTRAST = 100
-_FEWEST_PAINTED = 0.01  # share of the vertices; a handful of reddish ones is no labelling
+_FEWEST_PAINTED = 0.01  # share of the vertices; a handful of reddish ones is not a labelling
 
 
 @dataclass(frozen=True, eq=False)

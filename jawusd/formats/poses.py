@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 
 from jawusd.errors import FormatError
 from jawusd.formats.atomic import write_text_atomic
-from jawusd.formats.text import read_text
+from jawusd.formats.text import parse_json, read_text
 from jawusd.geometry import make_transform, matrix_from_wxyz, rigidity_defect
 from jawusd.geometry.arrays import Array
 
@@ -60,10 +59,7 @@ def _delimiter(text: str) -> str:
 
 
 def _json_columns(text: str, path: Path) -> dict[str, list[str]]:
-    try:
-        records = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise FormatError(f"is not JSON ({error}).", path=path) from error
+    records = parse_json(text, path)
     if not isinstance(records, list) or not all(isinstance(record, dict) for record in records):
         raise FormatError("must be a JSON list of objects, one per frame.", path=path)
     if not records:

@@ -45,7 +45,7 @@ class RigFacts:
     """Say what was found out about the rig files."""
 
     table_error_mm: float  # largest vertex distance of the sampled decoder to the exact model [mm]
-    findings: tuple[str, ...]  # what the validators say, "severity: message"; empty when all is well
+    findings: tuple[str, ...]  # of the validators, "severity: message"; empty when all is well
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +55,7 @@ class ReportData:
     actor: str
     tracks: Tracks
     model: JawModel
-    sync: Mapping[str, object]  # result of the sync stage: `offsets`, `method` and what it says of its confidence
+    sync: Mapping[str, object]  # result of the sync stage: `offsets`, `method` and its confidence
     cameras: tuple[CameraFacts, ...]  # empty where the capture is not at hand
     inferred: tuple[str, ...]  # what was derived instead of being given
     seconds: Mapping[str, float]  # per stage [s]

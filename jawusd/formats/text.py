@@ -1,10 +1,15 @@
-"""Read text files with errors that name the file."""
+"""Read text files, TOML and JSON with errors that name the file."""
 
 from __future__ import annotations
 
+import json
+import os
+import tomllib
 from pathlib import Path
 
 from jawusd.errors import FormatError
+
+_MOST_TOML_BYTES = 4 << 20
 
 
 def read_text(path: Path, most_bytes: int, encoding: str = "utf-8") -> str:
@@ -24,3 +29,28 @@ def read_text(path: Path, most_bytes: int, encoding: str = "utf-8") -> str:
         raise FormatError(f"is not UTF-8 text ({error}).", path=path) from error
     except OSError as error:
         raise FormatError(f"cannot be read: {error.strerror}.", path=path) from error
+
+
+def read_toml(path: str | os.PathLike[str]) -> dict[str, object]:
+    """Return the tables and values of a TOML file.
+
+    Raises:
+        FormatError: missing, too large, not UTF-8 or not TOML.
+    """
+    path = Path(path)
+    try:
+        return tomllib.loads(read_text(path, _MOST_TOML_BYTES))
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise FormatError(f"is not valid TOML: {error}.", path=path) from error
+
+
+def parse_json(text: str, path: Path) -> object:
+    """Return the value of a JSON text read from a file.
+
+    Raises:
+        FormatError: it is not JSON.
+    """
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise FormatError(f"is not JSON ({error}).", path=path) from error

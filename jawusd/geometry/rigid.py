@@ -10,18 +10,18 @@ from jawusd.geometry.se3 import make_transform
 
 
 def rigid_fit(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = None) -> Array:
-    """Return the rigid T (4, 4) minimising sum w |T source - target|^2 (Arun et al. 1987, Umeyama 1991).
+    """Return the rigid T (..., 4, 4) minimising sum w |T source - target|^2 (Arun et al. 1987, Umeyama 1991).
 
     Args:
         source: points [mm], shape (N, 3), N >= 3, not on one line.
-        target: points [mm], shape (N, 3).
+        target: points [mm], one set or many, shape (..., N, 3).
         weights: non-negative, shape (N,).
 
     Raises:
         ValueError: wrong shapes, fewer than three points, or points on one line.
     """
     P, Q = np.asarray(source, dtype=np.float64), np.asarray(target, dtype=np.float64)
-    if P.shape != Q.shape or P.ndim != 2 or P.shape[1] != 3 or len(P) < 3:
+    if P.shape != Q.shape[-2:] or P.ndim != 2 or P.shape[1] != 3 or len(P) < 3:
         raise ValueError(f"source and target must both have shape (N >= 3, 3), got {P.shape} and {Q.shape}")
     w = np.ones(len(P)) if weights is None else np.asarray(weights, dtype=np.float64)
     w = w / w.sum()
@@ -29,9 +29,10 @@ def rigid_fit(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = 
     spread = np.linalg.svd((P - p0) * np.sqrt(w)[:, None], compute_uv=False)
     if spread[1] < 1e-9 * max(spread[0], 1e-300):
         raise ValueError("the source points lie on one line: their rotation about it is free")
-    U, _, Vt = np.linalg.svd(((P - p0) * w[:, None]).T @ (Q - q0))
-    D = np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
-    R = (U @ D @ Vt).T
+    U, _, Vt = np.linalg.svd(((P - p0) * w[:, None]).T @ (Q - q0[..., None, :]))
+    sign = np.ones((*U.shape[:-2], 1, 3))
+    sign[..., 0, 2] = np.sign(np.linalg.det(U @ Vt))
+    R = np.swapaxes((U * sign) @ Vt, -1, -2)
     return make_transform(R, q0 - R @ p0)
 
 

@@ -1,4 +1,4 @@
-"""Rodrigues' formula in operators alone, for floats, arrays, tensors and graph values alike.
+"""Rodrigues' formula in operators alone, for floats, arrays, tensors and graph values.
 
 With W the skew matrix of a rotation vector omega and x = |omega|^2, the rotation is ``I + a W + b W W`` and its left
 Jacobian ``I + b W + c W W``, where a = sin t / t, b = (1 - cos t) / t^2, c = (t - sin t) / t^3 and t = sqrt(x) (Sola,

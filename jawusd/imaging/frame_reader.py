@@ -18,7 +18,7 @@ _KEPT_BYTES = 128 << 20
 
 
 class FrameReader:
-    """Give single pictures of one video; several threads may ask.
+    """Read single pictures of one video; safe to use from several threads.
 
     A decoder keeps running where the last picture was, so that the next one costs one picture; the last pictures are
     kept. A jump starts at the key frame before.
@@ -53,7 +53,7 @@ class FrameReader:
 
     def _read_to(self, index: int) -> None:
         running = self._running
-        self._running = None  # should it fail, the next picture starts anew
+        self._running = None  # if decoding fails, the next picture opens the file again
         if running is None or not self._next <= index < self._next + _AHEAD:
             walks_back = self._last - _BACK <= index < self._last
             first = max(0, index - min(_BACK, self._most - 1)) if walks_back else index

@@ -31,7 +31,7 @@ class MaskReader:
 
     Attributes:
         path: PNG pattern or video.
-        count: one past the last frame the source knows of.
+        count: one past the last frame of the source.
     """
 
     def __init__(

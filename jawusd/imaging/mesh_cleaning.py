@@ -20,7 +20,7 @@ def manifold(mesh: Mesh) -> Mesh:
     """Return a surface as a manifold, of the same shape but for what cannot be one.
 
     Points at the same place are merged, empty and repeated faces dropped; where more than two faces meet in an edge,
-    the smallest ones go; faces that are linked are wound alike; parts that touch in a point alone get a point each.
+    the smallest ones go; linked faces are wound consistently; parts that touch only in a point get a point each.
     """
     surface = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     surface.merge_vertices()

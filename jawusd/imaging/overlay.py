@@ -98,7 +98,7 @@ def tracking_sheet(
             if own is not None:
                 picture = next(videos[camera.name].frames(own, own + 1, colour="rgb")).image
                 tile = _cut_to_teeth(draw_overlay(picture, camera, scans), camera, scans, tile_px)
-            tiles.append(_captioned(tile, f"{camera.name}  frame {frame}"))
+            tiles.append(captioned(tile, f"{camera.name}  frame {frame}"))
     return contact_sheet(tiles, len(cameras))
 
 
@@ -166,7 +166,8 @@ def _cut_to_teeth(
     return np.asarray(cv2.warpAffine(image, to_tile, tile_px, flags=shrinks), np.uint8)
 
 
-def _captioned(tile: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
+def captioned(tile: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
+    """Return an RGB tile (h, w, 3) under a line of text."""
     out = np.vstack([np.zeros((_CAPTION_PX, tile.shape[1], 3), np.uint8), tile])
     cv2.putText(out, text, (6, _CAPTION_PX - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1, cv2.LINE_AA)
     return out

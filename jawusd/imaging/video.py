@@ -21,7 +21,7 @@ from jawusd.imaging.pixels import Colour, Slices, converted
 from jawusd.imaging.timeline import Timeline
 
 _REENCODE = "Re-encode it, for example: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp4."
-# WebM keeps transparency in a second stream, which only these decoders read; the file's meta data tell of it.
+# WebM keeps transparency in a second stream, which only these decoders read; announced in the file's meta data.
 _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
 
 
@@ -44,7 +44,7 @@ class Video:
         timeline: which picture is shown at which frame.
         start_s: presentation time of the first picture in the file, where its sound counts from too [s].
         fps: average pictures per second.
-        rotation_deg: counter-clockwise turn the file asks for: 0, 90, 180 or 270. It is applied to every picture.
+        rotation_deg: counter-clockwise turn stored in the file: 0, 90, 180 or 270. It is applied to every picture.
         size_px: (width, height) after rotation.
         has_alpha: the pictures carry transparency.
         is_gray: they are stored as one channel.
@@ -187,7 +187,7 @@ class Video:
                     dts.append(packet.pts if packet.dts is None else packet.dts)
                     key.append(packet.is_keyframe)
         except av.FFmpegError:
-            # A file that breaks off: what stands before the break counts, `announced` tells whether more was promised.
+            # A truncated file: what precedes the break counts; `announced` shows whether more was promised.
             pass
         order = np.argsort(pts, kind="stable")
         times = np.array(pts, np.int64)[order]
@@ -228,7 +228,7 @@ class Video:
             return
         decoder = av.CodecContext.create(self._alpha_decoder, "r")
         for packet in container.demux(stream):
-            # PyAV's stub does not say that a decoder of pictures is made.
+            # PyAV's stub lacks the decoder's class.
             yield from decoder.decode(packet if packet.size else None)  # type: ignore[attr-defined]
 
     def _undecodable(self, index: int) -> CaptureError:

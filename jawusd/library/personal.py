@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from jawusd.errors import FittingError
-from jawusd.geometry import LANDMARKS, transform_points
+from jawusd.geometry import LANDMARKS, rigid_fit, transform_points
 from jawusd.geometry.arrays import Array
-from jawusd.library.transport import Donor, displacements, landmark_distance_mm, poses_of_landmarks
+from jawusd.library.transport import Donor, displacements, landmark_distance_mm
 
-# Landmark distances [mm] at which a person counts exp(-1/2) as much as one with the same landmarks; inf: all alike.
+# Landmark distances [mm] at which a person's weight falls to exp(-1/2); inf: equal weights.
 BANDWIDTHS_MM = (math.inf, 4.0, 2.0, 1.0)
 _POSES = 1600
 _POSES_LEFT_OUT = 120  # poses per person that leaving-one-out looks at
@@ -65,8 +65,8 @@ class Expected:
 class Learned:
     """What a library says of itself."""
 
-    # landmark distance over which a person's weight falls by exp(-1/2), inf when all count alike; None when the closest
-    # person alone counts
+    # landmark distance over which a person's weight falls by exp(-1/2), inf for equal weights; None when only the
+    # closest person is used
     bandwidth_mm: float | None
     expected: Expected | None  # error to be expected; None when the library has a single person
 
@@ -104,7 +104,7 @@ def leave_one_out(donors: Sequence[Donor], *, closest: bool = False) -> Learned:
         moved = np.stack([displacements(donor, rest, shares) for donor in others])
         for found, bandwidth in zip(errors, choices, strict=True):
             average = np.einsum("j,jkpi->kpi", _weights(others, rest, bandwidth), moved)
-            predicted = transform_points(poses_of_landmarks(rest, rest + average), rest)
+            predicted = transform_points(rigid_fit(rest, rest + average), rest)
             found[left_out.name] = np.linalg.norm(predicted - truth, axis=-1)
     expected = [Expected(found) for found in errors]
     best = int(np.argmin([found.pooled().mean() for found in expected]))
@@ -123,7 +123,7 @@ def personal_motion(donors: Sequence[Donor], target: Array, learned: Learned) ->
     shares = np.concatenate([_captured_shares(donor, _POSES // len(used)) for donor, _ in used])
     moved = sum(weight * displacements(donor, target, shares) for donor, weight in used)
     return PersonalMotion(
-        poses_of_landmarks(target, target + moved), {donor.name: float(weight) for donor, weight in used}, learned
+        rigid_fit(target, target + moved), {donor.name: float(weight) for donor, weight in used}, learned
     )
 
 

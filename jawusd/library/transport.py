@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jawusd.evaluator import JawRig
-from jawusd.geometry import landmark_frame, make_transform, rigid_fit, transform_points
+from jawusd.geometry import landmark_frame, rigid_fit, transform_points
 from jawusd.geometry.arrays import Array
 
 
@@ -61,13 +61,3 @@ def displacements(donor: Donor, target: Array, shares: Array) -> Array:
     axes = landmark_frame(target)[:3, :3]  # rows: left, up and anterior in the target's frame
     to_target = axes.T @ np.diag([width, reach, reach]) @ axes @ rigid_fit(rest, target)[:3, :3]
     return moved @ to_target.T
-
-
-def poses_of_landmarks(rest: Array, moved: Array) -> Array:
-    """Return the rigid motions (K, 4, 4) that bring landmarks (P, 3) nearest to others (K, P, 3) (Kabsch 1976)."""
-    p, q = rest.mean(axis=0), moved.mean(axis=1)
-    U, _, Vt = np.linalg.svd(np.swapaxes(moved - q[:, None], 1, 2) @ (rest - p))
-    sign = np.ones((len(moved), 3))
-    sign[:, 2] = np.linalg.det(U @ Vt)
-    R = U * sign[:, None, :] @ Vt
-    return make_transform(R, q - R @ p)

@@ -21,13 +21,13 @@ _ARCH_BLUR_PX = 0.8  # softens the border between the arches to fractions of a p
 
 @dataclass(frozen=True, eq=False)
 class Seeds:
-    """Hold what a person said about a working picture."""
+    """Hold what a person drew in a working picture."""
 
-    known: Mask  # where something is said about each arch, shape (2, h, w)
+    known: Mask  # where a person marked each arch as tooth or not, shape (2, h, w)
     share: NDArray[np.float32]  # of tooth there, shape (2, h, w)
 
     def pinned(self, shares: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return shares of both arches, shape (2, h, w), replaced by what a person said where something is said."""
+        """Return shares of both arches, shape (2, h, w), replaced by what a person drew where it is known."""
         shares = np.where(self.known, self.share, shares)
         other = self.known & (self.share > 0.5)
         return np.where(other[::-1] & ~self.known, 0, shares)
@@ -48,8 +48,8 @@ def learn_colours(
 
 def doubted_odds(rgb: NDArray[np.uint8], model: ColourModel, config: SegmentationConfig) -> NDArray[np.float32]:
     """Return the log-odds of being tooth that colours alone give, less what is demanded of them, shape (h, w)."""
-    demanded = model.surroundings_reach(config.surroundings_share) + config.doubt
-    return model.weigh(rgb) - np.float32(np.clip(demanded, *config.doubt_range))
+    demanded = model.surroundings_quantile(config.surroundings_share) + config.doubt
+    return model.log_odds(rgb) - np.float32(np.clip(demanded, *config.doubt_range))
 
 
 def cut_arches(
@@ -95,7 +95,7 @@ def part_arches(
     config: SegmentationConfig,
     px_per_mm: float,
 ) -> NDArray[np.float32]:
-    """Return the shares of both arches, shape (2, h, w), with the border between them drawn by edges among teeth alone.
+    """Return the shares of both arches, shape (2, h, w), with the border between them drawn by edges among teeth only.
 
     The sum of both is kept. Teeth over teeth show a far weaker edge than teeth over lips. Beside the latter it would
     count for nothing: the border would stay where it was expected, and poses would follow their own prediction.

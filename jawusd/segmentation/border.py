@@ -13,7 +13,7 @@ from jawusd.segmentation.colours import shadeless
 from jawusd.segmentation.config import SegmentationConfig
 
 _EVEN = 1e-4  # variance of the logs that is added [-]: half an 8-bit step
-_FEWEST = 100  # pixels that tell how much colours spread
+_FEWEST = 100  # fewest pixels that give the spread of colours
 _ARCH_BLUR_PX = 0.8  # softens the border between the arches to fractions of a pixel
 _FAR_BLUR_PX = 2.0  # finds the nearer arch for pixels that have become teeth
 
@@ -32,9 +32,9 @@ def settle_borders(
 ) -> tuple[NDArray[np.float32], Mask]:
     """Return shares (2, h, w) with soft borders, half at the outline, and where a border would show, shape (h, w).
 
-    Teeth are told from surroundings once more, along their border, by the colours on either side right there. Colours
-    learned over the take decide what is tooth; where exactly it ends they decide badly, as the middle between two
-    colours differs from place to place. Fisher's discriminant between the means on both sides, weighted by how much
+    Teeth are separated from surroundings once more, along their border, by the local colours on either side. Colours
+    learned over the take decide what is tooth, but not where exactly it ends, as the middle between two colours
+    differs from place to place. Fisher's discriminant between the means on both sides, weighted by how much
     colours spread on one side, finds it (the local region statistics of Lankton & Tannenbaum 2008). Where the sides do
     not differ the border stays, and a part with such a border most of the way round is no tooth.
     """

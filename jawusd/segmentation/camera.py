@@ -21,7 +21,7 @@ from jawusd.segmentation.learn import Example, cut_picture
 from jawusd.segmentation.picture import PictureFrame, Window
 
 _ARCHES = (0, 1)
-_EVERY = 20  # vertices of a crown to one that tells where it is
+_EVERY = 20  # of so many crown vertices one is projected to find the window
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,11 +81,11 @@ class CameraSegmenter:
             return None
         expected = expect_crowns(self._scans, poses, window.camera)
         seeds = self._seeds(window, keys)
-        if turn == 0 or not self.colours.knows():
+        if turn == 0 or not self.colours.is_trained():
             self._learn(window, expected, keys, seeds)
         reach = c.reach_mm[min(turn, len(c.reach_mm) - 1)]
-        # Outlines made here are steadier than drawn ones, and the tracker judges them by one another: a finished mask
-        # takes over only where the cut goes wrong.
+        # Outlines made here are steadier than drawn ones, and the tracker compares them with one another: a
+        # finished mask replaces a cut only where it fails.
         drawn = seeds.share if seeds is not None and seeds.known.all() else None
         guide = None if drawn is not None else seeds
         # Borders settle in the first turn too: the tracker takes rougher outlines than it is used to for a lost row.
@@ -110,7 +110,7 @@ class CameraSegmenter:
         """
         c = self._config
         around = np.concatenate([self._around(poses) for poses in guesses])
-        window = self._frame.window(image, around, c.margin_mm) if self.colours.knows() else None
+        window = self._frame.window(image, around, c.margin_mm) if self.colours.is_trained() else None
         if window is None:
             return np.zeros(len(guesses))
         odds = np.clip(doubted_odds(window.rgb, self.colours, c), *c.agreement_range)
@@ -150,7 +150,7 @@ class CameraSegmenter:
         return Seeds(known | all(key is not None and key.finished for key in keys), share)
 
     def _learn(self, window: Window, expected: Expectation, keys: Sequence[Key | None], seeds: Seeds | None) -> None:
-        """Let the colours follow a picture, and above all what a person said about it."""
+        """Update the colours with a picture, and above all with what a person drew in it."""
         c = self._config
         if not all(key is not None and key.finished for key in keys):
             learn_colours(self.colours, window.rgb, expected, c, self._frame.px_per_mm)
@@ -162,7 +162,7 @@ class CameraSegmenter:
 
     def _contrast(self, window: Window, masks: NDArray[np.uint8]) -> Array:
         """Return how much likelier teeth are just inside the outline of an arch than just outside of both."""
-        odds = self.colours.weigh(window.rgb)
+        odds = self.colours.log_odds(window.rgb)
         share = 1 / (1 + np.exp(-odds))
         teeth = (masks.max(0) > 127).astype(np.uint8)
         kernel = np.ones((5, 5), np.uint8)

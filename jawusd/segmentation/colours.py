@@ -13,20 +13,20 @@ _BINS = 32  # per channel
 _FLOOR = 12.0  # added to every channel before ratios [8-bit steps]: noise of dark pixels has no colour
 _RATIO_STEP = 0.03  # width of a bin of the log ratios [-]: from red over green 0.6 to 1.6 and beyond
 _MOST = 6.0  # bound of the log-odds by colour alone [-]
-_ROUNDS, _STEPS = 5, 8  # times covered crowns are told apart, and Newton steps each time
+_ROUNDS, _STEPS = 5, 8  # times hidden crowns are reclassified, and Newton steps each time
 _LIGHT = 1  # the term of lightness
 _RIDGE = 0.01  # keeps weights finite where colours do not overlap
 
 
 class ColourModel:
-    """Learn the colours of teeth and of everything around them, and weigh colours by it.
+    """Learn the colours of teeth and of their surroundings, and rate colours by log-odds.
 
     What lies under projected crowns is teeth and, where lips, cheeks or tongue hide them, surroundings; what lies
-    beyond them is surroundings. A logistic regression on the colours, their squares and products tells the two apart;
+    beyond them is surroundings. A logistic regression on the colours, their squares and products separates the two;
     what it finds to be surroundings under the crowns changes class, and it is fitted again. So few terms cannot follow
     colours of lips that happen to lie under crowns only.
 
-    Colours are lightness and the logs of red and blue over green: shade scales the channels alike and leaves those
+    Colours are lightness and the logs of red and blue over green: shade scales all channels equally and leaves those
     (Finlayson et al. 2006), so that back teeth in the shade of the mouth look like the lit ones in front.
     """
 
@@ -46,8 +46,8 @@ class ColourModel:
             counts += weight * new / max(1, where.sum())
         self._table = None
 
-    def knows(self) -> bool:
-        """Tell whether any picture was seen."""
+    def is_trained(self) -> bool:
+        """Return whether any picture was seen."""
         return bool(self._under.any() and self._beyond.any())
 
     def counts(self) -> tuple[NDArray[np.int64], Array]:
@@ -63,11 +63,11 @@ class ColourModel:
             into.ravel()[seen] = known
         self._table = None
 
-    def weigh(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+    def log_odds(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
         """Return the log-odds of tooth against surroundings per pixel, shape (h, w)."""
         return self._odds()[_bins(rgb)]
 
-    def surroundings_reach(self, share: float) -> float:
+    def surroundings_quantile(self, share: float) -> float:
         """Return the log-odds that the given share of the surroundings stays below."""
         odds, counts = self._odds(), self._beyond.ravel()
         order = np.argsort(odds)
@@ -75,7 +75,7 @@ class ColourModel:
 
     def _odds(self) -> NDArray[np.float32]:
         if self._table is None:
-            weights = _tell_apart(self._under.ravel(), self._beyond.ravel())
+            weights = _fitted_weights(self._under.ravel(), self._beyond.ravel())
             self._table = np.clip(_terms() @ weights, -_MOST, _MOST).astype(np.float32)
         return self._table
 
@@ -113,7 +113,7 @@ def _terms() -> Array:
     return np.stack([np.ones_like(a), light, a, b, a**2, b**2, a * b], axis=1)
 
 
-def _tell_apart(under: Array, beyond: Array) -> Array:
+def _fitted_weights(under: Array, beyond: Array) -> Array:
     """Return the weights of the terms from the counts of every bin, shape (7,); darkness never counts for teeth."""
     seen = np.flatnonzero(under + beyond)
     x = _terms()[seen]

@@ -22,7 +22,7 @@ class SegmentationConfig:
     # Frames over which colours are remembered [-]: light changes with the head, not from frame to frame.
     memory_frames: float = 24.0
     # Share of the surroundings below whose log-odds a colour cannot be tooth [-], and how much higher [-] its log-odds
-    # must be where place says nothing: how well colours tell the two apart differs from person to person.
+    # must be where place gives no evidence: how well colours separate the two differs from person to person.
     surroundings_share: float = 0.95
     doubt: float = 1.5
     # Bounds of the log-odds demanded in all [-].
@@ -50,7 +50,7 @@ class SegmentationConfig:
     speck_px: int = 25
     # Iterations of the cut [-].
     steps: int = 40
-    # How far from where it is expected the border between the arches is sought [mm], and iterations for that [-].
+    # How far from where it is expected the border between the arches is searched [mm], and iterations for that [-].
     arch_band_mm: float = 1.0
     arch_steps: int = 60
     # Weight of a person's mask in the colours [frames].

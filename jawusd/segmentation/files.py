@@ -15,7 +15,7 @@ from jawusd.imaging.mask_files import PngMasks
 
 ARCHES = ("upper", "lower")
 PATTERN = "%06d.png"
-_UNKNOWN = 128  # gray value of strokes where nothing is said
+_UNKNOWN = 128  # gray value of strokes where nothing was drawn
 _STROKES_UNKNOWN = 0.5  # share of such pixels that makes a picture one of strokes
 
 
@@ -54,7 +54,7 @@ class KeyMasks:
     """Give what a person drew for some frames, in folders named as those that are written.
 
     A picture is a finished mask, or, where at least half of it has the gray value 128, strokes: 255 on teeth of the
-    arch, 0 on anything else, 128 where nothing is said.
+    arch, 0 on anything else, 128 where nothing was drawn.
     """
 
     def __init__(self, folder: Path | None, sizes_px: dict[str, tuple[int, int]]) -> None:

@@ -10,13 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.geometry.arrays import Mask
-from jawusd.imaging.overlay import LOWER_COLOUR, UPPER_COLOUR, contact_sheet, save_png
+from jawusd.imaging.overlay import LOWER_COLOUR, UPPER_COLOUR, captioned, contact_sheet, save_png
 from jawusd.imaging.video import Video
 from jawusd.segmentation.files import ARCHES, KeyMasks
 
 _COLUMNS = 3
 _TILE_PX = (480, 270)
-_CAPTION_PX = 22
 _MARGIN = 0.15  # of the teeth's extent, left around them
 
 
@@ -46,10 +45,7 @@ def _tile(picture: NDArray[np.uint8], masks: Sequence[NDArray[np.uint8] | None],
             cv2.drawContours(picture, outlines, -1, colour, 2)
             extent |= mask > 127
     cut = np.asarray(cv2.resize(_cut(picture, extent), _TILE_PX, interpolation=cv2.INTER_AREA), np.uint8)
-    tile = np.vstack([np.zeros((_CAPTION_PX, cut.shape[1], 3), np.uint8), cut])
-    place = (6, _CAPTION_PX - 7)
-    cv2.putText(tile, caption, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1, cv2.LINE_AA)
-    return tile
+    return captioned(cut, caption)
 
 
 def _cut(picture: NDArray[np.uint8], extent: Mask) -> NDArray[np.uint8]:

@@ -67,6 +67,7 @@ def test_rigid_fit_recovers_a_motion_and_never_mirrors():
     assert np.linalg.det(rigid_fit(p, p * [-1, 1, 1])[:3, :3]) == pytest.approx(1)
     q = transform_points(T, p)
     q[0] += 10
+    np.testing.assert_allclose(rigid_fit(p, np.stack([q, p])), [rigid_fit(p, q), np.eye(4)], atol=1e-12)
     weighted = rigid_fit(p, q, weights=[0, 1, 1, 1])
     np.testing.assert_allclose(weighted, T, atol=1e-10)
 

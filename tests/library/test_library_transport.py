@@ -6,9 +6,9 @@ from example_people import person
 from scipy.spatial.transform import Rotation
 
 from jawusd.errors import FittingError
-from jawusd.geometry import make_transform, random_rotation, so3_exp, transform_points
+from jawusd.geometry import make_transform, random_rotation, rigid_fit, so3_exp, transform_points
 from jawusd.library.personal import leave_one_out, personal_motion
-from jawusd.library.transport import Donor, displacements, landmark_distance_mm, poses_of_landmarks
+from jawusd.library.transport import Donor, displacements, landmark_distance_mm
 
 D = np.array([[0.0, 0, 0], [20, 2, 1], [8, -4, 0.5], [38, 0, 0], [3, 1, 3]])
 
@@ -25,7 +25,7 @@ def motions(donor, d):
 
 def carried(donor, target, d):
     shares = donor.rig.normalized(d)
-    return poses_of_landmarks(target, target + displacements(donor, target, shares))
+    return rigid_fit(target, target + displacements(donor, target, shares))
 
 
 def test_to_the_same_bones_a_motion_is_carried_unchanged(donor):
@@ -58,7 +58,7 @@ def test_poses_of_landmarks_agree_with_scipy():
     rng = np.random.default_rng(2)
     rest = rng.normal(scale=40, size=(5, 3))
     moved = transform_points(make_transform(so3_exp([0.3, -0.1, 0.2]), [1.0, 2, 3]), rest) + rng.normal(size=(5, 3))
-    found = poses_of_landmarks(rest, moved[None])[0]
+    found = rigid_fit(rest, moved[None])[0]
     expected, _ = Rotation.align_vectors(moved - moved.mean(0), rest - rest.mean(0))
     np.testing.assert_allclose(found[:3, :3], expected.as_matrix(), atol=1e-9)
     np.testing.assert_allclose(found @ np.append(rest.mean(0), 1), np.append(moved.mean(0), 1), atol=1e-9)
@@ -87,7 +87,7 @@ def test_the_expected_error_of_a_person_does_not_use_that_person(donor):
     codes = odd.rig.arrays["codes"]
     codes = codes[:: -(-len(codes) // 120)]
     shares = odd.rig.normalized(codes)
-    predicted = poses_of_landmarks(odd.landmarks, odd.landmarks + displacements(donor, odd.landmarks, shares))
+    predicted = rigid_fit(odd.landmarks, odd.landmarks + displacements(donor, odd.landmarks, shares))
     truth = transform_points(odd.rig.pose(codes), odd.rig.arrays["landmarks"])
     by_hand = np.linalg.norm(transform_points(predicted, odd.landmarks) - truth, axis=-1)
     np.testing.assert_allclose(learned.expected.errors_mm["odd"], by_hand, atol=1e-6)

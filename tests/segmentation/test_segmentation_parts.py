@@ -81,13 +81,13 @@ def test_lips_over_crowns_are_not_teeth():
     beyond = np.zeros((100, 100), bool)
     beyond[70:] = beyond[:10] = True
     model = ColourModel(10.0)
-    assert not model.knows()
+    assert not model.is_trained()
     model.learn(rgb, under, beyond)
-    odds = model.weigh(rgb)
-    assert model.knows()
+    odds = model.log_odds(rgb)
+    assert model.is_trained()
     assert (odds[40:60] > 0).mean() > 0.98
     assert (odds[20:40] < 0).mean() > 0.98
-    reach = model.surroundings_reach(0.9)
+    reach = model.surroundings_quantile(0.9)
     assert (odds[beyond] <= reach).mean() == pytest.approx(0.9, abs=0.05)
 
 
@@ -100,8 +100,8 @@ def test_dark_lips_under_crowns_do_not_make_darkness_teeth():
     under[30:60] = True
     model = ColourModel(10.0)
     model.learn(rgb, under, ~under)
-    assert np.median(model.weigh(rgb)[30:40]) < 0
-    assert (model.weigh(rgb)[40:60] > 0).mean() > 0.95
+    assert np.median(model.log_odds(rgb)[30:40]) < 0
+    assert (model.log_odds(rgb)[40:60] > 0).mean() > 0.95
 
 
 def test_borders_settle_where_the_picture_changes():
@@ -258,10 +258,10 @@ def test_colours_go_on_where_they_stopped(tmp_path):
     states = ColourStates(tmp_path, {"cam0": fresh})
     assert states.take_up(9, 1) is None
     assert states.take_up(5, -1) is None
-    assert not fresh.knows()
+    assert not fresh.is_trained()
     assert states.take_up(7, 1) == 6  # frame 7 is on record, its colours are not
     assert states.take_up(5, 1) == 5
-    assert np.array_equal(fresh.weigh(rgb), model.weigh(rgb))
+    assert np.array_equal(fresh.log_odds(rgb), model.log_odds(rgb))
 
 
 def test_a_folder_without_key_masks_is_refused(tmp_path):
