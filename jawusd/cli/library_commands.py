@@ -58,7 +58,7 @@ def retarget(
 def _retarget_motion(
     anim: Path, source: Path, target: Path, fps: float | None, out: Path, force: bool, as_json: bool
 ) -> None:
-    from jawusd.cli.motion import carried_over, carried_over_lines
+    from jawusd.cli.motion import carried_over, emit_motion
     from jawusd.pipeline.library import load_any_rig
     from jawusd.rig import write_animation
     from jawusd.rig.read import describe
@@ -68,10 +68,10 @@ def _retarget_motion(
         if place.suffix not in (".usd", ".usda", ".usdc"):
             raise typer.BadParameter("must be a USD layer: .usda, .usdc or .usd.", param_hint=option)
     taker = load_any_rig(target)
-    motion, report = carried_over(source, anim, taker)
+    motion, changes = carried_over(source, anim, taker)
     rate = fps or motion.fps or describe(target)["fps"]
     write_animation(out, target, motion.frames, motion.d, rate, rig=taker)
-    emit({"file": str(out), "fps": rate, **report}, as_json, lambda: carried_over_lines(report, out, rate))
+    emit_motion(out, rate, motion, changes, as_json)
 
 
 def _personal(landmarks: Path, folder: Path, use: Use, out: Path, force: bool, as_json: bool) -> None:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, TypedDict
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jawusd.cli.output import emit
 from jawusd.errors import FormatError
 from jawusd.formats.arkit import read_arkit
 from jawusd.formats.keys import FARTHEST_FRAME, MOST_FRAMES, load_keys
@@ -44,40 +45,6 @@ class AuthoredMotion:
                 f"the motion runs from frame {first:g} to {last:g}; allowed are {MOST_FRAMES} frames within "
                 f"+-{FARTHEST_FRAME:g}."
             )
-
-
-class Clamped(TypedDict):
-    """Say what became of a motion kept inside the bound; sizes over the clamped frames [mm].
-
-    Attributes:
-        frames: first and last.
-        lost: frames without parameters.
-        clamped: frames that lay outside.
-    """
-
-    frames: list[float]
-    lost: int
-    clamped: int
-    largest_clamp_mm: float
-    mean_clamp_mm: float
-
-
-class CarriedOver(TypedDict):
-    """Say what became of a motion carried to another rig; sizes from equal shares of the ranges [mm].
-
-    Attributes:
-        frames: first and last.
-        samples, lost, valid: how many there are, are without parameters, and lie inside the bound.
-        clamped: samples that lay outside the bound at equal shares.
-    """
-
-    frames: list[float]
-    samples: int
-    lost: int
-    valid: int
-    clamped: int
-    mean_move_mm: float
-    largest_move_mm: float
 
 
 def read_motion(rig: JawRig, source: Path) -> AuthoredMotion:
@@ -123,29 +90,48 @@ def read_face(rig: JawRig, source: Path, fps: float | None) -> AuthoredMotion:
     return AuthoredMotion(capture.frames, d, capture.fps)
 
 
-def kept_inside(rig: JawRig, motion: AuthoredMotion) -> tuple[AuthoredMotion, Clamped]:
+@dataclass(frozen=True)
+class Changes:
+    """Say what was changed in a motion.
+
+    Attributes:
+        figures: counts and sizes [mm].
+        lines: for people; the first continues the line that names the file.
+    """
+
+    figures: dict[str, float]
+    lines: list[str]
+
+
+def emit_motion(out: Path, rate: float, motion: AuthoredMotion, changes: Changes, as_json: bool) -> None:
+    """Print which motion was written, and what was changed in it."""
+    first, last = float(motion.frames[0]), float(motion.frames[-1])
+    head, *rest = changes.lines
+    result = {"file": str(out), "fps": rate, "frames": [first, last], **changes.figures}
+    emit(result, as_json, lambda: [f"{out}: frames {first:g} .. {last:g} at {rate:g} fps{head}", *rest])
+
+
+def kept_inside(rig: JawRig, motion: AuthoredMotion) -> tuple[AuthoredMotion, Changes]:
     """Move parameters to the nearest valid ones where they lie outside the bound."""
     outside = rig.margin(motion.d) < float(rig.arrays["margin_limit_mm"])
     kept = motion.d.copy()
     kept[outside] = rig.project(motion.d[outside])
     moved_mm = np.linalg.norm(kept - motion.d, axis=1)[outside]
-    report: Clamped = {
-        "frames": [float(motion.frames[0]), float(motion.frames[-1])],
-        "lost": int(np.isnan(kept).any(axis=1).sum()),
-        "clamped": int(outside.sum()),
-        "largest_clamp_mm": float(moved_mm.max(initial=0.0)),
-        "mean_clamp_mm": float(moved_mm.mean()) if moved_mm.size else 0.0,
-    }
-    return AuthoredMotion(motion.frames, kept, motion.fps), report
+    lost, clamped = int(np.isnan(kept).any(axis=1).sum()), int(outside.sum())
+    largest, mean = float(moved_mm.max(initial=0.0)), float(moved_mm.mean()) if moved_mm.size else 0.0
+    lines = ["", *_lost_line(lost)]
+    if clamped:
+        moved = f"moved by {mean:.2f} mm on average, {largest:.2f} mm at most"
+        lines.append(f"{clamped} frames lay outside the bound, {moved}")
+    figures = {"lost": lost, "clamped": clamped, "largest_clamp_mm": largest, "mean_clamp_mm": mean}
+    return AuthoredMotion(motion.frames, kept, motion.fps), Changes(figures, lines)
 
 
-def carried_over(giver: Path, source: Path, taker: JawRig) -> tuple[AuthoredMotion, CarriedOver]:
+def carried_over(source_rig: Path, source: Path, target: JawRig) -> tuple[AuthoredMotion, Changes]:
     """Read a motion of one rig and carry it to another, see `pipeline.library.retarget`.
 
     Args:
-        giver: rig the motion was made for.
         source: an animation layer, keys, or a table of d or of poses.
-        taker: the rig that shall move.
 
     Raises:
         FormatError: no such motion or rig.
@@ -153,21 +139,26 @@ def carried_over(giver: Path, source: Path, taker: JawRig) -> tuple[AuthoredMoti
     """
     from jawusd.pipeline.library import load_any_rig, retarget
 
-    rig = load_any_rig(giver)
+    rig = load_any_rig(source_rig)
     motion = _motion_of(rig, source)
-    carried = retarget(rig, taker, motion.frames, motion.d)
+    carried = retarget(rig, target, motion.frames, motion.d)
     known = np.isfinite(carried.d).all(axis=1)
-    moved_mm = carried.moved_mm[known]
-    report: CarriedOver = {
-        "frames": [float(carried.frames[0]), float(carried.frames[-1])],
-        "samples": int(known.size),
-        "lost": int((~known).sum()),
-        "valid": int(taker.validate_parameters(carried.d[known]).valid.sum()),
-        "clamped": int(carried.outside.sum()),
-        "mean_move_mm": float(moved_mm.mean()),
-        "largest_move_mm": float(moved_mm.max()),
-    }
-    return AuthoredMotion(carried.frames, carried.d, motion.fps), report
+    samples, lost = int(known.size), int((~known).sum())
+    valid, clamped = int(target.validate_parameters(carried.d[known]).valid.sum()), int(carried.outside.sum())
+    mean, largest = float(carried.moved_mm[known].mean()), float(carried.moved_mm[known].max())
+    lines = [f", {valid} of {samples - lost} samples valid", *_lost_line(lost)]
+    if clamped:
+        lines.append(f"{clamped} samples lay outside the bound at equal shares of the ranges")
+    if largest > 0.005:
+        moved = f"{mean:.2f} mm on average, {largest:.2f} mm at most"
+        lines.append(f"moved from equal shares by {moved}, to turn where the source turns and stay inside")
+    figures = {"samples": samples, "lost": lost, "valid": valid, "clamped": clamped}
+    sizes = {"mean_move_mm": mean, "largest_move_mm": largest}
+    return AuthoredMotion(carried.frames, carried.d, motion.fps), Changes({**figures, **sizes}, lines)
+
+
+def _lost_line(lost: int) -> list[str]:
+    return [f"{lost} frames say nothing and were bridged"] if lost else []
 
 
 def _motion_of(rig: JawRig, path: Path) -> AuthoredMotion:
@@ -183,33 +174,3 @@ def _motion_of(rig: JawRig, path: Path) -> AuthoredMotion:
     frames, poses = read_poses_of_stage(path)
     rate = float(open_stage(path).GetTimeCodesPerSecond())
     return AuthoredMotion(frames.astype(np.float64), rig.encode(poses)[0], rate)
-
-
-def clamped_lines(result: Clamped, out: Path, fps: float) -> list[str]:
-    """Return the report of `kept_inside` as text."""
-    first, last = result["frames"]
-    lines = [f"{out}: frames {first:g} .. {last:g} at {fps:g} fps", *_lost_line(result["lost"])]
-    if result["clamped"]:
-        moved = f"moved by {result['mean_clamp_mm']:.2f} mm on average, {result['largest_clamp_mm']:.2f} mm at most"
-        lines.append(f"{result['clamped']} frames lay outside the bound, {moved}")
-    return lines
-
-
-def _lost_line(lost: int) -> list[str]:
-    return [f"{lost} frames say nothing and were bridged"] if lost else []
-
-
-def carried_over_lines(result: CarriedOver, out: Path, fps: float) -> list[str]:
-    """Return the report of `carried_over` as text."""
-    first, last = result["frames"]
-    known = result["samples"] - result["lost"]
-    lines = [
-        f"{out}: frames {first:g} .. {last:g} at {fps:g} fps, {result['valid']} of {known} samples valid",
-        *_lost_line(result["lost"]),
-    ]
-    if result["clamped"]:
-        lines.append(f"{result['clamped']} samples lay outside the bound at equal shares of the ranges")
-    if result["largest_move_mm"] > 0.005:
-        moved = f"{result['mean_move_mm']:.2f} mm on average, {result['largest_move_mm']:.2f} mm at most"
-        lines.append(f"moved from equal shares by {moved}, to turn where the source turns and stay inside")
-    return lines

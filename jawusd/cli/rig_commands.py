@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -264,16 +263,7 @@ def animate(
     import numpy as np
 
     import jawusd
-    from jawusd.cli.motion import (
-        CarriedOver,
-        Clamped,
-        carried_over,
-        carried_over_lines,
-        clamped_lines,
-        kept_inside,
-        read_face,
-        read_motion,
-    )
+    from jawusd.cli.motion import carried_over, emit_motion, kept_inside, read_face, read_motion
     from jawusd.rig import describe, write_animation, write_splines
 
     if (source is None) == (arkit is None):
@@ -283,21 +273,15 @@ def animate(
     for path in filter(None, (out, splines)):
         refuse_existing(path, force)
     loaded = jawusd.load(rig)
-    report: Clamped | CarriedOver
-    lines: Callable[[Path, float], list[str]]
     if source is not None and retarget_from is not None:
-        motion, report = carried_over(retarget_from, source, loaded)
-        lines = partial(carried_over_lines, report)
-    else:
-        if source is not None:
-            motion = read_motion(loaded, source)
-        elif arkit is not None:
-            motion = read_face(loaded, arkit, fps)
-        motion, report = kept_inside(loaded, motion)
-        lines = partial(clamped_lines, report)
+        motion, changes = carried_over(retarget_from, source, loaded)
+    elif source is not None:
+        motion, changes = kept_inside(loaded, read_motion(loaded, source))
+    elif arkit is not None:
+        motion, changes = kept_inside(loaded, read_face(loaded, arkit, fps))
     rate = fps or motion.fps or describe(rig)["fps"]
     write_animation(out, rig, motion.frames, motion.d, rate)
     if splines is not None:
         known = np.isfinite(motion.d).all(axis=1)
         write_splines(splines, out, motion.frames[known], motion.d[known], rate)
-    emit({"file": str(out), "fps": rate, **report}, as_json, lambda: lines(out, rate))
+    emit_motion(out, rate, motion, changes, as_json)

@@ -24,7 +24,7 @@ from jawusd.pipeline.calibrate import (
 )
 from jawusd.pipeline.fit import FitSummary, fit_lines, fit_subject, fit_summary
 from jawusd.pipeline.prepare import input_hashes, naming_file, open_capture, rescaled_cameras, subject_of_capture
-from jawusd.pipeline.report import BuildFacts, missing_packages, where, write_build_report
+from jawusd.pipeline.report import BuildFacts, missing_packages, place_of, write_build_report
 from jawusd.pipeline.segment import SegmentOptions, segment_capture, with_masks
 from jawusd.pipeline.segment_record import SegmentSummary, delete_masks, segment_lines
 from jawusd.pipeline.state import (
@@ -293,7 +293,7 @@ class _Build:
         return [*files, *take], {}
 
     def _report(self, missing: str | None) -> tuple[list[Path], ReportSummary]:
-        place = where(self.capture, self.folder)
+        place = place_of(self.capture, self.folder)
         if missing is not None:
             # The rig is complete without; the summary says what is missing and how to get it.
             return [], {"capture": place, "missing": missing}

@@ -38,33 +38,16 @@ class CameraReport(TypedDict):
     missed: list[int]
 
 
-class ShapeReport(TypedDict):
-    """Sum up the errors of distances on the boards [mm]."""
-
-    distances: int
-    mean: float
-    p95: float
-    max: float
-
-
-class ScaleReport(TypedDict):
-    """Compare the size of the teeth as seen with their scans; see `capture.scale.ScaleCheck`."""
-
-    ratio: float | None
-    sigma: float | None
-    reason: str
-
-
 class CalibrationSummary(TypedDict):
     """Hold `capture.calibrate.CalibrationReport` as plain data."""
 
     cameras: dict[str, CameraReport]
     views: int
-    board_shape: ShapeReport
+    board_shape: dict[str, float]
     expected_shape_mm: float
     mouth_mm: tuple[float, float, float]
     mouth_from: str
-    scale: ScaleReport
+    scale: dict[str, float | str | None]
     advice: list[str]
     notes: list[str]
 

@@ -178,7 +178,7 @@ def fit_personal(subject: Subject, motion: PersonalMotion, progress: Progress) -
     caution = {"code": "personal", "message": _caution(motion)}
     model.meta["warnings"] = [*fit_summary(model)["warnings"], caution]
     if expected is not None:
-        limit = np.maximum(model.arrays["residual_limit_mm"], expected.summary()["mean"])
+        limit = np.maximum(model.arrays["residual_limit_mm"], expected.pooled().mean())
         model.arrays["residual_limit_mm"] = limit
     # The poses carried over are no take of this person: nothing captured goes into the file.
     none = np.zeros(0)

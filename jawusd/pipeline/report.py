@@ -163,7 +163,7 @@ def report_build(
         path = write_build_report(folder, facts, progress, experiments)
         # The next --resume must find the file as recorded, or it would write the report again.
         known = state.stages.get("report")
-        result = {"capture": where(facts.capture, folder)} if facts.capture else dict(known.result if known else {})
+        result = {"capture": place_of(facts.capture, folder)} if facts.capture else dict(known.result if known else {})
         state.finish("report", known.inputs if known else "", [path], known.seconds if known else 0.0, result)
     return {"file": str(path), "bytes": path.stat().st_size}
 
@@ -182,15 +182,11 @@ def fitted_poses(folder: Path) -> Path:
 def missing_packages() -> str | None:
     """Return what keeps a report from being written, None if nothing does."""
     try:
-        _import_document()
+        with explain_missing_packages():
+            import jawusd.report.document  # noqa: F401
     except MissingDependencyError as error:
         return str(error)
     return None
-
-
-@explain_missing_packages()
-def _import_document() -> None:
-    import jawusd.report.document  # noqa: F401
 
 
 def build_facts(folder: Path, state: BuildState, capture: Capture | None, *, allow_outside: bool = False) -> BuildFacts:
@@ -201,19 +197,19 @@ def build_facts(folder: Path, state: BuildState, capture: Capture | None, *, all
         allow_outside: let paths in the capture leave its folder.
     """
     if capture is not None:
-        return BuildFacts(state.stages, calibrated(capture, folder))
+        return BuildFacts(state.stages, with_calibration(capture, folder))
     record = state.stages.get("report")
     place = record.result.get("capture") if record else None
     if not place:
         return BuildFacts(state.stages, None, "the build does not say where its capture is: name it with --capture.")
     path = folder / str(place)
     try:
-        return BuildFacts(state.stages, calibrated(open_capture(path, allow_outside=allow_outside), folder))
+        return BuildFacts(state.stages, with_calibration(open_capture(path, allow_outside=allow_outside), folder))
     except JawusdError as error:
         return BuildFacts(state.stages, None, f"the capture is not at hand ({error}): name it with --capture.")
 
 
-def calibrated(capture: Capture, folder: Path) -> Capture:
+def with_calibration(capture: Capture, folder: Path) -> Capture:
     """Return the capture with the calibration that the build made from its boards, if it names none."""
     made = folder / CALIBRATION
     if capture.calibration is not None or not made.is_file():
@@ -221,7 +217,7 @@ def calibrated(capture: Capture, folder: Path) -> Capture:
     return capture.model_copy(update={"calibration": made, "calibration_unit_mm": 1.0})
 
 
-def where(capture: Capture, folder: Path) -> str:
+def place_of(capture: Capture, folder: Path) -> str:
     """Return the path of a capture seen from the rig's folder; absolute where there is no way between them."""
     try:
         return os.path.relpath(capture.folder, folder.resolve())

@@ -147,7 +147,7 @@ def make_folder(path: Path) -> None:
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Hold the output folder for one build; the lock falls with the process, however it ends.
+    """Hold the output folder for one build; the system releases the lock when the process ends, however it ends.
 
     What a killed build left unfinished is deleted.
 

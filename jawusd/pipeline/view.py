@@ -25,7 +25,7 @@ from jawusd.pipeline.bake import DEFAULT_FPS
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.media import GRAY, open_videos
 from jawusd.pipeline.prepare import load_cameras, load_meshes, open_capture, subject_of_capture, tracked_cameras
-from jawusd.pipeline.report import calibrated, is_build, recorded_offsets
+from jawusd.pipeline.report import is_build, recorded_offsets, with_calibration
 from jawusd.pipeline.state import BuildState, Progress
 
 if TYPE_CHECKING:
@@ -222,7 +222,7 @@ def viewed_capture(
     capture = open_capture(path, allow_outside=allow_outside)
     build = tracks if tracks is not None and is_build(tracks) else None
     if build is not None:
-        capture = calibrated(capture, build)
+        capture = with_calibration(capture, build)
     poses = _poses(capture, tracks)
     videos = open_videos(capture)
     cameras = [] if capture.calibration is None else load_cameras(capture)
