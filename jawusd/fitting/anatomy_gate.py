@@ -12,7 +12,6 @@ import numpy as np
 
 from jawusd.fitting.data import SubjectAnatomy, TrainingData, displacement
 from jawusd.geometry import se3_inverse, so3_log
-from jawusd.geometry.arrays import Array
 
 _OPENING_MAX_MM = 75.0
 _LATERAL_MAX_MM = 20.0
@@ -106,13 +105,14 @@ def _out_of_range(data: TrainingData) -> list[AnatomyWarning]:
     near = u[-u[:, 1] < _NEAR_CLOSED_MM]
     forward = near[:, 2] if len(near) else np.zeros(1)
     travel = np.linalg.norm([displacement(data.motion, condyle) for condyle in data.landmarks[3:]], axis=-1)
+    turned = np.rad2deg(np.linalg.norm(so3_log(data.motion[:, :3, :3]), axis=-1))
     found = [
         ("opening", float(np.percentile(-u[:, 1], _QUANTILE)), _OPENING_MAX_MM, "mm"),
         ("rise", float(np.percentile(u[:, 1], _QUANTILE)), _RISE_MAX_MM, "mm"),
         ("laterotrusion", float(np.percentile(np.abs(u[:, 0]), _QUANTILE)), _LATERAL_MAX_MM, "mm"),
         ("protrusion", float(np.percentile(forward, _QUANTILE)), _PROTRUSION_MAX_MM, "mm"),
         ("retrusion", float(np.percentile(-forward, _QUANTILE)), _RETRUSION_MAX_MM, "mm"),
-        ("rotation", _largest_rotation_deg(data.motion), _ROTATION_MAX_DEG, "deg"),
+        ("rotation", float(np.percentile(turned, _QUANTILE)), _ROTATION_MAX_DEG, "deg"),
         (
             "condylar translation",
             float(np.percentile(travel, _QUANTILE)),
@@ -127,7 +127,3 @@ def _out_of_range(data: TrainingData) -> list[AnatomyWarning]:
         for name, value, limit, unit in found
         if value > limit
     ]
-
-
-def _largest_rotation_deg(motion: Array) -> float:
-    return float(np.rad2deg(np.percentile(np.linalg.norm(so3_log(motion[:, :3, :3]), axis=-1), _QUANTILE)))

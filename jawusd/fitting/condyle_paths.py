@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.evaluator.models import JawModelForm
 from jawusd.fitting.data import SubjectAnatomy, TrainingData
@@ -85,17 +84,13 @@ def _path(name: str, motion: Array, data: TrainingData, bone: Mesh | None) -> Co
     opening = -(transform_point(motion, data.incisor) - data.incisor)[:, 1]
     heads = []
     if bone is not None:
-        near = Mesh(bone.vertices, _faces_near(bone, data.landmarks[3]))
+        around = np.linalg.norm(bone.vertices - data.landmarks[3], axis=1) < 2 * _AROUND_MM
+        near = Mesh(bone.vertices, bone.faces[around[bone.faces].all(axis=1)])
         for share in _SHOWN_OPENINGS:
             k = round(share * (len(motion) - 1))
             moved = Mesh(transform_points(motion[k], near.vertices), near.faces)
             heads.append(sagittal_section(moved, points[0, k], _AROUND_MM))
     return CondylePath(name, opening, points, tuple(heads))
-
-
-def _faces_near(mesh: Mesh, centre: Array) -> NDArray[np.int32]:
-    near = np.linalg.norm(mesh.vertices - centre, axis=1) < 2 * _AROUND_MM
-    return mesh.faces[near[mesh.faces].all(axis=1)]
 
 
 def sagittal_section(mesh: Mesh, centre: Array, around_mm: float) -> Array:

@@ -14,6 +14,9 @@ from jawusd.formats.tracks import LOST, Tracks
 from jawusd.geometry import LANDMARKS, hat, orthonormalise, rigidity_defect, transform_points
 from jawusd.geometry.arrays import Array, Mask
 
+#: Tracks, or frame numbers (F,) and poses T_skull_mandible (F, 4, 4) with NaN where there is none.
+Source = Tracks | tuple[ArrayLike, ArrayLike]
+
 #: How far real jaws deviate from a three-parameter model: smaller tracking errors hardly matter [mm].
 MODEL_SIGMA_MM = 0.3
 _LARGEST_SIGMA_MM = 2.0  # frames less certain than this over the mandible (rms) are left out
@@ -106,8 +109,15 @@ class TrainingData:
 
 @dataclass(frozen=True)
 class Selection:
-    """Hold training data, which of the captured frames (F,) it uses, and the frame numbers excluded, by reason."""
+    """Hold the captured poses (F, 4, 4) with their frame numbers (F,), and the training data selected from them.
 
+    Attributes:
+        used: which captured frames the data hold, shape (F,).
+        excluded: frame numbers left out, by reason.
+    """
+
+    frames: NDArray[np.int64]
+    T_skull_mandible: Array
     data: TrainingData
     used: Mask
     excluded: dict[str, list[int]]
@@ -116,6 +126,11 @@ class Selection:
 def displacement(motion: Array, point: Array) -> Array:
     """Return the displacement (N, 3) of a point (3,) under motions (N, 4, 4) [mm]."""
     return motion[:, :3, :3] @ point + motion[:, :3, 3] - point
+
+
+def select(source: Source, anatomy: SubjectAnatomy) -> Selection:
+    """Select the frames of a source that can train a model; see `select_tracks` and `select_poses` for errors."""
+    return select_tracks(source, anatomy) if isinstance(source, Tracks) else select_poses(*source, anatomy)
 
 
 def select_tracks(tracks: Tracks, anatomy: SubjectAnatomy) -> Selection:
@@ -183,7 +198,7 @@ def _select(
         metric=MandibleMetric.of_points(anatomy.at_rest(anatomy.mandible_vertices)),
     )
     _check_motion(data)
-    return Selection(data, used, excluded)
+    return Selection(frames, T, data, used, excluded)
 
 
 def _exclude(used: Mask, mask: Mask, reason: str, frames: NDArray[np.int64], excluded: dict[str, list[int]]) -> None:

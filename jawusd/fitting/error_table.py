@@ -15,6 +15,7 @@ from jawusd.fitting.form import FittedForm
 from jawusd.geometry import LANDMARKS, transform_point
 from jawusd.geometry.arrays import Array, Mask
 
+Refit = Callable[[TrainingData], FittedForm]
 #: Mean, median, p95, max [mm] and number of frames of each column.
 ErrorTable = dict[str, dict[str, float]]
 
@@ -58,13 +59,13 @@ def seen_errors(data: TrainingData, form: FittedForm) -> dict[str, ErrorTable]:
 
 
 def unseen_errors(
-    data: TrainingData, kept: Mask, folds: int, refit: Callable[[TrainingData], FittedForm], tell: Callable[[int], None]
+    data: TrainingData, kept: Mask, folds: int, refit: Refit, notify: Callable[[int], None]
 ) -> tuple[ErrorTable, dict[str, dict[str, float]], Array]:
     """Leave out contiguous parts of a take in turn, refit, and measure the error on them.
 
     Args:
         kept: frames that count, shape (N,): those the fit to all did not trim.
-        tell: called with the number of each part.
+        notify: called with the number of each part.
 
     Returns:
         The error table; how the errors grow with the distance of a pose's parameters from the captured ones: for every
@@ -74,7 +75,7 @@ def unseen_errors(
     fold = np.arange(len(data)) * folds // len(data)
     errors, distances = [], []
     for k in range(folds):
-        tell(k)
+        notify(k)
         seen, unseen = data.select(fold != k), data.select((fold == k) & kept)
         if not len(unseen):
             continue

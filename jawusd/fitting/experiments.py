@@ -7,20 +7,18 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from jawusd.errors import FittingError
 from jawusd.fitting.condyle_paths import condyle_paths, parameter_paths, path_distances, sagittal_section
 from jawusd.fitting.coverage import missing_movements, shown_parameters
-from jawusd.fitting.data import SubjectAnatomy, TrainingData, select_poses, select_tracks
+from jawusd.fitting.data import Source, SubjectAnatomy, TrainingData, select
 from jawusd.fitting.fit import FittingConfig, Progress, fit_form
 from jawusd.fitting.form import FittedForm
 from jawusd.fitting.nlpca import Nlpca, train_nlpca
-from jawusd.fitting.paper import COMPONENTS, PaperFit, fit_paper
+from jawusd.fitting.paper import COMPONENTS, PaperFit
 from jawusd.fitting.synthesis import Bounds, captured_reference, distance_to_nearest
 from jawusd.formats.experiments import Coverage, Distances, Experiments
 from jawusd.formats.mesh import Mesh
-from jawusd.formats.tracks import Tracks
 from jawusd.geometry import se3_exp, se3_log, transform_point, transform_points
 from jawusd.geometry.arrays import Array, Mask
 
@@ -56,7 +54,7 @@ class _Fitted:
 
 
 def run_experiments(
-    source: Tracks | tuple[ArrayLike, ArrayLike],
+    source: Source,
     anatomy: SubjectAnatomy,
     *,
     bones: Mapping[str, Mesh] | None = None,
@@ -68,8 +66,7 @@ def run_experiments(
     """Do the paper's experiments on a take.
 
     Args:
-        source: tracks (their raw poses are used, except prior-aided ones), or frame numbers (F,) and poses
-            T_skull_mandible (F, 4, 4) with NaN where there is none.
+        source: of tracks the raw poses are used, except prior-aided ones.
         bones: meshes "mandible" and "skull" for outlines, scan frame [mm]; either may be missing.
         config: starts and seed of the networks, trimming, alpha, folds; the method is ignored.
         quick: leave out the networks and the paper's model, and draw random poses of the default model alone.
@@ -81,12 +78,11 @@ def run_experiments(
         FittingError: too few poses or no motion.
     """
     wanted = QUICK if quick else tuple(MODELS)
-    tell, steps = progress or (lambda done, total: None), len(wanted) + (0 if quick else COMPONENTS)
-    selection = select_tracks(source, anatomy) if isinstance(source, Tracks) else select_poses(*source, anatomy)
-    data, bones = selection.data, bones or {}
+    notify, steps = progress or (lambda done, total: None), len(wanted) + (0 if quick else COMPONENTS)
+    data, bones = select(source, anatomy).data, bones or {}
     shown, sentences = shown_parameters(data)
-    fitted = _fit_all(data, shown, wanted, config, lambda done: tell(done, steps))
-    nets = [] if quick else _networks(data, config, fitted.forms.get("paper"), lambda d: tell(len(wanted) + d, steps))
+    fitted = _fit_all(data, shown, wanted, config, lambda done: notify(done, steps))
+    nets = [] if quick else _networks(data, config, fitted.forms.get("paper"), lambda d: notify(len(wanted) + d, steps))
     captured = np.stack([transform_point(data.motion, centre) for centre in data.landmarks[3:]])
     d, kept = fitted.d[DEFAULT], fitted.d[DEFAULT][fitted.forms[DEFAULT].kept]
     swept = {name: fitted.forms[name].model for name in ("paper", DEFAULT) if name in fitted.forms}
@@ -97,13 +93,17 @@ def run_experiments(
     drawn = {name: bounds[name] for name in bounds if name == DEFAULT or not quick}
     distances += _reconstruction(data, fitted, nets) + _synthesis(data, fitted, drawn, config)
     compared = {name: fitted.forms[name].model for name in (LINEAR, DEFAULT) if name in fitted.forms}
-    tell(steps, steps)
+    notify(steps, steps)
+    skull = np.empty((0, 2, 2))
+    if "skull" in bones:
+        placed = Mesh(transform_points(anatomy.T_anatomical_skull, bones["skull"].vertices), bones["skull"].faces)
+        skull = sagittal_section(placed, data.landmarks[3], _SKULL_AROUND_MM)
     lacking = (*sentences, *missing_movements(kept, shown))
     return Experiments(
         actor=actor,
         frames=len(data),
         captured_condyles=captured,
-        skull=_skull_outline(bones.get("skull"), data, anatomy),
+        skull=skull,
         condyle_paths=tuple(paths),
         distances=tuple(distances),
         coverage=_coverage(kept, bounds[DEFAULT], lacking),
@@ -113,7 +113,7 @@ def run_experiments(
 
 
 def _fit_all(
-    data: TrainingData, shown: Mask, wanted: tuple[str, ...], config: FittingConfig, tell: Callable[[int], None]
+    data: TrainingData, shown: Mask, wanted: tuple[str, ...], config: FittingConfig, notify: Callable[[int], None]
 ) -> _Fitted:
     forms: dict[str, FittedForm] = {}
     parameters: dict[str, Array] = {}
@@ -121,11 +121,11 @@ def _fit_all(
     nets: dict[int, Nlpca] = {}
     notes = []
     for step, name in enumerate(wanted):
-        tell(step)
+        notify(step)
         start = time.perf_counter()
         try:
             chosen = replace(config, method=MODELS[name].method, literal=MODELS[name].literal)
-            form = _fit(data, shown, chosen, nets)
+            form = fit_form(data, shown, chosen, nets)  # the two variants of the paper's model share their networks
         except FittingError as error:
             if name == DEFAULT:
                 raise
@@ -144,26 +144,19 @@ def _fit_all(
     return _Fitted(forms, parameters, nearest, tuple(notes))
 
 
-def _fit(data: TrainingData, shown: Mask, config: FittingConfig, nets: dict[int, Nlpca]) -> FittedForm:
-    """Fit one model; the two variants of the paper's share their networks."""
-    if config.method == "paper":
-        return fit_paper(data, shown, config.literal, config.starts, config.seed, nets)
-    return fit_form(data, shown, config)
-
-
 def _networks(
-    data: TrainingData, config: FittingConfig, paper: FittedForm | None, tell: Callable[[int], None]
+    data: TrainingData, config: FittingConfig, paper: FittedForm | None, notify: Callable[[int], None]
 ) -> list[Nlpca]:
     """Return networks of 1..5 components; the last is that of the paper's model, if there is one."""
     points = se3_log(data.motion) @ data.metric.twist_root()
     nets = []
     for count in range(1, COMPONENTS + 1):
-        tell(count - 1)
+        notify(count - 1)
         if count == COMPONENTS and isinstance(paper, PaperFit):
             nets.append(paper.network_sum.net)
         else:
             nets.append(train_nlpca(points, count, config.seed))
-    tell(COMPONENTS)
+    notify(COMPONENTS)
     return nets
 
 
@@ -200,13 +193,6 @@ def _synthesis(
                 distance = distance_to_nearest(data.metric, form.model.motion(d), data.motion)
                 found.append(Distances(SYNTHESIS, name, bound, distance))
     return found
-
-
-def _skull_outline(skull: Mesh | None, data: TrainingData, anatomy: SubjectAnatomy) -> Array:
-    if skull is None:
-        return np.empty((0, 2, 2))
-    placed = Mesh(transform_points(anatomy.T_anatomical_skull, skull.vertices), skull.faces)
-    return sagittal_section(placed, data.landmarks[3], _SKULL_AROUND_MM)
 
 
 def _coverage(d: Array, bounds: Bounds, sentences: tuple[str, ...]) -> Coverage:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 import scipy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jawusd.errors import EvaluatorError, FittingError
 from jawusd.evaluator import JawRig
@@ -17,14 +17,16 @@ from jawusd.fitting.anatomy_gate import AnatomyWarning, check_anatomy
 from jawusd.fitting.anchored import fit_anchored
 from jawusd.fitting.bounds import alpha_shapes, fit_slice_hull, valid_box
 from jawusd.fitting.coverage import PARAMETERS, missing_movements, shown_parameters
-from jawusd.fitting.data import Selection, SubjectAnatomy, TrainingData, select_poses, select_tracks
+from jawusd.fitting.data import Selection, Source, SubjectAnatomy, TrainingData, select
 from jawusd.fitting.error_table import ErrorTable, seen_errors, unseen_errors
 from jawusd.fitting.form import FittedForm
 from jawusd.fitting.pca import fit_pca
 from jawusd.fitting.screening import screened
 from jawusd.formats.model import JawModel
-from jawusd.formats.tracks import Tracks
 from jawusd.geometry.arrays import Array, Mask
+
+if TYPE_CHECKING:
+    from jawusd.fitting.nlpca import Nlpca
 
 #: Called with the steps done and the steps in all.
 Progress = Callable[[int, int], None]
@@ -73,7 +75,7 @@ class FittingConfig:
 
 
 def fit_model(
-    source: Tracks | tuple[ArrayLike, ArrayLike],
+    source: Source,
     *,
     T_anatomical_skull: ArrayLike,
     landmarks: ArrayLike,
@@ -86,8 +88,7 @@ def fit_model(
     """Fit a person's jaw model.
 
     Args:
-        source: tracks (their raw poses are used), or frame numbers (F,) and poses T_skull_mandible (F, 4, 4) with NaN
-            where there is none.
+        source: of tracks the raw poses are used.
         T_anatomical_skull: skull (scan) frame to anatomical frame, shape (4, 4).
         landmarks: `geometry.LANDMARKS` in mandible coordinates [mm], shape (5, 3).
         mandible_vertices: points whose motion is measured, mandible coordinates [mm], shape (V, 3); None: the
@@ -104,14 +105,9 @@ def fit_model(
     """
     anatomy = SubjectAnatomy.of(T_anatomical_skull, landmarks, mandible_vertices, T_rest)
     steps = config.holdout_folds + 2
-    tell = progress or (lambda done, total: None)
-    tell(0, steps)
-    if isinstance(source, Tracks):
-        frames, T, selection = source.frames, source.raw_T_upper_lower, select_tracks(source, anatomy)
-    else:
-        frames, T = np.asarray(source[0], dtype=np.int64), np.asarray(source[1], dtype=np.float64)
-        selection = select_poses(frames, T, anatomy)
-    selection = screened(selection)
+    notify = progress or (lambda done, total: None)
+    notify(0, steps)
+    selection = screened(select(source, anatomy))
     data = selection.data
     warnings = check_anatomy(data, anatomy)
     shown, sentences = shown_parameters(data)
@@ -124,45 +120,42 @@ def fit_model(
     if len(data) < _FEW_POSES:
         warnings.append(AnatomyWarning("few_poses", f"Only {len(data)} poses: the model interpolates coarsely."))
     form = fit_form(data, shown, config)
-    errors, unseen_mm = seen_errors(data, form), np.zeros(0)
-    uncertainty: dict[str, dict[str, float]] = {}
-    if config.holdout_folds:
-        # In the folds the networks of "paper" have one start: that of the best network of the full fit.
-        seed = form.notes.get("seed")
-        again = replace(config, starts=1, seed=seed if isinstance(seed, int) else config.seed)
-        errors["holdout"], uncertainty, unseen_mm = unseen_errors(
-            data,
-            form.kept,
-            config.holdout_folds,
-            lambda part: fit_form(part, shown, again),
-            lambda fold: tell(fold + 1, steps),
-        )
-    captured_d, _ = data.metric.nearest(form.model, data.motion[form.kept])
-    if not np.isfinite(captured_d).all():
+    errors, uncertainty, unseen_mm = _errors(data, shown, form, config, lambda fold: notify(fold + 1, steps))
+    d, _ = data.metric.nearest(form.model, data.motion[form.kept])
+    if not np.isfinite(d).all():
         raise FittingError("the parameters of some training poses cannot be found.", hint="Check the poses' units.")
-    kept_d = captured_d[:: -(-len(captured_d) // _MOST_CAPTURED)]
-    warnings += [AnatomyWarning("take_lacks", sentence) for sentence in missing_movements(kept_d, shown)]
-    hull, tolerance_mm = fit_slice_hull(captured_d)
-    arrays: dict[str, Array] = {
+    captured_d = d[:: -(-len(d) // _MOST_CAPTURED)]
+    warnings += [AnatomyWarning("take_lacks", sentence) for sentence in missing_movements(captured_d, shown)]
+    hull, tolerance_mm = fit_slice_hull(d)
+    arrays = {
         **form.arrays(),
         **hull,
+        **alpha_shapes(d, config.alpha),
         "T_anatomical_skull": anatomy.T_anatomical_skull,
         "T_rest": anatomy.T_rest,
         "incisor": data.incisor,
         "landmarks": anatomy.landmarks,
         "d_range": valid_box(hull),
-        **alpha_shapes(captured_d, config.alpha),
-        "codes": kept_d,
+        "codes": captured_d,
         "margin_limit_mm": np.array(-tolerance_mm),
     }
-    model = _finish(arrays, unseen_mm, form, selection, frames, T, errors, warnings, config)
-    model.meta |= {"actor": actor, "uncertainty": uncertainty}
-    tell(steps, steps)
+    meta: dict[str, object] = {
+        "actor": actor,
+        "method": config.method,
+        "config": asdict(config),
+        "versions": {"numpy": np.__version__, "scipy": scipy.__version__},
+        "errors": errors,
+        "uncertainty": uncertainty,
+    }
+    model = _model(selection, form, arrays, meta, warnings, unseen_mm)
+    notify(steps, steps)
     return model
 
 
-def fit_form(data: TrainingData, shown: Mask, config: FittingConfig) -> FittedForm:
-    """Fit the decoder of `config.method` alone to data that show some parameters (3,).
+def fit_form(
+    data: TrainingData, shown: Mask, config: FittingConfig, nets: dict[int, Nlpca] | None = None
+) -> FittedForm:
+    """Fit the decoder of `config.method` alone to data that show some parameters (3,); `nets` as in `fit_paper`.
 
     Raises:
         FittingError: the method cannot be fitted to these data.
@@ -175,27 +168,36 @@ def fit_form(data: TrainingData, shown: Mask, config: FittingConfig) -> FittedFo
         return fit_pca(data, shown)
     from jawusd.fitting.paper import fit_paper  # imports torch, which takes two seconds
 
-    return fit_paper(data, shown, config.literal, config.starts, config.seed)
+    return fit_paper(data, shown, config.literal, config.starts, config.seed, nets)
 
 
-def _finish(
-    arrays: dict[str, Array],
-    unseen_mm: Array,
-    form: FittedForm,
+def _errors(
+    data: TrainingData, shown: Mask, form: FittedForm, config: FittingConfig, notify: Callable[[int], None]
+) -> tuple[dict[str, ErrorTable], dict[str, dict[str, float]], Array]:
+    """Return the error tables of a fit by name, and the rest of `unseen_errors`, empty without hold-out."""
+    tables = seen_errors(data, form)
+    if not config.holdout_folds:
+        return tables, {}, np.zeros(0)
+    # In the folds the networks of "paper" have one start: that of the best network of the full fit.
+    seed = form.notes.get("seed")
+    again = replace(config, starts=1, seed=seed if isinstance(seed, int) else config.seed)
+    tables["holdout"], uncertainty, rms_mm = unseen_errors(
+        data, form.kept, config.holdout_folds, lambda part: fit_form(part, shown, again), notify
+    )
+    return tables, uncertainty, rms_mm
+
+
+def _model(
     selection: Selection,
-    frames: NDArray[np.int64],
-    T: Array,
-    errors: dict[str, ErrorTable],
+    form: FittedForm,
+    arrays: dict[str, Array],
+    meta: dict[str, object],
     warnings: list[AnatomyWarning],
-    config: FittingConfig,
+    unseen_mm: Array,
 ) -> JawModel:
     """Encode every captured pose with the evaluator and set the limits of the verdicts from the trained ones."""
-    meta: dict[str, object] = {
+    meta |= {
         "kind": form.kind,
-        "method": config.method,
-        "config": asdict(config),
-        "versions": {"numpy": np.__version__, "scipy": scipy.__version__},
-        "errors": errors,
         "fit": form.notes,
         "warnings": [asdict(warning) for warning in warnings],
         "excluded_frames": selection.excluded,
@@ -206,14 +208,13 @@ def _finish(
     except EvaluatorError as error:
         advice = " ".join(warning.message for warning in warnings)
         raise FittingError(f"the poses give no usable model: {error}", hint=advice or None) from error
-    d, residual_mm = rig.encode(T)
-    trained = np.zeros(len(frames), dtype=bool)
+    d, residual_mm = rig.encode(selection.T_skull_mandible)
+    trained = np.zeros(len(d), dtype=bool)
     trained[np.flatnonzero(selection.used)[form.kept]] = True
     limit = max(float(np.percentile(residual_mm[trained], _TRAINED_QUANTILE)), _SMALLEST_RESIDUAL_LIMIT_MM)
     if len(unseen_mm):
         limit = max(limit, float(np.percentile(unseen_mm, _UNSEEN_QUANTILE)))
-    reached = d[trained]
-    meta["ranges_mm"] = {
-        name: [float(reached[:, i].min()), float(reached[:, i].max())] for i, name in enumerate(PARAMETERS)
-    }
-    return JawModel({**arrays, "residual_limit_mm": np.array(limit)}, frames, d, residual_mm, trained, meta)
+    ends = zip(d[trained].min(axis=0).tolist(), d[trained].max(axis=0).tolist())
+    meta["ranges_mm"] = {name: [low, high] for name, (low, high) in zip(PARAMETERS, ends)}
+    arrays = {**arrays, "residual_limit_mm": np.array(limit)}
+    return JawModel(arrays, selection.frames, d, residual_mm, trained, meta)

@@ -7,6 +7,8 @@ quadratic map from the incisal displacement to the rotation cannot: fitted by ra
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from jawusd.fitting.data import Selection, TrainingData
@@ -31,7 +33,7 @@ def screened(selection: Selection) -> Selection:
     used = selection.used.copy()
     used[np.flatnonzero(used)[outliers]] = False
     excluded = {**selection.excluded, REASON: selection.data.frames[outliers].tolist()}
-    return Selection(selection.data.select(~outliers), used, excluded)
+    return replace(selection, data=selection.data.select(~outliers), used=used, excluded=excluded)
 
 
 def gross_outliers(data: TrainingData) -> Mask:

@@ -12,7 +12,6 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from jawusd.formats.atomic import write_text_atomic
-from jawusd.formats.experiments import Experiments
 from jawusd.formats.report import ReportData
 from jawusd.formats.tracks import LOST, LostReason
 from jawusd.report.facts import model_facts, sync_facts, tracks_facts
@@ -85,10 +84,6 @@ def _figures(data: ReportData) -> dict[str, Markup]:
     found = data.experiments
     if found is None:
         return drawn
-    return drawn | _experiment_figures(found)
-
-
-def _experiment_figures(found: Experiments) -> dict[str, Markup]:
     figures = {
         "coverage": (coverage_figure(found.coverage, found.actor), "Captured poses, the bounds and the gaps."),
         "reconstruction": (reconstruction_figure(found), "Histograms of the reconstruction error of each model."),
@@ -96,7 +91,7 @@ def _experiment_figures(found: Experiments) -> dict[str, Markup]:
         "condyle": (condyle_figure(found), "Path of the left condyle when the jaw opens."),
         "parameters": (parameter_figure(found), "Path of the left condyle for each parameter."),
     }
-    return {key: inline_svg(figure, key, words) for key, (figure, words) in figures.items()}
+    return drawn | {key: inline_svg(figure, key, words) for key, (figure, words) in figures.items()}
 
 
 def _error_tables(data: ReportData) -> list[tuple[str, str, list[tuple[str, dict[str, float]]]]]:

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from jawusd.formats.experiments import CondylePath, Coverage, Distances, Experiments, ParameterPath
+from jawusd.formats.experiments import CondylePath, Coverage, Distances, Experiments
 from jawusd.geometry.arrays import Array
 from jawusd.report.style import BLACK, BLUE, GREEN, GREY, ORANGE, PALE, SKY, VERMILION, new_figure, save_figure
 
@@ -99,8 +99,13 @@ def parameter_figure(found: Experiments) -> Figure:
             axis = axes[3 * row + column]
             _draw_points(axis, captured[:, [h, v]], GREY, "captured condyle centres")
             for path in found.parameter_paths:
-                if path.parameter == column:
-                    _draw_parameter(axis, path, h, v)
+                if path.parameter != column:
+                    continue
+                linear = path.model == "pca"
+                label = "linear model (PCA)" if linear else f"{path.model} model"
+                color, style = (BLUE, "--") if linear else (VERMILION, "-")
+                axis.plot(path.points[:, h], path.points[:, v], style, color=color, lw=2, label=label)
+                axis.plot(path.points[-1, h], path.points[-1, v], "o", ms=5, color=color)
             axis.set_aspect("equal", adjustable="datalim")
             axis.set_xlabel(across)
         axes[3 * row].set_ylabel(along)
@@ -112,14 +117,6 @@ def parameter_figure(found: Experiments) -> Figure:
     figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
     figure.suptitle("left condyle while one parameter moves alone; above: from the side, below: from above")
     return figure
-
-
-def _draw_parameter(axis: Axes, path: ParameterPath, h: int, v: int) -> None:
-    linear = path.model == "pca"
-    label = "linear model (PCA)" if linear else f"{path.model} model"
-    color, style = (BLUE, "--") if linear else (VERMILION, "-")
-    axis.plot(path.points[:, h], path.points[:, v], style, color=color, lw=2, label=label)
-    axis.plot(path.points[-1, h], path.points[-1, v], "o", ms=5, color=color)
 
 
 def _draw_points(axis: Axes, points: Array, color: str, label: str) -> None:

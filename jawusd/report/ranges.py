@@ -116,11 +116,6 @@ def ranges_figure(people: Sequence[tuple[str, dict[str, list[float]]]]) -> Figur
         axis.barh(rows, [high - low for low, high in ends], left=[low for low, _ in ends], color=color, height=0.7)
         axis.axvline(0.0, color=BLACK, lw=0.8)
         axis.set(title=title, xlabel="[mm]")
-    axes[0].set_yticks(rows, [_literal(name) for name, _ in shown])
+    axes[0].set_yticks(rows, [name[:30].replace("$", r"\$") for name, _ in shown])  # a $ starts a formula
     axes[0].invert_yaxis()
     return figure
-
-
-def _literal(name: str) -> str:
-    """Return a name escaped for matplotlib, in which a dollar sign starts a formula."""
-    return name[:30].replace("$", r"\$")

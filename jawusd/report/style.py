@@ -85,11 +85,9 @@ def figure_bytes(figure: Figure, kind: str, dpi: int, *, transparent: bool = Fal
 
 
 def inline_svg(figure: Figure, key: str, words: str) -> Markup:
-    """Return a figure as an SVG element for a page, without references to other files, in the page's colours.
+    """Return a figure as an SVG element for a page, in the page's colours, with alternative text.
 
-    Args:
-        key: prefix of all ids of this figure; unique in the page.
-        words: alternative text.
+    The key is the prefix of all ids of this figure; unique in the page.
     """
     text = figure_bytes(figure, "svg", _INLINE_DPI, transparent=True).decode()
     text = text[text.index("<svg") :]

@@ -22,7 +22,6 @@ def draw_sync(curves: Mapping[str, LightCurve], offsets: Mapping[str, int] | Non
     """Draw the brightness of all clips to a PNG or SVG file, whole and around the first and last flash.
 
     Args:
-        curves: by camera name.
         offsets: frame k of a camera shows the instant of frame k + offset of the reference camera; None if they are not
             known, for a picture of the clips as recorded only.
 

@@ -22,6 +22,33 @@ _PAPER_COVERAGE_PERCENT, _PAPER_MEAN_MM, _PAPER_WORST_MM = 0.754, 1.73, 7.22
 _EXERCISES = "full opening, slides to both sides and protrusion, closed and half open"
 _LACKING = {"take_lacks", "not_shown"}  # warnings of the fit about movements that are missing or too small
 _MISTAKES = {"scan_units", "pose_units", "front_back_flip", "left_right_flip", "upside_down", "swapped_jaws"}
+_SENTENCES = {
+    "sync": {
+        GOOD: "The cameras agree in time; what is left below a frame was measured and taken into account.",
+        LOOK: "The cameras may be off by a frame: play the footage side by side.",
+        BAD: "The cameras do not agree in time: give the offsets by hand ([sync] offsets) and build again.",
+    },
+    "track": {
+        GOOD: "The teeth were followed through the take, as exactly as the masks allow.",
+        LOOK: "Most of the take is tracked; look at the worst frames below before relying on it.",
+        BAD: "Much of the take is lost or uncertain: check masks and calibration at the worst frames below.",
+    },
+    "fit": {
+        GOOD: "Three parameters reproduce this person's poses to a fraction of a millimetre.",
+        LOOK: "The model is usable, but look at the figures marked below.",
+        BAD: "The model does not describe this take: see which figure is out of range.",
+    },
+    "bounds": {
+        GOOD: "The limits enclose what was captured, and the take covers the envelope.",
+        LOOK: "The limits hold what was captured, but parts of the envelope were not recorded (see below).",
+        BAD: "The limits leave out poses that were captured: do not rely on them.",
+    },
+    "rig": {
+        GOOD: "The files are valid, and readers of the table get the model's poses.",
+        LOOK: "The files are valid; the table is a coarse copy of the model.",
+        BAD: "The rig has errors: run `jawusd validate` on it.",
+    },
+}
 
 
 @dataclass(frozen=True)
@@ -73,9 +100,9 @@ def _share(name: str, share: float, good: float, fair: float) -> Check:
     return Check(name, f"{100 * share:.1f} %", limit, GOOD if share >= good else LOOK if share >= fair else BAD)
 
 
-def _verdict(stage: str, checks: list[Check], sentences: dict[str, str]) -> Verdict:
+def _verdict(stage: str, checks: list[Check]) -> Verdict:
     grade = _worst([check.grade for check in checks])
-    return Verdict(stage, sentences.get(grade, "There is nothing to judge it by."), tuple(checks), grade)
+    return Verdict(stage, _SENTENCES[stage].get(grade, "There is nothing to judge it by."), tuple(checks), grade)
 
 
 def _sync(data: ReportData) -> Verdict:
@@ -90,15 +117,7 @@ def _sync(data: ReportData) -> Verdict:
     method = str(sync.get("method", "not known"))
     if method == "taken as simultaneous":
         checks.append(Check("how the cameras were aligned", method, "flash, sound or given offsets", LOOK))
-    return _verdict(
-        "sync",
-        checks,
-        {
-            GOOD: "The cameras agree in time; what is left below a frame was measured and taken into account.",
-            LOOK: "The cameras may be off by a frame: play the footage side by side.",
-            BAD: "The cameras do not agree in time: give the offsets by hand ([sync] offsets) and build again.",
-        },
-    )
+    return _verdict("sync", checks)
 
 
 def _track(tracks: Tracks) -> Verdict:
@@ -123,15 +142,7 @@ def _track(tracks: Tracks) -> Verdict:
         _below("expected error at the incisor (1 sigma, median)", float(sigma[0]), 0.15, 0.5, "mm", 3),
         _below("expected error at the worse condyle (1 sigma, median)", float(sigma[3:].max()), 0.5, 1.0, "mm", 3),
     ]
-    return _verdict(
-        "track",
-        checks,
-        {
-            GOOD: "The teeth were followed through the take, as exactly as the masks allow.",
-            LOOK: "Most of the take is tracked; look at the worst frames below before relying on it.",
-            BAD: "Much of the take is lost or uncertain: check masks and calibration at the worst frames below.",
-        },
-    )
+    return _verdict("track", checks)
 
 
 def _fit(data: ReportData) -> Verdict:
@@ -165,15 +176,7 @@ def _fit(data: ReportData) -> Verdict:
         elif warning["code"] not in _LACKING:
             grade = BAD if warning["code"] in _MISTAKES else LOOK
             checks.append(Check("human range", warning["message"], "see the table of human ranges", grade))
-    return _verdict(
-        "fit",
-        checks,
-        {
-            GOOD: "Three parameters reproduce this person's poses to a fraction of a millimetre.",
-            LOOK: "The model is usable, but look at the figures marked below.",
-            BAD: "The model does not describe this take: see which figure is out of range.",
-        },
-    )
+    return _verdict("fit", checks)
 
 
 def _bounds(data: ReportData) -> Verdict:
@@ -194,15 +197,7 @@ def _bounds(data: ReportData) -> Verdict:
     checks += [Check("captured movements", sentence, _EXERCISES, LOOK) for sentence in lacks]
     if not lacks:
         checks.append(Check("captured movements", "nothing missing", _EXERCISES, GOOD))
-    return _verdict(
-        "bounds",
-        checks,
-        {
-            GOOD: "The limits enclose what was captured, and the take covers the envelope.",
-            LOOK: "The limits hold what was captured, but parts of the envelope were not recorded (see below).",
-            BAD: "The limits leave out poses that were captured: do not rely on them.",
-        },
-    )
+    return _verdict("bounds", checks)
 
 
 def _rig(data: ReportData) -> Verdict:
@@ -211,12 +206,4 @@ def _rig(data: ReportData) -> Verdict:
         Check("validators", f"{len(errors)} errors", "no errors", BAD if errors else GOOD),
         _below("sampled decoder against the exact model, worst vertex", data.rig.table_error_mm, 0.06, 0.2, "mm", 3),
     ]
-    return _verdict(
-        "rig",
-        checks,
-        {
-            GOOD: "The files are valid, and readers of the table get the model's poses.",
-            LOOK: "The files are valid; the table is a coarse copy of the model.",
-            BAD: "The rig has errors: run `jawusd validate` on it.",
-        },
-    )
+    return _verdict("rig", checks)

@@ -17,7 +17,7 @@ from jawusd.formats.mesh import Mesh
 from jawusd.geometry import LANDMARKS, Camera
 from jawusd.geometry.arrays import Array
 from jawusd.imaging.video_writer import VideoWriter
-from jawusd.synthetic.anatomy import PersonAnatomy, build_anatomy
+from jawusd.synthetic.anatomy import build_anatomy
 from jawusd.synthetic.masks import Outline, drawn_mask
 from jawusd.synthetic.person import Person
 from jawusd.synthetic.picks import SeenVertex, choose_picks
@@ -30,6 +30,7 @@ Progress = Callable[[int, int], None]
 
 # Frame k of a camera shows the instant of frame k + offset of the first one.
 _OFFSETS = (0, 5, -3)
+_SCANS = ("upper_teeth", "lower_teeth", "mandible", "skull")
 _PICKS = 4
 _PICK_NOISE_PX = 1.0
 _PICTURES_PER_BOARD = 2
@@ -66,13 +67,9 @@ class DemoConfig:
 
 
 def write_demo(folder: str | os.PathLike[str], config: DemoConfig, progress: Progress | None = None) -> Path:
-    """Record a synthetic person into a capture folder, replacing files of the same names.
+    """Record a synthetic person into a capture folder, replacing files of the same names; return capture.toml.
 
-    Args:
-        progress: called with pictures done and pictures in all.
-
-    Returns:
-        The path of capture.toml.
+    Progress is counted in pictures, done and in all.
 
     Raises:
         MissingDependencyError: there is no OpenGL without a display (EGL).
@@ -87,7 +84,8 @@ def write_demo(folder: str | os.PathLike[str], config: DemoConfig, progress: Pro
         recorder = _Recorder(folder, config, cameras, renderer, progress)
         recorder.performance(Scene(person, anatomy, renderer), take)
         T_world_board = recorder.boards()
-    for name, mesh in _scans(anatomy).items():
+    scans = (anatomy.upper.mesh, anatomy.lower.mesh, anatomy.mandible, anatomy.skull)
+    for name, mesh in zip(_SCANS, scans, strict=True):
         write_bytes_atomic(folder / "scans" / f"{name}.ply", _ply(mesh))
     save_calibration(folder / "calibration.toml", cameras)
     write_npz_atomic(folder / "truth" / "truth.npz", _truth(person, cameras, take, T_world_board))
@@ -183,15 +181,6 @@ class _Recorder:
             self._progress(self._done, self._total)
 
 
-def _scans(anatomy: PersonAnatomy) -> dict[str, Mesh]:
-    return {
-        "upper_teeth": anatomy.upper.mesh,
-        "lower_teeth": anatomy.lower.mesh,
-        "mandible": anatomy.mandible,
-        "skull": anatomy.skull,
-    }
-
-
 def _ply(mesh: Mesh) -> bytes:
     """Encode a coloured mesh as binary PLY with float32 positions."""
     vertices = np.zeros(len(mesh.vertices), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
@@ -244,7 +233,7 @@ def _description(config: DemoConfig, cameras: list[Camera], take: Take, picks: d
         f"frames = [{take.tracked[0]}, {take.tracked[1]}]",
         "",
         "[scans]",
-        *(f'{name} = "scans/{name}.ply"' for name in ("upper_teeth", "lower_teeth", "mandible", "skull")),
+        *(f'{name} = "scans/{name}.ply"' for name in _SCANS),
         "",
     ]
     for camera in cameras:

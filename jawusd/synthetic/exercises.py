@@ -149,9 +149,7 @@ def _swing(n: int) -> Array:
 def _border(n: int, turn: float, end: int) -> tuple[Array, Array]:
     """Trace a border: slide to one side closed, open along it, cross over and close along the other side.
 
-    Args:
-        turn: share of the closing in which the mandible crosses over.
-        end: frames in which it returns to the middle.
+    The mandible crosses over in the share `turn` of the closing and returns to the middle in the last `end` frames.
 
     Returns:
         Opening 0..1 and excursion -1..1, shape (n,) each.

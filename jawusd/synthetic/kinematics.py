@@ -113,19 +113,15 @@ def eminence(joint: Joint, side: int, slide_mm: ArrayLike, medial_mm: ArrayLike 
 def joint_pose(
     joint: Joint, pitch_rad: ArrayLike, slides_mm: ArrayLike, shift_mm: ArrayLike, lifts_mm: ArrayLike
 ) -> Array:
-    """Return the mandible poses that put both condyles on their eminences.
+    """Return the mandible poses T_skull_mandible (..., 4, 4) that put both condyles on their eminences.
 
     Args:
         pitch_rad: opening rotation about the condylar axis, shape (...).
         slides_mm: forward slide of the (left, right) condyle, shape (..., 2).
         shift_mm: shift of the condylar midpoint to the left, shape (...).
         lifts_mm: distance of the (left, right) condyle below its eminence, shape (..., 2).
-
-    Returns:
-        T_skull_mandible, shape (..., 4, 4).
     """
-    pitch, slides, shift = np.asarray(pitch_rad), np.asarray(slides_mm), np.asarray(shift_mm)
-    lifts = np.asarray(lifts_mm)
+    pitch, slides, shift, lifts = (np.asarray(value) for value in (pitch_rad, slides_mm, shift_mm, lifts_mm))
     left, right = joint.condyles
     rest_axis = left - right
     distance = joint.condylar_distance_mm
@@ -148,7 +144,7 @@ def joint_pose(
 def controlled_pose(
     joint: Joint, opening: ArrayLike, lateral: ArrayLike, protrusion: ArrayLike, extra_mm: ArrayLike | None = None
 ) -> Array:
-    """Return mandible poses for controls, extrapolated smoothly outside their ranges.
+    """Return T_skull_mandible (..., 4, 4) for controls, extrapolated smoothly outside their ranges.
 
     Args:
         opening: 0 closed .. 1 wide open, shape (...).
@@ -156,9 +152,6 @@ def controlled_pose(
         protrusion: -1 retruded .. 1 protruded, of the range at that opening, shape (...).
         extra_mm: small movements outside the three controls: side shift, lift of the left and of the right condyle,
             shape (..., 3); None is zero.
-
-    Returns:
-        T_skull_mandible, shape (..., 4, 4); the identity for zero controls.
     """
     opening, lateral, protrusion = np.broadcast_arrays(
         *(np.asarray(c, dtype=np.float64) for c in (opening, lateral, protrusion))

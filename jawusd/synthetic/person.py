@@ -104,7 +104,8 @@ class Person:
         self.joint = _draw_joint(rng)
         self.noise = Noise(0.12, float(np.deg2rad(0.08)), rng.uniform(0.10, 0.20), rng.uniform(0.065, 0.12))
         self.mandible_points = _mandible_points(self.joint)
-        self.landmarks = np.concatenate([_dental_landmarks(self.joint), self.joint.condyles])
+        first_molars = self.joint.incisor + np.array([[22.0, 0.5, -26.0], [-22.0, 0.5, -26.0]])
+        self.landmarks = np.concatenate([self.joint.incisor[None], first_molars, self.joint.condyles])
         self._envelope = Envelope(self.pose, self.mandible_points, exponent=1.3 if envelope == "competing" else None)
 
     def pose(self, opening: ArrayLike, lateral: ArrayLike, protrusion: ArrayLike) -> Array:
@@ -146,12 +147,6 @@ class Person:
     def incisor(self, T_skull_mandible: ArrayLike) -> Array:
         """Return the displacement of the lower incisal point from rest [mm], scan axes, shape (..., 3)."""
         return transform_point(T_skull_mandible, self.joint.incisor) - self.joint.incisor
-
-
-def _dental_landmarks(joint: Joint) -> Array:
-    """Incisal point and the first molars (left, right), scan frame, shape (3, 3)."""
-    x, y, z = joint.incisor
-    return np.array([[x, y, z], [x + 22.0, y + 0.5, z - 26.0], [x - 22.0, y + 0.5, z - 26.0]])
 
 
 def _mandible_points(joint: Joint) -> Array:

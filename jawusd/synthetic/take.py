@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from jawusd.geometry import make_transform, so3_exp
 from jawusd.geometry.arrays import Array, Mask
-from jawusd.synthetic.anatomy import lifted_bite
+from jawusd.synthetic.anatomy import Occlusion, lifted_bite
 from jawusd.synthetic.exercises import schedule, smooth_noise, smoothed
 from jawusd.synthetic.kinematics import smoothstep
-from jawusd.synthetic.occlusion import Occlusion
 from jawusd.synthetic.person import Person
 from jawusd.synthetic.soft_tissue import LipState
 from jawusd.synthetic.studio import T_WORLD_SCAN

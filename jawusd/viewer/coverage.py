@@ -67,7 +67,8 @@ class CoveragePlot:
             f'stroke="{GREY}"/>',
             f'<text x="{_LEFT}" y="13" {_TEXT} font-weight="bold">mask area left uncovered [%]</text>',
         ]
-        parts += [self._lost_bar(int(frame)) for frame in tracks.frames[~tracks.tracked()]]
+        lost = f'stroke="{VERMILION}" stroke-opacity=".4"'
+        parts += [self._vertical(int(frame), lost) for frame in tracks.frames[~tracks.tracked()]]
         parts += [self._curve(tracks.frames, percent[:, k], color) for k, color in enumerate(_COLORS)]
         for value in np.linspace(0, self._top / 1.08, 3):
             y = self._y(value)
@@ -83,7 +84,7 @@ class CoveragePlot:
 
     def with_playhead(self, frame: int) -> str:
         """Return the SVG of the plot with a line at the frame shown."""
-        line = f'<path d="M{self._x(frame):.1f} {_TOP}V{_HEIGHT - _BOTTOM}" stroke="currentColor" stroke-width="1.5"/>'
+        line = self._vertical(frame, 'stroke="currentColor" stroke-width="1.5"')
         box = f'viewBox="0 0 {_WIDTH} {_HEIGHT}" width="100%" style="display:block"'
         return f'<svg {box}><use href="#jaw-coverage"/>{line}</svg>'
 
@@ -94,8 +95,8 @@ class CoveragePlot:
     def _y(self, percent: float) -> float:
         return _HEIGHT - _BOTTOM - percent / self._top * (_HEIGHT - _TOP - _BOTTOM)
 
-    def _lost_bar(self, frame: int) -> str:
-        return f'<path d="M{self._x(frame):.1f} {_TOP}V{_HEIGHT - _BOTTOM}" stroke="{VERMILION}" stroke-opacity=".4"/>'
+    def _vertical(self, frame: int, style: str) -> str:
+        return f'<path d="M{self._x(frame):.1f} {_TOP}V{_HEIGHT - _BOTTOM}" {style}/>'
 
     def _curve(self, frames: NDArray[np.int64], percent: Array, color: str) -> str:
         """Return a curve that breaks where there is no value."""

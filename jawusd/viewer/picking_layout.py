@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jawusd.formats.mesh import Mesh
-from jawusd.geometry import make_transform, transform_point, transform_points
+from jawusd.geometry import make_transform, so3_exp, transform_point, transform_points
 from jawusd.geometry.arrays import Array
 from jawusd.geometry.rays import meet_triangles
 from jawusd.geometry.se3 import se3_inverse
@@ -64,8 +64,8 @@ class PickingLayout:
         for arch in ARCHES:
             yaw, pitch = np.radians(SIDES[side])
             pitch = pitch if arch == "lower" else -pitch
-            turned = make_transform(_about_y(yaw) @ _about_x(pitch), np.zeros(3)) @ T_anatomical_skull
-            facing = make_transform(np.diag([1.0, -1.0, -1.0]), np.zeros(3)) @ turned
+            R = np.diag([1.0, -1.0, -1.0]) @ so3_exp([0.0, yaw, 0.0]) @ so3_exp([pitch, 0.0, 0.0])
+            facing = make_transform(R, np.zeros(3)) @ T_anatomical_skull
             placed = transform_points(facing, scans[arch].vertices)
             low, high = placed.min(axis=0), placed.max(axis=0)
             move = np.array([middle - (low[0] + high[0]) / 2, top - low[1], -high[2] - _GAP_MM])
@@ -124,13 +124,3 @@ def hit_vertex(mesh: Mesh, T_world_scan: Array, origin: ArrayLike, direction: Ar
     distance = float(along[face])
     nearest = np.linalg.norm(mesh.vertices[corners] - (o + distance * d), axis=1).argmin()
     return int(corners[nearest]), distance
-
-
-def _about_y(angle: float) -> Array:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
-
-
-def _about_x(angle: float) -> Array:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[1, 0, 0], [0, c, -s], [0, s, c]])

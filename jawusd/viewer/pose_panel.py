@@ -40,18 +40,14 @@ class PosePanel:
         self.keep_valid = gui.add_checkbox("keep valid", True, hint="Stop sliders at the bound of this person.")
         self.keep_valid.on_update(guarded(client, self._keep))
         self.reading = gui.add_html("")
-        steps = gui.add_button_group("history", ("undo", "redo", "close jaw"))
-        steps.on_click(guarded(client, self._step))
+        gui.add_button_group("history", ("undo", "redo", "close jaw")).on_click(guarded(client, self._step))
         with gui.add_folder("Hold while dragging"):
             self.pins = {name: self._add_pin(name) for name in _PINNABLE}
         with gui.add_folder("View"):
-            views = gui.add_button_group("look from", tuple(PRESETS))
-            views.on_click(guarded(client, self._look))
-            paths = gui.add_checkbox("paths and captured places", True)
-            paths.on_update(guarded(client, self._show_paths))
+            gui.add_button_group("look from", tuple(PRESETS)).on_click(guarded(client, self._look))
+            gui.add_checkbox("paths and captured places", True).on_update(guarded(client, self._show_paths))
             add_dark_checkbox(client)
-        undo = gui.add_command("Undo", hotkey="Z", modifier="cmd/ctrl")
-        undo.on_trigger(guarded(client, self._undo))
+        gui.add_command("Undo", hotkey="Z", modifier="cmd/ctrl").on_trigger(guarded(client, self._undo))
 
     def _add_slider(self, index: int, label: str) -> viser.GuiSliderHandle[float]:
         slider = self._client.gui.add_slider(label, -1.0, 1.0, STEP_MM, 0.0, hint=_HINTS[index])

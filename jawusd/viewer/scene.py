@@ -57,36 +57,33 @@ class JawScene:
         self._scene.add_light_hemisphere("/light", ground_color=_GROUND, intensity=_AMBIENT)
         for name in STILL:
             if name in actor.meshes:
-                self._add_still(name, actor.meshes[name])
+                mesh = actor.meshes[name]
+                placed = Mesh(transform_points(self._T_world_skull, mesh.vertices), mesh.faces)
+                self._add_mesh(
+                    f"/{name}", placed, _COLORS.get(name, _BONE), _SKULL_OPACITY if name == "skull" else None
+                )
         self._jaw = self._scene.add_frame("/jaw", show_axes=False)
         moving = [name for name in MOVING if name in actor.meshes]
         self._bone = _PLACEHOLDER if "mandible" in actor.placeholders else _BONE
-        self.grips = [self._add_moving(name, actor) for name in moving]
+        self.grips = []
+        for name in moving:
+            opacity = _CLEAR if name in actor.placeholders else None
+            color = _COLORS.get(name, self._bone)
+            self.grips.append(self._add_mesh(f"/jaw/{name}", actor.meshes[name], color, opacity))
         self._mandible = self.grips[moving.index("mandible")] if "mandible" in moving else None
         self._inside = True
         self._add_landmarks(rig.arrays["landmarks"])
         self._paths = self._add_paths(actor)
         self._pins = {name: self._ball(f"/pin/{name}", _PIN_MM, _PIN, opacity=0.6) for name in LANDMARKS}
         self._held = self._ball("/held", _MARKER_MM, _HELD)
-        self._line = self._scene.add_line_segments(
-            "/pull", np.zeros((1, 2, 3)), colors=_HELD, thickness=2.5, thickness_units="screen"
-        )
+        self._line = self._lines("/pull", np.zeros((1, 2, 3)), _HELD)
         self.show_hold(None, None)
         self.show_pins({})
 
-    def _add_still(self, name: str, mesh: Mesh) -> None:
-        vertices = transform_points(self._T_world_skull, mesh.vertices)
-        clear = _SKULL_OPACITY if name == "skull" else None
-        self._scene.add_mesh_simple(
-            f"/{name}", vertices, mesh.faces, color=_COLORS.get(name, _BONE), opacity=clear, side=_side(mesh)
-        )
-
-    def _add_moving(self, name: str, actor: ViewedActor) -> viser.MeshHandle:
-        mesh, color = actor.meshes[name], _COLORS.get(name, self._bone)
-        clear = _CLEAR if name in actor.placeholders else None
-        return self._scene.add_mesh_simple(
-            f"/jaw/{name}", mesh.vertices, mesh.faces, color=color, opacity=clear, side=_side(mesh)
-        )
+    def _add_mesh(self, name: str, mesh: Mesh, color: Color, opacity: float | None) -> viser.MeshHandle:
+        # Drawing both sides of faces costs twice as much and is needed for open meshes only.
+        side: Literal["front", "double"] = "front" if is_solid(mesh) else "double"
+        return self._scene.add_mesh_simple(name, mesh.vertices, mesh.faces, color=color, opacity=opacity, side=side)
 
     def _add_landmarks(self, landmarks: Array) -> None:
         for name, place in zip(LANDMARKS, landmarks, strict=True):
@@ -173,11 +170,6 @@ class JawScene:
             self._mandible.opacity = _CLEAR if preset.startswith("condyle") else None
         with self._client.atomic():
             camera.position, camera.look_at, camera.up_direction = tuple(eye), tuple(target), (0.0, 1.0, 0.0)
-
-
-def _side(mesh: Mesh) -> Literal["front", "double"]:
-    """Return which sides of faces are drawn: both cost twice as much and are needed for open meshes only."""
-    return "front" if is_solid(mesh) else "double"
 
 
 def preset_view(rest: Array, preset: str) -> tuple[Array, Array]:
