@@ -6,6 +6,7 @@ import json
 import os
 from dataclasses import dataclass, field
 from enum import IntEnum
+from typing import TypedDict, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,36 @@ from jawusd.geometry import LANDMARKS, rigidity_defect
 from jawusd.geometry.arrays import Array, Mask
 
 FAMILY, VERSION = "jawusd-tracks", 1
+
+
+class CameraCorrections(TypedDict):
+    """Camera poses as a take corrects them; tables by camera name."""
+
+    corrected: bool
+    pivot_mm: list[float]
+    turns_deg: dict[str, list[float]]
+    turns_sigma_deg: dict[str, list[float]]
+    moves_mm: dict[str, list[float]]
+    moves_sigma_mm: dict[str, list[float]]
+    T_cam_world: dict[str, list[list[float]]]
+
+
+class TracksMeta(TypedDict, total=False):
+    """Configuration, and what was estimated over a whole take; tables by camera name, pairs are (upper, lower)."""
+
+    tracking: dict[str, object]
+    correlation_px: float
+    delays_frames: dict[str, float]
+    delays_sigma_frames: dict[str, float]
+    mask_bias_px: list[float]
+    mask_bias_sigma_px: list[float]
+    extrinsics: CameraCorrections
+    start: dict[str, object]
+    painted: list[bool]
+    solver: str
+    backend: str
+    evaluations_per_row_and_frame: float
+    calibration_rescaled_px: dict[str, tuple[list[int], list[int]]]
 
 
 class TrackStatus(IntEnum):
@@ -91,7 +122,6 @@ class Tracks:
         lost_value, lost_limit: the figure that was found and its limit, in the unit the reason names, shape (F, 2);
             NaN without a reason.
         camera_names: the cameras, length C.
-        meta: configuration, versions, hashes, estimated nuisances.
     """
 
     frames: NDArray[np.int64]
@@ -112,7 +142,7 @@ class Tracks:
     residual_px: Array
     matched_px: Array
     camera_names: tuple[str, ...]
-    meta: dict = field(default_factory=dict)
+    meta: TracksMeta = field(default_factory=TracksMeta)
     lost_reason: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 2), np.uint8))
     lost_value: Array = field(default_factory=lambda: np.zeros((0, 2)))
     lost_limit: Array = field(default_factory=lambda: np.zeros((0, 2)))
@@ -125,7 +155,7 @@ class Tracks:
 
     def tracked(self) -> Mask:
         """Return which frames have both final poses, shape (F,)."""
-        return np.isfinite(self.T_upper_lower).all((1, 2))
+        return np.asarray(np.isfinite(self.T_upper_lower).all((1, 2)))
 
     def explain_loss(self, index: int, arch: int) -> str:
         """Say why an arch (0 upper, 1 lower) was given up in the frame at an index."""
@@ -158,17 +188,13 @@ def _shapes(count: int, cameras: int) -> dict[str, tuple[int, ...]]:
 
 
 def save_tracks(path: str | os.PathLike[str], tracks: Tracks) -> None:
-    """Write tracks atomically.
-
-    Args:
-        path: where to, `.npz`.
-        tracks: what to write.
+    """Write tracks atomically as `.npz`.
 
     Raises:
         OutputError: the file cannot be written.
         ValueError: an array has the wrong shape.
     """
-    arrays: dict[str, NDArray] = {}
+    arrays: dict[str, Array] = {}
     for name, shape in _shapes(len(tracks.frames), len(tracks.camera_names)).items():
         value = np.asarray(getattr(tracks, name))
         if value.shape != shape:
@@ -187,10 +213,7 @@ def save_tracks(path: str | os.PathLike[str], tracks: Tracks) -> None:
 
 
 def load_tracks(path: str | os.PathLike[str]) -> Tracks:
-    """Read tracks and check them.
-
-    Args:
-        path: `tracks.npz` of format jawusd-tracks/1.
+    """Read tracks of format jawusd-tracks/1 and check them.
 
     Raises:
         FormatError: not a tracks file, wrong shapes, or poses that are not rigid.
@@ -221,7 +244,7 @@ def load_tracks(path: str | os.PathLike[str]) -> Tracks:
                 raise FormatError(
                     f'"{name}" of frame {frame} is not rigid (off by {defect.max():.2g}, allowed 1e-6).', path=path
                 )
-    return Tracks(**values, camera_names=tuple(names), meta=meta)
+    return Tracks(**values, camera_names=tuple(names), meta=cast(TracksMeta, meta))
 
 
 def is_tracks(path: str | os.PathLike[str]) -> bool:

@@ -1,4 +1,4 @@
-"""Poses of both rows of teeth from masks in several views."""
+"""Poses of both arches from masks in several views."""
 
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.sequence.take import track_capture

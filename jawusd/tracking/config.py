@@ -1,8 +1,21 @@
-"""The numbers of the tracker, each with its unit and reason."""
+"""The settings of the tracker, each with its unit and reason."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
+
+
+class Mapper(Protocol):
+    """Run a function over items in their order, as `map` does, or in threads."""
+
+    def __call__(self, function: Callable[[_Item], _Result], items: Iterable[_Item], /) -> Iterable[_Result]:
+        """Return the results."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -33,13 +46,13 @@ class TrackingConfig:
     normal_cosine: float = 0.7
     # How much nearer a crown may lie one pixel inside its own contour [mm]: a cusp's curvature, not a second tooth.
     depth_tolerance_mm: float = 1.5
-    # Depth by which one row must lie in front of the other to hide it [mm]: above the error of the poses.
+    # Depth by which one arch must lie in front of the other to hide it [mm]: above the error of the poses.
     overlap_tolerance_mm: float = 0.4
     # Update below which iterations stop [mm at the crowns]: a tenth of the accuracy that can be reached.
     converged_mm: float = 0.004
     # Motion after which a scan is drawn again for hidden parts [px]: hidden parts are judged to one pixel.
     redraw_px: float = 1.0
-    # Distance a row may plausibly lie from its prediction [mm]: a weak pull that only matters where masks say nothing.
+    # Distance a arch may plausibly lie from its prediction [mm]: a weak pull that only matters where masks say nothing.
     prediction_mm: float = 0.5
     # Outline variance times correlation length behind that pull [px^3]: 0.4 px over 18 px, typical masks by hand.
     typical_noise_px3: float = 3.0
@@ -54,36 +67,36 @@ class TrackingConfig:
     history_frames: int = 31
     # Good frames remembered to judge scores [frames]: closing lips take longer, a lost pose does not.
     score_frames: int = 7
-    # Score below this share of the recent median makes a row suspect [-]: lips seldom hide as much in a few frames.
+    # Score below this share of the recent median makes a arch suspect [-]: lips seldom hide as much in a few frames.
     suspect_score: float = 0.6
     # Score share below which even closing lips are no excuse [-].
     alarming_score: float = 0.3
-    # Residual spread above this multiple of the recent median makes a row suspect [-].
+    # Residual spread above this multiple of the recent median makes a arch suspect [-].
     suspect_residual: float = 1.4
-    # Uncovered mask above the recent median by more than this makes a row, or a mask, suspect [-].
+    # Uncovered mask above the recent median by more than this makes a arch, or a mask, suspect [-].
     suspect_coverage: float = 0.04
-    # Residual of one view above this multiple of the row's recent median makes its mask suspect [-].
+    # Residual of one view above this multiple of the arch's recent median makes its mask suspect [-].
     uneven_residual: float = 1.6
     # Score of one view below this share of its recent median means its mask shows something else [-].
     dead_score: float = 0.03
     # Price of a mask pixel left uncovered, in px of contour [1/px]: tells wrong minima apart where few edges show.
-    bare_price: float = 0.5
-    # Gain in worth of the remaining masks, as a share of their score, that proves the one left out wrong [-].
+    uncovered_price: float = 0.5
+    # Gain in objective of the remaining masks, as a share of their score, that proves the one left out wrong [-].
     conflict_gain: float = 0.15
-    # Gain in worth over the first attempt, as a share of the score, that makes a frame count as recovered [-].
+    # Gain in objective over the first attempt, as a share of the score, that makes a frame count as recovered [-].
     recovery_gain: float = 0.05
     # Rings of the multi-start [mm, rad]: the prediction error of a fast chewing stroke, and of teeth back in sight.
     search_rings: tuple[tuple[float, float], ...] = ((2.0, 0.05), (4.0, 0.12))
     # Gates of the first look at a start [px], and how many starts are followed to the end.
-    glance_gates_px: tuple[float, ...] = (14.0, 8.0)
+    trial_gates_px: tuple[float, ...] = (14.0, 8.0)
     search_finalists: int = 4
-    # Matched contour below which a row is lost [px]: 8 mm of tooth edge.
+    # Matched contour below which a arch is lost [px]: 8 mm of tooth edge.
     least_matched_px: float = 60.0
     # Residual spread above this multiple of the suspect limit means lost [-]; with a low score the limit itself does.
     lost_residual: float = 1.3
-    # Uncovered share of a mask above which the row is lost [-]: good poses leave about 0.01.
+    # Uncovered share of a mask above which the arch is lost [-]: good poses leave about 0.01.
     lost_coverage: float = 0.12
-    # Position uncertainty of the crowns above which a row is lost [mm].
+    # Position uncertainty of the crowns above which a arch is lost [mm].
     lost_sigma_mm: float = 0.5
     # Matched share of the visible contour the first frame must reach [-]: good ones reach 0.15 with lips nearly closed.
     first_share: float = 0.1

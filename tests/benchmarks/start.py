@@ -165,7 +165,7 @@ def score_search(bench: Bench, count: int, threads: int) -> None:
                 spent = time.process_time() - begin
                 error = bench.errors_mm(found.poses, frame)
                 print(
-                    f"{frame:5} {error[0]:8.3f}{error[1]:7.3f} {found.worth_px:8.0f} {found.fit:6.2f} {spent:9.1f}",
+                    f"{frame:5} {error[0]:8.3f}{error[1]:7.3f} {found.objective_px:8.0f} {found.fit:6.2f} {spent:9.1f}",
                     end="",
                     flush=True,
                 )

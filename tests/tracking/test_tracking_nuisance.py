@@ -14,7 +14,7 @@ from jawusd.tracking.contour.equations import OutlineSums, Solution
 from jawusd.tracking.contour.frame_record import FrameRecord
 from jawusd.tracking.sequence.extrinsics import Extrinsics, corrected_cameras
 from jawusd.tracking.sequence.frame_tracker import FrameTracker
-from jawusd.tracking.sequence.nuisance import Nuisances, bridge, leads
+from jawusd.tracking.sequence.nuisance import Nuisances, bridge, delay_motions
 
 FRAMES = 16
 WITHOUT = TrackingConfig(refine_rounds=0)
@@ -197,7 +197,7 @@ def test_a_lost_row_is_bridged_by_even_motion():
     records, step = _records(12, lost=(4, 5, 6))
     pose, _ = bridge(records, 5, 1)
     assert pose == pytest.approx(records[5].solution.poses[0], abs=1e-6)
-    moved = leads(records, 5, np.array([0.0, 0.25]))
+    moved = delay_motions(records, 5, np.array([0.0, 0.25]))
     assert moved[0] == pytest.approx(np.tile(np.eye(4), (2, 1, 1)))
     assert moved[1, 1] == pytest.approx(se3_exp(0.25 * step), abs=1e-6)
     assert moved[1, 0] == pytest.approx(moved[1, 1], abs=1e-6)
@@ -206,7 +206,7 @@ def test_a_lost_row_is_bridged_by_even_motion():
 def test_long_gaps_and_ends_are_not_bridged():
     assert bridge(_records(20, lost=range(4, 18))[0], 10, 1) is None
     assert bridge(_records(6, lost=(0, 1))[0], 0, 1) is None
-    assert leads(_records(6, lost=(0, 1))[0], 0, np.array([0.0, 0.3]))[1, 1].tolist() == np.eye(4).tolist()
+    assert delay_motions(_records(6, lost=(0, 1))[0], 0, np.array([0.0, 0.3]))[1, 1].tolist() == np.eye(4).tolist()
 
 
 def test_frames_lost_to_a_late_camera_are_found_once_it_is_known(tmp_path):
@@ -214,9 +214,9 @@ def test_frames_lost_to_a_late_camera_are_found_once_it_is_known(tmp_path):
     capture = make_capture(write_masks(tmp_path / "late", FRAMES, delays=(0.0, 0.3, -0.2)), FRAMES)
     original = FrameTracker.track
 
-    def distrustful(self, starts, views, gallery, reach_px=0.0):
-        record = original(self, starts, views, gallery, reach_px)
-        shaky = max(np.abs(v.lead - np.eye(4)).max() for v in views) == 0 and self.history.usual_score().any()
+    def distrustful(self, starts, views, pose_history, reach_px=0.0):
+        record = original(self, starts, views, pose_history, reach_px)
+        shaky = max(np.abs(v.T_delay - np.eye(4)).max() for v in views) == 0 and self.history.usual_score().any()
         seen = abs(record.solution.poses[1, 1, 3] - AT[1, 1, 3]) < 0.3
         return replace(record, status=np.array([record.status[0], LOST], np.int8)) if shaky and seen else record
 

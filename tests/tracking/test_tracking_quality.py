@@ -148,10 +148,10 @@ def test_gallery_keeps_unlike_jaw_poses_relative_to_the_head():
     motion = _motion(poses)
     for k in range(30):
         motion.remember(np.stack([poses[0], poses[1] @ se3_exp([0, 0, 0, 0, -0.5 * k, 0])]), np.array([True, True]))
-    assert 6 < len(motion.gallery()) <= 16
+    assert 6 < len(motion.pose_history()) <= 16
     motion.update(se3_exp([0, 0.1, 0, 5, 0, 0]) @ poses, BOTH, BOTH)
     head = motion.predict()[0]
-    for entry in motion.gallery():
+    for entry in motion.pose_history():
         jaw = se3_inverse(head) @ entry[1]
         assert jaw[:3, :3] == pytest.approx((se3_inverse(poses[0]) @ poses[1])[:3, :3], abs=1e-6)
 
@@ -160,7 +160,7 @@ def test_searches_become_rarer_while_lost():
     motion = _motion(jaw_poses(1)[0])
     due = []
     for _ in range(40):
-        due.append(motion.worth_searching())
+        due.append(motion.search_is_due())
         motion.update(motion.predict(), UPPER, BOTH)
     assert due[:5] == [True, True, True, False, True] and sum(due) < 10
 
@@ -169,7 +169,7 @@ def test_searches_stay_due_while_there_is_nothing_to_see():
     motion = _motion(jaw_poses(1)[0])
     for _ in range(7):
         motion.update(motion.predict(), UPPER, UPPER)
-        assert motion.worth_searching()
+        assert motion.search_is_due()
 
 
 def test_shift_brings_crowns_back_onto_their_masks():

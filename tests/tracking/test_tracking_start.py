@@ -386,4 +386,4 @@ def test_search_is_the_same_in_threads(pictures, short_search):
     T = check_occlusion(SCANS, None)[0]
     with ThreadPoolExecutor(2) as pool:
         both = [StartSearch(MESHES, solver, T, m).at(footage, FIRST + 1) for m in (map, pool.map)]
-    assert (both[0].poses == both[1].poses).all() and both[0].worth_px == both[1].worth_px
+    assert (both[0].poses == both[1].poses).all() and both[0].objective_px == both[1].objective_px

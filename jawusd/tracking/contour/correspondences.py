@@ -7,14 +7,16 @@ from __future__ import annotations
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
+from jawusd.geometry.arrays import Array
 from jawusd.tracking.contour.samples import INVERSE_DEPTH, LENGTH, NX, NY, U, V, X, Y, Z, pixel_of
 
 _EDGE = 127.5  # mask value at the outline: half of a pixel belongs to the teeth
 
 
 @numba.njit(nogil=True, cache=True, inline="always")
-def _sample(mask, x, y):
+def _sample(mask: NDArray[np.uint8], x: float, y: float) -> float:
     """Interpolate a uint8 picture bilinearly; 0 outside."""
     if x < 0 or y < 0 or x >= mask.shape[1] - 1 or y >= mask.shape[0] - 1:
         return 0.0
@@ -28,7 +30,7 @@ def _sample(mask, x, y):
 
 
 @numba.njit(nogil=True, cache=True, inline="always")
-def _at(picture, x, y):
+def _at(picture: NDArray[np.float32], x: float, y: float) -> float:
     i = pixel_of(x)
     j = pixel_of(y)
     if i < 0 or j < 0 or j >= picture.shape[0] or i >= picture.shape[1]:
@@ -37,7 +39,7 @@ def _at(picture, x, y):
 
 
 @numba.njit(nogil=True, cache=True)
-def _nearest_edge(mask, x, y, nx, ny, reach):
+def _nearest_edge(mask: NDArray[np.uint8], x: float, y: float, nx: float, ny: float, reach: float) -> float:
     """Return the signed distance [px] along the normal to the nearest way out of the mask.
 
     NaN where there is none within reach; positive infinity where all of the reach lies inside the mask.
@@ -63,26 +65,34 @@ def _nearest_edge(mask, x, y, nx, ny, reach):
 
 
 @numba.njit(nogil=True, cache=True)
-def search_edges(samples, mask, other_mask, other_inverse_depth, reach_px, tolerance_mm, cos_limit, out):
+def search_edges(
+    samples: Array,
+    mask: NDArray[np.uint8],
+    other_mask: NDArray[np.uint8],
+    other_inverse_depth: NDArray[np.float32],
+    reach_px: float,
+    tolerance_mm: float,
+    cos_limit: float,
+    out: Array,
+) -> None:
     """Write the signed distance [px] from every contour sample to the mask edge it should lie on.
 
     Args:
-        samples: contour samples, shape (n, COLUMNS).
-        mask: this row's mask, uint8, 255 = teeth, shape (h, w).
-        other_mask: the other row's mask or zeros, shape (h, w).
-        other_inverse_depth: rendered inverse depth of the other row's scan [1/mm], 0 = empty, shape (h, w).
-        reach_px: how far to look on both sides.
-        tolerance_mm: depth difference between the rows that counts as real.
+        samples: shape (n, COLUMNS).
+        mask, other_mask: of this and of the other arch, 255 = teeth, shape (h, w).
+        other_inverse_depth: rendered inverse depth of the other arch's scan [1/mm], 0 = empty, shape (h, w).
+        reach_px: search distance on either side.
+        tolerance_mm: depth difference between the arches that counts as real.
         cos_limit: least cosine between the sample's normal and the mask's own at the edge.
         out: receives, shape (n,): the distance, positive outwards; NaN where the sample is hidden, or no edge or only
             another object's edge is near; +inf where the whole reach lies inside the mask.
     """
     for s in range(len(samples)):
-        row = samples[s]
-        x, y, nx, ny, own = row[U], row[V], row[NX], row[NY], row[INVERSE_DEPTH]
+        sample = samples[s]
+        x, y, nx, ny, own = sample[U], sample[V], sample[NX], sample[NY], sample[INVERSE_DEPTH]
         out[s] = np.nan
         if _at(other_inverse_depth, x, y) * (1 - tolerance_mm * own) > own:
-            continue  # the other row of teeth is in front
+            continue  # the other arch is in front
         d = _nearest_edge(mask, x, y, nx, ny, reach_px)
         if np.isfinite(d):
             ex = x + d * nx
@@ -94,20 +104,21 @@ def search_edges(samples, mask, other_mask, other_inverse_depth, reach_px, toler
             if _sample(other_mask, ex + 2 * nx, ey + 2 * ny) > _EDGE:
                 other = _at(other_inverse_depth, ex + 2 * nx, ey + 2 * ny)
                 if other == 0.0 or other * (1 - 0.25 * tolerance_mm * own) > own:
-                    continue  # this edge is made by the other row, which lies in front
+                    continue  # this edge is made by the other arch, which lies in front
         out[s] = d
 
 
 @numba.njit(nogil=True, cache=True)
-def _slope(row, pose, matrix, centre, jacobian):
+def _slope(sample: Array, pose: Array, matrix: Array, centre: Array, jacobian: Array) -> None:
     """Write how far a sample moves along its normal [px] per unit of a left twist about a world point."""
-    a = pose[0, 0] * row[X] + pose[0, 1] * row[Y] + pose[0, 2] * row[Z] + pose[0, 3]
-    b = pose[1, 0] * row[X] + pose[1, 1] * row[Y] + pose[1, 2] * row[Z] + pose[1, 3]
-    c = pose[2, 0] * row[X] + pose[2, 1] * row[Y] + pose[2, 2] * row[Z] + pose[2, 3]
+    a = pose[0, 0] * sample[X] + pose[0, 1] * sample[Y] + pose[0, 2] * sample[Z] + pose[0, 3]
+    b = pose[1, 0] * sample[X] + pose[1, 1] * sample[Y] + pose[1, 2] * sample[Z] + pose[1, 3]
+    c = pose[2, 0] * sample[X] + pose[2, 1] * sample[Y] + pose[2, 2] * sample[Z] + pose[2, 3]
     w = matrix[2, 0] * a + matrix[2, 1] * b + matrix[2, 2] * c + matrix[2, 3]
     for k in range(3):
-        along = row[NX] * (matrix[0, k] - row[U] * matrix[2, k]) + row[NY] * (matrix[1, k] - row[V] * matrix[2, k])
-        jacobian[3 + k] = along / w
+        along_x = sample[NX] * (matrix[0, k] - sample[U] * matrix[2, k])
+        along_y = sample[NY] * (matrix[1, k] - sample[V] * matrix[2, k])
+        jacobian[3 + k] = (along_x + along_y) / w
     a -= centre[0]
     b -= centre[1]
     c -= centre[2]
@@ -117,15 +128,26 @@ def _slope(row, pose, matrix, centre, jacobian):
 
 
 @numba.njit(nogil=True, cache=True)
-def accumulate(samples, distances, gate_px, score_gate_px, pull, pose, matrix, centre, precision, gradient, bias_slope):
-    """Add the Tukey-weighted normal equations of one row of teeth in one view.
+def accumulate(
+    samples: Array,
+    distances: Array,
+    gate_px: float,
+    score_gate_px: float,
+    pull: float,
+    pose: Array,
+    matrix: Array,
+    centre: Array,
+    precision: Array,
+    gradient: Array,
+    bias_slope: Array,
+) -> tuple[float, float, float, float, float]:
+    """Add the Tukey-weighted normal equations of one arch in one view.
 
     The residual d of a sample shrinks by n . du when the sample moves by du in the picture; du follows from a left
-    twist (omega, v) of the row about `centre` (Drummond & Cipolla 2002 use the same point-to-edge distances).
+    twist (omega, v) of the arch about `centre` (Drummond & Cipolla 2002 use the same point-to-edge distances).
 
     Args:
-        samples: contour samples, shape (n, COLUMNS).
-        distances: as `search_edges` writes them, shape (n,).
+        samples, distances: as `search_edges` takes and writes them, shapes (n, COLUMNS) and (n,).
         gate_px: residual beyond which the Tukey weight is zero.
         score_gate_px: residual beyond which a sample adds nothing to the score.
         pull: weight at the gate of samples deep inside the mask; 0 leaves them out.
@@ -143,7 +165,7 @@ def accumulate(samples, distances, gate_px, score_gate_px, pull, pose, matrix, c
         d = distances[s]
         if np.isnan(d):
             continue
-        row = samples[s]
+        sample = samples[s]
         if np.isinf(d):
             if pull == 0.0:
                 continue
@@ -152,14 +174,14 @@ def accumulate(samples, distances, gate_px, score_gate_px, pull, pose, matrix, c
         else:
             e = 1.0 - (d / score_gate_px) ** 2
             if e > 0:
-                score_px += e * e * e * row[LENGTH]
+                score_px += e * e * e * sample[LENGTH]
             e = 1.0 - (d / gate_px) ** 2
             if e <= 0:
                 continue
             weight = e * e
-            matched_px += row[LENGTH]
-        weight *= row[LENGTH]
-        _slope(row, pose, matrix, centre, jacobian)
+            matched_px += sample[LENGTH]
+        weight *= sample[LENGTH]
+        _slope(sample, pose, matrix, centre, jacobian)
         for i in range(6):
             for k in range(6):
                 precision[i, k] += weight * jacobian[i] * jacobian[k]
@@ -172,8 +194,17 @@ def accumulate(samples, distances, gate_px, score_gate_px, pull, pose, matrix, c
 
 
 @numba.njit(nogil=True, cache=True)
-def scatter_of_tiles(samples, distances, gate_px, pose, matrix, centre, shape, tile_px):
-    """Return the sum over picture tiles of s s^T, s = sum of w J d over the samples in the tile.
+def scatter_of_tiles(
+    samples: Array,
+    distances: Array,
+    gate_px: float,
+    pose: Array,
+    matrix: Array,
+    centre: Array,
+    shape: tuple[int, int],
+    tile_px: int,
+) -> Array:
+    """Return the sum over picture tiles of s s^T, shape (6, 6); s is the sum of w J d over the samples in the tile.
 
     Errors of the outline move together over some length of contour; within a tile they add up before they are
     squared. Over the normal matrix this tells how much less a pixel of contour says than independent errors would
@@ -183,9 +214,6 @@ def scatter_of_tiles(samples, distances, gate_px, pose, matrix, centre, shape, t
         samples, distances, gate_px, pose, matrix, centre: as for `accumulate`.
         shape: (h, w) of the picture.
         tile_px: side of the square tiles, longer than the errors' correlation.
-
-    Returns:
-        Scatter matrix, shape (6, 6).
     """
     across = shape[1] // tile_px + 1
     sums = np.zeros(((shape[0] // tile_px + 1) * across, 6))
@@ -194,10 +222,10 @@ def scatter_of_tiles(samples, distances, gate_px, pose, matrix, centre, shape, t
         d = distances[s]
         if not abs(d) < gate_px:
             continue
-        row = samples[s]
-        weight = (1.0 - (d / gate_px) ** 2) ** 2 * row[LENGTH]
-        _slope(row, pose, matrix, centre, jacobian)
-        tile = int(row[V]) // tile_px * across + int(row[U]) // tile_px
+        sample = samples[s]
+        weight = (1.0 - (d / gate_px) ** 2) ** 2 * sample[LENGTH]
+        _slope(sample, pose, matrix, centre, jacobian)
+        tile = int(sample[V]) // tile_px * across + int(sample[U]) // tile_px
         for k in range(6):
             sums[tile, k] += weight * d * jacobian[k]
     return sums.T @ sums

@@ -12,10 +12,23 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from jawusd.geometry import make_transform, se3_inverse, se3_log
+from jawusd.geometry import make_transform, se3_exp, se3_inverse, se3_log
 from jawusd.geometry.arrays import Array
 
-ARCHES = (0, 1)  # upper, lower
+
+def translation(t: Array) -> Array:
+    """Return the motion by a vector [mm], shape (3,), as a transform (4, 4)."""
+    return make_transform(np.eye(3), t)
+
+
+def motion_about(centre: Array, twist: Array) -> Array:
+    """Return the motion of a twist, shape (..., 6), about a world point (3,), shape (..., 4, 4)."""
+    return translation(centre) @ se3_exp(twist) @ translation(-centre)
+
+
+def twist_between(start: Array, end: Array, centre: Array) -> Array:
+    """Return the twist about a world point (3,) that takes one pose (4, 4) to another, shape (6,)."""
+    return se3_log(translation(-centre) @ end @ se3_inverse(start) @ translation(centre))
 
 
 class OutlineSums(NamedTuple):
@@ -94,7 +107,7 @@ class NormalEquations:
 
     @property
     def coupling(self) -> Array:
-        """The precision that couples upper (rows) and lower arch (columns), shape (6, 6)."""
+        """The precision that couples upper (arches) and lower arch (columns), shape (6, 6)."""
         return self.matrix[:6, 6:]
 
     def add(self, arch: int, precision: Array, right: Array) -> None:
@@ -109,7 +122,7 @@ class NormalEquations:
 
     def solve(self) -> Array:
         """Return the twists of both arches, shape (2, 6)."""
-        return np.linalg.solve(self.matrix, self.right).reshape(2, 6)
+        return np.asarray(np.linalg.solve(self.matrix, self.right), np.float64).reshape(2, 6)
 
 
 class ResidualTerm(Protocol):
@@ -145,7 +158,6 @@ class StartTerm:
     def accumulate(self, state: Solution, equations: NormalEquations) -> None:
         """Add the pull at the state's poses."""
         for arch, weight in enumerate(equations.outline_weight):
-            to, back = (make_transform(np.eye(3), sign * state.centres[arch]) for sign in (-1, 1))
-            away = se3_log(to @ state.poses[arch] @ se3_inverse(self.start[arch]) @ back)
+            away = twist_between(self.start[arch], state.poses[arch], state.centres[arch])
             strength = weight * self.strength[arch]
             equations.add(arch, np.diag(strength), -strength * away)

@@ -31,8 +31,8 @@ class FrameRecord:
     """Hold what is known about one instant.
 
     Attributes:
-        solution: the alignment; its poses of lost rows mean nothing.
-        status: of both rows, as in `Tracks`, shape (2,).
+        solution: the alignment; its poses of lost arches mean nothing.
+        status: of both arches, as in `Tracks`, shape (2,).
         used: masks that took part, shape (2, C).
         coverage: E_SP over mask pixels, shape (2, C); NaN without a mask.
         losses: why each arch is lost.
@@ -52,8 +52,8 @@ class FrameSummary:
     Attributes:
         poses: T_world_upper and T_world_lower, shape (2, 4, 4).
         status, used, coverage: as in `FrameRecord`.
-        score_px: contour that fits per row and view, shape (2, C).
-        residual_px: standard deviation of the residuals per row, shape (2,).
+        score_px: contour that fits per arch and view, shape (2, C).
+        residual_px: standard deviation of the residuals per arch, shape (2,).
     """
 
     poses: Array

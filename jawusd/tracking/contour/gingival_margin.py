@@ -10,21 +10,15 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.geometry.arrays import Array, Mask
+from jawusd.geometry.arrays import Array, Indices, Mask
 
 _SHORTEST_MM = 1e-3  # shorter pieces carry no direction
 
 
 def crown_gum_segments(vertices: Array, crown_faces: NDArray[np.int32], gum_faces: NDArray[np.int32]) -> Array:
-    """Return the segments in which crown triangles cut gum triangles.
+    """Return the segments in which crown triangles cut gum triangles, as end points [mm], shape (S, 2, 3).
 
-    Args:
-        vertices: scan vertices [mm], shape (V, 3).
-        crown_faces: vertex indices, shape (F, 3).
-        gum_faces: vertex indices, shape (G, 3).
-
-    Returns:
-        End points of the segments [mm], shape (S, 2, 3); pieces shorter than 1 um are left out.
+    Pieces shorter than 1 um are left out.
     """
     if not len(crown_faces) or not len(gum_faces):
         return np.zeros((0, 2, 3))
@@ -42,16 +36,16 @@ def crown_gum_segments(vertices: Array, crown_faces: NDArray[np.int32], gum_face
     return segments[np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1) > _SHORTEST_MM]
 
 
-def _touching(triangles: NDArray, low: NDArray, high: NDArray) -> Mask:
+def _touching(triangles: Array, low: Array, high: Array) -> Mask:
     return (triangles.min(1) <= high).all(1) & (triangles.max(1) >= low).all(1)
 
 
-def _cells(low: NDArray, high: NDArray, cell: float) -> NDArray[np.int64]:
+def _cells(low: Array, high: Array, cell: float) -> NDArray[np.int64]:
     return np.floor((high - low) / cell).astype(np.int64) + 1
 
 
 @numba.njit(nogil=True, cache=True)
-def _box(triangle, low, cell, count, first, last):
+def _box(triangle: Array, low: Array, cell: float, count: Indices, first: Indices, last: Indices) -> None:
     """Write the first and last grid cell that the bounding box of a triangle meets."""
     for k in range(3):
         a = min(triangle[0, k], triangle[1, k], triangle[2, k])
@@ -61,7 +55,7 @@ def _box(triangle, low, cell, count, first, last):
 
 
 @numba.njit(nogil=True, cache=True)
-def _grid(triangles, low, cell, count):
+def _grid(triangles: Array, low: Array, cell: float, count: Indices) -> tuple[Indices, Indices]:
     """Sort triangles into grid cells: the members of cell c are items[starts[c]:starts[c + 1]]."""
     first = np.empty(3, np.int64)
     last = np.empty(3, np.int64)
@@ -88,8 +82,8 @@ def _grid(triangles, low, cell, count):
 
 
 @numba.njit(nogil=True, cache=True)
-def _cut(crown, gum, low, cell, count, starts, items):
-    """Return the segments common to crown and gum triangles, each pair looked at once."""
+def _cut(crown: Array, gum: Array, low: Array, cell: float, count: Indices, starts: Indices, items: Indices) -> Array:
+    """Return the segments common to crown and gum triangles; each pair is tested once."""
     first = np.empty(3, np.int64)
     last = np.empty(3, np.int64)
     first_g = np.empty(3, np.int64)
@@ -124,7 +118,7 @@ def _cut(crown, gum, low, cell, count, starts, items):
 
 
 @numba.njit(nogil=True, cache=True)
-def _common_segment(a, b, points):
+def _common_segment(a: Array, b: Array, points: Array) -> bool:
     """Write the two ends of the segment common to two triangles; tell whether there is one."""
     n = 0
     for e in range(3):
@@ -148,7 +142,7 @@ def _common_segment(a, b, points):
 
 
 @numba.njit(nogil=True, cache=True)
-def _pierce(p, q, triangle, out):
+def _pierce(p: Array, q: Array, triangle: Array, out: Array) -> bool:
     """Write the point in which segment pq passes through a triangle (Moeller & Trumbore 1997); tell whether it does."""
     dx, dy, dz = q[0] - p[0], q[1] - p[1], q[2] - p[2]
     ax, ay, az = triangle[1, 0] - triangle[0, 0], triangle[1, 1] - triangle[0, 1], triangle[1, 2] - triangle[0, 2]

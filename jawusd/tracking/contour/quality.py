@@ -1,4 +1,4 @@
-"""What a solution is worth: score, residual, coverage, covariance."""
+"""Quality of an alignment: score, residual, coverage, covariance."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from jawusd.geometry import hat, make_transform, mandible_metric, se3_adjoint, se3_inverse, transform_points
+from jawusd.geometry import hat, mandible_metric, se3_adjoint, se3_inverse, transform_points
 from jawusd.geometry.arrays import Array
-from jawusd.imaging.raster import count_and_not, count_bits, draw_silhouette, pack_bits, project
+from jawusd.imaging.raster import count_and_not, count_bits, pack_bits
 from jawusd.tracking.config import TrackingConfig
-from jawusd.tracking.contour.equations import NormalEquations, ResidualTerm, Solution
-from jawusd.tracking.contour.scan import Scan
+from jawusd.tracking.contour.equations import NormalEquations, ResidualTerm, Solution, translation
+from jawusd.tracking.contour.scan import ARCHES, Scan
 from jawusd.tracking.contour.views import View
 
 # E[w d^2] / E[w] of a unit normal residual under the Tukey weight at 4.685 standard deviations, by quadrature.
@@ -20,23 +20,23 @@ _TUKEY_VARIANCE = 0.828
 
 
 def score_px(solution: Solution) -> Array:
-    """Return the contour length that fits its mask edges, closeness counted, per row and view [px], shape (2, C)."""
+    """Return the contour length that fits its mask edges, closeness counted, per arch and view [px], shape (2, C)."""
     return solution.outline.score_px
 
 
 def matched_px(solution: Solution) -> Array:
-    """Return the matched contour length per row [px], shape (2,)."""
+    """Return the matched contour length per arch [px], shape (2,)."""
     return solution.outline.matched_px.sum(1)
 
 
 def residual_px(solution: Solution) -> Array:
-    """Return the standard deviation of the matched residuals per row [px], shape (2,); NaN without a match."""
+    """Return the standard deviation of the matched residuals per arch [px], shape (2,); NaN without a match."""
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.sqrt(solution.outline.square.sum(1) / solution.outline.weight.sum(1) / _TUKEY_VARIANCE)
 
 
 def view_residual_px(solution: Solution) -> Array:
-    """Return the standard deviation of the matched residuals per row and view [px], shape (2, C); NaN without any."""
+    """Return the standard deviation of the matched residuals per arch and view [px], shape (2, C); NaN without any."""
     weight, square = solution.outline.weight, solution.outline.square
     out = np.full(weight.shape, np.nan)
     np.divide(square, weight * _TUKEY_VARIANCE, out=out, where=weight > 0)
@@ -46,80 +46,73 @@ def view_residual_px(solution: Solution) -> Array:
 def uncovered_px(scans: Sequence[Scan], solution: Solution, views: Sequence[View]) -> tuple[Array, Array]:
     """Return E_SP of paper eq. 8, the mask pixels that the projected crowns leave uncovered, and all mask pixels.
 
-    Returns:
-        Pixel counts per row and view, shape (2, C) each.
+    Both are counts per arch and view, shape (2, C).
     """
-    bare, total = np.zeros((2, len(views))), np.zeros((2, len(views)))
+    uncovered, total = np.zeros((2, len(views))), np.zeros((2, len(views)))
     for r, scan in enumerate(scans):
-        points = np.empty((len(scan.vertices), 3), np.float32)
         for c, view in enumerate(views):
             if not view.present[r]:
                 continue
             mask = pack_bits(view.masks[r] > 127)
-            crowns = np.zeros_like(mask)
-            project(scan.vertices_single, (view.matrix @ view.lead[r] @ solution.poses[r]).astype(np.float32), points)
-            draw_silhouette(points, scan.crown_faces, 0, 0, view.masks.shape[2], scan.painted, crowns)
-            bare[r, c], total[r, c] = count_and_not(mask, crowns), count_bits(mask)
-    return bare, total
+            crowns = scan.silhouette(view.matrix @ view.T_delay[r] @ solution.poses[r], view.masks.shape[1:])
+            uncovered[r, c], total[r, c] = count_and_not(mask, crowns), count_bits(mask)
+    return uncovered, total
 
 
-def row_fit(scans: Sequence[Scan], solution: Solution, views: Sequence[View], bare_price: float) -> Array:
-    """Return how much of a row's visible contour fits its masks, less the price of uncovered mask, shape (2,) [-].
+def coverage_error(uncovered: Array, total: Array) -> Array:
+    """Return the share of every mask that stays uncovered, NaN without a mask, from what `uncovered_px` returned."""
+    return np.where(total > 0, uncovered / np.maximum(total, 1), np.nan)
+
+
+def arch_fit(scans: Sequence[Scan], solution: Solution, views: Sequence[View], uncovered_price: float) -> Array:
+    """Return how much of an arch's visible contour fits its masks, less the price of uncovered mask, shape (2,) [-].
 
     The median over the views, so that one spoiled mask of three does not count; -inf where nothing is visible.
 
-    Args:
-        scans: upper and lower, prepared.
-        solution: an alignment.
-        views: the pictures it was made with.
-        bare_price: price of an uncovered pixel in px of contour [1/px].
+    The price of an uncovered pixel is given in px of contour [1/px].
     """
-    bare, _ = uncovered_px(scans, solution, views)
-    shares = (score_px(solution) - bare_price * bare) / np.maximum(solution.visible_px, 1.0)
+    uncovered, _ = uncovered_px(scans, solution, views)
+    shares = (score_px(solution) - uncovered_price * uncovered) / np.maximum(solution.visible_px, 1.0)
     out = np.full(2, -np.inf)
-    for r in (0, 1):
+    for r in ARCHES:
         seen = shares[r, solution.visible_px[r] > 0]
         if len(seen):
             out[r] = np.median(seen)
     return out
 
 
-def twist_covariance(solution: Solution, row: int, sigma_px: float, correlation_px: float) -> Array:
-    """Return the covariance of a row's left twist about the world origin, sigma^2 l H^-1, shape (6, 6).
+def twist_covariance(solution: Solution, arch: int, sigma_px: float, correlation_px: float) -> Array:
+    """Return the covariance of an arch's left twist about the world origin, sigma^2 l H^-1, shape (6, 6).
 
     Args:
-        solution: an alignment.
-        row: 0 upper, 1 lower.
+        arch: 0 upper, 1 lower.
         sigma_px: standard deviation of the mask outline.
         correlation_px: contour length l over which the outline's errors move together: n pixels of contour hold n / l
             independent measurements.
 
-    Returns:
-        Covariance (rad, mm); infinite on the diagonal where the masks leave a motion free.
+    Infinite on the diagonal where the masks leave a motion free.
     """
-    H = solution.outline.precision[row].sum(0)
+    H = solution.outline.precision[arch].sum(0)
     free = np.diag(np.full(6, np.inf))
     if not np.isfinite(sigma_px) or np.linalg.matrix_rank(H, hermitian=True) < 6:
         return free
-    A = se3_adjoint(make_transform(np.eye(3), solution.centres[row]))
+    A = se3_adjoint(translation(solution.centres[arch]))
     return A @ (sigma_px**2 * correlation_px * np.linalg.inv(H)) @ A.T
 
 
 def joint_covariance(solution: Solution, prior: ResidualTerm, sigma_px: Array, correlation_px: float) -> Array | None:
-    """Return the covariance of both rows' left twists about the world origin given masks and prior, shape (12, 12).
+    """Return the covariance of both arches' left twists about the world origin given masks and prior, shape (12, 12).
+
+    None where masks and prior leave a motion free.
 
     Args:
-        solution: an alignment with the prior.
         prior: what else is known of the two poses, as log-likelihood.
-        sigma_px, correlation_px: as for `twist_covariance`, the former per row, shape (2,).
-
-    Returns:
-        Covariance (rad, mm), rows (upper, lower); None where masks and prior leave a motion free.
+        sigma_px, correlation_px: as for `twist_covariance`, the former per arch, shape (2,).
     """
     equations = NormalEquations()
     prior.accumulate(replace(solution, centres=np.zeros((2, 3))), equations)
-    for r in (0, 1):
-        to_centre = se3_adjoint(make_transform(np.eye(3), -solution.centres[r]))
+    for r in ARCHES:
+        to_centre = se3_adjoint(translation(-solution.centres[r]))
         H = solution.outline.precision[r].sum(0) / (sigma_px[r] ** 2 * correlation_px)
         equations.add(r, to_centre.T @ H @ to_centre, np.zeros(6))
     precision = equations.matrix
@@ -140,7 +133,7 @@ def correlation_px(solution: Solution, config: TrackingConfig) -> Array:
     """
     out = np.full(2, np.nan)
     sigma = residual_px(solution)
-    for r in (0, 1):
+    for r in ARCHES:
         H = solution.outline.precision[r].sum(0)
         if sigma[r] > 0 and np.linalg.matrix_rank(H, hermitian=True) == 6:
             measured = np.trace(np.linalg.solve(H, solution.scatters[r])) / (6 * sigma[r] ** 2)
@@ -148,20 +141,20 @@ def correlation_px(solution: Solution, config: TrackingConfig) -> Array:
     return out
 
 
-def crown_sigma_mm(scan: Scan, solution: Solution, row: int, config: TrackingConfig) -> float:
+def crown_sigma_mm(scan: Scan, solution: Solution, arch: int, config: TrackingConfig) -> float:
     """Return the rms standard deviation of the position of crown vertices [mm]; infinite if the masks leave it free."""
-    sigma = float(residual_px(solution)[row])
-    covariance = twist_covariance(solution, row, sigma, config.correlation_px)
+    sigma = float(residual_px(solution)[arch])
+    covariance = twist_covariance(solution, arch, sigma, config.correlation_px)
     if not np.isfinite(covariance).all():
         return np.inf
-    points = transform_points(solution.poses[row], scan.probes)
+    points = transform_points(solution.poses[arch], scan.probes)
     return float(np.sqrt(np.trace(mandible_metric(points) @ covariance)))
 
 
 def relative_covariance(T_world_upper: Array, covariance_upper: Array, covariance_lower: Array) -> Array:
     """Return the covariance of the left twist of T_upper_lower about the skull origin, shape (..., 6, 6).
 
-    T_true = T_u^-1 exp(x_l - x_u) T_u T to first order, so the twist is Ad(T_u^-1)(x_l - x_u); the rows' errors are
+    T_true = T_u^-1 exp(x_l - x_u) T_u T to first order, so the twist is Ad(T_u^-1)(x_l - x_u); the arches' errors are
     independent because no mask edge counts for both.
     """
     A = se3_adjoint(se3_inverse(T_world_upper))
@@ -169,12 +162,9 @@ def relative_covariance(T_world_upper: Array, covariance_upper: Array, covarianc
 
 
 def landmark_sigmas(T_upper_lower: Array, covariance: Array, landmarks: Array) -> Array:
-    """Return the standard deviation of the landmarks' position in the skull frame [mm], shape (..., L).
+    """Return the standard deviation of landmarks (L, 3) in the skull frame [mm], shape (..., L).
 
-    Args:
-        T_upper_lower: relative poses, shape (..., 4, 4).
-        covariance: as `relative_covariance` gives it, shape (..., 6, 6).
-        landmarks: points in mandible coordinates [mm], shape (L, 3).
+    `T_upper_lower` has shape (..., 4, 4), `covariance` is that of `relative_covariance`, shape (..., 6, 6).
     """
     points = transform_points(T_upper_lower, landmarks)
     J = np.concatenate([-hat(points), np.broadcast_to(np.eye(3), (*points.shape, 3))], axis=-1)

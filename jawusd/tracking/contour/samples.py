@@ -1,4 +1,4 @@
-"""Points on the visible contour of a projected scan: silhouette edges, scan borders and the crown-gum line.
+"""Points on the visible contour of a projected scan: silhouette edges, scan borders and the gingival margin.
 
 Every compiled function here releases the GIL and keeps no state.
 """
@@ -10,14 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.geometry.arrays import Array
-from jawusd.tracking.contour.scan import Scan
+from jawusd.tracking.contour.scan import CROWN, GUM, Faces, Scan
 
 # Columns of a sample: point in scan coordinates [mm], pixel, outward unit normal in the picture, contour length it
 # stands for [px], inverse depth [1/mm].
 X, Y, Z, U, V, NX, NY, LENGTH, INVERSE_DEPTH = range(9)
 COLUMNS = 9
-
-CROWN, GUM = 1, 2  # labels of the rendered scan; 0 is empty
 
 
 def contour_samples(
@@ -29,10 +27,9 @@ def contour_samples(
     step_px: float,
     depth_tolerance_mm: float,
 ) -> Array:
-    """Return the contour points at which the picture of the scan changes from crown to anything but crown.
+    """Return the contour points at which the picture changes from crown to anything else, shape (n, COLUMNS).
 
     Args:
-        scan: the row of teeth.
         matrix: projection from scan coordinates [mm] to homogeneous px of the region, shape (3, 4).
         eye: camera centre in scan coordinates [mm], shape (3,).
         labels: what is seen at every pixel of the region: CROWN, GUM or 0, shape (h, w).
@@ -40,19 +37,16 @@ def contour_samples(
         step_px: largest distance between samples.
         depth_tolerance_mm: how much nearer the surface just inside the contour may be before the contour counts as
             hidden behind it.
-
-    Returns:
-        Samples, shape (n, COLUMNS).
     """
     scan_tables = (scan.vertices, scan.crown_faces, scan.planes, scan.edges)
     candidates = _silhouette(*scan_tables, eye, matrix, step_px, labels.shape)
-    kept = _seen(candidates, labels, inverse_depth, depth_tolerance_mm)
-    line = _gum_line(scan.margin, matrix, labels, inverse_depth, depth_tolerance_mm)
-    return np.concatenate([kept, line])
+    silhouette = _visible(candidates, labels, inverse_depth, depth_tolerance_mm)
+    margin = _gingival_margin(scan.gingival_margin, matrix, labels, inverse_depth, depth_tolerance_mm)
+    return np.concatenate([silhouette, margin])
 
 
 @numba.njit(nogil=True, cache=True, inline="always")
-def _pixel(matrix, x, y, z):
+def _pixel(matrix: Array, x: float, y: float, z: float) -> tuple[float, float, float]:
     w = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z + matrix[2, 3]
     u = (matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z + matrix[0, 3]) / w
     v = (matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z + matrix[1, 3]) / w
@@ -60,7 +54,16 @@ def _pixel(matrix, x, y, z):
 
 
 @numba.njit(nogil=True, cache=True)
-def _silhouette(vertices, faces, planes, edges, eye, matrix, step_px, shape):
+def _silhouette(
+    vertices: Array,
+    faces: Faces,
+    planes: Array,
+    edges: Faces,
+    eye: Array,
+    matrix: Array,
+    step_px: float,
+    shape: tuple[int, int],
+) -> Array:
     """Sample the edges between faces turned to and away from the eye, and all borders, inside the region."""
     front = np.empty(len(faces), np.bool_)
     for f in range(len(faces)):
@@ -103,56 +106,64 @@ def _silhouette(vertices, faces, planes, edges, eye, matrix, step_px, shape):
             out = grown
         for q in range(pieces):
             t = (q + 0.5) / pieces
-            row = out[n]
+            sample = out[n]
             for a in range(3):
-                row[a] = vertices[i, a] + t * (vertices[j, a] - vertices[i, a])
-            row[U], row[V], w = _pixel(matrix, row[X], row[Y], row[Z])
-            row[NX] = nx
-            row[NY] = ny
-            row[LENGTH] = length / pieces
-            row[INVERSE_DEPTH] = 1.0 / w
+                sample[a] = vertices[i, a] + t * (vertices[j, a] - vertices[i, a])
+            sample[U], sample[V], w = _pixel(matrix, sample[X], sample[Y], sample[Z])
+            sample[NX] = nx
+            sample[NY] = ny
+            sample[LENGTH] = length / pieces
+            sample[INVERSE_DEPTH] = 1.0 / w
             n += 1
     return out[:n]
 
 
 @numba.njit(nogil=True, cache=True, inline="always")
-def pixel_of(coordinate):
+def pixel_of(coordinate: float) -> int:
     """Return the index of the pixel a coordinate falls into."""
     return int(np.floor(coordinate + 0.5))
 
 
 @numba.njit(nogil=True, cache=True)
-def _seen(samples, labels, inverse_depth, tolerance_mm):
-    """Keep samples with this very surface visible on the inner side and no crown on the outer side."""
+def _visible(
+    samples: Array, labels: NDArray[np.uint8], inverse_depth: NDArray[np.float32], tolerance_mm: float
+) -> Array:
+    """Keep samples whose own surface is visible on the inner side, with no crown on the outer side."""
     out = np.empty_like(samples)
     height, width = labels.shape
     n = 0
     for s in range(len(samples)):
-        row = samples[s]
-        i = pixel_of(row[U] - row[NX])
-        j = pixel_of(row[V] - row[NY])
-        a = pixel_of(row[U] + row[NX])
-        b = pixel_of(row[V] + row[NY])
+        sample = samples[s]
+        i = pixel_of(sample[U] - sample[NX])
+        j = pixel_of(sample[V] - sample[NY])
+        a = pixel_of(sample[U] + sample[NX])
+        b = pixel_of(sample[V] + sample[NY])
         if min(i, a) < 0 or min(j, b) < 0 or max(i, a) >= width or max(j, b) >= height:
             continue
         if labels[b, a] == CROWN or labels[j, i] != CROWN:
             continue
-        if _nearer(inverse_depth[j, i], row[INVERSE_DEPTH], tolerance_mm):
+        if _nearer(inverse_depth[j, i], sample[INVERSE_DEPTH], tolerance_mm):
             continue
-        out[n] = row
+        out[n] = sample
         n += 1
     return out[:n]
 
 
 @numba.njit(nogil=True, cache=True, inline="always")
-def _nearer(seen, own, tolerance_mm):
+def _nearer(seen: float, own: float, tolerance_mm: float) -> bool:
     """Tell whether an inverse depth lies more than the tolerance in front of another one."""
     return seen * (1.0 - tolerance_mm * own) > own
 
 
 @numba.njit(nogil=True, cache=True)
-def _gum_line(segments, matrix, labels, inverse_depth, tolerance_mm):
-    """Sample the crown-gum line where crown is seen on one side and gum on the other; outward is towards the gum."""
+def _gingival_margin(
+    segments: Array,
+    matrix: Array,
+    labels: NDArray[np.uint8],
+    inverse_depth: NDArray[np.float32],
+    tolerance_mm: float,
+) -> Array:
+    """Sample the gingival margin where crown is seen on one side and gum on the other; outward is towards the gum."""
     reach = 1.5  # px: the nearest pixels that surely belong to one side
     out = np.empty((len(segments), COLUMNS))
     height, width = labels.shape

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,9 +12,18 @@ from scipy.sparse.csgraph import connected_components
 
 from jawusd.errors import TrackingError
 from jawusd.formats.mesh import Mesh, crown_face_mask, tooth_labels
+from jawusd.geometry import transform_point
 from jawusd.geometry.arrays import Array
 from jawusd.imaging.decimation import decimated_scan
+from jawusd.imaging.raster import draw_depth_labels, draw_silhouette, project, words_for
 from jawusd.tracking.contour.gingival_margin import crown_gum_segments
+
+#: Vertex indices of faces, or other tables of indices that compiled code reads.
+Faces = NDArray[np.int32]
+
+ARCHES = (0, 1)
+ARCH_NAMES = ("upper", "lower")
+CROWN, GUM = 1, 2  # labels of a drawn scan; 0 is empty
 
 _PROBES = 300  # enough for a mean over the crowns to one per cent
 # Crown faces above which most steps use a thinned scan, and how many that one keeps: thinning from 20,000 to 5,000
@@ -24,7 +34,7 @@ _FEWEST_CROWN_FACES = 100  # fewer cannot show a contour in several directions
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """Hold one row of teeth ready for projection.
+    """Hold one arch ready for projection.
 
     Attributes:
         name: "upper" or "lower".
@@ -34,23 +44,23 @@ class Scan:
         gum_faces: faces that only hide what lies behind them, int32, shape (G, 3).
         planes: normal and offset (n, n.p) of every crown face, shape (F, 4); only signs of n.x - offset are used.
         edges: vertex, vertex, face, other face or -1 at a border, int32, shape (E, 4).
-        margin: segments of the crown-gum line that are no mesh edges [mm], shape (S, 2, 3).
+        gingival_margin: segments of the crown-gum line that are no mesh edges [mm], shape (S, 2, 3).
         probes: some vertices spread over the crowns, at which motion is measured [mm], shape (N <= 300, 3).
         centre: centroid of the crown vertices [mm], shape (3,).
         radius_mm: largest distance of a crown vertex from the centre.
         painted: whether the scan's colours told crown from gum; otherwise the whole scan counts as crown.
             Painted crowns are wound outwards, so faces turned away need not be drawn.
-        thin: the same row with fewer faces, for all but the last steps; None where this one is thin enough.
+        thin: the same arch with fewer faces, for all but the last steps; None where this one is thin enough.
     """
 
     name: str
     vertices: Array
     vertices_single: NDArray[np.float32]
-    crown_faces: NDArray[np.int32]
-    gum_faces: NDArray[np.int32]
+    crown_faces: Faces
+    gum_faces: Faces
     planes: Array
-    edges: NDArray[np.int32]
-    margin: Array
+    edges: Faces
+    gingival_margin: Array
     probes: Array
     centre: Array
     radius_mm: float
@@ -61,6 +71,38 @@ class Scan:
         """Return the vertices of the crowns [mm], shape (N, 3), at most about `limit` of them."""
         points = self.vertices[np.unique(self.crown_faces)]
         return points if limit is None else points[:: max(1, len(points) // limit)]
+
+    def silhouette(self, matrix: Array, shape: tuple[int, int], left: int = 0, top: int = 0) -> NDArray[np.uint64]:
+        """Return the pixels that the crowns cover in a picture of (h, w), as bit rows.
+
+        Args:
+            matrix: projection from scan coordinates [mm] to homogeneous px, shape (3, 4).
+            left, top: pixel at the picture's first column and row.
+        """
+        bits = np.zeros((shape[0], words_for(shape[1])), np.uint64)
+        draw_silhouette(self._projected(matrix), self.crown_faces, left, top, shape[1], self.painted, bits)
+        return bits
+
+    def draw(self, matrix: Array, depth: NDArray[np.float32], labels: NDArray[np.uint8]) -> None:
+        """Draw inverse depth [1/mm] and CROWN or GUM into pictures (h, w) of zeros; `matrix` as for `silhouette`."""
+        points = self._projected(matrix)
+        draw_depth_labels(points, self.crown_faces, 0, 0, self.painted, depth, labels, CROWN)
+        draw_depth_labels(points, self.gum_faces, 0, 0, False, depth, labels, GUM)
+
+    def _projected(self, matrix: Array) -> NDArray[np.float32]:
+        points = np.empty((len(self.vertices), 3), np.float32)
+        project(self.vertices_single, matrix.astype(np.float32), points)
+        return points
+
+
+def probe_points(scans: Sequence[Scan]) -> Array:
+    """Return a dozen points of each arch, which show any motion of it, scan coordinates [mm], shape (2, 12, 3)."""
+    return np.stack([scan.probes[np.linspace(0, len(scan.probes) - 1, 12).astype(int)] for scan in scans])
+
+
+def teeth_centre(scans: Sequence[Scan], poses: Array) -> Array:
+    """Return the point amid both arches in the world [mm], shape (3,), at T_world_scan (2, 4, 4)."""
+    return np.mean([transform_point(pose, scan.centre) for pose, scan in zip(poses, scans, strict=True)], axis=0)
 
 
 def prepare_scan(mesh: Mesh, name: str) -> Scan:
@@ -98,8 +140,8 @@ def prepare_scan(mesh: Mesh, name: str) -> Scan:
 def _with_tables(
     name: str,
     vertices: Array,
-    crown_faces: NDArray[np.int32],
-    gum_faces: NDArray[np.int32],
+    crown_faces: Faces,
+    gum_faces: Faces,
     painted: bool,
 ) -> Scan:
     """Return the scan with the tables of the contour search."""
@@ -115,7 +157,7 @@ def _with_tables(
         gum_faces=gum_faces,
         planes=np.column_stack([normal, np.einsum("ij,ij->i", normal, corner[:, 0])]),
         edges=_edge_table(crown_faces),
-        margin=crown_gum_segments(vertices, crown_faces, gum_faces),
+        gingival_margin=crown_gum_segments(vertices, crown_faces, gum_faces),
         probes=crowns[np.linspace(0, len(crowns) - 1, min(len(crowns), _PROBES)).astype(int)],
         centre=centre,
         radius_mm=float(np.linalg.norm(corner.reshape(-1, 3) - centre, axis=1).max()),
@@ -123,13 +165,13 @@ def _with_tables(
     )
 
 
-def _weld(vertices: Array, faces: NDArray[np.int32]) -> tuple[NDArray, NDArray[np.int32]]:
+def _weld(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
     """Merge vertices at the same place: triangle soups would otherwise consist of borders only."""
     unique, inverse = np.unique(vertices, axis=0, return_inverse=True)
     return np.ascontiguousarray(unique), np.ascontiguousarray(inverse.reshape(-1)[faces], np.int32)
 
 
-def _wound_outwards(vertices: Array, faces: NDArray[np.int32]) -> NDArray[np.int32]:
+def _wound_outwards(vertices: Array, faces: Faces) -> Faces:
     """Return the faces with those connected pieces turned round that enclose a negative volume.
 
     Volumes are taken about each piece's own centre, so the open base of a crown adds little.
@@ -148,7 +190,7 @@ def _wound_outwards(vertices: Array, faces: NDArray[np.int32]) -> NDArray[np.int
     return np.ascontiguousarray(np.where(inside_out[:, None], faces[:, ::-1], faces), np.int32)
 
 
-def _edge_table(faces: NDArray[np.int32]) -> NDArray[np.int32]:
+def _edge_table(faces: Faces) -> Faces:
     """Return vertex, vertex, face, other face (-1 at a border) of every edge, shape (E, 4).
 
     Where more than two faces meet in an edge, all but the first two are paired off as edges of their own.

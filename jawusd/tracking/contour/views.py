@@ -22,14 +22,14 @@ _CHUNK = 48  # instants held at once when going backwards: about 20 MB
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Hold what one camera shows of both rows of teeth at one instant, undistorted, at the working size.
+    """Hold what one camera shows of both arches at one instant, undistorted, at the working size.
 
     Attributes:
         matrix: world [mm] to homogeneous px of this picture, shape (3, 4).
         eye: camera centre in the world [mm], shape (3,).
-        masks: of the upper and the lower row, uint8, 255 = teeth, shape (2, h, w); zeros where there is none.
+        masks: of the upper and the lower arch, uint8, 255 = teeth, shape (2, h, w); zeros where there is none.
         present: which of the two masks exist, shape (2,).
-        lead: how the rows move, in the world, from the reference instant to this camera's own, shape (2, 4, 4).
+        T_delay: how the arches move, in the world, from the reference instant to this camera's own, shape (2, 4, 4).
         bias_px: how far the masks reach beyond the teeth [px], shape (2,).
     """
 
@@ -37,7 +37,7 @@ class View:
     eye: Array
     masks: NDArray[np.uint8]
     present: Mask
-    lead: Array = field(default_factory=lambda: np.tile(np.eye(4), (2, 1, 1)))
+    T_delay: Array = field(default_factory=lambda: np.tile(np.eye(4), (2, 1, 1)))
     bias_px: Array = field(default_factory=lambda: np.zeros(2))
 
 
@@ -60,8 +60,7 @@ class MaskViews:
         """Open the mask readers and choose the working sizes.
 
         Args:
-            sources: the capture's cameras.
-            cameras: calibrated cameras by name.
+            sources, cameras: all cameras of the capture; the calibrated ones by name.
             offsets: reference frame minus own frame number of every camera.
             centre_world: where the teeth are at the start [mm], shape (3,).
             working_px_per_mm: resolution at the teeth; pictures are never enlarged.
@@ -81,7 +80,7 @@ class MaskViews:
             self._readers.append([self._stack.enter_context(reader) for reader in readers])
         self.frames = (
             min(self._offsets),
-            max(o + r.count for o, pair in zip(self._offsets, self._readers, strict=True) for r in pair),
+            max(o + reader.count for o, pair in zip(self._offsets, self._readers, strict=True) for reader in pair),
         )
 
     def __enter__(self) -> MaskViews:
@@ -97,16 +96,12 @@ class MaskViews:
             CaptureError: a mask cannot be decoded.
         """
         return [
-            _view(working, [r.read(frame - offset) for r in pair])
+            _view(working, [reader.read(frame - offset) for reader in pair])
             for working, offset, pair in zip(self._working, self._offsets, self._readers, strict=True)
         ]
 
     def walk(self, first: int, stop: int, step: int = 1) -> Iterator[tuple[int, list[View]]]:
-        """Yield instants with their views in either direction, reading forwards all the same.
-
-        Args:
-            first, stop, step: as for `range`; step is 1 or -1.
-        """
+        """Yield instants of a range with their views; with step -1 backwards, though masks are read forwards."""
         if step > 0:
             for frame in range(first, stop):
                 yield frame, self.at(frame)
@@ -116,6 +111,11 @@ class MaskViews:
             held = [(frame, self.at(frame)) for frame in range(begin, end)]
             while held:
                 yield held.pop()
+
+
+def present_masks(views: Sequence[View]) -> Mask:
+    """Return which masks exist, shape (2, C)."""
+    return np.array([view.present for view in views]).T
 
 
 def masked_sources(

@@ -7,22 +7,20 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.errors import TrackingError
 from jawusd.formats.capture import Pick
 from jawusd.geometry import (
     Camera,
-    make_transform,
     mandible_metric,
     orthonormalise,
     rigid_fit,
-    se3_exp,
     transform_point,
     transform_points,
     triangulate,
 )
 from jawusd.geometry.arrays import Array
+from jawusd.tracking.contour.equations import motion_about
 
 _FEWEST = 3
 # A pick whose vertex projects farther than this from its pixel counts as wrong [mm at the teeth]: three times the
@@ -43,28 +41,21 @@ class _Sighting:
 
 
 def pose_from_picks(
-    picks: Sequence[Pick], vertices: Array, cameras: Mapping[str, Camera], row: str
+    picks: Sequence[Pick], vertices: Array, cameras: Mapping[str, Camera], arch: str
 ) -> tuple[Array, list[int]]:
-    """Return the pose of one row of teeth that agrees with its picks.
+    """Return T_world_scan that agrees with the picks, shape (4, 4), and the numbers of picks left out as wrong.
 
-    Args:
-        picks: vertices of the scan with pixels in at least two views each.
-        vertices: vertices of the scan file [mm], shape (V, 3).
-        cameras: calibrated cameras by name.
-        row: "upper" or "lower", for messages.
-
-    Returns:
-        T_world_row, shape (4, 4), and the numbers (from 1) of picks left out as wrong.
+    Numbers count from 1; `vertices` are those of the scan file [mm], shape (V, 3); `arch` names it in messages.
 
     Raises:
         TrackingError: too few picks, a pick that cannot be, or picks that contradict one another.
     """
     if len(picks) < _FEWEST:
         raise TrackingError(
-            f"bootstrap: {len(picks)} picks on the {row} teeth, at least {_FEWEST} are needed",
+            f"bootstrap: {len(picks)} picks on the {arch} teeth, at least {_FEWEST} are needed",
             hint="Pick more vertices, spread over the arch, each in two or more cameras.",
         )
-    sightings = [_sighting(k, pick, vertices, cameras, row) for k, pick in enumerate(picks, start=1)]
+    sightings = [_sighting(k, pick, vertices, cameras, arch) for k, pick in enumerate(picks, start=1)]
     places = np.stack([triangulate(s.matrices, s.pixels) for s in sightings])
     points = np.stack([s.point for s in sightings])
     best, best_cost = None, np.inf
@@ -80,14 +71,14 @@ def pose_from_picks(
             best, best_cost = pose, cost
     if best is None:
         raise TrackingError(
-            f"bootstrap: the picks on the {row} teeth lie on a line", hint="Pick front teeth and both sides."
+            f"bootstrap: the picks on the {arch} teeth lie on a line", hint="Pick front teeth and both sides."
         )
     for _ in range(3):
         good = [s for s in sightings if _miss_mm(s, best) < _TOLERANCE_MM]
         if len(good) < _FEWEST:
             misses = ", ".join(f"pick {s.number}: {_miss_mm(s, best):.1f} mm" for s in sightings)
             raise TrackingError(
-                f"bootstrap: the picks on the {row} teeth contradict one another "
+                f"bootstrap: the picks on the {arch} teeth contradict one another "
                 f"({misses}; allowed {_TOLERANCE_MM} mm)",
                 hint="Check vertex numbers, pixels and camera names of the picks, and that the views show one instant.",
             )
@@ -102,13 +93,13 @@ def picked_sigma_mm(
     pose: Array,
     probes: Array,
 ) -> float:
-    """Return how far careless clicks let a row stray, the rms standard deviation over its crowns [mm].
+    """Return how far careless clicks let a arch stray, the rms standard deviation over its crowns [mm].
 
     Args:
         picks: the picks behind the pose, without those left out.
         vertices: vertices of the scan file [mm], shape (V, 3).
         cameras: calibrated cameras by name.
-        pose: T_world_row, shape (4, 4).
+        pose: T_world_arch, shape (4, 4).
         probes: points spread over the crowns, scan coordinates [mm], shape (N, 3).
     """
     H = np.zeros((6, 6))
@@ -124,8 +115,8 @@ def picked_sigma_mm(
     return float(np.sqrt(np.trace(M @ np.linalg.pinv(H, hermitian=True))))
 
 
-def _sighting(number: int, pick: Pick, vertices: NDArray, cameras: Mapping[str, Camera], row: str) -> _Sighting:
-    where = f"bootstrap: pick {number} on the {row} teeth"
+def _sighting(number: int, pick: Pick, vertices: Array, cameras: Mapping[str, Camera], arch: str) -> _Sighting:
+    where = f"bootstrap: pick {number} on the {arch} teeth"
     if pick.vertex >= len(vertices):
         raise TrackingError(f"{where} names vertex {pick.vertex}, the scan has {len(vertices)} (numbered from 0)")
     names = [view.camera for view in pick.views]
@@ -149,7 +140,7 @@ def _sighting(number: int, pick: Pick, vertices: NDArray, cameras: Mapping[str, 
     return _Sighting(number, vertices[pick.vertex], np.stack(matrices), np.stack(pixels))
 
 
-def _residuals_px(s: _Sighting, pose: Array) -> tuple[NDArray, NDArray, NDArray]:
+def _residuals_px(s: _Sighting, pose: Array) -> tuple[Array, Array, Array]:
     """Return projection minus pixel (C, 2), depths (C,) and the derivative by the world point (C, 2, 3)."""
     h = s.matrices @ np.append(transform_point(pose, s.point), 1.0)
     projected = h[:, :2] / h[:, 2:]
@@ -174,11 +165,10 @@ def _refined(sightings: Sequence[_Sighting], pose: Array) -> Array:
         for s in sightings:
             residual, _, slope = _residuals_px(s, pose)
             p = transform_point(pose, s.point) - centre
-            turn = np.stack([np.cross(p, row) for row in slope.reshape(-1, 3)])
+            turn = np.stack([np.cross(p, direction) for direction in slope.reshape(-1, 3)])
             J = np.hstack([turn, slope.reshape(-1, 3)])
             H += J.T @ J
             g -= J.T @ residual.ravel()
-        twist = np.linalg.solve(H, g)
-        to, back = make_transform(np.eye(3), -centre), make_transform(np.eye(3), centre)
-        pose = orthonormalise(back @ se3_exp(twist) @ to @ pose)
+        twist = np.asarray(np.linalg.solve(H, g), np.float64)
+        pose = orthonormalise(motion_about(centre, twist) @ pose)
     return pose

@@ -23,13 +23,9 @@ _WIDTH_PX = 320  # of the surveyed pictures: their middles are good to a tenth o
 
 @dataclass(frozen=True, eq=False)
 class Footage:
-    """Name the masks to be tracked.
+    """Name the masks to be tracked: those of cameras with masks, in frames from first to one past the last, or all.
 
-    Attributes:
-        sources: cameras with masks.
-        cameras: calibrated cameras by name.
-        offsets: reference frame minus own frame number, by camera name.
-        frames: first frame and one past the last, or None for all that have masks.
+    `offsets` are reference frame minus own frame number, by camera name.
     """
 
     sources: Sequence[CameraSource]
@@ -38,7 +34,7 @@ class Footage:
     frames: tuple[int, int] | None
 
     def survey(self, frames: tuple[int, int] | None, count: int) -> MaskSurvey:
-        """Look at evenly spread frames, of the whole footage if no range is given."""
+        """Measure the masks of evenly spread frames, of the whole footage if no range is given."""
         return survey_masks(self.sources, self.cameras, self.offsets, frames or self.frames, count)
 
     def views(self, centre: Array, px_per_mm: float) -> MaskViews:
@@ -46,7 +42,7 @@ class Footage:
         return MaskViews(self.sources, self.cameras, self.offsets, centre, px_per_mm)
 
     def has_masks(self, frame: int) -> bool:
-        """Tell whether both rows have masks in two cameras on a frame."""
+        """Tell whether both arches have masks in two cameras on a frame."""
         try:
             self.survey((frame, frame + 1), 1)
         except TrackingError:
@@ -83,7 +79,7 @@ class MaskSurvey:
         return out
 
     def promising(self, count: int) -> NDArray[np.int64]:
-        """Return frames that show much of both rows in all cameras, the best first, at most `count`.
+        """Return frames that show much of both arches in all cameras, the best first, at most `count`.
 
         Beyond what a tenth of the frames reach more area counts for nothing: a mask that large may be a wrong one.
         Frames next to one another resemble each other: neighbours come after all others.
@@ -91,8 +87,9 @@ class MaskSurvey:
         full = np.maximum(np.quantile(self.areas_px, 0.9, axis=0), 1.0)
         shown = np.sqrt(np.minimum(self.areas_px / full, 1.0)).sum(-1).min(-1)
         usable = ((self.areas_px > 0).sum(-1) >= 2).all(-1)
-        apart, beside = [], []
-        for f in np.argsort(-shown, kind="stable"):
+        apart: list[int] = []
+        beside: list[int] = []
+        for f in np.argsort(-shown, kind="stable").tolist():
             if usable[f]:
                 (beside if any(abs(f - g) <= _BESIDE for g in apart) else apart).append(f)
         return self.frames[[*apart, *beside][:count]]
@@ -105,17 +102,10 @@ def survey_masks(
     frames: tuple[int, int] | None,
     count: int,
 ) -> MaskSurvey:
-    """Look at evenly spread frames of a take.
-
-    Args:
-        sources: cameras that have masks.
-        cameras: calibrated cameras by name.
-        offsets: reference frame minus own frame number, by camera name.
-        frames: first frame and one past the last; all that could have masks by default.
-        count: how many frames are looked at.
+    """Measure the masks of at most `count` evenly spread frames; all arguments as in `Footage`.
 
     Raises:
-        TrackingError: no frame shows both rows of teeth in two cameras.
+        TrackingError: no frame shows both arches in two cameras.
         CaptureError: a mask cannot be read.
     """
     with ExitStack() as stack:
@@ -131,7 +121,7 @@ def survey_masks(
         shifts = [offsets[source.name] for source in sources]
         first, stop = frames or (
             min(shifts),
-            max(o + r.count for o, pair in zip(shifts, readers, strict=True) for r in pair),
+            max(o + reader.count for o, pair in zip(shifts, readers, strict=True) for reader in pair),
         )
         chosen = np.unique(np.linspace(first, stop - 1, min(count, stop - first)).round().astype(np.int64))
         middles = np.full((len(chosen), 2, len(sources), 2), np.nan)

@@ -1,4 +1,4 @@
-"""Masks that were named for the wrong camera or the wrong row of teeth: which exchange would put them right?"""
+"""Masks that were named for the wrong camera or the wrong arch: which exchange explains them?"""
 
 from __future__ import annotations
 
@@ -7,19 +7,16 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.errors import CaptureError, TrackingError
 from jawusd.formats.capture import CameraSource, Masks
-from jawusd.geometry import transform_point
 from jawusd.geometry.arrays import Array
-from jawusd.imaging.raster import count_and_not, count_bits, draw_silhouette, pack_bits, project
-from jawusd.tracking.contour.scan import Scan
+from jawusd.imaging.raster import count_and_not, count_bits, pack_bits
+from jawusd.tracking.contour.scan import ARCHES, Scan, teeth_centre
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import View
 from jawusd.tracking.initialization.footage import Footage
 
-_ROWS = (0, 1)
 # An exchange is believed if it leaves less than this share of what is uncovered as the masks are named.
 _PROOF = 0.5
 # Uncovered share of all masks of a camera from which an exchange is looked for: good poses leave 0.01, and two cameras'
@@ -34,7 +31,7 @@ class Mixup:
     Attributes:
         finding: what is wrong, to follow "frame F: ".
         hint: what to do.
-        sources: the cameras with their masks put right.
+        sources: the cameras with the exchange undone.
     """
 
     finding: str
@@ -46,49 +43,45 @@ class Mixup:
         return TrackingError(self.finding, frame=frame, hint=self.hint)
 
 
-def all_rows_exchanged(sources: Sequence[CameraSource]) -> Mixup:
-    """Return the exchange of rows in all cameras, which exchanged scan files look like as well."""
+def all_arches_exchanged(sources: Sequence[CameraSource]) -> Mixup:
+    """Return the exchange of arches in all cameras, which exchanged scan files look like as well."""
     return Mixup(
         "the masks of the upper and lower teeth are exchanged in every camera",
         "Exchange masks.upper and masks.lower, or upper_teeth and lower_teeth in [scans].",
-        _with_masks(sources, {k: s.masks.exchanged for k, s in enumerate(sources)}),
+        _with_masks(sources, {k: _masks(s).exchanged for k, s in enumerate(sources)}),
     )
 
 
 def possible_mixups(sources: Sequence[CameraSource]) -> list[Mixup]:
-    """Return every exchange of rows in one camera or in all, and of masks between two cameras of one picture size."""
+    """Return every exchange of arches in one camera or in all, and of masks between two cameras of one picture size."""
     out = []
     for k, source in enumerate(sources):
         out.append(
             Mixup(
                 f"the masks of the upper and lower teeth are exchanged in camera {source.name}",
                 f"Exchange masks.upper and masks.lower of camera {source.name}.",
-                _with_masks(sources, {k: source.masks.exchanged}),
+                _with_masks(sources, {k: _masks(source).exchanged}),
             )
         )
-    out.append(all_rows_exchanged(sources))
+    out.append(all_arches_exchanged(sources))
     for a, b in combinations(range(len(sources)), 2):
         first, second = sources[a].name, sources[b].name
         out.append(
             Mixup(
                 f"the masks of cameras {first} and {second} are exchanged",
                 f"Exchange the masks of cameras {first} and {second}, or their entries in the calibration.",
-                _with_masks(sources, {a: sources[b].masks, b: sources[a].masks}),
+                _with_masks(sources, {a: _masks(sources[b]), b: _masks(sources[a])}),
             )
         )
     return out
 
 
 def likely_mixup(footage: Footage, solver: ContourSolver, poses: Array, frame: int) -> Mixup | None:
-    """Return the exchange that explains masks far better which lie off their scans, with the evidence; None without.
+    """Return the exchange that explains much better why masks lie off their scans, with the evidence; None without.
 
-    Args:
-        footage: the masks as they are named.
-        solver: holds the scans.
-        poses: T_world_upper, T_world_lower, good to a millimetre or so, shape (2, 4, 4).
-        frame: the frame of these poses.
+    `poses` are T_world_upper and T_world_lower of the frame, good to a millimetre or so, shape (2, 4, 4).
     """
-    given = _bare_shares(footage, solver, poses, frame)
+    given = _uncovered_shares(footage, solver, poses, frame)
     if not (given >= _ODD_SHARE).any():
         return None
     found = []
@@ -96,7 +89,7 @@ def likely_mixup(footage: Footage, solver: ContourSolver, poses: Array, frame: i
         if _sizes_differ(footage, mixup.sources):
             continue
         try:
-            shares = _bare_shares(replace(footage, sources=mixup.sources), solver, poses, frame)
+            shares = _uncovered_shares(replace(footage, sources=mixup.sources), solver, poses, frame)
         except CaptureError:
             continue  # mask videos of other lengths than those cameras' clips
         found.append((float(np.nanmean(shares)), mixup))
@@ -107,29 +100,27 @@ def likely_mixup(footage: Footage, solver: ContourSolver, poses: Array, frame: i
     return replace(mixup, finding=f"{mixup.finding}: {evidence}")
 
 
-def _bare_shares(footage: Footage, solver: ContourSolver, poses: Array, frame: int) -> Array:
+def _uncovered_shares(footage: Footage, solver: ContourSolver, poses: Array, frame: int) -> Array:
     """Return the share of each camera's masks that lies off their scans, NaN without a mask, shape (C,)."""
-    centre = np.mean([transform_point(poses[r], solver.scans[r].centre) for r in _ROWS], axis=0)
-    with footage.views(centre, solver.config.working_px_per_mm / 2) as masks:
-        return np.array([_bare_share(view, solver.scans, poses) for view in masks.at(frame)])
+    with footage.views(teeth_centre(solver.scans, poses), solver.config.working_px_per_mm / 2) as masks:
+        return np.array([_uncovered_share(view, solver.scans, poses) for view in masks.at(frame)])
 
 
-def _bare_share(view: View, scans: Sequence[Scan], poses: Array) -> float:
-    bare = total = 0
-    for r in _ROWS:
+def _uncovered_share(view: View, scans: Sequence[Scan], poses: Array) -> float:
+    uncovered = total = 0
+    for r in ARCHES:
         if view.present[r]:
-            mask, crowns = pack_bits(view.masks[r] > 127), _crown_bits(view, scans[r], poses[r])
-            bare, total = bare + count_and_not(mask, crowns), total + count_bits(mask)
-    return bare / total if total else np.nan
+            mask = pack_bits(view.masks[r] > 127)
+            crowns = scans[r].silhouette(view.matrix @ poses[r], view.masks.shape[1:])
+            uncovered, total = uncovered + count_and_not(mask, crowns), total + count_bits(mask)
+    return uncovered / total if total else np.nan
 
 
-def _crown_bits(view: View, scan: Scan, pose: Array) -> NDArray[np.uint64]:
-    """Return the silhouette of the crowns in a view as bit rows, shape (h, words)."""
-    points = np.empty((len(scan.vertices), 3), np.float32)
-    bits = np.zeros_like(pack_bits(view.masks[0]))
-    project(scan.vertices_single, (view.matrix @ pose).astype(np.float32), points)
-    draw_silhouette(points, scan.crown_faces, 0, 0, view.masks.shape[2], scan.painted, bits)
-    return bits
+def _masks(source: CameraSource) -> Masks:
+    """Return the masks of a camera that `masked_sources` chose."""
+    if source.masks is None:
+        raise TrackingError("there are no masks", camera=source.name)
+    return source.masks
 
 
 def _with_masks(sources: Sequence[CameraSource], masks: dict[int, Masks]) -> tuple[CameraSource, ...]:
@@ -138,6 +129,6 @@ def _with_masks(sources: Sequence[CameraSource], masks: dict[int, Masks]) -> tup
 
 def _sizes_differ(footage: Footage, sources: Sequence[CameraSource]) -> bool:
     """Tell whether masks would go to a camera with pictures of another size."""
-    size = {source.masks.upper: footage.cameras[source.name].size_px for source in footage.sources}
-    size |= {source.masks.lower: footage.cameras[source.name].size_px for source in footage.sources}
-    return any(size[source.masks.upper] != footage.cameras[source.name].size_px for source in sources)
+    size = {_masks(source).upper: footage.cameras[source.name].size_px for source in footage.sources}
+    size |= {_masks(source).lower: footage.cameras[source.name].size_px for source in footage.sources}
+    return any(size[_masks(source).upper] != footage.cameras[source.name].size_px for source in sources)

@@ -1,13 +1,13 @@
-"""Brute-force search for the pose of one row of teeth: orientations one by one, all translations at once.
+"""Brute-force search for the pose of one arch: orientations one by one, all translations at once.
 
-For one orientation the picture of the row hardly changes under small translations but for a shift. How well it fits
-its mask at every shift is a correlation, which the fast Fourier transform gives for all shifts together; a translation
-is then worth the sum over the cameras of what its shifts are worth.
+For one orientation, small translations hardly do more than shift the picture of the arch. How well it fits its mask at
+every shift is a correlation, which the fast Fourier transform gives for all shifts together; the objective of a
+translation is the sum over the cameras.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,15 +17,14 @@ from scipy import fft, ndimage
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import make_transform, so3_exp, transform_points
 from jawusd.geometry.arrays import Array
-from jawusd.imaging.raster import draw_depth_labels, project
-from jawusd.tracking.contour.samples import CROWN, GUM
-from jawusd.tracking.contour.scan import Scan, prepare_scan
+from jawusd.tracking.config import Mapper
+from jawusd.tracking.contour.scan import CROWN, Scan, prepare_scan
 from jawusd.tracking.contour.views import View
 
 _CELL_MM = 1.2  # vertices closer than this become one: below the pixels of the search
 _BLUR_MM = 0.9  # of the outlines, so that a grid of a few degrees and two millimetres does not miss the optimum
 # Price of an uncovered mask pixel of 1 mm in mm of fitting outline [1/mm].
-_BARE_PRICE = 1.0
+_UNCOVERED_PRICE = 1.0
 
 
 @dataclass(frozen=True)
@@ -33,7 +32,7 @@ class Grid:
     """Lay out the poses to be tried about a guess.
 
     Attributes:
-        yaw_rad, pitch_rad, roll_rad: turns about the up, left and front axes of the row.
+        yaw_rad, pitch_rad, roll_rad: turns about the up, left and front axes of the arch.
         reach_mm: translations to either side along left, up and front.
         step_mm: distance of the translations.
     """
@@ -44,7 +43,7 @@ class Grid:
     reach_mm: tuple[float, float, float]
     step_mm: float = 1.5
 
-    def turns(self) -> Iterable[Array]:
+    def turns(self) -> Iterator[Array]:
         """Yield the rotations to be tried, shape (3, 3)."""
         for yaw in self.yaw_rad:
             for pitch in self.pitch_rad:
@@ -59,9 +58,9 @@ class Grid:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """Hold one pose that the search found promising: its worth [px] and T_world_row, shape (4, 4)."""
+    """Hold one pose that the search found promising: its objective [px] and T_world_arch, shape (4, 4)."""
 
-    worth: float
+    objective: float
     pose: Array
 
 
@@ -73,25 +72,17 @@ def coarse_scan(mesh: Mesh, name: str) -> Scan:
     solid = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
     faces = np.unique(faces[solid], axis=0)
     colors = None if mesh.colors is None else mesh.colors[chosen]
-    return prepare_scan(Mesh(mesh.vertices[chosen], faces, colors), name)
+    return prepare_scan(Mesh(mesh.vertices[chosen], faces.astype(np.int32), colors), name)
 
 
 class _Screen:
-    """Tell what the drawn row is worth in one picture at every shift."""
+    """Tell how well the drawn arch fits its mask in one picture at every shift."""
 
-    def __init__(self, view: View, row: int, px_per_mm: float, shifts: Array, at: NDArray) -> None:
-        """Prepare the correlation.
-
-        Args:
-            view: the picture, with a mask of the row.
-            row: 0 upper, 1 lower.
-            px_per_mm: its resolution at the teeth.
-            shifts: world translations that will be asked for [mm], shape (N, 3).
-            at: world point that is shifted [mm], shape (3,).
-        """
+    def __init__(self, view: View, arch: int, px_per_mm: float, shifts: Array, at: Array) -> None:
+        """Prepare the correlation for world translations `shifts` (N, 3) of a world point `at` (3,) [mm]."""
         # Rounded: sub-pixel shifts gain nothing on blurred outlines.
         pixels = np.rint(shifts @ _slope(view.matrix, at).T).astype(np.int64)
-        picture = _template(view.masks[row], view.masks[1 - row], px_per_mm)
+        picture = _template(view.masks[arch], view.masks[1 - arch], px_per_mm)
         some = np.abs(picture) > 1e-3
         y, x = np.flatnonzero(some.any(1)), np.flatnonzero(some.any(0))
         picture = picture[y[0] : y[-1] + 1, x[0] : x[-1] + 1]
@@ -104,58 +95,55 @@ class _Screen:
         self._matrix = np.array([[1, 0, right - x[0]], [0, 1, down - y[0]], [0, 0, 1.0]]) @ view.matrix
         self._columns, self._rows = (pixels % self._full[::-1]).T
 
-    def worth(self, scan: Scan, pose: Array) -> NDArray[np.float32]:
-        """Return the worth of a pose under all shifts [px], shape (N,)."""
-        points = np.empty((len(scan.vertices), 3), np.float32)
-        project(scan.vertices_single, (self._matrix @ pose).astype(np.float32), points)
+    def objective(self, scan: Scan, pose: Array) -> NDArray[np.float32]:
+        """Return the objective of a pose under all shifts [px], shape (N,)."""
         depth, labels = np.zeros(self._shape, np.float32), np.zeros(self._shape, np.uint8)
-        draw_depth_labels(points, scan.crown_faces, 0, 0, scan.painted, depth, labels, CROWN)
-        draw_depth_labels(points, scan.gum_faces, 0, 0, False, depth, labels, GUM)
+        scan.draw(self._matrix @ pose, depth, labels)
         drawn = fft.rfft2((labels == CROWN).astype(np.float32), self._full)
         return fft.irfft2(np.conj(drawn) * self._template, self._full)[self._rows, self._columns]
 
 
-def search_row(
+def search_arch(
     scan: Scan,
-    row: int,
+    arch: int,
     views: Sequence[View],
     px_per_mm: float,
     base: Array,
     hinge: Array,
     grid: Grid,
-    map_: Callable[..., Iterable] = map,
+    map_: Mapper = map,
 ) -> list[Candidate]:
     """Return the best translation of every orientation of a grid, the best orientations first.
 
     Args:
-        scan: the row of teeth, coarse.
-        row: 0 upper, 1 lower.
-        views: pictures of one instant; those without a mask of the row are left out.
+        scan: the arch, coarse.
+        arch: 0 upper, 1 lower.
+        views: of one instant; those without a mask of the arch are left out.
         px_per_mm: their resolution at the teeth.
-        base: guessed pose of the row's (left, up, front) axes about the point to turn about, world <- axes, shape
+        base: guessed pose of the arch's (left, up, front) axes about the point to turn about, world <- axes, shape
             (4, 4).
         hinge: scan frame to (left, up, front) axes about that point, shape (4, 4).
-        grid: what to try.
-        map_: runs orientations, in threads if it likes.
+        map_: runs the orientations.
     """
     shifts = grid.shifts() @ base[:3, :3].T
-    screens = [_Screen(view, row, px_per_mm, shifts, base[:3, 3]) for view in views if view.present[row]]
+    screens = [_Screen(view, arch, px_per_mm, shifts, base[:3, 3]) for view in views if view.present[arch]]
 
-    def look(turn: Array) -> Candidate:
+    def best_translation(turn: Array) -> Candidate:
         pose = base @ make_transform(turn, np.zeros(3)) @ hinge
-        worth = sum(screen.worth(scan, pose) for screen in screens)
-        best = int(worth.argmax())
-        return Candidate(float(worth[best]), make_transform(np.eye(3), shifts[best]) @ pose)
+        objective = np.sum([screen.objective(scan, pose) for screen in screens], axis=0)
+        best = int(objective.argmax())
+        return Candidate(float(objective[best]), make_transform(np.eye(3), shifts[best]) @ pose)
 
-    return sorted(map_(look, grid.turns()), key=lambda c: -c.worth)
+    return sorted(map_(best_translation, grid.turns()), key=lambda c: -c.objective)
 
 
 def _template(mask: NDArray[np.uint8], other: NDArray[np.uint8], px_per_mm: float) -> Array:
-    """Return the picture whose correlation with the drawn crowns is their worth, up to a constant [px].
+    """Return the picture whose correlation with the drawn crowns is their objective, up to a constant [px].
 
-    Worth is the length of outline that lies on the mask's outline, less a price of uncovered mask pixels. The first is
-    the correlation of the blurred gradients of both pictures, normalised to 1 per pixel of a straight edge; moving
-    both derivatives to the mask makes it -div(w grad m). Where the other row begins, the outline is that row's (w = 0).
+    The objective is the length of outline that lies on the mask's outline, less a price of uncovered mask pixels. The
+    first is the correlation of the blurred gradients of both pictures, normalised to 1 per pixel of a straight edge;
+    moving both derivatives to the mask makes it -div(w grad m). Where the other arch begins, the outline belongs to
+    that arch (w = 0).
     """
     sigma = _BLUR_MM * px_per_mm * np.sqrt(2)  # both outlines' blur in one
     inside = mask / 255.0
@@ -163,7 +151,7 @@ def _template(mask: NDArray[np.uint8], other: NDArray[np.uint8], px_per_mm: floa
     smooth = ndimage.gaussian_filter(inside, sigma)
     dy, dx = np.gradient(smooth)
     edges = -(np.gradient(own * dy, axis=0) + np.gradient(own * dx, axis=1)) * sigma * np.sqrt(2 * np.pi)
-    return edges + _BARE_PRICE / px_per_mm * inside
+    return edges + _UNCOVERED_PRICE / px_per_mm * inside
 
 
 def _slope(matrix: Array, point: Array) -> Array:
@@ -173,7 +161,7 @@ def _slope(matrix: Array, point: Array) -> Array:
 
 
 def hinge_at_front(crowns: Array, T_anatomical_scan: Array) -> Array:
-    """Return the anatomical frame of a row, moved to the middle of its front teeth, shape (4, 4).
+    """Return the anatomical frame of a arch, moved to the middle of its front teeth, shape (4, 4).
 
     Args:
         crowns: crown vertices in the scan frame [mm], shape (N, 3).

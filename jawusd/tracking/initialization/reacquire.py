@@ -8,38 +8,26 @@ import numpy as np
 
 from jawusd.geometry import transform_point
 from jawusd.geometry.arrays import Array, Mask
-from jawusd.imaging.raster import draw_silhouette, project, unpack_bits, words_for
+from jawusd.imaging.raster import unpack_bits
 from jawusd.tracking.contour.scan import Scan
 from jawusd.tracking.contour.views import View
 
 
-def shift_to_masks(scan: Scan, pose: Array, row: int, views: Sequence[View], use: Mask) -> Array:
+def shift_to_masks(scan: Scan, pose: Array, arch: int, views: Sequence[View], use: Mask) -> Array:
     """Return the translation across the line of sight that brings the crowns' middle onto that of their masks [mm].
 
     Lips hide the back teeth, and others in every view, so the depth found would be wrong by a centimetre or two: it
     is left alone. Across, the result is good to a few millimetres: enough for a search to start from.
 
-    Args:
-        scan: the row of teeth.
-        pose: T_world_row, shape (4, 4).
-        row: 0 upper, 1 lower.
-        views: one per camera.
-        use: masks to be used, shape (2, C).
-
-    Returns:
-        World translation, shape (3,); zero without a mask.
+    `pose` is T_world_scan, `use` tells the masks to be used, shape (2, C). Zero without a mask.
     """
-    points = np.empty((len(scan.vertices), 3), np.float32)
     centre = np.append(transform_point(pose, scan.centre), 1.0)
     H, g, sight = np.zeros((3, 3)), np.zeros(3), np.zeros(3)
-    for c in np.flatnonzero(use[row]):
-        view = views[c]
+    for view in (view for view, used in zip(views, use[arch], strict=True) if used):
         height, width = view.masks.shape[1:]
         # Three pictures wide and high: what is to be brought near may lie off the picture.
-        bits = np.zeros((3 * height, words_for(3 * width)), np.uint64)
-        project(scan.vertices_single, (view.matrix @ view.lead[row] @ pose).astype(np.float32), points)
-        draw_silhouette(points, scan.crown_faces, -width, -height, 3 * width, scan.painted, bits)
-        crowns, mask = unpack_bits(bits, 3 * width), view.masks[row] > 127
+        bits = scan.silhouette(view.matrix @ view.T_delay[arch] @ pose, (3 * height, 3 * width), -width, -height)
+        crowns, mask = unpack_bits(bits, 3 * width), view.masks[arch] > 127
         depth = view.matrix[2] @ centre
         if depth <= 0 or not crowns.any() or not mask.any():
             continue

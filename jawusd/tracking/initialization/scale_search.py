@@ -1,12 +1,12 @@
-"""How large are the teeth as calibrated cameras see them? A search of the size at which the masks fit the scans best.
+"""The size of the teeth as calibrated cameras see them: a search for the size at which masks and scans agree best.
 
-Nothing in pictures of a board tells how large its squares are: taken for too large, all the world is. Seen from several
-sides the teeth then fit their masks at no pose, until the cameras are moved closer together by as much.
+Pictures of a board do not show how large its squares are. With the wrong size the whole world is scaled, and the teeth
+fit their masks in several views at no pose until the cameras are moved closer together or apart.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,24 +14,23 @@ import numpy as np
 from jawusd.errors import TrackingError
 from jawusd.formats.capture import Capture
 from jawusd.formats.mesh import Mesh
-from jawusd.geometry import Camera, transform_point
+from jawusd.geometry import Camera
 from jawusd.geometry.arrays import Array
-from jawusd.tracking.config import TrackingConfig
-from jawusd.tracking.contour.quality import row_fit, score_px, uncovered_px
-from jawusd.tracking.contour.scan import prepare_scan
+from jawusd.tracking.config import Mapper, TrackingConfig
+from jawusd.tracking.contour.quality import arch_fit, score_px, uncovered_px
+from jawusd.tracking.contour.scan import ARCH_NAMES, prepare_scan, teeth_centre
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import masked_sources
 from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.initialization.scan_checks import check_occlusion
 from jawusd.tracking.initialization.start_search import StartSearch
 
-_ROWS = (0, 1)
-# Sizes of the world at which the poses are searched anew; between them the fit rises towards the true one.
+# Sizes of the world at which the poses are searched from scratch; between them the fit rises towards the true one.
 _STARTS = (1.0, 1 / 1.15, 1.15, 1 / 1.32, 1.32)
 _STEPS = (0.03, 0.01, 0.005)
 _SMALLEST, _LARGEST = 0.5, 2.0
 _SURVEYED, _FRAMES_TRIED = 24, 2
-_CLEAR_FIT = 0.3  # as for the start of a take: wrong poses stay below 0.1 in one of the rows
+_CLEAR_FIT = 0.3  # as for the start of a take: wrong poses stay below 0.1 in one of the arches
 
 
 def seen_size(
@@ -39,24 +38,22 @@ def seen_size(
     cameras: Sequence[Camera],
     offsets: Mapping[str, int],
     meshes: Sequence[Mesh],
-    map_: Callable[..., Iterable] = map,
+    map_: Mapper = map,
 ) -> float:
-    """Return how many times as large as their scans the cameras see the teeth; told to half a per cent.
+    """Return how many times as large as their scans the cameras see the teeth, to half a per cent.
 
     Args:
         capture: gives masks, frame range and anatomical axes.
         cameras: calibrated up to the size of the world.
         offsets: reference frame minus own frame number, by camera name.
         meshes: upper and lower teeth scans in one frame, in occlusion [mm].
-        map_: runs parts of the search, in threads if it likes.
+        map_: runs parts of the search.
 
     Raises:
         TrackingError: too few masks, or the scans fit them at no size.
         CaptureError: a mask cannot be read.
     """
-    solver = ContourSolver(
-        tuple(prepare_scan(m, n) for m, n in zip(meshes, ("upper", "lower"), strict=True)), TrackingConfig()
-    )
+    solver = ContourSolver(tuple(prepare_scan(m, n) for m, n in zip(meshes, ARCH_NAMES, strict=True)), TrackingConfig())
     T_anatomical_scan, _ = check_occlusion(solver.scans, capture.anatomy.T_anatomical_skull)
     sizes = _Sizes(capture, cameras, offsets, StartSearch(meshes, solver, T_anatomical_scan, map_))
     frames = sizes.footage(1.0).survey(None, _SURVEYED).promising(_FRAMES_TRIED).tolist()
@@ -97,36 +94,35 @@ class _Sizes:
         return Footage(sources, cameras, self._offsets, self._capture.frames)
 
     def climb(self, frame: int, size: float, poses: Array) -> tuple[float, float]:
-        """Return the size at which the fit is best, going uphill from given poses, and the fit of the worse row."""
-        worth, fit, poses = self._fitted(frame, size, poses, size)
+        """Return the size at which the fit is best, going uphill from given poses, and the fit of the worse arch."""
+        objective, fit, poses = self._fitted(frame, size, poses, size)
         beside = {}
         for step in _STEPS:
-            beside = {0: worth}
+            beside = {0: objective}
             for direction in (1, -1):
                 while True:
                     there = size * (1 + step) ** direction
                     if not _SMALLEST <= there <= _LARGEST:
                         break
                     other = self._fitted(frame, there, poses, size)
-                    if other[0] <= worth:
+                    if other[0] <= objective:
                         beside[direction] = other[0]
                         break
-                    beside = {-direction: worth}
-                    size, (worth, fit, poses) = there, other
+                    beside = {-direction: objective}
+                    size, (objective, fit, poses) = there, other
         if {1, -1} <= beside.keys():  # the top of a parabola through the last three
-            bend = beside[1] - 2 * worth + beside[-1]
+            bend = beside[1] - 2 * objective + beside[-1]
             size *= (1 + _STEPS[-1]) ** (0.5 * (beside[-1] - beside[1]) / bend if bend < 0 else 0.0)
         return size, fit
 
     def _fitted(self, frame: int, size: float, poses: Array, size_of_poses: float) -> tuple[float, float, Array]:
-        """Return worth, fit of the worse row and poses, aligned from poses found at another size."""
+        """Return objective, fit of the worse arch and poses, aligned from poses found at another size."""
         scans, config = self._solver.scans, self._solver.config
         start = poses.copy()
         start[:, :3, 3] *= size / size_of_poses
-        centre = np.mean([transform_point(start[r], scans[r].centre) for r in _ROWS], axis=0)
-        with self.footage(size).views(centre, config.working_px_per_mm) as masks:
+        with self.footage(size).views(teeth_centre(scans, start), config.working_px_per_mm) as masks:
             views = masks.at(frame)
         end = self._solver.solve(start, views, config.wide_gates_px)
-        bare, _ = uncovered_px(scans, end, views)
-        worth = float((score_px(end) - config.bare_price * bare).sum())
-        return worth, float(row_fit(scans, end, views, config.bare_price).min()), end.poses
+        uncovered, _ = uncovered_px(scans, end, views)
+        objective = float((score_px(end) - config.uncovered_price * uncovered).sum())
+        return objective, float(arch_fit(scans, end, views, config.uncovered_price).min()), end.poses

@@ -27,7 +27,7 @@ _SHARE = 0.005  # of the crown vertices that may be exceptions
 
 
 def check_occlusion(scans: Sequence[Scan], T_anatomical_scan: ArrayLike | None) -> tuple[Array, list[str]]:
-    """Check that both rows of teeth lie in one frame, in occlusion.
+    """Check that both arches lie in one frame, in occlusion.
 
     Args:
         scans: upper and lower, prepared.
@@ -37,7 +37,7 @@ def check_occlusion(scans: Sequence[Scan], T_anatomical_scan: ArrayLike | None) 
         T_anatomical_scan, shape (4, 4), and what is odd but may be, one sentence each.
 
     Raises:
-        TrackingError: the rows are far apart, beside one another, or inside one another.
+        TrackingError: the arches are far apart, beside one another, or inside one another.
     """
     crowns = [scan.crown_vertices(6000) for scan in scans]
     near, depth = _gap_mm(crowns), _overlap_mm(scans)
@@ -55,11 +55,11 @@ def check_occlusion(scans: Sequence[Scan], T_anatomical_scan: ArrayLike | None) 
             hint=hint,
         )
     given = T_anatomical_scan is not None
-    # The thin direction of the upper row alone: that of both rows means little while they are not known to meet.
+    # The thin direction of the upper arch alone: that of both arches means little while they are not known to meet.
     up = np.array(T_anatomical_scan, np.float64)[1, :3] if given else _thin_direction(crowns[0])
     between = crowns[0].mean(0) - crowns[1].mean(0)
     height, aside = float(up @ between), float(np.linalg.norm(between - up * (up @ between)))
-    # The side of its gum tells a lower row above the upper one from scans whose axes are turned over.
+    # The side of its gum tells a lower arch above the upper one from scans whose axes are turned over.
     height = abs(height) if (side := _gum_side(scans[0], up)) == 0 else height * side
     if height < _LEAST_HEIGHT_MM:
         raise TrackingError(
@@ -89,7 +89,7 @@ def check_occlusion(scans: Sequence[Scan], T_anatomical_scan: ArrayLike | None) 
 
 
 def _gum_side(scan: Scan, up: Array) -> float:
-    """Return on which side of its crowns a row has its gum: 1 towards `up`, -1 away from it, 0 if it has none."""
+    """Return on which side of its crowns a arch has its gum: 1 towards `up`, -1 away from it, 0 if it has none."""
     if not scan.painted or not len(scan.gum_faces):
         return 0.0
     gum, crowns = (scan.vertices[np.unique(faces)].mean(0) for faces in (scan.gum_faces, scan.crown_faces))
@@ -97,7 +97,7 @@ def _gum_side(scan: Scan, up: Array) -> float:
 
 
 def _gap_mm(crowns: Sequence[Array]) -> float:
-    """Return the distance of the vertices that are closest to the other row [mm]."""
+    """Return the distance of the vertices that are closest to the other arch [mm]."""
     distance = cKDTree(crowns[0]).query(crowns[1])[0]
     return float(np.quantile(distance, _SHARE))
 
@@ -119,7 +119,7 @@ def _overlap_mm(scans: Sequence[Scan]) -> float:
 
 
 def _thin_direction(points: Array) -> Array:
-    """Return the direction in which a row of teeth extends least, shape (3,)."""
+    """Return the direction in which a arch extends least, shape (3,)."""
     return np.linalg.svd(points - points.mean(0), full_matrices=False)[2][2]
 
 

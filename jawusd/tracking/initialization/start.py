@@ -2,30 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from jawusd.errors import CaptureError, TrackingError
-from jawusd.formats.capture import Capture
+from jawusd.formats.capture import Bootstrap, Capture
 from jawusd.formats.mesh import Mesh
-from jawusd.geometry import Camera, transform_point
+from jawusd.geometry import Camera
 from jawusd.geometry.arrays import Array
+from jawusd.tracking.config import Mapper
+from jawusd.tracking.contour.scan import teeth_centre
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import masked_sources
 from jawusd.tracking.initialization.bootstrap import picked_sigma_mm, pose_from_picks
 from jawusd.tracking.initialization.first_frame import first_record
 from jawusd.tracking.initialization.footage import Footage
-from jawusd.tracking.initialization.mixups import all_rows_exchanged, likely_mixup, possible_mixups
+from jawusd.tracking.initialization.mixups import all_arches_exchanged, likely_mixup, possible_mixups
 from jawusd.tracking.initialization.scan_checks import check_occlusion
 from jawusd.tracking.initialization.start_search import Found, StartSearch
 
-_ROWS = (0, 1)
-_SURVEYED = 24  # frames looked at: two seconds of reading, and every exercise of a usual take is met
+_SURVEYED = 24  # frames surveyed: two seconds of reading, and every exercise of a usual take is met
 _FRAMES_TRIED = 5
 _MIXUPS_TRIED = 12  # all of them with four cameras; every one costs a search
-# Fit that leaves no doubt [-]. Wrong poses of a hundred searches stayed below 0.1 in one of the rows, right ones
+# Fit that leaves no doubt [-]. Wrong poses of a hundred searches stayed below 0.1 in one of the arches, right ones
 # exceed 0.35 where much of the teeth shows, and 0.1 with lips nearly closed or cameras 0.1 degrees off.
 _CLEAR_FIT = 0.3
 # Poses as sure as this [mm] lie within the basin of the contour solver.
@@ -44,7 +45,7 @@ class Start:
 
     frame: int
     poses: Array
-    notes: dict
+    notes: dict[str, object]
 
 
 def find_start(
@@ -53,17 +54,16 @@ def find_start(
     offsets: Mapping[str, int],
     meshes: Sequence[Mesh],
     solver: ContourSolver,
-    map_: Callable[..., Iterable] = map,
+    map_: Mapper = map,
 ) -> Start:
     """Return the first frame and the poses there, from the capture's picks or, without any, by search.
 
     Args:
-        capture: the capture; its masks, picks and frame range are used.
-        cameras: calibrated cameras by name.
-        offsets: reference frame minus own frame number, by camera name.
+        capture: gives masks, picks and frame range.
+        cameras, offsets: by camera name; reference frame minus own frame number.
         meshes: upper and lower teeth scans in one frame, in occlusion [mm].
         solver: holds the same scans, prepared.
-        map_: runs parts of the search, in threads if it likes.
+        map_: runs parts of the search.
 
     Raises:
         TrackingError: picks that cannot be, scans that do not belong together, masks that were exchanged, or no frame
@@ -74,16 +74,17 @@ def find_start(
     T_anatomical_scan, findings = check_occlusion(solver.scans, capture.anatomy.T_anatomical_skull)
     search = StartSearch(meshes, solver, T_anatomical_scan, map_)
     if capture.bootstrap is not None:
-        start = _picked(capture, footage, meshes, search)
+        start = _picked(capture.bootstrap, capture.frames, footage, meshes, search)
     else:
         start = search_start(search, footage)
     return Start(start.frame, start.poses, {**start.notes, "scan_findings": findings})
 
 
-def _picked(capture: Capture, footage: Footage, meshes: Sequence[Mesh], search: StartSearch) -> Start:
-    """Return the poses that agree with the picks; where picks leave much open, the best ones for the masks nearby."""
-    bootstrap = capture.bootstrap
-    first, stop = capture.frames or (0, bootstrap.frame + 1)
+def _picked(
+    bootstrap: Bootstrap, frames: tuple[int, int] | None, footage: Footage, meshes: Sequence[Mesh], search: StartSearch
+) -> Start:
+    """Return the poses that agree with the picks; where picks are uncertain, the best ones for the masks nearby."""
+    first, stop = frames or (0, bootstrap.frame + 1)
     if not first <= bootstrap.frame < stop:
         raise TrackingError(f"bootstrap.frame is {bootstrap.frame}, frames run from {first} to {stop - 1}")
     poses, left_out, sigma_mm = [], {}, {}
@@ -93,19 +94,20 @@ def _picked(capture: Capture, footage: Footage, meshes: Sequence[Mesh], search: 
         left_out[scan.name] = wrong
         good = [pick for k, pick in enumerate(picks, start=1) if k not in wrong]
         sigma_mm[scan.name] = picked_sigma_mm(good, mesh.vertices, footage.cameras, pose, scan.probes)
-    notes = {"by": "picks", "frame": bootstrap.frame, "picks_left_out": left_out, "picks_sigma_mm": sigma_mm}
+    notes: dict[str, object] = {"by": "picks", "frame": bootstrap.frame}
+    notes |= {"picks_left_out": left_out, "picks_sigma_mm": sigma_mm}
     start = Start(bootstrap.frame, np.stack(poses), notes)
     if (mixup := likely_mixup(footage, search.solver, start.poses, start.frame)) is not None:
         raise mixup.refusal(start.frame)
     if max(sigma_mm.values()) <= _SURE_MM or not footage.has_masks(start.frame):
         return start
     found = search_around(search, footage, start.frame, start.poses)
-    notes |= {"by": "picks, then search", "worth_px": found.worth_px, "fit": found.fit}
+    notes |= {"by": "picks, then search", "worth_px": found.objective_px, "fit": found.fit}
     return Start(start.frame, found.poses, notes)
 
 
 def search_start(search: StartSearch, footage: Footage) -> Start:
-    """Find a frame on which both rows of teeth can be aligned, and their poses there.
+    """Find a frame on which both arches can be aligned, and their poses there.
 
     The first frame that fits beyond doubt is taken, or else the one that fits best.
 
@@ -147,7 +149,7 @@ def search_start(search: StartSearch, footage: Footage) -> Start:
         )
     frame, found = best
     _check_upright(search, footage, frame, found)
-    notes = {"by": "search", "frame": frame, "worth_px": found.worth_px, "fit": found.fit}
+    notes = {"by": "search", "frame": frame, "worth_px": found.objective_px, "fit": found.fit}
     return Start(frame, found.poses, {**notes, "failed": {str(f): m for f, m in failed.items()}})
 
 
@@ -164,28 +166,27 @@ def search_around(search: StartSearch, footage: Footage, frame: int, poses: Arra
         anywhere = search.at(footage, frame)
     except TrackingError:
         return near
-    return max(near, anywhere, key=lambda found: found.worth_px)
+    return max(near, anywhere, key=lambda found: found.objective_px)
 
 
 def _aligned(search: StartSearch, footage: Footage, poses: Array, frame: int) -> Array:
     """Return the poses as aligned by the solver if they pass the checks of a first frame, shape (2, 4, 4)."""
     solver = search.solver
-    centre = np.mean([transform_point(poses[r], solver.scans[r].centre) for r in _ROWS], axis=0)
-    with footage.views(centre, solver.config.working_px_per_mm) as masks:
-        return first_record(solver, solver.config, poses, masks, frame).solution.poses
+    with footage.views(teeth_centre(solver.scans, poses), solver.config.working_px_per_mm) as masks:
+        return first_record(solver, solver.config, poses, masks.at(frame), frame).solution.poses
 
 
 def _check_upright(search: StartSearch, footage: Footage, frame: int, found: Found) -> None:
-    """Refuse masks that fit better with the rows exchanged everywhere: turned over, an upper row resembles a lower."""
-    mixup = all_rows_exchanged(footage.sources)
+    """Refuse masks that fit better with the arches exchanged: turned over, an upper arch resembles a lower one."""
+    mixup = all_arches_exchanged(footage.sources)
     try:
         other = search.at(replace(footage, sources=mixup.sources), frame)
     except TrackingError:
         return
-    if other.worth_px > found.worth_px:
+    if other.objective_px > found.objective_px:
         raise TrackingError(
-            f"{mixup.finding}: {other.worth_px:.0f} px of contour fit after exchanging them, "
-            f"{found.worth_px:.0f} px as they are named",
+            f"{mixup.finding}: {other.objective_px:.0f} px of contour fit after exchanging them, "
+            f"{found.objective_px:.0f} px as they are named",
             frame=frame,
             hint=mixup.hint,
         )

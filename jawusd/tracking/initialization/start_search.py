@@ -1,8 +1,8 @@
-"""Search the poses of both rows of teeth on single frames: all poses coarsely, the best ones finely."""
+"""Search the poses of both arches on single frames: all poses coarsely, the best ones finely."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,18 +11,18 @@ from jawusd.errors import TrackingError
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import make_transform, so3_log, transform_point, transform_points
 from jawusd.geometry.arrays import Array
+from jawusd.tracking.config import Mapper
 from jawusd.tracking.contour.equations import Solution
-from jawusd.tracking.contour.quality import row_fit, score_px, uncovered_px
+from jawusd.tracking.contour.quality import arch_fit, score_px, uncovered_px
+from jawusd.tracking.contour.scan import ARCH_NAMES, ARCHES, teeth_centre
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import View
 from jawusd.tracking.initialization.footage import Footage
-from jawusd.tracking.initialization.pose_search import Candidate, Grid, coarse_scan, hinge_at_front, search_row
+from jawusd.tracking.initialization.pose_search import Candidate, Grid, coarse_scan, hinge_at_front, search_arch
 
-_ROWS = (0, 1)
-_NAMES = ("upper", "lower")
 _PX_PER_MM = 2.0  # of the search: one pixel is a third of the step between orientations at the canines
-_FINALISTS = 5  # poses per row that are refined
-_DISTINCT_MM = 2.0  # poses closer than this lead to the same minimum
+_FINALISTS = 5  # poses per arch that are refined
+_DISTINCT_MM = 2.0  # poses closer than this T_delay to the same minimum
 # Turns about the guess: the teeth face the cameras, the upper ones are above the lower ones. Masks one beside the other
 # in a lateral movement, or half hidden by lips, mislead the roll most.
 _GRID = Grid(
@@ -38,8 +38,8 @@ _NEAR_GRID = Grid(
     roll_rad=np.radians(np.arange(-20, 21, 10.0)),
     reach_mm=(6.0, 6.0, 6.0),
 )
-_WIDEST_JAW_RAD = 0.8  # turn between the rows beyond which a jaw does not open
-_FARTHEST_JAW_MM = 75.0  # distance of the rows' front teeth beyond which it does not either
+_WIDEST_JAW_RAD = 0.8  # turn between the arches beyond which a jaw does not open
+_FARTHEST_JAW_MM = 75.0  # distance of the arches' front teeth beyond which it does not either
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,24 +48,24 @@ class Found:
 
     Attributes:
         poses: T_world_upper, T_world_lower, shape (2, 4, 4).
-        worth_px: fitting contour less the price of uncovered mask, both rows.
-        fit: `row_fit` of the row that fits worse [-].
+        objective_px: fitting contour less the price of uncovered mask, both arches.
+        fit: `arch_fit` of the arch that fits worse [-].
     """
 
     poses: Array
-    worth_px: float
+    objective_px: float
     fit: float
 
 
 class StartSearch:
-    """Search the poses of both rows of teeth on single frames."""
+    """Search the poses of both arches on single frames."""
 
     def __init__(
         self,
         meshes: Sequence[Mesh],
         solver: ContourSolver,
         T_anatomical_scan: Array,
-        map_: Callable[..., Iterable] = map,
+        map_: Mapper = map,
     ) -> None:
         """Prepare coarse scans.
 
@@ -73,10 +73,10 @@ class StartSearch:
             meshes: upper and lower teeth scans in one frame, in occlusion [mm].
             solver: holds the same scans, prepared.
             T_anatomical_scan: scan frame to (left, up, front) axes, shape (4, 4).
-            map_: runs the parts of the search, in threads if it likes.
+            map_: runs parts of the search.
         """
         self.solver, self._config, self._map = solver, solver.config, map_
-        self._coarse = tuple(coarse_scan(m, n) for m, n in zip(meshes, _NAMES, strict=True))
+        self._coarse = tuple(coarse_scan(m, n) for m, n in zip(meshes, ARCH_NAMES, strict=True))
         self._hinges = [hinge_at_front(s.crown_vertices(), T_anatomical_scan) for s in self._coarse]
         self._coarse_solver = ContourSolver(self._coarse, solver.config)
 
@@ -92,7 +92,7 @@ class StartSearch:
             views = masks.at(frame)
         axes = _guessed_axes(places, survey.eyes)
         bases = [make_transform(axes, place) for place in places]
-        finalists = [self._searched(r, views, bases[r], _GRID) for r in _ROWS]
+        finalists = [self._searched(r, views, bases[r], _GRID) for r in ARCHES]
         return self._settled(finalists, views, footage, frame)
 
     def near(self, footage: Footage, frame: int, poses: Array) -> Found:
@@ -104,14 +104,14 @@ class StartSearch:
         with footage.views(transform_point(poses[0], self._coarse[0].centre), _PX_PER_MM) as masks:
             views = masks.at(frame)
         finalists = []
-        for r in _ROWS:
+        for r in ARCHES:
             base = poses[r] @ np.linalg.inv(self._hinges[r])
             finalists.append([poses[r], *self._searched(r, views, base, _NEAR_GRID)])
         return self._settled(finalists, views, footage, frame)
 
     def _searched(self, r: int, views: Sequence[View], base: Array, grid: Grid) -> list[Array]:
-        """Return the best poses of a row that differ from one another."""
-        found = search_row(self._coarse[r], r, views, _PX_PER_MM, base, self._hinges[r], grid, self._map)
+        """Return the best poses of a arch that differ from one another."""
+        found = search_arch(self._coarse[r], r, views, _PX_PER_MM, base, self._hinges[r], grid, self._map)
         return self._distinct(found, r)
 
     def _settled(
@@ -121,14 +121,13 @@ class StartSearch:
         pairs = self._refined_pairs(finalists, views)
         if not pairs:
             raise TrackingError("the best poses of the two rows of teeth are none a jaw can take", frame=frame)
-        centre = np.mean([transform_point(pairs[0][r], self._coarse[r].centre) for r in _ROWS], axis=0)
-        with footage.views(centre, self._config.working_px_per_mm) as masks:
+        with footage.views(teeth_centre(self._coarse, pairs[0]), self._config.working_px_per_mm) as masks:
             views = masks.at(frame)
         ends = [self.solver.solve(poses, views, self._config.wide_gates_px) for poses in pairs]
-        worth = [self._worth(self.solver, s, views).sum() for s in ends]
-        best = int(np.argmax(worth))
-        fit = row_fit(self.solver.scans, ends[best], views, self._config.bare_price)
-        return Found(ends[best].poses, float(worth[best]), float(fit.min()))
+        objective = [self._worth(self.solver, s, views).sum() for s in ends]
+        best = int(np.argmax(objective))
+        fit = arch_fit(self.solver.scans, ends[best], views, self._config.uncovered_price)
+        return Found(ends[best].poses, float(objective[best]), float(fit.min()))
 
     def _distinct(self, found: Sequence[Candidate], r: int) -> list[Array]:
         """Return the best poses that differ from one another."""
@@ -145,10 +144,10 @@ class StartSearch:
     def _refined_pairs(self, finalists: Sequence[Sequence[Array]], views: Sequence[View]) -> list[Array]:
         """Refine the finalists coarsely and return up to four pairs a jaw can take, shape (2, 4, 4) each."""
         ranked = []
-        for r in _ROWS:
+        for r in ARCHES:
             ends = []
             for pose in finalists[r]:
-                start = np.stack([finalists[q][0] if q != r else pose for q in _ROWS])
+                start = np.stack([finalists[q][0] if q != r else pose for q in ARCHES])
                 end = self._coarse_solver.solve(start, views, self._config.wide_gates_px)
                 ends.append((self._worth(self._coarse_solver, end, views)[r], end.poses[r]))
             ranked.append(sorted(ends, key=lambda e: -e[0]))
@@ -157,19 +156,20 @@ class StartSearch:
         return [poses for _, poses in sorted(pairs, key=lambda p: -p[0])[:4]]
 
     def _possible(self, poses: Array) -> bool:
-        """Tell whether a jaw can bring the rows into these poses."""
+        """Tell whether a jaw can bring the arches into these poses."""
         turn = so3_log(poses[0, :3, :3].T @ poses[1, :3, :3])
-        fronts = [(poses[r] @ np.linalg.inv(self._hinges[r]))[:3, 3] for r in _ROWS]
-        return np.linalg.norm(turn) < _WIDEST_JAW_RAD and np.linalg.norm(fronts[1] - fronts[0]) < _FARTHEST_JAW_MM
+        fronts = [(poses[r] @ np.linalg.inv(self._hinges[r]))[:3, 3] for r in ARCHES]
+        gap_mm = np.linalg.norm(fronts[1] - fronts[0])
+        return bool(np.linalg.norm(turn) < _WIDEST_JAW_RAD and gap_mm < _FARTHEST_JAW_MM)
 
     def _worth(self, solver: ContourSolver, solution: Solution, views: Sequence[View]) -> Array:
-        """Return the fitting contour less the price of uncovered mask per row [px], shape (2,)."""
-        bare, _ = uncovered_px(solver.scans, solution, views)
+        """Return the fitting contour less the price of uncovered mask per arch [px], shape (2,)."""
+        uncovered, _ = uncovered_px(solver.scans, solution, views)
         # A price per area: the coarse pictures' pixels are larger.
-        price = self._config.bare_price
+        price = self._config.uncovered_price
         if solver is self._coarse_solver:
             price *= self._config.working_px_per_mm / _PX_PER_MM
-        return (score_px(solution) - price * bare).sum(1)
+        return (score_px(solution) - price * uncovered).sum(1)
 
 
 def _guessed_axes(places: Array, eyes: Array) -> Array:

@@ -87,7 +87,7 @@ def _is_consistent(mesh: Mesh) -> bool:
 
 
 class PaperEnergy:
-    """Give the energy of poses of one row of teeth.
+    """Give the energy of poses of one arch.
 
     Every view is drawn into a screen buffer of its own around the teeth, at the working size and undistorted. A pixel
     is red or green as soon as a triangle of that colour covers its centre, whatever lies in front of it: with faces

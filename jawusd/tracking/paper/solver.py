@@ -11,7 +11,6 @@ from itertools import product
 from math import radians
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.geometry import orthonormalise, transform_point
 from jawusd.geometry.arrays import Array
@@ -49,14 +48,14 @@ class PaperConfig:
     dense_samples: int = 3
     dense_rad: float = radians(0.2)
     dense_mm: float = 0.1
-    # Whether boundary pixels in the mask of the other row go uncounted. The paper counts them, which drags the lower
-    # row out from behind the upper one in closed bites.
+    # Whether boundary pixels in the mask of the other arch go uncounted. The paper counts them, which drags the lower
+    # arch out from behind the upper one in closed bites.
     other_row_hides: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class PaperSolution:
-    """Hold the outcome for one row of teeth at one instant.
+    """Hold the outcome for one arch at one instant.
 
     Attributes:
         pose: T_world_scan, shape (4, 4).
@@ -70,7 +69,7 @@ class PaperSolution:
 
 
 def solve_paper(energy: Energy, start: Array, centre: Array, config: PaperConfig) -> PaperSolution:
-    """Minimise the energy of one row of teeth at one instant.
+    """Minimise the energy of one arch at one instant.
 
     The six numbers are those of eq. 6, R = Rz(theta_z) Ry(theta_y) Rx(theta_x) and t, taken from the start: zero is
     the pose of the previous frame, and rotations turn about the teeth's centroid. The paper leaves that choice open.
@@ -91,8 +90,8 @@ def solve_paper(energy: Energy, start: Array, centre: Array, config: PaperConfig
     while improved and rounds < config.most_rounds:
         rounds += 1
         before = lowest
-        for block in (slice(0, 3), slice(3, 6)):
-            best, lowest = _descend(at, best, lowest, block, config)
+        for rotation in (True, False):
+            best, lowest = _descend(at, best, lowest, rotation, config)
         improved = lowest < before
     spacing = np.repeat([config.dense_rad, config.dense_mm], 3)
     half = config.dense_samples // 2
@@ -104,9 +103,9 @@ def solve_paper(energy: Energy, start: Array, centre: Array, config: PaperConfig
     return PaperSolution(_poses(start, centre, best[None])[0], lowest, rounds)
 
 
-def _descend(at: Energy, best: Array, lowest: float, block: slice, config: PaperConfig) -> tuple[Array, float]:
+def _descend(at: Energy, best: Array, lowest: float, rotation: bool, config: PaperConfig) -> tuple[Array, float]:
     """Take one step in rotation or in translation; return the better of the two ends with its energy."""
-    rotation = block.start == 0
+    block = slice(0, 3) if rotation else slice(3, 6)
     step = config.difference_rad if rotation else config.difference_mm
     nudges = np.zeros((6, 6))
     nudges[:3, block] = step * np.eye(3)
@@ -150,7 +149,7 @@ def golden_section(line: Line, reach: float, tolerance: float) -> tuple[float, f
     return (a, at_a) if at_a <= at_b else (b, at_b)
 
 
-def _poses(start: Array, centre: Array, parameters: NDArray) -> Array:
+def _poses(start: Array, centre: Array, parameters: Array) -> Array:
     """Return T_world_scan of (N, 6) angles and translations from the start, shape (N, 4, 4)."""
     cx, cy, cz = np.cos(parameters[:, :3]).T
     sx, sy, sz = np.sin(parameters[:, :3]).T

@@ -11,18 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.errors import TrackingError
-from jawusd.formats.capture import Capture
+from jawusd.formats.capture import Bootstrap, Capture
 from jawusd.formats.mesh import Mesh
-from jawusd.formats.tracks import LOST, PARTIAL, TRACKED, LostReason, Tracks
+from jawusd.formats.tracks import LOST, PARTIAL, TRACKED, LostReason, Tracks, TracksMeta
 from jawusd.geometry import LANDMARKS, Camera, relative_pose, transform_point
 from jawusd.geometry.arrays import Array
 from jawusd.imaging.pixel_counts import RasterCounter
+from jawusd.tracking.contour.scan import ARCH_NAMES, ARCHES
 from jawusd.tracking.contour.views import MaskViews, View
 from jawusd.tracking.initialization.bootstrap import pose_from_picks
-from jawusd.tracking.paper.energy import PaperEnergy, PaperScan, paper_scan
+from jawusd.tracking.paper.energy import PaperEnergy, PaperScan, PixelCounter, paper_scan
 from jawusd.tracking.paper.solver import PaperConfig, solve_paper
 
-_ROWS = (0, 1)
 _FEWEST_MASKS = 2  # one view leaves the depth unknown
 
 Backend = Literal["cpu", "gl"]
@@ -49,18 +49,16 @@ def track_capture_paper(
     threads: int = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> Tracks:
-    """Track both rows of teeth through a capture with the paper's method.
+    """Track both arches through a capture with the paper's method.
 
-    It knows no failure and no uncertainty: a row with two masks or more counts as tracked however badly it fits, and
+    It knows no failure and no uncertainty: an arch with two masks or more counts as tracked however badly it fits, and
     covariances, sigmas, residuals and matched lengths of the result are NaN throughout, which says "not known" and
     not "certain"; a fit to such tracks weighs all frames alike. `coverage_error` is what there is to judge them by.
 
     Args:
-        capture: the capture; its masks, bootstrap picks and frame range are used.
-        cameras: calibrated cameras; world lengths in mm.
-        offsets: reference frame minus own frame number, per camera name.
+        capture: gives masks, bootstrap picks and frame range.
+        cameras, offsets: as for `track_capture`.
         upper, lower: teeth scans in one frame [mm], with the boundary of interest painted green.
-        config: the method's numbers.
         backend: where pixels are drawn and counted.
         threads: worker threads of the CPU backend; the result does not depend on it.
         progress: called with frames done and frames in all, once per frame.
@@ -73,12 +71,13 @@ def track_capture_paper(
     config = config or PaperConfig()
     table = {camera.name: camera for camera in cameras}
     scans = (paper_scan(upper, "upper"), paper_scan(lower, "lower"))
-    start = _start_poses(capture, table, (upper, lower))
-    centre = np.mean([transform_point(start[r], scans[r].centre) for r in _ROWS], axis=0)
+    bootstrap = _picks(capture)
+    start = _start_poses(bootstrap, table, (upper, lower))
+    centre = np.mean([transform_point(start[r], scans[r].centre) for r in ARCHES], axis=0)
     with ExitStack() as stack:
         masks = stack.enter_context(MaskViews(capture.cameras, table, offsets, centre, config.working_px_per_mm))
         first, stop = capture.frames or masks.frames
-        begin = capture.bootstrap.frame
+        begin = bootstrap.frame
         if not first <= begin < stop:
             raise TrackingError(f"bootstrap.frame is {begin}, frames run from {first} to {stop - 1}")
         energies = _energies(scans, config, backend, threads, stack)
@@ -93,44 +92,56 @@ def track_capture_paper(
         names = tuple(camera.name for camera in masks.cameras)
     if not capture.frames:
         masked = [frame for frame, record in records.items() if np.isfinite(record.coverage).any()]
-        records = {f: r for f, r in records.items() if min(masked) <= f <= max(masked)}
+        records = {f: record for f, record in records.items() if min(masked) <= f <= max(masked)}
     counted = sum(energy.evaluations for energy in energies) / len(energies)
-    notes = {"solver": "paper", "backend": backend, "evaluations_per_row_and_frame": counted / max(len(records), 1)}
-    return _assembled(records, names, {**notes, "tracking": asdict(config)})
+    meta: TracksMeta = {
+        "solver": "paper",
+        "backend": backend,
+        "evaluations_per_row_and_frame": counted / max(len(records), 1),
+        "tracking": asdict(config),
+    }
+    return _assembled(records, names, meta)
 
 
-def _start_poses(capture: Capture, cameras: Mapping[str, Camera], meshes: tuple[Mesh, Mesh]) -> Array:
-    """Return T_world_upper, T_world_lower from the picks, shape (2, 4, 4)."""
+def _picks(capture: Capture) -> Bootstrap:
     if capture.bootstrap is None:
         raise TrackingError(
             "the capture has no [bootstrap] picks, which the paper's method starts from",
             path=capture.folder / "capture.toml",
             hint="Add three or more picks per row of teeth, each seen by two cameras.",
         )
-    picks = (capture.bootstrap.upper, capture.bootstrap.lower)
-    names = ("upper", "lower")
-    return np.stack([pose_from_picks(picks[r], meshes[r].vertices, cameras, names[r])[0] for r in _ROWS])
+    return capture.bootstrap
+
+
+def _start_poses(bootstrap: Bootstrap, cameras: Mapping[str, Camera], meshes: tuple[Mesh, Mesh]) -> Array:
+    """Return T_world_upper, T_world_lower from the picks, shape (2, 4, 4)."""
+    picks = (bootstrap.upper, bootstrap.lower)
+    return np.stack([pose_from_picks(picks[r], meshes[r].vertices, cameras, ARCH_NAMES[r])[0] for r in ARCHES])
 
 
 def _energies(
     scans: Sequence[PaperScan], config: PaperConfig, backend: Backend, threads: int, stack: ExitStack
 ) -> list[PaperEnergy]:
-    """Return the energy of both rows; what they hold is freed with the stack."""
+    """Return the energy of both arches; what they hold is freed with the stack."""
+    counters: list[PixelCounter]
     if backend == "gl":
         # Only here: without moderngl the module does not import, and the CPU backend needs none.
         from jawusd.imaging.gl import GlCounter, open_context
 
         context = open_context()
         stack.callback(context.release)
-        counters = [GlCounter(context, s.vertices, s.plain_faces, s.boundary_faces, cull=s.cull) for s in scans]
+        counters = [
+            stack.enter_context(GlCounter(context, s.vertices, s.plain_faces, s.boundary_faces, cull=s.cull))
+            for s in scans
+        ]
     else:
         counters = [
-            RasterCounter(s.vertices, s.plain_faces, s.boundary_faces, cull=s.cull, threads=threads) for s in scans
+            stack.enter_context(
+                RasterCounter(s.vertices, s.plain_faces, s.boundary_faces, cull=s.cull, threads=threads)
+            )
+            for s in scans
         ]
-    return [
-        PaperEnergy(stack.enter_context(counter), scan, config.boundary_weight)
-        for counter, scan in zip(counters, scans, strict=True)
-    ]
+    return [PaperEnergy(counter, scan, config.boundary_weight) for counter, scan in zip(counters, scans, strict=True)]
 
 
 def _instant(
@@ -140,10 +151,10 @@ def _instant(
     last: Array,
     views: Sequence[View],
 ) -> _Record:
-    """Align both rows, each by itself; a row without enough masks keeps its pose and counts as lost."""
+    """Align both arches, each by itself; an arch without enough masks keeps its pose and counts as lost."""
     poses, status = last.copy(), np.full(2, LOST, np.int8)
     coverage = np.full((2, len(views)), np.nan)
-    for r in _ROWS:
+    for r in ARCHES:
         present = np.array([view.present[r] for view in views])
         if present.sum() < _FEWEST_MASKS:
             continue
@@ -156,7 +167,7 @@ def _instant(
     return _Record(poses, status, coverage)
 
 
-def _assembled(records: Mapping[int, _Record], camera_names: tuple[str, ...], meta: dict) -> Tracks:
+def _assembled(records: Mapping[int, _Record], camera_names: tuple[str, ...], meta: TracksMeta) -> Tracks:
     frames = np.array(sorted(records), np.int64)
     count = len(frames)
     status = np.stack([records[f].status for f in frames])

@@ -1,14 +1,16 @@
-"""Camera poses that a whole take corrects: what is known of them beforehand, and how views are put right."""
+"""Camera poses corrected from a whole take: their prior, and views as the corrected cameras see them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jawusd.geometry import Camera, make_transform, se3_adjoint, se3_exp, se3_inverse, se3_log
+from jawusd.formats.tracks import CameraCorrections, TracksMeta
+from jawusd.geometry import Camera, se3_adjoint, se3_exp, se3_inverse, se3_log
 from jawusd.geometry.arrays import Array
+from jawusd.tracking.contour.equations import motion_about, translation
 from jawusd.tracking.contour.views import View
 
 
@@ -39,8 +41,7 @@ class Extrinsics:
 
     def motions(self) -> Array:
         """Return how each camera sees the world moved, shape (C, 4, 4)."""
-        to = make_transform(np.eye(3), -self.pivot)
-        return se3_inverse(to) @ se3_exp(self.twists) @ to
+        return motion_about(self.pivot, self.twists)
 
     def then(self, twists: Array, sigma: Array) -> Extrinsics:
         """Return the corrections with more on top of them, shapes (C, 6)."""
@@ -51,7 +52,7 @@ class Extrinsics:
         """Return the corrected T_cam_world, shape (C, 4, 4)."""
         return self.T_cam_world @ self.motions()
 
-    def put_right(self, views: Sequence[View]) -> list[View]:
+    def correct(self, views: Sequence[View]) -> list[View]:
         """Return the views as the corrected cameras see them."""
         moved = self.motions()
         return [
@@ -60,19 +61,18 @@ class Extrinsics:
         ]
 
     def precision(self, turn_rad: float, move_mm: float) -> Array:
-        """Return what is known of the twists of each camera beforehand, shape (C, 6, 6).
+        """Return the prior precision of the twists of each camera, shape (C, 6, 6).
 
-        Args:
-            turn_rad, move_mm: how far cameras turn about themselves and move, standard deviation per axis.
+        Cameras turn about themselves and move with the given standard deviations per axis.
         """
-        A = se3_adjoint(make_transform(np.eye(3), -self.pivot) @ se3_inverse(self.T_cam_world))
+        A = se3_adjoint(translation(-self.pivot) @ se3_inverse(self.T_cam_world))
         variance = np.r_[np.full(3, turn_rad**2), np.full(3, move_mm**2)]
         return np.linalg.inv(A @ (variance[:, None] * np.swapaxes(A, -1, -2)))
 
-    def report(self, names: Sequence[str]) -> dict:
+    def report(self, names: Sequence[str]) -> CameraCorrections:
         """Return corrections, uncertainties and corrected poses by camera name, for the tracks' meta data."""
 
-        def by_name(values: Array) -> dict[str, list]:
+        def by_name(values: Array) -> dict[str, list[float]]:
             return dict(zip(names, values.tolist(), strict=True))
 
         return {
@@ -82,21 +82,16 @@ class Extrinsics:
             "turns_sigma_deg": by_name(np.degrees(self.sigma[:, :3])),
             "moves_mm": by_name(self.twists[:, 3:]),
             "moves_sigma_mm": by_name(self.sigma[:, 3:]),
-            "T_cam_world": by_name(self.poses()),
+            "T_cam_world": dict(zip(names, self.poses().tolist(), strict=True)),
         }
 
 
 def lever(pivot: Array, centre: Array) -> Array:
     """Return what turns a twist about a pivot into the same motion's twist about a centre, shape (6, 6)."""
-    return se3_adjoint(make_transform(np.eye(3), pivot - centre))
+    return se3_adjoint(translation(pivot - centre))
 
 
-def corrected_cameras(cameras: Sequence[Camera], meta: Mapping) -> list[Camera]:
-    """Return the cameras the poses of tracks belong to: as calibrated but for what the take corrected.
-
-    Args:
-        cameras: as calibrated.
-        meta: the tracks' meta data.
-    """
-    poses = meta.get("extrinsics", {}).get("T_cam_world", {})
+def corrected_cameras(cameras: Sequence[Camera], meta: TracksMeta) -> list[Camera]:
+    """Return calibrated cameras with the corrections that the meta data of tracks hold."""
+    poses = meta["extrinsics"]["T_cam_world"] if "extrinsics" in meta else {}
     return [replace(c, T_cam_world=np.array(poses.get(c.name, c.T_cam_world))) for c in cameras]

@@ -1,10 +1,10 @@
-"""Track through masks that are made on the way, each from where the teeth are expected."""
+"""Track while masks are made: each frame is segmented around the poses predicted for it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +17,10 @@ from jawusd.geometry import Camera, se3_exp, se3_inverse, se3_log, transform_poi
 from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import FOR_AUTO_MASKS, TrackingConfig
 from jawusd.tracking.contour.frame_record import FrameRecord, FrameSummary
-from jawusd.tracking.contour.quality import uncovered_px
-from jawusd.tracking.contour.scan import prepare_scan
+from jawusd.tracking.contour.quality import coverage_error, uncovered_px
+from jawusd.tracking.contour.scan import prepare_scan, probe_points
 from jawusd.tracking.contour.solver import ContourSolver
-from jawusd.tracking.contour.views import View
+from jawusd.tracking.contour.views import View, present_masks
 from jawusd.tracking.initialization.bootstrap import pose_from_picks
 from jawusd.tracking.initialization.first_frame import first_record
 from jawusd.tracking.sequence.frame_tracker import FrameTracker
@@ -35,27 +35,17 @@ See = Callable[[int, Array, int], Sequence[View]]
 Agreement = Callable[[int, Array], Array]
 
 _CLEARLY = 1.01  # share of a guess's agreement at which another is better: less is noise of colours
-# Shares of the way from where the jaw was to where it has been before: jaws go the same ways again and again.
+# Shares of the way from the jaw's last pose to earlier ones: jaws repeat their paths.
 _SHARES = (0.15, 0.3, 0.6, 1.0)
-# Distance between where the lower row was expected and where it is [mm] beyond which it had gone astray before: what is
-# expected of a jaw that is followed errs by less.
-_ASTRAY_MM = 4.0
+# Distance between predicted and found pose of the lower arch [mm] beyond which the earlier poses were wrong:
+# predictions of a jaw that is tracked err by less.
+_WRONG_POSE_MM = 4.0
 _WEAK_SCORE = 0.5  # share of the usual score below which a pose may have been drawn away by its own masks
 _FIRST_ROUNDS = 3  # picks are a few tenths of a millimetre off; each round takes most of the rest
 
 
-@dataclass(frozen=True, eq=False)
-class _OneFrame:
-    """Show the views of a single frame in the way `MaskViews` does."""
-
-    views: Sequence[View]
-
-    def at(self, frame: int) -> Sequence[View]:
-        return self.views
-
-
 class GuidedTracker:
-    """Follow the teeth frame by frame, asking for masks where they are expected."""
+    """Track the teeth frame by frame; masks are made around the predicted poses."""
 
     def __init__(
         self,
@@ -73,20 +63,17 @@ class GuidedTracker:
             upper, lower: teeth scans in one frame, in occlusion [mm].
             see: makes the masks.
             agreement: tells good guesses from bad ones. Masks made around a guess tend to confirm it.
-            rounds: how often masks and poses take turns on a frame.
-            config: the tracker's numbers; those for masks it asked for unless given.
-            executor: runs parts of the work.
+            rounds: how often masks and poses alternate on a frame.
 
         Raises:
             TrackingError: a scan cannot be tracked.
         """
         self._config = config or FOR_AUTO_MASKS
         self._meshes = {"upper": upper, "lower": lower}
-        scans = [prepare_scan(mesh, row) for row, mesh in self._meshes.items()]
+        scans = [prepare_scan(mesh, arch) for arch, mesh in self._meshes.items()]
         self._solver = ContourSolver(scans, self._config, executor)
         self._see, self._agreement, self._rounds = see, agreement, rounds
-        # A dozen points of a row show any motion of it.
-        self._probes = np.stack([s.probes[np.linspace(0, len(s.probes) - 1, 12).astype(int)] for s in scans])
+        self._probes = probe_points(scans)
 
     def picked(self, bootstrap: Bootstrap | None, cameras: Mapping[str, Camera]) -> Array:
         """Return T_world_upper and T_world_lower that agree with the picks, shape (2, 4, 4).
@@ -102,7 +89,7 @@ class GuidedTracker:
             )
         picks = {"upper": bootstrap.upper, "lower": bootstrap.lower}
         return np.stack(
-            [pose_from_picks(picks[row], mesh.vertices, cameras, row)[0] for row, mesh in self._meshes.items()]
+            [pose_from_picks(picks[arch], mesh.vertices, cameras, arch)[0] for arch, mesh in self._meshes.items()]
         )
 
     def begin(self, frame: int, poses: Array) -> FrameRecord:
@@ -112,77 +99,73 @@ class GuidedTracker:
             TrackingError: the teeth do not fit what is seen.
         """
         for turn in range(_FIRST_ROUNDS):
-            views = _OneFrame(self._see(frame, poses, min(turn, self._rounds - 1)))
+            views = self._see(frame, poses, min(turn, self._rounds - 1))
             record = first_record(self._solver, self._config, poses, views, frame)
             poses = record.solution.poses
         return record
 
     def follow(self, frames: range, past: Sequence[FrameSummary]) -> Iterator[tuple[int, FrameRecord, bool]]:
-        """Yield frames, what is known about them, and whether a jaw that had gone astray was found again.
+        """Yield frames, their records, and whether earlier poses of the jaw turn out to have been wrong.
 
-        They come one after the other away from known ones. Rows that are lost are where colours alone say they may be.
+        Lost arches take the poses that agree best with the colours.
 
         Args:
-            frames: the frames, in either direction.
-            past: what is known of the frames before, from the first one aligned to the one next to these.
+            frames: in either direction, starting beside a known frame.
+            past: the frames before, from the first one aligned to the one next to these.
         """
         history = History(self._config.history_frames, self._config.score_frames)
         motion = MotionPredictor(past[0].poses, self._probes)
-        history.take_up(past[0])
+        history.add_summary(past[0])
         for before in past[1:]:
-            motion.update(before.poses, before.status != LOST, before.used.any(1), guessed=True)
-            history.take_up(before)
+            motion.update(before.poses, np.asarray(before.status != LOST), np.asarray(before.used.any(1)), guessed=True)
+            history.add_summary(before)
         tracker = FrameTracker(self._solver, self._config, history)
-        sound = _is_sound(past[-1], history)
+        reliable = _is_reliable(past[-1], history)
         for frame in frames:
-            record = self._one(tracker, motion, frame, sound)
+            record = self._one(tracker, motion, frame, reliable)
             poses, expected = record.solution.poses, motion.predict()
-            motion.update(poses, record.status != LOST, record.used.any(1), guessed=True)
+            motion.update(poses, np.asarray(record.status != LOST), np.asarray(record.used.any(1)), guessed=True)
             history.add(record)
-            before, sound = sound, _is_sound(FrameSummary.of(record), history)
-            yield frame, record, sound and not before and self.apart_mm(expected, poses) > _ASTRAY_MM
+            was_reliable, reliable = reliable, _is_reliable(FrameSummary.of(record), history)
+            yield frame, record, reliable and not was_reliable and self.apart_mm(expected, poses) > _WRONG_POSE_MM
 
     def apart_mm(self, one: Array, other: Array) -> float:
-        """Return how far the lower row is between two poses of both, shape (2, 4, 4), at most [mm]."""
+        """Return how far the lower arch is between two poses of both, shape (2, 4, 4), at most [mm]."""
         gap = transform_points(one[1], self._probes[1]) - transform_points(other[1], self._probes[1])
         return float(np.linalg.norm(gap, axis=1).max())
 
     def judge(self, frame: int, poses: Array, status: NDArray[np.int8]) -> FrameRecord:
         """Return the record of a frame whose poses, shape (2, 4, 4), and status, shape (2,), are known already."""
         views = self._see(frame, poses, self._rounds - 1)
-        use = np.array([[view.present[r] for view in views] for r in (0, 1)])
+        use = present_masks(views)
         solution = self._solver.solve(poses, views, (), use)
-        bare_px, mask_px = uncovered_px(self._solver.scans, solution, views)
-        coverage = np.where(mask_px > 0, bare_px / np.maximum(mask_px, 1), np.nan)
+        coverage = coverage_error(*uncovered_px(self._solver.scans, solution, views))
         return FrameRecord(solution, status, use, coverage)
 
-    def _one(self, tracker: FrameTracker, motion: MotionPredictor, frame: int, sound: bool) -> FrameRecord:
+    def _one(self, tracker: FrameTracker, motion: MotionPredictor, frame: int, reliable: bool) -> FrameRecord:
         c = self._config
-        starts = motion.starts() if sound else self._likeliest_first(frame, motion.starts(), motion.gallery())
-        gallery = motion.gallery() if motion.worth_searching() else None
+        starts = motion.starts() if reliable else self._likeliest_first(frame, motion.starts(), motion.pose_history())
+        pose_history = motion.pose_history() if motion.search_is_due() else None
         reach = c.gate_per_miss * motion.miss_mm() * c.working_px_per_mm
         views = self._see(frame, starts[0], 0)
         record = None
-        if gallery is None:
-            # Masks made around a prediction look suspect next to settled ones: the ladder waits for those.
+        if pose_history is None:
+            # Masks made around a prediction look suspect next to settled ones: further attempts wait for those.
             record = self._settle(tracker, frame, starts[0], tracker.align_once(starts[0], views, reach))
             if (record.status == LOST).any():
                 views, record = self._see(frame, starts[0], 0), None
         if record is None:
-            record = self._settle(tracker, frame, starts[0], tracker.track(starts, views, gallery, reach))
+            record = self._settle(tracker, frame, starts[0], tracker.track(starts, views, pose_history, reach))
         lost = (record.status == LOST)[:, None, None]
         poses = np.where(lost, starts[0], record.solution.poses)
         return replace(record, solution=replace(record.solution, poses=poses))
 
-    def _likeliest_first(self, frame: int, starts: list[Array], gallery: list[Array]) -> list[Array]:
-        """Return starts with the one in front that agrees best with the colours.
+    def _likeliest_first(self, frame: int, starts: list[Array], pose_history: list[Array]) -> list[Array]:
+        """Return starts (2, 4, 4) with the one in front that agrees best with the colours.
 
-        Args:
-            frame: the frame.
-            starts: predictions, the likeliest first, each shape (2, 4, 4).
-            gallery: earlier poses; the ways to them are tried too.
+        Poses between the prediction and earlier poses are tried too.
         """
-        guesses = [*starts, *_ways(starts, gallery)]
+        guesses = [*starts, *_poses_towards(starts, pose_history)]
         rates = self._agreement(frame, np.stack(guesses))
         best = int(np.argmax(rates))
         if rates[best] <= _CLEARLY * rates[0]:
@@ -190,7 +173,7 @@ class GuidedTracker:
         return [guesses[best], *(start for k, start in enumerate(starts) if k != best)]
 
     def _settle(self, tracker: FrameTracker, frame: int, start: Array, record: FrameRecord) -> FrameRecord:
-        """Let masks and poses take turns after the first look."""
+        """Alternate masks and poses after the first alignment."""
         for turn in range(1, self._rounds):
             lost = (record.status == LOST)[:, None, None]
             poses = np.where(lost, start, record.solution.poses)
@@ -198,17 +181,17 @@ class GuidedTracker:
         return record
 
 
-def _is_sound(past: FrameSummary, history: History) -> bool:
-    """Tell whether nothing about a frame that is in the history already is unusual."""
-    scarce = past.score_px.sum(1) < _WEAK_SCORE * history.usual_score().sum(1)
-    return bool((past.status == TRACKED).all() and not scarce.any())
+def _is_reliable(past: FrameSummary, history: History) -> bool:
+    """Tell whether a frame, which the history holds already, has nothing unusual."""
+    weak = past.score_px.sum(1) < _WEAK_SCORE * history.usual_score().sum(1)
+    return bool((past.status == TRACKED).all() and not weak.any())
 
 
-def _ways(starts: Sequence[Array], gallery: Sequence[Array]) -> list[Array]:
-    """Return poses of the jaw on the ways from the last start to earlier ones, the head where it is expected."""
+def _poses_towards(starts: Sequence[Array], pose_history: Sequence[Array]) -> list[Array]:
+    """Return poses of the jaw between the first start and earlier ones, with the predicted head."""
     head, last = starts[0][0], se3_inverse(starts[0][0]) @ starts[0][1]
     out = []
-    for poses in gallery:
+    for poses in pose_history:
         twist = se3_log(se3_inverse(poses[0]) @ poses[1] @ se3_inverse(last))
         out += [np.stack([head, head @ se3_exp(share * twist) @ last]) for share in _SHARES]
     return out

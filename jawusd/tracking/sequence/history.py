@@ -1,34 +1,29 @@
-"""What earlier frames tell about the next one: expected poses, and what is normal for a good frame."""
+"""What follows from earlier frames for the next one: predicted poses, and the usual quality of a good frame."""
 
 from __future__ import annotations
 
 from collections import deque
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.formats.tracks import TRACKED
 from jawusd.geometry import orthonormalise, se3_inverse, transform_points
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.contour.frame_record import FrameRecord, FrameSummary
+from jawusd.tracking.contour.scan import ARCHES
 
-_GALLERY = 16  # earlier poses kept: enough to cover the exercises of a jaw at 2 mm
+_KEPT_POSES = 16  # earlier poses kept: enough to cover the exercises of a jaw at 2 mm
 _APART_MM = 2.0  # poses nearer than this have the same basin
 _RECENT = 8  # frames over which prediction errors are remembered: a third of a chewing stroke at 24 fps
 
 
 class MotionPredictor:
-    """Extrapolate with constant velocity; keep a gallery of earlier poses for getting back after a loss."""
+    """Extrapolate with constant velocity; keep earlier poses as starts for getting back after a loss."""
 
     def __init__(self, poses: Array, points: Array) -> None:
-        """Start at rest.
-
-        Args:
-            poses: T_world_upper, T_world_lower, shape (2, 4, 4).
-            points: some points of both rows, at which prediction errors are measured, shape (2, N, 3).
-        """
+        """Start at rest; prediction errors will be measured at some points of both arches, shape (2, N, 3)."""
         self._points = points
-        self._misses: deque[float] = deque(maxlen=2 * _RECENT)  # two rows
+        self._misses: deque[float] = deque(maxlen=2 * _RECENT)  # two arches
         self._last = np.array(poses)
         self._step: list[Array | None] = [None, None]
         self._lost_for = np.zeros(2, int)
@@ -38,9 +33,9 @@ class MotionPredictor:
     def predict(self) -> Array:
         """Return the expected T_world_upper, T_world_lower of the next frame, shape (2, 4, 4)."""
         out = self._last.copy()
-        for r in (0, 1):
-            if self._step[r] is not None:
-                out[r] = self._step[r] @ self._last[r]
+        for r, step in enumerate(self._step):
+            if step is not None:
+                out[r] = step @ self._last[r]
         if self._lost_for[1] and not self._lost_for[0]:
             out[1] = out[0] @ se3_inverse(self._last[0]) @ self._last[1]  # a lost jaw is carried along by the head
         return orthonormalise(out)
@@ -54,16 +49,16 @@ class MotionPredictor:
         return [moving, self._last.copy(), half]
 
     def update(self, poses: Array, found: Mask, seen: Mask, guessed: bool = False) -> None:
-        """Take in the next frame; rows not found keep their predictions, or go where they are guessed.
+        """Add the next frame; arches not found keep their predictions, or go where they are guessed.
 
         Args:
             poses: T_world_upper, T_world_lower, shape (2, 4, 4).
-            found: rows whose poses can be trusted, shape (2,).
-            seen: rows that have any mask, shape (2,).
-            guessed: whether poses of rows not found are guesses better than predictions.
+            found: arches whose poses can be trusted, shape (2,).
+            seen: arches that have any mask, shape (2,).
+            guessed: whether poses of arches not found are guesses better than predictions.
         """
         expected = self.predict()
-        for r in (0, 1):
+        for r in ARCHES:
             if found[r]:
                 if not self._lost_for[r]:
                     gap = transform_points(expected[r], self._points[r]) - transform_points(poses[r], self._points[r])
@@ -87,15 +82,15 @@ class MotionPredictor:
         return max(self._misses, default=0.0)
 
     def remember(self, poses: Array, found: Mask) -> None:
-        """Keep poses of both rows, shape (2, 4, 4), as later starts if they are unlike those kept."""
+        """Keep poses of both arches, shape (2, 4, 4), as later starts if they are unlike those kept."""
         if not found.all():
             return
         new = se3_inverse(poses[0]) @ poses[1]
         if any(np.linalg.norm((new - se3_inverse(p[0]) @ p[1])[:3, 3]) < _APART_MM for p in self._seen):
             return
-        self._seen = [*self._seen[-_GALLERY + 1 :], np.array(poses)]
+        self._seen = [*self._seen[-_KEPT_POSES + 1 :], np.array(poses)]
 
-    def worth_searching(self) -> bool:
+    def search_is_due(self) -> bool:
         """Tell whether a search from many starts is due: always at first, then ever less often while it fails.
 
         Frames without masks do not count: teeth that come back are looked for at once.
@@ -103,46 +98,46 @@ class MotionPredictor:
         failures = int(self._failures.max())
         return failures & (failures - 1) == 0 or failures % 16 == 0
 
-    def gallery(self) -> list[Array]:
+    def pose_history(self) -> list[Array]:
         """Return earlier poses as starts for the next frame: the jaw relative to where the head is now."""
         head = self.predict()[0]
         return [np.stack([p[0], head @ se3_inverse(p[0]) @ p[1]]) for p in self._seen]
 
 
 class History:
-    """Remember what good frames looked like lately, to tell a bad one."""
+    """Remember the quality of recent good frames, to tell a bad one."""
 
     def __init__(self, length: int, score_length: int) -> None:
         """Start empty; keep at most `length` frames, scores of at most `score_length`."""
-        self._scores: deque[NDArray] = deque(maxlen=score_length)
-        self._residuals: deque[NDArray] = deque(maxlen=length)
-        self._coverages: deque[NDArray] = deque(maxlen=length)
+        self._scores: deque[Array] = deque(maxlen=score_length)
+        self._residuals: deque[Array] = deque(maxlen=length)
+        self._coverages: deque[Array] = deque(maxlen=length)
 
     def add(self, record: FrameRecord) -> None:
-        """Take in a frame; only rows tracked without trouble count."""
-        self.take_up(FrameSummary.of(record))
+        """Add a frame; only arches tracked without trouble count."""
+        self.add_summary(FrameSummary.of(record))
 
-    def take_up(self, past: FrameSummary) -> None:
-        """Take in what was kept of a frame."""
+    def add_summary(self, past: FrameSummary) -> None:
+        """Add what was kept of a frame."""
         good = past.status == TRACKED
         self._scores.append(np.where(good[:, None], past.score_px, np.nan))
         self._residuals.append(np.where(good, past.residual_px, np.nan))
         self._coverages.append(np.where(good[:, None] & past.used, past.coverage, np.nan))
 
     def usual_score(self) -> Array:
-        """Return the median score per row and view [px], shape (2, C); 0 while unknown."""
+        """Return the median score per arch and view [px], shape (2, C); 0 while unknown."""
         return _median(self._scores, 0.0)
 
     def usual_residual(self) -> Array:
-        """Return the median residual per row [px], shape (2,); infinite while unknown."""
+        """Return the median residual per arch [px], shape (2,); infinite while unknown."""
         return _median(self._residuals, np.inf)
 
     def usual_coverage(self) -> Array:
-        """Return the median coverage error per row and view, shape (2, C); 0 while unknown."""
+        """Return the median coverage error per arch and view, shape (2, C); 0 while unknown."""
         return _median(self._coverages, 0.0)
 
 
-def _median(values: deque[NDArray], otherwise: float) -> Array:
+def _median(values: deque[Array], otherwise: float) -> Array:
     stack = np.array(values)
     known = np.isfinite(stack).any(0)
     out = np.full(stack.shape[1:], otherwise)

@@ -1,4 +1,4 @@
-"""The person's own jaw model as a prior on where the lower teeth are relative to the upper ones."""
+"""The jaw model of the person as a prior on the pose of the lower arch relative to the upper one."""
 
 from __future__ import annotations
 

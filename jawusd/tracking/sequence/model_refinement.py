@@ -1,4 +1,4 @@
-"""The second pass: frames that the masks alone leave uncertain, tracked again with the person's own jaw model."""
+"""The second pass: frames that the masks alone leave uncertain, tracked again with the jaw model of the person."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.evaluator import JawRig
 from jawusd.formats.capture import Capture
@@ -17,17 +16,23 @@ from jawusd.geometry import Camera, relative_pose, se3_adjoint, se3_exp, se3_inv
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.equations import Solution
-from jawusd.tracking.contour.quality import joint_covariance, landmark_sigmas, matched_px, residual_px, uncovered_px
+from jawusd.tracking.contour.quality import (
+    coverage_error,
+    joint_covariance,
+    landmark_sigmas,
+    matched_px,
+    residual_px,
+    uncovered_px,
+)
 from jawusd.tracking.contour.scan import prepare_scan
 from jawusd.tracking.contour.solver import ContourSolver
-from jawusd.tracking.contour.views import MaskViews, View
+from jawusd.tracking.contour.views import MaskViews, View, present_masks
 from jawusd.tracking.sequence.extrinsics import corrected_cameras
 from jawusd.tracking.sequence.kinematic_prior import KinematicPrior
 from jawusd.tracking.sequence.smoothing import smooth_poses
 
-_ROWS = (0, 1)
-# Standard deviation of the worst landmark above which a frame is tracked again [mm]: the distance jaws stray from any
-# three-parameter model; below it the masks know better than the model.
+# Standard deviation of the worst landmark above which a frame is tracked again [mm]: about the error of any
+# three-parameter model; below it the masks are more accurate than the model.
 _HARD_MM = 0.3
 _FEWEST_GOOD = 15  # frames that must agree with the model before it may help others
 
@@ -54,13 +59,12 @@ def refine_tracks(
     """Track the hard frames again with the fitted model as a prior on the relative pose.
 
     Final poses, `prior_aided` and, of frames that were lost, uncertainties change; everything raw stays, so that no
-    model is ever fitted to or scored on poses its prior had a hand in.
+    model is ever fitted to or scored on poses that its prior influenced.
 
     Args:
         tracks: the first pass.
         jaw: the model fitted to it.
-        capture, cameras, offsets, upper, lower, config: as for `track_capture`.
-        threads: worker threads; the result does not depend on it.
+        capture, cameras, offsets, upper, lower, config, threads: as for `track_capture`.
         progress: called with hard frames done and hard frames in all.
 
     Raises:
@@ -68,7 +72,7 @@ def refine_tracks(
     """
     config = config or TrackingConfig()
     hard = np.flatnonzero(hard_frames(tracks))
-    measured = np.isfinite(tracks.raw_T_upper_lower).all((1, 2))
+    measured = np.asarray(np.isfinite(tracks.raw_T_upper_lower).all((1, 2)))
     good = measured & ~hard_frames(tracks)
     if not len(hard) or good.sum() < _FEWEST_GOOD:
         return tracks
@@ -77,25 +81,25 @@ def refine_tracks(
     middle = np.mean([transform_point(tracks.T_world_upper[good][0], s.centre) for s in scans], axis=0)
     prior = KinematicPrior(jaw, _spread_mm(jaw, tracks, good))
     starts = _starts(tracks, jaw, measured)
-    found: dict[int, _Aided] = {}
+    found: dict[int, _Refined] = {}
     with (
         MaskViews(capture.cameras, table, offsets, middle, config.working_px_per_mm) as masks,
         ThreadPoolExecutor(threads) as pool,
     ):
         solver = ContourSolver(scans, config, pool if threads > 1 else None)
         second = _SecondPass(solver, config, prior, tracks)
-        for done, k in enumerate(hard, start=1):
-            views = _corrected(masks.at(int(tracks.frames[k])), tracks, k, starts)
+        for done, k in enumerate(hard.tolist(), start=1):
+            views = _corrected_views(masks.at(int(tracks.frames[k])), tracks, k, starts)
             aided = second.align(k, starts[k], views)
             if aided is not None:
-                found[int(k)] = aided
+                found[k] = aided
             if progress:
                 progress(done, len(hard))
     return _merged(tracks, jaw, found)
 
 
 @dataclass(frozen=True, eq=False)
-class _Aided:
+class _Refined:
     """Hold a frame's poses (2, 4, 4) with the joint covariance of their left world twists (12, 12)."""
 
     poses: Array
@@ -111,9 +115,9 @@ class _SecondPass:
         self._outline_weight = 1.0 / _variances(tracks)
         self._correlation_px = float(tracks.meta.get("correlation_px", config.correlation_px))
 
-    def align(self, k: int, start: Array, views: Sequence[View]) -> _Aided | None:
+    def align(self, k: int, start: Array, views: Sequence[View]) -> _Refined | None:
         """Return the poses of frame index k found with the prior, or None if they cannot be trusted."""
-        present = np.array([[v.present[r] for v in views] for r in _ROWS])
+        present = present_masks(views)
         lost = self._tracks.status[k] == LOST
         use = present & (self._tracks.masks_used[k] | lost[:, None])
         gates = self._config.wide_gates_px if lost.any() else self._config.gates_from(0.0)
@@ -121,19 +125,19 @@ class _SecondPass:
         covariance = joint_covariance(solution, self._prior, residual_px(solution), self._correlation_px)
         if covariance is None or not self._fits(solution, views, use, covariance):
             return None
-        return _Aided(solution.poses, covariance)
+        return _Refined(solution.poses, covariance)
 
-    def _fits(self, solution: Solution, views: Sequence[View], use: Mask, covariance: NDArray) -> bool:
+    def _fits(self, solution: Solution, views: Sequence[View], use: Mask, covariance: Array) -> bool:
         c, jaw = self._config, self._prior.jaw
-        bare_px, mask_px = uncovered_px(self._solver.scans, solution, views)
-        bare = np.where(use & (mask_px > 0), bare_px / np.maximum(mask_px, 1), 0.0).max()
+        coverage = coverage_error(*uncovered_px(self._solver.scans, solution, views))
+        uncovered = np.where(use & np.isfinite(coverage), coverage, 0.0).max()
         rough = residual_px(solution) > c.lost_residual * c.suspect_residual * self._usual_px
         few = matched_px(solution) < c.least_matched_px
         relative = relative_pose(*solution.poses)
         sigma = landmark_sigmas(relative, _relative_covariance(solution.poses, covariance), jaw.arrays["landmarks"])
         verdict = jaw.validate(relative)
         return bool(
-            bare <= c.lost_coverage and not rough.any() and not few.any() and sigma.max() <= c.lost_sigma_mm
+            uncovered <= c.lost_coverage and not rough.any() and not few.any() and sigma.max() <= c.lost_sigma_mm
             and verdict.valid
         )  # fmt: skip
 
@@ -145,7 +149,7 @@ def _spread_mm(jaw: JawRig, tracks: Tracks, good: Mask) -> float:
 
 
 def _variances(tracks: Tracks) -> Array:
-    """Return the outline variance times correlation length per row [px^3], shape (2,)."""
+    """Return the outline variance times correlation length per arch [px^3], shape (2,)."""
     typical = np.nanmedian(np.where(tracks.status == TRACKED, tracks.residual_px, np.nan), axis=0)
     return typical**2 * float(tracks.meta["correlation_px"])
 
@@ -153,7 +157,7 @@ def _variances(tracks: Tracks) -> Array:
 def _starts(tracks: Tracks, jaw: JawRig, measured: Mask) -> Array:
     """Return where to start every frame, T_world_upper and T_world_lower, shape (F, 2, 4, 4).
 
-    Where a row is lost, the other row and the model between the neighbouring frames tell where it is; where both are,
+    Where a arch is lost, the other arch and the model between the neighbouring frames tell where it is; where both are,
     the head moves evenly from the last pose to the next.
     """
     frames = tracks.frames.astype(np.float64)
@@ -165,8 +169,8 @@ def _starts(tracks: Tracks, jaw: JawRig, measured: Mask) -> Array:
     upper[by_jaw] = lower[by_jaw] @ se3_inverse(relative[by_jaw])
     known |= by_jaw
     index = np.flatnonzero(known)
-    for k in np.flatnonzero(~known):
-        after = np.searchsorted(index, k)
+    for k in np.flatnonzero(~known).tolist():
+        after = int(np.searchsorted(index, k))
         a, b = index[max(after - 1, 0)], index[min(after, len(index) - 1)]
         share = 0.0 if a == b else (frames[k] - frames[a]) / (frames[b] - frames[a])
         upper[k] = se3_exp(share * se3_log(upper[b] @ se3_inverse(upper[a]))) @ upper[a]
@@ -175,7 +179,7 @@ def _starts(tracks: Tracks, jaw: JawRig, measured: Mask) -> Array:
     return np.stack([upper, lower], axis=1)
 
 
-def _corrected(views: Sequence[View], tracks: Tracks, k: int, poses: Array) -> list[View]:
+def _corrected_views(views: Sequence[View], tracks: Tracks, k: int, poses: Array) -> list[View]:
     """Return the views of frame index k with the delays and the mask bias of the first pass taken out."""
     before, after = poses[max(k - 1, 0)], poses[min(k + 1, len(poses) - 1)]
     span = max(1, min(k + 1, len(poses) - 1) - max(k - 1, 0))
@@ -183,19 +187,19 @@ def _corrected(views: Sequence[View], tracks: Tracks, k: int, poses: Array) -> l
     bias = np.asarray(tracks.meta["mask_bias_px"], np.float64)
     out = []
     for name, view in zip(tracks.camera_names, views, strict=True):
-        lead = se3_exp(tracks.meta["delays_frames"][name] * velocity)
-        out.append(replace(view, lead=lead, bias_px=bias))
+        T_delay = se3_exp(tracks.meta["delays_frames"][name] * velocity)
+        out.append(replace(view, T_delay=T_delay, bias_px=bias))
     return out
 
 
 def _relative_covariance(poses: Array, covariance: Array) -> Array:
-    """Return the covariance of the left twist of T_upper_lower from the joint one of both rows, shape (6, 6)."""
+    """Return the covariance of the left twist of T_upper_lower from the joint one of both arches, shape (6, 6)."""
     A = se3_adjoint(se3_inverse(poses[0]))
     slope = np.hstack([-A, A])
     return slope @ covariance @ slope.T
 
 
-def _merged(tracks: Tracks, jaw: JawRig, found: Mapping[int, _Aided]) -> Tracks:
+def _merged(tracks: Tracks, jaw: JawRig, found: Mapping[int, _Refined]) -> Tracks:
     """Return the tracks with the aided frames in place, smoothed again; the relative pose by itself, as jaws move."""
     upper, relative = tracks.raw_T_world_upper.copy(), tracks.raw_T_upper_lower.copy()
     covariance = {name: getattr(tracks, name).copy() for name in ("covariance_upper", "covariance_lower")}

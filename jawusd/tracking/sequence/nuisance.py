@@ -1,4 +1,4 @@
-"""What a whole take tells: time offsets below a frame, masks drawn too wide, wrong camera poses."""
+"""Disturbances estimated from a whole take: delays below a frame, masks drawn too wide, wrong camera poses."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from jawusd.formats.tracks import LOST
-from jawusd.geometry import make_transform, se3_exp, se3_inverse, se3_log
 from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import TrackingConfig
+from jawusd.tracking.contour.equations import Solution, motion_about, twist_between
 from jawusd.tracking.contour.frame_record import FrameRecord
+from jawusd.tracking.contour.scan import ARCHES
 from jawusd.tracking.sequence.extrinsics import Extrinsics, lever
 
 
@@ -21,7 +22,7 @@ class Nuisances:
 
     Attributes:
         delays: camera c shows the instant of frame + delays[c], in frames, the first camera's is 0, shape (C,).
-        bias_px: how far the masks of each row reach beyond the teeth at the working size, shape (2,).
+        bias_px: how far the masks of each arch reach beyond the teeth at the working size, shape (2,).
         sigma_delays, sigma_bias_px: their standard deviations, shapes (C,) and (2,).
         twists, sigma_twists: corrections of the camera poses as in `Extrinsics`, shape (C, 6).
         shift_px: rms distance by which the twists shift contours beyond what poses of the teeth make up for.
@@ -46,7 +47,7 @@ class Nuisances:
         return bool(late.any() or wide.any() or self.cameras_moved(config))
 
     def settled(self, config: TrackingConfig) -> bool:
-        """Tell whether all are so small that estimating them once more is not worth it."""
+        """Tell whether all are so small that estimating them once more changes too little."""
         late = np.abs(self.delays).max() / config.refine_delay_frames
         wide = np.abs(self.bias_px).max() / config.refine_bias_px
         return max(late, wide, self.shift_px / config.refine_shift_px) < config.settled_share
@@ -57,8 +58,8 @@ class Nuisances:
         return bool(clear and self.shift_px > config.refine_shift_px)
 
 
-# Spread expected before looking, which keeps them finite where a take says nothing: cameras synchronised to whole
-# frames, masks by different hands.
+# Prior standard deviations, which keep the estimates finite where a take does not constrain them: cameras synchronised
+# to whole frames, masks by different hands.
 _PRIOR_DELAY_FRAMES = 0.5
 _PRIOR_BIAS_PX = 0.5
 
@@ -66,8 +67,8 @@ _PRIOR_BIAS_PX = 0.5
 class TakeEquations:
     """Sum up the normal equations of what all frames share, the poses eliminated frame by frame.
 
-    The residual of a sample is d = J (x + delay_c v + A y_c) + bias with the pose correction x of its frame, the row's
-    velocity v, and the camera's twist y_c brought to the row's centre by A, so all frames share delays, biases and
+    The residual of a sample is d = J (x + delay_c v + A y_c) + bias with the pose correction x of its frame, the arch's
+    velocity v, and the camera's twist y_c brought to the arch's centre by A, so all frames share delays, biases and
     twists: a bordered block-diagonal system, solved by its Schur complement (as in bundle adjustment, Triggs et al.
     1999).
     """
@@ -79,34 +80,28 @@ class TakeEquations:
         extrinsics: Extrinsics,
         frames: Iterable[int] | None = None,
     ) -> None:
-        """Sum up.
+        """Sum up the given frames, by default all; lost arches and frames without both neighbours are left out.
 
         Args:
-            records: by frame; rows lost, and frames without both neighbours, are left out.
-            variance_px3: outline variance times correlation length per row [px^3], shape (2,).
+            records: by frame.
+            variance_px3: outline variance times correlation length per arch [px^3], shape (2,).
             extrinsics: the camera poses the records were aligned with.
-            frames: the frames to use, by default all.
         """
         self._extrinsics = extrinsics
         self._cameras = len(extrinsics.twists)
         size = 7 * self._cameras + 2
         self._S, self._r, self._weight = np.zeros((size, size)), np.zeros(size), 0.0
         for frame in sorted(records if frames is None else frames):
-            for row in (0, 1):
-                velocity = velocity_twist(records, frame, row)
+            for arch in ARCHES:
+                velocity = velocity_twist(records, frame, arch)
                 if velocity is not None:
-                    block, right, weight = _reduced(records[frame].solution, velocity, row, extrinsics.pivot)
-                    self._S += block / variance_px3[row]
-                    self._r += right / variance_px3[row]
-                    self._weight += weight / variance_px3[row]
+                    block, right, weight = _reduced(records[frame].solution, velocity, arch, extrinsics.pivot)
+                    self._S += block / variance_px3[arch]
+                    self._r += right / variance_px3[arch]
+                    self._weight += weight / variance_px3[arch]
 
     def solve(self, config: TrackingConfig, cameras_move: bool) -> Nuisances:
-        """Return the nuisances the frames show.
-
-        Args:
-            config: gives the spread of camera poses expected before looking.
-            cameras_move: estimate the camera poses too; else they are taken as they are.
-        """
+        """Return the nuisances of the frames; camera poses are estimated only if `cameras_move`."""
         C, size = self._cameras, len(self._r)
         S = self._S.copy()
         prior = np.r_[np.full(C, _PRIOR_DELAY_FRAMES), np.full(2, _PRIOR_BIAS_PX)]
@@ -123,7 +118,7 @@ class TakeEquations:
         twists = centred @ x[C + 2 :]
         sigma = np.sqrt(np.diag(covariance))
         sigma_twists = np.sqrt(np.diag(centred @ covariance[C + 2 :, C + 2 :] @ centred))
-        square = twists @ self._S[C + 2 :, C + 2 :] @ twists / max(self._weight, 1e-300)
+        square = float(twists @ self._S[C + 2 :, C + 2 :] @ twists) / max(self._weight, 1e-300)
         return Nuisances(
             delays=x[:C],
             bias_px=x[C : C + 2],
@@ -135,75 +130,67 @@ class TakeEquations:
         )
 
 
-def leads(records: Mapping[int, FrameRecord], frame: int, delays: Array) -> Array:
-    """Return the motion of both rows from the reference instant to each camera's own, shape (C, 2, 4, 4)."""
+def delay_motions(records: Mapping[int, FrameRecord], frame: int, delays: Array) -> Array:
+    """Return the motion of both arches from the reference instant to each camera's own, shape (C, 2, 4, 4)."""
     out = np.tile(np.eye(4), (len(delays), 2, 1, 1))
-    for row in (0, 1):
-        velocity = velocity_twist(records, frame, row)
+    for arch in ARCHES:
+        velocity = velocity_twist(records, frame, arch)
         if velocity is None:
-            across = bridge(records, frame, row)
+            across = bridge(records, frame, arch)
             velocity = None if across is None else across[1]
         if velocity is not None:
-            to = make_transform(np.eye(3), -records[frame].solution.centres[row])
-            out[:, row] = se3_inverse(to) @ se3_exp(delays[:, None] * velocity) @ to
+            out[:, arch] = motion_about(records[frame].solution.centres[arch], delays[:, None] * velocity)
     return out
 
 
-def _reduced(solution, velocity, row: int, pivot) -> tuple[Array, Array, float]:
+def _reduced(solution: Solution, velocity: Array, arch: int, pivot: Array) -> tuple[Array, Array, float]:
     """Return one frame's part of the normal equations, the pose eliminated, and the weight of its samples."""
     outline = solution.outline
-    C = len(outline.weight[row])
+    C = len(outline.weight[arch])
     size = 7 * C + 2
-    to_centre = lever(pivot, solution.centres[row])
+    to_centre = lever(pivot, solution.centres[arch])
     S, r, B = np.zeros((size, size)), np.zeros(size), np.zeros((6, size))
-    bias = np.eye(size)[C + row]
+    bias = np.eye(size)[C + arch]
     for c in range(C):
-        H, g, s = outline.precision[row, c], outline.gradient[row, c], outline.bias_slope[row, c]
-        D = np.zeros((6, size))  # how the nuisances move the row in this camera
+        H, g, s = outline.precision[arch, c], outline.gradient[arch, c], outline.bias_slope[arch, c]
+        D = np.zeros((6, size))  # how the nuisances move the arch in this camera
         D[:, c] = velocity
         D[:, C + 2 + 6 * c : C + 8 + 6 * c] = to_centre
         B += H @ D + np.outer(s, bias)
-        S += (
-            D.T @ H @ D
-            + np.outer(D.T @ s, bias)
-            + np.outer(bias, s @ D)
-            + outline.weight[row, c] * np.outer(bias, bias)
-        )
-        r += D.T @ g + outline.distance[row, c] * bias
-    H, g = outline.precision[row].sum(0), outline.gradient[row].sum(0)
+        S += D.T @ H @ D + np.outer(D.T @ s, bias) + np.outer(bias, s @ D)
+        S += outline.weight[arch, c] * np.outer(bias, bias)
+        r += D.T @ g + outline.distance[arch, c] * bias
+    H, g = outline.precision[arch].sum(0), outline.gradient[arch].sum(0)
     eliminated = np.linalg.lstsq(H, np.column_stack([B, g]), rcond=1e-10)[0]
-    return S - B.T @ eliminated[:, :-1], r - B.T @ eliminated[:, -1], float(outline.weight[row].sum())
+    return S - B.T @ eliminated[:, :-1], r - B.T @ eliminated[:, -1], float(outline.weight[arch].sum())
 
 
-def velocity_twist(records: Mapping[int, FrameRecord], frame: int, row: int) -> Array | None:
-    """Return the twist per frame about the row's centre, shape (6,); None without tracked frames before and after."""
-    around = [records.get(f) for f in (frame - 1, frame, frame + 1)]
-    if any(r is None or r.status[row] == LOST for r in around):
+def velocity_twist(records: Mapping[int, FrameRecord], frame: int, arch: int) -> Array | None:
+    """Return the twist per frame about the arch's centre, shape (6,); None without tracked frames before and after."""
+    if not all(_is_tracked(records, f, arch) for f in (frame - 1, frame, frame + 1)):
         return None
-    before, now, after = (r.solution for r in around)
-    to = make_transform(np.eye(3), -now.centres[row])
-    step = to @ after.poses[row] @ se3_inverse(before.poses[row]) @ se3_inverse(to)
-    return 0.5 * se3_log(step)
+    before, now, after = (records[f].solution for f in (frame - 1, frame, frame + 1))
+    return 0.5 * twist_between(before.poses[arch], after.poses[arch], now.centres[arch])
+
+
+def _is_tracked(records: Mapping[int, FrameRecord], frame: int, arch: int) -> bool:
+    return frame in records and bool(records[frame].status[arch] != LOST)
 
 
 _BRIDGE_FRAMES = 6  # a quarter of a second at 24 fps: jaws turn round in less than two of these
 
 
-def bridge(records: Mapping[int, FrameRecord], frame: int, row: int) -> tuple[Array, Array] | None:
-    """Return a row's pose (4, 4) and twist per frame about its centre (6,), going evenly between tracked frames.
+def bridge(records: Mapping[int, FrameRecord], frame: int, arch: int) -> tuple[Array, Array] | None:
+    """Interpolate an arch evenly between tracked frames: its pose (4, 4) and twist per frame about its centre (6,).
 
     None without tracked frames close by on both sides.
     """
     reach = range(1, _BRIDGE_FRAMES + 1)
-
-    def known(f: int) -> bool:
-        return f in records and records[f].status[row] != LOST
-
-    before = next((frame - k for k in reach if known(frame - k)), None)
-    after = next((frame + k for k in reach if known(frame + k)), None)
+    before = next((frame - k for k in reach if _is_tracked(records, frame - k, arch)), None)
+    after = next((frame + k for k in reach if _is_tracked(records, frame + k, arch)), None)
     if before is None or after is None:
         return None
-    to = make_transform(np.eye(3), -records[frame].solution.centres[row])
-    start, end = (records[f].solution.poses[row] for f in (before, after))
-    twist = se3_log(to @ end @ se3_inverse(start) @ se3_inverse(to)) / (after - before)
-    return se3_inverse(to) @ se3_exp((frame - before) * twist) @ to @ start, twist
+    centre = records[frame].solution.centres[arch]
+    start, end = (records[f].solution.poses[arch] for f in (before, after))
+    twist = twist_between(start, end, centre) / (after - before)
+    return motion_about(centre, (frame - before) * twist) @ start, twist

@@ -1,4 +1,4 @@
-"""Smooth poses over time, each frame weighted by what its masks say and by how lively the motion is."""
+"""Smooth poses over time, weighted by each frame's covariance and the process noise of the motion nearby."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from scipy.ndimage import uniform_filter1d
 from jawusd.geometry import make_transform, orthonormalise, se3_adjoint, se3_exp, se3_inverse, se3_log
 from jawusd.geometry.arrays import Array, Mask
 
-# Frames on either side over which liveliness is judged: a third of a second at 24 fps.
+# Frames on either side over which process noise is estimated: a third of a second at 24 fps.
 _WINDOW = 4
-# Least acceleration variance, as a share of what noise independent from frame to frame would show: the habits of
-# whoever draws masks make part of it the same in neighbouring frames, where it does not show.
+# Least acceleration variance, as a share of what noise independent from frame to frame would show: part of the outline
+# errors is the same in neighbouring frames and cancels in second differences.
 _FLOOR = 0.5
 _SHORTEST = 5  # frames; shorter runs say nothing about their own smoothness
 
@@ -25,19 +25,18 @@ def smooth_poses(frames: NDArray[np.int64], poses: Array, covariance: Array, cen
     differences a_k of the poses: the smoother of a random walk in velocity (Rauch, Tung & Striebel 1965), with Q_k
     taken from the raw second differences nearby less the share of noise, so that a sudden stop stays sudden.
 
+    Lost frames stay NaN, runs of fewer than five frames stay as they are.
+
     Args:
         frames: frame numbers, shape (F,).
         poses: measured poses, NaN where lost, shape (F, 4, 4).
         covariance: of their left twists about the world origin, shape (F, 6, 6).
         centre: the fixed point, amid the motion [mm], shape (3,).
-
-    Returns:
-        Poses, shape (F, 4, 4); lost frames stay NaN, runs of fewer than five frames stay as they are.
     """
     to = make_transform(np.eye(3), -np.asarray(centre))
     A, back = se3_adjoint(to), se3_inverse(to)
     out = poses.copy()
-    known = np.isfinite(poses).all((1, 2)) & np.isfinite(covariance).all((1, 2))
+    known = np.asarray(np.isfinite(poses).all((1, 2)) & np.isfinite(covariance).all((1, 2)))
     for run in _runs(frames, known):
         if len(run) >= _SHORTEST:
             twists = _corrections(to @ poses[run] @ back, A @ covariance[run] @ A.T)
@@ -60,9 +59,9 @@ def _corrections(poses: Array, covariance: Array) -> Array:
     bend = np.diff(steps, axis=0)  # of frames 1 .. N-2
     variance = np.einsum("nii->ni", covariance)
     noise = variance[:-2] + 4 * variance[1:-1] + variance[2:]
-    lively = uniform_filter1d(bend**2 - noise, 2 * _WINDOW + 1, axis=0, mode="nearest")
-    weight = 1.0 / np.maximum(lively, _FLOOR * noise)
-    # Band storage: diagonal d of the upper triangle in row 17 - d; twists of three neighbours reach 17 entries.
+    process_noise = uniform_filter1d(bend**2 - noise, 2 * _WINDOW + 1, axis=0, mode="nearest")
+    weight = 1.0 / np.maximum(process_noise, _FLOOR * noise)
+    # Band storage: diagonal d of the upper triangle in arch 17 - d; twists of three neighbours reach 17 entries.
     bands = np.zeros((18, 6 * count))
     right = np.zeros(6 * count)
     information = np.linalg.inv(covariance)
@@ -74,6 +73,6 @@ def _corrections(poses: Array, covariance: Array) -> Array:
             if b >= a:
                 columns = np.arange(6 * b, 6 * (b + len(bend)))
                 bands[17 - 6 * (b - a), columns] += ca * cb * weight.ravel()
-        rows = np.arange(6 * a, 6 * (a + len(bend)))
-        right[rows] -= ca * (weight * bend).ravel()
+        arches = np.arange(6 * a, 6 * (a + len(bend)))
+        right[arches] -= ca * (weight * bend).ravel()
     return solveh_banded(bands, right).reshape(count, 6)

@@ -1,4 +1,4 @@
-"""A whole take: bootstrap, forwards, backwards, and once more from the far side into what was lost."""
+"""A whole take: the first frame, forwards, backwards, then backwards into every gap, and a refinement of it all."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 
 from jawusd.formats.capture import Capture
 from jawusd.formats.mesh import Mesh
-from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, Tracks
-from jawusd.geometry import Camera, transform_point
+from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, Tracks, TracksMeta
+from jawusd.geometry import Camera
 from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.frame_record import FrameRecord
-from jawusd.tracking.contour.scan import prepare_scan
+from jawusd.tracking.contour.scan import prepare_scan, probe_points, teeth_centre
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import MaskViews, View
 from jawusd.tracking.initialization.first_frame import first_record
@@ -23,7 +23,7 @@ from jawusd.tracking.initialization.start import find_start
 from jawusd.tracking.sequence.extrinsics import Extrinsics
 from jawusd.tracking.sequence.frame_tracker import FrameTracker
 from jawusd.tracking.sequence.history import History, MotionPredictor
-from jawusd.tracking.sequence.nuisance import Nuisances, TakeEquations, bridge, leads
+from jawusd.tracking.sequence.nuisance import Nuisances, TakeEquations, bridge, delay_motions
 from jawusd.tracking.sequence.results import assemble, outline_variance
 
 Progress = Callable[[int, int], None]
@@ -45,16 +45,14 @@ def track_capture(
     threads: int = 2,
     progress: Progress | None = None,
 ) -> Tracks:
-    """Track both rows of teeth through a capture.
+    """Track both arches through a capture.
 
     Args:
-        capture: the capture; its masks, frame range and bootstrap picks are used; without picks the teeth are
-            searched.
-        cameras: calibrated cameras; world lengths in mm.
+        capture: gives masks, frame range and bootstrap picks; without picks the teeth are searched.
+        cameras: calibrated; world lengths in mm.
         offsets: reference frame minus own frame number, per camera name.
         upper, lower: teeth scans in one frame, in occlusion [mm].
         landmarks: points whose uncertainty is reported, mandible (= scan) coordinates [mm], shape (5, 3).
-        config: the tracker's numbers.
         threads: worker threads; the result does not depend on it.
         progress: called with frames done and frames in all, once per frame.
 
@@ -68,25 +66,25 @@ def track_capture(
     with ThreadPoolExecutor(threads) as pool:
         solver = ContourSolver(scans, config, pool if threads > 1 else None)
         start = find_start(capture, table, offsets, (upper, lower), solver, pool.map)
-        centre = np.mean([transform_point(start.poses[r], scans[r].centre) for r in (0, 1)], axis=0)
+        centre = teeth_centre(scans, start.poses)
         with MaskViews(capture.cameras, table, offsets, centre, config.working_px_per_mm) as masks:
             first, stop = capture.frames or masks.frames
             take = _Take(solver, config, masks, first, stop, progress)
             take.begin(start.frame, start.poses)
             take.run(range(start.frame + 1, stop))
             take.run(range(start.frame - 1, first - 1, -1))
-            take.re_enter()
+            take.close_gaps()
             nuisances, extrinsics = take.refine()
             records = take.records if capture.frames else _trimmed(take.records)
             names = tuple(camera.name for camera in masks.cameras)
-    notes = {"start": start.notes, "painted": [s.painted for s in scans]}
+    notes: TracksMeta = {"start": start.notes, "painted": [s.painted for s in scans]}
     return assemble(records, names, np.asarray(landmarks, np.float64), nuisances, extrinsics, config, notes)
 
 
 def _trimmed(records: dict[int, FrameRecord]) -> dict[int, FrameRecord]:
     """Drop frames without any mask before the first and after the last frame that has one."""
     masked = [frame for frame, record in records.items() if np.isfinite(record.coverage).any()]
-    return {f: r for f, r in records.items() if min(masked) <= f <= max(masked)}
+    return {f: record for f, record in records.items() if min(masked) <= f <= max(masked)}
 
 
 class _Take:
@@ -104,13 +102,12 @@ class _Take:
         self._solver, self._config, self._masks = solver, config, masks
         self._first, self._stop = first, stop
         self._progress = progress or (lambda done, total: None)
-        # A dozen points of a row show any motion of it.
-        self._probes = np.stack([s.probes[np.linspace(0, len(s.probes) - 1, 12).astype(int)] for s in solver.scans])
+        self._probes = probe_points(solver.scans)
         self.records: dict[int, FrameRecord] = {}
 
     def begin(self, frame: int, poses: Array) -> None:
         """Align the bootstrap frame from the pick poses."""
-        self.records[frame] = first_record(self._solver, self._config, poses, self._masks, frame)
+        self.records[frame] = first_record(self._solver, self._config, poses, self._masks.at(frame), frame)
         self._progress(1, self._stop - self._first)
 
     def run(self, frames: range) -> None:
@@ -123,8 +120,8 @@ class _Take:
             self.records[frame] = record
             self._progress(len(self.records), self._stop - self._first)
 
-    def re_enter(self) -> None:
-        """Track backwards into every gap from the frame after it, and keep what is found."""
+    def close_gaps(self) -> None:
+        """Track backwards into every gap from the frame after it, and keep frames that lose fewer arches."""
         for first, stop in _gaps(self.records):
             if stop not in self.records:
                 continue
@@ -137,7 +134,7 @@ class _Take:
                     self.records[frame] = replace(record, status=status)
 
     def refine(self) -> tuple[Nuisances, Extrinsics]:
-        """Estimate delays, biases and camera poses; where they matter, align all frames again with them put right."""
+        """Estimate delays, biases and camera poses; where they matter, align all frames again with them corrected."""
         c = self._config
         extrinsics = Extrinsics.calibrated(self._masks.cameras, self._middle())
         equations = self._equations(extrinsics)
@@ -162,12 +159,12 @@ class _Take:
 
     def _middle(self) -> Array:
         """Return a point amid the teeth, world coordinates [mm], shape (3,)."""
-        return np.median([r.solution.centres for r in self.records.values()], axis=(0, 1))
+        return np.median([record.solution.centres for record in self.records.values()], axis=(0, 1))
 
     def _settle(self, found: Nuisances, extrinsics: Extrinsics, cameras_moved: bool) -> tuple[Nuisances, Extrinsics]:
-        """Align some frames again and again until the nuisances stay: matches follow them only step by step."""
+        """Align some frames repeatedly until the nuisances converge: matches follow them only step by step."""
         c, records = self._config, dict(self.records)
-        whole = [f for f, r in sorted(records.items()) if (r.status != LOST).all()]
+        whole = [f for f, record in sorted(records.items()) if (record.status != LOST).all()]
         sample = {
             whole[k]: self._masks.at(whole[k]) for k in np.linspace(0, len(whole) - 1, c.settle_frames).astype(int)
         }
@@ -177,7 +174,7 @@ class _Take:
                 extrinsics = extrinsics.then(found.twists, found.sigma_twists)
             for frame, views in sample.items():
                 start, used = records[frame].solution.poses, records[frame].used
-                views = _put_right(views, self.records, frame, found, extrinsics)
+                views = _corrected_views(views, self.records, frame, found, extrinsics)
                 solution = self._solver.solve(start, views, c.gates_from(0.0), used)
                 records[frame] = replace(records[frame], solution=solution)
             more = TakeEquations(records, variance, extrinsics, sample).solve(c, cameras_moved)
@@ -187,11 +184,11 @@ class _Take:
         return found, extrinsics
 
     def _realign(self, nuisances: Nuisances, extrinsics: Extrinsics) -> None:
-        """Align every frame again, starting from where it is, with all that the take tells put right."""
+        """Align every frame again from its poses, with all nuisances of the take corrected."""
         before = dict(self.records)
         tracker, _ = self._from(self._first)
         for frame, views in self._masks.walk(self._first, self._stop):
-            views = _put_right(views, before, frame, nuisances, extrinsics)
+            views = _corrected_views(views, before, frame, nuisances, extrinsics)
             record = tracker.track(_starts_again(before, frame), views, None)
             found = record.status == TRACKED
             doubted = np.isin(before[frame].status, (RECOVERED, LOST))
@@ -212,40 +209,40 @@ class _Take:
 
     def _one(self, tracker: FrameTracker, motion: MotionPredictor, views: Sequence[View]) -> FrameRecord:
         reach = self._config.gate_per_miss * motion.miss_mm() * self._config.working_px_per_mm
-        gallery = motion.gallery() if motion.worth_searching() else None
-        record = tracker.track(motion.starts(), views, gallery, reach)
-        motion.update(record.solution.poses, record.status != LOST, record.used.any(1))
+        pose_history = motion.pose_history() if motion.search_is_due() else None
+        record = tracker.track(motion.starts(), views, pose_history, reach)
+        motion.update(record.solution.poses, np.asarray(record.status != LOST), np.asarray(record.used.any(1)))
         tracker.history.add(record)
         return record
 
 
-def _put_right(
+def _corrected_views(
     views: Sequence[View],
     records: Mapping[int, FrameRecord],
     frame: int,
     nuisances: Nuisances,
     extrinsics: Extrinsics,
 ) -> list[View]:
-    """Return the views of a frame with delays, biases and camera poses put right."""
-    moved = leads(records, frame, nuisances.delays)
-    views = extrinsics.put_right(views)
-    return [replace(v, lead=m, bias_px=nuisances.bias_px) for v, m in zip(views, moved, strict=True)]
+    """Return the views of a frame with delays, biases and camera poses corrected."""
+    moved = delay_motions(records, frame, nuisances.delays)
+    views = extrinsics.correct(views)
+    return [replace(v, T_delay=m, bias_px=nuisances.bias_px) for v, m in zip(views, moved, strict=True)]
 
 
 def _starts_again(records: Mapping[int, FrameRecord], frame: int) -> list[Array]:
-    """Return the poses from which to align a frame again: where it is; where a row is lost, from even motion first."""
+    """Return the poses from which to align a frame again: where it is; where a arch is lost, from even motion first."""
     own = records[frame].solution.poses
     lost = np.flatnonzero(records[frame].status == LOST)
     even = own.copy()
-    for row in lost:
-        across = bridge(records, frame, row)
+    for arch in lost.tolist():
+        across = bridge(records, frame, arch)
         if across is not None:
-            even[row] = across[0]
+            even[arch] = across[0]
     return [even, own] if len(lost) else [own]
 
 
 def _gaps(records: Mapping[int, FrameRecord]) -> Iterable[tuple[int, int]]:
-    """Yield runs of frames in which a row is lost, as first frame and one past the last."""
+    """Yield runs of frames in which a arch is lost, as first frame and one past the last."""
     lost = [frame for frame in sorted(records) if (records[frame].status == LOST).any()]
     runs: list[list[int]] = []
     for frame in lost:
