@@ -36,7 +36,7 @@ def tracker():
     """A tracker that has seen one good frame."""
     solver, views = ContourSolver(SCANS, CONFIG), _views(0)
     solution = solver.solve(POSES[0], views, CONFIG.gates_from(0.0))
-    bare, total = uncovered_px(SCANS, solution, views)
+    bare, total = uncovered_px(SCANS, solution.poses, views)
     history = History(CONFIG.history_frames, CONFIG.score_frames)
     history.add(FrameRecord(solution, np.full(2, TRACKED, np.int8), np.ones((2, 3), bool), bare / total))
     return FrameTracker(solver, CONFIG, history)

@@ -108,7 +108,7 @@ def test_uncovered_pixels_are_those_off_the_crowns():
         masks[0, 5:15, 20 : 30 + k] = 255
         views.append(View(camera.projection_matrix(), camera.centre_world(), masks, np.array([True, k != 2])))
     solution = ContourSolver(SCANS, CONFIG).solve(poses, views, (2.5,))
-    bare, total = uncovered_px(SCANS, solution, views)
+    bare, total = uncovered_px(SCANS, solution.poses, views)
     assert total[0] == pytest.approx([(v.masks[0] > 0).sum() for v in views])
     assert total[1, 2] == 0 and bare[1, 2] == 0
     assert (bare[0] - [100, 110, 120] >= 0).all() and (bare[0] - [100, 110, 120] < 0.02 * total[0]).all()
@@ -228,4 +228,4 @@ def test_gates_open_with_the_reach():
 
 def test_scans_of_the_example_are_what_tests_take_them_for():
     assert arch(True).faces.shape == MESHES[0].faces.shape
-    assert all(s.painted and len(s.margin) > 100 for s in SCANS)
+    assert all(s.painted and len(s.gingival_margin) > 100 for s in SCANS)

@@ -72,8 +72,8 @@ def _crossings(a, b):
 def test_no_line_without_gum_or_without_contact():
     ball = trimesh.creation.icosphere(subdivisions=2, radius=5.0)
     far = ball.copy().apply_translation([30.0, 0, 0])
-    assert prepare_scan(_painted([(ball, RED)]), "upper").margin.shape == (0, 2, 3)
-    assert prepare_scan(_painted([(ball, RED), (far, GREY)]), "upper").margin.shape == (0, 2, 3)
+    assert prepare_scan(_painted([(ball, RED)]), "upper").gingival_margin.shape == (0, 2, 3)
+    assert prepare_scan(_painted([(ball, RED), (far, GREY)]), "upper").gingival_margin.shape == (0, 2, 3)
 
 
 def test_edge_table_agrees_with_trimesh():

@@ -43,7 +43,7 @@ def view_residual_px(solution: Solution) -> Array:
     return np.sqrt(out)
 
 
-def uncovered_px(scans: Sequence[Scan], solution: Solution, views: Sequence[View]) -> tuple[Array, Array]:
+def uncovered_px(scans: Sequence[Scan], poses: Array, views: Sequence[View]) -> tuple[Array, Array]:
     """Return E_SP of paper eq. 8, the mask pixels that the projected crowns leave uncovered, and all mask pixels.
 
     Both are counts per arch and view, shape (2, C).
@@ -54,7 +54,7 @@ def uncovered_px(scans: Sequence[Scan], solution: Solution, views: Sequence[View
             if not view.present[r]:
                 continue
             mask = pack_bits(view.masks[r] > 127)
-            crowns = scan.silhouette(view.matrix @ view.T_delay[r] @ solution.poses[r], view.masks.shape[1:])
+            crowns = scan.silhouette(view.matrix @ view.T_delay[r] @ poses[r], view.masks.shape[1:])
             uncovered[r, c], total[r, c] = count_and_not(mask, crowns), count_bits(mask)
     return uncovered, total
 
@@ -71,7 +71,7 @@ def arch_fit(scans: Sequence[Scan], solution: Solution, views: Sequence[View], u
 
     The price of an uncovered pixel is given in px of contour [1/px].
     """
-    uncovered, _ = uncovered_px(scans, solution, views)
+    uncovered, _ = uncovered_px(scans, solution.poses, views)
     shares = (score_px(solution) - uncovered_price * uncovered) / np.maximum(solution.visible_px, 1.0)
     out = np.full(2, -np.inf)
     for r in ARCHES:

@@ -42,7 +42,7 @@ def first_record(
     if (better := score_px(wide).sum(1) > score_px(best).sum(1)).any():
         poses = np.where(better[:, None, None], wide.poses, best.poses)
         best = solver.solve(poses, views, config.wide_gates_px[-2:], use)
-    coverage = coverage_error(*uncovered_px(solver.scans, best, views))
+    coverage = coverage_error(*uncovered_px(solver.scans, best.poses, views))
     fit = arch_fit(solver.scans, best, views, config.uncovered_price)
     for r in ARCHES:
         share = score_px(best)[r].sum() / max(best.visible_px[r].sum(), 1.0)

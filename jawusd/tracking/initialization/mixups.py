@@ -11,10 +11,9 @@ import numpy as np
 from jawusd.errors import CaptureError, TrackingError
 from jawusd.formats.capture import CameraSource, Masks
 from jawusd.geometry.arrays import Array
-from jawusd.imaging.raster import count_and_not, count_bits, pack_bits
-from jawusd.tracking.contour.scan import ARCHES, Scan, teeth_centre
+from jawusd.tracking.contour.quality import coverage_error, uncovered_px
+from jawusd.tracking.contour.scan import teeth_centre
 from jawusd.tracking.contour.solver import ContourSolver
-from jawusd.tracking.contour.views import View
 from jawusd.tracking.initialization.footage import Footage
 
 # An exchange is believed if it leaves less than this share of what is uncovered as the masks are named.
@@ -103,17 +102,8 @@ def likely_mixup(footage: Footage, solver: ContourSolver, poses: Array, frame: i
 def _uncovered_shares(footage: Footage, solver: ContourSolver, poses: Array, frame: int) -> Array:
     """Return the share of each camera's masks that lies off their scans, NaN without a mask, shape (C,)."""
     with footage.views(teeth_centre(solver.scans, poses), solver.config.working_px_per_mm / 2) as masks:
-        return np.array([_uncovered_share(view, solver.scans, poses) for view in masks.at(frame)])
-
-
-def _uncovered_share(view: View, scans: Sequence[Scan], poses: Array) -> float:
-    uncovered = total = 0
-    for r in ARCHES:
-        if view.present[r]:
-            mask = pack_bits(view.masks[r] > 127)
-            crowns = scans[r].silhouette(view.matrix @ poses[r], view.masks.shape[1:])
-            uncovered, total = uncovered + count_and_not(mask, crowns), total + count_bits(mask)
-    return uncovered / total if total else np.nan
+        uncovered, total = uncovered_px(solver.scans, poses, masks.at(frame))
+    return coverage_error(uncovered.sum(0), total.sum(0))
 
 
 def _masks(source: CameraSource) -> Masks:

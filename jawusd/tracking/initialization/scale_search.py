@@ -123,6 +123,6 @@ class _Sizes:
         with self.footage(size).views(teeth_centre(scans, start), config.working_px_per_mm) as masks:
             views = masks.at(frame)
         end = self._solver.solve(start, views, config.wide_gates_px)
-        uncovered, _ = uncovered_px(scans, end, views)
+        uncovered, _ = uncovered_px(scans, end.poses, views)
         objective = float((score_px(end) - config.uncovered_price * uncovered).sum())
         return objective, float(arch_fit(scans, end, views, config.uncovered_price).min()), end.poses

@@ -164,7 +164,7 @@ class StartSearch:
 
     def _worth(self, solver: ContourSolver, solution: Solution, views: Sequence[View]) -> Array:
         """Return the fitting contour less the price of uncovered mask per arch [px], shape (2,)."""
-        uncovered, _ = uncovered_px(solver.scans, solution, views)
+        uncovered, _ = uncovered_px(solver.scans, solution.poses, views)
         # A price per area: the coarse pictures' pixels are larger.
         price = self._config.uncovered_price
         if solver is self._coarse_solver:

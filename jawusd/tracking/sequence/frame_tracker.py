@@ -122,7 +122,7 @@ class FrameTracker:
 
     def _try(self, start: Array, views: Sequence[View], gates: Sequence[float], use: Mask) -> _Trial:
         solution = self._solver.solve(start, views, gates, use)
-        return _Trial(solution, *uncovered_px(self._solver.scans, solution, views), use)
+        return _Trial(solution, *uncovered_px(self._solver.scans, solution.poses, views), use)
 
     def _suspect(self, trial: _Trial) -> Mask:
         """Tell which arches look worse than in recent frames, shape (2,)."""

@@ -139,7 +139,7 @@ class GuidedTracker:
         views = self._see(frame, poses, self._rounds - 1)
         use = present_masks(views)
         solution = self._solver.solve(poses, views, (), use)
-        coverage = coverage_error(*uncovered_px(self._solver.scans, solution, views))
+        coverage = coverage_error(*uncovered_px(self._solver.scans, solution.poses, views))
         return FrameRecord(solution, status, use, coverage)
 
     def _one(self, tracker: FrameTracker, motion: MotionPredictor, frame: int, reliable: bool) -> FrameRecord:

@@ -129,7 +129,7 @@ class _SecondPass:
 
     def _fits(self, solution: Solution, views: Sequence[View], use: Mask, covariance: Array) -> bool:
         c, jaw = self._config, self._prior.jaw
-        coverage = coverage_error(*uncovered_px(self._solver.scans, solution, views))
+        coverage = coverage_error(*uncovered_px(self._solver.scans, solution.poses, views))
         uncovered = np.where(use & np.isfinite(coverage), coverage, 0.0).max()
         rough = residual_px(solution) > c.lost_residual * c.suspect_residual * self._usual_px
         few = matched_px(solution) < c.least_matched_px
