@@ -267,7 +267,7 @@ def test_all_shifts_at_once_agree_with_drawing_each(pictures):
         view = masks.at(FIRST + 2)[1]
     scan = coarse_scan(Mesh(MESHES[1].vertices, MESHES[1].faces), "lower")  # without gum silhouettes say all
     shifts = np.random.default_rng(0).uniform(-8, 8, (12, 3))
-    found = _Screen(view, 1, 2.0, shifts, centre).worth(scan, pose)
+    found = _Screen(view, 1, 2.0, shifts, centre).objective(scan, pose)
     template = np.pad(_template(view.masks[1], view.masks[0], 2.0), 60)
     h = view.matrix @ np.append(centre, 1)
     slope = (view.matrix[:2, :3] - (h[:2] / h[2])[:, None] * view.matrix[2, :3]) / h[2]
@@ -332,9 +332,9 @@ def test_without_one_the_frame_that_fits_best_is_taken(pictures):
 def test_wrong_minimum_that_covers_the_masks_is_refused(pictures):
     solver, poses = ContourSolver(SCANS, TrackingConfig()), jaw_poses(FRAMES)[0]
     with _footage(pictures).views(poses[0, :3, 3], 7.2) as masks:
-        assert first_record(solver, solver.config, poses, masks, FIRST).solution.poses.shape == (2, 4, 4)
+        assert first_record(solver, solver.config, poses, masks.at(FIRST), FIRST).solution.poses.shape == (2, 4, 4)
         with pytest.raises(TrackingError, match="upper teeth do not fit their masks") as refusal:
-            first_record(solver, solver.config, _misplaced(poses), masks, FIRST)
+            first_record(solver, solver.config, _misplaced(poses), masks.at(FIRST), FIRST)
     share, bare, fit = re.findall(
         r"(-?[\d.]+)%? (?:of the visible|of the masks stays|\(at least 0.05)", str(refusal.value)
     )
