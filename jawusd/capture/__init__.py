@@ -1,1 +1,1 @@
-"""Bring the cameras of a capture together in time and space."""
+"""Synchronise and calibrate the cameras of a capture."""

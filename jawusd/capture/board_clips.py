@@ -19,7 +19,7 @@ class BoardClip:
 
     Attributes:
         path: video or pattern.
-        numbers: of the pictures there are, increasing; in a video those of the frames at which they are shown.
+        numbers: picture numbers, increasing; in a video the frames at which the pictures are shown.
         size_px: (width, height) of every picture.
     """
 
@@ -41,7 +41,7 @@ class BoardClip:
 
     @property
     def is_video(self) -> bool:
-        """Tell whether successive pictures are moments of one motion."""
+        """Return whether successive pictures are moments of one motion."""
         return self._video is not None
 
     def pictures(self, wanted: list[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
@@ -91,5 +91,5 @@ def _read(path: Path) -> NDArray[np.uint8]:
 
 
 def sharpness(image: NDArray[np.uint8]) -> float:
-    """Return the variance of the Laplacian (Pech-Pacheco et al. 2000), of use between pictures of one camera."""
+    """Return the variance of the Laplacian (Pech-Pacheco et al. 2000), comparable between pictures of one camera."""
     return float(cv2.Laplacian(image, cv2.CV_16S).var()) + 1e-9

@@ -16,7 +16,7 @@ from jawusd.formats.capture import Boards
 from jawusd.geometry.arrays import Array, Mask
 
 MOST_VIEWS = 80  # more add minutes, not accuracy
-_LOOKED_AT = 6  # pictures in which another board is looked for
+_LOOKED_AT = 6  # pictures searched for another board
 _PER_WINDOW = 2  # successive video pictures of which the sharpest is taken
 # 10 to 90 % width of the board's edges: wider than this share of the camera's median is motion, within these limits.
 _BLUR_RATIO, _BLUR_LIMITS_PX = 1.5, (4.0, 8.0)
@@ -118,7 +118,7 @@ def _choose(names: tuple[str, ...], clips: list[BoardClip]) -> tuple[list[int], 
     with ThreadPoolExecutor(max_workers=min(len(clips), 4)) as pool:
         for values in pool.map(lambda clip: [sharpness(image) for _, image in clip.pictures(shared)], clips):
             sharp.append(np.array(values) / np.median(values))
-    worst = np.min(sharp, axis=0)  # a picture counts as sharp where it is so in all cameras
+    worst = np.min(sharp, axis=0)  # a picture counts as sharp if it is sharp in all cameras
     windows = np.array_split(np.arange(len(shared)), min(MOST_VIEWS, -(-len(shared) // _PER_WINDOW)))
     return [shared[window[np.argmax(worst[window])]] for window in windows], notes
 

@@ -1,7 +1,7 @@
 """Bundle adjustment of fixed cameras over views of a planar board.
 
 Minimises the robust reprojection error over intrinsics (fx, fy, cx, cy, k1, k2; the other coefficients stay 0: few
-pictures of a small board cannot tell them apart), camera poses (the first camera is the world) and board poses. The
+pictures of a small board do not determine them), camera poses (the first camera is the world) and board poses. The
 Jacobian is analytic: OpenCV's for the lens, Solà et al. 2018 (eq. 143) for the rotations; most of it is 0.
 """
 
@@ -111,7 +111,7 @@ class _Problem:
         """Return the unknowns with the least robust error (Levenberg-Marquardt, reweighted; Triggs et al. 2000).
 
         The normal equations are formed from the sparse Jacobian and solved densely: exact, where iterative solvers
-        crawl because focal length and distance nearly exchange for each other.
+        converge slowly because focal length and distance are nearly exchangeable.
         """
         for _ in range(2):  # the second time with the spread that the first one reached
             scale = _HUBER_SIGMAS * max(_LEAST_SIGMA_PX, 1.4826 * float(np.median(np.abs(self.residuals(x)))))

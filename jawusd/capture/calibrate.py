@@ -1,4 +1,4 @@
-"""Calibrate the cameras of a capture from its boards, and say how far the result can be trusted."""
+"""Calibrate the cameras of a capture from its boards, and estimate the accuracy of the result."""
 
 from __future__ import annotations
 
@@ -45,11 +45,11 @@ class CameraFigures(TypedDict):
 
 @dataclass(frozen=True)
 class CalibrationReport:
-    """Say how good a calibration is."""
+    """Hold the accuracy of a calibration, and advice."""
 
     cameras: dict[str, CameraFigures]
     views: int  # board poses used
-    board_shape: ShapeError  # error of distances between triangulated corners near the mouth, on the very pictures used
+    board_shape: ShapeError  # error of distances between triangulated corners near the mouth, on the pictures used
     expected_shape_mm: float  # mean error of distances in the mouth volume expected from the corners' scatter
     mouth_mm: tuple[float, float, float]  # middle of the mouth in the world, and from what it is known
     mouth_from: str

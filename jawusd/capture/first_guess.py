@@ -120,7 +120,7 @@ def _turn(points_mm: Array, order: NDArray[np.int64]) -> Array:
 
 
 def _alike(a: Array, b: Array) -> Mask:
-    """Say whether poses agree, shape (...)."""
+    """Return whether poses agree, shape (...)."""
     angle = np.linalg.norm(so3_log(a[..., :3, :3] @ np.swapaxes(b[..., :3, :3], -1, -2)), axis=-1)
     apart = np.linalg.norm(a[..., :3, 3] - b[..., :3, 3], axis=-1)
     return (angle < _SAME_ANGLE_RAD) & (apart < _SAME_SHARE * np.linalg.norm(b[..., :3, 3], axis=-1))

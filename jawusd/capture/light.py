@@ -2,7 +2,7 @@
 
 The mean brightness of a picture falls and rises with the room light. The times of these steps, matched between two
 cameras, give their offset in whole frames; a step that falls into an exposure leaves a picture of intermediate
-brightness, which tells the fraction of a frame (if the shutter is open all the time; with a shorter exposure only when
+brightness, which gives the fraction of a frame (if the shutter is open all the time; with a shorter exposure only when
 the step happens to fall into it).
 """
 
@@ -38,7 +38,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Offset:
-    """Say how one camera lies in time: its frame k shows the instant of frame k + frames of the reference camera."""
+    """Hold the time offset of one camera: its frame k shows the instant of frame k + frames of the reference camera."""
 
     frames: int  # the offset in whole frames
     exact_frames: float  # the same with its estimated fraction
@@ -74,7 +74,7 @@ def find_steps(brightness: Array, first_frame: int = 0) -> list[Step]:
         around = brightness[first:last]
         low, high = around.min(), around.max()
         if high - low < contrast / 2:
-            continue  # it fades: clouds, a dimmer, an automatic exposure
+            continue  # a slow change: clouds, a dimmer, an automatic exposure
         lit = float(((around - low) / (high - low)).sum())
         rising = bool(bright[at])
         steps.append(Step(first_frame + (last - lit if rising else first + lit), rising))

@@ -1,4 +1,4 @@
-"""Check the board's square size against the teeth: picked vertices have known distances on the scan, or masks tell."""
+"""Check the board's square size against the teeth, by picked vertices of the scan or by masks."""
 
 from __future__ import annotations
 

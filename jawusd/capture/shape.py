@@ -1,4 +1,4 @@
-"""What a calibration is for: lengths in the mouth. Measured on the board's corners, and expected from their scatter."""
+"""Errors of lengths in the mouth: measured on the board's corners, and expected from their scatter."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class ShapeError:
 
 
 def mouth_centre(cameras: list[Camera], bootstrap: Bootstrap | None, T_world_board: Array) -> tuple[Array, str]:
-    """Return the middle of the mouth in the world [mm], shape (3,), and what tells it."""
+    """Return the middle of the mouth in the world [mm], shape (3,), and what it was found from."""
     picks = triangulated_picks(cameras, bootstrap)
     if picks:
         return np.concatenate([points for _, points in picks.values()]).mean(0), "the picked teeth"

@@ -23,7 +23,7 @@ _CAPTURED = ("captured_frames", "captured_d", "captured_residual_mm", "captured_
 
 @dataclass(eq=False)
 class JawModel:
-    """Hold a fitted model and what it says of the captured poses."""
+    """Hold a fitted model and its parameters of the captured poses."""
 
     arrays: dict[str, Array]  # the decoder's named arrays, see `jawusd.evaluator`
     frames: NDArray[np.int64]  # captured frame numbers, shape (F,)

@@ -1,4 +1,4 @@
-"""What the report of a build shows: everything gathered, nothing judged or drawn yet."""
+"""What the report of a build shows: gathered, but not yet rated or drawn."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from jawusd.formats.tracks import Tracks
 
 @dataclass(frozen=True)
 class CameraFacts:
-    """Say what one camera gave."""
+    """Describe the input of one camera."""
 
     name: str
     video: str  # file name of the footage, "" without any
@@ -42,7 +42,7 @@ class ReplayPart:
 
 @dataclass(frozen=True)
 class RigFacts:
-    """Say what was found out about the rig files."""
+    """Hold the checks of the rig files."""
 
     table_error_mm: float  # largest vertex distance of the sampled decoder to the exact model [mm]
     findings: tuple[str, ...]  # of the validators, "severity: message"; empty when all is well

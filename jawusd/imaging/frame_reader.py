@@ -1,4 +1,4 @@
-"""Single pictures of a video, quick for somebody who steps through it."""
+"""Read single pictures of a video, fast for stepping through it."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from jawusd.errors import CaptureError
 from jawusd.imaging.video import Video, VideoFrame
 
-_AHEAD = 24  # pictures: to decode on is quicker than to start over at a key frame
-_BACK = 8  # pictures decoded at once for somebody who walks backwards
+_AHEAD = 24  # pictures: decoding on is faster than starting over at a key frame
+_BACK = 8  # pictures decoded at once when stepping backwards
 _KEPT_BYTES = 128 << 20
 
 
@@ -25,7 +25,7 @@ class FrameReader:
     """
 
     def __init__(self, video: Video) -> None:
-        """Take a video whose pictures are asked for."""
+        """Take the video."""
         self.video = video
         width, height = video.size_px
         self._most = max(2, min(64, _KEPT_BYTES // (3 * width * height)))

@@ -146,7 +146,7 @@ class GlCounter:
         self._compute = self._own(context.compute_shader(_COUNT))
         self._compute["drawn"], self._compute["masks"] = 0, 1
         buffer = self._own(context.buffer(np.ascontiguousarray(vertices, np.float32)))
-        # All teeth first, the boundary over them: no depth is needed, later triangles simply win.
+        # All teeth first, the boundary over them: later triangles overwrite, so no depth is needed.
         self._passes = []
         for shade, faces in ((0.5, plain_faces), (1.0, boundary_faces)):
             if len(faces):
@@ -226,7 +226,7 @@ class GlCounter:
         target.texture.use(0)
 
     def _target(self, layers: int) -> _Target:
-        """Return a target of at least so many layers; clearing costs time, so small ones exist beside large ones."""
+        """Return a target of at least this many layers; clearing costs time, so small ones exist beside large ones."""
         width, height, views = self._shown().size
         room = min(1 << (layers - 1).bit_length(), self._most_layers)
         if room not in self._targets:

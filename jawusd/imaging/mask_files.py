@@ -1,4 +1,4 @@
-"""Masks as they come out of other programs: numbered PNG files and videos, and what in a picture counts as tooth."""
+"""Masks written by other programs: numbered PNG files and videos, and which pixels count as tooth."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ def _png_has_alpha(path: Path) -> bool:
 
 
 def _refuse_opaque(images: Iterator[RawImage], path: Path) -> None:
-    """Raise if every picture with an alpha channel is an opaque photograph; mostly the first one is not."""
+    """Raise if every picture with an alpha channel is an opaque photograph; usually the first one is not."""
     count = 0
     for image in images:
         if not _is_opaque_photograph(image):
@@ -158,12 +158,12 @@ def _refuse_opaque(images: Iterator[RawImage], path: Path) -> None:
 
 @lru_cache(maxsize=256)
 def _refuse_opaque_video(path: Path, changed_ns: int) -> None:
-    """Raise as `_refuse_opaque`, looking once at a video; the time of its last change tells it from an earlier one."""
+    """Raise as `_refuse_opaque`, reading a video once; the time of its last change identifies its version."""
     _refuse_opaque((frame.image for frame in Video(path).frames(colour="rgba", threads=1)), path)
 
 
 def _is_opaque_photograph(image: RawImage) -> bool:
-    """Tell whether alpha says nothing, and colours are no black-and-white mask either."""
+    """Return whether alpha is opaque everywhere and the colours are no black-and-white mask either."""
     if image.ndim != 3 or image.shape[2] != 4:
         return False
     small = _eight_bits(image)
@@ -193,7 +193,7 @@ def _coverage(image: MaskImage, path: Path, where: str) -> MaskImage:
 
 
 def _labelled(image: RawImage, labels: LabelValues, path: Path, where: str) -> MaskImage:
-    """Return 255 where a label image shows the wanted arch; refuse values that mean nothing."""
+    """Return 255 where a label image shows the wanted arch; refuse other values."""
     plane = image if image.ndim == 2 else image[..., 0]
     if image.ndim == 3 and not all((image[..., c] == plane).all() for c in (1, 2)):
         raise CaptureError(

@@ -24,7 +24,7 @@ class MaskReader:
     """Read the masks of one arch in one camera.
 
     Reading frame after frame decodes the next few in a background thread; any other order works and decodes on
-    demand. One reader serves one thread; use it as a context manager or close it, or its thread waits for ever.
+    demand. One reader serves one thread; use it as a context manager or close it, or its thread never ends.
 
     Frames are those of the camera's clock: frame k is shown k nominal frame durations after its first picture. In a
     video of variable rate some have no picture, and no mask.
@@ -133,7 +133,7 @@ class MaskReader:
 
 
 def _timeline_of_pngs(path: Path, source: PngMasks, video: Timeline | None) -> Timeline | None:
-    """Return what tells the number of a file by the frame; None where they are the same."""
+    """Return the timeline that maps frames to file numbers; None where they are equal."""
     if video is None or not video.missing:
         return None
     if source.count > len(video.numbers):
@@ -147,7 +147,7 @@ def _timeline_of_pngs(path: Path, source: PngMasks, video: Timeline | None) -> T
 
 
 def _timeline_of_video(path: Path, source: VideoMasks, video: Timeline | None) -> Timeline:
-    """Return what tells the picture of a mask video by the camera's frame."""
+    """Return the timeline that maps the camera's frames to pictures of a mask video."""
     if video is None or source.timeline.count == video.count != len(video.numbers) != source.count:
         return source.timeline  # a constant rate was made of the variable one
     if source.count != len(video.numbers):
@@ -181,7 +181,7 @@ def open_masks(
 
 @lru_cache(maxsize=64)
 def _timeline(video: Path, changed_ns: int) -> Timeline:
-    """Return the timeline of a video; the time of its last change tells it from an earlier one of that name."""
+    """Return the timeline of a video; the time of its last change identifies its version."""
     return Video(video).timeline
 
 
@@ -198,7 +198,7 @@ def mask_size_px(path: str | os.PathLike[str]) -> tuple[int, int]:
 
 
 class _Ahead:
-    """Run an iterator in a thread, a few items ahead of whoever takes them."""
+    """Run an iterator in a thread, a few items ahead of the reader."""
 
     def __init__(self, items: Generator[MaskImage | None], first_frame: int) -> None:
         self.next_frame = first_frame

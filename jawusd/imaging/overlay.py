@@ -1,4 +1,4 @@
-"""Draw tracked scans over the footage, to be judged by eye (paper figs. 10 and 11)."""
+"""Draw tracked scans over the footage, for visual checks (paper figs. 10 and 11)."""
 
 from __future__ import annotations
 

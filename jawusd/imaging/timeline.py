@@ -1,4 +1,4 @@
-"""Frames lie evenly in time, pictures of a video need not: which picture is shown at which frame."""
+"""Map frames, which lie evenly in time, to pictures of a video, which need not."""
 
 from __future__ import annotations
 

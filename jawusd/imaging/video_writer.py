@@ -1,4 +1,4 @@
-"""Write videos: H.264 for people, lossless gray for masks."""
+"""Write videos: H.264 for viewing, lossless gray for masks."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from jawusd.formats.atomic import atomic_path
 class VideoWriter:
     """Write pictures to a video, one after the other, as a context manager.
 
-    The file appears under its name when the block ends well; after an exception there is none.
+    The file gets its name when the block ends without an exception; otherwise there is none.
     """
 
     def __init__(

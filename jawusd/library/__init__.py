@@ -1,1 +1,1 @@
-"""Many persons' jaws: an index of a folder of rigs, and a jaw for somebody who was never captured."""
+"""An index of a folder of rigs, and jaw motion for a person without a capture."""

@@ -1,7 +1,7 @@
 """The index of a folder of rigs: `library.json`, format jawusd-library/1.
 
-The index is only a memory of what the scan found: a path in it is never opened. Rigs are looked for below the folder
-and nowhere else, and read again when their content has changed.
+The index is only a cache of the scan: paths in it are never opened. Rigs are searched below the folder only, and read
+again when their content has changed.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ Loader = Callable[[Path], JawRig]
 
 @dataclass(frozen=True)
 class Entry:
-    """What the index knows of one rig."""
+    """Hold the index entry of one rig."""
 
     path: str  # of the rig's file, relative to the folder, with slashes
     actor: str  # name of the person
@@ -50,7 +50,7 @@ class Entry:
     condylar_distance_mm: float  # between the condyle centres
     condyle_incisor_mm: float  # from the middle between the condyles to the incisal point
     errors_mm: dict[str, object]  # the model's error tables, as its header has them
-    not_shown: bool  # the person's capture lacks a movement: of no use for others
+    not_shown: bool  # the person's capture lacks a movement: not usable for others
 
     def landmarks(self) -> Array:
         """Return the landmarks in the order of `LANDMARKS` [mm], shape (5, 3)."""
@@ -166,7 +166,8 @@ def _content(path: Path, root: Path) -> str:
 def _entry(name: str, content: str, rig: JawRig) -> Entry:
     landmarks = rig.arrays["landmarks"]
     shown = transform_points(landmark_frame(landmarks), landmarks)
-    warnings = rig.meta.get("warnings") or []
+    warnings, errors = rig.meta.get("warnings"), rig.meta.get("errors")
+    codes = [w.get("code") for w in warnings if isinstance(w, dict)] if isinstance(warnings, list) else []
     return Entry(
         path=name,
         actor=str(rig.meta.get("actor") or Path(name).parent.name or "unnamed"),
@@ -176,8 +177,8 @@ def _entry(name: str, content: str, rig: JawRig) -> Entry:
         landmarks_mm={key: row.tolist() for key, row in zip(LANDMARKS, shown, strict=True)},
         condylar_distance_mm=condylar_distance_mm(landmarks),
         condyle_incisor_mm=condyle_incisor_mm(landmarks),
-        errors_mm=dict(rig.meta.get("errors") or {}),
-        not_shown=any(isinstance(w, dict) and w.get("code") == "not_shown" for w in warnings),
+        errors_mm=errors if isinstance(errors, dict) else {},
+        not_shown="not_shown" in codes,
     )
 
 

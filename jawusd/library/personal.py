@@ -1,7 +1,7 @@
-"""The motion of somebody without a capture: that of the persons of a library, carried over and averaged.
+"""Motion for a person without a capture: that of the persons of a library, carried over and averaged.
 
-How much a library person counts falls with the distance between the landmarks; how fast, and how wrong the result is to
-be expected, the library itself says: every person in turn is predicted from the others and compared.
+The weight of a library person falls with the distance between the landmarks. How fast, and the error to be expected,
+follow from leaving each person of the library out in turn and predicting it from the others.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from jawusd.library.transport import Donor, displacements, landmark_distance_mm
 # Landmark distances [mm] at which a person's weight falls to exp(-1/2); inf: equal weights.
 BANDWIDTHS_MM = (math.inf, 4.0, 2.0, 1.0)
 _POSES = 1600
-_POSES_LEFT_OUT = 120  # poses per person that leaving-one-out looks at
+_POSES_LEFT_OUT = 120  # poses per person in leave-one-out
 _FEWEST_DONORS = 2  # with two persons each can be predicted from the other
 
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """What leaving one person out says of the error."""
+    """Hold the errors found by leaving one person out."""
 
     # by name of the person left out, the landmark errors [mm], shape (K, 5), at equal shares of the ranges: both the
     # shape of the motion and the ranges count
@@ -63,7 +63,7 @@ class Expected:
 
 @dataclass(frozen=True, eq=False)
 class Learned:
-    """What a library says of itself."""
+    """Hold what leave-one-out found for a library."""
 
     # landmark distance over which a person's weight falls by exp(-1/2), inf for equal weights; None when only the
     # closest person is used
@@ -77,8 +77,8 @@ class PersonalMotion:
 
     # T_skull_mandible in the frame of the landmarks, the identity with the teeth together, shape (N, 4, 4)
     poses: Array
-    weights: dict[str, float]  # how much each library person counts; they sum to 1
-    learned: Learned  # what the weights and the expected error come from
+    weights: dict[str, float]  # of the library persons; they sum to 1
+    learned: Learned  # the source of the weights and the expected error
 
 
 def leave_one_out(donors: Sequence[Donor], *, closest: bool = False) -> Learned:
@@ -128,14 +128,14 @@ def personal_motion(donors: Sequence[Donor], target: Array, learned: Learned) ->
 
 
 def _captured_shares(donor: Donor, count: int) -> Array:
-    """Return about so many of a person's captured poses, in the order of time, as shares of the ranges."""
+    """Return about `count` of a person's captured poses, in the order of time, as shares of the ranges."""
     codes = donor.rig.arrays["codes"]
     step = -(-len(codes) // max(count, 1))
     return donor.rig.normalized(codes[::step])
 
 
 def _weights(donors: Sequence[Donor], target: Array, bandwidth_mm: float | None) -> Array:
-    """Return the weights (n,), which sum to 1; without a bandwidth, of the closest person alone."""
+    """Return the weights (n,), which sum to 1; without a bandwidth, of the closest person only."""
     distance = np.array([landmark_distance_mm(donor.landmarks, target) for donor in donors])
     if bandwidth_mm is None:
         return (np.arange(len(donors)) == distance.argmin()).astype(np.float64)

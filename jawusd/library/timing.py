@@ -1,11 +1,11 @@
 """Keep the timing of a curve that is carried to another person: it rises and falls where its original does.
 
-What a share of a range is worth changes with the opening, so that a curve carried share by share may peak frames before
-or after the original. The curve kept is the one nearest to it, in least squares, among those that move the same way as
-the original between any two samples: isotonic regression (Barlow et al. 1972) whose direction changes with the sign of
-the original's steps. It is solved exactly by passing along the samples the cost of all samples so far as a function of
-the value of the last one; the derivative of that cost is piecewise linear and rising, and each step cuts off one end of
-it, as in R. Tibshirani, H. Hoefling, R. Tibshirani, Nearly-Isotonic Regression, Technometrics 53 (2011).
+What a share of a range amounts to changes with the opening, so that a curve carried share by share may peak frames
+before or after the original. The curve kept is the nearest to it, in least squares, among those that move the same way
+as the original between any two samples: isotonic regression (Barlow et al. 1972) whose direction changes with the sign
+of the original's steps. It is solved exactly by passing along the samples the cost of all samples so far as a function
+of the value of the last one; the derivative of that cost is piecewise linear and rising, and each step cuts off one end
+of it, as in R. Tibshirani, H. Hoefling, R. Tibshirani, Nearly-Isotonic Regression, Technometrics 53 (2011).
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def follow(original: Array, carried: Array, least: float) -> Array:
 
 
 def _zigzag(rising: Mask, wanted: Array) -> Array:
-    """Return the values z (n,) nearest to those wanted (n,): z[i + 1] >= z[i] where ``rising`` (n - 1,), else <=."""
+    """Return the values z (n,) nearest to wanted ones (n,): z[i + 1] >= z[i] where ``rising`` (n - 1,), else <=."""
     cost = _Slopes()
     cost.add(wanted[0])
     limits = np.empty(len(rising))

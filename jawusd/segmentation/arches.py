@@ -1,4 +1,4 @@
-"""Both arches in one picture: colours, place and edges weighed against one another."""
+"""Both arches in one picture: colours, place and edges weighted against one another."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def learn_colours(
 
 
 def doubted_odds(rgb: NDArray[np.uint8], model: ColourModel, config: SegmentationConfig) -> NDArray[np.float32]:
-    """Return the log-odds of being tooth that colours alone give, less what is demanded of them, shape (h, w)."""
+    """Return the log-odds of being tooth by colours alone, less the log-odds demanded of them, shape (h, w)."""
     demanded = model.surroundings_quantile(config.surroundings_share) + config.doubt
     return model.log_odds(rgb) - np.float32(np.clip(demanded, *config.doubt_range))
 

@@ -20,7 +20,7 @@ _FAR_BLUR_PX = 2.0  # finds the nearer arch for pixels that have become teeth
 
 @dataclass(frozen=True, eq=False)
 class _Sides:
-    """Hold what the colours on both sides of the border say about every pixel."""
+    """Hold the comparison of every pixel with the colours on both sides of the border."""
 
     share: NDArray[np.float32]  # of tooth, half way between the sides 0.5, shape (h, w)
     # standard deviations between the sides, 0 where one of them is not near, shape (h, w)
@@ -66,7 +66,7 @@ def _signed_distance(region: Mask) -> NDArray[np.float32]:
 
 
 def _compare_sides(inside: NDArray[np.float32], colours: NDArray[np.float32], window: int) -> _Sides | None:
-    """Weigh every pixel between the mean colours on both sides of the border; None where there are not both."""
+    """Compare every pixel with the mean colours on both sides of the border; None if one side is missing."""
     near = np.abs(inside) < window / 2
     sides = ((inside > 1) & near, (inside < -1) & near)
     means = [_mean_near(side, colours, window) for side in sides]
@@ -91,7 +91,7 @@ def _mean_near(side: Mask, colours: NDArray[np.float32], window: int) -> tuple[N
 
 
 def _unfounded(teeth: Mask, clear: Mask, config: SegmentationConfig) -> Mask:
-    """Tell which pixels belong to specks, and to parts with hardly a border in the picture, shape (h, w)."""
+    """Return which pixels belong to specks, and to parts with hardly a border in the picture, shape (h, w)."""
     count, parts, stats, _ = cv2.connectedComponentsWithStats(teeth.astype(np.uint8))
     outline = teeth & (cv2.erode(teeth.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)
     length = np.bincount(parts[outline], minlength=count)

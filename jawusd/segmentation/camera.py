@@ -31,7 +31,8 @@ class Segment:
     camera: Camera  # the pinhole camera of the window
     masks: NDArray[np.uint8]  # shares of the upper and lower arch, 255 = all, uint8, shape (2, h, w)
     present: Mask  # which arches are in sight at all, shape (2,)
-    contrast: Array  # how far colours change for the better at the outline, per arch, -1 .. 1; NaN where there is none.
+    # by how much colours look more like teeth inside the outline, per arch, -1 .. 1; NaN where there is none
+    contrast: Array
     # how much of each arch's mask is not where the crowns were expected, as a share; NaN without a mask
     unexpected: Array
     # pixels of each arch's outline that show in the picture, that do not, and that border the other arch, shape (2, 3)
@@ -88,7 +89,7 @@ class CameraSegmenter:
         # finished mask replaces a cut only where it fails.
         drawn = seeds.share if seeds is not None and seeds.known.all() else None
         guide = None if drawn is not None else seeds
-        # Borders settle in the first turn too: the tracker takes rougher outlines than it is used to for a lost row.
+        # Borders settle in the first turn too: the tracker takes rougher outlines than usual for a lost arch.
         shares, clear = cut_picture(window, expected, self.colours, c, self._frame.px_per_mm, reach, guide)
         if drawn is not None and _overlap(shares, drawn) < c.key_overlap:
             shares = drawn

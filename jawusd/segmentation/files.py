@@ -51,7 +51,7 @@ class Key:
 
 
 class KeyMasks:
-    """Give what a person drew for some frames, in folders named as those that are written.
+    """Read what a person drew for some frames, in folders named like those that are written.
 
     A picture is a finished mask, or, where at least half of it has the gray value 128, strokes: 255 on teeth of the
     arch, 0 on anything else, 128 where nothing was drawn.

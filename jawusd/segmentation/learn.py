@@ -1,4 +1,4 @@
-"""What finished masks of a few frames teach about the energy: its few numbers, and how wide a person draws."""
+"""Learn the numbers of the energy, and how wide a person draws, from finished masks of a few frames."""
 
 from __future__ import annotations
 
