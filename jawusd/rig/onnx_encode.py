@@ -15,7 +15,7 @@ from jawusd.geometry.arrays import Array
 from jawusd.geometry.rodrigues import Triple, cross, dot
 from jawusd.rig.onnx_graph import Graph, Value
 from jawusd.rig.onnx_model import decode_motion, images
-from jawusd.rig.sampling import valid_box
+from jawusd.rig.sampling import grid_points, valid_box
 
 _ITERATIONS = 30
 _SETTLED_MM = 1e-7  # a row is done when its step is shorter; the loop ends when all are
@@ -72,7 +72,7 @@ def _nearest_start(g: Graph, rig: JawRig, vectors: Array, target: Value) -> tupl
     """Return the grid point (n, 3) whose images are nearest to the target, and its squared distance (n, 1)."""
     box = valid_box(rig) + np.array([-_WIDER_MM, _WIDER_MM])
     axes = [np.linspace(low, high, count) for (low, high), count in zip(box, _STARTS, strict=True)]
-    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    grid = grid_points(axes)
     candidates = np.swapaxes((rig.pose(grid) @ vectors)[:, :3], 1, 2).reshape(-1, 12)
     # |a - b|^2 without the |a|^2 that all candidates share
     distance = g.constant((candidates**2).sum(axis=1)[None]) - (target @ candidates.T) * 2.0

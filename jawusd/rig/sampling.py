@@ -6,6 +6,8 @@ square root of the curvature spread it evenly (de Boor, A Practical Guide to Spl
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from jawusd.errors import RigError
@@ -27,19 +29,24 @@ def valid_box(rig: JawRig) -> Array:
     """Return the box (3, 2) [mm] of d that the table spans: `d_range`, widened to all d with a margin above zero.
 
     Raises:
-        RigError: the bounds leave no valid parameters.
+        RigError: The bounds leave no valid parameters.
     """
     box = np.array(rig.arrays["d_range"], dtype=np.float64)
     reach = 1.0 + float(rig.arrays["slice_margin_mm"]) + float(rig.arrays["slice_softness_mm"])
     wide = box + np.array([-reach, reach])
     axes = [np.linspace(low, high, _PROBES_PER_AXIS) for low, high in wide]
-    probes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    probes = grid_points(axes)
     valid = probes[rig.margin(probes) >= 0]
     if not len(valid):
         raise RigError("the bounds of the model leave no valid parameters.")
     step = np.array([axis[1] - axis[0] for axis in axes])
     low, high = valid.min(axis=0) - step, valid.max(axis=0) + step
     return np.stack([np.minimum(box[:, 0], low), np.maximum(box[:, 1], high)], axis=1).clip(wide[:, :1], wide[:, 1:])
+
+
+def grid_points(axes: Sequence[Array] | Array) -> Array:
+    """Return the points (n1 n2 n3, 3) of a grid with the given values along its axes."""
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def sample_valid(rig: JawRig, count: int, seed: int = 0) -> Array:

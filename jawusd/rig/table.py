@@ -9,10 +9,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from jawusd.errors import RigError
 from jawusd.evaluator import JawRig
+from jawusd.evaluator.schema import ADDITIVE
 from jawusd.evaluator.table import SampledTable
 from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import se3_exp, transform_points
-from jawusd.rig.sampling import grid_axes, sample_valid, valid_box
+from jawusd.rig.sampling import grid_axes, grid_points, sample_valid, valid_box
 
 DEFAULT_SIZE = 33
 SIZES = (17, 33, 65)
@@ -76,16 +77,14 @@ def build_table(rig: JawRig, vertices: Array, size: int = DEFAULT_SIZE) -> Decod
     if size not in SIZES:
         raise RigError(f"a table of {size} knots per axis is not offered; allowed are {', '.join(map(str, SIZES))}.")
     axes = grid_axes(rig, valid_box(rig), vertices[extreme_vertices(vertices)], size)
-    if rig.meta["kind"] == "additive":
-        twists = np.concatenate([rig.twist(_on_axis(i, axis)) for i, axis in enumerate(axes)])
+    if rig.meta["kind"] == ADDITIVE:
+        twists = np.concatenate([rig.twist(np.outer(axis, np.eye(3)[i])) for i, axis in enumerate(axes)])
         table = DecoderTable("curves", axes, twists.astype(np.float32))
     else:
-        grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-        twists = rig.twist(grid.reshape(-1, 3)).reshape(*grid.shape[:3], 6)
+        twists = rig.twist(grid_points(axes)).reshape(size, size, size, 6)
         table = DecoderTable("grid", axes, twists.astype(np.float32))
     # the error of linear interpolation peaks in the middle of the cells
-    middles = np.stack(np.meshgrid(*(0.5 * (axis[1:] + axis[:-1]) for axis in axes[:3]), indexing="ij"), axis=-1)
-    middles = middles.reshape(-1, 3)
+    middles = grid_points([0.5 * (axis[1:] + axis[:-1]) for axis in axes])
     samples = np.concatenate([middles[rig.margin(middles) >= 0], sample_valid(rig, _VALID_SAMPLES)])
     error = table_error(rig, table, vertices, samples)
     return DecoderTable(table.format, table.axes, table.twists, error, len(samples))
@@ -132,9 +131,3 @@ def extreme_vertices(vertices: Array) -> NDArray[np.int64]:
     radius = np.sqrt(1 - height**2)
     directions = np.stack([radius * np.cos(turn), radius * np.sin(turn), height], axis=1)
     return np.unique(np.argmax(directions @ vertices.T, axis=1))
-
-
-def _on_axis(i: int, values: Array) -> Array:
-    d = np.zeros((len(values), 3))
-    d[:, i] = values
-    return d
