@@ -111,6 +111,11 @@ def checked_arrays(arrays: Mapping[str, ArrayLike], kind: str) -> dict[str, Arra
     return checked
 
 
+def flat_arrays(arrays: Mapping[str, Array]) -> dict[str, list[float]]:
+    """Return arrays as `jawusd.evaluator.formula` takes them: flat, row by row."""
+    return {name: value.ravel().tolist() for name, value in arrays.items()}
+
+
 def _checked(
     name: str, arrays: Mapping[str, ArrayLike], shape: tuple[int | str, ...], lengths: dict[str, int]
 ) -> Array:

@@ -52,7 +52,7 @@ S = TypeVar("S", bound="Symbol")
 
 
 class Symbol:
-    """A number that stands for a value of a program: each operator adds an operation to that program."""
+    """A number that represents a value of a program: each operator adds an operation to that program."""
 
     def operation(self: S, name: str, *operands: S | float) -> S:
         """Add "Add", "Subtract", "Multiply" or "Divide", applied to two operands."""

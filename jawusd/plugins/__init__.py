@@ -1,1 +1,1 @@
-"""Helpers that run inside other programs; none of them imports jawusd, so that each can be copied there alone."""
+"""Helpers that run inside other programs; `extension` writes them as files that need nothing of jawusd."""

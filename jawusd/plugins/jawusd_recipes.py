@@ -1,6 +1,6 @@
 """Drive a mandible with a jaw rig in Maya, Houdini or Unreal: short recipes on top of `jawusd_reader.py`.
 
-Copy both files to where the program's Python finds them. `model.npz` is read without `pxr`.
+Put both files where the program's Python finds them. `model.npz` is read without `pxr`.
 
     import jawusd_reader, jawusd_recipes as recipes
     rig = jawusd_reader.load("actor/model.npz")              # or actor.usda, where the program brings pxr
@@ -16,7 +16,7 @@ Copy both files to where the program's Python finds them. `model.npz` is read wi
     # Unreal: the mandible's binding in a level sequence, and d1, d2, d3 per frame
     recipes.unreal_keys(rig, binding, {0: (0, 0, 0), 24: (20, 0, 0)})
 
-The mandible's own transform is replaced by T_skull_mandible, below a parent that stands where the skull does. Lengths
+The mandible's own transform is replaced by T_skull_mandible, below a parent at the skull's pose. Lengths
 are millimetres; where the parent does not scale them, give `scale`, 0.1 for centimetres.
 """
 

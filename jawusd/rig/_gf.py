@@ -54,7 +54,7 @@ def quatf_arrays(T: ArrayLike) -> list[Vt.QuatfArray]:
 
 
 def _continuous_wxyz(T: ArrayLike) -> Array:
-    # USD's slerp takes the short way between two samples, but readers that interpolate the four numbers do not.
+    # USD's slerp follows the shorter arc between two samples, but readers that interpolate the four numbers do not.
     wxyz = wxyz_from_matrix(np.asarray(T, dtype=np.float64)[:, :3, :3])
     if len(wxyz) > 1:
         turn = np.where(np.einsum("ij,ij->i", wxyz[1:], wxyz[:-1]) < 0, -1.0, 1.0)

@@ -16,7 +16,7 @@ from jawusd.rig import _gf
 from jawusd.rig.layers import add_pose, define_prim, new_layer, set_attribute, stage_of
 from jawusd.rig.layout import ACTOR, GEO, MANDIBLE, MATERIALS, SKULL
 from jawusd.rig.read import open_stage
-from jawusd.rig.untrusted import blames_file
+from jawusd.rig.untrusted import raises_format_error
 
 # Every mesh name is unique: Blender merges an Xform with an only child and keeps the child's name.
 MESH_PATHS = {
@@ -157,7 +157,7 @@ def corner_normals(mesh: Mesh) -> Array:
     return normals[corners]
 
 
-@blames_file(0)
+@raises_format_error(0)
 def read_geometry(path: str | os.PathLike[str], *, placeholders: bool = False) -> dict[str, Mesh]:
     """Read the meshes of `geo.usdc`: those of anatomy, or the placeholders.
 
@@ -183,7 +183,7 @@ def read_geometry(path: str | os.PathLike[str], *, placeholders: bool = False) -
     return found
 
 
-@blames_file(0)
+@raises_format_error(0)
 def read_gum(path: str | os.PathLike[str]) -> dict[str, Mask]:
     """Return which faces (F,) of the teeth meshes are gum, by the names of `MESH_PATHS`.
 

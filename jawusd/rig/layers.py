@@ -107,7 +107,7 @@ def write_layer(layer: Sdf.Layer, path: Path) -> Path:
     with atomic_path(path) as temporary:
         try:
             written = layer.Export(str(temporary))
-        except Tf.ErrorException:  # says in which line of OpenUSD, not why
+        except Tf.ErrorException:  # names a line of OpenUSD, not a reason
             written = False
         if not written:
             raise OutputError("could not be written; is the disk full? What was there before is untouched.", path=path)

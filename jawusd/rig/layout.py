@@ -1,4 +1,4 @@
-"""Where everything lies in a rig: prim paths and file names; `jawusd.evaluator.schema` says it of the model arrays."""
+"""Prim paths and file names of a rig; `jawusd.evaluator.schema` has the attributes of the model arrays."""
 
 FORMAT_VERSION = 1
 

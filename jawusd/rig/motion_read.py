@@ -14,13 +14,13 @@ from jawusd.geometry.se3 import rigidity_defect
 from jawusd.rig.animation import LOST
 from jawusd.rig.layout import ACTOR, MANDIBLE, PARAMETERS
 from jawusd.rig.read import find_rig_prim, open_stage
-from jawusd.rig.untrusted import blames_file
+from jawusd.rig.untrusted import raises_format_error
 
 _MOST_FRAMES = 220_000  # as many as are written, an hour at 60 per second
 _RIGID = 1e-5  # single-precision quaternions, as DCCs write them, stay below
 
 
-@blames_file(0)
+@raises_format_error(0)
 def read_poses_of_stage(path: str | os.PathLike[str], prim_path: str | None = None) -> tuple[NDArray[np.int64], Array]:
     """Read the poses of the mandible at every whole frame of a stage.
 
@@ -55,7 +55,7 @@ def read_poses_of_stage(path: str | os.PathLike[str], prim_path: str | None = No
     return times, poses
 
 
-@blames_file(0)
+@raises_format_error(0)
 def read_parameters_of_stage(
     path: str | os.PathLike[str], prim_path: str | None = None
 ) -> tuple[Array, Array, float] | None:

@@ -1,6 +1,6 @@
 """The encoder as an ONNX loop: damped Gauss-Newton from the nearest of many starts.
 
-The distance of two poses is that of `jawusd.evaluator.encoding`: four homogeneous vectors stand for all landmarks.
+The distance of two poses is that of `jawusd.evaluator.encoding`: four homogeneous vectors represent all landmarks.
 """
 
 from __future__ import annotations

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from jawusd.evaluator import JawRig
+from jawusd.evaluator.arrays import flat_arrays
 from jawusd.evaluator.formula import MODELS, BoundFormula, RigidMotion
-from jawusd.evaluator.operations import triple
+from jawusd.evaluator.operations import Rows, triple
 from jawusd.geometry.arrays import Array
 from jawusd.geometry.rodrigues import apply_series, dot
 from jawusd.geometry.se3 import se3_adjoint, se3_inverse
@@ -15,16 +16,14 @@ from jawusd.rig.onnx_graph import Graph, Value
 
 def decode_motion(g: Graph, rig: JawRig, d: Value) -> RigidMotion[Value]:
     """Add the model to a graph: parameters d (n, 3) [mm] to a motion in the anatomical frame."""
-    formula = MODELS[rig.meta["kind"]](_flat(rig))
-    tables = {name: np.array(table) for name, table in formula.tables.items()}
-    return formula.motion(triple(g.parts(d, 3)), tables, g)
+    formula = MODELS[rig.meta["kind"]](flat_arrays(rig.arrays))
+    return formula.motion(triple(g.parts(d, 3)), _stored(formula.tables), g)
 
 
 def add_margin(g: Graph, rig: JawRig, d: Value) -> Value:
     """Add the signed distance (n, 1) to the bound [mm] to a graph."""
-    formula = BoundFormula(_flat(rig))
-    tables = {name: np.array(table) for name, table in formula.tables.items()}
-    return formula.margin(triple(g.parts(d, 3)), tables, g)
+    formula = BoundFormula(flat_arrays(rig.arrays))
+    return formula.margin(triple(g.parts(d, 3)), _stored(formula.tables), g)
 
 
 def add_twist(g: Graph, rig: JawRig, motion: RigidMotion[Value], name: str) -> None:
@@ -49,5 +48,5 @@ def images(g: Graph, rig: JawRig, motion: RigidMotion[Value], vectors: Array) ->
     return entries @ matrix + g.constant((rig.arrays["T_rest"] @ vectors)[:3].T.reshape(1, -1))
 
 
-def _flat(rig: JawRig) -> dict[str, list[float]]:
-    return {name: value.ravel().tolist() for name, value in rig.arrays.items()}
+def _stored(tables: dict[str, Rows]) -> dict[str, Array]:
+    return {name: np.array(table) for name, table in tables.items()}

@@ -18,8 +18,8 @@ from jawusd.rig.arrays import read_arrays, read_value
 from jawusd.rig.layout import ONNX_ATTRIBUTES, PARAMETERS
 from jawusd.rig.schema import has_jaw_api
 from jawusd.rig.table import DecoderTable
-from jawusd.rig.untrusted import blames_file, check_reach
-from jawusd.rig.versions import bring_up_to_date
+from jawusd.rig.untrusted import check_reach, raises_format_error
+from jawusd.rig.versions import upgrade_rig
 
 PathArg = str | os.PathLike[str]
 
@@ -80,14 +80,14 @@ def find_rig_prim(stage: Usd.Stage, where: object, prim_path: str | None = None)
     return prims[0]
 
 
-@blames_file(1)
+@raises_format_error(1)
 def rig_of(prim: Usd.Prim, where: object) -> JawRig:
     """Build the evaluator from a rig prim.
 
     Raises:
         FormatError: A header that is not JSON or names another kind of model; else as `load_rig`.
     """
-    bring_up_to_date(prim, where)
+    upgrade_rig(prim, where)
     check_units(prim, where)
     kind = str(read_value(prim, "jaw:model:kind", where))
     arrays = read_arrays(prim, kind, where)
@@ -117,7 +117,7 @@ def check_units(prim: Usd.Prim, where: object) -> None:
             raise UnitsError(f"{name} is {found}, allowed is {wanted}.", path=str(where))
 
 
-@blames_file(1)
+@raises_format_error(1)
 def read_table(prim: Usd.Prim, where: object) -> DecoderTable:
     """Read the sampled decoder of a rig prim.
 
@@ -125,7 +125,7 @@ def read_table(prim: Usd.Prim, where: object) -> DecoderTable:
         FormatError: Values are missing, or do not match one another.
         VersionError: Written by a newer version.
     """
-    bring_up_to_date(prim, where)
+    upgrade_rig(prim, where)
     stored_as = str(read_value(prim, "jaw:decoder:format", where))
     d1, d2, d3 = (_numbers(prim, f"jaw:decoder:d{i}Knots", where) for i in (1, 2, 3))
     axes, counts = (d1, d2, d3), [len(d1), len(d2), len(d3)]
@@ -177,7 +177,7 @@ class Description(TypedDict):
     errors: object
 
 
-@blames_file(0)
+@raises_format_error(0)
 def describe(path: PathArg, prim_path: str | None = None) -> Description:
     """Return what a rig file holds, for `jawusd info`; arguments and errors as for `load_rig`."""
     stage = open_stage(path)

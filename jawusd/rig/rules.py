@@ -53,7 +53,7 @@ def check_model(prim: Usd.Prim) -> Iterator[Finding]:
 
 
 def check_table(prim: Usd.Prim) -> Iterator[Finding]:
-    """Check that the sampled table is complete, and as near to the exact model as it says."""
+    """Check that the sampled table is complete, and within its stated error of the exact model."""
     try:
         table = read_table(prim, _where(prim))
     except JawusdError as error:
@@ -115,7 +115,7 @@ def check_bounds(prim: Usd.Prim) -> Iterator[Finding]:
 
 
 def check_mandible(prim: Usd.Prim) -> Iterator[Finding]:
-    """Check that the mandible moves by translate (double3) and orient (quatd) alone, and where the model says."""
+    """Check that the mandible moves by translate (double3) and orient (quatd) alone, as the model does."""
     targets = prim.GetRelationship("jaw:mandible").GetTargets() if prim.HasRelationship("jaw:mandible") else []
     if len(targets) != 1:
         yield _finding("error", "Mandible", prim, f"jaw:mandible names {len(targets)} prims, expected 1.")

@@ -25,7 +25,7 @@ _NESTED = re.compile(rb"(?:[(\[{]\s*){500}")
 _OF_A_RIG = ("jaw:formatVersion", "jaw:model", "jaw:bounds", "jaw:decoder")
 
 
-def blames_file(argument: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
+def raises_format_error(argument: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Return a decorator that makes a reader raise FormatError where values of a file have unexpected types.
 
     Args:

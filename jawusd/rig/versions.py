@@ -20,7 +20,7 @@ from jawusd.rig.layout import FORMAT_VERSION
 STEPS: dict[int, Callable[[Usd.Prim], None]] = {}
 
 
-def bring_up_to_date(prim: Usd.Prim, where: object) -> None:
+def upgrade_rig(prim: Usd.Prim, where: object) -> None:
     """Check the version of a rig prim and upgrade an older one.
 
     The new attributes are authored in the session layer of the prim's stage: in memory, stronger than the files, never

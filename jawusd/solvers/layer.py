@@ -97,7 +97,7 @@ class JawLayer(nn.Module):
         return self.from_anatomical @ self.motion(d) @ self.closed
 
     def _images(self, d: Tensor) -> Tensor:
-        """Return where the four vectors that stand for the landmarks go (n, 12), see `evaluator.encoding`."""
+        """Return the images (n, 12) of the four vectors that represent the landmarks, see `evaluator.encoding`."""
         return (self._poses(d) @ self.vectors)[:, :3].reshape(-1, 12)
 
     def _slope_and_curvature(self, d: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor, nn
 
+from jawusd.evaluator.arrays import flat_arrays
 from jawusd.evaluator.formula import MODELS, BoundFormula, RigidMotion
 from jawusd.evaluator.operations import Rows, triple
 from jawusd.geometry.arrays import Array
@@ -120,8 +121,3 @@ def transforms(motion: RigidMotion[Tensor]) -> Tensor:
     columns = torch.cat([x for row, shift in zip(motion.turn, motion.t) for x in (*row, shift)], dim=1)
     change = torch.cat([columns, torch.zeros_like(columns[:, :4])], dim=1).reshape(-1, 4, 4)
     return change + torch.eye(4, dtype=columns.dtype, device=columns.device)
-
-
-def flat_arrays(arrays: Mapping[str, Array]) -> dict[str, list[float]]:
-    """Return the arrays of a rig as the formulas take them: flat, row by row."""
-    return {name: value.ravel().tolist() for name, value in arrays.items()}

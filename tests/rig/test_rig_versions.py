@@ -61,7 +61,7 @@ def test_reading_twice_on_one_stage_upgrades_once(older):
     stage = Usd.Stage.Open(str(older / "actor.usda"))
     prim = stage.GetPrimAtPath("/Actor")
     for _ in range(2):
-        versions.bring_up_to_date(prim, older)
+        versions.upgrade_rig(prim, older)
         assert prim.GetAttribute("jaw:formatVersion").Get() == 2
     np.testing.assert_allclose(prim.GetAttribute("jaw:model:incisor").Get(), example_rig().arrays["incisor"])
 
