@@ -1,4 +1,4 @@
-"""Commands on many actors: library, and retarget, from one rig to another or to somebody who has none."""
+"""Commands on many actors: library, and retarget, from one rig to another or to a person without one."""
 
 from __future__ import annotations
 

@@ -66,6 +66,6 @@ def main() -> None:
         typer.echo("jawusd: stopped; finished stages are kept, continue with --resume.", err=True)
         sys.exit(INTERRUPTED)
     except BrokenPipeError:
-        # The reader of a pipe (head, less) went away: nothing to tell anybody.
+        # The reader of the pipe (head, less) has closed it.
         sys.stderr.close()
         sys.exit(0)

@@ -28,7 +28,7 @@ class AuthoredMotion:
     Attributes:
         frames: frame numbers (F,), increasing.
         d: parameters (F, 3) [mm], NaN in frames without parameters.
-        fps: frames per second, None where the source does not know.
+        fps: frames per second, None where the source does not say.
     """
 
     frames: Array

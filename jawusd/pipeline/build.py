@@ -70,7 +70,7 @@ class BuildOptions:
 
 
 class ReportSummary(TypedDict):
-    """Say where the capture lies seen from the rig, and the report's file, or what is missing to write one."""
+    """Hold the capture's path relative to the rig, and the report's file, or which package it lacks."""
 
     capture: str
     file: NotRequired[str]
@@ -165,7 +165,7 @@ class _Build:
         names = [camera.name for camera in capture.cameras]
         sync = self._stage("sync", self._inputs([], videos, capture.sync.model_dump(), names, capture.fps), self._sync)
         segment = self._segmented(sync.result["offsets"], videos)
-        # Paths stay out: the contents count, not where the capture lies.
+        # Contents are hashed, not paths: a capture may be moved.
         described = capture.model_dump(mode="json", include={"frames", "bootstrap", "anatomy", "calibration_unit_mm"})
         masks = [camera.masks and camera.masks.labels for camera in capture.cameras]
         track = self._stage(
@@ -233,7 +233,7 @@ class _Build:
         path = self.folder / CALIBRATION
         record = self._stage(
             "calibrate",
-            # Without picks, masks tell whether the squares have the size they are said to have.
+            # Without picks, the stated size of the squares is checked with the masks.
             self._inputs(["boards", "teeth", *([] if picks else ["masks", "videos"])], described, picks, names),
             lambda: ([path], calibrate_boards(capture, path, self.progress)),
         )

@@ -124,7 +124,7 @@ class PersonalRig:
 
 
 def personal_rig(landmarks: Path, library: Library, *, closest: bool, name: str, progress: Progress) -> PersonalRig:
-    """Make a rig for somebody without a capture, from landmarks and a library.
+    """Make a rig for a person without a capture, from landmarks and a library.
 
     The motion of the library's persons is carried over to the landmarks and averaged (see `library.personal`), and the
     anchored model is fitted to it. Its header states the error to be expected, from leave-one-out over the library;

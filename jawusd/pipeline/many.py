@@ -1,4 +1,4 @@
-"""Many captures: one build each on worker processes or a Dask cluster, and one table of how they went."""
+"""Many captures: one build each on worker processes or a Dask cluster, and one table of the outcomes."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ from jawusd.pipeline.state import Progress, make_folder
 SUMMARY_JSON, SUMMARY_CSV = "builds.json", "builds.csv"
 BUILT, KEPT, FAILED, STOPPED = "built", "kept", "failed", "stopped"
 
-#: Called with one line of text whenever something has happened.
-Tell = Callable[[str], None]
+#: Called with one line of text about every event.
+Notify = Callable[[str], None]
 
-_TELL_SECONDS = 10.0  # between two lines about one stage of one capture
+_NOTIFY_SECONDS = 10.0  # between two lines about one stage of one capture
 _STOP_SECONDS = 15.0  # that builds have to end by themselves
 CONNECT_SECONDS = 10
 _LOOPBACK = "127.0.0.1"
@@ -79,7 +79,7 @@ class ManyOptions:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Say how the build of one capture went.
+    """Hold the outcome of the build of one capture.
 
     Attributes:
         name: of its folder.
@@ -105,7 +105,7 @@ class Outcome:
     error: str | None = None
 
 
-def build_many(captures: Sequence[ListedCapture], root: Path, options: ManyOptions, tell: Tell) -> list[Outcome]:
+def build_many(captures: Sequence[ListedCapture], root: Path, options: ManyOptions, notify: Notify) -> list[Outcome]:
     """Build the rig of every capture in a folder of its own; one that fails does not stop the rest.
 
     The table of outcomes is written to builds.json and builds.csv, also when the work is interrupted.
@@ -132,9 +132,9 @@ def build_many(captures: Sequence[ListedCapture], root: Path, options: ManyOptio
     with cluster as client:
         check_workers(client, root)
         try:
-            for outcome in _run(client, captures, root, options.build, tell):
+            for outcome in _run(client, captures, root, options.build, notify):
                 found[outcome.name] = outcome
-                tell(f"[{len(found)}/{len(captures)}] {outcome.name}: {outcome.error or outcome.status}")
+                notify(f"[{len(found)}/{len(captures)}] {outcome.name}: {outcome.error or outcome.status}")
         finally:
             outcomes = [found.get(c.name, Outcome(c.name, str(c.path), STOPPED)) for c in captures]
             _write(root, outcomes)
@@ -154,13 +154,13 @@ def outcome_lines(outcomes: Sequence[Outcome]) -> list[str]:
 
 
 def _run(
-    client: Client, captures: Sequence[ListedCapture], root: Path, options: BuildOptions, tell: Tell
+    client: Client, captures: Sequence[ListedCapture], root: Path, options: BuildOptions, notify: Notify
 ) -> Iterator[Outcome]:
     """Yield outcomes as builds end; when the caller is interrupted, end those under way."""
     run = uuid.uuid4().hex
     # A worker that takes over from one that died meets what that one had finished.
     options = options if options.fresh else replace(options, resume=True)
-    with _listening(client, run, tell):
+    with _listening(client, run, notify):
         items = {
             client.submit(_build_one, run, item, str(root / item.name), options, key=f"{run}-{item.name}"): item
             for item in captures
@@ -169,7 +169,7 @@ def _run(
             for future in as_completed(items):
                 yield _outcome(future, items[future])
         except BaseException:
-            tell("stopping; what is finished is kept")
+            notify("stopping; what is finished is kept")
             client.run(_call_off, run, on_error="ignore")
             with contextlib.suppress(TimeoutError):
                 wait(list(items), timeout=_STOP_SECONDS)
@@ -177,9 +177,9 @@ def _run(
 
 
 @contextlib.contextmanager
-def _listening(client: Client, run: str, tell: Tell) -> Iterator[None]:
-    """Pass on what workers tell of a run."""
-    client.subscribe_topic(run, lambda event: tell(event[1]))
+def _listening(client: Client, run: str, notify: Notify) -> Iterator[None]:
+    """Pass on the messages of the workers of a run."""
+    client.subscribe_topic(run, lambda event: notify(event[1]))
     try:
         yield
     finally:
@@ -232,15 +232,15 @@ def _mean_mm(fit: FitSummary, table: str) -> float | None:
 
 def _progress(run: str, name: str) -> Progress:
     """Return a reporter for one build on a worker, which also ends the build of a run that was called off."""
-    worker, told, last = get_worker(), "", 0.0
+    worker, stage_before, last = get_worker(), "", 0.0
 
     def report(stage: str, done: int, total: int) -> None:
-        nonlocal told, last
+        nonlocal stage_before, last
         if run in _called_off:
             raise _CalledOffError
         now = time.monotonic()
-        if stage != told or now - last > _TELL_SECONDS:
-            told, last = stage, now
+        if stage != stage_before or now - last > _NOTIFY_SECONDS:
+            stage_before, last = stage, now
             worker.log_event(run, f"{name}: {stage} {done}/{total}" if total > 1 else f"{name}: {stage}")
 
     return report

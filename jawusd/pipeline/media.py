@@ -86,8 +86,7 @@ def write_overlay(
         offsets: frame offset by camera.
 
     Raises:
-        CaptureError: no camera has a video, or one cannot be decoded.
-        CalibrationError: a video has another shape than its camera's calibration.
+        CaptureError, CalibrationError: see `open_footage`.
         OutputError: the files cannot be written.
     """
     from jawusd.imaging.overlay import save_png, tracking_sheet
@@ -139,8 +138,7 @@ def draw_worst_frames(capture: Capture, offsets: Mapping[str, int], tracks: Trac
         offsets: frame offset by camera.
 
     Raises:
-        CaptureError: no camera has a video, or one cannot be decoded.
-        CalibrationError: a video has another shape than its camera's calibration.
+        CaptureError, CalibrationError: see `open_footage`.
         FormatError: the tracks are of another capture.
     """
     from jawusd.imaging.overlay import encode_jpeg, tracking_sheet
@@ -194,8 +192,7 @@ def write_plates(
         The file pattern of every camera, below the folder.
 
     Raises:
-        CaptureError: no camera has a video, or one cannot be decoded.
-        CalibrationError: a video has another shape than its camera's calibration.
+        CaptureError, CalibrationError: see `open_footage`.
         OutputError: the files cannot be written.
     """
     from jawusd.imaging.plates import PlateWriter

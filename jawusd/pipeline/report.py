@@ -66,7 +66,7 @@ class BuildFacts:
 
     Attributes:
         stages: record of each stage.
-        capture: the capture it was made from, None where it is not at hand.
+        capture: the capture it was made from, None where it is not available.
         why_not: why there is no capture.
     """
 

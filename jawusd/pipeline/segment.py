@@ -177,9 +177,9 @@ class _Segmentation:
             self._new_segmenters(poses)
             with self._opened(start, self._footage.at(start)) as shown:
                 self._write(start, self._tracker.begin(start, poses), shown.segments)
-        self._tell("segment", len(self._journal.entries))
+        self._advance("segment", len(self._journal.entries))
         for step, end in ((1, self._stop), (-1, self._first - 1)):
-            self._go(start, end, step)
+            self._track_to(start, end, step)
         if keyed := self._keyed():
             self._learn_and_repeat(keyed)
         return self._journal.entries
@@ -188,7 +188,7 @@ class _Segmentation:
     def _start(self) -> int:
         return self._capture.bootstrap.frame if self._capture.bootstrap else self._first
 
-    def _tell(self, stage_name: str, done: int) -> None:
+    def _advance(self, stage_name: str, done: int) -> None:
         self._progress(stage_name, done, self._stop - self._first)
 
     @contextlib.contextmanager
@@ -207,8 +207,8 @@ class _Segmentation:
             name: CameraSegmenter(camera, self._meshes, poses, self._config) for name, camera in self._cameras.items()
         }
 
-    def _go(self, start: int, end: int, step: int) -> None:
-        """Go from the frame of the picks to one end of the take, past what was finished before."""
+    def _track_to(self, start: int, end: int, step: int) -> None:
+        """Track from the frame of the picks to one end of the take; frames finished before are skipped."""
         from jawusd.segmentation.state import ColourStates
 
         done = start
@@ -242,7 +242,7 @@ class _Segmentation:
                 self._track_back(start, frame, step, record)
                 follow = None  # its past has changed
             self._write(frame, record, shown.segments)
-            self._tell("segment", len(self._journal.entries))
+            self._advance("segment", len(self._journal.entries))
 
     def _track_back(self, start: int, found: int, step: int, record: FrameRecord) -> None:
         """Track back from a frame where the jaw was found again until it rejoins the forward track; replace the frames.
@@ -286,7 +286,7 @@ class _Segmentation:
         )
 
     def _keyed(self) -> list[int]:
-        """Return the frames for which a person drew and whose poses are known."""
+        """Return the frames with drawn masks or strokes and known poses."""
         drawn = {name: set(self._keys.frames(name)) for name in self._cameras}
         return [
             frame
@@ -319,7 +319,7 @@ class _Segmentation:
             with self._opened(frame, pictures) as shown:
                 record = self._tracker.judge(frame, *self._journal.known(frame))
             self._write(frame, record, shown.segments, again=True)
-            self._tell("segment again", frame + 1 - self._first)
+            self._advance("segment again", frame + 1 - self._first)
 
     def _see(self, frame: int, poses: Array, turn: int) -> list[View]:
         """Segment all cameras' pictures of an open frame and return them as the tracker's views."""

@@ -55,7 +55,7 @@ class CameraEntry(TypedDict):
 
 
 class TrackEntry(TypedDict):
-    """Hold the fields of `FrameSummary` that tell a good frame from a bad one."""
+    """Hold the fields of `FrameSummary` that show how well a frame was tracked."""
 
     used: list[list[bool]]
     coverage: list[Pair]
