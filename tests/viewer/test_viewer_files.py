@@ -30,12 +30,12 @@ def test_an_actor_brings_its_meshes_with_teeth_and_gum_apart(folder):
 def test_gum_is_where_the_paint_is_grey(folder):
     from example_rig import example_meshes
 
-    from jawusd.rig.geo import gum_faces
+    from jawusd.formats.mesh import crown_face_mask
 
     gum = read_gum(folder / "geo.usdc")
     assert set(gum) == {"upper_teeth", "lower_teeth"}
     for name, faces in gum.items():
-        np.testing.assert_array_equal(faces, gum_faces(example_meshes()[name]))
+        np.testing.assert_array_equal(faces, ~crown_face_mask(example_meshes()[name]))
 
 
 def test_a_part_of_a_mesh_has_only_the_vertices_it_uses():
