@@ -34,7 +34,6 @@ def make_file(usd: str, blend: str) -> None:
 
     Args:
         usd: Any file that holds one rig and its meshes, `actor.usda`, an animation of it or `actor.usdz`.
-        blend: The file to write.
 
     Raises:
         jawusd_reader.ReaderError: There is not exactly one rig, or it has no mandible.

@@ -53,7 +53,6 @@ def write_animation(
         frames: Increasing frame numbers (F,), whole or not; keys or every frame.
         d: Parameters (F, 3) [mm]; rows with NaN are lost frames, bridged linearly and listed in the layer's
             `customLayerData["lostFrames"]`.
-        fps: Frames per second.
         rig: The evaluator; read from `actor` if None.
 
     Raises:
@@ -97,7 +96,6 @@ def bake_times(rig: JawRig, frames: Array, d: Array, span: Array) -> tuple[Array
     farther than 0.02 mm from the model.
 
     Args:
-        rig: The model.
         frames: Times of the samples of d, increasing, shape (F,).
         d: Their values [mm], shape (F, 3).
         span: First and last time to cover.
@@ -178,11 +176,9 @@ def write_splines(
     before 25.05 ignores splines or cannot parse them, and other readers refuse the whole file.
 
     Args:
-        out: File to write.
         animation: The animation layer made from the same keys.
         frames: Key frames (F,), increasing.
         d: Keys (F, 3) [mm].
-        fps: Frames per second.
 
     Raises:
         RigError: The keys do not increase or are not finite.

@@ -44,10 +44,8 @@ def bake_rig(
 
     Args:
         folder: Where the files go; made if missing.
-        rig: The exact model.
         meshes: `upper_teeth` and optionally `skull` in the skull frame, `lower_teeth` and optionally `mandible` in the
             mandible frame [mm].
-        name: Name of the actor.
         fps: Frames per second of the captured motion.
         frames: Captured frame numbers (F,), increasing.
         d: Parameters of the captured frames (F, 3) [mm], NaN where lost.

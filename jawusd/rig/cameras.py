@@ -46,11 +46,9 @@ def write_cameras(
 
     Args:
         out: File to write, `.usda`; the motion goes to `<name>_motion.usdc` beside it.
-        cameras: The calibrated cameras.
         actor: The layer to show, `anim_capture.usdc` or `actor.usda`.
         frames: Frame numbers (F,), increasing.
         T_world_skull: Poses of the skull (F, 4, 4) [mm], NaN where lost.
-        fps: Frames per second.
 
     Returns:
         The motion's file and the take's, in the order written.

@@ -90,11 +90,7 @@ def extent(vertices: Array) -> Array:
 
 
 def check_meshes(meshes: Mapping[str, Mesh]) -> None:
-    """Check the meshes of a rig.
-
-    Raises:
-        RigError: An unknown or missing mesh, or a mesh without faces or with values that are not finite.
-    """
+    """Check the meshes of a rig; raise RigError as `build_geometry` does."""
     unknown = sorted(set(meshes) - set(MESH_PATHS))
     if unknown:
         raise RigError(f"there is no mesh called {unknown[0]!r}; allowed are {', '.join(MESH_PATHS)}.")

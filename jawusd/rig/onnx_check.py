@@ -26,8 +26,6 @@ def onnx_error_mm(path: str | os.PathLike[str], rig: JawRig, d: Array, recorded:
     parameters it finds are compared with them.
 
     Args:
-        path: The graph.
-        rig: The model.
         d: Parameters (n, 3) [mm].
         recorded: SHA-256 of the file that the rig records; any other file is refused unread. None disables the check:
             rigs baked before 0.1.0 record none.

@@ -31,8 +31,6 @@ def add_encoder(g: Graph, rig: JawRig, pose: Value, d: str, residual: str) -> No
     """Add the search to a graph.
 
     Args:
-        g: The graph, of the type of inputs and outputs.
-        rig: The exact model.
         pose: Poses (n, 4, 4).
         d: Name of the output: parameters (n, 3) [mm].
         residual: Name of the output: rms landmark distances (n,) [mm].

@@ -67,7 +67,6 @@ def grid_axes(rig: JawRig, box: Array, points: Array, size: int) -> tuple[Array,
     """Return values of d1, d2 and d3 between which linear interpolation errs least.
 
     Args:
-        rig: The exact model.
         box: Range of each parameter [mm], shape (3, 2).
         points: Mandible points whose motion counts, mandible frame [mm], shape (V, 3).
         size: Number of values per axis.

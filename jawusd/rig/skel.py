@@ -37,9 +37,7 @@ def write_skel(
 
     Args:
         out: File to write, in the folder of `geo.usdc`.
-        rig: The exact model.
         mesh_names: The meshes in `geo.usdc`, names as in `MESH_PATHS`.
-        fps: Frames per second.
         frames: Frame numbers (F,), increasing; without them the jaw stays in the closed bite.
         d: Parameters (F, 3) [mm]; rows with NaN get no key.
 

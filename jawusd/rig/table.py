@@ -64,7 +64,6 @@ def build_table(rig: JawRig, vertices: Array, size: int = DEFAULT_SIZE) -> Decod
     """Sample a rig and measure the table's error.
 
     Args:
-        rig: The exact model.
         vertices: Mandible vertices (V, 3), mandible frame [mm], at which the error is measured.
         size: Values per axis, 17, 33 or 65.
 

@@ -12,6 +12,8 @@ from example_rig import FPS, example_meshes, example_motion, example_rig
 from pxr import Sdf
 from scipy.spatial.transform import Rotation
 
+from jawusd.evaluator.formula import MODELS
+from jawusd.evaluator.schema import KINDS
 from jawusd.formats.model import JawModel, save_model
 from jawusd.plugins import extension, jawusd_reader
 from jawusd.plugins.extension import packed_reader
@@ -43,6 +45,10 @@ def assert_same_jaw(read, rig):
     wanted = rig.arrays["landmarks"] @ np.swapaxes(expected[:, :3, :3], 1, 2) + expected[:, None, :3, 3]
     np.testing.assert_allclose(points, wanted, atol=1e-9)
     np.testing.assert_allclose([read.margin(*row) for row in d.tolist()], rig.margin(d), atol=1e-9)
+
+
+def test_every_kind_of_the_schema_has_a_formula():
+    assert tuple(MODELS) == KINDS
 
 
 def test_model_file_gives_the_evaluators_poses(rig, model_file):
