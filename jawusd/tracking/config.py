@@ -28,7 +28,7 @@ class TrackingConfig:
     sample_step_px: float = 3.0
     # Residual gates per iteration [px]. Narrow at the end: wider ones reach lip and gum edges half a millimetre away.
     wide_gates_px: tuple[float, ...] = (14.0, 10.0, 8.0, 6.0, 4.0, 4.0, 4.0, 4.0, 4.0, 4.0)
-    # Gate to start from when motion is easy to predict [px]; the others are for lively motion and the fallback.
+    # Gate to start from when motion is easy to predict [px]; the others are for fast motion and the fallback.
     first_gate_px: float = 6.0
     # First gate over the recent prediction error [-]: the next one may be larger.
     gate_per_miss: float = 1.5
@@ -52,7 +52,7 @@ class TrackingConfig:
     converged_mm: float = 0.004
     # Motion after which a scan is drawn again for hidden parts [px]: hidden parts are judged to one pixel.
     redraw_px: float = 1.0
-    # Distance a arch may plausibly lie from its prediction [mm]: a weak pull that only matters where masks say nothing.
+    # Plausible distance of an arch from its prediction [mm]: a weak pull, for motions that masks leave free.
     prediction_mm: float = 0.5
     # Outline variance times correlation length behind that pull [px^3]: 0.4 px over 18 px, typical masks by hand.
     typical_noise_px3: float = 3.0
@@ -67,13 +67,13 @@ class TrackingConfig:
     history_frames: int = 31
     # Good frames remembered to judge scores [frames]: closing lips take longer, a lost pose does not.
     score_frames: int = 7
-    # Score below this share of the recent median makes a arch suspect [-]: lips seldom hide as much in a few frames.
+    # Score below this share of the recent median makes an arch suspect [-]: lips seldom hide as much in a few frames.
     suspect_score: float = 0.6
     # Score share below which even closing lips are no excuse [-].
     alarming_score: float = 0.3
-    # Residual spread above this multiple of the recent median makes a arch suspect [-].
+    # Residual spread above this multiple of the recent median makes an arch suspect [-].
     suspect_residual: float = 1.4
-    # Uncovered mask above the recent median by more than this makes a arch, or a mask, suspect [-].
+    # Uncovered mask above the recent median by more than this makes an arch, or a mask, suspect [-].
     suspect_coverage: float = 0.04
     # Residual of one view above this multiple of the arch's recent median makes its mask suspect [-].
     uneven_residual: float = 1.6
@@ -81,22 +81,22 @@ class TrackingConfig:
     dead_score: float = 0.03
     # Price of a mask pixel left uncovered, in px of contour [1/px]: tells wrong minima apart where few edges show.
     uncovered_price: float = 0.5
-    # Gain in objective of the remaining masks, as a share of their score, that proves the one left out wrong [-].
+    # Gain in the objective of the remaining masks, as a share of their score, that proves the one left out wrong [-].
     conflict_gain: float = 0.15
-    # Gain in objective over the first attempt, as a share of the score, that makes a frame count as recovered [-].
+    # Gain in the objective over the first attempt, as a share of the score, that makes a frame count as recovered [-].
     recovery_gain: float = 0.05
     # Rings of the multi-start [mm, rad]: the prediction error of a fast chewing stroke, and of teeth back in sight.
     search_rings: tuple[tuple[float, float], ...] = ((2.0, 0.05), (4.0, 0.12))
-    # Gates of the first look at a start [px], and how many starts are followed to the end.
+    # Gates of the brief trial of every start [px], and how many starts are followed to the end.
     trial_gates_px: tuple[float, ...] = (14.0, 8.0)
     search_finalists: int = 4
-    # Matched contour below which a arch is lost [px]: 8 mm of tooth edge.
+    # Matched contour below which an arch is lost [px]: 8 mm of tooth edge.
     least_matched_px: float = 60.0
     # Residual spread above this multiple of the suspect limit means lost [-]; with a low score the limit itself does.
     lost_residual: float = 1.3
     # Uncovered share of a mask above which the arch is lost [-]: good poses leave about 0.01.
     lost_coverage: float = 0.12
-    # Position uncertainty of the crowns above which a arch is lost [mm].
+    # Position uncertainty of the crowns above which an arch is lost [mm].
     lost_sigma_mm: float = 0.5
     # Matched share of the visible contour the first frame must reach [-]: good ones reach 0.15 with lips nearly closed.
     first_share: float = 0.1
@@ -106,7 +106,7 @@ class TrackingConfig:
     refine_bias_px: float = 0.1
     # Most rounds of that [-]: each leaves a tenth of the delay.
     refine_rounds: int = 2
-    # Shift of contours by wrong camera poses [px] from which those are corrected: below, what looks like it is the
+    # Shift of contours by wrong camera poses [px] from which those are corrected: below, apparent shifts are the
     # habits of whoever drew the masks.
     refine_shift_px: float = 0.15
     # How far calibrated cameras turn and move until the take, standard deviation per axis [rad, mm]: a knock.
@@ -124,6 +124,6 @@ class TrackingConfig:
 
 
 #: For masks that jawusd made. They vary more from frame to frame than drawn ones: outlines get rougher as lips close,
-#: and what looks lost by the rules for drawn masks is not. A pose given up for nothing is a frame without a jaw, and
+#: and what looks lost by the rules for drawn masks is not. A pose given up needlessly is a frame without a jaw, and
 #: while masks are made it leaves the next ones without a guide.
 FOR_AUTO_MASKS = TrackingConfig(suspect_residual=3.0, suspect_score=0.25)

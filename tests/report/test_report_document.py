@@ -14,7 +14,8 @@ from package_copy import ROOT
 from report_data import experiments, report_data
 
 from jawusd.formats.report import Overlay
-from jawusd.report.document import document
+from jawusd.formats.tracks import LostReason
+from jawusd.report.document import _frame_lists, document
 from jawusd.report.replay import replay_data
 
 SECTIONS = (
@@ -54,6 +55,15 @@ def outside(text):
 @pytest.fixture(scope="module")
 def page():
     return document(report_data(lost=(20, 21)))
+
+
+def test_reasons_of_losses_are_listed_with_their_frames():
+    data = report_data(lost=(20, 21))
+    data.tracks.lost_reason[20:22, 1] = LostReason.LOW_SCORE
+    listed = {reason: (count, frames) for reason, count, frames in _frame_lists(data)}
+    first = data.tracks.frames[20]
+    assert listed["lost, lower arch: low score"] == listed["lost by the tracker"] == (2, f"{first}\u2013{first + 1}")
+    assert "lost, lower arch: low score" in document(data)
 
 
 def test_nothing_comes_from_elsewhere(page):

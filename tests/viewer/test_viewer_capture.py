@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from jawusd.cli.main import app
 from jawusd.errors import CaptureError, FormatError
 from jawusd.formats.capture import load_capture
-from jawusd.formats.tracks import LOST, PARTIAL, TRACKED, Tracks, save_tracks
+from jawusd.formats.tracks import LOST, PARTIAL, TRACKED, LostReason, Tracks, save_tracks
 from jawusd.geometry import transform_point, transform_points
 from jawusd.pipeline.view import viewed_capture
 from jawusd.viewer.capture_page import CapturePage
@@ -42,13 +42,15 @@ def write_true_tracks(path, cameras=("cam0", "cam1", "cam2")):
     poses["T_world_lower"][7] = poses["T_upper_lower"][7] = np.nan
     status = np.full((count, 2), TRACKED, np.int8)
     status[7, 1], status[3] = LOST, PARTIAL
+    reason, value, limit = np.zeros((count, 2), np.uint8), np.full((count, 2), np.nan), np.full((count, 2), np.nan)
+    reason[7, 1], value[7, 1], limit[7, 1] = LostReason.LOW_SCORE, 0.31, 0.6
     covariance = np.zeros((count, 6, 6))
     save_tracks(path, Tracks(
         frames=known["frames"][rows], **poses, **{f"raw_{name}": value for name, value in poses.items()}, status=status,
         prior_aided=np.arange(count) == 3, coverage_error=np.full((count, 2, 3), 0.004),
         masks_used=np.ones((count, 2, 3), bool), covariance_upper=covariance, covariance_lower=covariance,
         covariance_relative=covariance, sigma_mm=np.zeros((count, 5)), residual_px=np.zeros((count, 2)),
-        matched_px=np.zeros((count, 2)), camera_names=cameras,
+        matched_px=np.zeros((count, 2)), camera_names=cameras, lost_reason=reason, lost_value=value, lost_limit=limit,
     ))  # fmt: skip
     return path
 
@@ -147,7 +149,8 @@ def test_stepping_jumping_and_looking(page):
     page.press(footage.slider, FIRST + 9)
     assert f"frame {FIRST + 9}" in footage._words.content
     page.press(footage.jumps, "next worse")
-    assert footage.frame == FIRST + 7 and "lower: lost" in footage._words.content  # the lost one comes first
+    assert footage.frame == FIRST + 7  # the lost one comes first
+    assert "lower: lost, matched contour 31% of the usual" in footage._words.content
     page.press(footage.jumps, "next worse")
     assert footage.frame in footage.worst[1:2]
     page.press(footage.jumps, "previous")

@@ -93,14 +93,10 @@ def picked_sigma_mm(
     pose: Array,
     probes: Array,
 ) -> float:
-    """Return how far careless clicks let a arch stray, the rms standard deviation over its crowns [mm].
+    """Return the rms standard deviation of the crowns' position that careless clicks leave [mm].
 
-    Args:
-        picks: the picks behind the pose, without those left out.
-        vertices: vertices of the scan file [mm], shape (V, 3).
-        cameras: calibrated cameras by name.
-        pose: T_world_arch, shape (4, 4).
-        probes: points spread over the crowns, scan coordinates [mm], shape (N, 3).
+    `picks` are those behind the pose T_world_scan, shape (4, 4); `probes` are points spread over the crowns, scan
+    coordinates [mm], shape (N, 3).
     """
     H = np.zeros((6, 6))
     for k, pick in enumerate(picks, start=1):

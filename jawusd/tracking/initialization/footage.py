@@ -1,4 +1,4 @@
-"""The masks of a take before anything is known about the teeth: where they are, and which frames show them well."""
+"""The masks of a take before the teeth are located: where the masks are, and which frames show them well."""
 
 from __future__ import annotations
 

@@ -161,7 +161,7 @@ def _slope(matrix: Array, point: Array) -> Array:
 
 
 def hinge_at_front(crowns: Array, T_anatomical_scan: Array) -> Array:
-    """Return the anatomical frame of a arch, moved to the middle of its front teeth, shape (4, 4).
+    """Return the anatomical frame of an arch, moved to the middle of its front teeth, shape (4, 4).
 
     Args:
         crowns: crown vertices in the scan frame [mm], shape (N, 3).

@@ -27,14 +27,9 @@ _SHARE = 0.005  # of the crown vertices that may be exceptions
 
 
 def check_occlusion(scans: Sequence[Scan], T_anatomical_scan: ArrayLike | None) -> tuple[Array, list[str]]:
-    """Check that both arches lie in one frame, in occlusion.
+    """Check that both arches lie in one frame, in occlusion; return T_anatomical_scan (4, 4) and odd findings.
 
-    Args:
-        scans: upper and lower, prepared.
-        T_anatomical_scan: scan frame to (left, up, front) axes, shape (4, 4), or None to derive it.
-
-    Returns:
-        T_anatomical_scan, shape (4, 4), and what is odd but may be, one sentence each.
+    `T_anatomical_scan` maps the scan frame to (left, up, front) axes; None derives it. Findings are one sentence each.
 
     Raises:
         TrackingError: the arches are far apart, beside one another, or inside one another.
@@ -89,7 +84,7 @@ def check_occlusion(scans: Sequence[Scan], T_anatomical_scan: ArrayLike | None) 
 
 
 def _gum_side(scan: Scan, up: Array) -> float:
-    """Return on which side of its crowns a arch has its gum: 1 towards `up`, -1 away from it, 0 if it has none."""
+    """Return on which side of its crowns an arch has its gum: 1 towards `up`, -1 away from it, 0 if it has none."""
     if not scan.painted or not len(scan.gum_faces):
         return 0.0
     gum, crowns = (scan.vertices[np.unique(faces)].mean(0) for faces in (scan.gum_faces, scan.crown_faces))
@@ -119,7 +114,7 @@ def _overlap_mm(scans: Sequence[Scan]) -> float:
 
 
 def _thin_direction(points: Array) -> Array:
-    """Return the direction in which a arch extends least, shape (3,)."""
+    """Return the direction in which an arch extends least, shape (3,)."""
     return np.linalg.svd(points - points.mean(0), full_matrices=False)[2][2]
 
 

@@ -110,7 +110,7 @@ class StartSearch:
         return self._settled(finalists, views, footage, frame)
 
     def _searched(self, r: int, views: Sequence[View], base: Array, grid: Grid) -> list[Array]:
-        """Return the best poses of a arch that differ from one another."""
+        """Return the best poses of an arch that differ from one another."""
         found = search_arch(self._coarse[r], r, views, _PX_PER_MM, base, self._hinges[r], grid, self._map)
         return self._distinct(found, r)
 
@@ -124,7 +124,7 @@ class StartSearch:
         with footage.views(teeth_centre(self._coarse, pairs[0]), self._config.working_px_per_mm) as masks:
             views = masks.at(frame)
         ends = [self.solver.solve(poses, views, self._config.wide_gates_px) for poses in pairs]
-        objective = [self._worth(self.solver, s, views).sum() for s in ends]
+        objective = [self._objective(self.solver, s, views).sum() for s in ends]
         best = int(np.argmax(objective))
         fit = arch_fit(self.solver.scans, ends[best], views, self._config.uncovered_price)
         return Found(ends[best].poses, float(objective[best]), float(fit.min()))
@@ -149,7 +149,7 @@ class StartSearch:
             for pose in finalists[r]:
                 start = np.stack([finalists[q][0] if q != r else pose for q in ARCHES])
                 end = self._coarse_solver.solve(start, views, self._config.wide_gates_px)
-                ends.append((self._worth(self._coarse_solver, end, views)[r], end.poses[r]))
+                ends.append((self._objective(self._coarse_solver, end, views)[r], end.poses[r]))
             ranked.append(sorted(ends, key=lambda e: -e[0]))
         pairs = [(u[0] + v[0], np.stack([u[1], v[1]])) for u in ranked[0] for v in ranked[1]]
         pairs = [p for p in pairs if self._possible(p[1])]
@@ -162,7 +162,7 @@ class StartSearch:
         gap_mm = np.linalg.norm(fronts[1] - fronts[0])
         return bool(np.linalg.norm(turn) < _WIDEST_JAW_RAD and gap_mm < _FARTHEST_JAW_MM)
 
-    def _worth(self, solver: ContourSolver, solution: Solution, views: Sequence[View]) -> Array:
+    def _objective(self, solver: ContourSolver, solution: Solution, views: Sequence[View]) -> Array:
         """Return the fitting contour less the price of uncovered mask per arch [px], shape (2,)."""
         uncovered, _ = uncovered_px(solver.scans, solution.poses, views)
         # A price per area: the coarse pictures' pixels are larger.
@@ -173,7 +173,7 @@ class StartSearch:
 
 
 def _guessed_axes(places: Array, eyes: Array) -> Array:
-    """Return left, up and front of the teeth in the world as far as the masks tell, shape (3, 3), axes in columns.
+    """Return left, up and front of the teeth in the world as far as the masks show, shape (3, 3), axes in columns.
 
     Args:
         places: middles of the upper and the lower masks [mm], shape (2, 3).

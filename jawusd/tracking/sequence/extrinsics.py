@@ -19,11 +19,11 @@ class Extrinsics:
     """Hold corrections of camera poses.
 
     Camera c sees the world moved by exp(twists[c]) about the pivot: T_cam_world is followed by it on its right side.
-    A motion common to all cameras is a motion of the world, so the twists add up to nothing.
+    A motion common to all cameras is a motion of the world, so the twists sum to zero.
 
     Attributes:
         T_cam_world: the calibrated poses, shape (C, 4, 4).
-        pivot: a point amid the teeth, about which the masks tell most, world coordinates [mm], shape (3,).
+        pivot: a point amid the teeth, where the masks constrain motion best, world coordinates [mm], shape (3,).
         twists: the corrections [rad, mm], shape (C, 6).
         sigma: their standard deviations [rad, mm], shape (C, 6).
     """

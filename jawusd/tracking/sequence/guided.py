@@ -30,7 +30,7 @@ from jawusd.tracking.sequence.history import History, MotionPredictor
 #: expected, shape (2, 4, 4), and the round, 0 for poses that are only predicted.
 See = Callable[[int, Array, int], Sequence[View]]
 
-#: Tells how well a frame's pictures agree with guessed poses, without masks: called with the frame and T_world_upper
+#: Measures how well a frame's pictures agree with guessed poses, without masks: called with the frame and T_world_upper
 #: and T_world_lower, shape (N, 2, 4, 4); returns N numbers, more for better.
 Agreement = Callable[[int, Array], Array]
 
@@ -40,7 +40,7 @@ _SHARES = (0.15, 0.3, 0.6, 1.0)
 # Distance between predicted and found pose of the lower arch [mm] beyond which the earlier poses were wrong:
 # predictions of a jaw that is tracked err by less.
 _WRONG_POSE_MM = 4.0
-_WEAK_SCORE = 0.5  # share of the usual score below which a pose may have been drawn away by its own masks
+_WEAK_SCORE = 0.5  # share of the usual score below which a pose may follow wrong masks made around it
 _FIRST_ROUNDS = 3  # picks are a few tenths of a millimetre off; each round takes most of the rest
 
 

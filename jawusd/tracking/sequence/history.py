@@ -93,7 +93,7 @@ class MotionPredictor:
     def search_is_due(self) -> bool:
         """Tell whether a search from many starts is due: always at first, then ever less often while it fails.
 
-        Frames without masks do not count: teeth that come back are looked for at once.
+        Frames without masks do not count: teeth that come back are searched at once.
         """
         failures = int(self._failures.max())
         return failures & (failures - 1) == 0 or failures % 16 == 0

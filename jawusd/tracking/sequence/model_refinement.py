@@ -157,8 +157,8 @@ def _variances(tracks: Tracks) -> Array:
 def _starts(tracks: Tracks, jaw: JawRig, measured: Mask) -> Array:
     """Return where to start every frame, T_world_upper and T_world_lower, shape (F, 2, 4, 4).
 
-    Where a arch is lost, the other arch and the model between the neighbouring frames tell where it is; where both are,
-    the head moves evenly from the last pose to the next.
+    A lost arch follows from the other one and the model, interpolated between the neighbouring frames; where both are
+    lost, the head moves evenly from the last pose to the next.
     """
     frames = tracks.frames.astype(np.float64)
     d = jaw.interpolate(frames[measured], jaw.encode(tracks.raw_T_upper_lower[measured], inside=True)[0], frames)

@@ -113,7 +113,7 @@ class TakeEquations:
         covariance = np.zeros((size, size))
         covariance[np.ix_(keep, keep)] = np.linalg.inv(S[np.ix_(keep, keep)])
         x = covariance @ self._r
-        # A motion common to all cameras is one of the world, of which the masks tell nothing.
+        # A motion common to all cameras is one of the world, which the masks cannot show.
         centred = np.eye(6 * C) - np.kron(np.full((C, C), 1 / C), np.eye(6))
         twists = centred @ x[C + 2 :]
         sigma = np.sqrt(np.diag(covariance))

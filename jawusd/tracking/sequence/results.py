@@ -124,7 +124,7 @@ def _covariances(records: list[FrameRecord], correlation: float) -> Array:
 
 
 def _relative(poses: Array) -> Array:
-    """Return T_upper_lower, NaN where a arch is lost, shape (F, 4, 4)."""
+    """Return T_upper_lower, NaN where an arch is lost, shape (F, 4, 4)."""
     out = np.full((len(poses), 4, 4), np.nan)
     both = np.isfinite(poses).all((1, 2, 3))
     out[both] = relative_pose(poses[both, 0], poses[both, 1])
@@ -132,7 +132,7 @@ def _relative(poses: Array) -> Array:
 
 
 def _relative_covariance(poses: Array, covariance: Array) -> Array:
-    """Return the covariance of T_upper_lower's left twist, NaN where a arch is lost, shape (F, 6, 6)."""
+    """Return the covariance of T_upper_lower's left twist, NaN where an arch is lost, shape (F, 6, 6)."""
     out = np.full((len(poses), 6, 6), np.nan)
     both = np.isfinite(poses).all((1, 2, 3))
     out[both] = relative_covariance(poses[both, 0], covariance[both, 0], covariance[both, 1])

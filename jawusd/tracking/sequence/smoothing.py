@@ -15,7 +15,7 @@ _WINDOW = 4
 # Least acceleration variance, as a share of what noise independent from frame to frame would show: part of the outline
 # errors is the same in neighbouring frames and cancels in second differences.
 _FLOOR = 0.5
-_SHORTEST = 5  # frames; shorter runs say nothing about their own smoothness
+_SHORTEST = 5  # frames; shorter runs do not show their process noise
 
 
 def smooth_poses(frames: NDArray[np.int64], poses: Array, covariance: Array, centre: Array) -> Array:

@@ -28,8 +28,8 @@ from jawusd.tracking.sequence.results import assemble, outline_variance
 
 Progress = Callable[[int, int], None]
 
-# Where tracking starts over it learns from so many frames around at most, or a long take with many gaps would cost the
-# square of its length: minutes of film, in which a jaw goes everywhere.
+# Most frames around a restart whose poses and quality the tracker takes over: without a limit, a long take with many
+# gaps would cost the square of its length.
 _NEARBY_FRAMES = 4000
 
 
@@ -197,7 +197,7 @@ class _Take:
             tracker.history.add(record)
 
     def _from(self, frame: int) -> tuple[FrameTracker, MotionPredictor]:
-        """Return a tracker that knows the frames around a tracked one."""
+        """Return a tracker and a predictor that start from the frames around a tracked one."""
         history = History(self._config.history_frames, self._config.score_frames)
         known = sorted(self.records, key=lambda f: -abs(f - frame))[-_NEARBY_FRAMES:]
         for near in known[-self._config.history_frames :]:
@@ -230,7 +230,7 @@ def _corrected_views(
 
 
 def _starts_again(records: Mapping[int, FrameRecord], frame: int) -> list[Array]:
-    """Return the poses from which to align a frame again: where it is; where a arch is lost, from even motion first."""
+    """Return the starts for aligning a frame again: its poses, preceded by interpolated ones if an arch is lost."""
     own = records[frame].solution.poses
     lost = np.flatnonzero(records[frame].status == LOST)
     even = own.copy()
@@ -242,7 +242,7 @@ def _starts_again(records: Mapping[int, FrameRecord], frame: int) -> list[Array]
 
 
 def _gaps(records: Mapping[int, FrameRecord]) -> Iterable[tuple[int, int]]:
-    """Yield runs of frames in which a arch is lost, as first frame and one past the last."""
+    """Yield runs of frames in which an arch is lost, as first frame and one past the last."""
     lost = [frame for frame in sorted(records) if (records[frame].status == LOST).any()]
     runs: list[list[int]] = []
     for frame in lost:
