@@ -1,19 +1,40 @@
 """jawusd: capture in, jaw rig out.
 
-Importing this package loads nothing heavy; `load` brings in OpenUSD when it is called.
+Importing this package loads nothing heavy; what its names need is loaded when they are first used.
 """
 
 from __future__ import annotations
 
+import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from os import PathLike
 
+    from jawusd.errors import JawusdError
     from jawusd.evaluator import JawRig
+    from jawusd.pipeline.build import build
+    from jawusd.pipeline.track import track
 
-__all__ = ["__version__", "load"]
+__all__ = ["JawRig", "JawusdError", "__version__", "build", "load", "track"]
 __version__ = "0.1.0"
+
+_MODULES = {
+    "JawRig": "jawusd.evaluator",
+    "JawusdError": "jawusd.errors",
+    "build": "jawusd.pipeline.build",
+    "track": "jawusd.pipeline.track",
+}
+
+
+def __getattr__(name: str) -> object:
+    if name not in _MODULES:
+        raise AttributeError(f"module 'jawusd' has no attribute {name!r}")
+    return getattr(importlib.import_module(_MODULES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return __all__
 
 
 def load(path: str | PathLike[str], *, fast: bool = False) -> JawRig:
@@ -23,9 +44,6 @@ def load(path: str | PathLike[str], *, fast: bool = False) -> JawRig:
         path: `actor.usda` (or any layer or package that carries the rig), or a `model.npz`.
         fast: Compile the most used functions with numba: the same results to 1e-10, several times faster. Needs
             `pip install 'jawusd[fast]'`; the first use after an installation compiles for about a minute.
-
-    Returns:
-        The evaluator of the rig.
 
     Raises:
         FormatError: the file is not a rig, is incomplete, or was written by a newer version.

@@ -126,7 +126,7 @@ def _validate(rig: JawRig, options: argparse.Namespace) -> int:
     return 0 if verdicts.valid.all() else 1
 
 
-def _print_rows(header: list[str], rows: list[list], *, as_json: bool) -> None:
+def _print_rows(header: list[str], rows: Sequence[Sequence[object]], *, as_json: bool) -> None:
     if as_json:
         print(json.dumps([{name: _plain(value) for name, value in zip(header, row)} for row in rows]))
         return

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import overload
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jawusd.geometry.arrays import Array
+from jawusd.geometry.arrays import Array, Indices
+
+Rows = TypeVar("Rows", Array, Indices)  # rows, or the numbers of rows
 
 CHUNK_ROWS = 2048
 LARGEST = 1e9  # 1,000 km: no jaw, and squares and cubes of it still fit a float
@@ -43,22 +45,22 @@ def as_rows(values: ArrayLike, tail: tuple[int, ...], name: str) -> tuple[Array,
     return usable_rows(rows), batch
 
 
-@overload
-def in_chunks(function: Callable[..., Array], *rows: Array) -> Array: ...
-@overload
-def in_chunks(function: Callable[..., tuple[Array, Array]], *rows: Array) -> tuple[Array, Array]: ...
-def in_chunks(function: Callable[..., Array | tuple[Array, Array]], *rows: Array) -> Array | tuple[Array, ...]:
-    """Return ``function(*rows)``, an array or two, computed in pieces of `CHUNK_ROWS` rows.
+def in_chunks(function: Callable[[Rows], Array], rows: Rows) -> Array:
+    """Return ``function(rows)`` computed in pieces of `CHUNK_ROWS` rows.
 
     Temporary memory stays the same however many rows there are.
     """
-    count = len(rows[0])
-    if count <= CHUNK_ROWS:
-        return function(*rows)
-    parts = [function(*(each[i : i + CHUNK_ROWS] for each in rows)) for i in range(0, count, CHUNK_ROWS)]
-    if isinstance(parts[0], tuple):
-        return tuple(np.concatenate(part) for part in zip(*parts))
-    return np.concatenate([np.asarray(part) for part in parts])
+    if len(rows) <= CHUNK_ROWS:
+        return function(rows)
+    return np.concatenate([function(rows[i : i + CHUNK_ROWS]) for i in range(0, len(rows), CHUNK_ROWS)])
+
+
+def pairs_in_chunks(function: Callable[[Rows], tuple[Array, Array]], rows: Rows) -> tuple[Array, Array]:
+    """Return what `in_chunks` does, of a function that returns two arrays."""
+    if len(rows) <= CHUNK_ROWS:
+        return function(rows)
+    parts = [function(rows[i : i + CHUNK_ROWS]) for i in range(0, len(rows), CHUNK_ROWS)]
+    return np.concatenate([first for first, _ in parts]), np.concatenate([second for _, second in parts])
 
 
 def as_points(points: ArrayLike, name: str) -> Array:

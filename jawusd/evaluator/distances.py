@@ -36,7 +36,7 @@ def handle_vectors(points: Array, weights: ArrayLike | None) -> Array:
     """
     share = np.ones(len(points)) if weights is None else np.asarray(weights, dtype=np.float64)
     if share.shape != (len(points),) or not np.isfinite(share).all() or (share < 0).any() or share.sum() == 0:
-        raise ValueError(f"weights must be {len(points)} numbers >= 0, not all zero, got {weights}")
+        raise ValueError(f"weights must be {len(points)} numbers >= 0, not all zero, got {share.tolist()}")
     return np.column_stack([points, np.ones(len(points))]).T * np.sqrt(share / share.sum())
 
 

@@ -95,11 +95,13 @@ class Gauge:
 
     def displacement(self, d: Array) -> Array:
         """Return the displacement u [mm] of the incisal point, anatomical frame, shape (n, 3), for d (n, 3)."""
-        return np.stack(derivatives.displacement(self.numbers, *d.T, ARRAYS)[0], axis=-1)
+        d1, d2, d3 = d.T
+        return np.stack(derivatives.displacement(self.numbers, d1, d2, d3, ARRAYS)[0], axis=-1)
 
     def displacement_jacobian(self, d: Array) -> tuple[Array, Array]:
         """Return u (n, 3) [mm] and du/dd, shape (n, 3, 3), for d (n, 3) [mm]."""
-        u, (x_1, y_1, y_2, y_3, z_1, z_2) = derivatives.displacement(self.numbers, *d.T, ARRAYS)
+        d1, d2, d3 = d.T
+        u, (x_1, y_1, y_2, y_3, z_1, z_2) = derivatives.displacement(self.numbers, d1, d2, d3, ARRAYS)
         jacobian = np.zeros((len(d), 3, 3))
         jacobian[:, 0, 0], jacobian[:, 0, 1] = x_1, 1.0
         jacobian[:, 1, 0], jacobian[:, 1, 1], jacobian[:, 1, 2] = y_1, y_2, y_3
@@ -114,7 +116,7 @@ class Gauge:
         row goes through `derivatives.inverse`, the same search in floats.
         """
         finite = np.isfinite(u).all(axis=1)
-        if len(u) == 1 and finite[0]:
+        if len(u) == 1 and finite.all():
             x, y, z = u[0].tolist()
             return np.array([derivatives.inverse(self.numbers, (x, y, z), derivatives.FLOATS)])
         d1 = -u[:, 1]

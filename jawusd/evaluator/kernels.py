@@ -10,7 +10,7 @@ from typing import Protocol
 
 import numpy as np
 
-from jawusd.evaluator.batching import in_chunks, usable_rows
+from jawusd.evaluator.batching import in_chunks, pairs_in_chunks, usable_rows
 from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.distances import distance_residual, landmark_vectors
 from jawusd.evaluator.encoding import Encoder
@@ -138,7 +138,7 @@ class NumpyKernels:
 
     def encode(self, T: Array) -> tuple[Array, Array]:
         """Return the d (n, 3) [mm] nearest to poses T_skull_mandible (n, 4, 4), and the residuals (n,) [mm]."""
-        return in_chunks(self._encoder.encode, usable_rows(T))
+        return pairs_in_chunks(self._encoder.encode, usable_rows(T))
 
     def judge_poses(self, T: Array, limits: Limits) -> Verdicts:
         """Return verdicts on poses T_skull_mandible (n, 4, 4)."""

@@ -147,7 +147,8 @@ class AnchoredModel:
         """Return f(u) (n, 3) [rad] and df/du (n, 3, 3) [rad/mm]."""
         q, slopes = spline_input(self.gauge.numbers, self._scales, tuple(u.T), ARRAYS)
         omega, omega_q = self._spline(np.stack(q, axis=1))
-        by_u = gradient_by_u(tuple(np.moveaxis(omega_q, 2, 0)), self._scales, tuple(x[:, None] for x in slopes))
+        by_q = omega_q[:, :, 0], omega_q[:, :, 1], omega_q[:, :, 2]
+        by_u = gradient_by_u(by_q, self._scales, (slopes[0][:, None], slopes[1][:, None]))
         return omega, np.stack(by_u, axis=2)
 
     def _spline(self, q: Array) -> tuple[Array, Array]:
@@ -230,7 +231,8 @@ class AdditiveModel:
 
     def log(self, d: Array) -> Array:
         """Return the twist log M(d), shape (n, 6)."""
-        return sum(curve.value(d[:, i]) for i, curve in enumerate(self.curves))
+        first, second, third = self.curves
+        return first.value(d[:, 0]) + second.value(d[:, 1]) + third.value(d[:, 2])
 
     def log_jacobian(self, d: Array) -> Array:
         """Return d log M / dd, shape (n, 6, 3)."""
@@ -248,7 +250,7 @@ class AdditiveModel:
         u = self.displacement_of(R, t)
         grid = self.start_displacements
         distance = np.einsum("ij,ij->i", grid, grid) - 2.0 * u @ grid.T
-        return np.where(np.isfinite(u).all(axis=1)[:, None], self.starts[np.argmin(distance, axis=1)], np.nan)
+        return np.where(np.isfinite(u).all(axis=1, keepdims=True), self.starts[np.argmin(distance, axis=1)], np.nan)
 
 
 JawModelForm = AnchoredModel | AdditiveModel

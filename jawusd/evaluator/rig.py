@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from jawusd.evaluator import sections
 from jawusd.evaluator.arrays import RigArrays
-from jawusd.evaluator.batching import as_keys, as_points, as_rows, in_chunks, rows_of
+from jawusd.evaluator.batching import as_keys, as_points, as_rows, in_chunks, pairs_in_chunks, rows_of
 from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.distances import carried, handle_vectors, point_velocities
 from jawusd.evaluator.encoding import Encoder, Encoding, whitening_of
@@ -22,7 +23,7 @@ from jawusd.evaluator.polygons import PolygonBound
 from jawusd.evaluator.search import BoundedSearch, IkResult, nearest_distance
 from jawusd.evaluator.sections import Ranges
 from jawusd.evaluator.verdicts import Limits, Verdicts, too_fast
-from jawusd.geometry.arrays import Array
+from jawusd.geometry.arrays import Array, Indices
 from jawusd.geometry.se3 import transform_points
 
 BoundName = Literal["slices", "polygons"]
@@ -142,11 +143,10 @@ class JawRig(RigArrays):
             return self._encode_weighted(T_skull_mandible, covariance, inside)
         rows, batch = rows_of(T_skull_mandible, (4, 4), "T_skull_mandible")
         d, residual_mm = self.kernels.encode(rows)
-        out = np.flatnonzero(self.kernels.margins(d) < 0) if inside else ()
-        if len(out):
+        if inside and (out := np.flatnonzero(self.kernels.margins(d) < 0)).size:
             targets = self._encoder.targets(rows[out])
             d[out] = in_chunks(lambda target: self._search.solve_ik_multistart(self._vectors, target), targets)
-            residual_mm[out] = in_chunks(self._encoder.residual_mm, d[out], rows[out])
+            residual_mm[out] = in_chunks(lambda i: self._encoder.residual_mm(d[i], rows[i]), out)
         return Encoding(d.reshape(*batch, 3), residual_mm.reshape(batch))
 
     def _encode_weighted(self, T_skull_mandible: ArrayLike, covariance: ArrayLike, inside: bool) -> Encoding:
@@ -156,12 +156,12 @@ class JawRig(RigArrays):
         start, _ = self.kernels.encode(rows)
         start[np.isnan(whitening).any(axis=(1, 2))] = np.nan
 
-        def encode(T: Array, whitening: Array, start: Array) -> tuple[Array, Array]:
-            first = self._search.nearest(start) if inside else start
-            d = self._encoder.most_likely(T, whitening, first, self.bound if inside else None)
-            return d, self._encoder.residual_mm(d, T)
+        def encode(i: Indices) -> tuple[Array, Array]:
+            first = self._search.nearest(start[i]) if inside else start[i]
+            d = self._encoder.most_likely(rows[i], whitening[i], first, self.bound if inside else None)
+            return d, self._encoder.residual_mm(d, rows[i])
 
-        d, residual_mm = in_chunks(encode, rows, whitening, start)
+        d, residual_mm = pairs_in_chunks(encode, np.arange(len(rows)))
         return Encoding(d.reshape(*batch, 3), residual_mm.reshape(batch))
 
     def margin(self, d: ArrayLike, *, bound: BoundName = "slices") -> Array:
@@ -310,7 +310,7 @@ class JawRig(RigArrays):
         else:
             given, _ = as_rows(np.broadcast_to(np.asarray(start, float), (*batch, 3)), (3,), "start")
             first = in_chunks(self._search.nearest, given)
-            d = in_chunks(lambda target, d: self._search.solve_ik(vectors, target, d), scaled, first)
+            d = in_chunks(lambda i: self._search.solve_ik(vectors, scaled[i], first[i]), np.arange(len(scaled)))
         left = carried(*self.model.decode(d), vectors) - scaled
         distance_mm = np.sqrt(np.einsum("nij,nij->n", left, left))
         return IkResult(d.reshape(*batch, 3), distance_mm.reshape(batch))
@@ -355,7 +355,7 @@ class JawRig(RigArrays):
         """
         d = np.stack(np.broadcast_arrays(*(np.asarray(x, dtype=np.float64) for x in (d1, d2, d3))), axis=-1)
         rows, batch = as_rows(d, (3,), "d")
-        ends = [in_chunks(lambda d, axis=axis: self.bound.chord(d, axis), rows) for axis in (1, 2)]
+        ends = [pairs_in_chunks(partial(self.bound.chord, axis=axis), rows) for axis in (1, 2)]
         return Ranges(*(end.reshape(batch) for pair in ends for end in pair))
 
     def normalized(self, d: ArrayLike) -> Array:

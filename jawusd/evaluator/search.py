@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jawusd.errors import EvaluatorError
-from jawusd.evaluator.batching import in_chunks
+from jawusd.evaluator.batching import pairs_in_chunks
 from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.kernels import Kernels
 from jawusd.evaluator.models import JawModelForm
@@ -49,7 +49,7 @@ class BoundedSearch:
             raise EvaluatorError(
                 "the bound of this rig leaves no valid jaw parameters.", hint="Fit the model again with a wider margin."
             )
-        return _Scan(points, *in_chunks(self._model.decode, points))
+        return _Scan(points, *pairs_in_chunks(self._model.decode, points))
 
     def nearest(self, d: Array) -> Array:
         """Return the nearest points (n, 3) [mm] inside the bound; d (n, 3) itself where it is inside.

@@ -62,7 +62,8 @@ class SingleAnchored:
 
     def decode_derivative(self, d: Array) -> tuple[Array, Array, Array]:
         """Return R (1, 3, 3), t (1, 3) and S (1, 6, 3) for one row d (1, 3)."""
-        u, (x_1, y_1, y_2, y_3, z_1, z_2) = displacement(self._gauge, *d[0].tolist(), FLOATS)
+        d1, d2, d3 = d[0].tolist()
+        u, (x_1, y_1, y_2, y_3, z_1, z_2) = displacement(self._gauge, d1, d2, d3, FLOATS)
         return self._derivative(u, np.array(((x_1, 1.0, 0.0), (y_1, y_2, y_3), (z_1, z_2, 1.0))))
 
     def motion_derivative_at(self, u: Array) -> tuple[Array, Array, Array]:

@@ -68,12 +68,13 @@ def minimise(
     """
     x = start.copy()
     cost = np.full(len(x), np.nan)
-    rows = np.flatnonzero(np.isfinite(x).all(axis=1))
+    rows: Indices = np.flatnonzero(np.isfinite(x).all(axis=1))
     r, J = residual(x[rows], rows)
     cost[rows] = np.einsum("nm,nm->n", r, r)
     measured = np.isfinite(cost[rows])
     x[rows[~measured]] = np.nan
-    rows, r, J = _picked(measured, rows, r, J)
+    rows = rows[measured]
+    r, J = _picked(measured, r, J)
     damping = np.full(len(rows), START_DAMPING)
     multiplier = np.zeros(len(rows)) if bound is None else _first_multiplier(bound, x[rows], r, J)
     for _ in range(iterations):
@@ -84,10 +85,12 @@ def minimise(
         moving = (np.abs(step) > tolerance_mm).any(axis=1) & (damping < LARGEST_DAMPING)
         if bound is None:
             x[rows] += np.where(moving[:, None], 0.0, step)  # the last step costs nothing and doubles the digits
-        rows, r, J, damping, multiplier, step = _picked(moving, rows, r, J, damping, multiplier, step)
+        rows = rows[moving]
+        r, J, damping, multiplier, step = _picked(moving, r, J, damping, multiplier, step)
         if not rows.size:
             break
-        trial, allowed = x[rows] + step, True
+        trial = x[rows] + step
+        allowed: Mask | bool = True
         if bound is not None:
             trial, allowed = pulled_inside(bound, trial)
         r_trial, J_trial = residual(trial, rows)
@@ -162,12 +165,13 @@ def _bounded_step(bound: Bound, x: Array, r: Array, J: Array, damping: Array, mu
 def pulled_inside(bound: Bound, x: Array) -> tuple[Array, Mask]:
     """Move the points x (n, 3) [mm] down the gradient until just inside, in place; return them and which got there."""
     inside = np.zeros(len(x), dtype=bool)
-    rows = np.arange(len(x))
+    rows: Indices = np.arange(len(x))
     for _ in range(PULL_BACKS):
         distance, normal = bound.signed_distance_gradient(x[rows])
         out = distance > 0
         inside[rows[~out]] = True
-        rows, distance, normal = _picked(out, rows, distance, normal)
+        rows = rows[out]
+        distance, normal = _picked(out, distance, normal)
         if not rows.size:
             break
         squared = np.maximum(np.einsum("ni,ni->n", normal, normal), LEAST_SLOPE)

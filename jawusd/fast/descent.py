@@ -6,8 +6,8 @@ they should go, (3, m) [mm]. In the chart POINT the vectors are not used and the
 
 from __future__ import annotations
 
-from collections import namedtuple
 from math import isfinite, sqrt
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,19 +26,45 @@ from jawusd.evaluator.solver import (
     TOUCHING_MM,
 )
 from jawusd.fast.hull import signed_distance_curvature, signed_distance_gradient
-from jawusd.fast.motion import motion_by_displacement, motion_derivative
+from jawusd.fast.motion import Scratch, motion_by_displacement, motion_derivative
 from jawusd.fast.packing import SIDES
-from jawusd.fast.rigid import device, solve
+from jawusd.fast.rigid import Vector, device, solve
+from jawusd.geometry.arrays import Array
 
 PARAMETERS, DISPLACEMENT, POINT = 0, 1, 2  # charts: x is d, the incisal displacement u, or d compared as it is
 
-Problem = namedtuple("Problem", "chart vectors target")
-Normal = namedtuple("Normal", "A g A_trial g_trial damped step inward trial")
-Edge = namedtuple("Edge", "v gradient curvature")
+
+class Problem(NamedTuple):
+    """A problem, see above."""
+
+    chart: int
+    vectors: Array
+    target: Array
+
+
+class Normal(NamedTuple):
+    """The memory of one search for its equations."""
+
+    A: Array
+    g: Array
+    A_trial: Array
+    g_trial: Array
+    damped: Array
+    step: Array
+    inward: Array
+    trial: Array
+
+
+class Edge(NamedTuple):
+    """The memory of one search for the bound."""
+
+    v: Array
+    gradient: Array
+    curvature: Array
 
 
 @device
-def normal_scratch():
+def normal_scratch() -> Normal:
     """Return the memory of one search for its equations."""
     return Normal(
         np.empty((3, 3)),
@@ -53,13 +79,13 @@ def normal_scratch():
 
 
 @device
-def edge_scratch(bound):
+def edge_scratch(bound: Array) -> Edge:
     """Return the memory of one search for the bound."""
     return Edge(np.empty(int(bound[SIDES])), np.empty(3), np.empty((3, 3)))
 
 
 @device
-def equations(model, problem, x, w, A, g):
+def equations(model: Array, problem: Problem, x: Array, w: Scratch, A: Array, g: Array) -> float:
     """Return the squared residual at x; write the normal equations' A (3, 3) and gradient g (3,)."""
     A[:, :] = 0.0
     g[:] = 0.0
@@ -101,13 +127,13 @@ def equations(model, problem, x, w, A, g):
 
 
 @device
-def _velocity(S, k, y0, y1, y2, h):
+def _velocity(S: Array, k: int, y0: float, y1: float, y2: float, h: float) -> Vector:
     w0, w1, w2 = S[0, k], S[1, k], S[2, k]
     return w1 * y2 - w2 * y1 + h * S[3, k], w2 * y0 - w0 * y2 + h * S[4, k], w0 * y1 - w1 * y0 + h * S[5, k]
 
 
 @device
-def descend(model, problem, x, w, n):
+def descend(model: Array, problem: Problem, x: Array, w: Scratch, n: Normal) -> None:
     """Move x (3,) to the bottom; NaN if the residual is not finite there."""
     cost = equations(model, problem, x, w, n.A, n.g)
     if not isfinite(cost):
@@ -132,7 +158,7 @@ def descend(model, problem, x, w, n):
 
 
 @device
-def descend_inside(model, bound, problem, x, w, n, edge):
+def descend_inside(model: Array, bound: Array, problem: Problem, x: Array, w: Scratch, n: Normal, edge: Edge) -> float:
     """Move x (3,), inside the bound, to the bottom of its valley inside; return the squared residual there."""
     cost = equations(model, problem, x, w, n.A, n.g)
     if not isfinite(cost):
@@ -158,12 +184,12 @@ def descend_inside(model, bound, problem, x, w, n, edge):
 
 
 @device
-def _settled(step):
+def _settled(step: Array) -> bool:
     return max(abs(step[0]), abs(step[1]), abs(step[2])) <= TOLERANCE_MM
 
 
 @device
-def _damp(A, damping, out):
+def _damp(A: Array, damping: float, out: Array) -> None:
     amount = damping * ((A[0, 0] + A[1, 1] + A[2, 2]) / 3.0) + LEAST_STIFFNESS
     out[:] = A
     for i in range(3):
@@ -171,19 +197,19 @@ def _damp(A, damping, out):
 
 
 @device
-def _dot(a, b):
+def _dot(a: Array, b: Array) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @device
-def _first_multiplier(bound, x, g, edge):
+def _first_multiplier(bound: Array, x: Array, g: Array, edge: Edge) -> float:
     found = signed_distance_gradient(bound, x[0], x[1], x[2], edge.v, edge.gradient)
     press = -_dot(edge.gradient, g) / max(_dot(edge.gradient, edge.gradient), LEAST_SLOPE)
     return max(press, 0.0) if found > -TOUCHING_MM else 0.0
 
 
 @device
-def _bounded_step(bound, x, damping, multiplier, n, edge):
+def _bounded_step(bound: Array, x: Array, damping: float, multiplier: float, n: Normal, edge: Edge) -> float:
     """Write the step of the quadratic model under the linearised bound; return the bound's multiplier."""
     found = signed_distance_curvature(bound, x[0], x[1], x[2], edge.v, edge.gradient, edge.curvature)
     for i in range(3):
@@ -203,7 +229,7 @@ def _bounded_step(bound, x, damping, multiplier, n, edge):
 
 
 @device
-def _pulled_back(bound, x, edge):
+def _pulled_back(bound: Array, x: Array, edge: Edge) -> bool:
     """Move x (3,) down the gradient until just inside; tell whether it got there."""
     for _ in range(PULL_BACKS):
         found = signed_distance_gradient(bound, x[0], x[1], x[2], edge.v, edge.gradient)

@@ -12,11 +12,12 @@ from jawusd.evaluator import derivatives
 from jawusd.evaluator.derivatives import gradient_by_u, spline_input
 from jawusd.evaluator.formula import GaugeNumbers
 from jawusd.fast.packing import ARCH, COUNT, CURVES, DROP, FADE, LINEAR, OFFSET, PATH, SCALES, SOFTNESS, SPLINE
-from jawusd.fast.rigid import FLOATS, device
+from jawusd.fast.rigid import FLOATS, Vector, device
+from jawusd.geometry.arrays import Array
 
 
 @device
-def gauge_of(model):
+def gauge_of(model: Array) -> GaugeNumbers:
     """Return the gauge of an anchored model."""
     m = model[PATH:]
     arch, drop = model[ARCH:], model[DROP:]
@@ -34,7 +35,7 @@ def gauge_of(model):
 
 
 @device
-def displacement(model, d1, d2, d3, by_d):
+def displacement(model: Array, d1: float, d2: float, d3: float, by_d: Array) -> Vector:
     """Return u [mm] of d [mm]; write du/dd to by_d (3, 3)."""
     u, (x_1, y_1, y_2, y_3, z_1, z_2) = derivatives.displacement(gauge_of(model), d1, d2, d3, FLOATS)
     by_d[0, 0], by_d[0, 1], by_d[0, 2] = x_1, 1.0, 0.0
@@ -44,19 +45,19 @@ def displacement(model, d1, d2, d3, by_d):
 
 
 @device
-def parameters_at(model, u):
+def parameters_at(model: Array, u: Vector) -> Vector:
     """Return the d [mm] of an incisal displacement u [mm]."""
     return derivatives.inverse(gauge_of(model), u, FLOATS)
 
 
 @device
-def _input(model, u):
+def _input(model: Array, u: Vector) -> tuple[Vector, tuple[float, float]]:
     scales = (model[SCALES], model[SCALES + 1], model[SCALES + 2])
     return spline_input(gauge_of(model), scales, u, FLOATS)
 
 
 @device
-def spline(model, u, work):
+def spline(model: Array, u: Vector, work: Array) -> Vector:
     """Return the rotation vector f(u) [rad] for the incisal displacement u [mm]."""
     count = int(model[COUNT])
     (q0, q1, q2), _ = _input(model, u)
@@ -75,7 +76,7 @@ def spline(model, u, work):
 
 
 @device
-def _with_linear(model, q0, q1, q2, k0, k1, k2):
+def _with_linear(model: Array, q0: float, q1: float, q2: float, k0: float, k1: float, k2: float) -> Vector:
     m, offset = model[LINEAR:], model[OFFSET:]
     return (
         k0 + q0 * m[0] + q1 * m[3] + q2 * m[6] - offset[0],
@@ -85,7 +86,7 @@ def _with_linear(model, q0, q1, q2, k0, k1, k2):
 
 
 @device
-def spline_derivative(model, u, work, by_u):
+def spline_derivative(model: Array, u: Vector, work: Array, by_u: Array) -> Vector:
     """Return f(u) [rad]; write df/du [rad/mm] to by_u (3, 3)."""
     count = int(model[COUNT])
     (q0, q1, q2), slopes = _input(model, u)
@@ -113,7 +114,7 @@ def spline_derivative(model, u, work, by_u):
 
 
 @device
-def interval(knots, count, x):
+def interval(knots: Array, count: int, x: float) -> int:
     """Return how many of the first ``count`` knots are <= x."""
     low, high = 0, count
     while low < high:
@@ -126,7 +127,7 @@ def interval(knots, count, x):
 
 
 @device
-def summed_curves(model, d1, d2, d3, twist, by_d):
+def summed_curves(model: Array, d1: float, d2: float, d3: float, twist: Array, by_d: Array) -> None:
     """Write log M (6,) of an additive model and its derivative (6, 3)."""
     twist[:] = 0.0
     for axis, x in enumerate((d1, d2, d3)):

@@ -9,13 +9,14 @@ from math import exp, log
 
 from jawusd.fast.forms import interval
 from jawusd.fast.packing import HULL, MARGIN, ROUNDING, SIDES
-from jawusd.fast.rigid import device
+from jawusd.fast.rigid import Vector, device
+from jawusd.geometry.arrays import Array
 
 _NEGLIGIBLE = 45.0  # exp(-45) = 3e-20: shares below it change nothing
 
 
 @device
-def _support_piece(bound, d1):
+def _support_piece(bound: Array, d1: float) -> tuple[Array, float, float, float]:
     """Return the curve's piece at d1: its coefficients (4 k,), the distance from its start [mm], both end knots."""
     sides = int(bound[SIDES])
     curve = bound[HULL + 2 * sides :]
@@ -26,7 +27,7 @@ def _support_piece(bound, d1):
 
 
 @device
-def signed_distance(bound, d1, d2, d3, v):
+def signed_distance(bound: Array, d1: float, d2: float, d3: float, v: Array) -> Vector:
     """Return how far outside d lies [mm]; leave the shares of the half-planes in v and return those of both ends."""
     sides, rounding = int(bound[SIDES]), bound[ROUNDING]
     c, s, first, last = _support_piece(bound, d1)
@@ -50,12 +51,12 @@ def signed_distance(bound, d1, d2, d3, v):
 
 
 @device
-def _share(x):
+def _share(x: float) -> float:
     return exp(x) if x > -_NEGLIGIBLE else 0.0
 
 
 @device
-def signed_distance_gradient(bound, d1, d2, d3, v, gradient):
+def signed_distance_gradient(bound: Array, d1: float, d2: float, d3: float, v: Array, gradient: Array) -> float:
     """Return the signed distance [mm]; write its gradient (3,)."""
     out, low, high = signed_distance(bound, d1, d2, d3, v)
     _weigh(bound, d1, low, high, v, gradient)
@@ -63,7 +64,7 @@ def signed_distance_gradient(bound, d1, d2, d3, v, gradient):
 
 
 @device
-def _weigh(bound, d1, low, high, v, gradient):
+def _weigh(bound: Array, d1: float, low: float, high: float, v: Array, gradient: Array) -> None:
     """Write the gradient (3,): the normals of the half-spaces weighted by their shares."""
     sides = int(bound[SIDES])
     c, s, _, _ = _support_piece(bound, d1)
@@ -78,7 +79,9 @@ def _weigh(bound, d1, low, high, v, gradient):
 
 
 @device
-def signed_distance_curvature(bound, d1, d2, d3, v, gradient, curvature):
+def signed_distance_curvature(
+    bound: Array, d1: float, d2: float, d3: float, v: Array, gradient: Array, curvature: Array
+) -> float:
     """Return the signed distance [mm]; write its gradient (3,) and the rounding's part of its Hessian (3, 3) [1/mm]."""
     out, low, high = signed_distance(bound, d1, d2, d3, v)
     _weigh(bound, d1, low, high, v, gradient)
@@ -97,7 +100,7 @@ def signed_distance_curvature(bound, d1, d2, d3, v, gradient, curvature):
 
 
 @device
-def _spread(share, a, b, c, curvature):
+def _spread(share: float, a: float, b: float, c: float, curvature: Array) -> None:
     curvature[0, 0] += share * a * a
     curvature[0, 1] += share * a * b
     curvature[0, 2] += share * a * c

@@ -5,20 +5,31 @@
 
 from __future__ import annotations
 
-from collections import namedtuple
+from typing import NamedTuple
 
 import numpy as np
 
 from jawusd.fast.forms import displacement, spline, spline_derivative, summed_curves
 from jawusd.fast.packing import CLOSED, COUNT, FROM_ANATOMICAL, INCISOR
-from jawusd.fast.rigid import coefficient_slopes, device, inverse_coefficient, move, product, rotate
+from jawusd.fast.rigid import Vector, coefficient_slopes, device, inverse_coefficient, move, product, rotate
+from jawusd.geometry.arrays import Array
 from jawusd.geometry.rodrigues import angle_coefficients, apply_series, cross, dot
 
-Scratch = namedtuple("Scratch", "centres u_d omega_u twist twist_d M S")
+
+class Scratch(NamedTuple):
+    """The memory of one call."""
+
+    centres: Array
+    u_d: Array
+    omega_u: Array
+    twist: Array
+    twist_d: Array
+    M: Array
+    S: Array
 
 
 @device
-def scratch(model):
+def scratch(model: Array) -> Scratch:
     """Return the memory one call works in: never shared, so that threads do not meet."""
     return Scratch(
         np.empty(4 * int(model[COUNT])),
@@ -32,7 +43,7 @@ def scratch(model):
 
 
 @device
-def motion(model, d1, d2, d3, w):
+def motion(model: Array, d1: float, d2: float, d3: float, w: Scratch) -> None:
     """Write M(d) to w.M; of an anchored model also the rotation vector, of an additive one the twist."""
     if model[COUNT] == 0:
         summed_curves(model, d1, d2, d3, w.twist, w.twist_d)
@@ -44,7 +55,7 @@ def motion(model, d1, d2, d3, w):
 
 
 @device
-def _anchor(model, u, w):
+def _anchor(model: Array, u: Vector, w: Scratch) -> None:
     """Write to w.M the motion that rotates by w.twist[:3] and carries the incisal point by u."""
     rotate((w.twist[0], w.twist[1], w.twist[2]), w.M)
     p = (model[INCISOR], model[INCISOR + 1], model[INCISOR + 2])
@@ -53,7 +64,7 @@ def _anchor(model, u, w):
 
 
 @device
-def motion_by_displacement(model, u0, u1, u2, w):
+def motion_by_displacement(model: Array, u0: float, u1: float, u2: float, w: Scratch) -> None:
     """Write the motion of an anchored model that carries the incisal point by u, and S by u, to w.M and w.S."""
     omega = spline_derivative(model, (u0, u1, u2), w.centres, w.omega_u)
     w.twist[0], w.twist[1], w.twist[2] = omega
@@ -69,7 +80,7 @@ def motion_by_displacement(model, u0, u1, u2, w):
 
 
 @device
-def motion_derivative(model, d1, d2, d3, w):
+def motion_derivative(model: Array, d1: float, d2: float, d3: float, w: Scratch) -> None:
     """Write M(d) and its spatial derivative to w.M and w.S; of an additive model also its twist's to w.twist_d."""
     if model[COUNT] == 0:
         summed_curves(model, d1, d2, d3, w.twist, w.twist_d)
@@ -85,7 +96,7 @@ def motion_derivative(model, d1, d2, d3, w):
 
 
 @device
-def _spatial(w):
+def _spatial(w: Scratch) -> None:
     """Write to w.S the spatial derivative of exp(twist) whose twist changes by w.twist_d.
 
     With t = v + b w x v + c w x (w x v) the translation, a change of the twist turns by W = J dw and shifts the
@@ -111,7 +122,7 @@ def _spatial(w):
 
 
 @device
-def logarithm(model, d1, d2, d3, w):
+def logarithm(model: Array, d1: float, d2: float, d3: float, w: Scratch) -> None:
     """Write log M(d) to w.twist."""
     motion(model, d1, d2, d3, w)
     if model[COUNT] != 0:
@@ -122,7 +133,7 @@ def logarithm(model, d1, d2, d3, w):
 
 
 @device
-def logarithm_derivative(model, d1, d2, d3, w):
+def logarithm_derivative(model: Array, d1: float, d2: float, d3: float, w: Scratch) -> None:
     """Write d log M / dd to w.twist_d (6, 3)."""
     motion_derivative(model, d1, d2, d3, w)
     if model[COUNT] == 0:
@@ -147,7 +158,7 @@ def logarithm_derivative(model, d1, d2, d3, w):
 
 
 @device
-def pose(model, d1, d2, d3, w, out):
+def pose(model: Array, d1: float, d2: float, d3: float, w: Scratch, out: Array) -> None:
     """Write T_skull_mandible (4, 4) to out."""
     motion(model, d1, d2, d3, w)
     product(model, FROM_ANATOMICAL, w.M, model, CLOSED, out)

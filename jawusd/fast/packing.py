@@ -7,6 +7,7 @@ comes in one. The names below are places in those arrays; a slice of the model h
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.curves import HermiteCurve
@@ -50,16 +51,9 @@ HULL = 3  # their normals column by column (2, k), then the curve of the support
 
 
 def packed_model(model: JawModelForm, frames: RigFrames, vectors: Array) -> Array:
-    """Return the numbers of a model.
-
-    Args:
-        model: The jaw model.
-        frames: Of its rig.
-        vectors: Homogeneous vectors (4, 4) that stand for the landmarks, anatomical frame [mm].
-    """
-    anchored = isinstance(model, AnchoredModel)
-    both = [
-        [len(model.centres) if anchored else 0],
+    """Return the numbers of a model; see `distances.landmark_vectors` for the vectors (4, 4) [mm]."""
+    both: list[ArrayLike] = [
+        [len(model.centres) if isinstance(model, AnchoredModel) else 0],
         model.incisor,
         frames.T_skull_anatomical,
         frames.T_anatomical_mandible_rest,
@@ -68,16 +62,16 @@ def packed_model(model: JawModelForm, frames: RigFrames, vectors: Array) -> Arra
         frames.adjoint,
         vectors,
     ]
-    return _joined(both + (_anchored(model) if anchored else _additive(model)))
+    return _joined(both + (_anchored(model) if isinstance(model, AnchoredModel) else _additive(model)))
 
 
 def packed_bound(bound: SliceHull) -> Array:
     """Return the numbers of a bound."""
-    head = [[bound.softness_mm, bound.offset_mm, len(bound.directions)], bound.directions.T]
+    head = [np.array([bound.softness_mm, bound.offset_mm, len(bound.directions)]), bound.directions.T]
     return _joined([*head, _curve(bound.supports)])
 
 
-def _anchored(model: AnchoredModel) -> list:
+def _anchored(model: AnchoredModel) -> list[ArrayLike]:
     gauge = model.gauge
     count = len(model.centres)
     return [
@@ -94,7 +88,7 @@ def _anchored(model: AnchoredModel) -> list:
     ]
 
 
-def _additive(model: AdditiveModel) -> list:
+def _additive(model: AdditiveModel) -> list[ArrayLike]:
     curves = [_curve(curve) for curve in model.curves]
     first = GRID + 2 * model.starts.size
     begins = first + np.cumsum([0, len(curves[0]), len(curves[1])])
@@ -105,5 +99,5 @@ def _curve(curve: HermiteCurve) -> Array:
     return _joined([[len(curve.knots)], curve.knots, curve.starts, curve.coefficients])
 
 
-def _joined(parts: list) -> Array:
+def _joined(parts: list[ArrayLike]) -> Array:
     return np.concatenate([np.asarray(part, dtype=np.float64).ravel() for part in parts])

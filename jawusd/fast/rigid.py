@@ -11,11 +11,13 @@ from numba.extending import register_jitable
 from jawusd.evaluator import derivatives
 from jawusd.evaluator.derivatives import Elementary
 from jawusd.geometry import rodrigues
+from jawusd.geometry.arrays import Array
 from jawusd.geometry.rodrigues import angle_coefficients, apply_series, dot, turning
 
+Vector = tuple[float, float, float]
+
 # inlined into the functions of `rows` and `searches`, which are the ones kept on disk
-_OPTIONS = {"nogil": True, "error_model": "numpy"}
-device = numba.njit(**_OPTIONS)
+device = numba.njit(nogil=True, error_model="numpy")
 
 # Plain functions of other modules that compiled code calls. Inlined, or else the functions in an `Elementary` would
 # be addresses in the machine code, which then cannot be kept on disk.
@@ -25,23 +27,23 @@ for _function in (
     *(derivatives.fade, derivatives.displacement, derivatives.opening_equation, derivatives.inverse),
     *(derivatives.spline_input, derivatives.gradient_by_u),
 ):
-    register_jitable(forceinline=True, **_OPTIONS)(_function)
+    register_jitable(forceinline=True, nogil=True, error_model="numpy")(_function)
 
 _SERIES_SQUARED = 0.09  # below, derivatives of the coefficients come from their series; closed forms lose digits
 
 
 @device
-def _sqrt(x):
+def _sqrt(x: float) -> float:
     return math.sqrt(x)
 
 
 @device
-def _exp(x):
+def _exp(x: float) -> float:
     return math.exp(x)
 
 
 @device
-def _clip(x, low, high):
+def _clip(x: float, low: float, high: float) -> float:
     return min(max(x, low), high)
 
 
@@ -49,7 +51,7 @@ FLOATS = Elementary(_sqrt, _exp, _clip)
 
 
 @device
-def coefficient_slopes(squared, a, b, c):
+def coefficient_slopes(squared: float, a: float, b: float, c: float) -> tuple[float, float]:
     """Return the derivatives by a^2 of the second and third of `angle_coefficients`."""
     x = squared
     if x < _SERIES_SQUARED:
@@ -61,7 +63,7 @@ def coefficient_slopes(squared, a, b, c):
 
 
 @device
-def inverse_coefficient(squared):
+def inverse_coefficient(squared: float) -> tuple[float, float]:
     """Return (1 - h cot h)/a^2, h = a/2, of the inverse left Jacobian, and its derivative by a^2."""
     x = squared
     if x < _SERIES_SQUARED:
@@ -76,7 +78,7 @@ def inverse_coefficient(squared):
 
 
 @device
-def rotate(omega, M):
+def rotate(omega: Vector, M: Array) -> None:
     """Write the rotation of a rotation vector [rad] to the first three columns of M (3, 4)."""
     a, b, _ = angle_coefficients(dot(omega, omega))
     rows = turning(omega, a, b)
@@ -86,7 +88,7 @@ def rotate(omega, M):
 
 
 @device
-def move(twist, M):
+def move(twist: Array, M: Array) -> None:
     """Write the rigid motion exp(twist) to M (3, 4)."""
     omega = (twist[0], twist[1], twist[2])
     rotate(omega, M)
@@ -95,7 +97,7 @@ def move(twist, M):
 
 
 @device
-def product(A, first, M, B, second, out):
+def product(A: Array, first: int, M: Array, B: Array, second: int, out: Array) -> None:
     """Write the first three rows of L M Q to out, L (4, 4) in A from ``first`` and Q (4, 4) in B from ``second``."""
     for i in range(3):
         l = A[first + 4 * i :]
@@ -108,7 +110,7 @@ def product(A, first, M, B, second, out):
 
 
 @device
-def solve(A, b, x):
+def solve(A: Array, b: Array, x: Array) -> None:
     """Write the solution of A x = b, A (3, 3) symmetric, by cofactors; finite even where A is singular."""
     a, p, q, c, s, f = A[0, 0], A[0, 1], A[0, 2], A[1, 1], A[1, 2], A[2, 2]
     c00, c01, c02 = c * f - s * s, q * s - p * f, p * s - q * c

@@ -8,8 +8,11 @@ cache has to go (``rm -r jawusd/fast/__pycache__``).
 
 from __future__ import annotations
 
+from functools import partial
+
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from jawusd.evaluator.batching import LARGEST
 from jawusd.fast.descent import Problem, descend_inside, edge_scratch, normal_scratch
@@ -18,21 +21,20 @@ from jawusd.fast.motion import logarithm, logarithm_derivative, pose, scratch
 from jawusd.fast.packing import ADJOINT
 from jawusd.fast.rigid import device
 from jawusd.fast.searches import NOT_FINITE, encode, encoding_scratch, finite, hull_scratch, judge, outside
+from jawusd.geometry.arrays import Array
 
-
-def compiled(signature: str):
-    """Return a decorator that compiles for these argument types and keeps the code on disk."""
-    return numba.njit(signature, nogil=True, cache=True, error_model="numpy")
+# compiles for the given argument types and keeps the code on disk
+compiled = partial(numba.njit, nogil=True, cache=True, error_model="numpy")
 
 
 @device
-def usable(d1, d2, d3):
+def usable(d1: float, d2: float, d3: float) -> bool:
     """Tell whether d can be computed with; others give NaN."""
     return abs(d1) < LARGEST and abs(d2) < LARGEST and abs(d3) < LARGEST
 
 
 @compiled("f8[:,::1](f8[::1], f8, f8, f8)")
-def single_pose(model, d1, d2, d3):
+def single_pose(model: Array, d1: float, d2: float, d3: float) -> Array:
     """Return T_skull_mandible (4, 4) of one d [mm]."""
     out = np.empty((4, 4))
     pose(model, d1, d2, d3, scratch(model), out)
@@ -40,7 +42,7 @@ def single_pose(model, d1, d2, d3):
 
 
 @compiled("void(f8[::1], f8[:,::1], f8[:,:,::1])")
-def poses(model, d, out):
+def poses(model: Array, d: Array, out: Array) -> None:
     """Write the poses (n, 4, 4) of d (n, 3) [mm] to out."""
     w = scratch(model)
     for row in range(len(d)):
@@ -51,7 +53,7 @@ def poses(model, d, out):
 
 
 @compiled("void(f8[::1], f8[:,::1], f8[:,::1])")
-def twists(model, d, out):
+def twists(model: Array, d: Array, out: Array) -> None:
     """Write the twists (n, 6), skull frame, of d (n, 3) [mm] to out."""
     w = scratch(model)
     for row in range(len(d)):
@@ -67,7 +69,7 @@ def twists(model, d, out):
 
 
 @compiled("void(f8[::1], f8[:,::1], f8[:,:,::1])")
-def jacobians(model, d, out):
+def jacobians(model: Array, d: Array, out: Array) -> None:
     """Write the derivatives (n, 6, 3) of the twists by d (n, 3) [mm] to out."""
     w = scratch(model)
     for row in range(len(d)):
@@ -84,13 +86,13 @@ def jacobians(model, d, out):
 
 
 @compiled("f8(f8[::1], f8, f8, f8)")
-def single_margin(bound, d1, d2, d3):
+def single_margin(bound: Array, d1: float, d2: float, d3: float) -> float:
     """Return the margin [mm] of one d [mm]."""
     return -signed_distance(bound, d1, d2, d3, hull_scratch(bound))[0]
 
 
 @compiled("void(f8[::1], f8[:,::1], f8[::1])")
-def margins(bound, d, out):
+def margins(bound: Array, d: Array, out: Array) -> None:
     """Write the margins (n,) [mm] of d (n, 3) [mm] to out."""
     v = hull_scratch(bound)
     for row in range(len(d)):
@@ -100,7 +102,7 @@ def margins(bound, d, out):
 
 
 @compiled("void(f8[::1], f8[:,::1], f8[:,::1])")
-def margin_gradients(bound, d, out):
+def margin_gradients(bound: Array, d: Array, out: Array) -> None:
     """Write the derivatives (n, 3) of the margins by d (n, 3) [mm] to out."""
     v = hull_scratch(bound)
     for row in range(len(d)):
@@ -113,7 +115,7 @@ def margin_gradients(bound, d, out):
 
 
 @compiled("void(f8[::1], f8[:,:,::1], f8[:,::1], f8[::1])")
-def encodings(model, T, d, residual_mm):
+def encodings(model: Array, T: Array, d: Array, residual_mm: Array) -> None:
     """Write the d (n, 3) [mm] nearest to poses T (n, 4, 4), and the residuals (n,) [mm]."""
     e = encoding_scratch(model)
     for row in range(len(T)):
@@ -124,7 +126,17 @@ def encodings(model, T, d, residual_mm):
 
 
 @compiled("void(f8[::1], f8[::1], f8[:,:,::1], f8, f8, f8[:,::1], f8[::1], f8[::1], u1[::1])")
-def judgements(model, bound, T, residual_limit_mm, margin_limit_mm, d, residual_mm, margin_mm, reason):
+def judgements(
+    model: Array,
+    bound: Array,
+    T: Array,
+    residual_limit_mm: float,
+    margin_limit_mm: float,
+    d: Array,
+    residual_mm: Array,
+    margin_mm: Array,
+    reason: NDArray[np.uint8],
+) -> None:
     """Write d (n, 3), residuals and margins (n,) [mm] and reasons (n,) of poses T (n, 4, 4)."""
     e, v = encoding_scratch(model), hull_scratch(bound)
     for row in range(len(T)):
@@ -133,7 +145,9 @@ def judgements(model, bound, T, residual_limit_mm, margin_limit_mm, d, residual_
 
 
 @compiled("void(f8[::1], f8[:,::1], f8, f8[::1], f8[::1], u1[::1])")
-def parameter_judgements(bound, d, margin_limit_mm, residual_mm, margin_mm, reason):
+def parameter_judgements(
+    bound: Array, d: Array, margin_limit_mm: float, residual_mm: Array, margin_mm: Array, reason: NDArray[np.uint8]
+) -> None:
     """Write residuals (0 or NaN), margins (n,) [mm] and reasons (n,) of parameters d (n, 3) [mm]."""
     v = hull_scratch(bound)
     for row in range(len(d)):
@@ -144,7 +158,7 @@ def parameter_judgements(bound, d, margin_limit_mm, residual_mm, margin_mm, reas
 
 
 @compiled("void(f8[::1], f8[::1], i8, f8[:,::1], f8[:,:,::1], f8[:,::1], f8[::1])")
-def descents(model, bound, chart, vectors, targets, x, cost):
+def descents(model: Array, bound: Array, chart: int, vectors: Array, targets: Array, x: Array, cost: Array) -> None:
     """Move x (n, 3) [mm] to the bottoms of their valleys inside the bound; write what is left squared (n,)."""
     w, n, edge = scratch(model), normal_scratch(), edge_scratch(bound)
     for row in range(len(x)):

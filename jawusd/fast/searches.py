@@ -2,34 +2,43 @@
 
 from __future__ import annotations
 
-from collections import namedtuple
 from math import sqrt
+from typing import NamedTuple
 
 import numpy as np
 
 from jawusd.evaluator.batching import LARGEST
 from jawusd.evaluator.verdicts import RIGID_TOLERANCE, ROUNDING_MM, Reason
-from jawusd.fast.descent import DISPLACEMENT, PARAMETERS, Problem, descend, normal_scratch
+from jawusd.fast.descent import DISPLACEMENT, PARAMETERS, Normal, Problem, descend, normal_scratch
 from jawusd.fast.forms import parameters_at
 from jawusd.fast.hull import signed_distance
-from jawusd.fast.motion import motion, scratch
+from jawusd.fast.motion import Scratch, motion, scratch
 from jawusd.fast.packing import COUNT, FROM_CLOSED, GRID, INCISOR, SIDES, STARTS, TO_ANATOMICAL, VECTORS
 from jawusd.fast.rigid import device
+from jawusd.geometry.arrays import Array
 
 NOT_FINITE, _NOT_RIGID = Reason.NOT_FINITE.value, Reason.NOT_RIGID.value
 _OFF_MODEL, _OUTSIDE_BOUNDS = Reason.OFF_MODEL.value, Reason.OUTSIDE_BOUNDS.value
 
-Encoding = namedtuple("Encoding", "w n target x product")
+
+class Encoding(NamedTuple):
+    """The memory of one call that encodes."""
+
+    w: Scratch
+    n: Normal
+    target: Array
+    x: Array
+    product: Array
 
 
 @device
-def encoding_scratch(model):
+def encoding_scratch(model: Array) -> Encoding:
     """Return the memory of one call that encodes."""
     return Encoding(scratch(model), normal_scratch(), np.empty((3, 4)), np.empty(3), np.empty((4, 4)))
 
 
 @device
-def encode(model, T, e):
+def encode(model: Array, T: Array, e: Encoding) -> float:
     """Write to e.x the d [mm] whose pose is nearest to T (4, 4), and return the residual [mm]."""
     vectors = model[VECTORS : VECTORS + 16].reshape(4, 4)
     M = e.w.M
@@ -54,7 +63,7 @@ def encode(model, T, e):
 
 
 @device
-def _measured(model, T, half, M):
+def _measured(model: Array, T: Array, half: Array, M: Array) -> None:
     """Write the first three rows of L^-1 T Q^-1 to M."""
     for i in range(4):
         for k in range(4):
@@ -71,7 +80,7 @@ def _measured(model, T, half, M):
 
 
 @device
-def _read_off(model, x):
+def _read_off(model: Array, x: Array) -> None:
     """Replace the incisal displacement x by the d of the start whose displacement is nearest."""
     count = int(model[STARTS])
     at = model[GRID + 3 * count :]
@@ -86,7 +95,7 @@ def _read_off(model, x):
 
 
 @device
-def _residual_mm(model, vectors, e):
+def _residual_mm(model: Array, vectors: Array, e: Encoding) -> float:
     motion(model, e.x[0], e.x[1], e.x[2], e.w)
     total = 0.0
     for i in range(3):
@@ -99,7 +108,7 @@ def _residual_mm(model, vectors, e):
 
 
 @device
-def finite(T):
+def finite(T: Array) -> bool:
     """Tell whether all of T (4, 4) are numbers a jaw can have."""
     for i in range(4):
         for k in range(4):
@@ -109,7 +118,7 @@ def finite(T):
 
 
 @device
-def rigid(T):
+def rigid(T: Array) -> bool:
     """Tell whether T (4, 4) is rigid to the evaluator's tolerance: `geometry.rigidity_defect`."""
     defect = max(abs(T[3, 0]), abs(T[3, 1]), abs(T[3, 2]), abs(T[3, 3] - 1.0))
     for i in range(3):
@@ -123,7 +132,9 @@ def rigid(T):
 
 
 @device
-def judge(model, bound, T, residual_limit, margin_limit, e, v):
+def judge(
+    model: Array, bound: Array, T: Array, residual_limit: float, margin_limit: float, e: Encoding, v: Array
+) -> tuple[int, float, float]:
     """Return reason, residual and margin [mm] of a pose T (4, 4), its d in e.x: `evaluator.verdicts.judge`."""
     e.x[:] = np.nan
     if not finite(T):
@@ -137,12 +148,12 @@ def judge(model, bound, T, residual_limit, margin_limit, e, v):
 
 
 @device
-def outside(margin, margin_limit):
+def outside(margin: float, margin_limit: float) -> int:
     """Return the reason against a margin [mm], 0 if there is none."""
     return 0 if margin >= margin_limit - ROUNDING_MM else _OUTSIDE_BOUNDS
 
 
 @device
-def hull_scratch(bound):
+def hull_scratch(bound: Array) -> Array:
     """Return the memory of one call for the hull."""
     return np.empty(int(bound[SIDES]))

@@ -10,9 +10,9 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from jawusd.errors import CaptureError, FormatError, UnitsError
-from jawusd.formats.npz import check_format
 from jawusd.formats.text import read_toml
 from jawusd.geometry import rigidity_defect
+from jawusd.npz import check_format
 
 FAMILY, VERSION = "jawusd-capture", 1
 

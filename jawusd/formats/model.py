@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.formats.atomic import write_npz_atomic
-from jawusd.formats.npz import TWIST_ORDER, UNITS, read_npz, take
 from jawusd.geometry.arrays import Array, Mask
+from jawusd.npz import TWIST_ORDER, UNITS, read_npz, take
 
 FAMILY, VERSION = "jawusd-model", 1
 _CAPTURED = ("captured_frames", "captured_d", "captured_residual_mm", "captured_trained")
@@ -66,7 +66,7 @@ def load_model(path: str | os.PathLike[str]) -> JawModel:
     decoder = {name: value for name, value in arrays.items() if name not in _CAPTURED}
     return JawModel(
         arrays=decoder,
-        frames=frames,
+        frames=frames.astype(np.int64),
         d=captured["captured_d"],
         residual_mm=captured["captured_residual_mm"],
         trained=captured["captured_trained"].astype(bool),

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from jawusd.errors import FormatError
 from jawusd.formats.atomic import write_npz_atomic
-from jawusd.formats.npz import TWIST_ORDER, UNITS, read_npz, take
 from jawusd.geometry import LANDMARKS, rigidity_defect
 from jawusd.geometry.arrays import Array, Mask
+from jawusd.npz import TWIST_ORDER, UNITS, read_npz, take
 
 FAMILY, VERSION = "jawusd-tracks", 1
 

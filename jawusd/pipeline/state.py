@@ -14,7 +14,7 @@ from typing import Generic, TypeVar
 
 from jawusd.errors import FormatError, OutputError
 from jawusd.formats.atomic import clear_unfinished, write_text_atomic
-from jawusd.formats.npz import check_format
+from jawusd.npz import check_format
 
 FAMILY, VERSION = "jawusd-build", 1
 BUILD_FILE = "build.json"

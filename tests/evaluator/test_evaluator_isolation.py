@@ -42,7 +42,7 @@ def test_import_loads_nothing_third_party_but_numpy():
     third_party, own = done.stdout.splitlines()
     assert third_party == "numpy"
     layers = {name.split(".")[1] for name in own.split()}
-    assert layers == {"errors", "evaluator", "geometry"}
+    assert layers == {"errors", "evaluator", "geometry", "npz"}
 
 
 def test_the_probe_sees_a_planted_import():
@@ -66,3 +66,20 @@ def test_a_rig_works_where_only_numpy_can_be_imported():
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == "True"
     assert run(NUMPY_ONLY + "import scipy\n").returncode != 0
+
+
+def test_the_package_offers_its_names_and_loads_them_when_used():
+    code = (
+        "import sys, jawusd\n"
+        "print(*dir(jawusd))\n"
+        "print(*sorted(name for name in sys.modules if name.startswith('jawusd.')), 'numpy' in sys.modules)\n"
+        "print(jawusd.JawRig.__name__, jawusd.JawusdError.__name__, 'pxr' in sys.modules)\n"
+    )
+    done = run(code)
+    assert done.stdout.splitlines() == [
+        "JawRig JawusdError __version__ build load track",
+        "False",
+        "JawRig JawusdError False",
+    ], done.stderr
+    assert callable(jawusd.build) and callable(jawusd.track)
+    assert not hasattr(jawusd, "unheard_of")

@@ -1,4 +1,4 @@
-"""Read npz files that hold plain arrays and a JSON string `meta`."""
+"""Read npz files that hold plain arrays and a JSON string `meta`, guarded against damaged and hostile files."""
 
 from __future__ import annotations
 
@@ -8,15 +8,19 @@ import os
 import struct
 import zipfile
 import zlib
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.errors import FormatError, UnitsError, VersionError
+from jawusd.geometry.arrays import Array
 
 UNITS = {"length": "mm", "angle": "rad"}
 TWIST_ORDER = ["omega", "v"]
+
+NamedArrays = dict[str, Array]  # of whatever type the file has; `take` checks those that are used
+JsonObject = dict[str, object]
 
 # Ten times what 20,000 frames take; guards against archives that unpack to fill the memory.
 _MAX_ARRAY_BYTES = 512 << 20
@@ -28,16 +32,12 @@ _DAMAGED = (
 )  # fmt: skip
 
 
-def read_npz(path: str | os.PathLike[str], family: str, version: int) -> tuple[dict[str, NDArray], dict]:
+def read_npz(path: str | os.PathLike[str], family: str, version: int) -> tuple[NamedArrays, JsonObject]:
     """Read the arrays and the meta data of a jawusd npz file and check format, version and units.
 
     Args:
-        path: the file.
-        family: format name without version, e.g. ``"jawusd-tracks"``.
-        version: newest version this reader knows.
-
-    Returns:
-        Arrays by name, and the meta data.
+        family: Format name without version, e.g. ``"jawusd-tracks"``.
+        version: Newest version this reader knows.
 
     Raises:
         FormatError: not such a file, or damaged.
@@ -45,7 +45,7 @@ def read_npz(path: str | os.PathLike[str], family: str, version: int) -> tuple[d
         UnitsError: other units or twist order.
     """
     path = Path(path)
-    arrays: dict[str, NDArray] = {}
+    arrays: NamedArrays = {}
     try:
         with zipfile.ZipFile(path) as archive:
             total = sum(member.file_size for member in archive.infolist())
@@ -76,12 +76,6 @@ def read_npz(path: str | os.PathLike[str], family: str, version: int) -> tuple[d
 def check_format(found: object, family: str, version: int, path: str | os.PathLike[str]) -> int:
     """Check a format label such as ``"jawusd-tracks/1"`` and return its version.
 
-    Args:
-        found: the label as it was read.
-        family: the name wanted, as "jawusd-tracks".
-        version: the newest version known.
-        path: the file, for errors.
-
     Raises:
         FormatError: another format, or no label.
         VersionError: a newer version.
@@ -96,12 +90,8 @@ def check_format(found: object, family: str, version: int, path: str | os.PathLi
     return int(number)
 
 
-def check_units(meta: dict, path: str | os.PathLike[str]) -> None:
+def check_units(meta: Mapping[str, object], path: str | os.PathLike[str]) -> None:
     """Check the units and the twist order written in a file's meta data.
-
-    Args:
-        meta: the file's header.
-        path: the file, for errors.
 
     Raises:
         UnitsError: they differ from mm, rad and (omega, v), or are missing.
@@ -112,17 +102,12 @@ def check_units(meta: dict, path: str | os.PathLike[str]) -> None:
         raise UnitsError(f"twist order is {meta.get('twist_order')}, allowed is {TWIST_ORDER}.", path=path)
 
 
-def take(
-    arrays: dict[str, NDArray], name: str, shape: tuple[int | None, ...], path: object, *, finite: bool = True
-) -> NDArray:
-    """Return one array after checking its shape and finiteness.
+def take(arrays: NamedArrays, name: str, shape: tuple[int | None, ...], path: object, *, finite: bool = True) -> Array:
+    """Return one of the arrays of `read_npz` after checking its shape and finiteness.
 
     Args:
-        arrays: what `read_npz` gave.
-        name: the array.
-        shape: required shape, None where any length goes.
-        path: file name for the message.
-        finite: refuse NaN and infinity.
+        shape: Required shape, None where any length goes.
+        finite: Refuse NaN and infinity.
 
     Raises:
         FormatError: missing, of another shape, or not finite.
