@@ -8,7 +8,7 @@ from example_rig import FPS, assert_valid_usd, example_motion, example_rig
 from pxr import Usd
 
 from jawusd.errors import FormatError, MissingDependencyError, OutputError, RigError
-from jawusd.formats.mesh import Mesh
+from jawusd.formats.mesh import Mesh, crown_face_mask
 from jawusd.formats.tracks import Tracks, save_tracks
 from jawusd.pipeline.view import motion_names, open_viewer, part_of, viewed_actor
 from jawusd.rig.geo import read_geometry, read_gum
@@ -29,8 +29,6 @@ def test_an_actor_brings_its_meshes_with_teeth_and_gum_apart(folder):
 
 def test_gum_is_where_the_paint_is_grey(folder):
     from example_rig import example_meshes
-
-    from jawusd.formats.mesh import crown_face_mask
 
     gum = read_gum(folder / "geo.usdc")
     assert set(gum) == {"upper_teeth", "lower_teeth"}
