@@ -22,14 +22,14 @@ WRONG_TURN_RAD = 0.25
 
 def animators_shot(rig: JawRig) -> tuple[np.ndarray, np.ndarray]:
     """Return frame numbers (F,) and poses (F, 4, 4) of a shot that asks for too much."""
-    d = rig.arrays["codes"][::4] * EXAGGERATED
+    d = rig.captured_d[::4] * EXAGGERATED
     poses = rig.pose(d)
     c, s = np.cos(WRONG_TURN_RAD), np.sin(WRONG_TURN_RAD)
     hinge = np.eye(4)
     hinge[:3, :3] = [[1, 0, 0], [0, c, -s], [0, s, c]]
     hinge[:3, 3] = WRONG_AXIS_MM - hinge[:3, :3] @ WRONG_AXIS_MM
-    A = rig.arrays["T_anatomical_skull"]
-    poses[-1] = np.linalg.inv(A) @ hinge @ A @ rig.arrays["T_rest"]
+    A = rig.T_anatomical_skull
+    poses[-1] = np.linalg.inv(A) @ hinge @ A @ rig.T_rest
     return np.arange(len(poses)), poses
 
 
@@ -52,7 +52,7 @@ def main() -> None:
 
     repaired = np.where(valid[:, None, None], poses, rig.pose(rig.project(verdicts.d)))
     print(f"valid after the repair: {rig.validate(repaired).valid.sum()} of {len(frames)}")
-    incisor = rig.arrays["landmarks"][0]
+    incisor = rig.landmarks[0]
     moved_mm = np.linalg.norm(transform_point(repaired, incisor) - transform_point(poses, incisor), axis=1)
     print(f"farthest move of the incisal point: {moved_mm.max():.1f} mm, in frame {frames[moved_mm.argmax()]}")
     write_poses(options.out, frames, repaired)

@@ -44,7 +44,7 @@ def main() -> None:
 
     stage = Usd.Stage.Open(str(options.out))
     mandible = UsdGeom.Xformable(stage.GetPrimAtPath(MANDIBLE))
-    incisor = np.append(rig.arrays["landmarks"][0], 1.0)
+    incisor = np.append(rig.landmarks[0], 1.0)
     print(f"{options.out}: frames {stage.GetStartTimeCode():g} .. {stage.GetEndTimeCode():g}")
     for label, at in (("at whole frames", times), ("half way between", times[:-1] + 0.5)):
         # USD's matrices act on row vectors: transposed, they are ours.

@@ -86,7 +86,7 @@ def pose(
     T = loaded.pose(d)
     margin = float(loaded.margin(d))
     twist, valid = loaded.twist(d), margin >= float(loaded.arrays["margin_limit_mm"])
-    landmarks = dict(zip(LANDMARKS, transform_points(T, loaded.arrays["landmarks"]), strict=True))
+    landmarks = dict(zip(LANDMARKS, transform_points(T, loaded.landmarks), strict=True))
 
     def lines() -> list[str]:
         rows = [" ".join(f"{value:12.6f}" for value in row) for row in T]

@@ -71,16 +71,16 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _info(rig: JawRig, options: argparse.Namespace) -> int:
-    low, high = rig.arrays["d_range"].T
+    low, high = rig.d_range.T
     facts = {
         "actor": rig.meta.get("actor"),
-        "kind": rig.meta["kind"],
+        "kind": rig.kind,
         "method": rig.meta.get("method"),
         "d_min_mm": low.tolist(),
         "d_max_mm": high.tolist(),
         "residual_limit_mm": rig.limits.residual_mm,
         "margin_limit_mm": rig.limits.margin_mm,
-        "captured_poses": len(rig.arrays["codes"]),
+        "captured_poses": len(rig.captured_d),
     }
     if options.json:
         print(json.dumps(facts))
@@ -95,7 +95,7 @@ def _pose(rig: JawRig, options: argparse.Namespace) -> int:
     T = rig.pose(d)
     margin_mm = float(rig.margin(d))
     if options.json:
-        landmarks = rig.arrays["landmarks"] @ T[:3, :3].T + T[:3, 3]
+        landmarks = rig.landmarks @ T[:3, :3].T + T[:3, 3]
         facts = {
             "d": options.d,
             "T_skull_mandible": T.tolist(),

@@ -57,6 +57,12 @@ class RigArrays:
         return str(self.meta.get("method") or "")
 
     @property
+    def inferred(self) -> tuple[str, ...]:
+        """What the rig holds that was not measured on the person, in words."""
+        found = self.meta.get("inferred")
+        return tuple(str(each) for each in found) if isinstance(found, list | tuple) else ()
+
+    @property
     def T_anatomical_skull(self) -> Array:
         """Skull to anatomical coordinates (x left, y up, z anterior), shape (4, 4)."""
         return self.arrays["T_anatomical_skull"]

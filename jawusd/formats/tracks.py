@@ -65,6 +65,9 @@ class TrackStatus(IntEnum):
 LOST, TRACKED, RECOVERED, PARTIAL = TrackStatus
 
 
+_WHOLE = ("frames", "status", "prior_aided", "masks_used", "lost_reason")
+
+
 class LostReason(IntEnum):
     """Values of `Tracks.lost_reason`: which check made the tracker give an arch up, with the figure it looks at."""
 
@@ -228,8 +231,8 @@ def load_tracks(path: str | os.PathLike[str]) -> Tracks:
     if "masks_used" not in arrays and "coverage_error" in arrays:  # trackers other than ours need not say
         arrays["masks_used"] = np.isfinite(arrays["coverage_error"])
     values = {
-        # NaN is how a lost frame is written, so only the frame numbers must be finite.
-        name: take(arrays, name, shape, path, finite=name == "frames")
+        # NaN is how a lost frame is written, so only whole numbers must be finite.
+        name: take(arrays, name, shape, path, finite=name in _WHOLE)
         for name, shape in _shapes(count, len(names)).items()
         if not name.startswith("lost_") or "lost_reason" in arrays  # older files have none of the three
     }
@@ -244,7 +247,16 @@ def load_tracks(path: str | os.PathLike[str]) -> Tracks:
                 raise FormatError(
                     f'"{name}" of frame {frame} is not rigid (off by {defect.max():.2g}, allowed 1e-6).', path=path
                 )
-    return Tracks(**values, camera_names=tuple(names), meta=cast(TracksMeta, meta))
+    return Tracks(
+        frames=values.pop("frames").astype(np.int64),
+        status=values.pop("status").astype(np.int8),
+        prior_aided=values.pop("prior_aided").astype(bool),
+        masks_used=values.pop("masks_used").astype(bool),
+        lost_reason=values.pop("lost_reason", np.zeros((0, 2))).astype(np.uint8),
+        **values,
+        camera_names=tuple(names),
+        meta=cast(TracksMeta, meta),
+    )
 
 
 def is_tracks(path: str | os.PathLike[str]) -> bool:

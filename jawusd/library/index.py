@@ -164,16 +164,16 @@ def _content(path: Path, root: Path) -> str:
 
 
 def _entry(name: str, content: str, rig: JawRig) -> Entry:
-    landmarks = rig.arrays["landmarks"]
+    landmarks = rig.landmarks
     shown = transform_points(landmark_frame(landmarks), landmarks)
     warnings, errors = rig.meta.get("warnings"), rig.meta.get("errors")
     codes = [w.get("code") for w in warnings if isinstance(w, dict)] if isinstance(warnings, list) else []
     return Entry(
         path=name,
-        actor=str(rig.meta.get("actor") or Path(name).parent.name or "unnamed"),
-        kind=str(rig.meta["kind"]),
+        actor=rig.actor or Path(name).parent.name or "unnamed",
+        kind=rig.kind,
         content=content,
-        ranges_mm={key: row.tolist() for key, row in zip(PARAMETERS, rig.arrays["d_range"], strict=True)},
+        ranges_mm={key: row.tolist() for key, row in zip(PARAMETERS, rig.d_range, strict=True)},
         landmarks_mm={key: row.tolist() for key, row in zip(LANDMARKS, shown, strict=True)},
         condylar_distance_mm=condylar_distance_mm(landmarks),
         condyle_incisor_mm=condyle_incisor_mm(landmarks),

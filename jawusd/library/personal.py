@@ -99,7 +99,7 @@ def leave_one_out(donors: Sequence[Donor], *, closest: bool = False) -> Learned:
     for i, left_out in enumerate(donors):
         others = [*donors[:i], *donors[i + 1 :]]
         shares, rest = _captured_shares(left_out, _POSES_LEFT_OUT), left_out.landmarks
-        own = left_out.rig.arrays["landmarks"]
+        own = left_out.rig.landmarks
         truth = transform_points(left_out.rig.pose(left_out.rig.denormalized(shares)), own)
         moved = np.stack([displacements(donor, rest, shares) for donor in others])
         for found, bandwidth in zip(errors, choices, strict=True):
@@ -129,7 +129,7 @@ def personal_motion(donors: Sequence[Donor], target: Array, learned: Learned) ->
 
 def _captured_shares(donor: Donor, count: int) -> Array:
     """Return about `count` of a person's captured poses, in the order of time, as shares of the ranges."""
-    codes = donor.rig.arrays["codes"]
+    codes = donor.rig.captured_d
     step = -(-len(codes) // max(count, 1))
     return donor.rig.normalized(codes[::step])
 

@@ -27,7 +27,7 @@ class Donor:
     @property
     def landmarks(self) -> Array:
         """The landmarks with the teeth together, skull frame [mm], shape (5, 3), in the order of `LANDMARKS`."""
-        return transform_points(self.rig.arrays["T_rest"], self.rig.arrays["landmarks"])
+        return transform_points(self.rig.T_rest, self.rig.landmarks)
 
 
 def condylar_distance_mm(landmarks: Array) -> float:
@@ -55,7 +55,7 @@ def displacements(donor: Donor, target: Array, shares: Array) -> Array:
     """
     rest = donor.landmarks
     d = donor.rig.denormalized(shares)
-    moved = transform_points(donor.rig.pose(d), donor.rig.arrays["landmarks"]) - rest
+    moved = transform_points(donor.rig.pose(d), donor.rig.landmarks) - rest
     width = condylar_distance_mm(target) / condylar_distance_mm(rest)
     reach = condyle_incisor_mm(target) / condyle_incisor_mm(rest)
     axes = landmark_frame(target)[:3, :3]  # rows: left, up and anterior in the target's frame

@@ -247,7 +247,7 @@ def retarget(source: JawRig, target: JawRig, frames: Array, d: Array) -> Retarge
 
 def _in_time(source: JawRig, target: JawRig, original: Array, carried: Array) -> Array:
     """Return d (F, 3) [mm] near those carried, inside the bound, rising and falling where the original does."""
-    sizes = [np.ptp(rig.arrays["d_range"], axis=1) for rig in (source, target)]
+    sizes = [np.ptp(rig.d_range, axis=1) for rig in (source, target)]
     least = _SLOWEST * sizes[1] / np.maximum(sizes[0], SMALLEST_REACH_MM)
     kept, limit = carried.copy(), float(target.arrays["margin_limit_mm"])
     for _ in range(_ROUNDS):

@@ -28,7 +28,7 @@ def model_hash(rig: JawRig) -> str:
 
 def write_arrays(prim: Sdf.PrimSpec, rig: JawRig, prefixes: tuple[str, ...]) -> None:
     """Write the model arrays whose attribute names start with one of the prefixes."""
-    for name, spec in arrays_of(rig.meta["kind"]).items():
+    for name, spec in arrays_of(rig.kind).items():
         if spec.attribute is None or not spec.attribute.startswith(prefixes):
             continue
         value = rig.arrays[name]

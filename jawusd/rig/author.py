@@ -45,7 +45,7 @@ def interface_layer(rig: JawRig, name: str, meshes: Mapping[str, Mesh], fps: flo
     hint = Sdf.AttributeSpec(actor, "extentsHint", _TYPES.Float3Array, Sdf.VariabilityVarying)
     hint.default = _gf.vec3f_array(reach(rig, meshes))
 
-    for parameter, limits in zip(layout.PARAMETERS, rig.arrays["d_range"], strict=True):
+    for parameter, limits in zip(layout.PARAMETERS, rig.d_range, strict=True):
         set_attribute(actor, parameter, _TYPES.Double, 0.0, animated=True)
         set_attribute(actor, f"{parameter}:range", _TYPES.Double2, _gf.vec2d(limits))
     set_attribute(actor, "jaw:formatVersion", _TYPES.Int, layout.FORMAT_VERSION)
@@ -78,7 +78,7 @@ def decoder_layer(rig: JawRig, table: DecoderTable) -> Sdf.Layer:
     layer = new_layer()
     actor = define_prim(layer, layout.ACTOR, "Xform")
     set_attribute(actor, "jaw:meta", _TYPES.String, json.dumps(rig.meta, sort_keys=True))
-    set_attribute(actor, "jaw:model:kind", _TYPES.Token, rig.meta["kind"])
+    set_attribute(actor, "jaw:model:kind", _TYPES.Token, rig.kind)
     write_arrays(actor, rig, _DECODER_ARRAYS)
     set_attribute(actor, "jaw:decoder:format", _TYPES.Token, table.format)
     set_attribute(actor, "jaw:decoder:shape", _TYPES.IntArray, _gf.int_array([len(axis) for axis in table.axes]))

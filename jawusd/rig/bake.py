@@ -69,7 +69,7 @@ def bake_rig(
     if "mandible" not in meshes:
         grown = grow_placeholder(rig, meshes["lower_teeth"])
         meshes, placeholder = {**meshes, "mandible": grown.mesh}, grown.source
-    geometry = build_geometry(meshes, rig.arrays["T_rest"], placeholder)
+    geometry = build_geometry(meshes, rig.T_rest, placeholder)
     moving = np.concatenate([meshes[key].vertices for key in ("mandible", "lower_teeth")])
     table = build_table(rig, moving, table_size)
     written = [

@@ -36,7 +36,7 @@ def add_encoder(g: Graph, rig: JawRig, pose: Value, d: str, residual: str) -> No
         residual: Name of the output: rms landmark distances (n,) [mm].
     """
     f = Graph(np.float64, "f_")
-    vectors = landmark_vectors(rig.arrays["landmarks"])
+    vectors = landmark_vectors(rig.landmarks)
     flat = f.reshape(f.op("Cast", pose, to=TensorProto.DOUBLE), [-1, 16])
     target = f.op("MatMul", flat, f.constant(_images_of_pose(vectors)), name="target")
     start, cost = _nearest_start(f, rig, vectors, target)

@@ -16,7 +16,7 @@ from jawusd.rig.onnx_graph import Graph, Value
 
 def decode_motion(g: Graph, rig: JawRig, d: Value) -> RigidMotion[Value]:
     """Add the model to a graph: parameters d (n, 3) [mm] to a motion in the anatomical frame."""
-    formula = MODELS[rig.meta["kind"]](flat_arrays(rig.arrays))
+    formula = MODELS[rig.kind](flat_arrays(rig.arrays))
     return formula.motion(triple(g.parts(d, 3)), _stored(formula.tables), g)
 
 
@@ -31,7 +31,7 @@ def add_twist(g: Graph, rig: JawRig, motion: RigidMotion[Value], name: str) -> N
     x = dot(motion.omega, motion.omega)
     a, b, _ = g.angle_coefficients(x)
     v = apply_series(motion.omega, motion.t, -0.5, g.inverse_coefficient(x, a, b))
-    to_skull = se3_adjoint(se3_inverse(rig.arrays["T_anatomical_skull"]))
+    to_skull = se3_adjoint(se3_inverse(rig.T_anatomical_skull))
     g.op("MatMul", g.concat([*motion.omega, *v]), g.constant(to_skull.T), name=name)
 
 
@@ -40,12 +40,12 @@ def images(g: Graph, rig: JawRig, motion: RigidMotion[Value], vectors: Array) ->
 
     Moved by what the motion adds to the closed bite, so that the closed bite itself is exact in any precision.
     """
-    to_skull = se3_inverse(rig.arrays["T_anatomical_skull"])[:3, :3]
-    at_rest = rig.arrays["T_anatomical_skull"] @ rig.arrays["T_rest"] @ vectors
+    to_skull = se3_inverse(rig.T_anatomical_skull)[:3, :3]
+    at_rest = rig.T_anatomical_skull @ rig.T_rest @ vectors
     # entry (i, j) of [turn | t] moves vector k by to_skull[:, i] at_rest[j, k]
     matrix = np.einsum("ci,jk->ijkc", to_skull, at_rest).reshape(12, -1)
     entries = g.concat([x for row, shift in zip(motion.turn, motion.t) for x in (*row, shift)])
-    return entries @ matrix + g.constant((rig.arrays["T_rest"] @ vectors)[:3].T.reshape(1, -1))
+    return entries @ matrix + g.constant((rig.T_rest @ vectors)[:3].T.reshape(1, -1))
 
 
 def _stored(tables: dict[str, Rows]) -> dict[str, Array]:

@@ -106,8 +106,8 @@ def _metadata(rig: JawRig) -> dict[str, str]:
         "length_unit": "mm",
         "angle_unit": "rad",
         "twist_order": "omega v",
-        "kind": rig.meta["kind"],
-        "actor": str(rig.meta.get("actor", "")),
+        "kind": rig.kind,
+        "actor": rig.actor,
         "rig_hash": model_hash(rig),
-        "d_range_mm": json.dumps(rig.arrays["d_range"].tolist()),
+        "d_range_mm": json.dumps(rig.d_range.tolist()),
     }

@@ -60,7 +60,7 @@ class Placeholder:
 
 def grow_placeholder(rig: JawRig, lower_teeth: Mesh) -> Placeholder:
     """Build a placeholder from a rig and the lower scan, mandible frame [mm]."""
-    T_anatomical_mandible = rig.arrays["T_anatomical_skull"] @ rig.arrays["T_rest"]
+    T_anatomical_mandible = rig.T_anatomical_skull @ rig.T_rest
     condyles, source = find_condyles(rig)
     scan = transform_points(T_anatomical_mandible, lower_teeth.vertices)
     vertices, faces = _swept(*_control_sections(scan, transform_points(T_anatomical_mandible, condyles)))
@@ -72,13 +72,13 @@ def find_condyles(rig: JawRig) -> tuple[Array, str]:
 
     The motion gives height and depth of a condyle; its distance from the midline is that of the landmark.
     """
-    landmarks = rig.arrays["landmarks"][_CONDYLES]
-    inferred = [text for text in rig.meta.get("inferred", ()) if text.startswith("condyle")]
+    landmarks = rig.landmarks[_CONDYLES]
+    inferred = [text for text in rig.inferred if text.startswith("condyle")]
     if not any("mean adult places" in text for text in inferred):
         return landmarks, "landmarks of the model"
-    T_anatomical_mandible = rig.arrays["T_anatomical_skull"] @ rig.arrays["T_rest"]
+    T_anatomical_mandible = rig.T_anatomical_skull @ rig.T_rest
     back = se3_inverse(T_anatomical_mandible)
-    poses = rig.arrays["T_anatomical_skull"] @ rig.pose(rig.arrays["codes"]) @ back
+    poses = rig.T_anatomical_skull @ rig.pose(rig.captured_d) @ back
     poses = poses[:: max(1, len(poses) // 400)]
     mean = transform_points(T_anatomical_mandible, landmarks)
     found = [_thinnest(poses, place) for place in mean]

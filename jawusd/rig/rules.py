@@ -63,7 +63,7 @@ def check_table(prim: Usd.Prim) -> Iterator[Finding]:
     if rig is None:
         return
     d = sample_valid(rig, _PROBES)
-    read = table.pose(d, rig.arrays["T_rest"])
+    read = table.pose(d, rig.T_rest)
     error_mm = landmark_distance(rig, read, rig.pose(d)).max()
     if error_mm > table.max_error_mm + _TABLE_SLACK_MM:
         message = f"the table is {error_mm:.3f} mm from the model, maxError says {table.max_error_mm:.3f} mm."

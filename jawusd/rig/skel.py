@@ -59,7 +59,7 @@ def write_skel(
     order = Sdf.AttributeSpec(mandible, "xformOpOrder", Sdf.ValueTypeNames.TokenArray, Sdf.VariabilityUniform)
     order.default = Vt.TokenArray()
     for name in mesh_names:
-        _bind(layer, MESH_PATHS[name], rig.arrays["T_rest"] if _moves(name) else np.eye(4), int(_moves(name)))
+        _bind(layer, MESH_PATHS[name], rig.T_rest if _moves(name) else np.eye(4), int(_moves(name)))
     root.payloadList.prependedItems = [Sdf.Payload(f"./{GEO_FILE}")]
     return write_layer(layer, Path(out))
 
@@ -71,7 +71,7 @@ def _moves(name: str) -> bool:
 def _hinge(rig: JawRig) -> Array:
     """Return the point midway between the condyles in the closed bite, skull coordinates [mm]."""
     condyles = [LANDMARKS.index(name) for name in ("condyle_left", "condyle_right")]
-    return transform_points(rig.arrays["T_rest"], rig.arrays["landmarks"][condyles]).mean(axis=0)
+    return transform_points(rig.T_rest, rig.landmarks[condyles]).mean(axis=0)
 
 
 def _define_skeleton(stage: Usd.Stage, hinge: Array) -> None:
@@ -101,7 +101,7 @@ def _define_motion(
         return None
     frames, d = np.asarray(frames, dtype=np.float64), np.asarray(d, dtype=np.float64)
     known = np.isfinite(d).all(axis=1)
-    moved = rig.pose(d[known]) @ se3_inverse(rig.arrays["T_rest"])
+    moved = rig.pose(d[known]) @ se3_inverse(rig.T_rest)
     joint = make_transform(moved[:, :3, :3], (moved @ hinge)[:, :3, 3])
     for frame, T, rotation in zip(frames[known].tolist(), joint, _gf.quatf_arrays(joint), strict=True):
         translations.Set(_gf.vec3f_array(T[None, :3, 3]), frame)

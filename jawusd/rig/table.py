@@ -76,7 +76,7 @@ def build_table(rig: JawRig, vertices: Array, size: int = DEFAULT_SIZE) -> Decod
     if size not in SIZES:
         raise RigError(f"a table of {size} knots per axis is not offered; allowed are {', '.join(map(str, SIZES))}.")
     axes = grid_axes(rig, valid_box(rig), vertices[extreme_vertices(vertices)], size)
-    if rig.meta["kind"] == ADDITIVE:
+    if rig.kind == ADDITIVE:
         twists = np.concatenate([rig.twist(np.outer(axis, np.eye(3)[i])) for i, axis in enumerate(axes)])
         table = DecoderTable("curves", axes, twists.astype(np.float32))
     else:
@@ -96,7 +96,7 @@ def table_error(rig: JawRig, table: DecoderTable, vertices: Array, d: Array) -> 
     parameters; those are then checked at every vertex.
     """
     exact = rig.pose(d)
-    read = table.pose(d, rig.arrays["T_rest"])
+    read = table.pose(d, rig.T_rest)
     rough = largest_distance(exact, read, vertices[extreme_vertices(vertices)])
     worst = np.argsort(rough)[-_FULL_CHECKS:]
     return float(largest_distance(exact[worst], read[worst], vertices).max())
@@ -104,7 +104,7 @@ def table_error(rig: JawRig, table: DecoderTable, vertices: Array, d: Array) -> 
 
 def landmark_distance(rig: JawRig, T_a: Array, T_b: Array) -> Array:
     """Return the largest distance [mm] of a landmark between two sets of poses (n, 4, 4), shape (n,)."""
-    return np.linalg.norm(transform_points(T_a - T_b, rig.arrays["landmarks"]), axis=-1).max(axis=-1)
+    return np.linalg.norm(transform_points(T_a - T_b, rig.landmarks), axis=-1).max(axis=-1)
 
 
 def largest_distance(T_a: Array, T_b: Array, points: Array) -> Array:

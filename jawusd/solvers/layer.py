@@ -29,13 +29,13 @@ class JawLayer(nn.Module):
     def __init__(self, rig: JawRig) -> None:
         super().__init__()
         self.rig = rig
-        self.motion = Motion(str(rig.meta["kind"]), rig.arrays)
+        self.motion = Motion(rig.kind, rig.arrays)
         self.bound = Margin(rig.arrays)
-        A = rig.arrays["T_anatomical_skull"]
-        closed = A @ rig.arrays["T_rest"]
+        A = rig.T_anatomical_skull
+        closed = A @ rig.T_rest
         self.register_buffer("from_anatomical", torch.tensor(se3_inverse(A)))
         self.register_buffer("closed", torch.tensor(closed))
-        vectors = landmark_vectors(rig.arrays["landmarks"])
+        vectors = landmark_vectors(rig.landmarks)
         self.register_buffer("vectors", torch.tensor(vectors))
 
     def forward(self, d: Tensor) -> Tensor:

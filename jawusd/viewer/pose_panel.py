@@ -96,7 +96,7 @@ class PosePanel:
         """Update sliders, pins and numbers from the session."""
         session = self._session
         limits = session.limits()
-        ends = slider_ends(limits, session.rig.arrays["d_range"], session.keep_valid)
+        ends = slider_ends(limits, session.rig.d_range, session.keep_valid)
         for slider, (low, high), value in zip(self.sliders, ends, session.work.d, strict=True):
             low, high = min(low, _outwards(value, -1)), max(high, _outwards(value, 1))
             if (slider.min, slider.max) != (low, high):

@@ -40,14 +40,14 @@ class Readout:
 
 def landmark_places(rig: JawRig, d: Array) -> Array:
     """Return the landmarks, anatomical frame [mm], shape (..., 5, 3), for d (..., 3) [mm]."""
-    T = rig.arrays["T_anatomical_skull"] @ rig.pose(d)
-    return transform_points(T, rig.arrays["landmarks"])
+    T = rig.T_anatomical_skull @ rig.pose(d)
+    return transform_points(T, rig.landmarks)
 
 
 def rest_places(rig: JawRig) -> Array:
     """Return the landmarks in the closed bite, anatomical frame [mm], shape (5, 3)."""
-    T = rig.arrays["T_anatomical_skull"] @ rig.arrays["T_rest"]
-    return transform_points(T, rig.arrays["landmarks"])
+    T = rig.T_anatomical_skull @ rig.T_rest
+    return transform_points(T, rig.landmarks)
 
 
 def read_out(rig: JawRig, d: Array) -> Readout:
@@ -68,19 +68,19 @@ def triple(values: Array) -> tuple[float, float, float]:
 
 def captured_d(rig: JawRig) -> Array:
     """Return the parameters of the captured poses that a rig holds [mm], shape (N, 3)."""
-    return rig.arrays["codes"]
+    return rig.captured_d
 
 
 def habitual_path(rig: JawRig, samples: int = 60) -> Array:
     """Return the landmarks along plain opening (d2 = d3 = 0), anatomical frame [mm], shape (samples, 5, 3)."""
-    opening = np.linspace(0.0, float(rig.arrays["d_range"][0, 1]), samples)
+    opening = np.linspace(0.0, float(rig.d_range[0, 1]), samples)
     return landmark_places(rig, np.stack([opening, np.zeros(samples), np.zeros(samples)], axis=1))
 
 
 def border_path(rig: JawRig, axis: int, samples: int = 40) -> Array:
     """Return a ring of parameters (n, 3) [mm] on the bound in the plane of d1 and d2 (axis 1) or d3 (axis 2)."""
     # Samples are denser at both ends, where the bound closes.
-    low, high = rig.arrays["d_range"][0]
+    low, high = rig.d_range[0]
     opening = low + (high - low) * 0.5 * (1.0 - np.cos(np.linspace(0.0, np.pi, samples)))
     ends = rig.ranges(opening)
     least, most = ends[2 * (axis - 1)], ends[2 * (axis - 1) + 1]

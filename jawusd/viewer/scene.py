@@ -49,7 +49,7 @@ class JawScene:
         """Draw the skull side and the jaw in the closed bite."""
         self._client, self._scene = client, client.scene
         rig = actor.rig
-        self._T_world_skull = np.array(rig.arrays["T_anatomical_skull"])
+        self._T_world_skull = np.array(rig.T_anatomical_skull)
         self._rest = rest_places(rig)
         self._scene.configure_default_lights(cast_shadow=False)
         # Hemisphere light: an environment map takes half of a frame's time on machines without a graphics card.
@@ -72,7 +72,7 @@ class JawScene:
             self.grips.append(self._add_mesh(f"/jaw/{name}", actor.meshes[name], color, opacity))
         self._mandible = self.grips[moving.index("mandible")] if "mandible" in moving else None
         self._inside = True
-        self._add_landmarks(rig.arrays["landmarks"])
+        self._add_landmarks(rig.landmarks)
         self._paths = self._add_paths(actor)
         self._pins = {name: self._ball(f"/pin/{name}", _PIN_MM, _PIN, opacity=0.6) for name in LANDMARKS}
         self._held = self._ball("/held", _MARKER_MM, _HELD)

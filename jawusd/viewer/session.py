@@ -89,7 +89,7 @@ class Session:
         found = np.array(self.rig.ranges(*d)).reshape(2, 2)
         for other in (alone, d[1:, None]):
             found = np.where(np.isfinite(found).all(axis=1, keepdims=True), found, other)
-        return np.vstack([self.rig.arrays["d_range"][0], found])
+        return np.vstack([self.rig.d_range[0], found])
 
     def set_parameter(self, index: int, value: float) -> None:
         """Set d1, d2 or d3 (index 0 .. 2) [mm], as a slider does; successive moves of one are one step for undo.
@@ -132,7 +132,7 @@ class Session:
             return d
         d = d.copy()
         if index == 0:
-            d[0] = np.clip(d[0], *self.rig.arrays["d_range"][0])
+            d[0] = np.clip(d[0], *self.rig.d_range[0])
             tried = d * np.stack([np.ones_like(_SHARES), _SHARES, _SHARES], axis=1)
             valid = np.flatnonzero(self.rig.margin(tried) >= 0.0)
             return tried[valid[0]] if valid.size else self.rig.project(d)
@@ -178,7 +178,7 @@ class Session:
         """Pin one of `geometry.LANDMARKS` at its place, or unpin it. Pins hold while dragging; sliders move them."""
         pins = tuple(pin for pin in self.work.pins if pin.name != name)
         if on:
-            place = self.rig.arrays["landmarks"][LANDMARKS.index(name)]
+            place = self.rig.landmarks[LANDMARKS.index(name)]
             pins += (Pin(name, triple(place), triple(transform_point(self.pose(), place))),)
         self._change(None, replace(self.work, pins=pins))
 

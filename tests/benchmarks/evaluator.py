@@ -92,8 +92,8 @@ def axis_angle_joint(rotation: np.ndarray, translation: np.ndarray) -> np.ndarra
 
 def sampled(rig: evaluator.JawRig) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray]:
     """Return the arguments of the rig's table: 33 knots [mm] each way, twists, T_rest."""
-    knots = tuple(np.linspace(low, high, 33) for low, high in rig.arrays["d_range"])
-    return knots, rig.twist(np.stack(np.meshgrid(*knots, indexing="ij"), axis=-1)), rig.arrays["T_rest"]
+    knots = tuple(np.linspace(low, high, 33) for low, high in rig.d_range)
+    return knots, rig.twist(np.stack(np.meshgrid(*knots, indexing="ij"), axis=-1)), rig.T_rest
 
 
 def peers(rig: evaluator.JawRig, d: np.ndarray) -> dict[str, Callable[[], object]]:
@@ -113,7 +113,7 @@ def callers(rig: evaluator.JawRig, table: SampledTable | None, d: np.ndarray) ->
     single = len(d) == 1
     T = rig.pose(d)
     x, pose = (d[0], T[0]) if single else (d, T)
-    handles = rig.arrays["landmarks"][:3]
+    handles = rig.landmarks[:3]
     target = transform_points(T, handles) + 0.3
     start, goal = (rig.project(x), target[0]) if single else (rig.project(d), target)
     noisy = se3_exp(np.full(6, [0.003] * 3 + [0.2] * 3)) @ pose
@@ -140,7 +140,7 @@ def timings(rigs: dict[str, evaluator.JawRig]) -> dict[str, dict[int, float]]:
     plain = rigs["numpy"]
     table = SampledTable(*sampled(plain))
     rng = np.random.default_rng(1)
-    inside = plain.project(rng.uniform(*plain.arrays["d_range"].T, (2000, 3)))
+    inside = plain.project(rng.uniform(*plain.d_range.T, (2000, 3)))
     found: dict[str, dict[int, float]] = {}
     for size in SIZES:
         d = np.resize(inside, (size, 3))
@@ -159,9 +159,9 @@ def timings(rigs: dict[str, evaluator.JawRig]) -> dict[str, dict[int, float]]:
 def encoding_error_mm(rig: evaluator.JawRig) -> float:
     """Return by how much residuals of 200 encodings exceed those of scipy's least_squares at worst [mm]."""
     rng = np.random.default_rng(3)
-    d = rig.project(rng.uniform(*rig.arrays["d_range"].T, (200, 3)))
+    d = rig.project(rng.uniform(*rig.d_range.T, (200, 3)))
     T = se3_exp(rng.normal(size=(200, 6)) * ([0.01] * 3 + [0.5] * 3)) @ rig.pose(d)
-    landmarks = rig.arrays["landmarks"]
+    landmarks = rig.landmarks
     found, residual_mm = rig.encode(T)
     excess = []
     for start, pose, left_mm in zip(d, T, residual_mm):
@@ -179,8 +179,8 @@ def drags(rigs: dict[str, evaluator.JawRig]) -> dict[str, tuple[float, float]]:
     """Return the worst excess [mm] of 1,000 drags by about 2 mm over the paper's search, and one's milliseconds."""
     rng = np.random.default_rng(2)
     fast = rigs["fast"]
-    start = fast.project(rng.uniform(*fast.arrays["d_range"].T, (1000, 3)))
-    handles = fast.arrays["landmarks"][:3]
+    start = fast.project(rng.uniform(*fast.d_range.T, (1000, 3)))
+    handles = fast.landmarks[:3]
     targets = transform_points(fast.pose(start), handles) + rng.normal(size=(1000, 1, 3))
     _, brute_mm = brute_force_ik(fast, handles, targets, start)
     found = {}

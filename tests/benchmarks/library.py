@@ -79,7 +79,7 @@ class Captured:
         to_here = B @ to_here
         to_here[:3, 3] = here.mean(0) - to_here[:3, :3] @ there.mean(0)
         back = np.linalg.inv(to_here)
-        rig, rest = other.rig, other.rig.arrays["T_rest"]
+        rig, rest = other.rig, other.rig.T_rest
         at_shares = rig.pose(rig.denormalized(self.shares))
         nearest = rig.pose(rig.encode(back @ self.poses @ to_here @ rest)[0])
         undo = np.linalg.inv(rest)

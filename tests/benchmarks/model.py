@@ -207,7 +207,7 @@ def one_bound(subject: Subject) -> list[float]:
     for axis, opening in SWEEPS:
         d = np.zeros((60, 3))
         d[:, 0] = opening
-        d[:, axis] = np.linspace(*rig.arrays["d_range"][axis], 60)
+        d[:, axis] = np.linspace(*rig.d_range[axis], 60)
         sweep.append(d[rig.margin(d) > 0])
     return [*figures, float(subject.person.is_valid(rig.pose(np.concatenate(sweep))).mean())]
 

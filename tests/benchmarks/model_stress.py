@@ -87,7 +87,7 @@ def one_person(seed: int, envelope: str) -> None:
 
 def inside(rig: JawRig) -> np.ndarray:
     """Return parameters spread over the bounds [mm], shape (n, 3)."""
-    low, high = rig.arrays["d_range"].T
+    low, high = rig.d_range.T
     d = low + (high - low) * np.random.default_rng(6).random((4000, 3))
     return d[rig.margin(d) > 0]
 
@@ -97,7 +97,7 @@ def sweeps(rig: JawRig) -> np.ndarray:
     found = []
     for axis in range(3):
         for opening in SWEPT_OPENINGS_MM if axis else (0.0,):
-            low, high = rig.arrays["d_range"][axis]
+            low, high = rig.d_range[axis]
             d = np.zeros((int((high - low) / STEP_MM) + 1, 3))
             d[:, 0] = opening
             d[:, axis] = np.linspace(low, high, len(d))

@@ -44,7 +44,7 @@ def main() -> None:
     rng = np.random.default_rng(0)
     rows = {
         "captured": captured,
-        "thrown": se3_exp(rng.uniform(-1, 1, (COUNT, 6)) * [0.5, 0.2, 0.2, 15, 30, 20]) @ rig.arrays["T_rest"],
+        "thrown": se3_exp(rng.uniform(-1, 1, (COUNT, 6)) * [0.5, 0.2, 0.2, 15, 30, 20]) @ rig.T_rest,
         "knocked": knocked(rig, captured, rng),
         "mirrored": captured[rng.integers(len(captured), size=COUNT)] * [[-1], [1], [1], [1]],
         "gaping": gaping(rig, rng),
@@ -69,10 +69,10 @@ def knocked(rig: JawRig, captured: np.ndarray, rng: np.random.Generator) -> np.n
     d = rig.encode(chosen)[0]
     out = np.empty_like(chosen)
     for k, T in enumerate(chosen):
-        middle = transform_point(T, rig.arrays["landmarks"][:3].mean(0))
+        middle = transform_point(T, rig.landmarks[:3].mean(0))
         to, back = make_transform(np.eye(3), -middle), make_transform(np.eye(3), middle)
         # Of equal length before and after: what lay along the model is turned away from it.
-        M = mandible_metric(transform_points(to @ T, rig.arrays["landmarks"]))
+        M = mandible_metric(transform_points(to @ T, rig.landmarks))
         J = se3_left_jacobian(rig.twist(d[k])) @ rig.jacobian(d[k])
         J = np.concatenate([J[:3], J[3:] + np.cross(J[:3].T, middle).T])
         along = J @ np.linalg.solve(J.T @ M @ J, J.T @ M @ twist[k])
@@ -84,12 +84,12 @@ def knocked(rig: JawRig, captured: np.ndarray, rng: np.random.Generator) -> np.n
 
 def gaping(rig: JawRig, rng: np.random.Generator) -> np.ndarray:
     """Return the rotation of a wide open jaw about the incisal point of the closed one."""
-    d1 = rng.uniform(0.8, 1.0, COUNT) * rig.arrays["d_range"][0, 1]
+    d1 = rng.uniform(0.8, 1.0, COUNT) * rig.d_range[0, 1]
     low2, high2, low3, high3 = rig.ranges(d1)
     d = np.stack([d1, rng.uniform(low2, high2), rng.uniform(low3, high3)], axis=1)
     T = rig.pose(rig.project(d))
-    incisor = rig.arrays["landmarks"][0]
-    closed = transform_point(rig.arrays["T_rest"], incisor)
+    incisor = rig.landmarks[0]
+    closed = transform_point(rig.T_rest, incisor)
     T[:, :3, 3] += closed - transform_point(T, incisor)
     return T
 

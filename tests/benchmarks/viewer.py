@@ -41,7 +41,7 @@ def drags(page, rng):
     """Return drag events: the pointer wanders by millimetres from the incisal point."""
     session = page.session
     session.set_pose([12.0, 0.0, 0.0])
-    place = transform_point(session.pose(), session.rig.arrays["landmarks"][0])
+    place = transform_point(session.pose(), session.rig.landmarks[0])
     session.grab(place)
     path = place + np.cumsum(rng.normal(0, 0.6, (ROUNDS, 3)), axis=0) * np.exp(-np.arange(ROUNDS) / 300)[:, None]
 
@@ -58,7 +58,7 @@ def drags(page, rng):
 def slides(page, rng):
     """Return slider events: the opening goes up and down, the others wander."""
     session = page.session
-    values = rng.uniform(0, float(session.rig.arrays["d_range"][0, 1]), ROUNDS)
+    values = rng.uniform(0, float(session.rig.d_range[0, 1]), ROUNDS)
 
     def one(index, value):
         session.set_parameter(index, value)

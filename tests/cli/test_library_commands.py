@@ -178,7 +178,7 @@ def face(path, wider_mm=0.0):
 
 def incisor_travel(rig, opening_mm):
     """How far the incisal point has gone [mm] at an opening on the habitual path."""
-    return np.linalg.norm((rig.pose([opening_mm, 0, 0]) - rig.arrays["T_rest"]) @ [*rig.arrays["landmarks"][0], 1.0])
+    return np.linalg.norm((rig.pose([opening_mm, 0, 0]) - rig.T_rest) @ [*rig.landmarks[0], 1.0])
 
 
 def test_a_library_is_listed_searched_and_compared(people, tmp_path):

@@ -39,7 +39,7 @@ def test_pose_prints_what_the_evaluator_says(actor):
     found = json.loads(run("pose", actor, "--d", 12, -3, 1.5, "--json"))
     rig = jawusd.load(actor)
     np.testing.assert_allclose(found["T_skull_mandible"], rig.pose([12, -3, 1.5]), atol=1e-12)
-    np.testing.assert_allclose(se3_exp(found["twist"]) @ rig.arrays["T_rest"], rig.pose([12, -3, 1.5]), atol=1e-9)
+    np.testing.assert_allclose(se3_exp(found["twist"]) @ rig.T_rest, rig.pose([12, -3, 1.5]), atol=1e-9)
     assert found["valid"] is True and found["margin_mm"] == pytest.approx(float(rig.margin([12, -3, 1.5])))
     assert set(found["landmarks_mm"]) == {"incisor", "molar_left", "molar_right", "condyle_left", "condyle_right"}
     assert "OUTSIDE" in run("pose", actor, "--d", 12, 30, 0)
@@ -103,7 +103,7 @@ def test_info_says_how_a_frame_was_tracked(tmp_path):
 
 def test_ik_reaches_a_reachable_target(actor):
     rig = jawusd.load(actor)
-    point = rig.arrays["landmarks"][0]
+    point = rig.landmarks[0]
     target = (rig.pose([10.0, 2.0, 1.0]) @ np.append(point, 1))[:3]
     found = json.loads(run("ik", actor, "--point", *point, "--target", *target, "--json"))
     assert found["distance_mm"] < 1e-3 and found["margin_mm"] >= 0
@@ -161,7 +161,7 @@ def face_csv(path, weights, fps=30):
 def test_animate_takes_arkit_weights_as_shares_of_the_persons_ranges(actor, tmp_path):
     """The ends are measured with `ranges`: 1 is the edge of the bound, so opening halfway and then to either side."""
     rig = jawusd.load(actor)
-    d1 = 0.5 * rig.arrays["d_range"][0, 1]
+    d1 = 0.5 * rig.d_range[0, 1]
     d2_min, d2_max, _, d3_max = rig.ranges(d1)
     weights = [(0, 0, 0, 0), (0.5, 0, 0, 0), (0.5, 0.5, 0, 0), (0.5, 0.1, 0.6, 0), (0.5, 0, 0, 0.5), None] * 20
     csv = face_csv(tmp_path / "face.csv", weights)
@@ -229,4 +229,4 @@ def test_a_rig_of_a_newer_version_is_refused(actor, tmp_path):
 def test_the_twist_of_a_pose_is_its_logarithm(actor):
     rig = jawusd.load(actor)
     d = np.array([15.0, -2.0, 1.0])
-    np.testing.assert_allclose(rig.twist(d), se3_log(rig.pose(d) @ np.linalg.inv(rig.arrays["T_rest"])), atol=1e-10)
+    np.testing.assert_allclose(rig.twist(d), se3_log(rig.pose(d) @ np.linalg.inv(rig.T_rest)), atol=1e-10)

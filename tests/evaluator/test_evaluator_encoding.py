@@ -20,7 +20,7 @@ def rig(request):
 
 def noisy_poses(rig, count, seed, angle_rad=0.004, shift_mm=0.3):
     rng = np.random.default_rng(seed)
-    low, high = rig.arrays["d_range"].T
+    low, high = rig.d_range.T
     d = rng.uniform(low, high, (count, 3))
     noise = rng.normal(size=(count, 6)) * ([angle_rad] * 3 + [shift_mm] * 3)
     return d, se3_exp(noise) @ rig.pose(d)
@@ -28,7 +28,7 @@ def noisy_poses(rig, count, seed, angle_rad=0.004, shift_mm=0.3):
 
 def landmark_differences(rig, d, T):
     difference = rig.pose(d) - T
-    landmarks = rig.arrays["landmarks"]
+    landmarks = rig.landmarks
     return landmarks @ difference[:3, :3].T + difference[:3, 3]
 
 
@@ -117,7 +117,7 @@ def test_weighted_encode_minimises_the_mahalanobis_distance(rig):
 def test_weighted_encode_trusts_what_was_measured_well(rig):
     """A translation measured poorly along one axis pulls the result less than with equal weights."""
     d = np.array([20.0, 1.0, 1.0])
-    A = rig.arrays["T_anatomical_skull"]
+    A = rig.T_anatomical_skull
     x_skull = A[:3, :3].T @ [1.0, 0.0, 0.0]
     T = rig.pose(d).copy()
     T[:3, 3] += 2.0 * x_skull

@@ -16,7 +16,7 @@ def rig(request):
 
 
 def valid_d(rig, count, seed):
-    low, high = rig.arrays["d_range"].T
+    low, high = rig.d_range.T
     return rig.project(np.random.default_rng(seed).uniform(low, high, (count, 3)))
 
 
@@ -27,7 +27,7 @@ def where(rig, d, handles):
 
 def test_reachable_targets_are_reached(rig):
     d = valid_d(rig, 200, 0)
-    chin = rig.arrays["landmarks"][0]
+    chin = rig.landmarks[0]
     found, distance_mm = rig.ik(chin, where(rig, d, chin[None])[:, 0])
     assert distance_mm.max() < 1e-5
     np.testing.assert_allclose(found, d, atol=1e-4)
@@ -37,7 +37,7 @@ def test_reachable_targets_are_reached(rig):
 def test_never_worse_than_the_papers_search_and_always_valid(rig, handles):
     """Random drags of up to 8 mm from a valid pose, many beyond reach."""
     start = valid_d(rig, 100, 1)
-    points = rig.arrays["landmarks"][:handles]
+    points = rig.landmarks[:handles]
     targets = where(rig, start, points) + np.random.default_rng(2).normal(size=(100, 1, 3)) * 4.0
     brute, brute_mm = brute_force_ik(rig, points, targets, start)
     found, distance_mm = rig.ik(points, targets, start=start)
@@ -55,7 +55,7 @@ def test_a_far_throw_finds_the_better_side_of_a_ripple(kind, monkeypatch):
     arrays["slice_support"] += 0.3 * np.sin(np.arange(len(arrays["slice_support"])) * np.pi / 2)[:, None]
     rig = JawRig(arrays, example_meta(kind))
     start = valid_d(rig, 300, 0)
-    points = rig.arrays["landmarks"][:1]
+    points = rig.landmarks[:1]
     targets = where(rig, start, points) + np.random.default_rng(0).normal(size=(300, 1, 3)) * 6.0
     _, brute_mm = brute_force_ik(rig, points, targets, start)
     found, distance_mm = rig.ik(points, targets, start=start)
@@ -68,11 +68,11 @@ def test_a_far_throw_finds_the_better_side_of_a_ripple(kind, monkeypatch):
 
 def test_dragging_does_not_jump(rig):
     """Along a smooth path of the target, inside and outside reach, the jaw moves at most a few times as far."""
-    chin = rig.arrays["landmarks"][0]
+    chin = rig.landmarks[0]
     time = np.linspace(0.0, 2 * np.pi, 400)
-    A = rig.arrays["T_anatomical_skull"]
+    A = rig.T_anatomical_skull
     path = np.stack([14 * np.sin(2 * time), -18 + 16 * np.cos(time), -5 + 9 * np.sin(time)], axis=1)
-    targets = rig.arrays["T_rest"][:3, :3] @ chin + rig.arrays["T_rest"][:3, 3] + path @ A[:3, :3]
+    targets = rig.T_rest[:3, :3] @ chin + rig.T_rest[:3, 3] + path @ A[:3, :3]
     d = rig.project([2.0, 0.0, 0.0])
     drag = []
     for target in targets:
@@ -86,7 +86,7 @@ def test_dragging_does_not_jump(rig):
 
 
 def test_weights_decide_between_handles(rig):
-    points = rig.arrays["landmarks"][[0, 3]]
+    points = rig.landmarks[[0, 3]]
     start = rig.project([15.0, 0.0, 1.0])
     targets = where(rig, start, points) + [[[1.0, -2.0, 0.5]], [[0.0, 3.0, 0.0]]][0]
     targets[1] += [0.0, 4.0, 0.0]
@@ -99,13 +99,13 @@ def test_weights_decide_between_handles(rig):
 
 
 def test_a_start_outside_is_brought_inside(rig):
-    chin = rig.arrays["landmarks"][0]
+    chin = rig.landmarks[0]
     found, _ = rig.ik(chin, where(rig, [5.0, 0.0, 0.0], chin[None])[0] + 40.0, start=[100.0, 30.0, 30.0])
     assert rig.margin(found) >= -1e-12
 
 
 def test_targets_and_starts_with_nan_give_nan(rig):
-    chin = rig.arrays["landmarks"][0]
+    chin = rig.landmarks[0]
     targets = np.tile(where(rig, [5.0, 0.0, 0.0], chin[None]), (3, 1))
     targets[1, 0] = np.nan
     for start in (None, [1.0, 0.0, 0.0]):

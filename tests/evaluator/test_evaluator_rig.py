@@ -34,7 +34,7 @@ def rig(request):
 
 
 def random_d(rig, shape, seed=0):
-    low, high = rig.arrays["d_range"].T
+    low, high = rig.d_range.T
     return np.random.default_rng(seed).uniform(low, high, (*shape, 3))
 
 
@@ -126,15 +126,15 @@ def test_poses_are_rigid_for_scipy(rig):
 
 
 def test_rest_pose_is_the_closed_bite(rig):
-    np.testing.assert_allclose(rig.pose([0.0, 0.0, 0.0]), rig.arrays["T_rest"], atol=1e-12)
+    np.testing.assert_allclose(rig.pose([0.0, 0.0, 0.0]), rig.T_rest, atol=1e-12)
     np.testing.assert_allclose(rig.twist([0.0, 0.0, 0.0]), 0.0, atol=1e-12)
 
 
 def test_twist_is_the_logarithm_relative_to_rest(rig):
     d = random_d(rig, (100,))
     T = rig.pose(d)
-    np.testing.assert_allclose(se3_exp(rig.twist(d)) @ rig.arrays["T_rest"], T, atol=1e-10)
-    np.testing.assert_allclose(se3_log(T @ np.linalg.inv(rig.arrays["T_rest"])), rig.twist(d), atol=1e-10)
+    np.testing.assert_allclose(se3_exp(rig.twist(d)) @ rig.T_rest, T, atol=1e-10)
+    np.testing.assert_allclose(se3_log(T @ np.linalg.inv(rig.T_rest)), rig.twist(d), atol=1e-10)
 
 
 def test_jacobian_agrees_with_differences_of_the_twist(rig):
@@ -152,7 +152,7 @@ def test_jacobian_agrees_with_differences_of_the_twist(rig):
 
 def test_point_jacobian_agrees_with_differences_of_points(rig):
     d, h = random_d(rig, (3, 2)), 1e-4
-    points = rig.arrays["landmarks"][:3]
+    points = rig.landmarks[:3]
 
     def moved(d):
         T = rig.pose(d)
@@ -189,7 +189,7 @@ def test_arrays_come_back_read_only(rig):
     for name, value in given.items():
         np.testing.assert_array_equal(rig.arrays[name], value)
     with pytest.raises(ValueError, match="read-only"):
-        rig.arrays["incisor"][0] = 1.0
+        rig.incisor[0] = 1.0
 
 
 def test_changing_the_given_arrays_does_not_change_the_rig():

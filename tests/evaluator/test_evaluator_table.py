@@ -13,7 +13,7 @@ RIG = JawRig(example_arrays(), example_meta())
 
 
 def sampled(counts=(17, 15, 13), uneven=True):
-    low, high = RIG.arrays["d_range"].T
+    low, high = RIG.d_range.T
     share = [np.linspace(0, 1, n) ** (1.3 if uneven else 1.0) for n in counts]
     knots = tuple(a + (b - a) * s for a, b, s in zip(low, high, share))
     twists = RIG.twist(np.stack(np.meshgrid(*knots, indexing="ij"), axis=-1))
@@ -21,26 +21,26 @@ def sampled(counts=(17, 15, 13), uneven=True):
 
 
 def random_d(count, seed=0):
-    low, high = RIG.arrays["d_range"].T
+    low, high = RIG.d_range.T
     return np.random.default_rng(seed).uniform(low, high, (count, 3))
 
 
 def test_twist_is_scipys_linear_interpolation():
     knots, twists = sampled()
-    table = SampledTable(knots, twists, RIG.arrays["T_rest"])
+    table = SampledTable(knots, twists, RIG.T_rest)
     d = np.concatenate([random_d(3000), [[k[0] for k in knots], [k[-1] for k in knots], [k[3] for k in knots]]])
     np.testing.assert_allclose(table.twist(d), RegularGridInterpolator(knots, twists)(d), atol=1e-12)
 
 
 def test_pose_is_the_exponential_of_the_twist():
     knots, twists = sampled()
-    table = SampledTable(knots, twists, RIG.arrays["T_rest"])
+    table = SampledTable(knots, twists, RIG.T_rest)
     d = random_d(20)
     for x, T in zip(d, table.pose(d)):
         w1, w2, w3, *v = table.twist(x)
         generator = np.zeros((4, 4))
         generator[:3] = [[0, -w3, w2, v[0]], [w3, 0, -w1, v[1]], [-w2, w1, 0, v[2]]]
-        np.testing.assert_allclose(T, expm(generator) @ RIG.arrays["T_rest"], atol=1e-11)
+        np.testing.assert_allclose(T, expm(generator) @ RIG.T_rest, atol=1e-11)
         np.testing.assert_allclose(table.pose(x), T, atol=1e-12)
 
 
@@ -49,9 +49,9 @@ def test_a_finer_table_comes_closer_to_the_model():
     d = random_d(2000)
     errors = []
     for counts in ((9, 9, 9), (17, 17, 17), (33, 33, 33)):
-        table = SampledTable(*sampled(counts, uneven=False), RIG.arrays["T_rest"])
+        table = SampledTable(*sampled(counts, uneven=False), RIG.T_rest)
         difference = (table.pose(d) - RIG.pose(d))[:, :3]
-        landmarks = np.column_stack([RIG.arrays["landmarks"], np.ones(5)])
+        landmarks = np.column_stack([RIG.landmarks, np.ones(5)])
         errors.append(np.linalg.norm(difference @ landmarks.T, axis=1).max())
     assert errors[2] < 0.5 * errors[1] < 0.25 * errors[0]
     assert errors[2] < 0.1
@@ -59,7 +59,7 @@ def test_a_finer_table_comes_closer_to_the_model():
 
 def test_parameters_outside_are_clamped_and_nan_gives_nan():
     knots, twists = sampled()
-    table = SampledTable(knots, twists, RIG.arrays["T_rest"])
+    table = SampledTable(knots, twists, RIG.T_rest)
     corner = np.array([k[-1] for k in knots])
     np.testing.assert_array_equal(table.pose(corner + 50.0), table.pose(corner))
     np.testing.assert_allclose(table.pose(corner[None] + 50.0)[0], table.pose(corner), atol=1e-12)

@@ -8,7 +8,7 @@ from jawusd.evaluator import JawRig, Reason
 from jawusd.geometry.se3 import se3_exp
 
 RIG = JawRig(example_arrays(), example_meta())
-INSIDE = RIG.project(np.random.default_rng(0).uniform(*RIG.arrays["d_range"].T, (400, 3)) * 0.9)
+INSIDE = RIG.project(np.random.default_rng(0).uniform(*RIG.d_range.T, (400, 3)) * 0.9)
 
 
 def reasons(verdicts):
@@ -136,15 +136,15 @@ def test_implausible_poses_are_refused():
     directions = rng.normal(size=(2500, 2, 3))
     directions /= np.linalg.norm(directions, axis=2, keepdims=True)
     knock = np.concatenate([np.deg2rad(3.0) * directions[:, 0], 3.0 * directions[:, 1]], axis=1)
-    centre = RIG.arrays["landmarks"].mean(axis=0)
+    centre = RIG.landmarks.mean(axis=0)
     shift = np.eye(4)
     shift[:3, 3] = centre
     knocked = T[rng.integers(len(T), size=2500)] @ shift @ se3_exp(knock) @ np.linalg.inv(shift)
-    A = RIG.arrays["T_anatomical_skull"]
+    A = RIG.T_anatomical_skull
     turn = np.eye(4)
     turn[:3, :3] = RIG.pose([40.0, 0.0, 0.0])[:3, :3]
-    rotated = np.linalg.inv(A) @ turn @ A @ RIG.arrays["T_rest"]
+    rotated = np.linalg.inv(A) @ turn @ A @ RIG.T_rest
     mirrored = T[:500].copy()
     mirrored[:, 0] *= -1.0
-    poses = np.concatenate([se3_exp(random_twists) @ RIG.arrays["T_rest"], knocked, rotated[None], mirrored])
+    poses = np.concatenate([se3_exp(random_twists) @ RIG.T_rest, knocked, rotated[None], mirrored])
     assert (~RIG.validate(poses).valid).mean() >= 0.99

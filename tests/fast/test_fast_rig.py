@@ -44,7 +44,7 @@ def fast(kind):
 
 def random_d(rig, shape, beyond_mm=6.0, seed=0):
     """Parameters inside and outside the bound."""
-    low, high = rig.arrays["d_range"].T
+    low, high = rig.d_range.T
     return np.random.default_rng(seed).uniform(low - beyond_mm, high + beyond_mm, (*shape, 3))
 
 
@@ -157,7 +157,7 @@ def test_encode_agrees_on_and_off_the_model(rig, fast):
 
 def test_encode_is_as_near_as_scipy_finds(fast):
     T = noisy_poses(fast, (30,), seed=5)
-    landmarks = fast.arrays["landmarks"]
+    landmarks = fast.landmarks
     d, residual_mm = fast.encode(T)
 
     def miss(x, pose):
@@ -214,7 +214,7 @@ def test_project_agrees(rig, fast):
 
 
 def test_inverse_kinematics_agrees(rig, fast):
-    points = rig.arrays["landmarks"][:3]
+    points = rig.landmarks[:3]
     start = rig.project(random_d(rig, (300,), 0.0))
     targets = transform_points(rig.pose(start), points) + np.random.default_rng(1).normal(size=(300, 1, 3)) * 2.0
     for given in ({"start": start}, {}):

@@ -20,7 +20,7 @@ def donor():
 
 def motions(donor, d):
     """Poses relative to the closed bite, skull frame."""
-    return donor.rig.pose(d) @ np.linalg.inv(donor.rig.arrays["T_rest"])
+    return donor.rig.pose(d) @ np.linalg.inv(donor.rig.T_rest)
 
 
 def carried(donor, target, d):
@@ -76,7 +76,7 @@ def test_twins_predict_each_other_without_error_and_count_alike(donor):
     made = personal_motion(twins, donor.landmarks, leave_one_out(twins))
     assert sum(made.weights.values()) == pytest.approx(1) and len(made.weights) == 3
     assert made.learned.expected.summary()["max"] < 1e-6
-    d, residual_mm = donor.rig.encode(made.poses @ donor.rig.arrays["T_rest"])
+    d, residual_mm = donor.rig.encode(made.poses @ donor.rig.T_rest)
     assert residual_mm.max() < 1e-6
     assert donor.rig.margin(d).min() > -0.5
 
@@ -84,11 +84,11 @@ def test_twins_predict_each_other_without_error_and_count_alike(donor):
 def test_the_expected_error_of_a_person_does_not_use_that_person(donor):
     odd = Donor("odd", person("odd", ranges=0.7, opening=0.85, wider_mm=2.0))
     learned = leave_one_out([donor, Donor("two", person("two")), odd])
-    codes = odd.rig.arrays["codes"]
+    codes = odd.rig.captured_d
     codes = codes[:: -(-len(codes) // 120)]
     shares = odd.rig.normalized(codes)
     predicted = rigid_fit(odd.landmarks, odd.landmarks + displacements(donor, odd.landmarks, shares))
-    truth = transform_points(odd.rig.pose(codes), odd.rig.arrays["landmarks"])
+    truth = transform_points(odd.rig.pose(codes), odd.rig.landmarks)
     by_hand = np.linalg.norm(transform_points(predicted, odd.landmarks) - truth, axis=-1)
     np.testing.assert_allclose(learned.expected.errors_mm["odd"], by_hand, atol=1e-6)
     assert by_hand.mean() > 1

@@ -87,7 +87,7 @@ def test_exact_model_table_and_onnx_agree_on_random_valid_parameters(built):
     out, _ = built
     rig = jawusd.load(out / "actor.usda")
     rng = np.random.default_rng(0)
-    low, high = rig.arrays["d_range"].T
+    low, high = rig.d_range.T
     d = rng.uniform(low, high, (60000, 3))
     d = d[rig.margin(d) >= 0][:1000]
     assert len(d) == 1000
@@ -105,7 +105,7 @@ def test_exact_model_table_and_onnx_agree_on_random_valid_parameters(built):
     table = read_table(find_rig_prim(stage, out), out)
     from jawusd.geometry import se3_exp
 
-    read = se3_exp(table.twist(d)) @ rig.arrays["T_rest"]
+    read = se3_exp(table.twist(d)) @ rig.T_rest
     assert np.linalg.norm(transform_points(read, vertices) - exact, axis=-1).max() < 0.06
 
 

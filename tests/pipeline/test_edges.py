@@ -37,7 +37,7 @@ def rig(request):
 
 def test_parameters_on_the_bound_stay_there(rig):
     rng = np.random.default_rng(0)
-    low, high = rig.arrays["d_range"].T
+    low, high = rig.d_range.T
     outside = rng.uniform(low - 5, high + 5, (300, 3))
     outside = outside[rig.margin(outside) < -0.1]
     on = rig.project(outside)
@@ -56,5 +56,5 @@ def test_parameters_around_zero_are_the_closed_bite(rig, d):
 def test_parameters_far_away_are_outside_and_finite(rig):
     for d in ([1e4, 0, 0], [0, -1e4, 1e4], [-1e6, 1e6, 0]):
         assert np.isfinite(rig.margin(d)) and rig.margin(d) < 0 and np.isfinite(rig.margin_gradient(d)).all()
-        low, high = rig.arrays["d_range"].T
+        low, high = rig.d_range.T
         assert (rig.project(d) > low - 10).all() and (rig.project(d) < high + 10).all()

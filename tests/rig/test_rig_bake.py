@@ -108,7 +108,7 @@ def test_table_in_the_file_agrees_with_the_model(folder, kind):
     T = np.tile(np.eye(4), (len(d), 1, 1))
     T[:, :3, :3] = Rotation.from_rotvec(twist[:, :3]).as_matrix()
     T[:, :3, 3] = np.einsum("nij,nj->ni", so3_left_jacobian(twist[:, :3]), twist[:, 3:])
-    read = moved(T @ rig.arrays["T_rest"], mandible_vertices())
+    read = moved(T @ rig.T_rest, mandible_vertices())
     worst = np.linalg.norm(read - moved(rig.pose(d), mandible_vertices()), axis=-1).max()
     stated = prim.GetAttribute("jaw:decoder:maxError").Get()
     assert 0 < worst <= stated <= 0.06
@@ -176,7 +176,7 @@ def test_measured_error_is_that_of_the_worst_vertex(kind):
     twist = table.twist(d)
     T[:, :3, :3] = Rotation.from_rotvec(twist[:, :3]).as_matrix()
     T[:, :3, 3] = np.einsum("nij,nj->ni", so3_left_jacobian(twist[:, :3]), twist[:, 3:])
-    worst = np.linalg.norm(moved(T @ rig.arrays["T_rest"], vertices) - moved(rig.pose(d), vertices), axis=-1).max()
+    worst = np.linalg.norm(moved(T @ rig.T_rest, vertices) - moved(rig.pose(d), vertices), axis=-1).max()
     assert table_error(rig, table, vertices, d) == pytest.approx(worst, abs=1e-9)
 
 

@@ -57,7 +57,7 @@ def test_table_is_as_near_to_the_golden_poses_as_it_says(golden):
     rig = load_rig(folder / "actor.usda")
     inside = margins >= 0
     assert inside.sum() >= 5
-    distance = largest_distance(table.pose(d[inside], rig.arrays["T_rest"]), poses[inside], rig.arrays["landmarks"])
+    distance = largest_distance(table.pose(d[inside], rig.T_rest), poses[inside], rig.landmarks)
     assert distance.max() <= table.max_error_mm + 0.01
 
 

@@ -32,7 +32,8 @@ def sliding_jaw(condyles, meta=INFERRED, travel_mm=9.0, noise_mm=0.05):
     poses = make_transform(R, centre + path - np.einsum("nij,j->ni", R, centre))
     landmarks = np.array([[0, 0, 0], [21, -1, -26], [-21, -1, -26], *MEAN])
     arrays = {"landmarks": landmarks, "codes": np.zeros((300, 3)), "T_anatomical_skull": np.eye(4), "T_rest": np.eye(4)}
-    return types.SimpleNamespace(arrays=arrays, meta=meta, pose=lambda d: poses[: len(d)])
+    inferred, captured_d = tuple(meta["inferred"]), arrays["codes"]
+    return types.SimpleNamespace(**arrays, captured_d=captured_d, inferred=inferred, pose=lambda d: poses[: len(d)])
 
 
 @pytest.mark.parametrize("offset", [(0.0, -10.0, -4.0), (0.0, 6.0, 5.0)])
@@ -77,10 +78,10 @@ def test_it_is_a_closed_body_below_the_scan_with_heads_at_the_condyles(kind):
     rig, lower = example_rig(kind), example_meshes()["lower_teeth"]
     grown = grow_placeholder(rig, lower)
     made = closed(grown.mesh)
-    condyles = rig.arrays["landmarks"][[LANDMARKS.index(name) for name in ("condyle_left", "condyle_right")]]
+    condyles = rig.landmarks[[LANDMARKS.index(name) for name in ("condyle_left", "condyle_right")]]
     np.testing.assert_allclose(grown.condyles, condyles)
     assert all(winding(made, point) == pytest.approx(1) for point in condyles)
-    A = (rig.arrays["T_anatomical_skull"] @ rig.arrays["T_rest"])[:3, :3]
+    A = (rig.T_anatomical_skull @ rig.T_rest)[:3, :3]
     height = grown.mesh.vertices @ A[1]
     assert height.min() < (lower.vertices @ A[1]).min() - 10
     assert height.max() < (condyles @ A[1]).max() + 8
@@ -88,7 +89,7 @@ def test_it_is_a_closed_body_below_the_scan_with_heads_at_the_condyles(kind):
 
 def test_a_scan_of_few_teeth_gives_a_body_too():
     rig, lower = example_rig(), example_meshes()["lower_teeth"]
-    near = np.linalg.norm(lower.vertices - rig.arrays["landmarks"][0], axis=1) < 8
+    near = np.linalg.norm(lower.vertices - rig.landmarks[0], axis=1) < 8
     faces = lower.faces[near[lower.faces].all(axis=1)]
     used, renamed = np.unique(faces, return_inverse=True)
     closed(grow_placeholder(rig, Mesh(lower.vertices[used], renamed.reshape(-1, 3))).mesh)

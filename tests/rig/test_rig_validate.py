@@ -73,14 +73,14 @@ def forget_hashes(folder):
 def break_onnx_identity(folder):
     forget_hashes(folder)
     rig = example_rig()
-    arrays = {**rig.arrays, "incisor": rig.arrays["incisor"] + 0.1}
+    arrays = {**rig.arrays, "incisor": rig.incisor + 0.1}
     write_onnx(folder / "actor.onnx", decode_model(JawRig(arrays, rig.meta)))
 
 
 def break_encoder_identity(folder):
     forget_hashes(folder)
     rig = example_rig()
-    arrays = {**rig.arrays, "incisor": rig.arrays["incisor"] + 0.1}
+    arrays = {**rig.arrays, "incisor": rig.incisor + 0.1}
     write_onnx(folder / "actor_encode.onnx", encode_model(JawRig(arrays, rig.meta)))
 
 
@@ -98,7 +98,7 @@ def break_encoder_agreement(folder):
     """The right label on the graph of another jaw."""
     forget_hashes(folder)
     rig = example_rig()
-    model = encode_model(JawRig({**rig.arrays, "incisor": rig.arrays["incisor"] + 0.5}, rig.meta))
+    model = encode_model(JawRig({**rig.arrays, "incisor": rig.incisor + 0.5}, rig.meta))
     right = onnx.load(folder / "actor_encode.onnx")
     del model.metadata_props[:]
     model.metadata_props.extend(right.metadata_props)

@@ -20,7 +20,7 @@ def pair(request):
 
 
 def random_d(rig, shape, seed=0, spread=1.0):
-    low, high = rig.arrays["d_range"].T
+    low, high = rig.d_range.T
     return np.random.default_rng(seed).uniform(low, high, (*shape, 3)) * spread
 
 

@@ -54,7 +54,7 @@ def cost(prior, poses, centres, twists):
     for pose, centre, twist in zip(poses, centres, twists.reshape(2, 6)):
         to, back = make_transform(np.eye(3), -centre), make_transform(np.eye(3), centre)
         moved.append(back @ se3_exp(twist) @ to @ pose)
-    points = prior.jaw.arrays["landmarks"]
+    points = prior.jaw.landmarks
     target = transform_points(relative_pose(*moved), points)
 
     def distance(d):
@@ -151,7 +151,7 @@ def test_hidden_teeth_are_found_with_the_model(take, jaw, truth):
     assert aided.prior_aided[list(HIDDEN)].all() and not aided.prior_aided[:6].any()
     assert worst_mm(aided.T_world_lower, truth) < 0.15
     before = relative_pose(truth[:, 0], truth[:, 1])
-    condyle = jaw.arrays["landmarks"][3]
+    condyle = jaw.landmarks[3]
     error = np.linalg.norm(
         transform_point(aided.T_upper_lower, condyle) - transform_point(before, condyle),
         axis=-1,

@@ -74,7 +74,7 @@ def test_dragging_the_incisor_is_inverse_kinematics(tab):
     until(lambda: not tab.session.dragging)
     handle, pointer = held[-1]
     T = rig.pose(start)
-    asked = rig.arrays["T_anatomical_skull"][:3, :3] @ (pointer - T[:3, :3] @ handle - T[:3, 3])
+    asked = rig.T_anatomical_skull[:3, :3] @ (pointer - T[:3, :3] @ handle - T[:3, 3])
     np.testing.assert_allclose(asked, [5.0, 0.0, 0.0], atol=0.6)  # the surface lies nearer to the eye than the incisor
     found, _ = rig.ik(handle, pointer, start=start)
     moved = [T[:3, :3] @ handle + T[:3, 3] for T in rig.pose(np.stack([found, tab.session.d]))]

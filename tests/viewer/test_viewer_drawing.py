@@ -21,15 +21,15 @@ RIG = example_rig()
 
 def test_the_numbers_of_a_pose_are_displacements_in_anatomical_axes():
     d = np.array([14.0, 2.0, 0.5])
-    A = RIG.arrays["T_anatomical_skull"][:3, :3]
-    T, rest = RIG.pose(d), RIG.arrays["T_rest"]
-    moved = [A @ ((T - rest) @ [*RIG.arrays["landmarks"][LANDMARKS.index(name)], 1])[:3] for name in
+    A = RIG.T_anatomical_skull[:3, :3]
+    T, rest = RIG.pose(d), RIG.T_rest
+    moved = [A @ ((T - rest) @ [*RIG.landmarks[LANDMARKS.index(name)], 1])[:3] for name in
              ("incisor", "condyle_left", "condyle_right")]  # fmt: skip
     found = read_out(RIG, d)
     np.testing.assert_allclose([found.lateral_mm, -found.opening_mm, found.protrusion_mm], moved[0], atol=1e-9)
     np.testing.assert_allclose([found.condyle_left_mm, found.condyle_right_mm], moved[1:], atol=1e-9)
     assert found.inside and found.margin_mm == float(RIG.margin(d)) and found.opening_mm > 10
-    codes = RIG.arrays["codes"]
+    codes = RIG.captured_d
     nearest = np.linalg.norm(codes - d, axis=1).min() if len(codes) else np.inf
     assert found.captured_mm == pytest.approx(nearest)
     assert not read_out(RIG, [14.0, 40.0, 0.0]).inside
@@ -37,8 +37,8 @@ def test_the_numbers_of_a_pose_are_displacements_in_anatomical_axes():
 
 def test_the_places_of_five_poses_are_those_of_each():
     d = np.array([[0.0, 0, 0], [4, 1, 0], [9, -1, 0.5], [14, 2, 0], [20, 0, 0]])
-    points = np.column_stack([RIG.arrays["landmarks"], np.ones(5)])
-    expected = [(RIG.arrays["T_anatomical_skull"] @ RIG.pose(one) @ points.T).T[:, :3] for one in d]
+    points = np.column_stack([RIG.landmarks, np.ones(5)])
+    expected = [(RIG.T_anatomical_skull @ RIG.pose(one) @ points.T).T[:, :3] for one in d]
     np.testing.assert_allclose(landmark_places(RIG, d), expected, atol=1e-9)
     np.testing.assert_allclose(landmark_places(RIG, d[:4]), expected[:4], atol=1e-9)
 
@@ -49,7 +49,7 @@ def test_paths_begin_closed_and_borders_lie_on_the_bound():
     for axis in (1, 2):
         ring = border_path(RIG, axis)
         assert len(ring) > 40 and np.abs(RIG.margin(ring)).max() < 1e-6
-        assert (ring[:, 3 - axis] == 0).all() and np.ptp(ring[:, 0]) > 0.9 * np.ptp(RIG.arrays["d_range"][0])
+        assert (ring[:, 3 - axis] == 0).all() and np.ptp(ring[:, 0]) > 0.9 * np.ptp(RIG.d_range[0])
 
 
 def marked(svg):

@@ -55,7 +55,7 @@ def test_the_mandible_on_the_page_stands_where_the_rig_says(quiet):
     rig = quiet.page.session.rig
     quiet.enter(quiet.page.pose.sliders[0], 17.0)
     jaw = quiet.page.scene._jaw
-    expected = rig.arrays["T_anatomical_skull"] @ rig.pose(quiet.page.session.d)
+    expected = rig.T_anatomical_skull @ rig.pose(quiet.page.session.d)
     np.testing.assert_allclose(matrix_from_wxyz(jaw.wxyz), expected[:3, :3], atol=1e-9)
     np.testing.assert_allclose(jaw.position, expected[:3, 3], atol=1e-9)
 
@@ -71,8 +71,8 @@ def test_a_drag_of_the_mesh_is_inverse_kinematics_and_pins_are_shown(quiet):
     assert page.scene._held.visible and page.session.dragging
     quiet.drag(grip, "end", incisor, incisor + [5.0, 0, 0])
     assert not page.scene._held.visible and not page.session.dragging
-    A = rig.arrays["T_anatomical_skull"]
-    found, _ = rig.ik(rig.arrays["landmarks"][0], np.linalg.solve(A, [*(incisor + [5.0, 0, 0]), 1])[:3], start=start)
+    A = rig.T_anatomical_skull
+    found, _ = rig.ik(rig.landmarks[0], np.linalg.solve(A, [*(incisor + [5.0, 0, 0]), 1])[:3], start=start)
     moved = landmark_places(rig, np.stack([found, page.session.d]))[:, 0]
     assert np.linalg.norm(moved[0] - moved[1]) < 0.1 and page.session.d[1] > 2
     quiet.enter(page.pose.pins["condyle_left"], True)

@@ -19,7 +19,7 @@ def session():
 
 def place(d, index):
     T = RIG.pose(d)
-    return T[:3, :3] @ RIG.arrays["landmarks"][index] + T[:3, 3]
+    return T[:3, :3] @ RIG.landmarks[index] + T[:3, 3]
 
 
 def test_begins_closed_and_valid(session):
@@ -33,7 +33,7 @@ def test_ends_of_d2_and_d3_follow_the_opening_as_the_rig_says(session):
         assert session.d[0] == pytest.approx(opening, abs=1e-12)
         expected = np.array(RIG.ranges(*session.d)).reshape(2, 2)
         np.testing.assert_allclose(session.limits()[1:], expected, atol=1e-9)
-        np.testing.assert_array_equal(session.limits()[0], RIG.arrays["d_range"][0])
+        np.testing.assert_array_equal(session.limits()[0], RIG.d_range[0])
 
 
 def test_sliders_stop_at_the_bound_only_where_asked_to(session):
@@ -57,13 +57,13 @@ def test_the_opening_wins_and_takes_d2_and_d3_with_it(session):
     session.set_parameter(0, 5.0)
     session.set_parameter(1, 50.0)
     side = session.d[1]
-    wide = float(RIG.arrays["d_range"][0, 1]) * 0.9
+    wide = float(RIG.d_range[0, 1]) * 0.9
     session.set_parameter(0, wide)
     assert session.d[0] == pytest.approx(wide) and 0 < session.d[1] < side and session.readout().inside
     nearly = session.d * [1, 1.05, 1.05]
     assert float(RIG.margin(nearly)) < 0
     session.set_parameter(0, 1000.0)
-    assert session.readout().inside and session.d[0] <= RIG.arrays["d_range"][0, 1] + 1e-9
+    assert session.readout().inside and session.d[0] <= RIG.d_range[0, 1] + 1e-9
 
 
 def test_limits_stay_numbers_outside_the_bound(session):
@@ -84,10 +84,10 @@ def test_a_drag_follows_the_pointer_as_inverse_kinematics_does(session):
     start = session.d
     chin = place(start, 0)
     session.grab(chin)
-    target = chin + RIG.arrays["T_anatomical_skull"][:3, :3].T @ [5.0, 0.0, 0.0]
+    target = chin + RIG.T_anatomical_skull[:3, :3].T @ [5.0, 0.0, 0.0]
     for share in np.linspace(0.1, 1.0, 10):
         left = session.drag_to(chin + share * (target - chin))
-    found, distance = RIG.ik(RIG.arrays["landmarks"][0], target, start=start)
+    found, distance = RIG.ik(RIG.landmarks[0], target, start=start)
     assert np.linalg.norm(place(session.d, 0) - place(found, 0)) < 0.1
     assert left == pytest.approx(float(distance), abs=0.01) and session.readout().inside
     np.testing.assert_allclose(session.held_place(), place(session.d, 0), atol=1e-9)
@@ -112,7 +112,7 @@ def test_a_pinned_condyle_stays_while_the_chin_is_dragged(session, name):
         before = place(session.d, index)
         chin = place(session.d, 0)
         session.grab(chin)
-        session.drag_to(chin + RIG.arrays["T_anatomical_skull"][:3, :3].T @ [0.0, 3.0, 4.0])
+        session.drag_to(chin + RIG.T_anatomical_skull[:3, :3].T @ [0.0, 3.0, 4.0])
         moved[pinned] = np.linalg.norm(place(session.d, index) - before)
         session.release()
     assert moved[True] < 0.35 * moved[False] and moved[True] < 0.5

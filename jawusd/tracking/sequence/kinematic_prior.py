@@ -57,7 +57,7 @@ class KinematicPrior:
 
     def _precision(self, d: Array, pose: Array) -> Array:
         """Return P at a model pose, shape (6, 6)."""
-        M = mandible_metric(transform_points(pose, self.jaw.arrays["landmarks"]))
+        M = mandible_metric(transform_points(pose, self.jaw.landmarks))
         # The derivative of the logarithm becomes that of the pose by the left Jacobian (Barfoot 2017, eq. 7.85).
         J = se3_left_jacobian(self.jaw.twist(d)) @ self.jaw.jacobian(d)
         along = M @ J

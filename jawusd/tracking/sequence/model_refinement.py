@@ -134,7 +134,7 @@ class _SecondPass:
         rough = residual_px(solution) > c.lost_residual * c.suspect_residual * self._usual_px
         few = matched_px(solution) < c.least_matched_px
         relative = relative_pose(*solution.poses)
-        sigma = landmark_sigmas(relative, _relative_covariance(solution.poses, covariance), jaw.arrays["landmarks"])
+        sigma = landmark_sigmas(relative, _relative_covariance(solution.poses, covariance), jaw.landmarks)
         verdict = jaw.validate(relative)
         return bool(
             uncovered <= c.lost_coverage and not rough.any() and not few.any() and sigma.max() <= c.lost_sigma_mm
@@ -213,11 +213,11 @@ def _merged(tracks: Tracks, jaw: JawRig, found: Mapping[int, _Refined]) -> Track
             covariance["covariance_upper"][k] = aided.covariance[:6, :6]
             covariance["covariance_lower"][k] = aided.covariance[6:, 6:]
             spread[k] = smoothing[k]
-            sigma[k] = landmark_sigmas(relative[k], spread[k], jaw.arrays["landmarks"])
+            sigma[k] = landmark_sigmas(relative[k], spread[k], jaw.landmarks)
             status[k] = np.where(status[k] == LOST, RECOVERED, status[k])
     head = np.nanmedian(upper[:, :3, 3], axis=0)
     upper = smooth_poses(tracks.frames, upper, covariance["covariance_upper"], head)
-    relative = smooth_poses(tracks.frames, relative, smoothing, jaw.arrays["landmarks"].mean(0))
+    relative = smooth_poses(tracks.frames, relative, smoothing, jaw.landmarks.mean(0))
     lower = tracks.T_world_lower.copy()
     both = np.isfinite(upper).all((1, 2)) & np.isfinite(relative).all((1, 2))
     lower[both] = upper[both] @ relative[both]
