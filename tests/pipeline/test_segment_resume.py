@@ -119,8 +119,8 @@ def test_frames_in_which_the_jaw_went_astray_are_done_anew(
     first, astray = take[0].frames[0], []
     follow_one = GuidedTracker._one
 
-    def gone_astray(tracker, ladder, motion, frame, sound):
-        record = follow_one(tracker, ladder, motion, frame, sound)
+    def gone_astray(tracker, frame_tracker, motion, frame, sound):
+        record = follow_one(tracker, frame_tracker, motion, frame, sound)
         if frame - first not in wrong or frame in astray:
             return record
         astray.append(frame)
