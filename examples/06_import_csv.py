@@ -51,7 +51,7 @@ def main() -> None:
     model = fit_subject(subject, motion)
     bake_subject(subject, model, options.out)
     rig = jawusd.load(options.out / "actor.usda")
-    print(f"{table}: {len(frames)} poses; opening up to {rig.arrays['d_range'][0, 1]:.1f} mm")
+    print(f"{table}: {len(frames)} poses; opening up to {rig.d_range[0, 1]:.1f} mm")
     points = subject.meshes["mandible"].vertices[::20]
     away = transform_points(rig.pose(rig.encode(T_true)[0]), points) - transform_points(T_true, points)
     error_mm = np.linalg.norm(away, axis=-1).mean(axis=1)

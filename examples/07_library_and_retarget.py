@@ -68,8 +68,8 @@ def main() -> None:
     save_model(options.out / "newcomer.npz", made)
     print(made.meta["warnings"][-1]["message"])
     own, rig = (JawRig(model.arrays, model.meta) for model in (captured(NEWCOMER, "her own"), made))
-    d = rig.denormalized(own.normalized(own.arrays["codes"]))
-    away = transform_points(rig.pose(d), she.landmarks) - transform_points(own.pose(own.arrays["codes"]), she.landmarks)
+    d = rig.denormalized(own.normalized(own.captured_d))
+    away = transform_points(rig.pose(d), she.landmarks) - transform_points(own.pose(own.captured_d), she.landmarks)
     print(f"in truth, against the rig she would get from a capture: {np.linalg.norm(away, axis=-1).mean():.2f} mm")
 
 

@@ -89,10 +89,6 @@ class Gauge:
         """Return drop(d2, d3) [mm] and its derivatives by d2 and by d3."""
         return derivatives.drop(self.numbers, d2, d3, ARRAYS)
 
-    def fade(self, d1: Array) -> tuple[Array, Array]:
-        """Return the share of the glide surface felt at opening d1, and its derivative by d1."""
-        return derivatives.fade(self.numbers, d1, ARRAYS)
-
     def displacement(self, d: Array) -> Array:
         """Return the displacement u [mm] of the incisal point, anatomical frame, shape (n, 3), for d (n, 3)."""
         d1, d2, d3 = d.T

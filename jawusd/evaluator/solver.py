@@ -107,7 +107,7 @@ def minimise(
 
 
 def _picked(wanted: Mask, *arrays: Array) -> tuple[Array, ...]:
-    """Return the wanted rows of each array; the arrays themselves, uncopied, if that is all of them."""
+    """Return the wanted rows of each array; the arrays themselves, not copies, if all are wanted."""
     return arrays if wanted.all() else tuple(array[wanted] for array in arrays)
 
 

@@ -232,3 +232,10 @@ def test_damaged_arrays_are_refused_by_name(change, message):
 def test_unknown_kind_is_refused():
     with pytest.raises(EvaluatorError, match='kind "quadratic"'):
         JawRig(example_arrays(), example_meta() | {"kind": "quadratic"})
+
+
+def test_a_rig_says_what_it_is():
+    rig = JawRig(example_arrays(), example_meta())
+    assert repr(rig) == "<JawRig example, anchored, d1 0.0 to 42.0, d2 -9.0 to 9.5, d3 -1.5 to 7.0 mm>"
+    assert rig.encode(rig.pose([5.0, 0.0, 0.0])).residual_mm < 1e-9
+    assert rig.ranges(5.0).d2_min < 0 < rig.ranges(5.0).d2_max

@@ -148,3 +148,8 @@ def test_implausible_poses_are_refused():
     mirrored[:, 0] *= -1.0
     poses = np.concatenate([se3_exp(random_twists) @ RIG.T_rest, knocked, rotated[None], mirrored])
     assert (~RIG.validate(poses).valid).mean() >= 0.99
+
+
+def test_reasons_print_their_names():
+    assert str(Reason.OFF_MODEL | Reason.TOO_FAST) == "OFF_MODEL|TOO_FAST" and str(Reason.VALID) == "VALID"
+    assert "OFF_MODEL" in repr(Reason(4))
