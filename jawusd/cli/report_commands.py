@@ -87,19 +87,26 @@ def report(
         subject = subject_given(source.stem, capture, upper_teeth, lower_teeth, mandible, landmarks, allow_outside)
     with progress() as tell, naming_file(poses):
         found = do_experiments(subject, motion, starts, tell)
-        summary = draw_experiments(found, folder)
+        files = draw_experiments(found, folder)
         if is_build(source):
-            page = report_build(source, capture, tell, found, allow_outside=allow_outside)
-            summary["files"].append(Path(page["file"]))
-    emit(summary, as_json, lambda: experiment_lines(summary))
+            files.append(report_build(source, capture, tell, found, allow_outside=allow_outside))
+    summary = {
+        "actor": found.actor,
+        "frames": found.frames,
+        "table": found.table(),
+        "coverage": list(found.coverage.sentences),
+        "notes": list(found.notes),
+        "files": files,
+    }
+    emit(summary, as_json, lambda: [*experiment_lines(found), *map(str, files)])
 
 
 def _report_build(folder: Path, capture: Path | None, allow_outside: bool, as_json: bool) -> None:
     from jawusd.pipeline.report import report_build
 
     with progress() as tell:
-        summary = report_build(folder, capture, tell, allow_outside=allow_outside)
-    emit(summary, as_json, lambda: [summary["file"]])
+        path = report_build(folder, capture, tell, allow_outside=allow_outside)
+    emit({"file": str(path), "bytes": path.stat().st_size}, as_json, lambda: [str(path)])
 
 
 def view(

@@ -47,7 +47,7 @@ class TracksMeta(TypedDict, total=False):
     solver: str
     backend: str
     evaluations_per_row_and_frame: float
-    calibration_rescaled_px: dict[str, tuple[list[int], list[int]]]
+    calibration_rescaled_px: dict[str, tuple[tuple[int, int], tuple[int, int]]]
 
 
 class TrackStatus(IntEnum):

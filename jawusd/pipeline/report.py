@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from importlib import metadata
 from pathlib import Path
-from typing import TypedDict, TypeVar
+from typing import TypeVar
 
 from jawusd import __version__
 from jawusd.errors import FormatError, JawusdError, MissingDependencyError, explain_missing_packages
@@ -40,24 +40,6 @@ _NETWORKS = (
     "The paper's own models (NLPCA) take about a minute to train: `jawusd report DIR --experiments` adds them to the "
     "figures."
 )
-
-
-class ReportResult(TypedDict):
-    """Name the report written, and its size [bytes]."""
-
-    file: str
-    bytes: int
-
-
-class ExperimentsSummary(TypedDict):
-    """Hold the table of the experiments, sentences about what the capture lacks, notes, and the files written."""
-
-    actor: str
-    frames: int
-    table: list[dict[str, str | int | float]]
-    coverage: list[str]
-    notes: list[str]
-    files: list[Path]
 
 
 @dataclass(frozen=True)
@@ -137,8 +119,8 @@ def report_build(
     experiments: Experiments | None = None,
     *,
     allow_outside: bool = False,
-) -> ReportResult:
-    """Write the report of a finished build again.
+) -> Path:
+    """Write the report of a finished build again and return its path.
 
     Args:
         capture: capture.toml or its folder; without it, where the build says it was.
@@ -165,7 +147,7 @@ def report_build(
         known = state.stages.get("report")
         result = {"capture": place_of(facts.capture, folder)} if facts.capture else dict(known.result if known else {})
         state.finish("report", known.inputs if known else "", [path], known.seconds if known else 0.0, result)
-    return {"file": str(path), "bytes": path.stat().st_size}
+    return path
 
 
 def is_build(folder: Path) -> bool:
@@ -316,8 +298,8 @@ def do_experiments(
 
 
 @explain_missing_packages()
-def draw_experiments(found: Experiments, folder: Path) -> ExperimentsSummary:
-    """Write the figures and the table of the experiments into a folder, which is made if missing.
+def draw_experiments(found: Experiments, folder: Path) -> list[Path]:
+    """Write the figures and the table of the experiments into a folder, which is made if missing; return the files.
 
     Raises:
         OutputError: a file cannot be written.
@@ -325,16 +307,8 @@ def draw_experiments(found: Experiments, folder: Path) -> ExperimentsSummary:
     from jawusd.report import figures
 
     files = figures.draw_experiments(found, folder)
-    table = found.table()
-    save_table(folder / TABLE_FILE, table)
-    return {
-        "actor": found.actor,
-        "frames": found.frames,
-        "table": table,
-        "coverage": list(found.coverage.sentences),
-        "notes": list(found.notes),
-        "files": [*files, folder / TABLE_FILE],
-    }
+    save_table(folder / TABLE_FILE, found.table())
+    return [*files, folder / TABLE_FILE]
 
 
 @explain_missing_packages()
@@ -345,14 +319,13 @@ def experiment_files(folder: Path) -> list[Path]:
     return [folder / f"{name}.{suffix}" for name in FIGURES for suffix in ("png", "svg")] + [folder / TABLE_FILE]
 
 
-def experiment_lines(summary: ExperimentsSummary) -> list[str]:
-    """Return the result of `draw_experiments` as text."""
+def experiment_lines(found: Experiments) -> list[str]:
+    """Return the results of the experiments as text."""
     heads = ("mean", "median", "p95", "max")
-    lines = [f"{summary['actor']}: {summary['frames']} captured poses; distances [mm]"]
+    lines = [f"{found.actor}: {found.frames} captured poses; distances [mm]"]
     lines.append(f"{'experiment':<16}{'model':<30}{'quantity':<32}{'count':>6}" + "".join(f"{h:>9}" for h in heads))
-    for row in summary["table"]:
+    for row in found.table():
         figures = "".join(f"{row[f'{head}_mm']:9.3f}" for head in heads)
         lines.append(f"{row['experiment']:<16}{row['model']:<30}{row['quantity']:<32}{row['count']:>6}{figures}")
-    lines += [f"note: {note}" for note in summary["notes"]]
-    lines += [f"coverage: {sentence}" for sentence in summary["coverage"] or ["no exercise is missing."]]
-    return lines + [str(path) for path in summary["files"]]
+    lines += [f"note: {note}" for note in found.notes]
+    return lines + [f"coverage: {sentence}" for sentence in found.coverage.sentences or ["no exercise is missing."]]
