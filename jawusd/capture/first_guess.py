@@ -44,7 +44,6 @@ def guess_cameras(
     """Calibrate each camera alone, then place the cameras by the views they share.
 
     Args:
-        sizes_px: picture (width, height) per camera.
         corners_px: seen corners, NaN where unseen, shape (C, V, N, 2).
         points_mm: corners on the board, shape (N, 3).
         symmetries: orders in which the same corners may be listed, permutations of (N,); the first is the identity.

@@ -60,7 +60,6 @@ def find_steps(brightness: Array, first_frame: int = 0) -> list[Step]:
 
     Args:
         brightness: mean brightness of successive pictures, 0 .. 255, shape (n,).
-        first_frame: frame number of the first one.
     """
     if len(brightness) < 2 or brightness.max() - brightness.min() < _CONTRAST * brightness.max():
         return []

@@ -52,9 +52,7 @@ def check_scale(
     """Compare the spread of the picks in space with that on the scans (Umeyama 1991).
 
     Args:
-        bootstrap: the picks, at one instant in all views.
         scans: vertices [mm] by "upper" and "lower", shape (n, 3).
-        square_mm: the square size taken, named in the error.
 
     Raises:
         CalibrationError: the teeth come out with another size than the scan's.

@@ -45,7 +45,6 @@ def load_cameras_file(path: str | os.PathLike[str], unit_mm: float = 1.0) -> lis
 
     Args:
         path: aniposelib TOML, a COLMAP text model (its folder or one of its files) or nerfstudio's transforms.json.
-        unit_mm: length of the file's unit [mm].
 
     Raises:
         CalibrationError: a value is missing or wrong, or the camera model is not supported.
@@ -58,7 +57,8 @@ def load_cameras_file(path: str | os.PathLike[str], unit_mm: float = 1.0) -> lis
         cameras = load_nerfstudio(path)
     else:
         cameras = load_calibration(path)
-    return [replace(camera, T_cam_world=_in_mm(camera.T_cam_world, unit_mm)) for camera in cameras]
+    poses = [make_transform(camera.T_cam_world[:3, :3], unit_mm * camera.T_cam_world[:3, 3]) for camera in cameras]
+    return [replace(camera, T_cam_world=pose) for camera, pose in zip(cameras, poses, strict=True)]
 
 
 def calibration_files(path: Path) -> list[Path]:
@@ -133,12 +133,6 @@ def load_nerfstudio(path: str | os.PathLike[str]) -> list[Camera]:
         T_cam_world = se3_inverse(T_world_gl @ _OPENGL)
         _add(cameras, Camera(_camera_name(frame["file_path"]), size, K, distortion, T_cam_world), path)
     return [cameras[name] for name in sorted(cameras)]
-
-
-def _in_mm(T: Array, unit_mm: float) -> Array:
-    T = T.copy()
-    T[:3, 3] *= unit_mm
-    return T
 
 
 def _rows(path: Path, every: int = 1) -> list[list[str]]:

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from jawusd.errors import FormatError, OutputError
 from jawusd.formats.atomic import write_bytes_atomic
-from jawusd.formats.capture import Bootstrap, Pick
+from jawusd.formats.capture import Bootstrap
 
 _TABLE = "bootstrap"
 
@@ -78,13 +78,10 @@ def _lines(picks: Bootstrap) -> list[str]:
     lines = [f"frame = {picks.frame}"]
     for arch, picked in (("upper", picks.upper), ("lower", picks.lower)):
         for pick in picked:
-            lines += ["", f"[[{_TABLE}.{arch}]]", f"vertex = {pick.vertex}", f"views = [{_views(pick)}]"]
+            # Camera names hold no character that TOML would escape.
+            views = (f'{{ camera = "{view.camera}", x = {view.x:.2f}, y = {view.y:.2f} }}' for view in pick.views)
+            lines += ["", f"[[{_TABLE}.{arch}]]", f"vertex = {pick.vertex}", f"views = [{', '.join(views)}]"]
     return lines
-
-
-def _views(pick: Pick) -> str:
-    # Camera names hold no character that TOML would escape.
-    return ", ".join(f'{{ camera = "{view.camera}", x = {view.x:.2f}, y = {view.y:.2f} }}' for view in pick.views)
 
 
 def _blocks(text: str) -> Iterator[tuple[str, list[str]]]:

@@ -30,7 +30,6 @@ class MaskReader:
     video of variable rate some have no picture, and no mask.
 
     Attributes:
-        path: PNG pattern or video.
         count: one past the last frame of the source.
     """
 
@@ -48,7 +47,6 @@ class MaskReader:
         Args:
             path: a PNG pattern with one `%d` or `%06d` (the number of the picture in the camera's video), or a video
                 with one picture per picture, or per frame, of the camera's video.
-            size_px: (width, height) of the camera's pictures.
             timeline: of the camera's video; without one, PNG files are numbered by frames.
             labels: for label images, the gray values of the wanted arch and of the other one.
             prepare: applied to each mask in the background thread, such as `WorkingView.mask`.

@@ -75,7 +75,6 @@ def tracking_sheet(
     Args:
         frames: frames of the reference camera, all of them in tracks.
         offsets: whole-frame offset per camera name, see `capture.sync`.
-        tile_px: (width, height) of a tile.
 
     Raises:
         ValueError: a frame is not in tracks.

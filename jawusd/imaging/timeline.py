@@ -16,7 +16,6 @@ class Timeline:
 
     Attributes:
         numbers: frame of each picture, increasing, shape (n,).
-        rate: frames per second.
         count: one past the frame of the last picture.
     """
 

@@ -38,7 +38,6 @@ class Video:
     """Give access to the pictures of a video file; holds no open file, so threads may share it.
 
     Attributes:
-        path: the file.
         count: number of pictures.
         times_s: presentation times after the first picture [s], shape (count,), increasing.
         timeline: which picture is shown at which frame.
@@ -114,7 +113,6 @@ class Video:
 
         Args:
             last: one after the last picture; None = to the end.
-            colour: what to make of each picture.
             region: (x0, y0, x1, y1) [px], x1 and y1 exclusive, in the turned picture; None = all of it.
             threads: decoder threads; 0 lets the codec choose.
 

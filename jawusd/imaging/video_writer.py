@@ -34,7 +34,6 @@ class VideoWriter:
         Args:
             path: `.mp4` for H.264 (yuv420p), `.mkv` for lossless FFV1 gray.
             size_px: (width, height); both even for H.264.
-            lossless: FFV1 with one 8-bit gray channel instead of H.264.
             quality_crf: H.264 constant rate factor, 0 (best) .. 51.
 
         Raises:

@@ -64,7 +64,6 @@ def cut_arches(
     """Segment a picture (h, w, 3); return the shares of both arches, 0 .. 1, shape (2, h, w).
 
     Args:
-        expected: where the crowns are expected in it.
         reach_mm: how far teeth may lie outside their projection.
         seeds: what a person drew, which no colour overrides.
     """

@@ -74,7 +74,6 @@ class CameraSegmenter:
         Args:
             poses: T_world_upper, T_world_lower as expected, shape (2, 4, 4).
             turn: 0 for predicted poses, then 1 and so on as they get better.
-            keys: what a person drew for each arch.
         """
         c = self._config
         window = self._frame.window(image, self._around(poses), c.margin_mm)
