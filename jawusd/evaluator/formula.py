@@ -335,7 +335,7 @@ class BoundFormula:
             slopes[i] = [catmull_rom(x, y, span) for x, y in zip(supports[i - 1], supports[i + 1])]
         self.tables = {"directions": directions, **curve_tables("support", knots, supports, slopes)}
         self.first_mm, self.last_mm = knots[0], knots[-1]
-        self.softness_mm, self.margin_mm = arrays["slice_softness_mm"][0], arrays["slice_margin_mm"][0]
+        self.softness_mm, self.offset_mm = arrays["slice_softness_mm"][0], arrays["slice_margin_mm"][0]
 
     def margin(self, d: Triple[N], tables: Mapping[str, Table], ops: Operations[N, Table]) -> N:
         """Return the signed distance of d [mm] to the bound [mm], positive inside.
@@ -346,4 +346,4 @@ class BoundFormula:
         supports = curve("support", d1, tables, ops)
         sides = [d2 * x + d3 * y - h for x, y, h in zip(*ops.columns(tables["directions"]), supports)]
         terms = [x / self.softness_mm for x in (*sides, self.first_mm - d1, d1 - self.last_mm)]
-        return self.margin_mm - self.softness_mm * ops.log_sum_exp(terms)
+        return self.offset_mm - self.softness_mm * ops.log_sum_exp(terms)

@@ -200,8 +200,8 @@ def describe(path: PathArg, prim_path: str | None = None) -> Description:
         "ranges_mm": {name.removeprefix("jaw:"): row.tolist() for name, row in zip(PARAMETERS, rig.d_range)},
         "landmarks_mm": dict(zip(names, rig.landmarks.tolist(), strict=True)),
         "thresholds_mm": {
-            "residual": float(rig.arrays["residual_limit_mm"]),
-            "margin": float(rig.arrays["margin_limit_mm"]),
+            "residual": rig.limits.residual_mm,
+            "margin": rig.limits.margin_mm,
         },
         "table": {
             "format": table.format,

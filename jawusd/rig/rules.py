@@ -106,7 +106,7 @@ def check_bounds(prim: Usd.Prim) -> Iterator[Finding]:
     d = _parameters(prim, times)
     margin = rig.margin(d)
     worst = int(np.argmin(np.where(np.isfinite(margin), margin, -np.inf)))
-    outside = ~(margin >= float(rig.arrays["margin_limit_mm"]))
+    outside = ~(margin >= rig.limits.margin_mm)
     if outside.any():
         values = ", ".join(f"{x:.2f}" for x in d[worst])
         message = f"{outside.sum()} of {len(d)} samples are outside; worst at {times[worst]}: d = ({values}) mm, "

@@ -32,7 +32,7 @@ def valid_box(rig: JawRig) -> Array:
         RigError: The bounds leave no valid parameters.
     """
     box = np.array(rig.d_range, dtype=np.float64)
-    reach = 1.0 + float(rig.arrays["slice_margin_mm"]) + float(rig.arrays["slice_softness_mm"])
+    reach = 1.0 + rig.bound.offset_mm + rig.bound.softness_mm
     wide = box + np.array([-reach, reach])
     axes = [np.linspace(low, high, _PROBES_PER_AXIS) for low, high in wide]
     probes = grid_points(axes)

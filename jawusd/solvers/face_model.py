@@ -30,7 +30,7 @@ def jaw_pose_from_axis_angle(
         translation: Translation t of the jaw [model units], shape (..., 3); None for models that only turn it.
         joint: The jaw joint j of the face with the mouth closed [model units], shape (3,).
         T_skull_model: Rigid alignment of the model's frame with the skull (upper teeth scan) frame, in mm, (4, 4).
-        T_rest: Pose of the closed bite, `JawRig.arrays["T_rest"]`, shape (4, 4).
+        T_rest: Pose of the closed bite, `JawRig.T_rest`, shape (4, 4).
         unit_mm: Length of a model unit; both models count in metres.
 
     Returns:

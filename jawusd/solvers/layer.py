@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.distances import landmark_vectors
 from jawusd.geometry.se3 import se3_inverse
-from jawusd.solvers.motion import Margin, Motion
+from jawusd.solvers.motion import MarginModule, MotionModule
 
 _LEAST_CURVATURE = 1e-9  # relative; keeps encodings differentiable where a parameter hardly moves the landmarks
 
@@ -29,8 +29,8 @@ class JawLayer(nn.Module):
     def __init__(self, rig: JawRig) -> None:
         super().__init__()
         self.rig = rig
-        self.motion = Motion(rig.kind, rig.arrays)
-        self.bound = Margin(rig.arrays)
+        self.motion = MotionModule(rig.kind, rig.arrays)
+        self.bound = MarginModule(rig.arrays)
         A = rig.T_anatomical_skull
         closed = A @ rig.T_rest
         self.register_buffer("from_anatomical", torch.tensor(se3_inverse(A)))

@@ -90,7 +90,7 @@ class _Formula(nn.Module):
         return dict(self.named_buffers())
 
 
-class Motion(_Formula):
+class MotionModule(_Formula):
     """The motion of a model of any kind, anatomical frame."""
 
     def __init__(self, kind: str, arrays: Mapping[str, Array]) -> None:
@@ -103,7 +103,7 @@ class Motion(_Formula):
         return transforms(self._formula.motion(triple(d.split(1, dim=1)), self._tables(), OPERATIONS))
 
 
-class Margin(_Formula):
+class MarginModule(_Formula):
     """The signed distance to the slice hull."""
 
     def __init__(self, arrays: Mapping[str, Array]) -> None:
