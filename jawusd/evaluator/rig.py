@@ -267,12 +267,11 @@ class JawRig(RigArrays):
         self, verdicts: Verdicts, poses: Array, batch: tuple[int, ...], times_s: ArrayLike | None, limits: Limits
     ) -> Verdicts:
         """Return the verdicts in batch shape; frames reached too fast are marked if there is a speed limit."""
-        fast = np.zeros(batch, dtype=bool)
-        if limits.speed_mm_s is not None:
-            measured = np.where(verdicts.measured()[:, None, None], poses, np.nan)
-            positions = transform_points(measured, self.landmarks[None]).reshape(*batch, -1, 3)
-            fast = too_fast(positions, times_s, limits.speed_mm_s)
-        return verdicts.finished(batch, fast)
+        if limits.speed_mm_s is None:
+            return verdicts.finished(batch)
+        measured = np.where(verdicts.measured()[:, None, None], poses, np.nan)
+        positions = transform_points(measured, self.landmarks[None]).reshape(*batch, -1, 3)
+        return verdicts.finished(batch, too_fast(positions, times_s, limits.speed_mm_s))
 
     def ik(
         self,

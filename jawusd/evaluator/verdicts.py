@@ -73,9 +73,11 @@ class Verdicts:
         reason[self.measured() & _outside(margin_mm, limits)] |= Reason.OUTSIDE_BOUNDS.value
         return Verdicts(reason == 0, reason, self.residual_mm, margin_mm, self.d)
 
-    def finished(self, batch: tuple[int, ...], fast: Mask) -> Verdicts:
+    def finished(self, batch: tuple[int, ...], fast: Mask | None = None) -> Verdicts:
         """Return the verdicts in a batch shape, with the frames marked in ``fast`` (of that shape) too fast."""
-        reason = self.reason.reshape(batch) | np.where(fast, Reason.TOO_FAST.value, 0).astype(np.uint8)
+        reason = self.reason.reshape(batch)
+        if fast is not None:
+            reason = reason | np.where(fast, Reason.TOO_FAST.value, 0).astype(np.uint8)
         residual_mm, margin_mm = self.residual_mm.reshape(batch), self.margin_mm.reshape(batch)
         return Verdicts(reason == 0, reason, residual_mm, margin_mm, self.d.reshape(*batch, 3))
 
