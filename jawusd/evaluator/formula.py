@@ -251,7 +251,7 @@ def curve(name: str, x: N, tables: Mapping[str, Table], ops: Operations[N, Table
     """Return the point at x of the curve of `curve_tables`, a row."""
     found = ops.lookup(x, tables[f"{name}_knot"], [tables[f"{name}_{part}"] for part in _CURVE_TABLES])
     s = x - found[0][0]
-    return [polynomial(powers, s) for powers in zip(*found[1:])]
+    return [((c3 * s + c2) * s + c1) * s + c0 for c0, c1, c2, c3 in zip(*found[1:])]
 
 
 class JawFormula(Protocol):

@@ -1,6 +1,7 @@
 """Contour samples, edge search, normal equations and the joint solver."""
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,8 +11,9 @@ from jawusd.geometry import make_transform, rigidity_defect, se3_exp, se3_invers
 from jawusd.imaging.raster import draw_depth_labels, project
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.correspondences import accumulate, search_edges
+from jawusd.tracking.contour.equations import GingivalMarginTerm, NormalEquations, SilhouetteTerm
 from jawusd.tracking.contour.samples import COLUMNS, CROWN, GUM, INVERSE_DEPTH, LENGTH, NX, NY, U, V, contour_samples
-from jawusd.tracking.contour.scan import prepare_scan
+from jawusd.tracking.contour.scan import ARCHES, prepare_scan
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import View
 
@@ -39,7 +41,8 @@ def _samples(r, pose, camera):
     draw_depth_labels(points, SCANS[r].crown_faces, 0, 0, False, depth, labels, CROWN)
     draw_depth_labels(points, SCANS[r].gum_faces, 0, 0, False, depth, labels, GUM)
     eye = transform_point(se3_inverse(pose), camera.centre_world())
-    return contour_samples(SCANS[r], camera.projection_matrix() @ pose, eye, labels, depth, 3.0, 1.5), labels
+    matrix = camera.projection_matrix() @ pose
+    return contour_samples(SCANS[r], matrix, eye, labels, depth, 3.0, 1.5)[0], labels
 
 
 def test_samples_lie_on_the_outline_of_the_rendered_crowns():
@@ -179,6 +182,22 @@ def test_masks_left_out_do_not_count():
     a, b = (solver.solve(POSES[6], v, USUAL, use) for v in (views, broken))
     assert (a.poses[0] == b.poses[0]).all()
     assert not b.outline.precision[:, 2].any() and b.outline.precision[:, :2].any()
+
+
+def test_silhouette_and_gingival_margin_are_terms_of_their_own():
+    solution = ContourSolver(SCANS, CONFIG).solve(POSES[2], _views(2), ())
+    equations, parts = NormalEquations(), []
+    for term in (SilhouetteTerm(), GingivalMarginTerm()):
+        before = equations.matrix.copy()
+        term.accumulate(solution, equations)
+        parts.append(np.trace(equations.matrix - before))
+    assert min(parts) > 0.02 * sum(parts)  # each one constrains the poses
+    both = [np.trace(solution.outline.precision[r].sum(0)) for r in ARCHES]
+    np.testing.assert_allclose(sum(parts), sum(both), rtol=1e-12)
+    bare = [replace(scan, gingival_margin=scan.gingival_margin[:0]) for scan in SCANS]
+    without = ContourSolver(bare, CONFIG).solve(POSES[2], _views(2), ())
+    np.testing.assert_allclose(without.silhouette.precision, solution.silhouette.precision, rtol=1e-9)
+    assert not without.gingival_margin.precision.any()
 
 
 def test_a_row_without_masks_stays_where_it_was():

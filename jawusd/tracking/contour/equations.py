@@ -8,6 +8,7 @@ kind of measurement is a new class with `accumulate`, handed to `ContourSolver.s
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -58,6 +59,10 @@ class OutlineSums(NamedTuple):
         shapes: tuple[tuple[int, ...], ...] = ((6, 6), (6,), (6,), (), (), (), (), ())
         return cls(*(np.zeros((2, cameras, *shape)) for shape in shapes))
 
+    def plus(self, other: OutlineSums) -> OutlineSums:
+        """Return the sums over the samples of both."""
+        return OutlineSums(*(ours + theirs for ours, theirs in zip(self, other, strict=True)))
+
 
 @dataclass(frozen=True, eq=False)
 class Solution:
@@ -65,7 +70,8 @@ class Solution:
 
     Attributes:
         poses: T_world_upper and T_world_lower, shape (2, 4, 4).
-        outline: sums over the matched contour samples.
+        silhouette: sums over the matched samples of silhouettes and borders of the scans.
+        gingival_margin: sums over the matched samples of the crown-gum line.
         centres: points the twists turn about, world coordinates [mm], shape (2, 3).
         scatters: sums over picture tiles of the squared score of `scatter_of_tiles`, per arch, shape (2, 6, 6).
         visible_px: contour length that could have been matched, per arch and view [px], shape (2, C).
@@ -73,11 +79,17 @@ class Solution:
     """
 
     poses: Array
-    outline: OutlineSums
+    silhouette: OutlineSums
+    gingival_margin: OutlineSums
     centres: Array
     scatters: Array
     visible_px: Array
     iterations: int
+
+    @cached_property
+    def outline(self) -> OutlineSums:
+        """The sums over all matched contour samples."""
+        return self.silhouette.plus(self.gingival_margin)
 
 
 class NormalEquations:
@@ -133,14 +145,25 @@ class ResidualTerm(Protocol):
         ...
 
 
-class OutlineTerm:
-    """Draw silhouettes and gingival margins onto the edges of their masks."""
+class SilhouetteTerm:
+    """Draw the silhouettes of the crowns onto the edges of their masks."""
 
     def accumulate(self, state: Solution, equations: NormalEquations) -> None:
-        """Add the sums over the matched contour samples of all views."""
-        for arch, weight in enumerate(equations.outline_weight):
-            precision, gradient = (table[arch].sum(0) for table in state.outline[:2])
-            equations.add(arch, weight * precision, weight * gradient)
+        """Add the sums over the matched silhouette samples of all views."""
+        _add_outline(state.silhouette, equations)
+
+
+class GingivalMarginTerm:
+    """Draw the crown-gum lines onto the edges of their masks."""
+
+    def accumulate(self, state: Solution, equations: NormalEquations) -> None:
+        """Add the sums over the matched samples of the gingival margin of all views."""
+        _add_outline(state.gingival_margin, equations)
+
+
+def _add_outline(sums: OutlineSums, equations: NormalEquations) -> None:
+    for arch, weight in enumerate(equations.outline_weight):
+        equations.add(arch, weight * sums.precision[arch].sum(0), weight * sums.gradient[arch].sum(0))
 
 
 @dataclass(frozen=True, eq=False)

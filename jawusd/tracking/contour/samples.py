@@ -26,8 +26,10 @@ def contour_samples(
     inverse_depth: NDArray[np.float32],
     step_px: float,
     depth_tolerance_mm: float,
-) -> Array:
+) -> tuple[Array, int]:
     """Return the contour points at which the picture changes from crown to anything else, shape (n, COLUMNS).
+
+    Those of the silhouette come first, then those of the gingival margin; the second result counts the first.
 
     Args:
         matrix: projection from scan coordinates [mm] to homogeneous px of the region, shape (3, 4).
@@ -42,7 +44,7 @@ def contour_samples(
     candidates = _silhouette(*scan_tables, eye, matrix, step_px, labels.shape)
     silhouette = _visible(candidates, labels, inverse_depth, depth_tolerance_mm)
     margin = _gingival_margin(scan.gingival_margin, matrix, labels, inverse_depth, depth_tolerance_mm)
-    return np.concatenate([silhouette, margin])
+    return np.concatenate([silhouette, margin]), len(silhouette)
 
 
 @numba.njit(nogil=True, cache=True, inline="always")

@@ -14,10 +14,11 @@ from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.config import Mapper, TrackingConfig
 from jawusd.tracking.contour.correspondences import accumulate, scatter_of_tiles, search_edges
 from jawusd.tracking.contour.equations import (
+    GingivalMarginTerm,
     NormalEquations,
     OutlineSums,
-    OutlineTerm,
     ResidualTerm,
+    SilhouetteTerm,
     Solution,
     StartTerm,
     motion_about,
@@ -28,7 +29,8 @@ from jawusd.tracking.contour.views import View, present_masks
 
 _DENSE_STEPS = 2  # with all faces of a dense scan, after the thinned one has settled
 
-_Match = tuple[Array, Array, float]  # samples, their distances to the mask edge, visible contour length [px]
+# samples, how many of them are silhouette, their distances to the mask edge, visible contour length [px]
+_Match = tuple[Array, int, Array, float]
 
 
 class ContourSolver:
@@ -83,7 +85,8 @@ class ContourSolver:
         """Take one step per gate from the given poses."""
         poses = np.array(poses, np.float64)
         rendering = _Rendering(self, views)
-        all_terms: tuple[ResidualTerm, ...] = (OutlineTerm(), StartTerm(start, self._start_strength), *terms)
+        pull = StartTerm(start, self._start_strength)
+        all_terms: tuple[ResidualTerm, ...] = (SilhouetteTerm(), GingivalMarginTerm(), pull, *terms)
         iterations = 0
         for gate in gates_px:
             iterations += 1
@@ -116,23 +119,25 @@ class ContourSolver:
 
         matches = dict(zip(tasks, self.map(match, tasks), strict=True))
         centres = np.stack([transform_point(poses[r], self.scans[r].centre) for r in ARCHES])
-        outline = OutlineSums.zeros(len(views))
+        silhouette, margin = OutlineSums.zeros(len(views)), OutlineSums.zeros(len(views))
         scatters, visible = np.zeros((2, 6, 6)), np.zeros((2, len(views)))
         pull = config.pull if gate > config.pull_above_px else 0.0
         used = [gate, gate]
         if gate <= config.final_gate_px[1]:
-            used = [self._final_gate([matches[t][1] for t in tasks if t[0] == r], gate) for r in ARCHES]
+            used = [self._final_gate([matches[t][2] for t in tasks if t[0] == r], gate) for r in ARCHES]
         for r, c in tasks:
-            samples, distances, visible[r, c] = matches[r, c]
+            samples, count, distances, visible[r, c] = matches[r, c]
             where = (views[c].T_delay[r] @ poses[r], views[c].matrix, centres[r])
-            tables = (outline.precision[r, c], outline.gradient[r, c], outline.bias_slope[r, c])
-            sums = accumulate(samples, distances, used[r], config.score_gate_px, pull, *where, *tables)
-            for table, value in zip(outline[3:], sums, strict=True):
-                table[r, c] = value
+            for outline, part in ((silhouette, slice(None, count)), (margin, slice(count, None))):
+                tables = (outline.precision[r, c], outline.gradient[r, c], outline.bias_slope[r, c])
+                gates = (used[r], config.score_gate_px, pull)
+                sums = accumulate(samples[part], distances[part], *gates, *where, *tables)
+                for table, value in zip(outline[3:], sums, strict=True):
+                    table[r, c] = value
             if final:
                 shape = views[c].masks.shape[1:]
                 scatters[r] += scatter_of_tiles(samples, distances, used[r], *where, shape, config.tile_px)
-        return Solution(poses.copy(), outline, centres, scatters, visible, 0)
+        return Solution(poses.copy(), silhouette, margin, centres, scatters, visible, 0)
 
     def _match(
         self,
@@ -145,14 +150,14 @@ class ContourSolver:
     ) -> _Match:
         config, scan = self.config, self.scans[r]
         eye = pose[:3, :3].T @ (view.eye - pose[:3, 3])
-        samples = contour_samples(
+        samples, silhouettes = contour_samples(
             scan, view.matrix @ pose, eye, labels[r], depths[r], config.sample_step_px, config.depth_tolerance_mm
         )
         distances = np.empty(len(samples))
         other = (view.masks[1 - r], depths[1 - r])
         limits = (reach, config.overlap_tolerance_mm, config.normal_cosine)
         search_edges(samples, view.masks[r], *other, *limits, distances)
-        return samples, distances - view.bias_px[r], float(samples[:, LENGTH].sum())
+        return samples, silhouettes, distances - view.bias_px[r], float(samples[:, LENGTH].sum())
 
     def _final_gate(self, distances: list[Array], gate: float) -> float:
         """Return the Tukey gate that suits the spread of the residuals (median absolute deviation)."""
