@@ -23,17 +23,11 @@ _USD = (".usd", ".usda", ".usdc", ".usdz")
 
 @dataclass(frozen=True, eq=False)
 class AuthoredMotion:
-    """Hold a motion as it was read.
+    """Hold a motion as it was read."""
 
-    Attributes:
-        frames: frame numbers (F,), increasing.
-        d: parameters (F, 3) [mm], NaN in frames without parameters.
-        fps: frames per second, None where the source does not say.
-    """
-
-    frames: Array
-    d: Array
-    fps: float | None
+    frames: Array  # frame numbers (F,), increasing
+    d: Array  # parameters (F, 3) [mm], NaN in frames without parameters
+    fps: float | None  # frames per second, None where the source does not say
 
     def __post_init__(self) -> None:
         """Refuse what cannot be written out frame by frame."""
@@ -92,15 +86,10 @@ def read_face(rig: JawRig, source: Path, fps: float | None) -> AuthoredMotion:
 
 @dataclass(frozen=True)
 class Changes:
-    """Say what was changed in a motion.
+    """Say what was changed in a motion."""
 
-    Attributes:
-        figures: counts and sizes [mm].
-        lines: for people; the first continues the line that names the file.
-    """
-
-    figures: dict[str, float]
-    lines: list[str]
+    figures: dict[str, float]  # counts and sizes [mm]
+    lines: list[str]  # for people; the first continues the line that names the file
 
 
 def emit_motion(out: Path, rate: float, motion: AuthoredMotion, changes: Changes, as_json: bool) -> None:

@@ -34,23 +34,14 @@ _FARTHER_MM = 4.0  # by which slides may exceed the captured ones
 
 @dataclass(frozen=True)
 class CondylarGuidance:
-    """Hold the paths of the left and right condyle, anatomical frame.
+    """Hold the paths of the left and right condyle, anatomical frame."""
 
-    Attributes:
-        incisor: lower incisal point at rest [mm], shape (3,).
-        centres: kinematic centres at rest [mm], shape (2, 3).
-        slopes: polynomial coefficients of the height over the slide, shape (2, 4) [mm].
-        slide_range: captured slides [mm], shape (2, 2).
-        shift: coefficients of the sideways movement of the middle [mm], shape (5,).
-        misfit_mm: rms residual of the three equations over the captured poses.
-    """
-
-    incisor: Array
-    centres: Array
-    slopes: Array
-    slide_range: Array
-    shift: Array
-    misfit_mm: float
+    incisor: Array  # lower incisal point at rest [mm], shape (3,)
+    centres: Array  # kinematic centres at rest [mm], shape (2, 3)
+    slopes: Array  # polynomial coefficients of the height over the slide, shape (2, 4) [mm]
+    slide_range: Array  # captured slides [mm], shape (2, 2)
+    shift: Array  # coefficients of the sideways movement of the middle [mm], shape (5,)
+    misfit_mm: float  # rms residual of the three equations over the captured poses
 
     @classmethod
     def of_motion(cls, motion: Array, weights: Array, incisor: Array, condyles: Array) -> CondylarGuidance:

@@ -27,19 +27,12 @@ _SMALLEST_MOTION_MM = 1.0  # rms over the mandible from the first pose, 95 % qua
 
 @dataclass(frozen=True)
 class SubjectAnatomy:
-    """Hold the landmarks and measured points of a person's jaw and the frames of its poses.
+    """Hold the landmarks and measured points of a person's jaw and the frames of its poses."""
 
-    Attributes:
-        T_anatomical_skull: skull (scan) frame to anatomical frame, shape (4, 4).
-        landmarks: `geometry.LANDMARKS` in mandible coordinates [mm], shape (5, 3).
-        mandible_vertices: points whose motion is measured, mandible coordinates [mm], shape (V, 3).
-        T_rest: T_skull_mandible of the closed bite, shape (4, 4).
-    """
-
-    T_anatomical_skull: Array
-    landmarks: Array
-    mandible_vertices: Array
-    T_rest: Array
+    T_anatomical_skull: Array  # skull (scan) frame to anatomical frame, shape (4, 4)
+    landmarks: Array  # `geometry.LANDMARKS` in mandible coordinates [mm], shape (5, 3)
+    mandible_vertices: Array  # points whose motion is measured, mandible coordinates [mm], shape (V, 3)
+    T_rest: Array  # T_skull_mandible of the closed bite, shape (4, 4)
 
     @classmethod
     def of(
@@ -78,22 +71,14 @@ class SubjectAnatomy:
 
 @dataclass(frozen=True)
 class TrainingData:
-    """Hold the poses a model is fitted to.
-
-    Attributes:
-        motion: motions away from the closed bite, anatomical frame, shape (N, 4, 4).
-        weights: between 0 and 1, shape (N,).
-        incisor: lower incisal point in the closed bite, anatomical frame [mm], shape (3,).
-        landmarks: all landmarks likewise, shape (5, 3).
-        metric: the mandible metric, anatomical frame.
-    """
+    """Hold the poses a model is fitted to."""
 
     frames: NDArray[np.int64]
-    motion: Array
-    weights: Array
-    incisor: Array
-    landmarks: Array
-    metric: MandibleMetric
+    motion: Array  # motions away from the closed bite, anatomical frame, shape (N, 4, 4)
+    weights: Array  # between 0 and 1, shape (N,)
+    incisor: Array  # lower incisal point in the closed bite, anatomical frame [mm], shape (3,)
+    landmarks: Array  # all landmarks likewise, shape (5, 3)
+    metric: MandibleMetric  # the mandible metric, anatomical frame
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -109,18 +94,13 @@ class TrainingData:
 
 @dataclass(frozen=True)
 class Selection:
-    """Hold the captured poses (F, 4, 4) with their frame numbers (F,), and the training data selected from them.
-
-    Attributes:
-        used: which captured frames the data hold, shape (F,).
-        excluded: frame numbers left out, by reason.
-    """
+    """Hold the captured poses (F, 4, 4) with their frame numbers (F,), and the training data selected from them."""
 
     frames: NDArray[np.int64]
     T_skull_mandible: Array
     data: TrainingData
-    used: Mask
-    excluded: dict[str, list[int]]
+    used: Mask  # which captured frames the data hold, shape (F,)
+    excluded: dict[str, list[int]]  # frame numbers left out, by reason
 
 
 def displacement(motion: Array, point: Array) -> Array:

@@ -42,26 +42,18 @@ _FEW_POSES = 100
 
 @dataclass(frozen=True)
 class FittingConfig:
-    """Choose the model and how it is checked.
-
-    Attributes:
-        literal: with method "paper", keep the paper's fixed grouping of components.
-        holdout_folds: contiguous parts of the take that are left out in turn to measure the error on unseen poses;
-            0 to skip.
-        trim_mad: frames farther from the model than the median by this many normalised median absolute deviations
-            count as tracking failures and are left out.
-        alpha: largest circumradius of the triangles of the paper's alpha shapes, range-normalised units.
-        starts: random starts of the networks of method "paper"; the best is kept.
-        seed: of the first start.
-    """
+    """Choose the model and how it is checked."""
 
     method: Method = "anchored"
-    literal: bool = False
+    literal: bool = False  # with method "paper", keep the paper's fixed grouping of components
+    # contiguous parts of the take that are left out in turn to measure the error on unseen poses; 0 to skip
     holdout_folds: int = 5
+    # frames farther from the model than the median by this many normalised median absolute deviations count as tracking
+    # failures and are left out
     trim_mad: float = 4.5
-    alpha: float = 0.23
-    starts: int = 4
-    seed: int = 0
+    alpha: float = 0.23  # largest circumradius of the triangles of the paper's alpha shapes, range-normalised units
+    starts: int = 4  # random starts of the networks of method "paper"; the best is kept
+    seed: int = 0  # of the first start
 
     def __post_init__(self) -> None:
         if self.method not in get_args(Method):

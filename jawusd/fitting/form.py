@@ -12,16 +12,11 @@ from jawusd.geometry.arrays import Array, Mask
 
 @dataclass(frozen=True, eq=False)
 class FittedForm:
-    """Hold a fitted decoder.
-
-    Attributes:
-        kept: training frames that were not trimmed, shape (N,).
-        notes: JSON-able facts about the fit, for the header.
-    """
+    """Hold a fitted decoder."""
 
     model: JawModelForm
-    kept: Mask
-    notes: dict[str, object]
+    kept: Mask  # training frames that were not trimmed, shape (N,)
+    notes: dict[str, object]  # JSON-able facts about the fit, for the header
 
     @property
     def kind(self) -> str:

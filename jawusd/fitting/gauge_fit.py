@@ -39,15 +39,11 @@ _GRID = 33
 
 @dataclass(frozen=True)
 class GaugeFit:
-    """Hold a gauge, its check and its regularisation.
-
-    Attributes:
-        smallest_minor: least principal minor of the Jacobian over the box (see `smallest_minor`).
-        stiffness: factor on the ridge penalties, 1 unless the gauge folded at first; None: no glide surface at all.
-    """
+    """Hold a gauge, its check and its regularisation."""
 
     gauge: Gauge
-    smallest_minor: float
+    smallest_minor: float  # least principal minor of the Jacobian over the box (see `smallest_minor`)
+    # factor on the ridge penalties, 1 unless the gauge folded at first; None: no glide surface at all
     stiffness: float | None
 
 

@@ -20,16 +20,11 @@ from jawusd.geometry.arrays import Array
 
 @dataclass(frozen=True)
 class MandibleMetric:
-    """Measure pose differences by the displacement of a set of mandible points.
+    """Measure pose differences by the displacement of a set of mandible points."""
 
-    Attributes:
-        vectors: four homogeneous columns that represent the points, their mean last (see `evaluator.distances`),
-            shape (4, 4).
-        extremes: vertices of the points' convex hull [mm], shape (H, 3).
-    """
-
+    # four homogeneous columns that represent the points, their mean last (see `evaluator.distances`), shape (4, 4)
     vectors: Array
-    extremes: Array
+    extremes: Array  # vertices of the points' convex hull [mm], shape (H, 3)
 
     @classmethod
     def of_points(cls, points: Array) -> MandibleMetric:

@@ -32,17 +32,12 @@ Values = TypeVar("Values", Array, torch.Tensor)
 
 @dataclass(frozen=True)
 class Nlpca:
-    """A trained network.
+    """A trained network."""
 
-    Attributes:
-        layers: weights and biases, input to output: (D, h), (h,), (h, k), (k,), (k, h), (h,), (h, D), (D,).
-        scale: factor on the data before the network.
-        centre: subtracted from the data first, shape (D,).
-    """
-
+    # weights and biases, input to output: (D, h), (h,), (h, k), (k,), (k, h), (h,), (h, D), (D,)
     layers: tuple[Array, ...]
-    scale: float
-    centre: Array
+    scale: float  # factor on the data before the network
+    centre: Array  # subtracted from the data first, shape (D,)
     cost: float
 
     @property

@@ -93,14 +93,10 @@ class _Sum:
 
 @dataclass(frozen=True, eq=False)
 class PaperFit(FittedForm):
-    """Hold a fitted model of the paper, which trims nothing, and its networks.
-
-    Attributes:
-        root: L (6, 6) of the metric coordinates log(M) @ L.
-    """
+    """Hold a fitted model of the paper, which trims nothing, and its networks."""
 
     network_sum: _Sum
-    root: Array
+    root: Array  # L (6, 6) of the metric coordinates log(M) @ L
 
     def reconstruct_as_published(self, motion: Array) -> Array:
         """Return motions (N, 4, 4) encoded and decoded by the networks, not projected, before any shift."""

@@ -37,19 +37,12 @@ def farthest_points(points: Array, count: int) -> Array:
 
 @dataclass(frozen=True)
 class SplineBasis:
-    """Turn normalised points into regression columns whose bending energy is a quadratic form.
+    """Turn normalised points into regression columns whose bending energy is a quadratic form."""
 
-    Attributes:
-        centres: shape (m, 3).
-        null_space: maps free coefficients to kernel weights that meet the side conditions, shape (m, k).
-        energy: bending energy of the free coefficients, zero rows for the linear tail, shape (k + 3, k + 3).
-        at_zero: kernel values at q = 0, shape (m,).
-    """
-
-    centres: Array
-    null_space: Array
-    energy: Array
-    at_zero: Array
+    centres: Array  # shape (m, 3)
+    null_space: Array  # maps free coefficients to kernel weights that meet the side conditions, shape (m, k)
+    energy: Array  # bending energy of the free coefficients, zero rows for the linear tail, shape (k + 3, k + 3)
+    at_zero: Array  # kernel values at q = 0, shape (m,)
 
     @classmethod
     def on_centres(cls, centres: Array) -> SplineBasis:

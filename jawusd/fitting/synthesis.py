@@ -23,21 +23,13 @@ _BATCH, _BATCHES = 4000, 50  # a bound that fills less than a half percent of it
 
 @dataclass(frozen=True, eq=False)
 class Bounds:
-    """Hold the bounds of one model.
+    """Hold the bounds of one model."""
 
-    Attributes:
-        box: captured range of each parameter [mm], shape (3, 2).
-        polygons: the paper's alpha shapes.
-        rings: their outlines in (d1, d2) and (d1, d3) [mm], each ring (n, 2).
-        slices: the slice hull.
-        slices_box: the box that holds the slice hull [mm], shape (3, 2).
-    """
-
-    box: Array
-    polygons: PolygonBound
-    rings: tuple[tuple[Array, ...], tuple[Array, ...]]
-    slices: SliceHull
-    slices_box: Array
+    box: Array  # captured range of each parameter [mm], shape (3, 2)
+    polygons: PolygonBound  # the paper's alpha shapes
+    rings: tuple[tuple[Array, ...], tuple[Array, ...]]  # their outlines in (d1, d2) and (d1, d3) [mm], each ring (n, 2)
+    slices: SliceHull  # the slice hull
+    slices_box: Array  # the box that holds the slice hull [mm], shape (3, 2)
 
     @classmethod
     def of(cls, d: Array, alpha: float) -> Bounds:

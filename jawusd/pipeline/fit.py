@@ -49,22 +49,16 @@ _MOST_NUMBERS = 16_000_000  # a million 4 x 4 matrices
 
 @dataclass(frozen=True)
 class TrajectoryOptions:
-    """Say how a file of poses is written.
+    """Say how a file of poses is written."""
 
-    Attributes:
-        columns: our column names to the file's, see `formats.poses.read_poses`; tables only.
-        length_unit: of the translations, a key of `LENGTH_UNITS_MM`; tables only, HDF5 files name theirs.
-        invert: the poses map skull to mandible.
-        rest_frame: a frame with the teeth in occlusion: the jaw is measured from there, so that the file's mandible
-            frame may lie anywhere on the mandible; None: the poses are identity in occlusion.
-        group: the trajectory of an HDF5 file; None: its raw one.
-    """
-
+    # our column names to the file's, see `formats.poses.read_poses`; tables only
     columns: Mapping[str, str] = field(default_factory=dict)
-    length_unit: str = "mm"
-    invert: bool = False
+    length_unit: str = "mm"  # of the translations, a key of `LENGTH_UNITS_MM`; tables only, HDF5 files name theirs
+    invert: bool = False  # the poses map skull to mandible
+    # a frame with the teeth in occlusion: the jaw is measured from there, so that the file's mandible frame may lie
+    # anywhere on the mandible; None: the poses are identity in occlusion
     rest_frame: int | None = None
-    group: str | None = None
+    group: str | None = None  # the trajectory of an HDF5 file; None: its raw one
 
 
 class FitSummary(TypedDict, total=False):

@@ -108,19 +108,12 @@ def plot_ranges(entries: Sequence[Entry], folder: Path, force: bool) -> list[Pat
 
 @dataclass(frozen=True, eq=False)
 class PersonalRig:
-    """A rig made from landmarks.
+    """A rig made from landmarks."""
 
-    Attributes:
-        model: the fitted model.
-        motion: what it was fitted to.
-        left_out: library persons not used, their captures lack a movement.
-        header: what the model's header says of its making.
-    """
-
-    model: JawModel
-    motion: PersonalMotion
-    left_out: tuple[str, ...]
-    header: Mapping[str, object]
+    model: JawModel  # the fitted model
+    motion: PersonalMotion  # what it was fitted to
+    left_out: tuple[str, ...]  # library persons not used, their captures lack a movement
+    header: Mapping[str, object]  # what the model's header says of its making
 
 
 def personal_rig(landmarks: Path, library: Library, *, closest: bool, name: str, progress: Progress) -> PersonalRig:
@@ -200,19 +193,12 @@ def _finite(value: float | None) -> float | None:
 
 @dataclass(frozen=True, eq=False)
 class Retargeted:
-    """Hold a motion carried to another person, and what had to be changed for it.
+    """Hold a motion carried to another person, and what had to be changed for it."""
 
-    Attributes:
-        frames: frame numbers, shape (G,).
-        d: parameters of the target [mm], inside its bound, NaN where the motion is lost, shape (G, 3).
-        outside: samples at which equal shares would leave the bound, shape (G,).
-        moved_mm: how far each sample is from equal shares, in d, NaN where lost, shape (G,).
-    """
-
-    frames: Array
-    d: Array
-    outside: Mask
-    moved_mm: Array
+    frames: Array  # frame numbers, shape (G,)
+    d: Array  # parameters of the target [mm], inside its bound, NaN where the motion is lost, shape (G, 3)
+    outside: Mask  # samples at which equal shares would leave the bound, shape (G,)
+    moved_mm: Array  # how far each sample is from equal shares, in d, NaN where lost, shape (G,)
 
 
 def retarget(source: JawRig, target: JawRig, frames: Array, d: Array) -> Retargeted:

@@ -152,25 +152,15 @@ def read_meshes(files: Mapping[str, Path]) -> dict[str, Mesh]:
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """Hold what fitting and reports need to know of a person.
+    """Hold what fitting and reports need to know of a person."""
 
-    Attributes:
-        name: of the person or the capture.
-        T_anatomical_skull: scan frame to anatomical frame, shape (4, 4).
-        landmarks: `geometry.LANDMARKS` in the mandible frame [mm], shape (5, 3).
-        meshes: by the names of `MESHES`, scan frame [mm]; may be empty.
-        fps: frames per second of the poses, None if not known.
-        T_rest: T_skull_mandible of the closed bite, shape (4, 4).
-        inferred: what was derived instead of being given.
-    """
-
-    name: str
-    T_anatomical_skull: Array
-    landmarks: Array
-    meshes: Mapping[str, Mesh]
-    fps: float | None = None
-    T_rest: Array = field(default_factory=lambda: np.eye(4))
-    inferred: tuple[str, ...] = ()
+    name: str  # of the person or the capture
+    T_anatomical_skull: Array  # scan frame to anatomical frame, shape (4, 4)
+    landmarks: Array  # `geometry.LANDMARKS` in the mandible frame [mm], shape (5, 3)
+    meshes: Mapping[str, Mesh]  # by the names of `MESHES`, scan frame [mm]; may be empty
+    fps: float | None = None  # frames per second of the poses, None if not known
+    T_rest: Array = field(default_factory=lambda: np.eye(4))  # T_skull_mandible of the closed bite, shape (4, 4)
+    inferred: tuple[str, ...] = ()  # what was derived instead of being given
 
     def measured_points(self) -> Array | None:
         """Return the points whose motion is measured [mm], shape (V, 3): mandible, else lower teeth, else None."""

@@ -44,17 +44,11 @@ _NETWORKS = (
 
 @dataclass(frozen=True)
 class BuildFacts:
-    """Say what a finished build left behind.
+    """Say what a finished build left behind."""
 
-    Attributes:
-        stages: record of each stage.
-        capture: the capture it was made from, None where it is not available.
-        why_not: why there is no capture.
-    """
-
-    stages: Stages
-    capture: Capture | None
-    why_not: str = ""
+    stages: Stages  # record of each stage
+    capture: Capture | None  # the capture it was made from, None where it is not available
+    why_not: str = ""  # why there is no capture
 
 
 @explain_missing_packages()

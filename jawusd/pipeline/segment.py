@@ -44,17 +44,11 @@ _MOST_REDONE, _REJOINED_MM = 24, 0.7
 
 @dataclass(frozen=True)
 class SegmentOptions:
-    """Choose how to segment.
+    """Choose how to segment."""
 
-    Attributes:
-        keys: folder with masks or strokes a person drew for some frames, or None.
-        resume: keep the frames that were finished before.
-        jobs: threads.
-    """
-
-    keys: Path | None = None
-    resume: bool = False
-    jobs: int = 2
+    keys: Path | None = None  # folder with masks or strokes a person drew for some frames, or None
+    resume: bool = False  # keep the frames that were finished before
+    jobs: int = 2  # threads
 
 
 def segment_capture(

@@ -54,18 +54,12 @@ R_co = TypeVar("R_co", bound=Mapping[str, object], covariant=True)
 
 @dataclass(frozen=True)
 class StageRecord(Generic[R_co]):
-    """Record one finished stage.
+    """Record one finished stage."""
 
-    Attributes:
-        inputs: hash of everything the stage read: files, configuration, results of earlier stages.
-        outputs: hash by file name, relative to the folder.
-        result: small results that later stages or reports need.
-    """
-
-    inputs: str
-    outputs: dict[str, str]
+    inputs: str  # hash of everything the stage read: files, configuration, results of earlier stages
+    outputs: dict[str, str]  # hash by file name, relative to the folder
     seconds: float
-    result: R_co
+    result: R_co  # small results that later stages or reports need
 
 
 #: Finished stages by name.

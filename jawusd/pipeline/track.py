@@ -36,26 +36,18 @@ _LISTED_FRAMES = 20
 
 
 class TrackSummary(TypedDict):
-    """Hold what a person should know of tracks; numbers of frames, unless the name says otherwise.
-
-    Attributes:
-        lost: frame numbers.
-        lost_reasons: frames lost for each reason, by arch.
-        calibration_rescaled_px: sizes calibrated and recorded, by camera.
-        sigma_mm: median standard deviation of the landmarks, None if not known.
-        coverage_error_percent: share of the masks left uncovered, None without masks.
-    """
+    """Hold what a person should know of tracks; numbers of frames, unless the name says otherwise."""
 
     frames: int
     tracked: int
-    lost: list[int]
-    lost_reasons: NotRequired[dict[str, dict[str, int]]]
+    lost: list[int]  # frame numbers
+    lost_reasons: NotRequired[dict[str, dict[str, int]]]  # frames lost for each reason, by arch
     recovered: int
     without_a_camera: int
     prior_aided: int
-    calibration_rescaled_px: dict[str, tuple[Size, Size]]
-    sigma_mm: dict[str, float | None]
-    coverage_error_percent: float | None
+    calibration_rescaled_px: dict[str, tuple[Size, Size]]  # sizes calibrated and recorded, by camera
+    sigma_mm: dict[str, float | None]  # median standard deviation of the landmarks, None if not known
+    coverage_error_percent: float | None  # share of the masks left uncovered, None without masks
 
 
 class ArchSummary(TypedDict):

@@ -61,19 +61,13 @@ class Occlusion:
 
 @dataclass(frozen=True, eq=False)
 class PersonAnatomy:
-    """Teeth and bones in the scan frame (x left, y up, z anterior, origin at the upper incisal edge) [mm].
-
-    Attributes:
-        mandible: without teeth.
-        skull: sockets of the joint, cheekbones, upper jaw bone.
-        occlusion: contact of the two arches.
-    """
+    """Teeth and bones in the scan frame (x left, y up, z anterior, origin at the upper incisal edge) [mm]."""
 
     upper: DentalArch
     lower: DentalArch
-    mandible: Mesh
-    skull: Mesh
-    occlusion: Occlusion
+    mandible: Mesh  # without teeth
+    skull: Mesh  # sockets of the joint, cheekbones, upper jaw bone
+    occlusion: Occlusion  # contact of the two arches
 
 
 def build_anatomy(person: Person) -> PersonAnatomy:

@@ -41,21 +41,13 @@ _NOISE_PATTERNS = 5
 
 @dataclass(frozen=True)
 class DemoConfig:
-    """Choose the person and the size of a synthetic capture.
+    """Choose the person and the size of a synthetic capture."""
 
-    Attributes:
-        seed: of person and performance.
-        frames: tracked frames at 24 per second.
-        size_px: width and height of the pictures.
-        boards: poses of the calibration board.
-        quality_crf: H.264 constant rate factor of the videos.
-    """
-
-    seed: int = 0
-    frames: int = 240
-    size_px: tuple[int, int] = (1280, 720)
-    boards: int = 24
-    quality_crf: int = 23
+    seed: int = 0  # of person and performance
+    frames: int = 240  # tracked frames at 24 per second
+    size_px: tuple[int, int] = (1280, 720)  # width and height of the pictures
+    boards: int = 24  # poses of the calibration board
+    quality_crf: int = 23  # H.264 constant rate factor of the videos
 
     def __post_init__(self) -> None:
         if self.frames <= OPEN_HOLD + REST_HOLD:

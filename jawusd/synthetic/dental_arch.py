@@ -30,35 +30,22 @@ _COLUMN_MM = 0.55
 
 @dataclass(frozen=True)
 class ArchShape:
-    """Form and position of one arch.
+    """Form and position of one arch."""
 
-    Attributes:
-        quadratic_per_mm: the line of edges and buccal cusps recedes by a x^2 + b x^4: a [1/mm].
-        quartic_per_mm3: b [1/mm^3].
-        setback_mm: distance of this line inside that curve.
-        tips_mm: height of edge or highest cusp of each tooth, first incisor to second molar, left then right,
-            shape (2, 7).
-        midline_mm: x of the midline.
-    """
-
-    quadratic_per_mm: float
-    quartic_per_mm3: float
-    setback_mm: float
+    quadratic_per_mm: float  # the line of edges and buccal cusps recedes by a x^2 + b x^4: a [1/mm]
+    quartic_per_mm3: float  # b [1/mm^3]
+    setback_mm: float  # distance of this line inside that curve
+    # height of edge or highest cusp of each tooth, first incisor to second molar, left then right, shape (2, 7)
     tips_mm: Array
-    midline_mm: float
+    midline_mm: float  # x of the midline
 
 
 @dataclass(frozen=True, eq=False)
 class DentalArch:
-    """One arch with gum, scan frame.
+    """One arch with gum, scan frame."""
 
-    Attributes:
-        mesh: crowns first, then gum; red, green and grey.
-        tooth: tooth of each vertex, 1..7 left and -1..-7 right from the midline, 0 gum, shape (V,).
-    """
-
-    mesh: Mesh
-    tooth: NDArray[np.int8]
+    mesh: Mesh  # crowns first, then gum; red, green and grey
+    tooth: NDArray[np.int8]  # tooth of each vertex, 1..7 left and -1..-7 right from the midline, 0 gum, shape (V,)
 
 
 class _Line:

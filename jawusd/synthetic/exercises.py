@@ -36,21 +36,13 @@ _SCHEDULES: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Recording:
-    """A person's exercises; poses are T_skull_mandible, shape (F, 4, 4).
+    """A person's exercises; poses are T_skull_mandible, shape (F, 4, 4)."""
 
-    Attributes:
-        controls: opening 0..1, lateral -1..1, protrusion -1..1, shape (F, 3).
-        phase: name of the exercise of each frame, shape (F,).
-        T_manifold: poses of the controls alone.
-        T_true: poses with the small extra movements.
-        T_noisy: `T_true` with tracking noise.
-    """
-
-    controls: Array
-    phase: NDArray[np.str_]
-    T_manifold: Array
-    T_true: Array
-    T_noisy: Array
+    controls: Array  # opening 0..1, lateral -1..1, protrusion -1..1, shape (F, 3)
+    phase: NDArray[np.str_]  # name of the exercise of each frame, shape (F,)
+    T_manifold: Array  # poses of the controls alone
+    T_true: Array  # poses with the small extra movements
+    T_noisy: Array  # `T_true` with tracking noise
 
 
 def record(person: Person, n_frames: int, seed: int, kind: Kind = "training", noise_scale: float = 1.0) -> Recording:

@@ -25,57 +25,31 @@ _CUSP_ROUNDING_MM = 0.3
 
 @dataclass(frozen=True)
 class Joint:
-    """Parameters of one person's joint; pairs are (left, right), lengths mm, angles rad.
+    """Parameters of one person's joint; pairs are (left, right), lengths mm, angles rad."""
 
-    Attributes:
-        condyles: centres of the condyles at rest, shape (2, 3).
-        incisor: lower incisal point at rest, shape (3,).
-        eminence_height_mm: drop of each eminence from fossa to the far side of its crest, shape (2,).
-        eminence_width_mm: half width of the slope, shape (2,).
-        eminence_start_mm: forward distance from rest to the steepest point, shape (2,).
-        medial_slope: drop per medial mm, shape (2,).
-        bennett_rad: angle of each condyle's path to the sagittal plane when it is the balancing one, shape (2,).
-        side_shift_mm: immediate side shift when that side works, shape (2,).
-        lateral_max_mm: largest difference of the two slides when that side works, shape (2,).
-        lateral_shrink: share of it that is lost at full opening.
-        working_share: share of that difference which the balancing condyle takes, closed.
-        rotation_max_rad: pitch at full opening.
-        rotation_bend: curvature of pitch over opening (0: proportional).
-        slide_open_mm: forward slide at full opening.
-        slide_limit_mm: forward slide at which a condyle is stopped.
-        slide_early: share of the slide that follows the rotation from the first millimetre.
-        slide_onset: opening (0..1) over which that share sets in.
-        protrusion_max_mm: forward slide in full protrusion, closed.
-        retrusion_max_mm: backward slide in full retrusion, closed.
-        hinge_share: share of the opening slide that retrusion reverses while the mouth is less than half open.
-        deviation_mm: sideways deviation of the opening path: S-shaped and one-sided part, shape (2,).
-        protrusive_guidance: glide of the teeth: initial slope, later slope, transition [mm], shape (3,).
-        lateral_guidance: same for lateral movements, shape (3,).
-    """
-
-    condyles: Array
-    incisor: Array
-    eminence_height_mm: Array
-    eminence_width_mm: Array
-    eminence_start_mm: Array
-    medial_slope: Array
-    bennett_rad: Array
-    side_shift_mm: Array
-    lateral_max_mm: Array
-    lateral_shrink: float
-    working_share: float
-    rotation_max_rad: float
-    rotation_bend: float
-    slide_open_mm: float
-    slide_limit_mm: float
-    slide_early: float
-    slide_onset: float
-    protrusion_max_mm: float
-    retrusion_max_mm: float
-    hinge_share: float
-    deviation_mm: Array
-    protrusive_guidance: Array
-    lateral_guidance: Array
+    condyles: Array  # centres of the condyles at rest, shape (2, 3)
+    incisor: Array  # lower incisal point at rest, shape (3,)
+    eminence_height_mm: Array  # drop of each eminence from fossa to the far side of its crest, shape (2,)
+    eminence_width_mm: Array  # half width of the slope, shape (2,)
+    eminence_start_mm: Array  # forward distance from rest to the steepest point, shape (2,)
+    medial_slope: Array  # drop per medial mm, shape (2,)
+    bennett_rad: Array  # angle of each condyle's path to the sagittal plane when it is the balancing one, shape (2,)
+    side_shift_mm: Array  # immediate side shift when that side works, shape (2,)
+    lateral_max_mm: Array  # largest difference of the two slides when that side works, shape (2,)
+    lateral_shrink: float  # share of it that is lost at full opening
+    working_share: float  # share of that difference which the balancing condyle takes, closed
+    rotation_max_rad: float  # pitch at full opening
+    rotation_bend: float  # curvature of pitch over opening (0: proportional)
+    slide_open_mm: float  # forward slide at full opening
+    slide_limit_mm: float  # forward slide at which a condyle is stopped
+    slide_early: float  # share of the slide that follows the rotation from the first millimetre
+    slide_onset: float  # opening (0..1) over which that share sets in
+    protrusion_max_mm: float  # forward slide in full protrusion, closed
+    retrusion_max_mm: float  # backward slide in full retrusion, closed
+    hinge_share: float  # share of the opening slide that retrusion reverses while the mouth is less than half open
+    deviation_mm: Array  # sideways deviation of the opening path: S-shaped and one-sided part, shape (2,)
+    protrusive_guidance: Array  # glide of the teeth: initial slope, later slope, transition [mm], shape (3,)
+    lateral_guidance: Array  # same for lateral movements, shape (3,)
 
     @property
     def lever_mm(self) -> float:

@@ -64,19 +64,12 @@ def _draw_joint(rng: np.random.Generator) -> Joint:
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations of tracking noise and of movements outside the three controls.
+    """Standard deviations of tracking noise and of movements outside the three controls."""
 
-    Attributes:
-        tracking_mm: at the middle of the dental arch, per axis, independent between frames.
-        tracking_rad: of the rotation, per axis, independent between frames.
-        side_mm: side shift outside the three controls, smooth in time.
-        lift_mm: lift of each condyle off its eminence, smooth in time.
-    """
-
-    tracking_mm: float
-    tracking_rad: float
-    side_mm: float
-    lift_mm: float
+    tracking_mm: float  # at the middle of the dental arch, per axis, independent between frames
+    tracking_rad: float  # of the rotation, per axis, independent between frames
+    side_mm: float  # side shift outside the three controls, smooth in time
+    lift_mm: float  # lift of each condyle off its eminence, smooth in time
 
 
 class Person:

@@ -48,40 +48,24 @@ _LIP = np.array(
 
 @dataclass(frozen=True)
 class LipState:
-    """The shape of the lips.
+    """The shape of the lips."""
 
-    Attributes:
-        upper_mm: height of the middle of the upper lip's edge over the upper incisal edge.
-        lower_mm: depth of the middle of the lower lip's edge below the lower incisal edge, moving with the jaw.
-        width_mm: half distance between the corners.
-        slant: rise of the mouth per mm to the left.
-    """
-
-    upper_mm: float
-    lower_mm: float
-    width_mm: float
-    slant: float
+    upper_mm: float  # height of the middle of the upper lip's edge over the upper incisal edge
+    lower_mm: float  # depth of the middle of the lower lip's edge below the lower incisal edge, moving with the jaw
+    width_mm: float  # half distance between the corners
+    slant: float  # rise of the mouth per mm to the left
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A coloured surface for rendering.
+    """A coloured surface for rendering."""
 
-    Attributes:
-        vertices: positions [mm], shape (V, 3).
-        faces: shape (F, 3).
-        colors: linear diffuse reflectance, shape (V, 3), 0..1.
-        gloss: strength of the highlight, shape (V,), 0..1.
-        skin: 1 where the surface has the grain of skin, 0 elsewhere, shape (V,).
-        inside: 1 in the mouth, where surfaces get less light with depth, shape (V,).
-    """
-
-    vertices: Array
-    faces: Faces
-    colors: Array
-    gloss: Array
-    skin: Array
-    inside: Array
+    vertices: Array  # positions [mm], shape (V, 3)
+    faces: Faces  # shape (F, 3)
+    colors: Array  # linear diffuse reflectance, shape (V, 3), 0..1
+    gloss: Array  # strength of the highlight, shape (V,), 0..1
+    skin: Array  # 1 where the surface has the grain of skin, 0 elsewhere, shape (V,)
+    inside: Array  # 1 in the mouth, where surfaces get less light with depth, shape (V,)
 
 
 class Face:

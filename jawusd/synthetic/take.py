@@ -33,33 +33,19 @@ _EXERCISES = (
 
 @dataclass(frozen=True, eq=False)
 class Take:
-    """A performance, sampled at the instants of the reference camera's frames.
+    """A performance, sampled at the instants of the reference camera's frames."""
 
-    Attributes:
-        first_instant: reference frame number of the first instant; negative when another camera started earlier.
-        tracked: first and one past the last reference frame to be tracked.
-        rest_frame: reference frame with the teeth in occlusion.
-        dark: dark intervals [first, last) in reference frames, shape (2, 2).
-        controls: opening, lateral, protrusion, shape (I, 3).
-        phase: name of the exercise, shape (I,).
-        T_skull_mandible: shape (I, 4, 4).
-        T_world_skull: shape (I, 4, 4).
-        lips: one per instant.
-        tongue_mm: forward, up, left, shape (I, 3).
-        light: brightness, shape (I,).
-    """
-
-    first_instant: int
-    tracked: tuple[int, int]
-    rest_frame: int
-    dark: NDArray[np.int64]
-    controls: Array
-    phase: NDArray[np.str_]
-    T_skull_mandible: Array
-    T_world_skull: Array
-    lips: list[LipState]
-    tongue_mm: Array
-    light: Array
+    first_instant: int  # reference frame number of the first instant; negative when another camera started earlier
+    tracked: tuple[int, int]  # first and one past the last reference frame to be tracked
+    rest_frame: int  # reference frame with the teeth in occlusion
+    dark: NDArray[np.int64]  # dark intervals [first, last) in reference frames, shape (2, 2)
+    controls: Array  # opening, lateral, protrusion, shape (I, 3)
+    phase: NDArray[np.str_]  # name of the exercise, shape (I,)
+    T_skull_mandible: Array  # shape (I, 4, 4)
+    T_world_skull: Array  # shape (I, 4, 4)
+    lips: list[LipState]  # one per instant
+    tongue_mm: Array  # forward, up, left, shape (I, 3)
+    light: Array  # brightness, shape (I,)
 
 
 def perform(person: Person, occlusion: Occlusion, frames: int, offsets: tuple[int, ...], seed: int) -> Take:

@@ -26,24 +26,16 @@ _CUSP_SHARPNESS_PER_MM = 4.0
 
 @dataclass(frozen=True)
 class CrownForm:
-    """Shape of one kind of tooth.
+    """Shape of one kind of tooth."""
 
-    Attributes:
-        width_mm: mesio-distal.
-        depth_mm: facio-lingual.
-        height_mm: gum line to the highest cusp or the edge.
-        torque_deg: tilt of the occlusal end towards the facial side.
-        cusps: of premolars and molars: x and z as shares of half the width and depth, and the depth below the highest
-            cusp [mm]; empty for incisors and canines.
-        tip_mm: height of a canine's tip over its shoulders; 0 for the others.
-    """
-
-    width_mm: float
-    depth_mm: float
-    height_mm: float
-    torque_deg: float
+    width_mm: float  # mesio-distal
+    depth_mm: float  # facio-lingual
+    height_mm: float  # gum line to the highest cusp or the edge
+    torque_deg: float  # tilt of the occlusal end towards the facial side
+    # of premolars and molars: x and z as shares of half the width and depth, and the depth below the highest cusp [mm];
+    # empty for incisors and canines
     cusps: tuple[tuple[float, float, float], ...] = ()
-    tip_mm: float = 0.0
+    tip_mm: float = 0.0  # height of a canine's tip over its shoulders; 0 for the others
 
     @property
     def tip_z_mm(self) -> float:

@@ -22,16 +22,11 @@ _MOST_PER_S = 30.0  # limits the load on the network; screens hardly show more
 
 @dataclass(frozen=True, eq=False)
 class Clip:
-    """Hold parameters at rising frames, linear in between.
-
-    Attributes:
-        frames: frame numbers, shape (F,).
-        d: parameters [mm], shape (F, 3); finite.
-    """
+    """Hold parameters at rising frames, linear in between."""
 
     name: str
-    frames: Array
-    d: Array
+    frames: Array  # frame numbers, shape (F,)
+    d: Array  # parameters [mm], shape (F, 3); finite
     fps: float
 
     @classmethod

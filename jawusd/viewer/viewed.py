@@ -28,66 +28,47 @@ Region = tuple[float, float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class ViewedActor:
-    """Hold an actor to be viewed.
-
-    Attributes:
-        meshes: by the names of `STILL` and `MOVING` [mm], already decimated for a screen; any may be missing.
-        placeholders: names of meshes that only stand in for anatomy.
-        fps: frames per second of new animations.
-        folder: of the rig; animations are written there.
-        clip_names: lists the motions available now: the captured take and the animation layers beside the rig.
-        load_clip: reads one of them; raises a JawusdError.
-        save_layer: writes an animation layer (file name, clip, overwrite) beside the rig and returns its path; raises a
-            JawusdError.
-    """
+    """Hold an actor to be viewed."""
 
     name: str
     rig: JawRig
+    # by the names of `STILL` and `MOVING` [mm], already decimated for a screen; any may be missing
     meshes: Mapping[str, Mesh]
-    placeholders: frozenset[str]
-    fps: float
-    folder: Path
+    placeholders: frozenset[str]  # names of meshes that only stand in for anatomy
+    fps: float  # frames per second of new animations
+    folder: Path  # of the rig; animations are written there
+    # lists the motions available now: the captured take and the animation layers beside the rig
     clip_names: Callable[[], tuple[str, ...]]
-    load_clip: Callable[[str], Clip]
+    load_clip: Callable[[str], Clip]  # reads one of them; raises a JawusdError
+    # writes an animation layer (file name, clip, overwrite) beside the rig and returns its path; raises a JawusdError
     save_layer: Callable[[str, Clip, bool], Path]
 
 
 @dataclass(frozen=True, eq=False)
 class ViewedCapture:
-    """Hold a capture to be viewed.
-
-    Attributes:
-        frames: first and last frame to step through, of the reference camera, both inclusive.
-        offsets: frame k of a camera shows the instant of frame k + offset of the reference camera.
-        sizes_px: (width, height) of the pictures by camera, for every camera with footage, in the capture's order.
-        cameras: calibrated cameras by name; empty without a calibration.
-        scans: the teeth by arch, "upper" and "lower" [mm], vertices as in their files.
-        crowns: which faces of a scan are teeth, shape (F,); the others are gum.
-        T_anatomical_skull: scan frame to anatomical frame, shape (4, 4).
-        tracks: tracked poses; None without.
-        picks: of the capture file; None without.
-        picture: (camera, frame of the reference camera, T_world_upper and T_world_lower or None, look) to RGB
-            (h, w, 3) uint8, gray where the camera has no picture; raises a JawusdError.
-        teeth_region: (camera, frame) to the region of the teeth in its masks, None without masks.
-        poses_of_picks: poses that agree with picks, T_world_upper and T_world_lower (4, 4), and the names of the picks
-            that do not fit; raises a JawusdError.
-        save_picks: writes picks to the capture file, given those read from it before; raises a JawusdError.
-    """
+    """Hold a capture to be viewed."""
 
     name: str
     fps: float
-    frames: tuple[int, int]
-    offsets: Mapping[str, int]
+    frames: tuple[int, int]  # first and last frame to step through, of the reference camera, both inclusive
+    offsets: Mapping[str, int]  # frame k of a camera shows the instant of frame k + offset of the reference camera
+    # (width, height) of the pictures by camera, for every camera with footage, in the capture's order
     sizes_px: Mapping[str, tuple[int, int]]
-    cameras: Mapping[str, Camera]
-    scans: Mapping[str, Mesh]
-    crowns: Mapping[str, Mask]
-    T_anatomical_skull: Array
-    tracks: Tracks | None
-    picks: Bootstrap | None
+    cameras: Mapping[str, Camera]  # calibrated cameras by name; empty without a calibration
+    scans: Mapping[str, Mesh]  # the teeth by arch, "upper" and "lower" [mm], vertices as in their files
+    crowns: Mapping[str, Mask]  # which faces of a scan are teeth, shape (F,); the others are gum
+    T_anatomical_skull: Array  # scan frame to anatomical frame, shape (4, 4)
+    tracks: Tracks | None  # tracked poses; None without
+    picks: Bootstrap | None  # of the capture file; None without
+    # (camera, frame of the reference camera, T_world_upper and T_world_lower or None, look) to RGB (h, w, 3) uint8,
+    # gray where the camera has no picture; raises a JawusdError
     picture: Callable[[str, int, tuple[Array, Array] | None, Look], NDArray[np.uint8]]
+    # (camera, frame) to the region of the teeth in its masks, None without masks
     teeth_region: Callable[[str, int], Region | None]
+    # poses that agree with picks, T_world_upper and T_world_lower (4, 4), and the names of the picks that do not fit;
+    # raises a JawusdError
     poses_of_picks: Callable[[Bootstrap], tuple[tuple[Array, Array], list[str]]]
+    # writes picks to the capture file, given those read from it before; raises a JawusdError
     save_picks: Callable[[Bootstrap, Bootstrap | None], None]
 
     def tracked_poses(self, frame: int) -> tuple[Array, Array] | None:

@@ -66,25 +66,15 @@ class OutlineSums(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Hold poses with their linearised residuals: the state of an iteration, and the outcome of an alignment.
+    """Hold poses with their linearised residuals: the state of an iteration, and the outcome of an alignment."""
 
-    Attributes:
-        poses: T_world_upper and T_world_lower, shape (2, 4, 4).
-        silhouette: sums over the matched samples of silhouettes and borders of the scans.
-        gingival_margin: sums over the matched samples of the crown-gum line.
-        centres: points the twists turn about, world coordinates [mm], shape (2, 3).
-        scatters: sums over picture tiles of the squared score of `scatter_of_tiles`, per arch, shape (2, 6, 6).
-        visible_px: contour length that could have been matched, per arch and view [px], shape (2, C).
-        iterations: how many linearised steps were taken.
-    """
-
-    poses: Array
-    silhouette: OutlineSums
-    gingival_margin: OutlineSums
-    centres: Array
-    scatters: Array
-    visible_px: Array
-    iterations: int
+    poses: Array  # T_world_upper and T_world_lower, shape (2, 4, 4)
+    silhouette: OutlineSums  # sums over the matched samples of silhouettes and borders of the scans
+    gingival_margin: OutlineSums  # sums over the matched samples of the crown-gum line
+    centres: Array  # points the twists turn about, world coordinates [mm], shape (2, 3)
+    scatters: Array  # sums over picture tiles of the squared score of `scatter_of_tiles`, per arch, shape (2, 6, 6)
+    visible_px: Array  # contour length that could have been matched, per arch and view [px], shape (2, C)
+    iterations: int  # how many linearised steps were taken
 
     @cached_property
     def outline(self) -> OutlineSums:
@@ -168,15 +158,10 @@ def _add_outline(sums: OutlineSums, equations: NormalEquations) -> None:
 
 @dataclass(frozen=True, eq=False)
 class StartTerm:
-    """Pull weakly towards the start, which keeps motions finite that the masks leave free.
+    """Pull weakly towards the start, which keeps motions finite that the masks leave free."""
 
-    Attributes:
-        start: T_world_upper and T_world_lower, shape (2, 4, 4).
-        strength: precision of every component of the twists, in units of the outline sums, shape (2, 6).
-    """
-
-    start: Array
-    strength: Array
+    start: Array  # T_world_upper and T_world_lower, shape (2, 4, 4)
+    strength: Array  # precision of every component of the twists, in units of the outline sums, shape (2, 6)
 
     def accumulate(self, state: Solution, equations: NormalEquations) -> None:
         """Add the pull at the state's poses."""

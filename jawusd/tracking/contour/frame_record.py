@@ -28,21 +28,13 @@ NO_LOSS = Loss(LostReason.NONE, np.nan, np.nan)
 
 @dataclass(frozen=True, eq=False)
 class FrameRecord:
-    """Hold what is known about one instant.
+    """Hold what is known about one instant."""
 
-    Attributes:
-        solution: the alignment; its poses of lost arches mean nothing.
-        status: of both arches, as in `Tracks`, shape (2,).
-        used: masks that took part, shape (2, C).
-        coverage: E_SP over mask pixels, shape (2, C); NaN without a mask.
-        losses: why each arch is lost.
-    """
-
-    solution: Solution
-    status: NDArray[np.int8]
-    used: Mask
-    coverage: Array
-    losses: tuple[Loss, Loss] = (NO_LOSS, NO_LOSS)
+    solution: Solution  # the alignment; its poses of lost arches mean nothing
+    status: NDArray[np.int8]  # of both arches, as in `Tracks`, shape (2,)
+    used: Mask  # masks that took part, shape (2, C)
+    coverage: Array  # E_SP over mask pixels, shape (2, C); NaN without a mask
+    losses: tuple[Loss, Loss] = (NO_LOSS, NO_LOSS)  # why each arch is lost
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,37 +34,23 @@ _FEWEST_CROWN_FACES = 100  # fewer cannot show a contour in several directions
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """Hold one arch ready for projection.
+    """Hold one arch ready for projection."""
 
-    Attributes:
-        name: "upper" or "lower".
-        vertices: welded vertices in scan coordinates [mm], float64, shape (V, 3).
-        vertices_single: the same in float32 for the rasteriser.
-        crown_faces: faces to be matched, int32, shape (F, 3).
-        gum_faces: faces that only hide what lies behind them, int32, shape (G, 3).
-        planes: normal and offset (n, n.p) of every crown face, shape (F, 4); only signs of n.x - offset are used.
-        edges: vertex, vertex, face, other face or -1 at a border, int32, shape (E, 4).
-        gingival_margin: segments of the crown-gum line that are no mesh edges [mm], shape (S, 2, 3).
-        probes: some vertices spread over the crowns, at which motion is measured [mm], shape (N <= 300, 3).
-        centre: centroid of the crown vertices [mm], shape (3,).
-        radius_mm: largest distance of a crown vertex from the centre.
-        painted: whether the scan's colours told crown from gum; otherwise the whole scan counts as crown.
-            Painted crowns are wound outwards, so faces turned away need not be drawn.
-        thin: the same arch with fewer faces, for all but the last steps; None where this one is thin enough.
-    """
-
-    name: str
-    vertices: Array
-    vertices_single: NDArray[np.float32]
-    crown_faces: Faces
-    gum_faces: Faces
-    planes: Array
-    edges: Faces
-    gingival_margin: Array
-    probes: Array
-    centre: Array
-    radius_mm: float
+    name: str  # "upper" or "lower"
+    vertices: Array  # welded vertices in scan coordinates [mm], float64, shape (V, 3)
+    vertices_single: NDArray[np.float32]  # the same in float32 for the rasteriser
+    crown_faces: Faces  # faces to be matched, int32, shape (F, 3)
+    gum_faces: Faces  # faces that only hide what lies behind them, int32, shape (G, 3)
+    planes: Array  # normal and offset (n, n.p) of every crown face, shape (F, 4); only signs of n.x - offset are used
+    edges: Faces  # vertex, vertex, face, other face or -1 at a border, int32, shape (E, 4)
+    gingival_margin: Array  # segments of the crown-gum line that are no mesh edges [mm], shape (S, 2, 3)
+    probes: Array  # some vertices spread over the crowns, at which motion is measured [mm], shape (N <= 300, 3)
+    centre: Array  # centroid of the crown vertices [mm], shape (3,)
+    radius_mm: float  # largest distance of a crown vertex from the centre
+    # whether the scan's colours told crown from gum; otherwise the whole scan counts as crown. Painted crowns are wound
+    # outwards, so faces turned away need not be drawn
     painted: bool
+    # the same arch with fewer faces, for all but the last steps; None where this one is thin enough
     thin: Scan | None = None
 
     def crown_vertices(self, limit: int | None = None) -> Array:

@@ -22,22 +22,16 @@ _CHUNK = 48  # instants held at once when going backwards: about 20 MB
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Hold what one camera shows of both arches at one instant, undistorted, at the working size.
+    """Hold what one camera shows of both arches at one instant, undistorted, at the working size."""
 
-    Attributes:
-        matrix: world [mm] to homogeneous px of this picture, shape (3, 4).
-        eye: camera centre in the world [mm], shape (3,).
-        masks: of the upper and the lower arch, uint8, 255 = teeth, shape (2, h, w); zeros where there is none.
-        present: which of the two masks exist, shape (2,).
-        T_delay: how the arches move, in the world, from the reference instant to this camera's own, shape (2, 4, 4).
-        bias_px: how far the masks reach beyond the teeth [px], shape (2,).
-    """
-
-    matrix: Array
-    eye: Array
+    matrix: Array  # world [mm] to homogeneous px of this picture, shape (3, 4)
+    eye: Array  # camera centre in the world [mm], shape (3,)
+    # of the upper and the lower arch, uint8, 255 = teeth, shape (2, h, w); zeros where there is none
     masks: NDArray[np.uint8]
-    present: Mask
+    present: Mask  # which of the two masks exist, shape (2,)
+    # how the arches move, in the world, from the reference instant to this camera's own, shape (2, 4, 4)
     T_delay: Array = field(default_factory=lambda: np.tile(np.eye(4), (2, 1, 1)))
+    # how far the masks reach beyond the teeth [px], shape (2,)
     bias_px: Array = field(default_factory=lambda: np.zeros(2))
 
 

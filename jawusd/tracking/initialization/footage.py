@@ -52,22 +52,15 @@ class Footage:
 
 @dataclass(frozen=True, eq=False)
 class MaskSurvey:
-    """Hold middles and areas of the masks of some frames.
+    """Hold middles and areas of the masks of some frames."""
 
-    Attributes:
-        frames: reference camera frames, shape (F,).
-        middles: mean position (x, y) of every mask in its undistorted survey picture [px], NaN without a mask, shape
-            (F, 2, C, 2); rows are upper, lower.
-        areas_px: size of every mask, shape (F, 2, C); 0 without one.
-        matrices: world [mm] to homogeneous px of the survey pictures, shape (C, 3, 4).
-        eyes: camera centres in the world [mm], shape (C, 3).
-    """
-
-    frames: NDArray[np.int64]
+    frames: NDArray[np.int64]  # reference camera frames, shape (F,)
+    # mean position (x, y) of every mask in its undistorted survey picture [px], NaN without a mask, shape (F, 2, C, 2);
+    # rows are upper, lower
     middles: Array
-    areas_px: Array
-    matrices: Array
-    eyes: Array
+    areas_px: Array  # size of every mask, shape (F, 2, C); 0 without one
+    matrices: Array  # world [mm] to homogeneous px of the survey pictures, shape (C, 3, 4)
+    eyes: Array  # camera centres in the world [mm], shape (C, 3)
 
     def places(self) -> Array:
         """Return the world points seen at the middles of the masks [mm], NaN with fewer than two, shape (F, 2, 3)."""

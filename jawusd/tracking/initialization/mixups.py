@@ -25,17 +25,11 @@ _ODD_SHARE = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Mixup:
-    """Hold one way in which masks may have been exchanged.
+    """Hold one way in which masks may have been exchanged."""
 
-    Attributes:
-        finding: what is wrong, to follow "frame F: ".
-        hint: what to do.
-        sources: the cameras with the exchange undone.
-    """
-
-    finding: str
-    hint: str
-    sources: tuple[CameraSource, ...]
+    finding: str  # what is wrong, to follow "frame F: "
+    hint: str  # what to do
+    sources: tuple[CameraSource, ...]  # the cameras with the exchange undone
 
     def refusal(self, frame: int) -> TrackingError:
         """Return the error that names the exchange."""

@@ -35,17 +35,11 @@ _SURE_MM = 0.8
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Say where tracking begins.
+    """Say where tracking begins."""
 
-    Attributes:
-        frame: reference camera frame.
-        poses: T_world_upper, T_world_lower, shape (2, 4, 4).
-        notes: how it was found, for the meta data of the tracks.
-    """
-
-    frame: int
-    poses: Array
-    notes: dict[str, object]
+    frame: int  # reference camera frame
+    poses: Array  # T_world_upper, T_world_lower, shape (2, 4, 4)
+    notes: dict[str, object]  # how it was found, for the meta data of the tracks
 
 
 def find_start(

@@ -44,17 +44,11 @@ _FARTHEST_JAW_MM = 75.0  # distance of the arches' front teeth beyond which it d
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Hold what a search found on a frame.
+    """Hold what a search found on a frame."""
 
-    Attributes:
-        poses: T_world_upper, T_world_lower, shape (2, 4, 4).
-        objective_px: fitting contour less the price of uncovered mask, both arches.
-        fit: `arch_fit` of the arch that fits worse [-].
-    """
-
-    poses: Array
-    objective_px: float
-    fit: float
+    poses: Array  # T_world_upper, T_world_lower, shape (2, 4, 4)
+    objective_px: float  # fitting contour less the price of uncovered mask, both arches
+    fit: float  # `arch_fit` of the arch that fits worse [-]
 
 
 class StartSearch:

@@ -32,21 +32,13 @@ class PixelCounter(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class PaperScan:
-    """Hold the regions of a teeth scan that the paper draws (fig. 8).
+    """Hold the regions of a teeth scan that the paper draws (fig. 8)."""
 
-    Attributes:
-        vertices: scan coordinates [mm], shape (V, 3).
-        plain_faces: red: teeth that only have to cover their masks, shape (F, 3).
-        boundary_faces: green: the boundary of interest, shape (B, 3).
-        cull: whether faces turned away may be left out.
-        centre: centroid of the teeth [mm], shape (3,).
-    """
-
-    vertices: Array
-    plain_faces: NDArray[np.int32]
-    boundary_faces: NDArray[np.int32]
-    cull: bool
-    centre: Array
+    vertices: Array  # scan coordinates [mm], shape (V, 3)
+    plain_faces: NDArray[np.int32]  # red: teeth that only have to cover their masks, shape (F, 3)
+    boundary_faces: NDArray[np.int32]  # green: the boundary of interest, shape (B, 3)
+    cull: bool  # whether faces turned away may be left out
+    centre: Array  # centroid of the teeth [mm], shape (3,)
 
 
 def paper_scan(mesh: Mesh, name: str) -> PaperScan:

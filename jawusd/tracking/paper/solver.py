@@ -55,17 +55,11 @@ class PaperConfig:
 
 @dataclass(frozen=True, eq=False)
 class PaperSolution:
-    """Hold the outcome for one arch at one instant.
+    """Hold the outcome for one arch at one instant."""
 
-    Attributes:
-        pose: T_world_scan, shape (4, 4).
-        energy: E of eq. 6 there [px].
-        rounds: rounds of rotation and translation.
-    """
-
-    pose: Array
-    energy: float
-    rounds: int
+    pose: Array  # T_world_scan, shape (4, 4)
+    energy: float  # E of eq. 6 there [px]
+    rounds: int  # rounds of rotation and translation
 
 
 def solve_paper(energy: Energy, start: Array, centre: Array, config: PaperConfig) -> PaperSolution:

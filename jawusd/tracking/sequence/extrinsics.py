@@ -20,18 +20,12 @@ class Extrinsics:
 
     Camera c sees the world moved by exp(twists[c]) about the pivot: T_cam_world is followed by it on its right side.
     A motion common to all cameras is a motion of the world, so the twists sum to zero.
-
-    Attributes:
-        T_cam_world: the calibrated poses, shape (C, 4, 4).
-        pivot: a point amid the teeth, where the masks constrain motion best, world coordinates [mm], shape (3,).
-        twists: the corrections [rad, mm], shape (C, 6).
-        sigma: their standard deviations [rad, mm], shape (C, 6).
     """
 
-    T_cam_world: Array
-    pivot: Array
-    twists: Array
-    sigma: Array
+    T_cam_world: Array  # the calibrated poses, shape (C, 4, 4)
+    pivot: Array  # a point amid the teeth, where the masks constrain motion best, world coordinates [mm], shape (3,)
+    twists: Array  # the corrections [rad, mm], shape (C, 6)
+    sigma: Array  # their standard deviations [rad, mm], shape (C, 6)
 
     @classmethod
     def calibrated(cls, cameras: Sequence[Camera], pivot: Array) -> Extrinsics:

@@ -32,14 +32,10 @@ class KinematicPrior:
     (xi^T M xi = mean squared displacement), the model's Jacobian J, and the rms distance s of captured poses from the
     model, spread over three directions. The prior of Zoss et al. 2018 (an empirical rig), with the width taken from
     the capture.
-
-    Attributes:
-        jaw: the person's model.
-        spread_mm: rms landmark distance s of good tracked poses from the model [mm].
     """
 
-    jaw: JawRig
-    spread_mm: float
+    jaw: JawRig  # the person's model
+    spread_mm: float  # rms landmark distance s of good tracked poses from the model [mm]
 
     def accumulate(self, state: Solution, equations: NormalEquations) -> None:
         """Add the log-likelihood of the deviation from the model, linearised."""
