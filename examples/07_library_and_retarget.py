@@ -51,7 +51,7 @@ def main() -> None:
     for entry in library.entries:
         width_mm, (_, opening_mm) = entry.condylar_distance_mm, entry.ranges_mm["opening"]
         print(f"{entry.actor:<8} opens {opening_mm:.1f} mm, condyles {width_mm:.1f} mm apart")
-    print(plot_ranges([vars(entry) for entry in library.entries], options.out, force=True)[0])
+    print(plot_ranges(library.entries, options.out, force=True)[0])
 
     actor, dee = jawusd.load(options.rig), models["dee"]
     carried = retarget(JawRig(dee.arrays, dee.meta), actor, dee.frames.astype(float), dee.d)

@@ -27,6 +27,7 @@ from jawusd.cli.options import (
 from jawusd.cli.output import emit, progress, refuse_existing
 
 if TYPE_CHECKING:
+    from jawusd.formats.experiments import Experiments
     from jawusd.viewer.server import PageServer
 
 
@@ -55,7 +56,7 @@ def report(
     allow_outside: Outside = False,
     as_json: Json = False,
 ) -> None:
-    """Write report.html of a finished build anew; or repeat the paper's experiments on a take (figures and table)."""
+    """Write report.html of a finished build again; or repeat the paper's experiments on a take (figures and table)."""
     options = trajectory_options(columns, length_unit, invert, rest_frame, group)
     if not experiments:
         if not source.is_dir():
@@ -70,7 +71,6 @@ def report(
         do_experiments,
         draw_experiments,
         experiment_files,
-        experiment_lines,
         fitted_poses,
         is_build,
         report_build,
@@ -90,6 +90,12 @@ def report(
         files = draw_experiments(found, folder)
         if is_build(source):
             files.append(report_build(source, capture, tell, found, allow_outside=allow_outside))
+    _emit_experiments(found, files, as_json)
+
+
+def _emit_experiments(found: Experiments, files: list[Path], as_json: bool) -> None:
+    from jawusd.pipeline.report import experiment_lines
+
     summary = {
         "actor": found.actor,
         "frames": found.frames,

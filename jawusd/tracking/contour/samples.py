@@ -73,14 +73,11 @@ def _silhouette(
     out = np.empty((4096, COLUMNS))
     n = 0
     for e in range(len(edges)):
-        f = edges[e, 2]
-        g = edges[e, 3]
+        i, j, f, g = edges[e, 0], edges[e, 1], edges[e, 2], edges[e, 3]
         if g >= 0 and front[f] == front[g]:
             continue
         if g >= 0 and not front[f]:
             f = g
-        i = edges[e, 0]
-        j = edges[e, 1]
         ui, vi, wi = _pixel(matrix, vertices[i, 0], vertices[i, 1], vertices[i, 2])
         uj, vj, wj = _pixel(matrix, vertices[j, 0], vertices[j, 1], vertices[j, 2])
         if wi <= 0 or wj <= 0:
