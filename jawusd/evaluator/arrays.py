@@ -104,7 +104,7 @@ def checked_arrays(arrays: Mapping[str, ArrayLike], kind: str) -> dict[str, Arra
         EvaluatorError: an unknown kind, or an array that is missing, of a wrong shape, not finite or out of range.
     """
     if kind not in KINDS:
-        raise EvaluatorError(f'the model is of kind "{kind}"; this jawusd knows {" and ".join(KINDS)}.')
+        raise EvaluatorError(f'the model is of kind "{kind}"; this jawusd knows {", ".join(KINDS)}.')
     lengths: dict[str, int] = {}
     checked = {name: _checked(name, arrays, spec.shape, lengths) for name, spec in arrays_of(kind).items()}
     _check_values(checked)

@@ -18,7 +18,7 @@ import numpy as np
 from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.distances import carried, distance_residual
 from jawusd.evaluator.frames import RigFrames
-from jawusd.evaluator.models import AnchoredModel, JawModelForm
+from jawusd.evaluator.models import JawModelForm
 from jawusd.evaluator.solver import minimise
 from jawusd.geometry.arrays import Array, Indices
 from jawusd.geometry.se3 import make_transform, se3_inverse, se3_left_jacobian_inverse, se3_log
@@ -60,13 +60,7 @@ class Encoder:
     def nearest(self, T: Array) -> Array:
         """Return the d (n, 3) nearest to poses T_skull_mandible (n, 4, 4)."""
         R, t = self._frames.motions(T)
-        model, target = self._model, carried(R, t, self._vectors)
-        if isinstance(model, AnchoredModel):
-            # the nearest pose does not depend on the chart: searching over the incisal displacement spares the gauge
-            residual = distance_residual(model.motion_derivative_at, self._vectors, target)
-            return model.parameters_at(minimise(residual, model.displacement_of(R, t)))
-        residual = distance_residual(model.decode_derivative, self._vectors, target)
-        return minimise(residual, model.read_off(R, t))
+        return self._model.chart_parameters(nearest_in_chart(self._model, R, t, self._vectors))
 
     def most_likely(self, T: Array, whitening: Array, start: Array, bound: SliceHull | None) -> Array:
         """Return the most likely d (n, 3) of noisy poses: the least ``|W xi|^2`` with ``T = exp(xi) pose(d)``.
@@ -88,6 +82,12 @@ class Encoder:
             return np.einsum("nij,nj->ni", W, xi), -W @ se3_left_jacobian_inverse(-xi) @ S
 
         return minimise(residual, start, bound)
+
+
+def nearest_in_chart(model: JawModelForm, R: Array, t: Array, vectors: Array) -> Array:
+    """Return the place (n, 3) in a model's chart whose motion is nearest to motions R (n, 3, 3), t (n, 3) [mm]."""
+    residual = distance_residual(model.chart_derivative, vectors, carried(R, t, vectors))
+    return minimise(residual, model.chart_start(R, t))
 
 
 def whitening_of(covariance: Array) -> Array:

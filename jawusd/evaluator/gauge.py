@@ -63,6 +63,11 @@ class Gauge:
         )
         object.__setattr__(self, "numbers", numbers)
 
+    def arrays(self) -> dict[str, Array]:
+        """Return the gauge's arrays by their names in a rig."""
+        names = ("path_coefficients", "path_scale_mm", "path_limits", "glide_arch", "glide_drop")
+        return {name: np.array(getattr(self, name)) for name in (*names, "glide_softness_mm", "glide_fade_mm")}
+
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Array]) -> Gauge:
         """Pick the gauge out of the named arrays of a model."""

@@ -6,12 +6,16 @@ Rows only: d has shape (n, 3); a row with a NaN gives NaN.
 
 Derivatives are *spatial*: ``S`` of shape (n, 6, 3) with ``M(d + e) = exp(S e) M(d)`` to first order, twists being
 (omega [rad], v [mm]).
+
+The search for the nearest pose runs in a chart of the model's own choice, coordinates x of shape (n, 3) [mm]: the
+incisal displacement where that spares the gauge, else d itself. The nearest pose does not depend on the chart.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import ClassVar, Protocol
 
 import numpy as np
 
@@ -19,10 +23,67 @@ from jawusd.evaluator.curves import HermiteCurve
 from jawusd.evaluator.derivatives import ARRAYS, gradient_by_u, spline_input
 from jawusd.evaluator.gauge import Gauge
 from jawusd.evaluator.motions import anchored_motions, motions_from_twists
-from jawusd.evaluator.single import SingleAdditive, SingleAnchored, motion_matrix
+from jawusd.evaluator.schema import ADDITIVE, ANCHORED
+from jawusd.evaluator.single import SingleAdditive, SingleAnchored, SingleForm, motion_matrix
 from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import se3_left_jacobian, se3_left_jacobian_inverse
 from jawusd.geometry.so3 import so3_left_jacobian, so3_left_jacobian_inverse
+
+
+class JawModelForm(Protocol):
+    """What a kind of model offers; decoders of a new kind implement this."""
+
+    kind: ClassVar[str]
+
+    @property
+    def incisor(self) -> Array:
+        """The lower incisal point at rest [mm], shape (3,)."""
+        ...
+
+    @property
+    def single(self) -> SingleForm:
+        """The same model for one d, in floats."""
+        ...
+
+    def arrays(self) -> dict[str, Array]:
+        """Return the kind's own arrays by their names in a rig."""
+        ...
+
+    def motion(self, d: Array) -> Array:
+        """Return M(d) as transforms, shape (n, 4, 4)."""
+        ...
+
+    def decode(self, d: Array) -> tuple[Array, Array]:
+        """Return the rotation (n, 3, 3) and translation (n, 3) [mm] of M(d)."""
+        ...
+
+    def decode_derivative(self, d: Array) -> tuple[Array, Array, Array]:
+        """Return rotation, translation [mm] and the spatial derivative S (n, 6, 3) of M(d)."""
+        ...
+
+    def log(self, d: Array) -> Array:
+        """Return the twist log M(d), shape (n, 6)."""
+        ...
+
+    def log_jacobian(self, d: Array) -> Array:
+        """Return d log M / dd, shape (n, 6, 3)."""
+        ...
+
+    def chart_start(self, R: Array, t: Array) -> Array:
+        """Return where in the chart the search for motions (R, t) starts, shape (n, 3)."""
+        ...
+
+    def chart_motion(self, x: Array) -> tuple[Array, Array]:
+        """Return rotation and translation [mm] at x."""
+        ...
+
+    def chart_derivative(self, x: Array) -> tuple[Array, Array, Array]:
+        """Return rotation, translation [mm] and the spatial derivative (n, 6, 3) by x."""
+        ...
+
+    def chart_parameters(self, x: Array) -> Array:
+        """Return the d (n, 3) [mm] of x."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -44,6 +105,7 @@ class AnchoredModel:
         single: The same model for one row, in floats.
     """
 
+    kind: ClassVar[str] = ANCHORED
     gauge: Gauge
     incisor: Array
     scales: Array
@@ -81,17 +143,17 @@ class AnchoredModel:
             weights=np.asarray(arrays["spline_weights"], dtype=float),
         )
 
+    def arrays(self) -> dict[str, Array]:
+        """Return the kind's own arrays by their names in a rig."""
+        own = {"spline_scales": self.scales, "spline_centres": self.centres, "spline_weights": self.weights}
+        return {**self.gauge.arrays(), **own}
+
     def decode(self, d: Array) -> tuple[Array, Array]:
         """Return the rotation (n, 3, 3) and translation (n, 3) [mm] of M(d)."""
         if len(d) == 1 and np.isfinite(d).all():
             M = motion_matrix(self.single.motion(*d[0].tolist()), self.single.anchor)[None]
         else:
             M = self.motion(d)
-        return M[:, :3, :3], M[:, :3, 3]
-
-    def motion_at(self, u: Array) -> tuple[Array, Array]:
-        """Return rotation and translation of the motion that carries the incisal point by u (n, 3) [mm]."""
-        M = anchored_motions(self.rotation(u), u + self.incisor, self.incisor)
         return M[:, :3, :3], M[:, :3, 3]
 
     def motion(self, d: Array) -> Array:
@@ -104,19 +166,28 @@ class AnchoredModel:
         if len(d) == 1 and np.isfinite(d).all():
             return self.single.decode_derivative(d)
         u, du = self.gauge.displacement_jacobian(d)
-        R, t, by_u = self.motion_derivative_at(u)
+        R, t, by_u = self.chart_derivative(u)
         return R, t, by_u @ du
 
-    def motion_derivative_at(self, u: Array) -> tuple[Array, Array, Array]:
-        """Return rotation, translation [mm] and the spatial derivative (n, 6, 3) by u (n, 3) [mm]."""
-        if len(u) == 1 and np.isfinite(u).all():
-            return self.single.motion_derivative_at(u)
-        omega, omega_u = self.rotation_jacobian(u)
-        M = anchored_motions(omega, u + self.incisor, self.incisor)
-        S = np.empty((len(u), 6, 3))
-        S[:, :3] = so3_left_jacobian(omega) @ omega_u
-        # The incisal point itself moves by du: w x (u + p) + v = du.
-        S[:, 3:] = np.eye(3) + np.cross((u + self.incisor)[:, :, None], S[:, :3], axis=1)
+    def chart_start(self, R: Array, t: Array) -> Array:
+        """Return the displacement u (n, 3) [mm] of the incisal point under the motions (R, t): the chart is u."""
+        return R @ self.incisor + t - self.incisor
+
+    def chart_motion(self, x: Array) -> tuple[Array, Array]:
+        """Return rotation and translation of the motion that carries the incisal point by x (n, 3) [mm]."""
+        M = anchored_motions(self.rotation(x), x + self.incisor, self.incisor)
+        return M[:, :3, :3], M[:, :3, 3]
+
+    def chart_derivative(self, x: Array) -> tuple[Array, Array, Array]:
+        """Return rotation, translation [mm] and the spatial derivative (n, 6, 3) by x (n, 3) [mm]."""
+        if len(x) == 1 and np.isfinite(x).all():
+            return self.single.chart_derivative(x)
+        omega, omega_x = self.rotation_jacobian(x)
+        M = anchored_motions(omega, x + self.incisor, self.incisor)
+        S = np.empty((len(x), 6, 3))
+        S[:, :3] = so3_left_jacobian(omega) @ omega_x
+        # The incisal point itself moves by dx: w x (x + p) + v = dx.
+        S[:, 3:] = np.eye(3) + np.cross((x + self.incisor)[:, :, None], S[:, :3], axis=1)
         return M[:, :3, :3], M[:, :3, 3], S
 
     def log(self, d: Array) -> Array:
@@ -130,13 +201,9 @@ class AnchoredModel:
         """Return d log M / dd, shape (n, 6, 3)."""
         return se3_left_jacobian_inverse(self.log(d)) @ self.decode_derivative(d)[2]
 
-    def parameters_at(self, u: Array) -> Array:
-        """Return the d (n, 3) [mm] of incisal displacements u (n, 3) [mm]."""
-        return self.gauge.inverse(u)
-
-    def displacement_of(self, R: Array, t: Array) -> Array:
-        """Return the displacement u (n, 3) [mm] of the incisal point under the motions (R, t)."""
-        return R @ self.incisor + t - self.incisor
+    def chart_parameters(self, x: Array) -> Array:
+        """Return the d (n, 3) [mm] of incisal displacements x (n, 3) [mm]."""
+        return self.gauge.inverse(x)
 
     def rotation(self, u: Array) -> Array:
         """Return the rotation vector f(u) (n, 3) [rad] for incisal displacements u (n, 3) [mm]."""
@@ -180,26 +247,21 @@ class AdditiveModel:
     Attributes:
         curves: The three curves of twists, about the origin of the anatomical frame.
         incisor: The incisal point at rest [mm], shape (3,).
-        d_range: Box of valid d [mm], shape (3, 2); starts for `read_off` are searched in it.
+        d_range: Box of valid d [mm], shape (3, 2).
         single: The same model for one row, in floats.
-        starts: Those starts, d [mm], shape (s, 3).
-        start_displacements: Displacements of the incisal point there [mm], shape (s, 3).
+        starts: Where searches start, spread over that box.
     """
 
+    kind: ClassVar[str] = ADDITIVE
     curves: tuple[HermiteCurve, HermiteCurve, HermiteCurve]
     incisor: Array
     d_range: Array
     single: SingleAdditive = field(init=False, repr=False)
-    starts: Array = field(init=False, repr=False)
-    start_displacements: Array = field(init=False, repr=False)
+    starts: StartGrid = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "single", SingleAdditive(self.curves))
-        # opening is long and curved, the other two short: 13 x 9 x 9 starts lie within the basin of Gauss-Newton
-        axes = [np.linspace(low, high, n) for (low, high), n in zip(self.d_range, (13, 9, 9))]
-        starts = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-        object.__setattr__(self, "starts", starts)
-        object.__setattr__(self, "start_displacements", self.displacement_of(*self.decode(starts)))
+        object.__setattr__(self, "starts", StartGrid.of(self.decode, self.incisor, self.d_range))
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Array]) -> AdditiveModel:
@@ -213,6 +275,14 @@ class AdditiveModel:
             incisor=np.asarray(arrays["incisor"], dtype=float),
             d_range=np.asarray(arrays["d_range"], dtype=float),
         )
+
+    def arrays(self) -> dict[str, Array]:
+        """Return the kind's own arrays by their names in a rig."""
+        own: dict[str, Array] = {}
+        for i, curve in enumerate(self.curves, start=1):
+            parts = {"knots": curve.knots, "twists": curve.values, "slopes": curve.slopes}
+            own |= {f"curve{i}_{part}": values for part, values in parts.items()}
+        return own
 
     def decode(self, d: Array) -> tuple[Array, Array]:
         """Return the rotation (n, 3, 3) and translation (n, 3) [mm] of M(d)."""
@@ -238,28 +308,52 @@ class AdditiveModel:
         """Return d log M / dd, shape (n, 6, 3)."""
         return np.stack([curve.slope(d[:, i]) for i, curve in enumerate(self.curves)], axis=2)
 
-    def displacement_of(self, R: Array, t: Array) -> Array:
-        """Return the displacement (n, 3) [mm] of the incisal point under the motions (R, t)."""
-        return R @ self.incisor + t - self.incisor
+    def chart_start(self, R: Array, t: Array) -> Array:
+        """Return the nearest of the starts, shape (n, 3) [mm]: the chart is d, curves have no closed-form inverse."""
+        return self.starts.nearest(R @ self.incisor + t - self.incisor)
 
-    def read_off(self, R: Array, t: Array) -> Array:
-        """Return the grid point d (n, 3) [mm] whose incisal displacement is nearest to that of the motions (R, t).
+    def chart_motion(self, x: Array) -> tuple[Array, Array]:
+        """Return rotation and translation [mm] at x, which is d."""
+        return self.decode(x)
 
-        Good enough to start Gauss-Newton from; the curves have no closed-form inverse.
-        """
-        u = self.displacement_of(R, t)
-        grid = self.start_displacements
-        distance = np.einsum("ij,ij->i", grid, grid) - 2.0 * u @ grid.T
-        return np.where(np.isfinite(u).all(axis=1, keepdims=True), self.starts[np.argmin(distance, axis=1)], np.nan)
+    def chart_derivative(self, x: Array) -> tuple[Array, Array, Array]:
+        """Return rotation, translation [mm] and the spatial derivative (n, 6, 3) by x, which is d."""
+        return self.decode_derivative(x)
+
+    def chart_parameters(self, x: Array) -> Array:
+        """Return x, which is d."""
+        return x
 
 
-JawModelForm = AnchoredModel | AdditiveModel
+@dataclass(frozen=True)
+class StartGrid:
+    """Parameters spread over a box, for searches of models without a closed-form inverse.
 
-
-def model_from_arrays(arrays: Mapping[str, Array]) -> JawModelForm:
-    """Build the model its named arrays describe: splines make it anchored, curves additive.
-
-    Raises:
-        KeyError: an array of the model is missing.
+    Attributes:
+        d: Jaw parameters [mm], shape (s, 3).
+        displacements: Displacements of the incisal point there [mm], shape (s, 3).
     """
-    return AnchoredModel.from_arrays(arrays) if "spline_weights" in arrays else AdditiveModel.from_arrays(arrays)
+
+    d: Array
+    displacements: Array
+
+    @classmethod
+    def of(cls, decode: Callable[[Array], tuple[Array, Array]], incisor: Array, d_range: Array) -> StartGrid:
+        """Decode a grid over the box d_range (3, 2) [mm]."""
+        # opening is long and curved, the other two short: 13 x 9 x 9 starts lie within the basin of Gauss-Newton
+        axes = [np.linspace(low, high, n) for (low, high), n in zip(d_range, (13, 9, 9))]
+        d = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        R, t = decode(d)
+        return cls(d, R @ incisor + t - incisor)
+
+    def nearest(self, u: Array) -> Array:
+        """Return the d (n, 3) whose incisal displacement is nearest to u (n, 3) [mm]; NaN for NaN."""
+        grid = self.displacements
+        distance = np.einsum("ij,ij->i", grid, grid) - 2.0 * u @ grid.T
+        return np.where(np.isfinite(u).all(axis=1, keepdims=True), self.d[np.argmin(distance, axis=1)], np.nan)
+
+
+FORMS: dict[str, Callable[[Mapping[str, Array]], JawModelForm]] = {
+    ANCHORED: AnchoredModel.from_arrays,
+    ADDITIVE: AdditiveModel.from_arrays,
+}

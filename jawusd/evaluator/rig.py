@@ -18,7 +18,7 @@ from jawusd.evaluator.encoding import Encoder, Encoding, whitening_of
 from jawusd.evaluator.frames import RigFrames
 from jawusd.evaluator.interpolation import interpolated
 from jawusd.evaluator.kernels import Kernels, NumpyKernels, RigParts
-from jawusd.evaluator.models import model_from_arrays
+from jawusd.evaluator.models import FORMS
 from jawusd.evaluator.polygons import PolygonBound
 from jawusd.evaluator.search import BoundedSearch, IkResult, nearest_distance
 from jawusd.evaluator.sections import Ranges
@@ -66,7 +66,7 @@ class JawRig(RigArrays):
             EvaluatorError: an unknown kind, or an array missing, of a wrong shape, not finite or out of range.
         """
         super().__init__(arrays, meta)
-        self.model = model_from_arrays(self.arrays)
+        self.model = FORMS[self.kind](self.arrays)
         self.bound = SliceHull.from_arrays(self.arrays)
         self.polygons = PolygonBound.from_arrays(self.arrays)
         self.limits = Limits(float(self.arrays["residual_limit_mm"]), float(self.arrays["margin_limit_mm"]))

@@ -11,6 +11,7 @@ A motion (R, t) is twelve numbers here: the rows of ``R - I``, then the displace
 from __future__ import annotations
 
 from bisect import bisect_right
+from typing import Protocol
 
 import numpy as np
 
@@ -22,6 +23,16 @@ from jawusd.geometry.rodrigues import angle_coefficients, apply_series, turning
 
 Vector = tuple[float, float, float]
 Motion = tuple[float, ...]
+
+
+class SingleForm(Protocol):
+    """A model for one finite d."""
+
+    anchor: Vector
+
+    def motion(self, d1: float, d2: float, d3: float) -> Motion:
+        """Return M(d)."""
+        ...
 
 
 class SingleAnchored:
@@ -66,7 +77,7 @@ class SingleAnchored:
         u, (x_1, y_1, y_2, y_3, z_1, z_2) = displacement(self._gauge, d1, d2, d3, FLOATS)
         return self._derivative(u, np.array(((x_1, 1.0, 0.0), (y_1, y_2, y_3), (z_1, z_2, 1.0))))
 
-    def motion_derivative_at(self, u: Array) -> tuple[Array, Array, Array]:
+    def chart_derivative(self, u: Array) -> tuple[Array, Array, Array]:
         """Return R (1, 3, 3), t (1, 3) and S (1, 6, 3) by u for one row u (1, 3)."""
         x, y, z = u[0].tolist()
         return self._derivative((x, y, z), np.eye(3))

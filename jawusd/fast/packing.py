@@ -13,18 +13,21 @@ from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.curves import HermiteCurve
 from jawusd.evaluator.frames import RigFrames
 from jawusd.evaluator.models import AdditiveModel, AnchoredModel, JawModelForm
+from jawusd.evaluator.schema import ANCHORED, KINDS
 from jawusd.geometry.arrays import Array
 
-# the model, both kinds
-COUNT = 0  # spline centres of an anchored model; 0 says additive
-INCISOR = 1  # (3,) [mm]
-FROM_ANATOMICAL = 4  # (4, 4) row by row: L, Q of pose = L M Q
-CLOSED = 20  # (4, 4): Q
-TO_ANATOMICAL = 36  # (4, 4): L^-1
-FROM_CLOSED = 52  # (4, 4): Q^-1
-ADJOINT = 68  # (6, 6): twists from the anatomical to the skull frame
-VECTORS = 104  # (4, 4): what stands for the landmarks, see `evaluator.distances`
-REST = 120  # where the part of the kind begins
+# the model, every kind
+KIND = 0  # place of the kind in `schema.KINDS`
+COUNT = 1  # spline centres of an anchored model, else 0
+INCISOR = 2  # (3,) [mm]
+FROM_ANATOMICAL = 5  # (4, 4) row by row: L, Q of pose = L M Q
+CLOSED = 21  # (4, 4): Q
+TO_ANATOMICAL = 37  # (4, 4): L^-1
+FROM_CLOSED = 53  # (4, 4): Q^-1
+ADJOINT = 69  # (6, 6): twists from the anatomical to the skull frame
+VECTORS = 105  # (4, 4): what stands for the landmarks, see `evaluator.distances`
+REST = 121  # where the part of the kind begins
+ANCHORED_KIND = KINDS.index(ANCHORED)
 
 # anchored
 SCALES = REST  # (3,) [mm]
@@ -51,9 +54,13 @@ HULL = 3  # their normals column by column (2, k), then the curve of the support
 
 
 def packed_model(model: JawModelForm, frames: RigFrames, vectors: Array) -> Array:
-    """Return the numbers of a model; see `distances.landmark_vectors` for the vectors (4, 4) [mm]."""
-    both: list[ArrayLike] = [
-        [len(model.centres) if isinstance(model, AnchoredModel) else 0],
+    """Return the numbers of a model; see `distances.landmark_vectors` for the vectors (4, 4) [mm].
+
+    Raises:
+        TypeError: the kind of model has no compiled form.
+    """
+    every: list[ArrayLike] = [
+        [KINDS.index(model.kind), len(model.centres) if isinstance(model, AnchoredModel) else 0],
         model.incisor,
         frames.T_skull_anatomical,
         frames.T_anatomical_mandible_rest,
@@ -62,7 +69,11 @@ def packed_model(model: JawModelForm, frames: RigFrames, vectors: Array) -> Arra
         frames.adjoint,
         vectors,
     ]
-    return _joined(both + (_anchored(model) if isinstance(model, AnchoredModel) else _additive(model)))
+    if isinstance(model, AnchoredModel):
+        return _joined([*every, *_anchored(model)])
+    if isinstance(model, AdditiveModel):
+        return _joined([*every, *_additive(model)])
+    raise TypeError(f"models of kind {model.kind!r} have no compiled form")
 
 
 def packed_bound(bound: SliceHull) -> Array:
@@ -90,9 +101,9 @@ def _anchored(model: AnchoredModel) -> list[ArrayLike]:
 
 def _additive(model: AdditiveModel) -> list[ArrayLike]:
     curves = [_curve(curve) for curve in model.curves]
-    first = GRID + 2 * model.starts.size
+    first = GRID + 2 * model.starts.d.size
     begins = first + np.cumsum([0, len(curves[0]), len(curves[1])])
-    return [begins, [len(model.starts)], model.starts, model.start_displacements, *curves]
+    return [begins, [len(model.starts.d)], model.starts.d, model.starts.displacements, *curves]
 
 
 def _curve(curve: HermiteCurve) -> Array:

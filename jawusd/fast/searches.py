@@ -13,7 +13,17 @@ from jawusd.fast.descent import DISPLACEMENT, PARAMETERS, Normal, Problem, desce
 from jawusd.fast.forms import parameters_at
 from jawusd.fast.hull import signed_distance
 from jawusd.fast.motion import Scratch, motion, scratch
-from jawusd.fast.packing import COUNT, FROM_CLOSED, GRID, INCISOR, SIDES, STARTS, TO_ANATOMICAL, VECTORS
+from jawusd.fast.packing import (
+    ANCHORED_KIND,
+    FROM_CLOSED,
+    GRID,
+    INCISOR,
+    KIND,
+    SIDES,
+    STARTS,
+    TO_ANATOMICAL,
+    VECTORS,
+)
 from jawusd.fast.rigid import device
 from jawusd.geometry.arrays import Array
 
@@ -52,7 +62,7 @@ def encode(model: Array, T: Array, e: Encoding) -> float:
     p0, p1, p2 = model[INCISOR], model[INCISOR + 1], model[INCISOR + 2]
     for i in range(3):
         e.x[i] = M[i, 0] * p0 + M[i, 1] * p1 + M[i, 2] * p2 + M[i, 3] - model[INCISOR + i]
-    if model[COUNT] != 0:
+    if model[KIND] == ANCHORED_KIND:
         # the nearest pose does not depend on the chart: searching over the displacement spares the gauge
         descend(model, Problem(DISPLACEMENT, vectors, e.target), e.x, e.w, e.n)
         e.x[0], e.x[1], e.x[2] = parameters_at(model, (e.x[0], e.x[1], e.x[2]))

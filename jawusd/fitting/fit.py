@@ -120,7 +120,7 @@ def fit_model(
     warnings += [AnatomyWarning("take_lacks", sentence) for sentence in missing_movements(captured_d, shown)]
     hull, tolerance_mm = fit_slice_hull(d)
     arrays = {
-        **form.arrays(),
+        **form.model.arrays(),
         **hull,
         **alpha_shapes(d, config.alpha),
         "T_anatomical_skull": anatomy.T_anatomical_skull,
@@ -189,7 +189,7 @@ def _model(
 ) -> JawModel:
     """Encode every captured pose with the evaluator and set the limits of the verdicts from the trained ones."""
     meta |= {
-        "kind": form.kind,
+        "kind": form.model.kind,
         "fit": form.notes,
         "warnings": [asdict(warning) for warning in warnings],
         "excluded_frames": selection.excluded,

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from jawusd.evaluator.distances import carried, distance_residual, landmark_vectors
-from jawusd.evaluator.models import AnchoredModel, JawModelForm
-from jawusd.evaluator.solver import minimise
+from jawusd.evaluator.distances import carried, landmark_vectors
+from jawusd.evaluator.encoding import nearest_in_chart
+from jawusd.evaluator.models import JawModelForm
 from jawusd.geometry import hat, make_transform
 from jawusd.geometry.arrays import Array
 
@@ -48,15 +48,8 @@ class MandibleMetric:
 
     def nearest(self, model: JawModelForm, target: Array) -> tuple[Array, Array]:
         """Return the parameters (N, 3) [mm] and motions (N, 4, 4) of a model nearest to motions (N, 4, 4)."""
-        R, t = _parts(target)
-        if isinstance(model, AnchoredModel):
-            # As in the evaluator: the nearest pose does not depend on the gauge, so search without it.
-            residual = distance_residual(model.motion_derivative_at, self.vectors, carried(R, t, self.vectors))
-            u = minimise(residual, model.displacement_of(R, t))
-            return model.gauge.inverse(u), make_transform(*model.motion_at(u))
-        residual = distance_residual(model.decode_derivative, self.vectors, carried(R, t, self.vectors))
-        d = minimise(residual, model.read_off(R, t))
-        return d, make_transform(*model.decode(d))
+        x = nearest_in_chart(model, *_parts(target), self.vectors)
+        return model.chart_parameters(x), make_transform(*model.chart_motion(x))
 
     def best_rotation(self, target: Array, incisor: Array, at: Array) -> Array:
         """Return the rotations (N, 3, 3) that fit motions (N, 4, 4) best with the incisal point fixed (Kabsch 1976).

@@ -54,11 +54,11 @@ def test_one_row_is_inverted_as_many_are():
     rng = np.random.default_rng(3)
     u = rng.uniform([-14, -60, -20], [14, 10, 12], (300, 3))
     expected = GAUGE.inverse(u)
-    np.testing.assert_allclose([model.parameters_at(row[None])[0] for row in u], expected, atol=1e-9)
+    np.testing.assert_allclose([model.chart_parameters(row[None])[0] for row in u], expected, atol=1e-9)
     steep = AnchoredModel.from_arrays(
         dict(ARRAYS, glide_drop=np.array([0.5, 0.5, 0.4, 0.4]), glide_fade_mm=np.array(5.0))
     )
-    found = np.array([steep.parameters_at(row[None])[0] for row in u])
+    found = np.array([steep.chart_parameters(row[None])[0] for row in u])
     np.testing.assert_allclose(steep.gauge.displacement(found), u, atol=1e-9)
 
 

@@ -8,8 +8,8 @@ from example_model import example_arrays
 from scipy.spatial.transform import Rotation
 
 from jawusd.evaluator.curves import HermiteCurve
-from jawusd.evaluator.models import AnchoredModel, model_from_arrays
-from jawusd.evaluator.schema import KINDS
+from jawusd.evaluator.models import FORMS, AnchoredModel
+from jawusd.evaluator.schema import KINDS, arrays_of
 from jawusd.geometry.se3 import se3_exp
 
 # inside, on a knot of the curves, past both ends of the path, at rest
@@ -27,14 +27,31 @@ def arrays(request):
     return example_arrays(request.param)
 
 
+def model_of(arrays):
+    return FORMS["anchored" if "spline_weights" in arrays else "additive"](arrays)
+
+
 def random_d(arrays, count, seed=0):
     low, high = arrays["d_range"].T
     return np.random.default_rng(seed).uniform(low, high, (count, 3))
 
 
+def test_every_kind_has_a_form_that_gives_its_arrays_back():
+    assert tuple(FORMS) == KINDS
+    common = set.intersection(*(set(arrays_of(kind)) for kind in KINDS))
+    for kind in KINDS:
+        arrays = example_arrays(kind)
+        model = FORMS[kind](arrays)
+        assert model.kind == kind
+        own = model.arrays()
+        assert set(own) == set(arrays_of(kind)) - common
+        for name, value in own.items():
+            np.testing.assert_array_equal(value, arrays[name])
+
+
 def test_motion_agrees_with_the_reference(arrays):
     """Values agree with the formulas evaluated in 50 digits."""
-    R, t = model_from_arrays(arrays).decode(POINTS)
+    R, t = model_of(arrays).decode(POINTS)
     for i, d in enumerate(POINTS):
         M = matrix(reference.motion(arrays, [mp.mpf(float(x)) for x in d]))
         np.testing.assert_allclose(R[i], M[:3, :3], atol=1e-12)
@@ -43,19 +60,19 @@ def test_motion_agrees_with_the_reference(arrays):
 
 def test_rest_is_the_identity(arrays):
     """M(0) = I: d = 0 is the closed bite."""
-    R, t = model_from_arrays(arrays).decode(np.zeros((2, 3)))
+    R, t = model_of(arrays).decode(np.zeros((2, 3)))
     np.testing.assert_allclose(R, np.stack([np.eye(3)] * 2), atol=1e-14)
     np.testing.assert_allclose(t, 0.0, atol=1e-12)
 
 
 def test_rotations_are_rotations(arrays):
     """scipy accepts the rotations as they are."""
-    R, _ = model_from_arrays(arrays).decode(random_d(arrays, 200))
+    R, _ = model_of(arrays).decode(random_d(arrays, 200))
     np.testing.assert_allclose(Rotation.from_matrix(R).as_matrix(), R, atol=1e-12)
 
 
 def test_log_is_the_logarithm_of_the_motion(arrays):
-    model = model_from_arrays(arrays)
+    model = model_of(arrays)
     d = random_d(arrays, 200)
     R, t = model.decode(d)
     M = se3_exp(model.log(d))
@@ -65,7 +82,7 @@ def test_log_is_the_logarithm_of_the_motion(arrays):
 
 def test_spatial_derivative_agrees_with_50_digit_differences(arrays):
     """M(d + e) = exp(S e) M(d): S agrees with differences taken in 50 digits to 1e-8 relative."""
-    model = model_from_arrays(arrays)
+    model = model_of(arrays)
     _, _, S = model.decode_derivative(POINTS)
     for i, d in enumerate(POINTS):
         M = reference.motion(arrays, [mp.mpf(float(x)) for x in d])
@@ -89,16 +106,16 @@ def test_the_incisor_tells_the_parameters_of_an_anchored_model():
     arrays = example_arrays("anchored")
     model = AnchoredModel.from_arrays(arrays)
     d = random_d(arrays, 300)
-    np.testing.assert_allclose(model.parameters_at(model.displacement_of(*model.decode(d))), d, atol=1e-9)
+    np.testing.assert_allclose(model.chart_parameters(model.chart_start(*model.decode(d))), d, atol=1e-9)
 
 
 def test_read_off_of_an_additive_model_starts_near():
     """The start is the best point of its grid: within a grid cell."""
     arrays = example_arrays("additive")
-    model = model_from_arrays(arrays)
+    model = model_of(arrays)
     d = random_d(arrays, 300)
     cell = np.diff(arrays["d_range"], axis=1)[:, 0] / (12, 8, 8)
-    assert (np.abs(model.read_off(*model.decode(d)) - d) < 1.5 * cell).all()
+    assert (np.abs(model.chart_start(*model.decode(d)) - d) < 1.5 * cell).all()
 
 
 def test_spline_is_smooth_through_its_centres():

@@ -107,7 +107,7 @@ def test_gradients_at_rest_and_at_spline_centres_are_finite():
     model = rig.model
     q = model.centres[:10] * model.scales
     gx, gz, _, _ = model.gauge.path(q[:, 0])
-    d = model.parameters_at(np.stack([q[:, 1] + gx, -q[:, 0], q[:, 2] + gz], axis=1))
+    d = model.chart_parameters(np.stack([q[:, 1] + gx, -q[:, 0], q[:, 2] + gz], axis=1))
     d = torch.tensor(np.concatenate([d, np.zeros((1, 3))]), requires_grad=True)
     layer(d).sum().backward()
     assert torch.isfinite(d.grad).all()
