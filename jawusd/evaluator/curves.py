@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from jawusd.evaluator.formula import cubic, polynomial
+from jawusd.evaluator.formula import cubic
 from jawusd.geometry.arrays import Array
 
 
@@ -42,7 +42,7 @@ class HermiteCurve:
     def value(self, x: Array) -> Array:
         """Return the points at x (n,), shape (n, k)."""
         c, s = self._locate(x)
-        return polynomial((c[:, 0], c[:, 1], c[:, 2], c[:, 3]), s)
+        return ((c[:, 3] * s + c[:, 2]) * s + c[:, 1]) * s + c[:, 0]
 
     def value_and_slope(self, x: Array) -> tuple[Array, Array]:
         """Return the points and the derivatives at x (n,), both of shape (n, k)."""

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Literal
+from typing import Literal, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from jawusd.evaluator import sections
 from jawusd.evaluator.arrays import RigArrays
-from jawusd.evaluator.batching import as_keys, as_points, as_rows, in_chunks, pairs_in_chunks, rows_of
+from jawusd.evaluator.batching import CHUNK_ROWS, as_keys, as_points, as_rows, in_chunks, pairs_in_chunks, rows_of
 from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.distances import carried, handle_vectors, point_velocities
 from jawusd.evaluator.encoding import Encoder, Encoding, whitening_of
@@ -175,16 +175,21 @@ class JawRig(RigArrays):
         Returns:
             Margins [mm], shape (...).
         """
-        if _checked(bound) == "polygons":
+        if bound != "slices":
             rows, batch = as_rows(d, (3,), "d")
-            return -in_chunks(self.polygons.signed_distance, rows).reshape(batch)
+            return -in_chunks(self._polygons(bound).signed_distance, rows).reshape(batch)
         d = np.asarray(d, dtype=np.float64)
         if d.shape == (3,):
             d1, d2, d3 = d.tolist()
             if abs(d1) + abs(d2) + abs(d3) < _SINGLE_LIMIT_MM:  # False for NaN
-                return np.array(self.kernels.margin(d1, d2, d3))
+                return cast("Array", np.float64(self.kernels.margin(d1, d2, d3)))  # a scalar, as numpy makes them
         rows, batch = rows_of(d, (3,), "d")
         return self.kernels.margins(rows).reshape(batch)
+
+    def _polygons(self, bound: BoundName) -> PolygonBound:
+        if bound != "polygons":
+            raise ValueError(f'bound must be "slices" or "polygons", got {bound!r}')
+        return self.polygons
 
     def margin_gradient(self, d: ArrayLike) -> Array:
         """Return the derivative of `margin` (slice bound) by d [mm/mm], shape (..., 3), for d (..., 3) [mm]."""
@@ -259,7 +264,7 @@ class JawRig(RigArrays):
 
     def _within(self, verdicts: Verdicts, bound: BoundName, limits: Limits) -> Verdicts:
         """Return the verdicts on rows with regard to a bound, given those with regard to the slice bound."""
-        if _checked(bound) == "slices":
+        if bound == "slices":
             return verdicts
         return verdicts.with_margin(self.margin(verdicts.d, bound=bound), limits)
 
@@ -309,7 +314,10 @@ class JawRig(RigArrays):
         else:
             given, _ = as_rows(np.broadcast_to(np.asarray(start, float), (*batch, 3)), (3,), "start")
             first = in_chunks(self._search.nearest, given)
-            d = in_chunks(lambda i: self._search.solve_ik(vectors, scaled[i], first[i]), np.arange(len(scaled)))
+            find = partial(self._search.solve_ik, vectors)
+            chunked = len(scaled) > CHUNK_ROWS
+            each = np.arange(len(scaled))
+            d = in_chunks(lambda i: find(scaled[i], first[i]), each) if chunked else find(scaled, first)
         left = carried(*self.model.decode(d), vectors) - scaled
         distance_mm = np.sqrt(np.einsum("nij,nij->n", left, left))
         return IkResult(d.reshape(*batch, 3), distance_mm.reshape(batch))
@@ -387,9 +395,3 @@ def _rebuilt(
     arrays: Mapping[str, ArrayLike], meta: Mapping[str, object], kernels: Callable[[RigParts], Kernels]
 ) -> JawRig:
     return JawRig(arrays, meta, kernels=kernels)
-
-
-def _checked(name: BoundName) -> BoundName:
-    if name not in ("slices", "polygons"):
-        raise ValueError(f'bound must be "slices" or "polygons", got {name!r}')
-    return name

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntFlag
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -45,8 +46,7 @@ _WORDS = {
 }
 
 
-@dataclass(frozen=True)
-class Verdicts:
+class Verdicts(NamedTuple):
     """What `JawRig.validate` found, one entry per pose.
 
     Attributes:
@@ -102,6 +102,8 @@ class Limits:
 
     def replaced(self, residual_mm: float | None, margin_mm: float | None, speed_mm_s: float | None) -> Limits:
         """Return these limits with those that are given in place of their own."""
+        if residual_mm is None and margin_mm is None and speed_mm_s is None:
+            return self
         return Limits(
             self.residual_mm if residual_mm is None else float(residual_mm),
             self.margin_mm if margin_mm is None else float(margin_mm),
