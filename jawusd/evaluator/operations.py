@@ -8,6 +8,8 @@ number that holds them all: a tensor, say. This file imports nothing but the sta
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
+from bisect import bisect_right
 from collections.abc import Sequence
 from typing import Protocol, TypeVar
 
@@ -51,12 +53,12 @@ class Operations(Protocol[N, Table]):
 S = TypeVar("S", bound="Symbol")
 
 
-class Symbol:
+class Symbol(ABC):
     """A number that represents a value of a program: each operator adds an operation to that program."""
 
+    @abstractmethod
     def operation(self: S, name: str, *operands: S | float) -> S:
         """Add "Add", "Subtract", "Multiply" or "Divide", applied to two operands."""
-        raise NotImplementedError
 
     def __add__(self: S, other: S | float) -> S:
         return self.operation("Add", self, other)
@@ -117,7 +119,7 @@ class FloatOperations:
     @staticmethod
     def lookup(x: float, knots: Rows, tables: Sequence[Rows]) -> list[list[float]]:
         """Return row i of each table, where i is the number of knots at or below x."""
-        interval = sum(knot <= x for (knot,) in knots)
+        interval = bisect_right(knots, [x])
         return [table[interval] for table in tables]
 
     @staticmethod

@@ -29,7 +29,7 @@ class Joint:
 
     condyles: Array  # centres of the condyles at rest, shape (2, 3)
     incisor: Array  # lower incisal point at rest, shape (3,)
-    eminence_height_mm: Array  # drop of each eminence from fossa to the far side of its crest, shape (2,)
+    eminence_height_mm: Array  # drop of each eminence from fossa over its crest, shape (2,)
     eminence_width_mm: Array  # half width of the slope, shape (2,)
     eminence_start_mm: Array  # forward distance from rest to the steepest point, shape (2,)
     medial_slope: Array  # drop per medial mm, shape (2,)
