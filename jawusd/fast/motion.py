@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jawusd.fast.forms import displacement, spline, spline_derivative, summed_curves
-from jawusd.fast.packing import ANCHORED_KIND, CLOSED, COUNT, FROM_ANATOMICAL, INCISOR, KIND
+from jawusd.fast.packing import ADDITIVE_KIND, CLOSED, COUNT, FROM_ANATOMICAL, INCISOR, KIND
 from jawusd.fast.rigid import Vector, coefficient_slopes, device, inverse_coefficient, move, product, rotate
 from jawusd.geometry.arrays import Array
 from jawusd.geometry.rodrigues import angle_coefficients, apply_series, cross, dot
@@ -45,7 +45,7 @@ def scratch(model: Array) -> Scratch:
 @device
 def motion(model: Array, d1: float, d2: float, d3: float, w: Scratch) -> None:
     """Write M(d) to w.M; of an anchored model also the rotation vector, of an additive one the twist."""
-    if model[KIND] != ANCHORED_KIND:
+    if model[KIND] == ADDITIVE_KIND:
         summed_curves(model, d1, d2, d3, w.twist, w.twist_d)
         move(w.twist, w.M)
         return
@@ -82,7 +82,7 @@ def motion_by_displacement(model: Array, u0: float, u1: float, u2: float, w: Scr
 @device
 def motion_derivative(model: Array, d1: float, d2: float, d3: float, w: Scratch) -> None:
     """Write M(d) and its spatial derivative to w.M and w.S; of an additive model also its twist's to w.twist_d."""
-    if model[KIND] != ANCHORED_KIND:
+    if model[KIND] == ADDITIVE_KIND:
         summed_curves(model, d1, d2, d3, w.twist, w.twist_d)
         move(w.twist, w.M)
         _spatial(w)
@@ -125,7 +125,7 @@ def _spatial(w: Scratch) -> None:
 def logarithm(model: Array, d1: float, d2: float, d3: float, w: Scratch) -> None:
     """Write log M(d) to w.twist."""
     motion(model, d1, d2, d3, w)
-    if model[KIND] == ANCHORED_KIND:
+    if model[KIND] != ADDITIVE_KIND:
         omega = (w.twist[0], w.twist[1], w.twist[2])
         factor, _ = inverse_coefficient(dot(omega, omega))
         t = (w.M[0, 3], w.M[1, 3], w.M[2, 3])
@@ -136,7 +136,7 @@ def logarithm(model: Array, d1: float, d2: float, d3: float, w: Scratch) -> None
 def logarithm_derivative(model: Array, d1: float, d2: float, d3: float, w: Scratch) -> None:
     """Write d log M / dd to w.twist_d (6, 3)."""
     motion_derivative(model, d1, d2, d3, w)
-    if model[KIND] != ANCHORED_KIND:
+    if model[KIND] == ADDITIVE_KIND:
         return
     omega = (w.twist[0], w.twist[1], w.twist[2])
     factor, slope = inverse_coefficient(dot(omega, omega))

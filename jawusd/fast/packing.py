@@ -13,7 +13,7 @@ from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.curves import HermiteCurve
 from jawusd.evaluator.frames import RigFrames
 from jawusd.evaluator.models import AdditiveModel, AnchoredModel, JawModelForm
-from jawusd.evaluator.schema import ANCHORED, KINDS
+from jawusd.evaluator.schema import ADDITIVE, ANCHORED, KINDS
 from jawusd.geometry.arrays import Array
 
 # the model, every kind
@@ -27,7 +27,7 @@ FROM_CLOSED = 53  # (4, 4): Q^-1
 ADJOINT = 69  # (6, 6): twists from the anatomical to the skull frame
 VECTORS = 105  # (4, 4): what stands for the landmarks, see `evaluator.distances`
 REST = 121  # where the part of the kind begins
-ANCHORED_KIND = KINDS.index(ANCHORED)
+ANCHORED_KIND, ADDITIVE_KIND = KINDS.index(ANCHORED), KINDS.index(ADDITIVE)
 
 # anchored
 SCALES = REST  # (3,) [mm]
