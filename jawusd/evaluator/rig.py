@@ -28,6 +28,7 @@ from jawusd.geometry.se3 import transform_points
 
 BoundName = Literal["slices", "polygons"]
 
+_scalar = cast("Callable[[float], Array]", np.float64)  # numpy types its scalars apart from its arrays
 _SINGLE_LIMIT_MM = 1e4  # beyond, functions of one d might raise where those of rows give infinities
 
 
@@ -182,7 +183,7 @@ class JawRig(RigArrays):
         if d.shape == (3,):
             d1, d2, d3 = d.tolist()
             if abs(d1) + abs(d2) + abs(d3) < _SINGLE_LIMIT_MM:  # False for NaN
-                return cast("Array", np.float64(self.kernels.margin(d1, d2, d3)))  # a scalar, as numpy makes them
+                return _scalar(self.kernels.margin(d1, d2, d3))
         rows, batch = rows_of(d, (3,), "d")
         return self.kernels.margins(rows).reshape(batch)
 
@@ -239,7 +240,9 @@ class JawRig(RigArrays):
         """
         rows, batch = rows_of(T_skull_mandible, (4, 4), "T_skull_mandible")
         limits = self.limits.replaced(residual_limit_mm, margin_limit_mm, speed_limit_mm_s)
-        verdicts = self._within(self.kernels.judge_poses(rows, limits), bound, limits)
+        verdicts = self.kernels.judge_poses(rows, limits)
+        if bound != "slices":
+            verdicts = verdicts.with_margin(self.margin(verdicts.d, bound=bound), limits)
         return self._with_speed(verdicts, rows, batch, times_s, limits)
 
     def validate_parameters(
@@ -258,15 +261,11 @@ class JawRig(RigArrays):
         """
         rows, batch = rows_of(d, (3,), "d")
         limits = self.limits.replaced(None, margin_limit_mm, speed_limit_mm_s)
-        verdicts = self._within(self.kernels.judge_parameters(rows, limits), bound, limits)
+        verdicts = self.kernels.judge_parameters(rows, limits)
+        if bound != "slices":
+            verdicts = verdicts.with_margin(self.margin(verdicts.d, bound=bound), limits)
         poses = rows if speed_limit_mm_s is None else self.kernels.poses(rows)
         return self._with_speed(verdicts, poses, batch, times_s, limits)
-
-    def _within(self, verdicts: Verdicts, bound: BoundName, limits: Limits) -> Verdicts:
-        """Return the verdicts on rows with regard to a bound, given those with regard to the slice bound."""
-        if bound == "slices":
-            return verdicts
-        return verdicts.with_margin(self.margin(verdicts.d, bound=bound), limits)
 
     def _with_speed(
         self, verdicts: Verdicts, poses: Array, batch: tuple[int, ...], times_s: ArrayLike | None, limits: Limits
