@@ -34,6 +34,46 @@ def test_what_is_too_long_is_found(source):
     assert oversized(source, "m.py")
 
 
+def unnamed_exceptions(source, name):
+    """Return the exceptions that public functions raise themselves and do not name in their docstrings."""
+    found = []
+    for node in public_functions(ast.parse(source)):
+        for raised in own_raises(node):
+            kind = ast.unparse(raised.func if isinstance(raised, ast.Call) else raised).split(".")[-1]
+            if kind[0].isupper() and kind not in (ast.get_docstring(node) or ""):
+                found.append(f"{name}:{node.name}: {kind}")
+    return found
+
+
+def public_functions(node):
+    """Yield the public functions of a module and of its public classes."""
+    for child in ast.iter_child_nodes(node):
+        public = not getattr(child, "name", "_").startswith("_")
+        if public and isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef):
+            yield child
+        elif public and isinstance(child, ast.ClassDef):
+            yield from public_functions(child)
+
+
+def own_raises(node):
+    """Yield what a function raises itself, without the functions and classes inside it."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.Raise) and child.exc is not None:
+            yield child.exc
+        if not isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda | ast.ClassDef):
+            yield from own_raises(child)
+
+
+def test_public_functions_name_the_exceptions_they_raise():
+    commands = ROOT / "jawusd" / "cli"  # docstrings of commands are their help
+    found = [unnamed_exceptions(p.read_text(), p.relative_to(ROOT)) for p in MODULES if commands not in p.parents]
+    assert [fault for faults in found for fault in faults] == []
+
+
+def test_an_exception_that_is_not_named_is_found():
+    assert unnamed_exceptions('def f(x):\n    """Return x."""\n    if x:\n        raise ValueError("x")\n', "m.py")
+
+
 GOOD = '''"""What it owns."""
 
 
