@@ -1,0 +1,38 @@
+"""What checks and estimates found about a capture, in one form for the terminal, JSON, tracks and reports."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Literal
+
+Severity = Literal["error", "warning", "note"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Say what is wrong or doubtful, where, by how much, and what to do.
+
+    An error makes the result impossible or useless; a warning may make it wrong; a note explains what was done.
+    """
+
+    kind: str  # a stable name for programs, in lower case with underscores: "scans_apart"
+    severity: Severity
+    message: str  # one sentence without the place: what was found and what is allowed, with units
+    value: float | None = None  # the figure found, in the unit the message names
+    limit: float | None = None  # what is allowed, in the same unit
+    path: str | None = None
+    camera: str | None = None
+    frame: int | None = None
+    hint: str | None = None  # what to do about it
+
+    def line(self) -> str:
+        """Return the finding as one line of text."""
+        frame = None if self.frame is None else f"frame {self.frame}"
+        camera = None if self.camera is None else f"camera {self.camera}"
+        where = ", ".join(part for part in (self.path, camera, frame) if part)
+        text = f"{self.severity}: {where}: {self.message}" if where else f"{self.severity}: {self.message}"
+        return f"{text} {self.hint}" if self.hint else text
+
+    def as_json(self) -> dict[str, str | float | int]:
+        """Return the fields that are set, for JSON."""
+        return {key: value for key, value in asdict(self).items() if value is not None}
