@@ -12,8 +12,11 @@ import trimesh
 from numpy.typing import NDArray
 
 from jawusd.errors import CaptureError
-from jawusd.formats.mesh import Mesh
+from jawusd.formats.mesh import Mesh, tooth_labels
 from jawusd.geometry.arrays import Array
+
+# People who read scans with this module label them next; scripts outside the package import both from here.
+__all__ = ["Winding", "load_mesh", "tooth_labels", "winding"]
 
 _KINDS = (".ply", ".stl", ".obj")
 # Diagonal of the bounding box [mm]: smallest, typical, largest. A full arch has about 80, a mandible 165, a skull 290.
