@@ -48,6 +48,7 @@ class TracksMeta(TypedDict, total=False):
     backend: str
     evaluations_per_row_and_frame: float
     calibration_rescaled_px: dict[str, tuple[tuple[int, int], tuple[int, int]]]
+    findings: list[dict[str, str | float | int]]  # `Finding.as_json` of everything doubtful about the take
 
 
 class TrackStatus(IntEnum):

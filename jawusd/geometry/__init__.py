@@ -7,7 +7,14 @@ Conventions of the whole package:
 * Lengths mm, angles rad, image coordinates px with the centre of the top-left pixel at (0, 0).
 """
 
-from jawusd.geometry.anatomy import LANDMARKS, anatomical_frame, find_landmarks, landmark_frame, mandible_metric
+from jawusd.geometry.anatomy import (
+    LANDMARKS,
+    anatomical_frame,
+    bite_normal,
+    find_landmarks,
+    landmark_frame,
+    mandible_metric,
+)
 from jawusd.geometry.camera import Camera
 from jawusd.geometry.quaternion import matrix_from_wxyz, wxyz_from_matrix
 from jawusd.geometry.rigid import rigid_fit, triangulate
@@ -41,6 +48,7 @@ __all__ = [
     "LANDMARKS",
     "Camera",
     "anatomical_frame",
+    "bite_normal",
     "find_landmarks",
     "hat",
     "landmark_frame",

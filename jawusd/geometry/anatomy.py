@@ -21,14 +21,19 @@ LANDMARKS = ("incisor", "molar_left", "molar_right", "condyle_left", "condyle_ri
 _CONDYLE_FROM_INCISOR_MM = np.array([50.0, 36.0, -80.0])
 # The first molars sit about this far behind the incisal point along the anterior axis.
 _MOLAR_BEHIND_INCISOR_MM = 25.0
+_MOLAR_ASIDE_MM = 22.0
 _MIDLINE_MM = 4.0
+_FEWEST_FRONT = 40  # points that make a front edge
+_FEWEST_SLABS = 4
+# Places at which the heights of both arches are compared, and how many of them say more than the mean heights do.
+_CELL_MM, _FEWEST_CELLS = 4.0, 6
 
 
 def anatomical_frame(upper_vertices: ArrayLike, lower_vertices: ArrayLike) -> Array:
     """Return T_anatomical_skull (4, 4) of two dental scans in occlusion, in any common scan frame.
 
     Up is the normal of the common plane of both arches, from the lower to the upper one; the midline is the mirror
-    axis of the arches in that plane; anterior is the closed end of the horseshoe.
+    axis of the arches in that plane; anterior is the closed end of the horseshoe. Teeth may be missing.
 
     Args:
         upper_vertices, lower_vertices: crown vertices [mm], shapes (N, 3) and (M, 3).
@@ -36,9 +41,7 @@ def anatomical_frame(upper_vertices: ArrayLike, lower_vertices: ArrayLike) -> Ar
     upper, lower = np.asarray(upper_vertices, dtype=np.float64), np.asarray(lower_vertices, dtype=np.float64)
     both = np.concatenate([_thin(upper), _thin(lower)])
     centre = both.mean(0)
-    normal = np.linalg.svd(both - centre, full_matrices=False)[2][2]
-    if normal @ (upper.mean(0) - lower.mean(0)) < 0:
-        normal = -normal
+    normal = bite_normal(upper, lower)
     e1 = np.linalg.svd(both - centre, full_matrices=False)[2][0]
     e1 = e1 - normal * (normal @ e1)
     e1 /= np.linalg.norm(e1)
@@ -53,11 +56,47 @@ def anatomical_frame(upper_vertices: ArrayLike, lower_vertices: ArrayLike) -> Ar
     R, midline = _centre_midline(both, np.stack([np.cross(normal, anterior), normal, anterior]))
     crown = upper @ R.T
     crown[:, 0] -= midline
-    front = crown[np.abs(crown[:, 0]) < _MIDLINE_MM]
+    edge = _front_edge(crown, -1.0, 0.6)
+    return make_transform(R, -np.array([midline, edge[:, 1].min(), edge[:, 2].mean()]))
+
+
+def bite_normal(upper_vertices: ArrayLike, lower_vertices: ArrayLike) -> Array:
+    """Return the normal of the common plane of two arches in occlusion, from the lower to the upper one, shape (3,).
+
+    Which way is up is decided tooth by tooth, where crowns of one arch stand over those of the other: over the whole
+    arches, heights of missing, short or deeply overlapping teeth would mix with those of others.
+
+    Args:
+        upper_vertices, lower_vertices: crown vertices [mm], shapes (N, 3) and (M, 3).
+    """
+    upper, lower = _thin(np.asarray(upper_vertices, np.float64)), _thin(np.asarray(lower_vertices, np.float64))
+    e1, e2, normal = np.linalg.svd(np.concatenate([upper - upper.mean(0), lower - lower.mean(0)]), full_matrices=False)[
+        2
+    ]
+    heights = []
+    for points in (upper, lower):
+        cells = np.floor(np.stack([points @ e1, points @ e2], 1) / _CELL_MM).astype(int)
+        there, index = np.unique(cells, axis=0, return_inverse=True)
+        mean = np.bincount(index.ravel(), points @ normal) / np.bincount(index.ravel())
+        heights.append(dict(zip(map(tuple, there.tolist()), mean.tolist())))
+    shared = [heights[0][cell] - heights[1][cell] for cell in heights[0].keys() & heights[1].keys()]
+    above = np.median(shared) if len(shared) >= _FEWEST_CELLS else normal @ (upper.mean(0) - lower.mean(0))
+    return -normal if above < 0 else normal
+
+
+def _front_edge(crown: Array, side: float, within_mm: float) -> Array:
+    """Return the points of the incisal edge next to the midline, or of the teeth next to it where incisors lack.
+
+    Args:
+        crown: crown points, x across from the midline, y up, z to the front [mm], shape (N, 3).
+        side: 1 if the edge is the upper end of the crowns, -1 if it is the lower one.
+        within_mm: of the extreme point of the edge.
+    """
+    reach = max(_MIDLINE_MM, float(np.sort(np.abs(crown[:, 0]))[min(_FEWEST_FRONT, len(crown) - 1)]))
+    front = crown[np.abs(crown[:, 0]) <= reach]
     front = front[front[:, 2] > front[:, 2].max() - 5.0]
-    edge = front[front[:, 1] < front[:, 1].min() + 0.6]
-    origin = np.array([midline, edge[:, 1].min(), edge[:, 2].mean()])
-    return make_transform(R, -origin)
+    height = side * front[:, 1]
+    return front[height > height.max() - within_mm]
 
 
 def _centre_midline(points: Array, R: Array) -> tuple[Array, float]:
@@ -70,16 +109,19 @@ def _centre_midline(points: Array, R: Array) -> tuple[Array, float]:
     Returns:
         The corrected rotation (3, 3) and the midline's lateral coordinate in it [mm].
     """
-    midline = 0.0
+    midline = float(np.percentile(points @ R[0], [2, 98]).mean())
     for _ in range(8):
         x, z = points @ R[0], points @ R[2]
         bins = np.linspace(np.percentile(z, 3), np.percentile(z, 85), 17)
         depth, middle = [], []
         for low, high in zip(bins[:-1], bins[1:], strict=True):
             slab = x[(z >= low) & (z < high)]
-            if len(slab) >= 20:
+            # A side without teeth tells nothing of the middle.
+            if min(np.count_nonzero(slab > midline), np.count_nonzero(slab < midline)) >= 10:
                 depth.append(0.5 * (low + high))
                 middle.append(0.5 * (np.percentile(slab, 1.5) + np.percentile(slab, 98.5)))
+        if len(depth) < _FEWEST_SLABS:
+            break
         slope, midline = np.polyfit(depth, middle, 1)
         if abs(slope) < 1e-6:
             break
@@ -132,15 +174,15 @@ def find_landmarks(
     A = np.asarray(T_anatomical_skull, dtype=np.float64)
     lower = transform_points(A, np.asarray(lower_vertices, dtype=np.float64))
     out = np.empty((5, 3))
-    midline = lower[np.abs(lower[:, 0]) < _MIDLINE_MM]
-    midline = midline[midline[:, 2] > midline[:, 2].max() - 6.0]
-    edge = midline[midline[:, 1] > midline[:, 1].max() - 0.4]
+    edge = _front_edge(lower, 1.0, 0.4)
     out[0] = [0.0, edge[:, 1].max(), edge[:, 2].mean()]
     for row, side in ((1, 1.0), (2, -1.0)):
         z = out[0, 2] - _MOLAR_BEHIND_INCISOR_MM
         near = lower[(lower[:, 0] * side > 0) & (np.abs(lower[:, 2] - z) < 3.0)]
-        crown = near[near[:, 1] > np.percentile(near[:, 1], 70)]
-        out[row] = crown.mean(0)
+        if len(near):
+            out[row] = near[near[:, 1] >= np.percentile(near[:, 1], 70)].mean(0)
+        else:  # no tooth there
+            out[row] = [side * _MOLAR_ASIDE_MM, out[0, 1], z]
     if mandible_vertices is None:
         for row, side in ((3, 1.0), (4, -1.0)):
             out[row] = out[0] + _CONDYLE_FROM_INCISOR_MM * [side, 1.0, 1.0]

@@ -149,7 +149,7 @@ def _start(data: ReportData) -> str:
     ]
     if left_out:
         text += f"; picks that did not fit were left out ({'; '.join(left_out)})"
-    return text + "".join(f"; {finding}" for finding in start.get("scan_findings", []))
+    return text
 
 
 def _cameras(data: ReportData) -> list[dict[str, str]]:

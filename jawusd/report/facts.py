@@ -23,7 +23,6 @@ class StartFacts(TypedDict, total=False):
     by: str
     frame: int
     picks_left_out: dict[str, list[int]]
-    scan_findings: list[str]
 
 
 class ExtrinsicsFacts(TypedDict, total=False):

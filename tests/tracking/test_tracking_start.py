@@ -196,57 +196,6 @@ def test_reversed_faces_do_not_matter(pictures):
     assert np.abs(as_is.T_world_lower - other.T_world_lower).max() < 1e-3
 
 
-def _moved(scan, by_mm):
-    return replace(scan, vertices=scan.vertices + np.asarray(by_mm, np.float64))
-
-
-def _opened(turn_rad):
-    """Return the lower scan as if the mouth were open, turned about the far ends of the arch."""
-    back, forth = make_transform(np.eye(3), [0, 0, -60]), make_transform(np.eye(3), [0, 0, 60])
-    T = back @ se3_exp([turn_rad, 0, 0, 0, 0, 0]) @ forth
-    return replace(SCANS[1], vertices=transform_points(T, SCANS[1].vertices))
-
-
-# The small arches are too short for the axes to be derived well; they are made in anatomical ones.
-def test_scans_in_occlusion_are_accepted():
-    T, findings = check_occlusion((SCANS[0], _moved(SCANS[1], [0, -1.5, 0])), np.eye(4))
-    assert np.array_equal(T, np.eye(4)) and not findings
-
-
-@pytest.mark.parametrize("axes", [None, np.eye(4)])
-@pytest.mark.parametrize(
-    ("by_mm", "message"),
-    [
-        ([0, -9, 0], r"they are \d\.\d mm apart where they are closest, at most 4 mm"),
-        ([0, 7, 0], r"the middle of the upper crowns lies 2\.\d mm above"),
-        ([0, 0, -17], r"they are \d.\d mm apart"),
-        ([30, -1, 0], "their arches lie 30 mm beside one another, at most 15 mm"),
-        ([0, 20, 0], r"the middle of the upper crowns lies -10\.\d mm above"),
-    ],
-)
-def test_scans_out_of_occlusion_are_refused(by_mm, message, axes):
-    with pytest.raises(TrackingError, match=f"not in occlusion: {message}"):
-        check_occlusion((SCANS[0], _moved(SCANS[1], by_mm)), axes)
-
-
-def test_scans_of_an_open_mouth_are_refused():
-    with pytest.raises(TrackingError, match="not in occlusion"):
-        check_occlusion((SCANS[0], _opened(0.35)), None)
-
-
-@pytest.mark.parametrize(
-    ("scans", "finding"),
-    [
-        ((SCANS[0], _moved(SCANS[1], [0, -5, 0])), "the scans do not touch: 2.1 mm apart"),
-        ((SCANS[0], _moved(SCANS[1], [6, 0, 0])), "apart sideways"),
-        ((SCANS[0], _moved(SCANS[1], [0, 3, 0])), "into one another"),
-        (SCANS[::-1], "exchanged scan files"),
-    ],
-)
-def test_odd_scans_are_noted(scans, finding):
-    assert any(finding in found for found in check_occlusion(scans, np.eye(4))[1])
-
-
 def test_survey_finds_the_rows(pictures):
     sources = masked_sources(_capture(pictures).cameras, TABLE, OFFSETS)
     survey = survey_masks(sources, TABLE, OFFSETS, (FIRST, FIRST + FRAMES), 3)

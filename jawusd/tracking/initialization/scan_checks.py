@@ -1,128 +1,158 @@
-"""Checks on the two teeth scans together: are they in occlusion, and is the upper one the upper one?"""
+"""Checks on the two teeth scans together: can they be a bite, and what is doubtful about it?"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial import cKDTree
 
 from jawusd.errors import TrackingError
-from jawusd.geometry import anatomical_frame, transform_points
+from jawusd.formats.finding import Finding
+from jawusd.geometry import anatomical_frame
 from jawusd.geometry.arrays import Array
-from jawusd.tracking.contour.scan import Scan
+from jawusd.tracking.contour.scan import ARCH_NAMES, Scan
+from jawusd.tracking.initialization.occlusion import Occlusion, measure_occlusion
 
-# Teeth in occlusion touch. Scans taken slightly open, or a bite registered carelessly, stay within the first limit;
-# beyond the second one the scans are not in one frame [mm].
-_LOOSE_MM, _APART_MM = 1.0, 4.0
-# Depth to which crowns may run into one another: registrations overlap by some tenths of a millimetre [mm].
-_TIGHT_MM, _THROUGH_MM = 1.0, 3.0
-# Distance of the middles of both arches along the bite plane: a severe malocclusion stays below [mm].
-_ASIDE_MM = 15.0
+# What no bite can be.
+_APART_MM = 4.0
+_THROUGH_SHARE = 0.5
+_SAME_SHARE = 0.5
+_BESIDE_SHARE = 0.35
+_FACING_BACK_RAD = np.pi / 2
+_WIDEST_MM, _NARROWEST_MM = 100.0, 20.0
+# What is doubtful: beyond what the persons and scanners of the population show.
+_LOOSE_MM = 0.8
+_TIGHT_MM = 1.3
+_ONE_SIDED_MM = 1.0
 _MIDLINES_MM = 4.0
-# Height of the middle of the upper crowns above that of the lower ones: 5 mm or more in any bite [mm].
-_LEAST_HEIGHT_MM = 2.5
-_SHARE = 0.005  # of the crown vertices that may be exceptions
+_WIDE_MM, _NARROW_MM = 76.0, 32.0
+_RATIOS = (0.85, 1.28)
+_LOWER_AHEAD_MM = 0.5
+_AXES_OFF_DEG = 30.0
+
+_EXPORT = "Export both scans in one coordinate frame with the teeth in occlusion (closed bite)."
+_UNITS = "Check units and scale of both scan files: lengths must be in mm."
+_LOOK = "Look at both scans together; correct them if it is not this person's bite."
 
 
-def check_occlusion(scans: Sequence[Scan], T_anatomical_scan: ArrayLike | None) -> tuple[Array, list[str]]:
-    """Check that both arches lie in one frame, in occlusion; return T_anatomical_scan (4, 4) and odd findings.
+def check_occlusion(scans: Sequence[Scan], T_anatomical_scan: ArrayLike | None) -> tuple[Array, list[Finding]]:
+    """Check that both arches lie in one frame, in occlusion; return T_anatomical_scan (4, 4) and what is doubtful.
 
-    `T_anatomical_scan` maps the scan frame to (left, up, front) axes; None derives it. Findings are one sentence each.
+    `T_anatomical_scan` maps the scan frame to (left, up, front) axes; None derives it.
 
     Raises:
-        TrackingError: the arches are far apart, beside one another, or inside one another.
+        TrackingError: the scans cannot be a bite: far apart, beside or inside one another, one turned over, one the
+            copy of the other, or not of the size of teeth.
     """
-    crowns = [scan.crown_vertices(6000) for scan in scans]
-    near, depth = _gap_mm(crowns), _overlap_mm(scans)
-    hint = "Export both scans in one coordinate frame with the teeth in occlusion (closed bite)."
-    if near > _APART_MM:
-        raise TrackingError(
-            f"the upper and lower teeth scans are not in occlusion: they are {near:.1f} mm apart where they are "
-            f"closest, at most {_APART_MM:g} mm are allowed",
-            hint=hint,
-        )
-    if depth > _THROUGH_MM:
-        raise TrackingError(
-            f"the upper and lower teeth scans are not in occlusion: their crowns run {depth:.1f} mm into one another, "
-            f"at most {_THROUGH_MM:g} mm are allowed",
-            hint=hint,
-        )
-    given = T_anatomical_scan is not None
-    # The thin direction of the upper arch alone: that of both arches means little while they are not known to meet.
-    up = np.array(T_anatomical_scan, np.float64)[1, :3] if given else _thin_direction(crowns[0])
-    between = crowns[0].mean(0) - crowns[1].mean(0)
-    height, aside = float(up @ between), float(np.linalg.norm(between - up * (up @ between)))
-    # The side of its gum tells a lower arch above the upper one from scans whose axes are turned over.
-    height = abs(height) if (side := _gum_side(scans[0], up)) == 0 else height * side
-    if height < _LEAST_HEIGHT_MM:
-        raise TrackingError(
-            f"the upper and lower teeth scans are not in occlusion: the middle of the upper crowns lies {height:.1f} "
-            f"mm above that of the lower ones, at least {_LEAST_HEIGHT_MM:g} mm are needed",
-            hint=hint,
-        )
-    if aside > _ASIDE_MM:
-        raise TrackingError(
-            f"the upper and lower teeth scans are not in occlusion: their arches lie {aside:.0f} mm beside one "
-            f"another, at most {_ASIDE_MM:g} mm are allowed",
-            hint=hint,
-        )
-    T = np.array(T_anatomical_scan, np.float64) if given else anatomical_frame(*crowns)
-    upper, lower = (transform_points(T, c) for c in crowns)
-    sideways = abs(_midline(upper) - _midline(lower))
-    findings = []
-    if near > _LOOSE_MM:
-        findings.append(f"the scans do not touch: {near:.1f} mm apart where they are closest")
-    if depth > _TIGHT_MM:
-        findings.append(f"the crowns of the scans run {depth:.1f} mm into one another")
-    if sideways > _MIDLINES_MM:
-        findings.append(f"the middles of the two arches lie {sideways:.1f} mm apart sideways")
-    if _width(lower) > _width(upper) and lower[:, 2].max() > upper[:, 2].max():
-        findings.append("the lower arch encloses the upper one: an underbite, or exchanged scan files")
+    T, findings = occlusion_findings(scans, T_anatomical_scan)
+    for finding in findings:
+        if finding.severity == "error":
+            raise TrackingError(finding.message, hint=finding.hint)
     return T, findings
 
 
-def _gum_side(scan: Scan, up: Array) -> float:
-    """Return on which side of its crowns an arch has its gum: 1 towards `up`, -1 away from it, 0 if it has none."""
-    if not scan.painted or not len(scan.gum_faces):
-        return 0.0
-    gum, crowns = (scan.vertices[np.unique(faces)].mean(0) for faces in (scan.gum_faces, scan.crown_faces))
-    return float(np.sign(up @ (gum - crowns)))
+def occlusion_findings(scans: Sequence[Scan], T_anatomical_scan: ArrayLike | None) -> tuple[Array, list[Finding]]:
+    """Return T_anatomical_scan (4, 4), given or derived, and everything wrong or doubtful about two scans in one frame.
+
+    Only what cannot be a bite is an error; then nothing else is told, since it follows from that.
+    """
+    given = T_anatomical_scan is not None
+    derived = anatomical_frame(*(scan.crown_vertices(6000) for scan in scans))
+    found = measure_occlusion(scans, derived)
+    errors = list(_impossible(found, scans))
+    findings = errors[:1] or list(_doubtful(found, scans))
+    if not given:
+        return derived, findings
+    T = np.array(T_anatomical_scan, np.float64)
+    tilt_deg = float(np.degrees(np.arccos(np.clip(T[1, :3] @ derived[1, :3], -1.0, 1.0))))
+    if tilt_deg > _AXES_OFF_DEG and not errors:
+        findings.append(
+            Finding(
+                "anatomical_axes_off",
+                "warning",
+                f"the up axis of [anatomy] T_anatomical_skull is {tilt_deg:.0f} degrees off the normal of the bite, "
+                f"up to {_AXES_OFF_DEG:g} are usual",
+                tilt_deg,
+                _AXES_OFF_DEG,
+                hint="Correct or remove T_anatomical_skull: without it the axes are derived from the scans.",
+            )
+        )
+    return T, findings
 
 
-def _gap_mm(crowns: Sequence[Array]) -> float:
-    """Return the distance of the vertices that are closest to the other arch [mm]."""
-    distance = cKDTree(crowns[0]).query(crowns[1])[0]
-    return float(np.quantile(distance, _SHARE))
+def _impossible(found: Occlusion, scans: Sequence[Scan]) -> Iterator[Finding]:
+    """Yield what shows that two scans are no bite, causes before their consequences."""
+
+    def error(kind: str, message: str, value: float, limit: float, hint: str = _EXPORT) -> Finding:
+        return Finding(kind, "error", message, value, limit, hint=hint)
+
+    for name, width in zip(ARCH_NAMES, found.widths_mm):
+        if not _NARROWEST_MM <= width <= _WIDEST_MM:
+            message = f"the {name} arch is {width:.0f} mm wide, teeth are {_NARROWEST_MM:g} to {_WIDEST_MM:g} mm"
+            yield error("scans_size", message, width, _WIDEST_MM, _UNITS)
+    off = "the upper and lower teeth scans are not in occlusion: "
+    if found.same > _SAME_SHARE:
+        message = f"the upper and lower teeth scans are the same arch: {found.same:.0%} of their surfaces coincide"
+        yield error("scans_same", message, found.same, _SAME_SHARE, "Name the other arch's file in [scans].")
+    if found.opposite < _BESIDE_SHARE and found.turn_rad < _FACING_BACK_RAD:
+        message = f"{off}their arches lie {found.aside_mm:.0f} mm beside one another, only {found.opposite:.0%} of the "
+        message += f"smaller one stands over the other, at least {_BESIDE_SHARE:.0%} are needed"
+        yield error("scans_beside", message, found.opposite, _BESIDE_SHARE)
+    if found.gap_mm > _APART_MM:
+        message = f"{off}they are {found.gap_mm:.1f} mm apart where they are closest, at most {_APART_MM:g} mm are "
+        yield error("scans_apart", message + "allowed", found.gap_mm, _APART_MM)
+    if found.turn_rad > _FACING_BACK_RAD:
+        turn_deg = float(np.degrees(found.turn_rad))
+        message = f"{off}one arch is turned by {turn_deg:.0f} degrees against the other, front to back"
+        yield error("scans_turned", message, turn_deg, float(np.degrees(_FACING_BACK_RAD)))
+    over = [k for k in (0, 1) if found.turned_over[k] and len(scans[k].gum_faces)]
+    if len(over) == 1:
+        message = f"{off}the {ARCH_NAMES[over[0]]} arch is upside down, its gum lies between the teeth of both arches"
+        yield error("scan_upside_down", message, 1.0, 0.0)
+    elif over:
+        message = f"{off}both arches have their gum between them: they were moved through one another"
+        yield error("scans_passed", message, 1.0, 0.0)
+    if found.through > _THROUGH_SHARE:
+        message = f"{off}the arches are inside one another, the lower crowns end more than 2 mm above the upper ones "
+        message += f"over {found.through:.0%} of the bite, at most {_THROUGH_SHARE:.0%} are possible"
+        yield error("scans_inside", message, found.through, _THROUGH_SHARE)
 
 
-def _overlap_mm(scans: Sequence[Scan]) -> float:
-    """Return how deep the lower crowns run into the upper ones, which must be wound outwards [mm]."""
-    if not scans[0].painted:
-        return 0.0  # without paint nothing says which side of the surface is inside
-    faces, vertices = scans[0].crown_faces, scans[0].vertices
-    corners = vertices[faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    points = scans[1].crown_vertices(6000)
-    distance, nearest = cKDTree(corners.mean(1)).query(points)
-    behind = np.einsum("ij,ij->i", points - corners.mean(1)[nearest], normals[nearest])
-    # Behind the surface and not merely past its border.
-    inside = np.where(behind < -0.7 * distance, distance, 0.0)
-    return float(np.quantile(inside, 1.0 - _SHARE))
+def _doubtful(found: Occlusion, scans: Sequence[Scan]) -> Iterator[Finding]:
+    """Yield what a bite may be, but seldom is."""
 
+    def warning(kind: str, message: str, value: float, limit: float, hint: str = _LOOK) -> Finding:
+        return Finding(kind, "warning", message, value, limit, hint=hint)
 
-def _thin_direction(points: Array) -> Array:
-    """Return the direction in which an arch extends least, shape (3,)."""
-    return np.linalg.svd(points - points.mean(0), full_matrices=False)[2][2]
-
-
-def _midline(points: Array) -> float:
-    """Return the middle of an arch from side to side [mm]."""
-    return float(np.percentile(points[:, 0], [1, 99]).mean())
-
-
-def _width(points: Array) -> float:
-    low, high = np.percentile(points[:, 0], [1, 99])
-    return float(high - low)
+    if found.gap_mm > _LOOSE_MM:
+        message = f"the teeth scans do not touch: {found.gap_mm:.1f} mm apart where they are closest, up to "
+        yield warning("scans_open", f"{message}{_LOOSE_MM:g} mm are usual", found.gap_mm, _LOOSE_MM, _EXPORT)
+    if found.depth_mm > _TIGHT_MM:
+        message = f"the crowns of the scans run {found.depth_mm:.1f} mm into one another, up to {_TIGHT_MM:g} mm are "
+        yield warning("scans_overlap", message + "usual", found.depth_mm, _TIGHT_MM, _EXPORT)
+    left, right = found.side_gaps_mm
+    if abs(left - right) > _ONE_SIDED_MM:
+        tight, loose = ("right", "left") if left > right else ("left", "right")
+        message = f"the bite is tilted: on the {loose} side the teeth are {abs(left - right):.1f} mm farther apart "
+        message += f"than on the {tight} one, up to {_ONE_SIDED_MM:g} mm are usual"
+        yield warning("bite_tilted", message, abs(left - right), _ONE_SIDED_MM)
+    if found.midlines_mm > _MIDLINES_MM:
+        message = f"the middles of the two arches lie {found.midlines_mm:.1f} mm apart sideways, up to "
+        yield warning("midlines_apart", f"{message}{_MIDLINES_MM:g} mm are usual", found.midlines_mm, _MIDLINES_MM)
+    for name, width in zip(ARCH_NAMES, found.widths_mm):
+        if not _NARROW_MM <= width <= _WIDE_MM:
+            message = f"the {name} arch is {width:.0f} mm wide, usual are {_NARROW_MM:g} to {_WIDE_MM:g} mm"
+            yield warning("scan_size", message, width, _WIDE_MM, _UNITS)
+    if not _RATIOS[0] <= found.width_ratio <= _RATIOS[1] and np.isfinite(found.width_ratio):
+        message = f"the upper arch is {found.width_ratio:.2f} times as wide as the lower one, usual are {_RATIOS[0]:g} "
+        message += f"to {_RATIOS[1]:g}: a crossbite, or scans of different scale"
+        yield warning("arch_widths", message, found.width_ratio, _RATIOS[found.width_ratio > 1.0])
+    if found.lower_ahead_mm > _LOWER_AHEAD_MM:
+        message = f"the lower front teeth stand {found.lower_ahead_mm:.1f} mm before the upper ones: an underbite, or "
+        hint = "Check that [scans] names the upper and the lower file rightly."
+        yield warning("underbite", message + "exchanged scan files", found.lower_ahead_mm, _LOWER_AHEAD_MM, hint)
+    for k, name in enumerate(ARCH_NAMES):
+        if found.turned_over[k] and not len(scans[k].gum_faces):
+            message = f"the open side of the {name} scan faces the other arch: it is upside down, or its faces are "
+            yield warning("scan_inside_out", message + "wound inwards", 1.0, 0.0, _LOOK)

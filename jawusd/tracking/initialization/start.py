@@ -9,6 +9,7 @@ import numpy as np
 
 from jawusd.errors import CaptureError, TrackingError
 from jawusd.formats.capture import Bootstrap, Capture
+from jawusd.formats.finding import Finding
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera
 from jawusd.geometry.arrays import Array
@@ -40,6 +41,7 @@ class Start:
     frame: int  # reference camera frame
     poses: Array  # T_world_upper, T_world_lower, shape (2, 4, 4)
     notes: dict[str, object]  # how it was found, for the meta data of the tracks
+    findings: tuple[Finding, ...] = ()  # what is doubtful about the scans
 
 
 def find_start(
@@ -71,7 +73,7 @@ def find_start(
         start = _picked(capture.bootstrap, capture.frames, footage, meshes, search)
     else:
         start = search_start(search, footage)
-    return Start(start.frame, start.poses, {**start.notes, "scan_findings": findings})
+    return replace(start, findings=tuple(findings))
 
 
 def _picked(

@@ -77,7 +77,11 @@ def track_capture(
             nuisances, extrinsics = take.refine()
             records = take.records if capture.frames else _trimmed(take.records)
             names = tuple(camera.name for camera in masks.cameras)
-    notes: TracksMeta = {"start": start.notes, "painted": [s.painted for s in scans]}
+    notes: TracksMeta = {
+        "start": start.notes,
+        "painted": [s.painted for s in scans],
+        "findings": [finding.as_json() for finding in start.findings],
+    }
     return assemble(records, names, np.asarray(landmarks, np.float64), nuisances, extrinsics, config, notes)
 
 

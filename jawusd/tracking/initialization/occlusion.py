@@ -1,0 +1,212 @@
+"""How two teeth scans meet: contact, overlap and relation of opposing crowns, measured locally along the arches."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from jawusd.geometry import bite_normal
+from jawusd.geometry.arrays import Array, Mask
+from jawusd.tracking.contour.scan import Scan
+
+_SAMPLES = 8000  # pieces of surface per arch: one per half millimetre
+_SHARE = 0.002  # of the crown surface that may be exceptions: a speck, a spike of the mesh
+_DEEPEST_MM = 5.0  # no point inside a crown is farther from its surface; what seems so lies past an open border
+_DEEP_MM = 1.0
+_SAME_MM = 0.05
+_BESIDE_MM = 4.0  # half of a molar: crowns nearer than this across the bite plane stand over one another
+_CELL_MM = 1.0
+_THROUGH_MM = 2.0  # cusps reach less deep into the other arch as seen from above
+_SLAB_MM = 3.0
+_FEWEST = 50  # pieces of surface that make a side of an arch
+_ASIDE_MM = 6.0  # nearer to the middle, left and right are one tooth
+_OPEN = 0.08  # a surface whose directed area is a smaller share of its area is closed and shows no open side
+
+
+@dataclass(frozen=True)
+class Occlusion:
+    """Hold how two arches meet; lengths in mm, NaN where the teeth do not show a figure."""
+
+    gap_mm: float  # distance of the crowns where they are closest, 0 where they touch
+    side_gaps_mm: tuple[float, float]  # the same left and right of the middle, negative where crowns overlap
+    depth_mm: float  # how deep crowns run into one another
+    deep_share: float  # of the crown surface that stands opposite other crowns: what runs in deeper than a millimetre
+    through: float  # share of the ground covered by both arches on which the lower crowns end 2 mm above the upper ones
+    same: float  # share of the surfaces that coincide
+    opposite: float  # share of the arch with fewer teeth that stands over or under crowns of the other one
+    aside_mm: float  # distance of the middles of both arches along the bite plane
+    turn_rad: float  # angle in the bite plane between the forward directions of both arches
+    turned_over: tuple[
+        bool | None, bool | None
+    ]  # upper, lower: occlusal side away from the other arch; None: not known
+    midlines_mm: float  # distance of the middles sideways, where both arches have teeth left and right
+    width_ratio: float  # width of the upper arch over that of the lower one at equal depth
+    widths_mm: tuple[float, float]  # largest width of each arch
+    lower_ahead_mm: float  # how far the lower front teeth stand before the upper ones
+
+
+@dataclass(frozen=True, eq=False)
+class _Surface:
+    """Hold pieces of a crown surface."""
+
+    points: Array  # [mm], shape (N, 3)
+    normals: Array  # outward units, shape (N, 3)
+    areas: Array  # [mm^2], shape (N,)
+    border: Mask  # next to an opening of the surface, where inside and outside cannot be told, shape (N,)
+
+
+def measure_occlusion(scans: Sequence[Scan], T_anatomical_scan: Array) -> Occlusion:
+    """Measure how two scans meet that lie in one frame; `T_anatomical_scan` maps it to (left, up, front) axes."""
+    surfaces = [_surface(scan) for scan in scans]
+    crowns = [scan.crown_vertices(_SAMPLES) for scan in scans]
+    normal = bite_normal(*crowns)
+    left = np.cross(normal, T_anatomical_scan[2, :3])
+    left /= np.linalg.norm(left)
+    axes = np.stack([left, normal, np.cross(left, normal)])
+    upper, lower = (points @ axes.T for points in crowns)
+    middle = float(np.mean([np.percentile(points[:, 0], [1, 99]).mean() for points in (upper, lower)]))
+    # Both ways: the surface that is finer sees contacts that the other one steps over.
+    signed = [_signed_distances(surfaces[k], surfaces[1 - k]) for k in (0, 1)]
+    nearest = [_weighted_quantile(d, surfaces[k].areas, _SHARE) for k, d in enumerate(signed)]
+    stand = [_beside(a, b) for a, b in ((upper, lower), (lower, upper))]
+    deep = sum(float(surfaces[k].areas[d < -_DEEP_MM].sum()) for k, d in enumerate(signed))
+    opposed = sum(float(surfaces[k].areas.sum() * stand[k].mean()) for k in (0, 1))
+    turned_over = (_turned_over(scans[0], surfaces[0], -normal), _turned_over(scans[1], surfaces[1], normal))
+    midlines_mm, width_ratio = _compare_widths(upper, lower)
+    return Occlusion(
+        gap_mm=max(0.0, min(nearest)),
+        side_gaps_mm=(_side_gap(signed, surfaces, left, middle), _side_gap(signed, surfaces, -left, -middle)),
+        depth_mm=max(0.0, -min(nearest)),
+        deep_share=deep / max(opposed, 1e-9),
+        through=_through(upper, lower),
+        same=float(np.mean(np.abs(signed[1]) < _SAME_MM)),
+        opposite=float(max(part.mean() for part in stand)),
+        aside_mm=float(np.linalg.norm((upper.mean(0) - lower.mean(0))[[0, 2]])),
+        turn_rad=_angle(_forward(upper[:, [0, 2]]), _forward(lower[:, [0, 2]])),
+        turned_over=turned_over,
+        midlines_mm=midlines_mm,
+        width_ratio=width_ratio,
+        widths_mm=(float(np.ptp(upper[:, 0])), float(np.ptp(lower[:, 0]))),
+        lower_ahead_mm=float(np.percentile(lower[:, 2], 99.5) - np.percentile(upper[:, 2], 99.5)),
+    )
+
+
+def _surface(scan: Scan) -> _Surface:
+    """Return the crown faces as pieces of surface, at most about `_SAMPLES` of them."""
+    border = np.zeros(len(scan.crown_faces), bool)
+    border[scan.edges[scan.edges[:, 3] < 0, 2]] = True
+    chosen = slice(None, None, max(1, len(scan.crown_faces) // _SAMPLES))
+    corners = scan.vertices[scan.crown_faces[chosen]]
+    directed = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    areas = np.linalg.norm(directed, axis=1)
+    return _Surface(corners.mean(1), directed / np.maximum(areas, 1e-12)[:, None], areas, border[chosen])
+
+
+def _signed_distances(these: _Surface, others: _Surface) -> Array:
+    """Return the distance of each piece from the other arch, negative inside of it [mm], shape (N,)."""
+    distance, nearest = cKDTree(others.points).query(these.points)
+    behind = np.einsum("ij,ij->i", these.points - others.points[nearest], others.normals[nearest])
+    # Behind the surface and not merely past its border.
+    inside = (behind < -0.7 * distance) & (distance < _DEEPEST_MM) & ~others.border[nearest]
+    return np.where(inside, -distance, distance)
+
+
+def _through(upper: Array, lower: Array) -> float:
+    """Return on which share of the ground that both arches cover the lower crowns end far above the upper ones.
+
+    Args:
+        upper, lower: crown points (left, up, front) [mm], shapes (N, 3) and (M, 3).
+    """
+    ends = []
+    for points, keep in ((upper, np.minimum), (lower, np.maximum)):
+        cells, index = np.unique(np.floor(points[:, [0, 2]] / _CELL_MM).astype(int), axis=0, return_inverse=True)
+        height = np.full(len(cells), np.inf if keep is np.minimum else -np.inf)
+        keep.at(height, index.ravel(), points[:, 1])
+        ends.append(dict(zip(map(tuple, cells.tolist()), height.tolist())))
+    shared = [ends[1][cell] - ends[0][cell] for cell in ends[0].keys() & ends[1].keys()]
+    return float(np.mean(np.array(shared) > _THROUGH_MM)) if shared else 0.0
+
+
+def _weighted_quantile(values: Array, weights: Array, share: float) -> float:
+    order = np.argsort(values)
+    total = np.cumsum(weights[order])
+    return float(values[order][min(np.searchsorted(total, share * total[-1]), len(values) - 1)])
+
+
+def _beside(these: Array, others: Array) -> Array:
+    """Return for each point whether the other arch has one over or under it, shape (N,)."""
+    return cKDTree(others[:, [0, 2]]).query(these[:, [0, 2]])[0] < _BESIDE_MM
+
+
+def _side_gap(signed: Sequence[Array], surfaces: Sequence[_Surface], aside: Array, middle: float) -> float:
+    """Return the gap of the crowns on the side to which `aside` points [mm]; NaN where an arch has no teeth there."""
+    gaps = []
+    for distance, surface in zip(signed, surfaces, strict=True):
+        there = surface.points @ aside - middle > _ASIDE_MM
+        if np.count_nonzero(there) < _FEWEST:
+            return float("nan")
+        gaps.append(_weighted_quantile(distance[there], surface.areas[there], 2 * _SHARE))
+    return min(gaps)
+
+
+def _compare_widths(upper: Array, lower: Array) -> tuple[float, float]:
+    """Return by how much the middles differ sideways [mm], and the ratio of the widths; NaN where not known.
+
+    They are compared in slabs across the arch in which both arches have teeth on both sides.
+    """
+    middle = 0.5 * (upper[:, 0].mean() + lower[:, 0].mean())
+    apart, ratios = [], []
+    for z in np.arange(max(upper[:, 2].min(), lower[:, 2].min()), min(upper[:, 2].max(), lower[:, 2].max()), _SLAB_MM):
+        ends = []
+        for points in (upper, lower):
+            x = points[(points[:, 2] >= z) & (points[:, 2] < z + _SLAB_MM), 0] - middle
+            if min(np.count_nonzero(x > _ASIDE_MM), np.count_nonzero(x < -_ASIDE_MM)) < 10:
+                break
+            ends.append(np.percentile(x, [1, 99]))
+        if len(ends) == 2:
+            apart.append(ends[0].mean() - ends[1].mean())
+            ratios.append(np.ptp(ends[0]) / np.ptp(ends[1]))
+    if len(apart) < 3:
+        return float("nan"), float("nan")
+    return abs(float(np.median(apart))), float(np.median(ratios))
+
+
+def _forward(flat: Array) -> Array:
+    """Return the direction in which the horseshoe of points (N, 2) is closed, shape (2,).
+
+    Of all directions it is the one against which both legs spread alike.
+    """
+    flat = flat[:: max(1, len(flat) // 2000)]
+    best, found = -np.inf, np.array([0.0, 1.0])
+    for angle in np.deg2rad(np.arange(0, 360, 5)):
+        ahead = np.array([np.sin(angle), np.cos(angle)])
+        depth, lateral = flat @ ahead, flat @ np.array([ahead[1], -ahead[0]])
+        lateral = lateral - np.percentile(lateral, [2, 98]).mean()
+        left, right = depth[lateral > 0], depth[lateral < 0]
+        if min(len(left), len(right)) < 20:
+            continue
+        worth = -np.corrcoef(depth, np.abs(lateral))[0, 1] - abs(left.mean() - right.mean()) / np.std(depth)
+        if worth > best:
+            best, found = worth, ahead
+    return found
+
+
+def _angle(a: Array, b: Array) -> float:
+    return float(np.arccos(np.clip(a @ b, -1.0, 1.0)))
+
+
+def _turned_over(scan: Scan, surface: _Surface, towards: Array) -> bool | None:
+    """Return whether the occlusal side looks away from the other arch; None if nothing shows it.
+
+    Crowns lie on the occlusal side of their gum. Without gum, the directed area of an open surface points away from
+    its opening, which is where the crowns were cut from the gum.
+    """
+    if len(scan.gum_faces):
+        gum = scan.vertices[np.unique(scan.gum_faces)]
+        return bool(towards @ (surface.points.mean(0) - gum.mean(0)) < 0)
+    directed = (surface.normals * surface.areas[:, None]).sum(0) / surface.areas.sum()
+    along = float(towards @ directed)
+    return None if abs(along) < _OPEN else along < 0
