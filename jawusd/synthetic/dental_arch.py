@@ -18,14 +18,14 @@ from jawusd.synthetic.teeth import CrownForm, crown
 
 RED, GREEN, GREY = (215, 45, 40), (40, 190, 60), (150, 150, 150)
 # Depth of the contact points behind the incisal edges and buccal cusp tips [mm]; the teeth are aligned at them.
-_CONTACT_MM = 0.9
-_CONTACT_OVERLAP_MM = 0.22
+CONTACT_MM = 0.9
+CONTACT_OVERLAP_MM = 0.22
 _BOUNDARY_MM = 2.5
 # Gum cross-section on one side, from the fold to the crest: distance outside the crown and height over the margin.
 _GUM_SIDE = np.array(
     [[2.6, -9.0], [2.0, -6.2], [1.45, -3.8], [1.0, -2.1], [0.72, -1.0], [0.42, -0.3], [0.05, 0.0], [-0.8, -0.5]]
 )
-_COLUMN_MM = 0.55
+COLUMN_MM = 0.55
 
 
 @dataclass(frozen=True)
@@ -48,15 +48,16 @@ class DentalArch:
     tooth: NDArray[np.int8]  # tooth of each vertex, 1..7 left and -1..-7 right from the midline, 0 gum, shape (V,)
 
 
-class _Line:
+class ArchLine:
     """A planar curve through the contact points, by arc length from the midline; positive to the left."""
 
     def __init__(self, shape: ArchShape) -> None:
+        """Follow the contact points of an arch of that shape."""
         x = np.linspace(-40.0, 40.0, 8001)
         z = -shape.quadratic_per_mm * x**2 - shape.quartic_per_mm3 * x**4
         slope = -2 * shape.quadratic_per_mm * x - 4 * shape.quartic_per_mm3 * x**3
         normal = np.stack([-slope, np.ones_like(x)], -1) / np.hypot(slope, 1.0)[:, None]
-        points = np.stack([x, z], -1) - (shape.setback_mm + _CONTACT_MM) * normal
+        points = np.stack([x, z], -1) - (shape.setback_mm + CONTACT_MM) * normal
         steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
         s = np.concatenate([[0.0], np.cumsum(steps)])
         self._s = s - np.interp(0.0, x, s)
@@ -92,7 +93,7 @@ def build_arch(forms: tuple[CrownForm, ...], shape: ArchShape, cusp_slope: float
         seed: of positions and irregularities of the teeth, which do not depend on the tips.
     """
     rng = np.random.default_rng([seed, 0x7EE7, int(upper)])
-    line = _Line(shape)
+    line = ArchLine(shape)
     centres = _centres(forms)
     parts, tooth, colors = [], [], []
     for half, side in enumerate((1, -1)):
@@ -100,7 +101,7 @@ def build_arch(forms: tuple[CrownForm, ...], shape: ArchShape, cusp_slope: float
             local, faces = crown(form, cusp_slope, rng)
             placed = _placed(local, form, line, side * centres[k], side, shape.tips_mm[half, k], rng)
             parts.append((placed, outward(placed, faces)))
-            colors.append(_crown_colors(local, form, k))
+            colors.append(crown_colors(local, form, k))
             tooth.append(np.full(len(local), side * (k + 1)))
     gum = _gum(forms, shape, line, np.concatenate([placed for placed, _ in parts]))
     parts.append(gum)
@@ -115,12 +116,12 @@ def build_arch(forms: tuple[CrownForm, ...], shape: ArchShape, cusp_slope: float
 
 def _centres(forms: tuple[CrownForm, ...]) -> Array:
     """Arc length of the tooth middles on one side."""
-    widths = np.array([form.width_mm - _CONTACT_OVERLAP_MM for form in forms])
+    widths = np.array([form.width_mm - CONTACT_OVERLAP_MM for form in forms])
     return np.cumsum(widths) - widths / 2
 
 
 def _placed(
-    local: Array, form: CrownForm, line: _Line, s: float, side: int, tip_mm: float, rng: np.random.Generator
+    local: Array, form: CrownForm, line: ArchLine, s: float, side: int, tip_mm: float, rng: np.random.Generator
 ) -> Array:
     """Move a crown to its place, occlusal side up."""
     point, normal = line.at(np.array(s))
@@ -131,12 +132,17 @@ def _placed(
     turn = so3_exp(np.array([np.deg2rad(form.torque_deg), 0.0, 0.0])) @ so3_exp(jitter)
     tip = np.array([0.0, form.height_mm, form.tip_z_mm])
     shift = rng.uniform(-0.12, 0.12, 2)
-    position = np.array([point[0], tip_mm, point[1]]) + (_CONTACT_MM + shift[0]) * facial + [0.0, shift[1], 0.0]
+    position = np.array([point[0], tip_mm, point[1]]) + (CONTACT_MM + shift[0]) * facial + [0.0, shift[1], 0.0]
     return (local - tip) @ (axes @ turn).T + position
 
 
-def _crown_colors(local: Array, form: CrownForm, k: int) -> NDArray[np.uint8]:
-    """Red, and green on the facial side of the last millimetres of the six front teeth."""
+def crown_colors(local: Array, form: CrownForm, k: int) -> NDArray[np.uint8]:
+    """Return red, and green on the facial side of the last millimetres of the six front teeth, shape (V, 3).
+
+    Args:
+        local: vertices in the crown frame, shape (V, 3).
+        k: tooth, 0 first incisor to 6 second molar.
+    """
     colors = np.tile(np.array(RED, dtype=np.uint8), (len(local), 1))
     if k < 3:
         middle = form.tip_z_mm
@@ -145,20 +151,30 @@ def _crown_colors(local: Array, form: CrownForm, k: int) -> NDArray[np.uint8]:
     return colors
 
 
-def _gum(forms: tuple[CrownForm, ...], shape: ArchShape, line: _Line, crowns: Array) -> tuple[Array, Faces]:
+def _gum(forms: tuple[CrownForm, ...], shape: ArchShape, line: ArchLine, crowns: Array) -> tuple[Array, Faces]:
     """Return a closed gum ridge: margins scalloped between the teeth, surface slightly outside the crowns."""
     half = _centres(forms)[-1] + forms[-1].width_mm / 2 + 2.5
-    s = np.linspace(-half, half, int(2 * half / _COLUMN_MM))
-    margin = _margin(forms, shape, s)
+    s = np.linspace(-half, half, int(2 * half / COLUMN_MM))
+    return gum_ridge(line, s, _margin(forms, shape, s), crowns)
+
+
+def gum_ridge(line: ArchLine, s: Array, margin: Array, crowns: Array) -> tuple[Array, Faces]:
+    """Return a closed gum ridge around crowns.
+
+    Args:
+        s: arc lengths of the cross-sections, evenly spaced, shape (S,).
+        margin: height of the gum margin there [mm], shape (S,).
+        crowns: vertices of the crowns, shape (V, 3).
+    """
     crown_s, crown_n = line.coordinates(crowns[:, [0, 2]])
     facial, lingual = _crown_extent(s, margin, crown_s, crown_n, crowns[:, 1])
     # Near the crest the gum follows every crown, further down only the arch as a whole.
     follow = np.clip(1.0 + _GUM_SIDE[:, 1] / 5.0, 0.0, 1.0)
     sides = []
     for extent, sign in ((facial, 1.0), (lingual, -1.0)):
-        even = _averaged(extent, int(9.0 / _COLUMN_MM))[:, None]
+        even = _averaged(extent, int(9.0 / COLUMN_MM))[:, None]
         offset = even + (extent[:, None] - even) * follow + sign * _GUM_SIDE[:, 0]
-        even_margin = _averaged(margin, int(9.0 / _COLUMN_MM))[:, None]
+        even_margin = _averaged(margin, int(9.0 / COLUMN_MM))[:, None]
         level = even_margin + (margin[:, None] - even_margin) * follow + _GUM_SIDE[:, 1]
         sides.append(np.stack([offset, level], -1))
     profile = np.concatenate([sides[0], sides[1][:, ::-1]], 1)

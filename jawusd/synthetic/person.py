@@ -25,7 +25,7 @@ def _asymmetric(rng: np.random.Generator, value: float, relative: float) -> Arra
     return value * (1.0 + relative * rng.uniform(-1.0, 1.0, 2))
 
 
-def _draw_joint(rng: np.random.Generator) -> Joint:
+def draw_joint(rng: np.random.Generator) -> Joint:
     """Draw the joint of one person."""
     u = rng.uniform
     half_distance, middle_x = u(47.0, 53.0), u(-0.7, 0.7)
@@ -94,7 +94,7 @@ class Person:
             raise ValueError(f"envelope must be 'box' or 'competing', got {envelope!r}")
         rng = np.random.default_rng([seed, 0x7A77])
         self.seed = seed
-        self.joint = _draw_joint(rng)
+        self.joint = draw_joint(rng)
         self.noise = Noise(0.12, float(np.deg2rad(0.08)), rng.uniform(0.10, 0.20), rng.uniform(0.065, 0.12))
         self.mandible_points = _mandible_points(self.joint)
         first_molars = self.joint.incisor + np.array([[22.0, 0.5, -26.0], [-22.0, 0.5, -26.0]])

@@ -1,0 +1,332 @@
+"""Captures of anybody: short takes of persons over the human range, with masks drawn by anybody, and their truth.
+
+No pictures: masks come from the rasteriser, crowns, gum, lips and tongue hiding one another. Seconds per person.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jawusd.formats.atomic import write_bytes_atomic, write_npz_atomic, write_text_atomic
+from jawusd.formats.calibration import save_calibration
+from jawusd.formats.mesh import Mesh, crown_face_mask
+from jawusd.geometry import Camera, make_transform, se3_inverse, so3_exp, transform_points
+from jawusd.geometry.arrays import Array
+from jawusd.imaging.raster import draw_depth_labels
+from jawusd.imaging.redraw import write_mask
+from jawusd.synthetic.annotator import Annotator, Hand, draw_annotator
+from jawusd.synthetic.bite import Bite, build_bite
+from jawusd.synthetic.dental_arch import DentalArch
+from jawusd.synthetic.dentition import without_gum
+from jawusd.synthetic.person import draw_joint
+from jawusd.synthetic.population import Traits, draw_traits
+from jawusd.synthetic.scanner import Scanner, draw_scanner, encoded, scanned
+from jawusd.synthetic.short_take import Motion, draw_cameras, draw_motion
+from jawusd.synthetic.soft_tissue import Face, palate, tongue
+
+FPS = 24.0
+FIRST_FRAME = 12
+JAWS = ("upper", "lower")
+_GUMS, _SOFT = (40, 80), 90  # labels: teeth 1..14 and 41..54, gums of the arches, soft tissue
+_LOWER_FROM = 41
+_PAD_PX = 24
+_PICKS = 4
+_PICK_NOISE_PX = 1.5
+
+#: Labels (rows, columns), first column and row of that part of the picture, inverse depth (rows, columns) [1/mm].
+Drawn = tuple[NDArray[np.uint8], tuple[int, int], NDArray[np.float32]]
+#: A surface in the world: vertices, and faces with their label.
+Surfaces = list[tuple[Array, list[tuple[NDArray[np.int32], int]]]]
+
+
+@dataclass(frozen=True)
+class ShortConfig:
+    """Choose a person and the size of the take."""
+
+    seed: int
+    frames: int = 14
+    unpainted: float = 0.0  # share of scanners without paint
+    without_picks: float = 0.25  # share of captures in which the teeth must be searched
+
+
+@dataclass(frozen=True, eq=False)
+class ShortCapture:
+    """Everything that was drawn for one capture."""
+
+    config: ShortConfig
+    traits: Traits
+    bite: Bite
+    scanner: Scanner
+    annotator: Annotator
+    cameras: list[Camera]
+    offsets: list[int]  # frame k of a camera shows the instant of frame k + offset of the first one
+    delays: Array  # and so much later [frames], shape (C,)
+    motion: Motion
+    T_scan_bite: Array  # the scanner's frame, shape (4, 4)
+    scans: tuple[Mesh, Mesh]  # as delivered, in the scanner's frame
+
+    @property
+    def arches(self) -> tuple[DentalArch, DentalArch]:
+        """Return both arches in the bite's frame."""
+        return self.bite.upper, self.bite.lower
+
+    @cached_property
+    def labels(self) -> list[list[tuple[NDArray[np.int32], int]]]:
+        """Return the faces of every tooth and gum with their labels, for both arches."""
+        return [_arch_labels(arch, row) for row, arch in enumerate(self.arches)]
+
+    def poses(self, t: float) -> tuple[Array, Array]:
+        """Return T_world_upper and T_world_lower (4, 4) of the scans at a time in frames."""
+        head, back = self.motion.head(t), se3_inverse(self.T_scan_bite)
+        return head @ back, head @ self.motion.jaw(t) @ back
+
+
+def draw_capture(config: ShortConfig) -> ShortCapture:
+    """Draw person, scanner, annotator, cameras and take."""
+    rng = np.random.default_rng([config.seed, 0x5C09])
+    traits = draw_traits(config.seed)
+    bite = build_bite(traits)
+    scanner = draw_scanner(config.seed, config.unpainted)
+    cameras, T_world_bite = draw_cameras(rng)
+    joint = draw_joint(np.random.default_rng([config.seed, 0x7A77]))
+    motion = draw_motion(joint, bite, T_world_bite, config.frames, rng)
+    turn = so3_exp(rng.normal(size=3) * 1.5)
+    T_scan_bite = make_transform(turn, rng.uniform(-80.0, 80.0, 3))
+    delays = np.zeros(len(cameras))
+    if rng.random() < 0.3:
+        delays[1:] = rng.uniform(-0.3, 0.3, len(cameras) - 1)
+    meshes = [without_gum(arch) if traits.gums == "crowns" else arch.mesh for arch in (bite.upper, bite.lower)]
+    scans = [scanned(mesh, scanner, np.random.default_rng([config.seed, 0x5CA3, k])) for k, mesh in enumerate(meshes)]
+    placed = [Mesh(transform_points(T_scan_bite, mesh.vertices), mesh.faces, mesh.colors) for mesh in scans]
+    return ShortCapture(
+        config,
+        traits,
+        bite,
+        scanner,
+        draw_annotator(config.seed, len(cameras)),
+        cameras,
+        [0, *(int(k) for k in rng.integers(-4, 5, len(cameras) - 1))],
+        delays,
+        motion,
+        T_scan_bite,
+        (placed[0], placed[1]),
+    )
+
+
+def write_short_capture(folder: str | os.PathLike[str], config: ShortConfig) -> ShortCapture:
+    """Write a capture folder with scans, masks, calibration, picks, capture.toml and truth; return what was drawn.
+
+    Raises:
+        OutputError: the folder cannot be written.
+        OSError: a mask cannot be written.
+    """
+    folder = Path(folder)
+    capture = draw_capture(config)
+    suffix = capture.scanner.suffix
+    for jaw, mesh in zip(JAWS, capture.scans, strict=True):
+        write_bytes_atomic(folder / "scans" / f"{jaw}_teeth{suffix}", encoded(mesh, capture.scanner))
+    save_calibration(folder / "calibration.toml", capture.cameras)
+    _write_masks(folder, capture)
+    write_npz_atomic(folder / "truth" / "truth.npz", _truth(capture))
+    write_text_atomic(folder / "capture.toml", _description(capture))
+    return capture
+
+
+def labelled(capture: ShortCapture, camera: int, t: float) -> Drawn:
+    """Draw who is seen where at a time: labels (rows, columns), first column and row of the part, inverse depth."""
+    view, T_skull = capture.cameras[camera], capture.motion.head(t)
+    T_jaw = capture.motion.jaw(t)
+    parts = [
+        (transform_points(T_skull, capture.bite.upper.mesh.vertices), capture.labels[0]),
+        (transform_points(T_skull @ T_jaw, capture.bite.lower.mesh.vertices), capture.labels[1]),
+        *_soft_parts(capture, T_skull, T_jaw, t),
+    ]
+    drawn = []
+    for points, surfaces in parts:
+        projected = np.column_stack([view.project(points), view.depth(points)])
+        drawn.append((np.ascontiguousarray(projected, np.float32), surfaces))
+    crowns = [pixels[arch.tooth != 0, :2] for (pixels, _), arch in zip(drawn, capture.arches)]
+    size, teeth = np.array(view.size_px), np.concatenate(crowns)
+    low = np.clip(np.floor(teeth.min(0)) - _PAD_PX, 0, size - 8).astype(int)
+    high = np.clip(np.ceil(teeth.max(0)) + _PAD_PX, low + 8, size).astype(int)
+    shape = (int(high[1] - low[1]), int(high[0] - low[0]))
+    labels, depth = np.zeros(shape, np.uint8), np.zeros(shape, np.float32)
+    for pixels, surfaces in drawn:
+        for faces, label in surfaces:
+            draw_depth_labels(pixels, faces, int(low[0]), int(low[1]), False, depth, labels, label)
+    return labels, (int(low[0]), int(low[1])), depth
+
+
+def _arch_labels(arch: DentalArch, row: int) -> list[tuple[NDArray[np.int32], int]]:
+    """Return the faces of the teeth and of the gum of an arch with their labels."""
+    faces = arch.mesh.faces
+    crown = crown_face_mask(arch.mesh)
+    tooth = np.asarray(arch.tooth[faces], int)
+    own = np.where(tooth[:, 0] != 0, tooth[:, 0], tooth[:, 1])
+    number = np.where(own > 0, own, 7 - own)  # left 1..7, right 8..14
+    parts = [(np.ascontiguousarray(faces[crown & (number == k)]), k + (_LOWER_FROM - 1) * row) for k in range(1, 15)]
+    return [*(part for part in parts if len(part[0])), (np.ascontiguousarray(faces[~crown]), _GUMS[row])]
+
+
+def _soft_parts(capture: ShortCapture, T_skull: Array, T_jaw: Array, t: float) -> Surfaces:
+    """Return palate, tongue and, unless retracted, lips."""
+    motion = capture.motion
+    roof, now = palate(), motion.controls[int(np.clip(round(t), 0, len(motion.controls) - 1))]
+    blob = tongue(*(motion.tongue_mm * np.clip((now[0] - 0.1) / 0.15, 0.0, 1.0)).tolist())
+    incisor = capture.bite.incisor
+    set_back = np.array([0.0, incisor[1] - 1.6, min(incisor[2] + 2.9, 0.0)])
+    parts = [
+        (transform_points(T_skull, roof.vertices + [0.0, 2.0, 0.0]), roof.faces),
+        (transform_points(T_skull @ T_jaw, blob.vertices + set_back - [0.0, 2.0, 2.0]), blob.faces),
+    ]
+    if motion.lips is not None:
+        face = Face(incisor)
+        parts.append((transform_points(T_skull, face.posed(motion.lips, T_jaw)), face.faces))
+    return [(points, [(np.ascontiguousarray(faces), _SOFT)]) for points, faces in parts]
+
+
+def _write_masks(folder: Path, capture: ShortCapture) -> None:
+    config, who = capture.config, capture.annotator
+    for c, camera in enumerate(capture.cameras):
+        rngs = [np.random.default_rng([config.seed, 0xA5C, c, row]) for row in (0, 1)]
+        hands = [Hand(who, row, c, camera.size_px, rngs[row]) for row in (0, 1)]
+        for jaw in JAWS:
+            (folder / "masks" / camera.name / jaw).mkdir(parents=True, exist_ok=True)
+        for k in range(config.frames):
+            t = k + float(capture.delays[c])
+            labels, window, _ = labelled(capture, c, t)
+            centre = transform_points(capture.motion.head(t), np.array([[0.0, -4.0, -10.0]]))
+            px_per_mm = float(camera.K[0, 0] / camera.depth(centre)[0])
+            own = FIRST_FRAME + k - capture.offsets[c]
+            for row, jaw in enumerate(JAWS):
+                first = 1 if row == 0 else _LOWER_FROM
+                teeth = np.where((labels >= first) & (labels < first + 14), labels - first + 1, 0).astype(np.uint8)
+                mask = hands[row].draw(teeth, labels == _GUMS[row], window, px_per_mm)
+                if mask is not None:
+                    write_mask(str(folder / "masks" / camera.name / jaw / f"{own:06d}.png"), mask)
+
+
+def _truth(capture: ShortCapture) -> dict[str, ArrayLike]:
+    config, cameras = capture.config, capture.cameras
+    poses = [capture.poses(float(k)) for k in range(config.frames)]
+    upper, lower = np.stack([p[0] for p in poses]), np.stack([p[1] for p in poses])
+    traits, who, bite = capture.traits, capture.annotator, capture.bite
+    groups = {
+        "bite": traits.bite,
+        "gums": traits.gums,
+        "cameras": str(len(cameras)),
+        "annotator": who.kind,
+        "height": f"{cameras[0].size_px[1]}",
+        "lips": "retracted" if capture.motion.lips is None else "lips",
+        "paint": capture.scanner.paint,
+        "scan": "coarse" if capture.scanner.faces < 10_000 else "fine",
+    }
+    return {
+        "frames": FIRST_FRAME + np.arange(config.frames),
+        "T_world_upper": upper,
+        "T_world_lower": lower,
+        "T_upper_lower": se3_inverse(upper) @ lower,
+        "T_bite_scan": se3_inverse(capture.T_scan_bite),
+        "camera_names": np.array([camera.name for camera in cameras]),
+        "offsets": np.array(capture.offsets),
+        "delays": capture.delays,
+        "K": np.stack([camera.K for camera in cameras]),
+        "dist": np.stack([camera.distortion for camera in cameras]),
+        "R": np.stack([camera.T_cam_world[:3, :3] for camera in cameras]),
+        "t": np.stack([camera.T_cam_world[:3, 3] for camera in cameras]),
+        "rest_frame": np.array(FIRST_FRAME + 1),
+        "overbite_mm": np.array(bite.overbite_mm),
+        "overjet_mm": np.array(bite.overjet_mm),
+        "gum_mm": who.gum_mm,
+        "gum_tooth_mm": who.gum_tooth_mm,
+        "edge_px": np.array(who.edge_px),
+        "camera_px": who.camera_px,
+        "groups": np.array(json.dumps(groups)),
+    }
+
+
+def _picks(capture: ShortCapture, rng: np.random.Generator) -> list[tuple[str, int, list[tuple[str, float, float]]]]:
+    """Choose tips of teeth that two cameras see, well spread: arch, vertex and (camera, x, y) of two cameras."""
+    seen = [labelled(capture, c, float(capture.delays[c])) for c in range(len(capture.cameras))]
+    out = []
+    for row, jaw in enumerate(JAWS):
+        mesh, pose = capture.scans[row], capture.poses(0.0)[row]
+        world = transform_points(pose, mesh.vertices)
+        visible = np.stack([_visible(capture.cameras[c], world, *seen[c], row) for c in range(len(seen))], 1)
+        good = np.flatnonzero(visible.sum(1) >= 2)
+        if len(good) < _PICKS:
+            continue
+        # What a person clicks on: the ends of the teeth, towards the other arch.
+        height = transform_points(se3_inverse(capture.T_scan_bite), mesh.vertices[good])[:, 1] * (1.0 if row else -1.0)
+        good = good[height >= np.quantile(height, 0.6)] if len(good) > 200 else good
+        for vertex in good[np.array(_spread(world[good], _PICKS))].tolist():
+            views = []
+            for c in np.flatnonzero(visible[vertex])[:2]:
+                x, y = capture.cameras[c].project(world[vertex]) + rng.normal(0.0, _PICK_NOISE_PX, 2)
+                views.append((capture.cameras[c].name, float(x), float(y)))
+            out.append((jaw, int(vertex), views))
+    return out
+
+
+def _visible(
+    camera: Camera,
+    world: Array,
+    labels: NDArray[np.uint8],
+    window: tuple[int, int],
+    depth: NDArray[np.float32],
+    row: int,
+) -> NDArray[np.bool_]:
+    """Tell which points (N, 3) of an arch's crowns a camera sees."""
+    at = np.rint(camera.project(world)).astype(int) - window
+    inside = np.asarray(((at >= 2) & (at < np.array(labels.shape[::-1]) - 2)).all(1))
+    at = np.where(inside[:, None], at, 0)
+    near = depth[at[:, 1], at[:, 0]] * camera.depth(world) < 1.0 + 0.4 / 300.0
+    first = 1 if row == 0 else _LOWER_FROM
+    own = labels[at[:, 1], at[:, 0]]
+    return np.asarray(inside & near & (own >= first) & (own < first + 14))
+
+
+def _spread(points: Array, count: int) -> list[int]:
+    """Farthest-point choice, starting with the point farthest from the middle."""
+    chosen = [int(np.linalg.norm(points - points.mean(0), axis=1).argmax())]
+    distance = np.linalg.norm(points - points[chosen[0]], axis=1)
+    while len(chosen) < count:
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return chosen
+
+
+def _description(capture: ShortCapture) -> str:
+    config, suffix = capture.config, capture.scanner.suffix
+    rng = np.random.default_rng([config.seed, 0x91C])
+    picks = [] if rng.random() < config.without_picks else _picks(capture, rng)
+    lines = [
+        'format = "jawusd-capture/1"', f'name = "person_{config.seed}"', 'units = "mm"', f"fps = {FPS}",
+        'calibration = "calibration.toml"', f"frames = [{FIRST_FRAME}, {FIRST_FRAME + config.frames}]", "",
+        "[scans]", *(f'{jaw}_teeth = "scans/{jaw}_teeth{suffix}"' for jaw in JAWS), "",
+    ]  # fmt: skip
+    for camera in capture.cameras:
+        lines += ["[[camera]]", f'name = "{camera.name}"']
+        lines += [f'masks.{jaw} = "masks/{camera.name}/{jaw}/%06d.png"' for jaw in JAWS] + [""]
+    names = [camera.name for camera in capture.cameras]
+    offsets = ", ".join(f"{name} = {offset}" for name, offset in zip(names, capture.offsets, strict=True))
+    lines += ["[sync]", 'method = "offsets"', f'reference = "{names[0]}"', f"offsets = {{ {offsets} }}", ""]
+    if {jaw for jaw, *_ in picks} == set(JAWS):
+        lines += ["[bootstrap]", f"frame = {FIRST_FRAME}", ""]
+        lines += [line for jaw, vertex, views in picks for line in _pick_lines(jaw, vertex, views)]
+    if rng.random() < 0.6:
+        lines += ["[motion]", f"rest_frame = {FIRST_FRAME + 1}", ""]
+    return "\n".join(lines)
+
+
+def _pick_lines(jaw: str, vertex: int, views: Iterable[tuple[str, float, float]]) -> list[str]:
+    text = ", ".join(f'{{ camera = "{name}", x = {x:.2f}, y = {y:.2f} }}' for name, x, y in views)
+    return [f"[[bootstrap.{jaw}]]", f"vertex = {vertex}", f"views = [{text}]", ""]
