@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Literal
 
@@ -36,3 +37,21 @@ class Finding:
     def as_json(self) -> dict[str, str | float | int]:
         """Return the fields that are set, for JSON."""
         return {key: value for key, value in asdict(self).items() if value is not None}
+
+    @classmethod
+    def from_json(cls, found: Mapping[str, str | float | int]) -> Finding:
+        """Return the finding that `as_json` gave; what is missing or unknown is left out."""
+        severities: dict[object, Severity] = {"error": "error", "note": "note"}
+        texts = {name: str(found[name]) for name in ("path", "camera", "hint") if name in found}
+        numbers = {name: float(found[name]) for name in ("value", "limit") if name in found}
+        return cls(
+            kind=str(found.get("kind", "")),
+            severity=severities.get(found.get("severity"), "warning"),
+            message=str(found.get("message", "")),
+            value=numbers.get("value"),
+            limit=numbers.get("limit"),
+            path=texts.get("path"),
+            camera=texts.get("camera"),
+            frame=int(found["frame"]) if "frame" in found else None,
+            hint=texts.get("hint"),
+        )

@@ -4,29 +4,23 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
-from functools import lru_cache
+from collections.abc import Callable, Iterator
+from functools import cached_property
 from pathlib import Path
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.errors import CaptureError
-from jawusd.imaging.pictures import read_picture
+from jawusd.imaging.mask_levels import MaskImage, RawImage
+from jawusd.imaging.mask_source import SourceLevels, load_png, png_levels, video_levels
+from jawusd.imaging.pictures import read_palette_numbers
 from jawusd.imaging.pixels import Colour
 from jawusd.imaging.video import Video
 
-MaskImage = NDArray[np.uint8]
-RawImage = NDArray[np.uint8] | NDArray[np.uint16]  # as files store it
 #: Gray values of the wanted arch and of the other one in label images; all else must be 0.
 LabelValues = tuple[int, int]
 
 _NUMBER = re.compile(r"%(0(\d+))?d")
-_HEADER_BYTES, _COLOUR_TYPE, _WITH_ALPHA = 26, 25, (4, 6)  # PNG specification, section 11.2.2
-# Soft edges are gray, and so is most of a photograph: with more than this share of pixels between a tenth and nine
-# tenths of the brightest the picture is no mask.
-_MOST_GRAY = 0.1
 _FEW = 6  # label values listed in an error
 
 
@@ -35,15 +29,29 @@ class PngMasks:
 
     Attributes:
         count: one past the highest number.
+        odd: pictures read so far that contradict the others and count as not segmented, and how.
     """
 
-    def __init__(self, pattern: Path, size_px: tuple[int, int] | None, labels: LabelValues | None = None) -> None:
-        """Find the files of a pattern with one %d or %06d, all of one (width, height) unless `size_px` is None.
+    def __init__(
+        self,
+        pattern: Path,
+        size_px: tuple[int, int] | None,
+        labels: LabelValues | None = None,
+        is_other: Callable[[RawImage], bool] | None = None,
+    ) -> None:
+        """Find the files of a pattern with one %d or %06d.
+
+        Args:
+            pattern: path of the files.
+            size_px: (width, height) of all of them, if known.
+            labels: see `LabelValues`.
+            is_other: tells pictures that are no masks, from which nothing follows for the others.
 
         Raises:
-            CaptureError: the folder is missing or holds no such file, or all are opaque pictures.
+            CaptureError: the folder is missing or holds no such file.
         """
-        self._pattern, self._size_px, self._labels = pattern, size_px, labels
+        self._pattern, self._size_px, self._labels, self._is_other = pattern, size_px, labels, is_other
+        self.odd: dict[int, str] = {}
         number = _NUMBER.search(pattern.name)
         if number is None or pattern.name.count("%") != 1:
             raise CaptureError(
@@ -63,18 +71,43 @@ class PngMasks:
                 "no file of the folder has such a name.", path=pattern, hint="Correct `masks` in capture.toml."
             )
         self.count = max(self._files) + 1
-        if labels is None and _png_has_alpha(self._files[min(self._files)]):
-            _refuse_opaque((self._load(self._files[k]) for k in sorted(self._files)), pattern)
+
+    @cached_property
+    def levels(self) -> SourceLevels:
+        """Find what the values mean, from some pictures of the whole take.
+
+        Raises:
+            CaptureError: the pictures are no masks.
+        """
+        return png_levels([self._files[k] for k in sorted(self._files)], self._is_other)
 
     def masks(self, first: int) -> Iterator[MaskImage | None]:
         """Yield the masks from a number on, (h, w) uint8, None where there is no file or nothing segmented.
 
         Raises:
-            CaptureError: a file cannot be decoded, has another size or is no mask.
+            CaptureError: a file cannot be decoded or has another size, or the pictures are no masks.
         """
         for number in range(first, self.count):
             path = self._files.get(number)
-            yield None if path is None else _mask(self._load(path), self._labels, path, "")
+            if path is None:
+                yield None
+            elif self._labels is not None:
+                image = self._load(path)
+                image = image if image.ndim == 2 else read_palette_numbers(path, image)
+                yield _labelled(image, self._labels, path, "")
+            else:
+                yield self._mask(path, number)
+
+    def _mask(self, path: Path, number: int) -> MaskImage | None:
+        image, found = self._load(path), self.levels
+        if found.levels is None:
+            return None
+        if found.palette_numbers:
+            image = read_palette_numbers(path, image)
+        mask, odd = found.levels.coverage(image)
+        if odd:
+            self.odd[number] = f"{path.name} {odd}"
+        return mask
 
     def first_size_px(self) -> tuple[int, int]:
         """Return the (width, height) of the first file."""
@@ -82,11 +115,7 @@ class PngMasks:
         return width, height
 
     def _load(self, path: Path) -> RawImage:
-        image = read_picture(path, cv2.IMREAD_UNCHANGED)
-        if image is None:
-            raise CaptureError(
-                "the mask cannot be decoded.", path=path, hint="Export it again, or delete it: that frame is skipped."
-            )
+        image = load_png(path)
         if self._size_px is not None:
             _check_size(path, image.shape[1::-1], self._size_px)
         return image
@@ -98,33 +127,45 @@ class VideoMasks:
     Attributes:
         count: number of pictures.
         timeline: which picture is shown at which frame.
+        odd: pictures read so far that contradict the others and count as not segmented, and how.
     """
 
     def __init__(self, path: Path, size_px: tuple[int, int], labels: LabelValues | None = None) -> None:
         """Open the video; see `PngMasks` for the arguments.
 
         Raises:
-            CaptureError: the video is missing or damaged, has another size, or all of its pictures are opaque.
+            CaptureError: the video is missing or damaged, or has another size.
         """
         self._video, self._labels = Video(path), labels
+        self.odd: dict[int, str] = {}
         _check_size(path, self._video.size_px, size_px)
         self.count, self.timeline = self._video.count, self._video.timeline
-        self._colour: Colour
-        if labels is not None:  # luma, unless there is none: conversions would change values
-            self._colour = "rgb" if self._video.is_rgb else "gray"
-        else:
-            self._colour = "gray" if self._video.is_gray else "rgba" if self._video.has_alpha else "rgb"
-        if self._colour == "rgba":
-            _refuse_opaque_video(path, path.stat().st_mtime_ns)
+
+    @cached_property
+    def levels(self) -> SourceLevels:
+        """Find what the values mean; see `PngMasks.levels`."""
+        return video_levels(self._video.path)[0]
 
     def masks(self, first: int) -> Iterator[MaskImage | None]:
         """Yield the masks from a picture on, (h, w) uint8, None where nothing is segmented.
 
         Raises:
-            CaptureError: a picture cannot be decoded or is no mask.
+            CaptureError: a picture cannot be decoded, or they are no masks.
         """
-        for frame in self._video.frames(first, colour=self._colour, threads=1):
-            yield _mask(frame.image, self._labels, self._video.path, f"picture {frame.index}: ")
+        if self._labels is not None:  # luma, unless there is none: conversions would change values
+            colour: Colour = "rgb" if self._video.is_rgb else "gray"
+            for frame in self._video.frames(first, colour=colour, threads=1):
+                yield _labelled(frame.image, self._labels, self._video.path, f"picture {frame.index}: ")
+            return
+        found, colour = video_levels(self._video.path)
+        if found.levels is None:
+            yield from (None for _ in range(first, self.count))
+            return
+        for frame in self._video.frames(first, colour=colour, threads=1):
+            mask, odd = found.levels.coverage(frame.image)
+            if odd:
+                self.odd[frame.index] = f"picture {frame.index} {odd}"
+            yield mask
 
 
 def _check_size(path: Path, found: tuple[int, int], allowed: tuple[int, int]) -> None:
@@ -134,62 +175,6 @@ def _check_size(path: Path, found: tuple[int, int], allowed: tuple[int, int]) ->
             path=path,
             hint="Export the masks at the size of the video.",
         )
-
-
-def _png_has_alpha(path: Path) -> bool:
-    with open(path, "rb") as handle:
-        header = handle.read(_HEADER_BYTES)
-    return len(header) == _HEADER_BYTES and header[_COLOUR_TYPE] in _WITH_ALPHA
-
-
-def _refuse_opaque(images: Iterator[RawImage], path: Path) -> None:
-    """Raise if every picture with an alpha channel is an opaque photograph; usually the first one is not."""
-    count = 0
-    for image in images:
-        if not _is_opaque_photograph(image):
-            return
-        count += 1
-    raise CaptureError(
-        f"the alpha channel is opaque in all {count} pictures: nothing is cut out.",
-        path=path,
-        hint="Export the matte itself, in black and white, or colour with its alpha (in After Effects: RGB + Alpha).",
-    )
-
-
-@lru_cache(maxsize=256)
-def _refuse_opaque_video(path: Path, changed_ns: int) -> None:
-    """Raise as `_refuse_opaque`, reading a video once; the time of its last change identifies its version."""
-    _refuse_opaque((frame.image for frame in Video(path).frames(colour="rgba", threads=1)), path)
-
-
-def _is_opaque_photograph(image: RawImage) -> bool:
-    """Return whether alpha is opaque everywhere and the colours are no black-and-white mask either."""
-    if image.ndim != 3 or image.shape[2] != 4:
-        return False
-    small = _eight_bits(image)
-    return bool(small[..., 3].min() == 255) and _gray_share(small[..., :3].max(axis=2)) > _MOST_GRAY
-
-
-def _mask(image: RawImage, labels: LabelValues | None, path: Path, where: str) -> MaskImage | None:
-    if labels is not None:
-        return _labelled(image, labels, path, where)
-    if _is_opaque_photograph(image):
-        return None  # as programs write frames that were not segmented
-    return _coverage(_eight_bits(image), path, where)
-
-
-def _coverage(image: MaskImage, path: Path, where: str) -> MaskImage:
-    """Return 8-bit coverage: alpha where it is used, else the brightest colour; 0/1 becomes 0/255."""
-    if image.ndim == 3:
-        has_alpha = image.shape[2] == 4 and image[..., 3].min() < 255
-        image = np.ascontiguousarray(image[..., 3]) if has_alpha else image[..., :3].max(axis=2)
-    if (share := _gray_share(image)) > _MOST_GRAY:
-        raise CaptureError(
-            f"{where}{share:.0%} of it are gray, which is no mask: white is tooth and black is not.",
-            path=path,
-            hint="Check that `masks` in capture.toml names the masks and not the footage.",
-        )
-    return np.multiply(image, 255, dtype=np.uint8) if image.max() == 1 else image
 
 
 def _labelled(image: RawImage, labels: LabelValues, path: Path, where: str) -> MaskImage:
@@ -212,12 +197,3 @@ def _labelled(image: RawImage, labels: LabelValues, path: Path, where: str) -> M
             "lossy compression.",
         )
     return np.where(plane == labels[0], np.uint8(255), np.uint8(0))
-
-
-def _eight_bits(image: RawImage) -> MaskImage:
-    return np.asarray(image >> 8 if image.dtype == np.uint16 else image, np.uint8)
-
-
-def _gray_share(image: MaskImage) -> float:
-    white = int(image.max())
-    return cv2.countNonZero(cv2.inRange(image, white // 10 + 1, white - white // 10 - 1)) / image.size

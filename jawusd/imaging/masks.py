@@ -13,7 +13,8 @@ from types import TracebackType
 
 from jawusd.errors import CaptureError
 from jawusd.formats.capture import CameraSource
-from jawusd.imaging.mask_files import LabelValues, MaskImage, PngMasks, VideoMasks
+from jawusd.imaging.mask_files import LabelValues, PngMasks, VideoMasks
+from jawusd.imaging.mask_levels import MaskImage, MaskLevels
 from jawusd.imaging.timeline import Timeline
 from jawusd.imaging.video import Video
 
@@ -31,6 +32,7 @@ class MaskReader:
 
     Attributes:
         count: one past the last frame of the source.
+        levels: what the values mean; None if nothing is segmented, or if they are labels.
     """
 
     def __init__(
@@ -42,7 +44,7 @@ class MaskReader:
         labels: LabelValues | None = None,
         prepare: Callable[[MaskImage], MaskImage] | None = None,
     ) -> None:
-        """Find the masks; decodes nothing yet, except first pictures of videos and of files with transparency.
+        """Find the masks, and what their values mean from some pictures of the whole take.
 
         Args:
             path: a PNG pattern with one `%d` or `%06d` (the number of the picture in the camera's video), or a video
@@ -54,6 +56,7 @@ class MaskReader:
         Raises:
             CaptureError: the folder or file is missing, holds no masks, or their size or count is wrong.
         """
+        self._labels = labels
         self.path = Path(path)
         self._source: PngMasks | VideoMasks
         self._timeline: Timeline | None
@@ -64,6 +67,7 @@ class MaskReader:
             self._source = pictures = VideoMasks(self.path, size_px, labels)
             self._timeline = _timeline_of_video(self.path, pictures, timeline)
         self.count = self._source.count if self._timeline is None else self._timeline.count
+        self.levels: MaskLevels | None = None if labels else self._source.levels.levels
         self._prepare = prepare
         self._previous: int | None = None
         self._ahead: _Ahead | None = None
@@ -89,6 +93,16 @@ class MaskReader:
         self.close()
         self._ahead = _Ahead(self._results(frame), frame)
         return self._ahead.take()
+
+    @property
+    def is_black(self) -> bool:
+        """Tell whether no picture shows anything; not known of labels."""
+        return self.levels is None and self._labels is None
+
+    @property
+    def odd(self) -> list[str]:
+        """Return which pictures read so far contradict the others, and how; they count as not segmented."""
+        return [self._source.odd[number] for number in sorted(self._source.odd)]
 
     def close(self) -> None:
         """Stop decoding ahead; the reader can still be used."""

@@ -7,6 +7,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
+
+RawPicture = NDArray[np.uint8] | NDArray[np.uint16]
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 _MOST_PX = 1 << 27  # four times 8K; a few bytes can declare a picture that fills the memory
@@ -25,3 +28,18 @@ def read_picture(path: Path, flags: int) -> NDArray[np.uint8] | NDArray[np.uint1
         return np.asarray(image, np.uint16)
     except (OSError, cv2.error, MemoryError):
         return None
+
+
+def has_palette(path: Path) -> bool:
+    """Tell whether a file is a PNG whose pixels are numbers of colours in a palette."""
+    with open(path, "rb") as file:
+        head = file.read(26)
+    return head.startswith(_PNG) and head[25:26] == b"\x03"  # PNG specification, section 11.2.2
+
+
+def read_palette_numbers(path: Path, picture: RawPicture) -> RawPicture:
+    """Return the palette numbers (h, w) of a PNG that has a palette; else the given picture."""
+    if not has_palette(path):
+        return picture
+    with Image.open(path) as image:
+        return np.asarray(image, np.uint8) if image.mode == "P" else picture

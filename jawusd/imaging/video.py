@@ -41,6 +41,7 @@ class Video:
         count: number of pictures.
         times_s: presentation times after the first picture [s], shape (count,), increasing.
         timeline: which picture is shown at which frame.
+        keys: numbers of pictures that decode by themselves, shape (n,).
         start_s: presentation time of the first picture in the file, where its sound counts from too [s].
         fps: average pictures per second.
         rotation_deg: counter-clockwise turn stored in the file: 0, 90, 180 or 270. It is applied to every picture.
@@ -78,6 +79,7 @@ class Video:
                 path=path,
                 hint="Copy it again from the camera, or cut it to the part that is whole.",
             )
+        self.keys = np.unique(self._seek_dts, return_index=True)[1]
         self.start_s = float(self._pts[0] * self._time_base)
         self.times_s = (self._pts - self._pts[0]) * self._time_base
         self.timeline = Timeline(self.times_s, self.fps)

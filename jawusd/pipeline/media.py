@@ -143,7 +143,7 @@ def draw_worst_frames(capture: Capture, offsets: Mapping[str, int], tracks: Trac
     """
     from jawusd.imaging.overlay import encode_jpeg, tracking_sheet
 
-    if list(tracks.camera_names) != [camera.name for camera in capture.cameras]:
+    if not set(tracks.camera_names) <= {camera.name for camera in capture.cameras}:
         raise FormatError(f"the capture has other cameras than the tracks ({', '.join(tracks.camera_names)}).")
     cameras, videos = open_footage(capture, tracks)
     shown = [cameras[name] for name in videos][:_MOST_CAMERAS]

@@ -12,6 +12,7 @@ import numpy as np
 from jawusd.errors import TrackingError, explain_missing_packages
 from jawusd.evaluator import JawRig
 from jawusd.formats.capture import Capture
+from jawusd.formats.finding import Finding
 from jawusd.formats.model import JawModel
 from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, LostReason, Tracks, TrackStatus, save_tracks
 from jawusd.geometry import LANDMARKS
@@ -48,6 +49,8 @@ class TrackSummary(TypedDict):
     calibration_rescaled_px: dict[str, tuple[Size, Size]]  # sizes calibrated and recorded, by camera
     sigma_mm: dict[str, float | None]  # median standard deviation of the landmarks, None if not known
     coverage_error_percent: float | None  # share of the masks left uncovered, None without masks
+    frames_used: NotRequired[dict[str, int]]  # frames in which masks of a camera took part, by camera
+    findings: NotRequired[list[dict[str, str | float | int]]]  # what is doubtful about the take: `Finding.as_json`
 
 
 class ArchSummary(TypedDict):
@@ -210,6 +213,8 @@ def track_summary(tracks: Tracks) -> TrackSummary:
         calibration_rescaled_px=tracks.meta.get("calibration_rescaled_px", {}),
         sigma_mm={name: _rounded(value) for name, value in zip(LANDMARKS, sigma.tolist(), strict=True)},
         coverage_error_percent=_rounded(100 * float(coverage.mean())) if coverage.size else None,
+        frames_used=dict(zip(tracks.camera_names, tracks.masks_used.any(1).sum(0).tolist(), strict=True)),
+        findings=tracks.meta.get("findings", []),
     )
 
 
@@ -296,5 +301,9 @@ def track_lines(summary: TrackSummary) -> list[str]:
     known = {name: value for name, value in summary["sigma_mm"].items() if value is not None}
     sigma = ", ".join(f"{name} {value}" for name, value in known.items()) or "not known"
     lines.append(f"  expected error (1 sigma, median) [mm]: {sigma}")
-    lines.append(f"  mask left uncovered: {summary['coverage_error_percent']} %")
-    return lines
+    uncovered = summary["coverage_error_percent"]
+    lines.append("  mask left uncovered: " + ("not known" if uncovered is None else f"{uncovered} %"))
+    if "frames_used" in summary:
+        used = ", ".join(f"{name} {count}" for name, count in summary["frames_used"].items())
+        lines.append(f"  frames in which masks took part: {used}")
+    return [*lines, *(f"  {Finding.from_json(found).line()}" for found in summary.get("findings", []))]

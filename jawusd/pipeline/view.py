@@ -261,7 +261,7 @@ def _poses(capture: Capture, tracks: Path | None) -> Tracks | None:
         return None
     found = load_tracks(tracks / _TRACKS if tracks.is_dir() else tracks)
     names = [camera.name for camera in capture.cameras]
-    if list(found.camera_names) != names:
+    if not set(found.camera_names) <= set(names):  # cameras without masks are not tracked with
         raise FormatError(
             f"is of the cameras {', '.join(found.camera_names)}; the capture has {', '.join(names)}.",
             path=tracks,

