@@ -1,4 +1,4 @@
-"""Commands on the footage of a capture: calibrate, sync, segment and plates."""
+"""Commands on the footage and scans of a capture: calibrate, sync, segment, scans and plates."""
 
 from __future__ import annotations
 
@@ -171,6 +171,32 @@ def _refuse_masks(folder: Path, record: Path, force: bool) -> None:
     if record.exists():
         hint = "Continue with --resume, overwrite with --force, or name another folder."
     raise OutputError("exists and is not empty.", path=folder, hint=hint)
+
+
+def scans(
+    capture: CaptureArg,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "-o",
+            "--out",
+            help="Folder of labels and picture, by default beside the scans and in the capture's folder. Name it in "
+            "the capture as [scans] labels.",
+            show_default=False,
+        ),
+    ] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Find labels again and overwrite those there are, corrected ones too.")
+    ] = False,
+    allow_outside: Outside = False,
+    as_json: Json = False,
+) -> None:
+    """Tell crown, gum and base of both teeth scans apart, store the labels, and draw a picture to look at."""
+    from jawusd.pipeline.scans import label_scans, scans_lines
+
+    with progress() as report:
+        summary = label_scans(capture, out, force=force, allow_outside=allow_outside, progress=report)
+    emit(summary, as_json, lambda: scans_lines(summary))
 
 
 def plates(

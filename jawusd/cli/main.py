@@ -27,6 +27,7 @@ for _command in (
     capture_commands.calibrate,
     capture_commands.sync,
     capture_commands.segment,
+    capture_commands.scans,
     rig_commands.info,
     rig_commands.pose,
     rig_commands.encode,

@@ -28,6 +28,8 @@ class Scans(_Strict):
     lower_teeth: Path
     mandible: Path | None = None
     skull: Path | None = None
+    #: Folder of the labels of the teeth scans; beside the scans if not given.
+    labels: Path | None = None
 
 
 class Masks(_Strict):

@@ -1,4 +1,4 @@
-"""A triangle mesh as the layers exchange it, and which of its faces are painted as crowns."""
+"""A triangle mesh as the layers exchange it, and which of its faces are crowns."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from jawusd.geometry.arrays import Array, Mask
 
-GUM, TOOTH, BOUNDARY = 0, 1, 2
+GUM, TOOTH, BOUNDARY, BASE = 0, 1, 2, 3
 
 # How far red or green must exceed the other channels (of 255) to be a label: painted labels exceed them by more (pure
 # red by 255), the gum of photographic scan textures, such as (200, 110, 110), by less.
@@ -24,6 +24,8 @@ class Mesh:
     vertices: Array  # positions [mm], shape (V, 3), float64
     faces: NDArray[np.int32]  # vertex indices, counter-clockwise seen from outside, shape (F, 3), int32
     colors: NDArray[np.uint8] | None = None  # red, green, blue per vertex, shape (V, 3), uint8, or None
+    # of a teeth scan, if known otherwise than by its paint: GUM, TOOTH, BOUNDARY or BASE per vertex, shape (V,), uint8
+    labels: NDArray[np.uint8] | None = None
 
     def __post_init__(self) -> None:
         vertices = np.ascontiguousarray(self.vertices, dtype=np.float64)
@@ -34,24 +36,36 @@ class Mesh:
             raise ValueError(f"faces index vertex {faces.max()} of {len(vertices)}")
         if self.colors is not None and np.shape(self.colors) != vertices.shape:
             raise ValueError(f"colors must have shape {vertices.shape}, got {np.shape(self.colors)}")
+        if self.labels is not None and np.shape(self.labels) != vertices.shape[:1]:
+            raise ValueError(f"labels must have shape {vertices.shape[:1]}, got {np.shape(self.labels)}")
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", faces)
+
+
+def painted_labels(mesh: Mesh) -> NDArray[np.uint8] | None:
+    """Return GUM, TOOTH or BOUNDARY per vertex of a painted teeth scan, shape (V,); None where it is not painted.
+
+    Red vertices are teeth, green ones teeth whose border is of interest (the incisal edge), all others gum. Hardly any
+    red or green is no paint.
+    """
+    if mesh.colors is None:
+        return None
+    labels = np.full(len(mesh.vertices), GUM, np.uint8)
+    red, green, blue = mesh.colors.astype(np.int16).T
+    labels[red - np.maximum(green, blue) > _PAINT_CONTRAST] = TOOTH
+    labels[green - np.maximum(red, blue) > _PAINT_CONTRAST] = BOUNDARY
+    return labels if np.count_nonzero(labels) >= max(_FEWEST_PAINTED * len(labels), 1) else None
 
 
 def tooth_labels(mesh: Mesh) -> NDArray[np.uint8]:
     """Return GUM, TOOTH or BOUNDARY per vertex of a teeth scan, shape (V,); everything that is tooth is > 0.
 
-    Red vertices are teeth, green ones teeth whose border is of interest (the incisal edge), all others gum. A scan
-    without colours, or with hardly any red or green, counts as teeth all over.
+    These are the mesh's labels, its base counted as gum; without labels its paint; without either, all is tooth.
     """
-    labels = np.full(len(mesh.vertices), GUM, np.uint8)
-    if mesh.colors is not None:
-        red, green, blue = mesh.colors.astype(np.int16).T
-        labels[red - np.maximum(green, blue) > _PAINT_CONTRAST] = TOOTH
-        labels[green - np.maximum(red, blue) > _PAINT_CONTRAST] = BOUNDARY
-    if np.count_nonzero(labels) < _FEWEST_PAINTED * len(labels) or mesh.colors is None:
-        labels[:] = TOOTH
-    return labels
+    if mesh.labels is not None:
+        return np.where(mesh.labels == BASE, GUM, mesh.labels).astype(np.uint8)
+    painted = painted_labels(mesh)
+    return np.full(len(mesh.vertices), TOOTH, np.uint8) if painted is None else painted
 
 
 def crown_face_mask(mesh: Mesh) -> Mask:

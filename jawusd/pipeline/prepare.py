@@ -15,12 +15,15 @@ from numpy.typing import ArrayLike
 from jawusd.errors import CalibrationError, CaptureError, JawusdError, explain_missing_packages
 from jawusd.formats.camera_files import calibration_files, load_cameras_file
 from jawusd.formats.capture import CameraSource, Capture, load_capture
+from jawusd.formats.finding import Finding
 from jawusd.formats.landmarks import load_landmarks
 from jawusd.formats.mesh import Mesh, tooth_labels
 from jawusd.formats.model import load_model
+from jawusd.formats.scan_labels import labels_path
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import LANDMARKS, Camera, anatomical_frame, find_landmarks, landmark_frame
 from jawusd.geometry.arrays import Array
+from jawusd.pipeline.scan_labels import TEETH, LabelledScan, label_teeth
 from jawusd.pipeline.state import hash_files
 
 BONES = ("mandible", "skull")
@@ -135,19 +138,49 @@ def _at_recorded_size(camera: Camera, capture: Capture, source: CameraSource) ->
 def load_meshes(capture: Capture) -> dict[str, Mesh]:
     """Read the scans and bones of a capture, by the names of `MESHES` [mm, scan frame]; bones may be absent.
 
+    The teeth scans carry labels unless they are painted.
+
     Raises:
         CaptureError: a mesh is damaged, or of a size that cannot be in mm.
+        FormatError: a file of labels is damaged, or of another version of its scan.
     """
+    return load_labelled(capture)[0]
+
+
+def load_labelled(capture: Capture) -> tuple[dict[str, Mesh], list[Finding]]:
+    """Return `load_meshes`, and what there is to say about the labels of the teeth scans."""
     paths = {name: getattr(capture.scans, name) for name in MESHES}
-    return read_meshes({name: path for name, path in paths.items() if path is not None})
+    files = {name: path for name, path in paths.items() if path is not None}
+    meshes = _files_read(files)
+    teeth = label_teeth(meshes, files, capture.scans.labels)
+    labelled = {TEETH[arch]: scan.mesh for arch, scan in teeth.items()}
+    return meshes | labelled, [finding for scan in teeth.values() for finding in scan.findings]
+
+
+def read_meshes(files: Mapping[str, Path]) -> dict[str, Mesh]:
+    """Read mesh files by the names of `MESHES`; raises as `load_meshes`."""
+    meshes = _files_read(files)
+    return meshes | {TEETH[arch]: scan.mesh for arch, scan in label_teeth(meshes, files, None).items()}
 
 
 @explain_missing_packages()
-def read_meshes(files: Mapping[str, Path]) -> dict[str, Mesh]:
-    """Read mesh files by the names of `MESHES`; raises as `load_meshes`."""
+def _files_read(files: Mapping[str, Path]) -> dict[str, Mesh]:
     from jawusd.imaging.meshio import load_mesh
 
     return {name: load_mesh(path, kind="bone" if name in BONES else "scan") for name, path in files.items()}
+
+
+def labelled_teeth(capture: Capture, folder: Path | None, *, ignore_files: bool = False) -> list[LabelledScan]:
+    """Return the upper and the lower scan with their labels, taken from a folder (None: beside the scans).
+
+    Args:
+        ignore_files: as if there were no files of labels.
+
+    Raises:
+        CaptureError, FormatError: as `load_meshes`.
+    """
+    files = {name: getattr(capture.scans, name) for name in TEETH.values()}
+    return list(label_teeth(_files_read(files), files, folder, ignore_files=ignore_files).values())
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,7 +303,9 @@ def input_files(capture: Capture, names: Iterable[str]) -> dict[str, list[Path]]
     parts: dict[str, list[Path]] = {}
     for name in names:
         if name == "teeth":
-            parts |= {key: [getattr(capture.scans, key)] for key in MESHES if key not in BONES}
+            scans = {key: getattr(capture.scans, key) for key in TEETH.values()}
+            parts |= {key: [path] for key, path in scans.items()}
+            parts |= {f"{key} labels": [labels_path(path, capture.scans.labels)] for key, path in scans.items()}
         elif name in BONES and (path := getattr(capture.scans, name)) is not None:
             parts[name] = [path]
         elif name == "calibration" and capture.calibration is not None:

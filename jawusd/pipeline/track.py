@@ -21,6 +21,7 @@ from jawusd.pipeline.media import write_overlay
 from jawusd.pipeline.prepare import (
     Size,
     load_cameras,
+    load_labelled,
     load_meshes,
     naming_file,
     open_capture,
@@ -137,7 +138,7 @@ def first_pass(
     from jawusd.tracking.paper.take import track_capture_paper
 
     with naming_file(capture.folder / "capture.toml"):
-        cameras, meshes = load_cameras(capture), load_meshes(capture)
+        cameras, (meshes, findings) = load_cameras(capture), load_labelled(capture)
         upper, lower = meshes["upper_teeth"], meshes["lower_teeth"]
         report = partial(progress, "track")
         if solver == "paper":
@@ -157,6 +158,7 @@ def first_pass(
             tracks = track_capture(
                 capture, cameras, offsets, upper, lower, landmarks, config, threads=jobs, progress=report
             )
+    tracks.meta["findings"] = [*tracks.meta.get("findings", []), *(finding.as_json() for finding in findings)]
     tracks.meta["calibration_rescaled_px"] = rescaled_cameras(capture)
     return tracks
 

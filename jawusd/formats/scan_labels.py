@@ -1,0 +1,94 @@
+"""Which vertices of a teeth scan are crown, gum and base: npz, format jawusd-scan-labels/1, beside the scan.
+
+    labels (V,) uint8    0 gum, 1 crown, 2 crown at a border of interest, 3 base plate; in the order of the scan file
+    meta                 JSON: scan_sha256 of the scan's vertices, source, weak_share
+
+The hash ties labels to one version of the scan: they are refused for any other.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.errors import FormatError
+from jawusd.formats.atomic import write_npz_atomic
+from jawusd.formats.mesh import BASE, Mesh
+from jawusd.npz import TWIST_ORDER, UNITS, read_npz, take
+
+FAMILY, VERSION = "jawusd-scan-labels", 1
+SUFFIX = ".labels.npz"
+
+LabelSource = Literal["automatic", "reviewed"]
+
+
+@dataclass(frozen=True, eq=False)
+class ScanLabels:
+    """Hold the labels of one scan."""
+
+    labels: NDArray[np.uint8]  # GUM, TOOTH, BOUNDARY or BASE of `formats.mesh` per vertex of the scan file, shape (V,)
+    source: LabelSource  # found from the shape, or seen and accepted by a person
+    weak_share: float = 0.0  # share of the border between crown and gum that the shape hardly supports, 0 .. 1
+
+
+def labels_path(scan: Path, folder: Path | None = None) -> Path:
+    """Return the file of the labels of a scan: beside it, or in a folder of labels."""
+    return (scan.parent if folder is None else folder) / f"{scan.stem}{SUFFIX}"
+
+
+def scan_hash(mesh: Mesh) -> str:
+    """Return the SHA-256 of the vertices of a scan, by which its labels know it."""
+    return hashlib.sha256(mesh.vertices.tobytes()).hexdigest()
+
+
+def save_scan_labels(path: str | os.PathLike[str], labels: ScanLabels, mesh: Mesh) -> None:
+    """Write the labels of a scan.
+
+    Raises:
+        ValueError: they are not of this mesh.
+        OutputError: the file cannot be written.
+    """
+    if labels.labels.shape != mesh.vertices.shape[:1]:
+        raise ValueError(f"{labels.labels.shape} labels for {len(mesh.vertices)} vertices")
+    meta = {
+        "format": f"{FAMILY}/{VERSION}",
+        "units": UNITS,
+        "twist_order": TWIST_ORDER,
+        "scan_sha256": scan_hash(mesh),
+        "source": labels.source,
+        "weak_share": labels.weak_share,
+    }
+    text = json.dumps(meta, sort_keys=True)
+    write_npz_atomic(path, {"labels": labels.labels.astype(np.uint8), "meta": np.array(text)})
+
+
+def load_scan_labels(path: str | os.PathLike[str], mesh: Mesh) -> ScanLabels:
+    """Read the labels of a scan.
+
+    Raises:
+        FormatError: not such a file, or made for another version of the scan.
+        VersionError: written by a newer version.
+    """
+    arrays, meta = read_npz(path, FAMILY, VERSION)
+    labels = take(arrays, "labels", (None,), path)
+    if meta.get("scan_sha256") != scan_hash(mesh) or len(labels) != len(mesh.vertices):
+        raise FormatError(
+            f"was made for another version of the scan ({len(labels)} vertices, the scan has {len(mesh.vertices)}).",
+            path=path,
+            hint="Make new labels with jawusd scans --force, or delete the file.",
+        )
+    if not np.isin(labels, range(BASE + 1)).all():
+        raise FormatError(f'"labels" must be 0 to {BASE}, found {labels.max():g}.', path=path)
+    source, weak = meta.get("source"), meta.get("weak_share", 0.0)
+    if source != "automatic" and source != "reviewed":
+        raise FormatError(f'source is "{source}", allowed are automatic and reviewed.', path=path)
+    if isinstance(weak, bool) or not isinstance(weak, int | float) or not 0 <= weak <= 1:
+        raise FormatError(f'weak_share is "{weak}", allowed is 0 to 1.', path=path)
+    return ScanLabels(labels.astype(np.uint8), source, float(weak))

@@ -1,0 +1,146 @@
+"""Label the teeth scans of a capture, store the labels, and draw them for review."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TypedDict
+
+import numpy as np
+
+from jawusd.errors import OutputError, explain_missing_packages
+from jawusd.formats.capture import Capture
+from jawusd.formats.mesh import tooth_labels
+from jawusd.formats.scan_labels import labels_path, save_scan_labels
+from jawusd.geometry import anatomical_frame
+from jawusd.pipeline.prepare import labelled_teeth, open_capture
+from jawusd.pipeline.scan_labels import LabelledScan
+from jawusd.pipeline.state import Progress, no_progress
+
+PICTURE = "scan_labels.png"
+
+
+class ScanSummary(TypedDict):
+    """Hold what is known about one scan."""
+
+    arch: str
+    scan: str
+    labels_by: str  # "file", "paint" or "shape"
+    labels_file: str | None  # None where nothing was written or read
+    faces: int
+    pieces: int
+    merged_vertices: int  # at the place of another one
+    empty_faces: int
+    repeated_faces: int
+    crown_percent: float  # of the vertices
+    weak_border_percent: float | None  # of the line between crown and gum, that the shape hardly shows
+    findings: list[dict[str, str | float | int]]
+
+
+class ScansSummary(TypedDict):
+    """Hold both scans and the picture."""
+
+    picture: str
+    scans: list[ScanSummary]
+
+
+@explain_missing_packages()
+def label_scans(
+    capture: Capture | str | os.PathLike[str],
+    out: str | os.PathLike[str] | None = None,
+    *,
+    force: bool = False,
+    allow_outside: bool = False,
+    progress: Progress = no_progress,
+) -> ScansSummary:
+    """Label both teeth scans of a capture, store what the shape says, and draw a picture of the labels.
+
+    Painted scans and those with labels keep them.
+
+    Args:
+        out: folder of labels and picture; without it the labels lie where the capture has them, else beside the
+            scans, and the picture in the capture's folder.
+        force: find the labels again and overwrite those there are.
+
+    Raises:
+        FormatError, CaptureError: the capture, a scan or its labels cannot be read.
+        OutputError: files exist already, or cannot be written.
+    """
+    opened = open_capture(capture, allow_outside=allow_outside)
+    folder = opened.scans.labels if out is None else Path(out)
+    picture = (opened.folder if out is None else Path(out)) / PICTURE
+    if picture.exists() and not force:
+        raise OutputError("exists already.", path=picture, hint="Name another folder, or overwrite it with --force.")
+    progress("scans", 0, 2)
+    scans = labelled_teeth(opened, folder, ignore_files=force)
+    progress("scans", 1, 2)
+    summaries = [_stored(scan, folder) for scan in scans]
+    _draw(scans, summaries, opened, picture)
+    progress("scans", 2, 2)
+    return {"picture": str(picture), "scans": summaries}
+
+
+def _stored(scan: LabelledScan, folder: Path | None) -> ScanSummary:
+    """Write the labels that the shape gave, and sum up."""
+    from jawusd.imaging.scan_surface import ScanSurface
+
+    file = labels_path(scan.path, folder)
+    if scan.origin == "shape" and scan.labels is not None:
+        save_scan_labels(file, scan.labels, scan.mesh)
+    surface = ScanSurface.of(scan.mesh)
+    return {
+        "arch": scan.arch,
+        "scan": str(scan.path),
+        "labels_by": scan.origin,
+        "labels_file": None if scan.origin == "paint" else str(file),
+        "faces": len(scan.mesh.faces),
+        "pieces": int(surface.piece.max()) + 1,
+        "merged_vertices": surface.merged,
+        "empty_faces": surface.empty,
+        "repeated_faces": surface.repeated,
+        "crown_percent": round(100 * float(np.mean(tooth_labels(scan.mesh) > 0)), 1),
+        "weak_border_percent": None if scan.labels is None else round(100 * scan.labels.weak_share, 1),
+        "findings": [finding.as_json() for finding in scan.findings],
+    }
+
+
+def _draw(scans: Sequence[LabelledScan], summaries: Sequence[ScanSummary], capture: Capture, picture: Path) -> None:
+    from jawusd.imaging.label_picture import label_sheet
+    from jawusd.imaging.overlay import save_png
+
+    given = capture.anatomy.T_anatomical_skull
+    crowns = [scan.mesh.vertices[tooth_labels(scan.mesh) > 0] for scan in scans]
+    T = anatomical_frame(*crowns) if given is None else np.array(given)
+    shown = [
+        (scan.arch, scan.mesh, tooth_labels(scan.mesh) if scan.mesh.labels is None else scan.mesh.labels)
+        for scan in scans
+    ]
+    captions = [
+        f"{s['arch']}: {s['faces']} faces, {s['pieces']} pieces, {s['crown_percent']:.0f} % crown, by {s['labels_by']}"
+        for s in summaries
+    ]
+    save_png(picture, label_sheet(shown, T, captions))
+
+
+def scans_lines(summary: ScansSummary) -> list[str]:
+    """Return `label_scans` as text."""
+    from jawusd.formats.finding import Finding
+
+    lines = []
+    for scan in summary["scans"]:
+        lines.append(
+            f"{scan['arch']}: {scan['faces']} faces in {scan['pieces']} pieces, {scan['crown_percent']} % crown "
+            f"(by {scan['labels_by']})"
+        )
+        cleaned = (
+            (scan["merged_vertices"], "vertices at the same place merged"),
+            (scan["empty_faces"], "empty faces"),
+            (scan["repeated_faces"], "repeated faces"),
+        )
+        found = [f"{count} {what}" for count, what in cleaned if count]
+        lines += [f"  {', '.join(found)}"] if found else []
+        if scan["labels_file"]:
+            lines.append(f"  labels: {scan['labels_file']}")
+        lines += [f"  {Finding.from_json(finding).line()}" for finding in scan["findings"]]
+    return [*lines, f"picture: {summary['picture']}"]
