@@ -249,6 +249,8 @@ def _truth(capture: ShortCapture) -> dict[str, ArrayLike]:
         "gum_tooth_mm": who.gum_tooth_mm,
         "edge_px": np.array(who.edge_px),
         "camera_px": who.camera_px,
+        "wobble_px": np.array(who.wobble_px),
+        "cell_px": np.array(who.cell_px),
         "groups": np.array(json.dumps(groups)),
     }
 

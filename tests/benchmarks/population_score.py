@@ -1,0 +1,189 @@
+"""Check, track and score one synthetic person's capture; used by population.py."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from cramer_rao import MEAN_W
+
+from jawusd.errors import JawusdError
+from jawusd.formats.capture import load_capture
+from jawusd.formats.tracks import Tracks
+from jawusd.geometry import se3_inverse, se3_log, transform_point, transform_points
+from jawusd.pipeline.prepare import load_cameras, load_meshes, subject_of_capture
+from jawusd.pipeline.track import track
+from jawusd.synthetic.annotator import REFERENCE_HEIGHT
+from jawusd.tracking import TrackingConfig
+from jawusd.tracking.contour.quality import twist_covariance
+from jawusd.tracking.contour.scan import prepare_scan
+from jawusd.tracking.contour.solver import ContourSolver
+from jawusd.tracking.contour.views import MaskViews
+
+ROWS = ("upper", "lower")
+AXES = ("left", "up", "front")
+
+
+@dataclass
+class Outcome:
+    """What became of one capture."""
+
+    seed: int
+    groups: dict[str, str]
+    refused: str = ""  # message of the error
+    refused_by: str = ""  # "check" or "track"
+    crashed: bool = False  # by an exception that is none of ours
+    findings: list[tuple[str, str, str]] = field(default_factory=list)  # kind, severity, line
+    figures: dict[str, float] = field(default_factory=dict)
+    vectors: dict[str, list[float]] = field(default_factory=dict)
+    seconds: float = 0.0
+
+
+def truth_of(folder: Path) -> dict[str, np.ndarray]:
+    """Return the truth of a synthetic capture."""
+    with np.load(folder / "truth" / "truth.npz", allow_pickle=False) as archive:
+        return {name: archive[name] for name in archive.files}
+
+
+def run(folder: Path, seed: int, score: bool = True) -> Outcome:
+    """Check and track a capture as `jawusd check` and `jawusd track` do, and compare with its truth."""
+    truth = truth_of(folder)
+    outcome = Outcome(seed, json.loads(str(truth["groups"])))
+    start = time.perf_counter()
+    try:
+        outcome.findings = check_findings(folder)
+        errors = [line for _, severity, line in outcome.findings if severity == "error"]
+        if errors:
+            outcome.refused, outcome.refused_by = " | ".join(errors), "check"
+            return outcome
+        tracks = track(folder, jobs=1)
+        outcome.findings += track_findings(tracks)
+    except JawusdError as error:
+        outcome.refused, outcome.refused_by = str(error), "track"
+        return outcome
+    except Exception as error:  # a crash is a result of this benchmark
+        outcome.refused, outcome.refused_by, outcome.crashed = repr(error), "track", True
+        return outcome
+    finally:
+        outcome.seconds = time.perf_counter() - start
+    if score:
+        compare(outcome, folder, tracks, truth)
+    return outcome
+
+
+def check_findings(folder: Path) -> list[tuple[str, str, str]]:
+    """Return what `jawusd check` finds, nothing while there is no such command."""
+    if importlib.util.find_spec("jawusd.pipeline.check") is None:
+        return []
+    from jawusd.pipeline.check import check
+
+    return [(f.kind, f.severity, f.line()) for f in check(folder)]
+
+
+def track_findings(tracks: Tracks) -> list[tuple[str, str, str]]:
+    """Return every flag that tracks carry."""
+    found = [(f["kind"], f["severity"], f["message"]) for f in tracks.meta.get("findings", [])]
+    if not found:  # tracks from before findings had one form
+        found += [("scans", "warning", line) for line in tracks.meta.get("start", {}).get("scan_findings", [])]
+    if tracks.meta.get("calibration_rescaled_px"):
+        found.append(("calibration_rescaled", "note", f"rescaled {tracks.meta['calibration_rescaled_px']}"))
+    if tracks.meta.get("extrinsics", {}).get("corrected"):
+        found.append(("cameras_moved", "note", "camera poses corrected"))
+    late = {n: d for n, d in tracks.meta.get("delays_frames", {}).items() if abs(d) > 0.5}
+    if late:
+        found.append(("camera_late", "note", f"delays of frames {late}"))
+    lost = ~tracks.tracked()
+    if lost.any():
+        found.append(("frames_lost", "note", f"{lost.sum()} of {len(lost)} frames lost"))
+    seen = np.isfinite(tracks.coverage_error).any(1)
+    unused = seen & ~tracks.masks_used.any(1)
+    for c in np.flatnonzero(unused.mean(0) > 0.5):
+        found.append(("camera_unused", "note", f"camera {tracks.camera_names[c]} left out of most frames"))
+    return found
+
+
+def compare(outcome: Outcome, folder: Path, tracks: Tracks, truth: dict[str, np.ndarray]) -> None:
+    """Add errors, steady shifts, the Cramer-Rao bound and NEES."""
+    capture = load_capture(folder)
+    meshes, cameras = load_meshes(capture), load_cameras(capture)
+    landmarks = subject_of_capture(capture, meshes).landmarks
+    rows = np.searchsorted(truth["frames"], tracks.frames)
+    good = tracks.tracked()
+    figures, vectors = outcome.figures, outcome.vectors
+    figures["lost"] = float((~good).mean())
+    if not good.any():
+        return
+    rows = rows[good]
+    to_bite = truth["T_bite_scan"][:3, :3]
+    scans = [prepare_scan(meshes[f"{row}_teeth"], row) for row in ROWS]
+    exact = np.stack([truth[f"T_world_{row}"][rows] for row in ROWS], axis=1)
+    found = np.stack([getattr(tracks, f"T_world_{row}")[good] for row in ROWS], axis=1)
+    bound = cramer_rao(folder, scans, exact, truth, rows, cameras)
+    for r, row in enumerate(ROWS):
+        gap = transform_points(found[:, r], scans[r].probes) - transform_points(exact[:, r], scans[r].probes)
+        distance = np.linalg.norm(gap, axis=-1)
+        figures[f"vertices {row}"] = float(distance.mean())
+        figures[f"rms {row}"] = float(np.sqrt((distance**2).mean()))
+        metric = [np.trace(_metric(transform_points(T, scans[r].probes)) @ C) for T, C in zip(exact[:, r], bound[:, r])]
+        figures[f"bound {row}"] = float(np.sqrt(np.median(metric)))
+        inwards = np.swapaxes(exact[:, r, :3, :3], 1, 2)
+        vectors[f"shift {row}"] = (to_bite @ np.einsum("fij,fj->fi", inwards, gap.mean(1)).mean(0)).tolist()
+        twist = se3_log(exact[:, r] @ se3_inverse(found[:, r]))
+        figures[f"nees {row}"] = _nees(twist, getattr(tracks, f"covariance_{row}")[good])
+    relative = truth["T_upper_lower"][rows]
+    measured = tracks.T_upper_lower[good]
+    for k, name in ((0, "incisor"), (3, "condyle")):
+        gap = transform_point(measured, landmarks[k]) - transform_point(relative, landmarks[k])
+        figures[name] = float(np.linalg.norm(gap, axis=-1).mean())
+        if name == "incisor":
+            vectors["shift relative"] = (to_bite @ gap.mean(0)).tolist()
+    twist = se3_log(relative @ se3_inverse(measured))
+    figures["nees relative"] = _nees(twist, tracks.covariance_relative[good])
+    figures["sigma incisor"] = float(np.nanmedian(tracks.sigma_mm[good, 0]))
+    figures["outcome ratio"] = max(figures[f"rms {row}"] / figures[f"bound {row}"] for row in ROWS)
+    gum = tracks.meta.get("gum_line_mm")
+    if gum is not None:
+        vectors["gum error"] = (np.asarray(gum, float).ravel()[:2] - truth["gum_mm"]).tolist()
+
+
+def cramer_rao(
+    folder: Path, scans: list, exact: np.ndarray, truth: dict, rows: np.ndarray, cameras: list
+) -> np.ndarray:
+    """Return the least covariance of both arches' twists by the annotator's known wobble, shape (F, 2, 6, 6)."""
+    capture, config = load_capture(folder), TrackingConfig()
+    offsets = dict(zip(truth["camera_names"].tolist(), truth["offsets"].tolist(), strict=True))
+    centre = np.mean([transform_point(exact[0, r], scans[r].centre) for r in (0, 1)], axis=0)
+    table = {camera.name: camera for camera in cameras}
+    solver, out = ContourSolver(scans, config), []
+    first = cameras[0]
+    scale = max(first.size_px[1] / REFERENCE_HEIGHT, 0.45)
+    full = float(first.K[0, 0] / first.depth(centre[None])[0])  # px per mm
+    working = min(full, config.working_px_per_mm)
+    wobble_px = float(truth["wobble_px"]) * scale / full * working
+    together_px = float(truth["cell_px"]) * scale / full * working
+    # rounding to whole pixels of the recorded picture, independent from pixel to pixel
+    noise = wobble_px**2 * together_px + (working / full) ** 3 / 12.0
+    with MaskViews(capture.cameras, table, offsets, centre, config.working_px_per_mm) as masks:
+        for pose, row in zip(exact, rows):
+            solution = solver.solve(pose, masks.at(int(truth["frames"][row])), ())
+            out.append([MEAN_W * twist_covariance(solution, r, 1.0, noise) for r in (0, 1)])
+    return np.array(out)
+
+
+def _metric(points: np.ndarray) -> np.ndarray:
+    from jawusd.geometry import mandible_metric
+
+    return mandible_metric(points)
+
+
+def _nees(twist: np.ndarray, covariance: np.ndarray) -> float:
+    """Return the median over frames of the normalised squared error over 6."""
+    usable = np.isfinite(covariance).all((1, 2))
+    if not usable.any():
+        return float("nan")
+    values = np.einsum("fi,fij,fj->f", twist[usable], np.linalg.pinv(covariance[usable]), twist[usable])
+    return float(values.mean() / 6)
