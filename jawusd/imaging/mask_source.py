@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 
 from jawusd.errors import CaptureError
-from jawusd.imaging.mask_levels import MaskLevels, NotMasks, RawImage, find_levels, spread_of_colours
+from jawusd.imaging.level_search import NotMasks, find_levels
+from jawusd.imaging.mask_levels import MaskLevels, RawImage, spread_of_colours
 from jawusd.imaging.pictures import has_palette, read_palette_numbers, read_picture
 from jawusd.imaging.pixels import Colour
 from jawusd.imaging.video import Video

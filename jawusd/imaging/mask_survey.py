@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from jawusd.formats.capture import CameraSource
 from jawusd.formats.finding import Finding
-from jawusd.imaging.mask_levels import MaskLevels
+from jawusd.imaging.mask_levels import MOST_SOFT, MaskLevels
 from jawusd.imaging.masks import open_masks
 
 ARCHES = ("upper", "lower")
@@ -17,8 +17,8 @@ def survey_masks(source: CameraSource, size_px: tuple[int, int]) -> list[Finding
     """Return what is to be said of the masks of one camera, from some pictures of the whole take.
 
     `size_px` is the (width, height) of the camera's pictures. Kinds: "camera_without_masks" and "masks_black", warnings
-    of what is not used; "mask_levels", a note of values that are not 0 and full white; "mask_polarity", a warning that
-    background and teeth can hardly be told apart.
+    of what is not used; "mask_levels", a note of values that are not 0 and full white; "masks_soft" and
+    "mask_polarity", warnings that the outline, or background and teeth, can hardly be told apart.
 
     Raises:
         CaptureError: the masks cannot be used: missing, damaged, of another size or number than the camera's pictures,
@@ -89,6 +89,20 @@ def _of_levels(source: CameraSource, arch: str, levels: MaskLevels) -> list[Find
                 f"teeth{inverted}.",
                 value=levels.teeth,
                 camera=source.name,
+            )
+        )
+    if levels.soft > MOST_SOFT:
+        out.append(
+            Finding(
+                "masks_soft",
+                "warning",
+                f"{levels.soft:.0%} of what the masks of the {arch} teeth show lie between background "
+                f"({levels.background:g}) and teeth ({levels.teeth:g}), at most {MOST_SOFT:.0%} are usual; the outline "
+                "is taken half the way.",
+                value=round(levels.soft, 3),
+                limit=MOST_SOFT,
+                camera=source.name,
+                hint="Export masks with edges a few pixels wide, and not the footage cut out.",
             )
         )
     if levels.doubtful:

@@ -8,7 +8,7 @@ import numpy as np
 
 from jawusd.errors import TrackingError
 from jawusd.formats.tracks import PARTIAL, TRACKED
-from jawusd.geometry.arrays import Array
+from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.frame_record import FrameRecord
 from jawusd.tracking.contour.quality import arch_fit, coverage_error, score_px, uncovered_px
@@ -19,6 +19,7 @@ from jawusd.tracking.contour.views import View, present_masks
 # Least `arch_fit` of a first frame [-]: teeth that slid along by one reach 0 in one of the arches, right poses 0.1 even
 # with lips nearly closed.
 _LEAST_FIT = 0.05
+_FEWEST_MASKS = 2  # of an arch: one view leaves the depth unknown
 
 
 def first_record(
@@ -31,7 +32,7 @@ def first_record(
     """
     use = present_masks(views)
     for r in ARCHES:
-        if use[r].sum() < 2:
+        if use[r].sum() < _FEWEST_MASKS:
             raise TrackingError(
                 f"{use[r].sum()} masks of the {ARCH_NAMES[r]} teeth, the first frame needs two",
                 frame=frame,
@@ -43,10 +44,15 @@ def first_record(
         poses = np.where(better[:, None, None], wide.poses, best.poses)
         best = solver.solve(poses, views, config.wide_gates_px[-2:], use)
     coverage = coverage_error(*uncovered_px(solver.scans, best.poses, views))
+    kept = _without_spoiled(use, coverage, config.lost_coverage)
+    if (kept != use).any():
+        use = kept
+        best = solver.solve(best.poses, views, config.wide_gates_px, use)
+        coverage = coverage_error(*uncovered_px(solver.scans, best.poses, views))
     fit = arch_fit(solver.scans, best, views, config.uncovered_price)
     for r in ARCHES:
         share = score_px(best)[r].sum() / max(best.visible_px[r].sum(), 1.0)
-        uncovered = np.nanmedian(coverage[r])
+        uncovered = np.nanmedian(coverage[r, use[r]])
         if share < config.first_share or uncovered > config.lost_coverage or fit[r] < _LEAST_FIT:
             raise TrackingError(
                 f"the {ARCH_NAMES[r]} teeth do not fit their masks: {share:.0%} of the visible contour "
@@ -58,3 +64,12 @@ def first_record(
             )
     status = np.where(use.all(1), TRACKED, PARTIAL).astype(np.int8)
     return FrameRecord(best, status, use, coverage)
+
+
+def _without_spoiled(use: Mask, coverage: Array, limit: float) -> Mask:
+    """Leave out masks that stay uncovered while at least two of their arch are covered, shape (2, C).
+
+    The limit is that of a lost arch, so what is left out would have cost every frame in which it took part.
+    """
+    kept = use & ~(coverage > limit)
+    return np.where(kept.sum(1, keepdims=True) >= _FEWEST_MASKS, kept, use)

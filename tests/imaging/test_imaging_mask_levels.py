@@ -1,0 +1,155 @@
+"""What the values of mask pictures are taken for, against masks whose values are known."""
+
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+from PIL import Image, ImageDraw
+
+from jawusd.errors import CaptureError
+from jawusd.formats.capture import CameraSource
+from jawusd.imaging.mask_levels import MOST_SOFT
+from jawusd.imaging.mask_survey import survey_masks
+from jawusd.imaging.masks import MaskReader
+
+SIZE = (160, 96)
+COUNT = 12
+
+
+def teeth(k: int, scale: int = 1) -> np.ndarray:
+    """Return a row of teeth drawn by Pillow, white on black, `scale` times the size."""
+    image = Image.new("L", (SIZE[0] * scale, SIZE[1] * scale))
+    draw = ImageDraw.Draw(image)
+    for tooth in range(6):
+        x, y = 20 + 18 * tooth + k, 40 + abs(tooth - 2.5) * 4
+        draw.ellipse([x * scale, y * scale, (x + 16) * scale, (y + 24) * scale], fill=255)
+    return np.asarray(image)
+
+
+def written(folder: Path, pictures) -> MaskReader:
+    folder.mkdir(exist_ok=True)
+    for k, picture in enumerate(pictures):
+        cv2.imwrite(str(folder / f"{k:03d}.png"), picture)
+    return MaskReader(folder / "%03d.png", SIZE)
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize(("background", "white"), [(0, 1), (0, 2), (0, 100), (20, 220), (255, 0), (1, 0), (200, 60)])
+def test_two_levels_of_any_value(tmp_path, bits, background, white):
+    unit = 257 if bits == 16 and white > 2 else 1
+    table = np.array([background, white]) * unit
+    pictures = [table[teeth(k) // 255].astype(np.uint16 if bits == 16 else np.uint8) for k in range(COUNT)]
+    reader = written(tmp_path, pictures)
+    for k in range(COUNT):
+        assert np.array_equal(reader.read(k), teeth(k))
+    assert reader.levels.inverted == (background > white) and not reader.levels.usual and reader.odd == []
+
+
+def test_half_the_way_between_the_levels_stays_the_outline(tmp_path):
+    sharp = [teeth(k, 4) for k in range(COUNT)]
+    soft = [cv2.resize(image, SIZE, interpolation=cv2.INTER_AREA) for image in sharp]
+    for background, white in ((0, 100), (255, 0), (30, 250)):
+        folder = tmp_path / f"{background}_{white}"
+        reader = written(folder, [np.round(background + s / 255.0 * (white - background)) for s in soft])
+        for k in (0, 5):
+            assert np.abs(reader.read(k).astype(int) - soft[k]).max() <= round(255 / abs(white - background))
+
+
+@pytest.mark.parametrize("blur_px", [1.0, 2.0, 3.0])
+def test_blurred_masks_keep_their_outline(tmp_path, blur_px):
+    blurred = [cv2.GaussianBlur(teeth(k), (0, 0), blur_px) for k in range(COUNT)]
+    reader = written(tmp_path, blurred)
+    for k in (0, 7):
+        assert ((reader.read(k) > 127) != (teeth(k) > 127)).sum() < 0.04 * (teeth(k) > 127).sum() * blur_px
+
+
+@pytest.mark.parametrize("crf", [12, 23, 32])
+@pytest.mark.parametrize("inverted", [False, True])
+def test_lossy_video_has_flat_levels_and_true_edges(tmp_path, crf, inverted):
+    path = tmp_path / "upper.mp4"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=25)
+        stream.width, stream.height = SIZE
+        stream.pix_fmt, stream.options = "yuv420p", {"crf": str(crf)}
+        for k in range(COUNT):
+            mask = np.zeros(SIZE[::-1], np.uint8) if k in (0, 6) else teeth(k)
+            frame = av.VideoFrame.from_ndarray(255 - mask if inverted else mask, format="gray")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    reader = MaskReader(path, SIZE)
+    assert reader.read(0) is None and reader.read(6) is None
+    for k in (3, 7, 11):
+        found = reader.read(k)
+        assert ((found > 127) != (teeth(k) > 127)).sum() < 0.05 * (teeth(k) > 0).sum()
+        assert (found[:20] == 0).mean() > 0.95
+    assert reader.levels.inverted == inverted
+
+
+def test_what_most_pictures_hold_counts(tmp_path):
+    pictures = [teeth(k) for k in range(COUNT)]
+    pictures[2] = teeth(2) // 255 * 100
+    pictures[3] = 255 - teeth(3)
+    pictures[4] = np.full(SIZE[::-1], 255, np.uint8)
+    pictures[5] = np.random.default_rng(0).integers(0, 255, SIZE[::-1]).astype(np.uint8)
+    pictures[6] = teeth(6).astype(np.uint16) * 257
+    pictures[7] = np.zeros(SIZE[::-1], np.uint8)
+    reader = written(tmp_path, pictures)
+    found = [reader.read(k) for k in range(COUNT)]
+    assert [k for k in range(COUNT) if found[k] is None] == [2, 3, 4, 5, 6, 7]
+    expected = [
+        "002.png reaches only 100, teeth are 255",
+        "003.png has",
+        "004.png is 255 all over",
+        "005.png is no mask",
+    ]
+    for line, start in zip(reader.odd, [*expected, "006.png has 16 bits per channel"], strict=True):
+        assert line.startswith(start)
+
+
+def test_masks_of_few_frames_are_found_among_black_ones(tmp_path):
+    pictures = [np.zeros(SIZE[::-1], np.uint8)] * 60
+    pictures[37] = teeth(0) // 255 * 9
+    assert np.array_equal(written(tmp_path, pictures).read(37), teeth(0))
+
+
+def test_a_video_cut_out_on_black_is_doubted(tmp_path):
+    skin = np.tile(np.linspace(40, 255, SIZE[0]), (SIZE[1], 1)).astype(np.uint8)
+    reader = written(tmp_path, [np.where(teeth(k) > 0, skin, 0) for k in range(COUNT)])
+    assert reader.levels.soft > MOST_SOFT
+
+
+def test_single_teeth_in_levels_of_their_own_are_refused(tmp_path):
+    numbers = [cv2.connectedComponents((teeth(k) > 0).astype(np.uint8))[1].astype(np.uint8) for k in range(COUNT)]
+    with pytest.raises(CaptureError, match=r"000\.png: it holds the levels 0, \d, \d; a mask has two"):
+        written(tmp_path, numbers)
+
+
+def test_survey_says_what_is_taken_and_what_is_not_used(tmp_path):
+    for row, factor in (("upper", 100), ("lower", 0)):
+        written(tmp_path / row, [teeth(k) // 255 * factor for k in range(COUNT)])
+    masks = {row: tmp_path / row / "%03d.png" for row in ("upper", "lower")}
+    found = survey_masks(CameraSource(name="left", masks=masks), SIZE)
+    assert [(one.kind, one.severity, one.camera) for one in found] == [
+        ("masks_black", "warning", "left"),
+        ("mask_levels", "note", "left"),
+    ]
+    assert "the masks of the lower teeth are all black" in found[0].message
+    assert "hold 0 and 100: 100 is taken as teeth" in found[1].message
+    assert survey_masks(CameraSource(name="right", video="right.mp4"), SIZE)[0].kind == "camera_without_masks"
+
+
+def test_light_masks_up_to_the_border_are_doubted(tmp_path):
+    framed = np.full(SIZE[::-1], 255, np.uint8)
+    framed[[0, -1]] = framed[:, [0, -1]] = 0
+    written(tmp_path / "upper", [np.where(teeth(k) > 0, 0, framed) for k in range(COUNT)])
+    masks = {row: tmp_path / "upper" / "%03d.png" for row in ("upper", "lower")}
+    kinds = [one.kind for one in survey_masks(CameraSource.model_construct(name="a", masks=masks_of(masks)), SIZE)]
+    assert kinds == ["mask_polarity", "mask_polarity"]
+
+
+def masks_of(masks: dict) -> object:
+    from jawusd.formats.capture import Masks
+
+    return Masks.model_construct(**masks, upper_value=None, lower_value=None)
