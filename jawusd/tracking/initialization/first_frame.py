@@ -70,14 +70,17 @@ class _Aligned:
 
 def _aligned(solver: ContourSolver, config: TrackingConfig, start: Array, views: Sequence[View], use: Mask) -> _Aligned:
     """Align with narrow and with wide gates, then without masks that stay uncovered."""
+    whole = use
     best = solver.solve(start, views, config.gates_from(0.0), use)
     wide = solver.solve(start, views, config.wide_gates_px, use)
     if (better := score_px(wide).sum(1) > score_px(best).sum(1)).any():
         poses = np.where(better[:, None, None], wide.poses, best.poses)
         best = solver.solve(poses, views, config.wide_gates_px[-2:], use)
     coverage = coverage_error(*uncovered_px(solver.scans, best.poses, views))
-    kept = _without_spoiled(use, coverage, config.lost_coverage)
-    if (kept != use).any():
+    for _ in range(2):  # without masks that stay uncovered; with those again that then are covered
+        kept = _without_spoiled(whole, coverage, config.lost_coverage)
+        if (kept == use).all():
+            break
         use = kept
         best = solver.solve(best.poses, views, config.wide_gates_px, use)
         coverage = coverage_error(*uncovered_px(solver.scans, best.poses, views))
