@@ -18,6 +18,7 @@ through `jawusd check` and `jawusd track` and is compared with its truth. Printe
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import re
 import shutil
@@ -39,6 +40,9 @@ from population_score import AXES, ROWS, Outcome, run
 
 from jawusd.synthetic.short_capture import ShortConfig, write_short_capture
 
+#: Seed, fault or -1, frames, share of scans without paint, folder of the captures.
+Task = tuple[int, int, int, float, Path]
+
 STEADY_MM = 0.02
 HARMLESS_MM = 0.1
 
@@ -55,9 +59,16 @@ def main() -> None:
     parser.add_argument("--only", default="", help="pattern of the faults' names")
     parser.add_argument("--each", type=int, help="persons per fault, a quarter of all if not given")
     parser.add_argument("--out", type=Path, help="folder to keep outcomes (JSON lines) in")
+    parser.add_argument("--captures", type=Path, help="folder to keep the captures in, and to take them from")
     options = parser.parse_args()
     seeds = range(options.seed, options.seed + options.persons)
-    config = (options.frames, options.unpainted)
+    with contextlib.ExitStack() as stack:
+        folder = options.captures or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="jawusd_persons_")))
+        measure(options, seeds, (options.frames, options.unpainted, folder))
+
+
+def measure(options: argparse.Namespace, seeds: Iterable[int], config: tuple[int, float, Path]) -> None:
+    """Run valid and spoilt captures and print."""
     valid = collect([(seed, -1, *config) for seed in seeds], options, "valid")
     valid.sort(key=lambda o: o.seed)
     report(valid)
@@ -77,25 +88,27 @@ def _part(seeds: list[int], index: int, count: int) -> list[int]:
     return list(dict.fromkeys(seeds[(index * 7 + i) % len(seeds)] for i in range(count)))
 
 
-def one(task: tuple[int, int, int, float]) -> Outcome | None:
+def one(task: Task) -> Outcome | None:
     """Write, spoil, track and score one capture; None if the fault cannot be planted into it."""
-    seed, fault, frames, unpainted = task
+    seed, fault, frames, unpainted, captures = task
     cv2.setNumThreads(1)
-    folder = Path(tempfile.mkdtemp(prefix=f"jawusd_person_{seed}_"))
-    try:
-        write_short_capture(folder, ShortConfig(seed, frames, unpainted))
-        if fault >= 0:
-            FAULTS[fault].plant(folder, np.random.default_rng([seed, fault]))
-        outcome = run(folder, seed)
-        outcome.groups["fault"] = FAULTS[fault].name if fault >= 0 else ""
+    valid = captures / f"person_{seed}_{frames}_{unpainted:g}"
+    if not (valid / "capture.toml").exists():  # written last
+        write_short_capture(valid, ShortConfig(seed, frames, unpainted))
+    if fault < 0:
+        return run(valid, seed)
+    with tempfile.TemporaryDirectory(prefix=f"jawusd_fault_{fault}_") as folder:
+        spoilt = shutil.copytree(valid, Path(folder) / "capture")
+        try:
+            FAULTS[fault].plant(spoilt, np.random.default_rng([seed, fault]))
+        except NotPossible:
+            return None
+        outcome = run(spoilt, seed)
+        outcome.groups["fault"] = FAULTS[fault].name
         return outcome
-    except NotPossible:
-        return None
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
 
 
-def collect(tasks: list[tuple[int, int, int, float]], options: argparse.Namespace, name: str) -> list[Outcome]:
+def collect(tasks: list[Task], options: argparse.Namespace, name: str) -> list[Outcome]:
     """Return the outcomes of all tasks; progress goes to stderr."""
     start, out = time.perf_counter(), []
     with ProcessPoolExecutor(options.jobs) as pool:
