@@ -72,7 +72,7 @@ def build(
         model.value, solver.value, backend.value, jobs=jobs, resume=resume, fresh=fresh, allow_outside=allow_outside
     )
     with progress() as report:
-        summary = stages.build(capture, out, options, report)
+        summary = stages.build(capture, out, options, report, lambda found: typer.echo(found.line(), err=True))
     emit(summary, as_json, lambda: stages.build_lines(summary))
 
 

@@ -1,4 +1,4 @@
-"""Commands on the footage and scans of a capture: calibrate, sync, segment, scans and plates."""
+"""Commands on a capture and its footage: check, calibrate, sync, segment, scans and plates."""
 
 from __future__ import annotations
 
@@ -14,6 +14,22 @@ from jawusd.cli.output import emit, plain, progress, refuse_existing
 
 if TYPE_CHECKING:
     from jawusd.pipeline.calibrate import SyncResult
+
+
+def check(capture: CaptureArg, allow_outside: Outside = False, as_json: Json = False) -> None:
+    """Check a capture in seconds, before any work: scans, masks, clips, calibration, picks, frames, disk space.
+
+    Prints everything wrong or doubtful at once. Exit code 0 without errors, 5 with.
+    """
+    from jawusd.errors import CaptureError
+    from jawusd.pipeline.check import check_capture, check_lines, check_summary
+
+    with progress() as report:
+        findings = check_capture(capture, allow_outside=allow_outside, progress=report)
+    summary = check_summary(str(capture), findings)
+    emit(summary, as_json, lambda: check_lines(findings))
+    if summary["errors"]:
+        raise typer.Exit(CaptureError.exit_code)
 
 
 def calibrate(

@@ -24,6 +24,7 @@ for _command in (
     build_commands.bake,
     build_commands.demo,
     build_commands.build_many,
+    capture_commands.check,
     capture_commands.calibrate,
     capture_commands.sync,
     capture_commands.segment,

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from jawusd.errors import CaptureError, FormatError, UnitsError
+from jawusd.errors import CaptureError, FormatError, JawusdError, UnitsError
 from jawusd.formats.text import read_toml
 from jawusd.geometry import rigidity_defect
 from jawusd.npz import check_format
@@ -229,14 +229,30 @@ def load_capture(path: str | os.PathLike[str], *, allow_outside: bool = False) -
         VersionError: written for a newer jawusd.
         CaptureError: a file it names does not exist, or lies outside its folder.
     """
+    capture, problems = read_capture(path, allow_outside=allow_outside)
+    if capture is None or problems:
+        raise problems[0]
+    return capture
+
+
+def read_capture(
+    path: str | os.PathLike[str], *, allow_outside: bool = False
+) -> tuple[Capture | None, list[JawusdError]]:
+    """Read a capture as `load_capture` does, and return everything that is wrong with it instead of raising.
+
+    The capture is None if values are missing or wrong; if it names files that do not exist, it still names them.
+    """
     path = Path(path)
     if path.is_dir():
         path = path / "capture.toml"
-    data = read_toml(path)
-    check_format(data.pop("format", None), FAMILY, VERSION, path)
-    units = data.pop("units", "mm")
-    if units != "mm":
-        raise UnitsError(f'units are "{units}", allowed is "mm".', path=path)
+    try:
+        data = read_toml(path)
+        check_format(data.pop("format", None), FAMILY, VERSION, path)
+        units = data.pop("units", "mm")
+        if units != "mm":
+            raise UnitsError(f'units are "{units}", allowed is "mm".', path=path)
+    except JawusdError as error:
+        return None, [error]
     folder = path.resolve().parent
     data["folder"] = folder
     if "camera" in data:
@@ -244,23 +260,26 @@ def load_capture(path: str | os.PathLike[str], *, allow_outside: bool = False) -
     try:
         capture = Capture.model_validate(data)
     except ValidationError as error:
-        raise FormatError(_first_problem(error), path=path) from error
-    except RecursionError as error:
-        raise FormatError("is nested too deeply.", path=path) from error
-    return _resolve(capture, folder, path, allow_outside)
+        return None, [FormatError(problem, path=path) for problem in _problems(error)]
+    except RecursionError:
+        return None, [FormatError("is nested too deeply.", path=path)]
+    problems: list[JawusdError] = []
+    return _resolve(capture, folder, path, allow_outside, problems), problems
 
 
-def _first_problem(error: ValidationError) -> str:
+def _problems(error: ValidationError) -> list[str]:
+    out = []
     # A misspelt key also makes the right one missing; the misspelling is the cause.
-    problem = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
-    where = ".".join("camera" if part == "cameras" else str(part) for part in problem["loc"])
-    found = problem.get("input")
-    shown = "" if isinstance(found, dict | list | tuple) or problem["type"] == "missing" else f' (found "{found}")'
-    return f"{where or 'the file'}: {problem['msg']}{shown}."
+    for problem in sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden"):
+        where = ".".join("camera" if part == "cameras" else str(part) for part in problem["loc"])
+        found = problem.get("input")
+        shown = "" if isinstance(found, dict | list | tuple) or problem["type"] == "missing" else f' (found "{found}")'
+        out.append(f"{where or 'the file'}: {problem['msg']}{shown}.")
+    return out
 
 
-def _resolve(capture: Capture, folder: Path, source: Path, allow_outside: bool) -> Capture:
-    """Make every path absolute, inside the folder, and check that it exists."""
+def _resolve(capture: Capture, folder: Path, source: Path, allow_outside: bool, problems: list[JawusdError]) -> Capture:
+    """Make every path absolute, and add to the problems each that leads out of the folder or does not exist."""
 
     def absolute(value: Path, key: str) -> Path:
         full = Path(os.path.normpath(folder / value))
@@ -269,16 +288,20 @@ def _resolve(capture: Capture, folder: Path, source: Path, allow_outside: bool) 
         try:
             inside, exists = anchor.resolve().is_relative_to(folder), anchor.exists()
         except (OSError, ValueError, RuntimeError) as error:  # too long, a null byte, links in a circle
-            raise CaptureError(f"{key} is no path that can be followed ({error!s:.100}).", path=source) from error
+            problems.append(CaptureError(f"{key} is no path that can be followed ({error!s:.100}).", path=source))
+            return full
         if not allow_outside and not inside:
-            raise CaptureError(
-                f'{key} = "{value}" leads out of the folder of the capture.',
-                path=source,
-                hint="Move the file inside, or allow it with --allow-outside.",
+            problems.append(
+                CaptureError(
+                    f'{key} = "{value}" leads out of the folder of the capture.',
+                    path=source,
+                    hint="Move the file inside, or allow it with --allow-outside.",
+                )
             )
-        if not exists:
+        elif not exists:
             kind = "folder" if "%" in full.name else "file"
-            raise CaptureError(f"{key}: there is no {kind} {anchor}.", path=source, hint="Check the path in the file.")
+            message = f"{key}: there is no {kind} {anchor}."
+            problems.append(CaptureError(message, path=source, hint="Check the path in the file."))
         return full
 
     def walk(value: object, key: str) -> object:

@@ -32,7 +32,8 @@ class Finding:
         camera = None if self.camera is None else f"camera {self.camera}"
         where = ", ".join(part for part in (self.path, camera, frame) if part)
         text = f"{self.severity}: {where}: {self.message}" if where else f"{self.severity}: {self.message}"
-        return f"{text} {self.hint}" if self.hint else text
+        end = "" if text.endswith((".", "!", "?")) else "."
+        return f"{text}{end} {self.hint}" if self.hint else text
 
     def as_json(self) -> dict[str, str | float | int]:
         """Return the fields that are set, for JSON."""

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from jawusd.formats.experiments import Experiments
+from jawusd.formats.finding import Finding
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.model import JawModel
 from jawusd.formats.tracks import Tracks
@@ -66,3 +67,4 @@ class ReportData:
     overlays: tuple[Overlay, ...]  # frames of the footage, the worst first
     parts: tuple[ReplayPart, ...]
     left_out: tuple[str, ...]  # what the report does not show, and why
+    findings: tuple[Finding, ...] = ()  # of the check before the first stage

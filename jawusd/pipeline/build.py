@@ -12,6 +12,7 @@ from typing import NotRequired, TypedDict, TypeVar, cast
 from jawusd import __version__
 from jawusd.errors import OutputError, explain_missing_packages
 from jawusd.formats.capture import Capture
+from jawusd.formats.finding import Finding
 from jawusd.formats.model import load_model, save_model
 from jawusd.formats.tracks import load_tracks, save_tracks
 from jawusd.pipeline.bake import bake_subject, write_take
@@ -22,6 +23,7 @@ from jawusd.pipeline.calibrate import (
     calibration_lines,
     sync_cameras,
 )
+from jawusd.pipeline.check import check_capture, refuse_errors
 from jawusd.pipeline.fit import FitSummary, fit_lines, fit_subject, fit_summary
 from jawusd.pipeline.prepare import input_hashes, naming_file, open_capture, rescaled_cameras, subject_of_capture
 from jawusd.pipeline.report import BuildFacts, missing_packages, place_of, write_build_report
@@ -69,6 +71,15 @@ class BuildOptions:
     allow_outside: bool = False
 
 
+FoundJson = dict[str, str | float | int]
+
+
+class CheckResult(TypedDict):
+    """Hold `Finding.as_json` of what was found before the first stage."""
+
+    findings: list[FoundJson]
+
+
 class ReportSummary(TypedDict):
     """Hold the capture's path relative to the rig, and the report's file, or which package it lacks."""
 
@@ -84,6 +95,7 @@ class BuildSummary(TypedDict):
         files: names of all files written, relative to the folder.
         seconds: per stage, also of those reused.
         reused: stages kept from an earlier build.
+        findings: `Finding.as_json` of what the check before the first stage found.
         calibrate, segment: None if the capture names a calibration, or masks.
         track: of the final tracks.
     """
@@ -93,6 +105,7 @@ class BuildSummary(TypedDict):
     files: list[str]
     seconds: dict[str, float]
     reused: list[str]
+    findings: NotRequired[list[FoundJson]]
     calibrate: CalibrationSummary | None
     sync: SyncResult
     segment: SegmentSummary | None
@@ -107,6 +120,7 @@ def build(
     out: str | os.PathLike[str],
     options: BuildOptions = BuildOptions(),
     progress: Progress | None = None,
+    tell: Callable[[Finding], None] | None = None,
 ) -> BuildSummary:
     """Build a rig from a capture.
 
@@ -114,8 +128,10 @@ def build(
         capture: the capture, its capture.toml or the folder that holds it.
         out: the rig's folder.
         progress: called with (stage, done, total) as work proceeds.
+        tell: called, before any work, with everything doubtful that a check of the capture found.
 
     Raises:
+        CaptureError: the check found errors; the message lists all of them.
         JawusdError: one of its kinds; stages finished before stay valid for `resume`.
     """
     capture = open_capture(capture, allow_outside=options.allow_outside)
@@ -126,7 +142,7 @@ def build(
         if options.fresh:
             state.clear()
             delete_masks(folder / MASKS)
-        return _Build(capture, folder, options, state, progress or no_progress).run()
+        return _Build(capture, folder, options, state, progress or no_progress).run(tell)
 
 
 def check_folder(folder: Path, options: BuildOptions) -> None:
@@ -157,11 +173,15 @@ class _Build:
         self.state, self.progress = state, progress
         self.reused: list[str] = []
 
-    def run(self) -> BuildSummary:
+    def run(self, tell: Callable[[Finding], None] | None) -> BuildSummary:
         """Run the stages in order, or reuse them."""
+        videos = input_hashes(self.capture, ["videos"])
+        check = self._checked(videos)
+        if tell is not None:
+            for found in check.result["findings"]:
+                tell(Finding.from_json(found))
         calibrate = self._calibrated()
         capture, options = self.capture, self.options
-        videos = input_hashes(capture, ["videos"])
         names = [camera.name for camera in capture.cameras]
         sync = self._stage("sync", self._inputs([], videos, capture.sync.model_dump(), names, capture.fps), self._sync)
         segment = self._segmented(sync.result["offsets"], videos)
@@ -200,6 +220,7 @@ class _Build:
             "files": sorted(outputs),
             "seconds": {name: record.seconds for name, record in self.state.stages.items()},
             "reused": self.reused,
+            "findings": check.result["findings"],
             "calibrate": calibrate.result if calibrate else None,
             "sync": sync.result,
             "segment": segment.result if segment else None,
@@ -221,6 +242,19 @@ class _Build:
         start = time.perf_counter()
         outputs, result = work()
         return self.state.finish(name, inputs, outputs, time.perf_counter() - start, result)
+
+    def _checked(self, videos: dict[str, str]) -> StageRecord[CheckResult]:
+        """Check the capture before any work, and refuse it with all errors at once."""
+        capture = self.capture
+
+        def work() -> tuple[list[Path], CheckResult]:
+            findings = check_capture(capture, self.folder, progress=self.progress)
+            refuse_errors(findings, capture)
+            return [], {"findings": [finding.as_json() for finding in findings]}
+
+        parts = ["teeth", "mandible", "skull", "calibration", "masks"]
+        described = capture.model_dump(mode="json", exclude={"folder"})
+        return self._stage("check", self._inputs(parts, videos, described), work)
 
     def _calibrated(self) -> StageRecord[CalibrationSummary] | None:
         """Calibrate from the boards if the capture names no calibration but has boards."""
@@ -304,7 +338,10 @@ class _Build:
 def build_lines(summary: BuildSummary) -> list[str]:
     """Return the summary of a build as text."""
     offsets = ", ".join(f"{name} {offset:+d}" for name, offset in summary["sync"]["offsets"].items())
-    lines = []
+    # What the tracks say of the scans is said with them.
+    told = [Finding.from_json(found).line() for found in summary["track"].get("findings", [])]
+    lines = [Finding.from_json(found).line() for found in summary.get("findings", [])]
+    lines = [line for line in lines if line not in told]
     if summary["calibrate"]:
         lines += [
             "the capture names no calibration: made one from its boards",

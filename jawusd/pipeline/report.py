@@ -8,12 +8,13 @@ from dataclasses import dataclass
 from functools import partial
 from importlib import metadata
 from pathlib import Path
-from typing import TypeVar
+from typing import TypeVar, cast
 
 from jawusd import __version__
 from jawusd.errors import FormatError, JawusdError, MissingDependencyError, explain_missing_packages
 from jawusd.formats.capture import Capture
 from jawusd.formats.experiments import Experiments, save_table
+from jawusd.formats.finding import Finding
 from jawusd.formats.model import load_model
 from jawusd.formats.report import CameraFacts, Overlay, ReportData, RigFacts
 from jawusd.formats.tracks import Tracks, load_tracks
@@ -99,6 +100,7 @@ def write_build_report(
         overlays=overlays,
         parts=_attempt("3-D replay", left_out, lambda: replay_parts(folder, model)) or (),
         left_out=tuple(dict.fromkeys(left_out)),
+        findings=_check_findings(facts.stages),
     )
     progress("report", 3, 4)
     write_document(folder / REPORT_FILE, data)
@@ -244,6 +246,13 @@ def _rig_facts(folder: Path) -> RigFacts:
     found = validate_stage(folder / "actor.usda")
     error_mm = float(describe(folder / "actor.usda")["table"]["max_error_mm"])
     return RigFacts(error_mm, tuple(f"{finding.severity}: {finding.message}" for finding in found))
+
+
+def _check_findings(stages: Stages) -> tuple[Finding, ...]:
+    """Return what the check before the first stage found."""
+    record = stages.get("check")
+    found = cast("list[dict[str, str | float | int]]", record.result.get("findings", [])) if record else []
+    return tuple(Finding.from_json(one) for one in found)
 
 
 def _hashes(stages: Stages) -> dict[str, str]:

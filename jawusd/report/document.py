@@ -69,7 +69,7 @@ def document(data: ReportData) -> str:
         uncertainty=data.model.meta.get("uncertainty", {}),
         start=_start(data),
         cameras=_cameras(data),
-        findings=[Finding.from_json(found).line() for found in data.tracks.meta.get("findings", [])],
+        findings=_findings(data),
     )
 
 
@@ -136,6 +136,12 @@ def _spans(frames: NDArray[np.int64]) -> str:
     texts = [str(part[0]) if len(part) == 1 else f"{part[0]}\u2013{part[-1]}" for part in parts]
     more = "" if len(texts) <= _LISTED else f" and {len(texts) - _LISTED} more spans"
     return ", ".join(texts[:_LISTED]) + more
+
+
+def _findings(data: ReportData) -> list[str]:
+    """Return what was found before the first stage and while tracking, each once."""
+    tracked = [Finding.from_json(found) for found in data.tracks.meta.get("findings", [])]
+    return list(dict.fromkeys(finding.line() for finding in (*data.findings, *tracked)))
 
 
 def _start(data: ReportData) -> str:

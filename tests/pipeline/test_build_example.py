@@ -14,7 +14,7 @@ from package_copy import ROOT
 from pxr import Usd, UsdGeom
 
 import jawusd
-from jawusd.errors import CalibrationError, CaptureError, JawusdError, OutputError, TrackingError
+from jawusd.errors import CaptureError, JawusdError, OutputError
 from jawusd.formats.calibration import load_calibration
 from jawusd.formats.tracks import load_tracks
 from jawusd.geometry import transform_points
@@ -124,7 +124,7 @@ def test_a_second_build_needs_a_word_and_resume_reuses_everything(built):
     with pytest.raises(OutputError, match="--resume"):
         build(EXAMPLE, out, BuildOptions(), quiet)
     again = build(EXAMPLE, out, BuildOptions(resume=True), quiet)
-    assert again["reused"] == ["sync", "track", "fit", "aid", "bake", "report"]
+    assert again["reused"] == ["check", "sync", "track", "fit", "aid", "bake", "report"]
 
 
 def test_resume_redoes_only_what_depends_on_a_change(built, tmp_path):
@@ -132,7 +132,7 @@ def test_resume_redoes_only_what_depends_on_a_change(built, tmp_path):
     shutil.copytree(built[0], out)
     (out / "model.npz").unlink()
     again = build(EXAMPLE, out, BuildOptions(resume=True), quiet)
-    assert again["reused"][:2] == ["sync", "track"] and "fit" not in again["reused"]
+    assert again["reused"][:3] == ["check", "sync", "track"] and "fit" not in again["reused"]
     assert (out / "model.npz").read_bytes() == (built[0] / "model.npz").read_bytes()
 
 
@@ -228,10 +228,10 @@ def truncated_video(folder):
     [
         (missing_mask_folder, CaptureError, "masks"),
         (masks_of_another_size, CaptureError, "320"),
-        (calibration_of_another_shape, CalibrationError, "another shape"),
+        (calibration_of_another_shape, CaptureError, "another shape"),
         (scan_in_metres, CaptureError, "metres"),
-        (calibration_without_rotation, CalibrationError, "not a rotation"),
-        (pick_outside_its_image, TrackingError, "outside"),
+        (calibration_without_rotation, CaptureError, "not a rotation"),
+        (pick_outside_its_image, CaptureError, "outside"),
         (truncated_video, CaptureError, "video"),
     ],
 )

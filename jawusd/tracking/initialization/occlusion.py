@@ -24,6 +24,8 @@ _SLAB_MM = 3.0
 _FEWEST = 50  # pieces of surface that make a side of an arch
 _ASIDE_MM = 6.0  # nearer to the middle, left and right are one tooth
 _OPEN = 0.08  # a surface whose directed area is a smaller share of its area is closed and shows no open side
+# Gum that says where the crowns stand: of this share of their area, and so far below them. What is less is crumbs.
+_GUM_SHARE, _GUM_BELOW_MM = 0.3, 2.0
 
 
 @dataclass(frozen=True)
@@ -39,9 +41,8 @@ class Occlusion:
     opposite: float  # share of the arch with fewer teeth that stands over or under crowns of the other one
     aside_mm: float  # distance of the middles of both arches along the bite plane
     turn_rad: float  # angle in the bite plane between the forward directions of both arches
-    turned_over: tuple[
-        bool | None, bool | None
-    ]  # upper, lower: occlusal side away from the other arch; None: not known
+    turned_over: tuple[bool | None, bool | None]  # upper, lower: gum between crowns and other arch; None: no gum
+    opens_towards: tuple[bool, bool]  # upper, lower: the open side of the crowns faces the other arch
     midlines_mm: float  # distance of the middles sideways, where both arches have teeth left and right
     width_ratio: float  # width of the upper arch over that of the lower one at equal depth
     widths_mm: tuple[float, float]  # largest width of each arch
@@ -87,6 +88,7 @@ def measure_occlusion(scans: Sequence[Scan], T_anatomical_scan: Array) -> Occlus
         aside_mm=float(np.linalg.norm((upper.mean(0) - lower.mean(0))[[0, 2]])),
         turn_rad=_angle(_forward(upper[:, [0, 2]]), _forward(lower[:, [0, 2]])),
         turned_over=turned_over,
+        opens_towards=(_opens_towards(surfaces[0], -normal), _opens_towards(surfaces[1], normal)),
         midlines_mm=midlines_mm,
         width_ratio=width_ratio,
         widths_mm=(float(np.ptp(upper[:, 0])), float(np.ptp(lower[:, 0]))),
@@ -199,14 +201,23 @@ def _angle(a: Array, b: Array) -> float:
 
 
 def _turned_over(scan: Scan, surface: _Surface, towards: Array) -> bool | None:
-    """Return whether the occlusal side looks away from the other arch; None if nothing shows it.
+    """Return whether the crowns lie on that side of their gum that looks away from the other arch; None: no gum."""
+    corners = scan.vertices[scan.gum_faces]
+    areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    if areas.sum() < _GUM_SHARE * surface.areas.sum():
+        return None
+    gum, crowns = (
+        np.average(points, axis=0, weights=weights)
+        for points, weights in ((corners.mean(1), areas), (surface.points, surface.areas))
+    )
+    along = float(towards @ (crowns - gum))
+    return None if abs(along) < _GUM_BELOW_MM else along < 0
 
-    Crowns lie on the occlusal side of their gum. Without gum, the directed area of an open surface points away from
-    its opening, which is where the crowns were cut from the gum.
+
+def _opens_towards(surface: _Surface, towards: Array) -> bool:
+    """Return whether the open side of a surface faces the other arch.
+
+    The directed area of an open surface points away from its opening, which is where crowns were cut from the gum.
     """
-    if len(scan.gum_faces):
-        gum = scan.vertices[np.unique(scan.gum_faces)]
-        return bool(towards @ (surface.points.mean(0) - gum.mean(0)) < 0)
     directed = (surface.normals * surface.areas[:, None]).sum(0) / surface.areas.sum()
-    along = float(towards @ directed)
-    return None if abs(along) < _OPEN else along < 0
+    return bool(towards @ directed < -_OPEN)

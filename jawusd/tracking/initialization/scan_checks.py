@@ -26,8 +26,8 @@ _LOOSE_MM = 0.8
 _TIGHT_MM = 1.3
 _ONE_SIDED_MM = 1.0
 _MIDLINES_MM = 4.0
-_WIDE_MM, _NARROW_MM = 76.0, 32.0
-_RATIOS = (0.85, 1.28)
+_WIDE_MM, _NARROW_MM = 80.0, 32.0
+_RATIOS = (0.88, 1.36)
 _LOWER_AHEAD_MM = 0.5
 _AXES_OFF_DEG = 30.0
 
@@ -60,8 +60,8 @@ def occlusion_findings(scans: Sequence[Scan], T_anatomical_scan: ArrayLike | Non
     given = T_anatomical_scan is not None
     derived = anatomical_frame(*(scan.crown_vertices(6000) for scan in scans))
     found = measure_occlusion(scans, derived)
-    errors = list(_impossible(found, scans))
-    findings = errors[:1] or list(_doubtful(found, scans))
+    errors = list(_impossible(found))
+    findings = errors[:1] or list(_doubtful(found))
     if not given:
         return derived, findings
     T = np.array(T_anatomical_scan, np.float64)
@@ -81,7 +81,7 @@ def occlusion_findings(scans: Sequence[Scan], T_anatomical_scan: ArrayLike | Non
     return T, findings
 
 
-def _impossible(found: Occlusion, scans: Sequence[Scan]) -> Iterator[Finding]:
+def _impossible(found: Occlusion) -> Iterator[Finding]:
     """Yield what shows that two scans are no bite, causes before their consequences."""
 
     def error(kind: str, message: str, value: float, limit: float, hint: str = _EXPORT) -> Finding:
@@ -106,7 +106,7 @@ def _impossible(found: Occlusion, scans: Sequence[Scan]) -> Iterator[Finding]:
         turn_deg = float(np.degrees(found.turn_rad))
         message = f"{off}one arch is turned by {turn_deg:.0f} degrees against the other, front to back"
         yield error("scans_turned", message, turn_deg, float(np.degrees(_FACING_BACK_RAD)))
-    over = [k for k in (0, 1) if found.turned_over[k] and len(scans[k].gum_faces)]
+    over = [k for k in (0, 1) if found.turned_over[k]]
     if len(over) == 1:
         message = f"{off}the {ARCH_NAMES[over[0]]} arch is upside down, its gum lies between the teeth of both arches"
         yield error("scan_upside_down", message, 1.0, 0.0)
@@ -119,7 +119,7 @@ def _impossible(found: Occlusion, scans: Sequence[Scan]) -> Iterator[Finding]:
         yield error("scans_inside", message, found.through, _THROUGH_SHARE)
 
 
-def _doubtful(found: Occlusion, scans: Sequence[Scan]) -> Iterator[Finding]:
+def _doubtful(found: Occlusion) -> Iterator[Finding]:
     """Yield what a bite may be, but seldom is."""
 
     def warning(kind: str, message: str, value: float, limit: float, hint: str = _LOOK) -> Finding:
@@ -153,6 +153,6 @@ def _doubtful(found: Occlusion, scans: Sequence[Scan]) -> Iterator[Finding]:
         hint = "Check that [scans] names the upper and the lower file rightly."
         yield warning("underbite", message + "exchanged scan files", found.lower_ahead_mm, _LOWER_AHEAD_MM, hint)
     for k, name in enumerate(ARCH_NAMES):
-        if found.turned_over[k] and not len(scans[k].gum_faces):
+        if found.opens_towards[k] and found.turned_over[k] is None:
             message = f"the open side of the {name} scan faces the other arch: it is upside down, or its faces are "
             yield warning("scan_inside_out", message + "wound inwards", 1.0, 0.0, _LOOK)

@@ -1,0 +1,178 @@
+"""Every cheap check of a capture at once, before any work: seconds, a few pictures of each file, no tracking."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TypedDict
+
+from jawusd.errors import CaptureError, JawusdError
+from jawusd.formats.capture import Capture, read_capture
+from jawusd.formats.finding import Finding, Severity
+from jawusd.pipeline.check_parts import Parts, found_error
+from jawusd.pipeline.check_scans import bone_findings, occlusion, scans
+from jawusd.pipeline.check_views import boards, calibration, clips, frames, masks, picks, synchronisation, views
+from jawusd.pipeline.state import Progress, no_progress
+
+# What the stages from capture to rig cannot do without, and what only the report needs.
+_NEEDED = ("av", "cv2", "numba", "scipy", "torch", "onnx", "shapely", "trimesh", "pyfqmr", "PIL")
+_FOR_REPORT = ("matplotlib", "jinja2")
+# Space that a build fills: rig, tracks and report; and masks where they are made from footage [MB].
+_RIG_MB, _MASK_MB, _LEAST_MB = 200.0, 0.06, 20.0
+
+
+class CheckSummary(TypedDict):
+    """Hold what a check of a capture found; findings are `Finding.as_json`."""
+
+    capture: str
+    findings: list[dict[str, str | float | int]]
+    errors: int
+    warnings: int
+
+
+@dataclass(frozen=True)
+class _Check:
+    """One check: what it looks at, the parts it needs, and the function."""
+
+    what: str
+    needs: tuple[str, ...]
+    run: Callable[[Parts], Iterator[Finding]]
+
+
+def _packages(parts: Parts) -> Iterator[Finding]:
+    missing = [name for name in _NEEDED if find_spec(name) is None]
+    if missing:
+        names = ", ".join(missing)
+        message = f"the packages {names} are not installed"
+        yield Finding("packages_missing", "error", message, hint="Install them with: pip install 'jawusd[build]'")
+    if lacking := [name for name in _FOR_REPORT if find_spec(name) is None]:
+        message = f"the packages {', '.join(lacking)} are not installed: there will be no report"
+        yield Finding("no_report", "warning", message, hint="Install them with: pip install 'jawusd[build]'")
+
+
+def _disk(parts: Parts) -> Iterator[Finding]:
+    place = next(folder for folder in (parts.out, *parts.out.parents) if folder.exists())
+    free_mb = shutil.disk_usage(place).free / 1e6
+    need_mb = _RIG_MB
+    if parts.capture is not None and not any(camera.masks for camera in parts.capture.cameras):
+        need_mb += _MASK_MB * 2 * sum(video.count for video in parts.videos.values())
+    if free_mb < need_mb:
+        message = f"{free_mb:.0f} MB are free on the disk, a build may need {need_mb:.0f} MB"
+        severity: Severity = "error" if free_mb < _LEAST_MB else "warning"
+        yield Finding("disk_space", severity, message, free_mb, need_mb, path=str(place), hint="Free some space.")
+
+
+_CHECKS = (
+    _Check("the packages", (), _packages),
+    _Check("the scans", ("capture",), scans),
+    _Check("the bite", ("scans",), occlusion),
+    _Check("bones and landmarks", ("meshes", "scans"), bone_findings),
+    _Check("the clips", ("capture",), clips),
+    _Check("the disk", (), _disk),
+    _Check("the calibration", ("capture",), calibration),
+    _Check("the boards", ("capture",), boards),
+    _Check("the masks", ("capture",), masks),
+    _Check("the time alignment", ("capture",), synchronisation),
+    _Check("the frames", ("capture",), frames),
+    _Check("the views", ("cameras", "samples"), views),
+    _Check("the picks", ("cameras", "scans"), picks),
+)
+
+
+def check_capture(
+    capture: Capture | str | os.PathLike[str],
+    out: str | os.PathLike[str] | None = None,
+    *,
+    allow_outside: bool = False,
+    progress: Progress | None = None,
+) -> list[Finding]:
+    """Return everything that can be found wrong or doubtful about a capture in seconds; errors come first.
+
+    Nothing is raised for what is wrong with the capture. A check that an earlier error leaves nothing to look at is
+    skipped, with a note that says so.
+
+    Args:
+        capture: the capture, its capture.toml or the folder that holds it.
+        out: the rig's folder to be, for the space on its disk; the capture's folder by default.
+        allow_outside: let paths in the capture leave its folder.
+        progress: called with (stage, done, total) as work proceeds.
+    """
+    progress = progress or no_progress
+    findings: list[Finding] = []
+    loaded: Capture | None
+    if isinstance(capture, Capture):
+        loaded = capture
+    else:
+        loaded, problems = read_capture(capture, allow_outside=allow_outside)
+        findings += [found_error("capture", problem) for problem in problems]
+    folder = loaded.folder if loaded is not None else Path(str(capture))
+    # A capture that was read already was allowed its paths then.
+    with Parts(loaded, Path(out or folder).resolve(), allow_outside or isinstance(capture, Capture)) as parts:
+        for done, check in enumerate(_CHECKS):
+            progress("check", done, len(_CHECKS))
+            findings += _run(check, parts)
+    progress("check", len(_CHECKS), len(_CHECKS))
+    order = {"error": 0, "warning": 1, "note": 2}
+    return sorted(_told_once(findings), key=lambda finding: order[finding.severity])
+
+
+def _run(check: _Check, parts: Parts) -> list[Finding]:
+    lacking = [name for name in check.needs if not getattr(parts, name)]
+    if lacking:
+        return [Finding("not_checked", "note", f"{check.what}: not checked, because what it needs cannot be read")]
+    found: list[Finding] = []
+    try:
+        found.extend(check.run(parts))
+    except JawusdError as error:
+        found.append(found_error("capture", error))
+    except Exception as error:  # whatever a check stumbles over must not hide what the others found
+        message = f"{check.what} could not be checked ({type(error).__name__}: {error})"
+        found.append(Finding("check_failed", "warning", message, hint="Look at these files; please report this."))
+    return found
+
+
+def _told_once(findings: Sequence[Finding]) -> list[Finding]:
+    """Return findings without those that say of the same place what another one says."""
+    unique: dict[tuple[str, str | None, str | None], Finding] = {}
+    for finding in findings:
+        key = (finding.message, finding.path, None if finding.path else finding.camera)
+        unique.setdefault(key, finding)
+    return list(unique.values())
+
+
+def refuse_errors(findings: Sequence[Finding], capture: Capture) -> None:
+    """Raise one error that lists all errors among findings.
+
+    Raises:
+        CaptureError: there is one.
+    """
+    errors = [finding for finding in findings if finding.severity == "error"]
+    if not errors:
+        return
+    path = capture.folder / "capture.toml"
+    if len(errors) == 1:
+        only = errors[0]
+        raise CaptureError(only.message, path=only.path or path, camera=only.camera, frame=only.frame, hint=only.hint)
+    listed = "".join(f"\n  {finding.line()}" for finding in errors)
+    raise CaptureError(f"{len(errors)} errors were found before any work:{listed}", path=path)
+
+
+def check_summary(name: str, findings: Sequence[Finding]) -> CheckSummary:
+    """Return findings as plain data."""
+    return {
+        "capture": name,
+        "findings": [finding.as_json() for finding in findings],
+        "errors": sum(finding.severity == "error" for finding in findings),
+        "warnings": sum(finding.severity == "warning" for finding in findings),
+    }
+
+
+def check_lines(findings: Sequence[Finding]) -> list[str]:
+    """Return findings as text, with a last line that counts them."""
+    counts = [(sum(f.severity == kind for f in findings), kind) for kind in ("error", "warning", "note")]
+    counted = ", ".join(f"{count} {kind}{'' if count == 1 else 's'}" for count, kind in counts)
+    return [*(finding.line() for finding in findings), counted]

@@ -1,0 +1,255 @@
+"""Checks of the footage of a capture: clips, calibration, masks, frames, and whether they fit one another."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+
+from jawusd.errors import CaptureError, JawusdError
+from jawusd.formats.finding import Finding
+from jawusd.geometry import Camera
+from jawusd.geometry.arrays import Array
+from jawusd.pipeline.check_parts import Parts, found_error
+from jawusd.pipeline.prepare import load_cameras
+
+_INSTANTS = 5  # at which the views are compared
+
+
+def clips(parts: Parts) -> Iterator[Finding]:
+    """Open every clip and decode three pictures of it."""
+    from jawusd.imaging.clip_checks import decoded_findings, rate_findings
+    from jawusd.imaging.video import Video
+
+    for camera in parts.given.cameras:
+        if camera.video is None or not parts.usable(camera.video):
+            continue
+        try:
+            video = Video(camera.video)
+        except JawusdError as error:
+            yield found_error("clip", error)
+            continue
+        yield from decoded_findings(video, camera.name)
+        parts.videos[camera.name] = video
+    yield from rate_findings(parts.videos, parts.given.fps, parts.description)
+
+
+def calibration(parts: Parts) -> Iterator[Finding]:
+    """Read the calibration and judge it."""
+    from jawusd.capture.camera_checks import camera_findings
+
+    capture = parts.given
+    if capture.calibration is None:
+        if capture.boards is None:
+            message = 'has neither "calibration" nor [boards] to make one from'
+            hint = "Name a calibration file, or clips of a calibration board."
+            yield Finding("no_calibration", "error", message, path=parts.description, hint=hint)
+        return
+    if not parts.usable(capture.calibration) or not all(parts.clip_read(camera) for camera in capture.cameras):
+        return  # a clip tells the size that its camera must be brought to
+    if len(capture.cameras) < 2:
+        message = "has one camera; two or more are needed to track teeth in space"
+        yield Finding("one_camera", "error", message, 1, 2, path=parts.description)
+    parts.cameras = {camera.name: camera for camera in load_cameras(capture)}
+    yield from camera_findings(list(parts.cameras.values()), str(capture.calibration))
+
+
+def boards(parts: Parts) -> Iterator[Finding]:
+    """Open the board clips, where a calibration must be made from them."""
+    from jawusd.imaging.clip_checks import decoded_findings
+    from jawusd.imaging.video import Video
+
+    capture = parts.given
+    if capture.boards is None or capture.calibration is not None:
+        return
+    for path, camera in zip(capture.boards.videos, capture.cameras, strict=True):
+        if "%" in path.name or not parts.usable(path):
+            continue
+        try:
+            video = Video(path)
+        except JawusdError as error:
+            yield found_error("board_clip", error)
+            continue
+        yield from decoded_findings(video, camera.name)
+        own = parts.videos.get(camera.name)
+        if own is not None and abs(video.size_px[0] * own.size_px[1] / own.size_px[0] - video.size_px[1]) > 1.0:
+            yield Finding(
+                "board_shape",
+                "error",
+                f"its board clip is {video.size_px[0]} x {video.size_px[1]} px, its video {own.size_px[0]} x "
+                f"{own.size_px[1]} px, another shape",
+                path=str(path),
+                camera=camera.name,
+                hint="Record the boards in the mode of the take.",
+            )
+
+
+def masks(parts: Parts) -> Iterator[Finding]:
+    """Look at some masks of every camera."""
+    from jawusd.imaging.mask_samples import sample_masks
+    from jawusd.imaging.mask_survey import survey_masks
+    from jawusd.imaging.masks import mask_size_px
+
+    capture = parts.given
+    sources = [camera for camera in capture.cameras if camera.masks is not None]
+    if not sources:
+        for camera in capture.cameras:
+            if camera.video is None:
+                yield Finding("no_masks", "error", "it has neither masks nor a video", camera=camera.name)
+        return
+    missing = False
+    for source in capture.cameras:
+        try:
+            if source.masks is None:
+                yield from survey_masks(source, (0, 0))
+                continue
+            usable = all(parts.usable(path) for path in (source.masks.upper, source.masks.lower))
+            if not usable or not parts.clip_read(source):
+                missing = True
+                continue
+            known = parts.cameras.get(source.name)
+            video = parts.videos.get(source.name)
+            size = known.size_px if known else video.size_px if video else mask_size_px(source.masks.upper)
+            yield from survey_masks(source, size)
+            sample = sample_masks(source, size, parts.open_files)
+        except JawusdError as error:
+            found = found_error("masks", error)
+            missing = True
+            yield replace(found, camera=source.name)
+            continue
+        if sample.first_frame is not None:
+            parts.samples[source.name] = sample
+    if len(parts.samples) < 2 and not missing:
+        names = ", ".join(parts.samples) or "none"
+        message = f"masks of two cameras or more are needed, those that can be used are of: {names}"
+        yield Finding("few_masks", "error", message, len(parts.samples), 2, path=parts.description)
+
+
+def synchronisation(parts: Parts) -> Iterator[Finding]:
+    """Look whether there is something to align the cameras by."""
+    capture = parts.given
+    if capture.sync.offsets is None and len(capture.cameras) > 1:
+        silent = [camera.name for camera in capture.cameras if camera.video is None]
+        if silent:
+            yield Finding(
+                "taken_as_simultaneous",
+                "warning",
+                f"{', '.join(silent)} without a video: the cameras cannot be aligned in time and count as simultaneous",
+                path=parts.description,
+                hint="Give [sync] offsets.",
+            )
+
+
+def frames(parts: Parts) -> Iterator[Finding]:
+    """Look whether the frames that the capture names exist."""
+    capture = parts.given
+    count = _frame_count(parts, capture.reference)
+    first, stop = capture.frames or (0, count or 0)
+
+    def out_of(kind: str, what: str, frame: int, severity: Literal["error", "warning"]) -> Finding:
+        message = f"{what} is {frame}, frames run from {first} to {stop - 1}"
+        hint = "Correct it in capture.toml."
+        return Finding(kind, severity, message, frame, stop - 1, path=parts.description, hint=hint)
+
+    if count is None:
+        return
+    if stop > count:
+        message = f"frames end at {stop - 1}, but camera {capture.reference} has frames 0 to {count - 1}"
+        yield Finding("frames_missing", "error", message, stop, count, path=parts.description, hint="Correct frames.")
+    if capture.bootstrap is not None and not first <= capture.bootstrap.frame < stop:
+        yield out_of("bootstrap_frame", "bootstrap.frame", capture.bootstrap.frame, "error")
+    rest = capture.motion.rest_frame
+    if rest is not None and not first <= rest < stop:
+        yield out_of("rest_frame", "motion.rest_frame", rest, "error" if rest >= count else "warning")
+    offsets = parts.offsets() or {}
+    for name, offset in offsets.items():
+        own = _frame_count(parts, name)
+        if own is not None and (first - offset >= own or stop - offset <= 0):
+            message = f"none of its {own} frames lies within the frames of the take, by its offset of {offset:+d}"
+            yield Finding("offset_wrong", "error", message, offset, camera=name, path=parts.description)
+    yield from _mask_ranges(parts, first, stop)
+
+
+def _frame_count(parts: Parts, name: str) -> int | None:
+    if name in parts.videos:
+        return parts.videos[name].timeline.count
+    return max(parts.samples[name].counts) if name in parts.samples else None
+
+
+def _mask_ranges(parts: Parts, first: int, stop: int) -> Iterator[Finding]:
+    """Say which cameras have masks for a part of the take only."""
+    for name, sample in parts.samples.items():
+        for arch, shown in zip(("upper", "lower"), sample.first_last, strict=True):
+            if shown is None:
+                continue
+            length = shown[1] - shown[0] + 1
+            if length < 0.9 * (stop - first):
+                message = f"the masks of the {arch} teeth cover frames {shown[0]} to {shown[1]} of the camera, "
+                message += f"{length} of the {stop - first} frames of the take"
+                hint = "The rest is tracked without this camera."
+                yield Finding("masks_short", "warning", message, length, stop - first, camera=name, hint=hint)
+
+
+def views(parts: Parts) -> Iterator[Finding]:
+    """Look whether the cameras see the teeth at one place, of the size of teeth."""
+    from jawusd.capture.mask_checks import middles_findings, seen_findings
+
+    reference = parts.samples.get(parts.given.reference)
+    if reference is None or reference.first_frame is None:
+        return
+    cameras = {name: camera for name, camera in parts.cameras.items() if name in parts.samples}
+    shown = [frames for frames in reference.first_last if frames is not None]
+    instants = np.unique(np.linspace(min(f[0] for f in shown), max(f[1] for f in shown), _INSTANTS + 2)[1:-1].round())
+    middles, pixels = [], []
+    for instant in instants.astype(int).tolist():
+        guesses = [_teeth(parts, cameras, instant, guess) for guess in parts.offset_guesses()]
+        middles.append([{name: found.mean(0) for name, found in guess.items()} for guess in guesses])
+        pixels.append(guesses[-1])
+    yield from middles_findings(cameras, middles)
+    yield from seen_findings(cameras, max(pixels, key=lambda guess: sum(map(len, guess.values()))))
+
+
+def _teeth(parts: Parts, cameras: Mapping[str, Camera], instant: int, offsets: Mapping[str, int]) -> dict[str, Array]:
+    """Return some pixels of both rows of teeth at an instant of the reference camera, by camera that shows both."""
+    out = {}
+    for name in cameras:
+        if name not in offsets:
+            continue
+        arches = [parts.samples[name].pixels(arch, instant - offsets[name]) for arch in (0, 1)]
+        if all(len(arch) for arch in arches):
+            out[name] = np.concatenate(arches)
+    return out
+
+
+def picks(parts: Parts) -> Iterator[Finding]:
+    """Look whether the picks agree with one another and with the masks."""
+    from jawusd.tracking.initialization.pick_checks import picked_poses, placed_findings
+
+    capture = parts.given
+    if capture.bootstrap is None:
+        if not parts.samples:
+            message = "has neither masks nor [bootstrap] picks: the teeth must be found in the footage alone"
+            yield Finding("no_picks", "warning", message, path=parts.description, hint="Give picks.")
+        return
+    meshes = [parts.meshes["upper_teeth"], parts.meshes["lower_teeth"]]
+    try:
+        poses, findings = picked_poses(capture.bootstrap, meshes, parts.cameras)
+    except JawusdError as error:
+        raise CaptureError(
+            error.message, path=parts.description, frame=capture.bootstrap.frame, hint=error.hint
+        ) from error
+    yield from findings
+    frame = capture.bootstrap.frame
+    guesses = []
+    for guess in parts.offset_guesses():
+        guesses.append(
+            {
+                name: (sample.pixels(0, frame - guess[name]), sample.pixels(1, frame - guess[name]))
+                for name, sample in parts.samples.items()
+                if name in guess
+            }
+        )
+    cameras = {name: camera for name, camera in parts.cameras.items() if name in parts.samples}
+    yield from placed_findings(parts.scans, poses, cameras, guesses, frame)

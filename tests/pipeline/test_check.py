@@ -1,0 +1,275 @@
+"""The cheap checks find every planted fault, all at once, and say nothing of a good capture."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+from package_copy import ROOT
+
+from jawusd.errors import CaptureError
+from jawusd.formats.finding import Finding
+from jawusd.imaging.video_writer import VideoWriter
+from jawusd.pipeline import check as checks
+from jawusd.pipeline.build import BuildOptions, build
+from jawusd.pipeline.check import check_capture
+
+EXAMPLE = ROOT / "examples" / "capture"
+
+
+@pytest.fixture
+def capture(tmp_path):
+    """A copy of the example whose files may be replaced, never written through: large ones are links."""
+    folder = tmp_path / "capture"
+    for source in EXAMPLE.rglob("*"):
+        target = folder / source.relative_to(EXAMPLE)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if source.is_file():
+            os.link(source, target) if source.stat().st_dev == tmp_path.stat().st_dev else shutil.copy(source, target)
+    return folder
+
+
+def written(path, data):
+    path.unlink(missing_ok=True)
+    path.write_bytes(data)
+
+
+def described(folder, old, new):
+    text = (folder / "capture.toml").read_text()
+    assert old in text
+    written(folder / "capture.toml", text.replace(old, new).encode())
+
+
+def calibrated(folder, old, new):
+    text = (folder / "calibration.toml").read_text()
+    assert re.search(old, text)
+    written(folder / "calibration.toml", re.sub(old, new, text, count=1).encode())
+
+
+def scan(folder, name, change):
+    mesh = trimesh.load(folder / "scans" / name, process=False)
+    mesh.vertices = change(mesh.vertices)
+    written(folder / "scans" / name, mesh.export(file_type="ply"))
+
+
+def mask_video(folder, name, value, size=(1280, 720), count=336):
+    path = folder / "masks" / name
+    path.unlink()
+    with VideoWriter(path, size, 24.0, lossless=True) as writer:
+        for k in range(count):
+            writer.write(np.full(size[::-1], value if k > 30 else 0, np.uint8))
+
+
+def exchanged(folder, a, b):
+    (folder / a).rename(folder / "aside")
+    (folder / b).rename(folder / a)
+    (folder / "aside").rename(folder / b)
+
+
+def found(folder, **options):
+    return check_capture(folder, **options)
+
+
+def kinds(folder, severity=None):
+    return [f.kind for f in found(folder) if severity in (None, f.severity)]
+
+
+def test_nothing_is_said_of_the_example():
+    assert found(EXAMPLE) == []
+
+
+def frames_beyond(folder):
+    described(folder, "frames = [20, 320]", "frames = [20, 3200]")
+
+
+def rest_frame_outside(folder):
+    described(folder, "rest_frame = 36", "rest_frame = 12")
+
+
+def pick_frame_outside(folder):
+    described(folder, "[bootstrap]\nframe = 20", "[bootstrap]\nframe = 12")
+
+
+def rate_of_another_take(folder):
+    described(folder, "fps = 24.0", "fps = 30.0")
+
+
+def offset_beyond(folder):
+    offsets = 'method = "offsets"\noffsets = { cam0 = 0, cam1 = 4000, cam2 = 0 }'
+    described(folder, 'method = "flash"', offsets)
+
+
+def calibration_in_metres(folder):
+    described(
+        folder, 'calibration = "calibration.toml"', 'calibration = "calibration.toml"\ncalibration_unit_mm = 0.001'
+    )
+
+
+def no_calibration(folder):
+    described(folder, 'calibration = "calibration.toml"\n', "")
+    text = (folder / "capture.toml").read_text()
+    written(folder / "capture.toml", re.sub(r"\[boards\]\n(?:\w+ = .*\n)+", "", text).encode())
+
+
+def truncated_clip(folder):
+    path = folder / "video" / "cam1.mp4"
+    written(path, path.read_bytes()[: path.stat().st_size // 2])
+
+
+def damaged_scan(folder):
+    path = folder / "scans" / "upper_teeth.ply"
+    written(path, path.read_bytes()[:4000])
+
+
+def scan_in_metres(folder):
+    scan(folder, "lower_teeth.ply", lambda v: v * 0.001)
+
+
+def scan_apart(folder):
+    scan(folder, "lower_teeth.ply", lambda v: v - [0, 8, 0])
+
+
+def mandible_elsewhere(folder):
+    scan(folder, "mandible.ply", lambda v: v - [0, 60, 0])
+
+
+def black_masks(folder):
+    for arch in ("upper", "lower"):
+        mask_video(folder, f"cam1/{arch}.mkv", 0)
+
+
+def masks_of_another_size(folder):
+    mask_video(folder, "cam1/upper.mkv", 255, (320, 180), 40)
+
+
+def arches_exchanged(folder):
+    exchanged(folder, "masks/cam1/upper.mkv", "masks/cam1/lower.mkv")
+
+
+def cameras_exchanged(folder):
+    exchanged(folder, "masks/cam1", "masks/cam2")
+
+
+def pick_on_another_vertex(folder):
+    described(folder, "vertex = 1674", "vertex = 100")
+
+
+def no_space(folder):
+    """Nothing to change: the disk is made to look full."""
+
+
+@pytest.mark.parametrize(
+    ("plant", "severity", "kind", "words"),
+    [
+        (frames_beyond, "error", "frames_missing", "frames end at 3199"),
+        (rest_frame_outside, "warning", "rest_frame", "motion.rest_frame is 12, frames run from 20 to 319"),
+        (pick_frame_outside, "error", "bootstrap_frame", "bootstrap.frame is 12"),
+        (rate_of_another_take, "warning", "fps_differs", "30 in the capture, but the clip shows 24"),
+        (offset_beyond, "error", "offset_wrong", "offset of +4000"),
+        (calibration_in_metres, "error", "cameras_together", "in metres"),
+        (no_calibration, "error", "no_calibration", "neither"),
+        (truncated_clip, "error", "clip", "cannot be opened"),
+        (damaged_scan, "error", "mesh", "cannot be read"),
+        (scan_in_metres, "error", "mesh", "metres"),
+        (scan_apart, "error", "scans_apart", "mm apart"),
+        (mandible_elsewhere, "warning", "bone_elsewhere", "mandible lies"),
+        (black_masks, "warning", "masks_black", "all black"),
+        (masks_of_another_size, "error", "masks", "320 x 180"),
+        (arches_exchanged, "error", "masks_arches_exchanged", "exchanged"),
+        (cameras_exchanged, "error", "masks_cameras_exchanged", "camera cam2 are exchanged"),
+        (pick_on_another_vertex, "warning", "pick_wrong", "pick 1 on the upper teeth"),
+        (no_space, "warning", "disk_space", "5 MB are free"),
+    ],
+)
+def test_each_fault_is_found_by_its_cause(capture, monkeypatch, plant, severity, kind, words):
+    if plant is no_space:
+        monkeypatch.setattr(checks.shutil, "disk_usage", lambda place: os.terminal_size((0, 0)) and None)
+        usage = type("Usage", (), {"free": 25e6})
+        monkeypatch.setattr(checks.shutil, "disk_usage", lambda place: usage)
+        words = "25 MB are free"
+    plant(capture)
+    matching = [f for f in found(capture) if f.kind == kind]
+    assert matching and all(f.severity == severity for f in matching)
+    assert any(words in f.line() for f in matching)
+
+
+def test_all_faults_are_listed_at_once_and_what_they_hide_is_named(capture):
+    (capture / "scans" / "skull.ply").unlink()
+    (capture / "video" / "cam2.mp4").unlink()
+    damaged_scan(capture)
+    rest_frame_outside(capture)
+    lines = [f.line() for f in found(capture)]
+    for words in ("skull.ply", "cam2.mp4", "upper_teeth.ply: the mesh cannot be read", "motion.rest_frame is 12"):
+        assert sum(words in line for line in lines) == 1, words
+    assert any("the bite: not checked" in line for line in lines)
+    assert [line.split(":")[0] for line in lines] == sorted(
+        (line.split(":")[0] for line in lines), key=["error", "warning", "note"].index
+    )
+
+
+def test_every_wrong_key_is_listed(capture):
+    described(capture, "fps = 24.0", "fsp = 24.0")
+    described(capture, "cols = 9", "colums = 9")
+    lines = [f.line() for f in found(capture) if f.severity == "error"]
+    assert any("fsp" in line for line in lines) and any("colums" in line for line in lines)
+
+
+def test_missing_packages_are_named(monkeypatch):
+    monkeypatch.setattr(checks, "find_spec", lambda name: None if name in ("torch", "jinja2") else True)
+    lines = [f.line() for f in found(EXAMPLE)]
+    assert any("torch" in line and "jawusd[build]" in line for line in lines)
+    assert any("no report" in line for line in lines)
+
+
+def test_a_check_that_stumbles_is_a_finding_and_the_others_go_on(capture, monkeypatch):
+    def stumbles(parts):
+        raise ZeroDivisionError("planted")
+
+    broken = tuple(checks._Check(c.what, c.needs, stumbles) if c.what == "the scans" else c for c in checks._CHECKS)
+    monkeypatch.setattr(checks, "_CHECKS", broken)
+    rest_frame_outside(capture)
+    got = found(capture)
+    assert {"check_failed", "rest_frame", "not_checked"} <= {f.kind for f in got}
+
+
+def test_build_refuses_with_all_errors_before_any_work(capture, tmp_path):
+    scan_in_metres(capture)
+    pick_frame_outside(capture)
+    with pytest.raises(CaptureError, match=r"(?s)2 errors.*metres.*bootstrap\.frame|2 errors.*bootstrap.*metres"):
+        build(capture, tmp_path / "out", BuildOptions())
+    assert not (tmp_path / "out" / "build.json").exists()
+
+
+def test_the_program_prints_findings_and_leaves_with_5(capture):
+    scan_in_metres(capture)
+    command = [sys.executable, "-m", "jawusd", "check", str(capture)]
+    plain = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    assert plain.returncode == 5 and "metres" in plain.stdout and "Traceback" not in plain.stderr
+    as_json = subprocess.run([*command, "--json"], capture_output=True, text=True, timeout=300, check=False)
+    summary = json.loads(as_json.stdout)
+    assert as_json.returncode == 5 and summary["errors"] == 1
+    assert Finding.from_json(summary["findings"][0]).severity == "error"
+
+
+def test_a_black_picture_in_between_does_not_end_the_masks(tmp_path):
+    from jawusd.formats.capture import CameraSource, Masks
+    from jawusd.imaging.mask_samples import sample_masks
+
+    for k in range(40):
+        picture = np.zeros((90, 160), np.uint8)
+        if 7 <= k <= 33 and k != 20:
+            picture[20:50, 30:90] = 255
+        cv2.imwrite(str(tmp_path / f"{k:06d}.png"), picture)
+    masks = Masks(upper=tmp_path / "%06d.png", lower=tmp_path / "%06d.png", upper_value=255, lower_value=128)
+    from contextlib import ExitStack
+
+    with ExitStack() as files:
+        sample = sample_masks(CameraSource(name="cam", masks=masks), (160, 90), files)
+        assert sample.first_last[0] == (7, 33) and sample.first_frame == 7
+        assert len(sample.pixels(0, 8)) > 100 and len(sample.pixels(0, 3)) == 0
