@@ -77,9 +77,13 @@ class PngMasks:
         """Find what the values mean, from some pictures of the whole take.
 
         Raises:
-            CaptureError: the pictures are no masks.
+            CaptureError: the pictures have another size or are no masks.
         """
-        return png_levels([self._files[k] for k in sorted(self._files)], self._is_other)
+        found = png_levels([self._files[k] for k in sorted(self._files)], self._is_other)
+        if self._size_px is not None:
+            for path, size in found.sizes_px:
+                _check_size(path, size, self._size_px)
+        return found
 
     def masks(self, first: int) -> Iterator[MaskImage | None]:
         """Yield the masks from a number on, (h, w) uint8, None where there is no file or nothing segmented.

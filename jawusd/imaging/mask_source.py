@@ -27,11 +27,12 @@ class SourceLevels:
     """Hold what the values of one source mean.
 
     `levels` is None if none of its pictures shows anything. `palette_numbers` are read instead of colours that are all
-    the same.
+    the same. `sizes_px` are the (width, height) of files looked at, one file per size.
     """
 
     levels: MaskLevels | None
     palette_numbers: bool = False
+    sizes_px: tuple[tuple[Path, tuple[int, int]], ...] = ()
 
 
 def png_levels(files: Sequence[Path], is_other: Callable[[RawImage], bool] | None = None) -> SourceLevels:
@@ -80,8 +81,11 @@ def _png_levels_of_version(
     """Find the levels of files, reading them once; times and sizes of the sample identify their version."""
     for palette_numbers in (False, True) if any(map(has_palette, sample)) else (False,):
         read: list[Path] = []
+        sizes: dict[tuple[int, int], Path] = {}
 
-        def pictures(paths: Sequence[Path], as_numbers: bool, read: list[Path]) -> Iterator[RawImage]:
+        def pictures(
+            paths: Sequence[Path], as_numbers: bool, read: list[Path], sizes: dict[tuple[int, int], Path]
+        ) -> Iterator[RawImage]:
             for path in paths:
                 try:
                     image = load_png(path)
@@ -89,19 +93,20 @@ def _png_levels_of_version(
                     continue  # that frame reports it
                 if is_other is None or not is_other(image):
                     read.append(path)
+                    sizes.setdefault((image.shape[1], image.shape[0]), path)
                     yield read_palette_numbers(path, image) if as_numbers else image
 
-        more = partial(pictures, others, palette_numbers, read)
+        more = partial(pictures, others, palette_numbers, read, sizes)
         try:
-            found = find_levels(pictures(sample, palette_numbers, read), False, more)
+            found = find_levels(pictures(sample, palette_numbers, read, sizes), False, more)
         except NotMasks as error:
             where = read[error.index] if error.index is not None else sample[0].parent
             raise CaptureError(error.reason, path=where, hint=error.hint) from error
         if not read:
             return SourceLevels(MaskLevels())  # nothing can be read, which every frame reports
         if found is not None:
-            return SourceLevels(found, palette_numbers)
-    return SourceLevels(None)
+            return SourceLevels(found, palette_numbers, tuple((path, size) for size, path in sizes.items()))
+    return SourceLevels(None, sizes_px=tuple((path, size) for size, path in sizes.items()))
 
 
 @lru_cache(maxsize=256)

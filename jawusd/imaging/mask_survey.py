@@ -79,14 +79,14 @@ def _of_levels(source: CameraSource, arch: str, levels: MaskLevels) -> list[Find
     out = []
     if not levels.usual:
         low, high = sorted((levels.background, levels.teeth))
-        inverted = "; teeth are dark on light" if levels.inverted else ""
+        inverted = "; they are inverted, teeth dark on light" if levels.inverted else ""
         channel = "transparency" if levels.plane == "alpha" else "masks"
         out.append(
             Finding(
                 "mask_levels",
                 "note",
-                f"the {channel} of the {arch} teeth hold {low:g} and {high:g}: {levels.teeth:g} is taken as "
-                f"teeth{inverted}.",
+                f"the {channel} of the {arch} teeth hold the values {low:g} and {high:g}: {levels.teeth:g} is "
+                f"taken as teeth{inverted}.",
                 value=levels.teeth,
                 camera=source.name,
             )

@@ -7,7 +7,7 @@ import os
 import queue
 import threading
 from collections.abc import Callable, Generator, Iterator
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from types import TracebackType
 
@@ -18,6 +18,7 @@ from jawusd.imaging.mask_levels import MaskImage, MaskLevels
 from jawusd.imaging.timeline import Timeline
 from jawusd.imaging.video import Video
 
+_LOOKED_AT = 10  # pictures of labels that are looked at first
 _AHEAD = 4  # pictures waiting at most: 8 MB of full HD per reader
 
 
@@ -94,10 +95,18 @@ class MaskReader:
         self._ahead = _Ahead(self._results(frame), frame)
         return self._ahead.take()
 
-    @property
+    @cached_property
     def is_black(self) -> bool:
-        """Tell whether no picture shows anything; not known of labels."""
-        return self.levels is None and self._labels is None
+        """Tell whether no picture shows anything.
+
+        Raises:
+            CaptureError: a picture of labels cannot be decoded, has the wrong size or means nothing.
+        """
+        if self._labels is None:
+            return self.levels is None
+        some = range(self.count // 2, self.count, max(1, self.count // _LOOKED_AT))
+        with contextlib.closing(self._results(0)) as results:
+            return all(self.read(frame) is None for frame in some) and all(mask is None for mask in results)
 
     @property
     def odd(self) -> list[str]:

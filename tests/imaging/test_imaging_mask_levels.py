@@ -9,13 +9,14 @@ import pytest
 from PIL import Image, ImageDraw
 
 from jawusd.errors import CaptureError
-from jawusd.formats.capture import CameraSource
+from jawusd.formats.capture import CameraSource, Masks
 from jawusd.imaging.mask_levels import MOST_SOFT
 from jawusd.imaging.mask_survey import survey_masks
-from jawusd.imaging.masks import MaskReader
+from jawusd.imaging.masks import MaskReader, open_masks
 
 SIZE = (160, 96)
 COUNT = 12
+NO_LABELS = {"upper_value": None, "lower_value": None}  # one folder for both rows
 
 
 def teeth(k: int, scale: int = 1) -> np.ndarray:
@@ -136,8 +137,33 @@ def test_survey_says_what_is_taken_and_what_is_not_used(tmp_path):
         ("mask_levels", "note", "left"),
     ]
     assert "the masks of the lower teeth are all black" in found[0].message
-    assert "hold 0 and 100: 100 is taken as teeth" in found[1].message
+    assert "hold the values 0 and 100: 100 is taken as teeth" in found[1].message
     assert survey_masks(CameraSource(name="right", video="right.mp4"), SIZE)[0].kind == "camera_without_masks"
+
+
+def test_survey_finds_wrong_sizes_and_missing_labels(tmp_path):
+    for k in range(COUNT):
+        picture = teeth(k) // 255 * 3
+        cv2.imwrite(str(tmp_path / f"{k:03d}.png"), picture[::2, ::2] if k == 7 else picture)
+    masks = {row: tmp_path / "%03d.png" for row in ("upper", "lower")}
+    source = CameraSource.model_construct(name="a", video=None, masks=Masks.model_construct(**masks, **NO_LABELS))
+    with pytest.raises(CaptureError, match=r"007\.png: the mask is 80 x 48 px, the camera's pictures are 160 x 96 px"):
+        survey_masks(source, SIZE)
+    cv2.imwrite(str(tmp_path / "007.png"), teeth(7) // 255 * 3)
+    labels = {"labels": tmp_path / "%03d.png", "upper_value": 3, "lower_value": 4}
+    found = survey_masks(CameraSource(name="a", masks=labels), SIZE)
+    assert [one.message for one in found] == ["the masks of the lower teeth are all black and are not used."]
+
+
+def test_label_pictures_may_have_a_palette(tmp_path):
+    for k in range(3):
+        image = Image.fromarray(teeth(k) // 255 * 2)
+        image.putpalette([0, 0, 0, 128, 0, 0, 0, 128, 0])
+        image.save(tmp_path / f"{k:03d}.png")
+    upper, _ = open_masks(
+        CameraSource(name="a", masks={"labels": tmp_path / "%03d.png", "upper_value": 2, "lower_value": 1}), SIZE
+    )
+    assert np.array_equal(upper.read(1), teeth(1))
 
 
 def test_light_masks_up_to_the_border_are_doubted(tmp_path):
@@ -145,11 +171,5 @@ def test_light_masks_up_to_the_border_are_doubted(tmp_path):
     framed[[0, -1]] = framed[:, [0, -1]] = 0
     written(tmp_path / "upper", [np.where(teeth(k) > 0, 0, framed) for k in range(COUNT)])
     masks = {row: tmp_path / "upper" / "%03d.png" for row in ("upper", "lower")}
-    kinds = [one.kind for one in survey_masks(CameraSource.model_construct(name="a", masks=masks_of(masks)), SIZE)]
-    assert kinds == ["mask_polarity", "mask_polarity"]
-
-
-def masks_of(masks: dict) -> object:
-    from jawusd.formats.capture import Masks
-
-    return Masks.model_construct(**masks, upper_value=None, lower_value=None)
+    source = CameraSource.model_construct(name="a", video=None, masks=Masks.model_construct(**masks, **NO_LABELS))
+    assert [one.kind for one in survey_masks(source, SIZE)] == ["mask_polarity", "mask_polarity"]

@@ -100,7 +100,7 @@ def test_errors_come_with_their_frame_when_read_ahead(pattern: Path) -> None:
 
 
 def test_wrong_size_names_file_found_and_allowed(pattern: Path, video: Path) -> None:
-    with pytest.raises(CaptureError, match=r"000002\.png: the mask is 64 x 40 px, .* are 128 x 80 px"):
+    with pytest.raises(CaptureError, match=r"000000\.png: the mask is 64 x 40 px, .* are 128 x 80 px"):
         MaskReader(pattern, (128, 80)).read(2)
     with pytest.raises(CaptureError, match=r"upper\.mkv: the mask is 64 x 40 px, .* are 40 x 64 px"):
         MaskReader(video, (40, 64))
