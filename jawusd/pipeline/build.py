@@ -27,12 +27,14 @@ from jawusd.pipeline.check import check_capture, refuse_errors
 from jawusd.pipeline.fit import FitSummary, fit_lines, fit_subject, fit_summary
 from jawusd.pipeline.prepare import input_hashes, naming_file, open_capture, rescaled_cameras, subject_of_capture
 from jawusd.pipeline.report import BuildFacts, missing_packages, place_of, write_build_report
+from jawusd.pipeline.scans import all_labelled, store_labels, with_stored_labels
 from jawusd.pipeline.segment import SegmentOptions, segment_capture, with_masks
 from jawusd.pipeline.segment_record import SegmentSummary, delete_masks, segment_lines
 from jawusd.pipeline.state import (
     BUILD_FILE,
     CALIBRATION,
     FIRST_PASS,
+    LABELS,
     LOCK_FILE,
     BuildState,
     Progress,
@@ -180,6 +182,7 @@ class _Build:
         if tell is not None:
             for found in check.result["findings"]:
                 tell(Finding.from_json(found))
+        labels = self._labelled()
         calibrate = self._calibrated()
         capture, options = self.capture, self.options
         names = [camera.name for camera in capture.cameras]
@@ -212,7 +215,7 @@ class _Build:
         missing = missing_packages()
         inputs = self._inputs([], bake.outputs, bake.inputs, videos, sync.result, missing)
         report = self._stage("report", inputs, lambda: self._report(missing))
-        stages = (calibrate, segment, track, fit, aid, bake, report)
+        stages = (labels, calibrate, segment, track, fit, aid, bake, report)
         outputs = {name for stage in stages if stage for name in stage.outputs}
         return {
             "capture": capture.name,
@@ -255,6 +258,16 @@ class _Build:
         parts = ["teeth", "mandible", "skull", "calibration", "masks"]
         described = capture.model_dump(mode="json", exclude={"folder"})
         return self._stage("check", self._inputs(parts, videos, described), work)
+
+    def _labelled(self) -> StageRecord[dict[str, str]] | None:
+        """Tell crown and gum of the scans apart where neither paint nor a file does."""
+        capture, folder = self.capture, self.folder / LABELS
+        if all_labelled(capture):
+            return None
+        none: dict[str, str] = {}
+        record = self._stage("scans", self._inputs(["teeth"]), lambda: (store_labels(capture, folder), none))
+        self.capture = with_stored_labels(capture, folder)
+        return record
 
     def _calibrated(self) -> StageRecord[CalibrationSummary] | None:
         """Calibrate from the boards if the capture names no calibration but has boards."""

@@ -151,7 +151,7 @@ def load_labelled(capture: Capture) -> tuple[dict[str, Mesh], list[Finding]]:
     """Return `load_meshes`, and what there is to say about the labels of the teeth scans."""
     paths = {name: getattr(capture.scans, name) for name in MESHES}
     files = {name: path for name, path in paths.items() if path is not None}
-    meshes = _files_read(files)
+    meshes = read_files(files)
     teeth = label_teeth(meshes, files, capture.scans.labels)
     labelled = {TEETH[arch]: scan.mesh for arch, scan in teeth.items()}
     return meshes | labelled, [finding for scan in teeth.values() for finding in scan.findings]
@@ -159,12 +159,13 @@ def load_labelled(capture: Capture) -> tuple[dict[str, Mesh], list[Finding]]:
 
 def read_meshes(files: Mapping[str, Path]) -> dict[str, Mesh]:
     """Read mesh files by the names of `MESHES`; raises as `load_meshes`."""
-    meshes = _files_read(files)
+    meshes = read_files(files)
     return meshes | {TEETH[arch]: scan.mesh for arch, scan in label_teeth(meshes, files, None).items()}
 
 
 @explain_missing_packages()
-def _files_read(files: Mapping[str, Path]) -> dict[str, Mesh]:
+def read_files(files: Mapping[str, Path]) -> dict[str, Mesh]:
+    """Read mesh files by the names of `MESHES` as they are, without labels; raises CaptureError as `load_meshes`."""
     from jawusd.imaging.meshio import load_mesh
 
     return {name: load_mesh(path, kind="bone" if name in BONES else "scan") for name, path in files.items()}
@@ -180,7 +181,7 @@ def labelled_teeth(capture: Capture, folder: Path | None, *, ignore_files: bool 
         CaptureError, FormatError: as `load_meshes`.
     """
     files = {name: getattr(capture.scans, name) for name in TEETH.values()}
-    return list(label_teeth(_files_read(files), files, folder, ignore_files=ignore_files).values())
+    return list(label_teeth(read_files(files), files, folder, ignore_files=ignore_files).values())
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,10 +21,12 @@ from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.pipeline.fit import Poses, fit_summary
 from jawusd.pipeline.media import draw_worst_frames, replay_parts
 from jawusd.pipeline.prepare import Subject, load_cameras, open_capture, subject_of_build
+from jawusd.pipeline.scans import with_stored_labels
 from jawusd.pipeline.state import (
     BUILD_FILE,
     CALIBRATION,
     FIRST_PASS,
+    LABELS,
     BuildState,
     Progress,
     Stages,
@@ -175,24 +177,24 @@ def build_facts(folder: Path, state: BuildState, capture: Capture | None, *, all
         allow_outside: let paths in the capture leave its folder.
     """
     if capture is not None:
-        return BuildFacts(state.stages, with_calibration(capture, folder))
+        return BuildFacts(state.stages, as_built(capture, folder))
     record = state.stages.get("report")
     place = record.result.get("capture") if record else None
     if not place:
         return BuildFacts(state.stages, None, "the build does not say where its capture is: name it with --capture.")
     path = folder / str(place)
     try:
-        return BuildFacts(state.stages, with_calibration(open_capture(path, allow_outside=allow_outside), folder))
+        return BuildFacts(state.stages, as_built(open_capture(path, allow_outside=allow_outside), folder))
     except JawusdError as error:
         return BuildFacts(state.stages, None, f"the capture is not at hand ({error}): name it with --capture.")
 
 
-def with_calibration(capture: Capture, folder: Path) -> Capture:
-    """Return the capture with the calibration that the build made from its boards, if it names none."""
+def as_built(capture: Capture, folder: Path) -> Capture:
+    """Return the capture with what the build found for it: the calibration from its boards, labels of its scans."""
     made = folder / CALIBRATION
-    if capture.calibration is not None or not made.is_file():
-        return capture
-    return capture.model_copy(update={"calibration": made, "calibration_unit_mm": 1.0})
+    if capture.calibration is None and made.is_file():
+        capture = capture.model_copy(update={"calibration": made, "calibration_unit_mm": 1.0})
+    return with_stored_labels(capture, folder / LABELS)
 
 
 def place_of(capture: Capture, folder: Path) -> str:

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TypedDict
 
 import numpy as np
+from numpy.typing import NDArray
 
 from jawusd.errors import OutputError, explain_missing_packages
-from jawusd.formats.capture import Capture
-from jawusd.formats.mesh import tooth_labels
-from jawusd.formats.scan_labels import labels_path, save_scan_labels
+from jawusd.formats.capture import Capture, Scans
+from jawusd.formats.mesh import Mesh, painted_labels, tooth_labels
+from jawusd.formats.scan_labels import ScanLabels, labels_path, save_scan_labels
 from jawusd.geometry import anatomical_frame
-from jawusd.pipeline.prepare import labelled_teeth, open_capture
-from jawusd.pipeline.scan_labels import LabelledScan
+from jawusd.pipeline.prepare import labelled_teeth, open_capture, read_files
+from jawusd.pipeline.scan_labels import TEETH, LabelledScan
 from jawusd.pipeline.state import Progress, no_progress
 
 PICTURE = "scan_labels.png"
@@ -79,6 +80,60 @@ def label_scans(
     _draw(scans, summaries, opened, picture)
     progress("scans", 2, 2)
     return {"picture": str(picture), "scans": summaries}
+
+
+def all_labelled(capture: Capture) -> bool:
+    """Tell whether paint or files say of both teeth scans what is crown; raises as `prepare.load_meshes`."""
+    scans = capture.scans
+    files = {name: getattr(scans, name) for name in TEETH.values()}
+    open_ones = {name: path for name, path in files.items() if not labels_path(path, scans.labels).is_file()}
+    return all(painted_labels(mesh) is not None for mesh in read_files(open_ones).values())
+
+
+def store_labels(capture: Capture, folder: Path) -> list[Path]:
+    """Write labels of the teeth scans to a folder if the shape has to tell one of them; return the files written.
+
+    Labels that an earlier call left there are deleted.
+
+    Raises:
+        FormatError, CaptureError: a scan or its labels cannot be read.
+        OutputError: a file cannot be written.
+    """
+    scans = labelled_teeth(capture, capture.scans.labels)
+    written = []
+    for scan in scans:
+        file = labels_path(scan.path, folder)
+        if scan.labels is not None and any(other.origin == "shape" for other in scans):
+            save_scan_labels(file, scan.labels, scan.mesh)
+            written.append(file)
+        else:
+            file.unlink(missing_ok=True)
+    return written
+
+
+def with_stored_labels(capture: Capture, folder: Path) -> Capture:
+    """Return the capture with the labels that `store_labels` left in a folder, unless it has labels of its own."""
+    scans = capture.scans
+    teeth = (scans.upper_teeth, scans.lower_teeth)
+    own = any(labels_path(path, scans.labels).is_file() for path in teeth)
+    if own or not any(labels_path(path, folder).is_file() for path in teeth):
+        return capture
+    return capture.model_copy(update={"scans": scans.model_copy(update={"labels": folder})})
+
+
+def save_reviewed(scans: Scans, meshes: Mapping[str, Mesh], arch: str, labels: NDArray[np.uint8]) -> Path:
+    """Write labels (V,) that a person has seen where the capture looks for them; return the file.
+
+    Args:
+        scans: of the capture.
+        meshes: the scans by arch.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    path = labels_path(getattr(scans, TEETH[arch]), scans.labels)
+    save_scan_labels(path, ScanLabels(labels, "reviewed"), meshes[arch])
+    return path
 
 
 def _stored(scan: LabelledScan, folder: Path | None) -> ScanSummary:

@@ -20,6 +20,7 @@ FAMILY, VERSION = "jawusd-build", 1
 BUILD_FILE = "build.json"
 LOCK_FILE = ".jawusd-lock"
 CALIBRATION = "calibration.toml"  # made from the boards when the capture names none
+LABELS = "labels"  # folder of the labels of scans that are neither painted nor labelled
 FIRST_PASS = "first_pass.npz"  # tracks without the model's help: what the model is fitted to
 _CHUNK_BYTES = 1 << 20
 

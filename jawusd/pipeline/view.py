@@ -17,7 +17,7 @@ from jawusd.errors import FormatError, OutputError, RigError, explain_missing_pa
 from jawusd.evaluator import JawRig
 from jawusd.formats.capture import Bootstrap, Capture
 from jawusd.formats.capture_edit import write_bootstrap
-from jawusd.formats.mesh import Mesh, crown_face_mask
+from jawusd.formats.mesh import Mesh, crown_face_mask, tooth_labels
 from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.geometry import Camera
 from jawusd.geometry.arrays import Array, Mask
@@ -25,7 +25,8 @@ from jawusd.pipeline.bake import DEFAULT_FPS
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.media import GRAY, open_videos
 from jawusd.pipeline.prepare import load_cameras, load_meshes, open_capture, subject_of_capture, tracked_cameras
-from jawusd.pipeline.report import is_build, recorded_offsets, with_calibration
+from jawusd.pipeline.report import as_built, is_build, recorded_offsets
+from jawusd.pipeline.scans import save_reviewed
 from jawusd.pipeline.state import BuildState, Progress
 
 if TYPE_CHECKING:
@@ -220,9 +221,10 @@ def viewed_capture(
 
     path = Path(path)
     capture = open_capture(path, allow_outside=allow_outside)
+    own_scans = capture.scans
     build = tracks if tracks is not None and is_build(tracks) else None
     if build is not None:
-        capture = with_calibration(capture, build)
+        capture = as_built(capture, build)
     poses = _poses(capture, tracks)
     videos = open_videos(capture)
     cameras = [] if capture.calibration is None else load_cameras(capture)
@@ -246,6 +248,9 @@ def viewed_capture(
         cameras=footage.cameras,
         scans=footage.scans,
         crowns={arch: crown_face_mask(mesh) for arch, mesh in footage.scans.items()},
+        labels={
+            arch: tooth_labels(mesh) if mesh.labels is None else mesh.labels for arch, mesh in footage.scans.items()
+        },
         T_anatomical_skull=subject_of_capture(capture, meshes).T_anatomical_skull,
         tracks=poses,
         picks=capture.bootstrap,
@@ -253,6 +258,7 @@ def viewed_capture(
         teeth_region=footage.teeth_region,
         poses_of_picks=footage.poses_of_picks,
         save_picks=partial(write_bootstrap, path / CAPTURE_FILE if path.is_dir() else path),
+        save_labels=partial(save_reviewed, own_scans, footage.scans),
     )
 
 

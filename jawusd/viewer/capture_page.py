@@ -17,6 +17,8 @@ from jawusd.viewer.footage_panel import FootagePanel
 from jawusd.viewer.picking_layout import PickingLayout, eye_to_see, hit_vertex, region_around
 from jawusd.viewer.picks import ARCHES
 from jawusd.viewer.picks_panel import PicksPanel
+from jawusd.viewer.scan_brush import BRUSHES
+from jawusd.viewer.scan_labels_panel import ScanLabelsPanel
 from jawusd.viewer.viewed import Region, ViewedCapture
 from jawusd.viewer.widgets import errors_shown, guarded, set_theme
 
@@ -29,7 +31,7 @@ class CapturePage:
     """Connect a page's widgets with a capture.
 
     Attributes:
-        footage, picks: the panels.
+        footage, picks, labels: the panels.
         layout: of the picture shown, None before the first.
         poses: T_page_scan (4, 4) of the scans shown, by arch.
         drawn: number of the last state drawn.
@@ -53,6 +55,8 @@ class CapturePage:
             self.footage = FootagePanel(client, capture, self._turn_camera, self.refresh)
         with tabs.add_tab("Picks"):
             self.picks = PicksPanel(client, capture, self.footage, self.turn, self.refresh)
+        with tabs.add_tab("Scans"):
+            self.labels = ScanLabelsPanel(client, capture, self._turn_painting, self._show_labels)
         gui.main_panel.dock_right()
         gui.main_panel.set_width(_PANEL_PX)
         client.scene.on_click()(guarded(client, self._clicked))  # type: ignore[arg-type]  # viser awaits coroutines
@@ -105,7 +109,7 @@ class CapturePage:
                 self.layout = PickingLayout(capture.sizes_px[view], await asyncio.to_thread(self._region, view, frame))
             self.scene.show_picture(image, self.layout)
             self.poses = {}
-            if self.picks.picking.value:
+            if self.picks.picking.value or self.labels.painting.value:
                 self.poses = self.layout.scan_poses(capture.scans, capture.T_anatomical_skull, self.picks.side)
         self.scene.place(footage.in_space, self.poses)
         camera, layout = (None, None) if footage.in_space else (view, self.layout)
@@ -191,14 +195,18 @@ class CapturePage:
         return facing @ self._capture.T_anatomical_skull
 
     async def _clicked(self, event: viser.SceneClickEvent) -> None:
-        """Pick the vertex or the pixel under the pointer."""
-        if not self.picks.picking.value:
+        """Pick the vertex or the pixel under the pointer, or paint the scan there."""
+        if not self.picks.picking.value and not self.labels.painting.value:
             return
         hits = []
         for arch, T in self.poses.items():
             hit = hit_vertex(self._capture.scans[arch], T, event.ray_origin, event.ray_direction)
             if hit is not None:
                 hits.append((hit[1], arch, hit[0]))
+        if self.labels.painting.value:
+            if hits:
+                self.labels.click(*min(hits)[1:])
+            return
         if hits:
             _, arch, vertex = min(hits)
             self.picks.book.add(arch, vertex)
@@ -208,6 +216,17 @@ class CapturePage:
                 return
             self.picks.book.see(self.footage.view, self.footage.frame, pixel)
         self.refresh()
+
+    def _turn_painting(self) -> None:
+        if self.labels.painting.value:
+            for arch in ARCHES:
+                self._show_labels(arch)
+        self.turn()
+
+    def _show_labels(self, arch: str) -> None:
+        """Draw a scan whose labels have changed."""
+        brush = self.labels.brush
+        self.scene.show_labels(arch, *(brush.faces_with(arch, label) for label in BRUSHES.values()))
 
     def close(self) -> None:
         """Stop what runs for this page."""

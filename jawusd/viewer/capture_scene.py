@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
 from jawusd.geometry import wxyz_from_matrix
-from jawusd.geometry.arrays import Array
+from jawusd.geometry.arrays import Array, Mask
 from jawusd.geometry.se3 import se3_inverse
 from jawusd.viewer.decimate import for_view
 from jawusd.viewer.picking_layout import FOV_RAD, PickingLayout
 from jawusd.viewer.picks import ARCHES, PickBook
 from jawusd.viewer.viewed import ViewedCapture
 
-ENAMEL, GUM = (236, 229, 212), (196, 112, 108)
+ENAMEL, GUM, BASE = (236, 229, 212), (196, 112, 108), (120, 135, 165)
 #: Colours of picks by arch, equal to those of the outlines; and of the one selected.
 ARCH_COLORS, SELECTED = {"upper": (255, 170, 0), "lower": (0, 200, 255)}, (255, 60, 200)
 #: Upwards in the page.
 UP = (0.0, -1.0, 0.0)
 _MOST_FACES = 7_000  # per part of an arch; clicks are tested against the whole scan
+_MOST_PAINTED_FACES = 25_000  # finer while labels are corrected
 _JPEG_QUALITY = 88
 _THUMB_PX = 480
 _FRUSTUM_MM = 60.0  # from the eye of a camera to its picture
@@ -50,6 +51,7 @@ class CaptureScene:
         self._space = scene.add_frame("/space", show_axes=False, visible=False)
         self._frustums = {name: self._add_frustum(name) for name in capture.sizes_px if name in capture.cameras}
         self._arches = {arch: scene.add_frame(f"/{arch}", show_axes=False, visible=False) for arch in ARCHES}
+        self._parts: dict[str, viser.MeshHandle] = {}
         for arch in ARCHES:
             self._add_scan(arch)
         self._marks: list[viser.SceneNodeHandle] = []
@@ -76,12 +78,25 @@ class CaptureScene:
         return frustum
 
     def _add_scan(self, arch: str) -> None:
-        mesh, crowns = self._capture.scans[arch], self._capture.crowns[arch]
-        for part, faces, color in (("teeth", crowns, ENAMEL), ("gum", ~crowns, GUM)):
+        crowns = self._capture.crowns[arch]
+        self._add_parts(arch, (("teeth", crowns, ENAMEL), ("gum", ~crowns, GUM)), _MOST_FACES)
+
+    def show_labels(self, arch: str, crown: Mask, gum: Mask, base: Mask) -> None:
+        """Draw a scan again with other faces as crown, gum and base, masks of shape (F,)."""
+        parts = ("teeth", crown, ENAMEL), ("gum", gum, GUM), ("base", base, BASE)
+        with self._client.atomic():
+            self._add_parts(arch, parts, _MOST_PAINTED_FACES)
+
+    def _add_parts(self, arch: str, parts: Sequence[tuple[str, Mask, tuple[int, int, int]]], most: int) -> None:
+        mesh = self._capture.scans[arch]
+        for part, faces, color in parts:
+            name = f"/{arch}/{part}"
+            if name in self._parts:
+                self._parts.pop(name).remove()
             if faces.any():
-                small = for_view(type(mesh)(mesh.vertices, mesh.faces[faces]), _MOST_FACES)
-                self._scene.add_mesh_simple(
-                    f"/{arch}/{part}",
+                small = for_view(type(mesh)(mesh.vertices, mesh.faces[faces]), most)
+                self._parts[name] = self._scene.add_mesh_simple(
+                    name,
                     small.vertices,
                     small.faces,
                     color=color,

@@ -57,6 +57,7 @@ class ViewedCapture:
     cameras: Mapping[str, Camera]  # calibrated cameras by name; empty without a calibration
     scans: Mapping[str, Mesh]  # the teeth by arch, "upper" and "lower" [mm], vertices as in their files
     crowns: Mapping[str, Mask]  # which faces of a scan are teeth, shape (F,); the others are gum
+    labels: Mapping[str, NDArray[np.uint8]]  # GUM, TOOTH, BOUNDARY or BASE per vertex of a scan, shape (V,), by arch
     T_anatomical_skull: Array  # scan frame to anatomical frame, shape (4, 4)
     tracks: Tracks | None  # tracked poses; None without
     picks: Bootstrap | None  # of the capture file; None without
@@ -70,6 +71,8 @@ class ViewedCapture:
     poses_of_picks: Callable[[Bootstrap], tuple[tuple[Array, Array], list[str]]]
     # writes picks to the capture file, given those read from it before; raises a JawusdError
     save_picks: Callable[[Bootstrap, Bootstrap | None], None]
+    # writes the labels of an arch that a person has seen, and returns the file; raises a JawusdError
+    save_labels: Callable[[str, NDArray[np.uint8]], Path]
 
     def tracked_poses(self, frame: int) -> tuple[Array, Array] | None:
         """Return T_world_upper and T_world_lower of a frame, NaN where lost; None where nothing was tracked."""

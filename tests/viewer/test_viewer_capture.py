@@ -1,14 +1,12 @@
 """A capture as the viewer is given it, and its page without a browser."""
 
-import asyncio
 import shutil
 import tomllib
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from package_copy import ROOT
-from quiet_page import QuietPage
+from quiet_capture_page import QuietCapturePage
 from typer.testing import CliRunner
 
 from jawusd.cli.main import app
@@ -17,7 +15,6 @@ from jawusd.formats.capture import load_capture
 from jawusd.formats.tracks import LOST, PARTIAL, TRACKED, LostReason, Tracks, save_tracks
 from jawusd.geometry import transform_point, transform_points
 from jawusd.pipeline.view import viewed_capture
-from jawusd.viewer.capture_page import CapturePage
 from jawusd.viewer.server import CaptureViewer
 
 EXAMPLE = ROOT / "examples" / "capture"
@@ -70,43 +67,6 @@ def copy(tmp_path_factory):
 @pytest.fixture(scope="module")
 def viewed(copy, tmp_path_factory):
     return viewed_capture(copy, write_true_tracks(tmp_path_factory.mktemp("tracks") / "tracks.npz"), quiet)
-
-
-class QuietCapturePage(QuietPage):
-    """A page of a capture that no browser shows."""
-
-    def make_page(self, viewer):
-        """Make the page once the visitor's camera is known, as the server does."""
-        state = self.client.camera._state
-        state.update_timestamp, state.image_width, state.image_height, state.fov = 1.0, 900, 700, 0.35
-        state.wxyz, state.position, state.look_at = np.array([1.0, 0, 0, 0]), np.zeros(3), np.array([0, 0, 1.0])
-        state.up_direction, state.near, state.far = np.array([0, -1.0, 0]), 1.0, 1e4
-        return CapturePage(self.client, viewer._capture)
-
-    def settle(self):
-        """Wait until everything is drawn."""
-
-        async def wait():
-            await asyncio.wait_for(self.page._drawing, 100)
-
-        asyncio.run_coroutine_threadsafe(wait(), self.loop).result(120)
-
-    def press(self, group, option):
-        """Press a button of a group, and wait."""
-        self.enter(group, option)
-        self.settle()
-
-    def click(self, place):
-        """Click where a place of the page (3,) is seen, and wait."""
-        eye = np.array(self.client.camera.position)
-        event = SimpleNamespace(client=self.client, ray_origin=tuple(eye), ray_direction=tuple(place - eye))
-
-        async def run():
-            for entry in self.client.scene._scene_pointer_cb:
-                await entry.callback(event)
-
-        asyncio.run_coroutine_threadsafe(run(), self.loop).result(60)
-        self.settle()
 
 
 @pytest.fixture
