@@ -13,9 +13,14 @@ from jawusd.geometry.arrays import Array
 _APART_S = 0.5  # neighbours show the same trouble
 
 
+def used_coverage(tracks: Tracks) -> Array:
+    """Return the share of each mask left uncovered, NaN where it is missing or took no part, shape (F, 2, C)."""
+    return np.where(tracks.masks_used, tracks.coverage_error, np.nan)
+
+
 def uncovered_percent(tracks: Tracks) -> Array:
     """Return the mask area left uncovered per frame and arch [%], mean over the masks used, shape (F, 2); NaN: none."""
-    value = np.where(tracks.masks_used, tracks.coverage_error, np.nan)
+    value = used_coverage(tracks)
     known = np.isfinite(value)
     total = np.where(known, value, 0.0).sum(axis=2)
     return 100 * np.divide(total, known.sum(axis=2), out=np.full(total.shape, np.nan), where=known.any(axis=2))

@@ -41,9 +41,10 @@ def png_levels(files: Sequence[Path], is_other: Callable[[RawImage], bool] | Non
     Raises:
         CaptureError: the pictures are no masks.
     """
-    sample = [files[k] for k in _spread(len(files), _SAMPLED)]
+    chosen = _spread(len(files), _SAMPLED)
+    sample = [files[k] for k in chosen]
     versions = tuple((stat.st_mtime_ns, stat.st_size) for stat in (path.stat() for path in sample))
-    others = _Others(path for path in files if path not in sample)
+    others = _Others(path for k, path in enumerate(files) if k not in chosen)
     return _png_levels_of_version(tuple(sample), versions, others, is_other)
 
 

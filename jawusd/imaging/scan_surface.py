@@ -16,6 +16,8 @@ from jawusd.geometry.arrays import Array, Indices
 # a millimetre and leave waves of some hundredths, which finer meshes show.
 _SCALE_MM = 0.35
 _MOST_ROUNDS = 12
+_FINE_MM = 0.4  # edges up to this length show creases in the vertex normals; from twice that the folds do [mm]
+_SEEN_MM = 0.75  # size of the cells in which the highest faces are what is seen from above
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,18 +69,22 @@ class ScanSurface:
     def wound(self, up: Array) -> ScanSurface:
         """Return the surface with those pieces turned whose faces look inwards; `up` (3,) is the occlusal direction.
 
-        A closed piece encloses a positive volume; of an open one the upper side looks upwards.
+        What is seen of a piece from above, it alone, must look upwards.
         """
         corners = self.vertices[self.faces]
         cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         owner = self.piece[self.faces[:, 0]]
-        count = int(self.piece.max()) + 1
-        # Area seen from above with its sign, the higher the more: 0 for level, so the same for closed and open pieces.
-        height = corners.mean(axis=1) @ up
-        area = np.linalg.norm(cross, axis=1)
-        level = np.bincount(owner, height * area, count) / np.maximum(np.bincount(owner, area, count), 1e-12)
-        score = np.bincount(owner, (cross @ up) * (height - level[owner]), count)
-        turned = (score < 0)[owner]
+        middle = corners.mean(axis=1)
+        one = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+        plan = np.floor(middle @ np.stack([one, np.cross(up, one)], axis=1) / _SEEN_MM).astype(np.int64)
+        plan -= plan.min(axis=0)
+        cell = (owner * (plan[:, 0].max() + 1) + plan[:, 0]) * (plan[:, 1].max() + 1) + plan[:, 1]
+        index = np.unique(cell, return_inverse=True)[1].reshape(-1)
+        height = middle @ up
+        highest = np.full(int(index.max()) + 1, -np.inf)
+        np.maximum.at(highest, index, height)
+        seen = height > highest[index] - _SEEN_MM / 2
+        turned = (np.bincount(owner, np.where(seen, cross @ up, 0.0), int(self.piece.max()) + 1) < 0)[owner]
         faces = np.where(turned[:, None], self.faces[:, ::-1], self.faces)
         return ScanSurface(self.vertices, faces, self.of_vertex, self.piece, self.merged, self.empty, self.repeated)
 
@@ -102,7 +108,7 @@ class ScanSurface:
 
         This is minus the smaller principal curvature, where that is negative, by Taubin's tensor of the normal
         curvatures along the edges ("Estimating the tensor of curvature of a surface from a polyhedral approximation",
-        ICCV 1995), taken from averaged normals.
+        ICCV 1995), taken from averaged normals; where edges are too long for that, the fold between faces.
         """
         n = len(self.vertices)
         normals = self.normals()
@@ -123,7 +129,28 @@ class ScanSurface:
         A += 1e-3 * np.eye(3)
         xx, xy, yy = np.linalg.solve(A, y[..., None])[..., 0].T
         least = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy**2)
-        return np.asarray(np.maximum(-least, 0.0))
+        length = np.bincount(ends, np.repeat(np.sqrt(square), 2), n) / np.maximum(np.bincount(ends, minlength=n), 1)
+        coarse = np.clip((length - _FINE_MM) / _FINE_MM, 0.0, 1.0)
+        return np.maximum(np.maximum(-least, 0.0), coarse * self._folds() / _SCALE_MM)
+
+    def _folds(self) -> Array:
+        """Return the largest angle by which two faces are folded inwards at every vertex [rad], shape (v,), >= 0."""
+        n = len(self.vertices)
+        corners = self.vertices[self.faces]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+        pairs = np.sort(self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        key = pairs[:, 0] * n + pairs[:, 1]
+        order = np.argsort(key, kind="stable")
+        same = key[order][1:] == key[order][:-1]
+        first, second = order[:-1][same], order[1:][same]
+        one, two = first // 3, second // 3
+        middle = corners.mean(axis=1)
+        inwards = np.einsum("ij,ij->i", middle[two] - middle[one], normals[one]) > 0
+        angle = np.where(inwards, np.arccos(np.clip(np.einsum("ij,ij->i", normals[one], normals[two]), -1, 1)), 0.0)
+        fold = np.zeros(n)
+        np.maximum.at(fold, pairs[first].ravel(), np.repeat(angle, 2))
+        return fold
 
 
 def merged_places(vertices: Array) -> tuple[Array, Indices]:

@@ -20,7 +20,9 @@ _BAND_MM = 1.5
 _UNDER_HULL_MM = 4.5
 # Farther than this from every highest place in plan, or this deep, is no crown any more.
 _ASIDE_MM, _DEEP_MM = 5.0, 13.0
+_LEVEL = 0.9  # cosine of the steepest slope of the hull that teeth make among themselves
 _ROUNDS = 3
+_MIDDLE_CELLS = 2  # around a piece's middle in plan
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,10 +44,11 @@ def biting_direction(points: Array, towards: Array | None) -> Array:
             side is taken on which the surface is more uneven.
     """
     middle = points.mean(axis=0)
-    axes = np.linalg.svd(points - middle, full_matrices=False)[2]
+    _, size, axes = np.linalg.svd(points - middle, full_matrices=False)
     if towards is not None and np.linalg.norm(towards - middle) > _BAND_MM:
         away = (towards - middle) / np.linalg.norm(towards - middle)
-        nearest = axes[np.abs(axes @ away).argmax()]
+        # Of the thin directions, since an overjet sets the arches apart along the bite as well.
+        nearest = axes[(np.abs(axes @ away) / np.maximum(size, 1e-9)).argmax()]
         up = nearest * np.sign(nearest @ away)
     else:
         up = axes[2] * np.sign(_roughness(points, axes[2]) - _roughness(points, -axes[2]) or 1.0)
@@ -81,6 +84,24 @@ def tops(points: Array, up: Array) -> Tops:
     return Tops(below, top_depth, crown, gum)
 
 
+def topped_by(points: Array, up: Array, piece: Indices) -> Mask:
+    """Return which pieces have nothing of other pieces above their own middle, shape (P,).
+
+    Args:
+        piece: number of the piece of every point, shape (v,).
+    """
+    cells, height, heights = _height_map(points, up)
+    count = int(piece.max()) + 1
+    size = np.maximum(np.bincount(piece, minlength=count), 1)
+    middle = np.stack([np.bincount(piece, cells[:, k], count) / size for k in range(2)], axis=1)
+    near = np.abs(cells - middle[piece]).max(axis=1) <= _MIDDLE_CELLS
+    own = np.full(count, -np.inf)
+    np.maximum.at(own, piece[near], height[near])
+    radius = _MIDDLE_CELLS
+    over = maximum_filter(heights, size=2 * radius + 1, mode="constant", cval=-np.inf)
+    return np.asarray(own >= over[tuple(middle.astype(np.int64).T)] - _BAND_MM)
+
+
 def _height_map(points: Array, up: Array) -> tuple[Indices, Array, Array]:
     """Return the cell (v, 2) and height (v,) of every point, and the largest height per cell, -inf where empty."""
     one = np.cross(up, np.eye(3)[np.abs(up).argmin()])
@@ -94,7 +115,7 @@ def _height_map(points: Array, up: Array) -> tuple[Indices, Array, Array]:
 
 
 def _hull_height(heights: Array) -> Array:
-    """Return the height of the upper side of the convex hull over every cell of a map, of its shape."""
+    """Return the height of the level upper side of the convex hull over every cell of a map, of its shape."""
     filled = np.argwhere(np.isfinite(heights))
     places = np.column_stack([filled * _CELL_MM, heights[tuple(filled.T)]])
     out = np.full(heights.shape, np.nan)
@@ -103,7 +124,9 @@ def _hull_height(heights: Array) -> Array:
     except (QhullError, ValueError):  # a flat or tiny piece
         out[tuple(filled.T)] = places[:, 2].max()
         return out
-    planes = planes[planes[:, 2] > 1e-3]
+    # Steep sides lead down to a palate, a fold or a base plate beside the teeth; level ones are carried on over them.
+    level = planes[:, 2] > _LEVEL
+    planes = planes[level] if level.any() else planes[planes[:, 2].argmax()][None]
     over = -(places[:, :2] @ planes[:, :2].T + planes[:, 3]) / planes[:, 2]
     out[tuple(filled.T)] = over.min(axis=1)
     return out

@@ -12,6 +12,7 @@ import numpy as np
 from jawusd.errors import TrackingError, explain_missing_packages
 from jawusd.evaluator import JawRig
 from jawusd.formats.capture import Capture
+from jawusd.formats.coverage import used_coverage
 from jawusd.formats.finding import Finding
 from jawusd.formats.model import JawModel
 from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, LostReason, Tracks, TrackStatus, save_tracks
@@ -49,7 +50,7 @@ class TrackSummary(TypedDict):
     prior_aided: int
     calibration_rescaled_px: dict[str, tuple[Size, Size]]  # sizes calibrated and recorded, by camera
     sigma_mm: dict[str, float | None]  # median standard deviation of the landmarks, None if not known
-    coverage_error_percent: float | None  # share of the masks left uncovered, None without masks
+    coverage_error_percent: float | None  # share of the masks used that is left uncovered, None without any
     frames_used: NotRequired[dict[str, int]]  # frames in which masks of a camera took part, by camera
     findings: NotRequired[list[dict[str, str | float | int]]]  # what is doubtful about the take: `Finding.as_json`
 
@@ -203,7 +204,8 @@ def track_summary(tracks: Tracks) -> TrackSummary:
     lost = tracks.frames[tracks.status.min(1) == LOST]
     tracked = tracks.tracked()
     sigma = np.median(tracks.sigma_mm[tracked], axis=0) if tracked.any() else np.full(len(LANDMARKS), np.nan)
-    coverage = tracks.coverage_error[np.isfinite(tracks.coverage_error)]
+    coverage = used_coverage(tracks)
+    coverage = coverage[np.isfinite(coverage)]
     return TrackSummary(
         frames=len(tracks.frames),
         tracked=int(tracked.sum()),

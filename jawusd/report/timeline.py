@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from jawusd.evaluator import JawRig
+from jawusd.formats.coverage import used_coverage
 from jawusd.formats.model import JawModel
 from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, TRACKED, Tracks
 from jawusd.geometry.arrays import Array, Mask
@@ -26,7 +27,7 @@ def tracking_figure(tracks: Tracks) -> Figure:
     figure, axes = new_figure(11.0, 7.4, 4, 1, sharex=True, height_ratios=[1.15, 1, 1, 1])
     _draw_state(axes[0], tracks)
     residual = np.where(tracks.status == LOST, np.nan, tracks.residual_px)
-    coverage = 100 * _mean_of_known(tracks.coverage_error, 2)
+    coverage = 100 * _mean_of_known(used_coverage(tracks), 2)
     for index, (name, color, style) in enumerate((("upper teeth", ORANGE, "-"), ("lower teeth", BLUE, "--"))):
         axes[1].plot(*_thinned(tracks.frames, residual[:, index], np.fmax), style, color=color, lw=1, label=name)
         axes[2].plot(*_thinned(tracks.frames, coverage[:, index], np.fmax), style, color=color, lw=1, label=name)

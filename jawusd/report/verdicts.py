@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from jawusd.evaluator import JawRig
+from jawusd.formats.coverage import used_coverage
+from jawusd.formats.finding import Finding
 from jawusd.formats.report import ReportData
 from jawusd.formats.tracks import LOST, RECOVERED, Tracks
 from jawusd.report.facts import model_facts, sync_facts, tracks_facts
@@ -20,6 +22,7 @@ MARKS = {GOOD: "\u2714", LOOK: "!", BAD: "\u2716", OPEN: "?"}
 # Yang et al. (2019): mask left uncovered on average, and the mean and worst reconstruction error of their Fig. 12.
 _PAPER_COVERAGE_PERCENT, _PAPER_MEAN_MM, _PAPER_WORST_MM = 0.754, 1.73, 7.22
 _EXERCISES = "full opening, slides to both sides and protrusion, closed and half open"
+_UNUSED = {"camera_without_masks", "masks_black", "camera_not_used", "camera_rarely_used"}  # findings of tracks
 _LACKING = {"take_lacks", "not_shown"}  # warnings of the fit about movements that are missing or too small
 _MISTAKES = {"scan_units", "pose_units", "front_back_flip", "left_right_flip", "upside_down", "swapped_jaws"}
 _SENTENCES = {
@@ -122,7 +125,7 @@ def _sync(data: ReportData) -> Verdict:
 
 def _track(tracks: Tracks) -> Verdict:
     tracked = tracks.tracked()
-    coverage = tracks.coverage_error
+    coverage = used_coverage(tracks)
     sigma = np.full(5, np.nan)
     if tracked.any():
         sigma = np.median(tracks.sigma_mm[tracked], axis=0)
@@ -142,6 +145,10 @@ def _track(tracks: Tracks) -> Verdict:
         _below("expected error at the incisor (1 sigma, median)", float(sigma[0]), 0.15, 0.5, "mm", 3),
         _below("expected error at the worse condyle (1 sigma, median)", float(sigma[3:].max()), 0.5, 1.0, "mm", 3),
     ]
+    found = [Finding.from_json(one) for one in tracks.meta.get("findings", [])]
+    unused = [f"{one.camera}: {one.message}" for one in found if one.kind in _UNUSED]
+    if unused:
+        checks.append(Check("cameras that are not used", " ".join(unused), "none", LOOK))
     return _verdict("track", checks)
 
 

@@ -54,7 +54,7 @@ class ShortConfig:
     seed: int
     frames: int = 14
     unpainted: float = 0.0  # share of scanners without paint
-    without_picks: float = 0.25  # share of captures in which the teeth must be searched
+    without_picks: float = 0.15  # share of captures in which the teeth must be searched
 
 
 @dataclass(frozen=True, eq=False)

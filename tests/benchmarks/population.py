@@ -6,10 +6,13 @@ through `jawusd check` and `jawusd track` and is compared with its truth. Printe
     refused     valid captures that were refused, with the messages
     warned      valid captures with each kind of finding: the false-alarm rate of that kind
     errors      vertices per arch and the incisal point: median and 95th percentile over persons of the mean over
-                frames; lost: share of frames
-    ratio       rms error of the vertices over the Cramer-Rao bound by the annotator's known wobble, the worse arch
-    shift       mean over frames of the error along each anatomical axis: share of persons within 0.02 mm
-    NEES        normalised squared error of the poses over 6, median over persons: 1 when sigmas are honest
+                frames; lost, gross: share of frames without a pose, or more than 0.5 mm wrong; silent: of gross ones
+                without a flag (plainly tracked, sigma below 0.25 mm)
+    ratio       error of the vertices (median over frames of their rms) over the Cramer-Rao bound by the known
+                wobble of the annotator, the worse arch
+    shift       median over frames of the error along each anatomical axis: share of persons within 0.02 mm
+    NEES        normalised squared error of the poses over 6, mean over frames that are not grossly wrong, median
+                over persons: 1 when sigmas are honest
     faults      per planted fault, over a quarter of the persons: refused or flagged with the right cause; with a wrong
                 one only; not at all; and of these how many were wrong by less than 0.1 mm at the incisal point all the
                 same
@@ -18,6 +21,7 @@ through `jawusd check` and `jawusd track` and is compared with its truth. Printe
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import re
 import shutil
@@ -39,6 +43,9 @@ from population_score import AXES, ROWS, Outcome, run
 
 from jawusd.synthetic.short_capture import ShortConfig, write_short_capture
 
+#: Seed, fault or -1, frames, share of scans without paint, folder of the captures.
+Task = tuple[int, int, int, float, Path]
+
 STEADY_MM = 0.02
 HARMLESS_MM = 0.1
 
@@ -55,9 +62,16 @@ def main() -> None:
     parser.add_argument("--only", default="", help="pattern of the faults' names")
     parser.add_argument("--each", type=int, help="persons per fault, a quarter of all if not given")
     parser.add_argument("--out", type=Path, help="folder to keep outcomes (JSON lines) in")
+    parser.add_argument("--captures", type=Path, help="folder to keep the captures in, and to take them from")
     options = parser.parse_args()
     seeds = range(options.seed, options.seed + options.persons)
-    config = (options.frames, options.unpainted)
+    with contextlib.ExitStack() as stack:
+        folder = options.captures or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="jawusd_persons_")))
+        measure(options, seeds, (options.frames, options.unpainted, folder))
+
+
+def measure(options: argparse.Namespace, seeds: Iterable[int], config: tuple[int, float, Path]) -> None:
+    """Run valid and spoilt captures and print."""
     valid = collect([(seed, -1, *config) for seed in seeds], options, "valid")
     valid.sort(key=lambda o: o.seed)
     report(valid)
@@ -77,25 +91,27 @@ def _part(seeds: list[int], index: int, count: int) -> list[int]:
     return list(dict.fromkeys(seeds[(index * 7 + i) % len(seeds)] for i in range(count)))
 
 
-def one(task: tuple[int, int, int, float]) -> Outcome | None:
+def one(task: Task) -> Outcome | None:
     """Write, spoil, track and score one capture; None if the fault cannot be planted into it."""
-    seed, fault, frames, unpainted = task
+    seed, fault, frames, unpainted, captures = task
     cv2.setNumThreads(1)
-    folder = Path(tempfile.mkdtemp(prefix=f"jawusd_person_{seed}_"))
-    try:
-        write_short_capture(folder, ShortConfig(seed, frames, unpainted))
-        if fault >= 0:
-            FAULTS[fault].plant(folder, np.random.default_rng([seed, fault]))
-        outcome = run(folder, seed)
-        outcome.groups["fault"] = FAULTS[fault].name if fault >= 0 else ""
+    valid = captures / f"person_{seed}_{frames}_{unpainted:g}"
+    if not (valid / "capture.toml").exists():  # written last
+        write_short_capture(valid, ShortConfig(seed, frames, unpainted))
+    if fault < 0:
+        return run(valid, seed)
+    with tempfile.TemporaryDirectory(prefix=f"jawusd_fault_{fault}_") as folder:
+        spoilt = shutil.copytree(valid, Path(folder) / "capture")
+        try:
+            FAULTS[fault].plant(spoilt, np.random.default_rng([seed, fault]))
+        except NotPossible:
+            return None
+        outcome = run(spoilt, seed)
+        outcome.groups["fault"] = FAULTS[fault].name
         return outcome
-    except NotPossible:
-        return None
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
 
 
-def collect(tasks: list[tuple[int, int, int, float]], options: argparse.Namespace, name: str) -> list[Outcome]:
+def collect(tasks: list[Task], options: argparse.Namespace, name: str) -> list[Outcome]:
     """Return the outcomes of all tasks; progress goes to stderr."""
     start, out = time.perf_counter(), []
     with ProcessPoolExecutor(options.jobs) as pool:
@@ -123,8 +139,8 @@ def report(outcomes: list[Outcome]) -> None:
     for (kind, severity), count in kinds.most_common():
         print(f"  {kind:<30}{severity:<9}{count:4d}  {100 * count / len(outcomes):5.1f} %")
     scored = [o for o in outcomes if "vertices upper" in o.figures]
-    head = ("n", "lost", "upper", "p95", "lower", "p95", "incisor", "p95", "ratio", "shift u", "shift l", "shift r")
-    heads = (*head, "NEES u", "NEES l", "NEES r")
+    head = ("n", "lost", "gross", "silent", "upper", "p95", "lower", "p95", "incisor", "p95", "ratio")
+    heads = (*head, "shift u", "shift l", "shift r", "NEES u", "NEES l", "NEES r")
     print(f"{'':<26}" + "".join(f"{name:>8}" for name in heads))
     for name, group in grouped(scored):
         print(f"{name:<26}" + row(group))
@@ -149,10 +165,10 @@ def row(group: list[Outcome]) -> str:
     def figures(name: str) -> np.ndarray:
         return np.array([o.figures[name] for o in group])
 
-    cells = [f"{len(group):8d}", f"{100 * figures('lost').mean():7.1f}%"]
+    cells = [f"{len(group):8d}", *(f"{100 * figures(name).mean():7.1f}%" for name in ("lost", "gross", "silent"))]
     for name in ("vertices upper", "vertices lower", "incisor"):
         cells += [f"{np.median(figures(name)):8.3f}", f"{np.percentile(figures(name), 95):8.3f}"]
-    cells.append(f"{np.median(figures('outcome ratio')):8.2f}")
+    cells.append(f"{np.median(figures('ratio')):8.2f}")
     for part in (*ROWS, "relative"):
         steady = [np.abs(o.vectors[f"shift {part}"]).max() <= STEADY_MM for o in group]
         cells.append(f"{100 * np.mean(steady):7.0f}%")

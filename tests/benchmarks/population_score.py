@@ -13,19 +13,20 @@ from cramer_rao import MEAN_W
 
 from jawusd.errors import JawusdError
 from jawusd.formats.capture import load_capture
-from jawusd.formats.tracks import Tracks
-from jawusd.geometry import se3_inverse, se3_log, transform_point, transform_points
+from jawusd.formats.tracks import TRACKED, Tracks
+from jawusd.geometry import mandible_metric, se3_inverse, se3_log, transform_point, transform_points
 from jawusd.pipeline.prepare import load_cameras, load_meshes, subject_of_capture
 from jawusd.pipeline.track import track
 from jawusd.synthetic.annotator import REFERENCE_HEIGHT
 from jawusd.tracking import TrackingConfig
 from jawusd.tracking.contour.quality import twist_covariance
-from jawusd.tracking.contour.scan import prepare_scan
+from jawusd.tracking.contour.scan import Scan, prepare_scan
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import MaskViews
 
 ROWS = ("upper", "lower")
 AXES = ("left", "up", "front")
+GROSS_MM = 0.5
 
 
 @dataclass
@@ -79,9 +80,9 @@ def check_findings(folder: Path) -> list[tuple[str, str, str]]:
     """Return what `jawusd check` finds, nothing while there is no such command."""
     if importlib.util.find_spec("jawusd.pipeline.check") is None:
         return []
-    from jawusd.pipeline.check import check
+    from jawusd.pipeline.check import check_capture
 
-    return [(f.kind, f.severity, f.line()) for f in check(folder)]
+    return [(f.kind, f.severity, f.line()) for f in check_capture(folder)]
 
 
 def track_findings(tracks: Tracks) -> list[tuple[str, str, str]]:
@@ -123,28 +124,38 @@ def compare(outcome: Outcome, folder: Path, tracks: Tracks, truth: dict[str, np.
     exact = np.stack([truth[f"T_world_{row}"][rows] for row in ROWS], axis=1)
     found = np.stack([getattr(tracks, f"T_world_{row}")[good] for row in ROWS], axis=1)
     bound = cramer_rao(folder, scans, exact, truth, rows, cameras)
+    usual = np.ones(len(rows), bool)
     for r, row in enumerate(ROWS):
         gap = transform_points(found[:, r], scans[r].probes) - transform_points(exact[:, r], scans[r].probes)
         distance = np.linalg.norm(gap, axis=-1)
+        of_frame = np.sqrt((distance**2).mean(1))
         figures[f"vertices {row}"] = float(distance.mean())
-        figures[f"rms {row}"] = float(np.sqrt((distance**2).mean()))
-        metric = [np.trace(_metric(transform_points(T, scans[r].probes)) @ C) for T, C in zip(exact[:, r], bound[:, r])]
-        figures[f"bound {row}"] = float(np.sqrt(np.median(metric)))
+        wrong = of_frame > GROSS_MM
+        sigma = _crown_sigmas(exact[:, r], scans[r], getattr(tracks, f"covariance_{row}")[good])
+        flagged = (tracks.status[good, r] != TRACKED) | (sigma > GROSS_MM / 2)
+        figures[f"gross {row}"] = float(wrong.mean())
+        usual &= ~wrong
+        figures[f"silent {row}"] = float((wrong & ~flagged).mean())
+        least = _crown_sigmas(exact[:, r], scans[r], bound[:, r])
+        figures[f"bound {row}"] = float(np.median(least))
+        figures[f"ratio {row}"] = float(np.median(of_frame) / np.median(least))
         inwards = np.swapaxes(exact[:, r, :3, :3], 1, 2)
-        vectors[f"shift {row}"] = (to_bite @ np.einsum("fij,fj->fi", inwards, gap.mean(1)).mean(0)).tolist()
+        vectors[f"shift {row}"] = (to_bite @ np.median(np.einsum("fij,fj->fi", inwards, gap.mean(1)), axis=0)).tolist()
         twist = se3_log(exact[:, r] @ se3_inverse(found[:, r]))
-        figures[f"nees {row}"] = _nees(twist, getattr(tracks, f"covariance_{row}")[good])
+        figures[f"nees {row}"] = _nees(twist[~wrong], getattr(tracks, f"covariance_{row}")[good][~wrong])
     relative = truth["T_upper_lower"][rows]
     measured = tracks.T_upper_lower[good]
     for k, name in ((0, "incisor"), (3, "condyle")):
         gap = transform_point(measured, landmarks[k]) - transform_point(relative, landmarks[k])
         figures[name] = float(np.linalg.norm(gap, axis=-1).mean())
         if name == "incisor":
-            vectors["shift relative"] = (to_bite @ gap.mean(0)).tolist()
+            vectors["shift relative"] = (to_bite @ np.median(gap, axis=0)).tolist()
     twist = se3_log(relative @ se3_inverse(measured))
-    figures["nees relative"] = _nees(twist, tracks.covariance_relative[good])
+    figures["nees relative"] = _nees(twist[usual], tracks.covariance_relative[good][usual])
     figures["sigma incisor"] = float(np.nanmedian(tracks.sigma_mm[good, 0]))
-    figures["outcome ratio"] = max(figures[f"rms {row}"] / figures[f"bound {row}"] for row in ROWS)
+    figures["ratio"] = max(figures[f"ratio {row}"] for row in ROWS)
+    for name in ("gross", "silent"):
+        figures[name] = max(figures[f"{name} {row}"] for row in ROWS)
     gum = tracks.meta.get("gum_line_mm")
     if gum is not None:
         vectors["gum error"] = (np.asarray(gum, float).ravel()[:2] - truth["gum_mm"]).tolist()
@@ -174,14 +185,16 @@ def cramer_rao(
     return np.array(out)
 
 
-def _metric(points: np.ndarray) -> np.ndarray:
-    from jawusd.geometry import mandible_metric
-
-    return mandible_metric(points)
+def _crown_sigmas(poses: np.ndarray, scan: Scan, covariances: np.ndarray) -> np.ndarray:
+    """Return the rms standard deviation of crown vertices [mm], shape (F,), by covariances of left twists."""
+    squares = [
+        np.trace(mandible_metric(transform_points(T, scan.probes)) @ C) for T, C in zip(poses, covariances, strict=True)
+    ]
+    return np.sqrt(np.array(squares))
 
 
 def _nees(twist: np.ndarray, covariance: np.ndarray) -> float:
-    """Return the median over frames of the normalised squared error over 6."""
+    """Return the mean over frames of the normalised squared error over 6."""
     usable = np.isfinite(covariance).all((1, 2))
     if not usable.any():
         return float("nan")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from report_data import report_data
 
+from jawusd.formats.finding import Finding
 from jawusd.formats.report import RigFacts
 from jawusd.report.ranges import human_ranges
 from jawusd.report.timeline import tracking_figure
@@ -83,6 +84,15 @@ def coarse(data):
 def test_each_fault_is_found_where_it_is(fault, stage):
     found = grades(fault(report_data()))
     assert found.pop(stage) == BAD and BAD not in found.values()
+
+
+def test_a_camera_that_is_not_used_asks_for_a_look():
+    data = report_data()
+    found = Finding("camera_not_used", "warning", "used in 0 of 60 frames.", camera="left")
+    data.tracks.meta["findings"] = [found.as_json()]
+    assert grades(data)["track"] == LOOK
+    track = next(verdict for verdict in judge(data) if verdict.stage == "track")
+    assert track.checks[-1].found == "left: used in 0 of 60 frames."
 
 
 @pytest.mark.parametrize("code", ["take_lacks", "not_shown"])

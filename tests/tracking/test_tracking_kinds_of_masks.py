@@ -11,6 +11,7 @@ from small_take import CAMERAS, FIRST, OFFSETS, ROWS, errors_mm, make_capture, p
 
 from jawusd.errors import CaptureError, TrackingError
 from jawusd.formats.finding import Finding
+from jawusd.pipeline.track import track_lines, track_summary
 
 COUNT = 6
 
@@ -157,3 +158,14 @@ def test_black_masks_everywhere_and_masks_of_three_levels_are_refused(drawn, tmp
     with pytest.raises(CaptureError, match=r"cam1/upper/.*png: it holds the levels 0, 127, 255.*upper_value"):
         track(make_capture(three, COUNT))
     assert CAMERAS[1].name == "cam1" and FIRST
+
+
+def test_a_camera_that_draws_the_first_frame_astray_is_left_out(drawn, tmp_path):
+    folder = rewritten(drawn, tmp_path, lambda m: np.roll(m, 25, axis=0), ["cam1"])
+    tracks = track(make_capture(folder, COUNT, away_mm=1.5))
+    assert [found.camera for found in findings(tracks, "camera_not_used")] == ["cam1"]
+    assert (errors_mm(tracks).mean(0) < 0.05).all()
+    summary = track_summary(tracks)
+    assert summary["frames_used"] == {"cam0": COUNT, "cam1": 0, "cam2": COUNT}
+    assert summary["coverage_error_percent"] < 1.0  # of the masks that are used
+    assert any("camera cam1: used in 0 of 6 frames" in line for line in track_lines(summary))

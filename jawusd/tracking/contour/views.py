@@ -67,8 +67,7 @@ class MaskViews:
         """
         self._stack = ExitStack()
         self._masked = masked = masked_sources(sources, cameras, offsets)
-        sizes = {name: camera.size_px for name, camera in cameras.items()}
-        self._surveyed = [f for s in sources for f in survey_masks(s, sizes.get(s.name, (0, 0)))]
+        self._sizes = [(s, cameras[s.name].size_px if s.masks else (0, 0)) for s in sources]
         self.cameras = tuple(cameras[s.name] for s in masked)
         self._offsets = [offsets[s.name] for s in masked]
         self._working, self._readers = [], []
@@ -90,7 +89,7 @@ class MaskViews:
 
     def findings(self) -> list[Finding]:
         """Return what is to be said of the masks, and of cameras that have none, as far as they were read."""
-        out = list(self._surveyed)
+        out = [finding for source, size in self._sizes for finding in survey_masks(source, size)]
         for source, pair in zip(self._masked, self._readers, strict=True):
             for arch, reader in zip(ARCHES, pair, strict=True):
                 out += odd_pictures(source, arch, reader.odd)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from jawusd.errors import TrackingError
 from jawusd.formats.tracks import PARTIAL, TRACKED
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.config import TrackingConfig
+from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.frame_record import FrameRecord
 from jawusd.tracking.contour.quality import arch_fit, coverage_error, score_px, uncovered_px
 from jawusd.tracking.contour.scan import ARCH_NAMES, ARCHES
@@ -19,6 +21,8 @@ from jawusd.tracking.contour.views import View, present_masks
 # Least `arch_fit` of a first frame [-]: teeth that slid along by one reach 0 in one of the arches, right poses 0.1 even
 # with lips nearly closed.
 _LEAST_FIT = 0.05
+# The same of a fit without one camera, which is to leave no doubt; see `start`.
+_CLEAR_FIT = 0.3
 _FEWEST_MASKS = 2  # of an arch: one view leaves the depth unknown
 
 
@@ -38,32 +42,71 @@ def first_record(
                 frame=frame,
                 hint="Choose a bootstrap frame that is segmented in every camera.",
             )
+    first = _aligned(solver, config, start, views, use)
+    if (problem := _problem(first, config)) is not None:
+        # One camera's masks may have drawn all astray: those of another place, size or time.
+        others = [_aligned(solver, config, start, views, _without_camera(use, c)) for c in range(len(views))]
+        clear = [one for one in others if one.fit.min() >= _CLEAR_FIT and _problem(one, config) is None]
+        if not clear:
+            raise TrackingError(
+                problem,
+                frame=frame,
+                hint="Check the picks, the calibration, the time offsets and the masks of this frame.",
+            )
+        first = max(clear, key=lambda one: float(one.fit.min()))
+    status = np.where(first.use.all(1), TRACKED, PARTIAL).astype(np.int8)
+    return FrameRecord(first.solution, status, first.use, first.coverage)
+
+
+@dataclass(frozen=True, eq=False)
+class _Aligned:
+    """Hold an alignment with the masks that took part and what they say of it; arrays per arch and view."""
+
+    solution: Solution
+    use: Mask  # shape (2, C)
+    coverage: Array  # shape (2, C)
+    fit: Array  # `arch_fit`, shape (2,)
+
+
+def _aligned(solver: ContourSolver, config: TrackingConfig, start: Array, views: Sequence[View], use: Mask) -> _Aligned:
+    """Align with narrow and with wide gates, then without masks that stay uncovered."""
+    whole = use
     best = solver.solve(start, views, config.gates_from(0.0), use)
     wide = solver.solve(start, views, config.wide_gates_px, use)
     if (better := score_px(wide).sum(1) > score_px(best).sum(1)).any():
         poses = np.where(better[:, None, None], wide.poses, best.poses)
         best = solver.solve(poses, views, config.wide_gates_px[-2:], use)
     coverage = coverage_error(*uncovered_px(solver.scans, best.poses, views))
-    kept = _without_spoiled(use, coverage, config.lost_coverage)
-    if (kept != use).any():
+    for _ in range(2):  # without masks that stay uncovered; with those again that then are covered
+        kept = _without_spoiled(whole, coverage, config.lost_coverage)
+        if (kept == use).all():
+            break
         use = kept
         best = solver.solve(best.poses, views, config.wide_gates_px, use)
         coverage = coverage_error(*uncovered_px(solver.scans, best.poses, views))
-    fit = arch_fit(solver.scans, best, views, config.uncovered_price)
+    return _Aligned(best, use, coverage, arch_fit(solver.scans, best, views, config.uncovered_price))
+
+
+def _problem(first: _Aligned, config: TrackingConfig) -> str | None:
+    """Say why an alignment cannot be believed; None if it can."""
     for r in ARCHES:
-        share = score_px(best)[r].sum() / max(best.visible_px[r].sum(), 1.0)
-        uncovered = np.nanmedian(coverage[r, use[r]])
-        if share < config.first_share or uncovered > config.lost_coverage or fit[r] < _LEAST_FIT:
-            raise TrackingError(
+        share = score_px(first.solution)[r].sum() / max(first.solution.visible_px[r].sum(), 1.0)
+        uncovered = np.nanmedian(first.coverage[r, first.use[r]])
+        if share < config.first_share or uncovered > config.lost_coverage or first.fit[r] < _LEAST_FIT:
+            return (
                 f"the {ARCH_NAMES[r]} teeth do not fit their masks: {share:.0%} of the visible contour "
                 f"matches (at least {config.first_share:.0%} is needed), {uncovered:.1%} of the masks stays uncovered "
                 f"(at most {config.lost_coverage:.0%} is allowed), and the first less the price of the second is "
-                f"{fit[r]:.2f} (at least {_LEAST_FIT} is needed)",
-                frame=frame,
-                hint="Check the picks, the calibration, the time offsets and the masks of this frame.",
+                f"{first.fit[r]:.2f} (at least {_LEAST_FIT} is needed)"
             )
-    status = np.where(use.all(1), TRACKED, PARTIAL).astype(np.int8)
-    return FrameRecord(best, status, use, coverage)
+    return None
+
+
+def _without_camera(use: Mask, camera: int) -> Mask:
+    """Leave one camera out of the arches that then have enough masks, shape (2, C)."""
+    kept = use.copy()
+    kept[:, camera] = False
+    return np.where(kept.sum(1, keepdims=True) >= _FEWEST_MASKS, kept, use)
 
 
 def _without_spoiled(use: Mask, coverage: Array, limit: float) -> Mask:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -98,6 +99,8 @@ def _picked(
     if max(sigma_mm.values()) <= _SURE_MM or not footage.has_masks(start.frame):
         return start
     found = search_around(search, footage, start.frame, start.poses)
+    if (without := _around_without_a_camera(search, footage, start.frame, start.poses, found)) is not None:
+        notes["camera_left_out"], found = without
     notes |= {"by": "picks, then search", "worth_px": found.objective_px, "fit": found.fit}
     return Start(start.frame, found.poses, notes)
 
@@ -163,6 +166,32 @@ def search_around(search: StartSearch, footage: Footage, frame: int, poses: Arra
     except TrackingError:
         return near
     return max(near, anywhere, key=lambda found: found.objective_px)
+
+
+def _around_without_a_camera(
+    search: StartSearch, footage: Footage, frame: int, poses: Array, found: Found
+) -> tuple[str, Found] | None:
+    """Return a camera whose masks draw the poses found astray, and the poses without it; None if they are right.
+
+    A camera is left out only if the others then fit beyond doubt.
+    """
+    if len(footage.sources) < 3:
+        return None
+    try:
+        _aligned(search, footage, found.poses, frame)
+    except TrackingError:
+        pass
+    else:
+        return None
+    better = []
+    for source in footage.sources:
+        others = replace(footage, sources=[other for other in footage.sources if other is not source])
+        with contextlib.suppress(TrackingError):
+            near = search.near(others, frame, poses)
+            if near.fit >= _CLEAR_FIT:
+                _aligned(search, others, near.poses, frame)
+                better.append((source.name, near))
+    return max(better, key=lambda one: one[1].fit, default=None)
 
 
 def _aligned(search: StartSearch, footage: Footage, poses: Array, frame: int) -> Array:

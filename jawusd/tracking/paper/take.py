@@ -90,6 +90,7 @@ def track_capture_paper(
                 if progress is not None:
                     progress(len(records), stop - first)
         names = tuple(camera.name for camera in masks.cameras)
+        findings = [finding.as_json() for finding in masks.findings()]
     if not capture.frames:
         masked = [frame for frame, record in records.items() if np.isfinite(record.coverage).any()]
         records = {f: record for f, record in records.items() if min(masked) <= f <= max(masked)}
@@ -99,6 +100,7 @@ def track_capture_paper(
         "backend": backend,
         "evaluations_per_row_and_frame": counted / max(len(records), 1),
         "tracking": asdict(config),
+        "findings": findings,
     }
     return _assembled(records, names, meta)
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections import deque
+from typing import NamedTuple
 
 import numpy as np
 
-from jawusd.formats.tracks import TRACKED
+from jawusd.formats.tracks import PARTIAL, TRACKED
 from jawusd.geometry import orthonormalise, se3_inverse, transform_points
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.contour.frame_record import FrameRecord, FrameSummary
@@ -104,17 +105,29 @@ class MotionPredictor:
         return [np.stack([p[0], head @ se3_inverse(p[0]) @ p[1]]) for p in self._seen]
 
 
+class _Partial(NamedTuple):
+    """Hold the quality of frames without one of the cameras; they count where there are no others."""
+
+    scores: deque[Array]
+    residuals: deque[Array]
+    coverages: deque[Array]
+
+
 class History:
-    """Remember the quality of recent good frames, to tell a bad one."""
+    """Remember the quality of recent good frames, to tell a bad one.
+
+    A camera may be missing in the whole take; then the frames without it tell what is usual.
+    """
 
     def __init__(self, length: int, score_length: int) -> None:
         """Start empty; keep at most `length` frames, scores of at most `score_length`."""
         self._scores: deque[Array] = deque(maxlen=score_length)
         self._residuals: deque[Array] = deque(maxlen=length)
         self._coverages: deque[Array] = deque(maxlen=length)
+        self._partial = _Partial(deque(maxlen=score_length), deque(maxlen=length), deque(maxlen=length))
 
     def add(self, record: FrameRecord) -> None:
-        """Add a frame; only arches tracked without trouble count."""
+        """Add a frame; only arches tracked without trouble count, see the class."""
         self.add_summary(FrameSummary.of(record))
 
     def add_summary(self, past: FrameSummary) -> None:
@@ -123,23 +136,28 @@ class History:
         self._scores.append(np.where(good[:, None], past.score_px, np.nan))
         self._residuals.append(np.where(good, past.residual_px, np.nan))
         self._coverages.append(np.where(good[:, None] & past.used, past.coverage, np.nan))
+        partial = past.status == PARTIAL
+        used = partial[:, None] & past.used
+        self._partial.scores.append(np.where(used, past.score_px, np.nan))
+        self._partial.residuals.append(np.where(partial, past.residual_px, np.nan))
+        self._partial.coverages.append(np.where(used, past.coverage, np.nan))
 
     def usual_score(self) -> Array:
         """Return the median score per arch and view [px], shape (2, C); 0 while unknown."""
-        return _median(self._scores, 0.0)
+        return _median(self._scores, _median(self._partial.scores, 0.0))
 
     def usual_residual(self) -> Array:
         """Return the median residual per arch [px], shape (2,); infinite while unknown."""
-        return _median(self._residuals, np.inf)
+        return _median(self._residuals, _median(self._partial.residuals, np.inf))
 
     def usual_coverage(self) -> Array:
         """Return the median coverage error per arch and view, shape (2, C); 0 while unknown."""
-        return _median(self._coverages, 0.0)
+        return _median(self._coverages, _median(self._partial.coverages, 0.0))
 
 
-def _median(values: deque[Array], otherwise: float) -> Array:
+def _median(values: deque[Array], otherwise: float | Array) -> Array:
     stack = np.array(values)
     known = np.isfinite(stack).any(0)
-    out = np.full(stack.shape[1:], otherwise)
+    out = np.array(np.broadcast_to(otherwise, stack.shape[1:]), np.float64)
     out[known] = np.nanmedian(stack[:, known], axis=0)
     return out
