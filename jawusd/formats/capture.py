@@ -30,6 +30,8 @@ class Scans(_Strict):
     skull: Path | None = None
     #: Folder of the labels of the teeth scans; beside the scans if not given.
     labels: Path | None = None
+    #: Whether the two scans are taken as they stand, or the lower one is moved to where the take shows the closed bite.
+    registration: Literal["scan", "take"] = "scan"
 
 
 class Masks(_Strict):

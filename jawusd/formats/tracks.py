@@ -32,6 +32,23 @@ class CameraCorrections(TypedDict):
     T_cam_world: dict[str, list[list[float]]]
 
 
+class Registration(TypedDict):
+    """Say how far the lower scan is from where the closed bite of the take shows it, in skull (scan) axes.
+
+    `T` (4, 4) maps the lower scan as it was given to where it belongs; shift and turn are of the same motion about the
+    middle of the lower crowns. Standard deviations follow.
+    """
+
+    frames: list[int]  # with the teeth together
+    named: bool  # whether the capture names such a frame
+    applied: bool  # whether poses and lower scan are those of the corrected registration
+    shift_mm: list[float]
+    turn_deg: list[float]
+    shift_sigma_mm: list[float]
+    turn_sigma_deg: list[float]
+    T: list[list[float]]
+
+
 class TracksMeta(TypedDict, total=False):
     """Configuration, and what was estimated over a whole take; tables by camera name, pairs are (upper, lower)."""
 
@@ -39,8 +56,14 @@ class TracksMeta(TypedDict, total=False):
     correlation_px: float
     delays_frames: dict[str, float]
     delays_sigma_frames: dict[str, float]
-    mask_bias_px: list[float]
-    mask_bias_sigma_px: list[float]
+    outline_bias_px: dict[str, list[float]]  # by camera: how far the masks of both arches reach over free edges
+    outline_bias_sigma_px: dict[str, list[float]]
+    gum_bias_px: dict[str, list[float]]  # by camera: the same at the gum line
+    gum_bias_sigma_px: dict[str, list[float]]
+    gum_line_mm: list[float]  # how far the drawn gum line lies from the scans' towards the gum, along the surface
+    gum_line_sigma_mm: list[float]
+    registration: Registration
+    steady_error: list[list[list[float]]]  # of both arches S (4, 4): the masks showed T_world_arch @ S
     extrinsics: CameraCorrections
     start: dict[str, object]
     painted: list[bool]

@@ -12,7 +12,7 @@ from jawusd.formats.capture import Capture
 from jawusd.formats.model import JawModel
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import LANDMARKS
-from jawusd.pipeline.prepare import BONES, Subject, load_cameras, tracked_cameras
+from jawusd.pipeline.prepare import BONES, Subject, load_cameras, registered_subject, tracked_cameras
 from jawusd.pipeline.state import Progress, no_progress
 
 DEFAULT_FPS = 24.0
@@ -56,6 +56,7 @@ def bake_subject(
     from jawusd.imaging.mesh_cleaning import manifold
     from jawusd.rig.bake import bake_rig
 
+    subject = registered_subject(subject, model.meta)
     # Bones come from segmented scans with all their faults; teeth scans stay as they are, vertex for vertex.
     meshes = {key: manifold(mesh) if key in BONES else mesh for key, mesh in subject.meshes.items()}
     moving = len(model.frames) > 0

@@ -27,7 +27,7 @@ from jawusd.formats.poses import read_poses
 from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.geometry import make_transform, matrix_from_wxyz, rigidity_defect, se3_inverse
 from jawusd.geometry.arrays import Array
-from jawusd.pipeline.prepare import Subject
+from jawusd.pipeline.prepare import Subject, registered_subject
 from jawusd.pipeline.state import Progress, no_progress
 
 if TYPE_CHECKING:
@@ -87,6 +87,9 @@ def fit_subject(
     """
     from jawusd.fitting import FittingConfig, fit_model
 
+    registration = motion.meta.get("registration") if isinstance(motion, Tracks) else None
+    if registration is not None:
+        subject = registered_subject(subject, {"registration": registration})
     model = fit_model(
         motion,
         T_anatomical_skull=subject.T_anatomical_skull,
@@ -100,6 +103,8 @@ def fit_subject(
     model.meta["inferred"] = list(subject.inferred)
     if subject.fps is not None:
         model.meta["fps"] = subject.fps
+    if registration is not None:
+        model.meta["registration"] = registration
     return model
 
 

@@ -17,7 +17,7 @@ from jawusd.formats.model import JawModel
 from jawusd.formats.report import Overlay, ReplayPart
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import Camera, transform_points
-from jawusd.pipeline.prepare import load_cameras, load_meshes, tracked_cameras
+from jawusd.pipeline.prepare import load_cameras, load_meshes, registered_meshes, tracked_cameras
 from jawusd.pipeline.state import Progress, make_folder
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ def write_overlay(
     from jawusd.imaging.video_writer import VideoWriter
 
     cameras, videos = open_footage(capture, tracks)
-    meshes = load_meshes(capture)
+    meshes = registered_meshes(load_meshes(capture), tracks.meta)
     upper, lower = meshes["upper_teeth"], meshes["lower_teeth"]
     make_folder(folder)
     done, total = 0, len(videos) * len(tracks.frames)
@@ -147,7 +147,7 @@ def draw_worst_frames(capture: Capture, offsets: Mapping[str, int], tracks: Trac
         raise FormatError(f"the capture has other cameras than the tracks ({', '.join(tracks.camera_names)}).")
     cameras, videos = open_footage(capture, tracks)
     shown = [cameras[name] for name in videos][:_MOST_CAMERAS]
-    meshes = load_meshes(capture)
+    meshes = registered_meshes(load_meshes(capture), tracks.meta)
     scans = meshes["upper_teeth"], meshes["lower_teeth"]
     found = []
     for index, reason in chosen_frames(tracks, capture.fps):

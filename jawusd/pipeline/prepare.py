@@ -6,7 +6,7 @@ import contextlib
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +21,14 @@ from jawusd.formats.mesh import Mesh, tooth_labels
 from jawusd.formats.model import load_model
 from jawusd.formats.scan_labels import labels_path
 from jawusd.formats.tracks import Tracks
-from jawusd.geometry import LANDMARKS, Camera, anatomical_frame, find_landmarks, landmark_frame
+from jawusd.geometry import (
+    LANDMARKS,
+    Camera,
+    anatomical_frame,
+    find_landmarks,
+    landmark_frame,
+    transform_points,
+)
 from jawusd.geometry.arrays import Array
 from jawusd.pipeline.scan_labels import TEETH, LabelledScan, label_teeth
 from jawusd.pipeline.state import hash_files
@@ -155,6 +162,35 @@ def load_labelled(capture: Capture) -> tuple[dict[str, Mesh], list[Finding]]:
     teeth = label_teeth(meshes, files, capture.scans.labels)
     labelled = {TEETH[arch]: scan.mesh for arch, scan in teeth.items()}
     return meshes | labelled, [finding for scan in teeth.values() for finding in scan.findings]
+
+
+def registered_meshes(meshes: Mapping[str, Mesh], meta: Mapping[str, object]) -> dict[str, Mesh]:
+    """Return meshes with the lower scan where the take shows it, if the meta data of tracks or model say so."""
+    T = _registration(meta)
+    out = dict(meshes)
+    if T is not None and "lower_teeth" in meshes:
+        out["lower_teeth"] = replace(
+            meshes["lower_teeth"], vertices=transform_points(T, meshes["lower_teeth"].vertices)
+        )
+    return out
+
+
+def registered_subject(subject: Subject, meta: Mapping[str, object]) -> Subject:
+    """Return a person with lower scan and lower teeth landmarks where the take shows them; see `registered_meshes`."""
+    T = _registration(meta)
+    if T is None:
+        return subject
+    lower = np.array([not name.startswith("condyle") for name in LANDMARKS])
+    landmarks = np.where(lower[:, None], transform_points(T, subject.landmarks), subject.landmarks)
+    return replace(subject, meshes=registered_meshes(subject.meshes, meta), landmarks=landmarks)
+
+
+def _registration(meta: Mapping[str, object]) -> Array | None:
+    """Return what moves the lower scan, shape (4, 4); None if it stays as it was given."""
+    found = meta.get("registration")
+    if not isinstance(found, dict) or not found.get("applied"):
+        return None
+    return np.array(found["T"], np.float64)
 
 
 def read_meshes(files: Mapping[str, Path]) -> dict[str, Mesh]:

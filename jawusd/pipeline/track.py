@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from functools import partial
 from pathlib import Path
@@ -15,7 +16,7 @@ from jawusd.formats.capture import Capture
 from jawusd.formats.coverage import used_coverage
 from jawusd.formats.finding import Finding
 from jawusd.formats.model import JawModel
-from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, LostReason, Tracks, TrackStatus, save_tracks
+from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, LostReason, Registration, Tracks, TrackStatus, save_tracks
 from jawusd.geometry import LANDMARKS
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.media import write_overlay
@@ -26,6 +27,7 @@ from jawusd.pipeline.prepare import (
     load_meshes,
     naming_file,
     open_capture,
+    registered_meshes,
     rescaled_cameras,
     subject_of_capture,
 )
@@ -52,6 +54,10 @@ class TrackSummary(TypedDict):
     sigma_mm: dict[str, float | None]  # median standard deviation of the landmarks, None if not known
     coverage_error_percent: float | None  # share of the masks used that is left uncovered, None without any
     frames_used: NotRequired[dict[str, int]]  # frames in which masks of a camera took part, by camera
+    outline_bias_px: NotRequired[dict[str, list[float]]]  # how far the masks reach over free edges, by camera and arch
+    gum_bias_px: NotRequired[dict[str, list[float]]]  # the same at the gum line
+    gum_line_mm: NotRequired[list[float]]  # of both arches, towards the gum along the surface
+    registration: NotRequired[Registration]  # of the lower scan, from frames with the teeth together
     findings: NotRequired[list[dict[str, str | float | int]]]  # what is doubtful about the take: `Finding.as_json`
 
 
@@ -177,7 +183,7 @@ def model_pass(
     from jawusd.tracking.sequence.model_refinement import refine_tracks
 
     with naming_file(capture.folder / "capture.toml"):
-        meshes = load_meshes(capture)
+        meshes = registered_meshes(load_meshes(capture), tracks.meta)
         return refine_tracks(
             tracks,
             JawRig(model.arrays, model.meta),
@@ -206,7 +212,7 @@ def track_summary(tracks: Tracks) -> TrackSummary:
     sigma = np.median(tracks.sigma_mm[tracked], axis=0) if tracked.any() else np.full(len(LANDMARKS), np.nan)
     coverage = used_coverage(tracks)
     coverage = coverage[np.isfinite(coverage)]
-    return TrackSummary(
+    summary = TrackSummary(
         frames=len(tracks.frames),
         tracked=int(tracked.sum()),
         lost=[int(frame) for frame in lost],
@@ -220,6 +226,12 @@ def track_summary(tracks: Tracks) -> TrackSummary:
         frames_used=dict(zip(tracks.camera_names, tracks.masks_used.any(1).sum(0).tolist(), strict=True)),
         findings=tracks.meta.get("findings", []),
     )
+    if "outline_bias_px" in tracks.meta:
+        summary["outline_bias_px"] = tracks.meta["outline_bias_px"]
+        summary["gum_bias_px"], summary["gum_line_mm"] = tracks.meta["gum_bias_px"], tracks.meta["gum_line_mm"]
+    if "registration" in tracks.meta:
+        summary["registration"] = tracks.meta["registration"]
+    return summary
 
 
 def lost_reasons(tracks: Tracks) -> dict[str, dict[str, int]]:
@@ -310,4 +322,27 @@ def track_lines(summary: TrackSummary) -> list[str]:
     if "frames_used" in summary:
         used = ", ".join(f"{name} {count}" for name, count in summary["frames_used"].items())
         lines.append(f"  frames in which masks took part: {used}")
+    lines += _take_lines(summary)
     return [*lines, *(f"  {Finding.from_json(found).line()}" for found in summary.get("findings", []))]
+
+
+def _take_lines(summary: TrackSummary) -> list[str]:
+    """Return what was estimated from all frames together: how the masks were drawn, and the scans' registration."""
+    lines = []
+    reaches = (("free edges", summary.get("outline_bias_px")), ("gum line", summary.get("gum_bias_px")))
+    for what, found in reaches:
+        if found is not None:
+            reach = ", ".join(f"{name} {upper:+.2f} {lower:+.2f}" for name, (upper, lower) in found.items())
+            lines.append(f"  masks reach beyond the {what}, upper and lower arch [px]: {reach}")
+    if "gum_line_mm" in summary:
+        upper, lower = summary["gum_line_mm"]
+        lines.append(
+            f"  gum line drawn towards the gum, along the surface [mm]: upper {upper:+.2f}, lower {lower:+.2f}"
+        )
+    if "registration" in summary:
+        bite = summary["registration"]
+        shift, turn = math.hypot(*bite["shift_mm"]), math.hypot(*bite["turn_deg"])
+        sigmas = math.hypot(*bite["shift_sigma_mm"]), math.hypot(*bite["turn_sigma_deg"])
+        what = "lower scan moved to the closed bite by" if bite["applied"] else "lower scan off the closed bite by"
+        lines.append(f"  {what} {shift:.2f} +- {sigmas[0]:.2f} mm, {turn:.2f} +- {sigmas[1]:.2f} degrees")
+    return lines

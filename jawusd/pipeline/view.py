@@ -24,7 +24,14 @@ from jawusd.geometry.arrays import Array, Mask
 from jawusd.pipeline.bake import DEFAULT_FPS
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.media import GRAY, open_videos
-from jawusd.pipeline.prepare import load_cameras, load_meshes, open_capture, subject_of_capture, tracked_cameras
+from jawusd.pipeline.prepare import (
+    load_cameras,
+    load_meshes,
+    open_capture,
+    registered_meshes,
+    subject_of_capture,
+    tracked_cameras,
+)
 from jawusd.pipeline.report import as_built, is_build, recorded_offsets
 from jawusd.pipeline.scans import save_reviewed
 from jawusd.pipeline.state import BuildState, Progress
@@ -228,9 +235,9 @@ def viewed_capture(
     poses = _poses(capture, tracks)
     videos = open_videos(capture)
     cameras = [] if capture.calibration is None else load_cameras(capture)
-    if poses is not None:
-        cameras = tracked_cameras(cameras, poses)
     meshes = load_meshes(capture)
+    if poses is not None:
+        cameras, meshes = tracked_cameras(cameras, poses), registered_meshes(meshes, poses.meta)
     offsets = _offsets(capture, build, progress)
     footage = _Footage(
         capture=capture,

@@ -124,7 +124,7 @@ def written(folder: Path, frames: tuple[int, int]) -> bool:
 def nuisances(tracks: Tracks) -> str:
     """Return what was found out about cameras and masks."""
     delays = ", ".join(f"{v:+.3f}" for v in tracks.meta["delays_frames"].values())
-    bias = ", ".join(f"{v:+.2f}" for v in tracks.meta["mask_bias_px"])
+    bias = ", ".join(f"{v:+.2f}" for v in np.mean(list(tracks.meta["outline_bias_px"].values()), axis=0))
     report = tracks.meta["extrinsics"]
     moves = f"corrected by up to {np.abs(list(report['moves_mm'].values())).max():.2f} mm"
     cameras = moves if report["corrected"] else "left alone"

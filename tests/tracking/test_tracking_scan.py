@@ -30,12 +30,17 @@ def test_crown_gum_line_of_ball_and_plate_is_a_circle():
     plate = trimesh.creation.box((20.0, 0.0, 20.0)).subdivide().subdivide()
     plate.apply_translation([0.0, 3.0, 0.013])
     vertices = np.concatenate([ball.vertices, plate.vertices])
-    segments = crown_gum_segments(
+    segments, directions = crown_gum_segments(
         vertices, ball.faces.astype(np.int32), (plate.faces + len(ball.vertices)).astype(np.int32)
     )
     assert np.allclose(segments[..., 1], 3.0, atol=1e-9)
     radius = np.linalg.norm(segments[..., [0, 2]], axis=-1)
     assert abs(radius - 4.0).max() < 0.02
+    # The ball's surface crosses the circle along its meridians.
+    along = segments[:, 1] - segments[:, 0]
+    middle = segments.mean(1)
+    assert np.abs(np.einsum("si,si->s", directions, along) / np.linalg.norm(along, axis=1)).max() < 1e-9
+    assert np.abs(np.einsum("si,si->s", directions, middle) / np.linalg.norm(middle, axis=1)).max() < 0.05
     # The plate is a flat box: top and bottom lie in one plane, so every piece is found twice.
     total = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1).sum()
     assert total == pytest.approx(2 * 2 * np.pi * 4.0, rel=0.01)
@@ -46,7 +51,7 @@ def test_crown_gum_line_agrees_with_a_brute_force_search():
     # No two triangles share a corner: whether those that touch count as crossing is up to rounding.
     vertices = rng.normal(size=(165, 3)) * 3
     crown, gum = np.split(np.arange(165, dtype=np.int32).reshape(-1, 3), [25])
-    segments = crown_gum_segments(vertices, crown, gum)
+    segments, directions = crown_gum_segments(vertices, crown, gum)
     count = 0
     for a in vertices[crown]:
         for b in vertices[gum]:

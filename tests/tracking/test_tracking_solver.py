@@ -6,13 +6,27 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from bumpy_teeth import arch, disturbed, jaw_poses, make_cameras, render_masks, vertex_error_mm
+from scipy import ndimage
 
 from jawusd.geometry import make_transform, rigidity_defect, se3_exp, se3_inverse, transform_point, transform_points
 from jawusd.imaging.raster import draw_depth_labels, project
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.correspondences import accumulate, search_edges
 from jawusd.tracking.contour.equations import GingivalMarginTerm, NormalEquations, SilhouetteTerm
-from jawusd.tracking.contour.samples import COLUMNS, CROWN, GUM, INVERSE_DEPTH, LENGTH, NX, NY, U, V, contour_samples
+from jawusd.tracking.contour.samples import (
+    COLUMNS,
+    CROWN,
+    GUM,
+    HABITS,
+    INVERSE_DEPTH,
+    LENGTH,
+    NX,
+    NY,
+    U,
+    V,
+    contour_samples,
+    gum_distances_px,
+)
 from jawusd.tracking.contour.scan import ARCHES, prepare_scan
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import View
@@ -42,7 +56,9 @@ def _samples(r, pose, camera):
     draw_depth_labels(points, SCANS[r].gum_faces, 0, 0, False, depth, labels, GUM)
     eye = transform_point(se3_inverse(pose), camera.centre_world())
     matrix = camera.projection_matrix() @ pose
-    return contour_samples(SCANS[r], matrix, eye, labels, depth, 3.0, 1.5)[0], labels
+    distances = np.empty(labels.shape, np.float32)
+    gum_distances_px(labels, distances)
+    return contour_samples(SCANS[r], matrix, eye, labels, depth, distances, 3.0, 1.5)[0], labels
 
 
 def test_samples_lie_on_the_outline_of_the_rendered_crowns():
@@ -104,15 +120,26 @@ def test_edges_across_the_contour_and_hidden_samples_are_left_out():
     assert np.isfinite(out[0])
 
 
+def test_gum_distances_agree_with_scipy():
+    labels = np.zeros((60, 80), np.uint8)
+    labels[20:24, 30:50], labels[40, 10], labels[5:30, 60:70] = GUM, GUM, CROWN
+    out = np.empty(labels.shape, np.float32)
+    gum_distances_px(labels, out)
+    exact = ndimage.distance_transform_edt(labels != GUM)
+    assert (out >= 0.9999 * exact).all() and (out <= 1.0825 * exact).all()
+
+
 def test_normal_equations_agree_with_finite_differences():
     camera, pose = CAMERAS[2], POSES[3, 1]
     samples, _ = _samples(1, pose, camera)
     rng = np.random.default_rng(1)
     distances = rng.normal(size=len(samples)) * 0.5
     centre = transform_point(pose, SCANS[1].centre)
-    precision, gradient, bias_slope = np.zeros((6, 6)), np.zeros(6), np.zeros(6)
+    precision, gradient = np.zeros((6, 6)), np.zeros(6)
+    habit_slope, habit_distance, habit_weight = np.zeros((3, 6)), np.zeros(3), np.zeros((3, 3))
     where = (pose, camera.projection_matrix(), centre)
-    sums = accumulate(samples, distances, 2.0, 2.5, 0.0, *where, precision, gradient, bias_slope)
+    tables = (precision, gradient, habit_slope, habit_distance, habit_weight)
+    sums = accumulate(samples, distances, 2.0, 2.5, 0.0, *where, *tables)
     h, J = 1e-5, np.empty((len(samples), 6))
     to, back = make_transform(np.eye(3), -centre), make_transform(np.eye(3), centre)
     for k in range(6):
@@ -125,10 +152,14 @@ def test_normal_equations_agree_with_finite_differences():
     scale = np.abs(J).max(0) * weight.sum()
     assert np.abs(precision - J.T @ (J * weight[:, None])).max() / scale.max() ** 2 < 1e-6
     assert (np.abs(gradient - J.T @ (weight * distances)) / scale < 1e-6).all()
-    assert (np.abs(bias_slope - J.T @ weight) / scale < 1e-6).all()
+    habits = samples[:, HABITS]
+    assert np.ptp(habits, axis=0).min() > 0.5  # free edges and gum line are both in sight
+    assert np.abs(habit_slope - habits.T @ (J * weight[:, None])).max() / scale.max() < 1e-5
+    assert np.allclose(habit_distance, habits.T @ (weight * distances))
+    assert np.allclose(habit_weight, habits.T @ (habits * weight[:, None]))
     matched = samples[np.abs(distances) < 2.0, LENGTH].sum()
     score = np.clip(1 - (distances / 2.5) ** 2, 0, None) ** 3 @ samples[:, LENGTH]
-    expected = (weight.sum(), weight @ distances, weight @ distances**2, matched, score)
+    expected = (weight.sum(), weight @ distances**2, matched, score)
     assert sums == pytest.approx(expected)
 
 

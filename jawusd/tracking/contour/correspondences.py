@@ -10,7 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.geometry.arrays import Array
-from jawusd.tracking.contour.samples import INVERSE_DEPTH, LENGTH, NX, NY, U, V, X, Y, Z, pixel_of
+from jawusd.tracking.contour.samples import (
+    COLUMNS,
+    EDGE_SHARE,
+    INVERSE_DEPTH,
+    LENGTH,
+    NX,
+    NY,
+    U,
+    V,
+    X,
+    Y,
+    Z,
+    pixel_of,
+)
 
 _EDGE = 127.5  # mask value at the outline: half of a pixel belongs to the teeth
 
@@ -139,8 +152,10 @@ def accumulate(
     centre: Array,
     precision: Array,
     gradient: Array,
-    bias_slope: Array,
-) -> tuple[float, float, float, float, float]:
+    habit_slope: Array,
+    habit_distance: Array,
+    habit_weight: Array,
+) -> tuple[float, float, float, float]:
     """Add the Tukey-weighted normal equations of one arch in one view.
 
     The residual d of a sample shrinks by n . du when the sample moves by du in the picture; du follows from a left
@@ -154,12 +169,13 @@ def accumulate(
         pose: scan to world, shape (4, 4).
         matrix: world [mm] to homogeneous px, shape (3, 4).
         centre: point the twist turns about, world coordinates [mm], shape (3,).
-        precision, gradient, bias_slope: added to, shapes (6, 6), (6,), (6,); see `OutlineSums`.
+        precision, gradient: added to, shapes (6, 6) and (6,); see `OutlineSums`.
+        habit_slope, habit_distance, habit_weight: added to, shapes (K, 6), (K,), (K, K).
 
     Returns:
-        The sums weight, distance, square, matched_px and score_px of `OutlineSums`.
+        The sums weight, square, matched_px and score_px of `OutlineSums`.
     """
-    sum_weight = sum_distance = sum_square = matched_px = score_px = 0.0
+    sum_weight = sum_square = matched_px = score_px = 0.0
     jacobian = np.empty(6)
     for s in range(len(samples)):
         d = distances[s]
@@ -186,11 +202,17 @@ def accumulate(
             for k in range(6):
                 precision[i, k] += weight * jacobian[i] * jacobian[k]
             gradient[i] += weight * jacobian[i] * d
-            bias_slope[i] += weight * jacobian[i]
+        for a in range(COLUMNS - EDGE_SHARE):
+            habit = weight * sample[EDGE_SHARE + a]
+            if habit != 0.0:
+                for i in range(6):
+                    habit_slope[a, i] += habit * jacobian[i]
+                habit_distance[a] += habit * d
+                for b in range(COLUMNS - EDGE_SHARE):
+                    habit_weight[a, b] += habit * sample[EDGE_SHARE + b]
         sum_weight += weight
-        sum_distance += weight * d
         sum_square += weight * d * d
-    return sum_weight, sum_distance, sum_square, matched_px, score_px
+    return sum_weight, sum_square, matched_px, score_px
 
 
 @numba.njit(nogil=True, cache=True)

@@ -35,20 +35,25 @@ def twist_between(start: Array, end: Array, centre: Array) -> Array:
 class OutlineSums(NamedTuple):
     """Sums over matched contour samples per arch and view; w weight, d distance to the mask edge [px], J slope.
 
+    The habits of whoever drew the masks shift the outline by h . (edge px, gum px, gum mm), the last three columns h of
+    a sample: free edges, the gum line in the picture, and the gum line along the crown's surface.
+
     Attributes:
         precision: sum w J^T J, shape (2, C, 6, 6).
         gradient: sum w J d, shape (2, C, 6).
-        bias_slope: sum w J, which couples poses with masks that are too wide, shape (2, C, 6).
-        weight, distance, square: sum w, sum w d and sum w d^2, shape (2, C).
+        habit_slope: sum w h J, which couples poses with habits, shape (2, C, 3, 6).
+        habit_distance, habit_weight: sum w h d and sum w h h^T, shapes (2, C, 3) and (2, C, 3, 3).
+        weight, square: sum w and sum w d^2, shape (2, C).
         matched_px: contour length within the gate, shape (2, C).
         score_px: contour length, each sample counted by 1 minus Tukey's loss at the score gate, shape (2, C).
     """
 
     precision: Array
     gradient: Array
-    bias_slope: Array
+    habit_slope: Array
+    habit_distance: Array
+    habit_weight: Array
     weight: Array
-    distance: Array
     square: Array
     matched_px: Array
     score_px: Array
@@ -56,7 +61,7 @@ class OutlineSums(NamedTuple):
     @classmethod
     def zeros(cls, cameras: int) -> OutlineSums:
         """Return empty sums for so many views."""
-        shapes: tuple[tuple[int, ...], ...] = ((6, 6), (6,), (6,), (), (), (), (), ())
+        shapes: tuple[tuple[int, ...], ...] = ((6, 6), (6,), (3, 6), (3,), (3, 3), (), (), (), ())
         return cls(*(np.zeros((2, cameras, *shape)) for shape in shapes))
 
     def plus(self, other: OutlineSums) -> OutlineSums:

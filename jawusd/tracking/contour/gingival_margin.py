@@ -15,25 +15,32 @@ from jawusd.geometry.arrays import Array, Indices, Mask
 _SHORTEST_MM = 1e-3  # shorter pieces carry no direction
 
 
-def crown_gum_segments(vertices: Array, crown_faces: NDArray[np.int32], gum_faces: NDArray[np.int32]) -> Array:
-    """Return the segments in which crown triangles cut gum triangles, as end points [mm], shape (S, 2, 3).
+def crown_gum_segments(
+    vertices: Array, crown_faces: NDArray[np.int32], gum_faces: NDArray[np.int32]
+) -> tuple[Array, Array]:
+    """Return the segments in which crown triangles cut gum triangles, and the way across them on the crown.
 
-    Pieces shorter than 1 um are left out.
+    End points [mm] have shape (S, 2, 3), the unit vectors in the crown's triangles perpendicular to the segments
+    (S, 3). Pieces shorter than 1 um are left out.
     """
     if not len(crown_faces) or not len(gum_faces):
-        return np.zeros((0, 2, 3))
+        return np.zeros((0, 2, 3)), np.zeros((0, 3))
     crown, gum = vertices[crown_faces], vertices[gum_faces]
     low = np.maximum(crown.min((0, 1)), gum.min((0, 1)))
     high = np.minimum(crown.max((0, 1)), gum.max((0, 1)))
     crown = np.ascontiguousarray(crown[_touching(crown, low, high)])
     gum = np.ascontiguousarray(gum[_touching(gum, low, high)])
     if not len(crown) or not len(gum):
-        return np.zeros((0, 2, 3))
+        return np.zeros((0, 2, 3)), np.zeros((0, 3))
     size = np.ptp(np.concatenate([crown, gum]), axis=1)
     cell = max(float(np.median(size.max(1))) * 1.5, float((high - low).max()) / 256, 1e-9)
     starts, items = _grid(gum, low, cell, _cells(low, high, cell))
-    segments = _cut(crown, gum, low, cell, _cells(low, high, cell), starts, items)
-    return segments[np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1) > _SHORTEST_MM]
+    segments, owner = _cut(crown, gum, low, cell, _cells(low, high, cell), starts, items)
+    long = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1) > _SHORTEST_MM
+    segments, corners = segments[long], crown[owner[long]]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    across = np.cross(normal, segments[:, 1] - segments[:, 0])
+    return segments, across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-18)
 
 
 def _touching(triangles: Array, low: Array, high: Array) -> Mask:
@@ -82,14 +89,17 @@ def _grid(triangles: Array, low: Array, cell: float, count: Indices) -> tuple[In
 
 
 @numba.njit(nogil=True, cache=True)
-def _cut(crown: Array, gum: Array, low: Array, cell: float, count: Indices, starts: Indices, items: Indices) -> Array:
-    """Return the segments common to crown and gum triangles; each pair is tested once."""
+def _cut(
+    crown: Array, gum: Array, low: Array, cell: float, count: Indices, starts: Indices, items: Indices
+) -> tuple[Array, Indices]:
+    """Return the segments common to crown and gum triangles, and their crown triangles; each pair is tested once."""
     first = np.empty(3, np.int64)
     last = np.empty(3, np.int64)
     first_g = np.empty(3, np.int64)
     last_g = np.empty(3, np.int64)
     points = np.empty((6, 3))
     out = np.empty((1024, 2, 3))
+    owner = np.empty(1024, np.int64)
     n = 0
     for t in range(len(crown)):
         _box(crown[t], low, cell, count, first, last)
@@ -112,9 +122,11 @@ def _cut(crown: Array, gum: Array, low: Array, cell: float, count: Indices, star
                                 grown = np.empty((2 * n, 2, 3))
                                 grown[:n] = out
                                 out = grown
+                                owner = np.concatenate((owner, np.empty(n, np.int64)))
                             out[n] = points[:2]
+                            owner[n] = t
                             n += 1
-    return out[:n].copy()
+    return out[:n].copy(), owner[:n].copy()
 
 
 @numba.njit(nogil=True, cache=True)

@@ -44,6 +44,7 @@ class Scan:
     planes: Array  # normal and offset (n, n.p) of every crown face, shape (F, 4); only signs of n.x - offset are used
     edges: Faces  # vertex, vertex, face, other face or -1 at a border, int32, shape (E, 4)
     gingival_margin: Array  # segments of the crown-gum line that are no mesh edges [mm], shape (S, 2, 3)
+    margin_directions: Array  # unit vectors on the crown across these segments, shape (S, 3)
     probes: Array  # some vertices spread over the crowns, at which motion is measured [mm], shape (N <= 300, 3)
     centre: Array  # centroid of the crown vertices [mm], shape (3,)
     radius_mm: float  # largest distance of a crown vertex from the centre
@@ -135,6 +136,7 @@ def _with_tables(
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     crowns = vertices[np.unique(crown_faces)]
     centre = crowns.mean(0)
+    margin, directions = crown_gum_segments(vertices, crown_faces, gum_faces)
     return Scan(
         name=name,
         vertices=vertices,
@@ -143,7 +145,8 @@ def _with_tables(
         gum_faces=gum_faces,
         planes=np.column_stack([normal, np.einsum("ij,ij->i", normal, corner[:, 0])]),
         edges=_edge_table(crown_faces),
-        gingival_margin=crown_gum_segments(vertices, crown_faces, gum_faces),
+        gingival_margin=margin,
+        margin_directions=directions,
         probes=crowns[np.linspace(0, len(crowns) - 1, min(len(crowns), _PROBES)).astype(int)],
         centre=centre,
         radius_mm=float(np.linalg.norm(corner.reshape(-1, 3) - centre, axis=1).max()),

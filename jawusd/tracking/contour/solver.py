@@ -7,7 +7,6 @@ from concurrent.futures import Executor
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.geometry import orthonormalise, transform_point, transform_points
 from jawusd.geometry.arrays import Array, Mask
@@ -23,7 +22,7 @@ from jawusd.tracking.contour.equations import (
     StartTerm,
     motion_about,
 )
-from jawusd.tracking.contour.samples import LENGTH, contour_samples
+from jawusd.tracking.contour.samples import HABITS, LENGTH, contour_samples, gum_distances_px
 from jawusd.tracking.contour.scan import ARCHES, Scan
 from jawusd.tracking.contour.views import View, present_masks
 
@@ -115,7 +114,7 @@ class ContourSolver:
         def match(task: tuple[int, int]) -> _Match:
             r, c = task
             pose = views[c].T_delay[r] @ poses[r]
-            return self._match(pose, views[c], r, rendering.labels[c], rendering.depths[c], gate + 1.0)
+            return self._match(pose, views[c], r, rendering, c, gate + 1.0)
 
         matches = dict(zip(tasks, self.map(match, tasks), strict=True))
         centres = np.stack([transform_point(poses[r], self.scans[r].centre) for r in ARCHES])
@@ -129,10 +128,10 @@ class ContourSolver:
             samples, count, distances, visible[r, c] = matches[r, c]
             where = (views[c].T_delay[r] @ poses[r], views[c].matrix, centres[r])
             for outline, part in ((silhouette, slice(None, count)), (margin, slice(count, None))):
-                tables = (outline.precision[r, c], outline.gradient[r, c], outline.bias_slope[r, c])
+                tables = tuple(table[r, c] for table in outline[:5])
                 gates = (used[r], config.score_gate_px, pull)
                 sums = accumulate(samples[part], distances[part], *gates, *where, *tables)
-                for table, value in zip(outline[3:], sums, strict=True):
+                for table, value in zip(outline[5:], sums, strict=True):
                     table[r, c] = value
             if final:
                 shape = views[c].masks.shape[1:]
@@ -144,20 +143,20 @@ class ContourSolver:
         pose: Array,
         view: View,
         r: int,
-        labels: NDArray[np.uint8],
-        depths: NDArray[np.float32],
+        rendering: _Rendering,
+        c: int,
         reach: float,
     ) -> _Match:
-        config, scan = self.config, self.scans[r]
+        config, scan, depths = self.config, self.scans[r], rendering.depths[c]
         eye = pose[:3, :3].T @ (view.eye - pose[:3, 3])
-        samples, silhouettes = contour_samples(
-            scan, view.matrix @ pose, eye, labels[r], depths[r], config.sample_step_px, config.depth_tolerance_mm
-        )
+        pictures = (rendering.labels[c][r], depths[r], rendering.gum_distances[c][r])
+        limits = (config.sample_step_px, config.depth_tolerance_mm)
+        samples, silhouettes = contour_samples(scan, view.matrix @ pose, eye, *pictures, *limits)
         distances = np.empty(len(samples))
         other = (view.masks[1 - r], depths[1 - r])
-        limits = (reach, config.overlap_tolerance_mm, config.normal_cosine)
-        search_edges(samples, view.masks[r], *other, *limits, distances)
-        return samples, silhouettes, distances - view.bias_px[r], float(samples[:, LENGTH].sum())
+        search_limits = (reach, config.overlap_tolerance_mm, config.normal_cosine)
+        search_edges(samples, view.masks[r], *other, *search_limits, distances)
+        return samples, silhouettes, distances - samples[:, HABITS] @ view.habits[r], float(samples[:, LENGTH].sum())
 
     def _final_gate(self, distances: list[Array], gate: float) -> float:
         """Return the Tukey gate that suits the spread of the residuals (median absolute deviation)."""
@@ -185,6 +184,7 @@ class _Rendering:
         shapes = [view.masks.shape for view in views]
         self.labels = [np.zeros(shape, np.uint8) for shape in shapes]
         self.depths = [np.zeros(shape, np.float32) for shape in shapes]
+        self.gum_distances = [np.full(shape, np.inf, np.float32) for shape in shapes]
 
     def update(self, poses: Array) -> None:
         """Draw the scans whose projection has moved by more than the allowed pixels."""
@@ -208,7 +208,10 @@ class _Rendering:
         view, labels, depth = self._views[c], self.labels[c][r], self.depths[c][r]
         labels[:] = 0
         depth[:] = 0
-        self._solver.scans[r].draw(view.matrix @ view.T_delay[r] @ pose, depth, labels)
+        scan = self._solver.scans[r]
+        scan.draw(view.matrix @ view.T_delay[r] @ pose, depth, labels)
+        if len(scan.gum_faces):
+            gum_distances_px(labels, self.gum_distances[c][r])
         self._drawn[r, c] = pose.copy()
 
 

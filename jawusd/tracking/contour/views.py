@@ -33,8 +33,8 @@ class View:
     present: Mask  # which of the two masks exist, shape (2,)
     # how the arches move, in the world, from the reference instant to this camera's own, shape (2, 4, 4)
     T_delay: Array = field(default_factory=lambda: np.tile(np.eye(4), (2, 1, 1)))
-    # how far the masks reach beyond the teeth [px], shape (2,)
-    bias_px: Array = field(default_factory=lambda: np.zeros(2))
+    # how far masks reach beyond the teeth at free edges [px], at the gum line [px], along the gum [mm], shape (2, 3)
+    habits: Array = field(default_factory=lambda: np.zeros((2, 3)))
 
 
 class MaskViews:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -43,6 +43,7 @@ class Start:
     poses: Array  # T_world_upper, T_world_lower, shape (2, 4, 4)
     notes: dict[str, object]  # how it was found, for the meta data of the tracks
     findings: tuple[Finding, ...] = ()  # what is doubtful about the scans
+    T_anatomical_scan: Array = field(default_factory=lambda: np.eye(4))  # scan frame to (left, up, front) axes
 
 
 def find_start(
@@ -74,7 +75,7 @@ def find_start(
         start = _picked(capture.bootstrap, capture.frames, footage, meshes, search)
     else:
         start = search_start(search, footage)
-    return replace(start, findings=tuple(findings))
+    return replace(start, findings=tuple(findings), T_anatomical_scan=T_anatomical_scan)
 
 
 def _picked(

@@ -180,15 +180,16 @@ def _starts(tracks: Tracks, jaw: JawRig, measured: Mask) -> Array:
 
 
 def _corrected_views(views: Sequence[View], tracks: Tracks, k: int, poses: Array) -> list[View]:
-    """Return the views of frame index k with the delays and the mask bias of the first pass taken out."""
+    """Return the views of frame index k with what the first pass found out about the take corrected."""
     before, after = poses[max(k - 1, 0)], poses[min(k + 1, len(poses) - 1)]
     span = max(1, min(k + 1, len(poses) - 1) - max(k - 1, 0))
     velocity = se3_log(after @ se3_inverse(before)) / span  # per frame
-    bias = np.asarray(tracks.meta["mask_bias_px"], np.float64)
-    out = []
+    meta, out = tracks.meta, []
+    steady = poses[k] @ np.array(meta.get("steady_error", np.tile(np.eye(4), (2, 1, 1)))) @ se3_inverse(poses[k])
     for name, view in zip(tracks.camera_names, views, strict=True):
-        T_delay = se3_exp(tracks.meta["delays_frames"][name] * velocity)
-        out.append(replace(view, T_delay=T_delay, bias_px=bias))
+        T_delay = se3_exp(meta["delays_frames"][name] * velocity) @ steady
+        habits = np.column_stack([meta["outline_bias_px"][name], meta["gum_bias_px"][name], meta["gum_line_mm"]])
+        out.append(replace(view, T_delay=T_delay, habits=habits))
     return out
 
 

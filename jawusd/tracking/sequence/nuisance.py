@@ -22,55 +22,107 @@ class Nuisances:
 
     Attributes:
         delays: camera c shows the instant of frame + delays[c], in frames, the first camera's is 0, shape (C,).
-        bias_px: how far the masks of each arch reach beyond the teeth at the working size, shape (2,).
-        sigma_delays, sigma_bias_px: their standard deviations, shapes (C,) and (2,).
+        habits: how far the masks reach beyond the teeth, per arch and camera, shape (2, C, 3): at free edges and at the
+            gum line [px of the working size], and over the gum along the surface [mm]; see `OutlineSums`.
+        shift_px: what the latter two make of the gum line on average, and edges, shape (2, C, 2) (edge, gum).
+        sigma_delays, sigma_habits, sigma_shift_px: their standard deviations.
         twists, sigma_twists: corrections of the camera poses as in `Extrinsics`, shape (C, 6).
-        shift_px: rms distance by which the twists shift contours beyond what poses of the teeth make up for.
+        contour_px: rms distance by which the twists shift contours beyond what poses of the teeth make up for.
+        covariance: of all unknowns as `TakeEquations` orders them, zero where not estimated, shape (U, U).
     """
 
     delays: Array
-    bias_px: Array
+    habits: Array
+    shift_px: Array
     sigma_delays: Array
-    sigma_bias_px: Array
+    sigma_habits: Array
+    sigma_shift_px: Array
     twists: Array
     sigma_twists: Array
-    shift_px: float = 0.0
+    contour_px: float
+    covariance: Array
 
     def plus(self, more: Nuisances) -> Nuisances:
-        """Return the sum with delays and biases that were estimated on top of these."""
-        return replace(more, delays=self.delays + more.delays, bias_px=self.bias_px + more.bias_px)
+        """Return the sum with delays and habits that were estimated on top of these."""
+        shift = self.shift_px + more.shift_px
+        return replace(more, delays=self.delays + more.delays, habits=self.habits + more.habits, shift_px=shift)
 
     def matters(self, config: TrackingConfig) -> bool:
-        """Tell whether anything exceeds its limit, and clearly so."""
+        """Tell whether anything exceeds its limit, delays and camera poses clearly so.
+
+        Habits have a prior of what hands do: without clear evidence their estimate is still the likeliest.
+        """
         late = np.abs(self.delays) > np.maximum(config.refine_delay_frames, 4 * self.sigma_delays)
-        wide = np.abs(self.bias_px) > np.maximum(config.refine_bias_px, 4 * self.sigma_bias_px)
+        wide = np.abs(self.shift_px) > config.refine_bias_px
         return bool(late.any() or wide.any() or self.cameras_moved(config))
 
     def settled(self, config: TrackingConfig) -> bool:
         """Tell whether all are so small that estimating them once more changes too little."""
         late = np.abs(self.delays).max() / config.refine_delay_frames
-        wide = np.abs(self.bias_px).max() / config.refine_bias_px
-        return max(late, wide, self.shift_px / config.refine_shift_px) < config.settled_share
+        wide = np.abs(self.shift_px).max() / config.refine_bias_px
+        return max(late, wide, self.contour_px / config.refine_shift_px) < config.settled_share
 
     def cameras_moved(self, config: TrackingConfig) -> bool:
         """Tell whether the camera poses are off by more than the limit, and clearly so."""
         clear = (np.abs(self.twists) > 4 * self.sigma_twists).any()
-        return bool(clear and self.shift_px > config.refine_shift_px)
+        return bool(clear and self.contour_px > config.refine_shift_px)
 
 
-# Prior standard deviations, which keep the estimates finite where a take does not constrain them: cameras synchronised
-# to whole frames, masks by different hands.
+# Prior standard deviations, which keep the estimates finite where a take does not constrain them. Cameras are
+# synchronised to whole frames.
 _PRIOR_DELAY_FRAMES = 0.5
-_PRIOR_BIAS_PX = 0.5
+# The habits of one hand: edges and gum line drawn too wide [px], the gum line apart from edges [px], the gum line along
+# the surface [mm]; by how much arches [px, mm] and cameras [px] differ from these.
+_PRIOR_EDGE_PX, _PRIOR_GUM_PX, _PRIOR_GUM_MM = 0.5, 0.4, 0.1
+_PRIOR_ARCH_PX, _PRIOR_ARCH_MM, _PRIOR_CAMERA_PX = 0.15, 0.05, 0.1
+# Frames whose outline errors are independent of one another [-]: the same hand draws the same lips and teeth all over
+# the take, so that more frames tell little more about its habits.
+_INDEPENDENT_FRAMES = 1.5
+
+
+class _Layout:
+    """Say where the unknowns of a take stand: delays, habits, camera twists."""
+
+    def __init__(self, cameras: int) -> None:
+        self.cameras = cameras
+        self.twists = cameras + 9 + 4 * cameras
+        self.size = self.twists + 6 * cameras
+
+    def twist(self, camera: int) -> slice[int, int, None]:
+        """Return where a camera's twist stands."""
+        return slice(self.twists + 6 * camera, self.twists + 6 * camera + 6)
+
+    def habits(self, arch: int, camera: int) -> Array:
+        """Return how the habits of an arch in a camera follow from the unknowns, shape (3, size)."""
+        out = np.zeros((3, self.size))
+        hand = self.cameras
+        of_arch = hand + 3 + 3 * arch
+        of_view = hand + 9 + 2 * (2 * camera + arch)
+        out[0, [hand, of_arch, of_view]] = 1.0
+        out[1, [hand, hand + 1, of_arch + 1, of_view + 1]] = 1.0
+        out[2, [hand + 2, of_arch + 2]] = 1.0
+        return out
+
+    def prior_sigma(self) -> Array:
+        """Return the prior standard deviations of delays and habits, shape (twists,)."""
+        arch = [_PRIOR_ARCH_PX, _PRIOR_ARCH_PX, _PRIOR_ARCH_MM]
+        hand = [_PRIOR_EDGE_PX, _PRIOR_GUM_PX, _PRIOR_GUM_MM, *arch, *arch]
+        return np.r_[np.full(self.cameras, _PRIOR_DELAY_FRAMES), hand, np.full(4 * self.cameras, _PRIOR_CAMERA_PX)]
+
+    def redundancy(self, frames: int) -> Array:
+        """Return by how much a take of so many frames overrates what it tells about each unknown, shape (size,)."""
+        out = np.ones(self.size)
+        out[self.cameras : self.twists] = max(1.0, frames / _INDEPENDENT_FRAMES)
+        return out
 
 
 class TakeEquations:
     """Sum up the normal equations of what all frames share, the poses eliminated frame by frame.
 
-    The residual of a sample is d = J (x + delay_c v + A y_c) + bias with the pose correction x of its frame, the arch's
-    velocity v, and the camera's twist y_c brought to the arch's centre by A, so all frames share delays, biases and
-    twists: a bordered block-diagonal system, solved by its Schur complement (as in bundle adjustment, Triggs et al.
-    1999).
+    The residual of a sample is d = J (x + delay_c v + A y_c) + h . b_c with the pose correction x of its frame, the
+    arch's velocity v, the camera's twist y_c brought to the arch's centre by A, and the habits b_c of the masks, so all
+    frames share delays, habits and twists: a bordered block-diagonal system, solved by its Schur complement (as in
+    bundle adjustment, Triggs et al. 1999).
     """
 
     def __init__(
@@ -88,46 +140,70 @@ class TakeEquations:
             extrinsics: the camera poses the records were aligned with.
         """
         self._extrinsics = extrinsics
-        self._cameras = len(extrinsics.twists)
-        size = 7 * self._cameras + 2
+        self._layout = _Layout(len(extrinsics.twists))
+        size, C = self._layout.size, self._layout.cameras
         self._S, self._r, self._weight = np.zeros((size, size)), np.zeros(size), 0.0
+        self._gum = np.zeros((2, C, 2))  # sums of weights and slopes of the gum line
+        self._frames = 0
         for frame in sorted(records if frames is None else frames):
+            self._frames += 1
             for arch in ARCHES:
                 velocity = velocity_twist(records, frame, arch)
                 if velocity is not None:
-                    block, right, weight = _reduced(records[frame].solution, velocity, arch, extrinsics.pivot)
+                    solution = records[frame].solution
+                    block, right, _ = _reduced(solution, velocity, arch, extrinsics.pivot, self._layout)
                     self._S += block / variance_px3[arch]
                     self._r += right / variance_px3[arch]
-                    self._weight += weight / variance_px3[arch]
+                    self._weight += solution.outline.weight[arch].sum() / variance_px3[arch]
+                    self._gum[arch] += solution.outline.habit_weight[arch, :, 1, 1:]
 
     def solve(self, config: TrackingConfig, cameras_move: bool) -> Nuisances:
         """Return the nuisances of the frames; camera poses are estimated only if `cameras_move`."""
-        C, size = self._cameras, len(self._r)
+        layout = self._layout
+        C, size, first_twist = layout.cameras, layout.size, layout.twists
         S = self._S.copy()
-        prior = np.r_[np.full(C, _PRIOR_DELAY_FRAMES), np.full(2, _PRIOR_BIAS_PX)]
-        S[: C + 2, : C + 2] += np.diag(prior**-2.0)
+        redundancy = layout.redundancy(self._frames)
+        S[:first_twist, :first_twist] += np.diag(redundancy[:first_twist] / layout.prior_sigma() ** 2)
         for c, precision in enumerate(self._extrinsics.precision(config.refine_turn_rad, config.refine_move_mm)):
-            block = slice(C + 2 + 6 * c, C + 8 + 6 * c)
-            S[block, block] += precision
-        keep = np.arange(1, size if cameras_move else C + 2)  # a delay common to all cameras is part of the motion
+            S[layout.twist(c), layout.twist(c)] += precision
+        # A delay common to all cameras is part of the motion.
+        keep = np.arange(1, size if cameras_move else first_twist)
         covariance = np.zeros((size, size))
         covariance[np.ix_(keep, keep)] = np.linalg.inv(S[np.ix_(keep, keep)])
         x = covariance @ self._r
         # A motion common to all cameras is one of the world, which the masks cannot show.
-        centred = np.eye(6 * C) - np.kron(np.full((C, C), 1 / C), np.eye(6))
-        twists = centred @ x[C + 2 :]
-        sigma = np.sqrt(np.diag(covariance))
-        sigma_twists = np.sqrt(np.diag(centred @ covariance[C + 2 :, C + 2 :] @ centred))
-        square = float(twists @ self._S[C + 2 :, C + 2 :] @ twists) / max(self._weight, 1e-300)
+        centred = np.eye(size)
+        centred[first_twist:, first_twist:] -= np.kron(np.full((C, C), 1 / C), np.eye(6))
+        x = centred @ x
+        covariance = centred @ (covariance * np.sqrt(np.outer(redundancy, redundancy))) @ centred
+        twists, sigma_twists = x[first_twist:], np.sqrt(np.diag(covariance)[first_twist:])
+        square = float(twists @ self._S[first_twist:, first_twist:] @ twists) / max(self._weight, 1e-300)
+        habits = np.stack([[layout.habits(arch, c) for c in range(C)] for arch in ARCHES])
+        slope = self._gum[..., 1] / np.maximum(self._gum[..., 0], 1e-300)
+        shift = np.stack([habits[:, :, 0], habits[:, :, 1] + slope[..., None] * habits[:, :, 2]], axis=2)
         return Nuisances(
             delays=x[:C],
-            bias_px=x[C : C + 2],
-            sigma_delays=sigma[:C],
-            sigma_bias_px=sigma[C : C + 2],
+            habits=habits @ x,
+            shift_px=shift @ x,
+            sigma_delays=np.sqrt(np.diag(covariance)[:C]),
+            sigma_habits=np.sqrt(np.einsum("...u,uv,...v->...", habits, covariance, habits)),
+            sigma_shift_px=np.sqrt(np.einsum("...u,uv,...v->...", shift, covariance, shift)),
             twists=twists.reshape(C, 6),
             sigma_twists=sigma_twists.reshape(C, 6),
-            shift_px=float(np.sqrt(max(square, 0.0))),
+            contour_px=float(np.sqrt(max(square, 0.0))),
+            covariance=covariance,
         )
+
+
+def pose_covariance(
+    records: Mapping[int, FrameRecord], frame: int, arch: int, nuisances: Nuisances, extrinsics: Extrinsics
+) -> Array:
+    """Return what the uncertainty of the nuisances adds to that of a pose: of the twist about its centre, (6, 6)."""
+    velocity = velocity_twist(records, frame, arch)
+    solution, layout = records[frame].solution, _Layout(len(extrinsics.twists))
+    velocity = np.zeros(6) if velocity is None else velocity
+    _, _, response = _reduced(solution, velocity, arch, extrinsics.pivot, layout)
+    return np.asarray(response @ nuisances.covariance @ response.T, np.float64)
 
 
 def delay_motions(records: Mapping[int, FrameRecord], frame: int, delays: Array) -> Array:
@@ -143,26 +219,29 @@ def delay_motions(records: Mapping[int, FrameRecord], frame: int, delays: Array)
     return out
 
 
-def _reduced(solution: Solution, velocity: Array, arch: int, pivot: Array) -> tuple[Array, Array, float]:
-    """Return one frame's part of the normal equations, the pose eliminated, and the weight of its samples."""
-    outline = solution.outline
-    C = len(outline.weight[arch])
-    size = 7 * C + 2
+def _reduced(
+    solution: Solution, velocity: Array, arch: int, pivot: Array, layout: _Layout
+) -> tuple[Array, Array, Array]:
+    """Return one frame's part of the normal equations, the pose eliminated, and how the pose follows the unknowns.
+
+    The last is the twist about the arch's centre per unit of the unknowns, shape (6, U).
+    """
+    outline, size = solution.outline, layout.size
     to_centre = lever(pivot, solution.centres[arch])
     S, r, B = np.zeros((size, size)), np.zeros(size), np.zeros((6, size))
-    bias = np.eye(size)[C + arch]
-    for c in range(C):
-        H, g, s = outline.precision[arch, c], outline.gradient[arch, c], outline.bias_slope[arch, c]
+    for c in range(layout.cameras):
+        H, g = outline.precision[arch, c], outline.gradient[arch, c]
+        habits = layout.habits(arch, c)
         D = np.zeros((6, size))  # how the nuisances move the arch in this camera
         D[:, c] = velocity
-        D[:, C + 2 + 6 * c : C + 8 + 6 * c] = to_centre
-        B += H @ D + np.outer(s, bias)
-        S += D.T @ H @ D + np.outer(D.T @ s, bias) + np.outer(bias, s @ D)
-        S += outline.weight[arch, c] * np.outer(bias, bias)
-        r += D.T @ g + outline.distance[arch, c] * bias
+        D[:, layout.twist(c)] = to_centre
+        slope = outline.habit_slope[arch, c].T @ habits
+        B += H @ D + slope
+        S += D.T @ H @ D + D.T @ slope + slope.T @ D + habits.T @ outline.habit_weight[arch, c] @ habits
+        r += D.T @ g + habits.T @ outline.habit_distance[arch, c]
     H, g = outline.precision[arch].sum(0), outline.gradient[arch].sum(0)
     eliminated = np.linalg.lstsq(H, np.column_stack([B, g]), rcond=1e-10)[0]
-    return S - B.T @ eliminated[:, :-1], r - B.T @ eliminated[:, -1], float(outline.weight[arch].sum())
+    return S - B.T @ eliminated[:, :-1], r - B.T @ eliminated[:, -1], -eliminated[:, :-1]
 
 
 def velocity_twist(records: Mapping[int, FrameRecord], frame: int, arch: int) -> Array | None:

@@ -8,10 +8,10 @@ from dataclasses import asdict
 import numpy as np
 
 from jawusd.formats.tracks import LOST, Tracks, TracksMeta
-from jawusd.geometry import relative_pose
+from jawusd.geometry import relative_pose, se3_adjoint
 from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import TrackingConfig
-from jawusd.tracking.contour.equations import Solution
+from jawusd.tracking.contour.equations import Solution, translation
 from jawusd.tracking.contour.frame_record import FrameRecord
 from jawusd.tracking.contour.quality import (
     correlation_px,
@@ -22,8 +22,15 @@ from jawusd.tracking.contour.quality import (
     twist_covariance,
 )
 from jawusd.tracking.contour.scan import ARCHES
+from jawusd.tracking.sequence.closed_bite import (
+    ClosedBite,
+    RestFrames,
+    check_registration,
+    closed_bite,
+    registration_findings,
+)
 from jawusd.tracking.sequence.extrinsics import Extrinsics
-from jawusd.tracking.sequence.nuisance import Nuisances
+from jawusd.tracking.sequence.nuisance import Nuisances, pose_covariance
 from jawusd.tracking.sequence.smoothing import smooth_poses
 
 
@@ -34,6 +41,7 @@ def assemble(
     nuisances: Nuisances,
     extrinsics: Extrinsics,
     config: TrackingConfig,
+    rest: RestFrames,
     notes: TracksMeta,
 ) -> Tracks:
     """Return the tracks of a take: raw poses as aligned, final poses smoothed over time.
@@ -41,31 +49,31 @@ def assemble(
     The covariances are those of the raw poses: outline errors change slowly, so smoothing reduces them little.
 
     `landmarks` are in mandible coordinates [mm], shape (5, 3); everything else goes to the meta data as well.
+
+    Raises:
+        TrackingError: the registration of the scans is to be corrected, and the mouth was not closed.
     """
     frames = np.array(sorted(records), np.int64)
     ordered = [records[f] for f in frames]
     status = np.stack([record.status for record in ordered])
-    raw = np.stack([record.solution.poses for record in ordered])
-    raw[status == LOST] = np.nan
-    correlation = take_correlation_px(records, config)
-    covariance = _covariances(ordered, correlation)
+    raw, covariance, covariance_relative, bite = _measured(records, nuisances, extrinsics, config, rest)
     losses = np.array([record.losses for record in ordered], np.float64)  # reason, value, limit
     known = status != LOST
     centres = np.stack([record.solution.centres for record in ordered])
     middle = np.median(centres[known.all(1)] if known.all(1).any() else centres, axis=(0, 1))
     final = np.stack([smooth_poses(frames, raw[:, r], covariance[:, r], middle) for r in ARCHES], axis=1)
     raw_relative, relative = _relative(raw), _relative(final)
-    covariance_relative = _relative_covariance(raw, covariance)
     meta: TracksMeta = {
         "tracking": asdict(config),
-        "correlation_px": correlation,
+        "correlation_px": take_correlation_px(records, config),
         "delays_frames": dict(zip(camera_names, nuisances.delays.tolist(), strict=True)),
         "delays_sigma_frames": dict(zip(camera_names, nuisances.sigma_delays.tolist(), strict=True)),
-        "mask_bias_px": nuisances.bias_px.tolist(),
-        "mask_bias_sigma_px": nuisances.sigma_bias_px.tolist(),
+        **_habits_report(nuisances, camera_names),
         "extrinsics": extrinsics.report(camera_names),
         **notes,
     }
+    if bite is not None:
+        meta |= _bite_report(bite, rest, meta.get("findings", []))
     return Tracks(
         frames=frames,
         T_world_upper=final[:, 0],
@@ -92,6 +100,55 @@ def assemble(
     )
 
 
+def _measured(
+    records: Mapping[int, FrameRecord],
+    nuisances: Nuisances,
+    extrinsics: Extrinsics,
+    config: TrackingConfig,
+    rest: RestFrames,
+) -> tuple[Array, Array, Array, ClosedBite | None]:
+    """Return the poses (F, 2, 4, 4), their covariances (F, 2, 6, 6), that of the relative pose (F, 6, 6), the bite."""
+    frames = np.array(sorted(records), np.int64)
+    raw = np.stack([records[f].solution.poses for f in frames])
+    raw[np.stack([records[f].status for f in frames]) == LOST] = np.nan
+    covariance = _covariances(records, take_correlation_px(records, config), nuisances, extrinsics)
+    relative = _relative_covariance(raw, covariance)
+    bite = closed_bite(frames, raw, covariance, rest)
+    if bite is None:
+        return raw, covariance, relative, None
+    relative = bite.reduce(relative, np.tile(np.eye(4), (len(frames), 1, 1)), 2)
+    covariance = np.stack([bite.reduce(covariance[:, r], raw[:, r], r) for r in ARCHES], axis=1)
+    return bite.correct(raw, rest.apply), covariance, relative, bite
+
+
+def _bite_report(bite: ClosedBite, rest: RestFrames, findings: list[dict[str, str | float | int]]) -> TracksMeta:
+    """Return what the closed bite tells, for the meta data; the findings are added to those given."""
+    registration = bite.report(rest)
+    check_registration(registration)
+    return {
+        "registration": registration,
+        "steady_error": bite.steady_motions(rest.apply).tolist(),
+        "findings": [*findings, *(found.as_json() for found in registration_findings(registration))],
+    }
+
+
+def _habits_report(nuisances: Nuisances, camera_names: tuple[str, ...]) -> TracksMeta:
+    """Return what the take tells about the hand that drew its masks, for the meta data."""
+
+    def by_camera(values: Array) -> dict[str, list[float]]:
+        return dict(zip(camera_names, values.T.tolist(), strict=True))
+
+    habits, sigma = nuisances.habits, nuisances.sigma_habits
+    return {
+        "outline_bias_px": by_camera(habits[..., 0]),
+        "outline_bias_sigma_px": by_camera(sigma[..., 0]),
+        "gum_bias_px": by_camera(habits[..., 1]),
+        "gum_bias_sigma_px": by_camera(sigma[..., 1]),
+        "gum_line_mm": habits[:, 0, 2].tolist(),
+        "gum_line_sigma_mm": sigma[:, 0, 2].tolist(),
+    }
+
+
 def outline_variance(records: Mapping[int, FrameRecord], config: TrackingConfig) -> Array:
     """Return the variance times correlation length of the outline errors per arch [px^3], shape (2,)."""
     residual = _of_tracked(records, residual_px)
@@ -113,13 +170,18 @@ def _of_tracked(records: Mapping[int, FrameRecord], figure: Callable[[Solution],
     return np.stack([np.where(r.status != LOST, figure(r.solution), np.nan) for r in records.values()])
 
 
-def _covariances(records: list[FrameRecord], correlation: float) -> Array:
+def _covariances(
+    records: Mapping[int, FrameRecord], correlation: float, nuisances: Nuisances, extrinsics: Extrinsics
+) -> Array:
     """Return the covariance of both arches' left twists, NaN where lost, shape (F, 2, 6, 6)."""
     out = np.full((len(records), 2, 6, 6), np.nan)
-    for k, record in enumerate(records):
+    for k, frame in enumerate(sorted(records)):
+        record = records[frame]
         sigma = residual_px(record.solution)
         for r in np.flatnonzero(record.status != LOST).tolist():
-            out[k, r] = twist_covariance(record.solution, r, sigma[r], correlation)
+            A = se3_adjoint(translation(record.solution.centres[r]))
+            common = pose_covariance(records, frame, r, nuisances, extrinsics)
+            out[k, r] = twist_covariance(record.solution, r, sigma[r], correlation) + A @ common @ A.T
     return out
 
 

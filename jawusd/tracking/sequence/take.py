@@ -21,6 +21,7 @@ from jawusd.tracking.contour.views import MaskViews, View
 from jawusd.tracking.initialization.first_frame import first_record
 from jawusd.tracking.initialization.start import find_start
 from jawusd.tracking.sequence.camera_use import use_of_cameras
+from jawusd.tracking.sequence.closed_bite import RestFrames, rest_frames
 from jawusd.tracking.sequence.extrinsics import Extrinsics
 from jawusd.tracking.sequence.frame_tracker import FrameTracker
 from jawusd.tracking.sequence.history import History, MotionPredictor
@@ -84,7 +85,12 @@ def track_capture(
         "painted": [s.painted for s in scans],
         "findings": [finding.as_json() for finding in findings],
     }
-    return assemble(records, names, np.asarray(landmarks, np.float64), nuisances, extrinsics, config, notes)
+    point = np.mean([scan.centre for scan in scans], axis=0)
+    rest_frame, up = capture.motion.rest_frame, start.T_anatomical_scan[1, :3]
+    rest = rest_frames(records, rest_frame, up, point, scans[1].probes)
+    bite = RestFrames(rest, rest_frame is not None, point, scans[1].centre, capture.scans.registration == "take")
+    points = np.asarray(landmarks, np.float64)
+    return assemble(records, names, points, nuisances, extrinsics, config, bite, notes)
 
 
 def _trimmed(records: dict[int, FrameRecord]) -> dict[int, FrameRecord]:
@@ -232,7 +238,7 @@ def _corrected_views(
     """Return the views of a frame with delays, biases and camera poses corrected."""
     moved = delay_motions(records, frame, nuisances.delays)
     views = extrinsics.correct(views)
-    return [replace(v, T_delay=m, bias_px=nuisances.bias_px) for v, m in zip(views, moved, strict=True)]
+    return [replace(view, T_delay=moved[c], habits=nuisances.habits[:, c]) for c, view in enumerate(views)]
 
 
 def _starts_again(records: Mapping[int, FrameRecord], frame: int) -> list[Array]:

@@ -1,0 +1,268 @@
+"""What frames with the teeth together say: how far the scans' registration is off, and the steady error of a take.
+
+The scans come in occlusion, so a closed bite shows T_upper_lower = identity, but for three things: the registration of
+the scans may be off, outlines drawn alike in every frame shift both arches steadily, and single frames vary. All have
+known spreads, so what is measured is shared out among them by linear least squares. Registrations are nearly always
+good to some hundredths of a millimetre, but bad ones are off by a lot: a Student distribution, by reweighting (Lange,
+Little & Taylor 1989).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.errors import TrackingError
+from jawusd.formats.finding import Finding, Severity
+from jawusd.formats.tracks import LOST, Registration
+from jawusd.geometry import relative_pose, se3_adjoint, se3_exp, se3_inverse, se3_log
+from jawusd.geometry.arrays import Array
+from jawusd.tracking.contour.equations import translation
+from jawusd.tracking.contour.frame_record import FrameRecord
+
+# Spread of the closed bite about the scans' own: of a good registration together with how firmly people bite [mm], and
+# the same at the ends of an arch as a turn [rad].
+_BITE_MM = 0.03
+_ARCH_MM = 25.0
+_DEGREES_OF_FREEDOM = 4.0  # of the Student distribution: one registration in some hundred is off by ten spreads
+# Share of a frame's error that is the same in all frames of a take [-].
+STEADY = 0.7
+# Teeth held together rest: slower than this against one another [mm/frame at the teeth], and no farther from the
+# closest frame [mm].
+_STILL_MM, _SAME_BITE_MM = 0.06, 0.15
+_LONGEST_REST = 24  # frames used on either side: later ones tell nothing new
+_FEWEST_FRAMES = 2
+
+
+@dataclass(frozen=True, eq=False)
+class RestFrames:
+    """Say where the teeth are together, and what to do about it.
+
+    Attributes:
+        frames: numbers of the frames.
+        named: whether the capture names one of them.
+        point, lower: amid the teeth, and amid the lower crowns, scan coordinates [mm], shape (3,).
+        apply: whether the lower scan is moved to where it belongs.
+    """
+
+    frames: tuple[int, ...]
+    named: bool
+    point: Array
+    lower: Array
+    apply: bool
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedBite:
+    """Hold what the frames with the teeth together tell; twists are (omega [rad], v [mm]) about `point` in scan axes.
+
+    Attributes:
+        frames: the frames used.
+        point: amid the teeth, scan coordinates [mm], shape (3,).
+        registration: left twist that takes the lower scan to where it belongs, shape (6,), and its covariance (6, 6).
+        steady: right twists that the poses of both arches are off by, shape (2, 6).
+        spread, remaining: covariance of the steady errors of upper arch, lower arch, and lower against upper, before
+            and after, shape (3, 6, 6).
+    """
+
+    frames: tuple[int, ...]
+    point: Array
+    registration: Array
+    registration_covariance: Array
+    steady: Array
+    spread: Array
+    remaining: Array
+
+    def correct(self, poses: Array, registered: bool) -> Array:
+        """Return poses (F, 2, 4, 4) without their steady error; if registered, of a lower scan moved by `motion`."""
+        out = poses @ se3_inverse(self.steady_motions(False))
+        if registered:
+            out[:, 1] = out[:, 1] @ se3_inverse(self.motion())
+        return np.asarray(out, np.float64)
+
+    def steady_motions(self, registered: bool) -> Array:
+        """Return S of T_aligned = T_corrected @ S for both arches, shape (2, 4, 4); see `correct`."""
+        motions = np.array(translation(self.point) @ se3_exp(self.steady) @ translation(-self.point), np.float64)
+        if registered:
+            motions[1] = self.motion() @ motions[1] @ se3_inverse(self.motion())
+        return motions
+
+    def motion(self) -> Array:
+        """Return the registration as a motion in scan coordinates, shape (4, 4)."""
+        return np.asarray(translation(self.point) @ se3_exp(self.registration) @ translation(-self.point), np.float64)
+
+    def report(self, rest: RestFrames) -> Registration:
+        """Return the registration for the tracks' meta data."""
+        A = se3_adjoint(translation(self.point - rest.lower))
+        twist, sigma = A @ self.registration, np.sqrt(np.diag(A @ self.registration_covariance @ A.T))
+        return {
+            "frames": list(self.frames),
+            "named": rest.named,
+            "applied": rest.apply,
+            "shift_mm": twist[3:].tolist(),
+            "turn_deg": np.degrees(twist[:3]).tolist(),
+            "shift_sigma_mm": sigma[3:].tolist(),
+            "turn_sigma_deg": np.degrees(sigma[:3]).tolist(),
+            "T": self.motion().tolist(),
+        }
+
+    def reduce(self, covariance: Array, T_world_scan: Array, which: int) -> Array:
+        """Return what is left of covariances of left twists about the world origin, shape (F, 6, 6).
+
+        Args:
+            covariance: before, shape (F, 6, 6).
+            T_world_scan: poses whose axes the steady error keeps, shape (F, 4, 4).
+            which: 0 upper arch, 1 lower arch, 2 lower against upper (`T_world_scan` is identity then).
+        """
+        A = se3_adjoint(translation(-self.point) @ se3_inverse(T_world_scan))
+        back = np.linalg.inv(A)
+        local = A @ covariance @ np.swapaxes(A, -1, -2)
+        root = _root(self.spread[which])
+        unit = np.linalg.solve(root, np.linalg.solve(root, self.remaining[which]).T).T
+        out = np.full_like(covariance, np.nan)
+        for k in np.flatnonzero(np.isfinite(local).all((1, 2))).tolist():
+            own = _root(local[k])
+            left = (1.0 - STEADY) * local[k] + STEADY * own @ unit @ own
+            out[k] = back[k] @ left @ back[k].T
+        return out
+
+
+def closed_bite(frames: NDArray[np.int64], poses: Array, covariance: Array, rest: RestFrames) -> ClosedBite | None:
+    """Share out the deviation of the closed bite; None if too few of the rest frames are tracked.
+
+    Args:
+        frames: shape (F,); poses: T_world_upper, T_world_lower, shape (F, 2, 4, 4), NaN where lost; covariance: of
+            their left twists, shape (F, 2, 6, 6).
+    """
+    point = rest.point
+    known = np.isfinite(poses).all((1, 2, 3)) & np.isfinite(covariance).all((1, 2, 3))
+    used = known & np.isin(frames, rest.frames)
+    if used.sum() < _FEWEST_FRAMES:
+        return None
+    there, back = translation(point), translation(-point)
+    relative = relative_pose(poses[used, 0], poses[used, 1])
+    found = se3_log(back @ relative @ there).mean(0)
+    A = se3_adjoint(back @ se3_inverse(poses[known].reshape(-1, 4, 4))).reshape(-1, 2, 6, 6)
+    local = A @ covariance[known] @ np.swapaxes(A, -1, -2)
+    upper, lower = np.median(local, axis=0)
+    upper, lower = _positive(upper), _positive(lower)
+    noise = (1.0 - STEADY) * (upper + lower) / 2.0
+    bite = np.diag(np.r_[np.full(3, (_BITE_MM / _ARCH_MM) ** 2), np.full(3, _BITE_MM**2)])
+    prior, registration = bite, np.zeros(6)
+    for _ in range(50):
+        gain = np.linalg.inv(upper + lower + noise + prior)
+        registration = prior @ gain @ found
+        excess = float(registration @ np.linalg.solve(bite, registration))
+        prior = bite * max(1.0, (_DEGREES_OF_FREEDOM + excess) / (_DEGREES_OF_FREEDOM + 6.0))
+    both = upper + lower
+    spread = np.stack([upper, lower, both])
+    return ClosedBite(
+        frames=tuple(int(f) for f in frames[used]),
+        point=point,
+        registration=registration,
+        registration_covariance=prior - prior @ gain @ prior,
+        steady=np.stack([-upper @ gain @ found, lower @ gain @ found]),
+        spread=spread,
+        remaining=spread - spread @ gain @ spread,
+    )
+
+
+# A registration off by more than this, and by more than its error explains, is worth a warning [mm, deg, sigmas].
+_OFF_MM, _OFF_DEG, _OFF_SIGMAS = 0.2, 0.5, 3.0
+
+
+def registration_findings(found: Registration) -> list[Finding]:
+    """Return a warning if the lower scan is not where the take shows the closed bite, a note if that was corrected."""
+    shift, turn = math.hypot(*found["shift_mm"]), math.hypot(*found["turn_deg"])
+    shifted = shift > max(_OFF_MM, _OFF_SIGMAS * math.hypot(*found["shift_sigma_mm"]))
+    turned = turn > max(_OFF_DEG, _OFF_SIGMAS * math.hypot(*found["turn_sigma_deg"]))
+    if not shifted and not turned:
+        return []
+    frames = f"{found['frames'][0]} to {found['frames'][-1]}"
+    where = f"in frames {frames}" if found["named"] else f"in frames {frames}, where the mouth is closed farthest,"
+    off = f"the lower scan is {shift:.2f} mm and {turn:.1f} degrees off the bite that the take shows {where}"
+    if found["applied"]:
+        return [Finding("scan_registration", "note", f"{off}: corrected", value=shift, limit=_OFF_MM)]
+    severity: Severity = "warning" if found["named"] else "note"  # without a name the mouth may just not have closed
+    hint = 'Register the scans again, or set registration = "take" in [scans] if the teeth are together there.'
+    return [Finding("scan_registration", severity, off, value=shift, limit=_OFF_MM, hint=hint)]
+
+
+# What registrations are off by at most; beyond it the mouth was not closed [mm, deg].
+_MOST_MM, _MOST_DEG = 3.0, 8.0
+
+
+def check_registration(found: Registration) -> None:
+    """Refuse to correct the lower scan by what cannot be an error of its registration.
+
+    Raises:
+        TrackingError: the lower scan is too far off the bite that the take shows.
+    """
+    shift, turn = math.hypot(*found["shift_mm"]), math.hypot(*found["turn_deg"])
+    if found["applied"] and (shift > _MOST_MM or turn > _MOST_DEG):
+        raise TrackingError(
+            f"the teeth are {shift:.1f} mm and {turn:.1f} degrees off the bite of the scans, a registration is off by "
+            f"{_MOST_MM:g} mm and {_MOST_DEG:g} degrees at most",
+            frame=found["frames"][0],
+            hint="Name a frame with the teeth together as rest_frame in [motion], or register the scans again.",
+        )
+
+
+def rest_frames(
+    records: Mapping[int, FrameRecord], named: int | None, up: Array, point: Array, probes: Array
+) -> tuple[int, ...]:
+    """Return the frames in which the teeth rest together, around a named one or where the mouth is closed farthest.
+
+    Args:
+        named: frame the capture names; None searches.
+        up: from the lower to the upper teeth, unit vector in scan axes, shape (3,).
+        point, probes: amid the teeth, shape (3,), and spread over the lower ones, shape (N, 3), scan coordinates [mm].
+    """
+    relative = {
+        frame: relative_pose(*record.solution.poses)
+        for frame, record in sorted(records.items())
+        if (record.status != LOST).all()
+    }
+    if named is None:
+        closed = {f: float((T[:3, :3] @ point + T[:3, 3] - point) @ up) for f, T in relative.items()}
+        ranked = sorted(closed, key=lambda f: -closed[f])
+        named = next((f for f in ranked if _still(relative, f, f + 1, probes)), None)
+    if named is None or named not in relative:
+        return ()
+    out = [named]
+    for step in (1, -1):
+        frame = named
+        while abs(frame + step - named) <= _LONGEST_REST and _still(relative, frame, frame + step, probes):
+            frame += step
+            if _moved_mm(relative[frame], relative[named], probes) > _SAME_BITE_MM:
+                break
+            out.append(frame)
+    return tuple(sorted(out))
+
+
+def _still(relative: Mapping[int, Array], frame: int, other: int, probes: Array) -> bool:
+    if frame not in relative or other not in relative:
+        return False
+    return _moved_mm(relative[frame], relative[other], probes) < _STILL_MM
+
+
+def _moved_mm(one: Array, other: Array, probes: Array) -> float:
+    """Return how far two poses (4, 4) of the lower arch are apart, on average over points (N, 3) [mm]."""
+    gap = probes @ (one - other)[:3, :3].T + (one - other)[:3, 3]
+    return float(np.linalg.norm(gap, axis=1).mean())
+
+
+def _root(matrix: Array) -> Array:
+    """Return the symmetric square root of a covariance (6, 6)."""
+    values, vectors = np.linalg.eigh(matrix)
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T, np.float64)
+
+
+def _positive(matrix: Array) -> Array:
+    """Return the nearest positive matrix to a median of covariances, shape (6, 6)."""
+    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
+    return np.asarray((vectors * np.maximum(values, 1e-3 * values.max() * 1e-6)) @ vectors.T, np.float64)

@@ -1,0 +1,111 @@
+"""What the closed bite tells about the scans' registration and the steady error of a take."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import multivariate_normal
+
+from jawusd.formats.tracks import TRACKED
+from jawusd.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
+from jawusd.tracking.contour.equations import OutlineSums, Solution, translation
+from jawusd.tracking.contour.frame_record import FrameRecord
+from jawusd.tracking.sequence.closed_bite import RestFrames, closed_bite, registration_findings, rest_frames
+
+POINT = np.array([3.0, -4.0, 20.0])
+REST = RestFrames((0, 1, 2, 3), True, POINT, POINT + (0, -5, 0), False)
+FRAMES = np.arange(12)
+SIGMA = np.r_[np.full(3, 0.002), np.full(3, 0.04)]  # of a pose about the point [rad, mm]
+
+
+def _take(registration=None, steady=((0,) * 6, (0,) * 6), seed=0):
+    """Return poses and covariances of a jaw that rests in four frames and then opens."""
+    rng = np.random.default_rng(seed)
+    there, back = translation(POINT), translation(-POINT)
+    opening = [np.zeros(6)] * 4 + [np.array([0.03 * k, 0, 0, 0, -0.8 * k, 0.1]) for k in range(1, 9)]
+    poses, covariance = np.empty((12, 2, 4, 4)), np.empty((12, 2, 6, 6))
+    moved = np.eye(4) if registration is None else there @ se3_exp(np.asarray(registration, float)) @ back
+    for k, twist in enumerate(opening):
+        head = se3_exp(np.r_[rng.normal(size=3) * 0.2, rng.normal(size=3) * 5]) @ translation([10, 20, 200])
+        true = head, head @ there @ se3_exp(twist) @ back @ moved
+        for r in (0, 1):
+            poses[k, r] = true[r] @ there @ se3_exp(np.asarray(steady[r], float)) @ back
+            A = se3_adjoint(poses[k, r] @ there)
+            covariance[k, r] = A @ np.diag(SIGMA**2) @ A.T
+    return poses, covariance
+
+
+def test_a_good_registration_takes_the_steady_error_out():
+    steady = (0, 0, 0, 0, 0.05, 0), (0, 0, 0, 0, -0.05, 0)
+    poses, covariance = _take(steady=steady)
+    bite = closed_bite(FRAMES, poses, covariance, REST)
+    exact, _ = _take()
+    before, after = (
+        np.abs(se3_log(se3_inverse(T[:, 1] @ translation(POINT)) @ exact[:, 1] @ translation(POINT))[:, 4]).max()
+        for T in (poses, bite.correct(poses, False))
+    )
+    assert before == pytest.approx(0.05, rel=1e-6)
+    assert after < 0.4 * before
+    assert np.linalg.norm(bite.registration[3:]) < 0.03
+    assert not registration_findings(bite.report(REST))
+
+
+@pytest.mark.parametrize(
+    ("mm", "degrees"),
+    [((0, 1, 0), (0, 0, 0)), ((0.6, 0, -0.8), (0, 0, 0)), ((0, 0, 0), (0, 3, 0)), ((1, 0, 0), (3, 0, 0))],
+)
+def test_a_bad_registration_is_measured_and_corrected(mm, degrees):
+    wrong = Rotation.from_euler("xyz", degrees, degrees=True).as_matrix()
+    scan = np.eye(4)
+    scan[:3, :3], scan[:3, 3] = wrong, np.array(mm) + REST.lower - wrong @ REST.lower  # the lower scan as it was given
+    poses, covariance = _take()
+    poses[:, 1] = poses[:, 1] @ se3_inverse(scan)
+    bite = closed_bite(FRAMES, poses, covariance, REST)
+    report = bite.report(REST)
+    assert np.linalg.norm(report["shift_mm"]) == pytest.approx(np.linalg.norm(mm), rel=0.2, abs=0.05)
+    assert np.linalg.norm(report["turn_deg"]) == pytest.approx(np.linalg.norm(degrees), rel=0.2, abs=0.05)
+    (finding,) = registration_findings(report)
+    assert finding.severity == "warning" and "mm" in finding.message and "degrees" in finding.message
+    relative = se3_inverse(bite.correct(poses, True)[:4, 0]) @ bite.correct(poses, True)[:4, 1]
+    left = relative @ np.append(REST.lower, 1.0) - np.append(REST.lower, 1.0)
+    assert np.linalg.norm(left, axis=1).max() < 0.1
+    assert np.degrees(np.linalg.norm(se3_log(relative)[:, :3], axis=1)).max() < 0.3
+    (note,) = registration_findings({**report, "applied": True})
+    assert note.severity == "note"
+
+
+def test_what_remains_is_the_conditional_covariance():
+    """scipy conditions the joint normal distribution of both steady errors on what the rest frames show."""
+    poses, covariance = _take(steady=((0, 0, 0, 0, 0.03, 0), (0,) * 6))
+    bite = closed_bite(FRAMES, poses, covariance, REST)
+    rng = np.random.default_rng(1)
+    upper, lower = (multivariate_normal(np.zeros(6), c, seed=rng).rvs(20000) for c in bite.spread[:2])
+    spread = bite.registration_covariance  # large enough to matter, any covariance will do for the comparison
+    assert np.all(np.linalg.eigvalsh(bite.remaining) > 0) and np.all(np.linalg.eigvalsh(spread) > 0)
+    assert (np.linalg.eigvalsh(bite.spread - bite.remaining) > -1e-12).all()
+    assert np.cov((lower - upper).T) == pytest.approx(bite.spread[2], abs=0.05 * SIGMA[3] ** 2)
+    skull = np.tile(np.eye(4), (12, 1, 1))
+    A = se3_adjoint(translation(POINT))
+    same = np.tile(A @ bite.spread[2] @ A.T, (12, 1, 1))
+    reduced = bite.reduce(same, skull, 2)
+    assert np.linalg.eigvalsh(reduced).min() > 0
+    assert np.trace(reduced[0]) < np.trace(same[0])
+
+
+def _records(poses):
+    nothing = OutlineSums.zeros(2), OutlineSums.zeros(2), np.zeros((2, 3)), np.zeros((2, 6, 6)), np.zeros((2, 2)), 1
+    status, used = np.full(2, TRACKED, np.int8), np.ones((2, 2), bool)
+    return {k: FrameRecord(Solution(p, *nothing), status, used, np.zeros((2, 2))) for k, p in enumerate(poses)}
+
+
+def test_rest_frames_are_those_around_the_named_one_and_else_the_most_closed():
+    poses, _ = _take()
+    up, probes = np.array([0.0, 1.0, 0.0]), POINT + np.random.default_rng(2).normal(size=(30, 3)) * 10
+    assert rest_frames(_records(poses), 1, up, POINT, probes) == (0, 1, 2, 3)
+    assert rest_frames(_records(poses), None, up, POINT, probes) == (0, 1, 2, 3)
+    assert rest_frames(_records(poses), 99, up, POINT, probes) == ()
+
+
+def test_without_rest_frames_nothing_is_said():
+    poses, covariance = _take()
+    poses[:3] = np.nan
+    assert closed_bite(FRAMES, poses, covariance, REST) is None
