@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import cast
 
@@ -36,7 +36,8 @@ class MaskLevels:
     deep: bool = False  # 16 bit per channel
     lossy: bool = False  # coding has left noise around the levels
     doubtful: bool = False  # whether border and area disagree about which level is the background
-    soft: float = 0.0  # share of what is not background that lies between the levels
+    # share of what is not background that lies between the levels
+    soft: float = field(default=0.0, compare=False)
 
     @property
     def usual(self) -> bool:

@@ -42,9 +42,12 @@ def survey_masks(source: CameraSource, size_px: tuple[int, int]) -> list[Finding
         for arch, reader in zip(ARCHES, readers, strict=True)
         if reader.is_black
     ]
-    for arch, reader in zip(ARCHES, readers, strict=True):
-        if reader.levels is not None:
-            out += _of_levels(source, arch, reader.levels)
+    upper, lower = (reader.levels for reader in readers)
+    if upper is not None and upper == lower:
+        return out + _of_levels(source, "both rows of", upper)
+    for arch, levels in zip(ARCHES, (upper, lower), strict=True):
+        if levels is not None:
+            out += _of_levels(source, f"the {arch}", levels)
     return out
 
 
@@ -75,7 +78,7 @@ def _black(source: CameraSource, message: str) -> Finding:
     )
 
 
-def _of_levels(source: CameraSource, arch: str, levels: MaskLevels) -> list[Finding]:
+def _of_levels(source: CameraSource, rows: str, levels: MaskLevels) -> list[Finding]:
     out = []
     if not levels.usual:
         low, high = sorted((levels.background, levels.teeth))
@@ -85,7 +88,7 @@ def _of_levels(source: CameraSource, arch: str, levels: MaskLevels) -> list[Find
             Finding(
                 "mask_levels",
                 "note",
-                f"the {channel} of the {arch} teeth hold the values {low:g} and {high:g}: {levels.teeth:g} is "
+                f"the {channel} of {rows} teeth hold the values {low:g} and {high:g}: {levels.teeth:g} is "
                 f"taken as teeth{inverted}.",
                 value=levels.teeth,
                 camera=source.name,
@@ -96,7 +99,7 @@ def _of_levels(source: CameraSource, arch: str, levels: MaskLevels) -> list[Find
             Finding(
                 "masks_soft",
                 "warning",
-                f"{levels.soft:.0%} of what the masks of the {arch} teeth show lie between background "
+                f"{levels.soft:.0%} of what the masks of {rows} teeth show lie between background "
                 f"({levels.background:g}) and teeth ({levels.teeth:g}), at most {MOST_SOFT:.0%} are usual; the outline "
                 "is taken half the way.",
                 value=round(levels.soft, 3),
@@ -110,7 +113,7 @@ def _of_levels(source: CameraSource, arch: str, levels: MaskLevels) -> list[Find
             Finding(
                 "mask_polarity",
                 "warning",
-                f"the masks of the {arch} teeth hold {levels.background:g} and {levels.teeth:g}, and border and area "
+                f"the masks of {rows} teeth hold {levels.background:g} and {levels.teeth:g}, and border and area "
                 f"of the pictures disagree about which is the background; {levels.teeth:g} is taken as teeth.",
                 camera=source.name,
                 hint="Export them with teeth in white on black, up to the border of the picture.",

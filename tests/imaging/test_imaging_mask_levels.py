@@ -172,4 +172,26 @@ def test_light_masks_up_to_the_border_are_doubted(tmp_path):
     written(tmp_path / "upper", [np.where(teeth(k) > 0, 0, framed) for k in range(COUNT)])
     masks = {row: tmp_path / "upper" / "%03d.png" for row in ("upper", "lower")}
     source = CameraSource.model_construct(name="a", video=None, masks=Masks.model_construct(**masks, **NO_LABELS))
-    assert [one.kind for one in survey_masks(source, SIZE)] == ["mask_polarity", "mask_polarity"]
+    assert [one.kind for one in survey_masks(source, SIZE)] == ["mask_polarity"]
+
+
+@pytest.mark.parametrize("tagged", ["full", "limited"])
+def test_the_range_that_a_video_announces_is_not_trusted(tmp_path, tagged):
+    path = tmp_path / "upper.mp4"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=25)
+        stream.width, stream.height = SIZE
+        stream.pix_fmt, stream.options = "yuv420p", {"qp": "0"}
+        stream.codec_context.color_range = 2 if tagged == "full" else 1
+        for k in range(COUNT):
+            frame = av.VideoFrame(*SIZE, "yuv420p")
+            luma = np.where(teeth(k) > 0, 235, 16) if tagged == "full" else teeth(k)  # the other one's values
+            for plane, values in zip(frame.planes, (luma, None, None), strict=True):
+                rows = np.full((plane.height, plane.line_size), 128, np.uint8)
+                rows[:, : plane.width] = 128 if values is None else values
+                plane.update(rows.tobytes())
+            frame.color_range = 2 if tagged == "full" else 1
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    found = MaskReader(path, SIZE).read(4)
+    assert np.array_equal(found, teeth(4))
