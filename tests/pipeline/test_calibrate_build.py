@@ -60,7 +60,8 @@ def test_the_build_calibrates_from_the_boards(calibrated):
     out, told = calibrated
     assert ("calibrate", 72, 72) in told
     record = json.loads((out / "build.json").read_text())["stages"]
-    assert list(record) == ["calibrate", "sync"] and list(record["calibrate"]["outputs"]) == ["calibration.toml"]
+    assert list(record) == ["check", "calibrate", "sync"]
+    assert list(record["calibrate"]["outputs"]) == ["calibration.toml"]
     report = record["calibrate"]["result"]
     assert all(camera["rms_px"] < 0.3 for camera in report["cameras"].values())
     assert report["board_shape"]["mean"] < 0.03 and report["scale"]["ratio"] == pytest.approx(1.0, abs=0.015)

@@ -120,7 +120,7 @@ def test_upper_scan_upside_down_and_the_same_file_twice_are_refused(bite):
         ("midlines_apart", {"move_mm": (5, 0, 0)}),
         ("underbite", {"move_mm": (0, -1, 5)}),
         ("arch_widths", {"scale": 0.7}),
-        ("scan_size", {"scale": 1.3}),
+        ("scan_size", {"scale": 1.36}),
     ],
 )
 def test_doubtful_bites_are_said_with_a_figure(bite, kind, change):
