@@ -20,7 +20,7 @@ _BAND_MM = 1.5
 _UNDER_HULL_MM = 4.5
 # Farther than this from every highest place in plan, or this deep, is no crown any more.
 _ASIDE_MM, _DEEP_MM = 5.0, 13.0
-_LEVEL = 0.9  # cosine of the steepest slope of the hull that teeth make among themselves
+_LEVEL = 0.95  # cosine of the steepest slope of the hull that teeth make among themselves
 _ROUNDS = 3
 _MIDDLE_CELLS = 2  # around a piece's middle in plan
 

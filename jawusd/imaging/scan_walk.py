@@ -19,8 +19,6 @@ from jawusd.imaging.scan_surface import ScanSurface
 _SHYNESS_MM = 2.5
 _SHARPEST = 3.0  # sharper creases count like this one [1/mm]
 _TOLERANCE, _STEPS = 1e-3, 600
-# Walks that leave a start more readily than this per mm of its outline meet no crease on their way to the gum [1/mm].
-_LEAKS = 0.06
 # A border along a weaker crease is hardly supported by the shape.
 _EVIDENCE, _EVIDENCE_REACH_MM = 0.6, 0.5  # [1/mm], [mm]
 
@@ -35,13 +33,16 @@ class CreaseWalk:
         self.crease = surface.creases(self.edges)
         self._weights = self._stepping()
 
-    def crowns(self, up: Mask, down: Mask, doubtful: Mask) -> Mask:
-        """Return which vertices are crown, given those that surely are (v,) and those that surely are gum (v,).
+    def crowns(self, up: Mask, down: Mask, most_leaving: Array) -> Mask:
+        """Return which vertices are crown, shape (v,).
 
-        Doubtful starts (v,), from which walks reach the gum without crossing a crease, are given up: ridges of gum.
+        Args:
+            up, down: where walks start as from crown and as from gum, shape (v,).
+            most_leaving: parts of `up` that walks leave for the gum more readily than this per mm of their outline,
+                meeting no crease, are ridges of gum and given up [1/mm], shape (v,).
         """
         share = self._meeting(up, down)
-        leaking = self._leaking(share, up) & doubtful
+        leaking = self._leaking(share, up, most_leaving)
         if leaking.any():
             up = up & ~leaking
             share = self._meeting(up, down)
@@ -86,8 +87,8 @@ class CreaseWalk:
         share[free] = found
         return share
 
-    def _leaking(self, share: Array, up: Mask) -> Mask:
-        """Return the starts, in connected parts, that walks leave for the gum without crossing a crease, shape (v,)."""
+    def _leaking(self, share: Array, up: Mask, most_leaving: Array) -> Mask:
+        """Return the starts, in connected parts, that walks leave for the gum too readily, shape (v,)."""
         part = parts(self.edges, up)
         count = int(part.max(initial=-1)) + 1
         steps = coo_array(self._weights)
@@ -98,7 +99,9 @@ class CreaseWalk:
         # A step crosses about as much of the outline as it is long.
         length = np.linalg.norm(self._surface.vertices[i] - self._surface.vertices[j], axis=1)
         outline = np.maximum(np.bincount(part[i], length, count), 1e-9)
-        return (part >= 0) & (flow / outline > _LEAKS)[part]
+        most = np.bincount(part[i], np.minimum(most_leaving[i], 1.0), count)
+        most /= np.maximum(np.bincount(part[i], minlength=count), 1)
+        return np.asarray((part >= 0) & (flow / outline > most)[part])
 
     def _without_islands(self, crown: Mask, up: Mask, down: Mask) -> Mask:
         """Return the crowns without islands: parts of either label in which no walk starts become the other one."""
