@@ -17,12 +17,19 @@ from jawusd.tracking.contour.quality import arch_fit, coverage_error, score_px, 
 from jawusd.tracking.contour.scan import ARCH_NAMES, ARCHES
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import View, present_masks
+from jawusd.tracking.initialization.magnification import magnified, measure_magnification
 
 # Least `arch_fit` of a first frame [-]: teeth that slid along by one reach 0 in one of the arches, right poses 0.1 even
 # with lips nearly closed.
 _LEAST_FIT = 0.05
 # The same of a fit without one camera, which is to leave no doubt; see `start`.
 _CLEAR_FIT = 0.3
+# Magnification of the masks against scans and calibration [-] from which it explains a start that fails, and that of
+# one camera against the others; it is estimated so often, since contours far from their masks are missed at first.
+_LEAST_SCALE, _OWN_SCALE, _SIZE_ROUNDS = 0.02, 0.015, 3
+_SIZE_HINT = (
+    "Check the scans' scaling, the board's square size, and that each calibration is of the lens and zoom used."
+)
 _FEWEST_MASKS = 2  # of an arch: one view leaves the depth unknown
 
 
@@ -48,6 +55,8 @@ def first_record(
         others = [_aligned(solver, config, start, views, _without_camera(use, c)) for c in range(len(views))]
         clear = [one for one in others if one.fit.min() >= _CLEAR_FIT and _problem(one, config) is None]
         if not clear:
+            if (cause := _wrong_size(solver, config, first, views)) is not None:
+                raise TrackingError(cause, frame=frame, hint=_SIZE_HINT)
             raise TrackingError(
                 problem,
                 frame=frame,
@@ -100,6 +109,29 @@ def _problem(first: _Aligned, config: TrackingConfig) -> str | None:
                 f"{first.fit[r]:.2f} (at least {_LEAST_FIT} is needed)"
             )
     return None
+
+
+def _wrong_size(solver: ContourSolver, config: TrackingConfig, first: _Aligned, views: Sequence[View]) -> str | None:
+    """Say by how much cameras show the teeth too large or small if that explains why they do not fit; else None."""
+    use, poses = present_masks(views), first.solution.poses
+    scales = np.zeros(len(views))
+    for _ in range(_SIZE_ROUNDS):
+        grown = [magnified(view, scale) for view, scale in zip(views, scales, strict=True)]
+        found = measure_magnification(solver.scans, [(poses, grown, use)], config)
+        if found is None:
+            return None
+        common = found.common
+        scales = scales + np.where(np.abs(found.scale - common) > _OWN_SCALE, found.scale, common)
+        grown = [magnified(view, scale) for view, scale in zip(views, scales, strict=True)]
+        again = _aligned(solver, config, poses, grown, use)
+        poses = again.solution.poses
+    if np.abs(scales).max() < _LEAST_SCALE or _problem(again, config) is not None or again.fit.min() < first.fit.min():
+        return None
+    shown = ", ".join(f"camera {c}: {100 * scale:+.1f} %" for c, scale in enumerate(scales, start=1))
+    return (
+        f"the cameras show the teeth in another size than scans and calibration say ({shown}), and fit once that is "
+        "corrected: a focal length, the scale of the scans or the calibration's lengths are wrong"
+    )
 
 
 def _without_camera(use: Mask, camera: int) -> Mask:

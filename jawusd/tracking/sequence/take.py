@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from jawusd.formats.capture import Capture
+from jawusd.formats.finding import Finding
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, Tracks, TracksMeta
 from jawusd.geometry import Camera
@@ -17,8 +18,9 @@ from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.frame_record import FrameRecord
 from jawusd.tracking.contour.scan import prepare_scan, probe_points, teeth_centre
 from jawusd.tracking.contour.solver import ContourSolver
-from jawusd.tracking.contour.views import MaskViews, View
+from jawusd.tracking.contour.views import MaskViews, View, present_masks
 from jawusd.tracking.initialization.first_frame import first_record
+from jawusd.tracking.initialization.magnification import measure_magnification
 from jawusd.tracking.initialization.start import find_start
 from jawusd.tracking.sequence.camera_use import use_of_cameras
 from jawusd.tracking.sequence.closed_bite import RestFrames, rest_frames
@@ -27,12 +29,14 @@ from jawusd.tracking.sequence.frame_tracker import FrameTracker
 from jawusd.tracking.sequence.history import History, MotionPredictor
 from jawusd.tracking.sequence.nuisance import Nuisances, TakeEquations, bridge, delay_motions
 from jawusd.tracking.sequence.results import assemble, outline_variance
+from jawusd.tracking.sequence.take_checks import lens_findings, motion_findings, time_findings
 
 Progress = Callable[[int, int], None]
 
 # Most frames around a restart whose poses and quality the tracker takes over: without a limit, a long take with many
 # gaps would cost the square of its length.
 _NEARBY_FRAMES = 4000
+_CHECKED_FRAMES = 8  # whose contours are searched widely for wrong lenses and sizes: half a second
 
 
 def track_capture(
@@ -79,7 +83,12 @@ def track_capture(
             nuisances, extrinsics = take.refine()
             records = take.records if capture.frames else _trimmed(take.records)
             names = tuple(camera.name for camera in masks.cameras)
-            findings = [*start.findings, *masks.findings(), *use_of_cameras(names, records)]
+            findings = [
+                *start.findings,
+                *masks.findings(),
+                *use_of_cameras(names, records),
+                *take.checks(nuisances, extrinsics),
+            ]
     notes: TracksMeta = {
         "start": start.notes,
         "painted": [s.painted for s in scans],
@@ -165,6 +174,24 @@ class _Take:
             residual = self._equations(extrinsics).solve(c, cameras_moved)
             found, pending, rounds = found.plus(residual), residual.matters(c), rounds + 1
         return found, extrinsics
+
+    def checks(self, nuisances: Nuisances, extrinsics: Extrinsics) -> list[Finding]:
+        """Return what the take tells of calibration, synchronisation and masks."""
+        names = [camera.name for camera in self._masks.cameras]
+        whole = [frame for frame, record in sorted(self.records.items()) if (record.status != LOST).all()]
+        found = motion_findings(names, extrinsics)
+        if not whole:
+            return found
+        instants = []
+        for k in np.unique(np.linspace(0, len(whole) - 1, _CHECKED_FRAMES).astype(int)):
+            views = self._masks.at(whole[k])
+            corrected = _corrected_views(views, self.records, whole[k], nuisances, extrinsics)
+            instants.append((self.records[whole[k]].solution.poses, corrected, present_masks(views)))
+        scans = [scan.thin or scan for scan in self._solver.scans]
+        magnification = measure_magnification(scans, instants, self._config)
+        if magnification is not None:
+            found += lens_findings(names, magnification)
+        return found + time_findings(names, self.records, nuisances, extrinsics, self._config)
 
     def _equations(self, extrinsics: Extrinsics) -> TakeEquations:
         return TakeEquations(self.records, outline_variance(self.records, self._config), extrinsics)

@@ -1,0 +1,213 @@
+"""What a tracked take says of calibration, synchronisation and masks: lenses, scan sizes, late cameras, lost frames.
+
+False alarms of all kinds: see the limits; measured with `tests/benchmarks/population.py --persons 100`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from jawusd.formats.finding import Finding
+from jawusd.formats.tracks import LOST
+from jawusd.geometry.arrays import Array
+from jawusd.tracking.config import TrackingConfig
+from jawusd.tracking.contour.frame_record import FrameRecord
+from jawusd.tracking.initialization.magnification import Magnification
+from jawusd.tracking.sequence.extrinsics import Extrinsics
+from jawusd.tracking.sequence.nuisance import Nuisances, TakeEquations
+from jawusd.tracking.sequence.results import outline_variance
+
+# Magnification of one camera against the others, and of all [-]; change of it over 25 mm at the teeth [-].
+_SCALE, _COMMON, _BEND = 0.02, 0.015, 0.006
+# Outline bias of a camera against the others [px].
+_BIAS_PX = 2.5
+# Motion of a camera since its calibration, which the take corrects.
+_TURN_DEG, _MOVE_MM = 0.25, 0.7
+_TELLING_CAMERAS = 3  # of two that differ, either may be wrong
+_CLEARLY = 4.0  # standard deviations
+_LATE_FRAMES = 0.7  # cameras that run freely are up to half a frame apart
+_PART_FRAMES = 5  # in the parts of a take whose delays are compared
+
+
+def lens_findings(names: Sequence[str], found: Magnification) -> list[Finding]:
+    """Return what the magnification of the cameras tells of scans, focal lengths, lenses and masks.
+
+    Kinds: "scan_size" [%], "focal_length" [%], "lens_distortion" [%], "masks_wide" [px].
+    """
+    out = []
+    common = found.common
+    sigma = float(np.sqrt(np.mean(found.sigma_scale**2)))
+    if abs(common) > max(_COMMON, _CLEARLY * sigma) and (np.sign(found.scale) == np.sign(common)).all():
+        out.append(
+            Finding(
+                "scan_size",
+                "warning",
+                f"every camera shows the teeth {_than(common)} than the scans: the scans' scale is wrong, or the "
+                f"calibration's lengths; at most {_COMMON:.1%} is usual.",
+                value=round(100 * common, 2),
+                limit=100 * _COMMON,
+                hint="Check the scans' unit and scaling, and the square size of the calibration board.",
+            )
+        )
+    for c, name in enumerate(names):
+        own = float(found.scale[c] - common)
+        if len(names) >= _TELLING_CAMERAS and abs(own) > max(_SCALE, _CLEARLY * found.sigma_scale[c]):
+            out.append(
+                Finding(
+                    "focal_length",
+                    "warning",
+                    f"it shows the teeth {_than(own)} than its calibration and the other cameras say; at most "
+                    f"{_SCALE:.0%} is usual. Its focal length is wrong, or its distance.",
+                    value=round(100 * own, 2),
+                    limit=100 * _SCALE,
+                    camera=name,
+                    hint="Calibrate it again with the lens, zoom and focus of the recording.",
+                )
+            )
+        elif abs(found.bend[c]) > max(_BEND, _CLEARLY * found.sigma_bend[c]):
+            out.append(
+                Finding(
+                    "lens_distortion",
+                    "warning",
+                    f"25 mm from the optical axis it shows the teeth {_than(float(found.bend[c]))} than its "
+                    f"calibration says; at most {_BEND:.1%} is usual. Its lens distortion is wrong.",
+                    value=round(100 * float(found.bend[c]), 2),
+                    limit=100 * _BEND,
+                    camera=name,
+                    hint="Check the signs and the order of the distortion coefficients, or calibrate it again.",
+                )
+            )
+        out += _wide(name, c, found)
+    return out
+
+
+def _than(share: float) -> str:
+    return f"{abs(share):.1%} {'larger' if share > 0 else 'smaller'}"
+
+
+def _wide(name: str, c: int, found: Magnification) -> list[Finding]:
+    """Say that a camera's masks are drawn wider or narrower than the others' by far."""
+    own = found.bias_px[c] - np.median(found.bias_px, axis=0)
+    bias = float(own.mean())
+    if len(found.bias_px) < _TELLING_CAMERAS:
+        return []
+    if np.abs(own).min() < max(_BIAS_PX, _CLEARLY * float(found.sigma_bias_px[c].max())) or own.min() * own.max() < 0:
+        return []
+    return [
+        Finding(
+            "masks_wide",
+            "warning",
+            f"its masks are drawn {abs(bias):.1f} px {'wider' if bias > 0 else 'narrower'} than those of the other "
+            f"cameras; at most {_BIAS_PX} px is usual.",
+            value=round(bias, 2),
+            limit=_BIAS_PX,
+            camera=name,
+            hint="Draw them again, or leave this camera out.",
+        )
+    ]
+
+
+def time_findings(
+    names: Sequence[str],
+    records: Mapping[int, FrameRecord],
+    nuisances: Nuisances,
+    extrinsics: Extrinsics,
+    config: TrackingConfig,
+) -> list[Finding]:
+    """Return cameras that are a frame late or early, from the start or from some frame on.
+
+    Kinds: "camera_late" [frames], "frame_dropped" [frames].
+    """
+    out = []
+    for k, name in enumerate(names):
+        late, sigma = float(nuisances.delays[k]), float(nuisances.sigma_delays[k])
+        if abs(late) > max(_LATE_FRAMES, _CLEARLY * sigma):
+            out.append(
+                Finding(
+                    "camera_late",
+                    "warning",
+                    f"its pictures are {abs(late):.1f} frames {'later' if late > 0 else 'earlier'} than its offset "
+                    f"says; below {_LATE_FRAMES} frames is usual.",
+                    value=round(late, 2),
+                    limit=_LATE_FRAMES,
+                    camera=name,
+                    hint=f"Check its offset in [sync]: {round(late):+d} frames would fit better.",
+                )
+            )
+    delays, sigmas, starts = _delays_of_parts(records, nuisances, extrinsics, config)
+    for k, name in enumerate(names):
+        step, sigma, at = _largest_step(delays[:, k], sigmas[:, k])
+        if abs(step) > max(_LATE_FRAMES, _CLEARLY * sigma):
+            out.append(
+                Finding(
+                    "frame_dropped",
+                    "warning",
+                    f"its delay changes by {step:+.1f} frames near here: a frame was dropped or doubled; below "
+                    f"{_LATE_FRAMES} frames is usual.",
+                    value=round(step, 2),
+                    limit=_LATE_FRAMES,
+                    camera=name,
+                    frame=starts[at],
+                    hint="Export the clip again at a constant frame rate, or cut the take there.",
+                )
+            )
+    return out
+
+
+def _delays_of_parts(
+    records: Mapping[int, FrameRecord], nuisances: Nuisances, extrinsics: Extrinsics, config: TrackingConfig
+) -> tuple[Array, Array, list[int]]:
+    """Return the delays of parts of the take and their sigmas, shape (P, C), and the parts' first frames."""
+    whole = [f for f, record in sorted(records.items()) if (record.status != LOST).all()]
+    count = max(1, min(12, len(whole) // _PART_FRAMES))
+    variance = outline_variance(records, config)
+    delays, sigmas, starts = [], [], []
+    for part in np.array_split(np.array(whole), count):
+        if not len(part):
+            continue
+        found = TakeEquations(records, variance, extrinsics, part.tolist()).solve(config, False)
+        delays.append(found.delays + nuisances.delays)
+        sigmas.append(found.sigma_delays)
+        starts.append(int(part[0]))
+    cameras = len(nuisances.delays)
+    return np.reshape(delays, (-1, cameras)), np.reshape(sigmas, (-1, cameras)), starts
+
+
+def _largest_step(values: Array, sigmas: Array) -> tuple[float, float, int]:
+    """Return the clearest step of a series, its sigma, and the index after it."""
+    best = (0.0, 1.0, 0)
+    for k in range(1, len(values)):
+        weights = 1.0 / np.maximum(sigmas, 1e-3) ** 2
+        before, after = (np.average(values[p], weights=weights[p]) for p in (slice(k), slice(k, None)))
+        sigma = float(np.sqrt(1.0 / weights[:k].sum() + 1.0 / weights[k:].sum()))
+        step = float(after - before)
+        if abs(step) / sigma > abs(best[0]) / best[1]:
+            best = (step, sigma, k)
+    return best
+
+
+def motion_findings(names: Sequence[str], extrinsics: Extrinsics) -> list[Finding]:
+    """Return a warning for each camera that stands clearly elsewhere than its calibration says.
+
+    Kind: "camera_moved" [degrees].
+    """
+    out = []
+    for name, twist, sigma in zip(names, extrinsics.twists, extrinsics.sigma, strict=True):
+        turn, move = float(np.rad2deg(np.linalg.norm(twist[:3]))), float(np.linalg.norm(twist[3:]))
+        clear = (np.abs(twist) > _CLEARLY * sigma).any()
+        if clear and (turn > _TURN_DEG or move > _MOVE_MM):
+            out.append(
+                Finding(
+                    "camera_moved",
+                    "warning",
+                    f"as the take shows it, it sees the teeth turned by {turn:.2f} degrees and moved by {move:.1f} mm "
+                    f"against its calibration (usual are {_TURN_DEG:g} degrees and {_MOVE_MM:g} mm); corrected.",
+                    value=round(turn, 3),
+                    limit=_TURN_DEG,
+                    camera=name,
+                    hint="It was knocked: calibrate again to be sure.",
+                )
+            )
+    return out
