@@ -1,4 +1,4 @@
-"""Read scans and bones from PLY, STL and OBJ."""
+"""Read scans and bones from PLY, STL and OBJ, and scans from 3Shape DCM."""
 
 from __future__ import annotations
 
@@ -7,25 +7,27 @@ import os
 from pathlib import Path
 from typing import Literal, NamedTuple
 
+import cv2
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from jawusd.errors import CaptureError
+from jawusd.errors import CaptureError, explain_missing_packages
 from jawusd.formats.mesh import Mesh, tooth_labels
 from jawusd.geometry.arrays import Array
 
 # People who read scans with this module label them next; scripts outside the package import both from here.
 __all__ = ["Winding", "load_mesh", "tooth_labels", "winding"]
 
-_KINDS = (".ply", ".stl", ".obj")
+_KINDS = (".ply", ".stl", ".obj", ".dcm")
 # Diagonal of the bounding box [mm]: smallest, typical, largest. A full arch has about 80, a mandible 165, a skull 290.
 _DIAGONAL_MM = {"scan": (20.0, 80.0, 150.0), "bone": (50.0, 200.0, 500.0)}
+_NO_COLOUR = 128  # gray, where a texture says nothing
 _UNITS_MM = {"metres": 1000.0, "centimetres": 10.0, "inches": 25.4, "micrometres": 0.001}
 
 
 def load_mesh(path: str | os.PathLike[str], kind: Literal["scan", "bone"] = "scan") -> Mesh:
-    """Read a triangle mesh [mm] from PLY, STL or OBJ, its vertices in the order of the file.
+    """Read a triangle mesh [mm] from PLY, STL, OBJ or 3Shape DCM, its vertices in the order of the file.
 
     Larger polygons are cut into triangles; STL files, which share no vertices, give three per triangle. Materials and
     textures are not read. A closed mesh that is inside out has its triangles turned; open ones stay as they are.
@@ -34,10 +36,13 @@ def load_mesh(path: str | os.PathLike[str], kind: Literal["scan", "bone"] = "sca
     Raises:
         CaptureError: the file is missing or damaged, holds no triangles or coordinates that are not finite, or is of
             a size that cannot be in mm.
+        MissingDependencyError: the mesh is a DCM file and open3sdcm is not installed.
     """
     path = Path(path)
     if path.suffix.lower() not in _KINDS:
         raise CaptureError(f"meshes are read from {', '.join(_KINDS)} files.", path=path, hint="Convert the mesh.")
+    if path.suffix.lower() == ".dcm":
+        return _checked(path, *_read_dcm(path), kind)
     try:
         # As a stream and not by name, so that no file named inside (materials, textures) is opened.
         with open(path, "rb") as stream:
@@ -56,6 +61,46 @@ def load_mesh(path: str | os.PathLike[str], kind: Literal["scan", "bone"] = "sca
     if isinstance(visual, trimesh.visual.ColorVisuals) and visual.kind == "vertex":
         colors = visual.vertex_colors[:, :3].astype(np.uint8)
     return _checked(path, np.asarray(loaded.vertices), np.asarray(loaded.faces), colors, kind)
+
+
+@explain_missing_packages("dcm")
+def _read_dcm(path: Path) -> tuple[Array, NDArray[np.int64], NDArray[np.uint8] | None]:
+    """Return vertices, faces, and colours from the texture or None.
+
+    Raises:
+        CaptureError: the file is missing or damaged.
+    """
+    import open3sdcm
+
+    if not path.is_file():
+        raise CaptureError("no such mesh.", path=path, hint="Check the path in capture.toml.")
+    try:
+        found = open3sdcm.load(str(path))
+        vertices, faces = np.array(found.vertices, np.float64), np.array(found.faces).astype(np.int64)
+        texture, corners = found.texture, found.uv
+    except Exception as error:  # its parser reports damaged and encrypted files by exceptions of its own
+        raise CaptureError(f"the mesh cannot be read ({error}).", path=path, hint="Export it as PLY or STL.") from error
+    if len(faces) == 0:
+        raise CaptureError("the file holds no triangles.", path=path, hint="Export the surface again.")
+    return vertices, faces, _texture_colors(texture, corners, faces, len(vertices))
+
+
+def _texture_colors(
+    texture: bytes | None, corners: Array | None, faces: NDArray[np.int64], count: int
+) -> NDArray[np.uint8] | None:
+    """Return the colour of every vertex: of a texture (JPEG) at its last corner's place (u to the right, v upwards)."""
+    if texture is None or corners is None or len(corners) != faces.size:
+        return None
+    image = cv2.imdecode(np.frombuffer(texture, np.uint8), cv2.IMREAD_COLOR)
+    if image is None:
+        return None
+    known = np.isfinite(corners).all(axis=1)
+    height, width = image.shape[:2]
+    place = np.clip(corners[known], 0.0, 1.0) * [width - 1, height - 1]
+    column, row = place[:, 0].astype(np.int64), height - 1 - place[:, 1].astype(np.int64)
+    colors = np.full((count, 3), _NO_COLOUR, np.uint8)
+    colors[faces.ravel()[known]] = image[row, column, ::-1]
+    return colors
 
 
 def _checked(

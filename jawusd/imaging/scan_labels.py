@@ -18,10 +18,13 @@ from jawusd.imaging.scan_surface import ScanSurface
 from jawusd.imaging.scan_tops import Tops, biting_direction, topped_by, tops
 from jawusd.imaging.scan_walk import CreaseWalk
 
-# A crown with what a scan keeps of its root is smaller than this in every direction, a gum larger [mm].
-_TOOTH_MM = 24.0
-_SPECK_MM = 2.0  # smaller pieces are scraps, which get the label of what they lie at
-_CROWN_MM = 4.0  # the smallest crown, from corner to corner of its box
+# From corner to corner of its box, a crown with what a scan keeps of its root and gum is smaller than this, the gum of
+# an arch or a quadrant larger [mm].
+_TOOTH_MM = 30.0
+_FEWEST_FACES = 100  # with fewer there is no shape to tell anything from, nor an arch to track
+# From corner to corner of its box the smallest crown; smaller pieces are scraps and brackets, which get the label of
+# what they lie at [mm].
+_CROWN_MM = 4.0
 # The lowest part of a piece, from which the walker may start as from gum if there is no surer gum [share of height].
 _LOWEST = 0.12
 # How readily walks leave a highest place for the gum, per mm of its outline [1/mm]: 0.003 (median) to 0.030 at crowns,
@@ -30,6 +33,9 @@ _LEAVING, _DOUBT_PER_MM, _MOST_DOUBT_MM = 0.06, 3.0, 0.6
 # Share of a piece's border without a crease: crowns that carry a collar of gum have 0.05 to 0.13 (median over an arch),
 # whole crowns, whose grooves and necks look like short creases, 0.2 to 1.
 _MOST_WEAK = 0.16
+# Pieces that begin this far above the lower end of the crown they lie at are on it (brackets), not around it (gum)
+# [share of the crown's height].
+_ON_CROWN = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +56,8 @@ def label_scan(mesh: Mesh, towards: Array | None) -> Labelling:
         towards: middle of the other arch in the same frame, teeth in occlusion, shape (3,); None if not known.
     """
     surface = ScanSurface.of(mesh)
+    if len(surface.faces) < _FEWEST_FACES:
+        return Labelling(np.full(len(mesh.vertices), TOOTH, np.uint8), np.array([0.0, 1.0, 0.0]), 0.0)
     up = biting_direction(surface.vertices, towards)
     surface = surface.wound(up)
     seen = tops(surface.vertices, up)
@@ -65,7 +73,7 @@ def _by_pieces(surface: ScanSurface, seen: Tops, up: Array, walk: CreaseWalk) ->
     small = extent < _TOOTH_MM
     starts = np.bincount(piece, seen.crown, len(extent))
     alone = small & (extent > _CROWN_MM) & topped_by(surface.vertices, up, piece)
-    bearing = (starts > 0) & (extent > _SPECK_MM) | alone
+    bearing = (extent > _CROWN_MM) & (starts > 0) | alone
     high = (seen.crown | (alone & (starts == 0))[piece] & (_height_share(surface, up) > 1 - _LOWEST)) & bearing[piece]
     if (bearing & small).sum() >= 3 and high[~small[piece]].sum() < 0.2 * high.sum():
         bearing &= small  # the others are the gum of the small ones
@@ -83,8 +91,26 @@ def _by_pieces(surface: ScanSurface, seen: Tops, up: Array, walk: CreaseWalk) ->
     both = own.any() and bool(np.median(np.where(count > 0, share, 1.0)[own]) <= _MOST_WEAK)
     whole = own if not both else own & (count == 0)
     crown = crown & bearing[piece] | whole[piece]
+    crown |= _carried(surface, up, bearing & small, ~bearing & small)[piece]
     counted = ~whole[owner]
     return crown, float(weak[counted].mean()) if counted.any() else 0.0
+
+
+def _carried(surface: ScanSurface, up: Array, crowns: Mask, others: Mask) -> Mask:
+    """Return which of other pieces (P,) sit on one of the crowns that are pieces of their own (P,), shape (P,)."""
+    out = np.zeros(len(others), dtype=bool)
+    if not crowns.any() or not others.any():
+        return out
+    height, piece, count = surface.vertices @ up, surface.piece, len(others)
+    low, high = np.full(count, np.inf), np.full(count, -np.inf)
+    np.minimum.at(low, piece, height)
+    np.maximum.at(high, piece, height)
+    standing = np.flatnonzero(crowns[piece])
+    size = np.maximum(np.bincount(piece, minlength=count), 1)
+    middle = np.stack([np.bincount(piece, axis, count) / size for axis in surface.vertices.T], axis=1)[others]
+    at = piece[standing[cKDTree(surface.vertices[standing]).query(middle)[1]]]
+    out[others] = low[others] > low[at] + _ON_CROWN * (high - low)[at]
+    return out
 
 
 def _extent_mm(surface: ScanSurface) -> Array:
@@ -108,7 +134,7 @@ def _height_share(surface: ScanSurface, up: Array) -> Array:
 
 def _scraps_joined(surface: ScanSurface, crown: Mask) -> Mask:
     """Return the crowns with scraps counted to whatever larger piece they lie at."""
-    scrap = (_extent_mm(surface) < _SPECK_MM)[surface.piece]
+    scrap = (_extent_mm(surface) < _CROWN_MM)[surface.piece]
     if not scrap.any() or scrap.all():
         return crown
     nearest = cKDTree(surface.vertices[~scrap]).query(surface.vertices[scrap])[1]

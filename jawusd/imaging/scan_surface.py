@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry.arrays import Array, Indices
@@ -36,9 +37,16 @@ class ScanSurface:
     def of(cls, mesh: Mesh) -> ScanSurface:
         """Clean a scan."""
         vertices, index = merged_places(mesh.vertices)
+        merged = len(mesh.vertices) - len(vertices)
         faces = index[mesh.faces]
         solid = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
         faces = faces[solid]
+        used = np.zeros(len(vertices), dtype=bool)
+        used[faces] = True
+        if used.any() and not used.all():  # vertices of no face count as the nearest one of the surface
+            number = np.cumsum(used) - 1
+            number[~used] = cKDTree(vertices[used]).query(vertices[~used])[1]
+            vertices, index, faces = vertices[used], number[index], number[faces]
         corners = np.sort(faces, axis=1)
         n = len(vertices)
         order = np.lexsort(corners.T)
@@ -55,7 +63,7 @@ class ScanSurface:
             faces=faces[kept],
             of_vertex=index,
             piece=piece.astype(np.int64),
-            merged=len(mesh.vertices) - n,
+            merged=merged,
             empty=int(len(solid) - solid.sum()),
             repeated=len(faces) - len(kept),
         )

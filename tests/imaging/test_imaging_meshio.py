@@ -1,12 +1,15 @@
 """Mesh reading against trimesh's own exporters and hand-written files, and every guard."""
 
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
 
-from jawusd.errors import CaptureError
+from jawusd.errors import CaptureError, MissingDependencyError
 from jawusd.formats.mesh import BOUNDARY, GUM, TOOTH, Mesh, crown_face_mask, tooth_labels
 from jawusd.imaging import meshio
 
@@ -155,3 +158,46 @@ def test_closed_meshes_inside_out_are_turned(tmp_path: Path) -> None:
     assert np.allclose(mesh.vertices, source.vertices, atol=1e-5) and np.array_equal(mesh.faces, source.faces)
     trimesh.Trimesh(source.vertices, source.faces[5:, ::-1], process=False).export(tmp_path / "open.ply")
     assert np.array_equal(meshio.load_mesh(tmp_path / "open.ply").faces, source.faces[5:, ::-1])
+
+
+class FakeScan:
+    """What open3sdcm returns for a scan with a texture: left half red, right half green."""
+
+    def __init__(self) -> None:
+        mesh = arch()
+        self.vertices, self.faces = np.float32(mesh.vertices), np.uint64(mesh.faces)
+        image = np.zeros((8, 16, 3), np.uint8)
+        image[:, :8], image[:, 8:] = (0, 0, 255), (0, 255, 0)  # BGR
+        self.texture = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 100])[1].tobytes()
+        x = mesh.vertices[mesh.faces.ravel(), 0]
+        self.uv = np.column_stack([np.where(x > 0, 0.9, 0.1), np.full(len(x), 0.5)]).astype(np.float32)
+        self.uv[:3] = np.nan
+
+
+def test_dcm_is_read_with_its_texture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fake = FakeScan()
+    monkeypatch.setitem(sys.modules, "open3sdcm", SimpleNamespace(load=lambda path: fake))
+    (tmp_path / "a.dcm").write_bytes(b"zip")
+    mesh = meshio.load_mesh(tmp_path / "a.dcm")
+    assert mesh.vertices.dtype == np.float64 and np.array_equal(mesh.faces, fake.faces.astype(int))
+    sided = np.abs(mesh.vertices[:, 0]) > 1e-3
+    right = mesh.vertices[:, 0] > 0
+    assert (mesh.colors[sided & right, 1] > 200).all() and (mesh.colors[sided & ~right, 0] > 200).all()
+    fake.texture = None
+    assert meshio.load_mesh(tmp_path / "a.dcm").colors is None
+    with pytest.raises(CaptureError, match="no such mesh"):
+        meshio.load_mesh(tmp_path / "b.dcm")
+
+    def fails(path: str) -> None:
+        raise RuntimeError("encrypted")
+
+    monkeypatch.setitem(sys.modules, "open3sdcm", SimpleNamespace(load=fails))
+    with pytest.raises(CaptureError, match=r"cannot be read \(encrypted\)"):
+        meshio.load_mesh(tmp_path / "a.dcm")
+
+
+def test_dcm_without_its_package_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "open3sdcm", None)
+    (tmp_path / "a.dcm").write_bytes(b"zip")
+    with pytest.raises(MissingDependencyError, match=r"jawusd\[dcm\]"):
+        meshio.load_mesh(tmp_path / "a.dcm")
