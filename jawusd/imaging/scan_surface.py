@@ -74,6 +74,10 @@ class ScanSurface:
         pairs = np.sort(self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
         return np.stack(np.divmod(np.unique(pairs[:, 0] * n + pairs[:, 1]), n), axis=1)
 
+    def edge_mm(self, edges: Indices) -> float:
+        """Return the median length of edges (E, 2) [mm]."""
+        return float(np.median(np.linalg.norm(self.vertices[edges[:, 0]] - self.vertices[edges[:, 1]], axis=1)))
+
     def wound(self, up: Array) -> ScanSurface:
         """Return the surface with those pieces turned whose faces look inwards; `up` (3,) is the occlusal direction.
 
@@ -104,7 +108,7 @@ class ScanSurface:
         corner = self.faces.ravel()
         normals = np.stack([np.bincount(corner, np.repeat(cross[:, k], 3), n) for k in range(3)], axis=1)
         edges = self.edges()
-        length = float(np.median(np.linalg.norm(self.vertices[edges[:, 0]] - self.vertices[edges[:, 1]], axis=1)))
+        length = self.edge_mm(edges)
         mean = averaging(edges, n)
         # One round of averaging spreads by about 0.7 edges, rounds add up like variances.
         for _ in range(int(np.clip(round(2 * (_SCALE_MM / max(length, 1e-6)) ** 2), 0, _MOST_ROUNDS))):

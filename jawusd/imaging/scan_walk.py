@@ -99,8 +99,8 @@ class CreaseWalk:
         # A step crosses about as much of the outline as it is long.
         length = np.linalg.norm(self._surface.vertices[i] - self._surface.vertices[j], axis=1)
         outline = np.maximum(np.bincount(part[i], length, count), 1e-9)
-        most = np.bincount(part[i], np.minimum(most_leaving[i], 1.0), count)
-        most /= np.maximum(np.bincount(part[i], minlength=count), 1)
+        number = np.maximum(np.bincount(part[i], minlength=count), 1)
+        most = np.bincount(part[i], np.minimum(most_leaving[i], 1.0), count) / number
         return np.asarray((part >= 0) & (flow / outline > most)[part])
 
     def _without_islands(self, crown: Mask, up: Mask, down: Mask) -> Mask:

