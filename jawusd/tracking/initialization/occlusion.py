@@ -91,7 +91,7 @@ def measure_occlusion(scans: Sequence[Scan], T_anatomical_scan: Array) -> Occlus
         opens_towards=(_opens_towards(surfaces[0], -normal), _opens_towards(surfaces[1], normal)),
         midlines_mm=midlines_mm,
         width_ratio=width_ratio,
-        widths_mm=(float(np.ptp(upper[:, 0])), float(np.ptp(lower[:, 0]))),
+        widths_mm=(_widest_mm(upper), _widest_mm(lower)),
         lower_ahead_mm=float(np.percentile(lower[:, 2], 99.5) - np.percentile(upper[:, 2], 99.5)),
     )
 
@@ -194,6 +194,12 @@ def _forward(flat: Array) -> Array:
         if worth > best:
             best, found = worth, ahead
     return found
+
+
+def _widest_mm(points: Array) -> float:
+    """Return the larger of both extents of an arch in its own plane [mm], wherever it lies."""
+    axes = np.linalg.svd(points - points.mean(0), full_matrices=False)[2]
+    return float(np.ptp(points @ axes[:2].T, axis=0).max())
 
 
 def _angle(a: Array, b: Array) -> float:

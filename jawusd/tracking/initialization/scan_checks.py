@@ -14,14 +14,19 @@ from jawusd.geometry.arrays import Array
 from jawusd.tracking.contour.scan import ARCH_NAMES, Scan
 from jawusd.tracking.initialization.occlusion import Occlusion, measure_occlusion
 
-# What no bite can be.
+# Figures of 130 persons of `synthetic.population` as their scanners deliver them, a third without paint, of three other
+# captures and of the scans of two patients (`tests/benchmarks/occlusion.py --persons 130`); the limits lie outside of
+# all of them: no valid bite is refused, and none is warned of but the underbites, 13 per cent of these persons.
+#
+# What no bite can be. Found: touching to 0.4 mm apart, nothing through, 0.64 of the smaller arch or more opposite the
+# other one, turned by up to 35 degrees where molars of one side lack, 48 to 78 mm wide.
 _APART_MM = 4.0
 _THROUGH_SHARE = 0.5
 _SAME_SHARE = 0.5
 _BESIDE_SHARE = 0.35
 _FACING_BACK_RAD = np.pi / 2
 _WIDEST_MM, _NARROWEST_MM = 100.0, 20.0
-# What is doubtful: beyond what the persons and scanners of the population show.
+# What is doubtful. Found: up to 1.1 mm deep, 0.4 mm one-sided, midlines 3.0 mm apart, width ratios 0.93 to 1.31.
 _LOOSE_MM = 0.8
 _TIGHT_MM = 1.3
 _ONE_SIDED_MM = 1.0
