@@ -225,7 +225,7 @@ def _teeth(parts: Parts, cameras: Mapping[str, Camera], instant: int, offsets: M
 
 def picks(parts: Parts) -> Iterator[Finding]:
     """Look whether the picks agree with one another and with the masks."""
-    from jawusd.tracking.initialization.pick_checks import picked_poses, placed_findings
+    from jawusd.tracking.initialization.pick_checks import exchanged_by_picks, picked_poses, placed_findings
 
     capture = parts.given
     if capture.bootstrap is None:
@@ -237,6 +237,14 @@ def picks(parts: Parts) -> Iterator[Finding]:
     try:
         poses, findings = picked_poses(capture.bootstrap, meshes, parts.cameras)
     except JawusdError as error:
+        if (pair := exchanged_by_picks(capture.bootstrap, meshes, parts.cameras)) is not None:
+            message = (
+                f"{pair[0]} and {pair[1]} are exchanged: the picks contradict one another by this calibration, and "
+            )
+            message += "agree with the two cameras exchanged in it"
+            hint = "Exchange their names in the calibration, or in the picks and footage."
+            yield Finding("cameras_exchanged", "error", message, path=str(capture.calibration), hint=hint)
+            return
         raise CaptureError(
             error.message, path=parts.description, frame=capture.bootstrap.frame, hint=error.hint
         ) from error

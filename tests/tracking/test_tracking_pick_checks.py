@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from small_take import CAMERAS, MESHES, jaw_poses
 
-from jawusd.geometry import transform_points
+from jawusd.formats.capture import Bootstrap
+from jawusd.geometry import transform_point, transform_points
 from jawusd.tracking.contour.scan import prepare_scan
-from jawusd.tracking.initialization.pick_checks import placed_findings
+from jawusd.tracking.initialization.pick_checks import exchanged_by_picks, picked_poses, placed_findings
 
 SCANS = [prepare_scan(mesh, name) for mesh, name in zip(MESHES, ("upper", "lower"), strict=True)]
 TABLE = {camera.name: camera for camera in CAMERAS}
@@ -59,3 +60,19 @@ def test_masks_elsewhere_are_a_warning_and_the_best_guess_counts():
     (only,) = found(away)
     assert (only.kind, only.severity, only.camera) == ("masks_off_picks", "warning", "cam1")
     assert only.value == pytest.approx(0.0) and not found(away, seen)
+
+
+def test_cameras_exchanged_in_the_calibration_are_told_by_the_picks():
+    rng = np.random.default_rng(1)
+    arches = {}
+    for mesh, pose, name in zip(MESHES, POSES, ("upper", "lower"), strict=True):
+        chosen = rng.choice(len(mesh.vertices), 5, replace=False)
+        views = [[(c.name, c.project(transform_point(pose, mesh.vertices[k]))) for c in CAMERAS] for k in chosen]
+        arches[name] = [
+            {"vertex": int(k), "views": [{"camera": n, "x": float(p[0]), "y": float(p[1])} for n, p in seen]}
+            for k, seen in zip(chosen, views, strict=True)
+        ]
+    picks = Bootstrap.model_validate({"frame": 7, **arches})
+    assert picked_poses(picks, MESHES, TABLE)[1] == []
+    wrong = {**TABLE, "cam0": TABLE["cam1"], "cam1": TABLE["cam0"]}
+    assert exchanged_by_picks(picks, MESHES, wrong) == ("cam0", "cam1")

@@ -9,6 +9,7 @@ from itertools import combinations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from jawusd.errors import TrackingError
 from jawusd.formats.capture import Bootstrap
 from jawusd.formats.finding import Finding
 from jawusd.formats.mesh import Mesh
@@ -63,6 +64,20 @@ def picked_poses(
                 )
             )
     return np.stack(poses), findings
+
+
+def exchanged_by_picks(
+    bootstrap: Bootstrap, meshes: Sequence[Mesh], cameras: Mapping[str, Camera]
+) -> tuple[str, str] | None:
+    """Return the two cameras with whose calibrations exchanged all picks agree that contradict one another as given."""
+    for a, b in combinations(cameras, 2):
+        swapped = {**cameras, a: cameras[b], b: cameras[a]}
+        try:
+            if not picked_poses(bootstrap, meshes, swapped)[1]:
+                return a, b
+        except TrackingError:
+            continue
+    return None
 
 
 def placed_findings(
