@@ -18,8 +18,8 @@ from jawusd.tracking.initialization.occlusion import Occlusion, measure_occlusio
 # captures and of the scans of two patients (`tests/benchmarks/occlusion.py --persons 130`); the limits lie outside of
 # all of them: no valid bite is refused, and none is warned of but the underbites, 13 per cent of these persons.
 #
-# What no bite can be. Found: touching to 0.4 mm apart, nothing through, 0.64 of the smaller arch or more opposite the
-# other one, turned by up to 35 degrees where molars of one side lack, 48 to 78 mm wide.
+# What no bite can be. Found: touching to 0.4 mm apart, nothing through, 0.61 of the smaller arch or more opposite the
+# other one, turned by up to 40 degrees where molars of one side lack, 48 to 78 mm wide.
 _APART_MM = 4.0
 _THROUGH_SHARE = 0.5
 _SAME_SHARE = 0.5
