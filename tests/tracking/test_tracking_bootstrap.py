@@ -118,3 +118,20 @@ def test_pick_in_an_unknown_camera_is_refused():
     picks[0] = Pick(vertex=picks[0].vertex, views=views)
     with pytest.raises(TrackingError, match="names camera cam9, which is not calibrated"):
         pose_from_picks(picks, MESH.vertices, CAMERAS, "upper")
+
+
+@pytest.mark.parametrize("size", [0.75, 1.3])
+def test_picks_that_agree_with_another_size_of_scan_say_so(size):
+    words = rf"agree with a scan {abs(1 / size - 1):.1%} {'larger' if size < 1 else 'smaller'} than this one"
+    for seed in range(4):
+        with pytest.raises(TrackingError, match="agree with a scan"):
+            pose_from_picks(_picks(5, 0.5, seed=seed), size * MESH.vertices, CAMERAS, "upper")
+    with pytest.raises(TrackingError, match=words):
+        pose_from_picks(_picks(5), size * MESH.vertices, CAMERAS, "upper")
+
+
+def test_picks_on_other_teeth_are_not_taken_for_another_size():
+    picks = _picks(5)
+    turned = [Pick(vertex=a.vertex, views=b.views) for a, b in zip(picks, [*picks[1:], picks[0]])]
+    with pytest.raises(TrackingError, match="contradict one another \\(pick 1"):
+        pose_from_picks(turned, MESH.vertices, CAMERAS, "upper")

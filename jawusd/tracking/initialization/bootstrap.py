@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -27,6 +27,9 @@ _FEWEST = 3
 # error of a careless click (5 px where a pixel is 0.07 mm).
 _TOLERANCE_MM = 1.1
 _CLICK_MM = _TOLERANCE_MM / 3  # standard deviation of a careless click along each axis
+# Size of the teeth by the picks over that of the scan, less 1, from which it may explain misses: clicks 0.4 mm off on
+# picks 40 mm apart leave 0.01.
+_SIZE_SHARE = 0.03
 _MOST_TRIPLES = 500  # consensus over more start triples adds nothing but time
 
 
@@ -76,6 +79,12 @@ def pose_from_picks(
     for _ in range(3):
         good = [s for s in sightings if _miss_mm(s, best) < _TOLERANCE_MM]
         if len(good) < _FEWEST:
+            if (size := _other_size(sightings, places)) is not None:
+                raise TrackingError(
+                    f"bootstrap: the picks on the {arch} teeth agree with a scan {_than(1 / size)} than this one, and "
+                    "contradict one another on this one: the scale of the scans is wrong, or the calibration's lengths",
+                    hint="Check the scans' unit and scaling, and the square size of the calibration board.",
+                )
             misses = ", ".join(f"pick {s.number}: {_miss_mm(s, best):.1f} mm" for s in sightings)
             raise TrackingError(
                 f"bootstrap: the picks on the {arch} teeth contradict one another "
@@ -84,6 +93,26 @@ def pose_from_picks(
             )
         best = _refined(good, best)
     return best, [s.number for s in sightings if s not in good]
+
+
+def _other_size(sightings: Sequence[_Sighting], places: Array) -> float | None:
+    """Return how many times too large the scan is if that explains why picks miss one another; else None.
+
+    `places` are the triangulated picks, world coordinates [mm], shape (P, 3).
+    """
+    points = np.stack([s.point for s in sightings])
+    spread, seen = (float(np.std(x - x.mean(0))) for x in (points, places))
+    size = spread / max(seen, 1e-9)
+    if len(sightings) <= _FEWEST or abs(size - 1.0) < _SIZE_SHARE:
+        return None
+    pose = rigid_fit(points / size, places)
+    fits = all(_miss_mm(replace(s, point=s.point / size), pose) < _TOLERANCE_MM for s in sightings)
+    return size if fits else None
+
+
+def _than(ratio: float) -> str:
+    """Say in words how much larger or smaller something is."""
+    return f"{abs(ratio - 1.0):.1%} {'larger' if ratio > 1.0 else 'smaller'}"
 
 
 def picked_sigma_mm(

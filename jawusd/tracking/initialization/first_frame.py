@@ -34,9 +34,16 @@ _FEWEST_MASKS = 2  # of an arch: one view leaves the depth unknown
 
 
 def first_record(
-    solver: ContourSolver, config: TrackingConfig, start: Array, views: Sequence[View], frame: int
+    solver: ContourSolver,
+    config: TrackingConfig,
+    start: Array,
+    views: Sequence[View],
+    frame: int,
+    explain: bool = False,
 ) -> FrameRecord:
     """Align the first frame from its views, starting from given T_world_upper and T_world_lower, shape (2, 4, 4).
+
+    With `explain`, which takes longer, an error names a wrong focal length if that is the cause.
 
     Raises:
         TrackingError: too few masks on this frame, or no alignment.
@@ -55,7 +62,7 @@ def first_record(
         others = [_aligned(solver, config, start, views, _without_camera(use, c)) for c in range(len(views))]
         clear = [one for one in others if one.fit.min() >= _CLEAR_FIT and _problem(one, config) is None]
         if not clear:
-            if (cause := _wrong_size(solver, config, first, views)) is not None:
+            if explain and (cause := _wrong_size(solver, config, start, views)) is not None:
                 raise TrackingError(cause, frame=frame, hint=_SIZE_HINT)
             raise TrackingError(
                 problem,
@@ -111,27 +118,28 @@ def _problem(first: _Aligned, config: TrackingConfig) -> str | None:
     return None
 
 
-def _wrong_size(solver: ContourSolver, config: TrackingConfig, first: _Aligned, views: Sequence[View]) -> str | None:
-    """Say by how much cameras show the teeth too large or small if that explains why they do not fit; else None."""
-    use, poses = present_masks(views), first.solution.poses
+def _wrong_size(solver: ContourSolver, config: TrackingConfig, start: Array, views: Sequence[View]) -> str | None:
+    """Say by how much scans or pictures are too large or small if that explains why they do not fit; else None."""
+    use = present_masks(views)
+    poses = solver.solve(start, views, config.wide_gates_px, use).poses
     scales = np.zeros(len(views))
     for _ in range(_SIZE_ROUNDS):
         grown = [magnified(view, scale) for view, scale in zip(views, scales, strict=True)]
         found = measure_magnification(solver.scans, [(poses, grown, use)], config)
         if found is None:
             return None
-        common = found.common
-        scales = scales + np.where(np.abs(found.scale - common) > _OWN_SCALE, found.scale, common)
+        own = found.scale - found.common
+        scales = scales + np.where(np.abs(own) > _OWN_SCALE, own, 0.0)
         grown = [magnified(view, scale) for view, scale in zip(views, scales, strict=True)]
         again = _aligned(solver, config, poses, grown, use)
         poses = again.solution.poses
-    if np.abs(scales).max() < _LEAST_SCALE or _problem(again, config) is not None or again.fit.min() < first.fit.min():
-        return None
-    shown = ", ".join(f"camera {c}: {100 * scale:+.1f} %" for c, scale in enumerate(scales, start=1))
-    return (
-        f"the cameras show the teeth in another size than scans and calibration say ({shown}), and fit once that is "
-        "corrected: a focal length, the scale of the scans or the calibration's lengths are wrong"
-    )
+    if np.abs(scales).max() > _LEAST_SCALE and _problem(again, config) is None and again.fit.min() >= _CLEAR_FIT:
+        worst = int(np.abs(scales).argmax())
+        return (
+            f"camera {worst + 1} of {len(views)} shows the teeth {100 * scales[worst]:+.1f} % larger than scans and "
+            "calibration say, and all fit once that is corrected: its focal length is wrong"
+        )
+    return None
 
 
 def _without_camera(use: Mask, camera: int) -> Mask:

@@ -128,7 +128,7 @@ class _Take:
 
     def begin(self, frame: int, poses: Array) -> None:
         """Align the bootstrap frame from the pick poses."""
-        self.records[frame] = first_record(self._solver, self._config, poses, self._masks.at(frame), frame)
+        self.records[frame] = first_record(self._solver, self._config, poses, self._masks.at(frame), frame, True)
         self._progress(1, self._stop - self._first)
 
     def run(self, frames: range) -> None:
