@@ -92,7 +92,15 @@ def test_what_remains_is_the_conditional_covariance():
 
 
 def _records(poses):
-    nothing = OutlineSums.zeros(2), OutlineSums.zeros(2), np.zeros((2, 3)), np.zeros((2, 6, 6)), np.zeros((2, 2)), 1
+    nothing = (
+        OutlineSums.zeros(2),
+        OutlineSums.zeros(2),
+        np.zeros((2, 3)),
+        np.zeros((2, 6, 6)),
+        np.zeros((2, 6, 6)),
+        np.zeros((2, 2)),
+        1,
+    )
     status, used = np.full(2, TRACKED, np.int8), np.ones((2, 2), bool)
     return {k: FrameRecord(Solution(p, *nothing), status, used, np.zeros((2, 2))) for k, p in enumerate(poses)}
 

@@ -43,7 +43,16 @@ def terms(prior, poses, centres):
     """Return the precision and the right side that a prior adds."""
     equations = NormalEquations()
     prior.accumulate(
-        Solution(poses, OutlineSums.zeros(0), OutlineSums.zeros(0), centres, np.zeros((2, 6, 6)), np.zeros((2, 0)), 0),
+        Solution(
+            poses,
+            OutlineSums.zeros(0),
+            OutlineSums.zeros(0),
+            centres,
+            np.zeros((2, 6, 6)),
+            np.zeros((2, 6, 6)),
+            np.zeros((2, 0)),
+            0,
+        ),
         equations,
     )
     return equations.matrix, equations.right

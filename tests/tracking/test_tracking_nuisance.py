@@ -201,7 +201,15 @@ def _records(count, lost=()):
         status = np.full(2, TRACKED, np.int8)
         if f in lost:
             poses[1], status[1] = se3_exp([0, 0, 0, 30.0, 0, 0]) @ poses[1], LOST
-        nothing = OutlineSums.zeros(2), OutlineSums.zeros(2), np.ones((2, 3)), np.zeros((2, 6, 6)), np.zeros((2, 2)), 1
+        nothing = (
+            OutlineSums.zeros(2),
+            OutlineSums.zeros(2),
+            np.ones((2, 3)),
+            np.zeros((2, 6, 6)),
+            np.zeros((2, 6, 6)),
+            np.zeros((2, 2)),
+            1,
+        )
         records[f] = FrameRecord(Solution(poses, *nothing), status, np.ones((2, 2), bool), np.zeros((2, 2)))
     return records, step
 

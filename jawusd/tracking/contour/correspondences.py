@@ -13,6 +13,7 @@ from jawusd.geometry.arrays import Array
 from jawusd.tracking.contour.samples import (
     COLUMNS,
     EDGE_SHARE,
+    GUM_SHARE,
     INVERSE_DEPTH,
     LENGTH,
     NX,
@@ -225,8 +226,10 @@ def scatter_of_tiles(
     centre: Array,
     shape: tuple[int, int],
     tile_px: int,
-) -> Array:
-    """Return the sum over picture tiles of s s^T, shape (6, 6); s is the sum of w J d over the samples in the tile.
+) -> tuple[Array, Array]:
+    """Return the sums over picture tiles of s s^T, shape (6, 6); s is the sum of w J d over the samples in the tile.
+
+    The second takes the share of gum line in place of d: how a gum line drawn a pixel off in one place moves the arch.
 
     Errors of the outline move together over some length of contour; within a tile they add up before they are
     squared. Over the normal matrix this tells how much less a pixel of contour says than independent errors would
@@ -239,6 +242,7 @@ def scatter_of_tiles(
     """
     across = shape[1] // tile_px + 1
     sums = np.zeros(((shape[0] // tile_px + 1) * across, 6))
+    gum = np.zeros_like(sums)
     jacobian = np.empty(6)
     for s in range(len(samples)):
         d = distances[s]
@@ -250,4 +254,5 @@ def scatter_of_tiles(
         tile = int(sample[V]) // tile_px * across + int(sample[U]) // tile_px
         for k in range(6):
             sums[tile, k] += weight * d * jacobian[k]
-    return sums.T @ sums
+            gum[tile, k] += weight * sample[GUM_SHARE] * jacobian[k]
+    return sums.T @ sums, gum.T @ gum

@@ -78,6 +78,7 @@ class Solution:
     gingival_margin: OutlineSums  # sums over the matched samples of the crown-gum line
     centres: Array  # points the twists turn about, world coordinates [mm], shape (2, 3)
     scatters: Array  # sums over picture tiles of the squared score of `scatter_of_tiles`, per arch, shape (2, 6, 6)
+    gum_scatters: Array  # the same of a pixel of gum line in place of the residual, shape (2, 6, 6)
     visible_px: Array  # contour length that could have been matched, per arch and view [px], shape (2, C)
     iterations: int  # how many linearised steps were taken
 

@@ -15,6 +15,8 @@ from jawusd.tracking.contour.equations import NormalEquations, ResidualTerm, Sol
 from jawusd.tracking.contour.scan import ARCHES, Scan
 from jawusd.tracking.contour.views import View
 
+# How far the gum line is drawn off by at one tooth apart from the next, standard deviation [px].
+_GUM_BY_TOOTH_PX = 0.3
 # E[w d^2] / E[w] of a unit normal residual under the Tukey weight at 4.685 standard deviations, by quadrature.
 _TUKEY_VARIANCE = 0.828
 
@@ -97,7 +99,9 @@ def twist_covariance(solution: Solution, arch: int, sigma_px: float, correlation
     if not np.isfinite(sigma_px) or np.linalg.matrix_rank(H, hermitian=True) < 6:
         return free
     A = se3_adjoint(translation(solution.centres[arch]))
-    return A @ (sigma_px**2 * correlation_px * np.linalg.inv(H)) @ A.T
+    inverse = np.linalg.inv(H)
+    gum = _GUM_BY_TOOTH_PX**2 * inverse @ solution.gum_scatters[arch] @ inverse
+    return A @ (sigma_px**2 * correlation_px * inverse + gum) @ A.T
 
 
 def joint_covariance(solution: Solution, prior: ResidualTerm, sigma_px: Array, correlation_px: float) -> Array | None:

@@ -119,7 +119,7 @@ class ContourSolver:
         matches = dict(zip(tasks, self.map(match, tasks), strict=True))
         centres = np.stack([transform_point(poses[r], self.scans[r].centre) for r in ARCHES])
         silhouette, margin = OutlineSums.zeros(len(views)), OutlineSums.zeros(len(views))
-        scatters, visible = np.zeros((2, 6, 6)), np.zeros((2, len(views)))
+        scatters, gum_scatters, visible = np.zeros((2, 6, 6)), np.zeros((2, 6, 6)), np.zeros((2, len(views)))
         pull = config.pull if gate > config.pull_above_px else 0.0
         used = [gate, gate]
         if gate <= config.final_gate_px[1]:
@@ -135,8 +135,10 @@ class ContourSolver:
                     table[r, c] = value
             if final:
                 shape = views[c].masks.shape[1:]
-                scatters[r] += scatter_of_tiles(samples, distances, used[r], *where, shape, config.tile_px)
-        return Solution(poses.copy(), silhouette, margin, centres, scatters, visible, 0)
+                own, gum = scatter_of_tiles(samples, distances, used[r], *where, shape, config.tile_px)
+                scatters[r] += own
+                gum_scatters[r] += gum
+        return Solution(poses.copy(), silhouette, margin, centres, scatters, gum_scatters, visible, 0)
 
     def _match(
         self,

@@ -23,6 +23,9 @@ from jawusd.geometry import relative_pose, se3_adjoint, se3_exp, se3_inverse, se
 from jawusd.geometry.arrays import Array
 from jawusd.tracking.contour.equations import translation
 from jawusd.tracking.contour.frame_record import FrameRecord
+from jawusd.tracking.contour.scan import ARCHES
+from jawusd.tracking.sequence.extrinsics import Extrinsics
+from jawusd.tracking.sequence.nuisance import TakeEquations, pose_response
 
 # Spread of the closed bite about the scans' own: of a good registration together with how firmly people bite [mm], and
 # the same at the ends of an arch as a turn [rad].
@@ -33,7 +36,7 @@ _DEGREES_OF_FREEDOM = 4.0  # of the Student distribution: one registration in so
 STEADY = 0.7
 # Teeth held together rest: slower than this against one another [mm/frame at the teeth], and no farther from the
 # closest frame [mm].
-_STILL_MM, _SAME_BITE_MM = 0.06, 0.15
+_STILL_MM, _SAME_BITE_MM = 0.12, 0.2
 _LONGEST_REST = 24  # frames used on either side: later ones tell nothing new
 _FEWEST_FRAMES = 2
 
@@ -151,19 +154,14 @@ def closed_bite(frames: NDArray[np.int64], poses: Array, covariance: Array, rest
     upper, lower = np.median(local, axis=0)
     upper, lower = _positive(upper), _positive(lower)
     noise = (1.0 - STEADY) * (upper + lower) / 2.0
-    bite = np.diag(np.r_[np.full(3, (_BITE_MM / _ARCH_MM) ** 2), np.full(3, _BITE_MM**2)])
-    prior, registration = bite, np.zeros(6)
-    for _ in range(50):
-        gain = np.linalg.inv(upper + lower + noise + prior)
-        registration = prior @ gain @ found
-        excess = float(registration @ np.linalg.solve(bite, registration))
-        prior = bite * max(1.0, (_DEGREES_OF_FREEDOM + excess) / (_DEGREES_OF_FREEDOM + 6.0))
+    prior = _registration_spread(found, upper + lower + noise)
+    gain = np.linalg.inv(upper + lower + noise + prior)
     both = upper + lower
     spread = np.stack([upper, lower, both])
     return ClosedBite(
         frames=tuple(int(f) for f in frames[used]),
         point=point,
-        registration=registration,
+        registration=prior @ gain @ found,
         registration_covariance=prior - prior @ gain @ prior,
         steady=np.stack([-upper @ gain @ found, lower @ gain @ found]),
         spread=spread,
@@ -210,6 +208,47 @@ def check_registration(found: Registration) -> None:
             frame=found["frames"][0],
             hint="Name a frame with the teeth together as rest_frame in [motion], or register the scans again.",
         )
+
+
+def observe_bite(
+    equations: TakeEquations,
+    records: Mapping[int, FrameRecord],
+    rest: RestFrames,
+    extrinsics: Extrinsics,
+    variance_px3: Array,
+) -> None:
+    """Tell the equations of a take that the teeth are together: habits that part them there are unlikely.
+
+    `variance_px3` is outline variance times correlation length per arch [px^3], shape (2,).
+    """
+    used = [f for f in rest.frames if f in records and (records[f].status != LOST).all()]
+    if len(used) < _FEWEST_FRAMES:
+        return
+    there, back = translation(rest.point), translation(-rest.point)
+    found, slopes, spread = [], [], []
+    for frame in used:
+        solution = records[frame].solution
+        head = solution.poses[0]
+        found.append(se3_log(back @ relative_pose(*solution.poses) @ there))
+        to_skull = [se3_adjoint(back @ se3_inverse(head) @ translation(solution.centres[r])) for r in ARCHES]
+        upper, lower = (to_skull[r] @ pose_response(records, frame, r, extrinsics) for r in ARCHES)
+        slopes.append(lower - upper)
+        H = solution.outline.precision.sum(1) / variance_px3[:, None, None]
+        spread.append(np.sum([to_skull[r] @ np.linalg.pinv(H[r]) @ to_skull[r].T for r in ARCHES], axis=0))
+    deviation, slope, outline = np.mean(found, axis=0), np.mean(slopes, axis=0), np.mean(spread, axis=0)
+    bite = _registration_spread(deviation, outline + slope @ equations.prior_covariance() @ slope.T)
+    equations.observe(slope, deviation, np.linalg.inv(outline + bite))
+
+
+def _registration_spread(found: Array, others: Array) -> Array:
+    """Return the covariance of the registration that explains a deviation (6,) beside others (6, 6), shape (6, 6)."""
+    bite = np.diag(np.r_[np.full(3, (_BITE_MM / _ARCH_MM) ** 2), np.full(3, _BITE_MM**2)])
+    spread = bite
+    for _ in range(50):
+        registration = spread @ np.linalg.solve(others + spread, found)
+        excess = float(registration @ np.linalg.solve(bite, registration))
+        spread = bite * max(1.0, (_DEGREES_OF_FREEDOM + excess) / (_DEGREES_OF_FREEDOM + 6.0))
+    return spread
 
 
 def rest_frames(

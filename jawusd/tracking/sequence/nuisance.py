@@ -145,6 +145,7 @@ class TakeEquations:
         self._S, self._r, self._weight = np.zeros((size, size)), np.zeros(size), 0.0
         self._gum = np.zeros((2, C, 2))  # sums of weights and slopes of the gum line
         self._frames = 0
+        self._seen_S, self._seen_r = np.zeros((size, size)), np.zeros(size)
         for frame in sorted(records if frames is None else frames):
             self._frames += 1
             for arch in ARCHES:
@@ -157,12 +158,24 @@ class TakeEquations:
                     self._weight += solution.outline.weight[arch].sum() / variance_px3[arch]
                     self._gum[arch] += solution.outline.habit_weight[arch, :, 1, 1:]
 
+    def observe(self, slope: Array, deviation: Array, precision: Array) -> None:
+        """Add what is known of the take besides its masks: deviation + slope @ unknowns is zero with that precision.
+
+        Shapes (n, U), (n,) and (n, n).
+        """
+        self._seen_S += slope.T @ precision @ slope
+        self._seen_r -= slope.T @ precision @ deviation
+
+    def prior_covariance(self) -> Array:
+        """Return the prior covariance of delays and habits, zero for camera twists, shape (U, U)."""
+        return np.diag(np.r_[self._layout.prior_sigma() ** 2, np.zeros(6 * self._layout.cameras)])
+
     def solve(self, config: TrackingConfig, cameras_move: bool) -> Nuisances:
         """Return the nuisances of the frames; camera poses are estimated only if `cameras_move`."""
         layout = self._layout
         C, size, first_twist = layout.cameras, layout.size, layout.twists
-        S = self._S.copy()
         redundancy = layout.redundancy(self._frames)
+        S = self._S + redundancy.max() * self._seen_S
         S[:first_twist, :first_twist] += np.diag(redundancy[:first_twist] / layout.prior_sigma() ** 2)
         for c, precision in enumerate(self._extrinsics.precision(config.refine_turn_rad, config.refine_move_mm)):
             S[layout.twist(c), layout.twist(c)] += precision
@@ -170,7 +183,7 @@ class TakeEquations:
         keep = np.arange(1, size if cameras_move else first_twist)
         covariance = np.zeros((size, size))
         covariance[np.ix_(keep, keep)] = np.linalg.inv(S[np.ix_(keep, keep)])
-        x = covariance @ self._r
+        x = covariance @ (self._r + redundancy.max() * self._seen_r)
         # A motion common to all cameras is one of the world, which the masks cannot show.
         centred = np.eye(size)
         centred[first_twist:, first_twist:] -= np.kron(np.full((C, C), 1 / C), np.eye(6))
@@ -195,15 +208,12 @@ class TakeEquations:
         )
 
 
-def pose_covariance(
-    records: Mapping[int, FrameRecord], frame: int, arch: int, nuisances: Nuisances, extrinsics: Extrinsics
-) -> Array:
-    """Return what the uncertainty of the nuisances adds to that of a pose: of the twist about its centre, (6, 6)."""
+def pose_response(records: Mapping[int, FrameRecord], frame: int, arch: int, extrinsics: Extrinsics) -> Array:
+    """Return the twist of a pose about its centre per unit of the nuisances, shape (6, U)."""
     velocity = velocity_twist(records, frame, arch)
     solution, layout = records[frame].solution, _Layout(len(extrinsics.twists))
     velocity = np.zeros(6) if velocity is None else velocity
-    _, _, response = _reduced(solution, velocity, arch, extrinsics.pivot, layout)
-    return np.asarray(response @ nuisances.covariance @ response.T, np.float64)
+    return _reduced(solution, velocity, arch, extrinsics.pivot, layout)[2]
 
 
 def delay_motions(records: Mapping[int, FrameRecord], frame: int, delays: Array) -> Array:

@@ -30,7 +30,7 @@ from jawusd.tracking.sequence.closed_bite import (
     registration_findings,
 )
 from jawusd.tracking.sequence.extrinsics import Extrinsics
-from jawusd.tracking.sequence.nuisance import Nuisances, pose_covariance
+from jawusd.tracking.sequence.nuisance import Nuisances, pose_response
 from jawusd.tracking.sequence.smoothing import smooth_poses
 
 
@@ -180,8 +180,9 @@ def _covariances(
         sigma = residual_px(record.solution)
         for r in np.flatnonzero(record.status != LOST).tolist():
             A = se3_adjoint(translation(record.solution.centres[r]))
-            common = pose_covariance(records, frame, r, nuisances, extrinsics)
-            out[k, r] = twist_covariance(record.solution, r, sigma[r], correlation) + A @ common @ A.T
+            response = A @ pose_response(records, frame, r, extrinsics)
+            own = twist_covariance(record.solution, r, sigma[r], correlation)
+            out[k, r] = own + response @ nuisances.covariance @ response.T
     return out
 
 

@@ -23,7 +23,7 @@ from jawusd.tracking.initialization.first_frame import first_record
 from jawusd.tracking.initialization.magnification import measure_magnification
 from jawusd.tracking.initialization.start import find_start
 from jawusd.tracking.sequence.camera_use import use_of_cameras
-from jawusd.tracking.sequence.closed_bite import RestFrames, rest_frames
+from jawusd.tracking.sequence.closed_bite import RestFrames, observe_bite, rest_frames
 from jawusd.tracking.sequence.extrinsics import Extrinsics
 from jawusd.tracking.sequence.frame_tracker import FrameTracker
 from jawusd.tracking.sequence.history import History, MotionPredictor
@@ -36,6 +36,7 @@ Progress = Callable[[int, int], None]
 # Most frames around a restart whose poses and quality the tracker takes over: without a limit, a long take with many
 # gaps would cost the square of its length.
 _NEARBY_FRAMES = 4000
+_SETTLED_REST = 6  # frames with the teeth together among those on which nuisances are settled
 _CHECKED_FRAMES = 8  # whose contours are searched widely for wrong lenses and sizes: half a second
 
 
@@ -80,7 +81,12 @@ def track_capture(
             take.run(range(start.frame + 1, stop))
             take.run(range(start.frame - 1, first - 1, -1))
             take.close_gaps()
-            nuisances, extrinsics = take.refine()
+            point = np.mean([scan.centre for scan in scans], axis=0)
+            named, up = capture.motion.rest_frame, start.T_anatomical_scan[1, :3]
+            frames = rest_frames(take.records, named, up, point, scans[1].probes)
+            corrects = capture.scans.registration == "take"
+            rest = RestFrames(frames, named is not None, point, scans[1].centre, corrects)
+            nuisances, extrinsics = take.refine(rest)
             records = take.records if capture.frames else _trimmed(take.records)
             names = tuple(camera.name for camera in masks.cameras)
             findings = [
@@ -94,12 +100,8 @@ def track_capture(
         "painted": [s.painted for s in scans],
         "findings": [finding.as_json() for finding in findings],
     }
-    point = np.mean([scan.centre for scan in scans], axis=0)
-    rest_frame, up = capture.motion.rest_frame, start.T_anatomical_scan[1, :3]
-    rest = rest_frames(records, rest_frame, up, point, scans[1].probes)
-    bite = RestFrames(rest, rest_frame is not None, point, scans[1].centre, capture.scans.registration == "take")
     points = np.asarray(landmarks, np.float64)
-    return assemble(records, names, points, nuisances, extrinsics, config, bite, notes)
+    return assemble(records, names, points, nuisances, extrinsics, config, rest, notes)
 
 
 def _trimmed(records: dict[int, FrameRecord]) -> dict[int, FrameRecord]:
@@ -154,9 +156,9 @@ class _Take:
                     status = np.where(was_lost & ~lost, RECOVERED, record.status).astype(np.int8)
                     self.records[frame] = replace(record, status=status)
 
-    def refine(self) -> tuple[Nuisances, Extrinsics]:
-        """Estimate delays, biases and camera poses; where they matter, align all frames again with them corrected."""
-        c = self._config
+    def refine(self, rest: RestFrames) -> tuple[Nuisances, Extrinsics]:
+        """Estimate delays, habits and camera poses; where they matter, align all frames again with them corrected."""
+        c, self._rest = self._config, rest
         extrinsics = Extrinsics.calibrated(self._masks.cameras, self._middle())
         equations = self._equations(extrinsics)
         found = equations.solve(c, True)
@@ -194,7 +196,10 @@ class _Take:
         return found + time_findings(names, self.records, nuisances, extrinsics, self._config)
 
     def _equations(self, extrinsics: Extrinsics) -> TakeEquations:
-        return TakeEquations(self.records, outline_variance(self.records, self._config), extrinsics)
+        variance = outline_variance(self.records, self._config)
+        equations = TakeEquations(self.records, variance, extrinsics)
+        observe_bite(equations, self.records, self._rest, extrinsics, variance)
+        return equations
 
     def _middle(self) -> Array:
         """Return a point amid the teeth, world coordinates [mm], shape (3,)."""
@@ -204,9 +209,9 @@ class _Take:
         """Align some frames repeatedly until the nuisances converge: matches follow them only step by step."""
         c, records = self._config, dict(self.records)
         whole = [f for f, record in sorted(records.items()) if (record.status != LOST).all()]
-        sample = {
-            whole[k]: self._masks.at(whole[k]) for k in np.linspace(0, len(whole) - 1, c.settle_frames).astype(int)
-        }
+        chosen = {whole[k] for k in np.linspace(0, len(whole) - 1, c.settle_frames).astype(int)}
+        chosen |= set(self._rest.frames[:_SETTLED_REST]) & set(whole)
+        sample = {frame: self._masks.at(frame) for frame in sorted(chosen)}
         variance = outline_variance(records, c)
         for _ in range(c.settle_rounds):
             if cameras_moved:
@@ -216,7 +221,10 @@ class _Take:
                 views = _corrected_views(views, self.records, frame, found, extrinsics)
                 solution = self._solver.solve(start, views, c.gates_from(0.0), used)
                 records[frame] = replace(records[frame], solution=solution)
-            more = TakeEquations(records, variance, extrinsics, sample).solve(c, cameras_moved)
+            equations = TakeEquations(records, variance, extrinsics, sample)
+            rest = replace(self._rest, frames=tuple(f for f in self._rest.frames if f in sample))
+            observe_bite(equations, records, rest, extrinsics, variance)
+            more = equations.solve(c, cameras_moved)
             found = found.plus(more)
             if more.settled(c):
                 break
