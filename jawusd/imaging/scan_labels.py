@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from jawusd.formats.mesh import GUM, TOOTH, Mesh
 from jawusd.geometry.arrays import Array, Mask
+from jawusd.imaging.scan_colours import crown_by_colour
 from jawusd.imaging.scan_surface import ScanSurface
 from jawusd.imaging.scan_tops import Tops, biting_direction, topped_by, tops
 from jawusd.imaging.scan_walk import CreaseWalk
@@ -30,10 +31,10 @@ _LOWEST = 0.12
 # How readily walks leave a highest place for the gum, per mm of its outline [1/mm]: 0.003 (median) to 0.030 at crowns,
 # 0.026 to 0.074 at ridges without teeth, which mostly lie below the hull of the arch (40 scans of one surface).
 _LEAVING, _DOUBT_PER_MM, _MOST_DOUBT_MM = 0.06, 3.0, 0.6
-# Share of a piece's border without a crease, median over an arch: 0.02 to 0.16 where crowns carry a collar of gum (58
-# scans of synthetic persons of 5,000 faces and more), 0.8 to 1.0 at plain synthetic crowns, 0.24 to 0.34 at real ones,
+# Share of a piece's border without a crease, median over an arch: 0.02 to 0.162 where crowns carry a collar of gum (58
+# scans of synthetic persons of 5,000 faces and more), 0.8 to 1.0 at plain synthetic crowns, 0.24 to 0.34 at real ones (0.167 seen from the roots),
 # whose grooves and necks look like short creases.
-_MOST_WEAK = 0.2
+_MOST_WEAK = 0.165
 _COARSE_MM = 1.2  # edges of this length hide a gum line [mm]: what looks like crowns alone may have one
 # Pieces that begin this far above the lower end of the crown they lie at are on it (brackets), not around it (gum)
 # [share of the crown's height].
@@ -52,7 +53,9 @@ class Labelling:
 
 
 def label_scan(mesh: Mesh, towards: Array | None) -> Labelling:
-    """Tell crown and gum of a teeth scan apart by its shape; a scan of crowns alone is crown all over.
+    """Tell crown and gum of a teeth scan apart by its shape, and by its colours where crowns and gum differ in them.
+
+    A scan of crowns alone is crown all over.
 
     Args:
         mesh: the scan [mm].
@@ -64,7 +67,8 @@ def label_scan(mesh: Mesh, towards: Array | None) -> Labelling:
     up = biting_direction(surface.vertices, towards)
     surface = surface.wound(up)
     seen = tops(surface.vertices, up)
-    walk = CreaseWalk(surface)
+    by_colour = None if mesh.colors is None else crown_by_colour(mesh.colors, surface, seen)
+    walk = CreaseWalk(surface, by_colour)
     crown, weak = _by_pieces(surface, seen, up, walk)
     crown = _scraps_joined(surface, crown)
     if crown.all() and surface.edge_mm(walk.edges) > _COARSE_MM:
@@ -94,7 +98,9 @@ def _by_pieces(surface: ScanSurface, seen: Tops, up: Array, walk: CreaseWalk) ->
     count = np.bincount(owner, minlength=len(extent))
     share = np.bincount(owner, weak, len(extent)) / np.maximum(count, 1)
     own = bearing & small
-    both = own.any() and bool(np.median(np.where(count > 0, share, 1.0)[own]) <= _MOST_WEAK)
+    both = own.any() and (
+        walk.by_colour is not None or bool(np.median(np.where(count > 0, share, 1.0)[own]) <= _MOST_WEAK)
+    )
     whole = own if not both else own & (count == 0)
     crown = crown & bearing[piece] | whole[piece]
     crown |= _carried(surface, up, bearing & small, ~bearing & small)[piece]

@@ -18,6 +18,9 @@ from jawusd.imaging.scan_surface import ScanSurface
 # Steps become e times rarer per 1/_SHYNESS_MM of inward curvature.
 _SHYNESS_MM = 2.5
 _SHARPEST = 3.0  # sharper creases count like this one [1/mm]
+# Share of a walker's steps that end at once, in crown or gum as the colour of the place says.
+_COLOUR_WEIGHT = 0.02
+_COLOUR_STEP = 0.3  # a difference of the likelihood of crown between neighbours that supports a border
 _TOLERANCE, _STEPS = 1e-3, 600
 # A border along a weaker crease is hardly supported by the shape.
 _EVIDENCE, _EVIDENCE_REACH_MM = 0.6, 0.5  # [1/mm], [mm]
@@ -26,9 +29,9 @@ _EVIDENCE, _EVIDENCE_REACH_MM = 0.6, 0.5  # [1/mm], [mm]
 class CreaseWalk:
     """Walk over one surface."""
 
-    def __init__(self, surface: ScanSurface) -> None:
-        """Find the creases."""
-        self._surface = surface
+    def __init__(self, surface: ScanSurface, by_colour: Array | None = None) -> None:
+        """Find the creases; `by_colour` is how likely each vertex is crown by its colour, 0 .. 1, shape (v,)."""
+        self._surface, self.by_colour = surface, by_colour
         self.edges = surface.edges()
         self.crease = surface.creases(self.edges)
         self._weights = self._stepping()
@@ -51,7 +54,10 @@ class CreaseWalk:
     def weak(self, crown: Mask) -> tuple[Indices, Mask]:
         """Return the border edges of a labelling, shape (n, 2), and which of them have no crease near, shape (n,)."""
         across = self.edges[crown[self.edges[:, 0]] != crown[self.edges[:, 1]]]
-        sharp = self._surface.vertices[self.crease > _EVIDENCE]
+        supported = self.crease > _EVIDENCE
+        if self.by_colour is not None:
+            supported[self.edges[np.abs(np.diff(self.by_colour[self.edges], axis=1))[:, 0] > _COLOUR_STEP]] = True
+        sharp = self._surface.vertices[supported]
         if not len(sharp) or not len(across):
             return across, np.ones(len(across), dtype=bool)
         middle = self._surface.vertices[across].mean(axis=1)
@@ -83,6 +89,9 @@ class CreaseWalk:
         degree = self._weights.sum(axis=1)[free] + 1e-9
         inner = csr_array(diags_array(degree) - self._weights[free][:, free])
         start = self._weights[free][:, fixed] @ share[fixed] + 0.5e-9
+        if self.by_colour is not None:
+            inner = csr_array(inner + diags_array(_COLOUR_WEIGHT * degree))
+            start = start + _COLOUR_WEIGHT * degree * self.by_colour[free]
         found, _ = cg(inner, start, x0=share[free], rtol=_TOLERANCE, maxiter=_STEPS, M=diags_array(1.0 / degree))
         share[free] = found
         return share

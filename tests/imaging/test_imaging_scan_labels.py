@@ -53,6 +53,22 @@ def test_crowns_that_are_pieces(upper: bool, turn: tuple[float, float, float]) -
     assert found.weak_share == 0
 
 
+def test_natural_colours_tell_what_the_shape_does_not() -> None:
+    rng = np.random.default_rng(4)
+    mesh, crown = bumps()
+    soft = mesh.vertices * [1.0, 0.65, 1.0]  # low crowns
+    other = soft.mean(0) + [0.0, 12.0, 0.0]
+    shade = rng.normal(1.0, 0.03, (len(crown), 1))
+    colors = np.clip(np.where(crown[:, None], (214, 204, 180), (196, 116, 112)) * shade, 0, 255).astype(np.uint8)
+    plain = label_scan(Mesh(soft, mesh.faces), other)
+    coloured = label_scan(Mesh(soft, mesh.faces, colors), other)
+    wrong = [((found.labels > 0) != crown).mean() for found in (plain, coloured)]
+    assert wrong[1] < 0.02 < wrong[0]
+    assert coloured.weak_share < plain.weak_share
+    stone = np.clip(np.array([130, 183, 191]) * shade, 0, 255).astype(np.uint8)  # a cast: no colours to go by
+    np.testing.assert_array_equal(label_scan(Mesh(soft, mesh.faces, stone), other).labels, plain.labels)
+
+
 def test_crowns_alone_are_crown_all_over() -> None:
     mesh = pieces(True)
     teeth = tooth_labels(mesh) > 0
