@@ -32,8 +32,8 @@ _LOWEST = 0.12
 # 0.026 to 0.074 at ridges without teeth, which mostly lie below the hull of the arch (40 scans of one surface).
 _LEAVING, _DOUBT_PER_MM, _MOST_DOUBT_MM = 0.06, 3.0, 0.6
 # Share of a piece's border without a crease, median over an arch: 0.02 to 0.162 where crowns carry a collar of gum (58
-# scans of synthetic persons of 5,000 faces and more), 0.8 to 1.0 at plain synthetic crowns, 0.24 to 0.34 at real ones (0.167 seen from the roots),
-# whose grooves and necks look like short creases.
+# scans of synthetic persons of 5,000 faces and more), 0.8 to 1.0 at plain synthetic crowns; 0.24 to 0.34 at real ones,
+# 0.167 once when seen from the roots, whose grooves and necks look like short creases.
 _MOST_WEAK = 0.165
 _COARSE_MM = 1.2  # edges of this length hide a gum line [mm]: what looks like crowns alone may have one
 # Pieces that begin this far above the lower end of the crown they lie at are on it (brackets), not around it (gum)
