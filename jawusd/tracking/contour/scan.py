@@ -48,7 +48,7 @@ class Scan:
     probes: Array  # some vertices spread over the crowns, at which motion is measured [mm], shape (N <= 300, 3)
     centre: Array  # centroid of the crown vertices [mm], shape (3,)
     radius_mm: float  # largest distance of a crown vertex from the centre
-    # whether the scan's colours told crown from gum; otherwise the whole scan counts as crown. Painted crowns are wound
+    # whether labels or paint told crown from gum; otherwise the whole scan counts as crown. Painted crowns are wound
     # outwards, so faces turned away need not be drawn
     painted: bool
     # the same arch with fewer faces, for all but the last steps; None where this one is thin enough
@@ -96,8 +96,8 @@ def prepare_scan(mesh: Mesh, name: str) -> Scan:
     """Split a teeth scan into crowns and gum and build the tables of the contour search.
 
     Args:
-        mesh: the teeth scan; vertex colours red and green mark crowns, anything else gum. Without such colours the
-            whole scan counts as crown.
+        mesh: the teeth scan; its labels, else its paint say what is crown, see `formats.mesh.tooth_labels`. Without
+            either the whole scan counts as crown.
         name: "upper" or "lower", for messages.
 
     Raises:
@@ -114,7 +114,7 @@ def prepare_scan(mesh: Mesh, name: str) -> Scan:
     if len(crown_faces) < _FEWEST_CROWN_FACES:
         raise TrackingError(
             f"{name} teeth scan: {len(crown_faces)} tooth faces, at least {_FEWEST_CROWN_FACES} are needed",
-            hint="Check the scan file and that its teeth are painted red and green.",
+            hint="Check the scan file, and with jawusd scans what is taken for crown.",
         )
     scan = _with_tables(name, vertices, crown_faces, gum_faces, painted)
     if len(crown_faces) <= _DENSE_FACES:
