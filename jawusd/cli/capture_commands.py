@@ -207,7 +207,7 @@ def scans(
     allow_outside: Outside = False,
     as_json: Json = False,
 ) -> None:
-    """Tell crown, gum and base of both teeth scans apart, store the labels, and draw a picture to look at."""
+    """Tell crown and gum of both teeth scans apart, store the labels, and draw a picture to look at."""
     from jawusd.pipeline.scans import label_scans, scans_lines
 
     with progress() as report:
