@@ -135,3 +135,28 @@ def test_picks_on_other_teeth_are_not_taken_for_another_size():
     turned = [Pick(vertex=a.vertex, views=b.views) for a, b in zip(picks, [*picks[1:], picks[0]])]
     with pytest.raises(TrackingError, match="contradict one another \\(pick 1"):
         pose_from_picks(turned, MESH.vertices, CAMERAS, "upper")
+
+
+def test_exchanged_cameras_are_named():
+    names = {"cam0": "cam1", "cam1": "cam0"}
+    message = "cameras cam0 and cam1 are exchanged, in the picks or in the calibration"
+    for seed in range(4):
+        picks = _picks(5, 0.5, views=2, seed=seed)
+        wrong = [
+            Pick(
+                vertex=p.vertex,
+                views=tuple(v.model_copy(update={"camera": names.get(v.camera, v.camera)}) for v in p.views),
+            )
+            for p in picks
+        ]
+        with pytest.raises(TrackingError, match=message):
+            pose_from_picks(wrong, MESH.vertices, CAMERAS, "upper")
+
+
+def test_views_that_do_not_meet_accuse_the_calibration():
+    picks = []
+    for pick in _picks(5):
+        first, *rest = pick.views
+        picks.append(Pick(vertex=pick.vertex, views=(first.model_copy(update={"y": first.y + 60.0}), *rest)))
+    with pytest.raises(TrackingError, match="lines of sight .* a calibration is wrong"):
+        pose_from_picks(picks, MESH.vertices, CAMERAS, "upper")

@@ -27,6 +27,7 @@ _FEWEST = 3
 # error of a careless click (5 px where a pixel is 0.07 mm).
 _TOLERANCE_MM = 1.1
 _CLICK_MM = _TOLERANCE_MM / 3  # standard deviation of a careless click along each axis
+_GAP_MM = 0.8  # by which the views of a carelessly clicked pick may miss one point
 # Size of the teeth by the picks over that of the scan, less 1, from which it may explain misses: clicks 0.4 mm off on
 # picks 40 mm apart leave 0.01.
 _SIZE_SHARE = 0.03
@@ -85,6 +86,11 @@ def pose_from_picks(
                     "contradict one another on this one: the scale of the scans is wrong, or the calibration's lengths",
                     hint="Check the scans' unit and scaling, and the square size of the calibration board.",
                 )
+            if (cause := _wrong_sight(picks, vertices, cameras, arch, places, sightings)) is not None:
+                raise TrackingError(
+                    f"bootstrap: the picks on the {arch} teeth contradict one another: {cause}",
+                    hint="Check the calibration and the picks' camera names, and that their views show one instant.",
+                )
             misses = ", ".join(f"pick {s.number}: {_miss_mm(s, best):.1f} mm" for s in sightings)
             raise TrackingError(
                 f"bootstrap: the picks on the {arch} teeth contradict one another "
@@ -108,6 +114,42 @@ def _other_size(sightings: Sequence[_Sighting], places: Array) -> float | None:
     pose = rigid_fit(points / size, places)
     fits = all(_miss_mm(replace(s, point=s.point / size), pose) < _TOLERANCE_MM for s in sightings)
     return size if fits else None
+
+
+def _wrong_sight(
+    picks: Sequence[Pick],
+    vertices: Array,
+    cameras: Mapping[str, Camera],
+    arch: str,
+    places: Array,
+    sightings: Sequence[_Sighting],
+) -> str | None:
+    """Say what is wrong if an exchange of cameras explains the misses, or views do not meet in a point; else None.
+
+    `places` are the triangulated picks, world coordinates [mm], shape (P, 3).
+    """
+    for a, b in combinations(cameras, 2):
+        other = {a: b, b: a}
+        renamed = [
+            Pick(
+                vertex=pick.vertex,
+                views=tuple(v.model_copy(update={"camera": other.get(v.camera, v.camera)}) for v in pick.views),
+            )
+            for pick in picks
+        ]
+        seen = [_sighting(k, pick, vertices, cameras, arch) for k, pick in enumerate(renamed, start=1)]
+        points, meets = np.stack([s.point for s in seen]), np.stack([triangulate(s.matrices, s.pixels) for s in seen])
+        pose = rigid_fit(points, meets)
+        if all(_miss_mm(s, pose) < _TOLERANCE_MM for s in seen):
+            return f"cameras {a} and {b} are exchanged, in the picks or in the calibration"
+    # Views from side by side meet even where they are of different points at one height.
+    gaps = [_miss_mm(replace(s, point=place), np.eye(4)) for s, place in zip(sightings, places, strict=True)]
+    if float(np.median(gaps)) < _GAP_MM:
+        return None
+    return (
+        f"the lines of sight of their views pass one another by up to {max(gaps):.1f} mm (usual are {_GAP_MM:g} mm): a "
+        "calibration is wrong, or a camera name, or the views are of different instants"
+    )
 
 
 def _than(ratio: float) -> str:
