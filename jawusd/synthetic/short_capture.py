@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -29,6 +28,7 @@ from jawusd.synthetic.dentition import without_gum
 from jawusd.synthetic.person import draw_joint
 from jawusd.synthetic.population import Traits, draw_traits
 from jawusd.synthetic.scanner import Scanner, draw_scanner, encoded, scanned
+from jawusd.synthetic.short_picks import TEETH_FROM, Drawn, ShortPick, pick_ends, pick_lines
 from jawusd.synthetic.short_take import Motion, draw_cameras, draw_motion
 from jawusd.synthetic.soft_tissue import Face, palate, tongue
 
@@ -36,13 +36,8 @@ FPS = 24.0
 FIRST_FRAME = 12
 JAWS = ("upper", "lower")
 _GUMS, _SOFT = (40, 80), 90  # labels: teeth 1..14 and 41..54, gums of the arches, soft tissue
-_LOWER_FROM = 41
 _PAD_PX = 24
-_PICKS = 4
-_PICK_NOISE_PX = 1.5
 
-#: Labels (rows, columns), first column and row of that part of the picture, inverse depth (rows, columns) [1/mm].
-Drawn = tuple[NDArray[np.uint8], tuple[int, int], NDArray[np.float32]]
 #: A surface in the world: vertices, and faces with their label.
 Surfaces = list[tuple[Array, list[tuple[NDArray[np.int32], int]]]]
 
@@ -172,7 +167,7 @@ def _arch_labels(arch: DentalArch, row: int) -> list[tuple[NDArray[np.int32], in
     tooth = np.asarray(arch.tooth[faces], int)
     own = np.where(tooth[:, 0] != 0, tooth[:, 0], tooth[:, 1])
     number = np.where(own > 0, own, 7 - own)  # left 1..7, right 8..14
-    parts = [(np.ascontiguousarray(faces[crown & (number == k)]), k + (_LOWER_FROM - 1) * row) for k in range(1, 15)]
+    parts = [(np.ascontiguousarray(faces[crown & (number == k)]), k - 1 + TEETH_FROM[row]) for k in range(1, 15)]
     return [*(part for part in parts if len(part[0])), (np.ascontiguousarray(faces[~crown]), _GUMS[row])]
 
 
@@ -207,7 +202,7 @@ def _write_masks(folder: Path, capture: ShortCapture) -> None:
             px_per_mm = float(camera.K[0, 0] / camera.depth(centre)[0])
             own = FIRST_FRAME + k - capture.offsets[c]
             for row, jaw in enumerate(JAWS):
-                first = 1 if row == 0 else _LOWER_FROM
+                first = TEETH_FROM[row]
                 teeth = np.where((labels >= first) & (labels < first + 14), labels - first + 1, 0).astype(np.uint8)
                 mask = hands[row].draw(teeth, labels == _GUMS[row], window, px_per_mm)
                 if mask is not None:
@@ -255,61 +250,15 @@ def _truth(capture: ShortCapture) -> dict[str, ArrayLike]:
     }
 
 
-def _picks(capture: ShortCapture, rng: np.random.Generator) -> list[tuple[str, int, list[tuple[str, float, float]]]]:
-    """Choose tips of teeth that two cameras see, well spread: arch, vertex and (camera, x, y) of two cameras."""
-    seen = [labelled(capture, c, float(capture.delays[c])) for c in range(len(capture.cameras))]
-    out = []
-    for row, jaw in enumerate(JAWS):
-        mesh, pose = capture.scans[row], capture.poses(0.0)[row]
-        world = transform_points(pose, mesh.vertices)
-        visible = np.stack([_visible(capture.cameras[c], world, *seen[c], row) for c in range(len(seen))], 1)
-        good = np.flatnonzero(visible.sum(1) >= 2)
-        if len(good) < _PICKS:
-            continue
-        # What a person clicks on: the ends of the teeth, towards the other arch.
-        height = transform_points(se3_inverse(capture.T_scan_bite), mesh.vertices[good])[:, 1] * (1.0 if row else -1.0)
-        good = good[height >= np.quantile(height, 0.6)] if len(good) > 200 else good
-        for vertex in good[np.array(_spread(world[good], _PICKS))].tolist():
-            views = []
-            for c in np.flatnonzero(visible[vertex])[:2]:
-                x, y = capture.cameras[c].project(world[vertex]) + rng.normal(0.0, _PICK_NOISE_PX, 2)
-                views.append((capture.cameras[c].name, float(x), float(y)))
-            out.append((jaw, int(vertex), views))
-    return out
-
-
-def _visible(
-    camera: Camera,
-    world: Array,
-    labels: NDArray[np.uint8],
-    window: tuple[int, int],
-    depth: NDArray[np.float32],
-    row: int,
-) -> NDArray[np.bool_]:
-    """Tell which points (N, 3) of an arch's crowns a camera sees."""
-    at = np.rint(camera.project(world)).astype(int) - window
-    inside = np.asarray(((at >= 2) & (at < np.array(labels.shape[::-1]) - 2)).all(1))
-    at = np.where(inside[:, None], at, 0)
-    near = depth[at[:, 1], at[:, 0]] * camera.depth(world) < 1.0 + 0.4 / 300.0
-    first = 1 if row == 0 else _LOWER_FROM
-    own = labels[at[:, 1], at[:, 0]]
-    return np.asarray(inside & near & (own >= first) & (own < first + 14))
-
-
-def _spread(points: Array, count: int) -> list[int]:
-    """Farthest-point choice, starting with the point farthest from the middle."""
-    chosen = [int(np.linalg.norm(points - points.mean(0), axis=1).argmax())]
-    distance = np.linalg.norm(points - points[chosen[0]], axis=1)
-    while len(chosen) < count:
-        chosen.append(int(distance.argmax()))
-        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
-    return chosen
-
-
 def _description(capture: ShortCapture) -> str:
     config, suffix = capture.config, capture.scanner.suffix
     rng = np.random.default_rng([config.seed, 0x91C])
-    picks = [] if rng.random() < config.without_picks else _picks(capture, rng)
+    picks: list[list[ShortPick]] = []
+    if rng.random() >= config.without_picks:
+        seen = [labelled(capture, c, float(capture.delays[c])) for c in range(len(capture.cameras))]
+        shown = (se3_inverse(capture.T_scan_bite), capture.cameras, seen, rng)
+        both = zip(capture.scans, (0, 1), capture.poses(0.0), strict=True)
+        picks = [pick_ends(mesh, row, pose, *shown) for mesh, row, pose in both]
     lines = [
         'format = "jawusd-capture/1"', f'name = "person_{config.seed}"', 'units = "mm"', f"fps = {FPS}",
         'calibration = "calibration.toml"', f"frames = [{FIRST_FRAME}, {FIRST_FRAME + config.frames}]", "",
@@ -321,14 +270,10 @@ def _description(capture: ShortCapture) -> str:
     names = [camera.name for camera in capture.cameras]
     offsets = ", ".join(f"{name} = {offset}" for name, offset in zip(names, capture.offsets, strict=True))
     lines += ["[sync]", 'method = "offsets"', f'reference = "{names[0]}"', f"offsets = {{ {offsets} }}", ""]
-    if {jaw for jaw, *_ in picks} == set(JAWS):
+    if picks and all(picks):
         lines += ["[bootstrap]", f"frame = {FIRST_FRAME}", ""]
-        lines += [line for jaw, vertex, views in picks for line in _pick_lines(jaw, vertex, views)]
+        for jaw, own in zip(JAWS, picks, strict=True):
+            lines += [line for pick in own for line in pick_lines(jaw, pick)]
     if rng.random() < 0.6:
         lines += ["[motion]", f"rest_frame = {FIRST_FRAME + 1}", ""]
     return "\n".join(lines)
-
-
-def _pick_lines(jaw: str, vertex: int, views: Iterable[tuple[str, float, float]]) -> list[str]:
-    text = ", ".join(f'{{ camera = "{name}", x = {x:.2f}, y = {y:.2f} }}' for name, x, y in views)
-    return [f"[[bootstrap.{jaw}]]", f"vertex = {vertex}", f"views = [{text}]", ""]
