@@ -224,6 +224,18 @@ def test_a_lost_row_is_bridged_by_even_motion():
     assert moved[1, 0] == pytest.approx(moved[1, 1], abs=1e-6)
 
 
+def test_delays_follow_an_accelerating_jaw_to_the_ends_of_the_take():
+    records, _ = _records(6)
+    push = np.array([0.004, 0, 0, 0, -0.5, 0.1])
+    for k, record in records.items():
+        poses = np.stack([se3_exp(0.5 * k**2 * push)] * 2)
+        records[k] = replace(record, solution=replace(record.solution, poses=poses, centres=np.zeros((2, 3))))
+    for k in records:
+        moved = delay_motions(records, k, np.array([0.0, 0.4, -0.3]))
+        for c, delay in enumerate((0.0, 0.4, -0.3)):
+            assert moved[c, 1] == pytest.approx(se3_exp((k * delay + 0.5 * delay**2) * push), abs=1e-9)
+
+
 def test_long_gaps_and_ends_are_not_bridged():
     assert bridge(_records(20, lost=range(4, 18))[0], 10, 1) is None
     assert bridge(_records(6, lost=(0, 1))[0], 0, 1) is None

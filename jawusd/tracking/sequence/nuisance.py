@@ -220,13 +220,35 @@ def delay_motions(records: Mapping[int, FrameRecord], frame: int, delays: Array)
     """Return the motion of both arches from the reference instant to each camera's own, shape (C, 2, 4, 4)."""
     out = np.tile(np.eye(4), (len(delays), 2, 1, 1))
     for arch in ARCHES:
-        velocity = velocity_twist(records, frame, arch)
-        if velocity is None:
-            across = bridge(records, frame, arch)
-            velocity = None if across is None else across[1]
-        if velocity is not None:
-            out[:, arch] = motion_about(records[frame].solution.centres[arch], delays[:, None] * velocity)
+        motion = _motion_twists(records, frame, arch)
+        if motion is not None:
+            velocity, change = motion
+            twists = delays[:, None] * velocity + 0.5 * delays[:, None] ** 2 * change
+            out[:, arch] = motion_about(records[frame].solution.centres[arch], twists)
     return out
+
+
+def _motion_twists(records: Mapping[int, FrameRecord], frame: int, arch: int) -> tuple[Array, Array] | None:
+    """Return the twist per frame about the arch's centre and its change per frame, shapes (6,): a parabola in time.
+
+    Through both neighbours, at ends through two on one side (a jaw starts and stops within a frame or two), and across
+    a gap evenly; None without tracked frames close by.
+    """
+
+    def step(frames: int) -> Array:
+        here, there = records[frame].solution, records[frame + frames].solution
+        return twist_between(here.poses[arch], there.poses[arch], here.centres[arch])
+
+    def tracked(*steps: int) -> bool:
+        return all(_is_tracked(records, frame + k, arch) for k in (0, *steps))
+
+    if tracked(-1, 1):
+        return 0.5 * (step(1) - step(-1)), step(1) + step(-1)
+    for way in (1, -1):
+        if tracked(way, 2 * way):
+            return way * (2.0 * step(way) - 0.5 * step(2 * way)), step(2 * way) - 2.0 * step(way)
+    across = bridge(records, frame, arch)
+    return None if across is None else (across[1], np.zeros(6))
 
 
 def _reduced(
