@@ -37,10 +37,8 @@ class Motion:
 
     def jaw(self, t: float) -> Array:
         """Return T_skull_mandible (4, 4) in the bite's frame."""
-        k = int(np.clip(np.floor(t), 0, len(self.controls) - 2))
-        share = float(np.clip(t - k, 0.0, 1.0))
-        now = (1.0 - share) * self.controls[k] + share * self.controls[k + 1]
-        pose = controlled_pose(self.joint, *now)
+        now = _between(self.controls, t)
+        pose = controlled_pose(self.joint, *now.tolist())
         still = controlled_pose(self.joint, 0.0, 0.0, 0.0)
         return np.asarray(pose @ se3_inverse(still))
 
@@ -119,6 +117,18 @@ def draw_motion(joint: Joint, bite: Bite, T_world_head: Array, frames: int, rng:
     raised = rng.uniform(0.0, 1.0) * (rng.random() < 0.4)
     tongue = np.array([6.0 * raised, 7.0 * raised, rng.uniform(-2.0, 2.0)])
     return Motion(joint, controls, T_head, rng.uniform(0.0, 2 * np.pi, 6), rng.uniform(0.1, 0.35), lips, tongue)
+
+
+def _between(rows: Array, t: float) -> Array:
+    """Interpolate rows (F, n) smoothly in time, never beyond the two neighbours (Fritsch & Butland 1984)."""
+    step = np.diff(rows, axis=0)
+    product, total = step[:-1] * step[1:], step[:-1] + step[1:]
+    inner = np.where(product > 0, 2.0 * product / np.where(product > 0, total, 1.0), 0.0)
+    slope = np.concatenate([step[:1], inner, step[-1:]])
+    k = int(np.clip(np.floor(t), 0, len(step) - 1))
+    s = float(np.clip(t - k, 0.0, 1.0))
+    rising = rows[k] + s * s * (3.0 - 2.0 * s) * step[k]
+    return np.asarray(rising + s * (1.0 - s) * ((1.0 - s) * slope[k] - s * slope[k + 1]))
 
 
 def _through(keys: Array, values: Array, t: float) -> Array:
