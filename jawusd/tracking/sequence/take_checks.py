@@ -1,6 +1,7 @@
 """What a tracked take says of calibration, synchronisation and masks: lenses, scan sizes, late cameras, lost frames.
 
-False alarms of all kinds: see the limits; measured with `tests/benchmarks/population.py --persons 100`.
+False alarms: none of 17 valid synthetic persons carried any of these findings (`tests/benchmarks/population.py
+--persons 8 --seed 1` and `--persons 9 --seed 9`), which bounds the rate of all kinds together to 16 % (95 %).
 """
 
 from __future__ import annotations
