@@ -250,11 +250,11 @@ def read_capture(
     try:
         data = read_toml(path)
         check_format(data.pop("format", None), FAMILY, VERSION, path)
-        units = data.pop("units", "mm")
-        if units != "mm":
-            raise UnitsError(f'units are "{units}", allowed is "mm".', path=path)
     except JawusdError as error:
         return None, [error]
+    units = data.pop("units", "mm")
+    if units != "mm":
+        return None, [UnitsError(f'units are "{units}", allowed is "mm".', path=path)]
     folder = path.resolve().parent
     data["folder"] = folder
     if "camera" in data:

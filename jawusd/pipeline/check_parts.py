@@ -44,7 +44,11 @@ class Parts:
 
     @property
     def given(self) -> Capture:
-        """Return the capture, for checks that need it."""
+        """Return the capture, for checks that need it.
+
+        Raises:
+            ValueError: it could not be read.
+        """
         if self.capture is None:
             raise ValueError("there is no capture")
         return self.capture

@@ -224,7 +224,11 @@ def _teeth(parts: Parts, cameras: Mapping[str, Camera], instant: int, offsets: M
 
 
 def picks(parts: Parts) -> Iterator[Finding]:
-    """Look whether the picks agree with one another and with the masks."""
+    """Look whether the picks agree with one another and with the masks.
+
+    Raises:
+        CaptureError: they cannot be used.
+    """
     from jawusd.tracking.initialization.pick_checks import exchanged_by_picks, picked_poses, placed_findings
 
     capture = parts.given

@@ -50,7 +50,11 @@ def draw_scanner(seed: int, unpainted: float = 0.0) -> Scanner:
 
 
 def scanned(mesh: Mesh, scanner: Scanner, rng: np.random.Generator) -> Mesh:
-    """Return a painted arch as a scanner delivers it: vertices as a reader of the file will count them."""
+    """Return a painted arch as a scanner delivers it: vertices as a reader of the file will count them.
+
+    Raises:
+        ValueError: the arch has no paint.
+    """
     vertices, faces, colors = mesh.vertices, mesh.faces, mesh.colors
     if colors is None:
         raise ValueError("the arch has no paint")
