@@ -105,6 +105,8 @@ class TrackingConfig:
     # below, they cost less than the noise of single frames.
     refine_delay_frames: float = 0.03
     refine_bias_px: float = 0.1
+    # Delay that is corrected before cameras may count as moved [frames]: beyond what free running cameras differ by.
+    late_frames: float = 0.6
     # Most rounds of that [-]: each leaves a tenth of the delay.
     refine_rounds: int = 2
     # Shift of contours by wrong camera poses [px] from which those are corrected: below, apparent shifts are the

@@ -86,14 +86,17 @@ def track_capture(
             frames = rest_frames(take.records, named, up, point, scans[1].probes)
             corrects = capture.scans.registration == "take"
             rest = RestFrames(frames, named is not None, point, scans[1].centre, corrects)
-            nuisances, extrinsics = take.refine(rest)
+            lenses = take.lenses()
+            nuisances, extrinsics = take.refine(rest, may_move=not lenses)
             records = take.records if capture.frames else _trimmed(take.records)
             names = tuple(camera.name for camera in masks.cameras)
             findings = [
                 *start.findings,
                 *masks.findings(),
                 *use_of_cameras(names, records),
-                *take.checks(nuisances, extrinsics),
+                *lenses,
+                *motion_findings(names, extrinsics),
+                *time_findings(names, take.records, nuisances, extrinsics, config),
             ]
     notes: TracksMeta = {
         "start": start.notes,
@@ -156,17 +159,22 @@ class _Take:
                     status = np.where(was_lost & ~lost, RECOVERED, record.status).astype(np.int8)
                     self.records[frame] = replace(record, status=status)
 
-    def refine(self, rest: RestFrames) -> tuple[Nuisances, Extrinsics]:
-        """Estimate delays, habits and camera poses; where they matter, align all frames again with them corrected."""
+    def refine(self, rest: RestFrames, may_move: bool) -> tuple[Nuisances, Extrinsics]:
+        """Estimate delays, habits and camera poses; where they matter, align all frames again with them corrected.
+
+        Cameras whose lens or scans are of another size must not move: their motion would only hide that.
+        """
         c, self._rest = self._config, rest
         extrinsics = Extrinsics.calibrated(self._masks.cameras, self._middle())
+        known = self._late_cameras(extrinsics)
         equations = self._equations(extrinsics)
         found = equations.solve(c, True)
-        cameras_moved = found.cameras_moved(c) and c.refine_rounds > 0
+        cameras_moved = may_move and found.cameras_moved(c) and c.refine_rounds > 0
         if not cameras_moved:
             extrinsics = extrinsics.then(np.zeros_like(found.twists), found.sigma_twists)
             found = equations.solve(c, False)
         pending, rounds = found.matters(c), 0
+        found = found if known is None else known.plus(found)
         if pending and c.refine_rounds:
             found, extrinsics = self._settle(found, extrinsics, cameras_moved)
         while pending and rounds < c.refine_rounds:
@@ -177,23 +185,31 @@ class _Take:
             found, pending, rounds = found.plus(residual), residual.matters(c), rounds + 1
         return found, extrinsics
 
-    def checks(self, nuisances: Nuisances, extrinsics: Extrinsics) -> list[Finding]:
-        """Return what the take tells of calibration, synchronisation and masks."""
-        names = [camera.name for camera in self._masks.cameras]
+    def _late_cameras(self, extrinsics: Extrinsics) -> Nuisances | None:
+        """Correct delays near a frame before anything else; None without any.
+
+        So late a camera also looks moved, and its masks look wrong where the jaw is fast.
+        """
+        c = self._config
+        found = self._equations(extrinsics).solve(c, False)
+        if np.abs(found.delays).max() < c.late_frames or not c.refine_rounds:
+            return None
+        found, _ = self._settle(found, extrinsics, False)
+        self._realign(found, extrinsics)
+        return found
+
+    def lenses(self) -> list[Finding]:
+        """Return what the take, before anything is corrected, tells of focal lengths, lenses and the scans' size."""
         whole = [frame for frame, record in sorted(self.records.items()) if (record.status != LOST).all()]
-        found = motion_findings(names, extrinsics)
         if not whole:
-            return found
+            return []
         instants = []
         for k in np.unique(np.linspace(0, len(whole) - 1, _CHECKED_FRAMES).astype(int)):
             views = self._masks.at(whole[k])
-            corrected = _corrected_views(views, self.records, whole[k], nuisances, extrinsics)
-            instants.append((self.records[whole[k]].solution.poses, corrected, present_masks(views)))
+            instants.append((self.records[whole[k]].solution.poses, views, present_masks(views)))
         scans = [scan.thin or scan for scan in self._solver.scans]
-        magnification = measure_magnification(scans, instants, self._config)
-        if magnification is not None:
-            found += lens_findings(names, magnification)
-        return found + time_findings(names, self.records, nuisances, extrinsics, self._config)
+        found = measure_magnification(scans, instants, self._config)
+        return [] if found is None else lens_findings([camera.name for camera in self._masks.cameras], found)
 
     def _equations(self, extrinsics: Extrinsics) -> TakeEquations:
         variance = outline_variance(self.records, self._config)

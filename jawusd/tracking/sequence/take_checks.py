@@ -28,6 +28,7 @@ _BIAS_PX = 2.5
 _TURN_DEG, _MOVE_MM = 0.25, 0.7
 _TELLING_CAMERAS = 3  # of two that differ, either may be wrong
 _CLEARLY = 4.0  # standard deviations
+_CLEAR_LENS = 3.0  # the same of magnifications, whose sigma is on the safe side
 _LATE_FRAMES = 0.7  # cameras that run freely are up to half a frame apart
 _PART_FRAMES = 5  # in the parts of a take whose delays are compared
 
@@ -39,8 +40,8 @@ def lens_findings(names: Sequence[str], found: Magnification) -> list[Finding]:
     """
     out = []
     common = found.common
-    sigma = float(np.sqrt(np.mean(found.sigma_scale**2)))
-    if abs(common) > max(_COMMON, _CLEARLY * sigma) and (np.sign(found.scale) == np.sign(common)).all():
+    sigma = float(np.sqrt(np.mean(found.sigma_scale**2) / len(found.scale)))  # cameras move independently
+    if abs(common) > max(_COMMON, _CLEAR_LENS * sigma) and (np.sign(found.scale) == np.sign(common)).all():
         out.append(
             Finding(
                 "scan_size",
@@ -54,7 +55,7 @@ def lens_findings(names: Sequence[str], found: Magnification) -> list[Finding]:
         )
     for c, name in enumerate(names):
         own = float(found.scale[c] - common)
-        if len(names) >= _TELLING_CAMERAS and abs(own) > max(_SCALE, _CLEARLY * found.sigma_scale[c]):
+        if len(names) >= _TELLING_CAMERAS and abs(own) > max(_SCALE, _CLEAR_LENS * found.sigma_scale[c]):
             out.append(
                 Finding(
                     "focal_length",
@@ -67,7 +68,7 @@ def lens_findings(names: Sequence[str], found: Magnification) -> list[Finding]:
                     hint="Calibrate it again with the lens, zoom and focus of the recording.",
                 )
             )
-        elif abs(found.bend[c]) > max(_BEND, _CLEARLY * found.sigma_bend[c]):
+        elif abs(found.bend[c]) > max(_BEND, _CLEAR_LENS * found.sigma_bend[c]):
             out.append(
                 Finding(
                     "lens_distortion",
