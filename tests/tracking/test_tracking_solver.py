@@ -16,7 +16,9 @@ from jawusd.tracking.contour.equations import GingivalMarginTerm, NormalEquation
 from jawusd.tracking.contour.samples import (
     COLUMNS,
     CROWN,
+    EDGE_SHARE,
     GUM,
+    GUM_SHARE,
     HABITS,
     INVERSE_DEPTH,
     LENGTH,
@@ -240,3 +242,23 @@ def test_a_row_without_masks_stays_where_it_was():
     solution = ContourSolver(SCANS, CONFIG).solve(start, views, USUAL)
     assert vertex_error_mm(MESHES[1], solution.poses[1], start[1]) < 1e-6
     assert vertex_error_mm(MESHES[0], solution.poses[0], POSES[3, 0]) < 0.02
+
+
+def test_crowns_without_gum_have_their_gum_line_where_they_face_the_gum():
+    camera, pose = CAMERAS[1], POSES[2, 0]
+    labels, depth = np.zeros(camera.size_px[::-1], np.uint8), np.zeros(camera.size_px[::-1], np.float32)
+    matrix = camera.projection_matrix() @ pose
+    up = SCANS[0].vertices[np.unique(SCANS[0].gum_faces)].mean(0) - SCANS[0].centre
+    up /= np.linalg.norm(up)
+    replace(SCANS[0], gum_faces=np.zeros((0, 3), np.int32)).draw(matrix, depth, labels)
+    far = np.full(labels.shape, np.inf, np.float32)
+    eye = transform_point(se3_inverse(pose), camera.centre_world())
+    samples, _ = contour_samples(SCANS[0], matrix, eye, labels, depth, far, 3.0, 1.5, up)
+    moved = (
+        camera.project(transform_points(pose, samples[:, :3] + 0.01 * up)) - samples[:, [U, V]]
+    ) / 0.01  # px per mm towards the gum
+    along = (moved * samples[:, [NX, NY]]).sum(1)
+    gum = samples[:, GUM_SHARE] == 1.0
+    edge = samples[:, EDGE_SHARE] == 1.0
+    assert gum.sum() > 50 and edge.sum() > 50
+    assert along[gum].min() > 0 and along[gum].min() > np.median(along[edge])

@@ -22,6 +22,8 @@ HABITS = slice(EDGE_SHARE, COLUMNS)  # an outline shifts by samples[:, HABITS] @
 # How far from visible gum an outline counts as gum line at all, and in full [mm]: nearer than the first, brushes of
 # half a millimetre blur the two.
 _GUM_FAR_MM, _GUM_NEAR_MM = 1.0, 0.55
+# Cosine to the direction of the gum from which outlines of crowns without gum begin to count, and count in full [-].
+_LEAST_FACING, _FULL_FACING = 0.3, 0.6
 
 
 def contour_samples(
@@ -33,6 +35,7 @@ def contour_samples(
     gum_distance_px: NDArray[np.float32],
     step_px: float,
     depth_tolerance_mm: float,
+    towards_gum: Array | None = None,
 ) -> tuple[Array, int]:
     """Return the contour points at which the picture changes from crown to anything else, shape (n, COLUMNS).
 
@@ -47,11 +50,14 @@ def contour_samples(
         step_px: largest distance between samples.
         depth_tolerance_mm: how much nearer the surface just inside the contour may be before the contour counts as
             hidden behind it.
+        towards_gum: unit vector in scan coordinates, shape (3,), for scans that end at the gum without showing it:
+            outlines that face this way are gum line.
     """
     scan_tables = (scan.vertices, scan.crown_faces, scan.planes, scan.edges)
     px_per_mm = _px_per_mm(matrix, scan.centre)
     candidates = _silhouette(*scan_tables, eye, matrix, step_px, labels.shape)
-    silhouette = _visible(candidates, labels, inverse_depth, gum_distance_px, depth_tolerance_mm, px_per_mm)
+    facing = np.zeros(2) if towards_gum is None else _picture_axes(matrix) @ towards_gum
+    silhouette = _visible(candidates, labels, inverse_depth, gum_distance_px, depth_tolerance_mm, px_per_mm, facing)
     segments, towards_gum = scan.gingival_margin, scan.margin_directions
     margin = _gingival_margin(segments, towards_gum, matrix, labels, inverse_depth, depth_tolerance_mm)
     return np.concatenate([silhouette, margin]), len(silhouette)
@@ -61,6 +67,13 @@ def _px_per_mm(matrix: Array, point: Array) -> float:
     """Return the scale of the picture at a point (3,) of the scan [px/mm]."""
     depth = float(matrix[2, :3] @ point + matrix[2, 3])
     return float(np.linalg.norm(np.cross(matrix[0, :3], matrix[2, :3]))) / max(depth, 1e-9)
+
+
+def _picture_axes(matrix: Array) -> Array:
+    """Return the directions right and down of the picture in scan coordinates, shape (2, 3)."""
+    away = matrix[2, :3] / np.linalg.norm(matrix[2, :3])
+    axes = matrix[:2, :3] - (matrix[:2, :3] @ away)[:, None] * away
+    return np.asarray(axes / np.linalg.norm(axes, axis=1, keepdims=True), np.float64)
 
 
 @numba.njit(nogil=True, cache=True, inline="always")
@@ -169,6 +182,7 @@ def _visible(
     gum_distance_px: NDArray[np.float32],
     tolerance_mm: float,
     px_per_mm: float,
+    facing_gum: Array,
 ) -> Array:
     """Keep samples whose own surface is visible on the inner side, with no crown on the outer; tell edge from gum."""
     out = np.empty_like(samples)
@@ -190,6 +204,8 @@ def _visible(
         if out[n, GUM_SHARE] == 0.0:
             distance_mm = gum_distance_px[pixel_of(sample[V]), pixel_of(sample[U])] / px_per_mm
             share = (_GUM_FAR_MM - distance_mm) / (_GUM_FAR_MM - _GUM_NEAR_MM)
+            cosine = sample[NX] * facing_gum[0] + sample[NY] * facing_gum[1]
+            share = max(share, (cosine - _LEAST_FACING) / (_FULL_FACING - _LEAST_FACING))
             out[n, GUM_SHARE] = min(max(share, 0.0), 1.0)
         out[n, EDGE_SHARE] = 1.0 - out[n, GUM_SHARE]
         n += 1

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from jawusd.geometry import orthonormalise, transform_point, transform_points
+from jawusd.geometry import bite_normal, orthonormalise, transform_point, transform_points
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.config import Mapper, TrackingConfig
 from jawusd.tracking.contour.correspondences import accumulate, scatter_of_tiles, search_edges
@@ -26,6 +26,7 @@ from jawusd.tracking.contour.samples import HABITS, LENGTH, contour_samples, gum
 from jawusd.tracking.contour.scan import ARCHES, Scan
 from jawusd.tracking.contour.views import View, present_masks
 
+_GUM_SHARE = 0.02  # gum faces for each crown face below which they are remains of what was cut away
 _DENSE_STEPS = 2  # with all faces of a dense scan, after the thinned one has settled
 
 # samples, how many of them are silhouette, their distances to the mask edge, visible contour length [px]
@@ -41,6 +42,7 @@ class ContourSolver:
         self.map: Mapper = executor.map if executor else map
         arms = np.array([[(scan.radius_mm / 2) ** 2] * 3 + [1.0] * 3 for scan in self.scans])
         self._start_strength = config.typical_noise_px3 / config.prediction_mm**2 * arms
+        self._towards_gum = _towards_gum(self.scans)
         thin = [scan.thin or scan for scan in self.scans]
         self._thin = ContourSolver(thin, config, executor) if any(scan.thin for scan in self.scans) else None
 
@@ -153,7 +155,8 @@ class ContourSolver:
         eye = pose[:3, :3].T @ (view.eye - pose[:3, 3])
         pictures = (rendering.labels[c][r], depths[r], rendering.gum_distances[c][r])
         limits = (config.sample_step_px, config.depth_tolerance_mm)
-        samples, silhouettes = contour_samples(scan, view.matrix @ pose, eye, *pictures, *limits)
+        gum = self._towards_gum[r]
+        samples, silhouettes = contour_samples(scan, view.matrix @ pose, eye, *pictures, *limits, gum)
         distances = np.empty(len(samples))
         other = (view.masks[1 - r], depths[1 - r])
         search_limits = (reach, config.overlap_tolerance_mm, config.normal_cosine)
@@ -174,6 +177,15 @@ class ContourSolver:
         return max(
             float(np.linalg.norm(step[r, :3]) * self.scans[r].radius_mm + np.linalg.norm(step[r, 3:])) for r in ARCHES
         )
+
+
+def _towards_gum(scans: Sequence[Scan]) -> list[Array | None]:
+    """Return for each arch where its gum must be, a unit vector in scan coordinates; None if the scan shows it."""
+    shown = [len(scan.gum_faces) > _GUM_SHARE * len(scan.crown_faces) for scan in scans]
+    if all(shown):
+        return [None, None]
+    up = bite_normal(scans[0].crown_vertices(), scans[1].crown_vertices())
+    return [None if gum else way * up for gum, way in zip(shown, (1.0, -1.0), strict=True)]
 
 
 class _Rendering:
