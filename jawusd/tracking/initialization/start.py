@@ -75,7 +75,7 @@ def find_start(
         start = _picked(capture.bootstrap, capture.frames, footage, meshes, search)
     else:
         start = search_start(search, footage)
-    return replace(start, findings=tuple(findings), T_anatomical_scan=T_anatomical_scan)
+    return replace(start, findings=(*start.findings, *findings), T_anatomical_scan=T_anatomical_scan)
 
 
 def _picked(
@@ -97,13 +97,42 @@ def _picked(
     start = Start(bootstrap.frame, np.stack(poses), notes)
     if (mixup := likely_mixup(footage, search.solver, start.poses, start.frame)) is not None:
         raise mixup.refusal(start.frame)
-    if max(sigma_mm.values()) <= _SURE_MM or not footage.has_masks(start.frame):
+    if not footage.has_masks(start.frame):
         return start
-    found = search_around(search, footage, start.frame, start.poses)
+    if max(sigma_mm.values()) <= _SURE_MM and _fits(search, footage, start):
+        return start
+    try:
+        found = search_around(search, footage, start.frame, start.poses)
+    except TrackingError:
+        return _elsewhere(search, footage, start)
     if (without := _around_without_a_camera(search, footage, start.frame, start.poses, found)) is not None:
         notes["camera_left_out"], found = without
     notes |= {"by": "picks, then search", "worth_px": found.objective_px, "fit": found.fit}
-    return Start(start.frame, found.poses, notes)
+    start = Start(start.frame, found.poses, notes)
+    return start if "camera_left_out" in notes or _fits(search, footage, start) else _elsewhere(search, footage, start)
+
+
+def _elsewhere(search: StartSearch, footage: Footage, start: Start) -> Start:
+    """Return a start on another frame if there is one that fits: lips may hide the teeth on the picked one.
+
+    Otherwise the start as it is, which is then refused with its own reasons.
+    """
+    try:
+        other = search_start(search, footage)
+    except TrackingError:
+        return start
+    message = f"the picks do not fit the masks of their frame; the teeth were found on frame {other.frame} without them"
+    unused = Finding("picks_unused", "warning", message, frame=start.frame, hint="Pick where both arches show well.")
+    return replace(other, findings=(unused,))
+
+
+def _fits(search: StartSearch, footage: Footage, start: Start) -> bool:
+    """Tell whether the poses of a start pass the checks of a first frame: hidden teeth have other minima nearby."""
+    try:
+        _aligned(search, footage, start.poses, start.frame)
+    except TrackingError:
+        return False
+    return True
 
 
 def search_start(search: StartSearch, footage: Footage) -> Start:
