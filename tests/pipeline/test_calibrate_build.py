@@ -60,7 +60,7 @@ def test_the_build_calibrates_from_the_boards(calibrated):
     out, told = calibrated
     assert ("calibrate", 72, 72) in told
     record = json.loads((out / "build.json").read_text())["stages"]
-    assert list(record) == ["check", "calibrate", "sync"]
+    assert set(record) == {"check", "calibrate", "sync"}
     assert list(record["calibrate"]["outputs"]) == ["calibration.toml"]
     report = record["calibrate"]["result"]
     assert all(camera["rms_px"] < 0.3 for camera in report["cameras"].values())

@@ -145,10 +145,10 @@ def test_exchanged_masks_are_named(pictures):
         track(capture)
 
 
-def test_picks_far_from_the_masks_are_refused(pictures):
-    capture = _capture(pictures, away_mm=12.0)
-    with pytest.raises(TrackingError, match=r"frame 8: the (upper|lower) teeth do not fit their masks"):
-        track(capture)
+def test_picks_far_from_the_masks_are_named_and_made_up_for(pictures):
+    tracks = track(_capture(pictures, away_mm=12.0))
+    assert "picks_off" in {found["kind"] for found in tracks.meta["findings"]}
+    assert errors_mm(tracks).max() < 0.1
 
 
 def test_bootstrap_frame_must_lie_in_the_range(pictures):

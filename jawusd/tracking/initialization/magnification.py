@@ -83,7 +83,8 @@ def measure_magnification(
         cameras = len(views)
         pivot = np.mean([transform_point(poses[r], scans[r].centre) for r in ARCHES], axis=0)
         for r in ARCHES:
-            parts = [_rows(scans[r], r, c, poses, view, pivot, config) for c, view in enumerate(views) if use[r, c]]
+            rows = (_rows(scans[r], r, c, poses, view, pivot, config) for c, view in enumerate(views) if use[r, c])
+            parts = [part for part in rows if part is not None]
             if len(parts) >= 2:
                 blocks.append(_joined(parts))
     if not blocks:
@@ -91,8 +92,8 @@ def measure_magnification(
     return _solved(blocks, cameras, config)
 
 
-def _rows(scan: Scan, r: int, c: int, poses: Array, view: View, pivot: Array, config: TrackingConfig) -> _Rows:
-    """Match the contour of an arch in one view with its mask, from far."""
+def _rows(scan: Scan, r: int, c: int, poses: Array, view: View, pivot: Array, config: TrackingConfig) -> _Rows | None:
+    """Match the contour of an arch in one view with its mask, from far; None if nothing matches."""
     pose = view.T_delay[r] @ poses[r]
     shape = view.masks.shape[1:]
     labels, depth = np.zeros(shape, np.uint8), np.zeros(shape, np.float32)
@@ -105,6 +106,8 @@ def _rows(scan: Scan, r: int, c: int, poses: Array, view: View, pivot: Array, co
     nothing = (np.zeros(shape, np.uint8), np.zeros(shape, np.float32))
     search_edges(samples, view.masks[r], *nothing, _REACH_PX, config.overlap_tolerance_mm, 0.8, distance)
     samples, distance = samples[np.isfinite(distance)], distance[np.isfinite(distance)]
+    if not len(samples):
+        return None
     points = transform_points(pose, samples[:, X : Z + 1])
     normal = samples[:, [NX, NY]]
     pixel = samples[:, [U, V]]

@@ -12,7 +12,7 @@ from jawusd.errors import CaptureError, TrackingError
 from jawusd.formats.capture import Bootstrap, Capture
 from jawusd.formats.finding import Finding
 from jawusd.formats.mesh import Mesh
-from jawusd.geometry import Camera
+from jawusd.geometry import Camera, transform_point
 from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import Mapper
 from jawusd.tracking.contour.scan import teeth_centre
@@ -31,6 +31,7 @@ _MIXUPS_TRIED = 12  # all of them with four cameras; every one costs a search
 # Fit that leaves no doubt [-]. Wrong poses of a hundred searches stayed below 0.1 in one of the arches, right ones
 # exceed 0.35 where much of the teeth shows, and 0.1 with lips nearly closed or cameras 0.1 degrees off.
 _CLEAR_FIT = 0.3
+_PICKS_OFF_MM = 3.0  # half a tooth
 # Poses as sure as this [mm] lie within the basin of the contour solver.
 _SURE_MM = 0.8
 
@@ -108,8 +109,21 @@ def _picked(
     if (without := _around_without_a_camera(search, footage, start.frame, start.poses, found)) is not None:
         notes["camera_left_out"], found = without
     notes |= {"by": "picks, then search", "worth_px": found.objective_px, "fit": found.fit}
-    start = Start(start.frame, found.poses, notes)
-    return start if "camera_left_out" in notes or _fits(search, footage, start) else _elsewhere(search, footage, start)
+    near = Start(start.frame, found.poses, notes, _picks_off(search, start, found.poses, sigma_mm))
+    return near if "camera_left_out" in notes or _fits(search, footage, near) else _elsewhere(search, footage, near)
+
+
+def _picks_off(search: StartSearch, start: Start, poses: Array, sigma_mm: Mapping[str, float]) -> tuple[Finding, ...]:
+    """Return a warning if the search found the teeth away from sure picks."""
+    out = []
+    for scan, picked, found in zip(search.solver.scans, start.poses, poses, strict=True):
+        off = float(np.linalg.norm(transform_point(found, scan.centre) - transform_point(picked, scan.centre)))
+        if off > max(_PICKS_OFF_MM, 4.0 * sigma_mm[scan.name]):
+            message = f"the picks of the {scan.name} teeth lie {off:.1f} mm from where the masks show them"
+            hint = "The masks were followed. Check the picked vertices and pixels."
+            limit = _PICKS_OFF_MM
+            out.append(Finding("picks_off", "warning", message, round(off, 2), limit, frame=start.frame, hint=hint))
+    return tuple(out)
 
 
 def _elsewhere(search: StartSearch, footage: Footage, start: Start) -> Start:
