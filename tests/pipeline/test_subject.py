@@ -12,8 +12,10 @@ from package_copy import ROOT
 from jawusd.errors import CaptureError, FormatError, RigError
 from jawusd.formats.model import JawModel, save_model
 from jawusd.geometry import LANDMARKS, landmark_frame
+from jawusd.pipeline.bake import bake_subject
 from jawusd.pipeline.prepare import (
     open_capture,
+    registered_subject,
     subject_of_build,
     subject_of_capture,
     subject_of_landmarks,
@@ -78,3 +80,36 @@ def test_landmarks_alone_measure_at_the_landmarks(tmp_path):
     found = subject_of_landmarks(tmp_path / "l.json", "someone")
     assert found.measured_points() is None and found.inferred == ("anatomical axes, from the landmarks",)
     np.testing.assert_array_equal(found.T_anatomical_skull, landmark_frame(at))
+
+
+def _moved(applied):
+    T = np.eye(4)
+    T[:3, 3] = (0.3, -1.0, 0.5)
+    return {"registration": {"applied": applied, "T": T.tolist()}}
+
+
+def test_a_registration_taken_from_the_take_moves_lower_scan_and_teeth_but_no_condyles():
+    subject = subject_of_scans(SCANS, "someone")
+    moved = registered_subject(subject, _moved(True))
+    assert np.allclose(moved.meshes["lower_teeth"].vertices - subject.meshes["lower_teeth"].vertices, (0.3, -1.0, 0.5))
+    assert np.array_equal(moved.meshes["upper_teeth"].vertices, subject.meshes["upper_teeth"].vertices)
+    away = moved.landmarks - subject.landmarks
+    for name, shift in zip(LANDMARKS, away, strict=True):
+        assert np.allclose(shift, 0.0 if name.startswith("condyle") else (0.3, -1.0, 0.5))
+    assert registered_subject(subject, _moved(False)) is subject
+    assert registered_subject(subject, {}) is subject
+
+
+def test_the_rig_holds_the_lower_scan_where_the_take_shows_it(tmp_path):
+    usd = pytest.importorskip("pxr.Usd")
+    subject = subject_of_scans(SCANS, "someone")
+    model = JawModel(example_arrays(), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0), np.zeros(0, bool))
+    places = []
+    for name, meta in (("given", {}), ("taken", _moved(True))):
+        model.meta.clear()
+        model.meta.update({**example_meta(), **meta})
+        bake_subject(subject, model, tmp_path / name, fps=FPS, table_size=17)
+        stage = usd.Stage.Open(str(tmp_path / name / "actor.usda"))
+        (mesh,) = [prim for prim in stage.Traverse() if prim.GetName() == "LowerTeethMesh"]
+        places.append(np.array(mesh.GetAttribute("points").Get()))
+    assert np.allclose(places[1] - places[0], (0.3, -1.0, 0.5), atol=1e-4)

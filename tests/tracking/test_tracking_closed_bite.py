@@ -9,7 +9,8 @@ from jawusd.formats.tracks import TRACKED
 from jawusd.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
 from jawusd.tracking.contour.equations import OutlineSums, Solution, translation
 from jawusd.tracking.contour.frame_record import FrameRecord
-from jawusd.tracking.sequence.closed_bite import RestFrames, closed_bite, registration_findings, rest_frames
+from jawusd.tracking.sequence.closed_bite import closed_bite, registration_findings
+from jawusd.tracking.sequence.rest_frames import RestFrames, rest_frames
 
 POINT = np.array([3.0, -4.0, 20.0])
 REST = RestFrames((0, 1, 2, 3), True, POINT, POINT + (0, -5, 0), False)

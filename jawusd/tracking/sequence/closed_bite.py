@@ -26,6 +26,7 @@ from jawusd.tracking.contour.frame_record import FrameRecord
 from jawusd.tracking.contour.scan import ARCHES
 from jawusd.tracking.sequence.extrinsics import Extrinsics
 from jawusd.tracking.sequence.nuisance import TakeEquations, pose_response
+from jawusd.tracking.sequence.rest_frames import RestFrames
 
 # Spread of the closed bite about the scans' own: of a good registration together with how firmly people bite [mm], and
 # the same at the ends of an arch as a turn [rad].
@@ -34,29 +35,7 @@ _ARCH_MM = 25.0
 _DEGREES_OF_FREEDOM = 4.0  # of the Student distribution: one registration in some hundred is off by ten spreads
 # Share of a frame's error that is the same in all frames of a take [-].
 STEADY = 0.7
-# Teeth held together rest: slower than this against one another [mm/frame at the teeth], and no farther from the
-# closest frame [mm].
-_STILL_MM, _SAME_BITE_MM = 0.12, 0.2
-_LONGEST_REST = 24  # frames used on either side: later ones tell nothing new
 _FEWEST_FRAMES = 2
-
-
-@dataclass(frozen=True, eq=False)
-class RestFrames:
-    """Say where the teeth are together, and what to do about it.
-
-    Attributes:
-        frames: numbers of the frames.
-        named: whether the capture names one of them.
-        point, lower: amid the teeth, and amid the lower crowns, scan coordinates [mm], shape (3,).
-        apply: whether the lower scan is moved to where it belongs.
-    """
-
-    frames: tuple[int, ...]
-    named: bool
-    point: Array
-    lower: Array
-    apply: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,50 +228,6 @@ def _registration_spread(found: Array, others: Array) -> Array:
         excess = float(registration @ np.linalg.solve(bite, registration))
         spread = bite * max(1.0, (_DEGREES_OF_FREEDOM + excess) / (_DEGREES_OF_FREEDOM + 6.0))
     return spread
-
-
-def rest_frames(
-    records: Mapping[int, FrameRecord], named: int | None, up: Array, point: Array, probes: Array
-) -> tuple[int, ...]:
-    """Return the frames in which the teeth rest together, around a named one or where the mouth is closed farthest.
-
-    Args:
-        named: frame the capture names; None searches.
-        up: from the lower to the upper teeth, unit vector in scan axes, shape (3,).
-        point, probes: amid the teeth, shape (3,), and spread over the lower ones, shape (N, 3), scan coordinates [mm].
-    """
-    relative = {
-        frame: relative_pose(*record.solution.poses)
-        for frame, record in sorted(records.items())
-        if (record.status != LOST).all()
-    }
-    if named is None:
-        closed = {f: float((T[:3, :3] @ point + T[:3, 3] - point) @ up) for f, T in relative.items()}
-        ranked = sorted(closed, key=lambda f: -closed[f])
-        named = next((f for f in ranked if _still(relative, f, f + 1, probes)), None)
-    if named is None or named not in relative:
-        return ()
-    out = [named]
-    for step in (1, -1):
-        frame = named
-        while abs(frame + step - named) <= _LONGEST_REST and _still(relative, frame, frame + step, probes):
-            frame += step
-            if _moved_mm(relative[frame], relative[named], probes) > _SAME_BITE_MM:
-                break
-            out.append(frame)
-    return tuple(sorted(out))
-
-
-def _still(relative: Mapping[int, Array], frame: int, other: int, probes: Array) -> bool:
-    if frame not in relative or other not in relative:
-        return False
-    return _moved_mm(relative[frame], relative[other], probes) < _STILL_MM
-
-
-def _moved_mm(one: Array, other: Array, probes: Array) -> float:
-    """Return how far two poses (4, 4) of the lower arch are apart, on average over points (N, 3) [mm]."""
-    gap = probes @ (one - other)[:3, :3].T + (one - other)[:3, 3]
-    return float(np.linalg.norm(gap, axis=1).mean())
 
 
 def _root(matrix: Array) -> Array:

@@ -24,13 +24,13 @@ from jawusd.tracking.contour.quality import (
 from jawusd.tracking.contour.scan import ARCHES
 from jawusd.tracking.sequence.closed_bite import (
     ClosedBite,
-    RestFrames,
     check_registration,
     closed_bite,
     registration_findings,
 )
 from jawusd.tracking.sequence.extrinsics import Extrinsics
 from jawusd.tracking.sequence.nuisance import Nuisances, pose_response
+from jawusd.tracking.sequence.rest_frames import RestFrames
 from jawusd.tracking.sequence.smoothing import smooth_poses
 
 
