@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import math
 import os
 from importlib import resources
 
@@ -15,7 +16,7 @@ from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.finding import Finding
 from jawusd.formats.report import ReportData
 from jawusd.formats.tracks import LOST, LostReason
-from jawusd.report.facts import model_facts, sync_facts, tracks_facts
+from jawusd.report.facts import TracksFacts, model_facts, sync_facts, tracks_facts
 from jawusd.report.figures import (
     condyle_figure,
     coverage_figure,
@@ -70,6 +71,7 @@ def document(data: ReportData) -> str:
         start=_start(data),
         cameras=_cameras(data),
         findings=_findings(data),
+        bite=_bite(data),
     )
 
 
@@ -186,10 +188,36 @@ def _cameras(data: ReportData) -> list[dict[str, str]]:
                 "offset": _signed(offsets.get(name), "d"),
                 "delay": _signed(meta.get("delays_frames", {}).get(name), ".3f"),
                 "masks": f"{100 * masks.mean():.1f} %" if masks.any() else "none",
+                "drawn": _drawn(meta, name),
                 "calibration": "; ".join(notes),
             }
         )
     return rows
+
+
+def _drawn(meta: TracksFacts, camera: str) -> str:
+    """Return how far a camera's masks reach beyond the teeth, upper and lower arch."""
+    edges, gum = meta.get("outline_bias_px", {}).get(camera), meta.get("gum_bias_px", {}).get(camera)
+    if edges is None or gum is None:
+        return ""
+    return f"edges {edges[0]:+.2f} / {edges[1]:+.2f}, gum line {gum[0]:+.2f} / {gum[1]:+.2f}"
+
+
+def _bite(data: ReportData) -> str:
+    """Return what the take tells of the gum line as drawn and of the closed bite."""
+    meta, said = tracks_facts(data), []
+    if "gum_line_mm" in meta:
+        upper, lower = meta["gum_line_mm"]
+        said.append(f"The gum line is drawn {upper:+.2f} mm (upper) and {lower:+.2f} mm (lower) towards the gum.")
+    if "registration" in meta:
+        found = meta["registration"]
+        shift, turn = math.hypot(*found["shift_mm"]), math.hypot(*found["turn_deg"])
+        sigma_mm, sigma_deg = math.hypot(*found["shift_sigma_mm"]), math.hypot(*found["turn_sigma_deg"])
+        off = f"{shift:.2f} \u00b1 {sigma_mm:.2f} mm and {turn:.2f} \u00b1 {sigma_deg:.2f} degrees"
+        frames = f"frames {found['frames'][0]} to {found['frames'][-1]}"
+        what = "was moved to the closed bite by" if found["applied"] else "is off the closed bite by"
+        said.append(f"As {frames} show it, the lower scan {what} {off}.")
+    return " ".join(said)
 
 
 def _signed(value: float | None, digits: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TypedDict, cast
 
 from jawusd.formats.report import ReportData
+from jawusd.formats.tracks import Registration
 
 ErrorTable = dict[str, dict[str, float]]
 
@@ -40,6 +41,10 @@ class TracksFacts(TypedDict, total=False):
     extrinsics: ExtrinsicsFacts
     calibration_rescaled_px: dict[str, tuple[tuple[int, int], tuple[int, int]]]
     delays_frames: dict[str, float]
+    outline_bias_px: dict[str, list[float]]
+    gum_bias_px: dict[str, list[float]]
+    gum_line_mm: list[float]
+    registration: Registration
 
 
 class ModelFacts(TypedDict, total=False):

@@ -150,6 +150,31 @@ def test_a_long_take_stays_small():
     assert len(text) < 4e6
 
 
+def test_how_masks_were_drawn_and_the_closed_bite_are_told():
+    data = report_data()
+    registration = {
+        "frames": [46, 50],
+        "named": True,
+        "applied": False,
+        "shift_mm": [0.0, 0.3, 0.4],
+        "turn_deg": [3.0, 0.0, 0.0],
+        "shift_sigma_mm": [0.03, 0.0, 0.04],
+        "turn_sigma_deg": [0.1, 0.0, 0.0],
+        "T": np.eye(4).tolist(),
+    }
+    names = data.tracks.camera_names
+    data.tracks.meta.update(
+        outline_bias_px={name: [0.25, -0.5] for name in names},
+        gum_bias_px={name: [0.75, 1.0] for name in names},
+        gum_line_mm=[0.11, -0.12],
+        registration=registration,
+    )
+    text = " ".join(Page(document(data)).text)
+    assert "edges +0.25 / -0.50, gum line +0.75 / +1.00" in text
+    assert "+0.11 mm (upper) and -0.12 mm (lower)" in text
+    assert "frames 46 to 50" in text and "off the closed bite by 0.50 ± 0.05 mm and 3.00 ± 0.10 degrees" in text
+
+
 def test_without_experiments_pictures_and_meshes_the_page_says_so():
     text = " ".join(Page(document(report_data(experiments=None, overlays=(), parts=(), cameras=()))).text)
     assert "The experiments could not be done" in text and "There are no pictures" in text
