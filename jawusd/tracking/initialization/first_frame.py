@@ -58,7 +58,7 @@ def first_record(
             )
     first = _aligned(solver, config, start, views, use)
     if (problem := _problem(first, config)) is not None:
-        # One camera's masks may have drawn all astray: those of another place, size or time.
+        # One camera's wrong masks (of another place, size or time) may have pulled all poses off.
         others = [_aligned(solver, config, start, views, _without_camera(use, c)) for c in range(len(views))]
         clear = [one for one in others if one.fit.min() >= _CLEAR_FIT and _problem(one, config) is None]
         if not clear:

@@ -215,7 +215,7 @@ def search_around(search: StartSearch, footage: Footage, frame: int, poses: Arra
 def _around_without_a_camera(
     search: StartSearch, footage: Footage, frame: int, poses: Array, found: Found
 ) -> tuple[str, Found] | None:
-    """Return a camera whose masks draw the poses found astray, and the poses without it; None if they are right.
+    """Return a camera whose masks bias the poses, and the poses without it; None if all masks agree.
 
     A camera is left out only if the others then fit beyond doubt.
     """
