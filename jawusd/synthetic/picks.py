@@ -57,7 +57,7 @@ def choose_picks(
     if len(good) < count:
         raise ValueError(f"only {len(good)} tips of teeth are seen by two cameras, {count} are needed")
     picks = []
-    for i in _spread(points[good], count):
+    for i in spread_out(points[good], count):
         k = good[i]
         views = []
         for c in sorted(np.argsort(-facing[k])[:2]):
@@ -109,8 +109,8 @@ def _hits(point: Array, eye: Array, corners: Array) -> bool:
     return bool(((u >= 0) & (v >= 0) & (u + v <= 1) & (along > nearest) & (along < 1)).any())
 
 
-def _spread(points: Array, count: int) -> list[int]:
-    """Farthest-point choice, starting with the point farthest from the middle."""
+def spread_out(points: Array, count: int) -> list[int]:
+    """Return the indices of well spread points (N, 3): farthest-point choice, from the one farthest off the middle."""
     chosen = [int(np.linalg.norm(points - points.mean(0), axis=1).argmax())]
     distance = np.linalg.norm(points - points[chosen[0]], axis=1)
     while len(chosen) < count:

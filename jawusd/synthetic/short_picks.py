@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera, transform_points
 from jawusd.geometry.arrays import Array
+from jawusd.synthetic.picks import spread_out
 
 #: Labels (rows, columns), first column and row of that part of the picture, inverse depth (rows, columns) [1/mm].
 Drawn = tuple[NDArray[np.uint8], tuple[int, int], NDArray[np.float32]]
@@ -48,7 +49,7 @@ def pick_ends(
     height = transform_points(T_bite_scan, mesh.vertices[good])[:, 1] * (1.0 if row else -1.0)
     good = good[height >= np.quantile(height, 0.6)] if len(good) > 200 else good
     out = []
-    for vertex in good[np.array(_spread(world[good], _PICKS))].tolist():
+    for vertex in good[np.array(spread_out(world[good], _PICKS))].tolist():
         views = []
         for c in np.flatnonzero(visible[vertex])[:2]:
             x, y = cameras[c].project(world[vertex]) + rng.normal(0.0, _PICK_NOISE_PX, 2)
@@ -80,13 +81,3 @@ def _visible(
     first = TEETH_FROM[row]
     own = labels[at[:, 1], at[:, 0]]
     return np.asarray(inside & near & (own >= first) & (own < first + 14))
-
-
-def _spread(points: Array, count: int) -> list[int]:
-    """Farthest-point choice, starting with the point farthest from the middle."""
-    chosen = [int(np.linalg.norm(points - points.mean(0), axis=1).argmax())]
-    distance = np.linalg.norm(points - points[chosen[0]], axis=1)
-    while len(chosen) < count:
-        chosen.append(int(distance.argmax()))
-        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
-    return chosen

@@ -9,7 +9,7 @@ from jawusd.formats.tracks import TRACKED
 from jawusd.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
 from jawusd.tracking.contour.equations import OutlineSums, Solution, translation
 from jawusd.tracking.contour.frame_record import FrameRecord
-from jawusd.tracking.sequence.closed_bite import closed_bite, registration_findings
+from jawusd.tracking.sequence.closed_bite import _ARCH_MM, _BITE_MM, STEADY, closed_bite, registration_findings
 from jawusd.tracking.sequence.rest_frames import RestFrames, rest_frames
 
 POINT = np.array([3.0, -4.0, 20.0])
@@ -75,21 +75,29 @@ def test_a_bad_registration_is_measured_and_corrected(mm, degrees):
 
 
 def test_what_remains_is_the_conditional_covariance():
-    """scipy conditions the joint normal distribution of both steady errors on what the rest frames show."""
-    poses, covariance = _take(steady=((0, 0, 0, 0, 0.03, 0), (0,) * 6))
-    bite = closed_bite(FRAMES, poses, covariance, REST)
+    """Draw steady errors, registration and noise by scipy; what a linear regression leaves of them must remain."""
+    bite = closed_bite(FRAMES, *_take(), REST)
+    upper, lower, both = bite.spread
+    registration = np.diag(np.r_[np.full(3, (_BITE_MM / _ARCH_MM) ** 2), np.full(3, _BITE_MM**2)])
+    noise = (1.0 - STEADY) * both / 2.0
     rng = np.random.default_rng(1)
-    upper, lower = (multivariate_normal(np.zeros(6), c, seed=rng).rvs(20000) for c in bite.spread[:2])
-    spread = bite.registration_covariance  # large enough to matter, any covariance will do for the comparison
-    assert np.all(np.linalg.eigvalsh(bite.remaining) > 0) and np.all(np.linalg.eigvalsh(spread) > 0)
-    assert (np.linalg.eigvalsh(bite.spread - bite.remaining) > -1e-12).all()
-    assert np.cov((lower - upper).T) == pytest.approx(bite.spread[2], abs=0.05 * SIGMA[3] ** 2)
-    skull = np.tile(np.eye(4), (12, 1, 1))
+    u, v, r, n = (
+        multivariate_normal(np.zeros(6), c, seed=rng).rvs(100_000) for c in (upper, lower, registration, noise)
+    )
+    seen = v - u + r + n
+    scale = np.sqrt(np.diag(both))
+    for error, remaining in zip((u, v, v - u), bite.remaining, strict=True):
+        left = error - seen @ np.linalg.lstsq(seen, error, rcond=None)[0]
+        assert np.cov(left.T) / np.outer(scale, scale) == pytest.approx(remaining / np.outer(scale, scale), abs=0.01)
+
+
+def test_covariances_shrink_by_what_the_closed_bite_tells():
+    bite = closed_bite(FRAMES, *_take(), REST)
     A = se3_adjoint(translation(POINT))
-    same = np.tile(A @ bite.spread[2] @ A.T, (12, 1, 1))
-    reduced = bite.reduce(same, skull, 2)
-    assert np.linalg.eigvalsh(reduced).min() > 0
-    assert np.trace(reduced[0]) < np.trace(same[0])
+    whole = np.tile(A @ bite.spread[2] @ A.T, (12, 1, 1))
+    reduced = bite.reduce(whole, np.tile(np.eye(4), (12, 1, 1)), 2)
+    expected = (1.0 - STEADY) * whole[0] + STEADY * A @ bite.remaining[2] @ A.T
+    assert reduced[0] == pytest.approx(expected, abs=1e-9 * np.abs(expected).max())
 
 
 def _records(poses):

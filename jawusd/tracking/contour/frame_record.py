@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.formats.tracks import LostReason
+from jawusd.formats.tracks import LOST, LostReason
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.quality import residual_px, score_px
@@ -35,6 +36,11 @@ class FrameRecord:
     used: Mask  # masks that took part, shape (2, C)
     coverage: Array  # E_SP over mask pixels, shape (2, C); NaN without a mask
     losses: tuple[Loss, Loss] = (NO_LOSS, NO_LOSS)  # why each arch is lost
+
+
+def whole_frames(records: Mapping[int, FrameRecord]) -> list[int]:
+    """Return the frames in which both arches are tracked, in order."""
+    return [frame for frame, record in sorted(records.items()) if (record.status != LOST).all()]
 
 
 @dataclass(frozen=True, eq=False)

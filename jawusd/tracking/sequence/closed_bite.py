@@ -239,4 +239,4 @@ def _root(matrix: Array) -> Array:
 def _positive(matrix: Array) -> Array:
     """Return the nearest positive matrix to a median of covariances, shape (6, 6)."""
     values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
-    return np.asarray((vectors * np.maximum(values, 1e-3 * values.max() * 1e-6)) @ vectors.T, np.float64)
+    return np.asarray((vectors * np.maximum(values, 1e-9 * values.max())) @ vectors.T, np.float64)

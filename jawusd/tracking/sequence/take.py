@@ -15,7 +15,7 @@ from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, Tracks, TracksMeta
 from jawusd.geometry import Camera
 from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import TrackingConfig
-from jawusd.tracking.contour.frame_record import FrameRecord
+from jawusd.tracking.contour.frame_record import FrameRecord, whole_frames
 from jawusd.tracking.contour.scan import prepare_scan, probe_points, teeth_centre
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import MaskViews, View, present_masks
@@ -165,10 +165,10 @@ class _Take:
 
         Cameras whose lens or scans are of another size must not move: their motion would only hide that.
         """
-        c, self._rest = self._config, rest
+        c = self._config
         extrinsics = Extrinsics.calibrated(self._masks.cameras, self._middle())
-        known = self._late_cameras(extrinsics)
-        equations = self._equations(extrinsics)
+        known = self._late_cameras(extrinsics, rest)
+        equations = self._equations(extrinsics, rest)
         found = equations.solve(c, True)
         cameras_moved = may_move and found.cameras_moved(c) and c.refine_rounds > 0
         if not cameras_moved:
@@ -177,31 +177,31 @@ class _Take:
         pending, rounds = found.matters(c), 0
         found = found if known is None else known.plus(found)
         if pending and c.refine_rounds:
-            found, extrinsics = self._settle(found, extrinsics, cameras_moved)
+            found, extrinsics = self._settle(found, extrinsics, rest, cameras_moved)
         while pending and rounds < c.refine_rounds:
             if cameras_moved:
                 extrinsics = extrinsics.then(found.twists, found.sigma_twists)
             self._realign(found, extrinsics)
-            residual = self._equations(extrinsics).solve(c, cameras_moved)
+            residual = self._equations(extrinsics, rest).solve(c, cameras_moved)
             found, pending, rounds = found.plus(residual), residual.matters(c), rounds + 1
         return found, extrinsics
 
-    def _late_cameras(self, extrinsics: Extrinsics) -> Nuisances | None:
+    def _late_cameras(self, extrinsics: Extrinsics, rest: RestFrames) -> Nuisances | None:
         """Correct delays near a frame before anything else; None without any.
 
         So late a camera also looks moved, and its masks look wrong where the jaw is fast.
         """
         c = self._config
-        found = self._equations(extrinsics).solve(c, False)
+        found = self._equations(extrinsics, rest).solve(c, False)
         if np.abs(found.delays).max() < c.late_frames or not c.refine_rounds:
             return None
-        found, _ = self._settle(found, extrinsics, False)
+        found, _ = self._settle(found, extrinsics, rest, False)
         self._realign(found, extrinsics)
         return found
 
     def lenses(self) -> list[Finding]:
         """Return what the take, before anything is corrected, tells of focal lengths, lenses and the scans' size."""
-        whole = [frame for frame, record in sorted(self.records.items()) if (record.status != LOST).all()]
+        whole = whole_frames(self.records)
         if not whole:
             return []
         instants = []
@@ -212,23 +212,28 @@ class _Take:
         found = measure_magnification(scans, instants, self._config)
         return [] if found is None else lens_findings([camera.name for camera in self._masks.cameras], found)
 
-    def _equations(self, extrinsics: Extrinsics) -> TakeEquations:
+    def _equations(self, extrinsics: Extrinsics, rest: RestFrames) -> TakeEquations:
         variance = outline_variance(self.records, self._config)
         equations = TakeEquations(self.records, variance, extrinsics)
-        observe_bite(equations, self.records, self._rest, extrinsics, variance)
+        observe_bite(equations, self.records, rest, extrinsics, variance)
         return equations
 
     def _middle(self) -> Array:
         """Return a point amid the teeth, world coordinates [mm], shape (3,)."""
         return np.median([record.solution.centres for record in self.records.values()], axis=(0, 1))
 
-    def _settle(self, found: Nuisances, extrinsics: Extrinsics, cameras_moved: bool) -> tuple[Nuisances, Extrinsics]:
+    def _settle(
+        self, found: Nuisances, extrinsics: Extrinsics, rest: RestFrames, cameras_moved: bool
+    ) -> tuple[Nuisances, Extrinsics]:
         """Align some frames repeatedly until the nuisances converge: matches follow them only step by step."""
         c, records = self._config, dict(self.records)
-        whole = [f for f, record in sorted(records.items()) if (record.status != LOST).all()]
+        whole = whole_frames(records)
+        if not whole:
+            return found, extrinsics
         chosen = {whole[k] for k in np.linspace(0, len(whole) - 1, c.settle_frames).astype(int)}
-        chosen |= set(self._rest.frames[:_SETTLED_REST]) & set(whole)
+        chosen |= set(rest.frames[:_SETTLED_REST]) & set(whole)
         sample = {frame: self._masks.at(frame) for frame in sorted(chosen)}
+        sampled_rest = replace(rest, frames=tuple(f for f in rest.frames if f in sample))
         variance = outline_variance(records, c)
         for _ in range(c.settle_rounds):
             if cameras_moved:
@@ -239,8 +244,7 @@ class _Take:
                 solution = self._solver.solve(start, views, c.gates_from(0.0), used)
                 records[frame] = replace(records[frame], solution=solution)
             equations = TakeEquations(records, variance, extrinsics, sample)
-            rest = replace(self._rest, frames=tuple(f for f in self._rest.frames if f in sample))
-            observe_bite(equations, records, rest, extrinsics, variance)
+            observe_bite(equations, records, sampled_rest, extrinsics, variance)
             more = equations.solve(c, cameras_moved)
             found = found.plus(more)
             if more.settled(c):

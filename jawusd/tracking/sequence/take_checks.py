@@ -13,10 +13,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from jawusd.formats.finding import Finding
-from jawusd.formats.tracks import LOST
 from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import TrackingConfig
-from jawusd.tracking.contour.frame_record import FrameRecord
+from jawusd.tracking.contour.frame_record import FrameRecord, whole_frames
 from jawusd.tracking.initialization.magnification import Magnification
 from jawusd.tracking.sequence.extrinsics import Extrinsics
 from jawusd.tracking.sequence.nuisance import Nuisances, TakeEquations
@@ -164,7 +163,7 @@ def _delays_of_parts(
     records: Mapping[int, FrameRecord], nuisances: Nuisances, extrinsics: Extrinsics, config: TrackingConfig
 ) -> tuple[Array, Array, list[int]]:
     """Return the delays of parts of the take and their sigmas, shape (P, C), and the parts' first frames."""
-    whole = [f for f, record in sorted(records.items()) if (record.status != LOST).all()]
+    whole = whole_frames(records)
     count = max(1, min(12, len(whole) // _PART_FRAMES))
     variance = outline_variance(records, config)
     delays, sigmas, starts = [], [], []
