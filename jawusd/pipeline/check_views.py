@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -16,6 +17,7 @@ from jawusd.pipeline.check_parts import Parts, found_error
 from jawusd.pipeline.prepare import load_cameras
 
 _INSTANTS = 5  # at which the views are compared
+_CROWN_POINTS = 6000
 
 
 def clips(parts: Parts) -> Iterator[Finding]:
@@ -229,7 +231,8 @@ def picks(parts: Parts) -> Iterator[Finding]:
     Raises:
         CaptureError: they cannot be used.
     """
-    from jawusd.tracking.initialization.pick_checks import exchanged_by_picks, picked_poses, placed_findings
+    from jawusd.tracking.initialization.pick_causes import Setting
+    from jawusd.tracking.initialization.pick_checks import pick_findings
 
     capture = parts.given
     if capture.bootstrap is None:
@@ -237,31 +240,42 @@ def picks(parts: Parts) -> Iterator[Finding]:
             message = "has neither masks nor [bootstrap] picks: the teeth must be found in the footage alone"
             yield Finding("no_picks", "warning", message, path=parts.description, hint="Give picks.")
         return
-    meshes = [parts.meshes["upper_teeth"], parts.meshes["lower_teeth"]]
+    picked, meshes = capture.bootstrap, parts.meshes
+    upper, lower = parts.scans
+    given = Setting(
+        (picked.upper, picked.lower),
+        (meshes["upper_teeth"].vertices, meshes["lower_teeth"].vertices),
+        (upper.crown_vertices(_CROWN_POINTS), lower.crown_vertices(_CROWN_POINTS)),
+        parts.cameras,
+    )
+    guesses = parts.offset_guesses()
+    # Exchanged masks keep the numbers of the camera that they show, unless they were numbered to fit the other one.
+    seen = [partial(_pixels, parts, picked.frame, guess, {}, numbered) for guess in guesses for numbered in (0, 1)]
     try:
-        poses, findings = picked_poses(capture.bootstrap, meshes, parts.cameras)
+        yield from pick_findings(given, seen, [name for name in parts.cameras if name in parts.samples], picked.frame)
     except JawusdError as error:
-        if (pair := exchanged_by_picks(capture.bootstrap, meshes, parts.cameras)) is not None:
-            message = (
-                f"{pair[0]} and {pair[1]} are exchanged: the picks contradict one another by this calibration, and "
-            )
-            message += "agree with the two cameras exchanged in it"
-            hint = "Exchange their names in the calibration, or in the picks and footage."
-            yield Finding("cameras_exchanged", "error", message, path=str(capture.calibration), hint=hint)
-            return
-        raise CaptureError(
-            error.message, path=parts.description, frame=capture.bootstrap.frame, hint=error.hint
-        ) from error
-    yield from findings
-    frame = capture.bootstrap.frame
-    guesses = []
-    for guess in parts.offset_guesses():
-        guesses.append(
-            {
-                name: (sample.pixels(0, frame - guess[name]), sample.pixels(1, frame - guess[name]))
-                for name, sample in parts.samples.items()
-                if name in guess
-            }
-        )
-    cameras = {name: camera for name, camera in parts.cameras.items() if name in parts.samples}
-    yield from placed_findings(parts.scans, poses, cameras, guesses, frame)
+        raise CaptureError(error.message, path=parts.description, frame=picked.frame, hint=error.hint) from error
+
+
+def _pixels(
+    parts: Parts,
+    instant: int,
+    offsets: Mapping[str, int],
+    known: dict[tuple[str, str], tuple[Array, Array]],
+    numbered: int,
+    source: str,
+    camera: str,
+) -> tuple[Array, Array]:
+    """Return pixels of both arches' masks of a source as if they were those of a camera, at a reference instant.
+
+    `numbered` is 0 if their frames are those of the camera, 1 if those of the source.
+    """
+    nothing = np.empty((0, 2))
+    by = (camera, source)[numbered]
+    if source not in parts.samples or by not in offsets:
+        return nothing, nothing
+    if (source, camera) not in known:
+        frame = instant - offsets[by]
+        sample = parts.samples[source]
+        known[source, camera] = (sample.pixels(0, frame), sample.pixels(1, frame))
+    return known[source, camera]

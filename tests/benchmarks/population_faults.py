@@ -264,9 +264,7 @@ def _wrong_teeth(text: str, rng: np.random.Generator) -> str:
 
 def _other_cameras(text: str, rng: np.random.Generator) -> str:
     """In every pick the two cameras exchanged."""
-    return re.sub(
-        r'camera = "(\w+)"(.*?)camera = "(\w+)"', lambda m: f'camera = "{m[3]}"{m[2]}camera = "{m[1]}"', text
-    )
+    return re.sub(r'camera = "(\w+)"(.*?)camera = "(\w+)"', lambda m: f'camera = "{m[3]}"{m[2]}camera = "{m[1]}"', text)
 
 
 def _frame_rate(folder: Path, rng: np.random.Generator) -> None:

@@ -167,7 +167,7 @@ SAID = {
     black_masks: ("warning", "masks_black", "all black"),
     masks_of_another_size: ("error", "masks", "320 x 180"),
     arches_exchanged: ("error", "masks_arches_exchanged", "exchanged"),
-    cameras_exchanged: ("error", "masks_cameras_exchanged", "camera cam2 are exchanged"),
+    cameras_exchanged: ("error", "masks_cameras_exchanged", "cameras cam1 and cam2 are exchanged"),
     pick_on_another_vertex: ("warning", "pick_wrong", "pick 1 on the upper teeth"),
 }
 

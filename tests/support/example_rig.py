@@ -52,9 +52,12 @@ def moved(T, points):
 
 def _ball(centre, radii, rings=8, segments=12):
     polar, turn = np.pi * np.arange(1, rings) / rings, 2 * np.pi * np.arange(segments) / segments
-    grid = np.stack(np.broadcast_arrays(
-        np.sin(polar)[:, None] * np.cos(turn), np.cos(polar)[:, None], -np.sin(polar)[:, None] * np.sin(turn)
-    ), axis=-1).reshape(-1, 3)
+    grid = np.stack(
+        np.broadcast_arrays(
+            np.sin(polar)[:, None] * np.cos(turn), np.cos(polar)[:, None], -np.sin(polar)[:, None] * np.sin(turn)
+        ),
+        axis=-1,
+    ).reshape(-1, 3)
     vertices = np.concatenate([grid, [[0, 1, 0], [0, -1, 0]]]) * radii + centre
     top, bottom = len(grid), len(grid) + 1
     faces = []

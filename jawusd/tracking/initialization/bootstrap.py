@@ -25,8 +25,8 @@ from jawusd.tracking.contour.equations import motion_about
 _FEWEST = 3
 # A pick whose vertex projects farther than this from its pixel counts as wrong [mm at the teeth]: three times the
 # error of a careless click (5 px where a pixel is 0.07 mm).
-_TOLERANCE_MM = 1.1
-_CLICK_MM = _TOLERANCE_MM / 3  # standard deviation of a careless click along each axis
+TOLERANCE_MM = 1.1
+_CLICK_MM = TOLERANCE_MM / 3  # standard deviation of a careless click along each axis
 _GAP_MM = 0.8  # by which the views of a carelessly clicked pick may miss one point
 # Size of the teeth by the picks over that of the scan, less 1, from which it may explain misses: clicks 0.4 mm off on
 # picks 40 mm apart leave 0.01.
@@ -70,7 +70,7 @@ def pose_from_picks(
             pose = rigid_fit(points[k], places[k])
         except ValueError:
             continue  # three picks on a line leave a rotation free
-        cost = sum(min(_miss_mm(s, pose), _TOLERANCE_MM) ** 2 for s in sightings)
+        cost = sum(min(_miss_mm(s, pose), TOLERANCE_MM) ** 2 for s in sightings)
         if cost < best_cost:
             best, best_cost = pose, cost
     if best is None:
@@ -78,7 +78,7 @@ def pose_from_picks(
             f"bootstrap: the picks on the {arch} teeth lie on a line", hint="Pick front teeth and both sides."
         )
     for _ in range(3):
-        good = [s for s in sightings if _miss_mm(s, best) < _TOLERANCE_MM]
+        good = [s for s in sightings if _miss_mm(s, best) < TOLERANCE_MM]
         if len(good) < _FEWEST:
             if (size := _other_size(sightings, places)) is not None:
                 raise TrackingError(
@@ -94,7 +94,7 @@ def pose_from_picks(
             misses = ", ".join(f"pick {s.number}: {_miss_mm(s, best):.1f} mm" for s in sightings)
             raise TrackingError(
                 f"bootstrap: the picks on the {arch} teeth contradict one another "
-                f"({misses}; allowed {_TOLERANCE_MM} mm)",
+                f"({misses}; allowed {TOLERANCE_MM} mm)",
                 hint="Check vertex numbers, pixels and camera names of the picks, and that the views show one instant.",
             )
         best = _refined(good, best)
@@ -112,7 +112,7 @@ def _other_size(sightings: Sequence[_Sighting], places: Array) -> float | None:
     if len(sightings) <= _FEWEST or abs(size - 1.0) < _SIZE_SHARE:
         return None
     pose = rigid_fit(points / size, places)
-    fits = all(_miss_mm(replace(s, point=s.point / size), pose) < _TOLERANCE_MM for s in sightings)
+    fits = all(_miss_mm(replace(s, point=s.point / size), pose) < TOLERANCE_MM for s in sightings)
     return size if fits else None
 
 
@@ -140,7 +140,7 @@ def _wrong_sight(
         seen = [_sighting(k, pick, vertices, cameras, arch) for k, pick in enumerate(renamed, start=1)]
         points, meets = np.stack([s.point for s in seen]), np.stack([triangulate(s.matrices, s.pixels) for s in seen])
         pose = rigid_fit(points, meets)
-        if all(_miss_mm(s, pose) < _TOLERANCE_MM for s in seen):
+        if all(_miss_mm(s, pose) < TOLERANCE_MM for s in seen):
             return f"cameras {a} and {b} are exchanged, in the picks or in the calibration"
     # Views from side by side meet even where they are of different points at one height.
     gaps = [_miss_mm(replace(s, point=place), np.eye(4)) for s, place in zip(sightings, places, strict=True)]
@@ -180,6 +180,37 @@ def picked_sigma_mm(
         H += J.T @ J
     M = mandible_metric(transform_points(pose, probes))
     return float(np.sqrt(np.trace(M @ np.linalg.pinv(H, hermitian=True))))
+
+
+def picks_miss_mm(picks: Sequence[Pick], vertices: Array, cameras: Mapping[str, Camera], pose: Array) -> Array:
+    """Return how far each pick's vertex lies off its pixels at T_world_scan (4, 4), at the vertex [mm], shape (P,)."""
+    sightings = [_sighting(k, pick, vertices, cameras, "picked") for k, pick in enumerate(picks, start=1)]
+    return np.array([_miss_mm(s, pose) for s in sightings])
+
+
+def picked_size(
+    picks: Sequence[Sequence[Pick]], vertices: Sequence[Array], cameras: Mapping[str, Camera]
+) -> tuple[float, float]:
+    """Return how many times as large as the picks show them the scans are [-], and the standard deviation of that.
+
+    `picks` and `vertices` are those of the upper and the lower scan. The deviation is that of careless clicks.
+
+    Raises:
+        TrackingError: a pick that cannot be.
+    """
+    product, square = 0.0, 0.0
+    for own, points in zip(picks, vertices, strict=True):
+        sightings = [_sighting(k, pick, points, cameras, "picked") for k, pick in enumerate(own, start=1)]
+        places = np.stack([triangulate(s.matrices, s.pixels) for s in sightings])
+        given = np.stack([s.point for s in sightings])
+        given = given - given.mean(0)
+        try:
+            turned = given @ rigid_fit(given, places)[:3, :3].T
+        except ValueError:
+            continue  # on a line
+        product += float((turned * (places - places.mean(0))).sum())
+        square += float((turned**2).sum())
+    return square / max(product, 1e-9), _CLICK_MM / np.sqrt(max(square, 1e-9))
 
 
 def _sighting(number: int, pick: Pick, vertices: Array, cameras: Mapping[str, Camera], arch: str) -> _Sighting:
