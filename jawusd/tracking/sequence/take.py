@@ -38,6 +38,7 @@ Progress = Callable[[int, int], None]
 # gaps would cost the square of its length.
 _NEARBY_FRAMES = 4000
 _SETTLED_REST = 6  # frames with the teeth together among those on which nuisances are settled
+_SHOWN_AS_MOTION = ("focal_length", "scan_size", "lens_distortion")  # a moved camera would only hide these
 _CHECKED_FRAMES = 8  # whose contours are searched widely for wrong lenses and sizes: half a second
 
 
@@ -88,7 +89,8 @@ def track_capture(
             corrects = capture.scans.registration == "take"
             rest = RestFrames(frames, named is not None, point, scans[1].centre, corrects)
             lenses = take.lenses()
-            nuisances, extrinsics = take.refine(rest, may_move=not lenses)
+            wrong_size = any(finding.kind in _SHOWN_AS_MOTION for finding in lenses)
+            nuisances, extrinsics = take.refine(rest, may_move=not wrong_size)
             records = take.records if capture.frames else _trimmed(take.records)
             names = tuple(camera.name for camera in masks.cameras)
             findings = [
@@ -163,7 +165,7 @@ class _Take:
     def refine(self, rest: RestFrames, may_move: bool) -> tuple[Nuisances, Extrinsics]:
         """Estimate delays, habits and camera poses; where they matter, align all frames again with them corrected.
 
-        Cameras whose lens or scans are of another size must not move: their motion would only hide that.
+        Cameras whose lens or scans are of another size must not move (`may_move`).
         """
         c = self._config
         extrinsics = Extrinsics.calibrated(self._masks.cameras, self._middle())
