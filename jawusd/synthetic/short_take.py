@@ -18,6 +18,8 @@ SIZES_PX = ((640, 360), (960, 540), (1280, 720), (1920, 1080))
 _TARGET_MM = np.array([0.0, -9.0, -12.0])
 _LIFT_STEP, _MOST_LIFT = 0.004, 0.35
 _TOUCH_MM = -0.02
+_LIFT_FRAMES = 4  # within which the jaw is lifted out of a contact
+_LEAST_MOVE, _WHOLE_MOVE = 4, 8  # frames of the shortest movement, and of one over the whole range
 #: Frames of the closed bite at the start.
 CLOSED_FRAMES = 3
 _PIVOT_MM = np.array([0.0, 20.0, -95.0])
@@ -95,19 +97,12 @@ def _camera(name: str, size: tuple[int, int], focal: float, rng: np.random.Gener
 def draw_motion(joint: Joint, bite: Bite, T_world_head: Array, frames: int, rng: np.random.Generator) -> Motion:
     """Draw a take of so many frames; movements are lifted until the teeth pass one another."""
     joint = replace(joint, incisor=bite.incisor)
-    wide, side, forward = (
-        rng.uniform(0.25, 0.45),
-        rng.choice([-1.0, 1.0]) * rng.uniform(0.4, 0.8),
-        rng.uniform(0.4, 0.8),
-    )
-    free = frames - CLOSED_FRAMES
-    keys = CLOSED_FRAMES - 1 + free * np.array([0.0, 0.35, 0.55, 0.78, 1.0])
-    values = np.array([[0, 0, 0], [wide, 0, 0], [0.12, 0.7 * side, 0], [0.1, -0.7 * side, 0.1], [0.1, 0, forward]])
-    controls = np.stack([_through(keys, values, t) for t in range(frames)])
+    controls = _exercise(frames, rng)
+    lift = np.zeros(frames)
     for i in range(CLOSED_FRAMES, frames):
-        start = controls[i, 0]
-        while controls[i, 0] < start + _MOST_LIFT and _cuts(joint, bite, controls[i]):
-            controls[i, 0] += _LIFT_STEP
+        while lift[i] < _MOST_LIFT and _cuts(joint, bite, controls[i] + [lift[i], 0.0, 0.0]):
+            lift[i] += _LIFT_STEP
+    controls[CLOSED_FRAMES:, 0] += _evenly(lift)[CLOSED_FRAMES:]
     turn = so3_exp(np.deg2rad(rng.normal(0.0, [4.0, 5.0, 4.0])))
     centre = _TARGET_MM
     T_head = T_world_head @ make_transform(turn, centre - turn @ centre)
@@ -117,6 +112,29 @@ def draw_motion(joint: Joint, bite: Bite, T_world_head: Array, frames: int, rng:
     raised = rng.uniform(0.0, 1.0) * (rng.random() < 0.4)
     tongue = np.array([6.0 * raised, 7.0 * raised, rng.uniform(-2.0, 2.0)])
     return Motion(joint, controls, T_head, rng.uniform(0.0, 2 * np.pi, 6), rng.uniform(0.1, 0.35), lips, tongue)
+
+
+def _exercise(frames: int, rng: np.random.Generator) -> Array:
+    """Return opening, lateral and protrusion per frame, shape (F, 3): opening, then what there is time for.
+
+    Scaled to what a jaw does in that time: at 24 frames/s it opens by up to some 100 mm/s.
+    """
+    side = rng.choice([-1.0, 1.0]) * rng.uniform(0.3, 0.55)
+    others = np.array([[0.12, side, 0.0], [0.1, -side, 0.1], [0.1, 0.0, rng.uniform(0.4, 0.8)]])
+    rng.shuffle(others)
+    free = frames - CLOSED_FRAMES
+    moves = int(np.clip(free // _LEAST_MOVE, 1, 1 + len(others)))
+    reach = min(1.0, free / moves / _WHOLE_MOVE)
+    values = reach * np.array([[0.0, 0.0, 0.0], [rng.uniform(0.25, 0.45), 0.0, 0.0], *others])[: moves + 1]
+    keys = CLOSED_FRAMES - 1 + free * np.linspace(0.0, 1.0, moves + 1)
+    return np.stack([_through(keys, values, t) for t in range(frames)])
+
+
+def _evenly(lift: Array) -> Array:
+    """Return the least even curve that is nowhere below a lift per frame, shape (F,)."""
+    apart = np.abs(np.subtract.outer(np.arange(len(lift)), np.arange(len(lift))))
+    share = np.where(apart < _LIFT_FRAMES, np.cos(0.5 * np.pi * apart / _LIFT_FRAMES) ** 2, 0.0)
+    return np.asarray((share * lift).max(axis=1), np.float64)
 
 
 def _between(rows: Array, t: float) -> Array:

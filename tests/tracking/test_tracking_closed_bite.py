@@ -9,7 +9,14 @@ from jawusd.formats.tracks import TRACKED
 from jawusd.geometry import se3_adjoint, se3_exp, se3_inverse, se3_log
 from jawusd.tracking.contour.equations import OutlineSums, Solution, translation
 from jawusd.tracking.contour.frame_record import FrameRecord
-from jawusd.tracking.sequence.closed_bite import _ARCH_MM, _BITE_MM, STEADY, closed_bite, registration_findings
+from jawusd.tracking.sequence.closed_bite import (
+    _ARCH_MM,
+    _BITE_MM,
+    _NEW_PER_FRAME,
+    STEADY,
+    closed_bite,
+    registration_findings,
+)
 from jawusd.tracking.sequence.rest_frames import RestFrames, rest_frames
 
 POINT = np.array([3.0, -4.0, 20.0])
@@ -35,10 +42,15 @@ def _take(registration=None, steady=((0,) * 6, (0,) * 6), seed=0):
     return poses, covariance
 
 
+def _parts(covariance):
+    """Return covariances by outlines of single frames and by habits."""
+    return 0.3 * covariance, 0.7 * covariance
+
+
 def test_a_good_registration_takes_the_steady_error_out():
     steady = (0, 0, 0, 0, 0.05, 0), (0, 0, 0, 0, -0.05, 0)
     poses, covariance = _take(steady=steady)
-    bite = closed_bite(FRAMES, poses, covariance, REST)
+    bite = closed_bite(FRAMES, poses, *_parts(covariance), REST)
     exact, _ = _take()
     before, after = (
         np.abs(se3_log(se3_inverse(T[:, 1] @ translation(POINT)) @ exact[:, 1] @ translation(POINT))[:, 4]).max()
@@ -60,7 +72,7 @@ def test_a_bad_registration_is_measured_and_corrected(mm, degrees):
     scan[:3, :3], scan[:3, 3] = wrong, np.array(mm) + REST.lower - wrong @ REST.lower  # the lower scan as it was given
     poses, covariance = _take()
     poses[:, 1] = poses[:, 1] @ se3_inverse(scan)
-    bite = closed_bite(FRAMES, poses, covariance, REST)
+    bite = closed_bite(FRAMES, poses, *_parts(covariance), REST)
     report = bite.report(REST)
     assert np.linalg.norm(report["shift_mm"]) == pytest.approx(np.linalg.norm(mm), rel=0.2, abs=0.05)
     assert np.linalg.norm(report["turn_deg"]) == pytest.approx(np.linalg.norm(degrees), rel=0.2, abs=0.05)
@@ -76,10 +88,12 @@ def test_a_bad_registration_is_measured_and_corrected(mm, degrees):
 
 def test_what_remains_is_the_conditional_covariance():
     """Draw steady errors, registration and noise by scipy; what a linear regression leaves of them must remain."""
-    bite = closed_bite(FRAMES, *_take(), REST)
+    poses, covariance = _take()
+    bite = closed_bite(FRAMES, poses, *_parts(covariance), REST)
     upper, lower, both = bite.spread
     registration = np.diag(np.r_[np.full(3, (_BITE_MM / _ARCH_MM) ** 2), np.full(3, _BITE_MM**2)])
-    noise = (1.0 - STEADY) * both / 2.0
+    outline = 0.3 / (0.7 + 0.3 * STEADY) * both  # `both` is the steady part of outline and habits
+    noise = (1.0 - STEADY) * outline / (1.0 + 3 * _NEW_PER_FRAME)  # four closed frames
     rng = np.random.default_rng(1)
     u, v, r, n = (
         multivariate_normal(np.zeros(6), c, seed=rng).rvs(100_000) for c in (upper, lower, registration, noise)
@@ -92,11 +106,13 @@ def test_what_remains_is_the_conditional_covariance():
 
 
 def test_covariances_shrink_by_what_the_closed_bite_tells():
-    bite = closed_bite(FRAMES, *_take(), REST)
+    poses, covariance = _take()
+    bite = closed_bite(FRAMES, poses, *_parts(covariance), REST)
     A = se3_adjoint(translation(POINT))
-    whole = np.tile(A @ bite.spread[2] @ A.T, (12, 1, 1))
-    reduced = bite.reduce(whole, np.tile(np.eye(4), (12, 1, 1)), 2)
-    expected = (1.0 - STEADY) * whole[0] + STEADY * A @ bite.remaining[2] @ A.T
+    steady = np.tile(A @ bite.spread[2] @ A.T, (12, 1, 1))
+    noise = np.diag(SIGMA**2)
+    reduced = bite.reduce(steady + noise, steady, np.tile(np.eye(4), (12, 1, 1)), 2)
+    expected = noise + A @ bite.remaining[2] @ A.T
     assert reduced[0] == pytest.approx(expected, abs=1e-9 * np.abs(expected).max())
 
 
@@ -125,4 +141,4 @@ def test_rest_frames_are_those_around_the_named_one_and_else_the_most_closed():
 def test_without_rest_frames_nothing_is_said():
     poses, covariance = _take()
     poses[:3] = np.nan
-    assert closed_bite(FRAMES, poses, covariance, REST) is None
+    assert closed_bite(FRAMES, poses, *_parts(covariance), REST) is None

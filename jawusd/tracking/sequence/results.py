@@ -27,6 +27,7 @@ from jawusd.tracking.sequence.closed_bite import (
     check_registration,
     closed_bite,
     registration_findings,
+    steady_part,
 )
 from jawusd.tracking.sequence.extrinsics import Extrinsics
 from jawusd.tracking.sequence.nuisance import Nuisances, pose_response
@@ -111,13 +112,16 @@ def _measured(
     frames = np.array(sorted(records), np.int64)
     raw = np.stack([records[f].solution.poses for f in frames])
     raw[np.stack([records[f].status for f in frames]) == LOST] = np.nan
-    covariance = _covariances(records, take_correlation_px(records, config), nuisances, extrinsics)
+    outline, habits = _covariances(records, take_correlation_px(records, config), nuisances, extrinsics)
+    covariance = outline + habits
     relative = _relative_covariance(raw, covariance)
-    bite = closed_bite(frames, raw, covariance, rest)
+    bite = closed_bite(frames, raw, outline, habits, rest)
     if bite is None:
         return raw, covariance, relative, None
-    relative = bite.reduce(relative, np.tile(np.eye(4), (len(frames), 1, 1)), 2)
-    covariance = np.stack([bite.reduce(covariance[:, r], raw[:, r], r) for r in ARCHES], axis=1)
+    steady = steady_part(outline, habits)
+    still = np.tile(np.eye(4), (len(frames), 1, 1))
+    relative = bite.reduce(relative, _relative_covariance(raw, steady), still, 2)
+    covariance = np.stack([bite.reduce(covariance[:, r], steady[:, r], raw[:, r], r) for r in ARCHES], axis=1)
     return bite.correct(raw, rest.apply), covariance, relative, bite
 
 
@@ -172,18 +176,21 @@ def _of_tracked(records: Mapping[int, FrameRecord], figure: Callable[[Solution],
 
 def _covariances(
     records: Mapping[int, FrameRecord], correlation: float, nuisances: Nuisances, extrinsics: Extrinsics
-) -> Array:
-    """Return the covariance of both arches' left twists, NaN where lost, shape (F, 2, 6, 6)."""
-    out = np.full((len(records), 2, 6, 6), np.nan)
+) -> tuple[Array, Array]:
+    """Return the covariance of both arches' left twists, NaN where lost, two parts of shape (F, 2, 6, 6).
+
+    The first by the outline errors of each frame alone, the second by the unknowns of the take.
+    """
+    outline, habits = np.full((2, len(records), 2, 6, 6), np.nan)
     for k, frame in enumerate(sorted(records)):
         record = records[frame]
         sigma = residual_px(record.solution)
         for r in np.flatnonzero(record.status != LOST).tolist():
             A = se3_adjoint(translation(record.solution.centres[r]))
             response = A @ pose_response(records, frame, r, extrinsics)
-            own = twist_covariance(record.solution, r, sigma[r], correlation)
-            out[k, r] = own + response @ nuisances.covariance @ response.T
-    return out
+            outline[k, r] = twist_covariance(record.solution, r, sigma[r], correlation)
+            habits[k, r] = response @ nuisances.covariance @ response.T
+    return outline, habits
 
 
 def _relative(poses: Array) -> Array:
