@@ -12,9 +12,10 @@ from jawusd.geometry import rigidity_defect, se3_exp, se3_inverse, se3_log
 from jawusd.tracking import TrackingConfig, track_capture
 from jawusd.tracking.contour.equations import OutlineSums, Solution
 from jawusd.tracking.contour.frame_record import FrameRecord
+from jawusd.tracking.sequence.delays import bridge, delay_motions, interpolation_errors
 from jawusd.tracking.sequence.extrinsics import Extrinsics, corrected_cameras
 from jawusd.tracking.sequence.frame_tracker import FrameTracker
-from jawusd.tracking.sequence.nuisance import Nuisances, bridge, delay_motions
+from jawusd.tracking.sequence.nuisance import Nuisances
 
 FRAMES = 16
 WITHOUT = TrackingConfig(refine_rounds=0)
@@ -234,6 +235,21 @@ def test_delays_follow_an_accelerating_jaw_to_the_ends_of_the_take():
         moved = delay_motions(records, k, np.array([0.0, 0.4, -0.3]))
         for c, delay in enumerate((0.0, 0.4, -0.3)):
             assert moved[c, 1] == pytest.approx(se3_exp((k * delay + 0.5 * delay**2) * push), abs=1e-9)
+
+
+def test_what_a_parabola_misses_is_known():
+    """A jaw that moves along a cubic: error = truth against the parabola, at the ends and amid the take."""
+    records, _ = _records(6)
+    push = np.array([0.0004, 0, 0, 0, -0.05, 0.01])
+    for k, record in records.items():
+        poses = np.stack([se3_exp(k**3 * push)] * 2)
+        records[k] = replace(record, solution=replace(record.solution, poses=poses, centres=np.zeros((2, 3))))
+    delays = np.array([0.0, 0.4, -0.3])
+    for k in records:
+        errors = interpolation_errors(records, k, 1, delays)
+        for c, (delay, moved) in enumerate(zip(delays, delay_motions(records, k, delays)[:, 1], strict=True)):
+            assert se3_exp(errors[c]) @ moved == pytest.approx(se3_exp(((k + delay) ** 3 - k**3) * push), abs=1e-9)
+    assert not interpolation_errors(_records(3)[0], 1, 0, delays).any()
 
 
 def test_long_gaps_and_ends_are_not_bridged():

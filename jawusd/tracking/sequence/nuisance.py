@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jawusd.formats.tracks import LOST
 from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import TrackingConfig
-from jawusd.tracking.contour.equations import Solution, motion_about, twist_between
+from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.frame_record import FrameRecord
 from jawusd.tracking.contour.scan import ARCHES
+from jawusd.tracking.sequence.delays import interpolation_errors, velocity_twist
 from jawusd.tracking.sequence.extrinsics import Extrinsics, lever
 
 
@@ -216,39 +216,13 @@ def pose_response(records: Mapping[int, FrameRecord], frame: int, arch: int, ext
     return _reduced(solution, velocity, arch, extrinsics.pivot, layout)[2]
 
 
-def delay_motions(records: Mapping[int, FrameRecord], frame: int, delays: Array) -> Array:
-    """Return the motion of both arches from the reference instant to each camera's own, shape (C, 2, 4, 4)."""
-    out = np.tile(np.eye(4), (len(delays), 2, 1, 1))
-    for arch in ARCHES:
-        motion = _motion_twists(records, frame, arch)
-        if motion is not None:
-            velocity, change = motion
-            twists = delays[:, None] * velocity + 0.5 * delays[:, None] ** 2 * change
-            out[:, arch] = motion_about(records[frame].solution.centres[arch], twists)
-    return out
-
-
-def _motion_twists(records: Mapping[int, FrameRecord], frame: int, arch: int) -> tuple[Array, Array] | None:
-    """Return the twist per frame about the arch's centre and its change per frame, shapes (6,): a parabola in time.
-
-    Through both neighbours, at ends through two on one side (a jaw starts and stops within a frame or two), and across
-    a gap evenly; None without tracked frames close by.
-    """
-
-    def step(frames: int) -> Array:
-        here, there = records[frame].solution, records[frame + frames].solution
-        return twist_between(here.poses[arch], there.poses[arch], here.centres[arch])
-
-    def tracked(*steps: int) -> bool:
-        return all(_is_tracked(records, frame + k, arch) for k in (0, *steps))
-
-    if tracked(-1, 1):
-        return 0.5 * (step(1) - step(-1)), step(1) + step(-1)
-    for way in (1, -1):
-        if tracked(way, 2 * way):
-            return way * (2.0 * step(way) - 0.5 * step(2 * way)), step(2 * way) - 2.0 * step(way)
-    across = bridge(records, frame, arch)
-    return None if across is None else (across[1], np.zeros(6))
+def interpolation_covariance(records: Mapping[int, FrameRecord], frame: int, arch: int, delays: Array) -> Array:
+    """Return what motion between frames adds to the covariance of a pose's twist about its centre, shape (6, 6)."""
+    precision = records[frame].solution.outline.precision[arch]
+    errors = interpolation_errors(records, frame, arch, delays)
+    pull = np.einsum("cij,cj->ic", precision, errors)
+    moved = np.linalg.lstsq(precision.sum(0), pull, rcond=1e-10)[0]
+    return np.asarray(moved @ moved.T, np.float64)
 
 
 def _reduced(
@@ -274,34 +248,3 @@ def _reduced(
     H, g = outline.precision[arch].sum(0), outline.gradient[arch].sum(0)
     eliminated = np.linalg.lstsq(H, np.column_stack([B, g]), rcond=1e-10)[0]
     return S - B.T @ eliminated[:, :-1], r - B.T @ eliminated[:, -1], -eliminated[:, :-1]
-
-
-def velocity_twist(records: Mapping[int, FrameRecord], frame: int, arch: int) -> Array | None:
-    """Return the twist per frame about the arch's centre, shape (6,); None without tracked frames before and after."""
-    if not all(_is_tracked(records, f, arch) for f in (frame - 1, frame, frame + 1)):
-        return None
-    before, now, after = (records[f].solution for f in (frame - 1, frame, frame + 1))
-    return 0.5 * twist_between(before.poses[arch], after.poses[arch], now.centres[arch])
-
-
-def _is_tracked(records: Mapping[int, FrameRecord], frame: int, arch: int) -> bool:
-    return frame in records and bool(records[frame].status[arch] != LOST)
-
-
-_BRIDGE_FRAMES = 6  # a quarter of a second at 24 fps: jaws turn round in less than two of these
-
-
-def bridge(records: Mapping[int, FrameRecord], frame: int, arch: int) -> tuple[Array, Array] | None:
-    """Interpolate an arch evenly between tracked frames: its pose (4, 4) and twist per frame about its centre (6,).
-
-    None without tracked frames close by on both sides.
-    """
-    reach = range(1, _BRIDGE_FRAMES + 1)
-    before = next((frame - k for k in reach if _is_tracked(records, frame - k, arch)), None)
-    after = next((frame + k for k in reach if _is_tracked(records, frame + k, arch)), None)
-    if before is None or after is None:
-        return None
-    centre = records[frame].solution.centres[arch]
-    start, end = (records[f].solution.poses[arch] for f in (before, after))
-    twist = twist_between(start, end, centre) / (after - before)
-    return motion_about(centre, (frame - before) * twist) @ start, twist

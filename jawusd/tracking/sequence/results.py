@@ -30,7 +30,7 @@ from jawusd.tracking.sequence.closed_bite import (
     steady_part,
 )
 from jawusd.tracking.sequence.extrinsics import Extrinsics
-from jawusd.tracking.sequence.nuisance import Nuisances, pose_response
+from jawusd.tracking.sequence.nuisance import Nuisances, interpolation_covariance, pose_response
 from jawusd.tracking.sequence.rest_frames import RestFrames
 from jawusd.tracking.sequence.smoothing import smooth_poses
 
@@ -188,7 +188,8 @@ def _covariances(
         for r in np.flatnonzero(record.status != LOST).tolist():
             A = se3_adjoint(translation(record.solution.centres[r]))
             response = A @ pose_response(records, frame, r, extrinsics)
-            outline[k, r] = twist_covariance(record.solution, r, sigma[r], correlation)
+            between = A @ interpolation_covariance(records, frame, r, nuisances.delays) @ A.T
+            outline[k, r] = twist_covariance(record.solution, r, sigma[r], correlation) + between
             habits[k, r] = response @ nuisances.covariance @ response.T
     return outline, habits
 

@@ -24,10 +24,11 @@ from jawusd.tracking.initialization.magnification import measure_magnification
 from jawusd.tracking.initialization.start import find_start
 from jawusd.tracking.sequence.camera_use import use_of_cameras
 from jawusd.tracking.sequence.closed_bite import observe_bite
+from jawusd.tracking.sequence.delays import bridge, delay_motions
 from jawusd.tracking.sequence.extrinsics import Extrinsics
 from jawusd.tracking.sequence.frame_tracker import FrameTracker
 from jawusd.tracking.sequence.history import History, MotionPredictor
-from jawusd.tracking.sequence.nuisance import Nuisances, TakeEquations, bridge, delay_motions
+from jawusd.tracking.sequence.nuisance import Nuisances, TakeEquations
 from jawusd.tracking.sequence.rest_frames import RestFrames, rest_frames
 from jawusd.tracking.sequence.results import assemble, outline_variance
 from jawusd.tracking.sequence.take_checks import lens_findings, motion_findings, time_findings
