@@ -61,8 +61,9 @@ class TrackingConfig:
     # Side of the tiles within which errors are measured together [px]: estimates change little from 20 to 45.
     tile_px: int = 30
     # True over measured correlation length [-]: the fit takes part of the error out of the residuals, and the Tukey
-    # weight costs efficiency. 2.2 to 3.0 over outline errors of 0.25 and 0.6 px, correlated over 2 to 14 px.
-    tile_factor: float = 2.8
+    # weight costs efficiency. 2.2 to 3.0 over outline errors of 0.25 and 0.6 px, correlated over 2 to 14 px; with 2.8,
+    # sigmas of the persons of `tests/benchmarks/population.py` were a fifth too wide.
+    tile_factor: float = 2.2
     # Good frames remembered to judge residuals and coverage [frames]: about a second.
     history_frames: int = 31
     # Good frames remembered to judge scores [frames]: closing lips take longer, a lost pose does not.

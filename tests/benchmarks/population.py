@@ -8,8 +8,9 @@ through `jawusd check` and `jawusd track` and is compared with its truth. Printe
     errors      vertices per arch and the incisal point: median and 95th percentile over persons of the mean over
                 frames; lost, gross: share of frames without a pose, or more than 0.5 mm wrong; silent: of gross ones
                 without a flag (plainly tracked, sigma below 0.25 mm)
-    ratio       error of the vertices (median over frames of their rms) over the Cramer-Rao bound by the known
-                wobble of the annotator, the worse arch
+    ratio       error of the vertices (median over frames of their rms) over the Cramer-Rao bound by the wobble of
+                the annotator, whose habits the take must tell; the worse arch. known: over the lower bound for habits
+                that are known, which no tracker of masks can reach
     shift       median over frames of the error along each anatomical axis: share of persons within 0.02 mm
     NEES        normalised squared error of the poses over 6, mean over frames that are not grossly wrong, median
                 over persons: 1 when sigmas are honest
@@ -139,7 +140,7 @@ def report(outcomes: list[Outcome]) -> None:
     for (kind, severity), count in kinds.most_common():
         print(f"  {kind:<30}{severity:<9}{count:4d}  {100 * count / len(outcomes):5.1f} %")
     scored = [o for o in outcomes if "vertices upper" in o.figures]
-    head = ("n", "lost", "gross", "silent", "upper", "p95", "lower", "p95", "incisor", "p95", "ratio")
+    head = ("n", "lost", "gross", "silent", "upper", "p95", "lower", "p95", "incisor", "p95", "ratio", "known")
     heads = (*head, "shift u", "shift l", "shift r", "NEES u", "NEES l", "NEES r")
     print(f"{'':<26}" + "".join(f"{name:>8}" for name in heads))
     for name, group in grouped(scored):
@@ -168,7 +169,7 @@ def row(group: list[Outcome]) -> str:
     cells = [f"{len(group):8d}", *(f"{100 * figures(name).mean():7.1f}%" for name in ("lost", "gross", "silent"))]
     for name in ("vertices upper", "vertices lower", "incisor"):
         cells += [f"{np.median(figures(name)):8.3f}", f"{np.percentile(figures(name), 95):8.3f}"]
-    cells.append(f"{np.median(figures('ratio')):8.2f}")
+    cells += [f"{np.median(figures(name)):8.2f}" for name in ("ratio", "ratio known")]
     for part in (*ROWS, "relative"):
         steady = [np.abs(o.vectors[f"shift {part}"]).max() <= STEADY_MM for o in group]
         cells.append(f"{100 * np.mean(steady):7.0f}%")
