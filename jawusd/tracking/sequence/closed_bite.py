@@ -139,8 +139,8 @@ def closed_bite(
         rest: where the teeth are together.
     """
     point = rest.point
-    known = np.isfinite(poses).all((1, 2, 3)) & np.isfinite(outline).all((1, 2, 3))
-    used = known & np.isin(frames, rest.frames)
+    known = np.asarray(np.isfinite(poses).all((1, 2, 3)) & np.isfinite(outline).all((1, 2, 3)), bool)
+    used = np.asarray(known & np.isin(frames, rest.frames), bool)
     count = int(used.sum())
     if count < _FEWEST_FRAMES:
         return None

@@ -52,9 +52,12 @@ class Nuisances:
 
         Habits have a prior of what hands do: without clear evidence their estimate is still the likeliest.
         """
-        late = np.abs(self.delays) > np.maximum(config.refine_delay_frames, 4 * self.sigma_delays)
         wide = np.abs(self.shift_px) > config.refine_bias_px
-        return bool(late.any() or wide.any() or self.cameras_moved(config))
+        return bool(self.late(config) or wide.any() or self.cameras_moved(config))
+
+    def late(self, config: TrackingConfig) -> bool:
+        """Tell whether a delay exceeds its limit, and clearly so."""
+        return bool((np.abs(self.delays) > np.maximum(config.refine_delay_frames, 4 * self.sigma_delays)).any())
 
     def settled(self, config: TrackingConfig) -> bool:
         """Tell whether all are so small that estimating them once more changes too little."""

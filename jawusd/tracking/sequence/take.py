@@ -186,7 +186,9 @@ class _Take:
                 extrinsics = extrinsics.then(found.twists, found.sigma_twists)
             self._realign(found, extrinsics)
             residual = self._equations(extrinsics, rest).solve(c, cameras_moved)
-            found, pending, rounds = found.plus(residual), residual.matters(c), rounds + 1
+            found, rounds = found.plus(residual), rounds + 1
+            # Where a late camera sees the teeth follows from the motion, which the first round mends.
+            pending = residual.matters(c) or (rounds == 1 and found.late(c))
         return found, extrinsics
 
     def _late_cameras(self, extrinsics: Extrinsics, rest: RestFrames) -> Nuisances | None:
