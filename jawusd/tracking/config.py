@@ -110,6 +110,8 @@ class TrackingConfig:
     late_frames: float = 0.6
     # Most rounds of that [-]: each leaves a tenth of the delay.
     refine_rounds: int = 2
+    # The same while a camera is still found to run apart: its masks follow the motion only step by step.
+    late_rounds: int = 4
     # Shift of contours by wrong camera poses [px] from which those are corrected: below, apparent shifts are the
     # habits of whoever drew the masks.
     refine_shift_px: float = 0.15

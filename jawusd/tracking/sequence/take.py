@@ -181,14 +181,15 @@ class _Take:
         found = found if known is None else known.plus(found)
         if pending and c.refine_rounds:
             found, extrinsics = self._settle(found, extrinsics, rest, cameras_moved)
-        while pending and rounds < c.refine_rounds:
+        while pending and rounds < (c.late_rounds if c.refine_rounds else 0):
             if cameras_moved:
                 extrinsics = extrinsics.then(found.twists, found.sigma_twists)
             self._realign(found, extrinsics)
             residual = self._equations(extrinsics, rest).solve(c, cameras_moved)
             found, rounds = found.plus(residual), rounds + 1
             # Where a late camera sees the teeth follows from the motion, which the first round mends.
-            pending = residual.matters(c) or (rounds == 1 and found.late(c))
+            late = residual.late(c) or (rounds == 1 and found.late(c))
+            pending = late or (rounds < c.refine_rounds and residual.matters(c))
         return found, extrinsics
 
     def _late_cameras(self, extrinsics: Extrinsics, rest: RestFrames) -> Nuisances | None:
