@@ -5,16 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Literal
 
 import numpy as np
 
 from jawusd.errors import CaptureError, JawusdError
-from jawusd.formats.finding import Finding
+from jawusd.formats.finding import Finding, Severity
 from jawusd.geometry import Camera
 from jawusd.geometry.arrays import Array
 from jawusd.pipeline.check_parts import Parts, found_error
-from jawusd.pipeline.prepare import load_cameras
+from jawusd.pipeline.prepare import load_cameras, rescaled_cameras
 
 _INSTANTS = 5  # at which the views are compared
 _CROWN_POINTS = 6000
@@ -56,6 +55,21 @@ def calibration(parts: Parts) -> Iterator[Finding]:
         yield Finding("one_camera", "error", message, 1, 2, path=parts.description)
     parts.cameras = {camera.name: camera for camera in load_cameras(capture)}
     yield from camera_findings(list(parts.cameras.values()), str(capture.calibration))
+    yield from _rescaled(parts)
+
+
+def _rescaled(parts: Parts) -> Iterator[Finding]:
+    """Say whose calibration is of another picture size; of some cameras only it is a mistake rather than a mode."""
+    found = rescaled_cameras(parts.given)
+    for name, (was, now) in found.items():
+        every = len(found) == len(parts.cameras)
+        message = (
+            f"it is calibrated at {was[0]} x {was[1]} px, its pictures or masks have the size {now[0]} x {now[1]} "
+        )
+        message += "px: taken as the same picture, scaled" + ("" if every else "; the other cameras' sizes agree")
+        hint = "Check that its masks were not made at a reduced size; picks count in the pixels of the calibration."
+        severity: Severity = "note" if every else "warning"
+        yield Finding("calibration_rescaled", severity, message, camera=name, hint=hint)
 
 
 def boards(parts: Parts) -> Iterator[Finding]:
@@ -150,7 +164,7 @@ def frames(parts: Parts) -> Iterator[Finding]:
     count = _frame_count(parts, capture.reference)
     first, stop = capture.frames or (0, count or 0)
 
-    def out_of(kind: str, what: str, frame: int, severity: Literal["error", "warning"]) -> Finding:
+    def out_of(kind: str, what: str, frame: int, severity: Severity) -> Finding:
         message = f"{what} is {frame}, frames run from {first} to {stop - 1}"
         hint = "Correct it in capture.toml."
         return Finding(kind, severity, message, frame, stop - 1, path=parts.description, hint=hint)

@@ -9,11 +9,12 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from jawusd.formats.capture import Pick
-from jawusd.geometry import Camera, rigid_fit, se3_exp, transform_point, triangulate
+from jawusd.geometry import Camera, rigid_fit, se3_exp, transform_points, triangulate
 from jawusd.geometry.arrays import Array
 
 # What may be wrong, standard deviations: shift over the picture's width, relative focal length; and of a click [mm].
 _SHIFT, _FOCAL, _CLICK_MM = 0.05, 0.1, 0.3
+_STEP = np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0])  # of the poses, about what they are off [rad, mm]
 
 
 def shifted(camera: Camera, shift_px: Array) -> Camera:
@@ -53,24 +54,36 @@ def fitted_camera(
     starts = [start for start in placed if start is not None]
     if len(starts) < len(placed):
         return None
-    middles = [np.mean([points[p.vertex] for p in own], axis=0) for own, points in zip(picks, vertices, strict=True)]
+    sights = [_sights(own, points) for own, points in zip(picks, vertices, strict=True)]
 
     def residuals(x: Array) -> Array:
         """Return misses over a click's, and the change of the camera over its own deviation."""
         table = {**cameras, name: changed(x)}
         out = [x[:2]]
-        for k, (own, points, start, middle) in enumerate(zip(picks, vertices, starts, middles, strict=True)):
-            T = se3_exp(x[2 + 6 * k : 8 + 6 * k] * np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0]))
-            for pick in own:
-                point = transform_point(start, middle + transform_point(T, points[pick.vertex] - middle))
-                for view in pick.views:
-                    camera = table[view.camera]
-                    mm_per_px = float(camera.depth(point)) / float(camera.K[0, 0])
-                    out.append((camera.project(point) - [view.x, view.y]) * mm_per_px / _CLICK_MM)
+        for k, (start, seen) in enumerate(zip(starts, sights, strict=True)):
+            T = se3_exp(x[2 + 6 * k : 8 + 6 * k] * _STEP)
+            for camera_name, (points, pixels, middle) in seen.items():
+                camera = table[camera_name]
+                placed = transform_points(start, middle + transform_points(T, points - middle))
+                mm_per_px = camera.depth(placed) / float(camera.K[0, 0])
+                out.append(((camera.project(placed) - pixels) * mm_per_px[:, None] / _CLICK_MM).ravel())
         return np.concatenate(out)
 
-    found = least_squares(residuals, np.zeros(14), method="lm", max_nfev=400)
+    found = least_squares(residuals, np.zeros(14), method="lm", max_nfev=250)
     return changed(found.x)
+
+
+def _sights(picks: Sequence[Pick], vertices: Array) -> dict[str, tuple[Array, Array, Array]]:
+    """Return the picked points of a scan (N, 3), their pixels (N, 2) and the middle of all picks (3,), by camera."""
+    middle = np.mean([vertices[pick.vertex] for pick in picks], axis=0)
+    seen: dict[str, list[tuple[Array, list[float]]]] = {}
+    for pick in picks:
+        for view in pick.views:
+            seen.setdefault(view.camera, []).append((vertices[pick.vertex], [view.x, view.y]))
+    return {
+        name: (np.stack([point for point, _ in own]), np.array([pixel for _, pixel in own]), middle)
+        for name, own in seen.items()
+    }
 
 
 def _placed(picks: Sequence[Pick], vertices: Array, cameras: Mapping[str, Camera]) -> Array | None:

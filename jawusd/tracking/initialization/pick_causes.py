@@ -24,10 +24,13 @@ from jawusd.tracking.initialization.pick_cameras import fitted_camera
 
 _CLOSE_MM = 1.0  # mask pixels this near to a projected crown point count as covered
 ON = 0.85  # share of a camera's masks on the scans, from which they count as placed rightly
-_PROOF = 0.5  # a mistake is believed if undoing it leaves less than this share of the doubt that is left as given
+# A mistake is believed if undoing it leaves less than this share of the doubt that is left as given; one that tracking
+# makes up for, which is a warning, also if picks that had to be left out fit then.
+_PROOF, _PROOF_BY_PICKS = 0.5, 0.75
 # What weighs as much as one another: share of masks off the scans, and distance of the picks from their vertices [mm].
 _OFF, _MISS_MM = 0.05, 0.3
 _UNSEEN = 0.25  # share off the scans that a camera without masks at the instant counts as: it may be elsewhere
+_SURE = 1.0  # doubt that an exchange leaves, below which nothing else is looked for
 _ALIKE = 0.15  # doubt by which a mistake may be worse than the likeliest one and still be named beside it
 # Size of the scans by the picks, less 1, from which it may be a mistake.
 _SIZE_SHARE = 0.02
@@ -153,6 +156,8 @@ def explanation(
     allowed = 0 if found is None else found.left_out
     tried: list[tuple[Mistake, Evidence]] = []
     for mistake in _mistakes(given):
+        if mistake.camera is not None and any(not m.correctable and e.doubt < _SURE for m, e in tried):
+            break  # those of single cameras, which take longest, come last
         try:
             undone = evidence(mistake.setting, seen, masked)
         except TrackingError:
@@ -162,8 +167,10 @@ def explanation(
     if not tried:
         return None
     mistake, undone = min(tried, key=lambda one: one[1].doubt)
-    if found is not None and undone.doubt > _PROOF * found.doubt:
-        return None
+    if found is not None:
+        by_picks = mistake.correctable and undone.left_out < found.left_out
+        if undone.doubt > (_PROOF_BY_PICKS if by_picks else _PROOF) * found.doubt:
+            return None
     alike = [other for other, left in tried if other is not mistake and left.doubt < undone.doubt + _ALIKE]
     if mistake.correctable and alike:
         said = "; or else ".join(one.message for one in (mistake, *(one for one in alike if one.correctable)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator, Sequence
 
 from jawusd.errors import TrackingError
@@ -33,7 +34,8 @@ def pick_findings(given: Setting, seen: Sequence[Seen], masked: Sequence[str], f
         problem = error
     cause = None
     if found is None or not found.good or found.doubt > _DOUBTFUL:
-        cause = explanation(given, found, seen, masked) if _can_be(given) else None
+        with contextlib.suppress(TrackingError):  # a pick that cannot be
+            cause = explanation(given, found, seen, masked) if _can_be(given) else None
     if cause is not None:
         yield _explained(*cause, found, frame)
         yield from _left_out(cause[1], frame)

@@ -8,29 +8,24 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from jawusd.errors import CaptureError, TrackingError
+from jawusd.errors import TrackingError
 from jawusd.formats.capture import Bootstrap, Capture
 from jawusd.formats.finding import Finding
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera, transform_point
 from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import Mapper
-from jawusd.tracking.contour.scan import teeth_centre
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import masked_sources
 from jawusd.tracking.initialization.bootstrap import picked_sigma_mm, pose_from_picks
-from jawusd.tracking.initialization.first_frame import first_record
 from jawusd.tracking.initialization.footage import Footage
-from jawusd.tracking.initialization.mixups import all_arches_exchanged, likely_mixup, possible_mixups
+from jawusd.tracking.initialization.mixups import all_arches_exchanged, likely_mixup
 from jawusd.tracking.initialization.scan_checks import check_occlusion
+from jawusd.tracking.initialization.start_causes import CLEAR_FIT, aligned, refuse_by_cause
 from jawusd.tracking.initialization.start_search import Found, StartSearch
 
 _SURVEYED = 24  # frames surveyed: two seconds of reading, and every exercise of a usual take is met
 _FRAMES_TRIED = 5
-_MIXUPS_TRIED = 12  # all of them with four cameras; every one costs a search
-# Fit that leaves no doubt [-]. Wrong poses of a hundred searches stayed below 0.1 in one of the arches, right ones
-# exceed 0.35 where much of the teeth shows, and 0.1 with lips nearly closed or cameras 0.1 degrees off.
-_CLEAR_FIT = 0.3
 _PICKS_OFF_MM = 3.0  # half a tooth
 # Poses as sure as this [mm] lie within the basin of the contour solver.
 _SURE_MM = 0.8
@@ -143,7 +138,7 @@ def _elsewhere(search: StartSearch, footage: Footage, start: Start) -> Start:
 def _fits(search: StartSearch, footage: Footage, start: Start) -> bool:
     """Tell whether the poses of a start pass the checks of a first frame: hidden teeth have other minima nearby."""
     try:
-        _aligned(search, footage, start.poses, start.frame)
+        aligned(search, footage, start.poses, start.frame)
     except TrackingError:
         return False
     return True
@@ -168,22 +163,22 @@ def search_start(search: StartSearch, footage: Footage) -> Start:
             # Most masks being right, the poses are, and show which ones are not. Poor poses may accuse any.
             mixup = likely_mixup(footage, search.solver, found.poses, frame)
             if mixup is None:
-                found = replace(found, poses=_aligned(search, footage, found.poses, frame))
+                found = replace(found, poses=aligned(search, footage, found.poses, frame))
         except TrackingError as error:
             failed[frame] = error.message
             continue
         if mixup is not None:
-            if found.fit >= _CLEAR_FIT:
+            if found.fit >= CLEAR_FIT:
                 raise mixup.refusal(frame)
             failed[frame] = mixup.finding
             accused.add(mixup.hint)
             continue
         if best is None or found.fit > best[1].fit:
             best = frame, found
-        if found.fit >= _CLEAR_FIT:
+        if found.fit >= CLEAR_FIT:
             break
     if best is None:
-        _name_mixup(search, footage, frames[0], accused)
+        refuse_by_cause(search, footage, frames[0], accused)
         raise TrackingError(
             f"there are no [bootstrap] picks, and searching the teeth failed on all {len(frames)} frames tried. "
             + " ".join(f"Frame {frame}: {message}." for frame, message in failed.items()),
@@ -203,7 +198,7 @@ def search_around(search: StartSearch, footage: Footage, frame: int, poses: Arra
         TrackingError: no pair of poses that a jaw can take.
     """
     near = search.near(footage, frame, poses)
-    if near.fit >= _CLEAR_FIT:
+    if near.fit >= CLEAR_FIT:
         return near
     try:
         anywhere = search.at(footage, frame)
@@ -222,7 +217,7 @@ def _around_without_a_camera(
     if len(footage.sources) < 3:
         return None
     try:
-        _aligned(search, footage, found.poses, frame)
+        aligned(search, footage, found.poses, frame)
     except TrackingError:
         pass
     else:
@@ -232,17 +227,10 @@ def _around_without_a_camera(
         others = replace(footage, sources=[other for other in footage.sources if other is not source])
         with contextlib.suppress(TrackingError):
             near = search.near(others, frame, poses)
-            if near.fit >= _CLEAR_FIT:
-                _aligned(search, others, near.poses, frame)
+            if near.fit >= CLEAR_FIT:
+                aligned(search, others, near.poses, frame)
                 better.append((source.name, near))
     return max(better, key=lambda one: one[1].fit, default=None)
-
-
-def _aligned(search: StartSearch, footage: Footage, poses: Array, frame: int) -> Array:
-    """Return the poses as aligned by the solver if they pass the checks of a first frame, shape (2, 4, 4)."""
-    solver = search.solver
-    with footage.views(teeth_centre(solver.scans, poses), solver.config.working_px_per_mm) as masks:
-        return first_record(solver, solver.config, poses, masks.at(frame), frame).solution.poses
 
 
 def _check_upright(search: StartSearch, footage: Footage, frame: int, found: Found) -> None:
@@ -259,20 +247,3 @@ def _check_upright(search: StartSearch, footage: Footage, frame: int, found: Fou
             frame=frame,
             hint=mixup.hint,
         )
-
-
-def _name_mixup(search: StartSearch, footage: Footage, frame: int, accused: set[str]) -> None:
-    """Refuse masks with which the search succeeds after an exchange, those first that were accused by their hints."""
-    explained: list[tuple[float, TrackingError]] = []
-    mixups = sorted(possible_mixups(footage.sources), key=lambda m: m.hint not in accused)
-    for mixup in mixups[:_MIXUPS_TRIED]:
-        try:
-            righted = replace(footage, sources=mixup.sources)
-            found = search.at(righted, frame)
-            _aligned(search, righted, found.poses, frame)
-        except (TrackingError, CaptureError):
-            continue  # this exchange explains nothing
-        why = f"{mixup.finding}: the teeth are found only after exchanging them"
-        explained.append((found.fit, replace(mixup, finding=why).refusal(frame)))
-    if explained:
-        raise max(explained, key=lambda e: e[0])[1]

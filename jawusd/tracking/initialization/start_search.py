@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from jawusd.errors import TrackingError
 from jawusd.formats.mesh import Mesh
-from jawusd.geometry import make_transform, so3_log, transform_point, transform_points
+from jawusd.geometry import make_transform, se3_inverse, so3_log, transform_point, transform_points
 from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import Mapper
 from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.quality import arch_fit, score_px, uncovered_px
-from jawusd.tracking.contour.scan import ARCH_NAMES, ARCHES, teeth_centre
+from jawusd.tracking.contour.scan import ARCH_NAMES, ARCHES, prepare_scan, teeth_centre
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import View
 from jawusd.tracking.initialization.footage import Footage
@@ -24,12 +24,13 @@ _PX_PER_MM = 2.0  # of the search: one pixel is a third of the step between orie
 _FINALISTS = 5  # poses per arch that are refined
 _DISTINCT_MM = 2.0  # poses closer than this T_delay to the same minimum
 # Turns about the guess: the teeth face the cameras, the upper ones are above the lower ones. Masks one beside the other
-# in a lateral movement, or half hidden by lips, mislead the roll most.
+# in a lateral movement, or half hidden by lips, mislead the roll most. With lips retracted the middle of the masks lies
+# up to 20 mm behind the front teeth.
 _GRID = Grid(
     yaw_rad=np.radians(np.arange(-50, 51, 10.0)),
     pitch_rad=np.radians(np.arange(-40, 41, 10.0)),
     roll_rad=np.radians(np.arange(-50, 51, 10.0)),
-    reach_mm=(13.0, 9.0, 15.0),
+    reach_mm=(13.0, 9.0, 22.5),
 )
 # Turns and translations about poses from picks: four careless clicks close together leave as much.
 _NEAR_GRID = Grid(
@@ -70,9 +71,17 @@ class StartSearch:
             map_: runs parts of the search.
         """
         self.solver, self._config, self._map = solver, solver.config, map_
+        self._meshes, self._T_anatomical_scan = meshes, T_anatomical_scan
         self._coarse = tuple(coarse_scan(m, n) for m, n in zip(meshes, ARCH_NAMES, strict=True))
         self._hinges = [hinge_at_front(s.crown_vertices(), T_anatomical_scan) for s in self._coarse]
         self._coarse_solver = ContourSolver(self._coarse, solver.config)
+
+    def mirrored(self) -> StartSearch:
+        """Return the search of the same scans mirrored, left and right exchanged."""
+        meshes = [mirrored_scan(mesh, self._T_anatomical_scan) for mesh in self._meshes]
+        scans = [prepare_scan(mesh, name) for mesh, name in zip(meshes, ARCH_NAMES, strict=True)]
+        solver = ContourSolver((scans[0], scans[1]), self._config)
+        return StartSearch(meshes, solver, self._T_anatomical_scan, self._map)
 
     def at(self, footage: Footage, frame: int) -> Found:
         """Return the best poses on a frame.
@@ -180,3 +189,10 @@ def _guessed_axes(places: Array, eyes: Array) -> Array:
     up -= front * (front @ up)
     up /= np.linalg.norm(up)
     return np.stack([np.cross(up, front), up, front], axis=1)
+
+
+def mirrored_scan(mesh: Mesh, T_anatomical_scan: Array) -> Mesh:
+    """Return a teeth scan with left and right exchanged, in the same frame."""
+    points = transform_points(T_anatomical_scan, mesh.vertices) * [-1.0, 1.0, 1.0]
+    vertices = transform_points(se3_inverse(T_anatomical_scan), points)
+    return replace(mesh, vertices=vertices, faces=np.ascontiguousarray(mesh.faces[:, ::-1]))
