@@ -34,6 +34,17 @@ def test_a_camera_a_frame_late_is_named_and_made_up_for(tmp_path):
     assert errors_mm(tracks, raw=True)[1:-1].mean() < 0.06
 
 
+def test_a_frame_dropped_in_mid_take_is_named(tmp_path):
+    folder = write_masks(tmp_path / "take", FRAMES + 1)
+    for row in ("upper", "lower"):
+        files = sorted((folder / "cam1" / row).glob("*.png"))
+        for earlier, later in zip(files[8:-1], files[9:], strict=True):
+            later.rename(earlier)
+    found = track(make_capture(folder, FRAMES)).meta["findings"]
+    (dropped,) = [f for f in found if f["kind"] == "frame_dropped"]
+    assert dropped["camera"] == "cam1" and abs(dropped["frame"] - (5 + 8)) <= 2
+
+
 def test_a_wrong_focal_length_is_named(capture):
     K = CAMERAS[2].K.copy()
     K[0, 0], K[1, 1] = 1.05 * K[0, 0], 1.05 * K[1, 1]

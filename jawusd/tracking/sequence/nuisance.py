@@ -169,6 +169,10 @@ class TakeEquations:
         self._seen_S += slope.T @ precision @ slope
         self._seen_r -= slope.T @ precision @ deviation
 
+    def normal_equations(self) -> tuple[Array, Array]:
+        """Return matrix and right side of the normal equations without priors, shapes (U, U) and (U,)."""
+        return self._S, self._r
+
     def prior_covariance(self) -> Array:
         """Return the prior covariance of delays and habits, zero for camera twists, shape (U, U)."""
         return np.diag(np.r_[self._layout.prior_sigma() ** 2, np.zeros(6 * self._layout.cameras)])
