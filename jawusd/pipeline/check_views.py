@@ -185,6 +185,16 @@ def frames(parts: Parts) -> Iterator[Finding]:
         if own is not None and (first - offset >= own or stop - offset <= 0):
             message = f"none of its {own} frames lies within the frames of the take, by its offset of {offset:+d}"
             yield Finding("offset_wrong", "error", message, offset, camera=name, path=parts.description)
+    ranges = {name: sample.first_last for name, sample in parts.samples.items() if name in offsets}
+    from jawusd.capture.mask_ranges import exchanged_by_frames
+
+    for a, b in exchanged_by_frames(ranges, offsets, first, stop):
+        message = (
+            f"the masks of cameras {a} and {b} are exchanged: by their offsets, each has masks of all frames of the "
+            "take only if it takes those of the other"
+        )
+        hint = f"Exchange the masks of cameras {a} and {b}, or their offsets."
+        yield Finding("masks_cameras_exchanged", "error", message, path=parts.description, hint=hint)
     yield from _mask_ranges(parts, first, stop)
 
 

@@ -12,8 +12,8 @@ through `jawusd check` and `jawusd track` and is compared with its truth. Printe
                 the annotator, whose habits the take must tell; the worse arch. known: over the lower bound for habits
                 that are known, which no tracker of masks can reach
     shift       median over frames of the error along each anatomical axis: share of persons within 0.02 mm
-    NEES        normalised squared error of the poses over 6, mean over frames that are not grossly wrong, median
-                over persons: 1 when sigmas are honest
+    NEES        normalised squared error of the poses over 6, mean over frames that are not grossly wrong and over
+                persons: 1 when sigmas are honest
     faults      per planted fault, over a quarter of the persons: refused or flagged with the right cause; with a wrong
                 one only; not at all; and of these how many were wrong by less than 0.1 mm at the incisal point all the
                 same
@@ -173,7 +173,7 @@ def row(group: list[Outcome]) -> str:
     for part in (*ROWS, "relative"):
         steady = [np.abs(o.vectors[f"shift {part}"]).max() <= STEADY_MM for o in group]
         cells.append(f"{100 * np.mean(steady):7.0f}%")
-    cells += [f"{np.nanmedian(figures(f'nees {part}')):8.2f}" for part in (*ROWS, "relative")]
+    cells += [f"{np.nanmean(figures(f'nees {part}')):8.2f}" for part in (*ROWS, "relative")]
     return "".join(cells)
 
 

@@ -13,6 +13,7 @@ import pytest
 import trimesh
 from package_copy import ROOT
 
+from jawusd.capture.mask_ranges import exchanged_by_frames
 from jawusd.errors import CaptureError
 from jawusd.formats.finding import Finding
 from jawusd.imaging.video_writer import VideoWriter
@@ -195,6 +196,16 @@ def test_each_fault_is_found_by_its_cause(capture, plants):
         matching = [f for f in got if f.kind == kind]
         assert matching and all(f.severity == severity for f in matching), plant
         assert any(words in f.line() for f in matching), plant
+
+
+def test_masks_numbered_for_another_camera_are_exchanged():
+    offsets = {"cam0": 0, "cam1": 4, "cam2": -3}
+    right = {name: ((10 - offset, 29 - offset), None) for name, offset in offsets.items()}
+    assert exchanged_by_frames(right, offsets, 10, 30) == []
+    wrong = {**right, "cam0": right["cam2"], "cam2": right["cam0"]}
+    assert exchanged_by_frames(wrong, offsets, 10, 30) == [("cam0", "cam2")]
+    short = {**right, "cam1": ((12, 20), (12, 20)), "cam2": (None, None)}  # no exchange explains that
+    assert exchanged_by_frames(short, offsets, 10, 30) == []
 
 
 def test_a_full_disk_is_told(tmp_path, monkeypatch):

@@ -16,6 +16,7 @@ from jawusd.tracking.sequence.closed_bite import (
     STEADY,
     closed_bite,
     registration_findings,
+    registration_unknown,
 )
 from jawusd.tracking.sequence.rest_frames import RestFrames, rest_frames
 
@@ -136,6 +137,12 @@ def test_rest_frames_are_those_around_the_named_one_and_else_the_most_closed():
     assert rest_frames(_records(poses), 1, up, POINT, probes) == (0, 1, 2, 3)
     assert rest_frames(_records(poses), None, up, POINT, probes) == (0, 1, 2, 3)
     assert rest_frames(_records(poses), 99, up, POINT, probes) == ()
+
+
+@pytest.mark.parametrize(("named", "words"), [(True, "rest_frame is not tracked"), (False, "no frame shows")])
+def test_a_take_without_a_closed_bite_says_so(named, words):
+    found = registration_unknown(RestFrames((), named, POINT, POINT, False))
+    assert found.kind == "registration_unknown" and found.severity == "note" and words in found.message
 
 
 def test_without_rest_frames_nothing_is_said():

@@ -37,7 +37,7 @@ from jawusd.tracking.initialization import start_search
 from jawusd.tracking.initialization.first_frame import first_record
 from jawusd.tracking.initialization.footage import Footage, MaskSurvey, survey_masks
 from jawusd.tracking.initialization.mixups import possible_mixups
-from jawusd.tracking.initialization.pose_search import Grid, _Screen, _template, coarse_scan
+from jawusd.tracking.initialization.pose_search import Grid, Screen, _template, coarse_scan
 from jawusd.tracking.initialization.scan_checks import check_occlusion
 from jawusd.tracking.initialization.start import find_start
 from jawusd.tracking.initialization.start_search import Found, StartSearch
@@ -188,6 +188,24 @@ def test_picks_close_together_are_helped_by_the_masks(pictures):
     assert max(_error_mm(start, r) for r in (0, 1)) < 0.1
 
 
+@pytest.mark.parametrize("fails", [False, True])
+def test_picks_that_fit_outlive_a_search_that_does_not(pictures, monkeypatch, fails):
+    astray = jaw_poses(START + 1)[START].copy()
+    astray[1, :3, 3] += [0.0, 0.0, -40.0]
+
+    def search(*_):
+        if fails:
+            raise TrackingError("no pair of poses")
+        return Found(astray, -300.0, -0.2)
+
+    monkeypatch.setattr(take_start, "_SURE_MM", 0.0)
+    monkeypatch.setattr(take_start, "search_around", search)
+    monkeypatch.setattr(take_start, "_around_without_a_camera", lambda *_: None)
+    start = _start(_capture(pictures))
+    assert start.notes["by"] == "picks" and not [f for f in start.findings if f.kind == "picks_off"]
+    assert max(_error_mm(start, r) for r in (0, 1)) < 1.0
+
+
 def test_reversed_faces_do_not_matter(pictures):
     turned = [Mesh(m.vertices, m.faces[:, ::-1], m.colors) for m in MESHES]
     capture = _capture(pictures)
@@ -216,7 +234,7 @@ def test_all_shifts_at_once_agree_with_drawing_each(pictures):
         view = masks.at(FIRST + 2)[1]
     scan = coarse_scan(Mesh(MESHES[1].vertices, MESHES[1].faces), "lower")  # without gum silhouettes say all
     shifts = np.random.default_rng(0).uniform(-8, 8, (12, 3))
-    found = _Screen(view, 1, 2.0, shifts, centre).objective(scan, pose)
+    found = Screen(view, 1, 2.0, shifts, centre).objective(scan, pose)
     template = np.pad(_template(view.masks[1], view.masks[0], 2.0), 60)
     h = view.matrix @ np.append(centre, 1)
     slope = (view.matrix[:2, :3] - (h[:2] / h[2])[:, None] * view.matrix[2, :3]) / h[2]

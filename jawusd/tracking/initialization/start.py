@@ -100,12 +100,15 @@ def _picked(
     try:
         found = search_around(search, footage, start.frame, start.poses)
     except TrackingError:
-        return _elsewhere(search, footage, start)
+        return start if _fits(search, footage, start) else _elsewhere(search, footage, start)
     if (without := _around_without_a_camera(search, footage, start.frame, start.poses, found)) is not None:
         notes["camera_left_out"], found = without
-    notes |= {"by": "picks, then search", "worth_px": found.objective_px, "fit": found.fit}
-    near = Start(start.frame, found.poses, notes, _picks_off(search, start, found.poses, sigma_mm))
-    return near if "camera_left_out" in notes or _fits(search, footage, near) else _elsewhere(search, footage, near)
+    searched = {"by": "picks, then search", "worth_px": found.objective_px, "fit": found.fit}
+    near = Start(start.frame, found.poses, notes | searched, _picks_off(search, start, found.poses, sigma_mm))
+    if "camera_left_out" in notes or _fits(search, footage, near):
+        return near
+    # A search may end in another minimum than picks that are hardly unsure.
+    return start if _fits(search, footage, start) else _elsewhere(search, footage, near)
 
 
 def _picks_off(search: StartSearch, start: Start, poses: Array, sigma_mm: Mapping[str, float]) -> tuple[Finding, ...]:

@@ -191,6 +191,15 @@ def registration_findings(found: Registration) -> list[Finding]:
     return [Finding("scan_registration", severity, off, value=shift, limit=_OFF_MM, hint=hint)]
 
 
+def registration_unknown(rest: RestFrames) -> Finding:
+    """Return a note that the take does not tell how well the scans are registered."""
+    where = (
+        "the frame named as rest_frame is not tracked" if rest.named else "no frame shows the teeth at rest together"
+    )
+    hint = "Record a closed bite with both rows in sight, and name it as rest_frame in [motion]."
+    return Finding("registration_unknown", "note", f"{where}: the bite of the scans was not checked", hint=hint)
+
+
 # What registrations are off by at most; beyond it the mouth was not closed [mm, deg].
 _MOST_MM, _MOST_DEG = 3.0, 8.0
 

@@ -27,6 +27,7 @@ from jawusd.tracking.sequence.closed_bite import (
     check_registration,
     closed_bite,
     registration_findings,
+    registration_unknown,
     steady_part,
 )
 from jawusd.tracking.sequence.extrinsics import Extrinsics
@@ -73,8 +74,11 @@ def assemble(
         "extrinsics": extrinsics.report(camera_names),
         **notes,
     }
-    if bite is not None:
-        meta |= _bite_report(bite, rest, meta.get("findings", []))
+    findings = meta.get("findings", [])
+    if bite is None:
+        meta["findings"] = [*findings, registration_unknown(rest).as_json()]
+    else:
+        meta |= _bite_report(bite, rest, findings)
     return Tracks(
         frames=frames,
         T_world_upper=final[:, 0],
