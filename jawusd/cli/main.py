@@ -6,7 +6,7 @@ import sys
 
 import typer
 
-from jawusd.cli import build_commands, capture_commands, library_commands, report_commands, rig_commands
+from jawusd.cli import build_commands, capture_commands, library_commands, report_commands, rig_commands, solve_commands
 from jawusd.errors import JawusdError, explain_missing_packages
 
 app = typer.Typer(
@@ -35,6 +35,7 @@ for _command in (
     rig_commands.validate,
     rig_commands.ik,
     rig_commands.animate,
+    solve_commands.solve,
     library_commands.retarget,
     library_commands.library,
     capture_commands.plates,

@@ -34,6 +34,8 @@ _USD_LERP_BELOW = 1e-5
 _MOST_FRAMES, _FARTHEST_FRAME = 220_000, 1e9
 #: Key of the lost frames in an animation layer's `customLayerData`.
 LOST = "lostFrames"
+#: The same of frames that were not seen.
+CARRIED = "carriedFrames"
 
 
 def write_animation(
@@ -44,6 +46,7 @@ def write_animation(
     fps: float,
     *,
     rig: JawRig | None = None,
+    carried: ArrayLike = (),
 ) -> Path:
     """Write an animation layer that sublayers an actor; a time code is a frame number.
 
@@ -54,6 +57,8 @@ def write_animation(
         d: Parameters (F, 3) [mm]; rows with NaN are lost frames, bridged linearly and listed in the layer's
             `customLayerData["lostFrames"]`.
         rig: The evaluator; read from `actor` if None.
+        carried: Frames whose d was not seen but follows from those around; listed in
+            `customLayerData["carriedFrames"]`.
 
     Raises:
         RigError: Frames do not increase, nothing to animate, or the frame rate is not positive.
@@ -82,6 +87,8 @@ def write_animation(
     layer = new_layer(fps)
     layer.subLayerPaths.append(relative_path(actor, out))
     layer.startTimeCode, layer.endTimeCode = float(frames[0]), float(frames[-1])
+    if len(np.atleast_1d(carried)):
+        layer.customLayerData = {**layer.customLayerData, CARRIED: _gf.int_array(np.floor(np.asarray(carried)))}
     if not known.all():
         lost = _gf.int_array(np.floor(frames[~known]))
         layer.customLayerData = {**layer.customLayerData, LOST: lost}

@@ -119,9 +119,17 @@ def prepare_scan(mesh: Mesh, name: str) -> Scan:
     scan = _with_tables(name, vertices, crown_faces, gum_faces, painted)
     if len(crown_faces) <= _DENSE_FACES:
         return scan
-    thin = _with_tables(name, *decimated_scan(vertices, crown_faces, gum_faces, _THIN_FACES), painted)
+    return replace(scan, thin=thinned(scan, _THIN_FACES))
+
+
+def thinned(scan: Scan, crown_faces: int) -> Scan:
+    """Return the same arch with about so many crown faces, or as it is if it has no more."""
+    if len(scan.crown_faces) <= crown_faces:
+        return scan
+    parts = decimated_scan(scan.vertices, scan.crown_faces, scan.gum_faces, crown_faces)
+    thin = _with_tables(scan.name, *parts, scan.painted)
     # Steps turn about the centre, so both must have the same.
-    return replace(scan, thin=replace(thin, probes=scan.probes, centre=scan.centre, radius_mm=scan.radius_mm))
+    return replace(thin, probes=scan.probes, centre=scan.centre, radius_mm=scan.radius_mm)
 
 
 def _with_tables(

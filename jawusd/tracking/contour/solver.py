@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,13 +25,23 @@ from jawusd.tracking.contour.equations import (
 )
 from jawusd.tracking.contour.samples import HABITS, LENGTH, contour_samples, gum_distances_px
 from jawusd.tracking.contour.scan import ARCHES, Scan
-from jawusd.tracking.contour.views import View, present_masks
+from jawusd.tracking.contour.views import Drawn, View, present_masks
 
 _GUM_SHARE = 0.02  # gum faces for each crown face below which they are remains of what was cut away
 _DENSE_STEPS = 2  # with all faces of a dense scan, after the thinned one has settled
 
 # samples, how many of them are silhouette, their distances to the mask edge, visible contour length [px]
 _Match = tuple[Array, int, Array, float]
+
+
+class Matched(NamedTuple):
+    """Hold the samples of an arch in a view with their distances to the mask edge, and the gate of their residuals."""
+
+    arch: int
+    camera: int
+    samples: Array
+    distances: Array
+    gate_px: float
 
 
 class ContourSolver:
@@ -85,13 +96,13 @@ class ContourSolver:
     ) -> Solution:
         """Take one step per gate from the given poses."""
         poses = np.array(poses, np.float64)
-        rendering = _Rendering(self, views)
+        rendering = Rendering(self, views)
         pull = StartTerm(start, self._start_strength)
         all_terms: tuple[ResidualTerm, ...] = (SilhouetteTerm(), GingivalMarginTerm(), pull, *terms)
         iterations = 0
         for gate in gates_px:
             iterations += 1
-            state = self._linearise(poses, views, use, gate, rendering)
+            state = self.linearise(poses, views, use, gate, rendering)
             equations = NormalEquations(outline_weight)
             for term in all_terms:
                 term.accumulate(state, equations)
@@ -102,13 +113,29 @@ class ContourSolver:
             if gate == gates_px[-1] and self._motion_mm(step) < self.config.converged_mm:
                 break
         gate = gates_px[-1] if gates_px else self.config.final_gate_px[1]
-        state = self._linearise(poses, views, use, gate, rendering, final=True)
+        state = self.linearise(poses, views, use, gate, rendering, final=True)
         return replace(state, iterations=iterations)
 
-    def _linearise(
-        self, poses: Array, views: Sequence[View], use: Mask, gate: float, rendering: _Rendering, final: bool = False
+    def linearise(
+        self,
+        poses: Array,
+        views: Sequence[View],
+        use: Mask,
+        gate: float,
+        rendering: Rendering,
+        final: bool = False,
+        matched: list[Matched] | None = None,
     ) -> Solution:
-        """Find correspondences at the given poses and sum up their residuals."""
+        """Find correspondences at the given poses and sum up their residuals.
+
+        Args:
+            poses: T_world_upper, T_world_lower, shape (2, 4, 4).
+            views, use: one picture per camera, and which masks take part, shape (2, C).
+            gate: residual beyond which a sample counts for nothing [px].
+            rendering: of these views; share one among all steps at an instant.
+            final: also sum up what the covariance needs.
+            matched: receives the samples behind the sums.
+        """
         config = self.config
         rendering.update(poses)
         tasks = [(r, c) for r in ARCHES for c in range(len(views)) if use[r, c]]
@@ -128,6 +155,8 @@ class ContourSolver:
             used = [self._final_gate([matches[t][2] for t in tasks if t[0] == r], gate) for r in ARCHES]
         for r, c in tasks:
             samples, count, distances, visible[r, c] = matches[r, c]
+            if matched is not None:
+                matched.append(Matched(r, c, samples, distances, used[r]))
             where = (views[c].T_delay[r] @ poses[r], views[c].matrix, centres[r])
             for outline, part in ((silhouette, slice(None, count)), (margin, slice(count, None))):
                 tables = tuple(table[r, c] for table in outline[:5])
@@ -147,7 +176,7 @@ class ContourSolver:
         pose: Array,
         view: View,
         r: int,
-        rendering: _Rendering,
+        rendering: Rendering,
         c: int,
         reach: float,
     ) -> _Match:
@@ -157,11 +186,17 @@ class ContourSolver:
         limits = (config.sample_step_px, config.depth_tolerance_mm)
         gum = self._towards_gum[r]
         samples, silhouettes = contour_samples(scan, view.matrix @ pose, eye, *pictures, *limits, gum)
-        distances = np.empty(len(samples))
-        other = (view.masks[1 - r], depths[1 - r])
+        visible = float(samples[:, LENGTH].sum())
         search_limits = (reach, config.overlap_tolerance_mm, config.normal_cosine)
-        search_edges(samples, view.masks[r], *other, *search_limits, distances)
-        return samples, silhouettes, distances - samples[:, HABITS] @ view.habits[r], float(samples[:, LENGTH].sum())
+        if view.edges is None:
+            distances = np.empty(len(samples))
+            search_edges(samples, view.masks[r], view.masks[1 - r], depths[1 - r], *search_limits, distances)
+        else:
+            drawn = Drawn(rendering.labels[c][r], rendering.labels[c][1 - r], depths[1 - r])
+            distances, weights = view.edges.search(samples, silhouettes, r, drawn, search_limits)
+            visible = float(samples[~np.isnan(weights), LENGTH].sum())
+            samples[:, LENGTH] *= np.nan_to_num(weights)
+        return samples, silhouettes, distances - samples[:, HABITS] @ view.habits[r], visible
 
     def _final_gate(self, distances: list[Array], gate: float) -> float:
         """Return the Tukey gate that suits the spread of the residuals (median absolute deviation)."""
@@ -188,8 +223,8 @@ def _towards_gum(scans: Sequence[Scan]) -> list[Array | None]:
     return [None if gum else way * up for gum, way in zip(shown, (1.0, -1.0), strict=True)]
 
 
-class _Rendering:
-    """Keep pictures of both scans in every view, drawn again only after they have moved."""
+class Rendering:
+    """Keep pictures of both scans in every view of one instant, drawn again only after they have moved."""
 
     def __init__(self, solver: ContourSolver, views: Sequence[View]) -> None:
         self._solver = solver

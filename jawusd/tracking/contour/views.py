@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +19,37 @@ from jawusd.imaging.mask_survey import ARCHES, odd_pictures, survey_masks
 from jawusd.imaging.masks import open_masks
 from jawusd.imaging.working_view import WorkingView
 
+#: Cameras that are needed where nothing but the masks tells how far away the teeth are.
+FEWEST_CAMERAS = 2
+
 _BORDER_PX = 20  # kept around the masks: more than the widest search
 _CHUNK = 48  # instants held at once when going backwards: about 20 MB
+
+
+class EdgeSearch(Protocol):
+    """Find where contour samples should lie in a picture."""
+
+    def search(
+        self, samples: Array, count: int, arch: int, drawn: Drawn, limits: tuple[float, float, float]
+    ) -> tuple[Array, Array]:
+        """Return the distance of each sample to its edge [px], NaN where none is seen, and its weight.
+
+        Weights are 0 .. 1, NaN for samples that the other arch hides.
+
+        Args:
+            samples: shape (n, COLUMNS); the first `count` are silhouette.
+            limits: reach [px], depth tolerance [mm], least cosine; as in `search_edges`.
+        """
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """Hold both arches as drawn into a picture."""
+
+    own: NDArray[np.uint8]  # labels of the arch alone: CROWN, GUM or 0, shape (h, w)
+    other: NDArray[np.uint8]  # the same of the other arch
+    other_inverse_depth: NDArray[np.float32]  # [1/mm], 0 = empty, shape (h, w)
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +65,8 @@ class View:
     T_delay: Array = field(default_factory=lambda: np.tile(np.eye(4), (2, 1, 1)))
     # how far masks reach beyond the teeth at free edges [px], at the gum line [px], along the gum [mm], shape (2, 3)
     habits: Array = field(default_factory=lambda: np.zeros((2, 3)))
+    # finds outlines by colour where there are no masks
+    edges: EdgeSearch | None = None
 
 
 class MaskViews:
@@ -52,6 +84,7 @@ class MaskViews:
         offsets: Mapping[str, int],
         centre_world: Array,
         working_px_per_mm: float,
+        fewest: int = FEWEST_CAMERAS,
     ) -> None:
         """Open the mask readers and choose the working sizes.
 
@@ -60,13 +93,14 @@ class MaskViews:
             offsets: reference frame minus own frame number of every camera.
             centre_world: where the teeth are at the start [mm], shape (3,).
             working_px_per_mm: resolution at the teeth; pictures are never enlarged.
+            fewest: cameras with masks that are needed.
 
         Raises:
-            TrackingError: fewer than two cameras have masks, or a camera is not calibrated or not synchronised.
+            TrackingError: fewer cameras have masks, or a camera is not calibrated or not synchronised.
             CaptureError: masks are missing, damaged, of the wrong size, or no masks.
         """
         self._stack = ExitStack()
-        self._masked = masked = masked_sources(sources, cameras, offsets)
+        self._masked = masked = masked_sources(sources, cameras, offsets, fewest)
         self._sizes = [(s, cameras[s.name].size_px if s.masks else (0, 0)) for s in sources]
         self.cameras = tuple(cameras[s.name] for s in masked)
         self._offsets = [offsets[s.name] for s in masked]
@@ -125,12 +159,15 @@ def present_masks(views: Sequence[View]) -> Mask:
 
 
 def masked_sources(
-    sources: Sequence[CameraSource], cameras: Mapping[str, Camera], offsets: Mapping[str, int]
+    sources: Sequence[CameraSource],
+    cameras: Mapping[str, Camera],
+    offsets: Mapping[str, int],
+    fewest: int = FEWEST_CAMERAS,
 ) -> tuple[CameraSource, ...]:
     """Return the cameras whose masks show anything.
 
     Raises:
-        TrackingError: fewer than two have such masks, or one of them is not calibrated or not synchronised.
+        TrackingError: fewer than `fewest` have such masks, or one of them is not calibrated or not synchronised.
         CaptureError: masks are missing, damaged, of the wrong size, or no masks.
     """
     masked = []
@@ -142,16 +179,19 @@ def masked_sources(
                 raise TrackingError(f"camera {source.name} has no {what}", hint="Calibrate and synchronise first.")
         if not all(reader.is_black for reader in open_masks(source, cameras[source.name].size_px)):
             masked.append(source)
-    if len(masked) < 2:
+    if len(masked) < fewest:
         without = [
             f"{source.name}: {'no masks' if source.masks is None else 'masks are all black'}"
             for source in sources
             if source not in masked
         ]
         raise TrackingError(
-            f"{len(masked)} of {len(sources)} cameras have masks; one view leaves the depth of the teeth unknown"
+            f"{len(masked)} of {len(sources)} cameras have masks"
+            + ("; one view leaves the depth of the teeth unknown" if fewest > 1 else "")
             + (f" ({'; '.join(without)})" if without else ""),
-            hint="Give masks for two cameras at least, some 30 degrees apart or more.",
+            hint="Give masks for two cameras at least, some 30 degrees apart or more."
+            if fewest > 1
+            else "Segment one camera at least.",
         )
     return tuple(masked)
 

@@ -15,7 +15,7 @@ from jawusd.geometry import Camera, triangulate
 from jawusd.geometry.arrays import Array
 from jawusd.imaging.masks import open_masks
 from jawusd.imaging.working_view import WorkingView
-from jawusd.tracking.contour.views import MaskViews
+from jawusd.tracking.contour.views import FEWEST_CAMERAS, MaskViews
 
 _BESIDE = 2  # surveyed frames to either side that show much the same
 _WIDTH_PX = 320  # of the surveyed pictures: their middles are good to a tenth of a millimetre
@@ -32,14 +32,15 @@ class Footage:
     cameras: Mapping[str, Camera]
     offsets: Mapping[str, int]
     frames: tuple[int, int] | None
+    fewest: int = FEWEST_CAMERAS  # that must show both arches
 
     def survey(self, frames: tuple[int, int] | None, count: int) -> MaskSurvey:
         """Measure the masks of evenly spread frames, of the whole footage if no range is given."""
-        return survey_masks(self.sources, self.cameras, self.offsets, frames or self.frames, count)
+        return survey_masks(self.sources, self.cameras, self.offsets, frames or self.frames, count, self.fewest)
 
     def views(self, centre: Array, px_per_mm: float) -> MaskViews:
         """Open the masks at a resolution at the teeth, which are near a world point [mm], shape (3,)."""
-        return MaskViews(self.sources, self.cameras, self.offsets, centre, px_per_mm)
+        return MaskViews(self.sources, self.cameras, self.offsets, centre, px_per_mm, self.fewest)
 
     def has_masks(self, frame: int) -> bool:
         """Tell whether both arches have masks in two cameras on a frame."""
@@ -61,6 +62,7 @@ class MaskSurvey:
     areas_px: Array  # size of every mask, shape (F, 2, C); 0 without one
     matrices: Array  # world [mm] to homogeneous px of the survey pictures, shape (C, 3, 4)
     eyes: Array  # camera centres in the world [mm], shape (C, 3)
+    fewest: int = FEWEST_CAMERAS  # cameras that must show both arches
 
     def places(self) -> Array:
         """Return the world points seen at the middles of the masks [mm], NaN with fewer than two, shape (F, 2, 3)."""
@@ -79,7 +81,7 @@ class MaskSurvey:
         """
         full = np.maximum(np.quantile(self.areas_px, 0.9, axis=0), 1.0)
         shown = np.sqrt(np.minimum(self.areas_px / full, 1.0)).sum(-1).min(-1)
-        usable = ((self.areas_px > 0).sum(-1) >= 2).all(-1)
+        usable = ((self.areas_px > 0).sum(-1) >= self.fewest).all(-1)
         apart: list[int] = []
         beside: list[int] = []
         for f in np.argsort(-shown, kind="stable").tolist():
@@ -94,11 +96,12 @@ def survey_masks(
     offsets: Mapping[str, int],
     frames: tuple[int, int] | None,
     count: int,
+    fewest: int = FEWEST_CAMERAS,
 ) -> MaskSurvey:
     """Measure the masks of at most `count` evenly spread frames; all arguments as in `Footage`.
 
     Raises:
-        TrackingError: no frame shows both arches in two cameras.
+        TrackingError: no frame shows both arches in enough cameras.
         CaptureError: a mask cannot be read.
     """
     with ExitStack() as stack:
@@ -128,10 +131,10 @@ def survey_masks(
                     rows @ np.arange(len(rows)) / rows.sum(),
                 ]
                 areas[f, r, c] = area
-    if not ((areas > 0).sum(-1) >= 2).all(-1).any():
+    if not ((areas > 0).sum(-1) >= fewest).all(-1).any():
         raise TrackingError(
             f"none of {len(chosen)} frames looked at from {chosen[0]} to {chosen[-1]} has masks of both rows of teeth "
-            "in two cameras",
+            f"in {fewest} camera{'s' if fewest > 1 else ''}",
             hint="Segment some frames in every camera, or give [bootstrap] picks on one that is.",
         )
     return MaskSurvey(
@@ -140,4 +143,5 @@ def survey_masks(
         areas_px=areas,
         matrices=np.stack([view.camera.projection_matrix() for view in working]),
         eyes=np.stack([view.camera.centre_world() for view in working]),
+        fewest=fewest,
     )

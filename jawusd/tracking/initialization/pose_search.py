@@ -75,7 +75,7 @@ def coarse_scan(mesh: Mesh, name: str) -> Scan:
     return prepare_scan(Mesh(mesh.vertices[chosen], faces.astype(np.int32), colors), name)
 
 
-class _Screen:
+class Screen:
     """Tell how well the drawn arch fits its mask in one picture at every shift."""
 
     def __init__(self, view: View, arch: int, px_per_mm: float, shifts: Array, at: Array) -> None:
@@ -126,7 +126,7 @@ def search_arch(
         map_: runs the orientations.
     """
     shifts = grid.shifts() @ base[:3, :3].T
-    screens = [_Screen(view, arch, px_per_mm, shifts, base[:3, 3]) for view in views if view.present[arch]]
+    screens = [Screen(view, arch, px_per_mm, shifts, base[:3, 3]) for view in views if view.present[arch]]
 
     def best_translation(turn: Array) -> Candidate:
         pose = base @ make_transform(turn, np.zeros(3)) @ hinge

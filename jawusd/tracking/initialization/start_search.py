@@ -93,7 +93,7 @@ class StartSearch:
         places = survey.places()[0]
         with footage.views(places.mean(0), _PX_PER_MM) as masks:
             views = masks.at(frame)
-        axes = _guessed_axes(places, survey.eyes)
+        axes = guessed_axes(places, survey.eyes)
         bases = [make_transform(axes, place) for place in places]
         finalists = [self._searched(r, views, bases[r], _GRID) for r in ARCHES]
         return self._settled(finalists, views, footage, frame)
@@ -175,7 +175,7 @@ class StartSearch:
         return (score_px(solution) - price * uncovered).sum(1)
 
 
-def _guessed_axes(places: Array, eyes: Array) -> Array:
+def guessed_axes(places: Array, eyes: Array) -> Array:
     """Return left, up and front of the teeth in the world as far as the masks show, shape (3, 3), axes in columns.
 
     Args:

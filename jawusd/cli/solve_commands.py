@@ -1,0 +1,66 @@
+"""Performances of people whose rigs exist: solve."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from jawusd.cli.options import Force, Json, Outside, RigArg
+from jawusd.cli.output import emit, progress, refuse_existing
+
+
+class Head(StrEnum):
+    """Say whether the head moves before the cameras."""
+
+    free = "free"
+    fixed = "fixed"
+
+
+class Focal(StrEnum):
+    """Say whether focal lengths are calibrated."""
+
+    known = "known"
+    free = "free"
+
+
+ShotArg = Annotated[
+    Path, typer.Argument(help="capture.toml of the shot, or the folder that holds it.", show_default=False)
+]
+
+
+def solve(
+    rig: RigArg,
+    shot: ShotArg,
+    out: Annotated[
+        Path, typer.Option("-o", "--out", help="Table of d (.csv), tracks (.npz) or animation layer (.usdc).")
+    ] = Path("take.csv"),
+    head: Annotated[Head, typer.Option(help="fixed: the cameras are worn, and move with the head.")] = Head.free,
+    focal: Annotated[
+        Focal, typer.Option(help="free: the calibration only guesses focal lengths; the take tells them.")
+    ] = Focal.known,
+    jobs: Annotated[int, typer.Option(min=1, max=64, help="Threads that search for the start.")] = 2,
+    force: Force = False,
+    allow_outside: Outside = False,
+    as_json: Json = False,
+) -> None:
+    """Solve a performance of the person of a rig from the masks of one or more cameras."""
+    from jawusd.pipeline import solve as stage
+
+    stage.check_output(rig, out)
+    refuse_existing(out, force)
+    with progress() as report:
+        found = stage.solve(
+            rig,
+            shot,
+            out,
+            fixed_head=head is Head.fixed,
+            free_focal=focal is Focal.free,
+            jobs=jobs,
+            allow_outside=allow_outside,
+            progress=report,
+        )
+    summary = stage.solve_summary(found)
+    emit({**summary, "file": str(out)}, as_json, lambda: [str(out), *stage.solve_lines(summary)])

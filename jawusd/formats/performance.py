@@ -1,0 +1,85 @@
+"""A solved performance: head and jaw of a known person, frame by frame, and the table that `jawusd solve` writes."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.formats.atomic import write_text_atomic
+from jawusd.geometry.arrays import Array, Mask
+
+HEADER = ("frame", "time_s", "d1", "d2", "d3", "sigma1", "sigma2", "sigma3", "margin_mm", "verdict", "state")
+
+
+class SolveState(IntEnum):
+    """Values of `Performance.state`."""
+
+    LOST = 0  # masks that nothing fits: the motion before and after carries the jaw
+    SOLVED = 1  # both arches found
+    CARRIED = 2  # an arch out of sight: lips closed, no picture
+
+    def __str__(self) -> str:
+        return self.name.lower()
+
+
+@dataclass(eq=False)
+class Performance:
+    """Hold a performance; every frame has a pose, and `covariance` says what it is worth.
+
+    Attributes:
+        frames: frame numbers of the reference camera, shape (F,).
+        T_world_upper: the head, shape (F, 4, 4).
+        d: jaw parameters [mm], shape (F, 3).
+        covariance: of a step of the head in its own axes about `pivot` (omega [rad], v [mm]) and of d [mm], shape
+            (F, 9, 9).
+        pivot: point of the upper scan [mm], shape (3,).
+        state: `SolveState`, shape (F,).
+        found: arches whose outlines took part, (upper, lower), shape (F, 2).
+        use: masks that took part, shape (F, 2, C).
+        uncovered: share of every mask that the scan leaves uncovered, shape (F, 2, C); NaN without a mask.
+        residual_px, matched_px: spread of the outlines' residuals, and contour that was matched, shape (F, 2).
+        margin_mm: signed distance to the rig's bound, > 0 inside, shape (F,).
+        verdict: what the rig says of the pose, in words, length F.
+        camera_names: length C.
+        notes: what was estimated for the whole take.
+    """
+
+    frames: NDArray[np.int64]
+    T_world_upper: Array
+    d: Array
+    covariance: Array
+    pivot: Array
+    state: NDArray[np.int8]
+    found: Mask
+    use: Mask
+    uncovered: Array
+    residual_px: Array
+    matched_px: Array
+    margin_mm: Array
+    verdict: list[str]
+    camera_names: tuple[str, ...]
+    notes: dict[str, object] = field(default_factory=dict)
+
+    @property
+    def sigma_d(self) -> Array:
+        """The standard deviations of d [mm], shape (F, 3)."""
+        return np.sqrt(np.einsum("fii->fi", self.covariance)[:, 6:])
+
+
+def write_performance(path: str | os.PathLike[str], performance: Performance, fps: float) -> None:
+    """Write the jaw of every frame as CSV, atomically: `HEADER`; lengths in mm, times from frame 0 on.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    p = performance
+    numbers = np.column_stack([p.frames / fps, p.d, p.sigma_d, p.margin_mm])
+    lines = [",".join(HEADER)]
+    for frame, row, verdict, state in zip(p.frames, numbers, p.verdict, p.state, strict=True):
+        words = (verdict.replace(",", ";"), str(SolveState(int(state))))
+        lines.append(",".join([str(int(frame)), *(f"{value:.6f}" for value in row), *words]))
+    write_text_atomic(path, "\n".join([*lines, ""]))

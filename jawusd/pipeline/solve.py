@@ -1,0 +1,205 @@
+"""Solve the performance of a person whose rig exists, and write it: `jawusd solve`."""
+
+from __future__ import annotations
+
+import os
+from functools import partial
+from pathlib import Path
+from typing import NotRequired, TypedDict, cast
+
+import numpy as np
+
+import jawusd
+from jawusd.errors import OutputError, RigError, explain_missing_packages
+from jawusd.evaluator import JawRig
+from jawusd.formats.capture import Capture
+from jawusd.formats.finding import Finding
+from jawusd.formats.performance import Performance, SolveState, write_performance
+from jawusd.formats.tracks import save_tracks
+from jawusd.pipeline.calibrate import sync_cameras
+from jawusd.pipeline.prepare import load_cameras, load_labelled, naming_file, open_capture, registered_meshes
+from jawusd.pipeline.state import Progress, no_progress
+from jawusd.pipeline.track import tracking_config
+
+#: What a performance can be written as, by the suffix of the file.
+SUFFIXES = (".csv", ".npz", ".usdc", ".usda")
+_USD = (".usd", ".usda", ".usdc", ".usdz")
+_LISTED_RUNS = 20
+
+
+class SolveSummary(TypedDict):
+    """Hold what a person should know of a performance; counts are numbers of frames."""
+
+    frames: int
+    solved: int
+    carried: list[tuple[int, int]]  # runs of frames, first and last, in which an arch is out of sight
+    lost: list[tuple[int, int]]  # the same in which masks fit nothing
+    outside: int  # beyond what the rig allows
+    cameras: list[str]
+    sigma_mm: dict[str, float]  # median standard deviation of d1, d2, d3 over solved frames
+    worst_sigma_mm: dict[str, float]  # the largest over all frames
+    limits: str  # what the result is worth, in words
+    focal: NotRequired[dict[str, tuple[float, float]]]  # found over calibrated, with sigma, by camera
+    findings: NotRequired[list[dict[str, str | float | int]]]
+
+
+@explain_missing_packages()
+def solve(
+    rig: str | os.PathLike[str],
+    shot: Capture | str | os.PathLike[str],
+    out: str | os.PathLike[str] | None = None,
+    *,
+    fixed_head: bool = False,
+    free_focal: bool = False,
+    jobs: int = 2,
+    allow_outside: bool = False,
+    progress: Progress | None = None,
+) -> Performance:
+    """Solve head pose and jaw parameters of every frame of a shot, and write them if a file is named.
+
+    Args:
+        rig: `actor.usda`, another layer of it, or `model.npz`.
+        shot: the capture of the shot, its capture.toml or the folder that holds it.
+        out: file to write: a table of d (.csv), tracks (.npz), or an animation layer on the rig (.usdc, .usda).
+        fixed_head: the cameras are worn, as on a helmet: the head does not move before them.
+        free_focal: the focal lengths of the calibration are guesses, good to a tenth.
+        jobs: threads of the search for the start; the result does not depend on it.
+        allow_outside: let paths in the capture leave its folder.
+
+    Raises:
+        FormatError, RigError: the rig cannot be read.
+        CaptureError, CalibrationError, SyncError: see `track`.
+        TrackingError: the teeth cannot be found in the masks.
+        OutputError: the file cannot be written.
+    """
+    from jawusd.tracking.performance.shot import solve_capture
+
+    check_output(rig, out)
+    progress = progress or no_progress
+    capture = open_capture(shot, allow_outside=allow_outside)
+    jaw = jawusd.load(rig)
+    offsets = sync_cameras(capture, progress)["offsets"]
+    with naming_file(capture.folder / "capture.toml"):
+        meshes, findings = load_labelled(capture)
+        meshes = registered_meshes(meshes, jaw.meta)
+        found = solve_capture(
+            capture,
+            load_cameras(capture),
+            offsets,
+            meshes["upper_teeth"],
+            meshes["lower_teeth"],
+            jaw,
+            tracking_config(capture),
+            fixed_head=fixed_head,
+            free_focal=free_focal,
+            threads=jobs,
+            progress=partial(progress, "solve"),
+        )
+    known = cast("list[dict[str, str | float | int]]", found.notes.get("findings", []))
+    found.notes["findings"] = [*known, *(finding.as_json() for finding in findings)]
+    if out is not None:
+        write_solved(out, found, jaw, rig, capture.fps)
+    return found
+
+
+@explain_missing_packages()
+def write_solved(
+    out: str | os.PathLike[str], performance: Performance, jaw: JawRig, rig: str | os.PathLike[str], fps: float
+) -> None:
+    """Write a performance as the suffix of the file says; see `solve`.
+
+    Raises:
+        OutputError: the file cannot be written.
+        RigError: the rig cannot carry an animation layer.
+    """
+    suffix = Path(out).suffix.lower()
+    if suffix == ".csv":
+        write_performance(out, performance, fps)
+    elif suffix == ".npz":
+        from jawusd.tracking.performance.results import tracks_of
+
+        save_tracks(out, tracks_of(performance, jaw))
+    else:
+        from jawusd.rig import write_animation
+
+        unseen = performance.frames[performance.state != SolveState.SOLVED]
+        write_animation(out, rig, performance.frames, performance.d, fps, rig=jaw, carried=unseen)
+
+
+def check_output(rig: str | os.PathLike[str], out: str | os.PathLike[str] | None) -> None:
+    """Check, before any work, that a performance can be written to a file of that name.
+
+    Raises:
+        OutputError: its suffix says nothing.
+        RigError: an animation layer needs a rig in USD.
+    """
+    if out is None:
+        return
+    if Path(out).suffix.lower() in _USD and Path(rig).suffix.lower() not in _USD:
+        raise RigError("is no USD rig, which an animation layer needs.", path=rig, hint="Name actor.usda of the rig.")
+    if Path(out).suffix.lower() not in SUFFIXES:
+        raise OutputError(
+            "its suffix does not say what to write.", path=out, hint=f"Name a file ending in {', '.join(SUFFIXES)}."
+        )
+
+
+def solve_summary(performance: Performance) -> SolveSummary:
+    """Sum up a performance."""
+    p = performance
+    solved = p.state == SolveState.SOLVED
+    sigma = p.sigma_d
+    typical = np.median(sigma[solved], axis=0) if solved.any() else np.full(3, np.nan)
+    names = ("d1", "d2", "d3")
+    summary = SolveSummary(
+        frames=len(p.frames),
+        solved=int(solved.sum()),
+        carried=_runs(p, SolveState.CARRIED),
+        lost=_runs(p, SolveState.LOST),
+        outside=sum("outside" in verdict for verdict in p.verdict),
+        cameras=list(p.camera_names),
+        sigma_mm={name: round(float(value), 4) for name, value in zip(names, typical, strict=True)},
+        worst_sigma_mm={name: round(float(value), 4) for name, value in zip(names, sigma.max(0), strict=True)},
+        limits=_limits(p),
+        findings=cast("list[dict[str, str | float | int]]", p.notes.get("findings", [])),
+    )
+    if "focal" in p.notes:
+        summary["focal"] = cast("dict[str, tuple[float, float]]", p.notes["focal"])
+    return summary
+
+
+def _runs(p: Performance, state: SolveState) -> list[tuple[int, int]]:
+    """Return the runs of frames in a state, first and last frame of each."""
+    runs: list[tuple[int, int]] = []
+    for frame in p.frames[p.state == state].tolist():
+        if runs and runs[-1][1] == frame - 1:
+            runs[-1] = (runs[-1][0], frame)
+        else:
+            runs.append((frame, frame))
+    return runs
+
+
+def _limits(p: Performance) -> str:
+    """Say what limits the accuracy."""
+    if len(p.camera_names) == 1:
+        return "having one camera: errors lie along its line of sight, which a second camera shows"
+    return "the rig: its own error at the condyles is larger than that of the outlines"
+
+
+def solve_lines(summary: SolveSummary) -> list[str]:
+    """Return `solve_summary` as text."""
+    lines = [f"solved {summary['solved']} of {summary['frames']} frames with {', '.join(summary['cameras'])}"]
+    for word, runs in (("carried by the motion around", summary["carried"]), ("lost", summary["lost"])):
+        if runs:
+            more = "" if len(runs) <= _LISTED_RUNS else f" and {len(runs) - _LISTED_RUNS} more runs"
+            listed = ", ".join(f"{a}" if a == b else f"{a}-{b}" for a, b in runs[:_LISTED_RUNS])
+            lines.append(f"  {word}: {sum(b - a + 1 for a, b in runs)} frames ({listed}{more})")
+    if summary["outside"]:
+        lines.append(f"  outside the rig's bound: {summary['outside']} frames")
+    sigma = ", ".join(f"{name} {value:.3f}" for name, value in summary["sigma_mm"].items())
+    lines.append(f"  expected error (1 sigma, median) [mm]: {sigma}")
+    worst = ", ".join(f"{name} {value:.2f}" for name, value in summary["worst_sigma_mm"].items())
+    lines.append(f"  largest: {worst}")
+    for name, (factor, sigma_factor) in summary.get("focal", {}).items():
+        lines.append(f"  focal length of {name}: {factor:.4f} times the calibrated one (+-{sigma_factor:.4f})")
+    lines.append(f"  limited by {summary['limits']}")
+    return [*lines, *(f"  {Finding.from_json(found).line()}" for found in summary.get("findings", []))]

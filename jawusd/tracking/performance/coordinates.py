@@ -1,0 +1,93 @@
+"""Head pose and jaw parameters as the unknowns of a frame, and how both arches move with them.
+
+The head turns and moves by twists in its own axes about the middle of the upper crowns, the pivot; the jaw parameters
+follow. A frame has nine unknowns: omega [rad], v [mm], d1, d2, d3 [mm].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from jawusd.evaluator import JawRig
+from jawusd.geometry import (
+    make_transform,
+    orthonormalise,
+    se3_adjoint,
+    se3_exp,
+    se3_inverse,
+    se3_left_jacobian,
+    se3_log,
+    transform_point,
+)
+from jawusd.geometry.arrays import Array
+from jawusd.tracking.contour.scan import Scan
+
+HEAD, JAW = slice(0, 6), slice(6, 9)
+LOCAL = 9
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """Hold where the head is and how the jaw stands."""
+
+    head: Array  # T_world_upper, shape (4, 4)
+    d: Array  # jaw parameters [mm], shape (3,)
+
+
+class Coordinates:
+    """Turn head poses and jaw parameters into poses of both arches, with their derivatives.
+
+    Attributes:
+        jaw: the person's rig.
+        pivot: point of the upper scan the head turns about [mm], shape (3,).
+    """
+
+    def __init__(self, jaw: JawRig, scans: Sequence[Scan]) -> None:
+        """Take the pivots from the scans, upper and lower."""
+        self.jaw, self.pivot, self._lower_centre = jaw, scans[0].centre, scans[1].centre
+        self._to_pivot = make_transform(np.eye(3), -self.pivot)
+        self._from_pivot = make_transform(np.eye(3), self.pivot)
+
+    def arches(self, pose: Pose) -> Array:
+        """Return T_world_upper and T_world_lower, shape (2, 4, 4)."""
+        return np.stack([pose.head, pose.head @ self.jaw.pose(pose.d)])
+
+    def pose_of(self, arches: Array) -> Pose:
+        """Return the pose of the rig nearest to poses of both arches, shape (2, 4, 4)."""
+        return Pose(arches[0].copy(), self.jaw.encode(se3_inverse(arches[0]) @ arches[1])[0])
+
+    def slopes(self, pose: Pose) -> tuple[Array, Array]:
+        """Return how the left world twists of both arches about their centres follow from the unknowns, (6, 9) each.
+
+        The centres are those of the crowns, as in `Solution.centres`.
+        """
+        relative = self.jaw.pose(pose.d)
+        turn = np.zeros((6, 6))
+        turn[:3, :3] = turn[3:, 3:] = pose.head[:3, :3]
+        upper, lower = np.zeros((6, LOCAL)), np.zeros((6, LOCAL))
+        upper[:, HEAD] = turn
+        centre = transform_point(relative, self._lower_centre)
+        lower[:, HEAD] = turn @ se3_adjoint(make_transform(np.eye(3), self.pivot - centre))
+        # The left twist of the mandible in the skull frame by d (Barfoot 2017, eq. 7.85 for the derivative of exp).
+        by_d = se3_left_jacobian(self.jaw.twist(pose.d)) @ self.jaw.jacobian(pose.d)
+        lower[:, JAW] = turn @ se3_adjoint(make_transform(np.eye(3), -centre)) @ by_d
+        return upper, lower
+
+    def moved(self, pose: Pose, step: Array) -> Pose:
+        """Return the pose after a step of the nine unknowns, shape (9,)."""
+        return Pose(self.turned(pose.head, step[HEAD]), pose.d + step[JAW])
+
+    def turned(self, head: Array, twist: Array) -> Array:
+        """Return T_world_upper, shape (..., 4, 4), after twists in the head's axes about the pivot, shape (..., 6)."""
+        return orthonormalise(head @ self._from_pivot @ se3_exp(twist) @ self._to_pivot)
+
+    def head_steps(self, before: Array, after: Array) -> Array:
+        """Return the twists that take heads (..., 4, 4) to others, (..., 6), in the first's axes at the pivot."""
+        return se3_log(self._to_pivot @ se3_inverse(before) @ after @ self._from_pivot)
+
+    def step(self, before: Pose, after: Pose) -> Array:
+        """Return the step of the nine unknowns from one pose to another, shape (9,)."""
+        return np.concatenate([self.head_steps(before.head, after.head), after.d - before.d])

@@ -1,0 +1,74 @@
+"""Focal lengths that nobody calibrated: how outlines grow with them, and pictures with another one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from jawusd.geometry import transform_points
+from jawusd.geometry.arrays import Array
+from jawusd.tracking.contour.samples import HABITS, LENGTH, NX, NY, U, V, X, Z
+from jawusd.tracking.contour.solver import Matched
+from jawusd.tracking.contour.views import View
+
+#: What is known of the logarithm of an unknown focal length, standard deviation [-]: a guess from the kind of lens.
+PRIOR_LOG_FOCAL = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Growth:
+    """Hold sums over matched samples per arch and view, as `OutlineSums`: g is how a sample grows with log focal [px].
+
+    Attributes:
+        twist: sum w J g, shape (2, C, 6).
+        habit: sum w h g, shape (2, C, 3).
+        own, distance: sum w g^2 and sum w g d, shape (2, C).
+    """
+
+    twist: Array
+    habit: Array
+    own: Array
+    distance: Array
+
+
+def growth_of(matched: Sequence[Matched], poses: Array, centres: Array, views: Sequence[View]) -> Growth:
+    """Return the sums over what was matched at poses (2, 4, 4) of both arches about their centres (2, 3)."""
+    count = len(views)
+    out = Growth(np.zeros((2, count, 6)), np.zeros((2, count, 3)), np.zeros((2, count)), np.zeros((2, count)))
+    for found in matched:
+        r, c = found.arch, found.camera
+        near = np.abs(found.distances) < found.gate_px  # False for NaN
+        samples, d = found.samples[near], found.distances[near]
+        weight = (1.0 - (d / found.gate_px) ** 2) ** 2 * samples[:, LENGTH]
+        growth = ((samples[:, [U, V]] - principal_point(views[c].matrix)) * samples[:, [NX, NY]]).sum(1)
+        slope = _slopes(samples, views[c].T_delay[r] @ poses[r], views[c].matrix, centres[r])
+        out.twist[r, c] = slope.T @ (weight * growth)
+        out.habit[r, c] = samples[:, HABITS].T @ (weight * growth)
+        out.own[r, c], out.distance[r, c] = weight @ growth**2, weight @ (growth * d)
+    return out
+
+
+def _slopes(samples: Array, pose: Array, matrix: Array, centre: Array) -> Array:
+    """Return how far samples move along their normals [px] per unit of a left twist about a world point, (n, 6)."""
+    points = transform_points(pose, samples[:, X : Z + 1])
+    depth = points @ matrix[2, :3] + matrix[2, 3]
+    across = matrix[:2, :3] - samples[:, [U, V], None] * matrix[2, :3]
+    along = np.einsum("nk,nkj->nj", samples[:, [NX, NY]], across) / depth[:, None]
+    return np.hstack([np.cross(points - centre, along), along])
+
+
+def with_focal(view: View, log_factor: float) -> View:
+    """Return a view with another focal length, by the logarithm of the factor."""
+    if log_factor == 0.0:
+        return view
+    factor = float(np.exp(log_factor))
+    grow = np.diag([factor, factor, 1.0])
+    grow[:2, 2] = (1.0 - factor) * principal_point(view.matrix)
+    return replace(view, matrix=grow @ view.matrix)
+
+
+def principal_point(matrix: Array) -> Array:
+    """Return where the optical axis meets the picture of a camera matrix (3, 4) without skew [px], shape (2,)."""
+    return np.asarray(matrix[:2, :3] @ matrix[2, :3] / (matrix[2, :3] @ matrix[2, :3]), np.float64)

@@ -1,0 +1,128 @@
+"""Align head and jaw with the pictures of one instant."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from jawusd.geometry.arrays import Array, Mask
+from jawusd.tracking.contour.equations import Solution
+from jawusd.tracking.contour.scan import ARCHES, thinned
+from jawusd.tracking.contour.solver import ContourSolver, Matched, Rendering
+from jawusd.tracking.contour.views import View
+from jawusd.tracking.performance.coordinates import HEAD, JAW, LOCAL, Coordinates, Pose
+
+# How softly the bound of the rig holds [mm]: it is only as wide as the take the rig was made from, and a hard one loses
+# jaws for good that go beyond.
+BOUND_MM = 1.0
+_QUICK_FACES, _QUICK_REDRAW_PX = 6_000, 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Expected:
+    """Say where head and jaw are expected before an instant is looked at."""
+
+    pose: Pose
+    precision: Array  # of the step away from there, shape (9,)
+
+
+@dataclass(frozen=True, eq=False)
+class Aligned:
+    """Hold an alignment: the pose, and what the outlines say about it."""
+
+    pose: Pose
+    solution: Solution
+
+
+class InstantSolver:
+    """Gauss-Newton in head pose and jaw parameters; keeps no state between instants."""
+
+    def __init__(self, solver: ContourSolver, coordinates: Coordinates) -> None:
+        self.solver, self.coordinates = solver, coordinates
+        self.config = solver.config
+
+    def align(
+        self,
+        start: Pose,
+        views: Sequence[View],
+        use: Mask,
+        gates_px: Sequence[float],
+        expected: Expected,
+        outline_weight: Array,
+        rendering: Rendering | None = None,
+    ) -> Aligned:
+        """Return the likeliest pose.
+
+        Args:
+            start: where to begin.
+            views, use: one picture per camera, and which masks take part, shape (2, C).
+            gates_px: residual gate of every step.
+            expected: what is known without the pictures.
+            outline_weight: 1 / (outline variance times correlation length) of both arches [1/px^3], shape (2,).
+            rendering: of these views, if there is one.
+        """
+        rendering = rendering or Rendering(self.solver, views)
+        pose = start
+        for gate in gates_px:
+            state = self.linearise(pose, views, use, rendering, gate)
+            matrix, right = self.equations(pose, state, outline_weight)
+            away = self.coordinates.step(expected.pose, pose)
+            step = np.asarray(
+                np.linalg.solve(matrix + np.diag(expected.precision), right - expected.precision * away), np.float64
+            )
+            pose = self.coordinates.moved(pose, step)
+            if gate == gates_px[-1] and self._motion_mm(step) < self.config.converged_mm:
+                break
+        state = self.linearise(pose, views, use, rendering, self.config.final_gate_px[1], final=True)
+        return Aligned(pose, state)
+
+    def linearise(
+        self,
+        pose: Pose,
+        views: Sequence[View],
+        use: Mask,
+        rendering: Rendering,
+        gate: float,
+        final: bool = False,
+        matched: list[Matched] | None = None,
+    ) -> Solution:
+        """Match the outlines at a pose and sum up their residuals; see `ContourSolver.linearise`."""
+        return self.solver.linearise(self.coordinates.arches(pose), views, use, gate, rendering, final, matched)
+
+    def equations(self, pose: Pose, state: Solution, outline_weight: Array) -> tuple[Array, Array]:
+        """Return precision (9, 9) and right side (9,) of a step, from outlines and bound."""
+        matrix, right = bound_equations(self.coordinates, pose.d)
+        for r, slope in zip(ARCHES, self.coordinates.slopes(pose), strict=True):
+            precision, gradient = state.outline.precision[r].sum(0), state.outline.gradient[r].sum(0)
+            matrix += outline_weight[r] * slope.T @ precision @ slope
+            right += outline_weight[r] * slope.T @ gradient
+        return matrix, right
+
+    def _motion_mm(self, step: Array) -> float:
+        """Return about how far crowns move in a step [mm]."""
+        turn = float(np.linalg.norm(step[HEAD][:3])) * self.solver.scans[0].radius_mm
+        return turn + float(np.linalg.norm(step[HEAD][3:])) + float(np.linalg.norm(step[JAW]))
+
+
+def bound_equations(coordinates: Coordinates, d: Array) -> tuple[Array, Array]:
+    """Return precision (9, 9) and right side (9,) of the soft bound: nothing inside, a quadratic outside."""
+    matrix, right = np.zeros((LOCAL, LOCAL)), np.zeros(LOCAL)
+    margin = float(coordinates.jaw.margin(d))
+    if margin < 0:
+        gradient = coordinates.jaw.margin_gradient(d)
+        matrix[JAW, JAW] = np.outer(gradient, gradient) / BOUND_MM**2
+        right[JAW] = -gradient * margin / BOUND_MM**2
+    return matrix, right
+
+
+def quick(solver: ContourSolver) -> ContourSolver:
+    """Return a solver of thinned scans that draws them less often, for the many steps of a first pass."""
+    scans = [thinned(replace(scan.thin or scan, thin=None), _QUICK_FACES) for scan in solver.scans]
+    return ContourSolver(scans, replace(solver.config, redraw_px=_QUICK_REDRAW_PX))
+
+
+def whole(solver: ContourSolver) -> ContourSolver:
+    """Return a solver that always takes all faces."""
+    return ContourSolver([replace(scan, thin=None) for scan in solver.scans], solver.config)

@@ -1,0 +1,99 @@
+"""A performance as tracks, so that whatever reads tracks reads it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jawusd.evaluator import JawRig
+from jawusd.formats.performance import Performance
+from jawusd.formats.tracks import LOST, TRACKED, Tracks, TracksMeta
+from jawusd.geometry import LANDMARKS, hat, make_transform, se3_adjoint, se3_left_jacobian
+from jawusd.geometry.arrays import Array
+from jawusd.tracking.contour.quality import landmark_sigmas
+from jawusd.tracking.performance.coordinates import HEAD, JAW
+
+
+def tracks_of(performance: Performance, jaw: JawRig) -> Tracks:
+    """Return the poses of both arches with their covariances.
+
+    Every frame has final poses; arches out of sight count as lost and have no raw ones. The standard deviations of the
+    landmarks include what the rig itself does not know.
+    """
+    p = performance
+    head, relative = p.T_world_upper, jaw.pose(p.d)
+    lower = head @ relative
+    # Left twists by the nine unknowns: of the head in the world, of the mandible in the skull frame.
+    turn = se3_adjoint(head @ make_transform(np.eye(3), p.pivot))
+    by_d = se3_left_jacobian(jaw.twist(p.d)) @ jaw.jacobian(p.d)
+    of_upper, of_lower = np.zeros((2, len(p.frames), 6, 9))
+    of_upper[..., HEAD] = of_lower[..., HEAD] = turn
+    of_lower[..., JAW] = se3_adjoint(head) @ by_d
+    relative_covariance = _spread(by_d, p.covariance[:, JAW, JAW])
+    own = landmark_sigmas(relative, relative_covariance, jaw.landmarks)
+    meta = TracksMeta(solver="performance")
+    meta.update(_known_notes(p))
+    count, cameras = len(p.frames), len(p.camera_names)
+    raw = {"upper": head.copy(), "lower": lower.copy(), "relative": relative.copy()}
+    raw["upper"][~p.found[:, 0]], raw["lower"][~p.found[:, 1]], raw["relative"][~p.found.all(1)] = (
+        np.nan,
+        np.nan,
+        np.nan,
+    )
+    return Tracks(
+        frames=p.frames,
+        T_world_upper=head,
+        T_world_lower=lower,
+        T_upper_lower=relative,
+        raw_T_world_upper=raw["upper"],
+        raw_T_world_lower=raw["lower"],
+        raw_T_upper_lower=raw["relative"],
+        status=np.where(p.found, TRACKED, LOST).astype(np.int8),
+        prior_aided=np.ones(count, bool),
+        coverage_error=p.uncovered.reshape(count, 2, cameras),
+        masks_used=p.use,
+        covariance_upper=_spread(of_upper, p.covariance),
+        covariance_lower=_spread(of_lower, p.covariance),
+        covariance_relative=relative_covariance + _of_rig(jaw, relative),
+        sigma_mm=np.hypot(own, rig_sigma_mm(jaw)),
+        residual_px=p.residual_px,
+        matched_px=p.matched_px,
+        camera_names=p.camera_names,
+        meta=meta,
+    )
+
+
+def rig_sigma_mm(jaw: JawRig) -> Array:
+    """Return how far off the rig itself is at each landmark [mm], shape (5,); 0 where it does not say."""
+    known = jaw.meta.get("uncertainty")
+    table = known if isinstance(known, dict) else {}
+    return np.array([float(table.get(name, {}).get("base_mm", 0.0)) for name in LANDMARKS])
+
+
+def _spread(slope: Array, covariance: Array) -> Array:
+    return np.asarray(slope @ covariance @ np.swapaxes(slope, -1, -2), np.float64)
+
+
+def _of_rig(jaw: JawRig, relative: Array) -> Array:
+    """Return the covariance of T_upper_lower that lets each landmark stray as far as the rig does, shape (F, 6, 6)."""
+    variance = rig_sigma_mm(jaw) ** 2
+    out = np.zeros((len(relative), 6, 6))
+    if not variance.all():
+        return out
+    for k, pose in enumerate(relative):
+        precision = np.zeros((6, 6))
+        for point, spread in zip(jaw.landmarks @ pose[:3, :3].T + pose[:3, 3], variance, strict=True):
+            J = np.hstack([-hat(point), np.eye(3)])
+            precision += J.T @ J * (3.0 / spread)
+        # Five landmarks would otherwise count as independent witnesses of one pose.
+        out[k] = np.linalg.inv(precision) * len(variance) / 2
+    return out
+
+
+def _known_notes(p: Performance) -> TracksMeta:
+    out = TracksMeta()
+    start, findings = p.notes.get("start"), p.notes.get("findings")
+    if isinstance(start, dict):
+        out["start"] = start
+    if isinstance(findings, list):
+        out["findings"] = findings
+    return out

@@ -1,0 +1,235 @@
+"""Where a solve begins with one camera: the person's jaw searched in its masks.
+
+One view tells the distance by size and perspective alone, and of size lips hide an unknown part. So all distances are
+tried at which the masks could be the teeth, with all orientations; then, for the most promising heads, the jaw's poses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from jawusd.errors import TrackingError
+from jawusd.evaluator import JawRig
+from jawusd.formats.mesh import Mesh
+from jawusd.geometry import make_transform, transform_point, transform_points
+from jawusd.geometry.arrays import Array
+from jawusd.imaging.raster import count_bits
+from jawusd.tracking.config import Mapper
+from jawusd.tracking.contour.quality import arch_fit
+from jawusd.tracking.contour.scan import ARCH_NAMES, ARCHES
+from jawusd.tracking.contour.solver import ContourSolver
+from jawusd.tracking.contour.views import View
+from jawusd.tracking.initialization.footage import Footage
+from jawusd.tracking.initialization.pose_search import Candidate, Grid, Screen, coarse_scan, hinge_at_front, search_arch
+from jawusd.tracking.initialization.start_search import guessed_axes
+from jawusd.tracking.performance.attempts import MOST_UNSURE, Attempts, FrameFit, Instant
+from jawusd.tracking.performance.coordinates import Coordinates, Pose
+from jawusd.tracking.performance.instant import Expected, InstantSolver
+
+_PX_PER_MM = 2.0
+_ANYWHERE_MM = 200.0  # where a first look is taken, along the optical axis
+_SURVEYED, _FRAMES_TRIED = 24, 4
+# How wide the teeth are that a mask may show [mm]: from the front teeth alone to a whole arch, in steps of an eighth.
+_WIDTHS_MM = 22.0 * 1.125 ** np.arange(10)
+_USUAL_WIDTH_MM = 42.0
+_GRID = Grid(
+    yaw_rad=np.radians(np.arange(-56, 57, 8.0)),
+    pitch_rad=np.radians(np.arange(-32, 33, 8.0)),
+    roll_rad=np.radians(np.arange(-32, 33, 8.0)),
+    reach_mm=(9.0, 7.5, 0.1),
+)
+_SHIFTS = np.stack(np.meshgrid(*[np.arange(-3, 3.1, 1.5)] * 2, [0.0], indexing="ij"), axis=-1).reshape(-1, 3)
+# Heads that are kept, jaws tried with each, pairs that are aligned in a few steps, to the end, and at the working size.
+_HEADS, _JAWS, _TRIED, _FINALISTS, _WINNERS = 240, 32, 160, 24, 5
+# Price of a pixel of crown beyond the mask, in px of contour: lips may hide it, so it is little.
+_OUTSIDE_PRICE = 0.05
+_DISTINCT_MM = 3.0  # mean distance of the teeth between heads that are kept
+# Fit of the arch that fits worse beyond which there is no doubt, and below which there is no start [-]: as with more
+# cameras, see `start_causes.CLEAR_FIT`.
+_CLEAR_FIT, _LEAST_FIT = 0.3, 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class FoundPose:
+    """Hold a start: frame, pose, and the fit of the arch that fits worse [-]."""
+
+    frame: int
+    pose: Pose
+    fit: float
+
+
+class SingleStart:
+    """Search head and jaw on frames of one camera."""
+
+    def __init__(
+        self, meshes: Sequence[Mesh], solver: ContourSolver, jaw: JawRig, T_anatomical_scan: Array, map_: Mapper = map
+    ) -> None:
+        """Prepare coarse scans.
+
+        Args:
+            meshes: upper and lower teeth scans in one frame [mm].
+            solver: holds the same scans, prepared.
+            jaw: the person's rig.
+            T_anatomical_scan: scan frame to (left, up, front) axes, shape (4, 4).
+            map_: runs orientations.
+        """
+        self._jaw, self._map, self._config = jaw, map_, solver.config
+        self._coarse = tuple(coarse_scan(mesh, name) for mesh, name in zip(meshes, ARCH_NAMES, strict=True))
+        self._hinge = hinge_at_front(self._coarse[0].crown_vertices(), T_anatomical_scan)
+        weight = np.full(2, 1.0 / solver.config.typical_noise_px3)
+        rough = ContourSolver(self._coarse, solver.config)
+        self._rough = Attempts(InstantSolver(rough, Coordinates(jaw, self._coarse)), weight)
+        self._fine = Attempts(InstantSolver(solver, Coordinates(jaw, solver.scans)), weight)
+        self._jaws = spread_out(jaw, _JAWS)
+
+    def find(self, footage: Footage) -> FoundPose:
+        """Return a start: the first frame that fits beyond doubt, or the one that fits best.
+
+        Raises:
+            TrackingError: no frame of those tried fits.
+            CaptureError: a mask cannot be read.
+        """
+        best: FoundPose | None = None
+        frames = footage.survey(None, _SURVEYED).promising(_FRAMES_TRIED).tolist()
+        for frame in frames:
+            found = self.at(footage, frame)
+            if found is not None and (best is None or found.fit > best.fit):
+                best = found
+            if best is not None and best.fit >= _CLEAR_FIT:
+                break
+        if best is None or best.fit < _LEAST_FIT:
+            raise TrackingError(
+                f"the teeth were not found in the masks of the one camera on {len(frames)} frames tried "
+                f"({', '.join(map(str, frames))})",
+                hint="Check that the rig is of this person, the focal length and the masks; begin the shot with the "
+                "teeth in sight, or give a second camera.",
+            )
+        return best
+
+    def at(self, footage: Footage, frame: int) -> FoundPose | None:
+        """Return the best pose on a frame, None if nothing fits."""
+        camera = footage.cameras[footage.sources[0].name]
+        anywhere = camera.centre_world() + _ANYWHERE_MM * camera.T_cam_world[2, :3]
+        with footage.views(anywhere, _PX_PER_MM) as masks:
+            (view,) = masks.at(frame)
+        if not view.present.all():
+            return None
+        places = _places(view)
+        usual = int(np.argmin(np.abs(_WIDTHS_MM - _USUAL_WIDTH_MM)))
+        with footage.views(places[usual].mean(0), _PX_PER_MM) as masks:
+            views = masks.at(frame)
+        instant = self._rough.instant(views)
+        ends = [self._after(pose, instant, self._config.wide_gates_px) for pose in self._searched(views, places)]
+        ends = sorted(ends, key=_worth)[:_WINNERS]
+        best: tuple[float, FrameFit] | None = None
+        px_per_mm = self._config.working_px_per_mm
+        for _, pose in ends:
+            with footage.views(transform_point(pose.head, self._coarse[0].centre), px_per_mm) as masks:
+                views = masks.at(frame)
+            end = self._refined(pose, self._fine, views)
+            if end is not None and (best is None or end[0] > best[0]):
+                best = end
+        return None if best is None else FoundPose(frame, best[1].pose, best[0])
+
+    def _searched(self, views: Sequence[View], places: Array) -> list[Pose]:
+        """Return the most promising heads with the most promising jaw of each.
+
+        The upper arch alone tells little about the distance; a few steps with both arches tell more.
+        """
+        found: list[Candidate] = []
+        for pair in places:
+            base = make_transform(guessed_axes(pair, views[0].eye[None]), pair[0])
+            found += search_arch(self._coarse[0], 0, views, _PX_PER_MM, base, self._hinge, _GRID, self._map)
+        found = [
+            replace(head, objective=head.objective - self._outside_price(0, head.pose, views[0])) for head in found
+        ]
+        heads = self._distinct(sorted(found, key=lambda head: -head.objective))
+        pairs = sorted(
+            (pair for some in self._map(partial(self._with_jaws, views), heads) for pair in some), key=_worth
+        )
+        instant = self._rough.instant(views)
+        few = self._config.trial_gates_px
+        tried = [(self._after(pose, instant, few)[0], pose) for _, pose in pairs[:_TRIED]]
+        return [pose for _, pose in sorted(tried, key=_worth)[:_FINALISTS]]
+
+    def _distinct(self, found: Sequence[Candidate]) -> list[Candidate]:
+        """Return the best candidates that differ from one another."""
+        probes = self._coarse[0].probes[::20]
+        kept: list[Candidate] = []
+        places = np.empty((_HEADS, len(probes), 3))
+        for head in found:
+            here = transform_points(head.pose, probes)
+            apart = np.linalg.norm(places[: len(kept)] - here, axis=-1).mean(1)
+            if not (apart < _DISTINCT_MM).any():
+                places[len(kept)] = here
+                kept.append(head)
+                if len(kept) == _HEADS:
+                    break
+        return kept
+
+    def _with_jaws(self, views: Sequence[View], head: Candidate) -> list[tuple[float, Pose]]:
+        """Return the two most promising jaws with a head, with the objective of both arches."""
+        place = transform_point(head.pose, self._coarse[1].centre)
+        screen = Screen(views[0], 1, _PX_PER_MM, _SHIFTS @ head.pose[:3, :3].T, place)
+        worth = []
+        for d in self._jaws:
+            pose = head.pose @ self._jaw.pose(d)
+            price = self._outside_price(1, pose, views[0])
+            worth.append(float(screen.objective(self._coarse[1], pose).max()) - price)
+        return [(head.objective + worth[k], Pose(head.pose, self._jaws[k])) for k in np.argsort(worth)[::-1][:2]]
+
+    def _outside_price(self, arch: int, pose: Array, view: View) -> float:
+        """Return the price of crowns drawn where there is no mask: teeth too near would cover any."""
+        bits = self._coarse[arch].silhouette(view.matrix @ pose, view.masks.shape[1:])
+        return _OUTSIDE_PRICE * max(int(count_bits(bits)) - int((view.masks[arch] > 127).sum()), 0)
+
+    def _after(self, pose: Pose, instant: Instant, gates: Sequence[float]) -> tuple[float, Pose]:
+        """Return how well both arches fit after some steps [px], and where they are then."""
+        expected = Expected(pose, MOST_UNSURE**-2.0)
+        trial = self._rough.attempt(pose, expected, instant, instant.present, gates)
+        arches = self._rough.instants.coordinates.arches(trial.pose)
+        outside = sum(self._outside_price(r, arches[r], instant.views[0]) for r in ARCHES)
+        price = self._config.uncovered_price * self._config.working_px_per_mm / _PX_PER_MM
+        return trial.objective(price) - outside, trial.pose
+
+    def _refined(self, pose: Pose, attempts: Attempts, views: Sequence[View]) -> tuple[float, FrameFit] | None:
+        """Return the fit of the worse arch after aligning, with the frame; None if an arch is not found."""
+        found = attempts.near(pose, attempts.instant(views), MOST_UNSURE)
+        if found.solution is None or not found.found.all():
+            return None
+        scans = attempts.instants.solver.scans
+        return float(arch_fit(scans, found.solution, views, self._config.uncovered_price).min()), found
+
+
+def _worth(entry: tuple[float, Pose]) -> float:
+    return -entry[0]
+
+
+def spread_out(jaw: JawRig, count: int) -> Array:
+    """Return captured jaw parameters far from one another, the bite among them, shape (at most count, 3) [mm]."""
+    d = np.vstack([np.zeros(3), jaw.captured_d])
+    tips = transform_points(jaw.pose(d), jaw.landmarks[:1])[:, 0]
+    chosen, distance = [0], np.linalg.norm(tips - tips[0], axis=1)
+    while len(chosen) < min(count, len(d)):
+        farthest = int(distance.argmax())
+        chosen.append(farthest)
+        distance = np.minimum(distance, np.linalg.norm(tips - tips[farthest], axis=1))
+    return np.asarray(d[chosen], np.float64)
+
+
+def _places(view: View) -> Array:
+    """Return where the middles of both masks are for every width the teeth may have [mm], shape (W, 2, 3)."""
+    middles, columns = np.ones((2, 3)), np.flatnonzero((view.masks > 127).any((0, 1)))
+    for r, mask in enumerate(view.masks):
+        rows, across = np.nonzero(mask > 127)
+        middles[r, :2] = across.mean(), rows.mean()
+    # With the third row of the camera matrix of unit length, the factor of a ray is its depth.
+    matrix = view.matrix / np.linalg.norm(view.matrix[2, :3])
+    rays = np.linalg.solve(matrix[:, :3], middles.T).T
+    focal_px = float(np.linalg.norm(np.cross(matrix[0, :3], matrix[2, :3])))
+    depths = focal_px * _WIDTHS_MM / max(float(np.ptp(columns)), 1.0)
+    return np.asarray(view.eye + depths[:, None, None] * rays, np.float64)

@@ -1,0 +1,123 @@
+"""What is unknown of a whole take besides its frames, and the equations of a frame in all unknowns.
+
+Of the take: how far the masks reach over free edges and gum line, the same in all cameras; with a fixed head, where it
+is; and focal lengths that are not known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from jawusd.geometry.arrays import Array
+from jawusd.tracking.contour.scan import ARCHES
+from jawusd.tracking.contour.views import View
+from jawusd.tracking.performance.attempts import FrameFit
+from jawusd.tracking.performance.coordinates import HEAD, JAW, LOCAL, Coordinates, Pose
+from jawusd.tracking.performance.focal import PRIOR_LOG_FOCAL, with_focal
+from jawusd.tracking.performance.instant import bound_equations
+
+_HABITS = 3  # of an arch, as in `OutlineSums`
+# What is known of them without the take: one hand's habits from arch to arch [px, px, mm].
+_PRIOR_HABITS = np.tile([0.15, 0.15, 0.05], 2)
+# Frames whose outline errors are independent of one another: the same hand draws the same teeth all over the take.
+_INDEPENDENT_FRAMES = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class TakeState:
+    """Hold the unknowns of a take as far as they are known."""
+
+    habits: Array  # of both arches, shape (2, 3): see `View.habits`
+    log_focal: Array  # logarithm of true over calibrated focal length, shape (C,)
+
+    @classmethod
+    def unknown(cls, cameras: int) -> TakeState:
+        """Return what is known before anything is estimated."""
+        return cls(np.zeros((2, _HABITS)), np.zeros(cameras))
+
+    def corrected(self, views: Sequence[View]) -> list[View]:
+        """Return the views of an instant with what is known of the take."""
+        pairs = zip(views, self.log_focal.tolist(), strict=True)
+        return [replace(with_focal(view, log_focal), habits=self.habits) for view, log_focal in pairs]
+
+
+class Unknowns:
+    """Say where the unknowns of frames and take stand, and set up equations in them.
+
+    Attributes:
+        local: how many a frame has.
+        shared: how many the take has.
+        jaw: where those of the jaw stand in a frame.
+        head: the same of the head, None if it is fixed.
+    """
+
+    def __init__(self, coordinates: Coordinates, frames: int, *, fixed_head: bool = False, free_focal: int = 0) -> None:
+        """Lay them out for a take of so many frames, and so many cameras of unknown focal length: all, or none."""
+        self._coordinates, self.fixed_head, self.free_focal = coordinates, fixed_head, free_focal
+        self.local = LOCAL - 6 if fixed_head else LOCAL
+        self.jaw = slice(self.local - 3, self.local)
+        self.head = None if fixed_head else HEAD
+        self._habits = slice(6 if fixed_head else 0, (6 if fixed_head else 0) + 2 * _HABITS)
+        self.focal = slice(self._habits.stop, self._habits.stop + free_focal)
+        self.shared = self.focal.stop
+        # A take overrates what its frames tell about habits by so much.
+        self.redundancy = np.ones(self.shared)
+        self.redundancy[self._habits] = max(1.0, frames / _INDEPENDENT_FRAMES)
+
+    def prior(self, state: TakeState) -> tuple[Array, Array]:
+        """Return precision and right side of what is known of the take without its frames, shapes (G,)."""
+        precision, off = np.zeros(self.shared), np.zeros(self.shared)
+        precision[self._habits] = self.redundancy[self._habits] * _PRIOR_HABITS**-2.0
+        off[self._habits] = state.habits.ravel()
+        precision[self.focal] = PRIOR_LOG_FOCAL**-2.0
+        off[self.focal] = state.log_focal if self.free_focal else ()
+        return precision, -precision * off
+
+    def frame(self, fit: FrameFit, weight: Array) -> tuple[Array, Array]:
+        """Return precision and right side of a frame by its outlines and the bound, shapes (L + G, L + G) and (L + G,).
+
+        Args:
+            fit: the frame, matched where it is.
+            weight: 1 / (outline variance times correlation length) of both arches [1/px^3], shape (2,).
+        """
+        pose, solution, found, size = fit.pose, fit.solution, fit.found, LOCAL + 2 * _HABITS + self.free_focal
+        matrix, right = np.zeros((size, size)), np.zeros(size)
+        matrix[:LOCAL, :LOCAL], right[:LOCAL] = bound_equations(self._coordinates, pose.d)
+        for r, slope in zip(ARCHES, self._coordinates.slopes(pose), strict=True):
+            if solution is None or not found[r]:
+                continue
+            sums = solution.outline
+            # The rows: six twists of the arch, three habits.
+            to_twist, to_habit = np.zeros((6, size)), np.zeros((_HABITS, size))
+            to_twist[:, :LOCAL] = slope
+            to_habit[:, LOCAL + _HABITS * r : LOCAL + _HABITS * (r + 1)] = np.eye(_HABITS)
+            both = to_twist.T @ sums.habit_slope[r].sum(0).T @ to_habit
+            own = to_twist.T @ sums.precision[r].sum(0) @ to_twist + to_habit.T @ sums.habit_weight[r].sum(0) @ to_habit
+            matrix += weight[r] * (own + both + both.T)
+            right += weight[r] * (to_twist.T @ sums.gradient[r].sum(0) + to_habit.T @ sums.habit_distance[r].sum(0))
+            if fit.growth is not None and self.free_focal:
+                columns = slice(size - self.free_focal, size)
+                cross = weight[r] * (fit.growth.twist[r] @ to_twist + fit.growth.habit[r] @ to_habit)
+                matrix[columns] += cross
+                matrix[:, columns] += cross.T
+                matrix[columns, columns] += weight[r] * np.diag(fit.growth.own[r])
+                right[columns] += weight[r] * fit.growth.distance[r]
+        if not self.fixed_head:
+            return matrix, right
+        order = np.r_[np.arange(LOCAL)[JAW], np.arange(LOCAL)[HEAD], np.arange(LOCAL, size)]
+        return matrix[np.ix_(order, order)], right[order]
+
+    def moved(
+        self, poses: Sequence[Pose], state: TakeState, local: Array, shared: Array
+    ) -> tuple[list[Pose], TakeState]:
+        """Return poses and take after a step of all unknowns, shapes (N, L) and (G,)."""
+        steps = np.zeros((len(poses), LOCAL))
+        steps[:, JAW] = local[:, self.jaw]
+        steps[:, HEAD] = shared[:6] if self.fixed_head else local[:, HEAD]
+        moved = [self._coordinates.moved(pose, step) for pose, step in zip(poses, steps, strict=True)]
+        habits = state.habits + shared[self._habits].reshape(2, _HABITS)
+        log_focal = state.log_focal + (shared[self.focal] if self.free_focal else 0.0)
+        return moved, TakeState(habits, log_focal)

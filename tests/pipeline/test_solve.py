@@ -1,0 +1,101 @@
+"""The first frames of the example capture as a shot of the person whose rig was built from all of it."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from package_copy import ROOT
+from pxr import Sdf
+from short_example import write_short
+
+import jawusd
+from jawusd.errors import OutputError, RigError, TrackingError
+from jawusd.formats.performance import SolveState
+from jawusd.formats.poses import read_parameters
+from jawusd.formats.tracks import load_tracks
+from jawusd.geometry import transform_point
+from jawusd.pipeline.prepare import open_capture
+from jawusd.pipeline.solve import check_output, solve, solve_summary, write_solved
+from jawusd.rig.motion_read import read_poses_of_stage
+
+EXAMPLE = ROOT / "examples" / "capture"
+COUNT = 12
+
+
+@pytest.fixture(scope="module")
+def shot(tmp_path_factory):
+    return write_short(tmp_path_factory.mktemp("shot"), COUNT)
+
+
+@pytest.fixture(scope="module")
+def rig(example_build):
+    return example_build[0] / "actor.usda"
+
+
+def tip_errors_mm(rig, frames, d):
+    with np.load(EXAMPLE / "truth" / "truth.npz") as truth:
+        relative = truth["T_upper_lower"][np.searchsorted(truth["frames"], frames)]
+    tip = rig.landmarks[0]
+    return np.linalg.norm(transform_point(rig.pose(d), tip) - transform_point(relative, tip), axis=-1)
+
+
+def run(*arguments, code=0):
+    command = [sys.executable, "-m", "jawusd", *map(str, arguments)]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
+    assert result.returncode == code and "Traceback" not in result.stderr, result.stdout + result.stderr
+    return result.stdout if code == 0 else result.stderr
+
+
+def test_the_command_writes_a_table_and_a_summary(rig, shot, tmp_path):
+    summary = json.loads(run("solve", rig, shot, "-o", tmp_path / "take.csv", "--json"))
+    assert summary["frames"] == summary["solved"] == COUNT and not summary["carried"] and not summary["lost"]
+    frames, d = read_parameters(tmp_path / "take.csv")
+    assert len(frames) == COUNT and tip_errors_mm(jawusd.load(rig), frames, d).max() < 0.3
+    assert "--force" in run("solve", rig, shot, "-o", tmp_path / "take.csv", code=10)
+
+
+def test_tracks_and_animation_hold_the_same_jaw(rig, shot, tmp_path):
+    jaw = jawusd.load(rig)
+    found = solve(rig, shot, tmp_path / "take.npz")
+    tracks = load_tracks(tmp_path / "take.npz")
+    np.testing.assert_allclose(tracks.T_upper_lower, jaw.pose(found.d), atol=1e-9)
+    assert solve_summary(found)["sigma_mm"]["d1"] < 0.1
+    solve(rig, shot, tmp_path / "take.usdc")
+    frames, poses = read_poses_of_stage(tmp_path / "take.usdc")
+    shown = poses[np.isin(frames, found.frames)]
+    np.testing.assert_allclose(shown, jaw.pose(found.d), atol=1e-3)
+
+
+def test_frames_that_were_not_seen_are_named(rig, shot, tmp_path):
+    capture = open_capture(shot)
+    found = solve(rig, capture, None)
+    found.state[3] = SolveState.CARRIED
+    write_solved(tmp_path / "take.usda", found, jawusd.load(rig), rig, capture.fps)
+    layer = Sdf.Layer.FindOrOpen(str(tmp_path / "take.usda"))
+    frame = int(found.frames[3])
+    assert list(layer.customLayerData["carriedFrames"]) == [frame]
+    assert solve_summary(found)["carried"] == [(frame, frame)]
+
+
+def test_one_camera_will_do(rig, shot):
+    capture = open_capture(shot)
+    alone = capture.model_copy(update={"cameras": capture.cameras[:1], "bootstrap": None})
+    found = solve(rig, alone, None)
+    assert found.camera_names == (capture.cameras[0].name,) and (found.state == SolveState.SOLVED).all()
+    assert tip_errors_mm(jawusd.load(rig), found.frames, found.d).mean() < 0.8
+
+
+def test_what_cannot_be_written_is_refused_before_any_work(rig, tmp_path):
+    with pytest.raises(OutputError, match="suffix"):
+        check_output(rig, tmp_path / "take.txt")
+    with pytest.raises(RigError, match="USD rig"):
+        check_output(rig.parent / "model.npz", tmp_path / "take.usdc")
+
+
+def test_a_shot_without_masks_is_refused(rig, shot):
+    capture = open_capture(shot)
+    none = tuple(camera.model_copy(update={"masks": None}) for camera in capture.cameras)
+    with pytest.raises(TrackingError, match="have masks"):
+        solve(rig, capture.model_copy(update={"cameras": none}), None)

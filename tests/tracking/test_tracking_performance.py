@@ -1,0 +1,179 @@
+"""Performances of a known jaw: unknowns, a take with lips closed over some frames, one and several cameras."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import small_take
+from bumpy_teeth import disturbed, jaw_poses, render_masks
+from example_model import LANDMARKS_ANATOMICAL, example_arrays, example_meta
+
+from jawusd.errors import TrackingError
+from jawusd.evaluator import JawRig
+from jawusd.formats.performance import SolveState
+from jawusd.geometry import relative_pose, transform_point, transform_points
+from jawusd.tracking.config import TrackingConfig
+from jawusd.tracking.contour.equations import twist_between
+from jawusd.tracking.contour.scan import prepare_scan, teeth_centre
+from jawusd.tracking.contour.solver import ContourSolver
+from jawusd.tracking.contour.views import MaskViews, masked_sources
+from jawusd.tracking.initialization.footage import Footage
+from jawusd.tracking.performance.coordinates import LOCAL, Coordinates, Pose
+from jawusd.tracking.performance.single_start import SingleStart
+from jawusd.tracking.performance.take import Shot, solve_performance
+
+COUNT = 26
+HIDDEN = range(12, 16)  # lips closed
+
+
+@pytest.fixture(scope="module")
+def jaw():
+    same = {"T_anatomical_skull": np.eye(4), "T_rest": np.eye(4), "landmarks": LANDMARKS_ANATOMICAL}
+    return JawRig({**example_arrays(), **same}, example_meta())
+
+
+@pytest.fixture(scope="module")
+def scans():
+    return tuple(prepare_scan(mesh, row) for mesh, row in zip(small_take.MESHES, small_take.ROWS))
+
+
+@pytest.fixture(scope="module")
+def truth():
+    """The jaw parameters and the head of every frame."""
+    t = np.arange(COUNT)
+    d = np.column_stack([7.0 + 2.5 * np.sin(0.3 * t), 1.2 * np.sin(0.25 * t), 0.6 + 0.5 * np.cos(0.2 * t)])
+    return d, jaw_poses(COUNT)[:, 0]
+
+
+@pytest.fixture(scope="module")
+def folder(jaw, truth, tmp_path_factory):
+    """The masks of the take; none on the hidden frames."""
+    return write_masks(tmp_path_factory.mktemp("shot"), jaw, truth, small_take.CAMERAS)
+
+
+def write_masks(out, jaw, truth, cameras):
+    rng = np.random.default_rng(0)
+    for camera in cameras:
+        for row in small_take.ROWS:
+            (out / camera.name / row).mkdir(parents=True)
+        for k, (d, head) in enumerate(zip(*truth)):
+            if k in HIDDEN:
+                continue
+            masks = render_masks(small_take.MESHES, np.stack([head, head @ jaw.pose(d)]), camera, None, 0.3, rng)
+            for row, mask in zip(small_take.ROWS, masks):
+                cv2.imwrite(str(small_take.png(out, camera.name, row, k)), (mask > 127).astype(np.uint8) * 255)
+    return out
+
+
+def solved(jaw, scans, truth, folder, cameras, off_mm=1.0, **options):
+    """Solve the take with some cameras from a disturbed start."""
+    d, head = truth
+    names = [camera.name for camera in cameras]
+    capture = small_take.make_capture(
+        folder, COUNT, cameras=[small_take.source(folder, n) for n in names], bootstrap=None
+    )
+    start = np.stack([head[0], head[0] @ jaw.pose(d[0])])
+    start = disturbed(start, off_mm, 0.01, np.random.default_rng(4))
+    table = {camera.name: camera for camera in cameras}
+    with MaskViews(capture.cameras, table, small_take.OFFSETS, teeth_centre(scans, start), 7.2, 1) as views:
+        frames = (small_take.FIRST, small_take.FIRST + COUNT)
+        pose = Coordinates(jaw, scans).pose_of(start)
+        shot = Shot(views, tuple(names), frames, small_take.FIRST, pose, 25.0, **options)
+        return solve_performance(jaw, scans, shot)
+
+
+def tip_error_mm(jaw, found, truth):
+    tip = jaw.landmarks[0]
+    return np.linalg.norm(transform_point(jaw.pose(found.d), tip) - transform_point(jaw.pose(truth[0]), tip), axis=-1)
+
+
+def seen():
+    return np.setdiff1d(np.arange(COUNT), HIDDEN)
+
+
+def test_slopes_are_what_steps_do(jaw, scans, truth):
+    coordinates = Coordinates(jaw, scans)
+    pose = Pose(truth[1][5], truth[0][5])
+    before = coordinates.arches(pose)
+    for k, unit in enumerate(1e-5 * np.eye(LOCAL)):
+        after = coordinates.arches(coordinates.moved(pose, unit))
+        for r, slope in enumerate(coordinates.slopes(pose)):
+            centre = transform_point(before[r], scans[r].centre)
+            np.testing.assert_allclose(slope[:, k], twist_between(before[r], after[r], centre) / 1e-5, atol=2e-4)
+
+
+def test_steps_and_moves_undo_each_other(jaw, scans, truth):
+    coordinates = Coordinates(jaw, scans)
+    a, b = (Pose(truth[1][k], truth[0][k]) for k in (3, 9))
+    reached = coordinates.moved(a, coordinates.step(a, b))
+    np.testing.assert_allclose(reached.head, b.head, atol=1e-9)
+    np.testing.assert_allclose(reached.d, b.d, atol=1e-12)
+    nearest = coordinates.pose_of(coordinates.arches(b))
+    np.testing.assert_allclose(nearest.d, b.d, atol=1e-6)
+
+
+@pytest.mark.parametrize(("count", "seen_mm", "hidden_mm"), [(3, 0.08, 0.5), (1, 0.5, 0.8)])
+def test_a_performance_is_found_and_carried_through_closed_lips(jaw, scans, truth, folder, count, seen_mm, hidden_mm):
+    found = solved(jaw, scans, truth, folder, small_take.CAMERAS[:count])
+    error = tip_error_mm(jaw, found, truth)
+    assert error[seen()].max() < seen_mm and error[list(HIDDEN)].max() < hidden_mm
+    assert (found.state[seen()] == SolveState.SOLVED).all() and (found.state[list(HIDDEN)] == SolveState.CARRIED).all()
+    sigma = found.sigma_d
+    assert sigma[list(HIDDEN)].min() > 2 * np.median(sigma[seen()])
+    crown = scans[0].vertices[::50]
+    head = np.linalg.norm(
+        transform_points(found.T_world_upper, crown) - transform_points(truth[1], crown), axis=-1
+    ).mean(1)
+    assert head[seen()].max() < 2.5 * seen_mm
+
+
+def test_a_start_elsewhere_is_refused(jaw, scans, truth, folder):
+    with pytest.raises(TrackingError, match="do not fit the masks"):
+        solved(jaw, scans, truth, folder, small_take.CAMERAS, off_mm=25.0)
+
+
+def test_relative_poses_are_the_rigs(jaw, scans, truth):
+    coordinates = Coordinates(jaw, scans)
+    pose = Pose(truth[1][2], truth[0][2])
+    np.testing.assert_allclose(relative_pose(*coordinates.arches(pose)), jaw.pose(pose.d), atol=1e-12)
+
+
+def test_a_wrong_focal_length_is_found(jaw, scans, truth, folder):
+    camera = small_take.CAMERAS[0]
+    K = camera.K.copy()
+    K[:2, :2] *= 1.06
+    wrong = replace(camera, K=K)
+    found = solved(jaw, scans, truth, folder, [wrong], free_focal=True)
+    factor, sigma = found.notes["focal"][camera.name]
+    assert abs(factor * 1.06 - 1) < 0.015 and sigma < 0.02
+    assert tip_error_mm(jaw, found, truth)[seen()].max() < 0.5
+
+
+def test_a_worn_camera_sees_one_head(jaw, scans, truth, tmp_path):
+    """The head of the first frame in all frames."""
+    still = (truth[0], np.repeat(truth[1][:1], COUNT, axis=0))
+    write_masks(tmp_path, jaw, still, small_take.CAMERAS[:1])
+    found = solved(jaw, scans, still, tmp_path, small_take.CAMERAS[:1], fixed_head=True)
+    assert np.ptp(found.T_world_upper, axis=0).max() == 0.0
+    assert tip_error_mm(jaw, found, truth)[seen()].max() < 0.4
+    head = transform_points(found.T_world_upper[0], scans[0].vertices) - transform_points(
+        still[1][0], scans[0].vertices
+    )
+    assert np.linalg.norm(head, axis=-1).max() < 0.5 and np.isfinite(found.covariance).all()
+
+
+def test_one_camera_finds_where_to_begin(jaw, scans, truth, folder):
+    camera = small_take.CAMERAS[0]
+    source = small_take.source(folder, camera.name)
+    capture = small_take.make_capture(folder, COUNT, cameras=[source], bootstrap=None)
+    with_d = JawRig({**jaw.arrays, "codes": np.vstack([truth[0], [[2.0, 0, 0], [14.0, 1, 1]]])}, jaw.meta)
+    table = {camera.name: camera}
+    footage = Footage(
+        masked_sources(capture.cameras, table, small_take.OFFSETS, 1), table, small_take.OFFSETS, capture.frames, 1
+    )
+    search = SingleStart(small_take.MESHES, ContourSolver(scans, TrackingConfig()), with_d, np.eye(4))
+    found = search.find(footage)
+    k = found.frame - small_take.FIRST
+    away = Coordinates(jaw, scans).step(Pose(truth[1][k], truth[0][k]), found.pose)
+    assert np.abs(away[:3]).max() < 0.03 and np.abs(away[3:]).max() < 1.5

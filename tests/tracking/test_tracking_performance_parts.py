@@ -1,0 +1,142 @@
+"""Parts of the performance solver against dense algebra, finite differences and simulated motion."""
+
+import numpy as np
+import pytest
+from example_model import LANDMARKS_ANATOMICAL, example_arrays, example_meta
+
+from jawusd.evaluator import JawRig
+from jawusd.formats.performance import Performance, SolveState, write_performance
+from jawusd.formats.poses import read_parameters
+from jawusd.formats.tracks import LOST, load_tracks, save_tracks
+from jawusd.geometry import make_transform, relative_pose, se3_exp, se3_inverse, se3_log
+from jawusd.tracking.performance.coordinates import Pose
+from jawusd.tracking.performance.motion import measured_motion
+from jawusd.tracking.performance.results import tracks_of
+from jawusd.tracking.performance.system import TakeSystem
+
+COUNT = 7
+
+
+@pytest.fixture(scope="module")
+def jaw():
+    same = {"T_anatomical_skull": np.eye(4), "T_rest": np.eye(4), "landmarks": LANDMARKS_ANATOMICAL}
+    return JawRig({**example_arrays(), **same}, example_meta())
+
+
+@pytest.mark.parametrize("frames", [3, 6, 7])
+@pytest.mark.parametrize("shared", [0, 3])
+def test_the_take_is_solved_as_the_dense_system_is(frames, shared):
+    rng = np.random.default_rng(frames)
+    local = 4
+    system, size = TakeSystem(frames, local, shared), frames * local + shared
+    H, g = np.zeros((size, size)), np.zeros(size)
+    for k in range(frames):
+        A, right = rng.normal(size=(local + shared + 2, local + shared)), rng.normal(size=local + shared)
+        system.add_frame(k, A.T @ A, right)
+        index = np.r_[k * local : (k + 1) * local, frames * local : size]
+        H[np.ix_(index, index)] += A.T @ A
+        g[index] += right
+    for add, pattern, width in ((system.add_bends, [1, -2, 1], 2), (system.add_steps, [-1, 1], 1)):
+        count = frames - len(pattern) + 1
+        value, weight = rng.normal(size=(count, width)), rng.random((count, width))
+        add(slice(1, 1 + width, None), value, weight)
+        for k, j in np.ndindex(count, width):
+            row = np.zeros(size)
+            row[[(k + a) * local + 1 + j for a in range(len(pattern))]] = pattern
+            H += weight[k, j] * np.outer(row, row)
+            g -= weight[k, j] * row * value[k, j]
+    own, take = system.solve()
+    np.testing.assert_allclose(np.r_[own.ravel(), take], np.linalg.solve(H, g), atol=1e-12)
+    inverse, found = np.linalg.inv(H), system.covariance()
+    for k in range(frames):
+        block = found.own[k] + found.response[k] @ found.shared @ found.response[k].T
+        np.testing.assert_allclose(block, inverse[k * local :, k * local :][:local, :local], atol=1e-12)
+
+
+def test_motion_is_told_from_the_noise_of_the_poses(jaw):
+    """Of smooth motion under noise as large as its second differences."""
+    from jawusd.tracking.performance.coordinates import Coordinates
+
+    class Arch:
+        centre = np.array([0.0, 4.0, -9.0])
+
+    coordinates, rng = Coordinates(jaw, (Arch, Arch)), np.random.default_rng(0)
+    t = np.arange(900.0)
+    d = np.column_stack([12 + 6 * np.sin(0.2 * t), 2 * np.sin(0.25 * t), 1 + 1.5 * np.cos(0.22 * t)])
+    move = np.array([5.0, 8.0, 6.0]) * np.sin(0.15 * t[:, None] + np.arange(3))
+    true = [Pose(make_transform(np.eye(3), m), x) for m, x in zip(move, d)]
+    shaken = [
+        Pose(p.head @ se3_exp(np.r_[np.zeros(3), rng.normal(0, 0.1, 3)]), p.d + rng.normal(0, 0.1, 3)) for p in true
+    ]
+    good = np.ones(len(t), bool)
+    wanted, found = (measured_motion(coordinates, poses, good, 24.0).bend for poses in (true, shaken))
+    np.testing.assert_allclose(np.sqrt(found[3:]), np.sqrt(wanted[3:]), rtol=0.5)
+    none = measured_motion(coordinates, shaken, ~good, 24.0)  # nothing seen: as the take behind the rig moved
+    assert (none.bend > 0).all() and (none.step > 0).all()
+
+
+@pytest.fixture
+def performance(jaw):
+    rng = np.random.default_rng(3)
+    t = np.arange(COUNT)
+    d = np.column_stack([7.0 + t, 0.3 * t, 0.1 * t])
+    A = rng.normal(size=(COUNT, 9, 9)) * np.r_[[1e-3] * 3, [0.1] * 6]
+    found = np.ones((COUNT, 2), bool)
+    found[4, 1] = False
+    return Performance(
+        frames=10 + t,
+        T_world_upper=se3_exp(rng.normal(size=(COUNT, 6)) * [0.1, 0.1, 0.1, 9, 9, 9]),
+        d=d,
+        covariance=np.swapaxes(A, 1, 2) @ A,
+        pivot=np.array([0.0, 5.0, -9.0]),
+        state=np.where(found.all(1), SolveState.SOLVED, SolveState.CARRIED).astype(np.int8),
+        found=found,
+        use=np.repeat(found[..., None], 2, axis=2),
+        uncovered=np.full((COUNT, 2, 2), 0.01),
+        residual_px=np.full((COUNT, 2), 0.4),
+        matched_px=np.full((COUNT, 2), 900.0),
+        margin_mm=np.asarray(jaw.margin(d)),
+        verdict=["valid"] * (COUNT - 1) + ["off the model, outside the bound"],
+        camera_names=("a", "b"),
+    )
+
+
+def test_covariances_are_those_of_the_moved_poses(jaw, performance):
+    """By Monte Carlo over the nine unknowns."""
+    tracks, p, k = tracks_of(performance, jaw), performance, 2
+    rng, to = np.random.default_rng(0), make_transform(np.eye(3), p.pivot)
+    steps = rng.multivariate_normal(np.zeros(9), p.covariance[k] * 1e-4, size=20_000)
+    head = p.T_world_upper[k] @ to @ se3_exp(steps[:, :6]) @ se3_inverse(to)
+    relative = jaw.pose(p.d[k] + steps[:, 6:])
+    lower = head @ relative
+    moved = {
+        "upper": se3_log(head @ se3_inverse(tracks.T_world_upper[k])),
+        "lower": se3_log(lower @ se3_inverse(tracks.T_world_lower[k])),
+        "relative": se3_log(relative @ se3_inverse(tracks.T_upper_lower[k])),
+    }
+    for name, twists in moved.items():
+        covariance = getattr(tracks, f"covariance_{name}")[k] * 1e-4
+        scale = np.sqrt(np.diag(covariance))
+        np.testing.assert_allclose(
+            np.cov(twists.T) / np.outer(scale, scale), covariance / np.outer(scale, scale), atol=0.06
+        )
+
+
+def test_tracks_hold_the_poses_and_what_was_not_seen(jaw, performance, tmp_path):
+    save_tracks(tmp_path / "take.npz", tracks_of(performance, jaw))
+    tracks = load_tracks(tmp_path / "take.npz")
+    np.testing.assert_allclose(
+        relative_pose(tracks.T_world_upper, tracks.T_world_lower), jaw.pose(performance.d), atol=1e-9
+    )
+    assert tracks.tracked().all() and tracks.prior_aided.all() and (tracks.sigma_mm > 0).all()
+    assert (tracks.status == LOST).sum() == 1 and tracks.status[4, 1] == LOST
+    assert np.isnan(tracks.raw_T_upper_lower[4]).all() and np.isfinite(tracks.raw_T_world_upper[4]).all()
+
+
+def test_the_table_is_read_as_parameters(performance, tmp_path):
+    write_performance(tmp_path / "take.csv", performance, 25.0)
+    frames, d = read_parameters(tmp_path / "take.csv")
+    np.testing.assert_array_equal(frames, performance.frames)
+    np.testing.assert_allclose(d, performance.d, atol=1e-6)
+    lines = (tmp_path / "take.csv").read_text().splitlines()
+    assert lines[5].endswith("valid,carried") and lines[-1].endswith("off the model; outside the bound,solved")
