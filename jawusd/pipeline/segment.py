@@ -1,4 +1,4 @@
-"""Make masks from footage: segmentation and tracking alternate, frame by frame, both ways from the picks."""
+"""Make masks from footage: colours show where the teeth are in every frame, masks are made there and aligned."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from jawusd.formats.capture import Capture, Masks
 from jawusd.formats.tracks import LOST
 from jawusd.geometry.arrays import Array
 from jawusd.pipeline.media import open_footage
-from jawusd.pipeline.prepare import input_hashes, load_meshes
+from jawusd.pipeline.prepare import input_hashes, load_meshes, subject_of_capture
+from jawusd.pipeline.segment_guide import followed_teeth, known_guide, save_guide
 from jawusd.pipeline.segment_record import (
     LEARNED,
     SUMMARY,
@@ -37,9 +38,6 @@ if TYPE_CHECKING:
     from jawusd.tracking.contour.views import View
 
 ARCHES = ("upper", "lower")
-# Where a jaw that had been followed wrongly is found: frames of the backward pass at most, about a second, and the
-# distance at which it has rejoined the forward track [mm].
-_MOST_REDONE, _REJOINED_MM = 24, 0.7
 
 
 @dataclass(frozen=True)
@@ -140,11 +138,13 @@ class _Segmentation:
         self._footage = ColourFootage(videos, offsets)
         self._keys = KeyMasks(options.keys, {name: camera.size_px for name, camera in self._cameras.items()})
         self._config = SegmentationConfig()
-        self._tracker = GuidedTracker(
-            *self._meshes, self._see, self._agreement, len(self._config.reach_mm), executor=pool
-        )
+        self._subject = subject_of_capture(capture, meshes)
+        self._tracker = GuidedTracker(*self._meshes, self._see, len(self._config.reach_mm), executor=pool)
         self._first, self._stop = capture.frames or self._footage.range()
-        self._journal = Journal(folder, self._inputs(offsets, options.keys), options.resume)
+        inputs = self._inputs(offsets, options.keys)
+        self._journal = Journal(folder, inputs, options.resume)
+        self._guide = known_guide(folder, inputs) if options.resume else {}
+        self._guide_inputs = inputs
         self._open: dict[int, _OpenFrame] = {}
         self._segmenters: dict[str, CameraSegmenter] = {}
 
@@ -164,19 +164,31 @@ class _Segmentation:
         start = self._start
         if not self._first <= start < self._stop:
             raise TrackingError(f"bootstrap.frame is {start}, frames run from {self._first} to {self._stop - 1}")
+        if not self._guide:
+            self._follow(start, poses)
         if start not in self._journal.entries:
             self._journal.drop(list(self._journal.entries))
             for path in (*state_files(self._folder), self._folder / LEARNED):
                 path.unlink(missing_ok=True)
             self._new_segmenters(poses)
             with self._opened(start, self._footage.at(start)) as shown:
-                self._write(start, self._tracker.begin(start, poses), shown.segments)
+                record = self._tracker.begin(start, self._guide[start].poses)
+                self._write(start, record, shown.segments)
         self._advance("segment", len(self._journal.entries))
         for step, end in ((1, self._stop), (-1, self._first - 1)):
             self._track_to(start, end, step)
         if keyed := self._keyed():
             self._learn_and_repeat(keyed)
         return self._journal.entries
+
+    def _follow(self, start: int, poses: Array) -> None:
+        """Find the teeth in all frames by their colours, from poses on one of them."""
+        frames = range(self._first, self._stop)
+        known = (start, poses)
+        self._guide = followed_teeth(
+            self._footage, self._cameras, self._meshes, self._subject, frames, known, self._progress, self._pool
+        )
+        save_guide(self._folder, self._guide_inputs, self._guide)
 
     @property
     def _start(self) -> int:
@@ -220,49 +232,20 @@ class _Segmentation:
             before = start
             with self._opened(start, self._footage.at(start)):
                 self._see(start, poses, 0)
-        frames, follow = range(before + step, end, step), None
+        frames = range(before + step, end, step)
+        past = [self._past(frame) for frame in range(start, before + step, step)]
+        guide = {frame: found.poses for frame, found in self._guide.items()}
+        follow = self._tracker.follow(frames, guide, past)
         for frame, pictures in self._footage.walk(frames):
-            if follow is None:
-                past = [self._past(done) for done in range(start, frame, step)]
-                follow = self._tracker.follow(range(frame, end, step), past)
             known = {name: model.counts() for name, model in colours.items()}
             with self._opened(frame, pictures) as shown:
-                _, record, found_again = next(follow)
+                _, record = next(follow)
             if (record.status == LOST).any():  # colours from where no teeth are would spoil all that follows
                 for name, model in colours.items():
                     model.take_up(*known[name])
             state.keep(frame, step)
-            if found_again:
-                self._track_back(start, frame, step, record)
-                follow = None  # its past has changed
             self._write(frame, record, shown.segments)
             self._advance("segment", len(self._journal.entries))
-
-    def _track_back(self, start: int, found: int, step: int, record: FrameRecord) -> None:
-        """Track back from a frame where the jaw was found again until it rejoins the forward track; replace the frames.
-
-        Nothing is replaced if it does not rejoin.
-        """
-        from jawusd.tracking.contour.frame_record import FrameSummary
-
-        colours = [(segmenter.colours, segmenter.colours.counts()) for segmenter in self._segmenters.values()]
-        here = FrameSummary.of(record)
-        # Twice, for a jaw at rest: nothing is known of how it moves.
-        past = [*(self._past(frame) for frame in range(start, found, step)), here, here]
-        frames = range(found - step, start, -step)[:_MOST_REDONE]
-        follow = self._tracker.follow(frames, past)
-        redone, rejoined = [], len(frames) < _MOST_REDONE  # the frame of the picks is known
-        for frame, pictures in self._footage.walk(frames):
-            with self._opened(frame, pictures) as shown:
-                _, again, _ = next(follow)
-            if self._tracker.apart_mm(self._journal.known(frame)[0], again.solution.poses) < _REJOINED_MM:
-                rejoined = True
-                break
-            redone.append((frame, again, shown.segments))
-        for frame, again, segments in redone if rejoined else ():
-            self._write(frame, again, segments)
-        for model, counts in colours:
-            model.take_up(*counts)
 
     def _past(self, frame: int) -> FrameSummary:
         """Return what the tracker needs to know about a finished frame."""
@@ -325,7 +308,9 @@ class _Segmentation:
             image, own = shown.pictures[name], self._footage.own(name, frame)
             if image is None or own is None:
                 return None
-            return self._segmenters[name].segment(image, poses, turn, self._keys.of(name, own))
+            found = self._segmenters[name].segment(image, poses, turn, self._keys.of(name, own))
+            # A mask made where colours do not show the arch would confirm a wrong pose.
+            return None if found is None else found.only(self._guide[frame].found)
 
         shown.segments = dict(zip(self._cameras, self._pool.map(one, self._cameras), strict=True))
         views = []
@@ -335,12 +320,6 @@ class _Segmentation:
             present = np.zeros(2, bool) if found is None else found.present
             views.append(View(camera.projection_matrix(), camera.centre_world(), masks, present))
         return views
-
-    def _agreement(self, frame: int, guesses: Array) -> Array:
-        """Return how well the colours of an open frame's pictures agree with guessed poses, shape (N,)."""
-        seen = [(name, image) for name, image in self._open[frame].pictures.items() if image is not None]
-        each = self._pool.map(lambda item: self._segmenters[item[0]].agreement(item[1], guesses), seen)
-        return np.sum(list(each), axis=0) if seen else np.zeros(len(guesses))
 
     def _write(self, frame: int, record: FrameRecord, segments: dict[str, Segment | None], again: bool = False) -> None:
         """Write the masks of a frame and what is known about it."""

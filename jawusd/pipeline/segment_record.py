@@ -104,10 +104,15 @@ class SegmentSummary(TypedDict):
     confidence: NotRequired[list[MaskConfidence]]
 
 
-def has_auto_masks(capture: Capture) -> bool:
-    """Tell whether the masks of a capture lie where `jawusd segment` wrote them, as CAMERA/upper/000123.png."""
+def auto_masks_folder(capture: Capture) -> Path | None:
+    """Return the folder in which all masks of a capture lie as `jawusd segment` wrote them, CAMERA/upper/000123.png.
+
+    None for other masks.
+    """
     masks = [path for camera in capture.cameras if camera.masks for path in (camera.masks.upper, camera.masks.lower)]
-    return bool(masks) and all(len(path.parents) > 2 and (path.parents[2] / SUMMARY).is_file() for path in masks)
+    folders = {path.parents[2] if len(path.parents) > 2 else None for path in masks}
+    folder = folders.pop() if len(folders) == 1 else None
+    return folder if folder is not None and (folder / SUMMARY).is_file() else None
 
 
 class Journal:

@@ -31,7 +31,8 @@ from jawusd.pipeline.prepare import (
     rescaled_cameras,
     subject_of_capture,
 )
-from jawusd.pipeline.segment_record import has_auto_masks
+from jawusd.pipeline.segment_guide import guide_findings
+from jawusd.pipeline.segment_record import auto_masks_folder
 from jawusd.pipeline.state import Progress, no_progress
 
 if TYPE_CHECKING:
@@ -165,6 +166,7 @@ def first_pass(
             tracks = track_capture(
                 capture, cameras, offsets, upper, lower, landmarks, config, threads=jobs, progress=report
             )
+            findings = [*findings, *guide_findings(capture, tracks, landmarks[:3])]
     tracks.meta["findings"] = [*tracks.meta.get("findings", []), *(finding.as_json() for finding in findings)]
     tracks.meta["calibration_rescaled_px"] = rescaled_cameras(capture)
     return tracks
@@ -202,7 +204,7 @@ def tracking_config(capture: Capture) -> TrackingConfig:
     """Return the tracker's numbers for the masks of a capture."""
     from jawusd.tracking.config import FOR_AUTO_MASKS, TrackingConfig
 
-    return FOR_AUTO_MASKS if has_auto_masks(capture) else TrackingConfig()
+    return TrackingConfig() if auto_masks_folder(capture) is None else FOR_AUTO_MASKS
 
 
 def track_summary(tracks: Tracks) -> TrackSummary:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera, transform_points
 from jawusd.geometry.arrays import Array, Mask
-from jawusd.segmentation.arches import Seeds, doubted_odds, learn_colours
+from jawusd.segmentation.arches import Seeds, learn_colours
 from jawusd.segmentation.colours import ColourModel
 from jawusd.segmentation.config import SegmentationConfig
-from jawusd.segmentation.crowns import OTHER, Expectation, ScanSurface, draw_crowns, expect_crowns
+from jawusd.segmentation.crowns import Expectation, ScanSurface, expect_crowns
 from jawusd.segmentation.files import Key
 from jawusd.segmentation.learn import Example, cut_picture
 from jawusd.segmentation.picture import PictureFrame, Window
@@ -40,6 +40,21 @@ class Segment:
     # what was segmented, and what was expected there
     window: Window
     expected: Expectation
+
+    def only(self, arches: Mask) -> Segment:
+        """Return the same without the masks of other arches than some, shape (2,)."""
+        if arches.all():
+            return self
+        masks = np.where(arches[:, None, None], self.masks, np.uint8(0))
+        unknown = np.where(arches, 0.0, np.nan)
+        return replace(
+            self,
+            masks=masks,
+            present=self.present & arches,
+            contrast=self.contrast + unknown,
+            unexpected=self.unexpected + unknown,
+            outline=np.where(arches[:, None], self.outline, 0),
+        )
 
 
 class CameraSegmenter:
@@ -100,25 +115,6 @@ class CameraSegmenter:
     def recorded(self, segment: Segment) -> list[NDArray[np.uint8]]:
         """Return the masks of both arches as recorded, (H, W) uint8, 0 or 255."""
         return [self._frame.recorded(mask.astype(np.float32) / 255, segment.window) for mask in segment.masks]
-
-    def agreement(self, image: NDArray[np.uint8], guesses: Array) -> Array:
-        """Return how well the colours of a picture agree with crowns in guessed poses (N, 2, 4, 4), without cutting.
-
-        The sum [working pixels] over the crowns in sight of the log-odds that colours alone give, at a coarse
-        resolution, shape (N,); zeros before any colours were learned. Lips may hide crowns, so pixels under them that
-        do not look like teeth count little; teeth that a guess leaves bare cost it all that they would have counted.
-        """
-        c = self._config
-        around = np.concatenate([self._around(poses) for poses in guesses])
-        window = self._frame.window(image, around, c.margin_mm) if self.colours.is_trained() else None
-        if window is None:
-            return np.zeros(len(guesses))
-        odds = np.clip(doubted_odds(window.rgb, self.colours, c), *c.agreement_range)
-        width, height = (max(1, n // c.agreement_coarse) for n in window.camera.size_px)
-        coarse = cv2.resize(odds, (width, height), interpolation=cv2.INTER_AREA)
-        camera = window.camera.scaled((width, height))
-        rates = [coarse[draw_crowns(self._scans, poses, camera) != OTHER].sum() for poses in guesses]
-        return np.array(rates, np.float64) * c.agreement_coarse**2
 
     def _around(self, poses: Array) -> Array:
         return np.concatenate([transform_points(poses[r], self._points[r]) for r in _ARCHES])

@@ -57,9 +57,5 @@ class SegmentationConfig:
     key_weight: float = 12.0
     # Overlap with a finished mask below which a cut is wrong [-]: good ones reach 0.85 on the worst frames.
     key_overlap: float = 0.8
-    # Bounds of the log-odds by which colours rate guessed poses [-]: lips over crowns are no fault of a pose; and how
-    # much coarser the picture is for that [-]: guesses differ by half a millimetre and more.
-    agreement_range: tuple[float, float] = (-0.5, 2.0)
-    agreement_coarse: int = 4
     # Fewest pixels that make a mask [px]: 4 square millimetres.
     least_px: int = 200

@@ -1,21 +1,16 @@
 """Segmentation stopped at any moment and taken up again, against one that was never stopped."""
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 import pytest
 from package_copy import ROOT
 
 from jawusd.formats.capture import load_capture
-from jawusd.formats.tracks import PARTIAL, TRACKED
 from jawusd.imaging.overlay import LOWER_COLOUR, UPPER_COLOUR
-from jawusd.pipeline import segment
 from jawusd.pipeline.segment import SegmentOptions, segment_teeth, with_masks
 from jawusd.pipeline.segment_record import LEARNED, RECORD, write_summary
 from jawusd.segmentation.files import mask_path, write_mask
 from jawusd.segmentation.sheet import write_sheet
-from jawusd.tracking.sequence.guided import GuidedTracker
 
 FRAMES = 4
 
@@ -59,9 +54,10 @@ def contents(folder):
 @pytest.mark.parametrize("torn", [False, True])
 def test_work_taken_up_gives_the_masks_of_work_never_stopped(take, undisturbed, tmp_path, torn):
     whole, entries, done = undisturbed
-    assert [(stage, finished) for stage, finished, _ in done] == [("segment", k + 1) for k in range(FRAMES)]
+    stages = ("follow", "segment")
+    assert [(stage, k) for stage, k, _ in done] == [(stage, k + 1) for stage in stages for k in range(FRAMES)]
     with pytest.raises(Stopped):
-        run(take, tmp_path, stop_at=3)
+        run(take, tmp_path, stop_at=FRAMES + 3)
     journal = tmp_path / RECORD
     if torn:  # the last line of the record did not reach the disk
         journal.write_bytes(journal.read_bytes()[:-40])
@@ -107,32 +103,3 @@ def test_doubtful_masks_are_shown_over_their_pictures(take, undisturbed, tmp_pat
     for colour in (UPPER_COLOUR, LOWER_COLOUR):
         assert (np.abs(drawn - colour).max(axis=2) < 40).sum() > 100
         assert (np.abs(bare - colour).max(axis=2) < 40).sum() < 20  # that picture has no masks
-
-
-@pytest.mark.parametrize(
-    ("wrong", "most", "mended"),
-    [((1, 2), 24, True), ((2,), 24, True), ((1, 2), 1, False)],  # back to the picks; to where ways meet; too far
-)
-def test_frames_in_which_the_jaw_went_astray_are_done_anew(
-    take, undisturbed, tmp_path, monkeypatch, wrong, most, mended
-):
-    first, astray = take[0].frames[0], []
-    follow_one = GuidedTracker._one
-
-    def gone_astray(tracker, frame_tracker, motion, frame, sound):
-        record = follow_one(tracker, frame_tracker, motion, frame, sound)
-        if frame - first not in wrong or frame in astray:
-            return record
-        astray.append(frame)
-        poses = record.solution.poses.copy()
-        poses[1, :3, 3] += [0.0, 3.0 * (frame - first), 0.0]
-        solution = replace(record.solution, poses=poses)
-        return replace(record, solution=solution, status=np.array([TRACKED, PARTIAL], np.int8))
-
-    monkeypatch.setattr(GuidedTracker, "_one", gone_astray)
-    monkeypatch.setattr(segment, "_MOST_REDONE", most)
-    entries, _ = run(take, tmp_path)
-    assert astray == [first + k for k in wrong]
-    for frame, entry in undisturbed[1].items():
-        off = np.abs(np.array(entries[frame]["poses"]) - entry["poses"]).max()
-        assert off > 2.0 if frame in astray and not mended else off < 0.25

@@ -1,0 +1,1 @@
+"""Tracking on the colours of pictures, without masks."""

@@ -1,0 +1,113 @@
+"""What teeth and what surrounds them look like in one camera: colour histograms, of all and by patch of an arch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from jawusd.geometry.arrays import Array, Mask
+
+PATCHES = 8  # per arch
+KINDS = 2  # free edges and gum line
+TABLES = PATCHES * KINDS  # per arch; table = KINDS * patch + kind
+_BITS = 4  # per channel: finer bins stay empty
+BINS = 1 << (3 * _BITS)
+
+_BLUR = 0.7  # of histograms [bins]
+_LOCAL = 0.5  # share of a patch's own histogram
+_MOST = 3.0  # bound of the log ratios: no colour is certain
+_LIPS = 0.2  # share of skin and lips in what may lie outside of teeth anywhere
+_EMPTY = 2e-5  # probability of colours never seen
+_ENOUGH = 200.0  # counts from which a new histogram counts in full
+_ROUNDS = 3  # of sorting lips out of what lies under crowns
+
+
+def colour_bins(rgb: NDArray[np.uint8]) -> NDArray[np.uint16]:
+    """Return the colour bin of every pixel of a picture (h, w, 3), shape (h, w)."""
+    coarse = rgb.astype(np.uint16) >> (8 - _BITS)
+    return np.asarray((coarse[..., 0] << (2 * _BITS)) | (coarse[..., 1] << _BITS) | coarse[..., 2], np.uint16)
+
+
+@dataclass(frozen=True, eq=False)
+class Areas:
+    """Name the pixels of a picture that teach a first model, each of shape (h, w)."""
+
+    crowns: Mask  # well inside of projected crowns
+    ring: Mask  # around them, within reach of the search
+    gum: Mask  # under projected gum, away from crowns
+    far: Mask  # beyond all: skin and lips
+
+
+class CameraColours:
+    """Learn the colours of teeth and of what surrounds them, and rate colours by log likelihood ratios."""
+
+    def __init__(self, bins: NDArray[np.uint16], areas: Areas) -> None:
+        """Learn from a first picture, whose bins are given, shape (h, w).
+
+        Lips hide crowns, and more than crowns may lie around them: both are sorted out by classifying repeatedly.
+        """
+
+        def count(where: Mask) -> Array:
+            return np.bincount(bins[where].ravel(), minlength=BINS).astype(np.float64)
+
+        under, ring, pink = count(areas.crowns), count(areas.ring), count(areas.gum)
+        lips = _smooth(count(areas.far)) + 1e-2
+        self._lips = lips / lips.sum()
+        tooth, outside, gum = under, ring, pink
+        for _ in range(_ROUNDS):
+            t, o, g = (_smooth(h) / max(h.sum(), 1.0) + 1e-6 for h in (tooth, outside, gum))
+            tooth = under * (t > np.maximum(o, self._lips))
+            gum = pink * ((g > 1.3 * self._lips) & (g > t))
+            outside = ring * (np.maximum(o, g) > self._lips)
+        self._gum, self._tooth, self._outside = (_smooth(h) / max(h.sum(), 1.0) for h in (gum, tooth, outside))
+        self._local_tooth = np.zeros((2, TABLES, BINS))
+        self._local_outside = np.zeros((2, TABLES, BINS))
+        self.ratio = self._ratio()
+
+    def learn(self, tooth: Array, outside: Array, rates: tuple[float, float]) -> None:
+        """Blend in the colours counted on both sides of found borders, each of shape (2, TABLES, BINS).
+
+        Args:
+            rates: weight of new tooth and of new outside colours, 0 .. 1.
+        """
+        # Free edges and gum line of a patch are the same teeth.
+        both = tooth.reshape(2, PATCHES, KINDS, BINS).sum(2, keepdims=True)
+        tooth = np.broadcast_to(both, (2, PATCHES, KINDS, BINS)).reshape(2, TABLES, BINS)
+        for known, new, rate in ((self._local_tooth, tooth, rates[0]), (self._local_outside, outside, rates[1])):
+            total = new.sum(-1, keepdims=True)
+            fresh = _smooth(new / np.maximum(total, 1.0))
+            first = known.sum(-1, keepdims=True) == 0
+            share = np.where(first, 1.0, rate) * np.minimum(1.0, total / _ENOUGH)
+            known *= 1 - share
+            known += share * fresh
+        self._tooth = _blended(self._tooth, tooth.sum((0, 1)), rates[0])
+        self._outside = _blended(self._outside, outside.sum((0, 1)), rates[1])
+        self.ratio = self._ratio()
+
+    def _ratio(self) -> NDArray[np.float32]:
+        """Return the log ratio of tooth over anything else by arch, table and bin, shape (2, TABLES, BINS)."""
+        tooth, outside = np.zeros((2, TABLES, BINS)), np.zeros((2, TABLES, BINS))
+        base = np.tile(np.stack([self._outside, 0.5 * (self._gum + self._outside)]), (PATCHES, 1))
+        for out, local, whole in ((tooth, self._local_tooth, self._tooth), (outside, self._local_outside, base)):
+            share = _LOCAL * (local.sum(-1, keepdims=True) > 0)
+            out[:] = share * local + (1 - share) * whole
+        outside = (1 - _LIPS) * outside + _LIPS * self._lips
+        return np.clip(np.log((tooth + _EMPTY) / (outside + _EMPTY)), -_MOST, _MOST).astype(np.float32)
+
+
+def _blended(known: Array, counts: Array, rate: float) -> Array:
+    """Return a histogram (BINS,) with new counts blended in, if they are enough."""
+    total = counts.sum()
+    return known if total < 2 * _ENOUGH else (1 - rate) * known + rate * _smooth(counts / total)
+
+
+def _smooth(histograms: Array) -> Array:
+    """Blur histograms (..., BINS) over neighbouring colours."""
+    side = 1 << _BITS
+    cube = histograms.reshape(-1, side, side, side)
+    return np.asarray(gaussian_filter(cube, (0, _BLUR, _BLUR, _BLUR), mode="nearest", truncate=3)).reshape(
+        histograms.shape
+    )

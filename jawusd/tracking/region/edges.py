@@ -1,0 +1,345 @@
+"""Find the edges of teeth in the colours of a picture: along every normal, the likeliest place of the border.
+
+What lies inside it should look like teeth, what lies outside like anything else: the log ratios of both are summed to
+the likelihood of every place (as Stoiber et al. 2022 do along such lines). No mask is made.
+
+Every compiled function here releases the GIL and keeps no state.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.geometry.arrays import Array
+from jawusd.tracking.contour.samples import INVERSE_DEPTH, NX, NY, U, V, pixel_of
+from jawusd.tracking.contour.scan import CROWN
+
+_MOST_STEPS = 10  # to either side of a sample
+_LEAST_CLEAR = 0.15  # share of the clear log ratio below which an edge is none
+_CREASE_PX = 6.0  # farthest that creases are looked for
+
+
+@numba.njit(nogil=True, cache=True, inline="always")
+def _label(labels: NDArray[np.uint8], x: float, y: float) -> int:
+    i = pixel_of(x)
+    j = pixel_of(y)
+    if i < 0 or j < 0 or j >= labels.shape[0] or i >= labels.shape[1]:
+        return 0
+    return labels[j, i]
+
+
+@numba.njit(nogil=True, cache=True, inline="always")
+def _ratio_at(bins: NDArray[np.uint16], table: NDArray[np.float32], x: float, y: float) -> float:
+    """Interpolate the log ratio of a table bilinearly; 0, which says nothing, outside of the picture."""
+    if x < 0 or y < 0 or x >= bins.shape[1] - 1 or y >= bins.shape[0] - 1:
+        return 0.0
+    i = int(x)
+    j = int(y)
+    a = x - i
+    b = y - j
+    return (table[bins[j, i]] * (1 - a) + table[bins[j, i + 1]] * a) * (1 - b) + (
+        table[bins[j + 1, i]] * (1 - a) + table[bins[j + 1, i + 1]] * a
+    ) * b
+
+
+@numba.njit(nogil=True, cache=True)
+def search_borders(
+    samples: Array,
+    tables: NDArray[np.int64],
+    bins: NDArray[np.uint16],
+    ratio: NDArray[np.float32],
+    own_labels: NDArray[np.uint8],
+    other_labels: NDArray[np.uint8],
+    other_inverse_depth: NDArray[np.float32],
+    reach_px: float,
+    tolerance_mm: float,
+    cos_limit: float,
+    clear_ratio: float,
+    out: Array,
+    clearness: Array,
+) -> None:
+    """Write the signed distance [px] from every contour sample to the likeliest border of teeth on its normal.
+
+    Args:
+        samples: shape (n, COLUMNS).
+        tables: row of `ratio` that holds for each sample, shape (n,).
+        bins: colour bin of every pixel, shape (h, w).
+        ratio: log likelihood ratio of tooth over anything else by colour bin, bounded [-], shape (T, B).
+        own_labels, other_labels: what is seen of this and of the other arch alone: CROWN, GUM or 0, shape (h, w).
+        other_inverse_depth: rendered inverse depth of the other arch's scan [1/mm], 0 = empty, shape (h, w).
+        reach_px: search distance on either side.
+        tolerance_mm: depth difference between the arches that counts as real.
+        cos_limit: least cosine between the sample's normal and the fall of the ratio at the border.
+        clear_ratio: mean log ratio on both sides from which a border counts in full [-].
+        out: receives, shape (n,): the distance, positive outwards; NaN where the sample is hidden or nothing is found.
+        clearness: receives the weight of each, 0 .. 1, NaN where the other arch hides it, shape (n,).
+    """
+    step = max(1.0, reach_px / _MOST_STEPS)
+    n = int(np.ceil(reach_px / step)) + 3
+    r = np.empty(2 * n + 1)
+    for s in range(len(samples)):
+        out[s] = np.nan
+        clearness[s] = 0.0
+        sample = samples[s]
+        x, y, nx, ny = sample[U], sample[V], sample[NX], sample[NY]
+        if _hidden(sample, other_inverse_depth, tolerance_mm):
+            clearness[s] = np.nan
+            continue
+        table = ratio[tables[s]]
+        _read_line(r, n, step, sample, bins, table, own_labels, other_labels)
+        k = _likeliest(r, n, step, reach_px)
+        if k < 0:
+            continue
+        clear = min(r[k - 3 : k].mean(), -r[k + 1 : k + 4].mean()) / clear_ratio
+        if clear <= _LEAST_CLEAR:
+            continue
+        d = _zero_crossing(r, n, step, k)
+        ex, ey, e = x + d * nx, y + d * ny, max(1.5, step)
+        gx = _ratio_at(bins, table, ex + e, ey) - _ratio_at(bins, table, ex - e, ey)
+        gy = _ratio_at(bins, table, ex, ey + e) - _ratio_at(bins, table, ex, ey - e)
+        if -(gx * nx + gy * ny) < cos_limit * np.sqrt(gx * gx + gy * gy):
+            continue  # runs across the contour: a lip or a neighbouring tooth
+        out[s] = d
+        clearness[s] = min(1.0, clear)
+
+
+@numba.njit(nogil=True, cache=True, inline="always")
+def _hidden(sample: Array, other_inverse_depth: NDArray[np.float32], tolerance_mm: float) -> bool:
+    """Tell whether the other arch lies in front of a sample."""
+    i, j = pixel_of(sample[U]), pixel_of(sample[V])
+    if i < 0 or j < 0 or j >= other_inverse_depth.shape[0] or i >= other_inverse_depth.shape[1]:
+        return False
+    own = sample[INVERSE_DEPTH]
+    return other_inverse_depth[j, i] * (1 - tolerance_mm * own) > own
+
+
+@numba.njit(nogil=True, cache=True)
+def _read_line(
+    r: Array,
+    n: int,
+    step: float,
+    sample: Array,
+    bins: NDArray[np.uint16],
+    table: NDArray[np.float32],
+    own_labels: NDArray[np.uint8],
+    other_labels: NDArray[np.uint8],
+) -> None:
+    """Read the log ratios along a normal; 0 past the own crown inwards, and past any crown outwards."""
+    x, y, nx, ny = sample[U], sample[V], sample[NX], sample[NY]
+    blocked = False
+    for i in range(n, 2 * n + 1):
+        t = (i - n) * step
+        px, py = x + t * nx, y + t * ny
+        if t > 1.0 and (_label(own_labels, px, py) == CROWN or _label(other_labels, px, py) == CROWN):
+            blocked = True
+        r[i] = 0.0 if blocked else _ratio_at(bins, table, px, py)
+    blocked = False
+    for i in range(n - 1, -1, -1):
+        t = (i - n) * step
+        px, py = x + t * nx, y + t * ny
+        if t < -1.0 and _label(own_labels, px, py) != CROWN:
+            blocked = True
+        r[i] = 0.0 if blocked else _ratio_at(bins, table, px, py)
+
+
+@numba.njit(nogil=True, cache=True, inline="always")
+def _likeliest(r: Array, n: int, step: float, reach_px: float) -> int:
+    """Return the index of the likeliest border; -1 if it lies at the end of the line."""
+    total = 0.0
+    best = -np.inf
+    at = -1
+    for i in range(2 * n + 1):
+        t = (i - n) * step
+        value = (total + 0.5 * r[i]) * min(step, 2.0) - 0.5 * (t / reach_px) ** 2
+        total += r[i]
+        if value > best:
+            best = value
+            at = i
+    return at if 3 <= at <= 2 * n - 3 and abs(at - n) * step <= reach_px else -1
+
+
+@numba.njit(nogil=True, cache=True, inline="always")
+def _zero_crossing(r: Array, n: int, step: float, k: int) -> float:
+    """Return where the ratio falls through 0 next to index k, else the place of k [px]."""
+    d = (k - n) * step
+    near = np.inf
+    for m in range(k - 2, k + 2):
+        if r[m] > 0 >= r[m + 1]:
+            place = (m - n + r[m] / (r[m] - r[m + 1])) * step
+            if abs(place - d) < abs(near - d):
+                near = place
+    return near if near < np.inf else d
+
+
+@numba.njit(nogil=True, cache=True, inline="always")
+def _channel(rgb: NDArray[np.uint8], x: float, y: float, c: int) -> float:
+    x = min(max(x, 0.0), rgb.shape[1] - 1.001)
+    y = min(max(y, 0.0), rgb.shape[0] - 1.001)
+    i = int(x)
+    j = int(y)
+    a = x - i
+    b = y - j
+    return (rgb[j, i, c] * (1 - a) + rgb[j, i + 1, c] * a) * (1 - b) + (
+        rgb[j + 1, i, c] * (1 - a) + rgb[j + 1, i + 1, c] * a
+    ) * b
+
+
+@numba.njit(nogil=True, cache=True)
+def sharpen(
+    samples: Array,
+    rgb: NDArray[np.uint8],
+    contrast: float,
+    reach_px: float,
+    blur_px: Array,
+    out: Array,
+    clearness: Array,
+) -> None:
+    """Move every border found to where the colour is half way between what lies inside and outside of it.
+
+    Args:
+        contrast: least difference of both sides' mean colours [8-bit steps].
+        reach_px: how far a border may move.
+        blur_px: motion during the exposure along the normals, shape (n,): so wide is a blurred edge.
+        out, clearness: as `search_borders` writes them; borders without a place half way lose most of their weight.
+    """
+    inner = np.empty(3)
+    outer = np.empty(3)
+    for s in range(len(samples)):
+        if not clearness[s] > 0:
+            continue
+        u, v, nx, ny, d = samples[s, U], samples[s, V], samples[s, NX], samples[s, NY], out[s]
+        wide = min(0.5 * blur_px[s], 10.0)
+        inner[:] = 0.0
+        outer[:] = 0.0
+        for q in range(3):
+            t = 1.75 + q + wide
+            for c in range(3):
+                inner[c] += _channel(rgb, u + (d - t) * nx, v + (d - t) * ny, c) / 3
+                outer[c] += _channel(rgb, u + (d + t) * nx, v + (d + t) * ny, c) / 3
+        norm = ((inner - outer) ** 2).sum()
+        if norm < contrast * contrast:
+            continue
+        half = _half_way(inner.sum(), outer.sum(), blur_px[s])
+        best = np.inf
+        last = 0.0
+        reach = reach_px + wide
+        for q in range(int(4 * reach) + 1):
+            t = d - reach + 0.5 * q
+            p = -half
+            for c in range(3):
+                p += (_channel(rgb, u + t * nx, v + t * ny, c) - outer[c]) * (inner[c] - outer[c]) / norm
+            if q > 0 and last > 0 >= p:
+                place = t - 0.5 + 0.5 * last / (last - p)
+                if abs(place - d) < abs(best - d):
+                    best = place
+            last = p
+        if best < np.inf:
+            out[s] = best
+        else:
+            clearness[s] *= 0.3
+
+
+@numba.njit(nogil=True, cache=True, inline="always")
+def _half_way(inside: float, outside: float, blur_px: float) -> float:
+    """Return the share of the inner colour at the edge: 1/2, but light, not its code, adds up during the exposure."""
+    if blur_px <= 1 or abs(inside - outside) <= 30:
+        return 0.5
+    light = 0.5 * ((inside / 765) ** 2.2 + (outside / 765) ** 2.2)
+    share = (765 * light ** (1 / 2.2) - outside) / (inside - outside)
+    return 0.5 + (min(max(share, 0.3), 0.85) - 0.5) * min(1.0, (blur_px - 1) / 4)
+
+
+@numba.njit(nogil=True, cache=True)
+def search_creases(
+    samples: Array,
+    rgb: NDArray[np.uint8],
+    own_labels: NDArray[np.uint8],
+    other_labels: NDArray[np.uint8],
+    reach_px: float,
+    contrast: float,
+    weight: float,
+    out: Array,
+    clearness: Array,
+) -> None:
+    """Find edges of crowns right before those of the other arch: where the dark line between both begins.
+
+    Args:
+        contrast: least difference between the tooth and the line [8-bit steps].
+        weight: of such an edge [-].
+        The others are those of `search_borders`; only samples without a border are looked at.
+    """
+    reach = min(reach_px, _CREASE_PX)
+    for s in range(len(samples)):
+        sample = samples[s]
+        if clearness[s] != 0.0:  # found, or hidden
+            continue
+        u, v, nx, ny = sample[U], sample[V], sample[NX], sample[NY]
+        beyond_x, beyond_y = u + 3 * nx, v + 3 * ny
+        if _label(other_labels, beyond_x, beyond_y) != CROWN or _label(own_labels, beyond_x, beyond_y) == CROWN:
+            continue
+        low, at = np.inf, 0.0
+        for k in range(int(-2 * reach), int(2 * reach) + 1):
+            t = 0.5 * k
+            p = _light(rgb, u + t * nx, v + t * ny) + 0.5 * abs(t)
+            if p < low:
+                low, at = p, t
+        low -= 0.5 * abs(at)
+        before = _light(rgb, u + (at - 4) * nx, v + (at - 4) * ny)
+        behind = _light(rgb, u + (at + 4) * nx, v + (at + 4) * ny)
+        if before - low < contrast or behind - low < 0.4 * contrast:
+            continue
+        last = low
+        half = 0.5 * (before + low)
+        for k in range(1, 9):
+            t = at - 0.5 * k
+            p = _light(rgb, u + t * nx, v + t * ny)
+            if p >= half:
+                out[s] = t + 0.5 * (p - half) / max(p - last, 1e-6)
+                clearness[s] = weight
+                break
+            last = p
+
+
+@numba.njit(nogil=True, cache=True, inline="always")
+def _light(rgb: NDArray[np.uint8], x: float, y: float) -> float:
+    return (_channel(rgb, x, y, 0) + _channel(rgb, x, y, 1) + _channel(rgb, x, y, 2)) / 3
+
+
+@numba.njit(nogil=True, cache=True)
+def count_colours(
+    samples: Array,
+    tables: NDArray[np.int64],
+    distances: Array,
+    clearness: Array,
+    bins: NDArray[np.uint16],
+    own_labels: NDArray[np.uint8],
+    other_labels: NDArray[np.uint8],
+    near_px: int,
+    far_px: int,
+    tooth: Array,
+    outside: Array,
+) -> None:
+    """Count the colours on both sides of borders that were found within 2 px.
+
+    Args:
+        near_px, far_px: distances from the contour that are counted.
+        tooth, outside: added to, shape (T, B).
+    """
+    for s in range(len(samples)):
+        if not clearness[s] > 0.3 or not abs(distances[s]) < 2:
+            continue
+        u, v, nx, ny = samples[s, U], samples[s, V], samples[s, NX], samples[s, NY]
+        for t in range(near_px, far_px + 1):
+            i, j = pixel_of(u - t * nx), pixel_of(v - t * ny)
+            if i < 0 or j < 0 or j >= bins.shape[0] or i >= bins.shape[1] or own_labels[j, i] != CROWN:
+                break
+            tooth[tables[s], bins[j, i]] += clearness[s]
+        for t in range(near_px, far_px + 1):
+            i, j = pixel_of(u + t * nx), pixel_of(v + t * ny)
+            if i < 0 or j < 0 or j >= bins.shape[0] or i >= bins.shape[1]:
+                break
+            if own_labels[j, i] == CROWN or other_labels[j, i] == CROWN:
+                break
+            outside[tables[s], bins[j, i]] += clearness[s]

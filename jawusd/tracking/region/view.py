@@ -1,0 +1,101 @@
+"""What one camera's picture says of the teeth by its colours."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.geometry.arrays import Array
+from jawusd.tracking.contour.samples import NX, NY, U, V, X, Z
+from jawusd.tracking.contour.scan import GUM
+from jawusd.tracking.contour.views import Drawn
+from jawusd.tracking.region.colours import BINS, KINDS, TABLES
+from jawusd.tracking.region.edges import count_colours, search_borders, search_creases, sharpen
+
+_SHUTTER = 0.5  # share of a frame's time that it is exposed: unknown, usual for film
+_LEARNED_PX = (2, 7)  # distances from borders between which colours are learned
+# Of the place of the gum line: least weight of a border [-], farthest [px], fewest samples.
+_SURE, _GUM_REACH_PX, _FEWEST_GUM = 0.3, 2.5, 30
+_CLEAR_RATIO = 1.0  # mean log ratio on both sides from which a border counts in full [-]
+_SHARPEN_PX = 5.0  # reach from which on borders are refined by colour
+_CONTRAST, _SHARP_REACH_PX = 20.0, 2.0  # of colours half way [8-bit steps], [px]
+_CREASE_CONTRAST, _CREASE_WEIGHT, _CREASE_REACH_PX = 25.0, 0.5, 7.0
+
+
+@dataclass(frozen=True, eq=False)
+class Counts:
+    """Collect what the borders found in a picture teach."""
+
+    tooth: Array  # colours inside of borders, shape (2, TABLES, BINS)
+    outside: Array  # colours outside, shape (2, TABLES, BINS)
+    gum_px: Array  # how far outside of the scans' gum line it was found [px], NaN where it was not, shape (2,)
+
+    @classmethod
+    def zeros(cls) -> Counts:
+        """Return empty counts."""
+        return cls(np.zeros((2, TABLES, BINS)), np.zeros((2, TABLES, BINS)), np.full(2, np.nan))
+
+
+@dataclass(frozen=True, eq=False)
+class RegionView:
+    """Hold a part of an undistorted picture with the colours that tell teeth."""
+
+    rgb: NDArray[np.uint8]  # shape (h, w, 3)
+    bins: NDArray[np.uint16]  # colour bins, shape (h, w)
+    ratio: NDArray[np.float32]  # log ratios of tooth over anything else, shape (2, TABLES, BINS)
+    patches: Array  # middles of the patches of both arches, left and front [mm], shape (2, PATCHES, 2)
+    axes: Array  # rotation from scan to anatomical axes, shape (3, 3)
+    before: Array  # projections of both arches to this picture at the frame before, shape (2, 3, 4)
+    counts: Counts | None  # collects what is found
+
+    def tables(self, samples: Array, count: int, arch: int, labels: NDArray[np.uint8]) -> NDArray[np.int64]:
+        """Return the table of log ratios for each sample; the first `count` are silhouette, shape (n,)."""
+        kind = np.ones(len(samples), np.int64)
+        ahead = samples[:count, [U, V]] + 2 * samples[:count, [NX, NY]]
+        i, j = np.clip(np.rint(ahead).astype(int), 0, np.array(labels.shape[::-1]) - 1).T
+        kind[:count] = labels[j, i] == GUM  # crowns before their own gum look like the gum line
+        apart = (samples[:, X : Z + 1] @ self.axes.T[:, [0, 2]])[:, None] - self.patches[arch]
+        return np.asarray(KINDS * (apart**2).sum(2).argmin(1) + kind, np.int64)
+
+    def search(
+        self, samples: Array, count: int, arch: int, drawn: Drawn, limits: tuple[float, float, float]
+    ) -> tuple[Array, Array]:
+        """Return distances and weights; see `EdgeSearch`."""
+        tables = self.tables(samples, count, arch, drawn.own)
+        blur_px = self._blur_px(samples, arch)
+        distances, clearness = np.empty(len(samples)), np.empty(len(samples))
+        both = (drawn.own, drawn.other, drawn.other_inverse_depth)
+        search_borders(samples, tables, self.bins, self.ratio[arch], *both, *limits, _CLEAR_RATIO, distances, clearness)
+        if limits[0] <= _SHARPEN_PX:
+            sharpen(samples, self.rgb, _CONTRAST, _SHARP_REACH_PX, blur_px, distances, clearness)
+        if limits[0] <= _CREASE_REACH_PX:
+            crease = (_CREASE_CONTRAST, _CREASE_WEIGHT)
+            search_creases(samples, self.rgb, drawn.own, drawn.other, limits[0], *crease, distances, clearness)
+        if self.counts is not None:
+            self._count(self.counts, arch, samples, tables, distances, clearness, drawn)
+        return distances, clearness
+
+    def _count(
+        self,
+        counts: Counts,
+        arch: int,
+        samples: Array,
+        tables: NDArray[np.int64],
+        distances: Array,
+        clearness: Array,
+        drawn: Drawn,
+    ) -> None:
+        sums = (counts.tooth[arch], counts.outside[arch])
+        labels = (drawn.own, drawn.other)
+        count_colours(samples, tables, distances, clearness, self.bins, *labels, *_LEARNED_PX, *sums)
+        line = (tables % KINDS == 1) & (clearness > _SURE) & (np.abs(distances) < _GUM_REACH_PX)
+        if line.sum() > _FEWEST_GUM:
+            counts.gum_px[arch] = np.median(distances[line])
+
+    def _blur_px(self, samples: Array, arch: int) -> Array:
+        """Return how far the samples move along their normals during the exposure [px], shape (n,)."""
+        h = samples[:, X : Z + 1] @ self.before[arch, :, :3].T + self.before[arch, :, 3]
+        moved = samples[:, [U, V]] - h[:, :2] / h[:, 2:]
+        return np.asarray(_SHUTTER * np.abs((moved * samples[:, [NX, NY]]).sum(1)), np.float64)

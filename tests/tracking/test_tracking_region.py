@@ -1,0 +1,146 @@
+"""Borders of teeth found in colours, against pictures whose borders are known by construction."""
+
+import numpy as np
+import pytest
+from package_copy import ROOT
+
+from jawusd.formats.capture import load_capture
+from jawusd.pipeline.media import open_footage
+from jawusd.pipeline.prepare import load_meshes, subject_of_capture
+from jawusd.pipeline.segment_guide import followed_teeth, known_guide, save_guide
+from jawusd.segmentation.footage import ColourFootage
+from jawusd.tracking.contour.samples import COLUMNS, INVERSE_DEPTH, LENGTH, NX, NY, U, V
+from jawusd.tracking.contour.scan import CROWN
+from jawusd.tracking.region.colours import BINS, PATCHES, TABLES, Areas, CameraColours, colour_bins
+from jawusd.tracking.region.edges import search_borders, search_creases, sharpen
+from jawusd.tracking.sequence.guided import GuidedTracker
+
+TOOTH, LIP = np.array([215.0, 205.0, 185.0]), np.array([150.0, 75.0, 80.0])
+SIZE, MIDDLE, RADIUS = 120, 60.3, 30.4
+LIMITS = (8.0, 0.4, 0.7)
+
+
+def disc(seed=0, noise=4.0, radius=RADIUS):
+    """Return a disc of tooth in lips, (h, w, 3), every pixel mixed by the area that the disc covers."""
+    y, x = np.mgrid[0:SIZE, 0:SIZE]
+    share = np.clip(radius - np.hypot(x - MIDDLE, y - MIDDLE) + 0.5, 0, 1)[..., None]
+    picture = share * TOOTH + (1 - share) * LIP + np.random.default_rng(seed).normal(0, noise, (SIZE, SIZE, 3))
+    return np.clip(picture, 0, 255).astype(np.uint8), share[..., 0]
+
+
+def samples_at(radius):
+    angles = np.linspace(0, 2 * np.pi, 90, endpoint=False)
+    out = np.zeros((len(angles), COLUMNS))
+    out[:, NX], out[:, NY] = np.cos(angles), np.sin(angles)
+    out[:, U], out[:, V] = MIDDLE + radius * out[:, NX], MIDDLE + radius * out[:, NY]
+    out[:, LENGTH], out[:, INVERSE_DEPTH] = 1.0, 1 / 200
+    return out
+
+
+def searched(picture, share, samples, reach=LIMITS[0], other_depth=None):
+    bins = colour_bins(picture)
+    inside, outside = share > 0.99, share < 0.01
+    colours = CameraColours(bins, Areas(inside, outside, np.zeros_like(inside), np.zeros_like(inside)))
+    y, x = np.mgrid[0:SIZE, 0:SIZE]  # the crown as drawn where it is thought to be
+    radius = np.hypot(samples[0, U] - MIDDLE, samples[0, V] - MIDDLE)
+    own = (np.hypot(x - MIDDLE, y - MIDDLE) <= radius).astype(np.uint8) * CROWN
+    other = np.zeros((SIZE, SIZE), np.uint8)
+    depth = np.zeros((SIZE, SIZE), np.float32) if other_depth is None else other_depth
+    distances, weights = np.empty(len(samples)), np.empty(len(samples))
+    tables = np.zeros(len(samples), np.int64)
+    limits = (reach, *LIMITS[1:])
+    search_borders(samples, tables, bins, colours.ratio[0], own, other, depth, *limits, 1.0, distances, weights)
+    return distances, weights
+
+
+@pytest.mark.parametrize("off", [-5.0, -1.3, 0.0, 2.6, 6.0])
+def test_borders_are_found_from_either_side(off):
+    picture, share = disc()
+    samples = samples_at(RADIUS + off)
+    distances, weights = searched(picture, share, samples)
+    assert (weights > 0.3).mean() > 0.95
+    found = weights > 0
+    assert np.abs(distances[found] + off).mean() < 0.6
+    sharpen(samples, picture, 20.0, 2.0, np.zeros(len(samples)), distances, weights)
+    assert np.abs(distances[found] + off).mean() < 0.12
+
+
+def test_what_the_other_arch_hides_says_nothing():
+    picture, share = disc()
+    nearer = np.full((SIZE, SIZE), 1 / 190, np.float32)
+    distances, weights = searched(picture, share, samples_at(RADIUS), other_depth=nearer)
+    assert np.isnan(distances).all() and np.isnan(weights).all()
+
+
+def test_without_teeth_no_border_is_found():
+    picture, share = disc()
+    lips = np.broadcast_to(LIP, picture.shape) + np.random.default_rng(1).normal(0, 4, picture.shape)
+    bins = colour_bins(picture)
+    colours = CameraColours(bins, Areas(share > 0.99, share < 0.01, np.zeros_like(share, bool), share < 0))
+    samples = samples_at(RADIUS)
+    distances, weights = np.empty(len(samples)), np.empty(len(samples))
+    empty = np.zeros((SIZE, SIZE), np.uint8)
+    own = (share > 0.01).astype(np.uint8) * CROWN
+    depth = np.zeros((SIZE, SIZE), np.float32)
+    flesh = colour_bins(np.clip(lips, 0, 255).astype(np.uint8))
+    tables = np.zeros(len(samples), np.int64)
+    search_borders(samples, tables, flesh, colours.ratio[0], own, empty, depth, *LIMITS, 1.0, distances, weights)
+    assert np.isnan(distances).all() and not weights.any()
+
+
+def test_crowns_before_crowns_end_at_the_dark_line():
+    picture = np.broadcast_to(TOOTH, (SIZE, SIZE, 3)).copy()
+    x = np.arange(SIZE)
+    shade = np.clip(1 - 0.6 * np.exp(-0.5 * ((x - 70.0) / 1.0) ** 2), 0, 1)
+    picture = np.clip(picture * shade[None, :, None], 0, 255).astype(np.uint8)
+    samples = np.zeros((1, COLUMNS))
+    samples[0, [U, V, NX, LENGTH]] = 68.0, 60.0, 1.0, 1.0
+    own, other = np.zeros((SIZE, SIZE), np.uint8), np.zeros((SIZE, SIZE), np.uint8)
+    own[:, :69], other[:, 69:] = CROWN, CROWN
+    distances, weights = np.full(1, np.nan), np.zeros(1)
+    search_creases(samples, picture, own, other, 5.0, 25.0, 0.5, distances, weights)
+    # Half as dark as the line is sqrt(2 ln 2) = 1.18 px before its middle.
+    assert weights[0] == 0.5 and distances[0] == pytest.approx(2.0 - 1.18, abs=0.3)
+
+
+def test_colours_follow_what_borders_show():
+    picture, share = disc()
+    areas = Areas(share > 0.99, share < 0.01, np.zeros_like(share, bool), np.zeros_like(share, bool))
+    colours = CameraColours(colour_bins(picture), areas)
+    blue = int(colour_bins(np.full((1, 1, 3), (30, 60, 200), np.uint8))[0, 0])
+    assert colours.ratio[1, 4, blue] < 0  # never seen
+    tooth, outside = np.zeros((2, TABLES, BINS)), np.zeros((2, TABLES, BINS))
+    tooth[1, 4, blue] = 1000.0  # lower arch, patch 2
+    outside[1, :, int(colour_bins(LIP[None, None].astype(np.uint8))[0, 0])] = 1000.0
+    colours.learn(tooth, outside, (0.5, 0.5))
+    assert colours.ratio[1, 4, blue] > 1.0 and colours.ratio[1, 5, blue] > 1.0  # the same teeth
+    assert colours.ratio.shape == (2, 2 * PATCHES, BINS)
+
+
+def test_the_example_is_followed_by_its_colours(tmp_path):
+    capture = load_capture(ROOT / "examples" / "capture" / "capture.toml")
+    with np.load(capture.folder / "truth" / "truth.npz") as truth:
+        offsets = dict(zip(truth["camera_names"].tolist(), truth["offsets"].tolist(), strict=True))
+        frames, poses = truth["frames"], np.stack([truth["T_world_upper"], truth["T_world_lower"]], axis=1)
+    meshes = load_meshes(capture)
+    teeth = meshes["upper_teeth"], meshes["lower_teeth"]
+    cameras, videos = open_footage(capture)
+    start = capture.bootstrap.frame
+    picked = GuidedTracker(*teeth, lambda *_: [], 1).picked(capture.bootstrap, cameras)
+    chosen = range(max(start - 2, int(frames[0])), start + 6)
+    done = []
+    footage, subject = ColourFootage(videos, offsets), subject_of_capture(capture, meshes)
+    guide = followed_teeth(
+        footage, cameras, teeth, subject, chosen, (start, picked), lambda *step: done.append(step), None
+    )
+    assert sorted(guide) == list(chosen) and done[-1] == ("follow", len(chosen), len(chosen))
+    for frame, found in guide.items():
+        true = poses[list(frames).index(frame)]
+        for r, mesh in enumerate(teeth):
+            points = np.c_[mesh.vertices[::50], np.ones(len(mesh.vertices[::50]))]
+            off = np.linalg.norm((points @ (found.poses[r] - true[r]).T)[:, :3], axis=1)
+            assert found.found[r] and off.mean() < 0.4
+    save_guide(tmp_path, "abc", guide)
+    again = known_guide(tmp_path, "abc")
+    assert all(np.array_equal(again[frame].poses, guide[frame].poses) for frame in guide)
+    assert known_guide(tmp_path, "other inputs") == {} == known_guide(tmp_path / "empty", "abc")
