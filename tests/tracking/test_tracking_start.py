@@ -24,6 +24,7 @@ from small_take import (
 )
 
 from jawusd.errors import TrackingError
+from jawusd.formats.capture import CameraSource, Masks
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import make_transform, random_rotation, se3_exp, se3_inverse, transform_point, transform_points
 from jawusd.imaging.raster import draw_silhouette, project, unpack_bits, words_for
@@ -32,8 +33,8 @@ from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.scan import prepare_scan
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import masked_sources
+from jawusd.tracking.initialization import mixups, start_search
 from jawusd.tracking.initialization import start as take_start
-from jawusd.tracking.initialization import start_search
 from jawusd.tracking.initialization.first_frame import first_record
 from jawusd.tracking.initialization.footage import Footage, MaskSurvey, survey_masks
 from jawusd.tracking.initialization.mixups import possible_mixups
@@ -361,3 +362,22 @@ def test_search_is_the_same_in_threads(pictures, short_search):
     with ThreadPoolExecutor(2) as pool:
         both = [StartSearch(MESHES, solver, T, m).at(footage, FIRST + 1) for m in (map, pool.map)]
     assert (both[0].poses == both[1].poses).all() and both[0].objective_px == both[1].objective_px
+
+
+@pytest.mark.parametrize(("without", "accused"), [(np.nan, False), (0.02, True)])
+def test_exchanges_that_leave_cameras_without_masks_prove_nothing(monkeypatch, without, accused):
+    """The masks of camera 1 lie off; an exchange that takes them away leaves only good ones, and is no explanation."""
+    sources = [
+        CameraSource(name=name, masks=Masks(upper=f"{name}/upper/%06d.png", lower=f"{name}/lower/%06d.png"))
+        for name in ("cam0", "cam1", "cam2")
+    ]
+
+    def shares(footage, solver, poses, frame):
+        named = [source.masks.upper.parts[0] for source in footage.sources]
+        return np.array([0.01, without, 0.02]) if named == ["cam0", "cam2", "cam1"] else np.array([0.01, 0.3, 0.02])
+
+    monkeypatch.setattr(mixups, "_uncovered_shares", shares)
+    footage = Footage(sources, TABLE, OFFSETS, (0, 10))
+    found = mixups.likely_mixup(footage, None, np.stack([np.eye(4)] * 2), 3)
+    assert (found is not None) == accused
+    assert not accused or "cam1 and cam2 are exchanged" in found.finding

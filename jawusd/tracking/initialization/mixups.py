@@ -77,7 +77,7 @@ def likely_mixup(footage: Footage, solver: ContourSolver, poses: Array, frame: i
     given = _uncovered_shares(footage, solver, poses, frame)
     if not (given >= _ODD_SHARE).any():
         return None
-    found = []
+    found: list[tuple[float, float, Mixup]] = []
     for mixup in possible_mixups(footage.sources):
         if _sizes_differ(footage, mixup.sources):
             continue
@@ -85,11 +85,16 @@ def likely_mixup(footage: Footage, solver: ContourSolver, poses: Array, frame: i
             shares = _uncovered_shares(replace(footage, sources=mixup.sources), solver, poses, frame)
         except CaptureError:
             continue  # mask videos of other lengths than those cameras' clips
-        found.append((float(np.nanmean(shares)), mixup))
-    share, mixup = min(found, key=lambda f: f[0])
-    if share >= _PROOF * np.nanmean(given):
+        # An exchange may leave a camera without masks on this frame: that explains nothing.
+        both = np.isfinite(given) & np.isfinite(shares)
+        if (given[both] >= _ODD_SHARE).any():
+            found.append((float(shares[both].mean()), float(given[both].mean()), mixup))
+    if not found:
         return None
-    evidence = f"{np.nanmean(given):.0%} of the masks lie off their scans, {share:.0%} would after exchanging them"
+    share, before, mixup = min(found, key=lambda f: f[0] / f[1])
+    if share >= _PROOF * before:
+        return None
+    evidence = f"{before:.0%} of the masks lie off their scans, {share:.0%} would after exchanging them"
     return replace(mixup, finding=f"{mixup.finding}: {evidence}")
 
 
