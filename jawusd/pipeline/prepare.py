@@ -166,7 +166,7 @@ def load_labelled(capture: Capture) -> tuple[dict[str, Mesh], list[Finding]]:
 
 def registered_meshes(meshes: Mapping[str, Mesh], meta: Mapping[str, object]) -> dict[str, Mesh]:
     """Return meshes with the lower scan where the take shows it, if the meta data of tracks or model say so."""
-    T = _registration(meta)
+    T = registration_of(meta)
     out = dict(meshes)
     if T is not None and "lower_teeth" in meshes:
         out["lower_teeth"] = replace(
@@ -177,7 +177,7 @@ def registered_meshes(meshes: Mapping[str, Mesh], meta: Mapping[str, object]) ->
 
 def registered_subject(subject: Subject, meta: Mapping[str, object]) -> Subject:
     """Return a person with lower scan and lower teeth landmarks where the take shows them; see `registered_meshes`."""
-    T = _registration(meta)
+    T = registration_of(meta)
     if T is None:
         return subject
     lower = np.array([not name.startswith("condyle") for name in LANDMARKS])
@@ -185,8 +185,8 @@ def registered_subject(subject: Subject, meta: Mapping[str, object]) -> Subject:
     return replace(subject, meshes=registered_meshes(subject.meshes, meta), landmarks=landmarks)
 
 
-def _registration(meta: Mapping[str, object]) -> Array | None:
-    """Return what moves the lower scan, shape (4, 4); None if it stays as it was given."""
+def registration_of(meta: Mapping[str, object]) -> Array | None:
+    """Return what moves the lower scan, by the meta data of tracks or model, shape (4, 4); None if it stays."""
     found = meta.get("registration")
     if not isinstance(found, dict) or not found.get("applied"):
         return None

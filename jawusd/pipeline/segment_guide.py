@@ -17,10 +17,10 @@ from jawusd.formats.capture import Capture
 from jawusd.formats.finding import Finding
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import Tracks
-from jawusd.geometry import Camera, relative_pose, transform_points
+from jawusd.geometry import Camera, relative_pose, se3_inverse, transform_points
 from jawusd.geometry.arrays import Array
 from jawusd.npz import TWIST_ORDER, UNITS, read_npz, take
-from jawusd.pipeline.prepare import Subject
+from jawusd.pipeline.prepare import Subject, registration_of
 from jawusd.pipeline.segment_record import auto_masks_folder
 from jawusd.pipeline.state import Progress
 
@@ -63,7 +63,7 @@ def followed_teeth(
     """
     from jawusd.segmentation.picture import PictureFrame
     from jawusd.tracking.contour.scan import prepare_scan, teeth_centre
-    from jawusd.tracking.region.tracker import RegionPose, RegionTracker
+    from jawusd.tracking.region.tracker import RegionTracker
 
     scans = [prepare_scan(mesh, name) for mesh, name in zip(teeth, ("upper", "lower"), strict=True)]
     frame, poses = start
@@ -71,12 +71,11 @@ def followed_teeth(
     views = {name: PictureFrame(camera, centre, _WORKING_PX_PER_MM) for name, camera in cameras.items()}
     axes, condyles = subject.T_anatomical_skull[:3, :3], subject.landmarks[-2:]
     tracker = RegionTracker(scans, list(cameras.values()), condyles, axes, executor=pool)
-    poses = tracker.begin(_cut(views, scans, footage.at(frame)), poses)
-    out = {frame: RegionPose(poses, np.ones(2, bool))}
+    out = {frame: tracker.begin(_cut(views, scans, footage.at(frame)), poses)}
     progress(STAGE, 1, len(frames))
     for way in (range(frame + 1, frames.stop), range(frame - 1, frames.start - 1, -1)):
         cuts: Iterator[Cut] = (_cut(views, scans, pictures) for _, pictures in footage.walk(way))
-        for at, found in zip(way, tracker.follow(cuts, poses), strict=True):
+        for at, found in zip(way, tracker.follow(cuts, out[frame].poses), strict=True):
             out[at] = found
             progress(STAGE, len(out), len(frames))
     return out
@@ -110,6 +109,7 @@ def save_guide(folder: Path, inputs: str, guide: Mapping[int, RegionPose]) -> No
         "frames": np.array(frames),
         "poses": np.stack([guide[frame].poses for frame in frames]),
         "found": np.stack([guide[frame].found for frame in frames]),
+        "covariance": np.stack([guide[frame].covariance for frame in frames]),
     }
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **arrays)
@@ -118,44 +118,73 @@ def save_guide(folder: Path, inputs: str, guide: Mapping[int, RegionPose]) -> No
 
 def known_guide(folder: Path, inputs: str) -> dict[int, RegionPose]:
     """Return what was followed from the same inputs; nothing if there is none, or it cannot be read."""
-    guide, made_from = _read(folder / GUIDE)
+    try:
+        guide, made_from = _read(folder / GUIDE)
+    except JawusdError:
+        return {}
     return guide if made_from == inputs else {}
 
 
 def _read(path: Path) -> tuple[dict[int, RegionPose], str]:
-    """Return a guide and the hash of what it was made from; nothing if it is missing or damaged."""
+    """Return a guide and the hash of what it was made from; nothing if it is missing.
+
+    Raises:
+        FormatError: it is damaged.
+    """
     from jawusd.tracking.region.tracker import RegionPose
 
     if not path.exists():
         return {}, ""
-    try:
-        arrays, meta = read_npz(path, _FAMILY, 1)
-        frames = take(arrays, "frames", (None,), path)
-        poses = take(arrays, "poses", (len(frames), 2, 4, 4), path)
-        found = take(arrays, "found", (len(frames), 2), path).astype(bool)
-    except JawusdError:
-        return {}, ""
-    rows = zip(frames, poses, found, strict=True)
-    return {int(frame): RegionPose(each, seen) for frame, each, seen in rows}, str(meta.get("inputs"))
+    arrays, meta = read_npz(path, _FAMILY, 1)
+    frames = take(arrays, "frames", (None,), path)
+    poses = take(arrays, "poses", (len(frames), 2, 4, 4), path)
+    found = take(arrays, "found", (len(frames), 2), path).astype(bool)
+    covariance = take(arrays, "covariance", (len(frames), 2, 6, 6), path, finite=False)
+    rows = zip(frames, poses, found, covariance, strict=True)
+    return {int(frame): RegionPose(*row) for frame, *row in rows}, str(meta.get("inputs"))
 
 
-def guide_findings(capture: Capture, tracks: Tracks, points: Array) -> list[Finding]:
-    """Compare tracks of masks that jawusd made with where colours alone showed the jaw; nothing for other masks.
+def take_up_guide(capture: Capture, tracks: Tracks, landmarks: Array) -> tuple[Tracks, list[Finding]]:
+    """Return tracks with poses that colours alone gave taken in, and what to say of both; other masks change nothing.
 
-    Kind: "footage_doubtful" [%], for frames that are lost or in which both differ by more than a millimetre. Masks made
-    around a wrong pose confirm it, and borders of colours err otherwise than masks do, so that both seldom agree on it.
+    Kinds: "footage_doubtful" [%], for frames that are lost or in which both differ by more than a millimetre, and
+    "footage_unchecked" where there are no such poses. Masks made around a wrong pose confirm it, and borders of colours
+    err otherwise than masks do, so that both seldom agree on it.
 
     Args:
-        points: of the lower teeth, scan coordinates [mm], shape (N, 3).
+        landmarks: lower teeth, then condyles, mandible coordinates [mm], shape (5, 3).
+
+    Raises:
+        FormatError: the file of the poses is damaged.
     """
+    from jawusd.tracking.sequence.combined import combine
+
     folder = auto_masks_folder(capture)
-    guide = _read(folder / GUIDE)[0] if folder is not None else {}
+    if folder is None:
+        return tracks, []
+    guide = _read(folder / GUIDE)[0]
     rows = [k for k, frame in enumerate(tracks.frames.tolist()) if frame in guide]
     if not rows:
-        return []
-    shown = np.stack([guide[int(tracks.frames[k])].poses for k in rows])
-    colours = transform_points(relative_pose(shown[:, 0], shown[:, 1]), points)
-    apart_mm = np.linalg.norm(transform_points(tracks.raw_T_upper_lower[rows], points) - colours, axis=-1).mean(-1)
+        message = "no poses by colours lie beside these masks: whether masks were made around wrong poses is not known"
+        hint = "Run `jawusd segment` again, and keep its guide.npz beside the masks."
+        return tracks, [Finding("footage_unchecked", "warning", message, path=str(folder / GUIDE), hint=hint)]
+    poses, covariance = np.full((len(tracks.frames), 2, 4, 4), np.nan), np.full((len(tracks.frames), 2, 6, 6), np.nan)
+    for k in rows:
+        shown = guide[int(tracks.frames[k])]
+        poses[k, shown.found], covariance[k, shown.found] = shown.poses[shown.found], shown.covariance[shown.found]
+    registration = registration_of(tracks.meta)
+    if registration is not None:
+        poses[:, 1] = poses[:, 1] @ se3_inverse(registration)
+    return combine(tracks, poses, covariance, landmarks), _disagreement(tracks, poses, landmarks[:3])
+
+
+def _disagreement(tracks: Tracks, poses: Array, points: Array) -> list[Finding]:
+    """Return what to say if masks and colours place points of the lower teeth (N, 3) apart too often."""
+    relative = np.full((len(poses), 4, 4), np.nan)
+    both = np.isfinite(poses).all((1, 2, 3))
+    relative[both] = relative_pose(poses[both, 0], poses[both, 1])
+    away = transform_points(tracks.raw_T_upper_lower, points) - transform_points(relative, points)
+    apart_mm = np.linalg.norm(away, axis=-1).mean(-1)
     bad = ~(apart_mm <= _APART_MM)  # NaN where an arch is lost
     share = float(bad.mean())
     if share <= _FEW:
@@ -166,11 +195,11 @@ def guide_findings(capture: Capture, tracks: Tracks, points: Array) -> list[Find
         Finding(
             "footage_doubtful",
             "warning",
-            f"the footage {judgement}: in {bad.sum()} of {len(rows)} frames the jaw is lost, or masks and colours "
+            f"the footage {judgement}: in {bad.sum()} of {len(bad)} frames the jaw is lost, or masks and colours "
             f"place it more than {_APART_MM:g} mm apart; at most {_FEW:.0%} of the frames is usual",
             value=round(100 * share, 1),
             limit=100 * _FEW,
-            frame=int(tracks.frames[rows[worst]]),
+            frame=int(tracks.frames[worst]),
             hint="Look at the overlay, draw masks of some frames (`jawusd segment --keys`), or light the mouth better.",
         )
     ]

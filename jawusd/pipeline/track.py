@@ -31,7 +31,7 @@ from jawusd.pipeline.prepare import (
     rescaled_cameras,
     subject_of_capture,
 )
-from jawusd.pipeline.segment_guide import guide_findings
+from jawusd.pipeline.segment_guide import take_up_guide
 from jawusd.pipeline.segment_record import auto_masks_folder
 from jawusd.pipeline.state import Progress, no_progress
 
@@ -166,7 +166,8 @@ def first_pass(
             tracks = track_capture(
                 capture, cameras, offsets, upper, lower, landmarks, config, threads=jobs, progress=report
             )
-            findings = [*findings, *guide_findings(capture, tracks, landmarks[:3])]
+            tracks, doubts = take_up_guide(capture, tracks, landmarks)
+            findings = [*findings, *doubts]
     tracks.meta["findings"] = [*tracks.meta.get("findings", []), *(finding.as_json() for finding in findings)]
     tracks.meta["calibration_rescaled_px"] = rescaled_cameras(capture)
     return tracks

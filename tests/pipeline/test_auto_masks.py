@@ -1,19 +1,21 @@
 """Masks that jawusd made are known as such, and the tracker allows them more than drawn ones."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from package_copy import ROOT
 
+from jawusd.errors import FormatError
 from jawusd.formats.capture import load_capture
+from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, Tracks
 from jawusd.geometry import make_transform
 from jawusd.pipeline.segment import with_masks
-from jawusd.pipeline.segment_guide import guide_findings, save_guide
+from jawusd.pipeline.segment_guide import GUIDE, save_guide, take_up_guide
 from jawusd.pipeline.segment_record import SUMMARY, auto_masks_folder
 from jawusd.pipeline.track import tracking_config
 from jawusd.tracking import TrackingConfig
 from jawusd.tracking.region.tracker import RegionPose
+
+LANDMARKS = np.array([[0, 0, 0], [20, 0, -25], [-20, 0, -25], [50, 40, -80], [-50, 40, -80]], float)
 
 
 def test_only_masks_beside_a_summary_of_segmentation_are_made(tmp_path):
@@ -36,22 +38,88 @@ def test_drawn_masks_are_judged_by_the_usual_numbers(tmp_path):
     assert made.suspect_residual > TrackingConfig().suspect_residual
 
 
+def _take(frames, relative):
+    """Return tracks whose upper arch rests, and the capture's guide of jaws that rest."""
+    count, still = len(frames), np.tile(np.eye(4), (len(frames), 1, 1))
+    small = np.tile(np.diag([1e-6] * 3 + [1e-2] * 3), (count, 1, 1))
+    found = np.isfinite(relative).all((1, 2))
+    return Tracks(
+        frames=frames,
+        **{name: still for name in ("T_world_upper", "raw_T_world_upper")},
+        **{name: relative for name in ("T_world_lower", "raw_T_world_lower", "T_upper_lower", "raw_T_upper_lower")},
+        status=np.column_stack([np.full(count, TRACKED), np.where(found, TRACKED, LOST)]).astype(np.int8),
+        prior_aided=np.zeros(count, bool),
+        coverage_error=np.zeros((count, 2, 3)),
+        masks_used=np.ones((count, 2, 3), bool),
+        **{name: small for name in ("covariance_upper", "covariance_lower", "covariance_relative")},
+        sigma_mm=np.full((count, 5), 0.1),
+        residual_px=np.full((count, 2), 0.5),
+        matched_px=np.full((count, 2), 900.0),
+        camera_names=("cam0", "cam1", "cam2"),
+    )
+
+
+def _guided(folder, frames):
+    """Return the example with masks in a folder whose guide shows jaws at rest, four times as uncertain."""
+    covariance = np.tile(np.diag([4e-6] * 3 + [4e-2] * 3), (2, 1, 1))
+    resting = RegionPose(np.tile(np.eye(4), (2, 1, 1)), np.ones(2, bool), covariance)
+    save_guide(folder, "inputs", {int(f): resting for f in frames})
+    (folder / SUMMARY).write_text("{}")
+    return with_masks(load_capture(ROOT / "examples" / "capture" / "capture.toml"), folder)
+
+
+def _shifted(count, mm):
+    return np.tile(make_transform(np.eye(3), [mm, 0.0, 0.0]), (count, 1, 1))
+
+
 @pytest.mark.parametrize(
     ("wrong", "lost", "words"), [(0, 0, None), (1, 0, None), (2, 3, "in parts"), (9, 2, "not usable")]
 )
 def test_masks_and_colours_that_disagree_make_footage_doubtful(tmp_path, wrong, lost, words):
     frames = np.arange(10, 50)
-    guide = {int(f): RegionPose(np.tile(np.eye(4), (2, 1, 1)), np.ones(2, bool)) for f in frames}
-    save_guide(tmp_path, "inputs", guide)
-    (tmp_path / SUMMARY).write_text("{}")
-    given = load_capture(ROOT / "examples" / "capture" / "capture.toml")
-    poses = np.tile(make_transform(np.eye(3), [0.3, 0.0, 0.0]), (len(frames), 1, 1))
-    poses[:wrong, 1, 3] = 1.5  # mm
+    poses = _shifted(len(frames), 0.3)
+    poses[:wrong, 0, 3] = 1.5  # mm
     poses[wrong : wrong + lost] = np.nan
-    tracks = SimpleNamespace(frames=frames, raw_T_upper_lower=poses)
-    found = guide_findings(with_masks(given, tmp_path), tracks, np.eye(3))
-    assert guide_findings(given, tracks, np.eye(3)) == []  # drawn masks
+    tracks = _take(frames, poses)
+    _, found = take_up_guide(_guided(tmp_path, frames), tracks, LANDMARKS)
     if words is None:
         assert found == []
     else:
         assert words in found[0].message and f"{wrong + lost} of 40" in found[0].message and found[0].frame == 10
+
+
+def test_drawn_masks_have_no_guide():
+    given = load_capture(ROOT / "examples" / "capture" / "capture.toml")
+    tracks = _take(np.arange(5), _shifted(5, 0.3))
+    assert take_up_guide(given, tracks, LANDMARKS) == (tracks, [])
+
+
+def test_masks_and_colours_are_weighted_by_their_covariance(tmp_path):
+    frames = np.arange(10, 50)
+    poses = _shifted(len(frames), 0.3)
+    poses[7] = np.nan
+    tracks, _ = take_up_guide(_guided(tmp_path, frames), _take(frames, poses), LANDMARKS)
+    moved = tracks.raw_T_upper_lower[:, 0, 3]
+    assert moved[[0, 7]] == pytest.approx([0.3 * 0.8, 0.0], abs=1e-9)
+    assert tracks.status[7].tolist() == [TRACKED, RECOVERED] and np.isfinite(tracks.T_upper_lower).all()
+    # The lower arch measured once more: 1 / (1 / 1 + 1 / 4) of the variance along x, and all of the colours' alone.
+    assert tracks.covariance_lower[[0, 7], 3, 3] == pytest.approx([0.8e-2, 4e-2])
+
+
+def test_masks_and_colours_that_contradict_each_other_widen_sigma(tmp_path):
+    frames = np.arange(10, 50)
+    poses = _shifted(len(frames), 0.0)
+    poses[20, 0, 3] = 2.0  # mm: 8.9 standard deviations of the difference, square 80 over 6 degrees of freedom
+    tracks, _ = take_up_guide(_guided(tmp_path, frames), _take(frames, poses), LANDMARKS)
+    assert tracks.covariance_lower[20, 3, 3] / tracks.covariance_lower[0, 3, 3] == pytest.approx(80 / 6)
+
+
+def test_masks_without_their_guide_are_told(tmp_path):
+    tracks = _take(np.arange(5), _shifted(5, 0.3))
+    capture = _guided(tmp_path, np.arange(5))
+    (tmp_path / GUIDE).unlink()
+    kept, found = take_up_guide(capture, tracks, LANDMARKS)
+    assert kept is tracks and found[0].kind == "footage_unchecked"
+    (tmp_path / GUIDE).write_bytes(b"damaged")
+    with pytest.raises(FormatError, match=GUIDE):
+        take_up_guide(capture, tracks, LANDMARKS)
