@@ -41,6 +41,7 @@ from jawusd.tracking.initialization.mixups import possible_mixups
 from jawusd.tracking.initialization.pose_search import Grid, Screen, _template, coarse_scan
 from jawusd.tracking.initialization.scan_checks import check_occlusion
 from jawusd.tracking.initialization.start import find_start
+from jawusd.tracking.initialization.start_causes import refuse_lone_arch
 from jawusd.tracking.initialization.start_search import Found, StartSearch
 
 FRAMES = 5
@@ -197,7 +198,7 @@ def test_picks_that_fit_outlive_a_search_that_does_not(pictures, monkeypatch, fa
     def search(*_):
         if fails:
             raise TrackingError("no pair of poses")
-        return Found(astray, -300.0, -0.2)
+        return Found(astray, -300.0, np.full(2, -0.2))
 
     monkeypatch.setattr(take_start, "_SURE_MM", 0.0)
     monkeypatch.setattr(take_start, "search_around", search)
@@ -277,7 +278,7 @@ class _FoundBefore:
             poses = _misplaced(poses)
         fit = self.fits[len(self.asked)]
         self.asked.append(frame)
-        return Found(poses, 1000.0 * fit, fit)
+        return Found(poses, 1000.0 * fit, np.full(2, fit))
 
 
 def _searched(folder, search):
@@ -381,3 +382,23 @@ def test_exchanges_that_leave_cameras_without_masks_prove_nothing(monkeypatch, w
     found = mixups.likely_mixup(footage, None, np.stack([np.eye(4)] * 2), 3)
     assert (found is not None) == accused
     assert not accused or "cam1 and cam2 are exchanged" in found.finding
+
+
+@pytest.mark.parametrize(
+    ("fits", "named"),
+    [
+        ({3: (0.6, -0.1), 5: (0.1, 0.0), 9: (0.4, 0.02)}, "lower scan does not fit its own masks"),
+        ({3: (-0.5, 0.35)}, "upper scan does not fit its own masks"),
+        ({3: (0.6, -0.1), 5: (0.5, 0.12)}, None),  # hidden on one frame, shown on another
+        ({3: (0.6, -0.1), 5: (-0.2, 0.4)}, None),
+        ({3: (0.2, -0.1)}, None),
+        ({}, None),
+    ],
+)
+def test_a_scan_that_fits_nowhere_while_the_other_does_is_named(fits, named):
+    fits = {frame: np.array(fit) for frame, fit in fits.items()}
+    if named is None:
+        refuse_lone_arch(fits)
+    else:
+        with pytest.raises(TrackingError, match=named):
+            refuse_lone_arch(fits)

@@ -135,7 +135,9 @@ def _doubtful(found: Occlusion) -> Iterator[Finding]:
         yield warning("scans_open", f"{message}{_LOOSE_MM:g} mm are usual", found.gap_mm, _LOOSE_MM, _EXPORT)
     if found.depth_mm > _TIGHT_MM:
         message = f"the crowns of the scans run {found.depth_mm:.1f} mm into one another, up to {_TIGHT_MM:g} mm are "
-        yield warning("scans_overlap", message + "usual", found.depth_mm, _TIGHT_MM, _EXPORT)
+        bare = [name for name, over in zip(ARCH_NAMES, found.turned_over) if over is None]
+        turned = f" Without gum, an upside down scan ({' or '.join(bare)}) also looks like that." if bare else ""
+        yield warning("scans_overlap", message + "usual", found.depth_mm, _TIGHT_MM, _EXPORT + turned)
     left, right = found.side_gaps_mm
     if abs(left - right) > _ONE_SIDED_MM:
         tight, loose = ("right", "left") if left > right else ("left", "right")

@@ -21,7 +21,7 @@ from jawusd.tracking.initialization.bootstrap import picked_sigma_mm, pose_from_
 from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.initialization.mixups import all_arches_exchanged, likely_mixup
 from jawusd.tracking.initialization.scan_checks import check_occlusion
-from jawusd.tracking.initialization.start_causes import CLEAR_FIT, aligned, refuse_by_cause
+from jawusd.tracking.initialization.start_causes import CLEAR_FIT, aligned, refuse_by_cause, refuse_lone_arch
 from jawusd.tracking.initialization.start_search import Found, StartSearch
 
 _SURVEYED = 24  # frames surveyed: two seconds of reading, and every exercise of a usual take is met
@@ -160,9 +160,11 @@ def search_start(search: StartSearch, footage: Footage) -> Start:
     failed: dict[int, str] = {}
     accused: set[str] = set()
     best: tuple[int, Found] | None = None
+    fits: dict[int, Array] = {}
     for frame in frames:
         try:
             found = search.at(footage, frame)
+            fits[frame] = found.fits
             # Most masks being right, the poses are, and show which ones are not. Poor poses may accuse any.
             mixup = likely_mixup(footage, search.solver, found.poses, frame)
             if mixup is None:
@@ -182,6 +184,7 @@ def search_start(search: StartSearch, footage: Footage) -> Start:
             break
     if best is None:
         refuse_by_cause(search, footage, frames[0], accused)
+        refuse_lone_arch(fits)
         raise TrackingError(
             f"there are no [bootstrap] picks, and searching the teeth failed on all {len(frames)} frames tried. "
             + " ".join(f"Frame {frame}: {message}." for frame, message in failed.items()),

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations
 
 from jawusd.errors import CaptureError, TrackingError
 from jawusd.geometry import Camera
 from jawusd.geometry.arrays import Array
-from jawusd.tracking.contour.scan import teeth_centre
+from jawusd.tracking.contour.scan import ARCH_NAMES, teeth_centre
 from jawusd.tracking.initialization.first_frame import first_record
 from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.initialization.mixups import possible_mixups
@@ -17,6 +17,7 @@ from jawusd.tracking.initialization.start_search import StartSearch
 
 # Fit that leaves no doubt [-]. Wrong poses of a hundred searches stayed below 0.1 in one of the arches, right ones
 # exceed 0.35 where much of the teeth shows, and 0.1 with lips nearly closed or cameras 0.1 degrees off.
+# (Scans of other persons: 0.35 to 0.77 in the arch that is right, below 0.05 in the other one, on eight persons.)
 CLEAR_FIT = 0.3
 _EXPLAINS = 0.1  # least fit with a mistake undone, which wrong poses do not reach
 _MOST_CAMERAS = 4  # whose exchanges are tried; every one costs a search
@@ -61,6 +62,31 @@ def refuse_by_cause(search: StartSearch, footage: Footage, frame: int, accused: 
         if cause is not None and fit >= _EXPLAINS:
             message = f"{cause.message}: the teeth are found only with that undone"
             raise TrackingError(message, frame=frame, hint=cause.hint)
+
+
+def refuse_lone_arch(fits: Mapping[int, Array]) -> None:
+    """Refuse a scan that fits none of its masks where the other one fits beyond doubt; return if there is none.
+
+    Args:
+        fits: what a search that failed found, by frame: `arch_fit` of both arches [-], shape (2,).
+
+    Raises:
+        TrackingError: names the scan.
+    """
+    clear = {frame: fit for frame, fit in fits.items() if fit.max() >= CLEAR_FIT}
+    arches = {int(fit.argmax()) for fit in clear.values()}
+    if len(arches) != 1 or any(fit.min() >= _EXPLAINS for fit in clear.values()):
+        return
+    good = arches.pop()
+    frame = max(clear, key=lambda f: float(clear[f][good]))
+    fit = clear[frame]
+    name, other = ARCH_NAMES[1 - good], ARCH_NAMES[good]
+    raise TrackingError(
+        f"the {name} scan does not fit its own masks on any frame where the {other} one does: {fit[1 - good]:.2f} of "
+        f"its contour against {fit[good]:.2f}, less what stays uncovered; at least {_EXPLAINS:g} is needed",
+        frame=frame,
+        hint=f"Check that the {name} scan is this person's, of this time, and that its masks show the {name} teeth.",
+    )
 
 
 def _fit(cause: _Cause, frame: int) -> float:

@@ -49,7 +49,12 @@ class Found:
 
     poses: Array  # T_world_upper, T_world_lower, shape (2, 4, 4)
     objective_px: float  # fitting contour less the price of uncovered mask, both arches
-    fit: float  # `arch_fit` of the arch that fits worse [-]
+    fits: Array  # `arch_fit` of both arches [-], shape (2,)
+
+    @property
+    def fit(self) -> float:
+        """The fit of the arch that fits worse [-]."""
+        return float(self.fits.min())
 
 
 class StartSearch:
@@ -129,8 +134,8 @@ class StartSearch:
         ends = [self.solver.solve(poses, views, self._config.wide_gates_px) for poses in pairs]
         objective = [self._objective(self.solver, s, views).sum() for s in ends]
         best = int(np.argmax(objective))
-        fit = arch_fit(self.solver.scans, ends[best], views, self._config.uncovered_price)
-        return Found(ends[best].poses, float(objective[best]), float(fit.min()))
+        fits = arch_fit(self.solver.scans, ends[best], views, self._config.uncovered_price)
+        return Found(ends[best].poses, float(objective[best]), fits)
 
     def _distinct(self, found: Sequence[Candidate], r: int) -> list[Array]:
         """Return the best poses that differ from one another."""
