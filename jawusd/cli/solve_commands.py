@@ -46,7 +46,10 @@ def solve(
     allow_outside: Outside = False,
     as_json: Json = False,
 ) -> None:
-    """Solve a performance of the person of a rig from the masks of one or more cameras."""
+    """Solve a performance of the person of a rig, from masks of one or more cameras or the videos of two or more.
+
+    Masks made from videos are kept beside the output.
+    """
     from jawusd.pipeline import solve as stage
 
     stage.check_output(rig, out)

@@ -18,6 +18,8 @@ from jawusd.formats.performance import Performance, SolveState, write_performanc
 from jawusd.formats.tracks import save_tracks
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.prepare import load_cameras, load_labelled, naming_file, open_capture, registered_meshes
+from jawusd.pipeline.segment import SegmentOptions, segment_capture, with_masks
+from jawusd.pipeline.segment_guide import take_up_guide
 from jawusd.pipeline.state import Progress, no_progress
 from jawusd.pipeline.track import tracking_config
 
@@ -59,7 +61,8 @@ def solve(
 
     Args:
         rig: `actor.usda`, another layer of it, or `model.npz`.
-        shot: the capture of the shot, its capture.toml or the folder that holds it.
+        shot: the capture of the shot, its capture.toml or the folder that holds it. If no camera has masks, they are
+            made from its videos, as `segment` does, and kept beside the output (`take_masks` for `take.csv`).
         out: file to write: a table of d (.csv), tracks (.npz), or an animation layer on the rig (.usdc, .usda).
         fixed_head: the cameras are worn, as on a helmet: the head does not move before them.
         free_focal: the focal lengths of the calibration are guesses, good to a tenth.
@@ -69,9 +72,10 @@ def solve(
     Raises:
         FormatError, RigError: the rig cannot be read.
         CaptureError, CalibrationError, SyncError: see `track`.
-        TrackingError: the teeth cannot be found in the masks.
+        TrackingError: the teeth cannot be found in the masks, or the videos.
         OutputError: the file cannot be written.
     """
+    from jawusd.tracking.performance.results import tracks_of
     from jawusd.tracking.performance.shot import solve_capture
 
     check_output(rig, out)
@@ -79,6 +83,8 @@ def solve(
     capture = open_capture(shot, allow_outside=allow_outside)
     jaw = jawusd.load(rig)
     offsets = sync_cameras(capture, progress)["offsets"]
+    if not any(camera.masks for camera in capture.cameras):
+        capture = _segmented(capture, offsets, out, jobs, progress)
     with naming_file(capture.folder / "capture.toml"):
         meshes, findings = load_labelled(capture)
         meshes = registered_meshes(meshes, jaw.meta)
@@ -96,10 +102,31 @@ def solve(
             progress=partial(progress, "solve"),
         )
     known = cast("list[dict[str, str | float | int]]", found.notes.get("findings", []))
-    found.notes["findings"] = [*known, *(finding.as_json() for finding in findings)]
+    _, doubts = take_up_guide(capture, tracks_of(found, jaw), jaw.landmarks)
+    found.notes["findings"] = [*known, *(finding.as_json() for finding in (*findings, *doubts))]
     if out is not None:
         write_solved(out, found, jaw, rig, capture.fps)
     return found
+
+
+def _segmented(
+    capture: Capture, offsets: dict[str, int], out: str | os.PathLike[str] | None, jobs: int, progress: Progress
+) -> Capture:
+    """Return a shot with masks made from its videos; those of an interrupted run are kept.
+
+    Raises:
+        OutputError: no output is named beside which they could lie.
+        CaptureError, TrackingError: see `segment_capture`.
+    """
+    if out is None:
+        raise OutputError(
+            "the shot has no masks, and no output is named beside which they could be made.",
+            path=capture.folder / "capture.toml",
+            hint="Name an output, or make masks with `jawusd segment` and name them in the capture file.",
+        )
+    folder = Path(out).with_name(f"{Path(out).stem}_masks")
+    segment_capture(capture, offsets, folder, SegmentOptions(resume=True, jobs=jobs), progress)
+    return with_masks(capture, folder)
 
 
 @explain_missing_packages()

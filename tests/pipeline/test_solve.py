@@ -11,12 +11,14 @@ from pxr import Sdf
 from short_example import write_short
 
 import jawusd
-from jawusd.errors import OutputError, RigError, TrackingError
+from jawusd.errors import CaptureError, OutputError, RigError
 from jawusd.formats.performance import SolveState
 from jawusd.formats.poses import read_parameters
 from jawusd.formats.tracks import load_tracks
 from jawusd.geometry import transform_point
 from jawusd.pipeline.prepare import open_capture
+from jawusd.pipeline.segment import with_masks
+from jawusd.pipeline.segment_record import auto_masks_folder
 from jawusd.pipeline.solve import check_output, solve, solve_summary, write_solved
 from jawusd.rig.motion_read import read_poses_of_stage
 
@@ -68,6 +70,33 @@ def test_tracks_and_animation_hold_the_same_jaw(rig, shot, tmp_path):
     np.testing.assert_allclose(shown, jaw.pose(found.d), atol=1e-3)
 
 
+def test_shots_without_masks_are_solved_from_their_videos(rig, tmp_path):
+    capture = open_capture(EXAMPLE)
+    bare = capture.model_copy(
+        update={
+            "cameras": tuple(camera.model_copy(update={"masks": None}) for camera in capture.cameras),
+            "frames": (capture.bootstrap.frame - 2, capture.bootstrap.frame + 2),
+        }
+    )
+    with pytest.raises(OutputError, match="no masks, and no output"):
+        solve(rig, bare, None)
+    found = solve(rig, bare, tmp_path / "take.csv")
+    assert (found.state == SolveState.SOLVED).all()
+    assert tip_errors_mm(jawusd.load(rig), found.frames, found.d).max() < 0.4
+    assert auto_masks_folder(with_masks(bare, tmp_path / "take_masks")) is not None
+    # Masks that were made before are taken up again.
+    before = (tmp_path / "take_masks" / "guide.npz").stat().st_mtime_ns
+    solve(rig, bare, tmp_path / "take.csv")
+    assert (tmp_path / "take_masks" / "guide.npz").stat().st_mtime_ns == before
+
+
+def test_one_camera_without_masks_is_refused(rig, tmp_path):
+    capture = open_capture(EXAMPLE)
+    one = capture.cameras[0].model_copy(update={"masks": None})
+    with pytest.raises(CaptureError, match="two at least"):
+        solve(rig, capture.model_copy(update={"cameras": (one,)}), tmp_path / "take.csv")
+
+
 def test_frames_that_were_not_seen_are_named(rig, shot, tmp_path):
     capture = open_capture(shot)
     found = solve(rig, capture, None)
@@ -94,8 +123,8 @@ def test_what_cannot_be_written_is_refused_before_any_work(rig, tmp_path):
         check_output(rig.parent / "model.npz", tmp_path / "take.usdc")
 
 
-def test_a_shot_without_masks_is_refused(rig, shot):
+def test_a_shot_without_masks_and_videos_is_refused(rig, shot, tmp_path):
     capture = open_capture(shot)
     none = tuple(camera.model_copy(update={"masks": None}) for camera in capture.cameras)
-    with pytest.raises(TrackingError, match="have masks"):
-        solve(rig, capture.model_copy(update={"cameras": none}), None)
+    with pytest.raises(CaptureError, match="no camera has a video"):
+        solve(rig, capture.model_copy(update={"cameras": none}), tmp_path / "take.csv")
