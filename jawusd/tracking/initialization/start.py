@@ -94,7 +94,7 @@ def _picked(
     if (mixup := likely_mixup(footage, search.solver, start.poses, start.frame)) is not None:
         raise mixup.refusal(start.frame)
     if not footage.has_masks(start.frame):
-        return start
+        return _elsewhere(search, footage, start, "the frame of the picks lacks masks of both arches in two cameras")
     if max(sigma_mm.values()) <= _SURE_MM and _fits(search, footage, start):
         return start
     try:
@@ -124,7 +124,12 @@ def _picks_off(search: StartSearch, start: Start, poses: Array, sigma_mm: Mappin
     return tuple(out)
 
 
-def _elsewhere(search: StartSearch, footage: Footage, start: Start) -> Start:
+def _elsewhere(
+    search: StartSearch,
+    footage: Footage,
+    start: Start,
+    reason: str = "the picks do not fit the masks of their frame",
+) -> Start:
     """Return a start on another frame if there is one that fits: lips may hide the teeth on the picked one.
 
     Otherwise the start as it is, which is then refused with its own reasons.
@@ -133,7 +138,7 @@ def _elsewhere(search: StartSearch, footage: Footage, start: Start) -> Start:
         other = search_start(search, footage)
     except TrackingError:
         return start
-    message = f"the picks do not fit the masks of their frame; the teeth were found on frame {other.frame} without them"
+    message = f"{reason}; the teeth were found on frame {other.frame} without the picks"
     unused = Finding("picks_unused", "warning", message, frame=start.frame, hint="Pick where both arches show well.")
     return replace(other, findings=(unused,))
 
