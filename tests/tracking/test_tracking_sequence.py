@@ -163,6 +163,7 @@ def test_a_picked_frame_without_two_masks_of_each_row_gives_way_to_another(take)
     found = {found["kind"]: found for found in tracks.meta["findings"]}
     assert "lacks masks of both arches" in found["picks_unused"]["message"]
     assert tracks.meta["start"]["frame"] != 8
+    assert tracks.meta["start"]["by"] == "picks, then search on another frame"
     assert np.nanmax(errors_mm(tracks)) < 0.1
 
 

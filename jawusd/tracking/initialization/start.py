@@ -108,7 +108,7 @@ def _picked(
     if "camera_left_out" in notes or _fits(search, footage, near):
         return near
     # A search may end in another minimum than picks that are hardly unsure.
-    return start if _fits(search, footage, start) else _elsewhere(search, footage, near)
+    return start if _fits(search, footage, start) else _elsewhere(search, footage, start)
 
 
 def _picks_off(search: StartSearch, start: Start, poses: Array, sigma_mm: Mapping[str, float]) -> tuple[Finding, ...]:
@@ -134,13 +134,31 @@ def _elsewhere(
 
     Otherwise the start as it is, which is then refused with its own reasons.
     """
-    try:
-        other = search_start(search, footage)
-    except TrackingError:
-        return start
-    message = f"{reason}; the teeth were found on frame {other.frame} without the picks"
+    other = _near_on_another_frame(search, footage, start)
+    if other is None:
+        try:
+            other = search_start(search, footage)
+        except TrackingError:
+            return start
+    message = f"{reason}; the teeth were found on frame {other.frame}"
     unused = Finding("picks_unused", "warning", message, frame=start.frame, hint="Pick where both arches show well.")
     return replace(other, findings=(unused,))
+
+
+def _near_on_another_frame(search: StartSearch, footage: Footage, start: Start) -> Start | None:
+    """Return the first frame that fits beyond doubt near the picked poses: heads move little, jaws not far."""
+    try:
+        frames = footage.survey(None, _SURVEYED).promising(_FRAMES_TRIED).tolist()
+    except TrackingError:
+        return None
+    for frame in frames:
+        with contextlib.suppress(TrackingError):
+            found = search.near(footage, frame, start.poses)
+            if found.fit >= CLEAR_FIT:
+                poses = aligned(search, footage, found.poses, frame)
+                notes = {"by": "picks, then search on another frame", "frame": frame, "fit": found.fit}
+                return Start(frame, poses, {**start.notes, **notes})
+    return None
 
 
 def _fits(search: StartSearch, footage: Footage, start: Start) -> bool:
