@@ -33,6 +33,9 @@ if TYPE_CHECKING:
 # Distance of the jaw by masks and by colours from which one is wrong [mm]: right ones of three takes were at most 0.9
 # apart. Shares of such frames, or lost ones, from which a take is doubtful, and not usable.
 _APART_MM, _FEW, _MANY = 1.0, 0.03, 0.2
+# Change of the jaw's motion from frame to frame [mm] after which the frames before are looked at again, and distance of
+# poses that are the same. Speech and chewing reach 1 mm at 24 frames a second: needless looks end after a frame.
+_JUMP_MM, _SAME_MM = 0.8, 0.15
 GUIDE, _FAMILY = "guide.npz", "jawusd-guide"
 STAGE = "follow"
 _WORKING_PX_PER_MM, _MARGIN_MM = 7.2, 6.0  # resolution at the teeth, and what is looked at around them
@@ -73,12 +76,45 @@ def followed_teeth(
     tracker = RegionTracker(scans, list(cameras.values()), condyles, axes, executor=pool)
     out = {frame: tracker.begin(_cut(views, scans, footage.at(frame)), poses)}
     progress(STAGE, 1, len(frames))
+
+    def cuts(way: range) -> Iterator[Cut]:
+        return (_cut(views, scans, pictures) for _, pictures in footage.walk(way))
+
     for way in (range(frame + 1, frames.stop), range(frame - 1, frames.start - 1, -1)):
-        cuts: Iterator[Cut] = (_cut(views, scans, pictures) for _, pictures in footage.walk(way))
-        for at, found in zip(way, tracker.follow(cuts, out[frame].poses), strict=True):
+        for at, found in zip(way, tracker.follow(cuts(way), out[frame].poses), strict=True):
             out[at] = found
             progress(STAGE, len(out), len(frames))
+        for jump in _jumps(way, out, subject.landmarks[:3]):
+            back = range(jump - way.step, frame, -way.step)
+            _follow_back(back, tracker.follow(cuts(back), out[jump].poses), out, subject.landmarks[:3])
     return out
+
+
+def _places(found: RegionPose, points: Array) -> Array:
+    """Return where points of the lower teeth (N, 3) are against the upper ones [mm], shape (N, 3)."""
+    return transform_points(relative_pose(found.poses[0], found.poses[1]), points)
+
+
+def _jumps(way: range, known: Mapping[int, RegionPose], points: Array) -> list[int]:
+    """Return the frames of a way on which the jaw changes its motion more suddenly than jaws do."""
+    if len(way) < 3:
+        return []
+    places = np.stack([_places(known[frame], points) for frame in way])
+    bend_mm = np.linalg.norm(np.diff(places, 2, axis=0), axis=-1).mean(-1)
+    return [way[k + 2] for k in np.flatnonzero(bend_mm > _JUMP_MM).tolist()]
+
+
+def _follow_back(back: range, again: Iterator[RegionPose], known: dict[int, RegionPose], points: Array) -> None:
+    """Put in poses followed the other way, as long as they differ and more contour fits them.
+
+    A jaw that is found again has been followed wrongly before; the frames up to there look right one by one.
+    """
+    for frame, found in zip(back, again, strict=False):
+        apart_mm = np.linalg.norm(_places(found, points) - _places(known[frame], points), axis=-1).mean()
+        better = found.worth_px > known[frame].worth_px or not known[frame].found.all()
+        if apart_mm < _SAME_MM or not found.found.all() or not better:
+            return
+        known[frame] = found
 
 
 def _cut(views: Mapping[str, PictureFrame], scans: Sequence[Scan], pictures: Pictures) -> Cut:

@@ -9,7 +9,7 @@ from jawusd.formats.capture import load_capture
 from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, Tracks
 from jawusd.geometry import make_transform
 from jawusd.pipeline.segment import with_masks
-from jawusd.pipeline.segment_guide import GUIDE, save_guide, take_up_guide
+from jawusd.pipeline.segment_guide import GUIDE, _follow_back, _jumps, save_guide, take_up_guide
 from jawusd.pipeline.segment_record import SUMMARY, auto_masks_folder
 from jawusd.pipeline.track import tracking_config
 from jawusd.tracking import TrackingConfig
@@ -123,3 +123,35 @@ def test_masks_without_their_guide_are_told(tmp_path):
     (tmp_path / GUIDE).write_bytes(b"damaged")
     with pytest.raises(FormatError, match=GUIDE):
         take_up_guide(capture, tracks, LANDMARKS)
+
+
+def _followed(frames, mm, worth_px=900.0):
+    """Return what was followed: the jaw moved by so many mm along x on each frame."""
+    covariance = np.tile(np.eye(6), (2, 1, 1))
+    return {
+        int(frame): RegionPose(
+            np.stack([np.eye(4), make_transform(np.eye(3), [x, 0.0, 0.0])]), np.ones(2, bool), covariance, worth_px
+        )
+        for frame, x in zip(frames, mm, strict=True)
+    }
+
+
+def test_a_jaw_found_again_is_followed_back_to_where_it_was_lost():
+    frames = range(20, 60)
+    moved = 0.5 * np.arange(40)
+    wrong = moved.copy()
+    wrong[15:25] += 1.5  # mm: lost on frame 35, found again on frame 45
+    known = _followed(frames, wrong, 700.0) | {f: v for f, v in _followed(frames, wrong).items() if not 35 <= f < 45}
+    assert _jumps(frames, known, LANDMARKS[:3]) == [35, 36, 45, 46]
+    back = range(44, 20, -1)
+    right = _followed(frames, moved)
+    _follow_back(back, (right[f] for f in back), known, LANDMARKS[:3])
+    assert [known[f].poses[1, 0, 3] for f in frames] == pytest.approx(moved)
+
+
+def test_poses_followed_back_that_fit_less_change_nothing():
+    frames = range(20, 30)
+    known, worse = _followed(frames, np.zeros(10)), _followed(frames, np.ones(10), 500.0)
+    before = dict(known)
+    _follow_back(range(28, 20, -1), (worse[f] for f in range(28, 20, -1)), known, LANDMARKS[:3])
+    assert known == before and _jumps(frames, known, LANDMARKS[:3]) == []

@@ -65,6 +65,7 @@ class RegionPose:
     poses: Array  # T_world_upper and T_world_lower, shape (2, 4, 4); predictions for arches not found
     found: Mask  # shape (2,)
     covariance: Array  # of their left twists about the world origin, NaN for arches not found, shape (2, 6, 6)
+    worth_px: float = 0.0  # contour of both arches that fits, closeness counted
 
 
 class RegionTracker:
@@ -108,7 +109,7 @@ class RegionTracker:
             solution = self._align(poses, self._views(pictures, poses))
             poses = solution.poses
             self._learn(pictures, poses, poses, _FIRST_RATES)
-        return RegionPose(poses, np.ones(2, bool), self._covariance(solution))
+        return RegionPose(poses, np.ones(2, bool), self._covariance(solution), float(score_px(solution).sum()))
 
     def follow(self, cuts: Iterator[Cut], poses: Array) -> Iterator[RegionPose]:
         """Yield poses frame after frame, away from the first one, whose poses are given.
@@ -116,6 +117,12 @@ class RegionTracker:
         Every call starts from what is known after `begin`.
         """
         known = deepcopy((self._colours, self._gum_px))
+        try:
+            yield from self._followed(cuts, poses)
+        finally:
+            self._colours, self._gum_px = known
+
+    def _followed(self, cuts: Iterator[Cut], poses: Array) -> Iterator[RegionPose]:
         motion = MotionPredictor(poses, probe_points(self._solver.scans))
         motion.remember(poses, np.ones(2, bool))
         usual: deque[Array] = deque(maxlen=_USUAL_FRAMES)
@@ -134,8 +141,7 @@ class RegionTracker:
             seen = np.full(2, any(picture is not None for picture in pictures))
             motion.update(poses, found, seen)
             covariance = np.where(found[:, None, None], self._covariance(solution), np.nan)
-            yield RegionPose(poses, found, covariance)
-        self._colours, self._gum_px = known
+            yield RegionPose(poses, found, covariance, float(score_px(solution).sum()))
 
     def _covariance(self, solution: Solution) -> Array:
         """Return the covariance of both arches' left world twists, shape (2, 6, 6)."""
