@@ -41,7 +41,7 @@ def solve(
     focal: Annotated[
         Focal, typer.Option(help="free: the calibration only guesses focal lengths; the take tells them.")
     ] = Focal.known,
-    jobs: Annotated[int, typer.Option(min=1, max=64, help="Threads that search for the start.")] = 2,
+    jobs: Annotated[int, typer.Option(min=1, max=64, help="Threads that search for the start and make masks.")] = 2,
     force: Force = False,
     allow_outside: Outside = False,
     as_json: Json = False,

@@ -160,6 +160,8 @@ def synchronisation(parts: Parts) -> Iterator[Finding]:
 
 def frames(parts: Parts) -> Iterator[Finding]:
     """Look whether the frames that the capture names exist."""
+    from jawusd.capture.mask_ranges import exchanged_by_frames
+
     capture = parts.given
     count = _frame_count(parts, capture.reference)
     first, stop = capture.frames or (0, count or 0)
@@ -186,8 +188,6 @@ def frames(parts: Parts) -> Iterator[Finding]:
             message = f"none of its {own} frames lies within the frames of the take, by its offset of {offset:+d}"
             yield Finding("offset_wrong", "error", message, offset, camera=name, path=parts.description)
     ranges = {name: sample.first_last for name, sample in parts.samples.items() if name in offsets}
-    from jawusd.capture.mask_ranges import exchanged_by_frames
-
     for a, b in exchanged_by_frames(ranges, offsets, first, stop):
         message = (
             f"the masks of cameras {a} and {b} are exchanged: by their offsets, each has masks of all frames of the "

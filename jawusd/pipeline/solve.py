@@ -20,6 +20,7 @@ from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.prepare import load_cameras, load_labelled, naming_file, open_capture, registered_meshes
 from jawusd.pipeline.segment import SegmentOptions, segment_capture, with_masks
 from jawusd.pipeline.segment_guide import take_up_guide
+from jawusd.pipeline.segment_record import RECORD
 from jawusd.pipeline.state import Progress, no_progress
 from jawusd.pipeline.track import tracking_config
 
@@ -66,7 +67,7 @@ def solve(
         out: file to write: a table of d (.csv), tracks (.npz), or an animation layer on the rig (.usdc, .usda).
         fixed_head: the cameras are worn, as on a helmet: the head does not move before them.
         free_focal: the focal lengths of the calibration are guesses, good to a tenth.
-        jobs: threads of the search for the start; the result does not depend on it.
+        jobs: threads that search for the start, and make masks; the result does not depend on it.
         allow_outside: let paths in the capture leave its folder.
 
     Raises:
@@ -115,7 +116,7 @@ def _segmented(
     """Return a shot with masks made from its videos; those of an interrupted run are kept.
 
     Raises:
-        OutputError: no output is named beside which they could lie.
+        OutputError: no output is named beside which they could lie, or other files are where they would.
         CaptureError, TrackingError: see `segment_capture`.
     """
     if out is None:
@@ -125,6 +126,12 @@ def _segmented(
             hint="Name an output, or make masks with `jawusd segment` and name them in the capture file.",
         )
     folder = Path(out).with_name(f"{Path(out).stem}_masks")
+    if folder.exists() and not (folder / RECORD).is_file():
+        raise OutputError(
+            "is where masks of the shot would be made, and holds something else.",
+            path=folder,
+            hint="Name these masks in the capture file if they are the shot's, or choose another name for the output.",
+        )
     segment_capture(capture, offsets, folder, SegmentOptions(resume=True, jobs=jobs), progress)
     return with_masks(capture, folder)
 

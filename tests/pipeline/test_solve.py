@@ -90,6 +90,17 @@ def test_shots_without_masks_are_solved_from_their_videos(rig, tmp_path):
     assert (tmp_path / "take_masks" / "guide.npz").stat().st_mtime_ns == before
 
 
+def test_masks_that_lie_where_others_would_be_made_are_kept(rig, tmp_path):
+    capture = open_capture(EXAMPLE)
+    none = tuple(camera.model_copy(update={"masks": None}) for camera in capture.cameras)
+    drawn = tmp_path / "take_masks" / "cam0" / "upper" / "000010.png"
+    drawn.parent.mkdir(parents=True)
+    drawn.write_bytes(b"drawn by a person")
+    with pytest.raises(OutputError, match="holds something else"):
+        solve(rig, capture.model_copy(update={"cameras": none}), tmp_path / "take.csv")
+    assert drawn.read_bytes() == b"drawn by a person"
+
+
 def test_one_camera_without_masks_is_refused(rig, tmp_path):
     capture = open_capture(EXAMPLE)
     one = capture.cameras[0].model_copy(update={"masks": None})

@@ -24,7 +24,6 @@ from small_take import (
 )
 
 from jawusd.errors import TrackingError
-from jawusd.formats.capture import CameraSource, Masks
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import make_transform, random_rotation, se3_exp, se3_inverse, transform_point, transform_points
 from jawusd.imaging.raster import draw_silhouette, project, unpack_bits, words_for
@@ -33,15 +32,14 @@ from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.scan import prepare_scan
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import masked_sources
-from jawusd.tracking.initialization import mixups, start_search
 from jawusd.tracking.initialization import start as take_start
+from jawusd.tracking.initialization import start_search
 from jawusd.tracking.initialization.first_frame import first_record
 from jawusd.tracking.initialization.footage import Footage, MaskSurvey, survey_masks
 from jawusd.tracking.initialization.mixups import possible_mixups
 from jawusd.tracking.initialization.pose_search import Grid, Screen, _template, coarse_scan
 from jawusd.tracking.initialization.scan_checks import check_occlusion
 from jawusd.tracking.initialization.start import find_start
-from jawusd.tracking.initialization.start_causes import refuse_lone_arch
 from jawusd.tracking.initialization.start_search import Found, StartSearch
 
 FRAMES = 5
@@ -192,13 +190,13 @@ def test_picks_close_together_are_helped_by_the_masks(pictures):
 
 @pytest.mark.parametrize("fails", [False, True])
 def test_picks_that_fit_outlive_a_search_that_does_not(pictures, monkeypatch, fails):
-    astray = jaw_poses(START + 1)[START].copy()
-    astray[1, :3, 3] += [0.0, 0.0, -40.0]
+    misplaced = jaw_poses(START + 1)[START].copy()
+    misplaced[1, :3, 3] += [0.0, 0.0, -40.0]
 
     def search(*_):
         if fails:
             raise TrackingError("no pair of poses")
-        return Found(astray, -300.0, np.full(2, -0.2))
+        return Found(misplaced, -300.0, np.full(2, -0.2))
 
     monkeypatch.setattr(take_start, "_SURE_MM", 0.0)
     monkeypatch.setattr(take_start, "search_around", search)
@@ -363,42 +361,3 @@ def test_search_is_the_same_in_threads(pictures, short_search):
     with ThreadPoolExecutor(2) as pool:
         both = [StartSearch(MESHES, solver, T, m).at(footage, FIRST + 1) for m in (map, pool.map)]
     assert (both[0].poses == both[1].poses).all() and both[0].objective_px == both[1].objective_px
-
-
-@pytest.mark.parametrize(("without", "accused"), [(np.nan, False), (0.02, True)])
-def test_exchanges_that_leave_cameras_without_masks_prove_nothing(monkeypatch, without, accused):
-    """The masks of camera 1 lie off; an exchange that takes them away leaves only good ones, and is no explanation."""
-    sources = [
-        CameraSource(name=name, masks=Masks(upper=f"{name}/upper/%06d.png", lower=f"{name}/lower/%06d.png"))
-        for name in ("cam0", "cam1", "cam2")
-    ]
-
-    def shares(footage, solver, poses, frame):
-        named = [source.masks.upper.parts[0] for source in footage.sources]
-        return np.array([0.01, without, 0.02]) if named == ["cam0", "cam2", "cam1"] else np.array([0.01, 0.3, 0.02])
-
-    monkeypatch.setattr(mixups, "_uncovered_shares", shares)
-    footage = Footage(sources, TABLE, OFFSETS, (0, 10))
-    found = mixups.likely_mixup(footage, None, np.stack([np.eye(4)] * 2), 3)
-    assert (found is not None) == accused
-    assert not accused or "cam1 and cam2 are exchanged" in found.finding
-
-
-@pytest.mark.parametrize(
-    ("fits", "named"),
-    [
-        ({3: (0.6, -0.1), 5: (0.1, 0.0), 9: (0.4, 0.02)}, "lower scan does not fit its own masks"),
-        ({3: (-0.5, 0.35)}, "upper scan does not fit its own masks"),
-        ({3: (0.6, -0.1), 5: (0.5, 0.12)}, None),  # hidden on one frame, shown on another
-        ({3: (0.6, -0.1), 5: (-0.2, 0.4)}, None),
-        ({3: (0.2, -0.1)}, None),
-        ({}, None),
-    ],
-)
-def test_a_scan_that_fits_nowhere_while_the_other_does_is_named(fits, named):
-    fits = {frame: np.array(fit) for frame, fit in fits.items()}
-    if named is None:
-        refuse_lone_arch(fits)
-    else:
-        with pytest.raises(TrackingError, match=named):
-            refuse_lone_arch(fits)

@@ -17,7 +17,7 @@ from jawusd.tracking.initialization.start_search import StartSearch
 
 # Fit that leaves no doubt [-]. Wrong poses of a hundred searches stayed below 0.1 in one of the arches, right ones
 # exceed 0.35 where much of the teeth shows, and 0.1 with lips nearly closed or cameras 0.1 degrees off.
-# (Scans of other persons: 0.35 to 0.77 in the arch that is right, below 0.05 in the other one, on eight persons.)
+# (Scans of other persons: 0.35 to 0.77 in the arch that is right, below 0.05 in the other one, on seven persons.)
 CLEAR_FIT = 0.3
 _EXPLAINS = 0.1  # least fit with a mistake undone, which wrong poses do not reach
 _MOST_CAMERAS = 4  # whose exchanges are tried; every one costs a search

@@ -34,6 +34,8 @@ def combine(tracks: Tracks, poses: Array, covariance: Array, landmarks: Array) -
         raw.append(pose)
         spread.append(variance)
     both = np.asarray(np.isfinite(raw).all((0, 2, 3)))
+    if not both.any():
+        return tracks
     middle = np.median(transform_points(raw[1][both], landmarks[:3]).reshape(-1, 3), axis=0)
     final = [smooth_poses(tracks.frames, pose, variance, middle) for pose, variance in zip(raw, spread, strict=True)]
     raw_relative, relative, between = (np.full((len(both), n, n), np.nan) for n in (4, 4, 6))

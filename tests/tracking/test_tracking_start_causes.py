@@ -1,0 +1,52 @@
+"""Which mistake explains that no start is found, and which seems to but does not."""
+
+import numpy as np
+import pytest
+from small_take import CAMERAS, OFFSETS
+
+from jawusd.errors import TrackingError
+from jawusd.formats.capture import CameraSource, Masks
+from jawusd.tracking.initialization import mixups
+from jawusd.tracking.initialization.footage import Footage
+from jawusd.tracking.initialization.start_causes import refuse_lone_arch
+
+TABLE = {camera.name: camera for camera in CAMERAS}
+
+
+@pytest.mark.parametrize(("without", "accused"), [(np.nan, False), (0.02, True)])
+def test_exchanges_that_leave_cameras_without_masks_prove_nothing(monkeypatch, without, accused):
+    """The masks of camera 1 lie off; an exchange that takes them away leaves only good ones, and is no explanation."""
+    sources = [
+        CameraSource(name=name, masks=Masks(upper=f"{name}/upper/%06d.png", lower=f"{name}/lower/%06d.png"))
+        for name in ("cam0", "cam1", "cam2")
+    ]
+
+    def shares(footage, solver, poses, frame):
+        named = [source.masks.upper.parts[0] for source in footage.sources]
+        return np.array([0.01, without, 0.02]) if named == ["cam0", "cam2", "cam1"] else np.array([0.01, 0.3, 0.02])
+
+    monkeypatch.setattr(mixups, "_uncovered_shares", shares)
+    footage = Footage(sources, TABLE, OFFSETS, (0, 10))
+    found = mixups.likely_mixup(footage, None, np.stack([np.eye(4)] * 2), 3)
+    assert (found is not None) == accused
+    assert not accused or "cam1 and cam2 are exchanged" in found.finding
+
+
+@pytest.mark.parametrize(
+    ("fits", "named"),
+    [
+        ({3: (0.6, -0.1), 5: (0.1, 0.0), 9: (0.4, 0.02)}, "lower scan does not fit its own masks"),
+        ({3: (-0.5, 0.35)}, "upper scan does not fit its own masks"),
+        ({3: (0.6, -0.1), 5: (0.5, 0.12)}, None),  # hidden on one frame, shown on another
+        ({3: (0.6, -0.1), 5: (-0.2, 0.4)}, None),
+        ({3: (0.2, -0.1)}, None),
+        ({}, None),
+    ],
+)
+def test_a_scan_that_fits_nowhere_while_the_other_does_is_named(fits, named):
+    fits = {frame: np.array(fit) for frame, fit in fits.items()}
+    if named is None:
+        refuse_lone_arch(fits)
+    else:
+        with pytest.raises(TrackingError, match=named):
+            refuse_lone_arch(fits)
