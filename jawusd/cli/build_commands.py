@@ -86,7 +86,11 @@ def track(
         typer.Option(help="model.npz of this person: a second pass with its help.", show_default=False),
     ] = None,
     overlay: Annotated[
-        Path | None, typer.Option(help="Folder for videos with the tracked scans over the footage.", show_default=False)
+        Path | None,
+        typer.Option(
+            help="Folder for videos of the tracked scans over the footage, or an .mp4 of all cameras side by side.",
+            show_default=False,
+        ),
     ] = None,
     jobs: Jobs = 2,
     force: Force = False,
@@ -96,7 +100,7 @@ def track(
     """Track both rows of teeth through the masks."""
     from jawusd.formats.model import load_model
     from jawusd.pipeline import track as stage
-    from jawusd.pipeline.media import overlay_files
+    from jawusd.pipeline.overlay import overlay_files
     from jawusd.pipeline.prepare import open_capture
 
     _check_backend(solver, backend)

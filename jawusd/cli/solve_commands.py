@@ -37,6 +37,13 @@ def solve(
     out: Annotated[
         Path, typer.Option("-o", "--out", help="Table of d (.csv), tracks (.npz) or animation layer (.usdc).")
     ] = Path("take.csv"),
+    overlay: Annotated[
+        Path | None,
+        typer.Option(
+            help="Video (.mp4) to write of the solved teeth over all cameras side by side.",
+            show_default=False,
+        ),
+    ] = None,
     head: Annotated[Head, typer.Option(help="fixed: the cameras are worn, and move with the head.")] = Head.free,
     focal: Annotated[
         Focal, typer.Option(help="free: the calibration only guesses focal lengths; the take tells them.")
@@ -52,13 +59,16 @@ def solve(
     """
     from jawusd.pipeline import solve as stage
 
-    stage.check_output(rig, out)
-    refuse_existing(out, force)
+    stage.check_output(rig, out, overlay)
+    written = [out, *([overlay] if overlay else [])]
+    for path in written:
+        refuse_existing(path, force)
     with progress() as report:
         found = stage.solve(
             rig,
             shot,
             out,
+            overlay=overlay,
             fixed_head=head is Head.fixed,
             free_focal=focal is Focal.free,
             jobs=jobs,
@@ -66,4 +76,5 @@ def solve(
             progress=report,
         )
     summary = stage.solve_summary(found)
-    emit({**summary, "file": str(out)}, as_json, lambda: [str(out), *stage.solve_lines(summary)])
+    files = [str(path) for path in written]
+    emit({**summary, "file": str(out), "files": files}, as_json, lambda: [*files, *stage.solve_lines(summary)])

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from jawusd.errors import FormatError
 from jawusd.formats.atomic import write_npz_atomic
+from jawusd.formats.solved import SolvedJaw, take_solved
 from jawusd.geometry import LANDMARKS, rigidity_defect
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.npz import TWIST_ORDER, UNITS, read_npz, take
@@ -65,12 +66,14 @@ class TracksMeta(TypedDict, total=False):
     registration: Registration
     steady_error: list[list[list[float]]]  # of both arches S (4, 4): the masks showed T_world_arch @ S
     extrinsics: CameraCorrections
+    focal: dict[str, list[float]]  # by camera: focal length over the calibrated one, and its standard deviation
     start: dict[str, object]
     painted: list[bool]
     solver: str
     backend: str
     evaluations_per_row_and_frame: float
     calibration_rescaled_px: dict[str, tuple[tuple[int, int], tuple[int, int]]]
+    margin_limit_mm: float  # smallest margin to the bound that the rig allows poses of a performance
     findings: list[dict[str, str | float | int]]  # `Finding.as_json` of everything doubtful about the take
 
 
@@ -149,6 +152,7 @@ class Tracks:
         lost_value, lost_limit: the figure that was found and its limit, in the unit the reason names, shape (F, 2);
             NaN without a reason.
         camera_names: the cameras, length C.
+        solved: of a solved performance, jaw parameters and state of every frame; None for other tracks.
     """
 
     frames: NDArray[np.int64]
@@ -170,6 +174,7 @@ class Tracks:
     matched_px: Array
     camera_names: tuple[str, ...]
     meta: TracksMeta = field(default_factory=TracksMeta)
+    solved: SolvedJaw | None = None
     lost_reason: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 2), np.uint8))
     lost_value: Array = field(default_factory=lambda: np.zeros((0, 2)))
     lost_limit: Array = field(default_factory=lambda: np.zeros((0, 2)))
@@ -183,6 +188,11 @@ class Tracks:
     def tracked(self) -> Mask:
         """Return which frames have both final poses, shape (F,)."""
         return np.asarray(np.isfinite(self.T_upper_lower).all((1, 2)))
+
+    def row_of(self, frame: int) -> int | None:
+        """Return the index of a frame; None where it is not in the tracks."""
+        row = int(np.searchsorted(self.frames, frame))
+        return row if row < len(self.frames) and self.frames[row] == frame else None
 
     def explain_loss(self, index: int, arch: int) -> str:
         """Say why an arch (0 upper, 1 lower) was given up in the frame at an index."""
@@ -227,6 +237,7 @@ def save_tracks(path: str | os.PathLike[str], tracks: Tracks) -> None:
         if value.shape != shape:
             raise ValueError(f"tracks.{name} has shape {value.shape}, expected {shape}")
         arrays[name] = value
+    arrays |= tracks.solved.arrays() if tracks.solved else {}
     meta = {
         "units": UNITS,
         "twist_order": TWIST_ORDER,
@@ -280,6 +291,7 @@ def load_tracks(path: str | os.PathLike[str]) -> Tracks:
         **values,
         camera_names=tuple(names),
         meta=cast(TracksMeta, meta),
+        solved=take_solved(arrays, count, path),
     )
 
 

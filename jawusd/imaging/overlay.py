@@ -13,16 +13,28 @@ from numpy.typing import NDArray
 
 from jawusd.formats.atomic import write_bytes_atomic
 from jawusd.formats.mesh import Mesh, crown_face_mask
-from jawusd.formats.tracks import Tracks
+from jawusd.formats.performance import SolveState
+from jawusd.formats.tracks import LOST, Tracks
 from jawusd.geometry import Camera, transform_points
 from jawusd.geometry.arrays import Array
+from jawusd.imaging.backdrop import Backdrop
 from jawusd.imaging.raster import draw_depth_labels
-from jawusd.imaging.video import Video
 
-UPPER_COLOUR = (255, 170, 0)
-LOWER_COLOUR = (0, 200, 255)
+#: Red, green and blue.
+Colour = tuple[int, int, int]
+
+UPPER_COLOUR: Colour = (255, 170, 0)
+LOWER_COLOUR: Colour = (0, 200, 255)
+#: Of an arch in a solved performance; they differ in brightness too.
+STATE_COLOURS: dict[SolveState, Colour] = {
+    SolveState.SOLVED: (0, 190, 120),
+    SolveState.CARRIED: (255, 225, 0),
+    SolveState.LOST: (255, 40, 170),
+}
 _LINE_PX = 2
-_CAPTION_PX = 22
+CAPTION_PX = 22
+#: Where a camera has no picture.
+EMPTY_GRAY = 60
 _MARGIN = 0.25  # of the teeth's extent, left around them in a tile
 
 
@@ -32,7 +44,7 @@ class PlacedScan:
 
     mesh: Mesh  # the scan [mm]; its gum hides what lies behind and is not painted
     T_world_scan: Array  # its pose, shape (4, 4); NaN leaves the scan out
-    colour: tuple[int, int, int]  # red, green, blue
+    colour: Colour
 
 
 def draw_overlay(
@@ -57,12 +69,27 @@ def draw_overlay(
     return out
 
 
+def arch_colours(tracks: Tracks, row: int) -> tuple[Colour, Colour]:
+    """Return the colours of upper and lower arch in the frame at a row: of their states in a solved performance."""
+    if tracks.solved is None:
+        return UPPER_COLOUR, LOWER_COLOUR
+    whole = SolveState(int(tracks.solved.state[row]))
+    seen, unseen = STATE_COLOURS[SolveState.SOLVED], STATE_COLOURS[whole]
+    upper, lower = (unseen if status == LOST else seen for status in tracks.status[row])
+    return upper, lower
+
+
+def placed_scans(tracks: Tracks, row: int, meshes: Sequence[Mesh]) -> list[PlacedScan]:
+    """Return the upper and the lower scan at the poses of the frame at a row."""
+    poses = tracks.T_world_upper[row], tracks.T_world_lower[row]
+    return [PlacedScan(*one) for one in zip(meshes, poses, arch_colours(tracks, row), strict=True)]
+
+
 def tracking_sheet(
     tracks: Tracks,
     frames: Sequence[int],
     cameras: Sequence[Camera],
-    videos: Mapping[str, Video],
-    offsets: Mapping[str, int],
+    backdrops: Mapping[str, Backdrop],
     upper: Mesh,
     lower: Mesh,
     *,
@@ -74,7 +101,7 @@ def tracking_sheet(
 
     Args:
         frames: frames of the reference camera, all of them in tracks.
-        offsets: whole-frame offset per camera name, see `capture.sync`.
+        backdrops: pictures by camera.
 
     Raises:
         ValueError: a frame is not in tracks.
@@ -86,16 +113,11 @@ def tracking_sheet(
         raise ValueError(f"frame {missing[0]} is not in the tracks, which hold {len(row_of)} frames")
     tiles = []
     for frame in frames:
-        row = row_of[frame]
-        scans = [
-            PlacedScan(upper, tracks.T_world_upper[row], UPPER_COLOUR),
-            PlacedScan(lower, tracks.T_world_lower[row], LOWER_COLOUR),
-        ]
+        scans = placed_scans(tracks, row_of[frame], (upper, lower))
         for camera in cameras:
-            own = videos[camera.name].timeline.picture(frame - offsets[camera.name])
-            tile = np.full((tile_px[1], tile_px[0], 3), 60, np.uint8)
-            if own is not None:
-                picture = next(videos[camera.name].frames(own, own + 1, colour="rgb")).image
+            picture = backdrops[camera.name].picture(frame)
+            tile = np.full((tile_px[1], tile_px[0], 3), EMPTY_GRAY, np.uint8)
+            if picture is not None:
                 tile = _cut_to_teeth(draw_overlay(picture, camera, scans), camera, scans, tile_px)
             tiles.append(captioned(tile, f"{camera.name}  frame {frame}"))
     return contact_sheet(tiles, len(cameras))
@@ -167,6 +189,6 @@ def _cut_to_teeth(
 
 def captioned(tile: NDArray[np.uint8], text: str) -> NDArray[np.uint8]:
     """Return an RGB tile (h, w, 3) under a line of text."""
-    out = np.vstack([np.zeros((_CAPTION_PX, tile.shape[1], 3), np.uint8), tile])
-    cv2.putText(out, text, (6, _CAPTION_PX - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1, cv2.LINE_AA)
+    out = np.vstack([np.zeros((CAPTION_PX, tile.shape[1], 3), np.uint8), tile])
+    cv2.putText(out, text, (6, CAPTION_PX - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1, cv2.LINE_AA)
     return out

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,12 +21,9 @@ from jawusd.pipeline.prepare import load_cameras, load_meshes, registered_meshes
 from jawusd.pipeline.state import Progress, make_folder
 
 if TYPE_CHECKING:
+    from jawusd.imaging.backdrop import Backdrop
     from jawusd.imaging.video import Video
 
-SHEET = "contact_sheet.png"
-GRAY = 60  # where a camera has no picture
-_SHEET_FRAMES = 6
-_CRF = 20  # H.264 quality for looking at, half the time of an archive
 _UNCOVERED, _UNCERTAIN = 3, 2  # frames shown for either reason; one typical frame is added, to compare with
 _MOST_CAMERAS = 4
 _TILE_PX = (400, 225)
@@ -68,67 +65,26 @@ def open_footage(capture: Capture, tracks: Tracks | None = None) -> tuple[dict[s
     return {camera.name: camera for camera in placed}, open_videos(capture)
 
 
-def overlay_files(capture: Capture, folder: Path) -> list[Path]:
-    """Return the files `write_overlay` writes: a video per camera that has one, and the contact sheet."""
-    return [folder / f"{camera.name}.mp4" for camera in capture.cameras if camera.video] + [folder / SHEET]
-
-
 @explain_missing_packages()
-def write_overlay(
-    capture: Capture, offsets: Mapping[str, int], tracks: Tracks, folder: Path, progress: Progress
-) -> list[Path]:
-    """Write per camera an H.264 video of the tracked frames with both scans drawn over them, and a contact sheet.
-
-    The videos run in step: where a camera has no picture they are gray. Lost arches are not drawn. Files of the same
-    name are overwritten. Returns `overlay_files`.
+def open_backdrops(capture: Capture, offsets: Mapping[str, int]) -> dict[str, Backdrop]:
+    """Return what lies behind drawn scans, footage or else masks, by the name of each camera that has either.
 
     Args:
         offsets: frame offset by camera.
 
     Raises:
-        CaptureError, CalibrationError: see `open_footage`.
-        OutputError: the files cannot be written.
+        CaptureError: no camera has video or masks, or one cannot be decoded.
     """
-    from jawusd.imaging.overlay import save_png, tracking_sheet
-    from jawusd.imaging.video_writer import VideoWriter
+    from jawusd.imaging.backdrop import Backdrop
 
-    cameras, videos = open_footage(capture, tracks)
-    meshes = registered_meshes(load_meshes(capture), tracks.meta)
-    upper, lower = meshes["upper_teeth"], meshes["lower_teeth"]
-    make_folder(folder)
-    done, total = 0, len(videos) * len(tracks.frames)
-    for name, video in videos.items():
-        width, height = (side // 2 * 2 for side in video.size_px)  # H.264 halves the colours
-        writer = VideoWriter(folder / f"{name}.mp4", (width, height), capture.fps, quality_crf=_CRF)
-        with writer as out:
-            for image in _drawn(tracks, video, offsets[name], cameras[name], upper, lower):
-                out.write(image[:height, :width])
-                done += 1
-                progress("overlay", done, total)
-    shown = np.unique(np.linspace(0, len(tracks.frames) - 1, _SHEET_FRAMES).round().astype(int))
-    sheet = tracking_sheet(
-        tracks, tracks.frames[shown].tolist(), [cameras[name] for name in videos], videos, offsets, upper, lower
-    )
-    save_png(folder / SHEET, sheet)
-    return overlay_files(capture, folder)
-
-
-def _drawn(
-    tracks: Tracks, video: Video, offset: int, camera: Camera, upper: Mesh, lower: Mesh
-) -> Iterator[NDArray[np.uint8]]:
-    """Yield the picture of every tracked frame, (h, w, 3) RGB."""
-    from jawusd.imaging.overlay import LOWER_COLOUR, UPPER_COLOUR, PlacedScan, draw_overlay
-
-    wanted = [video.timeline.picture(frame - offset) for frame in tracks.frames.tolist()]
-    for index, image in enumerate(video.pictures(wanted, colour="rgb")):
-        if image is None:
-            yield np.full((camera.size_px[1], camera.size_px[0], 3), GRAY, np.uint8)
-            continue
-        scans = [
-            PlacedScan(upper, tracks.T_world_upper[index], UPPER_COLOUR),
-            PlacedScan(lower, tracks.T_world_lower[index], LOWER_COLOUR),
-        ]
-        yield draw_overlay(image, camera, scans)
+    sources = [source for source in capture.cameras if source.video or source.masks]
+    if not sources:
+        raise CaptureError(
+            "no camera has a video or masks, so there is nothing to draw over.",
+            path=capture.folder / "capture.toml",
+            hint="Name the footage there (video = ...).",
+        )
+    return {source.name: Backdrop(source, offsets[source.name]) for source in sources}
 
 
 def draw_worst_frames(capture: Capture, offsets: Mapping[str, int], tracks: Tracks) -> tuple[Overlay, ...]:
@@ -141,18 +97,54 @@ def draw_worst_frames(capture: Capture, offsets: Mapping[str, int], tracks: Trac
         CaptureError, CalibrationError: see `open_footage`.
         FormatError: the tracks are of another capture.
     """
+    check_same_cameras(capture, tracks)
+    cameras, videos = open_footage(capture, tracks)
+    backdrops = {name: one for name, one in open_backdrops(capture, offsets).items() if name in videos}
+    return draw_frames(chosen_frames(tracks, capture.fps), tracks, cameras, backdrops, tracked_scans(capture, tracks))
+
+
+def check_same_cameras(capture: Capture, tracks: Tracks) -> None:
+    """Check that tracks may be of a capture; cameras without masks are not tracked with.
+
+    Raises:
+        FormatError: they name a camera it does not have.
+    """
+    names = [camera.name for camera in capture.cameras]
+    if not set(tracks.camera_names) <= set(names):
+        raise FormatError(
+            f"the tracks are of the cameras {', '.join(tracks.camera_names)}; the capture has {', '.join(names)}."
+        )
+
+
+def tracked_scans(capture: Capture, tracks: Tracks) -> tuple[Mesh, Mesh]:
+    """Return the teeth scans of a capture, upper and lower, that the poses of tracks belong to [mm].
+
+    Raises:
+        CaptureError, FormatError: see `load_meshes`.
+    """
+    meshes = registered_meshes(load_meshes(capture), tracks.meta)
+    return meshes["upper_teeth"], meshes["lower_teeth"]
+
+
+def draw_frames(
+    chosen: Sequence[tuple[int, str]],
+    tracks: Tracks,
+    cameras: Mapping[str, Camera],
+    backdrops: Mapping[str, Backdrop],
+    scans: tuple[Mesh, Mesh],
+) -> tuple[Overlay, ...]:
+    """Draw the scans into the pictures of some frames, given by row of the tracks and reason.
+
+    Raises:
+        CaptureError: a picture cannot be decoded.
+    """
     from jawusd.imaging.overlay import encode_jpeg, tracking_sheet
 
-    if not set(tracks.camera_names) <= {camera.name for camera in capture.cameras}:
-        raise FormatError(f"the capture has other cameras than the tracks ({', '.join(tracks.camera_names)}).")
-    cameras, videos = open_footage(capture, tracks)
-    shown = [cameras[name] for name in videos][:_MOST_CAMERAS]
-    meshes = registered_meshes(load_meshes(capture), tracks.meta)
-    scans = meshes["upper_teeth"], meshes["lower_teeth"]
+    shown = [cameras[name] for name in backdrops][:_MOST_CAMERAS]
     found = []
-    for index, reason in chosen_frames(tracks, capture.fps):
-        frame = int(tracks.frames[index])
-        sheet = tracking_sheet(tracks, [frame], shown, videos, offsets, *scans, tile_px=_TILE_PX)
+    for row, reason in chosen:
+        frame = int(tracks.frames[row])
+        sheet = tracking_sheet(tracks, [frame], shown, backdrops, *scans, tile_px=_TILE_PX)
         found.append(Overlay(frame, reason, encode_jpeg(sheet, _QUALITY)))
     return tuple(found)
 

@@ -17,6 +17,7 @@ from jawusd.formats.finding import Finding
 from jawusd.formats.performance import Performance, SolveState, write_performance
 from jawusd.formats.tracks import save_tracks
 from jawusd.pipeline.calibrate import sync_cameras
+from jawusd.pipeline.overlay import VIDEO, write_overlay
 from jawusd.pipeline.prepare import load_cameras, load_labelled, naming_file, open_capture, registered_meshes
 from jawusd.pipeline.segment import SegmentOptions, segment_capture, with_masks
 from jawusd.pipeline.segment_guide import take_up_guide
@@ -52,6 +53,7 @@ def solve(
     shot: Capture | str | os.PathLike[str],
     out: str | os.PathLike[str] | None = None,
     *,
+    overlay: str | os.PathLike[str] | None = None,
     fixed_head: bool = False,
     free_focal: bool = False,
     jobs: int = 2,
@@ -65,6 +67,7 @@ def solve(
         shot: the capture of the shot, its capture.toml or the folder that holds it. If no camera has masks, they are
             made from its videos, as `segment` does, and kept beside the output (`take_masks` for `take.csv`).
         out: file to write: a table of d (.csv), tracks (.npz), or an animation layer on the rig (.usdc, .usda).
+        overlay: video to write (.mp4) of the solved scans over all cameras side by side.
         fixed_head: the cameras are worn, as on a helmet: the head does not move before them.
         free_focal: the focal lengths of the calibration are guesses, good to a tenth.
         jobs: threads that search for the start, and make masks; the result does not depend on it.
@@ -74,12 +77,12 @@ def solve(
         FormatError, RigError: the rig cannot be read.
         CaptureError, CalibrationError, SyncError: see `track`.
         TrackingError: the teeth cannot be found in the masks, or the videos.
-        OutputError: the file cannot be written.
+        OutputError: a file cannot be written.
     """
     from jawusd.tracking.performance.results import tracks_of
     from jawusd.tracking.performance.shot import solve_capture
 
-    check_output(rig, out)
+    check_output(rig, out, overlay)
     progress = progress or no_progress
     capture = open_capture(shot, allow_outside=allow_outside)
     jaw = jawusd.load(rig)
@@ -107,6 +110,8 @@ def solve(
     found.notes["findings"] = [*known, *(finding.as_json() for finding in (*findings, *doubts))]
     if out is not None:
         write_solved(out, found, jaw, rig, capture.fps)
+    if overlay is not None:
+        write_overlay(capture, offsets, tracks_of(found, jaw), Path(overlay), progress)
     return found
 
 
@@ -160,13 +165,21 @@ def write_solved(
         write_animation(out, rig, performance.frames, performance.d, fps, rig=jaw, carried=unseen)
 
 
-def check_output(rig: str | os.PathLike[str], out: str | os.PathLike[str] | None) -> None:
-    """Check, before any work, that a performance can be written to a file of that name.
+def check_output(
+    rig: str | os.PathLike[str],
+    out: str | os.PathLike[str] | None,
+    overlay: str | os.PathLike[str] | None = None,
+) -> None:
+    """Check, before any work, that a performance and its overlay can be written to files of these names.
 
     Raises:
-        OutputError: its suffix says nothing.
+        OutputError: a suffix says nothing, or something else.
         RigError: an animation layer needs a rig in USD.
     """
+    if overlay is not None and Path(overlay).suffix.lower() != VIDEO:
+        raise OutputError(
+            "the overlay is one video of all cameras.", path=overlay, hint=f"Name a file ending in {VIDEO}."
+        )
     if out is None:
         return
     if Path(out).suffix.lower() in _USD and Path(rig).suffix.lower() not in _USD:

@@ -19,7 +19,7 @@ from jawusd.formats.model import JawModel
 from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, LostReason, Registration, Tracks, TrackStatus, save_tracks
 from jawusd.geometry import LANDMARKS
 from jawusd.pipeline.calibrate import sync_cameras
-from jawusd.pipeline.media import write_overlay
+from jawusd.pipeline.overlay import write_overlay
 from jawusd.pipeline.prepare import (
     Size,
     load_cameras,
@@ -104,7 +104,7 @@ def track(
         solver: "contour", or "paper" for the paper's own method, to compare with.
         backend: where the paper's method draws, "cpu" or "gl".
         model: jaw model of this person: uncertain frames are tracked again with it as a prior.
-        overlay: folder for videos with the tracked scans over the footage; see `media.write_overlay`.
+        overlay: folder, or .mp4 file, for videos with the tracked scans over the footage; see `overlay.write_overlay`.
         jobs: threads of the tracker; the result does not depend on it.
         allow_outside: let paths in the capture leave its folder.
 

@@ -23,10 +23,11 @@ from jawusd.geometry import Camera
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.pipeline.bake import DEFAULT_FPS
 from jawusd.pipeline.calibrate import sync_cameras
-from jawusd.pipeline.media import GRAY, open_videos
+from jawusd.pipeline.media import check_same_cameras, open_backdrops
 from jawusd.pipeline.prepare import (
     load_cameras,
     load_meshes,
+    naming_file,
     open_capture,
     registered_meshes,
     subject_of_capture,
@@ -37,8 +38,8 @@ from jawusd.pipeline.scans import save_reviewed
 from jawusd.pipeline.state import BuildState, Progress
 
 if TYPE_CHECKING:
-    from jawusd.imaging.frame_reader import FrameReader
-    from jawusd.imaging.video import Video
+    from jawusd.imaging.backdrop import Backdrop
+    from jawusd.imaging.overlay import PlacedScan
     from jawusd.viewer.motion import Clip
     from jawusd.viewer.server import CaptureViewer, Viewer
     from jawusd.viewer.viewed import Look, ViewedActor, ViewedCapture
@@ -223,7 +224,6 @@ def viewed_capture(
         CaptureError: there is no footage, or a file cannot be decoded.
         SyncError: the cameras cannot be aligned in time.
     """
-    from jawusd.imaging.frame_reader import FrameReader
     from jawusd.viewer.viewed import ViewedCapture
 
     path = Path(path)
@@ -233,25 +233,26 @@ def viewed_capture(
     if build is not None:
         capture = as_built(capture, build)
     poses = _poses(capture, tracks)
-    videos = open_videos(capture)
     cameras = [] if capture.calibration is None else load_cameras(capture)
     meshes = load_meshes(capture)
     if poses is not None:
         cameras, meshes = tracked_cameras(cameras, poses), registered_meshes(meshes, poses.meta)
     offsets = _offsets(capture, build, progress)
+    backdrops = open_backdrops(capture, offsets)
     footage = _Footage(
         capture=capture,
-        readers={name: FrameReader(video) for name, video in videos.items()},
+        backdrops=backdrops,
         cameras={camera.name: camera for camera in cameras},
         offsets=offsets,
         scans={arch: meshes[f"{arch}_teeth"] for arch in ("upper", "lower")},
+        tracks=poses,
     )
     return ViewedCapture(
         name=capture.name,
         fps=capture.fps,
-        frames=_frames(capture, poses, videos, offsets),
+        frames=_frames(capture, poses, backdrops, offsets),
         offsets=offsets,
-        sizes_px={name: video.size_px for name, video in videos.items()},
+        sizes_px={name: backdrop.size_px for name, backdrop in backdrops.items()},
         cameras=footage.cameras,
         scans=footage.scans,
         crowns={arch: crown_face_mask(mesh) for arch, mesh in footage.scans.items()},
@@ -273,13 +274,8 @@ def _poses(capture: Capture, tracks: Path | None) -> Tracks | None:
     if tracks is None:
         return None
     found = load_tracks(tracks / _TRACKS if tracks.is_dir() else tracks)
-    names = [camera.name for camera in capture.cameras]
-    if not set(found.camera_names) <= set(names):  # cameras without masks are not tracked with
-        raise FormatError(
-            f"is of the cameras {', '.join(found.camera_names)}; the capture has {', '.join(names)}.",
-            path=tracks,
-            hint="Name the build of this capture.",
-        )
+    with naming_file(tracks):
+        check_same_cameras(capture, found)
     return found
 
 
@@ -293,7 +289,7 @@ def _offsets(capture: Capture, build: Path | None, progress: Progress) -> dict[s
 
 
 def _frames(
-    capture: Capture, poses: Tracks | None, videos: Mapping[str, Video], offsets: Mapping[str, int]
+    capture: Capture, poses: Tracks | None, backdrops: Mapping[str, Backdrop], offsets: Mapping[str, int]
 ) -> tuple[int, int]:
     """Return the first and the last frame of the reference camera to step through."""
     if poses is not None and len(poses.frames):
@@ -302,8 +298,8 @@ def _frames(
         return capture.frames[0], capture.frames[1] - 1
     # From the first picture of any camera to the last.
     return (
-        max(0, min(offsets[name] for name in videos)),
-        max(offsets[name] + video.timeline.count - 1 for name, video in videos.items()),
+        max(0, min(offsets[name] for name in backdrops)),
+        max(offsets[name] + backdrop.count - 1 for name, backdrop in backdrops.items()),
     )
 
 
@@ -312,26 +308,33 @@ class _Footage:
     """Provide pictures, regions and poses of a capture to pages; safe to use from several threads."""
 
     capture: Capture
-    readers: Mapping[str, FrameReader]
+    backdrops: Mapping[str, Backdrop]
     cameras: Mapping[str, Camera]
     offsets: Mapping[str, int]
     scans: Mapping[str, Mesh]
+    tracks: Tracks | None
 
     def picture(self, name: str, frame: int, poses: tuple[Array, Array] | None, look: Look) -> NDArray[np.uint8]:
         """Return a camera's picture at a frame of the reference camera, with the teeth drawn over it."""
-        from jawusd.imaging.overlay import LOWER_COLOUR, UPPER_COLOUR, PlacedScan, draw_overlay
+        from jawusd.imaging.overlay import EMPTY_GRAY, draw_overlay
 
-        reader = self.readers[name]
-        own = reader.video.timeline.picture(frame - self.offsets[name])
-        if own is None:
-            width, height = reader.video.size_px
-            return np.full((height, width, 3), GRAY, np.uint8)
-        image = reader.picture(own)
-        if poses is None or look == "footage" or name not in self.cameras:
+        image = self.backdrops[name].picture(frame)
+        if image is None:
+            width, height = self.backdrops[name].size_px
+            return np.full((height, width, 3), EMPTY_GRAY, np.uint8)
+        placed = self._placed(frame, poses, look)
+        if not placed or name not in self.cameras:
             return image
-        colours = UPPER_COLOUR, LOWER_COLOUR
-        placed = [PlacedScan(*scan) for scan in zip(self.scans.values(), poses, colours, strict=True)]
         return draw_overlay(image, self.cameras[name], placed, fill=_FILL[look])
+
+    def _placed(self, frame: int, poses: tuple[Array, Array] | None, look: Look) -> list[PlacedScan]:
+        from jawusd.imaging.overlay import LOWER_COLOUR, UPPER_COLOUR, PlacedScan, arch_colours
+
+        if poses is None or look == "footage":
+            return []
+        row = None if self.tracks is None else self.tracks.row_of(frame)
+        colours = (UPPER_COLOUR, LOWER_COLOUR) if self.tracks is None or row is None else arch_colours(self.tracks, row)
+        return [PlacedScan(*scan) for scan in zip(self.scans.values(), poses, colours, strict=True)]
 
     def teeth_region(self, name: str, frame: int) -> tuple[float, float, float, float] | None:
         """Return left, top, right and bottom [px] of the masks of a camera at a frame, None without any."""
@@ -341,7 +344,7 @@ class _Footage:
         if source.masks is None:
             return None
         seen = []
-        for reader in open_masks(source, self.readers[name].video.size_px):
+        for reader in open_masks(source, self.backdrops[name].size_px):
             with reader as masks:
                 mask = masks.read(frame - self.offsets[name])
             if mask is not None:

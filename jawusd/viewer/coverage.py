@@ -31,8 +31,8 @@ def frames_to_inspect(tracks: Tracks, fps: float) -> list[int]:
 
 def frame_words(tracks: Tracks, frame: int) -> str:
     """Return HTML about the tracking of a frame."""
-    index = int(np.searchsorted(tracks.frames, frame))
-    if index == len(tracks.frames) or tracks.frames[index] != frame:
+    index = tracks.row_of(frame)
+    if index is None:
         return "not tracked"
     parts = []
     for arch, (name, color, code, percent) in enumerate(

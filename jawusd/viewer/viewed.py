@@ -76,10 +76,7 @@ class ViewedCapture:
 
     def tracked_poses(self, frame: int) -> tuple[Array, Array] | None:
         """Return T_world_upper and T_world_lower of a frame, NaN where lost; None where nothing was tracked."""
-        tracks = self.tracks
-        if tracks is None:
+        row = None if self.tracks is None else self.tracks.row_of(frame)
+        if self.tracks is None or row is None:
             return None
-        index = int(np.searchsorted(tracks.frames, frame))
-        if index == len(tracks.frames) or tracks.frames[index] != frame:
-            return None
-        return tracks.T_world_upper[index], tracks.T_world_lower[index]
+        return self.tracks.T_world_upper[row], self.tracks.T_world_lower[row]

@@ -6,11 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
+from jawusd.formats.capture import CameraSource
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import Camera, make_transform
 from jawusd.imaging import overlay
-from jawusd.imaging.video import Video
+from jawusd.imaging.backdrop import Backdrop
 from jawusd.imaging.video_writer import VideoWriter
 
 SIZE = (160, 120)
@@ -113,9 +114,9 @@ def test_tracking_sheet_shows_rows_of_frames_and_columns_of_cameras(tmp_path: Pa
     with VideoWriter(path, SIZE, 24) as out:
         for k in range(3):
             out.write(np.full((120, 160, 3), 80 + 40 * k, np.uint8))
-    videos = {"cam": Video(path)}
+    behind = {"cam": Backdrop(CameraSource(name="cam", video=path), 10)}
     sheet = overlay.tracking_sheet(
-        tracks(4), [10, 11, 13], [CAMERA], videos, {"cam": 10}, patch(12), patch(12), tile_px=(96, 64)
+        tracks(4), [10, 11, 13], [CAMERA], behind, patch(12), patch(12), tile_px=(96, 64)
     )
     assert sheet.shape == (3 * (64 + 22), 96, 3)
     first, second, third = np.split(sheet, 3)
@@ -128,7 +129,7 @@ def test_tracking_sheet_shows_rows_of_frames_and_columns_of_cameras(tmp_path: Pa
     assert (third[22:] == 60).all()  # the camera had stopped
     assert all((tile[:22] == 255).any() for tile in (first, second, third))
     with pytest.raises(ValueError, match="frame 99 is not in the tracks"):
-        overlay.tracking_sheet(tracks(4), [99], [CAMERA], videos, {"cam": 10}, patch(12), patch(12))
+        overlay.tracking_sheet(tracks(4), [99], [CAMERA], behind, patch(12), patch(12))
     overlay.save_png(tmp_path / "sheet.png", sheet)
     assert np.array_equal(cv2.imread(str(tmp_path / "sheet.png"))[..., ::-1], sheet)
 

@@ -11,10 +11,13 @@ import trimesh
 
 from jawusd.errors import CalibrationError, CaptureError, OutputError
 from jawusd.formats.calibration import save_calibration
+from jawusd.formats.performance import SolveState
+from jawusd.formats.solved import SolvedJaw
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import Camera, make_transform, relative_pose
+from jawusd.imaging.overlay import STATE_COLOURS
 from jawusd.imaging.video_writer import VideoWriter
-from jawusd.pipeline.media import overlay_files, write_overlay
+from jawusd.pipeline.overlay import TILE_PX, overlay_files, write_overlay
 from jawusd.pipeline.prepare import open_capture
 
 SIZE = (240, 180)
@@ -178,3 +181,70 @@ def test_the_command_guards_its_options_and_outputs(capture, tmp_path):
     assert (tmp_path / "out" / "right.mp4").read_text() == "precious"
     result = run("track", capture, "-o", tmp_path / "t.npz", "--solver", "guess")
     assert result.returncode == 2 and "contour" in result.stderr
+
+
+def solved_tracks() -> Tracks:
+    """Return the tracks above as a solve writes them: the lower arch is out of sight in frame 5, lost in frame 8."""
+    tracks = some_tracks()
+    count = len(FRAMES)
+    tracks.T_world_lower[-1] = tracks.T_world_upper[-1]
+    tracks.status[2, 1] = 0
+    state = np.ones(count, np.int8)
+    state[2], state[-1] = 2, 0
+    tracks.solved = SolvedJaw(np.ones((count, 3)), np.ones((count, 3)), np.ones(count), state, np.ones(count, bool))
+    return tracks
+
+
+def colours_in(image):
+    """Return which states of a solve are drawn into a picture."""
+    return {
+        state
+        for state, colour in STATE_COLOURS.items()
+        if np.count_nonzero(np.abs(image.astype(int) - colour).max(axis=2) < 60) > 100
+    }
+
+
+def test_one_video_shows_all_cameras_side_by_side_coloured_by_state(capture, tmp_path):
+    told = []
+    path = tmp_path / "new" / "take.mp4"
+    assert write_overlay(open_capture(capture), OFFSETS, solved_tracks(), path, lambda *a: told.append(a)) == [path]
+    assert told == [("overlay", k, len(FRAMES)) for k in range(1, len(FRAMES) + 1)]
+    pictures = decoded(path)
+    width, height = TILE_PX
+    assert len(pictures) == len(FRAMES) and pictures.shape[2] == 2 * width
+    left, right, bar = pictures[:, :height, :width], pictures[:, 30:height, width:], pictures[:, height + 22 :]
+    solved = {SolveState.SOLVED}
+    assert [colours_in(image) for image in left] == [
+        solved, solved, solved | {SolveState.CARRIED}, solved, solved, solved | {SolveState.LOST}
+    ]  # fmt: skip
+    assert colours_in(right[0]) == set() and colours_in(right[1]) == solved  # the right camera began one frame later
+    assert all((image > 200).any() for image in bar) and np.abs(bar[0].astype(int) - bar[1]).max() > 50
+
+
+def test_cameras_without_footage_show_their_masks(capture, tmp_path):
+    """Masks where OpenCV projects the boxes, so that the outlines must enclose them."""
+    opened = open_capture(capture)
+    for camera in CAMERAS:
+        for arch, y_mm in (("upper", -9.0), ("lower", 9.0)):
+            with VideoWriter(capture / f"{camera.name}_{arch}.mkv", SIZE, 25.0, lossless=True) as out:
+                for own in range(9):
+                    mask = np.zeros(SIZE[::-1], np.uint8)
+                    x_mm = 2.0 * (own + OFFSETS[camera.name] - FRAMES[0])
+                    row, low = pixel(camera, [x_mm - 15, y_mm, -3.0])
+                    mask[row - 2 : row + 3, low : pixel(camera, [x_mm + 15, y_mm, -3.0])[1]] = 255
+                    out.write(mask)
+    text = (capture / "capture.toml").read_text()
+    for camera in CAMERAS:
+        named = f'masks.upper = "{camera.name}_upper.mkv"\nmasks.lower = "{camera.name}_lower.mkv"\n'
+        text = text.replace(f'video = "{camera.name}.mp4"\n', named)
+    (capture / "capture.toml").write_text(text)
+    opened = open_capture(capture)
+    assert all(camera.video is None for camera in opened.cameras)
+    write_overlay(opened, OFFSETS, solved_tracks(), tmp_path / "take.mp4", quiet)
+    for picture in decoded(tmp_path / "take.mp4")[:2]:
+        tile = picture[: TILE_PX[1], : TILE_PX[0]].astype(int)
+        gray = (np.ptp(tile, axis=2) < 60) & (tile.mean(axis=2) > 85)
+        assert colours_in(tile) == {SolveState.SOLVED} and np.count_nonzero(gray[30:]) > 2000
+    blind = opened.model_copy(update={"cameras": tuple(c.model_copy(update={"masks": None}) for c in opened.cameras)})
+    with pytest.raises(CaptureError, match="no camera has a video or masks"):
+        write_overlay(blind, OFFSETS, solved_tracks(), tmp_path / "none.mp4", quiet)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 
-from jawusd.evaluator import JawRig
+from jawusd.evaluator import JawRig, Reason
 from jawusd.formats.performance import Performance
-from jawusd.formats.tracks import LOST, TRACKED, Tracks, TracksMeta
+from jawusd.formats.solved import SolvedJaw
+from jawusd.formats.tracks import LOST, TRACKED, Registration, Tracks, TracksMeta
 from jawusd.geometry import LANDMARKS, hat, make_transform, se3_adjoint, se3_left_jacobian
 from jawusd.geometry.arrays import Array
 from jawusd.tracking.contour.quality import landmark_sigmas
@@ -30,8 +33,10 @@ def tracks_of(performance: Performance, jaw: JawRig) -> Tracks:
     of_lower[..., JAW] = se3_adjoint(head) @ by_d
     relative_covariance = _spread(by_d, p.covariance[:, JAW, JAW])
     own = landmark_sigmas(relative, relative_covariance, jaw.landmarks)
-    meta = TracksMeta(solver="performance")
+    meta = TracksMeta(solver="performance", margin_limit_mm=float(jaw.limits.margin_mm))
     meta.update(_known_notes(p))
+    if "registration" in jaw.meta:  # the lower scan is posed as the rig has it
+        meta["registration"] = cast(Registration, jaw.meta["registration"])
     count, cameras = len(p.frames), len(p.camera_names)
     raw = {"upper": head.copy(), "lower": lower.copy(), "relative": relative.copy()}
     raw["upper"][~p.found[:, 0]], raw["lower"][~p.found[:, 1]], raw["relative"][~p.found.all(1)] = (
@@ -59,6 +64,7 @@ def tracks_of(performance: Performance, jaw: JawRig) -> Tracks:
         matched_px=p.matched_px,
         camera_names=p.camera_names,
         meta=meta,
+        solved=SolvedJaw(p.d, p.sigma_d, p.margin_mm, p.state, np.isin(p.verdict, Reason.VALID.words)),
     )
 
 
@@ -91,9 +97,11 @@ def _of_rig(jaw: JawRig, relative: Array) -> Array:
 
 def _known_notes(p: Performance) -> TracksMeta:
     out = TracksMeta()
-    start, findings = p.notes.get("start"), p.notes.get("findings")
+    start, findings, focal = p.notes.get("start"), p.notes.get("findings"), p.notes.get("focal")
     if isinstance(start, dict):
         out["start"] = start
     if isinstance(findings, list):
         out["findings"] = findings
+    if isinstance(focal, dict):
+        out["focal"] = focal
     return out

@@ -86,6 +86,19 @@ def lever(pivot: Array, centre: Array) -> Array:
 
 
 def corrected_cameras(cameras: Sequence[Camera], meta: TracksMeta) -> list[Camera]:
-    """Return calibrated cameras with the corrections that the meta data of tracks hold."""
+    """Return calibrated cameras with the corrections of pose and focal length that the meta data of tracks hold."""
     poses = meta["extrinsics"]["T_cam_world"] if "extrinsics" in meta else {}
-    return [replace(c, T_cam_world=np.array(poses.get(c.name, c.T_cam_world))) for c in cameras]
+    moved = [replace(c, T_cam_world=np.array(poses.get(c.name, c.T_cam_world))) for c in cameras]
+    focal = meta.get("focal", {})
+    return [_with_focal(c, focal[c.name][0]) if c.name in focal else c for c in moved]
+
+
+def _with_focal(camera: Camera, factor: float) -> Camera:
+    """Return a camera whose focal length is so many times as long, its lens as calibrated pixel by pixel.
+
+    The lens bends x' = f x instead of x: k1 becomes f^2 k1, and p1 becomes f p1, in OpenCV's formula.
+    """
+    K = camera.K.copy()
+    K[:2, :2] *= factor
+    powers = np.array([2, 4, 1, 1, 6, 2, 4, 6])[: camera.distortion.size]
+    return replace(camera, K=K, distortion=camera.distortion * factor**powers)
