@@ -33,13 +33,23 @@ if TYPE_CHECKING:
 
 def report(
     source: Annotated[
-        Path, typer.Argument(help="Folder of a build, or tracks.npz, CSV or HDF5 poses.", show_default=False)
+        Path,
+        typer.Argument(
+            help="Folder of a build, tracks.npz of a solve, or (for experiments) tracks.npz, CSV or HDF5 poses.",
+            show_default=False,
+        ),
     ],
     experiments: Annotated[
         bool, typer.Option("--experiments", help="The paper's experiments (Figs. 5, 12, 13) and the coverage plot.")
     ] = False,
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="Folder of the figures; DIR/experiments for a build.")
+        Path | None,
+        typer.Option(
+            "-o",
+            "--out",
+            help="Folder of the figures, DIR/experiments for a build; of a solve, the page: beside its tracks.",
+            show_default=False,
+        ),
     ] = None,
     capture: CaptureOption = None,
     upper_teeth: UpperOption = None,
@@ -52,13 +62,16 @@ def report(
     rest_frame: RestOption = None,
     group: GroupOption = None,
     starts: Annotated[int, typer.Option(min=1, max=64, help="Random starts of the paper's networks.")] = 2,
-    force: Annotated[bool, typer.Option("--force", help="Overwrite existing figures.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite existing figures, or the page of a solve.")] = False,
     allow_outside: Outside = False,
     as_json: Json = False,
 ) -> None:
-    """Write report.html of a finished build again; or repeat the paper's experiments on a take (figures and table)."""
+    """Write the report of a finished build again, or of a solve; or repeat the paper's experiments on a take."""
     options = trajectory_options(columns, length_unit, invert, rest_frame, group)
     if not experiments:
+        if source.suffix == ".npz":
+            _report_solve(source, capture, out or source.with_suffix(".html"), force, allow_outside, as_json)
+            return
         if not source.is_dir():
             raise typer.BadParameter("poses have no report: add --experiments for the paper's experiments on them.")
         _report_build(source, capture, allow_outside, as_json)
@@ -113,6 +126,18 @@ def _report_build(folder: Path, capture: Path | None, allow_outside: bool, as_js
     with progress() as tell:
         path = report_build(folder, capture, tell, allow_outside=allow_outside)
     emit({"file": str(path), "bytes": path.stat().st_size}, as_json, lambda: [str(path)])
+
+
+def _report_solve(
+    tracks: Path, capture: Path | None, page: Path, force: bool, allow_outside: bool, as_json: bool
+) -> None:
+    from jawusd.pipeline.solve_report import check_page, report_solve
+
+    check_page(page)
+    refuse_existing(page, force)
+    with progress() as tell:
+        report_solve(tracks, capture, page, tell, allow_outside=allow_outside)
+    emit({"file": str(page), "bytes": page.stat().st_size}, as_json, lambda: [str(page)])
 
 
 def view(

@@ -44,6 +44,13 @@ def solve(
             show_default=False,
         ),
     ] = None,
+    report: Annotated[
+        Path | None,
+        typer.Option(
+            help="Page (.html) to write: curves with expected errors, what was not seen, findings, pictures.",
+            show_default=False,
+        ),
+    ] = None,
     head: Annotated[Head, typer.Option(help="fixed: the cameras are worn, and move with the head.")] = Head.free,
     focal: Annotated[
         Focal, typer.Option(help="free: the calibration only guesses focal lengths; the take tells them.")
@@ -59,21 +66,22 @@ def solve(
     """
     from jawusd.pipeline import solve as stage
 
-    stage.check_output(rig, out, overlay)
-    written = [out, *([overlay] if overlay else [])]
+    stage.check_output(rig, out, overlay, report)
+    written = [path for path in (out, overlay, report) if path is not None]
     for path in written:
         refuse_existing(path, force)
-    with progress() as report:
+    with progress() as tell:
         found = stage.solve(
             rig,
             shot,
             out,
             overlay=overlay,
+            report=report,
             fixed_head=head is Head.fixed,
             free_focal=focal is Focal.free,
             jobs=jobs,
             allow_outside=allow_outside,
-            progress=report,
+            progress=tell,
         )
     summary = stage.solve_summary(found)
     files = [str(path) for path in written]

@@ -1,4 +1,4 @@
-"""What the report of a build shows: gathered, but not yet rated or drawn."""
+"""What the report of a build, or of a solved performance, shows: gathered, but not yet rated or drawn."""
 
 from __future__ import annotations
 
@@ -68,3 +68,17 @@ class ReportData:
     parts: tuple[ReplayPart, ...]
     left_out: tuple[str, ...]  # what the report does not show, and why
     findings: tuple[Finding, ...] = ()  # of the check before the first stage
+
+
+@dataclass(frozen=True, eq=False)
+class SolveReportData:
+    """Hold what the report of a solved performance shows."""
+
+    shot: str
+    tracks: Tracks  # with `solved`
+    fps: float  # frames per second
+    limits: str  # what the result is worth, in words; "" where it is not known
+    cameras: tuple[CameraFacts, ...]  # empty where the shot is not at hand
+    overlays: tuple[Overlay, ...]  # frames of the shot, the worst first
+    versions: Mapping[str, str]  # by package
+    left_out: tuple[str, ...]  # what the report does not show, and why

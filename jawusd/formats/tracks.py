@@ -73,6 +73,7 @@ class TracksMeta(TypedDict, total=False):
     backend: str
     evaluations_per_row_and_frame: float
     calibration_rescaled_px: dict[str, tuple[tuple[int, int], tuple[int, int]]]
+    fps: float  # frames per second of a performance
     margin_limit_mm: float  # smallest margin to the bound that the rig allows poses of a performance
     findings: list[dict[str, str | float | int]]  # `Finding.as_json` of everything doubtful about the take
 

@@ -76,7 +76,7 @@ def write_build_report(
     tracks, model = load_tracks(folder / "tracks.npz"), load_model(folder / "model.npz")
     subject = subject_of_build(folder)
     if experiments is None:
-        experiments = _attempt(
+        experiments = attempt(
             "experiments",
             left_out,
             lambda: do_experiments(subject, load_tracks(fitted_poses(folder)), 1, no_progress, quick=True),
@@ -85,22 +85,22 @@ def write_build_report(
     if describe(folder / "actor.usda")["placeholders"]:
         left_out.append("the mandible in 3-D: no mesh of it was given, and the rig's placeholder is no anatomy.")
     progress("report", 1, 4)
-    overlays = _attempt("pictures of the footage", left_out, lambda: _overlays(facts, tracks)) or ()
+    overlays = attempt("pictures of the footage", left_out, lambda: _overlays(facts, tracks)) or ()
     progress("report", 2, 4)
     data = ReportData(
         actor=subject.name,
         tracks=tracks,
         model=model,
         sync=facts.stages["sync"].result if "sync" in facts.stages else {},
-        cameras=_attempt("cameras", left_out, lambda: _cameras(facts)) or (),
+        cameras=attempt("cameras", left_out, lambda: _cameras(facts)) or (),
         inferred=tuple(fit_summary(model).get("inferred", ())),
         seconds={name: record.seconds for name, record in facts.stages.items() if name != "report"},
         hashes=_hashes(facts.stages),
-        versions=_versions(),
+        versions=package_versions(),
         rig=_rig_facts(folder),
         experiments=experiments,
         overlays=overlays,
-        parts=_attempt("3-D replay", left_out, lambda: replay_parts(folder, model)) or (),
+        parts=attempt("3-D replay", left_out, lambda: replay_parts(folder, model)) or (),
         left_out=tuple(dict.fromkeys(left_out)),
         findings=_check_findings(facts.stages),
     )
@@ -205,7 +205,7 @@ def place_of(capture: Capture, folder: Path) -> str:
         return str(capture.folder)
 
 
-def _attempt(what: str, left_out: list[str], work: Callable[[], T]) -> T | None:
+def attempt(what: str, left_out: list[str], work: Callable[[], T]) -> T | None:
     """Do a part of the report; what cannot be done is named in the report instead of stopping it."""
     try:
         with explain_missing_packages():
@@ -230,7 +230,16 @@ def recorded_offsets(stages: Stages) -> dict[str, int]:
 def _cameras(facts: BuildFacts) -> tuple[CameraFacts, ...]:
     if facts.capture is None:
         raise FormatError(facts.why_not)
-    sizes = {camera.name: camera.size_px for camera in load_cameras(facts.capture)}
+    return camera_facts(facts.capture)
+
+
+def camera_facts(capture: Capture) -> tuple[CameraFacts, ...]:
+    """Return what each camera of a capture has.
+
+    Raises:
+        CalibrationError, CaptureError: see `load_cameras`.
+    """
+    sizes = {camera.name: camera.size_px for camera in load_cameras(capture)}
     return tuple(
         CameraFacts(
             source.name,
@@ -238,7 +247,7 @@ def _cameras(facts: BuildFacts) -> tuple[CameraFacts, ...]:
             f"{source.masks.upper.name}, {source.masks.lower.name}" if source.masks else "",
             (int(sizes[source.name][0]), int(sizes[source.name][1])),
         )
-        for source in facts.capture.cameras
+        for source in capture.cameras
     )
 
 
@@ -262,7 +271,8 @@ def _hashes(stages: Stages) -> dict[str, str]:
     return dict(sorted(found.items()))
 
 
-def _versions() -> dict[str, str]:
+def package_versions() -> dict[str, str]:
+    """Return the versions of this package and of those that results depend on."""
     found = {"jawusd": __version__}
     for name in _PACKAGES:
         try:

@@ -22,6 +22,7 @@ from jawusd.pipeline.prepare import load_cameras, load_labelled, naming_file, op
 from jawusd.pipeline.segment import SegmentOptions, segment_capture, with_masks
 from jawusd.pipeline.segment_guide import take_up_guide
 from jawusd.pipeline.segment_record import RECORD
+from jawusd.pipeline.solve_report import check_page, solve_limits, write_solve_report
 from jawusd.pipeline.state import Progress, no_progress
 from jawusd.pipeline.track import tracking_config
 
@@ -54,6 +55,7 @@ def solve(
     out: str | os.PathLike[str] | None = None,
     *,
     overlay: str | os.PathLike[str] | None = None,
+    report: str | os.PathLike[str] | None = None,
     fixed_head: bool = False,
     free_focal: bool = False,
     jobs: int = 2,
@@ -68,6 +70,7 @@ def solve(
             made from its videos, as `segment` does, and kept beside the output (`take_masks` for `take.csv`).
         out: file to write: a table of d (.csv), tracks (.npz), or an animation layer on the rig (.usdc, .usda).
         overlay: video to write (.mp4) of the solved scans over all cameras side by side.
+        report: page to write (.html): d with sigma, what could not be seen, verdicts, findings and pictures.
         fixed_head: the cameras are worn, as on a helmet: the head does not move before them.
         free_focal: the focal lengths of the calibration are guesses, good to a tenth.
         jobs: threads that search for the start, and make masks; the result does not depend on it.
@@ -82,7 +85,7 @@ def solve(
     from jawusd.tracking.performance.results import tracks_of
     from jawusd.tracking.performance.shot import solve_capture
 
-    check_output(rig, out, overlay)
+    check_output(rig, out, overlay, report)
     progress = progress or no_progress
     capture = open_capture(shot, allow_outside=allow_outside)
     jaw = jawusd.load(rig)
@@ -112,6 +115,8 @@ def solve(
         write_solved(out, found, jaw, rig, capture.fps)
     if overlay is not None:
         write_overlay(capture, offsets, tracks_of(found, jaw), Path(overlay), progress)
+    if report is not None:
+        write_solve_report(report, tracks_of(found, jaw), capture, offsets, progress)
     return found
 
 
@@ -169,13 +174,17 @@ def check_output(
     rig: str | os.PathLike[str],
     out: str | os.PathLike[str] | None,
     overlay: str | os.PathLike[str] | None = None,
+    report: str | os.PathLike[str] | None = None,
 ) -> None:
-    """Check, before any work, that a performance and its overlay can be written to files of these names.
+    """Check, before any work, that a performance, its overlay and its report can be written to files of these names.
 
     Raises:
         OutputError: a suffix says nothing, or something else.
         RigError: an animation layer needs a rig in USD.
+        MissingDependencyError: the packages that draw a report are not installed.
     """
+    if report is not None:
+        check_page(report)
     if overlay is not None and Path(overlay).suffix.lower() != VIDEO:
         raise OutputError(
             "the overlay is one video of all cameras.", path=overlay, hint=f"Name a file ending in {VIDEO}."
@@ -206,7 +215,7 @@ def solve_summary(performance: Performance) -> SolveSummary:
         cameras=list(p.camera_names),
         sigma_mm={name: round(float(value), 4) for name, value in zip(names, typical, strict=True)},
         worst_sigma_mm={name: round(float(value), 4) for name, value in zip(names, sigma.max(0), strict=True)},
-        limits=_limits(p),
+        limits=solve_limits(p.camera_names),
         findings=cast("list[dict[str, str | float | int]]", p.notes.get("findings", [])),
     )
     if "focal" in p.notes:
@@ -223,13 +232,6 @@ def _runs(p: Performance, state: SolveState) -> list[tuple[int, int]]:
         else:
             runs.append((frame, frame))
     return runs
-
-
-def _limits(p: Performance) -> str:
-    """Say what limits the accuracy."""
-    if len(p.camera_names) == 1:
-        return "having one camera: errors lie along its line of sight, which a second camera shows"
-    return "the rig: its own error at the condyles is larger than that of the outlines"
 
 
 def solve_lines(summary: SolveSummary) -> list[str]:

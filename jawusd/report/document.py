@@ -45,37 +45,45 @@ def write_document(path: str | os.PathLike[str], data: ReportData) -> None:
 
 def document(data: ReportData) -> str:
     """Return the report as HTML; all content of files is escaped."""
-    environment = jinja2.Environment(
+    verdicts = judge(data)
+    return (
+        page_environment()
+        .get_template("report.html.j2")
+        .render(
+            data=data,
+            verdicts=verdicts,
+            overall=overall(verdicts),
+            words=WORDS,
+            marks=MARKS,
+            style=own_file("report.css"),
+            script=own_file("replay.js"),
+            replay=replay_data(data),
+            figures=_figures(data),
+            pictures=[(one, base64.b64encode(one.jpeg).decode("ascii")) for one in data.overlays],
+            ranges=human_ranges(data.tracks, data.model),
+            errors=_error_tables(data),
+            frames=_frame_lists(data),
+            uncertainty=data.model.meta.get("uncertainty", {}),
+            start=_start(data),
+            cameras=_cameras(data),
+            findings=_findings(data),
+            bite=_bite(data),
+        )
+    )
+
+
+def page_environment() -> jinja2.Environment:
+    """Return what fills in the templates of pages; it escapes what files say."""
+    return jinja2.Environment(
         loader=jinja2.PackageLoader("jawusd.report", "page"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    verdicts = judge(data)
-    return environment.get_template("report.html.j2").render(
-        data=data,
-        verdicts=verdicts,
-        overall=overall(verdicts),
-        words=WORDS,
-        marks=MARKS,
-        style=_own("report.css"),
-        script=_own("replay.js"),
-        replay=replay_data(data),
-        figures=_figures(data),
-        pictures=[(one, base64.b64encode(one.jpeg).decode("ascii")) for one in data.overlays],
-        ranges=human_ranges(data.tracks, data.model),
-        errors=_error_tables(data),
-        frames=_frame_lists(data),
-        uncertainty=data.model.meta.get("uncertainty", {}),
-        start=_start(data),
-        cameras=_cameras(data),
-        findings=_findings(data),
-        bite=_bite(data),
-    )
 
 
-def _own(name: str) -> Markup:
+def own_file(name: str) -> Markup:
     """Return a file of the package unescaped."""
     return Markup(resources.files("jawusd.report").joinpath("page", name).read_text(encoding="utf-8"))
 

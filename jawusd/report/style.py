@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 # Okabe & Ito, "Color Universal Design" (2008).
 BLACK, ORANGE, SKY, GREEN, BLUE, VERMILION = "#000000", "#E69F00", "#56B4E9", "#009E73", "#0072B2", "#D55E00"
-GREY, PALE = "#777777", "#C8C8C8"
+GREY, PALE, MAGENTA = "#777777", "#C8C8C8", "#D6278F"
 
 #: Matplotlib's settings for making and saving figures.
 SETTINGS: dict[RcKeyType, object] = {

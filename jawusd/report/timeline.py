@@ -29,19 +29,19 @@ def tracking_figure(tracks: Tracks) -> Figure:
     residual = np.where(tracks.status == LOST, np.nan, tracks.residual_px)
     coverage = 100 * _mean_of_known(used_coverage(tracks), 2)
     for index, (name, color, style) in enumerate((("upper teeth", ORANGE, "-"), ("lower teeth", BLUE, "--"))):
-        axes[1].plot(*_thinned(tracks.frames, residual[:, index], np.fmax), style, color=color, lw=1, label=name)
-        axes[2].plot(*_thinned(tracks.frames, coverage[:, index], np.fmax), style, color=color, lw=1, label=name)
+        axes[1].plot(*thinned(tracks.frames, residual[:, index], np.fmax), style, color=color, lw=1, label=name)
+        axes[2].plot(*thinned(tracks.frames, coverage[:, index], np.fmax), style, color=color, lw=1, label=name)
     axes[1].set_ylabel("distance of\noutlines [px]")
     axes[2].set_ylabel("mask left\nuncovered [%]")
     sigma = tracks.sigma_mm
     shown = (("incisor", 0, BLACK, "-"), ("left condyle", 3, VERMILION, "--"), ("right condyle", 4, GREEN, ":"))
     for name, index, color, style in shown:
-        axes[3].plot(*_thinned(tracks.frames, sigma[:, index], np.fmax), style, color=color, lw=1.1, label=name)
+        axes[3].plot(*thinned(tracks.frames, sigma[:, index], np.fmax), style, color=color, lw=1.1, label=name)
     axes[3].set_ylabel("expected error,\n1 sigma [mm]")
     axes[3].set_xlabel("frame of the reference camera")
     for axis in axes[1:]:
         axis.set_ylim(bottom=0)
-        _legend_beside(axis)
+        legend_beside(axis)
     return figure
 
 
@@ -54,18 +54,18 @@ def model_figure(model: JawModel) -> Figure:
     figure, axes = new_figure(11.0, 5.6, 3, 1, sharex=True, height_ratios=[1.5, 1, 1])
     shown = (("d1 opening", BLACK, "-"), ("d2 laterotrusion", BLUE, "--"), ("d3 protrusion", VERMILION, ":"))
     for index, (name, color, style) in enumerate(shown):
-        axes[0].plot(*_thinned(model.frames, model.d[:, index], _farther), style, color=color, lw=1.2, label=name)
+        axes[0].plot(*thinned(model.frames, model.d[:, index], farther), style, color=color, lw=1.2, label=name)
     axes[0].set_ylabel("parameter [mm]")
-    axes[1].plot(*_thinned(model.frames, model.residual_mm, np.fmax), color=BLUE, lw=1, label="pose to model")
+    axes[1].plot(*thinned(model.frames, model.residual_mm, np.fmax), color=BLUE, lw=1, label="pose to model")
     axes[1].axhline(rig.limits.residual_mm, color=VERMILION, lw=1, ls="--", label="limit of a valid pose")
     axes[1].set_ylabel("landmarks,\nrms [mm]")
     axes[1].set_ylim(bottom=0)
-    axes[2].plot(*_thinned(model.frames, margin, np.fmin), color=BLUE, lw=1, label="margin to the bound")
+    axes[2].plot(*thinned(model.frames, margin, np.fmin), color=BLUE, lw=1, label="margin to the bound")
     axes[2].axhline(rig.limits.margin_mm, color=VERMILION, lw=1, ls="--", label="limit of a valid pose")
     axes[2].set_ylabel("margin [mm]")
     axes[2].set_xlabel("frame of the reference camera")
     for axis in axes:
-        _legend_beside(axis)
+        legend_beside(axis)
     return figure
 
 
@@ -75,8 +75,8 @@ def _draw_state(axis: Axes, tracks: Tracks) -> None:
     states.append(np.repeat(tracks.prior_aided[:, None], 2, axis=1))
     for lane, (has, color) in enumerate(zip(states, _LANE_COLORS, strict=True)):
         for arch, low in ((0, 0.04), (1, -0.4)):
-            runs = _runs(tracks.frames, has[:, arch])
-            axis.broken_barh(runs, (low - lane, 0.36), facecolors=color, edgecolors=color, linewidth=0.8)
+            spans = runs(tracks.frames, has[:, arch])
+            axis.broken_barh(spans, (low - lane, 0.36), facecolors=color, edgecolors=color, linewidth=0.8)
         axis.axhline(-lane - 0.5, color=GREY, lw=0.4)
     shares = [f"{name}  {int(has.any(1).sum())}" for name, has in zip(_LANES, states, strict=True)]
     axis.set_yticks([-lane for lane in range(len(_LANES))], shares)
@@ -84,7 +84,7 @@ def _draw_state(axis: Axes, tracks: Tracks) -> None:
     axis.set_title("frames in each state (upper half of a bar: upper teeth, lower half: lower teeth)", loc="left")
 
 
-def _runs(frames: NDArray[np.int64], has: Mask) -> list[tuple[float, float]]:
+def runs(frames: NDArray[np.int64], has: Mask) -> list[tuple[float, float]]:
     """Return the spans (start, width) of consecutive frames with a property."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], has, [False]]).astype(np.int8)))
     spans = zip(edges[::2], edges[1::2], strict=True)
@@ -97,13 +97,13 @@ def _mean_of_known(values: Array, axis: int) -> Array:
         return np.nanmean(values, axis=axis)
 
 
-def _farther(a: Array, b: Array) -> Array:
+def farther(a: Array, b: Array) -> Array:
     """Return the value of two that is farther from zero and not NaN."""
     return np.where(np.isnan(a) | (np.abs(b) > np.abs(a)), b, a)
 
 
-def _thinned(frames: NDArray[np.int64], values: Array, keep: Callable[[Array, Array], Array]) -> tuple[Array, Array]:
-    """Return at most `_COLUMNS` points, reducing every few frames by `keep`."""
+def thinned(frames: NDArray[np.int64], values: Array, keep: Callable[[Array, Array], Array]) -> tuple[Array, Array]:
+    """Return at most `_COLUMNS` points (frames, values), reducing every few frames by `keep`."""
     step = -(-len(frames) // _COLUMNS)
     if step <= 1:
         return frames.astype(np.float64), values
@@ -117,5 +117,6 @@ def _thinned(frames: NDArray[np.int64], values: Array, keep: Callable[[Array, Ar
     return frames[starts].astype(np.float64), chosen
 
 
-def _legend_beside(axis: Axes) -> None:
+def legend_beside(axis: Axes) -> None:
+    """Put the legend to the right of a plot."""
     axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)

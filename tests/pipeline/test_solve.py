@@ -16,6 +16,7 @@ from jawusd.formats.performance import SolveState
 from jawusd.formats.poses import read_parameters
 from jawusd.formats.tracks import load_tracks
 from jawusd.geometry import transform_point
+from jawusd.imaging.video import Video
 from jawusd.pipeline.prepare import open_capture
 from jawusd.pipeline.segment import with_masks
 from jawusd.pipeline.segment_record import auto_masks_folder
@@ -139,3 +140,34 @@ def test_a_shot_without_masks_and_videos_is_refused(rig, shot, tmp_path):
     none = tuple(camera.model_copy(update={"masks": None}) for camera in capture.cameras)
     with pytest.raises(CaptureError, match="no camera has a video"):
         solve(rig, capture.model_copy(update={"cameras": none}), tmp_path / "take.csv")
+
+
+def test_a_performance_is_drawn_and_reported(rig, shot, tmp_path):
+    """Cameras of the shot have masks alone: these are drawn over."""
+    summary = json.loads(
+        run(
+            "solve", rig, shot, "-o", tmp_path / "take.npz", "--overlay", tmp_path / "take.mp4",
+            "--report", tmp_path / "take.html", "--json",
+        )
+    )  # fmt: skip
+    files = [tmp_path / f"take.{suffix}" for suffix in ("npz", "mp4", "html")]
+    assert summary["files"] == [str(path) for path in files]
+    assert Video(files[1]).count == COUNT
+    page = files[2].read_text()
+    assert f"{COUNT} frames (100.0 %)" in page and page.count("data:image/jpeg") >= 2
+    tracks = load_tracks(files[0])
+    assert tracks.solved is not None and tracks.meta["fps"] == open_capture(shot).fps
+    np.testing.assert_allclose(jawusd.load(rig).pose(tracks.solved.d), tracks.T_upper_lower, atol=1e-9)
+    again = tmp_path / "again.html"
+    run("report", files[0], "-o", again)
+    assert "no shot was named" in again.read_text()
+    run("report", files[0], "--capture", shot, "-o", again, "--force")
+    assert again.read_text() == page
+
+
+def test_files_with_other_names_are_refused_before_any_work(rig, shot, tmp_path):
+    for option, name in (("--overlay", "take.avi"), ("--report", "take.pdf")):
+        assert "End it in" in run("solve", rig, shot, "-o", tmp_path / "take.csv", option, tmp_path / name, code=10)
+    (tmp_path / "take.mp4").write_text("precious")
+    assert "--force" in run("solve", rig, shot, "-o", tmp_path / "t.csv", "--overlay", tmp_path / "take.mp4", code=10)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["take.mp4"]

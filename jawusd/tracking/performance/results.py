@@ -102,6 +102,8 @@ def _known_notes(p: Performance) -> TracksMeta:
         out["start"] = start
     if isinstance(findings, list):
         out["findings"] = findings
+    if isinstance(p.notes.get("fps"), float):
+        out["fps"] = cast(float, p.notes["fps"])
     if isinstance(focal, dict):
         out["focal"] = focal
     return out

@@ -155,7 +155,7 @@ class _Take:
             margin_mm=verdicts.margin_mm,
             verdict=verdicts.words(),
             camera_names=self._shot.camera_names,
-            notes={"habits": smoothed.state.habits.tolist(), **self._focal_notes(smoothed)},
+            notes={"fps": self._shot.fps, "habits": smoothed.state.habits.tolist(), **self._focal_notes(smoothed)},
         )
 
     def _focal_notes(self, smoothed: Smoothed) -> dict[str, object]:

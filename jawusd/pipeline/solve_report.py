@@ -1,0 +1,168 @@
+"""Write the report of a solved performance."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from jawusd.errors import FormatError, OutputError, explain_missing_packages
+from jawusd.formats.capture import Capture
+from jawusd.formats.coverage import worst_frames
+from jawusd.formats.performance import SolveState
+from jawusd.formats.report import Overlay, SolveReportData
+from jawusd.formats.tracks import Tracks, load_tracks
+from jawusd.pipeline.calibrate import sync_cameras
+from jawusd.pipeline.media import check_same_cameras, draw_frames, open_backdrops, tracked_scans
+from jawusd.pipeline.prepare import load_cameras, naming_file, open_capture, tracked_cameras
+from jawusd.pipeline.report import attempt, camera_facts, package_versions
+from jawusd.pipeline.state import Progress, make_folder
+
+PAGE = ".html"
+_MOST_UNSEEN, _MOST_UNCERTAIN, _MOST_OUTSIDE = 3, 2, 2  # frames shown for each reason; one typical one is added
+
+
+@explain_missing_packages()
+def check_page(path: str | os.PathLike[str]) -> None:
+    """Check, before any work, that a report can be written to a file of that name.
+
+    Raises:
+        OutputError: its suffix is not .html.
+        MissingDependencyError: matplotlib or jinja2 is not installed.
+    """
+    import jawusd.report.solve_page  # noqa: F401
+
+    if Path(path).suffix.lower() != PAGE:
+        raise OutputError("is no name of a report, which is a page.", path=path, hint=f"End it in {PAGE}.")
+
+
+def report_solve(
+    tracks: Path, capture: str | os.PathLike[str] | None, page: Path, progress: Progress, *, allow_outside: bool = False
+) -> Path:
+    """Write the report of a solve from the tracks it wrote, and return its path.
+
+    Args:
+        tracks: the .npz that `solve` wrote.
+        capture: the shot, its capture.toml or folder; without it there are no pictures and nothing about the cameras.
+        page: file to write.
+        allow_outside: let paths in the capture leave its folder.
+
+    Raises:
+        FormatError: not the tracks of a solve.
+        CaptureError, SyncError: the shot cannot be read.
+        OutputError: the page cannot be written.
+    """
+    check_page(page)
+    with naming_file(tracks):
+        found = load_tracks(tracks)
+        if found.solved is None:
+            raise FormatError(
+                "holds tracks that no solve made.",
+                hint="Name the .npz that `jawusd solve` wrote, or the folder of a build.",
+            )
+        if capture is None:
+            _write(page, found, None, {}, tracks.stem, progress)
+        else:
+            shot = open_capture(capture, allow_outside=allow_outside)
+            check_same_cameras(shot, found)
+            write_solve_report(page, found, shot, sync_cameras(shot, progress)["offsets"], progress)
+    return page
+
+
+def write_solve_report(
+    page: str | os.PathLike[str], tracks: Tracks, capture: Capture, offsets: Mapping[str, int], progress: Progress
+) -> None:
+    """Write the report of the tracks of a solve.
+
+    Args:
+        offsets: frame offset by camera.
+
+    Raises:
+        MissingDependencyError: matplotlib or jinja2 is not installed.
+        OutputError: the page cannot be written.
+    """
+    _write(Path(page), tracks, capture, offsets, capture.name, progress)
+
+
+@explain_missing_packages()
+def _write(
+    page: Path, tracks: Tracks, capture: Capture | None, offsets: Mapping[str, int], name: str, progress: Progress
+) -> None:
+    from jawusd.report.solve_page import write_solve_page
+
+    progress("report", 0, 2)
+    left_out: list[str] = []
+    overlays: tuple[Overlay, ...] | None = None
+    if capture is None:
+        left_out.append("pictures and cameras: no shot was named (--capture).")
+    else:
+        shot = capture
+        overlays = attempt("pictures", left_out, lambda: _overlays(shot, offsets, tracks))
+    progress("report", 1, 2)
+    data = SolveReportData(
+        shot=name,
+        tracks=tracks,
+        fps=_rate(tracks) if capture is None else capture.fps,
+        limits=solve_limits(tracks.camera_names),
+        cameras=() if capture is None else camera_facts(capture),
+        overlays=overlays or (),
+        versions=package_versions(),
+        left_out=tuple(left_out),
+    )
+    make_folder(page.resolve().parent)
+    write_solve_page(page, data)
+    progress("report", 2, 2)
+
+
+def _rate(tracks: Tracks) -> float:
+    rate = tracks.meta.get("fps")
+    if not isinstance(rate, float) or not 0 < rate < math.inf:
+        raise FormatError("does not say its frames per second.", hint="Name the shot with --capture.")
+    return rate
+
+
+def _overlays(capture: Capture, offsets: Mapping[str, int], tracks: Tracks) -> tuple[Overlay, ...]:
+    backdrops = open_backdrops(capture, offsets)
+    cameras = {camera.name: camera for camera in tracked_cameras(load_cameras(capture), tracks)}
+    chosen = frames_to_show(tracks, capture.fps)
+    found = draw_frames(chosen, tracks, cameras, backdrops, tracked_scans(capture, tracks))
+    for backdrop in backdrops.values():
+        backdrop.close()
+    return found
+
+
+def frames_to_show(tracks: Tracks, fps: float) -> list[tuple[int, str]]:
+    """Return rows of frames to look at, each with the reason: unseen, outside, uncertain, and a usual one.
+
+    Raises:
+        ValueError: the tracks are not those of a solve.
+    """
+    solved = tracks.solved
+    if solved is None:
+        raise ValueError("the tracks hold no solved performance")
+    sigma, seen = solved.sigma_mm.max(axis=1), solved.state == SolveState.SOLVED
+    found: list[tuple[int, str]] = []
+    for has, badness, most, words in (
+        (solved.state == SolveState.LOST, sigma, _MOST_UNSEEN, "lost, expected error up to {:.2f} mm"),
+        (solved.state == SolveState.CARRIED, sigma, _MOST_UNSEEN, "out of sight, expected error up to {:.2f} mm"),
+        (~solved.valid, -solved.margin_mm, _MOST_OUTSIDE, "{:.2f} mm outside the rig's bound"),
+        (seen, sigma, _MOST_UNCERTAIN, "solved, but with one of the largest expected errors, {:.2f} mm"),
+    ):
+        values = np.where(has, badness, np.nan)
+        rows = worst_frames(values, tracks.frames, fps, most, [row for row, _ in found])
+        found += [(row, words.format(values[row])) for row in rows]
+    if seen.any():
+        rows_seen = np.flatnonzero(seen)
+        usual = int(rows_seen[np.argsort(sigma[rows_seen])[len(rows_seen) // 2]])
+        found.append((usual, f"a usual one, expected error {sigma[usual]:.2f} mm"))
+    return found
+
+
+def solve_limits(cameras: Sequence[str]) -> str:
+    """Say what limits the accuracy of a solve from these cameras."""
+    if len(cameras) == 1:
+        return "having one camera: errors lie along its line of sight, which a second camera shows"
+    return "the rig: its own error at the condyles is larger than that of the outlines"
