@@ -165,7 +165,8 @@ def view(
     """See a rig in the browser, drag it, key it; or a capture's footage, to judge its poses and to set its picks."""
     import webbrowser
 
-    from jawusd.pipeline.view import is_capture, open_capture_viewer, open_viewer
+    from jawusd.pipeline.view import open_viewer
+    from jawusd.pipeline.view_capture import is_capture, open_capture_viewer
     from jawusd.viewer.server import is_loopback
 
     capture = is_capture(rig)

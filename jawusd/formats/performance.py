@@ -26,6 +26,20 @@ class SolveState(IntEnum):
         return self.name.lower()
 
 
+#: What the states mean, for people.
+STATE_WORDS: dict[SolveState, str] = {
+    SolveState.SOLVED: "solved from the masks",
+    SolveState.CARRIED: "out of sight: carried by the motion around",
+    SolveState.LOST: "lost: the masks fit nothing there",
+}
+#: Red, green and blue of an arch in pictures, by state; they differ in brightness too.
+STATE_COLOURS: dict[SolveState, tuple[int, int, int]] = {
+    SolveState.SOLVED: (0, 190, 120),
+    SolveState.CARRIED: (255, 225, 0),
+    SolveState.LOST: (255, 40, 170),
+}
+
+
 @dataclass(eq=False)
 class Performance:
     """Hold a performance; every frame has a pose, and `covariance` says what it is worth.

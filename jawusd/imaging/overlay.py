@@ -6,6 +6,7 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from jawusd.formats.atomic import write_bytes_atomic
 from jawusd.formats.mesh import Mesh, crown_face_mask
-from jawusd.formats.performance import SolveState
+from jawusd.formats.performance import STATE_COLOURS, SolveState
 from jawusd.formats.tracks import LOST, Tracks
 from jawusd.geometry import Camera, transform_points
 from jawusd.geometry.arrays import Array
@@ -25,12 +26,6 @@ Colour = tuple[int, int, int]
 
 UPPER_COLOUR: Colour = (255, 170, 0)
 LOWER_COLOUR: Colour = (0, 200, 255)
-#: Of an arch in a solved performance; they differ in brightness too.
-STATE_COLOURS: dict[SolveState, Colour] = {
-    SolveState.SOLVED: (0, 190, 120),
-    SolveState.CARRIED: (255, 225, 0),
-    SolveState.LOST: (255, 40, 170),
-}
 _LINE_PX = 2
 CAPTION_PX = 22
 #: Where a camera has no picture.
@@ -63,8 +58,9 @@ def draw_overlay(
     for number, scan in enumerate(scans, start=1):
         crown = (labels == number).astype(np.uint8)
         inner = cv2.erode(crown, kernel, borderType=cv2.BORDER_REPLICATE) > 0
-        tint = (1 - fill) * image[inner] + fill * np.array(scan.colour)
-        out[inner] = np.round(tint).astype(np.uint8)
+        if fill:
+            tint = (1 - fill) * image[inner] + fill * np.array(scan.colour)
+            out[inner] = np.round(tint).astype(np.uint8)
         out[(crown > 0) & ~inner] = scan.colour
     return out
 
@@ -160,6 +156,13 @@ def _points(camera: Camera, scan: PlacedScan) -> NDArray[np.float32]:
     return np.column_stack([camera.project(world), camera.depth(world)]).astype(np.float32)
 
 
+@lru_cache(maxsize=8)
+def _parted_faces(mesh: Mesh) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Return the faces of gum and of crowns; kept, since a video asks for every frame."""
+    crown = crown_face_mask(mesh)
+    return mesh.faces[~crown], mesh.faces[crown]
+
+
 def _visible_crowns(camera: Camera, scans: Sequence[PlacedScan]) -> NDArray[np.uint8]:
     width, height = camera.size_px
     inverse_depth, labels = np.zeros((height, width), np.float32), np.zeros((height, width), np.uint8)
@@ -167,8 +170,8 @@ def _visible_crowns(camera: Camera, scans: Sequence[PlacedScan]) -> NDArray[np.u
         if not np.isfinite(scan.T_world_scan).all():
             continue
         points = _points(camera, scan)
-        crown = crown_face_mask(scan.mesh)
-        for faces, label in ((scan.mesh.faces[~crown], 0), (scan.mesh.faces[crown], number)):
+        gum, crowns = _parted_faces(scan.mesh)
+        for faces, label in ((gum, 0), (crowns, number)):
             draw_depth_labels(points, faces, 0, 0, False, inverse_depth, labels, label)
     return labels
 

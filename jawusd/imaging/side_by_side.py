@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import cv2
 import numpy as np
@@ -54,6 +56,7 @@ class CameraWall:
         self._cells = {name: _Cell(parts.get(name, whole[name]), cameras.get(name), tile_px) for name in backdrops}
         self._backdrops = backdrops
         count = len(backdrops)
+        self._pool = ThreadPoolExecutor(min(count, os.cpu_count() or 1))
         self._columns = count if count <= _MOST_IN_ROW else math.ceil(math.sqrt(count))
         rows = -(-count // self._columns)
         self.size_px = (self._columns * tile_px[0], rows * (tile_px[1] + CAPTION_PX))
@@ -68,16 +71,18 @@ class CameraWall:
         Raises:
             CaptureError: a camera's picture cannot be decoded.
         """
-        tiles = []
-        for name, cell in self._cells.items():
-            backdrop = self._backdrops[name]
-            image = backdrop.picture(frame)
-            words = "no picture" if image is None else "" if backdrop.is_footage else "masks, no footage"
-            tiles.append(captioned(cell.draw(image, scans, fill), f"{name}   {words}"))
+        tiles = list(self._pool.map(lambda name: self._tile(name, frame, scans, fill), self._cells))
         return contact_sheet(tiles, self._columns)
+
+    def _tile(self, name: str, frame: int, scans: Sequence[PlacedScan], fill: float) -> NDArray[np.uint8]:
+        backdrop = self._backdrops[name]
+        image = backdrop.picture(frame)
+        words = "no picture" if image is None else "" if backdrop.is_footage else "masks, no footage"
+        return captioned(self._cells[name].draw(image, scans, fill), f"{name}   frame {frame}   {words}")
 
     def close(self) -> None:
         """Stop decoding ahead."""
+        self._pool.shutdown()
         for backdrop in self._backdrops.values():
             backdrop.close()
 

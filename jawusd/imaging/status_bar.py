@@ -8,16 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.formats.performance import SolveState
+from jawusd.formats.performance import STATE_COLOURS, STATE_WORDS, SolveState
 from jawusd.formats.tracks import Tracks
-from jawusd.imaging.overlay import LOWER_COLOUR, STATE_COLOURS, UPPER_COLOUR, Colour
+from jawusd.imaging.overlay import LOWER_COLOUR, UPPER_COLOUR, Colour
 
-#: What the states of a solve mean, in words.
-STATE_WORDS: dict[SolveState, str] = {
-    SolveState.SOLVED: "solved from the masks",
-    SolveState.CARRIED: "out of sight: carried by the motion around",
-    SolveState.LOST: "lost: the masks fit nothing there",
-}
 _WHITE: Colour = (240, 240, 240)
 _WIDE_PX = 1200  # narrower bars have a line for each piece of text
 _LINE_PX, _LEFT_PX, _GAP_PX, _SWATCH_PX = 26, 10, 34, 14

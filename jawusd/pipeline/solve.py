@@ -186,9 +186,7 @@ def check_output(
     if report is not None:
         check_page(report)
     if overlay is not None and Path(overlay).suffix.lower() != VIDEO:
-        raise OutputError(
-            "the overlay is one video of all cameras.", path=overlay, hint=f"Name a file ending in {VIDEO}."
-        )
+        raise OutputError("is no name of an overlay, which is one video.", path=overlay, hint=f"End it in {VIDEO}.")
     if out is None:
         return
     if Path(out).suffix.lower() in _USD and Path(rig).suffix.lower() not in _USD:

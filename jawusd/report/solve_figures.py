@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import ArrayLike, NDArray
 
-from jawusd.formats.performance import SolveState
+from jawusd.formats.performance import STATE_WORDS, SolveState
 from jawusd.formats.solved import SolvedJaw
 from jawusd.formats.tracks import LOST, Tracks
 from jawusd.geometry.arrays import Array
@@ -46,15 +46,9 @@ def jaw_figure(tracks: Tracks, solved: SolvedJaw, fps: float) -> Figure:
         _shade(axis, frames, solved)
         legend_beside(axis)
     _label_frames(axes[0], axes[-1], fps)
-    shades = [Patch(color=STATE_INKS[state], alpha=0.3, label=_SHADES[state]) for state in _UNSEEN]
+    shades = [Patch(color=STATE_INKS[state], alpha=0.3, label=STATE_WORDS[state]) for state in _UNSEEN]
     figure.legend(handles=shades, loc="outside upper right", ncols=2, frameon=False)
     return figure
-
-
-_SHADES = {
-    SolveState.CARRIED: "shaded: out of sight, carried by the motion around",
-    SolveState.LOST: "shaded: lost, the masks fit nothing",
-}
 
 
 def seen_figure(tracks: Tracks, solved: SolvedJaw, fps: float) -> Figure:

@@ -12,7 +12,7 @@ from markupsafe import Markup
 from jawusd.errors import FormatError
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.finding import Finding
-from jawusd.formats.performance import SolveState
+from jawusd.formats.performance import STATE_WORDS, SolveState
 from jawusd.formats.report import SolveReportData
 from jawusd.formats.solved import SolvedJaw
 from jawusd.formats.tracks import LOST
@@ -21,7 +21,6 @@ from jawusd.report.solve_figures import jaw_figure, seen_figure
 from jawusd.report.style import inline_svg
 
 _LISTED = 60  # runs named one by one
-_CAUSES = {SolveState.CARRIED: "out of sight: carried by the motion around", SolveState.LOST: "lost: masks fit nothing"}
 
 
 class Unseen(NamedTuple):
@@ -88,7 +87,7 @@ def unseen_runs(data: SolveReportData, solved: SolvedJaw) -> list[Unseen]:
         first, last = int(frames[rows[0]]), int(frames[rows[-1]])
         worst = ", ".join(f"{value:.2f}" for value in solved.sigma_mm[rows].max(axis=0))
         seconds = f"{first / data.fps:.2f} to {(last + 1) / data.fps:.2f}"
-        found.append(Unseen(first, last, seconds, _CAUSES[state], " and ".join(arches), worst))
+        found.append(Unseen(first, last, seconds, STATE_WORDS[state], " and ".join(arches), worst))
     return found
 
 

@@ -68,7 +68,7 @@ class CapturePage:
         self.refresh()
 
     def _turn_camera(self) -> None:
-        if self.picks.picking.value and not self.footage.in_space:
+        if self.picks.picking.value and self.footage.view in self._capture.sizes_px:
             self.picks.book.turn_to(self.footage.view)
         self.turn()
 
@@ -104,15 +104,19 @@ class CapturePage:
             shown = tracked or (default, default)
             self.poses = {arch: self.scene.T_page_world @ T for arch, T in zip(ARCHES, shown, strict=True)}
         else:
-            image = await asyncio.to_thread(capture.picture, view, frame, tracked, look)
+            if footage.on_wall:
+                image = await asyncio.to_thread(capture.wall, frame, tracked, look)
+            else:
+                image = await asyncio.to_thread(capture.picture, view, frame, tracked, look)
             if aim or self.layout is None:
-                self.layout = PickingLayout(capture.sizes_px[view], await asyncio.to_thread(self._region, view, frame))
+                self.layout = await asyncio.to_thread(self._lay_out, view, frame)
             self.scene.show_picture(image, self.layout)
             self.poses = {}
-            if self.picks.picking.value or self.labels.painting.value:
+            if (self.picks.picking.value or self.labels.painting.value) and not footage.on_wall:
                 self.poses = self.layout.scan_poses(capture.scans, capture.T_anatomical_skull, self.picks.side)
         self.scene.place(footage.in_space, self.poses)
-        camera, layout = (None, None) if footage.in_space else (view, self.layout)
+        footage.follow(frame)
+        camera, layout = (None, None) if footage.in_space or footage.on_wall else (view, self.layout)
         self.scene.show_marks(self.picks.book, camera, frame, layout)
         self.picks.refresh()
         if aim:
@@ -162,6 +166,14 @@ class CapturePage:
             self._of_picks = picks, None
             self.picks.say_fit(error.statement())
 
+    def _lay_out(self, view: str, frame: int) -> PickingLayout:
+        """Return the layout of a camera's picture, or of all of them."""
+        capture = self._capture
+        if view not in capture.sizes_px:
+            width, height = capture.wall_px
+            return PickingLayout(capture.wall_px, (0.0, 0.0, width - 1.0, height - 1.0))
+        return PickingLayout(capture.sizes_px[view], self._region(view, frame))
+
     def _region(self, camera: str, frame: int) -> Region:
         """Return the region of a camera's picture to show: the teeth, as far as they are known."""
         capture, size = self._capture, self._capture.sizes_px[camera]
@@ -210,7 +222,7 @@ class CapturePage:
         if hits:
             _, arch, vertex = min(hits)
             self.picks.book.add(arch, vertex)
-        elif not self.footage.in_space and self.layout is not None:
+        elif self.footage.view in self._capture.sizes_px and self.layout is not None:
             pixel = self.layout.pixel(event.ray_origin, event.ray_direction)
             if pixel is None:
                 return
@@ -230,5 +242,6 @@ class CapturePage:
 
     def close(self) -> None:
         """Stop what runs for this page."""
+        self.footage.player.stop()
         if self._drawing is not None:
             self._drawing.cancel()

@@ -9,6 +9,7 @@ from jawusd.formats.coverage import uncovered_percent, worst_frames
 from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, TRACKED, Tracks
 from jawusd.geometry.arrays import Array
 from jawusd.viewer.plots import BLUE, GREY, ORANGE, VERMILION, svg_definition
+from jawusd.viewer.solve_plot import doubt, solve_words
 
 _MOST_WORST = 12
 _WIDTH, _HEIGHT = 330, 170
@@ -24,13 +25,21 @@ _COLORS = (ORANGE, BLUE)  # upper, lower, as the outlines in the pictures
 
 
 def frames_to_inspect(tracks: Tracks, fps: float) -> list[int]:
-    """Return frames to inspect, the worst first, no two within half a second: lost ones, then by coverage."""
-    badness = np.where(tracks.tracked(), np.fmax.reduce(uncovered_percent(tracks), axis=1), np.inf)
+    """Return frames to inspect, the worst first, no two within half a second: lost ones, then by coverage.
+
+    Those of a solve are ordered by `solve_plot.doubt`.
+    """
+    if tracks.solved is not None:
+        badness = doubt(tracks.solved)
+    else:
+        badness = np.where(tracks.tracked(), np.fmax.reduce(uncovered_percent(tracks), axis=1), np.inf)
     return [int(tracks.frames[index]) for index in worst_frames(badness, tracks.frames, fps, _MOST_WORST)]
 
 
 def frame_words(tracks: Tracks, frame: int) -> str:
-    """Return HTML about the tracking of a frame."""
+    """Return HTML about the tracking, or the solve, of a frame."""
+    if tracks.solved is not None:
+        return solve_words(tracks, tracks.solved, frame)
     index = tracks.row_of(frame)
     if index is None:
         return "not tracked"

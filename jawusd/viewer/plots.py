@@ -50,7 +50,7 @@ class Plot:
 
     def with_point(self, x: float, y: float, inside: bool) -> str:
         """Return the SVG of the plot with the present pose marked."""
-        px, py = _place(self, np.array([[x, y]]))[0]
+        px, py = place(self, np.array([[x, y]]))[0]
         mark = f'<circle cx="{px:.1f}" cy="{py:.1f}" r="5" fill="{GREEN if inside else VERMILION}" stroke="white"/>'
         return _svg(f'<use href="#{self.name}"/>{mark}')
 
@@ -63,9 +63,9 @@ def bound_plot(rig: JawRig, axis: int) -> Plot:
     border = border_path(rig, axis)[:, [0, axis]]
     captured = _thinned(captured_d(rig)[:, [0, axis]])
     title = ("", "lateral d2 over opening d1", "protrusion d3 over opening d1")[axis]
-    plot = _framed(f"jaw-{name}", np.vstack([corners, border, captured]), title, "opening d1 [mm]", "mm")
+    plot = framed(f"jaw-{name}", np.vstack([corners, border, captured]), title, "opening d1 [mm]", "mm")
     parts = [_dots(plot, captured), *(_ring(plot, ring, GREY, "4 3") for ring in rings), _ring(plot, border, BLUE)]
-    return _drawn(plot, parts)
+    return drawn(plot, parts)
 
 
 def posselt_plot(rig: JawRig, axis: int) -> Plot:
@@ -82,8 +82,8 @@ def posselt_plot(rig: JawRig, axis: int) -> Plot:
         ("jaw-frontal", "Posselt, frontal: up over left", "to the subject's left [mm]"),
         ("jaw-sagittal", "Posselt, sagittal: up over forward", "forward [mm]"),
     )[axis - 1]
-    plot = _framed(name, np.vstack([border, captured]), title, label, "mm")
-    return _drawn(plot, [_dots(plot, captured), _ring(plot, border, BLUE)])
+    plot = framed(name, np.vstack([border, captured]), title, label, "mm")
+    return drawn(plot, [_dots(plot, captured), _ring(plot, border, BLUE)])
 
 
 def posselt_point(places: Array, rest: Array, axis: int) -> tuple[float, float]:
@@ -102,23 +102,23 @@ def curve_plot(clip: Clip | None, keys: KeyTrack, span: tuple[float, float]) -> 
     frames = np.union1d(np.linspace(first, last, _MOST_SAMPLES), [key.frame for key in keys])
     values = clip.at(frames)
     corners = np.stack([np.repeat([first, last], 2), np.tile([values.min(), values.max()], 2)], axis=1)
-    plot = _framed(name, corners, "parameters over frames", "frame", "mm", pad_x=False)
+    plot = framed(name, corners, "parameters over frames", "frame", "mm", pad_x=False)
     parts = []
     for axis, color in enumerate(CURVE_COLORS):
-        line = _path(_place(plot, np.stack([frames, values[:, axis]], axis=1)))
+        line = path_through(place(plot, np.stack([frames, values[:, axis]], axis=1)))
         parts.append(f'<path d="{line}" fill="none" stroke="{color}" stroke-width="1.5"/>')
         label = f'<text x="{_WIDTH - 70 + 24 * axis}" y="14" font-size="11" fill="{color}" font-weight="bold">'
         parts.append(f"{label}d{axis + 1}</text>")
         for key in keys:
-            px, py = _place(plot, np.array([[key.frame, key.d[axis]]]))[0]
+            px, py = place(plot, np.array([[key.frame, key.d[axis]]]))[0]
             parts.append(f'<circle cx="{px:.1f}" cy="{py:.1f}" r="3" fill="{color}"/>')
-    return _drawn(plot, parts)
+    return drawn(plot, parts)
 
 
 def with_playhead(plot: Plot, frame: float) -> str:
     """Return the SVG of a curve plot with a line at the frame shown."""
     frame = min(max(frame, plot.low[0]), plot.high[0])
-    px = _place(plot, np.array([[frame, plot.low[1]]]))[0, 0]
+    px = place(plot, np.array([[frame, plot.low[1]]]))[0, 0]
     line = f'<path d="M{px:.1f} {_TOP}V{_HEIGHT - _BOTTOM}" stroke="{ORANGE}" stroke-width="2"/>'
     return _svg(f'<use href="#{plot.name}"/>{line}')
 
@@ -161,7 +161,7 @@ def _thinned(points: Array) -> Array:
     return points[:: max(1, -(-len(points) // _MOST_POINTS))]
 
 
-def _place(plot: Plot, points: Array) -> Array:
+def place(plot: Plot, points: Array) -> Array:
     """Return pixels (n, 2) of data points (n, 2), kept inside the frame."""
     low, high = np.array(plot.low), np.array(plot.high)
     share = np.clip((points - low) / (high - low), 0.0, 1.0)
@@ -170,7 +170,7 @@ def _place(plot: Plot, points: Array) -> Array:
     return np.stack([x, y], axis=1)
 
 
-def _framed(name: str, data: Array, title: str, x_label: str, y_label: str, pad_x: bool = True) -> Plot:
+def framed(name: str, data: Array, title: str, x_label: str, y_label: str, pad_x: bool = True) -> Plot:
     """Return a plot of axes, ticks and labels that holds data (n, 2)."""
     low, high = data.min(axis=0), data.max(axis=0)
     pad = np.maximum(0.06 * (high - low), 0.5) * (float(pad_x), 1.0)
@@ -184,16 +184,17 @@ def _framed(name: str, data: Array, title: str, x_label: str, y_label: str, pad_
         f'<text x="4" y="{_TOP - 8}" {_TEXT}>{y_label}</text>',
     ]
     for tick in _ticks(low[0], high[0]):
-        px = _place(plot, np.array([[tick, low[1]]]))[0, 0]
+        px = place(plot, np.array([[tick, low[1]]]))[0, 0]
         parts.append(f'<text x="{px:.1f}" y="{_HEIGHT - _BOTTOM + 13}" text-anchor="middle" {_TEXT}>{tick:g}</text>')
     for tick in _ticks(low[1], high[1]):
-        py = _place(plot, np.array([[low[0], tick]]))[0, 1]
+        py = place(plot, np.array([[low[0], tick]]))[0, 1]
         parts.append(f'<text x="{_LEFT - 4}" y="{py + 4:.1f}" text-anchor="end" {_TEXT}>{tick:g}</text>')
         parts.append(f'<path d="M{_LEFT} {py:.1f}h{area[0]}" stroke="{GREY}" stroke-opacity=".25"/>')
-    return _drawn(plot, parts)
+    return drawn(plot, parts)
 
 
-def _drawn(plot: Plot, parts: list[str]) -> Plot:
+def drawn(plot: Plot, parts: list[str]) -> Plot:
+    """Return a plot with more SVG in its static part."""
     return replace(plot, static=plot.static + "".join(parts))
 
 
@@ -205,15 +206,16 @@ def _ticks(low: float, high: float) -> list[float]:
     return [round(step * k, 9) + 0.0 for k in range(int(np.ceil(low / step)), int(np.floor(high / step)) + 1)]
 
 
-def _path(pixels: Array) -> str:
+def path_through(pixels: Array) -> str:
+    """Return the SVG path through pixels (n, 2)."""
     return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in pixels)
 
 
 def _ring(plot: Plot, points: Array, color: str, dash: str = "") -> str:
     dashed = f' stroke-dasharray="{dash}"' if dash else ""
-    return f'<path d="{_path(_place(plot, points))}Z" fill="none" stroke="{color}" stroke-width="1.5"{dashed}/>'
+    return f'<path d="{path_through(place(plot, points))}Z" fill="none" stroke="{color}" stroke-width="1.5"{dashed}/>'
 
 
 def _dots(plot: Plot, points: Array) -> str:
-    steps = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in _place(plot, points))
+    steps = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in place(plot, points))
     return f'<path d="{steps}" stroke="{GREY}" stroke-width="2.5" stroke-linecap="round" stroke-opacity=".7"/>'

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from viser._scene_api import _encode_image_binary
 
-from jawusd.pipeline.view import viewed_capture
+from jawusd.pipeline.view_capture import viewed_capture
 
 STEPS = 16
 

@@ -11,11 +11,10 @@ import trimesh
 
 from jawusd.errors import CalibrationError, CaptureError, OutputError
 from jawusd.formats.calibration import save_calibration
-from jawusd.formats.performance import SolveState
+from jawusd.formats.performance import STATE_COLOURS, SolveState
 from jawusd.formats.solved import SolvedJaw
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import Camera, make_transform, relative_pose
-from jawusd.imaging.overlay import STATE_COLOURS
 from jawusd.imaging.video_writer import VideoWriter
 from jawusd.pipeline.overlay import TILE_PX, overlay_files, write_overlay
 from jawusd.pipeline.prepare import open_capture

@@ -1,10 +1,13 @@
 """A capture as the viewer is given it, and its page without a browser."""
 
 import shutil
+import time
 import tomllib
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from browser_tab import until
 from package_copy import ROOT
 from quiet_capture_page import QuietCapturePage
 from typer.testing import CliRunner
@@ -12,9 +15,11 @@ from typer.testing import CliRunner
 from jawusd.cli.main import app
 from jawusd.errors import CaptureError, FormatError
 from jawusd.formats.capture import load_capture
-from jawusd.formats.tracks import LOST, PARTIAL, TRACKED, LostReason, Tracks, save_tracks
+from jawusd.formats.performance import STATE_COLOURS, SolveState
+from jawusd.formats.solved import SolvedJaw
+from jawusd.formats.tracks import LOST, PARTIAL, TRACKED, LostReason, Tracks, load_tracks, save_tracks
 from jawusd.geometry import transform_point, transform_points
-from jawusd.pipeline.view import viewed_capture
+from jawusd.pipeline.view_capture import viewed_capture
 from jawusd.viewer.server import CaptureViewer
 
 EXAMPLE = ROOT / "examples" / "capture"
@@ -125,6 +130,83 @@ def test_stepping_jumping_and_looking(page):
     own = FIRST + 7 - page.page._capture.offsets["cam1"]
     assert f"(its own frame {own})" in footage._words.content
     assert page.notices == []
+
+
+def test_all_cameras_stand_side_by_side(page):
+    footage, capture = page.page.footage, page.page._capture
+    page.press(footage.views, "all cameras")
+    assert "all cameras" in footage._words.content and "its own frame" not in footage._words.content
+    width, height = capture.wall_px
+    assert page.page.scene._picture.image.shape == (height, width, 3) and page.page.layout.size_px == (width, height)
+    drawn, bare = (capture.wall(FIRST, capture.tracked_poses(FIRST), look) for look in ("outlines", "footage"))
+    changed = (drawn != bare).any(axis=2)
+    for part in np.array_split(changed, 3, axis=1):  # the teeth are drawn into each camera's part, well inside it
+        y, x = np.argwhere(part).min(axis=0), np.argwhere(part).max(axis=0)
+        assert (y > 20).all() and (x < np.array(part.shape) - 20).all() and part.sum() > 500
+    page.press(page.page.picks.picking, True)  # no picks are made here
+    before = len(page.page.picks.book.picks)
+    page.click(page.page.layout.place((width / 2, height / 2)))
+    assert len(page.page.picks.book.picks) == before and page.page.poses == {} and page.notices == []
+    page.press(footage.views, "cam1")
+    assert page.page.layout.size_px == capture.sizes_px["cam1"]
+
+
+def test_playing_leaves_out_pictures_instead_of_falling_behind(viewed):
+    drawn = []
+
+    def slowly(frame, poses, look):
+        time.sleep(0.25)  # six frames
+        drawn.append(frame)
+        return viewed.wall(frame, poses, look)
+
+    viewer = CaptureViewer(replace(viewed, wall=slowly), "127.0.0.1", 0)
+    opened = QuietCapturePage(viewer)
+    opened.settle()
+    footage = opened.page.footage
+    opened.press(footage.views, "all cameras")
+    opened.enter(footage.loop, False)
+    opened.enter(footage.play, True)
+    assert footage.player.playing and footage.play.label == "pause"
+    until(lambda: not footage.player.playing)  # the end is reached, and stays
+    until(lambda: not opened.page.busy)
+    assert footage.frame == footage.slider.value == drawn[-1] == viewed.frames[1] and footage.play.label == "play"
+    assert sorted(drawn) == drawn and len(drawn) < 0.5 * (STOP - FIRST)
+    opened.enter(footage.play, True)  # begins anew, and a frame that is chosen stops it
+    until(lambda: drawn[-1] < FIRST + 20)
+    opened.enter(footage.slider, FIRST + 3)
+    until(lambda: not opened.page.busy)
+    assert not footage.player.playing and footage.frame == drawn[-1] == FIRST + 3 and opened.notices == []
+    viewer.stop()
+
+
+def test_a_solve_is_shown_with_its_states(viewed, copy, tmp_path):
+    tracks = load_tracks(write_true_tracks(tmp_path / "take.npz"))
+    count = STOP - FIRST
+    tracks.T_world_lower[7] = tracks.T_world_upper[7]
+    tracks.T_upper_lower[7] = np.eye(4)
+    state, valid = np.ones(count, np.int8), np.ones(count, bool)
+    state[7], valid[20] = SolveState.CARRIED, False
+    sigma = np.full((count, 3), 0.05)
+    sigma[7] = 1.25
+    tracks.solved = SolvedJaw(np.full((count, 3), [10.0, -2.0, 0.5]), sigma, np.where(valid, 1.0, -0.75), state, valid)
+    save_tracks(tmp_path / "take.npz", tracks)
+    shown = viewed_capture(copy, tmp_path / "take.npz", quiet)
+    viewer = CaptureViewer(shown, "127.0.0.1", 0)
+    opened = QuietCapturePage(viewer)
+    opened.settle()
+    footage = opened.page.footage
+    assert footage.worst[:2] == [FIRST + 20, FIRST + 7]  # what the rig does not allow, then what was not seen
+    words = footage._words.content
+    assert "upper: solved from the masks" in words and "d1 opening 10.00 &plusmn; 0.05 mm" in words
+    opened.press(footage.slider, FIRST + 20)
+    assert "0.75 mm outside the bound: <b>the rig does not allow this pose" in footage._words.content
+    opened.press(footage.slider, FIRST + 7)
+    assert "lower: out of sight" in footage._words.content and "1.25 mm" in footage._words.content
+    poses = shown.tracked_poses(FIRST + 7)
+    picture = shown.picture("cam0", FIRST + 7, poses, "outlines").reshape(-1, 3).astype(int)
+    counts = {s: np.count_nonzero((picture == colour).all(axis=1)) for s, colour in STATE_COLOURS.items()}
+    assert counts[SolveState.SOLVED] > 500 and counts[SolveState.CARRIED] > 500 and counts[SolveState.LOST] == 0
+    viewer.stop()
 
 
 def test_scans_in_space_stand_where_the_cameras_see_them(page):

@@ -15,7 +15,7 @@ from package_copy import ROOT
 from jawusd.formats.capture import load_capture
 from jawusd.formats.tracks import load_tracks
 from jawusd.geometry import transform_point, transform_points
-from jawusd.pipeline.view import open_capture_viewer
+from jawusd.pipeline.view_capture import open_capture_viewer
 
 EXAMPLE = ROOT / "examples" / "capture"
 FIRST, STOP = 20, 90
@@ -115,6 +115,25 @@ def test_frames_are_stepped_and_the_cameras_stand_in_space(tab):
     box = tab.web.locator("canvas").first.bounding_box()
     for camera in tab.page._capture.cameras.values():
         x, y = tab.pixel(transform_point(tab.page.scene.T_page_world, camera.centre_world()))
+        assert box["x"] < x < box["x"] + box["width"] and box["y"] < y < box["y"] + box["height"]
+
+
+def test_all_cameras_play_side_by_side(tab):
+    page = tab.page
+    tab.press("all cameras")
+    tab.settle()
+    tab.press("play")
+    until(lambda: page.footage.player.playing and page.footage.frame != FIRST + 30)
+    seen = page.footage.frame
+    until(lambda: page.footage.frame not in (seen, FIRST + 30))
+    tab.press("pause")
+    until(lambda: not page.footage.player.playing and not page.busy)
+    tab.said(f"all cameras, frame {page.footage.frame}")
+    tab.settle()
+    tab.picture("capture_all")
+    box = tab.web.locator("canvas").first.bounding_box()
+    for corner in page.layout.corners():
+        x, y = tab.pixel(corner)
         assert box["x"] < x < box["x"] + box["width"] and box["y"] < y < box["y"] + box["height"]
 
 

@@ -14,7 +14,7 @@ from jawusd.formats.scan_labels import labels_path, load_scan_labels
 from jawusd.geometry import transform_point
 from jawusd.pipeline.prepare import load_labelled
 from jawusd.pipeline.state import no_progress
-from jawusd.pipeline.view import viewed_capture
+from jawusd.pipeline.view_capture import viewed_capture
 from jawusd.viewer.scan_brush import ScanBrush, surface_near
 from jawusd.viewer.server import CaptureViewer
 

@@ -1,0 +1,253 @@
+"""Give the viewer a capture: footage or masks, the teeth drawn over them, and what pages read and write of it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.errors import explain_missing_packages
+from jawusd.formats.capture import Bootstrap, Capture
+from jawusd.formats.capture_edit import write_bootstrap
+from jawusd.formats.mesh import Mesh, crown_face_mask, tooth_labels
+from jawusd.formats.tracks import Tracks, load_tracks
+from jawusd.geometry import Camera
+from jawusd.geometry.arrays import Array
+from jawusd.pipeline.calibrate import sync_cameras
+from jawusd.pipeline.media import check_same_cameras, open_backdrops
+from jawusd.pipeline.prepare import (
+    load_cameras,
+    load_meshes,
+    naming_file,
+    open_capture,
+    registered_meshes,
+    subject_of_capture,
+    tracked_cameras,
+)
+from jawusd.pipeline.report import as_built, is_build, recorded_offsets
+from jawusd.pipeline.scans import save_reviewed
+from jawusd.pipeline.state import BuildState, Progress
+
+if TYPE_CHECKING:
+    from jawusd.imaging.backdrop import Backdrop
+    from jawusd.imaging.overlay import PlacedScan
+    from jawusd.imaging.side_by_side import CameraWall
+    from jawusd.viewer.server import CaptureViewer
+    from jawusd.viewer.viewed import Look, ViewedCapture
+
+CAPTURE_FILE = "capture.toml"
+_TRACKS = "tracks.npz"
+_SPECKS_PERCENT = 0.5
+_TILE_PX = (480, 360)  # of each camera among all: three of them are as wide as the page
+_FILL: dict[Look, float] = {"outlines": 0.0, "tinted": 0.3}
+
+
+def is_capture(path: Path) -> bool:
+    """Tell whether a path is a capture, and not a rig."""
+    return path.suffix == ".toml" or (path / CAPTURE_FILE).is_file()
+
+
+@explain_missing_packages()
+def open_capture_viewer(
+    path: str | os.PathLike[str],
+    tracks: Path | None,
+    host: str,
+    port: int,
+    progress: Progress,
+    *,
+    allow_outside: bool = False,
+) -> CaptureViewer:
+    """Serve a capture to browsers; parameters and errors as for `viewed_capture`.
+
+    Raises:
+        MissingDependencyError: the viewer is not installed.
+    """
+    from jawusd.viewer.server import CaptureViewer
+
+    return CaptureViewer(viewed_capture(path, tracks, progress, allow_outside=allow_outside), host, port)
+
+
+def viewed_capture(
+    path: str | os.PathLike[str], tracks: Path | None, progress: Progress, *, allow_outside: bool = False
+) -> ViewedCapture:
+    """Read what the viewer shows of a capture.
+
+    Args:
+        path: capture.toml or its folder.
+        tracks: folder of a build made from it, or its tracks.npz; None shows the footage alone.
+        allow_outside: let paths in the capture leave its folder.
+
+    Raises:
+        FormatError: the capture or the tracks cannot be read, or the tracks are of other cameras.
+        CaptureError: there is no footage, or a file cannot be decoded.
+        SyncError: the cameras cannot be aligned in time.
+    """
+    from jawusd.imaging.side_by_side import CameraWall
+    from jawusd.viewer.viewed import ViewedCapture
+
+    path = Path(path)
+    capture = open_capture(path, allow_outside=allow_outside)
+    own_scans = capture.scans
+    build = tracks if tracks is not None and is_build(tracks) else None
+    if build is not None:
+        capture = as_built(capture, build)
+    poses = _poses(capture, tracks)
+    cameras = [] if capture.calibration is None else load_cameras(capture)
+    meshes = load_meshes(capture)
+    if poses is not None:
+        cameras, meshes = tracked_cameras(cameras, poses), registered_meshes(meshes, poses.meta)
+    offsets = _offsets(capture, build, progress)
+    backdrops = open_backdrops(capture, offsets)
+    by_name = {camera.name: camera for camera in cameras}
+    scans = {arch: meshes[f"{arch}_teeth"] for arch in ("upper", "lower")}
+    wall = CameraWall(by_name, backdrops, poses, tuple(scans.values()), _tile_px(backdrops, poses is not None))
+    footage = _Footage(
+        capture=capture,
+        backdrops=backdrops,
+        wall=wall,
+        cameras=by_name,
+        offsets=offsets,
+        scans=scans,
+        tracks=poses,
+    )
+    return ViewedCapture(
+        name=capture.name,
+        fps=capture.fps,
+        frames=_frames(capture, poses, backdrops, offsets),
+        offsets=offsets,
+        sizes_px={name: backdrop.size_px for name, backdrop in backdrops.items()},
+        cameras=footage.cameras,
+        scans=footage.scans,
+        crowns={arch: crown_face_mask(mesh) for arch, mesh in footage.scans.items()},
+        labels={
+            arch: tooth_labels(mesh) if mesh.labels is None else mesh.labels for arch, mesh in footage.scans.items()
+        },
+        T_anatomical_skull=subject_of_capture(capture, meshes).T_anatomical_skull,
+        tracks=poses,
+        picks=capture.bootstrap,
+        picture=footage.picture,
+        wall=footage.picture_of_all,
+        wall_px=wall.size_px,
+        teeth_region=footage.teeth_region,
+        poses_of_picks=footage.poses_of_picks,
+        save_picks=partial(write_bootstrap, path / CAPTURE_FILE if path.is_dir() else path),
+        save_labels=partial(save_reviewed, own_scans, footage.scans),
+    )
+
+
+def _tile_px(backdrops: Mapping[str, Backdrop], cut: bool) -> tuple[int, int]:
+    """Return the size of each camera's part of the wall; whole pictures keep the shape of the first."""
+    if cut:
+        return _TILE_PX
+    width, height = next(iter(backdrops.values())).size_px
+    scale = min(_TILE_PX[0] / max(width, height), 1.0)
+    return max(round(width * scale), 1), max(round(height * scale), 1)
+
+
+def _poses(capture: Capture, tracks: Path | None) -> Tracks | None:
+    if tracks is None:
+        return None
+    found = load_tracks(tracks / _TRACKS if tracks.is_dir() else tracks)
+    with naming_file(tracks):
+        check_same_cameras(capture, found)
+    return found
+
+
+def _offsets(capture: Capture, build: Path | None, progress: Progress) -> dict[str, int]:
+    """Return the frame offsets the build found, else find them."""
+    if build is not None:
+        found = recorded_offsets(BuildState(build).stages)
+        if found:
+            return found
+    return sync_cameras(capture, progress)["offsets"]
+
+
+def _frames(
+    capture: Capture, poses: Tracks | None, backdrops: Mapping[str, Backdrop], offsets: Mapping[str, int]
+) -> tuple[int, int]:
+    """Return the first and the last frame of the reference camera to step through."""
+    if poses is not None and len(poses.frames):
+        return int(poses.frames[0]), int(poses.frames[-1])
+    if capture.frames is not None:
+        return capture.frames[0], capture.frames[1] - 1
+    # From the first picture of any camera to the last.
+    return (
+        max(0, min(offsets[name] for name in backdrops)),
+        max(offsets[name] + backdrop.count - 1 for name, backdrop in backdrops.items()),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Footage:
+    """Provide pictures, regions and poses of a capture to pages; safe to use from several threads."""
+
+    capture: Capture
+    backdrops: Mapping[str, Backdrop]
+    wall: CameraWall
+    cameras: Mapping[str, Camera]
+    offsets: Mapping[str, int]
+    scans: Mapping[str, Mesh]
+    tracks: Tracks | None
+
+    def picture(self, name: str, frame: int, poses: tuple[Array, Array] | None, look: Look) -> NDArray[np.uint8]:
+        """Return a camera's picture at a frame of the reference camera, with the teeth drawn over it."""
+        from jawusd.imaging.overlay import EMPTY_GRAY, draw_overlay
+
+        image = self.backdrops[name].picture(frame)
+        if image is None:
+            width, height = self.backdrops[name].size_px
+            return np.full((height, width, 3), EMPTY_GRAY, np.uint8)
+        placed = self._placed(frame, poses, look)
+        if not placed or name not in self.cameras:
+            return image
+        return draw_overlay(image, self.cameras[name], placed, fill=_FILL[look])
+
+    def picture_of_all(self, frame: int, poses: tuple[Array, Array] | None, look: Look) -> NDArray[np.uint8]:
+        """Return the pictures of all cameras side by side, with the teeth drawn over them."""
+        return self.wall.draw(frame, self._placed(frame, poses, look), fill=_FILL.get(look, 0.0))
+
+    def _placed(self, frame: int, poses: tuple[Array, Array] | None, look: Look) -> list[PlacedScan]:
+        from jawusd.imaging.overlay import LOWER_COLOUR, UPPER_COLOUR, PlacedScan, arch_colours
+
+        if poses is None or look == "footage":
+            return []
+        row = None if self.tracks is None else self.tracks.row_of(frame)
+        colours = (UPPER_COLOUR, LOWER_COLOUR) if self.tracks is None or row is None else arch_colours(self.tracks, row)
+        return [PlacedScan(*scan) for scan in zip(self.scans.values(), poses, colours, strict=True)]
+
+    def teeth_region(self, name: str, frame: int) -> tuple[float, float, float, float] | None:
+        """Return left, top, right and bottom [px] of the masks of a camera at a frame, None without any."""
+        from jawusd.imaging.masks import open_masks
+
+        source = next(camera for camera in self.capture.cameras if camera.name == name)
+        if source.masks is None:
+            return None
+        seen = []
+        for reader in open_masks(source, self.backdrops[name].size_px):
+            with reader as masks:
+                mask = masks.read(frame - self.offsets[name])
+            if mask is not None:
+                y, x = np.nonzero(mask > 127)
+                seen.append(np.column_stack([x, y]))
+        if not any(map(len, seen)):
+            return None
+        # Specks far from the teeth do not count.
+        low, high = np.percentile(np.vstack(seen), (_SPECKS_PERCENT, 100 - _SPECKS_PERCENT), axis=0)
+        return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+
+    def poses_of_picks(self, picks: Bootstrap) -> tuple[tuple[Array, Array], list[str]]:
+        """Return the poses that agree with picks, and the names of those that do not fit."""
+        from jawusd.tracking.initialization.bootstrap import pose_from_picks
+
+        poses, wrong = [], []
+        for arch, mesh in self.scans.items():
+            pose, bad = pose_from_picks(getattr(picks, arch), mesh.vertices, self.cameras, arch)
+            poses.append(pose)
+            wrong += [f"{arch[0].upper()}{number}" for number in bad]
+        return (poses[0], poses[1]), wrong
