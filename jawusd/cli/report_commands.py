@@ -69,40 +69,28 @@ def report(
     """Write the report of a finished build again, or of a solve; or repeat the paper's experiments on a take."""
     options = trajectory_options(columns, length_unit, invert, rest_frame, group)
     if not experiments:
-        if source.suffix == ".npz":
-            _report_solve(source, capture, out or source.with_suffix(".html"), force, allow_outside, as_json)
-            return
-        if not source.is_dir():
-            raise typer.BadParameter("poses have no report: add --experiments for the paper's experiments on them.")
-        _report_build(source, capture, allow_outside, as_json)
+        _report_found(source, capture, out, force, allow_outside, as_json)
         return
     if out is None and not source.is_dir():
         raise typer.BadParameter("name the folder of the figures with -o.", param_hint="--out")
+    from jawusd.pipeline import report as stage
     from jawusd.pipeline.fit import read_motion
     from jawusd.pipeline.prepare import naming_file, subject_of_build
-    from jawusd.pipeline.report import (
-        do_experiments,
-        draw_experiments,
-        experiment_files,
-        fitted_poses,
-        is_build,
-        report_build,
-    )
 
     folder = out or source / "experiments"
-    for path in experiment_files(folder):
+    for path in stage.experiment_files(folder):
         refuse_existing(path, force)
-    poses = fitted_poses(source) if source.is_dir() else source
+    poses = stage.fitted_poses(source) if source.is_dir() else source
     motion = read_motion(poses, options)
     if source.is_dir() and not any((capture, upper_teeth, lower_teeth, mandible, landmarks)):
         subject = subject_of_build(source)
     else:
         subject = subject_given(source.stem, capture, upper_teeth, lower_teeth, mandible, landmarks, allow_outside)
     with progress() as tell, naming_file(poses):
-        found = do_experiments(subject, motion, starts, tell)
-        files = draw_experiments(found, folder)
-        if is_build(source):
-            files.append(report_build(source, capture, tell, found, allow_outside=allow_outside))
+        found = stage.do_experiments(subject, motion, starts, tell)
+        files = stage.draw_experiments(found, folder)
+        if stage.is_build(source):
+            files.append(stage.report_build(source, capture, tell, found, allow_outside=allow_outside))
     _emit_experiments(found, files, as_json)
 
 
@@ -120,24 +108,25 @@ def _emit_experiments(found: Experiments, files: list[Path], as_json: bool) -> N
     emit(summary, as_json, lambda: [*experiment_lines(found), *map(str, files)])
 
 
-def _report_build(folder: Path, capture: Path | None, allow_outside: bool, as_json: bool) -> None:
-    from jawusd.pipeline.report import report_build
-
-    with progress() as tell:
-        path = report_build(folder, capture, tell, allow_outside=allow_outside)
-    emit({"file": str(path), "bytes": path.stat().st_size}, as_json, lambda: [str(path)])
-
-
-def _report_solve(
-    tracks: Path, capture: Path | None, page: Path, force: bool, allow_outside: bool, as_json: bool
+def _report_found(
+    source: Path, capture: Path | None, out: Path | None, force: bool, allow_outside: bool, as_json: bool
 ) -> None:
+    """Write the report of what a solve or a build left behind."""
+    from jawusd.pipeline.report import report_build
     from jawusd.pipeline.solve_report import check_page, report_solve
 
-    check_page(page)
-    refuse_existing(page, force)
-    with progress() as tell:
-        report_solve(tracks, capture, page, tell, allow_outside=allow_outside)
-    emit({"file": str(page), "bytes": page.stat().st_size}, as_json, lambda: [str(page)])
+    if source.suffix == ".npz":
+        page = out or source.with_suffix(".html")
+        check_page(page)
+        refuse_existing(page, force)
+        with progress() as tell:
+            path = report_solve(source, capture, page, tell, allow_outside=allow_outside)
+    elif source.is_dir():
+        with progress() as tell:
+            path = report_build(source, capture, tell, allow_outside=allow_outside)
+    else:
+        raise typer.BadParameter("poses have no report: add --experiments for the paper's experiments on them.")
+    emit({"file": str(path), "bytes": path.stat().st_size}, as_json, lambda: [str(path)])
 
 
 def view(

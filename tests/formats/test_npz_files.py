@@ -2,6 +2,7 @@
 
 import json
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from example_tracks import make_tracks
 from jawusd.errors import FormatError, UnitsError, VersionError
 from jawusd.formats.atomic import write_npz_atomic
 from jawusd.formats.model import JawModel, load_model, save_model
+from jawusd.formats.solved import SolvedJaw
 from jawusd.formats.tracks import LostReason, TrackStatus, is_tracks, load_tracks, save_tracks
 
 
@@ -50,6 +52,36 @@ def test_reasons_of_losses_are_kept_and_may_be_missing(tmp_path):
     rewrite(tmp_path / "t.npz", lambda arrays: arrays["lost_reason"].fill(77))
     with pytest.raises(FormatError, match="lost_reason"):
         load_tracks(tmp_path / "t.npz")
+
+
+def test_a_solve_is_kept_and_checked(tmp_path):
+    tracks, path = make_tracks(), tmp_path / "t.npz"
+    count = len(tracks.frames)
+    save_tracks(path, tracks)
+    assert load_tracks(path).solved is None
+    rng = np.random.default_rng(0)
+    d, sigma, margin = rng.normal(size=(count, 3)), rng.random((count, 3)), rng.normal(size=count)
+    state, valid = np.arange(count, dtype=np.int8) % 3, np.arange(count) > 1
+    tracks.solved = SolvedJaw(d, sigma, margin, state, valid)
+    save_tracks(path, tracks)
+    again = load_tracks(path).solved
+    for name in ("d", "sigma_mm", "margin_mm", "state", "valid"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(tracks.solved, name))
+        assert getattr(again, name).dtype == getattr(tracks.solved, name).dtype
+    faults = {
+        "solved_state": lambda arrays: arrays["solved_state"].fill(9),
+        "solved_sigma_mm": lambda arrays: arrays.pop("solved_sigma_mm"),
+        "solved_margin_mm": lambda arrays: arrays["solved_margin_mm"].fill(np.nan),
+        "solved_d": lambda arrays: arrays.update(solved_d=arrays["solved_d"][:-1]),
+    }
+    for name, fault in faults.items():
+        save_tracks(path, tracks)
+        rewrite(path, fault)
+        with pytest.raises(FormatError, match=name):
+            load_tracks(path)
+    tracks.solved = replace(tracks.solved, margin_mm=margin[:-1])
+    with pytest.raises(ValueError, match="margin_mm"):
+        save_tracks(path, tracks)
 
 
 def rewrite(path, change):

@@ -2,13 +2,14 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from bumpy_teeth import jaw_poses
 from small_take import CAMERAS, LANDMARKS, MESHES, OFFSETS, errors_mm, make_capture, track, write_masks
 
 from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, load_tracks, save_tracks
-from jawusd.geometry import rigidity_defect, se3_exp, se3_inverse, se3_log
+from jawusd.geometry import Camera, rigidity_defect, se3_exp, se3_inverse, se3_log
 from jawusd.tracking import TrackingConfig, track_capture
 from jawusd.tracking.contour.equations import OutlineSums, Solution
 from jawusd.tracking.contour.frame_record import FrameRecord
@@ -275,3 +276,16 @@ def test_frames_lost_to_a_late_camera_are_found_once_it_is_known(tmp_path):
         tracks = track(capture)
     assert tracks.status[10].tolist() == [TRACKED, RECOVERED]
     assert errors_mm(tracks, raw=True)[10].max() < 0.1
+
+
+@pytest.mark.parametrize("coefficients", [0, 4, 5, 8])
+def test_a_focal_length_that_was_found_bends_pictures_pixel_by_pixel_as_before(coefficients):
+    """A longer lens shows a point where the calibrated one shows it spread by the factor, as OpenCV draws it."""
+    rng = np.random.default_rng(coefficients)
+    lens = rng.normal(size=coefficients) * 0.05
+    camera = Camera("a", (640, 480), np.array([[700.0, 0, 330], [0, 690, 250], [0, 0, 1]]), lens, np.eye(4))
+    (longer,) = corrected_cameras([camera], {"focal": {"a": [1.08, 0.01]}})
+    points = rng.uniform([-40, -30, 180], [40, 30, 260], (50, 3))
+    spread = points * [1.08, 1.08, 1.0]
+    seen = cv2.projectPoints(spread, np.zeros(3), np.zeros(3), camera.K, lens if coefficients else None)[0]
+    np.testing.assert_allclose(longer.project(points), seen.reshape(-1, 2), atol=1e-9)

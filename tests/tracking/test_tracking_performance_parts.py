@@ -131,6 +131,18 @@ def test_tracks_hold_the_poses_and_what_was_not_seen(jaw, performance, tmp_path)
     assert tracks.tracked().all() and tracks.prior_aided.all() and (tracks.sigma_mm > 0).all()
     assert (tracks.status == LOST).sum() == 1 and tracks.status[4, 1] == LOST
     assert np.isnan(tracks.raw_T_upper_lower[4]).all() and np.isfinite(tracks.raw_T_world_upper[4]).all()
+    solved = tracks.solved
+    np.testing.assert_array_equal(solved.d, performance.d)
+    np.testing.assert_array_equal(solved.sigma_mm, performance.sigma_d)
+    np.testing.assert_array_equal(solved.state, performance.state)
+    assert solved.valid.tolist() == [word == "valid" for word in performance.verdict] and not solved.valid.all()
+
+
+@pytest.mark.parametrize("applied", [True, False])
+def test_tracks_say_whether_the_lower_scan_was_moved(jaw, performance, applied):
+    T = make_transform(np.eye(3), [0.0, 0.3, 0.0]).tolist()
+    moved = JawRig(jaw.arrays, {**jaw.meta, "registration": {"applied": applied, "T": T}})
+    assert ("registration" in tracks_of(performance, moved).meta) == applied
 
 
 def test_the_table_is_read_as_parameters(performance, tmp_path):

@@ -35,8 +35,9 @@ def tracks_of(performance: Performance, jaw: JawRig) -> Tracks:
     own = landmark_sigmas(relative, relative_covariance, jaw.landmarks)
     meta = TracksMeta(solver="performance", margin_limit_mm=float(jaw.limits.margin_mm))
     meta.update(_known_notes(p))
-    if "registration" in jaw.meta:  # the lower scan is posed as the rig has it
-        meta["registration"] = cast(Registration, jaw.meta["registration"])
+    moved = jaw.meta.get("registration")
+    if isinstance(moved, dict) and moved.get("applied"):  # the lower scan is posed as the rig has it
+        meta["registration"] = cast(Registration, moved)
     count, cameras = len(p.frames), len(p.camera_names)
     raw = {"upper": head.copy(), "lower": lower.copy(), "relative": relative.copy()}
     raw["upper"][~p.found[:, 0]], raw["lower"][~p.found[:, 1]], raw["relative"][~p.found.all(1)] = (
