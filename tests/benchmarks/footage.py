@@ -2,7 +2,7 @@
 
     python tests/benchmarks/footage.py CAPTURE TRACKS
 
-TRACKS is the folder of a build of that capture. Times are the processor's, and the clock's beside them.
+TRACKS is the folder of a build of that capture, or tracks. Times are the processor's, and the clock's beside them.
 """
 
 import sys
@@ -38,7 +38,12 @@ def main(capture, tracks):
         image = viewed.picture(name, frame, viewed.tracked_poses(frame), look)
         _encode_image_binary(image, "jpeg", jpeg_quality=88)
 
+    def show_all(frame):
+        image = viewed.wall(frame, viewed.tracked_poses(frame), "outlines")
+        _encode_image_binary(image, "jpeg", jpeg_quality=88)
+
     show(middle)
+    show_all(middle)
     rng = np.random.default_rng(0)
     rows = {
         "next frame": range(middle + 1, middle + 1 + STEPS),
@@ -47,8 +52,12 @@ def main(capture, tracks):
         "jump": rng.integers(first, last, STEPS).tolist(),
     }
     print(f"{viewed.name}, {name}, {viewed.sizes_px[name]} px  [ms]   median  p95  max | clock median  p95  max")
-    for title, frames in rows.items():
-        ms = measured(show, frames)
+    measures = [(title, show, frames) for title, frames in rows.items()]
+    last_read = rows["next frame"][-1]
+    measures.append((f"next frame, all {len(viewed.sizes_px)} cameras", show_all, range(last_read, last_read + STEPS)))
+    show_all(last_read - 1)
+    for title, action, frames in measures:
+        ms = measured(action, frames)
         numbers = [f(ms[:, k]) for k in (0, 1) for f in (np.median, lambda v: np.percentile(v, 95), np.max)]
         print(f"{title:28s}" + "".join(f"{number:8.1f}" for number in numbers))
 

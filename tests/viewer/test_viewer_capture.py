@@ -10,6 +10,7 @@ import pytest
 from browser_tab import until
 from package_copy import ROOT
 from quiet_capture_page import QuietCapturePage
+from short_example import write_short
 from typer.testing import CliRunner
 
 from jawusd.cli.main import app
@@ -302,3 +303,14 @@ def test_bad_captures_and_foreign_tracks_are_clear_errors(copy, tmp_path):
         viewed_capture(path, None, quiet)
     result = CliRunner().invoke(app, ["view", str(tmp_path), "--tracks", str(tracks)])
     assert result.exit_code == 2 and "--tracks belongs to a capture" in result.output
+
+
+def test_a_capture_of_masks_alone_is_shown(tmp_path):
+    shown = viewed_capture(write_short(tmp_path, 12), None, quiet)
+    assert shown.frames == (20, 31) and list(shown.sizes_px) == ["cam0", "cam1", "cam2"]
+    picture = shown.picture("cam0", 22, None, "outlines")
+    y, x = np.nonzero(picture[..., 0] > 100)
+    x0, y0, x1, y1 = shown.teeth_region("cam0", 22)
+    assert x.min() < x0 + 2 and x.max() > x1 - 2 and y.min() < y0 + 2 and y.max() > y1 - 2
+    assert (picture == picture[..., :1]).all()
+    assert shown.wall(22, None, "outlines").shape == (shown.wall_px[1], shown.wall_px[0], 3)
