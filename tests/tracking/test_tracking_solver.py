@@ -27,7 +27,6 @@ from jawusd.tracking.contour.samples import (
     U,
     V,
     contour_samples,
-    gum_distances_px,
 )
 from jawusd.tracking.contour.scan import ARCHES, prepare_scan
 from jawusd.tracking.contour.solver import ContourSolver
@@ -58,9 +57,7 @@ def _samples(r, pose, camera):
     draw_depth_labels(points, SCANS[r].gum_faces, 0, 0, False, depth, labels, GUM)
     eye = transform_point(se3_inverse(pose), camera.centre_world())
     matrix = camera.projection_matrix() @ pose
-    distances = np.empty(labels.shape, np.float32)
-    gum_distances_px(labels, distances)
-    return contour_samples(SCANS[r], matrix, eye, labels, depth, distances, 3.0, 1.5)[0], labels
+    return contour_samples(SCANS[r], matrix, eye, labels, depth, 3.0, 1.5)[0], labels
 
 
 def test_samples_lie_on_the_outline_of_the_rendered_crowns():
@@ -122,13 +119,17 @@ def test_edges_across_the_contour_and_hidden_samples_are_left_out():
     assert np.isfinite(out[0])
 
 
-def test_gum_distances_agree_with_scipy():
-    labels = np.zeros((60, 80), np.uint8)
-    labels[20:24, 30:50], labels[40, 10], labels[5:30, 60:70] = GUM, GUM, CROWN
-    out = np.empty(labels.shape, np.float32)
-    gum_distances_px(labels, out)
-    exact = ndimage.distance_transform_edt(labels != GUM)
-    assert (out >= 0.9999 * exact).all() and (out <= 1.0825 * exact).all()
+def test_outlines_near_visible_gum_are_gum_line_as_scipy_measures_it():
+    camera, pose = CAMERAS[1], POSES[2, 0]
+    samples, labels = _samples(0, pose, camera)
+    to_gum_px = ndimage.distance_transform_edt(labels != GUM)
+    at = np.floor(samples[:, [U, V]] + 0.5).astype(int)
+    px_per_mm = camera.K[0, 0] / camera.depth(transform_point(pose, SCANS[0].centre))
+    far_mm = to_gum_px[at[:, 1], at[:, 0]] / px_per_mm
+    for distance_mm, share in ((far_mm > 1.05, 0.0), (far_mm < 0.5, 1.0)):
+        assert distance_mm.sum() > 20 and (samples[distance_mm, GUM_SHARE] == share).mean() > 0.99
+    between = samples[(far_mm > 0.6) & (far_mm < 0.95), GUM_SHARE]
+    assert ((between > 0) & (between < 1)).any()
 
 
 def test_normal_equations_agree_with_finite_differences():
@@ -251,9 +252,8 @@ def test_crowns_without_gum_have_their_gum_line_where_they_face_the_gum():
     up = SCANS[0].vertices[np.unique(SCANS[0].gum_faces)].mean(0) - SCANS[0].centre
     up /= np.linalg.norm(up)
     replace(SCANS[0], gum_faces=np.zeros((0, 3), np.int32)).draw(matrix, depth, labels)
-    far = np.full(labels.shape, np.inf, np.float32)
     eye = transform_point(se3_inverse(pose), camera.centre_world())
-    samples, _ = contour_samples(SCANS[0], matrix, eye, labels, depth, far, 3.0, 1.5, up)
+    samples, _ = contour_samples(SCANS[0], matrix, eye, labels, depth, 3.0, 1.5, up)
     moved = (
         camera.project(transform_points(pose, samples[:, :3] + 0.01 * up)) - samples[:, [U, V]]
     ) / 0.01  # px per mm towards the gum

@@ -32,7 +32,6 @@ def contour_samples(
     eye: Array,
     labels: NDArray[np.uint8],
     inverse_depth: NDArray[np.float32],
-    gum_distance_px: NDArray[np.float32],
     step_px: float,
     depth_tolerance_mm: float,
     towards_gum: Array | None = None,
@@ -46,7 +45,6 @@ def contour_samples(
         eye: camera centre in scan coordinates [mm], shape (3,).
         labels: what is seen at every pixel of the region: CROWN, GUM or 0, shape (h, w).
         inverse_depth: its inverse depth [1/mm], shape (h, w).
-        gum_distance_px: how far the nearest pixel lies that shows gum, shape (h, w).
         step_px: largest distance between samples.
         depth_tolerance_mm: how much nearer the surface just inside the contour may be before the contour counts as
             hidden behind it.
@@ -57,7 +55,7 @@ def contour_samples(
     px_per_mm = _px_per_mm(matrix, scan.centre)
     candidates = _silhouette(*scan_tables, eye, matrix, step_px, labels.shape)
     facing = np.zeros(2) if towards_gum is None else _picture_axes(matrix) @ towards_gum
-    silhouette = _visible(candidates, labels, inverse_depth, gum_distance_px, depth_tolerance_mm, px_per_mm, facing)
+    silhouette = _visible(candidates, labels, inverse_depth, depth_tolerance_mm, px_per_mm, facing)
     segments, towards_gum = scan.gingival_margin, scan.margin_directions
     margin = _gingival_margin(segments, towards_gum, matrix, labels, inverse_depth, depth_tolerance_mm)
     return np.concatenate([silhouette, margin]), len(silhouette)
@@ -179,7 +177,6 @@ def _visible(
     samples: Array,
     labels: NDArray[np.uint8],
     inverse_depth: NDArray[np.float32],
-    gum_distance_px: NDArray[np.float32],
     tolerance_mm: float,
     px_per_mm: float,
     facing_gum: Array,
@@ -202,7 +199,7 @@ def _visible(
             continue
         out[n] = sample
         if out[n, GUM_SHARE] == 0.0:
-            distance_mm = gum_distance_px[pixel_of(sample[V]), pixel_of(sample[U])] / px_per_mm
+            distance_mm = _gum_distance_px(labels, sample[U], sample[V], _GUM_FAR_MM * px_per_mm) / px_per_mm
             share = (_GUM_FAR_MM - distance_mm) / (_GUM_FAR_MM - _GUM_NEAR_MM)
             cosine = sample[NX] * facing_gum[0] + sample[NY] * facing_gum[1]
             share = max(share, (cosine - _LEAST_FACING) / (_FULL_FACING - _LEAST_FACING))
@@ -218,31 +215,18 @@ def _nearer(seen: float, own: float, tolerance_mm: float) -> bool:
     return seen * (1.0 - tolerance_mm * own) > own
 
 
-@numba.njit(nogil=True, cache=True)
-def gum_distances_px(labels: NDArray[np.uint8], out: NDArray[np.float32]) -> None:
-    """Write how far the nearest pixel lies that shows gum [px] for every pixel of a drawn scan, shape (h, w).
-
-    Off by 8 per cent at most (chamfer distance with steps 1 and 1.41; Borgefors 1986).
-    """
-    height, width = labels.shape
-    for direction in (1, -1):
-        for y in range(height) if direction > 0 else range(height - 1, -1, -1):
-            for x in range(width) if direction > 0 else range(width - 1, -1, -1):
-                if direction > 0:
-                    best = np.float32(0.0) if labels[y, x] == GUM else np.float32(1e6)
-                else:
-                    best = out[y, x]
-                b = y - direction
-                a = x - direction
-                if 0 <= a < width:
-                    best = min(best, out[y, a] + np.float32(1.0))
-                if 0 <= b < height:
-                    best = min(best, out[b, x] + np.float32(1.0))
-                    if x > 0:
-                        best = min(best, out[b, x - 1] + np.float32(1.4142))
-                    if x < width - 1:
-                        best = min(best, out[b, x + 1] + np.float32(1.4142))
-                out[y, x] = best
+@numba.njit(nogil=True, cache=True, inline="always")
+def _gum_distance_px(labels: NDArray[np.uint8], u: float, v: float, reach_px: float) -> float:
+    """Return how far the nearest pixel lies that shows gum [px]; the reach if none is nearer."""
+    i = pixel_of(u)
+    j = pixel_of(v)
+    n = int(reach_px)
+    best = reach_px * reach_px
+    for y in range(max(0, j - n), min(labels.shape[0], j + n + 1)):
+        for x in range(max(0, i - n), min(labels.shape[1], i + n + 1)):
+            if labels[y, x] == GUM:
+                best = min(best, float((x - i) ** 2 + (y - j) ** 2))
+    return np.sqrt(best)
 
 
 @numba.njit(nogil=True, cache=True)

@@ -23,7 +23,7 @@ from jawusd.tracking.contour.equations import (
     StartTerm,
     motion_about,
 )
-from jawusd.tracking.contour.samples import HABITS, LENGTH, contour_samples, gum_distances_px
+from jawusd.tracking.contour.samples import HABITS, LENGTH, contour_samples
 from jawusd.tracking.contour.scan import ARCHES, Scan
 from jawusd.tracking.contour.views import Drawn, View, present_masks
 
@@ -182,7 +182,7 @@ class ContourSolver:
     ) -> _Match:
         config, scan, depths = self.config, self.scans[r], rendering.depths[c]
         eye = pose[:3, :3].T @ (view.eye - pose[:3, 3])
-        pictures = (rendering.labels[c][r], depths[r], rendering.gum_distances[c][r])
+        pictures = (rendering.labels[c][r], depths[r])
         limits = (config.sample_step_px, config.depth_tolerance_mm)
         gum = self._towards_gum[r]
         samples, silhouettes = contour_samples(scan, view.matrix @ pose, eye, *pictures, *limits, gum)
@@ -233,7 +233,6 @@ class Rendering:
         shapes = [view.masks.shape for view in views]
         self.labels = [np.zeros(shape, np.uint8) for shape in shapes]
         self.depths = [np.zeros(shape, np.float32) for shape in shapes]
-        self.gum_distances = [np.full(shape, np.inf, np.float32) for shape in shapes]
 
     def update(self, poses: Array) -> None:
         """Draw the scans whose projection has moved by more than the allowed pixels."""
@@ -257,10 +256,7 @@ class Rendering:
         view, labels, depth = self._views[c], self.labels[c][r], self.depths[c][r]
         labels[:] = 0
         depth[:] = 0
-        scan = self._solver.scans[r]
-        scan.draw(view.matrix @ view.T_delay[r] @ pose, depth, labels)
-        if len(scan.gum_faces):
-            gum_distances_px(labels, self.gum_distances[c][r])
+        self._solver.scans[r].draw(view.matrix @ view.T_delay[r] @ pose, depth, labels)
         self._drawn[r, c] = pose.copy()
 
 
