@@ -28,7 +28,8 @@ if TYPE_CHECKING:
     from jawusd.segmentation.footage import ColourFootage, Pictures
     from jawusd.segmentation.picture import PictureFrame
     from jawusd.tracking.contour.scan import Scan
-    from jawusd.tracking.region.tracker import Cut, Picture, RegionPose
+    from jawusd.tracking.region.learned import Picture
+    from jawusd.tracking.region.tracker import Cut, RegionPose
 
 # Distance of the jaw by masks and by colours from which one is wrong [mm]: right ones of three takes were at most 0.9
 # apart. Shares of such frames, or lost ones, from which a take is doubtful, and not usable.
@@ -118,7 +119,7 @@ def _follow_back(back: range, again: Iterator[RegionPose], known: dict[int, Regi
 
 
 def _cut(views: Mapping[str, PictureFrame], scans: Sequence[Scan], pictures: Pictures) -> Cut:
-    from jawusd.tracking.region.tracker import Picture
+    from jawusd.tracking.region.learned import Picture
 
     def one(name: str, around: Array) -> Picture | None:
         image = pictures[name]

@@ -5,26 +5,20 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
-from copy import deepcopy
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.cluster.vq import kmeans2
-from scipy.ndimage import distance_transform_edt
 
 from jawusd.geometry import Camera, se3_exp, se3_inverse
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.equations import Solution, translation
 from jawusd.tracking.contour.quality import matched_px, residual_px, score_px, twist_covariance
-from jawusd.tracking.contour.scan import ARCHES, CROWN, GUM, Scan, probe_points
+from jawusd.tracking.contour.scan import ARCHES, Scan, probe_points
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import View
-from jawusd.tracking.region.colours import PATCHES, Areas, CameraColours, colour_bins
 from jawusd.tracking.region.condyles import CondyleTerm
-from jawusd.tracking.region.view import Counts, RegionView
+from jawusd.tracking.region.learned import FIRST_RATES, RATES, LearnedColours, Picture
 from jawusd.tracking.sequence.history import MotionPredictor
 
 # Gates of an alignment, of the brief trial of a start, distance of contour samples, motion that redraws scans [px].
@@ -41,17 +35,6 @@ _OPENED, _ASIDE = (
     (-6.0, -4.5, -3.0, -1.5, 1.5, 3.0, 4.5, 6.0),
     (-4.0, -2.0, 2.0, 4.0),
 )  # turns of the jaw tried [degrees]
-_RATES, _FIRST_RATES = (0.1, 0.2), (0.5, 0.5)  # at which colours of teeth and of surroundings are taken up
-_GUM_RATE, _MOST_GUM_PX = 0.1, 2.0  # at which the place of the gum line is taken up [-], and its bound
-# Areas that teach the first colours [px]: inside crowns, outside of them, ring around them, beyond all.
-_INSIDE_PX, _OUTSIDE_PX, _RING_PX, _BEYOND_PX = 2.0, 3.0, 30.0, 4.0
-
-
-class Picture(NamedTuple):
-    """Hold a part of an undistorted picture around the teeth."""
-
-    camera: Camera  # the pinhole camera of the part
-    rgb: NDArray[np.uint8]  # shape (h, w, 3)
 
 
 #: Cuts the pictures of an instant, one per camera or None, around T_world_upper and T_world_lower, shape (2, 4, 4).
@@ -90,25 +73,19 @@ class RegionTracker:
         config = replace(config or TrackingConfig(), sample_step_px=_SAMPLE_STEP_PX, redraw_px=_REDRAW_PX)
         self._solver = ContourSolver(scans, config, executor)
         self._least_px = config.least_matched_px
-        self._cameras = tuple(cameras)
         self._terms = (CondyleTerm(condyles, axes),)
         self._hinge = np.mean(condyles, axis=0)
-        # Seeded: the same scans give the same patches.
-        crowns = [scan.crown_vertices(3000) @ axes.T[:, [0, 2]] for scan in scans]
-        self._patches = np.stack([kmeans2(points, PATCHES, seed=1, minit="++")[0] for points in crowns])
         self._axes = axes
-        self._colours: list[CameraColours | None] = []
-        self._gum_px = np.zeros((2, len(cameras)))
+        self._colours = LearnedColours(scans, cameras, axes)
 
     def begin(self, cut: Cut, poses: Array) -> RegionPose:
         """Learn the colours of a first frame from poses of a few tenths of a millimetre; return better poses."""
-        pictures = cut(poses)
-        self._colours = [None if p is None else self._first_colours(p, poses) for p in pictures]
+        self._colours.begin(cut(poses), poses)
         for _ in range(_FIRST_ROUNDS):
             pictures = cut(poses)
-            solution = self._align(poses, self._views(pictures, poses))
+            solution = self._align(poses, self._colours.views(pictures, poses))
             poses = solution.poses
-            self._learn(pictures, poses, poses, _FIRST_RATES)
+            self._learn(pictures, poses, poses, FIRST_RATES)
         return RegionPose(poses, np.ones(2, bool), self._covariance(solution), float(score_px(solution).sum()))
 
     def follow(self, cuts: Iterator[Cut], poses: Array) -> Iterator[RegionPose]:
@@ -116,11 +93,11 @@ class RegionTracker:
 
         Every call starts from what is known after `begin`.
         """
-        known = deepcopy((self._colours, self._gum_px))
+        known, self._colours = self._colours, self._colours.copy()
         try:
             yield from self._followed(cuts, poses)
         finally:
-            self._colours, self._gum_px = known
+            self._colours = known
 
     def _followed(self, cuts: Iterator[Cut], poses: Array) -> Iterator[RegionPose]:
         motion = MotionPredictor(poses, probe_points(self._solver.scans))
@@ -129,14 +106,14 @@ class RegionTracker:
         for cut in cuts:
             starts = motion.starts()
             pictures = cut(starts[0])
-            views = self._views(pictures, poses)
+            views = self._colours.views(pictures, poses)
             solution = self._best(starts, views, poses, motion, usual)
             share = _share(solution)
             least = _LOST * np.median(usual, axis=0) if usual else np.zeros(2)
             found = (share >= least) & (matched_px(solution) >= self._least_px)
             before, poses = poses, np.where(found[:, None, None], solution.poses, motion.predict())
             if found.all():
-                self._learn(pictures, poses, before, _RATES)
+                self._learn(pictures, poses, before, RATES)
                 usual.append(share)
             seen = np.full(2, any(picture is not None for picture in pictures))
             motion.update(poses, found, seen)
@@ -184,59 +161,12 @@ class RegionTracker:
     def _align(self, start: Array, views: Sequence[View], gates_px: Sequence[float] = _GATES_PX) -> Solution:
         return self._solver.solve(start, views, gates_px, None, self._terms)
 
-    def _views(self, pictures: Sequence[Picture | None], before: Array, count: bool = False) -> list[View]:
-        """Return the views of an instant; `before` holds the poses of the frame before."""
-        out = []
-        for c, picture in enumerate(pictures):
-            colours = self._colours[c]
-            if picture is None or colours is None:
-                camera, shape = self._cameras[c], (1, 1)
-                edges = None
-            else:
-                camera, shape = picture.camera, picture.rgb.shape[:2]
-                matrix = camera.projection_matrix()
-                earlier = np.stack([matrix @ pose for pose in before])
-                counts = Counts.zeros() if count else None
-                bins = colour_bins(picture.rgb)
-                edges = RegionView(picture.rgb, bins, colours.ratio, self._patches, self._axes, earlier, counts)
-            habits = np.zeros((2, 3))
-            habits[:, 1] = self._gum_px[:, c]
-            empty, present = np.zeros((2, *shape), np.uint8), np.full(2, edges is not None)
-            view = View(camera.projection_matrix(), camera.centre_world(), empty, present, habits=habits, edges=edges)
-            out.append(view)
-        return out
-
     def _learn(
         self, pictures: Sequence[Picture | None], poses: Array, before: Array, rates: tuple[float, float]
     ) -> None:
-        """Take up the colours beside the borders found, and where the gum line is found against the scans'."""
-        views = self._views(pictures, before, count=True)
+        views = self._colours.views(pictures, before, count=True)
         self._solver.solve(poses, views, ())
-        for c, view in enumerate(views):
-            colours = self._colours[c]
-            picture = pictures[c]
-            if picture is not None and colours is None:  # its first picture
-                self._colours[c] = self._first_colours(picture, poses)
-            if not isinstance(view.edges, RegionView) or view.edges.counts is None or colours is None:
-                continue
-            counts = view.edges.counts
-            colours.learn(counts.tooth, counts.outside, rates)
-            known = np.isfinite(counts.gum_px)
-            step = _GUM_RATE * (counts.gum_px[known] - self._gum_px[known, c])
-            self._gum_px[known, c] = np.clip(self._gum_px[known, c] + step, -_MOST_GUM_PX, _MOST_GUM_PX)
-
-    def _first_colours(self, picture: Picture, poses: Array) -> CameraColours:
-        shape = picture.rgb.shape[:2]
-        labels = np.zeros((2, *shape), np.uint8)
-        for r in ARCHES:
-            matrix = picture.camera.projection_matrix() @ poses[r]
-            self._solver.scans[r].draw(matrix, np.zeros(shape, np.float32), labels[r])
-        crowns, gum = (labels == CROWN).any(0), (labels == GUM).any(0)
-        to_crown, to_any = (distance_transform_edt(~area) for area in (crowns, crowns | gum))
-        inside = distance_transform_edt(crowns) > _INSIDE_PX
-        outside = to_crown > _OUTSIDE_PX
-        near = outside & (to_crown < _RING_PX)
-        return CameraColours(colour_bins(picture.rgb), Areas(inside, near, near & gum, to_any > _BEYOND_PX))
+        self._colours.learn(views, pictures, poses, rates)
 
 
 def _share(solution: Solution) -> Array:

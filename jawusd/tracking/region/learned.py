@@ -1,0 +1,125 @@
+"""What teeth and their surroundings look like in every camera, learned on the way, and the views that use it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import copy, deepcopy
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.cluster.vq import kmeans2
+from scipy.ndimage import distance_transform_edt
+
+from jawusd.geometry import Camera
+from jawusd.geometry.arrays import Array
+from jawusd.tracking.contour.scan import ARCHES, CROWN, GUM, Scan
+from jawusd.tracking.contour.views import View
+from jawusd.tracking.region.colours import PATCHES, Areas, CameraColours, colour_bins
+from jawusd.tracking.region.view import Counts, RegionView
+
+#: At which colours of teeth and of surroundings are taken up: usually, and on the first frame.
+RATES, FIRST_RATES = (0.1, 0.2), (0.5, 0.5)
+_GUM_RATE, _MOST_GUM_PX = 0.1, 2.0  # at which the place of the gum line is taken up [-], and its bound
+# Areas that teach the first colours [px]: inside crowns, outside of them, ring around them, beyond all.
+_INSIDE_PX, _OUTSIDE_PX, _RING_PX, _BEYOND_PX = 2.0, 3.0, 30.0, 4.0
+
+
+class Picture(NamedTuple):
+    """Hold a part of an undistorted picture around the teeth."""
+
+    camera: Camera  # the pinhole camera of the part
+    rgb: NDArray[np.uint8]  # shape (h, w, 3)
+
+
+class LearnedColours:
+    """Hold the colours of all cameras and how far gum lines are found from those of the scans."""
+
+    def __init__(self, scans: Sequence[Scan], cameras: Sequence[Camera], axes: Array) -> None:
+        """Know nothing yet.
+
+        Args:
+            scans: upper and lower, in one frame.
+            cameras: in the order of the pictures.
+            axes: rotation from scan to anatomical axes: left, up, front; shape (3, 3).
+        """
+        self._scans, self._cameras, self._axes = tuple(scans), tuple(cameras), axes
+        # Seeded: the same scans give the same patches.
+        crowns = [scan.crown_vertices(3000) @ axes.T[:, [0, 2]] for scan in scans]
+        self._patches = np.stack([kmeans2(points, PATCHES, seed=1, minit="++")[0] for points in crowns])
+        self._colours: list[CameraColours | None] = [None] * len(cameras)
+        self._gum_px = np.zeros((2, len(cameras)))
+
+    def copy(self) -> LearnedColours:
+        """Return a copy that learns on its own."""
+        out = copy(self)
+        out._colours, out._gum_px = deepcopy(self._colours), self._gum_px.copy()
+        return out
+
+    def begin(self, pictures: Sequence[Picture | None], poses: Array) -> None:
+        """Learn the colours of a first frame from T_world_upper and T_world_lower there, shape (2, 4, 4)."""
+        self._colours = [None if p is None else self._first_colours(p, poses) for p in pictures]
+
+    def views(self, pictures: Sequence[Picture | None], before: Array, *, count: bool = False) -> list[View]:
+        """Return the views of an instant.
+
+        Args:
+            pictures: one per camera.
+            before: T_world_upper and T_world_lower at the frame before, shape (2, 4, 4).
+            count: also collect what the borders found teach, for `learn`.
+        """
+        out = []
+        for c, picture in enumerate(pictures):
+            colours = self._colours[c]
+            if picture is None or colours is None:
+                camera, shape = self._cameras[c], (1, 1)
+                edges = None
+            else:
+                camera, shape = picture.camera, picture.rgb.shape[:2]
+                matrix = camera.projection_matrix()
+                earlier = np.stack([matrix @ pose for pose in before])
+                counts = Counts.zeros() if count else None
+                bins = colour_bins(picture.rgb)
+                edges = RegionView(picture.rgb, bins, colours.ratio, self._patches, self._axes, earlier, counts)
+            habits = np.zeros((2, 3))
+            habits[:, 1] = self._gum_px[:, c]
+            empty, present = np.zeros((2, *shape), np.uint8), np.full(2, edges is not None)
+            view = View(camera.projection_matrix(), camera.centre_world(), empty, present, habits=habits, edges=edges)
+            out.append(view)
+        return out
+
+    def learn(
+        self, views: Sequence[View], pictures: Sequence[Picture | None], poses: Array, rates: tuple[float, float]
+    ) -> None:
+        """Take up the colours beside the borders found, and where the gum line is found against the scans'.
+
+        Args:
+            views: of the pictures, with counts of one look at them.
+            pictures, poses: of this instant.
+            rates: weight of new tooth and of new outside colours, 0 .. 1.
+        """
+        for c, view in enumerate(views):
+            colours = self._colours[c]
+            picture = pictures[c]
+            if picture is not None and colours is None:  # its first picture
+                self._colours[c] = self._first_colours(picture, poses)
+            if not isinstance(view.edges, RegionView) or view.edges.counts is None or colours is None:
+                continue
+            counts = view.edges.counts
+            colours.learn(counts.tooth, counts.outside, rates)
+            known = np.isfinite(counts.gum_px)
+            step = _GUM_RATE * (counts.gum_px[known] - self._gum_px[known, c])
+            self._gum_px[known, c] = np.clip(self._gum_px[known, c] + step, -_MOST_GUM_PX, _MOST_GUM_PX)
+
+    def _first_colours(self, picture: Picture, poses: Array) -> CameraColours:
+        shape = picture.rgb.shape[:2]
+        labels = np.zeros((2, *shape), np.uint8)
+        for r in ARCHES:
+            matrix = picture.camera.projection_matrix() @ poses[r]
+            self._scans[r].draw(matrix, np.zeros(shape, np.float32), labels[r])
+        crowns, gum = (labels == CROWN).any(0), (labels == GUM).any(0)
+        to_crown, to_any = (distance_transform_edt(~area) for area in (crowns, crowns | gum))
+        inside = distance_transform_edt(crowns) > _INSIDE_PX
+        outside = to_crown > _OUTSIDE_PX
+        near = outside & (to_crown < _RING_PX)
+        return CameraColours(colour_bins(picture.rgb), Areas(inside, near, near & gum, to_any > _BEYOND_PX))
