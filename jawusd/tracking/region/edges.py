@@ -18,6 +18,8 @@ from jawusd.tracking.contour.scan import CROWN
 
 _MOST_STEPS = 10  # to either side of a sample
 _LEAST_CLEAR = 0.15  # share of the clear log ratio below which an edge is none
+_LEAST_BLUR_PX, _MOST_BLUR_PX, _GAMMA = 1.0, 10.0, 2.2  # of motion taken into account; of the pictures' code
+_SMOOTH_PX = 1.0  # half the width over which slopes are measured
 _CREASE_PX = 6.0  # farthest that creases are looked for
 
 
@@ -196,21 +198,24 @@ def sharpen(
     out: Array,
     clearness: Array,
 ) -> None:
-    """Move every border found to where the colour is half way between what lies inside and outside of it.
+    """Move every border found to where the colour changes most steeply from what lies inside to what lies outside.
+
+    Where it is half way between both is no measure of the edge: crowns darken towards it as they turn away from light.
 
     Args:
         contrast: least difference of both sides' mean colours [8-bit steps].
         reach_px: how far a border may move.
         blur_px: motion during the exposure along the normals, shape (n,): so wide is a blurred edge.
-        out, clearness: as `search_borders` writes them; borders without a place half way lose most of their weight.
+        out, clearness: as `search_borders` writes them; borders without a steepest place lose most of their weight.
     """
     inner = np.empty(3)
     outer = np.empty(3)
+    line = np.empty(8 * int(reach_px + _SMOOTH_PX + _MOST_BLUR_PX) + 8)
     for s in range(len(samples)):
         if not clearness[s] > 0:
             continue
         u, v, nx, ny, d = samples[s, U], samples[s, V], samples[s, NX], samples[s, NY], out[s]
-        wide = min(0.5 * blur_px[s], 10.0)
+        wide = min(0.5 * blur_px[s], _MOST_BLUR_PX)
         inner[:] = 0.0
         outer[:] = 0.0
         for q in range(3):
@@ -218,37 +223,52 @@ def sharpen(
             for c in range(3):
                 inner[c] += _channel(rgb, u + (d - t) * nx, v + (d - t) * ny, c) / 3
                 outer[c] += _channel(rgb, u + (d + t) * nx, v + (d + t) * ny, c) / 3
-        norm = ((inner - outer) ** 2).sum()
-        if norm < contrast * contrast:
+        if ((inner - outer) ** 2).sum() < contrast * contrast:
             continue
-        half = _half_way(inner.sum(), outer.sum(), blur_px[s])
-        best = np.inf
-        last = 0.0
-        reach = reach_px + wide
-        for q in range(int(4 * reach) + 1):
-            t = d - reach + 0.5 * q
-            p = -half
+        # Pictures of moving edges are ramps of light, not of its code: their middle is the steepest place of what is
+        # blurred as much again.
+        power = _GAMMA if blur_px[s] > _LEAST_BLUR_PX else 1.0
+        norm = 0.0
+        for c in range(3):
+            inner[c], outer[c] = (inner[c] / 255) ** power, (outer[c] / 255) ** power
+            norm += (inner[c] - outer[c]) ** 2
+        arm = int(2 * (_SMOOTH_PX + wide)) + 1
+        steps = int(2 * (reach_px + wide))
+        for q in range(2 * (steps + arm) + 1):
+            t = d + 0.5 * (q - steps - arm)
+            p = 0.0
             for c in range(3):
-                p += (_channel(rgb, u + t * nx, v + t * ny, c) - outer[c]) * (inner[c] - outer[c]) / norm
-            if q > 0 and last > 0 >= p:
-                place = t - 0.5 + 0.5 * last / (last - p)
-                if abs(place - d) < abs(best - d):
-                    best = place
-            last = p
-        if best < np.inf:
-            out[s] = best
-        else:
+                value = _channel(rgb, u + t * nx, v + t * ny, c) / 255
+                p += ((value if power == 1.0 else value**power) - outer[c]) * (inner[c] - outer[c])
+            line[q] = p / norm
+        place = _steepest(line, steps, arm)
+        if np.isnan(place):
             clearness[s] *= 0.3
+        else:
+            out[s] = d + 0.5 * place
 
 
 @numba.njit(nogil=True, cache=True, inline="always")
-def _half_way(inside: float, outside: float, blur_px: float) -> float:
-    """Return the share of the inner colour at the edge: 1/2, but light, not its code, adds up during the exposure."""
-    if blur_px <= 1 or abs(inside - outside) <= 30:
-        return 0.5
-    light = 0.5 * ((inside / 765) ** 2.2 + (outside / 765) ** 2.2)
-    share = (765 * light ** (1 / 2.2) - outside) / (inside - outside)
-    return 0.5 + (min(max(share, 0.3), 0.85) - 0.5) * min(1.0, (blur_px - 1) / 4)
+def _steepest(line: Array, steps: int, arm: int) -> float:
+    """Return where a line falls most steeply, in samples from its middle; NaN if that is at an end or nowhere.
+
+    Args:
+        line: 2 (steps + arm) + 1 samples.
+        steps: of the search to either side.
+        arm: samples to either side whose difference, weighed linearly, is the slope.
+    """
+    before, slope = np.nan, np.nan
+    best, place = 0.0, np.nan
+    for k in range(2 * steps + 1):
+        after = 0.0
+        for i in range(1, arm + 1):
+            after += (line[k + arm - i] - line[k + arm + i]) * min(i, arm + 1 - i)
+        if k > 1 and slope > best and slope >= before and slope >= after:
+            best = slope
+            bend = before - 2 * slope + after
+            place = k - 1 - steps + (0.5 * (before - after) / bend if bend < 0 else 0.0)
+        before, slope = slope, after
+    return place
 
 
 @numba.njit(nogil=True, cache=True)
