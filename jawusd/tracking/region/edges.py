@@ -20,7 +20,8 @@ _MOST_STEPS = 10  # to either side of a sample
 _LEAST_CLEAR = 0.15  # share of the clear log ratio below which an edge is none
 _LEAST_BLUR_PX, _MOST_BLUR_PX, _GAMMA = 1.0, 10.0, 2.2  # of motion taken into account; of the pictures' code
 _SMOOTH_PX = 1.0  # half the width over which slopes are measured
-_CREASE_PX = 6.0  # farthest that creases are looked for
+# Farthest that creases are looked for, and their edges from the darkest place; half steps to measure a slope over.
+_CREASE_PX, _BESIDE_PX, _CREASE_ARM = 6.0, 3.0, 3
 
 
 @numba.njit(nogil=True, cache=True, inline="always")
@@ -283,14 +284,18 @@ def search_creases(
     out: Array,
     clearness: Array,
 ) -> None:
-    """Find edges of crowns right before those of the other arch: where the dark line between both begins.
+    """Find edges of crowns right before those of the other arch: where light changes most at the dark line between.
+
+    Either crown may be the darker one towards the line, but shading fades, and an edge is as sharp as the lens.
 
     Args:
-        contrast: least difference between the tooth and the line [8-bit steps].
+        contrast: least difference between the brighter tooth and the line [8-bit steps].
         weight: of such an edge [-].
         The others are those of `search_borders`; only samples without a border are looked at.
     """
     reach = min(reach_px, _CREASE_PX)
+    n = 2 * int(reach + _BESIDE_PX) + _CREASE_ARM
+    line = np.empty(2 * n + 1)
     for s in range(len(samples)):
         sample = samples[s]
         if clearness[s] != 0.0:  # found, or hidden
@@ -299,27 +304,41 @@ def search_creases(
         beyond_x, beyond_y = u + 3 * nx, v + 3 * ny
         if _label(other_labels, beyond_x, beyond_y) != CROWN or _label(own_labels, beyond_x, beyond_y) == CROWN:
             continue
-        low, at = np.inf, 0.0
-        for k in range(int(-2 * reach), int(2 * reach) + 1):
-            t = 0.5 * k
-            p = _light(rgb, u + t * nx, v + t * ny) + 0.5 * abs(t)
+        for k in range(2 * n + 1):
+            t = 0.5 * (k - n)
+            line[k] = _light(rgb, u + t * nx, v + t * ny)
+        low, at = np.inf, n
+        for k in range(n - int(2 * reach), n + int(2 * reach) + 1):
+            p = line[k] + 0.25 * abs(k - n)  # of two lines the nearer one
             if p < low:
-                low, at = p, t
-        low -= 0.5 * abs(at)
-        before = _light(rgb, u + (at - 4) * nx, v + (at - 4) * ny)
-        behind = _light(rgb, u + (at + 4) * nx, v + (at + 4) * ny)
-        if before - low < contrast or behind - low < 0.4 * contrast:
+                low, at = p, k
+        least = line[at]
+        before, behind = line[max(at - 8, 0)], line[min(at + 8, 2 * n)]
+        if max(before, behind) - least < contrast or min(before, behind) - least < 0.4 * contrast:
             continue
-        last = low
-        half = 0.5 * (before + low)
-        for k in range(1, 9):
-            t = at - 0.5 * k
-            p = _light(rgb, u + t * nx, v + t * ny)
-            if p >= half:
-                out[s] = t + 0.5 * (p - half) / max(p - last, 1e-6)
-                clearness[s] = weight
-                break
-            last = p
+        place = _sharpest(line, at, int(2 * _BESIDE_PX))
+        if not np.isnan(place) and abs(place - n) <= 2 * reach:
+            out[s] = 0.5 * (place - n)
+            clearness[s] = weight
+
+
+@numba.njit(nogil=True, cache=True, inline="always")
+def _sharpest(line: Array, at: int, steps: int) -> float:
+    """Return the index near another one at which a line changes most steeply, up or down; NaN at an end."""
+    best, place = 0.0, np.nan
+    before, slope = np.nan, np.nan
+    first = max(at - steps, _CREASE_ARM)
+    for k in range(first, min(at + steps, len(line) - 1 - _CREASE_ARM) + 1):
+        after = 0.0
+        for i in range(1, _CREASE_ARM + 1):
+            after += (line[k + i] - line[k - i]) * min(i, _CREASE_ARM + 1 - i)
+        after = abs(after)
+        if k > first + 1 and slope > best and slope >= before and slope >= after:
+            best = slope
+            bend = before - 2 * slope + after
+            place = k - 1 + (0.5 * (before - after) / bend if bend < 0 else 0.0)
+        before, slope = slope, after
+    return place
 
 
 @numba.njit(nogil=True, cache=True, inline="always")
