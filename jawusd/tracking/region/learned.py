@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy, deepcopy
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -60,13 +61,12 @@ class LearnedColours:
         """Learn the colours of a first frame from T_world_upper and T_world_lower there, shape (2, 4, 4)."""
         self._colours = [None if p is None else self._first_colours(p, poses) for p in pictures]
 
-    def views(self, pictures: Sequence[Picture | None], before: Array, *, count: bool = False) -> list[View]:
+    def views(self, pictures: Sequence[Picture | None], before: Array) -> list[View]:
         """Return the views of an instant.
 
         Args:
             pictures: one per camera.
             before: T_world_upper and T_world_lower at the frame before, shape (2, 4, 4).
-            count: also collect what the borders found teach, for `learn`.
         """
         out = []
         for c, picture in enumerate(pictures):
@@ -78,15 +78,23 @@ class LearnedColours:
                 camera, shape = picture.camera, picture.rgb.shape[:2]
                 matrix = camera.projection_matrix()
                 earlier = np.stack([matrix @ pose for pose in before])
-                counts = Counts.zeros() if count else None
                 bins = colour_bins(picture.rgb)
-                edges = RegionView(picture.rgb, bins, colours.ratio, self._patches, self._axes, earlier, counts)
+                edges = RegionView(picture.rgb, bins, colours.ratio, self._patches, self._axes, earlier)
             habits = np.zeros((2, 3))
             habits[:, 1] = self._gum_px[:, c]
             empty, present = np.zeros((2, *shape), np.uint8), np.full(2, edges is not None)
             view = View(camera.projection_matrix(), camera.centre_world(), empty, present, habits=habits, edges=edges)
             out.append(view)
         return out
+
+    def counting(self, views: Sequence[View]) -> list[View]:
+        """Return the same views, collecting what the borders found in them teach, for `learn`."""
+        return [
+            replace(view, edges=replace(view.edges, counts=Counts.zeros()))
+            if isinstance(view.edges, RegionView)
+            else view
+            for view in views
+        ]
 
     def learn(
         self, views: Sequence[View], pictures: Sequence[Picture | None], poses: Array, rates: tuple[float, float]

@@ -164,7 +164,7 @@ class RegionTracker:
     def _learn(
         self, pictures: Sequence[Picture | None], poses: Array, before: Array, rates: tuple[float, float]
     ) -> None:
-        views = self._colours.views(pictures, before, count=True)
+        views = self._colours.counting(self._colours.views(pictures, before))
         self._solver.solve(poses, views, ())
         self._colours.learn(views, pictures, poses, rates)
 

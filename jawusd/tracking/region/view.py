@@ -48,7 +48,7 @@ class RegionView:
     patches: Array  # middles of the patches of both arches, left and front [mm], shape (2, PATCHES, 2)
     axes: Array  # rotation from scan to anatomical axes, shape (3, 3)
     before: Array  # projections of both arches to this picture at the frame before, shape (2, 3, 4)
-    counts: Counts | None  # collects what is found
+    counts: Counts | None = None  # collects what is found
 
     def tables(self, samples: Array, count: int, arch: int, labels: NDArray[np.uint8]) -> NDArray[np.int64]:
         """Return the table of log ratios for each sample; the first `count` are silhouette, shape (n,)."""

@@ -1,0 +1,44 @@
+"""Where head and jaw are expected in the next frame."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jawusd.geometry.arrays import Mask
+from jawusd.tracking.performance.attempts import MOST_UNSURE
+from jawusd.tracking.performance.coordinates import LOCAL, Coordinates, Pose
+from jawusd.tracking.performance.instant import Expected
+
+# How far a prediction may be off, standard deviations [rad, mm, mm]: that of fast chewing at 24 frames a second. It
+# only has to keep finite what the pictures leave free; the smoother knows better.
+_MISS = np.r_[[0.01] * 3, [0.7] * 3, [0.7] * 3]
+_FIXED = np.r_[[0.05] * 6, [1.0] * 3]  # share of it with a head that does not move before the cameras
+_DAMPING = 0.8  # of the velocity: a stroke ends sooner than it goes on
+
+
+class Prediction:
+    """Extrapolate the motion of head and jaw with a damped velocity.
+
+    Attributes:
+        last: the pose of the last frame.
+        blind: frames since each arch was found, shape (2,).
+    """
+
+    def __init__(self, coordinates: Coordinates, begin: Pose, found: Mask, *, fixed_head: bool = False) -> None:
+        """Begin at rest with a frame on which some arches were found, shape (2,); a fixed head hardly moves."""
+        self._coordinates, self._miss = coordinates, _MISS * (_FIXED if fixed_head else 1.0)
+        self.last, self._velocity = begin, np.zeros(LOCAL)
+        self.blind = np.where(found, 0, 1)
+
+    def expected(self) -> Expected:
+        """Return the prediction, the less sure the longer the teeth were out of sight."""
+        sigma = self._miss * np.sqrt(1.0 + np.r_[[self.blind[0]] * 6, [self.blind.max()] * 3])
+        pose = self._coordinates.moved(self.last, _DAMPING * self._velocity)
+        return Expected(pose, np.minimum(sigma, MOST_UNSURE) ** -2.0)
+
+    def take(self, pose: Pose, found: Mask) -> None:
+        """Take up the next frame: where it is, and the arches that were found, shape (2,)."""
+        moved = self._coordinates.step(self.last, pose)
+        self._velocity = moved if found.all() and not self.blind.any() else np.zeros(LOCAL)
+        self.blind = np.where(found, 0, self.blind + 1)
+        self.last = pose
