@@ -50,7 +50,7 @@ class Occlusion:
 
 
 @dataclass(frozen=True, eq=False)
-class _Surface:
+class CrownSurface:
     """Hold pieces of a crown surface."""
 
     points: Array  # [mm], shape (N, 3)
@@ -61,7 +61,7 @@ class _Surface:
 
 def measure_occlusion(scans: Sequence[Scan], T_anatomical_scan: Array) -> Occlusion:
     """Measure how two scans meet that lie in one frame; `T_anatomical_scan` maps it to (left, up, front) axes."""
-    surfaces = [_surface(scan) for scan in scans]
+    surfaces = [crown_surface(scan) for scan in scans]
     crowns = [scan.crown_vertices(_SAMPLES) for scan in scans]
     normal = bite_normal(*crowns)
     left = np.cross(normal, T_anatomical_scan[2, :3])
@@ -86,7 +86,7 @@ def measure_occlusion(scans: Sequence[Scan], T_anatomical_scan: Array) -> Occlus
         same=float(np.mean(np.abs(signed[1]) < _SAME_MM)),
         opposite=float(max(part.mean() for part in stand)),
         aside_mm=float(np.linalg.norm((upper.mean(0) - lower.mean(0))[[0, 2]])),
-        turn_rad=_angle(_forward(upper[:, [0, 2]]), _forward(lower[:, [0, 2]])),
+        turn_rad=_angle(forward_of(upper[:, [0, 2]]), forward_of(lower[:, [0, 2]])),
         turned_over=turned_over,
         opens_towards=(_opens_towards(surfaces[0], -normal), _opens_towards(surfaces[1], normal)),
         midlines_mm=midlines_mm,
@@ -96,7 +96,7 @@ def measure_occlusion(scans: Sequence[Scan], T_anatomical_scan: Array) -> Occlus
     )
 
 
-def _surface(scan: Scan) -> _Surface:
+def crown_surface(scan: Scan) -> CrownSurface:
     """Return the crown faces as pieces of surface, at most about `_SAMPLES` of them."""
     border = np.zeros(len(scan.crown_faces), bool)
     border[scan.edges[scan.edges[:, 3] < 0, 2]] = True
@@ -104,10 +104,10 @@ def _surface(scan: Scan) -> _Surface:
     corners = scan.vertices[scan.crown_faces[chosen]]
     directed = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     areas = np.linalg.norm(directed, axis=1)
-    return _Surface(corners.mean(1), directed / np.maximum(areas, 1e-12)[:, None], areas, border[chosen])
+    return CrownSurface(corners.mean(1), directed / np.maximum(areas, 1e-12)[:, None], areas, border[chosen])
 
 
-def _signed_distances(these: _Surface, others: _Surface) -> Array:
+def _signed_distances(these: CrownSurface, others: CrownSurface) -> Array:
     """Return the distance of each piece from the other arch, negative inside of it [mm], shape (N,)."""
     distance, nearest = cKDTree(others.points).query(these.points)
     behind = np.einsum("ij,ij->i", these.points - others.points[nearest], others.normals[nearest])
@@ -143,7 +143,7 @@ def _beside(these: Array, others: Array) -> Array:
     return cKDTree(others[:, [0, 2]]).query(these[:, [0, 2]])[0] < _BESIDE_MM
 
 
-def _side_gap(signed: Sequence[Array], surfaces: Sequence[_Surface], aside: Array, middle: float) -> float:
+def _side_gap(signed: Sequence[Array], surfaces: Sequence[CrownSurface], aside: Array, middle: float) -> float:
     """Return the gap of the crowns on the side to which `aside` points [mm]; NaN where an arch has no teeth there."""
     gaps = []
     for distance, surface in zip(signed, surfaces, strict=True):
@@ -176,7 +176,7 @@ def _compare_widths(upper: Array, lower: Array) -> tuple[float, float]:
     return abs(float(np.median(apart))), float(np.median(ratios))
 
 
-def _forward(flat: Array) -> Array:
+def forward_of(flat: Array) -> Array:
     """Return the direction in which the horseshoe of points (N, 2) is closed, shape (2,).
 
     Of all directions it is the one against which both legs spread alike.
@@ -206,7 +206,7 @@ def _angle(a: Array, b: Array) -> float:
     return float(np.arccos(np.clip(a @ b, -1.0, 1.0)))
 
 
-def _turned_over(scan: Scan, surface: _Surface, towards: Array) -> bool | None:
+def _turned_over(scan: Scan, surface: CrownSurface, towards: Array) -> bool | None:
     """Return whether the crowns lie on that side of their gum that looks away from the other arch; None: no gum."""
     corners = scan.vertices[scan.gum_faces]
     areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
@@ -220,7 +220,7 @@ def _turned_over(scan: Scan, surface: _Surface, towards: Array) -> bool | None:
     return None if abs(along) < _GUM_BELOW_MM else along < 0
 
 
-def _opens_towards(surface: _Surface, towards: Array) -> bool:
+def _opens_towards(surface: CrownSurface, towards: Array) -> bool:
     """Return whether the open side of a surface faces the other arch.
 
     The directed area of an open surface points away from its opening, which is where crowns were cut from the gum.
