@@ -6,7 +6,15 @@ import sys
 
 import typer
 
-from jawusd.cli import build_commands, capture_commands, library_commands, report_commands, rig_commands, solve_commands
+from jawusd.cli import (
+    build_commands,
+    capture_commands,
+    library_commands,
+    photo_commands,
+    report_commands,
+    rig_commands,
+    solve_commands,
+)
 from jawusd.errors import JawusdError, explain_missing_packages
 
 app = typer.Typer(
@@ -29,6 +37,7 @@ for _command in (
     capture_commands.sync,
     capture_commands.segment,
     capture_commands.scans,
+    photo_commands.photos,
     rig_commands.info,
     rig_commands.pose,
     rig_commands.encode,

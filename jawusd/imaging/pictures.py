@@ -30,6 +30,12 @@ def read_picture(path: Path, flags: int) -> NDArray[np.uint8] | NDArray[np.uint1
         return None
 
 
+def read_gray(path: Path) -> NDArray[np.uint8] | None:
+    """Return a picture in 8-bit gray, shape (h, w), or None where the file is none that can be decoded."""
+    picture = read_picture(path, cv2.IMREAD_GRAYSCALE)
+    return None if picture is None else np.asarray(picture, np.uint8)
+
+
 def has_palette(path: Path) -> bool:
     """Tell whether a file is a PNG whose pixels are numbers of colours in a palette."""
     with open(path, "rb") as file:

@@ -14,7 +14,7 @@ from jawusd.tracking.initialization.occlusion import crown_surface
 
 # How far apart or into one another the nearest parts of two scanned rows are when the teeth are together [mm].
 _SIGMA_MM = 0.15
-_SHARE = 0.01  # of the lower crowns on a side: what touches there
+_SHARE = 0.04  # of the lower crowns on a side: what touches there
 _REACH_MM = 3.0  # farther inside, a point is past the base of a crown
 
 

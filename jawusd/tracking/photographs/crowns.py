@@ -54,7 +54,14 @@ class Outlines:
 
     def take(self, index: NDArray[np.int64]) -> Outlines:
         """Return some of the points, which may repeat."""
-        return Outlines(*(part[index] for part in (self.points, self.arch, self.tooth, self.pixels, self.normals, self.gum)))
+        return Outlines(
+            self.points[index],
+            self.arch[index],
+            self.tooth[index],
+            self.pixels[index],
+            self.normals[index],
+            self.gum[index],
+        )
 
 
 def split_teeth(scan: Scan, T_anatomical_scan: Array, arch: int) -> Crowns:
@@ -95,7 +102,9 @@ def _with_wall(scan: Scan, T_anatomical_scan: Array, to_gum: Array) -> Scan:
         feet.append(middle + to_gum * (low + _WALL_FROM * (high - low) - middle @ to_gum))
     wall = np.vstack([feet, np.array(feet) + _WALL_MM * to_gum])
     first, n = np.arange(len(feet) - 1), len(feet)
-    quads = np.vstack([np.column_stack([first, first + 1, first + n]), np.column_stack([first + 1, first + n + 1, first + n])])
+    quads = np.vstack(
+        [np.column_stack([first, first + 1, first + n]), np.column_stack([first + 1, first + n + 1, first + n])]
+    )
     vertices = np.vstack([scan.vertices, wall])
     gum = np.ascontiguousarray(quads + len(scan.vertices), np.int32)
     return replace(scan, vertices=vertices, vertices_single=vertices.astype(np.float32), gum_faces=gum)
@@ -155,7 +164,8 @@ def _ends(depth: NDArray[np.float32], labels: NDArray[np.uint8]) -> tuple[Array,
     right_is_near = depth[rows, columns + 1] > depth[rows, columns]
     # Gum in front has number 0: what ends there is the tooth behind it.
     right_is_near = np.where(labels[rows, columns] == 0, True, right_is_near & (labels[rows, columns + 1] > 0))
-    return columns + 0.5, rows.astype(float), (columns + right_is_near).astype(float), rows.astype(float)
+    row = rows.astype(np.float64)
+    return np.asarray(columns + 0.5, np.float64), row, (columns + right_is_near).astype(np.float64), row
 
 
 def _outward(tooth: NDArray[np.bool_], rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Array:

@@ -37,9 +37,7 @@ class Drawing:
     def mirrored(self) -> Drawing:
         """Return the drawing as seen in a mirror, left and right exchanged."""
         flip = np.array([-1.0, 1.0])
-        return Drawing(
-            self.name, self.pixels * flip + [self.size_px[0] - 1.0, 0.0], self.normals * flip, self.size_px
-        )
+        return Drawing(self.name, self.pixels * flip + [self.size_px[0] - 1.0, 0.0], self.normals * flip, self.size_px)
 
     def shrunk(self, factor: float) -> Drawing:
         """Return the drawing smaller by a factor, with fewer points."""

@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from jawusd.geometry import orthonormalise, transform_points
 from jawusd.geometry.arrays import Array
 from jawusd.tracking.contour.equations import motion_about
 
-#: Unknowns of a photograph: twist of the upper teeth about their centre [rad, mm], log focal length, distortion.
+#: Unknowns of a photograph: twist of the upper teeth about their centre [rad, mm], log focal length, distortion. With
+#: the focal length the distance changes so that the teeth stay as large: large steps of it are then harmless.
 UNKNOWNS = 8
 
 
@@ -25,11 +27,16 @@ class PhotoPose:
     def stepped(self, centre: Array, step: Array) -> PhotoPose:
         """Return the pose after a step (8,) of the unknowns; `centre` is that of the upper teeth, camera [mm]."""
         pose = orthonormalise(motion_about(centre, step[:6]) @ self.T_cam_upper)
+        pose[2, 3] += centre[2] * np.expm1(step[6])
         return PhotoPose(pose, self.focal_px * float(np.exp(step[6])), self.distortion + float(step[7]))
 
     def scaled(self, factor: float) -> PhotoPose:
         """Return the pose for the picture shrunk by a factor."""
         return replace(self, focal_px=self.focal_px * factor)
+
+    def opencv_k1(self, size_px: tuple[int, int]) -> float:
+        """Return the distortion as OpenCV's k1, of directions instead of half widths."""
+        return self.distortion * (2.0 * self.focal_px / size_px[0]) ** 2
 
     def camera_matrix(self, size_px: tuple[int, int]) -> Array:
         """Return the projection without distortion from camera [mm] to homogeneous px, shape (3, 3)."""
@@ -41,10 +48,13 @@ class PhotoPose:
         flat = self.focal_px * points[:, :2] / points[:, 2:]
         return flat * (1.0 + self.distortion * _radius2(flat, size_px))[:, None] + middle_of(size_px)
 
-    def slopes(self, points: Array, directions: Array, size_px: tuple[int, int]) -> tuple[Array, Array]:
+    def slopes(
+        self, points: Array, directions: Array, size_px: tuple[int, int], distance_mm: float
+    ) -> tuple[Array, Array]:
         """Return the derivative along image directions by the camera point (N, 3) [px/mm] and by the lens (N, 2).
 
-        The lens columns are log focal length and distortion. `directions` are unit vectors, shape (N, 2).
+        The lens columns are log focal length, with the distance of the teeth, and distortion. `directions` are unit
+        vectors, shape (N, 2).
         """
         flat = self.focal_px * points[:, :2] / points[:, 2:]
         r2 = _radius2(flat, size_px)
@@ -53,7 +63,8 @@ class PhotoPose:
         bent = directions * (1.0 + self.distortion * r2)[:, None]
         bent += flat * (2.0 * self.distortion * along / (0.5 * size_px[0]) ** 2)[:, None]
         by_point = np.column_stack([bent * self.focal_px, -(bent * flat).sum(1)]) / points[:, 2:]
-        return by_point, np.column_stack([(bent * flat).sum(1), along * r2])
+        by_focal = (bent * flat).sum(1) + by_point[:, 2] * distance_mm
+        return by_point, np.column_stack([by_focal, along * r2])
 
 
 def middle_of(size_px: tuple[int, int]) -> Array:
@@ -61,7 +72,7 @@ def middle_of(size_px: tuple[int, int]) -> Array:
     return 0.5 * (np.array(size_px, np.float64) - 1.0)
 
 
-def to_camera(pose: PhotoPose, T_upper_lower: Array, points: Array, arch: Array) -> tuple[Array, Array]:
+def to_camera(pose: PhotoPose, T_upper_lower: Array, points: Array, arch: NDArray[np.int64]) -> tuple[Array, Array]:
     """Return scan points (N, 3) of both arches in upper scan and in camera coordinates [mm], shape (N, 3) each."""
     in_upper = np.where(arch[:, None] == 1, transform_points(T_upper_lower, points), points)
     return in_upper, transform_points(pose.T_cam_upper, in_upper)

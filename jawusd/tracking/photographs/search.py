@@ -50,6 +50,11 @@ class UsualBite:
     T_anatomical_lower: Array  # shape (4, 4)
 
     @property
+    def frames(self) -> tuple[Array, Array]:
+        """Return both frames, upper and lower."""
+        return self.T_anatomical_upper, self.T_anatomical_lower
+
+    @property
     def T_upper_lower(self) -> Array:
         """Return the bite, shape (4, 4)."""
         return se3_inverse(self.T_anatomical_upper) @ self.T_anatomical_lower
@@ -95,33 +100,41 @@ def _row_frame(scan: Scan, arch: int, side: float) -> Array:
 
 
 def searched(
-    drawing: Drawing, crowns: Sequence[Crowns], bite: UsualBite, count: int
+    drawing: Drawing, crowns: Sequence[Crowns], usual: UsualBite, T_upper_lower: Array, count: int
 ) -> list[Candidate]:
-    """Return the most promising views of both rows, best first.
+    """Return the most promising views of both rows, at most one for each direction, best first.
 
     Args:
         drawing: the lines of the photograph.
         crowns: upper and lower, thin enough to be drawn thousands of times.
-        bite: the bite to search with.
-        count: how many candidates to return.
+        usual: says where left, up and front are.
+        T_upper_lower: the bite to search with, shape (4, 4).
+        count: how many candidates to return of each handedness.
     """
     size = next_fast_len(int(1.3 * _PX_PER_MM * _WIDTHS_MM.max()), real=True)
     drawn = list(_drawn_spectra(drawing, size))
-    found = []
+    found: list[Candidate] = []
     for turn in product(_YAW, _PITCH, _ROLL):
-        base = make_transform(_facing(turn), np.zeros(3)) @ make_transform(np.eye(3), _FRONT_MM) @ bite.T_anatomical_upper
+        base = (
+            make_transform(_facing(turn), np.zeros(3)) @ make_transform(np.eye(3), _FRONT_MM) @ usual.T_anatomical_upper
+        )
         base[2, 3] += _DISTANCE_MM
-        spectra = _seen_spectra(crowns, base, bite.T_upper_lower, size)
+        spectra = _seen_spectra(crowns, base, T_upper_lower, size)
+        best: dict[bool, Candidate] = {}
         for width_mm, mirrored, spectrum, total in drawn:
             overlap = irfft2((spectrum * spectra.conj()).sum(0), (size, size))
+            share = float(overlap.max()) / total
+            if mirrored in best and share <= best[mirrored].share:
+                continue
             row, column = np.unravel_index(int(overlap.argmax()), overlap.shape)
             # Shifts of the outlines against the middle of the drawn picture, as places of the teeth.
             shift = [(k + size // 2) % size - size // 2 for k in (column, row)]
             pose = base.copy()
             pose[:2, 3] += np.array(shift) / _PX_PER_MM
-            focal = drawing.size_px[0] / width_mm * _DISTANCE_MM
-            found.append(Candidate(float(overlap.max()) / total, pose, focal, mirrored))
-    return sorted(found, key=lambda one: -one.share)[:count]
+            best[mirrored] = Candidate(share, pose, drawing.size_px[0] / width_mm * _DISTANCE_MM, mirrored)
+        found += best.values()
+    found.sort(key=lambda one: -one.share)
+    return [one for way in (False, True) for one in [k for k in found if k.mirrored is way][:count]]
 
 
 def _facing(turn: tuple[float, float, float]) -> Array:

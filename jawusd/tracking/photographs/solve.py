@@ -16,8 +16,11 @@ from jawusd.tracking.photographs.crowns import Crowns, Outlines, draw_teeth, out
 from jawusd.tracking.photographs.drawing import Drawing, features, nearest
 from jawusd.tracking.photographs.lens import UNKNOWNS, PhotoPose, to_camera
 
-# What is known beforehand, standard deviations: distance of a camera about 250 mm [log], distortion [-].
-_DISTANCE_MM, _LOG_DISTANCE, _DISTORTION = 250.0, 0.6, 0.02
+# What is known beforehand, with standard deviations: telephones are held 80 to 200 mm from the teeth, macro lenses 200
+# to 400 [log]; distortion [-].
+_DISTANCE_MM, _LOG_DISTANCE, _DISTORTION = 180.0, 0.5, 0.02
+# One camera takes all photographs; what focusing does to its focal length [log].
+_LOG_FOCAL = 0.05
 # How far a usual bite is off [rad, mm]; about the centre of the lower teeth.
 _BITE_SIGMA = np.array([0.12] * 3 + [3.0] * 3)
 # Standard deviation of a step [rad, mm, log, -]: damps directions that lines do not show.
@@ -81,9 +84,7 @@ def seen_outlines(crowns: Sequence[Crowns], photo: Photo, bite: Bite) -> Outline
     seen = outlines_of(crowns, matrices, *draw_teeth(crowns, matrices, (height, width)))
     _, points = to_camera(photo.pose, bite.T_upper_lower, seen.points, seen.arch)
     towards_gum = seen.gum * bite.gum_mm[seen.arch] * photo.pose.focal_px / points[:, 2]
-    return replace(
-        seen, pixels=photo.pose.pixels(points, photo.drawing.size_px) + towards_gum[:, None] * seen.normals
-    )
+    return replace(seen, pixels=photo.pose.pixels(points, photo.drawing.size_px) + towards_gum[:, None] * seen.normals)
 
 
 class Aligner:
@@ -121,12 +122,13 @@ class Aligner:
             J, residual, weight = self._equations(photo, bite, centres[k], centre_lower, gate_mm)
             _add(H, g, part, J, residual, weight)
             _add(H, g, own, *_lens_prior(photo.pose, centres[k]))
+        _add(H, g, UNKNOWNS * np.arange(count) + 6, *_one_lens(bite.photos))
         _add(H, g, shared[:6], *self._bite_prior(bite.T_upper_lower))
         _add(H, g, shared[6:], np.eye(2), bite.gum_mm, np.full(2, _GUM_MM**-2))
         if self._contact is not None:
             _add(H, g, shared[:6], *self._contact.equations(bite.T_upper_lower, centre_lower))
         H[np.diag_indices(size)] += np.r_[np.tile(_LARGEST_STEP, count), _LARGEST_STEP[:6], 1.0, 1.0] ** -2.0
-        step = np.linalg.solve(H, g)
+        step = np.asarray(np.linalg.solve(H, g), np.float64)
         photos = tuple(
             replace(photo, pose=photo.pose.stepped(centres[k], step[UNKNOWNS * k : UNKNOWNS * (k + 1)]))
             for k, photo in enumerate(bite.photos)
@@ -143,7 +145,7 @@ class Aligner:
         found = match(seen, photo.drawing, 0.5 * gate_mm * px_per_mm)
         own = found.outlines
         in_upper, points = to_camera(photo.pose, bite.T_upper_lower, own.points, own.arch)
-        by_point, by_lens = photo.pose.slopes(points, own.normals, photo.drawing.size_px)
+        by_point, by_lens = photo.pose.slopes(points, own.normals, photo.drawing.size_px, centre[2])
         in_bite = by_point @ photo.pose.T_cam_upper[:3, :3] * (own.arch == 1)[:, None]
         by_gum = (own.gum * photo.pose.focal_px / points[:, 2])[:, None] * np.eye(2)[own.arch]
         turns = np.cross(points - centre, by_point), np.cross(in_upper - centre_lower, in_bite)
@@ -169,8 +171,18 @@ def _add(H: Array, g: Array, part: NDArray[np.int64], J: Array, residual: Array,
 def _lens_prior(pose: PhotoPose, centre: Array) -> tuple[Array, Array, Array]:
     """Return slopes, differences and weights of what is known of distance and distortion."""
     J = np.zeros((2, UNKNOWNS))
-    J[0, 5], J[1, 7] = 1.0 / centre[2], 1.0
-    return J, np.array([np.log(centre[2] / _DISTANCE_MM), pose.distortion]), np.array([_LOG_DISTANCE, _DISTORTION]) ** -2
+    J[0, 5], J[0, 6], J[1, 7] = 1.0 / centre[2], 1.0, 1.0
+    return (
+        J,
+        np.array([np.log(centre[2] / _DISTANCE_MM), pose.distortion]),
+        np.array([_LOG_DISTANCE, _DISTORTION]) ** -2,
+    )
+
+
+def _one_lens(photos: Sequence[Photo]) -> tuple[Array, Array, Array]:
+    """Return slopes, differences and weights by the log focal lengths: all are about their mean."""
+    logs = np.log([photo.pose.focal_px / photo.drawing.size_px[0] for photo in photos])
+    return np.eye(len(logs)) - 1.0 / len(logs), logs - logs.mean(), np.full(len(logs), _LOG_FOCAL**-2)
 
 
 def _px_per_mm(photo: Photo, crowns: Sequence[Crowns]) -> float:

@@ -1,0 +1,87 @@
+"""What photographs of teeth that are together tell: photos.json, format jawusd-photos/1."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+
+from jawusd.formats.atomic import write_text_atomic
+from jawusd.formats.finding import Finding
+from jawusd.geometry.arrays import Array
+
+FORMAT = "jawusd-photos/1"
+
+
+@dataclass(frozen=True, eq=False)
+class AlignedPhoto:
+    """Hold the pose and lens of one photograph; pixels are those of the picture, mirrored if it is."""
+
+    name: str
+    size_px: tuple[int, int]
+    mirrored: bool  # taken over a mirror: poses hold for the picture with left and right exchanged
+    focal_px: float
+    distortion: float  # OpenCV's k1
+    middle_px: Array  # principal point, shape (2,)
+    T_cam_upper: Array  # upper scan to camera, shape (4, 4)
+    outline_rms_px: float  # distance of all drawn points from the outlines, in px of a picture 1440 px wide
+    outline_median_px: float
+    free_rms_px: float  # the same without lines along the gum
+    misfit: float  # mean squared distance in place and direction over that of half a millimetre, at most 1 [-]
+    other_hand: float  # misfit if it were mirrored the other way, over its own, at the start [-]
+    T_upper_lower_alone: Array  # the bite by this photograph alone, shape (4, 4)
+    alone_off_mm: float  # how far that one lies from the common one at the lower incisor
+
+    def as_json(self) -> dict[str, object]:
+        """Return the fields as JSON knows them."""
+        u, v = self.middle_px.tolist()
+        return {
+            "name": self.name,
+            "size_px": list(self.size_px),
+            "mirrored": self.mirrored,
+            "focal_px": self.focal_px,
+            "camera_matrix": [[self.focal_px, 0.0, u], [0.0, self.focal_px, v], [0.0, 0.0, 1.0]],
+            "distortions": [self.distortion, 0.0, 0.0, 0.0, 0.0],
+            "T_cam_upper": self.T_cam_upper.tolist(),
+            "outline_rms_px": self.outline_rms_px,
+            "outline_median_px": self.outline_median_px,
+            "free_rms_px": self.free_rms_px,
+            "misfit": self.misfit,
+            "other_hand": self.other_hand,
+            "T_upper_lower_alone": self.T_upper_lower_alone.tolist(),
+            "alone_off_mm": self.alone_off_mm,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class AlignedPhotos:
+    """Hold photographs with the bite they share."""
+
+    T_upper_lower: Array  # lower scan to upper scan with the teeth together, shape (4, 4)
+    gum_mm: (
+        Array  # by how much gum lines are drawn nearer to the gum than the crowns reach, upper and lower, shape (2,)
+    )
+    depth_mm: float  # how deep crowns run into one another
+    photos: tuple[AlignedPhoto, ...]
+    findings: tuple[Finding, ...]
+
+    def as_json(self) -> dict[str, object]:
+        """Return the content of the file."""
+        return {
+            "format": FORMAT,
+            "units": "mm",
+            "T_upper_lower": self.T_upper_lower.tolist(),
+            "gum_mm": self.gum_mm.tolist(),
+            "depth_mm": self.depth_mm,
+            "photos": [photo.as_json() for photo in self.photos],
+            "findings": [finding.as_json() for finding in self.findings],
+        }
+
+
+def save_photographs(path: str | os.PathLike[str], photographs: AlignedPhotos) -> None:
+    """Write photos.json atomically.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    write_text_atomic(path, json.dumps(photographs.as_json(), indent=1) + "\n")
