@@ -27,7 +27,8 @@ class AlignedPhoto:
     outline_rms_px: float  # distance of all drawn points from the outlines, in px of a picture 1440 px wide
     outline_median_px: float
     free_rms_px: float  # the same without lines along the gum
-    misfit: float  # mean squared distance in place and direction over that of half a millimetre, at most 1 [-]
+    # mean squared distance in place and direction over that of half a millimetre, at most 1, of the row that fits worse
+    misfit: float
     other_hand: float  # misfit if it were mirrored the other way, over its own, at the start [-]
     T_upper_lower_alone: Array  # the bite by this photograph alone, shape (4, 4)
     alone_off_mm: float  # how far that one lies from the common one at the lower incisor

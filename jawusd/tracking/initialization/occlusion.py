@@ -86,7 +86,7 @@ def measure_occlusion(scans: Sequence[Scan], T_anatomical_scan: Array) -> Occlus
         same=float(np.mean(np.abs(signed[1]) < _SAME_MM)),
         opposite=float(max(part.mean() for part in stand)),
         aside_mm=float(np.linalg.norm((upper.mean(0) - lower.mean(0))[[0, 2]])),
-        turn_rad=_angle(forward_of(upper[:, [0, 2]]), forward_of(lower[:, [0, 2]])),
+        turn_rad=_angle(_forward(upper[:, [0, 2]]), _forward(lower[:, [0, 2]])),
         turned_over=turned_over,
         opens_towards=(_opens_towards(surfaces[0], -normal), _opens_towards(surfaces[1], normal)),
         midlines_mm=midlines_mm,
@@ -176,7 +176,7 @@ def _compare_widths(upper: Array, lower: Array) -> tuple[float, float]:
     return abs(float(np.median(apart))), float(np.median(ratios))
 
 
-def forward_of(flat: Array) -> Array:
+def _forward(flat: Array) -> Array:
     """Return the direction in which the horseshoe of points (N, 2) is closed, shape (2,).
 
     Of all directions it is the one against which both legs spread alike.

@@ -127,7 +127,7 @@ def _together(alone: Sequence[Bite], lines: Sequence[Drawing], rows: Rows, conta
 def _result(joint: Bite, alone: Sequence[Bite], starts: Sequence[Found], rows: Rows, contact: Contact) -> AlignedPhotos:
     """Return the figures of an alignment."""
     point = _lower_incisor(rows)
-    misfits = Aligner(rows.fine, rows.usual.T_upper_lower, None).misfit(joint, _GATE_MM)
+    misfits = Aligner(rows.fine, rows.usual.T_upper_lower, None).misfit(joint, _GATE_MM).max(1)
     photos = []
     for photo, own, start, misfit in zip(joint.photos, alone, starts, misfits, strict=True):
         off = transform_point(own.T_upper_lower, point) - transform_point(joint.T_upper_lower, point)

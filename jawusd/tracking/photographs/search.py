@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.ndimage import distance_transform_edt
 
-from jawusd.geometry import make_transform, se3_inverse, so3_exp
+from jawusd.geometry import anatomical_frame, make_transform, se3_inverse, so3_exp
 from jawusd.geometry.arrays import Array
 from jawusd.tracking.contour.scan import Scan
-from jawusd.tracking.initialization.occlusion import forward_of
 from jawusd.tracking.photographs.crowns import Crowns, draw_teeth, outlines_of
 from jawusd.tracking.photographs.drawing import Drawing
 
@@ -26,6 +25,7 @@ _PITCH = np.radians(np.arange(-20, 21, 10.0))
 _ROLL = np.radians([-10.0, 0.0, 10.0])
 # Widths that the picture may have at the teeth [mm].
 _WIDTHS_MM = 38.0 * 1.1 ** np.arange(9)
+_ROWS_APART_MM = 10.0
 _SECTORS = 4  # of directions; lines count only where theirs agree
 _NEAR_PX = 2.0  # of the search: how far off a line still counts half
 # Usual bites: lower front edges behind the upper ones, and how far both rows overlap there [mm].
@@ -89,14 +89,11 @@ def _row_frame(scan: Scan, arch: int, side: float) -> Array:
     """Return T_anatomical_scan of one row, its origin amid the edges of its front teeth, shape (4, 4)."""
     points = scan.crown_vertices(4000)
     up = side * _least_axis(scan)
-    across = np.linalg.svd(points - points.mean(0), full_matrices=False)[2][0]
-    flat = np.stack([across, np.cross(across, up)])
-    front = forward_of((points - points.mean(0)) @ flat.T) @ flat
-    R = np.stack([np.cross(up, front), up, front])
-    x, y, z = (points @ R.T).T
-    ahead = z > np.percentile(z, 90)
-    edge = np.percentile(y[ahead], 2 if arch == 0 else 98)
-    return make_transform(R, -np.array([np.percentile(x, [1, 99]).mean(), edge, np.percentile(z, 99.5)]))
+    # The frame of a bite whose other row would be this one again, moved.
+    T = anatomical_frame(points, points - _ROWS_APART_MM * up)
+    x, y, z = (points @ T[:3, :3].T).T
+    edge = np.percentile(y[z > np.percentile(z, 90)], 2 if arch == 0 else 98)
+    return make_transform(T[:3, :3], np.array([T[0, 3], -edge, -np.percentile(z, 99.5)]))
 
 
 def searched(

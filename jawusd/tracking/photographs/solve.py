@@ -101,13 +101,18 @@ class Aligner:
         return bite
 
     def misfit(self, bite: Bite, gate_mm: float) -> Array:
-        """Return the mean squared distance of the lines over that of the gate, at most 1, shape (P,)."""
-        out = []
-        for photo in bite.photos:
+        """Return the mean squared distance of lines over that of the gate, at most 1, by photograph and row, (P, 2).
+
+        Lines count for the row whose outline is nearest; 1 where a row has none.
+        """
+        out = np.ones((len(bite.photos), 2))
+        for k, photo in enumerate(bite.photos):
             gate_px = gate_mm * _px_per_mm(photo, self._crowns)
             found = match(seen_outlines(self._crowns, photo, bite), photo.drawing, 0.5 * gate_px)
-            out.append(float(np.minimum((found.apart / gate_px) ** 2, 1.0).mean()))
-        return np.array(out)
+            off = np.minimum((found.apart / gate_px) ** 2, 1.0)
+            for r in np.unique(found.outlines.arch):
+                out[k, r] = off[found.outlines.arch == r].mean()
+        return out
 
     def _step(self, bite: Bite, gate_mm: float) -> Bite:
         count = len(bite.photos)

@@ -23,8 +23,10 @@ _FACES = 6000  # crown faces per row, enough for these pictures
 _CANDIDATES, _FINALISTS = 20, 4  # of each handedness
 # Gates of the steps [mm]: from a tooth off to half a tooth off; then with rows slid along one another.
 _WIDE_GATES, _SLID_GATES = (4.0, 4.0, 3.5, 3.5, 3.0, 3.0, 2.5, 2.5), (3.0, 3.0, 2.5, 2.0, 2.0, 2.0)
-_SLIDES_MM = (-3.0, 0.0, 3.0)  # sideways and forward: half a tooth
-MISFIT_GATE_MM = 1.5
+# How far the lower row may be from a usual bite. All are looked at, the best few aligned.
+_ASIDE_MM, _UP_MM, _AHEAD_MM = (-4.0, -2.0, 0.0, 2.0, 4.0), (-2.0, 0.0, 2.0), (-4.0, -2.0, 0.0, 2.0, 4.0)
+_SLIDES = 4
+_MISFIT_GATE_MM = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,12 +69,25 @@ def find_first(drawing: Drawing, scans: Sequence[Scan], usual: Sequence[UsualBit
     ends = []
     for _, mirrored, one, rows in _finalists(tried):
         aligner = Aligner(rows.thin, rows.usual.T_upper_lower, contact)
-        axes = rows.usual.T_anatomical_upper[:3, :3]
-        for aside, ahead in product(_SLIDES_MM, _SLIDES_MM):
-            slide = make_transform(np.eye(3), axes.T @ [aside, 0.0, ahead])
-            slid = aligner.aligned(Bite(one.photos, slide @ rows.usual.T_upper_lower, one.gum_mm), _SLID_GATES)
-            ends.append((float(aligner.misfit(slid, MISFIT_GATE_MM)[0]), mirrored, slid, rows))
+        for begin in _slid(one, rows, aligner):
+            end = aligner.aligned(begin, _SLID_GATES)
+            ends.append((_misfit(aligner, end), mirrored, end, rows))
     return _best(ends)
+
+
+def _slid(bite: Bite, rows: Rows, aligner: Aligner) -> list[Bite]:
+    """Return a photograph with the bites among slid ones that fit best as they are, and the one that it has."""
+    axes = rows.usual.T_anatomical_upper[:3, :3]
+    out = []
+    for slide in product(_ASIDE_MM, _UP_MM, _AHEAD_MM):
+        T_upper_lower = make_transform(np.eye(3), axes.T @ slide) @ rows.usual.T_upper_lower
+        out.append(Bite(bite.photos, T_upper_lower, bite.gum_mm))
+    return [bite, *sorted(out, key=lambda one: _misfit(aligner, one))[:_SLIDES]]
+
+
+def _misfit(aligner: Aligner, bite: Bite) -> float:
+    """Return the misfit of one photograph, both rows alike."""
+    return float(aligner.misfit(bite, _MISFIT_GATE_MM).mean())
 
 
 def find_next(drawing: Drawing, rows: Rows, T_upper_lower: Array, contact: Contact) -> Found:
@@ -82,7 +97,7 @@ def find_next(drawing: Drawing, rows: Rows, T_upper_lower: Array, contact: Conta
     ends = []
     for _, mirrored, one, _ in _finalists([(*entry, rows) for entry in found]):
         again = aligner.aligned(Bite(one.photos, T_upper_lower, one.gum_mm), _SLID_GATES)
-        ends.append((float(aligner.misfit(again, MISFIT_GATE_MM)[0]), mirrored, again, rows))
+        ends.append((_misfit(aligner, again), mirrored, again, rows))
     return _best(ends)
 
 
@@ -97,7 +112,7 @@ def _aligned_candidates(
         lines = drawing.mirrored() if one.mirrored else drawing
         photo = Photo(lines, PhotoPose(one.T_cam_upper, one.focal_px, 0.0)).shrunk(factor)
         bite = aligner.aligned(Bite((photo,), T_upper_lower, np.zeros(2)), _WIDE_GATES)
-        out.append((float(aligner.misfit(bite, MISFIT_GATE_MM)[0]), one.mirrored, bite))
+        out.append((_misfit(aligner, bite), one.mirrored, bite))
     return sorted(out, key=lambda entry: entry[0])
 
 
