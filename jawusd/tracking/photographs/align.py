@@ -30,7 +30,7 @@ _AT_WIDTH_PX = 1440.0  # figures in px are for pictures of this width
 _TURN_PX = 10.0  # at that width: outlines across a line are not its own
 _CLEAR_MISFIT = 0.2  # a first photograph below this is not searched for among the others
 # Misfit of lines at half a millimetre beyond which crowns are not those of a picture: 0.28 to 0.36 with the right ones
-# of two patients (six photographs, none refused), 0.63 to 0.70 with those of somebody else (three photographs). Front
+# of two patients (six photographs, none refused), 0.55 to 0.70 with those of the other one (six photographs). Front
 # views alone of a synthetic person: 0.08 to 0.10, with the crowns of four others 0.32 to 0.56.
 _GATE_MM, _MOST_MISFIT = 0.5, 0.45
 _SAME_HAND = 1.15  # ratio of the misfits of both handednesses below which they cannot be told apart
