@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from jawusd.segmentation.footage import ColourFootage, Pictures
     from jawusd.segmentation.picture import PictureFrame
     from jawusd.tracking.contour.scan import Scan
-    from jawusd.tracking.region.learned import Picture
+    from jawusd.tracking.region.picture import Picture
     from jawusd.tracking.region.tracker import Cut, RegionPose
 
 # Distance of the jaw by masks and by colours from which one is wrong [mm]: right ones of three takes were at most 0.9
@@ -73,8 +73,8 @@ def followed_teeth(
     frame, poses = start
     centre = teeth_centre(scans, poses)
     views = {name: PictureFrame(camera, centre, _WORKING_PX_PER_MM) for name, camera in cameras.items()}
-    axes, condyles = subject.T_anatomical_skull[:3, :3], subject.landmarks[-2:]
-    tracker = RegionTracker(scans, list(cameras.values()), condyles, axes, executor=pool)
+    axes = subject.T_anatomical_skull[:3, :3]
+    tracker = RegionTracker(scans, list(cameras.values()), subject.landmarks, axes, executor=pool)
     out = {frame: tracker.begin(_cut(views, scans, footage.at(frame)), poses)}
     progress(STAGE, 1, len(frames))
 
@@ -119,7 +119,7 @@ def _follow_back(back: range, again: Iterator[RegionPose], known: dict[int, Regi
 
 
 def _cut(views: Mapping[str, PictureFrame], scans: Sequence[Scan], pictures: Pictures) -> Cut:
-    from jawusd.tracking.region.learned import Picture
+    from jawusd.tracking.region.picture import Picture
 
     def one(name: str, around: Array) -> Picture | None:
         image = pictures[name]

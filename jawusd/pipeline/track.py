@@ -144,6 +144,7 @@ def first_pass(
     """
     from jawusd.tracking import track_capture
     from jawusd.tracking.paper.take import track_capture_paper
+    from jawusd.tracking.region.strained import widen_strained
 
     with naming_file(capture.folder / "capture.toml"):
         cameras, (meshes, findings) = load_cameras(capture), load_labelled(capture)
@@ -161,12 +162,15 @@ def first_pass(
                 progress=report,
             )
         else:
-            landmarks = subject_of_capture(capture, meshes).landmarks
+            subject = subject_of_capture(capture, meshes)
+            landmarks = subject.landmarks
             config = tracking_config(capture)
             tracks = track_capture(
                 capture, cameras, offsets, upper, lower, landmarks, config, threads=jobs, progress=report
             )
             tracks, doubts = take_up_guide(capture, tracks, landmarks)
+            if auto_masks_folder(capture) is not None:
+                tracks = widen_strained(tracks, landmarks, subject.T_anatomical_skull[:3, :3])
             findings = [*findings, *doubts]
     tracks.meta["findings"] = [*tracks.meta.get("findings", []), *(finding.as_json() for finding in findings)]
     tracks.meta["calibration_rescaled_px"] = rescaled_cameras(capture)

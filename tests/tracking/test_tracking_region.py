@@ -1,10 +1,13 @@
 """Borders of teeth found in colours, against pictures whose borders are known by construction."""
 
+from typing import ClassVar
+
 import numpy as np
 import pytest
 from package_copy import ROOT
 
 from jawusd.formats.capture import load_capture
+from jawusd.geometry import relative_pose
 from jawusd.pipeline.media import open_footage
 from jawusd.pipeline.prepare import load_meshes, subject_of_capture
 from jawusd.pipeline.segment_guide import followed_teeth, known_guide, save_guide
@@ -144,3 +147,37 @@ def test_the_example_is_followed_by_its_colours(tmp_path):
     again = known_guide(tmp_path, "abc")
     assert all(np.array_equal(again[frame].poses, guide[frame].poses) for frame in guide)
     assert known_guide(tmp_path, "other inputs") == {} == known_guide(tmp_path / "empty", "abc")
+
+
+class Covered(ColourFootage):
+    """Show other frames in place of some, and what lips would hide in none: all skin."""
+
+    SHOWN: ClassVar = {22: None, 23: 48, 24: 49}
+
+    def walk(self, frames):
+        for frame in frames:
+            instead = self.SHOWN.get(frame, frame)
+            for _, pictures in super().walk(range(instead or frame, (instead or frame) + 1)):
+                skin = {name: np.full_like(image, (190, 130, 110)) for name, image in pictures.items()}
+                yield frame, skin if instead is None else pictures
+
+
+def test_teeth_are_found_again_when_lips_open_over_an_open_jaw():
+    capture = load_capture(ROOT / "examples" / "capture" / "capture.toml")
+    with np.load(capture.folder / "truth" / "truth.npz") as truth:
+        offsets = dict(zip(truth["camera_names"].tolist(), truth["offsets"].tolist(), strict=True))
+        first, relative, incisor = truth["frames"][0], truth["T_upper_lower"], np.append(truth["landmarks"][0], 1.0)
+    meshes = load_meshes(capture)
+    teeth = meshes["upper_teeth"], meshes["lower_teeth"]
+    cameras, videos = open_footage(capture)
+    start = capture.bootstrap.frame
+    picked = GuidedTracker(*teeth, lambda *_: [], 1).picked(capture.bootstrap, cameras)
+    known, subject = (start, picked), subject_of_capture(capture, meshes)
+    footage = Covered(videos, offsets)
+    guide = followed_teeth(footage, cameras, teeth, subject, range(20, 25), known, lambda *_: None, None)
+    assert not guide[22].found.any()
+    exact = {frame: relative[Covered.SHOWN[frame] - first] for frame in (23, 24)}
+    assert np.linalg.norm((exact[23] @ incisor - incisor)[:3]) > 10.0  # mm; the head moved by 4 mm
+    for frame, true in exact.items():
+        assert guide[frame].found.all()
+        assert np.linalg.norm(((relative_pose(*guide[frame].poses) - true) @ incisor)[:3]) < 0.5

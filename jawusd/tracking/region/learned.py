@@ -5,32 +5,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy, deepcopy
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
-from scipy.ndimage import distance_transform_edt
 
 from jawusd.geometry import Camera
 from jawusd.geometry.arrays import Array
-from jawusd.tracking.contour.scan import ARCHES, CROWN, GUM, Scan
+from jawusd.tracking.contour.scan import Scan
 from jawusd.tracking.contour.views import View
-from jawusd.tracking.region.colours import PATCHES, Areas, CameraColours, colour_bins
+from jawusd.tracking.region.colours import PATCHES, CameraColours, colour_bins
+from jawusd.tracking.region.picture import Picture, first_colours
 from jawusd.tracking.region.view import Counts, RegionView
 
 #: At which colours of teeth and of surroundings are taken up: usually, and on the first frame.
 RATES, FIRST_RATES = (0.1, 0.2), (0.5, 0.5)
 _GUM_RATE, _MOST_GUM_PX = 0.1, 2.0  # at which the place of the gum line is taken up [-], and its bound
-# Areas that teach the first colours [px]: inside crowns, outside of them, ring around them, beyond all.
-_INSIDE_PX, _OUTSIDE_PX, _RING_PX, _BEYOND_PX = 2.0, 3.0, 30.0, 4.0
-
-
-class Picture(NamedTuple):
-    """Hold a part of an undistorted picture around the teeth."""
-
-    camera: Camera  # the pinhole camera of the part
-    rgb: NDArray[np.uint8]  # shape (h, w, 3)
 
 
 class LearnedColours:
@@ -59,7 +48,7 @@ class LearnedColours:
 
     def begin(self, pictures: Sequence[Picture | None], poses: Array) -> None:
         """Learn the colours of a first frame from T_world_upper and T_world_lower there, shape (2, 4, 4)."""
-        self._colours = [None if p is None else self._first_colours(p, poses) for p in pictures]
+        self._colours = [None if p is None else first_colours(p, poses, self._scans) for p in pictures]
 
     def views(self, pictures: Sequence[Picture | None], before: Array) -> list[View]:
         """Return the views of an instant.
@@ -110,7 +99,7 @@ class LearnedColours:
             colours = self._colours[c]
             picture = pictures[c]
             if picture is not None and colours is None:  # its first picture
-                self._colours[c] = self._first_colours(picture, poses)
+                self._colours[c] = first_colours(picture, poses, self._scans)
             if not isinstance(view.edges, RegionView) or view.edges.counts is None or colours is None:
                 continue
             counts = view.edges.counts
@@ -118,16 +107,3 @@ class LearnedColours:
             known = np.isfinite(counts.gum_px)
             step = _GUM_RATE * (counts.gum_px[known] - self._gum_px[known, c])
             self._gum_px[known, c] = np.clip(self._gum_px[known, c] + step, -_MOST_GUM_PX, _MOST_GUM_PX)
-
-    def _first_colours(self, picture: Picture, poses: Array) -> CameraColours:
-        shape = picture.rgb.shape[:2]
-        labels = np.zeros((2, *shape), np.uint8)
-        for r in ARCHES:
-            matrix = picture.camera.projection_matrix() @ poses[r]
-            self._scans[r].draw(matrix, np.zeros(shape, np.float32), labels[r])
-        crowns, gum = (labels == CROWN).any(0), (labels == GUM).any(0)
-        to_crown, to_any = (distance_transform_edt(~area) for area in (crowns, crowns | gum))
-        inside = distance_transform_edt(crowns) > _INSIDE_PX
-        outside = to_crown > _OUTSIDE_PX
-        near = outside & (to_crown < _RING_PX)
-        return CameraColours(colour_bins(picture.rgb), Areas(inside, near, near & gum, to_any > _BEYOND_PX))

@@ -59,6 +59,10 @@ class RegionView:
         apart = (samples[:, X : Z + 1] @ self.axes.T[:, [0, 2]])[:, None] - self.patches[arch]
         return np.asarray(KINDS * (apart**2).sum(2).argmin(1) + kind, np.int64)
 
+    def likeness(self, arch: int) -> NDArray[np.float32]:
+        """Return how much every pixel looks like teeth of an arch rather than anything else, shape (h, w)."""
+        return np.asarray(self.ratio[arch].mean(0)[self.bins], np.float32)
+
     def search(
         self, samples: Array, count: int, arch: int, drawn: Drawn, limits: tuple[float, float, float]
     ) -> tuple[Array, Array]:
