@@ -55,15 +55,12 @@ def solve(
     focal: Annotated[
         Focal, typer.Option(help="free: the calibration only guesses focal lengths; the take tells them.")
     ] = Focal.known,
-    jobs: Annotated[int, typer.Option(min=1, max=64, help="Threads that search for the start and make masks.")] = 2,
+    jobs: Annotated[int, typer.Option(min=1, max=64, help="Threads that search for the start.")] = 2,
     force: Force = False,
     allow_outside: Outside = False,
     as_json: Json = False,
 ) -> None:
-    """Solve a performance of the person of a rig, from masks of one or more cameras or the videos of two or more.
-
-    Masks made from videos are kept beside the output.
-    """
+    """Solve a performance of the person of a rig, from the masks or else the videos of one or more cameras."""
     from jawusd.pipeline import solve as stage
 
     stage.check_output(rig, out, overlay, report)

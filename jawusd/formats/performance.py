@@ -18,7 +18,7 @@ HEADER = ("frame", "time_s", "d1", "d2", "d3", "sigma1", "sigma2", "sigma3", "ma
 class SolveState(IntEnum):
     """Values of `Performance.state`."""
 
-    LOST = 0  # masks that nothing fits: the motion before and after carries the jaw
+    LOST = 0  # pictures that nothing fits: the motion before and after carries the jaw
     SOLVED = 1  # both arches found
     CARRIED = 2  # an arch out of sight: lips closed, no picture
 
@@ -28,9 +28,9 @@ class SolveState(IntEnum):
 
 #: What the states mean, for people.
 STATE_WORDS: dict[SolveState, str] = {
-    SolveState.SOLVED: "solved from the masks",
+    SolveState.SOLVED: "solved from the pictures",
     SolveState.CARRIED: "out of sight: carried by the motion around",
-    SolveState.LOST: "lost: the masks fit nothing there",
+    SolveState.LOST: "lost: nothing fits the pictures there",
 }
 #: Red, green and blue of an arch in pictures, by state; they differ in brightness too.
 STATE_COLOURS: dict[SolveState, tuple[int, int, int]] = {
@@ -53,7 +53,7 @@ class Performance:
         pivot: point of the upper scan [mm], shape (3,).
         state: `SolveState`, shape (F,).
         found: arches whose outlines took part, (upper, lower), shape (F, 2).
-        use: masks that took part, shape (F, 2, C).
+        use: masks, or cameras, that took part, shape (F, 2, C).
         uncovered: share of every mask that the scan leaves uncovered, shape (F, 2, C); NaN without a mask.
         residual_px, matched_px: spread of the outlines' residuals, and contour that was matched, shape (F, 2).
         margin_mm: signed distance to the rig's bound, > 0 inside, shape (F,).

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,16 +20,14 @@ from jawusd.formats.tracks import Tracks
 from jawusd.geometry import Camera, relative_pose, se3_inverse, transform_points
 from jawusd.geometry.arrays import Array
 from jawusd.npz import TWIST_ORDER, UNITS, read_npz, take
+from jawusd.pipeline.cuts import Cutter
 from jawusd.pipeline.prepare import Subject, registration_of
 from jawusd.pipeline.segment_record import auto_masks_folder
 from jawusd.pipeline.state import Progress
 
 if TYPE_CHECKING:
-    from jawusd.segmentation.footage import ColourFootage, Pictures
-    from jawusd.segmentation.picture import PictureFrame
-    from jawusd.tracking.contour.scan import Scan
-    from jawusd.tracking.region.picture import Picture
-    from jawusd.tracking.region.tracker import Cut, RegionPose
+    from jawusd.segmentation.footage import ColourFootage
+    from jawusd.tracking.region.tracker import RegionPose
 
 # Distance of the jaw by masks and by colours from which one is wrong [mm]: right ones of three takes were at most 0.9
 # apart. Shares of such frames, or lost ones, from which a take is doubtful, and not usable.
@@ -39,7 +37,6 @@ _APART_MM, _FEW, _MANY = 1.0, 0.03, 0.2
 _JUMP_MM, _SAME_MM = 0.8, 0.15
 GUIDE, _FAMILY = "guide.npz", "jawusd-guide"
 STAGE = "follow"
-_WORKING_PX_PER_MM, _MARGIN_MM = 7.2, 6.0  # resolution at the teeth, and what is looked at around them
 
 
 def followed_teeth(
@@ -65,29 +62,25 @@ def followed_teeth(
         CaptureError: a picture cannot be decoded.
         TrackingError: a scan cannot be tracked.
     """
-    from jawusd.segmentation.picture import PictureFrame
     from jawusd.tracking.contour.scan import prepare_scan, teeth_centre
     from jawusd.tracking.region.tracker import RegionTracker
 
     scans = [prepare_scan(mesh, name) for mesh, name in zip(teeth, ("upper", "lower"), strict=True)]
     frame, poses = start
     centre = teeth_centre(scans, poses)
-    views = {name: PictureFrame(camera, centre, _WORKING_PX_PER_MM) for name, camera in cameras.items()}
+    cutter = Cutter(cameras, scans, centre)
     axes = subject.T_anatomical_skull[:3, :3]
     tracker = RegionTracker(scans, list(cameras.values()), subject.landmarks, axes, executor=pool)
-    out = {frame: tracker.begin(_cut(views, scans, footage.at(frame)), poses)}
+    out = {frame: tracker.begin(cutter.cut(footage.at(frame)), poses)}
     progress(STAGE, 1, len(frames))
 
-    def cuts(way: range) -> Iterator[Cut]:
-        return (_cut(views, scans, pictures) for _, pictures in footage.walk(way))
-
     for way in (range(frame + 1, frames.stop), range(frame - 1, frames.start - 1, -1)):
-        for at, found in zip(way, tracker.follow(cuts(way), out[frame].poses), strict=True):
+        for at, found in zip(way, tracker.follow(cutter.walk(footage, way), out[frame].poses), strict=True):
             out[at] = found
             progress(STAGE, len(out), len(frames))
         for jump in _jumps(way, out, subject.landmarks[:3]):
             back = range(jump - way.step, frame, -way.step)
-            _follow_back(back, tracker.follow(cuts(back), out[jump].poses), out, subject.landmarks[:3])
+            _follow_back(back, tracker.follow(cutter.walk(footage, back), out[jump].poses), out, subject.landmarks[:3])
     return out
 
 
@@ -116,21 +109,6 @@ def _follow_back(back: range, again: Iterator[RegionPose], known: dict[int, Regi
         if apart_mm < _SAME_MM or not found.found.all() or not better:
             return
         known[frame] = found
-
-
-def _cut(views: Mapping[str, PictureFrame], scans: Sequence[Scan], pictures: Pictures) -> Cut:
-    from jawusd.tracking.region.picture import Picture
-
-    def one(name: str, around: Array) -> Picture | None:
-        image = pictures[name]
-        window = None if image is None else views[name].window(image, around, _MARGIN_MM)
-        return None if window is None else Picture(window.camera, window.rgb)
-
-    def cut(poses: Array) -> list[Picture | None]:
-        around = np.concatenate([transform_points(T, scan.probes) for T, scan in zip(poses, scans, strict=True)])
-        return [one(name, around) for name in views]
-
-    return cut
 
 
 def save_guide(folder: Path, inputs: str, guide: Mapping[int, RegionPose]) -> None:

@@ -19,9 +19,8 @@ from jawusd.formats.tracks import save_tracks
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.overlay import VIDEO, write_overlay
 from jawusd.pipeline.prepare import load_cameras, load_labelled, naming_file, open_capture, registered_meshes
-from jawusd.pipeline.segment import SegmentOptions, segment_capture, with_masks
 from jawusd.pipeline.segment_guide import take_up_guide
-from jawusd.pipeline.segment_record import RECORD
+from jawusd.pipeline.solve_pictures import VideoOptions, solve_videos
 from jawusd.pipeline.solve_report import check_page, solve_limits, write_solve_report
 from jawusd.pipeline.state import Progress, no_progress
 from jawusd.pipeline.track import tracking_config
@@ -38,7 +37,7 @@ class SolveSummary(TypedDict):
     frames: int
     solved: int
     carried: list[tuple[int, int]]  # runs of frames, first and last, in which an arch is out of sight
-    lost: list[tuple[int, int]]  # the same in which masks fit nothing
+    lost: list[tuple[int, int]]  # the same in which nothing fits the pictures
     outside: int  # beyond what the rig allows
     cameras: list[str]
     sigma_mm: dict[str, float]  # median standard deviation of d1, d2, d3 over solved frames
@@ -66,8 +65,8 @@ def solve(
 
     Args:
         rig: `actor.usda`, another layer of it, or `model.npz`.
-        shot: the capture of the shot, its capture.toml or the folder that holds it. If no camera has masks, they are
-            made from its videos, as `segment` does, and kept beside the output (`take_masks` for `take.csv`).
+        shot: the capture of the shot, its capture.toml or the folder that holds it. If no camera has masks, the
+            videos themselves are followed by their colours.
         out: file to write: a table of d (.csv), tracks (.npz), or an animation layer on the rig (.usdc, .usda).
         overlay: video to write (.mp4) of the solved scans over all cameras side by side.
         report: page to write (.html): d with sigma, what could not be seen, verdicts, findings and pictures.
@@ -90,27 +89,32 @@ def solve(
     capture = open_capture(shot, allow_outside=allow_outside)
     jaw = jawusd.load(rig)
     offsets = sync_cameras(capture, progress)["offsets"]
-    if not any(camera.masks for camera in capture.cameras):
-        capture = _segmented(capture, offsets, out, jobs, progress)
     with naming_file(capture.folder / "capture.toml"):
+        cameras = load_cameras(capture)
         meshes, findings = load_labelled(capture)
         meshes = registered_meshes(meshes, jaw.meta)
-        found = solve_capture(
-            capture,
-            load_cameras(capture),
-            offsets,
-            meshes["upper_teeth"],
-            meshes["lower_teeth"],
-            jaw,
-            tracking_config(capture),
-            fixed_head=fixed_head,
-            free_focal=free_focal,
-            threads=jobs,
-            progress=partial(progress, "solve"),
-        )
+        if any(camera.masks for camera in capture.cameras):
+            solving = partial(progress, "solve")
+            teeth = meshes["upper_teeth"], meshes["lower_teeth"]
+            found = solve_capture(
+                capture,
+                cameras,
+                offsets,
+                *teeth,
+                jaw,
+                tracking_config(capture),
+                fixed_head=fixed_head,
+                free_focal=free_focal,
+                threads=jobs,
+                progress=solving,
+            )
+            findings += take_up_guide(capture, tracks_of(found, jaw), jaw.landmarks)[1]
+        else:
+            table = {camera.name: camera for camera in cameras}
+            options = VideoOptions(fixed_head, free_focal, jobs)
+            found = solve_videos(capture, table, offsets, meshes, jaw, options, progress)
     known = cast("list[dict[str, str | float | int]]", found.notes.get("findings", []))
-    _, doubts = take_up_guide(capture, tracks_of(found, jaw), jaw.landmarks)
-    found.notes["findings"] = [*known, *(finding.as_json() for finding in (*findings, *doubts))]
+    found.notes["findings"] = [*known, *(finding.as_json() for finding in findings)]
     if out is not None:
         write_solved(out, found, jaw, rig, capture.fps)
     if overlay is not None:
@@ -118,32 +122,6 @@ def solve(
     if report is not None:
         write_solve_report(report, tracks_of(found, jaw), capture, offsets, progress)
     return found
-
-
-def _segmented(
-    capture: Capture, offsets: dict[str, int], out: str | os.PathLike[str] | None, jobs: int, progress: Progress
-) -> Capture:
-    """Return a shot with masks made from its videos; those of an interrupted run are kept.
-
-    Raises:
-        OutputError: no output is named beside which they could lie, or other files are where they would.
-        CaptureError, TrackingError: see `segment_capture`.
-    """
-    if out is None:
-        raise OutputError(
-            "the shot has no masks, and no output is named beside which they could be made.",
-            path=capture.folder / "capture.toml",
-            hint="Name an output, or make masks with `jawusd segment` and name them in the capture file.",
-        )
-    folder = Path(out).with_name(f"{Path(out).stem}_masks")
-    if folder.exists() and not (folder / RECORD).is_file():
-        raise OutputError(
-            "is where masks of the shot would be made, and holds something else.",
-            path=folder,
-            hint="Name these masks in the capture file if they are the shot's, or choose another name for the output.",
-        )
-    segment_capture(capture, offsets, folder, SegmentOptions(resume=True, jobs=jobs), progress)
-    return with_masks(capture, folder)
 
 
 @explain_missing_packages()

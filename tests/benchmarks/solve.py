@@ -1,4 +1,4 @@
-"""Score `jawusd solve` on a capture that comes with its truth: python tests/benchmarks/solve.py CAPTURE [--only NAME]
+"""Score `jawusd solve` on a capture that comes with its truth: python tests/benchmarks/solve.py CAPTURE [--pixels]
 
 Builds the rig from the first frames (`jawusd track`, `jawusd fit`), then solves the last ones, which the rig never saw:
 with all cameras, every pair, every camera alone, every camera alone with its calibrated focal length off by 8 per cent
@@ -30,6 +30,7 @@ from jawusd.formats.performance import Performance, SolveState
 from jawusd.geometry import se3_inverse, transform_point, transform_points
 from jawusd.pipeline.fit import fit_subject
 from jawusd.pipeline.prepare import load_cameras, load_meshes, subject_of_capture
+from jawusd.pipeline.solve_pictures import VideoOptions, solve_videos
 from jawusd.tracking import track_capture
 from jawusd.tracking.contour.scan import prepare_scan
 from jawusd.tracking.contour.views import MaskViews
@@ -52,6 +53,7 @@ class Bench:
     truth: dict
     jaw: JawRig
     frames: tuple[int, int]
+    pixels: bool
 
     def shot(self, names: Sequence[str]) -> Capture:
         """Return the last frames in some cameras, without picks."""
@@ -84,6 +86,16 @@ def solve(bench: Bench, names: Sequence[str], focal: float = 1.0) -> tuple[Perfo
     marks: list[float] = []
     cameras = [replace(c, K=c.K * [[focal], [focal], [1]] + _kept_centre(c.K, focal)) for c in bench.cameras]
     begin = time.process_time()
+    if bench.pixels:
+        table = {camera.name: camera for camera in cameras if camera.name in names}
+        free = VideoOptions(free_focal=focal != 1.0)
+
+        def mark(stage: str, done: int, total: int) -> None:
+            if stage == "solve":
+                marks.append(time.process_time())
+
+        found = solve_videos(bench.shot(names), table, bench.offsets, bench.meshes, bench.jaw, free, mark)
+        return found, time.process_time() - marks[0], marks[0] - begin
     found = solve_capture(
         bench.shot(names),
         cameras,
@@ -164,6 +176,7 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=500, help="frames the rig is made of")
     parser.add_argument("--last", type=int, default=331, help="frames that are solved, from where the truth ends")
     parser.add_argument("--rig", type=Path, help="model.npz of the first frames, written if it does not exist")
+    parser.add_argument("--pixels", action="store_true", help="solve from the videos, not from the masks; no helmets")
     parser.add_argument("--only", help="trials whose name holds this: cameras, focal, helmet, cam0")
     options = parser.parse_args()
     capture = load_capture(options.capture)
@@ -174,7 +187,7 @@ def main() -> None:
     model = rig_of(capture, cameras, offsets, meshes, options.first, options.rig)
     begin = int(truth["frames"][0]) + options.first
     frames = (begin, min(begin + options.last, int(truth["frames"][-1]) + 1))
-    bench = Bench(capture, cameras, offsets, meshes, truth, JawRig(model.arrays, model.meta), frames)
+    bench = Bench(capture, cameras, offsets, meshes, truth, JawRig(model.arrays, model.meta), frames, options.pixels)
     names = [camera.name for camera in cameras]
     heads = f"{'incisor':>21}{'condyles':>21}{'rms d1 d2 d3':>20}{'NEES':>7}{'core':>8}{'start':>8}{'solved':>11}"
     print(f"{'[mm]':<24}{heads}")
@@ -183,7 +196,7 @@ def main() -> None:
     trials += [(f"focal +8% {name}", lambda name=name: solve(bench, [name], FOCAL_OFF)) for name in names]
     trials += [(f"helmet {name}", lambda name=name: worn(bench, [name])) for name in names]
     for label, run in trials:
-        if (options.only or "") in label:
+        if (options.only or "") in label and not (options.pixels and "helmet" in label):
             print(row(bench, label, run()), flush=True)
 
 

@@ -198,7 +198,7 @@ def test_a_solve_is_shown_with_its_states(viewed, copy, tmp_path):
     footage = opened.page.footage
     assert footage.worst[:2] == [FIRST + 20, FIRST + 7]  # what the rig does not allow, then what was not seen
     words = footage._words.content
-    assert "upper: solved from the masks" in words and "d1 opening 10.00 &plusmn; 0.05 mm" in words
+    assert "upper: solved from the pictures" in words and "d1 opening 10.00 &plusmn; 0.05 mm" in words
     opened.press(footage.slider, FIRST + 20)
     assert "0.75 mm outside the bound: <b>the rig does not allow this pose" in footage._words.content
     opened.press(footage.slider, FIRST + 7)

@@ -15,7 +15,7 @@ from jawusd.tracking.initialization.reacquire import shift_to_masks
 from jawusd.tracking.performance.attempts import Attempts, FrameFit, Instant, nothing_seen
 from jawusd.tracking.performance.coordinates import Pose
 from jawusd.tracking.performance.instant import Expected
-from jawusd.tracking.performance.prediction import Prediction
+from jawusd.tracking.performance.prediction import STEADY, Prediction
 
 _KEPT_JAWS = 12  # jaw parameters kept to start from after a loss
 _APART_MM = 3.0  # of the lower incisal point between two of them: within the solver's basin of each other
@@ -28,7 +28,7 @@ class ForwardPass:
     def __init__(self, attempts: Attempts, begin: FrameFit, *, fixed_head: bool = False) -> None:
         """Go on from a frame; with a fixed head only the jaw moves."""
         self._attempts, self._coordinates = attempts, attempts.instants.coordinates
-        self._motion = Prediction(self._coordinates, begin.pose, begin.found, fixed_head=fixed_head)
+        self._motion = Prediction(self._coordinates, begin.pose, begin.found, head=STEADY if fixed_head else 1.0)
         self._jaws: list[Array] = []
         self._remember(begin)
 

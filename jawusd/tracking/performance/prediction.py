@@ -12,7 +12,8 @@ from jawusd.tracking.performance.instant import Expected
 # How far a prediction may be off, standard deviations [rad, mm, mm]: that of fast chewing at 24 frames a second. It
 # only has to keep finite what the pictures leave free; the smoother knows better.
 _MISS = np.r_[[0.01] * 3, [0.7] * 3, [0.7] * 3]
-_FIXED = np.r_[[0.05] * 6, [1.0] * 3]  # share of it with a head that does not move before the cameras
+#: Share of it with a head that hardly moves before the cameras, and with one that is known.
+STEADY, KNOWN = 0.05, 1e-4
 _DAMPING = 0.8  # of the velocity: a stroke ends sooner than it goes on
 
 
@@ -24,9 +25,13 @@ class Prediction:
         blind: frames since each arch was found, shape (2,).
     """
 
-    def __init__(self, coordinates: Coordinates, begin: Pose, found: Mask, *, fixed_head: bool = False) -> None:
-        """Begin at rest with a frame on which some arches were found, shape (2,); a fixed head hardly moves."""
-        self._coordinates, self._miss = coordinates, _MISS * (_FIXED if fixed_head else 1.0)
+    def __init__(self, coordinates: Coordinates, begin: Pose, found: Mask, *, head: float = 1.0) -> None:
+        """Begin at rest with a frame on which some arches were found, shape (2,).
+
+        Args:
+            head: how far the head moves, as a share of what is usual.
+        """
+        self._coordinates, self._miss = coordinates, _MISS * np.r_[[head] * 6, [1.0] * 3]
         self.last, self._velocity = begin, np.zeros(LOCAL)
         self.blind = np.where(found, 0, 1)
 

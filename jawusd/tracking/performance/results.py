@@ -1,19 +1,73 @@
-"""A performance as tracks, so that whatever reads tracks reads it."""
+"""What a solve found as a performance, and a performance as tracks, so that whatever reads tracks reads it."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import cast
 
 import numpy as np
 
 from jawusd.evaluator import JawRig, Reason
-from jawusd.formats.performance import Performance
+from jawusd.formats.performance import Performance, SolveState
 from jawusd.formats.solved import SolvedJaw
 from jawusd.formats.tracks import LOST, TRACKED, Registration, Tracks, TracksMeta
 from jawusd.geometry import LANDMARKS, hat, make_transform, se3_adjoint, se3_left_jacobian
 from jawusd.geometry.arrays import Array
-from jawusd.tracking.contour.quality import landmark_sigmas
+from jawusd.tracking.contour.quality import landmark_sigmas, matched_px, residual_px
 from jawusd.tracking.performance.coordinates import HEAD, JAW
+from jawusd.tracking.performance.smoother import Smoothed
+
+
+def performance_of(
+    jaw: JawRig,
+    pivot: Array,
+    frames: Sequence[int],
+    smoothed: Smoothed,
+    camera_names: tuple[str, ...],
+    fps: float,
+    *,
+    free_focal: bool = False,
+) -> Performance:
+    """Return the performance of a take.
+
+    Args:
+        jaw: the person's rig.
+        pivot: point of the upper scan the head turns about [mm], shape (3,).
+        frames: of the reference camera, in the order of the fits.
+        smoothed: the take after the second pass.
+        camera_names: in the order of the views.
+        fps: frames per second.
+        free_focal: focal lengths were estimated, over those of the cameras.
+    """
+    fits = smoothed.fits
+    d = np.stack([fit.pose.d for fit in fits])
+    verdicts = jaw.validate_parameters(d)
+    found = np.stack([fit.found for fit in fits])
+    missed = np.stack([fit.missed for fit in fits]).any(1)
+    state = np.where(found.all(1), SolveState.SOLVED, np.where(missed, SolveState.LOST, SolveState.CARRIED))
+    nothing = np.full(2, np.nan)
+    notes: dict[str, object] = {"fps": fps, "habits": smoothed.state.habits.tolist()}
+    if free_focal:
+        factors, sigmas = np.exp(smoothed.state.log_focal), smoothed.sigma_log_focal
+        table = zip(camera_names, factors.tolist(), sigmas.tolist(), strict=True)
+        notes["focal"] = {name: [factor, sigma] for name, factor, sigma in table}
+    return Performance(
+        frames=np.array(frames, np.int64),
+        T_world_upper=np.stack([fit.pose.head for fit in fits]),
+        d=d,
+        covariance=smoothed.covariance,
+        pivot=pivot,
+        state=state.astype(np.int8),
+        found=found,
+        use=np.stack([fit.use for fit in fits]),
+        uncovered=np.stack([fit.uncovered for fit in fits]),
+        residual_px=np.stack([nothing if f.solution is None else residual_px(f.solution) for f in fits]),
+        matched_px=np.stack([np.zeros(2) if f.solution is None else matched_px(f.solution) for f in fits]),
+        margin_mm=verdicts.margin_mm,
+        verdict=verdicts.words(),
+        camera_names=camera_names,
+        notes=notes,
+    )
 
 
 def tracks_of(performance: Performance, jaw: JawRig) -> Tracks:

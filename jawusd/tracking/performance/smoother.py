@@ -47,16 +47,24 @@ class Smoother:
     def __init__(
         self,
         instants: InstantSolver,
-        views: Views,
+        views: Views | None,
         frames: Sequence[int],
         fps: float,
         cameras: int,
         *,
         fixed_head: bool = False,
         free_focal: bool = False,
+        length_px: float | None = None,
     ) -> None:
-        """Take what aligns instants, the pictures, the frames in order, and how many cameras there are."""
-        self._cameras, self._rounds = cameras, _FOCAL_ROUNDS if free_focal else _ROUNDS
+        """Take what aligns instants, the pictures, the frames in order, and how many cameras there are.
+
+        Args:
+            views: None for fits whose outlines are matched where they are; with a fixed head these have the same one.
+            length_px: over which outlines err alike, where residuals do not show it.
+        """
+        self._cameras, self._rounds, self._length_px = cameras, _FOCAL_ROUNDS if free_focal else _ROUNDS, length_px
+        if views is None:
+            self._rounds = 0
         self._instants, self._views, self._frames, self._fps = instants, views, frames, fps
         self._coordinates: Coordinates = instants.coordinates
         free = cameras if free_focal else 0
@@ -71,13 +79,13 @@ class Smoother:
         """
         config, fits = self._instants.config, list(fits)
         state = TakeState.unknown(self._cameras)
-        weight = 1.0 / outline_variance(fits, config)
+        weight = 1.0 / outline_variance(fits, config, self._length_px)
         good = np.array([fit.found.all() for fit in fits])
         motion = measured_motion(self._coordinates, [fit.pose for fit in fits], good, self._fps)
         total = self._rounds * len(fits)
-        if self._unknowns.fixed_head:
+        if self._unknowns.fixed_head and self._views is not None:
             fits = self._with_one_head(fits)
-        if self._unknowns.free_focal:
+        if self._unknowns.free_focal and self._views is not None:
             fits = [self._matched(fit, frame, state) for fit, frame in zip(fits, self._frames, strict=True)]
         for round_ in range(self._rounds + 1):
             system = self._system(fits, state, weight, motion)
@@ -90,7 +98,7 @@ class Smoother:
             for k, fit in enumerate(fits):
                 fits[k] = self._matched(fit, self._frames[k], state)
                 done(round_ * len(fits) + k + 1, total)
-            weight = 1.0 / outline_variance(fits, config)
+            weight = 1.0 / outline_variance(fits, config, self._length_px)
         sigma = np.zeros(self._cameras)
         covariance, shared = self._covariance(system)
         if self._unknowns.free_focal:
@@ -136,7 +144,7 @@ class Smoother:
 
     def _matched(self, fit: FrameFit, frame: int, state: TakeState) -> FrameFit:
         """Match the outlines of a frame at its pose."""
-        if not fit.use.any():
+        if not fit.use.any() or self._views is None:
             return fit
         views = state.corrected(self._views.at(frame))
         rendering = Rendering(self._instants.solver, views)
@@ -148,6 +156,8 @@ class Smoother:
 
     def _found_again(self, fits: list[FrameFit], weight: Array) -> list[FrameFit]:
         """Look once more, from smoothed poses, for arches whose masks nothing fitted."""
+        if self._views is None:
+            return fits
         attempts = Attempts(self._instants, weight, usual_residual_px(fits))
         for k, fit in enumerate(fits):
             if fit.missed.any():
@@ -173,9 +183,14 @@ class Smoother:
         return np.asarray(out, np.float64), found.shared
 
 
-def outline_variance(fits: Sequence[FrameFit], config: TrackingConfig) -> Array:
-    """Return the variance times correlation length of the outline errors per arch, over a take [px^3], shape (2,)."""
+def outline_variance(fits: Sequence[FrameFit], config: TrackingConfig, length_px: float | None = None) -> Array:
+    """Return the variance times correlation length of the outline errors per arch, over a take [px^3], shape (2,).
+
+    The length is taken from the residuals unless it is given.
+    """
     solutions = [(fit.solution, fit.found) for fit in fits if fit.solution is not None and fit.found.any()]
+    if length_px is not None:
+        return np.asarray(usual_residual_px(fits) ** 2 * length_px, np.float64)
     lengths = np.array([np.where(found, correlation_px(solution, config), np.nan) for solution, found in solutions])
     known = lengths[np.isfinite(lengths)]
     length = float(np.median(known)) if len(known) else config.correlation_px

@@ -9,9 +9,8 @@ import numpy as np
 
 from jawusd.errors import TrackingError
 from jawusd.evaluator import JawRig
-from jawusd.formats.performance import Performance, SolveState
+from jawusd.formats.performance import Performance
 from jawusd.tracking.config import TrackingConfig
-from jawusd.tracking.contour.quality import matched_px, residual_px
 from jawusd.tracking.contour.scan import Scan
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.performance.attempts import Attempts, FrameFit, usual_residual_px
@@ -19,6 +18,7 @@ from jawusd.tracking.performance.coordinates import Coordinates, Pose
 from jawusd.tracking.performance.forward import ForwardPass
 from jawusd.tracking.performance.instant import InstantSolver, quick, whole
 from jawusd.tracking.performance.instants import KeptViews, Views
+from jawusd.tracking.performance.results import performance_of
 from jawusd.tracking.performance.smoother import Smoothed, Smoother
 
 Progress = Callable[[int, int], None]
@@ -72,7 +72,16 @@ def solve_performance(
     solver = ContourSolver(scans, config or TrackingConfig())
     take = _Take(jaw, solver, shot, progress or (lambda done, total: None))
     take.first_pass()
-    return take.result(take.second_pass())
+    smoothed = take.second_pass()
+    return performance_of(
+        jaw,
+        take.coordinates.pivot,
+        sorted(take.fits),
+        smoothed,
+        shot.camera_names,
+        shot.fps,
+        free_focal=shot.free_focal,
+    )
 
 
 class _Take:
@@ -80,8 +89,8 @@ class _Take:
 
     def __init__(self, jaw: JawRig, solver: ContourSolver, shot: Shot, progress: Progress) -> None:
         self._jaw, self._config, self._shot, self._progress = jaw, solver.config, shot, progress
-        self._coordinates = Coordinates(jaw, solver.scans)
-        self._quick, self._full = (InstantSolver(one, self._coordinates) for one in (quick(solver), whole(solver)))
+        self.coordinates = Coordinates(jaw, solver.scans)
+        self._quick, self._full = (InstantSolver(one, self.coordinates) for one in (quick(solver), whole(solver)))
         self._views = KeptViews(shot.views)
         self._weight = np.full(2, 1.0 / self._config.typical_noise_px3)
         self.fits: dict[int, FrameFit] = {}
@@ -130,38 +139,3 @@ class _Take:
         options = {"fixed_head": shot.fixed_head, "free_focal": shot.free_focal}
         smoother = Smoother(self._full, self._views, frames, shot.fps, cameras, **options)
         return smoother.run([self.fits[frame] for frame in frames])
-
-    def result(self, smoothed: Smoothed) -> Performance:
-        """Return what was found."""
-        fits = smoothed.fits
-        d = np.stack([fit.pose.d for fit in fits])
-        verdicts = self._jaw.validate_parameters(d)
-        found = np.stack([fit.found for fit in fits])
-        missed = np.stack([fit.missed for fit in fits]).any(1)
-        state = np.where(found.all(1), SolveState.SOLVED, np.where(missed, SolveState.LOST, SolveState.CARRIED))
-        nothing = np.full(2, np.nan)
-        return Performance(
-            frames=np.array(sorted(self.fits), np.int64),
-            T_world_upper=np.stack([fit.pose.head for fit in fits]),
-            d=d,
-            covariance=smoothed.covariance,
-            pivot=self._coordinates.pivot,
-            state=state.astype(np.int8),
-            found=found,
-            use=np.stack([fit.use for fit in fits]),
-            uncovered=np.stack([fit.uncovered for fit in fits]),
-            residual_px=np.stack([nothing if f.solution is None else residual_px(f.solution) for f in fits]),
-            matched_px=np.stack([np.zeros(2) if f.solution is None else matched_px(f.solution) for f in fits]),
-            margin_mm=verdicts.margin_mm,
-            verdict=verdicts.words(),
-            camera_names=self._shot.camera_names,
-            notes={"fps": self._shot.fps, "habits": smoothed.state.habits.tolist(), **self._focal_notes(smoothed)},
-        )
-
-    def _focal_notes(self, smoothed: Smoothed) -> dict[str, object]:
-        """Return how long the focal lengths were found to be, over the calibrated ones, with standard deviations."""
-        if not self._shot.free_focal:
-            return {}
-        factors, sigmas = np.exp(smoothed.state.log_focal), smoothed.sigma_log_focal
-        table = zip(self._shot.camera_names, factors.tolist(), sigmas.tolist(), strict=True)
-        return {"focal": {name: [factor, sigma] for name, factor, sigma in table}}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +23,10 @@ class Picture(NamedTuple):
 
     camera: Camera  # the pinhole camera of the part
     rgb: NDArray[np.uint8]  # shape (h, w, 3)
+
+
+#: Cuts the pictures of an instant, one per camera or None, around T_world_upper and T_world_lower, shape (2, 4, 4).
+Cut = Callable[[Array], Sequence[Picture | None]]
 
 
 def first_colours(picture: Picture, poses: Array, scans: Sequence[Scan]) -> CameraColours:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
@@ -24,23 +24,20 @@ from jawusd.tracking.contour.scan import ARCHES, Scan, probe_points
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import View
 from jawusd.tracking.region.condyles import CondyleMotion, CondyleTerm
-from jawusd.tracking.region.learned import FIRST_RATES, RATES, LearnedColours
-from jawusd.tracking.region.picture import Picture
+from jawusd.tracking.region.learned import CORRELATION_PX, FIRST_RATES, RATES, LearnedColours
+from jawusd.tracking.region.picture import Cut, Picture
 from jawusd.tracking.region.starts import head_shifts, likeliest, starts_everywhere, turned_starts
 from jawusd.tracking.sequence.history import MotionPredictor
 
 # Gates of an alignment, of the brief trial of a start, distance of contour samples, motion that redraws scans [px].
 _GATES_PX, _TRIAL_GATES_PX, _SAMPLE_STEP_PX, _REDRAW_PX = (12.0, 8.0, 6.0, 4.0, 3.0, 2.5, 2.0), (8.0, 6.0), 2.0, 2.0
-# Contour length over which borders of colours err alike: lips and shadows move those of whole teeth [px]. With the
-# length of drawn masks, 18, the NEES of the relative pose was 3.8 and 9.4 on a path-traced and a rasterised take.
-_CORRELATION_PX = 110.0
-# Their variance times that length, against which expected condyles are weighed [px^3]: where the jaw is well seen, and
-# in doubtful frames. With the greater one everywhere, the incisal points of two takes were 0.006 mm worse; with the
-# lesser one a jaw drifted whose edges front teeth and lips hid.
+# Variance of borders times the length over which they err alike, against which expected condyles are weighed [px^3]:
+# where the jaw is well seen, and in doubtful frames. With the greater one everywhere, the incisal points of two takes
+# were 0.006 mm worse; with the lesser one a jaw drifted whose edges front teeth and lips hid.
 _LOOSE_PX3, _FIRM_PX3 = 3.0, 15.0
 # Contour that fits worth as much as a standard deviation squared of the condyles [px]: a sample beyond the gate costs
 # Tukey's loss of 4.685^2 / 6, and samples err alike over the length above.
-_STRAIN_PX = 0.5 * _CORRELATION_PX * 6.0 / 4.685**2
+_STRAIN_PX = 0.5 * CORRELATION_PX * 6.0 / 4.685**2
 _FIRST_ROUNDS = 3  # picks are a few tenths of a millimetre off; each round takes most of the rest
 _FAST_MM = 1.0  # predicted motion from which other starts are tried as well
 # Of the usual share of contour that fits, below which a jaw is searched, what was lost is not trusted again, and poses
@@ -53,10 +50,6 @@ _USUAL_FRAMES = 15  # over which the usual contour is measured
 _EAGER, _OFTEN = 6, 4
 _WIDE_MM = 40.0  # how far open a jaw is expected at most that was out of sight
 _HOPEFUL, _FINALISTS = 24, 3  # starts of a search that are tried, and that are followed to the end
-
-
-#: Cuts the pictures of an instant, one per camera or None, around T_world_upper and T_world_lower, shape (2, 4, 4).
-Cut = Callable[[Array], Sequence[Picture | None]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +153,7 @@ class RegionTracker:
     def _covariance(self, solution: Solution) -> Array:
         """Return the covariance of both arches' left world twists, shape (2, 6, 6)."""
         sigma = residual_px(solution)
-        return np.stack([twist_covariance(solution, r, float(sigma[r]), _CORRELATION_PX) for r in ARCHES])
+        return np.stack([twist_covariance(solution, r, float(sigma[r]), CORRELATION_PX) for r in ARCHES])
 
     def _best(self, starts: list[Array], views: list[View], last: Array) -> Solution:
         """Align from the prediction, and from other starts where the teeth are fast."""

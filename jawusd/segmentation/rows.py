@@ -1,0 +1,166 @@
+"""Find both rows of teeth in a picture of a mouth that nothing is known of: a first look, to begin a search with.
+
+Teeth are brighter and less red than all that surrounds them; between rows that are apart, it is dark or red.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from jawusd.geometry.arrays import Array, Mask
+
+_WIDTH_PX = 480  # of the picture that is worked on
+# Teeth are told by brightness less redness, CIELAB L* - 2.5 a*. Levels of it that are tried, as percentiles of the
+# picture, and the percentile of the picture that counts as white.
+_REDNESS, _LEVELS, _BRIGHTEST = 2.5, (40, 55, 65, 72, 78, 83, 87, 90, 92, 94, 96), 99.5
+# Of what surrounds teeth, so much must be redder by a difference of a*, or darker by a factor.
+_UNLIKE, _REDDER, _DARKER = 0.6, 3.0, 0.3
+_LEAST_AREA, _MOST_AREA = 0.0015, 0.2  # share of the picture that teeth cover
+_CLOSE_PX, _NEAR_PX, _FAR_PX = 4, 3, 12  # gaps closed between teeth; ring around them that is looked at
+# How far rows are apart at most, in widths of a row; of parts of teeth the least area, in shares of a row's; how
+# bright they are, from surroundings to the teeth found first, and how far they stand out from what is around them, in
+# shares of the teeth found first: wet lips and chins do less.
+_ROWS_APART, _LEAST_PART, _AS_BRIGHT, _LIKE = 1.0, 0.02, 0.65, 0.5
+# Lines between the rows: tilts over half the width in shares of it, sags in shares of the height; the least share of
+# the teeth on either side.
+_TILTS, _SAGS, _LEAST_SHARE = np.linspace(-0.3, 0.3, 21), np.linspace(-0.4, 0.4, 13), 0.2
+_LINE_PX = (-1, 0, 1)  # rows around a line that should be gap
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Hold both rows of teeth in a picture.
+
+    Attributes:
+        masks: upper and lower row, 0 or 255, shape (2, H, W).
+        bridged: share of the line between them that is no gap, 0 .. 1: 0 for rows that are apart.
+    """
+
+    masks: NDArray[np.uint8]
+    bridged: float
+
+
+def tooth_rows(rgb: NDArray[np.uint8]) -> Rows | None:
+    """Return the rows of teeth of an RGB picture (H, W, 3), upright; None where nothing looks like teeth."""
+    height, width = rgb.shape[:2]
+    small = cv2.resize(rgb, (_WIDTH_PX, max(8, round(height * _WIDTH_PX / width))), interpolation=cv2.INTER_AREA)
+    smooth = cv2.GaussianBlur(small, (0, 0), 1.0).astype(np.float32)
+    smooth = np.minimum(smooth / max(float(np.percentile(smooth, _BRIGHTEST)), 1.0), 1.0)
+    lab = np.asarray(cv2.cvtColor(smooth, cv2.COLOR_RGB2LAB), np.float64)
+    redness, toothlike = lab[..., 1], lab[..., 0] - _REDNESS * lab[..., 1]
+    found = _teeth(toothlike, redness)
+    if found is None:
+        return None
+    teeth, level = found
+    usual = float(np.median(toothlike[teeth]))
+    split = _split(teeth, np.clip((toothlike - level) / max(usual - level, 1.0), 0.0, 1.0))
+    if split is None:
+        return None
+    rows, bridged = split
+    shapes = [cv2.resize(255 * row.astype(np.uint8), (width, height), interpolation=cv2.INTER_LINEAR) for row in rows]
+    return Rows(np.where(np.stack(shapes) > 127, 255, 0).astype(np.uint8), bridged)
+
+
+def _teeth(toothlike: Array, redness: Array) -> tuple[Mask, float] | None:
+    """Return the pixels of the teeth, and the level they stand above."""
+    best: tuple[float, float, float, Mask] | None = None
+    for level in np.percentile(toothlike, _LEVELS).tolist():
+        above = ndimage.binary_opening(toothlike > level, np.ones((2, 2)))
+        groups, count = ndimage.label(ndimage.binary_closing(above, iterations=_CLOSE_PX))
+        areas = np.bincount(groups.ravel(), minlength=count + 1)
+        fair = (areas > _LEAST_AREA * groups.size) & (areas < _MOST_AREA * groups.size)
+        fair[[0, *_at_border(groups)]] = False
+        for number in np.flatnonzero(fair).tolist():
+            inside, outside = _standing_out(groups, number, above, toothlike, redness)
+            worth = (inside - outside) ** 2 * np.sqrt(areas[number])
+            if worth > (0.0 if best is None else best[0]):
+                best = worth, inside, outside, groups == number
+    if best is None:
+        return None
+    _, inside, outside, group = best
+    level = (inside + outside) / 2  # highlights on lips are above the lower one too
+    parts, count = ndimage.label(toothlike > level)
+    like = ndimage.median(toothlike, parts, np.arange(count + 1)) > outside + _AS_BRIGHT * (inside - outside)
+    own = np.bincount(parts.ravel(), group.ravel(), count + 1) > 0.5 * np.bincount(parts.ravel())
+    kept = [
+        number
+        for number in _parts_near(parts, group)
+        if like[number] and (own[number] or _stands_out(parts, number, toothlike, redness) > _LIKE * (inside - outside))
+    ]
+    return (np.isin(parts, kept), level) if kept else None
+
+
+def _stands_out(parts: NDArray[np.int32], number: int, toothlike: Array, redness: Array) -> float:
+    inside, outside = _standing_out(parts, number, parts > 0, toothlike, redness)
+    return inside - outside
+
+
+def _at_border(groups: NDArray[np.int32]) -> list[int]:
+    return np.unique(np.concatenate([groups[0], groups[-1], groups[:, 0], groups[:, -1]])).tolist()
+
+
+def _standing_out(
+    groups: NDArray[np.int32], number: int, above: Mask, toothlike: Array, redness: Array
+) -> tuple[float, float]:
+    """Return how much a group looks like teeth, and the ring around it; nothing if that is neither redder nor dark."""
+    (top, left), (bottom, right) = ((f(np.nonzero(groups == number), axis=1)) for f in (np.min, np.max))
+    around = np.s_[max(top - _FAR_PX, 0) : bottom + _FAR_PX + 1, max(left - _FAR_PX, 0) : right + _FAR_PX + 1]
+    group = groups[around] == number
+    own = group & above[around]
+    ring = ndimage.binary_dilation(group, iterations=_FAR_PX) & ~ndimage.binary_dilation(group, iterations=_NEAR_PX)
+    if not own.any() or not ring.any():
+        return 0.0, 0.0
+    inside = float(np.median(toothlike[around][own]))
+    unlike = redness[around][ring] > np.median(redness[around][own]) + _REDDER
+    unlike |= toothlike[around][ring] < _DARKER * inside
+    return (inside, float(np.percentile(toothlike[around][ring], 80))) if unlike.mean() > _UNLIKE else (0.0, 0.0)
+
+
+def _parts_near(parts: NDArray[np.int32], group: Mask) -> list[int]:
+    """Return the parts over, under and in a group of teeth that may be teeth by their size and place."""
+    rows, columns = np.nonzero(group)
+    reach = _ROWS_APART * (np.ptp(columns) + 1)
+    around = np.zeros(parts.shape, bool)
+    across = np.s_[max(columns.min() - _CLOSE_PX, 0) : columns.max() + _CLOSE_PX + 1]
+    around[max(int(rows.min() - reach), 0) : int(rows.max() + reach), across] = True
+    areas = np.bincount(parts.ravel())
+    inside = np.bincount(parts.ravel(), around.ravel(), len(areas))
+    kept = (inside > 0.8 * areas) & (areas > _LEAST_PART * ((parts > 0) & group).sum())
+    kept[[0, *_at_border(parts)]] = False
+    return np.flatnonzero(kept).tolist()
+
+
+def _split(teeth: Mask, bright: Array) -> tuple[NDArray[np.bool_], float] | None:
+    """Return upper and lower row (2, h, w), parted by the line with most gap, and the share of it that is none."""
+    rows, columns = np.nonzero(teeth)
+    first, last, top, bottom = columns.min(), columns.max(), rows.min(), rows.max()
+    lines = top + _lines(int(last - first + 1), int(bottom - top + 1))  # (N, width)
+    lines = np.clip(lines, 1, len(teeth) - 2)
+    across = np.arange(first, last + 1)
+    taken = teeth[:, across].any(0)
+    upper = np.cumsum(teeth[:, across], axis=0)
+    share = upper[lines, np.arange(len(across))].sum(1) / upper[-1].sum()
+    fair = np.flatnonzero((share > _LEAST_SHARE) & (share < 1 - _LEAST_SHARE))
+    if not len(fair):
+        return None
+    lines = lines[fair]
+    bridged = np.mean([bright[lines + k, across] for k in _LINE_PX], axis=0)[:, taken].mean(1)
+    best = int(bridged.argmin())
+    below = np.zeros(teeth.shape, bool)
+    below[:, across] = np.arange(len(teeth))[:, None] > lines[best]
+    return np.stack([teeth & ~below, teeth & below]), float(bridged[best])
+
+
+@lru_cache(maxsize=8)
+def _lines(width: int, height: int) -> NDArray[np.int64]:
+    """Return lines across a box, the rows at each column, shape (N, width)."""
+    place = np.linspace(-1.0, 1.0, width)
+    middles = np.arange(0.15 * height, 0.9 * height, 1.0)
+    middle, tilt, sag = (grid.reshape(-1, 1) for grid in np.meshgrid(middles, _TILTS * width / 2, _SAGS * height))
+    return np.rint(middle + tilt * place + sag * place**2).astype(np.int64)

@@ -1,0 +1,188 @@
+"""A performance from pictures alone: frame after frame both ways from the start, then all frames at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from jawusd.evaluator import JawRig
+from jawusd.formats.performance import Performance
+from jawusd.geometry import Camera
+from jawusd.geometry.arrays import Array
+from jawusd.tracking.config import TrackingConfig
+from jawusd.tracking.contour.quality import score_px
+from jawusd.tracking.contour.scan import Scan, teeth_centre, thinned
+from jawusd.tracking.contour.solver import ContourSolver
+from jawusd.tracking.performance.attempts import FrameFit
+from jawusd.tracking.performance.coordinates import Coordinates, Pose
+from jawusd.tracking.performance.instant import InstantSolver
+from jawusd.tracking.performance.prediction import KNOWN, STEADY
+from jawusd.tracking.performance.results import performance_of
+from jawusd.tracking.performance.smoother import Smoothed, Smoother
+from jawusd.tracking.region.learned import CORRELATION_PX, LearnedColours
+from jawusd.tracking.region.picture import Cut
+from jawusd.tracking.region.rig_tracker import RigTracker
+
+#: Cuts the pictures of a range of frames by cameras, of the capture or with other focal lengths, at a size that suits
+#: teeth near a point of the world [mm], shape (3,).
+Cuts = Callable[[Sequence[Camera], Array, range], Iterator[Cut]]
+Progress = Callable[[int, int], None]
+
+_FACES, _SAMPLE_STEP_PX, _REDRAW_PX = 20_000, 2.0, 2.0
+# Frames that tell a fixed head and unknown focal lengths before all are solved, and how often focal lengths are.
+_FIRST_FRAMES, _FOCAL_ROUNDS = 120, 3
+
+
+@dataclass(frozen=True, eq=False)
+class PictureShot:
+    """Say what to solve.
+
+    Attributes:
+        cuts: cut the pictures.
+        cameras: in the order of the pictures.
+        frames: of the reference camera.
+        fps: frames per second.
+        fixed_head: the cameras are worn: the head does not move before them.
+        free_focal: the focal lengths are guesses.
+    """
+
+    cuts: Cuts
+    cameras: Sequence[Camera]
+    frames: range
+    fps: float
+    fixed_head: bool = False
+    free_focal: bool = False
+
+
+class PictureTake:
+    """Follow a shot by the colours of its pictures."""
+
+    def __init__(
+        self,
+        jaw: JawRig,
+        scans: Sequence[Scan],
+        axes: Array,
+        shot: PictureShot,
+        config: TrackingConfig | None = None,
+    ) -> None:
+        """Prepare.
+
+        Args:
+            jaw: the person's rig.
+            scans: upper and lower teeth, prepared.
+            axes: rotation from scan to anatomical axes: left, up, front; shape (3, 3).
+            shot: pictures and frames.
+            config: the tracker's numbers.
+        """
+        self._scans, self._axes, self._jaw, self._shot = [thinned(scan, _FACES) for scan in scans], axes, jaw, shot
+        self.coordinates = Coordinates(jaw, self._scans)
+        config = replace(config or TrackingConfig(), sample_step_px=_SAMPLE_STEP_PX, redraw_px=_REDRAW_PX)
+        self._instants = InstantSolver(ContourSolver(self._scans, config), self.coordinates)
+
+    def begun(self, frame: int, near: Pose) -> tuple[Pose, float]:
+        """Return the pose on a frame near a guess, and how much of the contour in sight fits it, 0 .. 1.
+
+        Raises:
+            CaptureError: a picture cannot be decoded.
+        """
+        fit = self._tracker(self._shot.cameras, 1.0).begin(self._first_cut(self._shot.cameras, frame, near), near)
+        solution = fit.solution
+        if solution is None or not fit.found.all():
+            return fit.pose, 0.0
+        return fit.pose, float((score_px(solution).sum(1) / np.maximum(solution.visible_px.sum(1), 1.0)).min())
+
+    def solve(self, frame: int, start: Pose, progress: Progress = lambda done, total: None) -> Performance:
+        """Solve head pose and jaw parameters of every frame.
+
+        Args:
+            frame, start: where to begin.
+            progress: called with frames done and frames in all, once per frame.
+
+        Raises:
+            CaptureError: a picture cannot be decoded.
+        """
+        shot = self._shot
+        cameras, start, factors = self._known_before(frame, start, progress)
+        fits = self._follow(cameras, (frame, start), shot.frames, KNOWN if shot.fixed_head else 1.0, progress)
+        smoothed = self._smoothed(shot.frames, fits)
+        if shot.free_focal:
+            log_focal = smoothed.state.log_focal + np.log(factors)
+            smoothed = replace(smoothed, state=replace(smoothed.state, log_focal=log_focal))
+        names, pivot = tuple(camera.name for camera in cameras), self.coordinates.pivot
+        return performance_of(self._jaw, pivot, shot.frames, smoothed, names, shot.fps, free_focal=shot.free_focal)
+
+    def _known_before(self, at: int, start: Pose, progress: Progress) -> tuple[Sequence[Camera], Pose, Array]:
+        """Return cameras, start, and true over given focal lengths (C,), from some frames where they are unknown."""
+        shot = self._shot
+        cameras, factors = shot.cameras, np.ones(len(shot.cameras))
+        rounds = _FOCAL_ROUNDS if shot.free_focal else int(shot.fixed_head)
+        first = max(shot.frames.start, min(at, shot.frames.stop - _FIRST_FRAMES))
+        some = range(first, min(first + _FIRST_FRAMES, shot.frames.stop))
+        for round_ in range(rounds):
+            head = STEADY if shot.fixed_head and round_ == 0 else KNOWN if shot.fixed_head else 1.0
+            fits = self._follow(cameras, (at, start), some, head, progress)
+            if head == STEADY:
+                fits = self._with_one_head(fits)
+            elif shot.free_focal:
+                smoothed = self._smoothed(some, fits)
+                fits, growth = smoothed.fits, np.exp(smoothed.state.log_focal)
+                factors = factors * growth
+                cameras = [_zoomed(camera, float(f)) for camera, f in zip(cameras, growth, strict=True)]
+            start = fits[some.index(at)].pose
+        return cameras, start, factors
+
+    def _tracker(self, cameras: Sequence[Camera], head: float) -> RigTracker:
+        colours = LearnedColours(self._scans, cameras, self._axes)
+        return RigTracker(self._instants, colours, head=head, free_focal=self._shot.free_focal)
+
+    def _first_cut(self, cameras: Sequence[Camera], frame: int, near: Pose) -> Cut:
+        return next(iter(self._shot.cuts(cameras, self._centre(near), range(frame, frame + 1))))
+
+    def _centre(self, pose: Pose) -> Array:
+        return teeth_centre(self._scans, self.coordinates.arches(pose))
+
+    def _follow(
+        self, cameras: Sequence[Camera], start: tuple[int, Pose], frames: range, head: float, progress: Progress
+    ) -> list[FrameFit]:
+        """Return the fits of frames, from one and its pose on both ways."""
+        at, pose = start
+        tracker = self._tracker(cameras, head)
+        fits = {at: tracker.begin(self._first_cut(cameras, at, pose), pose)}
+        back = tracker.other_way(fits[at])
+        for way, one in ((range(at + 1, frames.stop), tracker), (range(at - 1, frames.start - 1, -1), back)):
+            for frame, cut in zip(way, self._shot.cuts(cameras, self._centre(pose), way), strict=True):
+                fits[frame] = one.step(cut)
+                progress(len(fits), len(frames))
+        return [fits[frame] for frame in frames]
+
+    def _smoothed(self, frames: range, fits: Sequence[FrameFit]) -> Smoothed:
+        """Return all frames refined together."""
+        shot = self._shot
+        smoother = Smoother(
+            self._instants,
+            None,
+            frames,
+            shot.fps,
+            len(shot.cameras),
+            fixed_head=shot.fixed_head,
+            free_focal=shot.free_focal,
+            length_px=CORRELATION_PX,
+        )
+        return smoother.run(fits)
+
+    def _with_one_head(self, fits: Sequence[FrameFit]) -> list[FrameFit]:
+        """Return the fits with the same head, the median of those found."""
+        seen = [fit for fit in fits if fit.found.all()] or list(fits)
+        first = seen[0].pose.head
+        away = np.median([self.coordinates.head_steps(first, fit.pose.head) for fit in seen], axis=0)
+        head = self.coordinates.turned(first, away)
+        return [replace(fit, pose=replace(fit.pose, head=head)) for fit in fits]
+
+
+def _zoomed(camera: Camera, factor: float) -> Camera:
+    """Return a camera with another focal length."""
+    K = camera.K.copy()
+    K[[0, 1], [0, 1]] *= factor
+    return replace(camera, K=K)

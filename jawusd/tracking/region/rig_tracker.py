@@ -1,0 +1,170 @@
+"""Follow head and jaw of a person whose rig exists by the colours of the pictures, lost and found again."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from jawusd.geometry.arrays import Array, Mask
+from jawusd.tracking.contour.equations import Solution
+from jawusd.tracking.contour.quality import matched_px, score_px
+from jawusd.tracking.contour.solver import Matched, Rendering
+from jawusd.tracking.contour.views import present_masks
+from jawusd.tracking.performance.attempts import MOST_UNSURE, FrameFit
+from jawusd.tracking.performance.coordinates import Pose
+from jawusd.tracking.performance.focal import growth_of
+from jawusd.tracking.performance.instant import Aligned, Expected, InstantSolver
+from jawusd.tracking.performance.prediction import Prediction
+from jawusd.tracking.performance.single_start import spread_out
+from jawusd.tracking.region.learned import CORRELATION_PX, FIRST_RATES, RATES, LearnedColours
+from jawusd.tracking.region.picture import Cut, Picture
+
+# Variance of the borders of colours times the length over which they err alike [px^3]: as for both arches alone.
+_BORDER_PX3 = 0.7**2 * CORRELATION_PX
+_GATES_PX, _WIDE_GATES_PX, _BRIEF_GATES_PX = (6.0, 4.0, 3.0, 2.5, 2.0), (12.0, 8.0, 6.0, 4.0, 3.0, 2.5, 2.0), (8.0, 6.0)
+_FIRST_ROUNDS = 3  # picks are a few tenths of a millimetre off; each round takes most of the rest
+# Share of the usual contour that fits, below which a pose is doubted, others are searched, and an arch is given up.
+_DOUBTED, _SEARCHED, _LOST = 0.8, 0.6, 0.33
+_USUAL_FRAMES = 15  # over which the usual contour is measured
+_JAWS, _FINALISTS = 24, 3  # poses of the jaw that a search tries, and follows to the end
+_SEARCHES = 8  # frames in a row that are searched; then every so many
+
+
+class RigTracker:
+    """Follow head and jaw of a known person from picture to picture."""
+
+    def __init__(
+        self, instants: InstantSolver, colours: LearnedColours, *, head: float = 1.0, free_focal: bool = False
+    ) -> None:
+        """Take what aligns instants and where the colours are kept; `begin` comes first.
+
+        Args:
+            head: how far the head moves, see `Prediction`.
+            free_focal: tell how outlines grow with focal lengths.
+        """
+        self._instants, self._coordinates, self._colours = instants, instants.coordinates, colours
+        self._head, self._free_focal = head, free_focal
+        self._jaws = spread_out(instants.coordinates.jaw, _JAWS)
+        self._usual: deque[Array] = deque(maxlen=_USUAL_FRAMES)
+        self._least_px = instants.config.least_matched_px
+        self._failed = 0
+
+    def begin(self, cut: Cut, pose: Pose) -> FrameFit:
+        """Learn the colours of a first frame from a pose of a few tenths of a millimetre; return the better pose."""
+        arches = self._coordinates.arches(pose)
+        self._colours.begin(cut(arches), arches)
+        sigma = MOST_UNSURE * np.r_[[min(1.0, self._head)] * 6, [1.0] * 3]
+        for _ in range(_FIRST_ROUNDS):
+            arches = self._coordinates.arches(pose)
+            look = _Look(self._instants, self._colours, cut(arches), arches)
+            found = look.align(pose, Expected(pose, sigma**-2.0), _WIDE_GATES_PX)
+            pose = found.pose
+            look.learn(pose, FIRST_RATES)
+        fit = look.fit(found, np.ones(2, bool), self._free_focal)
+        self._motion = Prediction(self._coordinates, pose, fit.found, head=self._head)
+        self._usual.append(_share(found.solution))
+        return fit
+
+    def other_way(self, begin: FrameFit) -> RigTracker:
+        """Return a tracker that goes on from the first frame with what is known now, and learns on its own."""
+        out = RigTracker(self._instants, self._colours.copy(), head=self._head, free_focal=self._free_focal)
+        out._motion = Prediction(self._coordinates, begin.pose, begin.found, head=self._head)
+        out._usual.extend(self._usual)
+        return out
+
+    def step(self, cut: Cut) -> FrameFit:
+        """Align the next frame."""
+        expected = self._motion.expected()
+        pictures = cut(self._coordinates.arches(expected.pose))
+        look = _Look(self._instants, self._colours, pictures, self._coordinates.arches(self._motion.last))
+        if not look.use.any():
+            self._motion.take(expected.pose, np.zeros(2, bool))
+            return FrameFit(expected.pose, None, look.use, look.use, np.full(look.use.shape, np.nan))
+        found = self._best(expected, look)
+        share = _share(found.solution)
+        trusted = (share >= _LOST * self._usual_share()) & (matched_px(found.solution) >= self._least_px)
+        if not trusted.any():
+            found = replace(found, pose=expected.pose)
+        if trusted.all():
+            look.learn(found.pose, RATES)
+            self._usual.append(share)
+        self._motion.take(found.pose, trusted)
+        return look.fit(found, trusted, self._free_focal)
+
+    def _usual_share(self) -> Array:
+        return np.asarray(np.median(self._usual, axis=0), np.float64)
+
+    def _best(self, expected: Expected, look: _Look) -> Aligned:
+        """Align from the prediction, and from other starts where that may have failed."""
+        found, usual = look.align(expected.pose, expected, _GATES_PX), self._usual_share()
+        if not (_share(found.solution) < _DOUBTED * usual).any():
+            self._failed = 0
+            return found
+        for start in (expected.pose, self._motion.last):
+            found = _better(found, look.align(start, expected, _WIDE_GATES_PX))
+        if not (_share(found.solution) < _SEARCHED * usual).any():
+            self._failed = 0
+            return found
+        self._failed += 1
+        due = self._failed <= _SEARCHES or self._failed % _SEARCHES == 0
+        return self._searched(found, expected, look) if due else found
+
+    def _searched(self, found: Aligned, expected: Expected, look: _Look) -> Aligned:
+        """Try poses of the jaw all over its range, with the head as it was found."""
+        brief = []
+        for d in self._jaws:
+            start = replace(found.pose, d=d)
+            brief.append(look.align(start, replace(expected, pose=start), _BRIEF_GATES_PX))
+        brief.sort(key=lambda trial: -float(score_px(trial.solution).sum()))
+        for trial in brief[:_FINALISTS]:
+            around = replace(expected, pose=trial.pose)
+            found = _better(found, look.align(trial.pose, around, _WIDE_GATES_PX))
+        return found
+
+
+class _Look:
+    """Hold the pictures of one instant, drawn into by all attempts."""
+
+    def __init__(
+        self, instants: InstantSolver, colours: LearnedColours, pictures: Sequence[Picture | None], before: Array
+    ) -> None:
+        self._instants, self._colours, self._pictures = instants, colours, pictures
+        self._views = colours.views(pictures, before)
+        self._rendering = Rendering(instants.solver, self._views)
+        self.use = present_masks(self._views)
+
+    def align(self, start: Pose, expected: Expected, gates_px: Sequence[float]) -> Aligned:
+        """Return the likeliest pose near a start."""
+        weight = np.full(2, 1.0 / _BORDER_PX3)
+        return self._instants.align(start, self._views, self.use, gates_px, expected, weight, self._rendering)
+
+    def learn(self, pose: Pose, rates: tuple[float, float]) -> None:
+        """Take up the colours beside the borders found at a pose."""
+        counting, gate = self._colours.counting(self._views), self._instants.config.final_gate_px[1]
+        self._instants.linearise(pose, counting, self.use, self._rendering, gate)
+        self._colours.learn(counting, self._pictures, self._instants.coordinates.arches(pose), rates)
+
+    def fit(self, found: Aligned, trusted: Mask, free_focal: bool) -> FrameFit:
+        """Return what is known of the frame, with the arches that are trusted, shape (2,)."""
+        use = self.use & trusted[:, None]
+        unknown = np.full(use.shape, np.nan)
+        if not free_focal or not trusted.any():
+            return FrameFit(found.pose, found.solution, use, use, unknown)
+        matched: list[Matched] = []
+        gate = self._instants.config.final_gate_px[1]
+        solution = self._instants.linearise(found.pose, self._views, use, self._rendering, gate, True, matched)
+        growth = growth_of(matched, solution.poses, solution.centres, self._views)
+        return FrameFit(found.pose, solution, use, use, unknown, growth)
+
+
+def _share(solution: Solution) -> Array:
+    """Return how much of the contour in sight fits, per arch, shape (2,)."""
+    return np.asarray(score_px(solution).sum(1) / np.maximum(solution.visible_px.sum(1), 1.0), np.float64)
+
+
+def _better(one: Aligned, other: Aligned) -> Aligned:
+    """Return the one with more contour that fits."""
+    return other if score_px(other.solution).sum() > score_px(one.solution).sum() else one
