@@ -29,6 +29,7 @@ _EXTRA_OF_PACKAGE = {
     "moderngl": "demo",
     "viser": "view",
     "h5py": "hdf5",
+    "pythonosc": "live",
     "dask": "many",
     "distributed": "many",
     **dict.fromkeys(

@@ -6,8 +6,10 @@ import asyncio
 import contextlib
 import ipaddress
 import logging
+import math
 import socket
 import sys
+import time
 from abc import ABC, abstractmethod
 from typing import Protocol
 from urllib.parse import urlsplit
@@ -15,6 +17,7 @@ from urllib.parse import urlsplit
 import viser
 
 from jawusd.errors import OutputError
+from jawusd.geometry.arrays import Array
 from jawusd.viewer import capture_scene
 from jawusd.viewer.capture_page import CapturePage
 from jawusd.viewer.page import Page, StaticPlots, begin_page
@@ -26,6 +29,7 @@ log = logging.getLogger(__name__)
 
 # Panels occupy a browser without a graphics card for most of a second: the jaw is sent this much earlier [s].
 _HEAD_START_S = 0.5
+_SHOW_EVERY_S = 0.1  # poses that come live
 
 
 class _LocalServer(viser.ViserServer):
@@ -104,8 +108,20 @@ class Viewer(PageServer):
         """Start serving an actor; see `PageServer` for the rest."""
         self._actor = actor
         self._static = StaticPlots(actor.rig)
+        self._shown_s = -math.inf
         super().__init__(actor.name, host, port)
         set_first_view(self._server, self._static.rest)
+
+    def show(self, d: Array) -> None:
+        """Show a pose of the jaw [mm] (3,) on all open pages; what comes faster than browsers draw is left out."""
+        now = time.monotonic()
+        if now - self._shown_s < _SHOW_EVERY_S:
+            return
+        self._shown_s = now
+        for page in list(self.pages.values()):
+            if isinstance(page, Page):
+                page.session.show(d)
+                page.refresh()
 
     async def _page(self, client: viser.ClientHandle) -> Page:
         scene = begin_page(client, self._actor)

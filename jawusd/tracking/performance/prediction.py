@@ -32,18 +32,20 @@ class Prediction:
             head: how far the head moves, as a share of what is usual.
         """
         self._coordinates, self._miss = coordinates, _MISS * np.r_[[head] * 6, [1.0] * 3]
-        self.last, self._velocity = begin, np.zeros(LOCAL)
+        self.last, self._velocity, self._frames = begin, np.zeros(LOCAL), 1.0
         self.blind = np.where(found, 0, 1)
 
-    def expected(self) -> Expected:
-        """Return the prediction, the less sure the longer the teeth were out of sight."""
-        sigma = self._miss * np.sqrt(1.0 + np.r_[[self.blind[0]] * 6, [self.blind.max()] * 3])
-        pose = self._coordinates.moved(self.last, _DAMPING * self._velocity)
+    def expected(self, frames: float = 1.0) -> Expected:
+        """Return the prediction some frames on, the less sure the longer the teeth were out of sight."""
+        self._frames = frames
+        sigma = frames * self._miss * np.sqrt(1.0 + np.r_[[self.blind[0]] * 6, [self.blind.max()] * 3])
+        reach = _DAMPING * (1.0 - _DAMPING**frames) / (1.0 - _DAMPING)
+        pose = self._coordinates.moved(self.last, reach * self._velocity)
         return Expected(pose, np.minimum(sigma, MOST_UNSURE) ** -2.0)
 
     def take(self, pose: Pose, found: Mask) -> None:
         """Take up the next frame: where it is, and the arches that were found, shape (2,)."""
-        moved = self._coordinates.step(self.last, pose)
+        moved = self._coordinates.step(self.last, pose) / self._frames
         self._velocity = moved if found.all() and not self.blind.any() else np.zeros(LOCAL)
         self.blind = np.where(found, 0, self.blind + 1)
         self.last = pose

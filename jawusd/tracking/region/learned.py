@@ -36,7 +36,7 @@ class LearnedColours:
             cameras: in the order of the pictures.
             axes: rotation from scan to anatomical axes: left, up, front; shape (3, 3).
         """
-        self._scans, self._cameras, self._axes = tuple(scans), tuple(cameras), axes
+        self._scans, self._cameras, self.axes = tuple(scans), tuple(cameras), axes
         # Seeded: the same scans give the same patches.
         crowns = [scan.crown_vertices(3000) @ axes.T[:, [0, 2]] for scan in scans]
         self._patches = np.stack([kmeans2(points, PATCHES, seed=1, minit="++")[0] for points in crowns])
@@ -71,7 +71,7 @@ class LearnedColours:
                 matrix = camera.projection_matrix()
                 earlier = np.stack([matrix @ pose for pose in before])
                 bins = colour_bins(picture.rgb)
-                edges = RegionView(picture.rgb, bins, colours.ratio, self._patches, self._axes, earlier)
+                edges = RegionView(picture.rgb, bins, colours.ratio, self._patches, self.axes, earlier)
             habits = np.zeros((2, 3))
             habits[:, 1] = self._gum_px[:, c]
             empty, present = np.zeros((2, *shape), np.uint8), np.full(2, edges is not None)

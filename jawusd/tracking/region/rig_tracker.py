@@ -21,36 +21,52 @@ from jawusd.tracking.performance.prediction import Prediction
 from jawusd.tracking.performance.single_start import spread_out
 from jawusd.tracking.region.learned import CORRELATION_PX, FIRST_RATES, RATES, LearnedColours
 from jawusd.tracking.region.picture import Cut, Picture
+from jawusd.tracking.region.starts import head_shifts, likeliest
 
 # Variance of the borders of colours times the length over which they err alike [px^3]: as for both arches alone.
 _BORDER_PX3 = 0.7**2 * CORRELATION_PX
 _GATES_PX, _WIDE_GATES_PX, _BRIEF_GATES_PX = (6.0, 4.0, 3.0, 2.5, 2.0), (12.0, 8.0, 6.0, 4.0, 3.0, 2.5, 2.0), (8.0, 6.0)
+# The same with few steps, and after how many frames colours are taken up then.
+_FEW_GATES_PX, _LEARN_EVERY, _FEW_JAWS, _FEW_HEADS = (8.0, 5.0, 3.0, 2.0), 3, 12, 4
 _FIRST_ROUNDS = 3  # picks are a few tenths of a millimetre off; each round takes most of the rest
-# Share of the usual contour that fits, below which a pose is doubted, others are searched, and an arch is given up.
-_DOUBTED, _SEARCHED, _LOST = 0.8, 0.6, 0.33
+# Share of the usual contour that fits, below which a pose is doubted, others are searched, an arch is given up,
+# and one that was lost is not trusted again.
+_DOUBTED, _SEARCHED, _LOST, _AGAIN = 0.8, 0.6, 0.33, 0.5
 _USUAL_FRAMES = 15  # over which the usual contour is measured
-_JAWS, _FINALISTS = 24, 3  # poses of the jaw that a search tries, and follows to the end
+# Poses of the jaw that a search tries, and follows to the end, and of the head.
+_JAWS, _FINALISTS, _HEADS = 24, 3, 12
 _SEARCHES = 8  # frames in a row that are searched; then every so many
 
 
 class RigTracker:
-    """Follow head and jaw of a known person from picture to picture."""
+    """Follow head and jaw of a known person from picture to picture.
+
+    Attributes:
+        expected: where they were expected in the last step.
+    """
 
     def __init__(
-        self, instants: InstantSolver, colours: LearnedColours, *, head: float = 1.0, free_focal: bool = False
+        self,
+        instants: InstantSolver,
+        colours: LearnedColours,
+        *,
+        head: float = 1.0,
+        free_focal: bool = False,
+        brief: bool = False,
     ) -> None:
         """Take what aligns instants and where the colours are kept; `begin` comes first.
 
         Args:
             head: how far the head moves, see `Prediction`.
             free_focal: tell how outlines grow with focal lengths.
+            brief: take fewer steps, and up colours less often, for pictures that wait for nobody.
         """
         self._instants, self._coordinates, self._colours = instants, instants.coordinates, colours
-        self._head, self._free_focal = head, free_focal
+        self._head, self._free_focal, self._brief = head, free_focal, brief
         self._jaws = spread_out(instants.coordinates.jaw, _JAWS)
         self._usual: deque[Array] = deque(maxlen=_USUAL_FRAMES)
         self._least_px = instants.config.least_matched_px
-        self._failed = 0
+        self._failed = self._frame = 0
 
     def begin(self, cut: Cut, pose: Pose) -> FrameFit:
         """Learn the colours of a first frame from a pose of a few tenths of a millimetre; return the better pose."""
@@ -63,6 +79,7 @@ class RigTracker:
             found = look.align(pose, Expected(pose, sigma**-2.0), _WIDE_GATES_PX)
             pose = found.pose
             look.learn(pose, FIRST_RATES)
+        self.expected = Expected(pose, sigma**-2.0)
         fit = look.fit(found, np.ones(2, bool), self._free_focal)
         self._motion = Prediction(self._coordinates, pose, fit.found, head=self._head)
         self._usual.append(_share(found.solution))
@@ -70,14 +87,15 @@ class RigTracker:
 
     def other_way(self, begin: FrameFit) -> RigTracker:
         """Return a tracker that goes on from the first frame with what is known now, and learns on its own."""
-        out = RigTracker(self._instants, self._colours.copy(), head=self._head, free_focal=self._free_focal)
+        out = RigTracker(
+            self._instants, self._colours.copy(), head=self._head, free_focal=self._free_focal, brief=self._brief
+        )
         out._motion = Prediction(self._coordinates, begin.pose, begin.found, head=self._head)
-        out._usual.extend(self._usual)
         return out
 
-    def step(self, cut: Cut) -> FrameFit:
-        """Align the next frame."""
-        expected = self._motion.expected()
+    def step(self, cut: Cut, frames: float = 1.0) -> FrameFit:
+        """Align the next frame, or one some frames on."""
+        self.expected = expected = self._motion.expected(frames)
         pictures = cut(self._coordinates.arches(expected.pose))
         look = _Look(self._instants, self._colours, pictures, self._coordinates.arches(self._motion.last))
         if not look.use.any():
@@ -85,11 +103,14 @@ class RigTracker:
             return FrameFit(expected.pose, None, look.use, look.use, np.full(look.use.shape, np.nan))
         found = self._best(expected, look)
         share = _share(found.solution)
-        trusted = (share >= _LOST * self._usual_share()) & (matched_px(found.solution) >= self._least_px)
+        least = np.where(self._motion.blind > 0, _AGAIN, _LOST) * self._usual_share()
+        trusted = (share >= least) & (matched_px(found.solution) >= self._least_px)
         if not trusted.any():
             found = replace(found, pose=expected.pose)
+        self._frame += 1
         if trusted.all():
-            look.learn(found.pose, RATES)
+            if not self._brief or self._frame % _LEARN_EVERY == 0:
+                look.learn(found.pose, RATES)
             self._usual.append(share)
         self._motion.take(found.pose, trusted)
         return look.fit(found, trusted, self._free_focal)
@@ -99,7 +120,8 @@ class RigTracker:
 
     def _best(self, expected: Expected, look: _Look) -> Aligned:
         """Align from the prediction, and from other starts where that may have failed."""
-        found, usual = look.align(expected.pose, expected, _GATES_PX), self._usual_share()
+        gates = _FEW_GATES_PX if self._brief else _GATES_PX
+        found, usual = look.align(expected.pose, expected, gates), self._usual_share()
         if not (_share(found.solution) < _DOUBTED * usual).any():
             self._failed = 0
             return found
@@ -109,17 +131,31 @@ class RigTracker:
             self._failed = 0
             return found
         self._failed += 1
-        due = self._failed <= _SEARCHES or self._failed % _SEARCHES == 0
-        return self._searched(found, expected, look) if due else found
+        if self._failed > _SEARCHES and self._failed % _SEARCHES:
+            return found
+        if _share(found.solution)[0] < _LOST * usual[0]:
+            found = self._with_head_searched(found, expected, look)
+        return self._searched(found, expected, look)
+
+    def _with_head_searched(self, found: Aligned, expected: Expected, look: _Look) -> Aligned:
+        """Try shifted poses of the head, which the jaw goes with."""
+        shifts = head_shifts(expected.pose.head, self._colours.axes)
+        order = likeliest(list(shifts @ expected.pose.head), look.views, self._instants.solver.scans, 0)
+        order = order[: _FEW_HEADS if self._brief else _HEADS]
+        for head in (shifts[k] @ expected.pose.head for k in order):
+            start = replace(expected.pose, head=head)
+            around = Expected(start, MOST_UNSURE**-2.0)
+            found = _better(found, look.align(start, around, _BRIEF_GATES_PX))
+        return look.align(found.pose, Expected(found.pose, MOST_UNSURE**-2.0), _WIDE_GATES_PX)
 
     def _searched(self, found: Aligned, expected: Expected, look: _Look) -> Aligned:
         """Try poses of the jaw all over its range, with the head as it was found."""
         brief = []
-        for d in self._jaws:
+        for d in self._jaws[: _FEW_JAWS if self._brief else None]:
             start = replace(found.pose, d=d)
             brief.append(look.align(start, replace(expected, pose=start), _BRIEF_GATES_PX))
         brief.sort(key=lambda trial: -float(score_px(trial.solution).sum()))
-        for trial in brief[:_FINALISTS]:
+        for trial in brief[: 2 if self._brief else _FINALISTS]:
             around = replace(expected, pose=trial.pose)
             found = _better(found, look.align(trial.pose, around, _WIDE_GATES_PX))
         return found
@@ -132,18 +168,18 @@ class _Look:
         self, instants: InstantSolver, colours: LearnedColours, pictures: Sequence[Picture | None], before: Array
     ) -> None:
         self._instants, self._colours, self._pictures = instants, colours, pictures
-        self._views = colours.views(pictures, before)
-        self._rendering = Rendering(instants.solver, self._views)
-        self.use = present_masks(self._views)
+        self.views = colours.views(pictures, before)
+        self._rendering = Rendering(instants.solver, self.views)
+        self.use = present_masks(self.views)
 
     def align(self, start: Pose, expected: Expected, gates_px: Sequence[float]) -> Aligned:
         """Return the likeliest pose near a start."""
         weight = np.full(2, 1.0 / _BORDER_PX3)
-        return self._instants.align(start, self._views, self.use, gates_px, expected, weight, self._rendering)
+        return self._instants.align(start, self.views, self.use, gates_px, expected, weight, self._rendering)
 
     def learn(self, pose: Pose, rates: tuple[float, float]) -> None:
         """Take up the colours beside the borders found at a pose."""
-        counting, gate = self._colours.counting(self._views), self._instants.config.final_gate_px[1]
+        counting, gate = self._colours.counting(self.views), self._instants.config.final_gate_px[1]
         self._instants.linearise(pose, counting, self.use, self._rendering, gate)
         self._colours.learn(counting, self._pictures, self._instants.coordinates.arches(pose), rates)
 
@@ -155,8 +191,8 @@ class _Look:
             return FrameFit(found.pose, found.solution, use, use, unknown)
         matched: list[Matched] = []
         gate = self._instants.config.final_gate_px[1]
-        solution = self._instants.linearise(found.pose, self._views, use, self._rendering, gate, True, matched)
-        growth = growth_of(matched, solution.poses, solution.centres, self._views)
+        solution = self._instants.linearise(found.pose, self.views, use, self._rendering, gate, True, matched)
+        growth = growth_of(matched, solution.poses, solution.centres, self.views)
         return FrameFit(found.pose, solution, use, use, unknown, growth)
 
 

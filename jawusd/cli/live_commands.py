@@ -1,0 +1,71 @@
+"""The jaw in pictures as they come."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated
+
+import typer
+
+from jawusd.cli.options import Outside, RigArg
+from jawusd.cli.solve_commands import Head, ShotArg
+
+
+def live(
+    rig: RigArg,
+    shot: ShotArg,
+    source: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Where the pictures of a camera come from: NAME=/dev/video0, NAME=rtsp://..., NAME=FILE. Cameras "
+            "without one stay out; without any, the shot's videos are played at their own rate.",
+            show_default=False,
+        ),
+    ] = None,
+    osc: Annotated[
+        str | None, typer.Option(help="HOST:PORT that OSC messages go to: /jaw/d, /jaw/sigma, ...", show_default=False)
+    ] = None,
+    view: Annotated[bool, typer.Option("--view", help="Show the jaw in a page on this machine, too.")] = False,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page; the next free one if taken.")] = 8080,
+    head: Annotated[Head, typer.Option(help="fixed: the cameras are worn, and move with the head.")] = Head.free,
+    seconds: Annotated[float | None, typer.Option(min=0.1, help="End after so long.", show_default=False)] = None,
+    jobs: Annotated[int, typer.Option(min=1, max=64, help="Threads that look at cameras at once.")] = 2,
+    allow_outside: Outside = False,
+) -> None:
+    """Follow the jaw of the person of a rig in cameras as they run: a line of JSON per instant, OSC, a page.
+
+    Instants that come too fast are left out; every line says how old its pictures are.
+    """
+    from jawusd.pipeline.live import live as follow
+    from jawusd.pipeline.osc import OscSender
+    from jawusd.pipeline.view import open_viewer
+
+    sources = dict(_named(entry) for entry in source or [])
+    sender = None if osc is None else OscSender(osc)
+    viewer = open_viewer(rig, "127.0.0.1", port) if view else None
+    if viewer is not None:
+        typer.echo(f"{viewer.url}  (Ctrl+C stops)", err=True)
+    fixed = head is Head.fixed
+    try:
+        for found in follow(
+            rig, shot, sources, fixed_head=fixed, jobs=jobs, seconds=seconds, allow_outside=allow_outside
+        ):
+            if sender is not None:
+                sender.send(found)
+            if viewer is not None:
+                viewer.show(found.d)
+            typer.echo(json.dumps(found.as_json()))
+    except KeyboardInterrupt:
+        pass
+    finally:
+        if sender is not None:
+            sender.close()
+        if viewer is not None:
+            viewer.stop()
+
+
+def _named(entry: str) -> tuple[str, str]:
+    name, found, where = entry.partition("=")
+    if not found or not name or not where:
+        raise typer.BadParameter(f"{entry!r} is not NAME=WHERE, for example mid=/dev/video0.")
+    return name, where

@@ -1,0 +1,277 @@
+"""Follow the jaw of a person whose rig exists in pictures as they come: `jawusd live`."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import jawusd
+from jawusd.errors import CaptureError, explain_missing_packages
+from jawusd.evaluator import JawRig
+from jawusd.formats.capture import Capture
+from jawusd.formats.performance import SolveState
+from jawusd.geometry.arrays import Array
+from jawusd.pipeline.calibrate import sync_cameras
+from jawusd.pipeline.cuts import Cutter
+from jawusd.pipeline.prepare import (
+    load_cameras,
+    load_labelled,
+    naming_file,
+    open_capture,
+    registered_meshes,
+)
+from jawusd.pipeline.solve_pictures import (
+    LEAST_FIT,
+    MOST_BRIDGED,
+    PreparedTeeth,
+    VideoOptions,
+    VideoShot,
+    masked_cameras,
+)
+from jawusd.pipeline.state import no_progress
+
+if TYPE_CHECKING:
+    from jawusd.imaging.live_source import LiveSource
+    from jawusd.segmentation.footage import Pictures
+    from jawusd.tracking.performance.attempts import FrameFit
+    from jawusd.tracking.performance.coordinates import Pose
+
+_PATIENCE_S = 2.0  # without the teeth after which they are searched again from nothing
+_WAIT_S = 0.25
+_BEFORE = 6  # frames of files that are followed before they are played: until the motion is known
+
+
+@dataclass(frozen=True, eq=False)
+class LiveFrame:
+    """Hold what is known of an instant.
+
+    Attributes:
+        time_s: when its pictures were taken, since the sources were begun; in files, since their first pictures.
+        d, sigma: jaw parameters and their standard deviations [mm], shape (3,).
+        margin_mm: signed distance to the rig's bound, > 0 inside.
+        verdict: what the rig says of the pose.
+        state: solved or carried.
+        latency_ms: from when the pictures were taken until now.
+        dropped: instants left out since the one before.
+    """
+
+    time_s: float
+    d: Array
+    sigma: Array
+    margin_mm: float
+    verdict: str
+    state: str
+    latency_ms: float
+    dropped: int
+
+    def as_json(self) -> dict[str, object]:
+        """Return the values, rounded to what they are worth."""
+        return {
+            "time_s": round(self.time_s, 4),
+            "d": [round(value, 3) for value in self.d.tolist()],
+            "sigma": [round(value, 3) for value in self.sigma.tolist()],
+            "margin_mm": round(self.margin_mm, 3),
+            "verdict": self.verdict,
+            "state": self.state,
+            "latency_ms": round(self.latency_ms, 1),
+            "dropped": self.dropped,
+        }
+
+
+@explain_missing_packages()
+def live(
+    rig: str | os.PathLike[str],
+    shot: Capture | str | os.PathLike[str],
+    sources: Mapping[str, str] | None = None,
+    *,
+    fixed_head: bool = False,
+    jobs: int = 2,
+    seconds: float | None = None,
+    allow_outside: bool = False,
+) -> Iterator[LiveFrame]:
+    """Yield what is known of instant after instant; pictures that come too fast are left out.
+
+    Args:
+        rig: `actor.usda`, another layer of it, or `model.npz`.
+        shot: a capture with these cameras' calibration and the scans of the rig; its videos are played at their own
+            rate where no other source is named.
+        sources: by camera name a device, an address or a file.
+        fixed_head: the cameras are worn: the head hardly moves before them.
+        jobs: threads that look at cameras at once.
+        seconds: after which to end; None goes on until the sources end.
+        allow_outside: let paths in the capture leave its folder.
+
+    Raises:
+        FormatError, RigError: the rig cannot be read.
+        CaptureError, CalibrationError, SyncError: shot or sources cannot be read.
+        TrackingError: the scans cannot be in occlusion.
+    """
+    capture = open_capture(shot, allow_outside=allow_outside)
+    jaw = jawusd.load(rig)
+    with ExitStack() as stack:
+        pool = stack.enter_context(ThreadPoolExecutor(jobs))
+        follower = _Follower(capture, jaw, sources or {}, fixed_head, pool)
+        stack.callback(follower.stop)
+        yield from follower.run(seconds)
+
+
+def _with_sources(capture: Capture, sources: Mapping[str, str]) -> tuple[Capture, dict[str, str]]:
+    """Return the capture with the cameras that take part, files among their sources as its videos, and all sources."""
+    names = [camera.name for camera in capture.cameras]
+    if unknown := sorted(set(sources) - set(names)):
+        raise CaptureError(
+            f"sources are named for {', '.join(unknown)}, the capture has {', '.join(names)}.",
+            path=capture.folder / "capture.toml",
+        )
+    videos = {camera.name: str(camera.video) for camera in capture.cameras if camera.video is not None}
+    where = dict(sources) or videos
+    if not where:
+        raise CaptureError(
+            "no camera has a video, and no source is named.",
+            path=capture.folder / "capture.toml",
+            hint="Name devices or streams with --source CAMERA=/dev/video0.",
+        )
+    files = {name: Path(one) for name, one in where.items() if Path(one).is_file()}
+    cameras = tuple(
+        camera.model_copy(update={"video": files.get(camera.name, camera.video)})
+        for camera in capture.cameras
+        if camera.name in where
+    )
+    return capture.model_copy(update={"cameras": cameras, "bootstrap": None}), where
+
+
+class _Follower:
+    """Follow the teeth in live sources."""
+
+    def __init__(
+        self, capture: Capture, jaw: JawRig, sources: Mapping[str, str], fixed_head: bool, pool: Executor
+    ) -> None:
+        from jawusd.imaging.live_source import LiveSource
+        from jawusd.tracking.region.live import LiveTake
+
+        self._capture, where = _with_sources(capture, sources)
+        self._jaw, self._period_s = jaw, 1.0 / capture.fps
+        self._files = all(Path(one).is_file() for one in where.values())
+        self._offsets = dict.fromkeys(where, 0)
+        if self._files:
+            self._offsets = sync_cameras(self._capture, no_progress)["offsets"]
+        with naming_file(capture.folder / "capture.toml"):
+            self._cameras = {camera.name: camera for camera in load_cameras(capture) if camera.name in where}
+            meshes = registered_meshes(load_labelled(capture)[0], jaw.meta)
+        self._teeth = PreparedTeeth(self._capture, meshes, jaw, pool.map)
+        cameras = tuple(self._cameras.values())
+        self._take = LiveTake(jaw, self._teeth.scans, self._teeth.axes, cameras, fixed_head=fixed_head, executor=pool)
+        self._sources: dict[str, LiveSource] = {
+            name: LiveSource(where[name], camera.size_px, -self._offsets[name] * self._period_s)
+            for name, camera in self._cameras.items()
+        }
+        self._cutter: Cutter | None = None
+
+    def stop(self) -> None:
+        """Stop reading the sources."""
+        for source in self._sources.values():
+            source.stop()
+
+    def run(self, seconds: float | None) -> Iterator[LiveFrame]:
+        """Yield instants until the sources end."""
+        start = self._begin_in_files() if self._files else 0
+        for source in self._sources.values():
+            source.open(start * self._period_s)
+        for source in self._sources.values():
+            source.wait_open()
+        begin = time.monotonic() - start * self._period_s
+        for source in self._sources.values():
+            source.play(begin)
+        last, blind_since = begin + (start - 0.5) * self._period_s, 0.0
+        while (at := self._next(last)) is not None:
+            if seconds is not None and at - begin > start * self._period_s + seconds:
+                return
+            pictures = self._pictures(at)
+            if self._cutter is None or 0 < blind_since < at - _PATIENCE_S:
+                self._begin_in_pictures(pictures)
+                blind_since, last = 0.0, at
+                continue
+            frames = max(1.0, (at - last) / self._period_s)
+            fit = self._take.step(self._cutter.cut(pictures), frames)
+            blind_since = 0.0 if fit.found.all() else blind_since or at
+            last = at
+            yield self._told(fit, at, begin, round(frames) - 1)
+
+    def _told(self, fit: FrameFit, at: float, begin: float, dropped: int) -> LiveFrame:
+        verdict = self._jaw.validate_parameters(fit.pose.d[None])
+        return LiveFrame(
+            time_s=at - begin,
+            d=fit.pose.d,
+            sigma=self._take.sigma_d(fit),
+            margin_mm=float(verdict.margin_mm[0]),
+            verdict=verdict.words()[0],
+            state=str(SolveState.SOLVED if fit.found.all() else SolveState.CARRIED),
+            latency_ms=1e3 * (time.monotonic() - at),
+            dropped=dropped,
+        )
+
+    def _begin_in_files(self) -> int:
+        """Search the teeth before the files are played; return the frame on which they were found.
+
+        Raises:
+            TrackingError: they were not found.
+        """
+        shot = VideoShot(self._capture, self._cameras, self._offsets, self._teeth, self._jaw, VideoOptions())
+        begin = shot.begin(no_progress)
+        after = range(begin.frame, min(begin.frame + _BEFORE, shot.footage.range()[1]))
+        for frame, pictures in shot.footage.walk(after):
+            if frame == begin.frame:
+                self._learn(pictures, begin.pose)
+            elif self._cutter is not None:
+                self._take.step(self._cutter.cut(pictures))
+        return after.stop
+
+    def _learn(self, pictures: Pictures, near: Pose) -> None:
+        """Learn the colours of pictures near a pose, if teeth are there."""
+        from jawusd.tracking.contour.scan import teeth_centre
+
+        centre = teeth_centre(self._teeth.scans, self._take.coordinates.arches(near))
+        cutter = Cutter(self._cameras, self._teeth.scans, centre)
+        if self._take.begin(cutter.cut(pictures), near) >= LEAST_FIT:
+            self._cutter = cutter
+
+    def _begin_in_pictures(self, pictures: Pictures) -> None:
+        """Search the teeth in pictures, if they show the rows apart."""
+        from jawusd.segmentation.rows import tooth_rows
+
+        rows = {name: tooth_rows(image) for name, image in pictures.items() if image is not None}
+        apart = {name: row for name, row in rows.items() if row is not None and row.bridged <= MOST_BRIDGED}
+        if len(apart) < min(2, len(self._cameras)):
+            return
+        none = dict.fromkeys(self._cameras, 0)
+        with tempfile.TemporaryDirectory() as folder:
+            masked = masked_cameras(self._capture, apart, none, Path(folder))
+            near = self._teeth.search.at(masked, self._cameras, none, 0)
+        if near is not None:
+            self._learn(pictures, near)
+
+    def _next(self, last: float) -> float | None:
+        """Wait for an instant that all sources have; return its time, None at the end."""
+        while True:
+            newest = [source.newest_s() for source in self._sources.values()]
+            if all(time_s is not None for time_s in newest):
+                at = min(time_s for time_s in newest if time_s is not None)
+                if at > last + 0.5 * self._period_s:
+                    return at
+            if any(source.ended for source in self._sources.values()):
+                return None
+            for source in self._sources.values():
+                source.wait(last + 0.5 * self._period_s, _WAIT_S)
+
+    def _pictures(self, at: float) -> Pictures:
+        """Return the pictures of an instant, None of sources that have none near it."""
+        found = {name: source.at(at) for name, source in self._sources.items()}
+        near = self._period_s
+        return {n: None if p is None or abs(p.time_s - at) > near else p.rgb for n, p in found.items()}

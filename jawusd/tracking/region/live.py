@@ -1,0 +1,88 @@
+"""Head and jaw of a known person in pictures that come one instant after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import replace
+
+import numpy as np
+
+from jawusd.evaluator import JawRig
+from jawusd.geometry import Camera
+from jawusd.geometry.arrays import Array
+from jawusd.tracking.config import TrackingConfig
+from jawusd.tracking.contour.quality import residual_px, score_px
+from jawusd.tracking.contour.scan import ARCHES, Scan, thinned
+from jawusd.tracking.contour.solver import ContourSolver
+from jawusd.tracking.performance.attempts import FrameFit
+from jawusd.tracking.performance.coordinates import JAW, Coordinates, Pose
+from jawusd.tracking.performance.instant import InstantSolver
+from jawusd.tracking.performance.prediction import STEADY
+from jawusd.tracking.region.learned import CORRELATION_PX, LearnedColours
+from jawusd.tracking.region.picture import Cut
+from jawusd.tracking.region.rig_tracker import RigTracker
+
+_FACES, _SAMPLE_STEP_PX, _REDRAW_PX = 6_000, 3.0, 3.0
+_WIDER = 1.5  # true over computed standard deviation, as where all frames are solved together
+
+
+class LiveTake:
+    """Follow head and jaw from instant to instant; `coordinates` are those of the poses."""
+
+    def __init__(
+        self,
+        jaw: JawRig,
+        scans: Sequence[Scan],
+        axes: Array,
+        cameras: Sequence[Camera],
+        *,
+        fixed_head: bool = False,
+        executor: Executor | None = None,
+    ) -> None:
+        """Prepare.
+
+        Args:
+            jaw: the person's rig.
+            scans: upper and lower teeth, prepared.
+            axes: rotation from scan to anatomical axes: left, up, front; shape (3, 3).
+            cameras: in the order of the pictures.
+            fixed_head: the cameras are worn: the head hardly moves before them.
+            executor: looks at cameras at once.
+        """
+        self._scans, self._axes, self._cameras = [thinned(scan, _FACES) for scan in scans], axes, cameras
+        self._head = STEADY if fixed_head else 1.0
+        self.coordinates = Coordinates(jaw, self._scans)
+        config = replace(TrackingConfig(), sample_step_px=_SAMPLE_STEP_PX, redraw_px=_REDRAW_PX)
+        self._instants = InstantSolver(ContourSolver(self._scans, config, executor), self.coordinates)
+        self._tracker: RigTracker | None = None
+
+    def begin(self, cut: Cut, near: Pose) -> float:
+        """Learn the colours of an instant near a pose; return how much of the contour in sight fits, 0 .. 1."""
+        colours = LearnedColours(self._scans, self._cameras, self._axes)
+        self._tracker = RigTracker(self._instants, colours, head=self._head, brief=True)
+        solution = self._tracker.begin(cut, near).solution
+        if solution is None:
+            return 0.0
+        return float((score_px(solution).sum(1) / np.maximum(solution.visible_px.sum(1), 1.0)).min())
+
+    def step(self, cut: Cut, frames: float = 1.0) -> FrameFit:
+        """Align the next instant, so many frames on.
+
+        Raises:
+            ValueError: nothing was begun.
+        """
+        if self._tracker is None:
+            raise ValueError("step before begin")
+        return self._tracker.step(cut, frames)
+
+    def sigma_d(self, fit: FrameFit) -> Array:
+        """Return the standard deviations of d after the last step [mm], shape (3,)."""
+        if self._tracker is None:
+            raise ValueError("sigma before begin")
+        precision = np.diag(self._tracker.expected.precision)
+        if fit.solution is not None and fit.found.any():
+            variance = np.where(fit.found, residual_px(fit.solution) ** 2 * CORRELATION_PX, np.inf)
+            for r, slope in zip(ARCHES, self.coordinates.slopes(fit.pose), strict=True):
+                precision += slope.T @ fit.solution.outline.precision[r].sum(0) @ slope / variance[r]
+        return np.asarray(_WIDER * np.sqrt(np.diag(np.linalg.inv(precision))[JAW]), np.float64)

@@ -1,0 +1,159 @@
+"""The example's videos as cameras that run."""
+
+import json
+import socket
+import subprocess
+import sys
+import time
+
+import av
+import numpy as np
+import pytest
+from package_copy import ROOT
+from pythonosc.osc_packet import OscPacket
+
+import jawusd
+from jawusd.errors import CaptureError, OutputError
+from jawusd.formats.performance import SolveState
+from jawusd.geometry import transform_point
+from jawusd.imaging.live_source import LiveSource
+from jawusd.pipeline.live import LiveFrame, live
+from jawusd.pipeline.osc import OscSender
+
+EXAMPLE = ROOT / "examples" / "capture"
+
+
+@pytest.fixture(scope="module")
+def rig(example_build):
+    return example_build[0] / "actor.usda"
+
+
+@pytest.fixture
+def film(tmp_path):
+    """Return a video of 24 pictures at 24 a second; picture k is k times ten bright."""
+    with av.open(str(tmp_path / "film.mp4"), "w") as container:
+        stream = container.add_stream("libx264", rate=24, options={"crf": "1"})
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv444p"
+        for k in range(24):
+            frame = av.VideoFrame.from_ndarray(np.full((48, 64, 3), 10 * k, np.uint8), format="rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    return str(tmp_path / "film.mp4")
+
+
+def played(*arguments):
+    source = LiveSource(*arguments)
+    source.open()
+    source.wait_open()
+    begin = time.monotonic()
+    source.play(begin)
+    return source, begin
+
+
+def test_files_are_played_at_their_own_rate(film):
+    source, begin = played(film, (64, 48))
+    while not source.ended:
+        source.wait(source.newest_s() or -1.0, 0.5)
+    assert time.monotonic() - begin > 23 / 24 - 0.01
+    assert source.newest_s() == pytest.approx(begin + 23 / 24, abs=1e-3)
+    picture = source.at(begin + 22 / 24)
+    assert picture is not None and abs(int(picture.rgb.mean()) - 220) < 4
+
+
+def test_a_file_begun_earlier_shows_its_pictures_earlier(film):
+    """Of two sources that show the same instant, the one begun half a second earlier is 12 pictures further."""
+    source, begin = played(film, (64, 48), 0.5)
+    source.wait(begin - 0.5, 2.0)
+    assert source.newest_s() is not None and source.newest_s() < begin + 0.1
+    assert source.at(begin) is not None and source.at(begin).rgb.mean() > 100
+    source.stop()
+
+
+@pytest.mark.parametrize(("where", "size"), [("film", (32, 48)), ("/dev/no_such_camera", (64, 48))])
+def test_sources_that_cannot_be_used_are_refused(film, where, size):
+    source, _ = played(film if where == "film" else where, size)
+    with pytest.raises(CaptureError, match=r"calibration is for|cannot be read"):
+        for _ in range(50):
+            source.wait(np.inf, 0.1)
+            source.newest_s()
+    assert source.ended
+
+
+def test_sources_of_unknown_cameras_are_refused(rig):
+    with pytest.raises(CaptureError, match="named for nobody"):
+        next(live(rig, EXAMPLE, {"nobody": "/dev/video0"}))
+
+
+def frame():
+    d, sigma = np.array([12.5, -1.25, 0.5]), np.array([0.125, 0.25, 0.5])
+    return LiveFrame(1.5, d, sigma, 0.75, "valid", str(SolveState.CARRIED), 41.26, 2)
+
+
+def test_osc_messages_arrive():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        receiver.settimeout(5)
+        sender = OscSender(f"127.0.0.1:{receiver.getsockname()[1]}")
+        sender.send(frame())
+        sender.close()
+        packet = receiver.recv(4096)
+    assert packet.startswith(b"#bundle\0")
+    found = {timed.message.address: timed.message.params for timed in OscPacket(packet).messages}
+    assert found["/jaw/d"] == [12.5, -1.25, 0.5] and found["/jaw/sigma"] == [0.125, 0.25, 0.5]
+    assert found["/jaw/margin"] == [0.75] and found["/jaw/time"] == [1.5] and found["/jaw/state"] == [2]
+
+
+def test_nobody_need_listen_to_osc():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        port = taken.getsockname()[1]
+    sender = OscSender(f"127.0.0.1:{port}")
+    for _ in range(5):
+        sender.send(frame())
+    sender.close()
+
+
+@pytest.mark.parametrize("address", ["9000", "127.0.0.1", "127.0.0.1:0", "127.0.0.1:http", ":9000"])
+def test_addresses_that_are_none_are_refused(address):
+    with pytest.raises(OutputError, match="no address"):
+        OscSender(address)
+
+
+def test_lines_say_what_the_frame_holds():
+    assert frame().as_json() == {
+        "time_s": 1.5,
+        "d": [12.5, -1.25, 0.5],
+        "sigma": [0.125, 0.25, 0.5],
+        "margin_mm": 0.75,
+        "verdict": "valid",
+        "state": "carried",
+        "latency_ms": 41.3,
+        "dropped": 2,
+    }
+
+
+def test_the_command_follows_the_example(rig):
+    """However slow the machine is, what is said to be solved is near the truth."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        receiver.settimeout(5)
+        to = f"127.0.0.1:{receiver.getsockname()[1]}"
+        command = [sys.executable, "-m", "jawusd", "live", str(rig), str(EXAMPLE), "--osc", to]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+        heard = OscPacket(receiver.recv(4096)).messages
+    assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
+    lines = [json.loads(line) for line in done.stdout.splitlines()]
+    assert lines and {timed.message.address for timed in heard} >= {"/jaw/d", "/jaw/state"}
+    first = next(timed.message.params for timed in heard if timed.message.address == "/jaw/d")
+    np.testing.assert_allclose(first, lines[0]["d"], atol=1e-3)
+    jaw = jawusd.load(rig)
+    with np.load(EXAMPLE / "truth" / "truth.npz") as truth:
+        frames, relative = truth["frames"].tolist(), truth["T_upper_lower"]
+    capture_fps, errors = 24.0, []
+    for line in lines:
+        number = round(line["time_s"] * capture_fps)
+        if line["state"] == "solved" and number in frames:
+            tip = jaw.landmarks[0]
+            wanted = transform_point(relative[frames.index(number)], tip)
+            errors.append(np.linalg.norm(transform_point(jaw.pose(line["d"]), tip) - wanted))
+    assert len(errors) > 0.3 * len(lines) and np.median(errors) < 0.6
