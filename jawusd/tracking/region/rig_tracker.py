@@ -14,7 +14,7 @@ from jawusd.tracking.contour.quality import matched_px, score_px
 from jawusd.tracking.contour.solver import Matched, Rendering
 from jawusd.tracking.contour.views import present_masks
 from jawusd.tracking.performance.attempts import MOST_UNSURE, FrameFit
-from jawusd.tracking.performance.coordinates import Pose
+from jawusd.tracking.performance.coordinates import JAW, Pose
 from jawusd.tracking.performance.focal import growth_of
 from jawusd.tracking.performance.instant import Aligned, Expected, InstantSolver
 from jawusd.tracking.performance.prediction import Prediction
@@ -27,14 +27,15 @@ from jawusd.tracking.region.starts import head_shifts, likeliest
 _BORDER_PX3 = 0.7**2 * CORRELATION_PX
 _GATES_PX, _WIDE_GATES_PX, _BRIEF_GATES_PX = (6.0, 4.0, 3.0, 2.5, 2.0), (12.0, 8.0, 6.0, 4.0, 3.0, 2.5, 2.0), (8.0, 6.0)
 # The same with few steps, and after how many frames colours are taken up then.
-_FEW_GATES_PX, _LEARN_EVERY, _FEW_JAWS, _FEW_HEADS = (8.0, 5.0, 3.0, 2.0), 3, 12, 4
+_FEW_GATES_PX, _LEARN_EVERY, _FEW_JAWS, _FEW_HEADS = (8.0, 5.0, 3.0, 2.0), 3, 6, 4
 _FIRST_ROUNDS = 3  # picks are a few tenths of a millimetre off; each round takes most of the rest
 # Share of the usual contour that fits, below which a pose is doubted, others are searched, an arch is given up,
 # and one that was lost is not trusted again.
 _DOUBTED, _SEARCHED, _LOST, _AGAIN = 0.8, 0.6, 0.33, 0.5
-_USUAL_FRAMES = 15  # over which the usual contour is measured
-# Poses of the jaw that a search tries, and follows to the end, and of the head.
-_JAWS, _FINALISTS, _HEADS = 24, 3, 12
+_USUAL_FRAMES = 15  # over which the usual contour is measured; it is no less than a share of that of the first frame
+_LEAST_USUAL = 0.7
+# Poses of the jaw among which a search looks, that it tries, and follows to the end, and of the head.
+_JAWS, _TRIED_JAWS, _FINALISTS, _HEADS = 96, 16, 3, 12
 _SEARCHES = 8  # frames in a row that are searched; then every so many
 
 
@@ -82,7 +83,8 @@ class RigTracker:
         self.expected = Expected(pose, sigma**-2.0)
         fit = look.fit(found, np.ones(2, bool), self._free_focal)
         self._motion = Prediction(self._coordinates, pose, fit.found, head=self._head)
-        self._usual.append(_share(found.solution))
+        self._first = _share(found.solution)
+        self._usual.append(self._first)
         return fit
 
     def other_way(self, begin: FrameFit) -> RigTracker:
@@ -116,7 +118,7 @@ class RigTracker:
         return look.fit(found, trusted, self._free_focal)
 
     def _usual_share(self) -> Array:
-        return np.asarray(np.median(self._usual, axis=0), np.float64)
+        return np.maximum(np.median(self._usual, axis=0), _LEAST_USUAL * self._first)
 
     def _best(self, expected: Expected, look: _Look) -> Aligned:
         """Align from the prediction, and from other starts where that may have failed."""
@@ -133,7 +135,7 @@ class RigTracker:
         self._failed += 1
         if self._failed > _SEARCHES and self._failed % _SEARCHES:
             return found
-        if _share(found.solution)[0] < _LOST * usual[0]:
+        if _share(found.solution)[0] < _SEARCHED * usual[0]:
             found = self._with_head_searched(found, expected, look)
         return self._searched(found, expected, look)
 
@@ -149,14 +151,18 @@ class RigTracker:
         return look.align(found.pose, Expected(found.pose, MOST_UNSURE**-2.0), _WIDE_GATES_PX)
 
     def _searched(self, found: Aligned, expected: Expected, look: _Look) -> Aligned:
-        """Try poses of the jaw all over its range, with the head as it was found."""
-        brief = []
-        for d in self._jaws[: _FEW_JAWS if self._brief else None]:
-            start = replace(found.pose, d=d)
-            brief.append(look.align(start, replace(expected, pose=start), _BRIEF_GATES_PX))
+        """Try poses of the jaw all over its range, those first whose teeth lie where it looks like teeth."""
+        head, jaw = found.pose.head, self._coordinates.jaw
+        places = [head @ jaw.pose(d) for d in self._jaws]
+        order = likeliest(places, look.views, self._instants.solver.scans, 1)
+        brief, sigma = [], np.r_[np.full(6, 1.0), MOST_UNSURE[JAW]]
+        loose = np.minimum(expected.precision, sigma**-2.0)
+        for k in order[: _FEW_JAWS if self._brief else _TRIED_JAWS]:
+            start = replace(found.pose, d=self._jaws[k])
+            brief.append(look.align(start, Expected(start, loose), _BRIEF_GATES_PX))
         brief.sort(key=lambda trial: -float(score_px(trial.solution).sum()))
         for trial in brief[: 2 if self._brief else _FINALISTS]:
-            around = replace(expected, pose=trial.pose)
+            around = Expected(trial.pose, loose)
             found = _better(found, look.align(trial.pose, around, _WIDE_GATES_PX))
         return found
 
