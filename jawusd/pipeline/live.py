@@ -104,7 +104,7 @@ def live(
             rate where no other source is named.
         sources: by camera name a device, an address or a file.
         fixed_head: the cameras are worn: the head hardly moves before them.
-        jobs: threads that look at cameras at once.
+        jobs: threads that search the teeth.
         seconds: after which to end; None goes on until the sources end.
         allow_outside: let paths in the capture leave its folder.
 
@@ -167,7 +167,7 @@ class _Follower:
             meshes = registered_meshes(load_labelled(capture)[0], jaw.meta)
         self._teeth = PreparedTeeth(self._capture, meshes, jaw, pool.map)
         cameras = tuple(self._cameras.values())
-        self._take = LiveTake(jaw, self._teeth.scans, self._teeth.axes, cameras, fixed_head=fixed_head, executor=pool)
+        self._take = LiveTake(jaw, self._teeth.scans, self._teeth.axes, cameras, fixed_head=fixed_head)
         self._sources: dict[str, LiveSource] = {
             name: LiveSource(where[name], camera.size_px, -self._offsets[name] * self._period_s)
             for name, camera in self._cameras.items()
