@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -89,9 +90,8 @@ class RigTracker:
 
     def other_way(self, begin: FrameFit) -> RigTracker:
         """Return a tracker that goes on from the first frame with what is known now, and learns on its own."""
-        out = RigTracker(
-            self._instants, self._colours.copy(), head=self._head, free_focal=self._free_focal, brief=self._brief
-        )
+        out = copy(self)
+        out._colours, out._usual = self._colours.copy(), self._usual.copy()
         out._motion = Prediction(self._coordinates, begin.pose, begin.found, head=self._head)
         return out
 
@@ -135,7 +135,7 @@ class RigTracker:
         self._failed += 1
         if self._failed > _SEARCHES and self._failed % _SEARCHES:
             return found
-        if _share(found.solution)[0] < _SEARCHED * usual[0]:
+        if self._head == 1.0 and _share(found.solution)[0] < _SEARCHED * usual[0]:
             found = self._with_head_searched(found, expected, look)
         return self._searched(found, expected, look)
 
@@ -155,8 +155,8 @@ class RigTracker:
         head, jaw = found.pose.head, self._coordinates.jaw
         places = [head @ jaw.pose(d) for d in self._jaws]
         order = likeliest(places, look.views, self._instants.solver.scans, 1)
-        brief, sigma = [], np.r_[np.full(6, 1.0), MOST_UNSURE[JAW]]
-        loose = np.minimum(expected.precision, sigma**-2.0)
+        brief, loose = [], expected.precision.copy()
+        loose[JAW] = MOST_UNSURE[JAW] ** -2.0
         for k in order[: _FEW_JAWS if self._brief else _TRIED_JAWS]:
             start = replace(found.pose, d=self._jaws[k])
             brief.append(look.align(start, Expected(start, loose), _BRIEF_GATES_PX))
