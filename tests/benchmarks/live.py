@@ -30,7 +30,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=30.0)
     parser.add_argument("--truth", type=Path, help="truth.npz, by default that of the capture")
     options = parser.parse_args()
-    capture, jaw = load_capture(options.capture), jawusd.load(options.rig)
+    capture, jaw = load_capture(options.capture, allow_outside=True), jawusd.load(options.rig)
     with np.load(options.truth or capture.folder / "truth" / "truth.npz", allow_pickle=False) as truth:
         true = dict(zip(truth["frames"].tolist(), truth["T_upper_lower"], strict=True))
     told = list(live(options.rig, options.capture, seconds=options.seconds, allow_outside=True))

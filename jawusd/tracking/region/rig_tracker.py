@@ -28,7 +28,8 @@ from jawusd.tracking.region.starts import head_shifts, likeliest
 _BORDER_PX3 = 0.7**2 * CORRELATION_PX
 _GATES_PX, _WIDE_GATES_PX, _BRIEF_GATES_PX = (6.0, 4.0, 3.0, 2.5, 2.0), (12.0, 8.0, 6.0, 4.0, 3.0, 2.5, 2.0), (8.0, 6.0)
 # The same with few steps, and after how many frames colours are taken up then.
-_FEW_GATES_PX, _LEARN_EVERY, _FEW_JAWS, _FEW_HEADS = (8.0, 5.0, 3.0, 2.0), 3, 6, 4
+_FEW_GATES_PX, _LEARN_EVERY, _FEW_JAWS, _FEW_HEADS = (8.0, 5.0, 3.0, 2.0), 3, 4, 3
+_BRIEF_PAUSE = 2  # failed frames per one that is searched
 _FIRST_ROUNDS = 3  # picks are a few tenths of a millimetre off; each round takes most of the rest
 # Share of the usual contour that fits, below which a pose is doubted, others are searched, an arch is given up,
 # and one that was lost is not trusted again.
@@ -127,13 +128,15 @@ class RigTracker:
         if not (_share(found.solution) < _DOUBTED * usual).any():
             self._failed = 0
             return found
-        for start in (expected.pose, self._motion.last):
-            found = _better(found, look.align(start, expected, _WIDE_GATES_PX))
+        others = (self._motion.last,) if self._brief else (expected.pose, self._motion.last)
+        for start in others:
+            found = _better(found, look.align(start, expected, gates if self._brief else _WIDE_GATES_PX))
         if not (_share(found.solution) < _SEARCHED * usual).any():
             self._failed = 0
             return found
         self._failed += 1
-        if self._failed > _SEARCHES and self._failed % _SEARCHES:
+        pause = _BRIEF_PAUSE if self._brief else 1 if self._failed <= _SEARCHES else _SEARCHES
+        if self._failed % pause:
             return found
         if self._head == 1.0 and _share(found.solution)[0] < _SEARCHED * usual[0]:
             found = self._with_head_searched(found, expected, look)
@@ -148,7 +151,8 @@ class RigTracker:
             start = replace(expected.pose, head=head)
             around = Expected(start, MOST_UNSURE**-2.0)
             found = _better(found, look.align(start, around, _BRIEF_GATES_PX))
-        return look.align(found.pose, Expected(found.pose, MOST_UNSURE**-2.0), _WIDE_GATES_PX)
+        gates = _FEW_GATES_PX if self._brief else _WIDE_GATES_PX
+        return look.align(found.pose, Expected(found.pose, MOST_UNSURE**-2.0), gates)
 
     def _searched(self, found: Aligned, expected: Expected, look: _Look) -> Aligned:
         """Try poses of the jaw all over its range, those first whose teeth lie where it looks like teeth."""
@@ -161,9 +165,9 @@ class RigTracker:
             start = replace(found.pose, d=self._jaws[k])
             brief.append(look.align(start, Expected(start, loose), _BRIEF_GATES_PX))
         brief.sort(key=lambda trial: -float(score_px(trial.solution).sum()))
-        for trial in brief[: 2 if self._brief else _FINALISTS]:
+        for trial in brief[: 1 if self._brief else _FINALISTS]:
             around = Expected(trial.pose, loose)
-            found = _better(found, look.align(trial.pose, around, _WIDE_GATES_PX))
+            found = _better(found, look.align(trial.pose, around, _FEW_GATES_PX if self._brief else _WIDE_GATES_PX))
         return found
 
 
