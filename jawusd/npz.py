@@ -102,6 +102,21 @@ def check_units(meta: Mapping[str, object], path: str | os.PathLike[str]) -> Non
         raise UnitsError(f"twist order is {meta.get('twist_order')}, allowed is {TWIST_ORDER}.", path=path)
 
 
+def upgraded_model(arrays: NamedArrays, path: object) -> NamedArrays:
+    """Return the arrays of a model of any version under their present names.
+
+    Version 1 held the tolerance of measured poses as the smallest margin of a valid pose, "margin_limit_mm".
+
+    Raises:
+        FormatError: that margin is no number.
+    """
+    known = dict(arrays)
+    if "margin_limit_mm" in known:
+        known.setdefault("tolerance_mm", np.negative(take(arrays, "margin_limit_mm", (), path), dtype=np.float64))
+        del known["margin_limit_mm"]
+    return known
+
+
 def take(arrays: NamedArrays, name: str, shape: tuple[int | None, ...], path: object, *, finite: bool = True) -> Array:
     """Return one of the arrays of `read_npz` after checking its shape and finiteness.
 

@@ -102,7 +102,7 @@ def emit_motion(out: Path, rate: float, motion: AuthoredMotion, changes: Changes
 
 def kept_inside(rig: JawRig, motion: AuthoredMotion) -> tuple[AuthoredMotion, Changes]:
     """Move parameters to the nearest valid ones where they lie outside the bound."""
-    outside = rig.margin(motion.d) < float(rig.arrays["margin_limit_mm"])
+    outside = np.isfinite(motion.d).all(axis=1) & ~rig.is_inside(motion.d)
     kept = motion.d.copy()
     kept[outside] = rig.project(motion.d[outside])
     moved_mm = np.linalg.norm(kept - motion.d, axis=1)[outside]

@@ -61,7 +61,11 @@ def _info_lines(found: Description) -> list[str]:
     ]
     for name, (low, high) in found["ranges_mm"].items():
         lines.append(f"  {name}: {low:.2f} .. {high:.2f} mm")
-    table = found["table"]
+    limits, table = found["thresholds_mm"], found["table"]
+    lines.append(
+        f"measured poses: at most {limits['residual']:.2f} mm from the model, "
+        f"tolerance {limits['tolerance']:.2f} mm outside the bound"
+    )
     lines.append(f"table: {table['format']} {table['shape']}, worst error {table['max_error_mm']:.4f} mm")
     for name, count in found["meshes"].items():
         mark = ", a placeholder, no anatomy" if name in found["placeholders"] else ""
@@ -85,7 +89,7 @@ def pose(
     _check_finite(d, "--d")
     T = loaded.pose(d)
     margin = float(loaded.margin(d))
-    twist, valid = loaded.twist(d), margin >= float(loaded.arrays["margin_limit_mm"])
+    twist, valid = loaded.twist(d), bool(loaded.is_inside(d))
     landmarks = dict(zip(LANDMARKS, transform_points(T, loaded.landmarks), strict=True))
 
     def lines() -> list[str]:
@@ -152,10 +156,16 @@ def validate(
         Path | None, typer.Argument(help="CSV or JSON of poses or of d, tracks.npz, or an animated USD stage.")
     ] = None,
     residual_mm: Annotated[float | None, typer.Option(help="Largest distance to the model; the rig's else.")] = None,
-    margin_mm: Annotated[float | None, typer.Option(help="Smallest margin to the bound; the rig's else.")] = None,
+    tolerance_mm: Annotated[
+        float | None,
+        typer.Option(min=0.0, help="How far outside the bound a pose may lie; 0 for authored poses; the rig's else."),
+    ] = None,
     as_json: Json = False,
 ) -> None:
-    """Check a rig, or judge poses against it; leaves with exit code 1 when something is invalid."""
+    """Check a rig, or judge poses as measured ones; leaves with exit code 1 when something is invalid.
+
+    A pose is inside the bound, within the tolerance that measured poses have, or outside.
+    """
     if poses is None:
         _validate_rig(rig, as_json)
         return
@@ -163,7 +173,7 @@ def validate(
 
     loaded = jawusd.load(rig)
     frames, T = _poses_or_parameters(loaded, poses)
-    verdicts = loaded.validate(T, residual_limit_mm=residual_mm, margin_limit_mm=margin_mm)
+    verdicts = loaded.validate(T, residual_limit_mm=residual_mm, tolerance_mm=tolerance_mm)
     rows = [
         {"frame": int(frame), "valid": bool(ok), "reason": words, "residual_mm": float(res), "margin_mm": float(margin)}
         for frame, ok, words, res, margin in zip(
@@ -171,16 +181,27 @@ def validate(
         )
     ]
     invalid = [row for row in rows if not row["valid"]]
-    result = {"poses": len(rows), "invalid": len(invalid), "verdicts": rows}
-    emit(result, as_json, lambda: _verdict_lines(rows, len(invalid)))
+    inside = int((verdicts.valid & verdicts.inside()).sum())
+    result = {
+        "poses": len(rows),
+        "inside": inside,
+        "within_tolerance": len(rows) - len(invalid) - inside,
+        "invalid": len(invalid),
+        "tolerance_mm": verdicts.tolerance_mm,
+        "verdicts": rows,
+    }
+    counts = f"{inside} inside, {result['within_tolerance']} within tolerance, {len(invalid)} invalid"
+    summary = f"{len(rows)} poses: {counts} (tolerance of measured poses {verdicts.tolerance_mm:.2f} mm)"
+    emit(result, as_json, lambda: [*_verdict_lines(rows), summary])
     if invalid:
         raise typer.Exit(NO)
 
 
-def _verdict_lines(rows: Sequence[Mapping[str, object]], invalid: int) -> list[str]:
+def _verdict_lines(rows: Sequence[Mapping[str, object]]) -> list[str]:
+    from jawusd.evaluator.verdicts import INSIDE
+
     shown = "frame {frame}: {reason} (residual {residual_mm:.2f} mm, margin {margin_mm:.2f} mm)"
-    lines = [shown.format(**row) for row in rows if not row["valid"]]
-    return [*lines, f"{len(rows) - invalid} of {len(rows)} poses are valid"]
+    return [shown.format(**row) for row in rows if row["reason"] != INSIDE]
 
 
 def _poses_or_parameters(rig: JawRig, path: Path) -> tuple[NDArray[np.int64], Array]:

@@ -79,7 +79,7 @@ def _info(rig: JawRig, options: argparse.Namespace) -> int:
         "d_min_mm": low.tolist(),
         "d_max_mm": high.tolist(),
         "residual_limit_mm": rig.limits.residual_mm,
-        "margin_limit_mm": rig.limits.margin_mm,
+        "tolerance_mm": rig.tolerance_mm,
         "captured_poses": len(rig.captured_d),
     }
     if options.json:
@@ -102,6 +102,7 @@ def _pose(rig: JawRig, options: argparse.Namespace) -> int:
             "twist": rig.twist(d).tolist(),
             "landmarks_mm": landmarks.tolist(),
             "margin_mm": margin_mm,
+            "inside": bool(rig.is_inside(d)),
         }
         print(json.dumps({name: _plain(value) for name, value in facts.items()}))
     else:

@@ -88,6 +88,11 @@ class RigArrays:
         return self.arrays["d_range"]
 
     @property
+    def tolerance_mm(self) -> float:
+        """How far outside the bound a measured pose may lie and still be possible [mm]; authored poses may not."""
+        return float(self.arrays["tolerance_mm"]) + 0.0  # no -0.0, which the negated limit of older files may be
+
+    @property
     def captured_d(self) -> Array:
         """Parameters of the captured poses [mm], shape (n, 3)."""
         return self.arrays["codes"]
@@ -160,8 +165,8 @@ def _check_values(arrays: dict[str, Array]) -> None:
     low, high = arrays["d_range"].T
     if not (low < high).all() or high[0] <= 0:
         raise EvaluatorError(f'"d_range" is {arrays["d_range"].tolist()} mm; rows must be (low, high), opening > 0.')
-    if arrays["margin_limit_mm"] > 0 or arrays["residual_limit_mm"] <= 0:
-        raise EvaluatorError('"residual_limit_mm" must be positive and "margin_limit_mm" at most 0.')
+    if arrays["tolerance_mm"] < 0 or arrays["residual_limit_mm"] <= 0:
+        raise EvaluatorError('"residual_limit_mm" must be positive and "tolerance_mm" not negative.')
 
 
 def _check_sections(arrays: dict[str, Array]) -> None:

@@ -1,4 +1,4 @@
-"""Read a rig from ``model.npz``, format jawusd-model/1, with numpy alone."""
+"""Read a rig from ``model.npz``, format jawusd-model/2, with numpy alone."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import os
 
 from jawusd.errors import EvaluatorError, FormatError
 from jawusd.evaluator.rig import JawRig
-from jawusd.npz import read_npz
+from jawusd.npz import read_npz, upgraded_model
 
-FAMILY, VERSION = "jawusd-model", 1
+FAMILY, VERSION = "jawusd-model", 2
 
 
 def load(path: str | os.PathLike[str]) -> JawRig:
@@ -20,6 +20,7 @@ def load(path: str | os.PathLike[str]) -> JawRig:
         UnitsError: lengths, angles or twists in another convention.
     """
     arrays, meta = read_npz(path, FAMILY, VERSION)
+    arrays = upgraded_model(arrays, path)
     try:
         return JawRig(arrays, meta)
     except EvaluatorError as error:

@@ -29,6 +29,8 @@ from typing import Generic, NamedTuple, Protocol
 from jawusd.evaluator.operations import FloatOperations, Operations, Rows, Table, rows, triple
 from jawusd.geometry.rodrigues import N, Triple, apply_series, dot, turning
 
+# A margin this little below zero still counts as inside: parameters on the bound itself may round to either side of it.
+ON_BOUND_MM = 1e-6
 FADE_SOFTNESS_MM = 1.0  # rounding of the kink at d1 = 0 in the fading of the glide surface
 LIMIT_SOFTNESS_MM = 4.0  # rounding of the kinks where the gothic arch stops changing with opening
 ARCH_BOW_MM = 10.0  # the quadratic arch features are d2^2 / 10 mm, to keep all coefficients of one order

@@ -9,21 +9,18 @@ from typing import Literal, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jawusd.evaluator import sections
-from jawusd.evaluator.arrays import RigArrays
-from jawusd.evaluator.batching import CHUNK_ROWS, as_keys, as_points, as_rows, in_chunks, pairs_in_chunks, rows_of
+from jawusd.evaluator.authoring import RigAuthoring
+from jawusd.evaluator.batching import CHUNK_ROWS, as_points, as_rows, in_chunks, pairs_in_chunks, rows_of
 from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.distances import carried, handle_vectors, point_velocities
 from jawusd.evaluator.encoding import Encoder, Encoding, whitening_of
 from jawusd.evaluator.frames import RigFrames
-from jawusd.evaluator.interpolation import interpolated
 from jawusd.evaluator.kernels import Kernels, NumpyKernels, RigParts
 from jawusd.evaluator.models import FORMS
 from jawusd.evaluator.polygons import PolygonBound
-from jawusd.evaluator.search import BoundedSearch, IkResult, nearest_distance
-from jawusd.evaluator.sections import Ranges
-from jawusd.evaluator.verdicts import Limits, Verdicts, too_fast
-from jawusd.geometry.arrays import Array, Indices
+from jawusd.evaluator.search import BoundedSearch, IkResult
+from jawusd.evaluator.verdicts import Limits, Verdicts, is_inside, too_fast
+from jawusd.geometry.arrays import Array, Indices, Mask
 from jawusd.geometry.se3 import transform_points
 
 BoundName = Literal["slices", "polygons"]
@@ -32,7 +29,7 @@ _scalar = cast("Callable[[float], Array]", np.float64)  # numpy types its scalar
 _SINGLE_LIMIT_MM = 1e4  # beyond, functions of one d might raise where those of rows give infinities
 
 
-class JawRig(RigArrays):
+class JawRig(RigAuthoring):
     """One person's jaw: pure functions from d = (opening, laterotrusion, protrusion) [mm] to poses and back.
 
     ``pose(d) = A^-1 M(d) A rest`` with A = T_anatomical_skull and rest = T_skull_mandible of the closed bite;
@@ -45,7 +42,7 @@ class JawRig(RigArrays):
         model: The function from d to motions.
         bound: The slice bound.
         polygons: The paper's bound.
-        limits: Thresholds of `validate` stored in the rig.
+        limits: Thresholds of `validate`, for measured poses, stored in the rig.
         kernels: What computes rows.
     """
 
@@ -59,7 +56,7 @@ class JawRig(RigArrays):
         """Build the rig.
 
         Args:
-            arrays: Named arrays of a model of format jawusd-model/1; others are left out.
+            arrays: Named arrays of a model of format jawusd-model/2; others are left out.
             meta: Its header; ``meta["kind"]`` is "anchored" or "additive".
             kernels: What computes rows; `jawusd.fast` has a faster implementation.
 
@@ -70,7 +67,7 @@ class JawRig(RigArrays):
         self.model = FORMS[self.kind](self.arrays)
         self.bound = SliceHull.from_arrays(self.arrays)
         self.polygons = PolygonBound.from_arrays(self.arrays)
-        self.limits = Limits(float(self.arrays["residual_limit_mm"]), float(self.arrays["margin_limit_mm"]))
+        self.limits = Limits(float(self.arrays["residual_limit_mm"]), self.tolerance_mm)
         self._frames = RigFrames(self.T_anatomical_skull, self.T_rest, self.model.single.anchor)
         parts = RigParts(self.model, self.bound, self._frames, self.landmarks)
         self._make_kernels, self.kernels = kernels, kernels(parts)
@@ -187,6 +184,13 @@ class JawRig(RigArrays):
         rows, batch = rows_of(d, (3,), "d")
         return self.kernels.margins(rows).reshape(batch)
 
+    def is_inside(self, d: ArrayLike, *, bound: BoundName = "slices") -> Mask:
+        """Tell whether jaw parameters d (..., 3) [mm] lie inside the bound: a margin of 0 or more.
+
+        The bound itself counts as inside, up to rounding of 1e-6 mm. The tolerance of measured poses has no part in it.
+        """
+        return is_inside(self.margin(d, bound=bound))
+
     def _polygons(self, bound: BoundName) -> PolygonBound:
         if bound != "polygons":
             raise ValueError(f'bound must be "slices" or "polygons", got {bound!r}')
@@ -217,17 +221,17 @@ class JawRig(RigArrays):
         T_skull_mandible: ArrayLike,
         *,
         residual_limit_mm: float | None = None,
-        margin_limit_mm: float | None = None,
+        tolerance_mm: float | None = None,
         bound: BoundName = "slices",
         times_s: ArrayLike | None = None,
         speed_limit_mm_s: float | None = None,
     ) -> Verdicts:
-        """Judge poses: finite, rigid, on the model, inside the bound, and reachable in time.
+        """Judge measured poses: finite, rigid, on the model, inside the bound or its tolerance, and reachable in time.
 
         Args:
             T_skull_mandible: Poses, shape (..., 4, 4).
             residual_limit_mm: Largest landmark distance to the model; the rig's own if None.
-            margin_limit_mm: Smallest margin; the rig's own if None.
+            tolerance_mm: How far outside the bound a measured pose may lie; the rig's own if None, 0 for authored ones.
             bound: Which bound, see `margin`.
             times_s: Times of the poses along the last batch axis, shape (F,); needed for a speed limit.
             speed_limit_mm_s: Largest speed of a landmark between consecutive poses; None disables the check.
@@ -236,10 +240,10 @@ class JawRig(RigArrays):
             Verdicts of the batch shape.
 
         Raises:
-            ValueError: wrong shapes, or a speed limit without rising times.
+            ValueError: wrong shapes, a tolerance below 0, or a speed limit without rising times.
         """
         rows, batch = rows_of(T_skull_mandible, (4, 4), "T_skull_mandible")
-        limits = self.limits.replaced(residual_limit_mm, margin_limit_mm, speed_limit_mm_s)
+        limits = self.limits.replaced(residual_limit_mm, tolerance_mm, speed_limit_mm_s)
         verdicts = self.kernels.judge_poses(rows, limits)
         if bound != "slices":
             verdicts = verdicts.with_margin(self.margin(verdicts.d, bound=bound), limits)
@@ -249,18 +253,20 @@ class JawRig(RigArrays):
         self,
         d: ArrayLike,
         *,
-        margin_limit_mm: float | None = None,
+        tolerance_mm: float = 0.0,
         bound: BoundName = "slices",
         times_s: ArrayLike | None = None,
         speed_limit_mm_s: float | None = None,
     ) -> Verdicts:
         """Judge jaw parameters d (..., 3) [mm] as `validate` does poses; the residual is 0.
 
+        They count as authored, without a tolerance; give that of the rig to judge measured ones.
+
         Raises:
-            ValueError: wrong shapes, or a speed limit without rising times.
+            ValueError: wrong shapes, a tolerance below 0, or a speed limit without rising times.
         """
         rows, batch = rows_of(d, (3,), "d")
-        limits = self.limits.replaced(None, margin_limit_mm, speed_limit_mm_s)
+        limits = self.limits.replaced(None, tolerance_mm, speed_limit_mm_s)
         verdicts = self.kernels.judge_parameters(rows, limits)
         if bound != "slices":
             verdicts = verdicts.with_margin(self.margin(verdicts.d, bound=bound), limits)
@@ -271,6 +277,7 @@ class JawRig(RigArrays):
         self, verdicts: Verdicts, poses: Array, batch: tuple[int, ...], times_s: ArrayLike | None, limits: Limits
     ) -> Verdicts:
         """Return the verdicts in batch shape; frames reached too fast are marked if there is a speed limit."""
+        verdicts = verdicts._replace(tolerance_mm=limits.tolerance_mm)
         if limits.speed_mm_s is None:
             return verdicts.finished(batch)
         measured = np.where(verdicts.measured()[:, None, None], poses, np.nan)
@@ -320,74 +327,6 @@ class JawRig(RigArrays):
         left = carried(*self.model.decode(d), vectors) - scaled
         distance_mm = np.sqrt(np.einsum("nij,nij->n", left, left))
         return IkResult(d.reshape(*batch, 3), distance_mm.reshape(batch))
-
-    def interpolate(
-        self,
-        frames: ArrayLike,
-        d_keys: ArrayLike,
-        at: ArrayLike,
-        method: Literal["linear", "smooth"] = "linear",
-    ) -> Array:
-        """Return jaw parameters between keys.
-
-        Args:
-            frames: Times of the keys, rising, shape (K,).
-            d_keys: Jaw parameters [mm] at the keys, shape (K, 3).
-            at: Times wanted, any shape; outside the keys the nearest key holds.
-            method: "linear", straight lines in d as in the paper, or "smooth", a C1 curve that stays inside the bound
-                between keys that are inside.
-
-        Returns:
-            Jaw parameters [mm], shape (*at.shape, 3).
-
-        Raises:
-            ValueError: wrong shapes, keys that are not finite or frames that do not rise, or an unknown method.
-        """
-        frames, keys = as_keys(frames, d_keys)
-        times, batch = as_rows(np.asarray(at, dtype=np.float64)[..., None], (1,), "at")
-        d = interpolated(frames, keys, times[:, 0], method, self.bound)
-        return d.reshape(*batch, 3)
-
-    def ranges(self, d1: ArrayLike, d2: ArrayLike = 0.0, d3: ArrayLike = 0.0) -> Ranges:
-        """Return how far d2 and d3 can each go alone from (d1, d2, d3).
-
-        Args:
-            d1: Opening [mm]; d1, d2, d3 broadcast to one shape (...).
-            d2: Laterotrusion [mm] at which d3 is moved.
-            d3: Protrusion [mm] at which d2 is moved.
-
-        Returns:
-            The ends [mm]; NaN where the section has no point on that line.
-        """
-        d = np.stack(np.broadcast_arrays(*(np.asarray(x, dtype=np.float64) for x in (d1, d2, d3))), axis=-1)
-        rows, batch = as_rows(d, (3,), "d")
-        ends = [pairs_in_chunks(partial(self.bound.chord, axis=axis), rows) for axis in (1, 2)]
-        return Ranges(*(end.reshape(batch) for pair in ends for end in pair))
-
-    def normalized(self, d: ArrayLike) -> Array:
-        """Return d as shares of this person's ranges, for carrying motion to another person.
-
-        The opening is divided by the full opening, d2 and d3 by the reach to their side along the habitual path at
-        that opening (at least 0.5 mm).
-
-        Args:
-            d: Jaw parameters [mm], shape (..., 3).
-
-        Returns:
-            Shares, shape (..., 3): 1 is the full range.
-        """
-        rows, batch = as_rows(d, (3,), "d")
-        return in_chunks(lambda d: sections.normalized(self.bound, self.d_range, d), rows).reshape(*batch, 3)
-
-    def denormalized(self, shares: ArrayLike) -> Array:
-        """Return the jaw parameters [mm], shape (..., 3), of shares (..., 3): the inverse of `normalized`."""
-        rows, batch = as_rows(shares, (3,), "shares")
-        return in_chunks(lambda n: sections.denormalized(self.bound, self.d_range, n), rows).reshape(*batch, 3)
-
-    def captured_distance(self, d: ArrayLike) -> Array:
-        """Return the distance [mm] (...) of d (..., 3) [mm] to the nearest captured pose, in d; inf without any."""
-        rows, batch = as_rows(d, (3,), "d")
-        return in_chunks(lambda d: nearest_distance(self.captured_d, d), rows).reshape(batch)
 
 
 def _rebuilt(

@@ -54,7 +54,7 @@ ARRAYS: dict[str, ArraySpec] = {
     "polygon_d1d3": ArraySpec("jaw:bounds:polygonD1D3", ("protrusion corners", 2)),
     "polygon_d1d3_counts": ArraySpec("jaw:bounds:polygonD1D3Counts", ("protrusion outlines",), integer=True),
     "residual_limit_mm": ArraySpec("jaw:thresholds:residual"),
-    "margin_limit_mm": ArraySpec("jaw:thresholds:margin"),
+    "tolerance_mm": ArraySpec("jaw:thresholds:tolerance"),
     "codes": ArraySpec("jaw:model:codes", ("codes", 3)),
     "path_coefficients": ArraySpec("jaw:model:pathCoefficients", (2, 5), ANCHORED),
     "path_scale_mm": ArraySpec("jaw:model:pathScale", (), ANCHORED),

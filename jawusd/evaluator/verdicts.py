@@ -9,13 +9,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jawusd.evaluator.formula import ON_BOUND_MM
 from jawusd.geometry.arrays import Array, Mask
 
 # A matrix written with 5 decimals or kept in half precision is rigid to about this; sheared or scaled ones are not.
 RIGID_TOLERANCE = 1e-3
 
-# Parameters on the bound itself, read back from a pose, may round to just outside.
-ROUNDING_MM = 1e-6
+INSIDE, OUTSIDE = "inside", "outside"
 
 
 class Reason(IntFlag):
@@ -41,7 +41,7 @@ _WORDS = {
     Reason.NOT_FINITE: "not finite",
     Reason.NOT_RIGID: "not rigid",
     Reason.OFF_MODEL: "off the model",
-    Reason.OUTSIDE_BOUNDS: "outside the bound",
+    Reason.OUTSIDE_BOUNDS: OUTSIDE,
     Reason.TOO_FAST: "too fast",
 }
 
@@ -50,11 +50,13 @@ class Verdicts(NamedTuple):
     """What `JawRig.validate` found, one entry per pose.
 
     Attributes:
-        valid: No reason against the pose, bool, shape (...).
+        valid: No reason against the pose, bool, shape (...): it is inside the bound, or a measured one within the
+            tolerance.
         reason: `Reason` flags, uint8, shape (...); ``Reason(int(code))`` names them, `words` spells them out.
         residual_mm: rms landmark distance to the nearest pose of the model, shape (...); NaN if not finite or rigid.
         margin_mm: Signed distance of d to the bound, > 0 inside, shape (...); NaN if not finite or rigid.
         d: Nearest jaw parameters [mm], shape (..., 3); NaN if not finite or rigid.
+        tolerance_mm: How far outside the bound a pose could lie and still be valid.
     """
 
     valid: Mask
@@ -62,6 +64,7 @@ class Verdicts(NamedTuple):
     residual_mm: Array
     margin_mm: Array
     d: Array
+    tolerance_mm: float = 0.0
 
     def measured(self) -> Mask:
         """Tell which poses were compared with the model: those that are finite and rigid."""
@@ -71,7 +74,7 @@ class Verdicts(NamedTuple):
         """Return the verdicts with the margins (n,) to another bound in place of theirs."""
         reason = self.reason & ~np.uint8(Reason.OUTSIDE_BOUNDS.value)
         reason[self.measured() & _outside(margin_mm, limits)] |= Reason.OUTSIDE_BOUNDS.value
-        return Verdicts(reason == 0, reason, self.residual_mm, margin_mm, self.d)
+        return self._replace(valid=reason == 0, reason=reason, margin_mm=margin_mm)
 
     def finished(self, batch: tuple[int, ...], fast: Mask | None = None) -> Verdicts:
         """Return the verdicts in a batch shape, with the frames marked in ``fast`` (of that shape) too fast."""
@@ -79,11 +82,38 @@ class Verdicts(NamedTuple):
         if fast is not None:
             reason = reason | np.where(fast, Reason.TOO_FAST.value, 0).astype(np.uint8)
         residual_mm, margin_mm = self.residual_mm.reshape(batch), self.margin_mm.reshape(batch)
-        return Verdicts(reason == 0, reason, residual_mm, margin_mm, self.d.reshape(*batch, 3))
+        return Verdicts(reason == 0, reason, residual_mm, margin_mm, self.d.reshape(*batch, 3), self.tolerance_mm)
+
+    def inside(self) -> Mask:
+        """Tell which poses lie inside the bound, shape (...), whatever else is wrong with them."""
+        return is_inside(self.margin_mm)
 
     def words(self) -> list[str]:
-        """Return the reasons in plain words, one per pose in row-major order."""
-        return [Reason(int(code)).words for code in self.reason.ravel()]
+        """Return the verdicts in plain words, one per pose in row-major order.
+
+        A valid pose is "inside", or "within tolerance 0.83 of 1.00 mm"; of the others the reasons are named.
+        """
+        pairs = zip(self.reason.ravel().tolist(), self.margin_mm.ravel().tolist())
+        return [Reason(code).words if code else place(margin, self.tolerance_mm) for code, margin in pairs]
+
+
+def is_inside(margin_mm: ArrayLike) -> Mask:
+    """Tell which margins [mm] (...) are those of parameters inside the bound; NaN is not."""
+    return np.asarray(np.asarray(margin_mm) >= -ON_BOUND_MM)
+
+
+def place(margin_mm: float, tolerance_mm: float = 0.0) -> str:
+    """Return where parameters lie, in words: "inside", "within tolerance 0.83 of 1.00 mm" or "outside".
+
+    Args:
+        margin_mm: Their margin.
+        tolerance_mm: How far outside measured parameters may lie; 0 for authored ones.
+    """
+    if is_inside(margin_mm):
+        return INSIDE
+    if margin_mm >= -tolerance_mm - ON_BOUND_MM:
+        return f"within tolerance {-margin_mm:.2f} of {tolerance_mm:.2f} mm"
+    return OUTSIDE
 
 
 @dataclass(frozen=True)
@@ -92,21 +122,33 @@ class Limits:
 
     Attributes:
         residual_mm: Largest landmark distance to the model.
-        margin_mm: Smallest margin.
+        tolerance_mm: How far outside the bound a pose may lie: 0 for authored poses, the rig's tolerance for measured
+            ones.
         speed_mm_s: Largest speed of any landmark between consecutive poses; None disables the check.
     """
 
     residual_mm: float
-    margin_mm: float
+    tolerance_mm: float
     speed_mm_s: float | None = None
 
-    def replaced(self, residual_mm: float | None, margin_mm: float | None, speed_mm_s: float | None) -> Limits:
-        """Return these limits with those that are given in place of their own."""
-        if residual_mm is None and margin_mm is None and speed_mm_s is None:
+    @property
+    def margin_mm(self) -> float:
+        """The smallest margin of a valid pose."""
+        return -self.tolerance_mm
+
+    def replaced(self, residual_mm: float | None, tolerance_mm: float | None, speed_mm_s: float | None) -> Limits:
+        """Return these limits with those that are given in place of their own.
+
+        Raises:
+            ValueError: a tolerance that is negative or NaN.
+        """
+        if residual_mm is None and tolerance_mm is None and speed_mm_s is None:
             return self
+        if tolerance_mm is not None and not tolerance_mm >= 0:
+            raise ValueError(f"tolerance_mm must be 0 or more, got {tolerance_mm}")
         return Limits(
             self.residual_mm if residual_mm is None else float(residual_mm),
-            self.margin_mm if margin_mm is None else float(margin_mm),
+            self.tolerance_mm if tolerance_mm is None else float(tolerance_mm),
             self.speed_mm_s if speed_mm_s is None else float(speed_mm_s),
         )
 
@@ -124,7 +166,7 @@ def judge(finite: Mask, rigid: Mask, residual_mm: Array, margin_mm: Array, d: Ar
 
 
 def _outside(margin_mm: Array, limits: Limits) -> Mask:
-    return ~(margin_mm >= limits.margin_mm - ROUNDING_MM)
+    return ~(margin_mm >= limits.margin_mm - ON_BOUND_MM)
 
 
 def too_fast(positions: Array, times_s: ArrayLike | None, limit_mm_s: float) -> Mask:

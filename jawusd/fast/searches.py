@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from jawusd.evaluator.batching import LARGEST
-from jawusd.evaluator.verdicts import RIGID_TOLERANCE, ROUNDING_MM, Reason
+from jawusd.evaluator.formula import ON_BOUND_MM
+from jawusd.evaluator.verdicts import RIGID_TOLERANCE, Reason
 from jawusd.fast.descent import DISPLACEMENT, PARAMETERS, Normal, Problem, descend, normal_scratch
 from jawusd.fast.forms import parameters_at
 from jawusd.fast.hull import signed_distance
@@ -160,7 +161,7 @@ def judge(
 @device
 def outside(margin: float, margin_limit: float) -> int:
     """Return the reason against a margin [mm], 0 if there is none."""
-    return 0 if margin >= margin_limit - ROUNDING_MM else _OUTSIDE_BOUNDS
+    return 0 if margin >= margin_limit - ON_BOUND_MM else _OUTSIDE_BOUNDS
 
 
 @device

@@ -129,7 +129,7 @@ def fit_model(
         "landmarks": anatomy.landmarks,
         "d_range": valid_box(hull),
         "codes": captured_d,
-        "margin_limit_mm": np.array(-tolerance_mm),
+        "tolerance_mm": np.array(tolerance_mm),
     }
     meta: dict[str, object] = {
         "actor": actor,

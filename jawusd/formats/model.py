@@ -1,4 +1,4 @@
-"""The fitted jaw model: `model.npz`, format jawusd-model/1.
+"""The fitted jaw model: `model.npz`, format jawusd-model/2.
 
 The arrays that a decoder needs (`JawModel.arrays`) carry the same names here, in the rig and in the evaluator, which
 checks them when it is made; this module checks only what it adds.
@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from jawusd.formats.atomic import write_npz_atomic
 from jawusd.geometry.arrays import Array, Mask
-from jawusd.npz import TWIST_ORDER, UNITS, read_npz, take
+from jawusd.npz import TWIST_ORDER, UNITS, read_npz, take, upgraded_model
 
-FAMILY, VERSION = "jawusd-model", 1
+FAMILY, VERSION = "jawusd-model", 2
 _CAPTURED = ("captured_frames", "captured_d", "captured_residual_mm", "captured_trained")
 
 
@@ -59,6 +59,7 @@ def load_model(path: str | os.PathLike[str]) -> JawModel:
         UnitsError: other units or twist order.
     """
     arrays, meta = read_npz(path, FAMILY, VERSION)
+    arrays = upgraded_model(arrays, path)
     frames = take(arrays, "captured_frames", (None,), path)
     count = len(frames)
     shapes = {"captured_d": (count, 3), "captured_residual_mm": (count,), "captured_trained": (count,)}

@@ -57,6 +57,7 @@ class Performance:
         uncovered: share of every mask that the scan leaves uncovered, shape (F, 2, C); NaN without a mask.
         residual_px, matched_px: spread of the outlines' residuals, and contour that was matched, shape (F, 2).
         margin_mm: signed distance to the rig's bound, > 0 inside, shape (F,).
+        valid: the rig allows the pose: inside its bound, or within the tolerance of measured poses, shape (F,).
         verdict: what the rig says of the pose, in words, length F.
         camera_names: length C.
         notes: what was estimated for the whole take.
@@ -74,6 +75,7 @@ class Performance:
     residual_px: Array
     matched_px: Array
     margin_mm: Array
+    valid: Mask
     verdict: list[str]
     camera_names: tuple[str, ...]
     notes: dict[str, object] = field(default_factory=dict)

@@ -25,7 +25,7 @@ class SolvedJaw:
         sigma_mm: their standard deviations [mm], shape (F, 3).
         margin_mm: signed distance to the rig's bound, > 0 inside, shape (F,).
         state: `SolveState`, shape (F,).
-        valid: the rig allows the pose, shape (F,).
+        valid: the rig allows the pose: inside its bound, or within the tolerance of measured poses, shape (F,).
     """
 
     d: Array

@@ -74,7 +74,7 @@ class TracksMeta(TypedDict, total=False):
     evaluations_per_row_and_frame: float
     calibration_rescaled_px: dict[str, tuple[tuple[int, int], tuple[int, int]]]
     fps: float  # frames per second of a performance
-    margin_limit_mm: float  # smallest margin to the bound that the rig allows poses of a performance
+    tolerance_mm: float  # how far outside the bound the rig allows poses of a performance
     findings: list[dict[str, str | float | int]]  # `Finding.as_json` of everything doubtful about the take
 
 
@@ -260,6 +260,9 @@ def load_tracks(path: str | os.PathLike[str]) -> Tracks:
         UnitsError: other units or twist order.
     """
     arrays, meta = read_npz(path, FAMILY, VERSION)
+    limit = meta.pop("margin_limit_mm", None)  # of older files: the smallest margin, which is below zero
+    if isinstance(limit, float):
+        meta["tolerance_mm"] = -limit
     names = meta.get("camera_names")
     if not isinstance(names, list) or not all(isinstance(n, str) for n in names):
         raise FormatError('"meta" has no list "camera_names".', path=path)

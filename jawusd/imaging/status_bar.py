@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.evaluator.verdicts import place
 from jawusd.formats.performance import STATE_COLOURS, STATE_WORDS, SolveState
 from jawusd.formats.tracks import Tracks
 from jawusd.imaging.overlay import LOWER_COLOUR, UPPER_COLOUR, Colour
@@ -50,10 +51,10 @@ class StatusBar:
             pairs = zip(("d1", "d2", "d3"), solved.d[row], solved.sigma_mm[row], strict=True)
             values = "   ".join(f"{name} {value:.2f} +-{sigma:.2f}" for name, value, sigma in pairs)
             margin = float(solved.margin_mm[row])
-            where = "inside" if margin >= 0 else "outside"
+            where = place(margin, float(self._tracks.meta.get("tolerance_mm", 0.0)))
             said.append((str(state), STATE_COLOURS[state], False))
             said.append((f"{values} mm (1 sigma)", _WHITE, False))
-            said.append((f"{abs(margin):.2f} mm {where} the bound", _WHITE, False))
+            said.append((f"bound: {where}, margin {margin:.2f} mm", _WHITE, False))
         return said
 
 

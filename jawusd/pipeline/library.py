@@ -227,7 +227,8 @@ def retarget(source: JawRig, target: JawRig, frames: Array, d: Array) -> Retarge
     carried = target.denormalized(source.normalized(at))
     kept, here = carried.copy(), np.isfinite(at[:, 0])
     kept[here] = _in_time(source, target, at[here], carried[here])
-    outside = target.margin(carried) < float(target.arrays["margin_limit_mm"])
+    outside = here.copy()
+    outside[here] = ~target.is_inside(carried[here])
     return Retargeted(times, kept, outside, np.linalg.norm(kept - carried, axis=1))
 
 
@@ -235,11 +236,11 @@ def _in_time(source: JawRig, target: JawRig, original: Array, carried: Array) ->
     """Return d (F, 3) [mm] near those carried, inside the bound, rising and falling where the original does."""
     sizes = [np.ptp(rig.d_range, axis=1) for rig in (source, target)]
     least = _SLOWEST * sizes[1] / np.maximum(sizes[0], SMALLEST_REACH_MM)
-    kept, limit = carried.copy(), float(target.arrays["margin_limit_mm"])
+    kept = carried.copy()
     for _ in range(_ROUNDS):
         for axis in range(3):
             kept[:, axis] = follow(original[:, axis], kept[:, axis], least[axis])
-        outside = target.margin(kept) < limit
+        outside = ~target.is_inside(kept)
         if not outside.any():
             break
         kept[outside] = target.project(kept[outside])

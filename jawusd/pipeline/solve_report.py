@@ -148,7 +148,7 @@ def frames_to_show(tracks: Tracks, fps: float) -> list[tuple[int, str]]:
     for has, badness, most, words in (
         (solved.state == SolveState.LOST, sigma, _MOST_UNSEEN, "lost, expected error up to {:.2f} mm"),
         (solved.state == SolveState.CARRIED, sigma, _MOST_UNSEEN, "out of sight, expected error up to {:.2f} mm"),
-        (~solved.valid, -solved.margin_mm, _MOST_OUTSIDE, "{:.2f} mm outside the rig's bound"),
+        (~solved.valid, -solved.margin_mm, _MOST_OUTSIDE, "{:.2f} mm outside the rig's bound, more than its tolerance"),
         (seen, sigma, _MOST_UNCERTAIN, "solved, but with one of the largest expected errors, {:.2f} mm"),
     ):
         values = np.where(has, badness, np.nan)

@@ -8,6 +8,7 @@
     T = rig.pose(20.0, 3.0, 0.5)             # d1, d2, d3 [mm] -> T_skull_mandible, rows of a 4x4 for column vectors
     translation, wxyz = jawusd_reader.decompose(T)
     rig.margin(20.0, 3.0, 0.5)               # signed distance to the bound [mm], > 0 inside
+    rig.is_inside(20.0, 3.0, 0.5)            # True: a margin of 0 or more
     rig.ranges(20.0)                         # ((d2 min, d2 max), (d3 min, d3 max)) for sliders
 """
 
@@ -23,7 +24,7 @@ import zipfile
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from jawusd.evaluator.formula import MODELS, BoundFormula
+from jawusd.evaluator.formula import MODELS, ON_BOUND_MM, BoundFormula
 from jawusd.evaluator.operations import FloatOperations, Rows, rows
 from jawusd.evaluator.schema import D_RANGE_ATTRIBUTES, arrays_of
 from jawusd.geometry.rodrigues import Triple
@@ -32,12 +33,12 @@ if TYPE_CHECKING:
     from pxr import Usd
 
 Pair = tuple[float, float]
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 SCHEMA = "JawRigAPI"
 PARAMETERS = ("d1", "d2", "d3")
 LABELS = ("Opening [mm]", "Laterotrusion [mm], + left", "Protrusion [mm], + forward")
 
-_NOT_NEEDED = ("codes", "polygon_", "residual_limit_mm", "margin_limit_mm")
+_NOT_NEEDED = ("codes", "polygon_", "residual_limit_mm", "tolerance_mm")
 _SEARCH_STEPS = 60
 _OPERATIONS = FloatOperations()
 
@@ -201,6 +202,10 @@ class Rig:
     def margin(self, d1: float, d2: float, d3: float) -> float:
         """Return the signed distance to the bound [mm], positive inside."""
         return self._bound.margin((d1, d2, d3), self._bound.tables, _OPERATIONS)
+
+    def is_inside(self, d1: float, d2: float, d3: float) -> bool:
+        """Tell whether jaw parameters [mm] lie inside the bound: a margin of 0 or more, up to rounding of 1e-6 mm."""
+        return self.margin(d1, d2, d3) >= -ON_BOUND_MM
 
     def ranges(self, d1: float, d2: float = 0.0, d3: float = 0.0) -> tuple[Pair, Pair]:
         """Return the valid (min, max) of d2 through d3, and of d3 through d2, at d1 [mm]; (nan, nan) where none is."""

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import ArrayLike, NDArray
 
+from jawusd.evaluator.verdicts import is_inside
 from jawusd.formats.performance import STATE_WORDS, SolveState
 from jawusd.formats.solved import SolvedJaw
 from jawusd.formats.tracks import LOST, Tracks
@@ -55,7 +56,8 @@ def seen_figure(tracks: Tracks, solved: SolvedJaw, fps: float) -> Figure:
     """Draw the state and verdict of every frame, and which masks of each camera took part, arch by arch."""
     frames, names = tracks.frames, tracks.camera_names
     lanes = [(str(state), solved.state == state, ink) for state, ink in STATE_INKS.items()]
-    lanes.append(("outside the bound", ~solved.valid, VERMILION))
+    lanes.append(("within tolerance", solved.valid & ~is_inside(solved.margin_mm), GREY))
+    lanes.append(("outside", ~solved.valid, VERMILION))
     height = 0.36 * (len(lanes) + len(names)) + 1.5
     figure, axes = new_figure(11.0, height, 2, 1, sharex=True, height_ratios=[len(lanes), max(len(names), 1)])
     for lane, (_, has, ink) in enumerate(lanes):
@@ -78,8 +80,9 @@ def _draw_margin(axis: Axes, tracks: Tracks, solved: SolvedJaw) -> None:
     axis.plot(at, margin, color=BLUE, lw=1.1, label="margin to the bound")
     axis.fill_between(at, np.fmin(margin, 0.0), 0.0, color=VERMILION, linewidth=0, alpha=0.6, label="outside")
     axis.axhline(0.0, color=GREY, lw=0.8)
-    if "margin_limit_mm" in tracks.meta:
-        axis.axhline(tracks.meta["margin_limit_mm"], color=VERMILION, lw=1, ls="--", label="limit of valid poses")
+    if "tolerance_mm" in tracks.meta:
+        tolerance = -tracks.meta["tolerance_mm"]
+        axis.axhline(tolerance, color=VERMILION, lw=1, ls="--", label="tolerance of measured poses")
     axis.set_ylabel("margin [mm],\ninside is positive")
 
 

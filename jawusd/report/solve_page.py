@@ -10,6 +10,7 @@ import numpy as np
 from markupsafe import Markup
 
 from jawusd.errors import FormatError
+from jawusd.evaluator.verdicts import is_inside
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.finding import Finding
 from jawusd.formats.performance import STATE_WORDS, SolveState
@@ -110,7 +111,12 @@ def _counts(solved: SolvedJaw) -> list[tuple[str, int, str, str]]:
             solved.state == SolveState.LOST,
             "there are masks that fit nothing; the motion around carries the jaw",
         ),
-        ("outside the bound", ~solved.valid, "the rig does not allow the pose"),
+        (
+            "within tolerance",
+            solved.valid & ~is_inside(solved.margin_mm),
+            "the pose lies outside the rig's bound, but no farther than measured poses may",
+        ),
+        ("outside", ~solved.valid, "the rig does not allow the pose"),
     )
     total = max(len(solved.state), 1)
     return [(name, int(has.sum()), f"{100 * has.sum() / total:.1f} %", words) for name, has, words in rows]

@@ -61,7 +61,8 @@ def model_figure(model: JawModel) -> Figure:
     axes[1].set_ylabel("landmarks,\nrms [mm]")
     axes[1].set_ylim(bottom=0)
     axes[2].plot(*thinned(model.frames, margin, np.fmin), color=BLUE, lw=1, label="margin to the bound")
-    axes[2].axhline(rig.limits.margin_mm, color=VERMILION, lw=1, ls="--", label="limit of a valid pose")
+    axes[2].axhline(0.0, color=GREY, lw=0.8, label="the bound")
+    axes[2].axhline(-rig.tolerance_mm, color=VERMILION, lw=1, ls="--", label="tolerance of measured poses")
     axes[2].set_ylabel("margin [mm]")
     axes[2].set_xlabel("frame of the reference camera")
     for axis in axes:

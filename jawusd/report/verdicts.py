@@ -190,8 +190,12 @@ def _bounds(data: ReportData) -> Verdict:
     model, meta = data.model, model_facts(data)
     rig = JawRig(model.arrays, model.meta)
     used = model.trained & np.all(np.isfinite(model.d), axis=1)
-    inside = rig.margin(model.d[used]) >= rig.limits.margin_mm if used.any() else np.zeros(1, bool)
-    checks = [_share("captured poses that the bounds call valid", float(inside.mean()), 0.97, 0.9)]
+    verdicts = rig.validate_parameters(model.d[used], tolerance_mm=rig.tolerance_mm)
+    inside, valid = (float(found.mean()) if used.any() else 0.0 for found in (verdicts.inside(), verdicts.valid))
+    name = (
+        f"captured poses inside the bound ({100 * inside:.1f} %) or within its tolerance of {rig.tolerance_mm:.2f} mm"
+    )
+    checks = [_share(name, valid, 0.97, 0.9)]
     synthesis = data.experiments.of("synthesis") if data.experiments else []
     known = next((one for one in synthesis if one.model.startswith("captured")), None)
     drawn = next((one for one in synthesis if one.model == meta.get("method") and "slice" in one.quantity), None)

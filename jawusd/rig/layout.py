@@ -1,6 +1,6 @@
 """Prim paths and file names of a rig; `jawusd.evaluator.schema` has the attributes of the model arrays."""
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
 ACTOR, GEO, MATERIALS = "/Actor", "/Actor/geo", "/Actor/mtl"
 SKULL, MANDIBLE = "/Actor/geo/Skull", "/Actor/geo/Mandible"

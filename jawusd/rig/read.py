@@ -201,7 +201,7 @@ def describe(path: PathArg, prim_path: str | None = None) -> Description:
         "landmarks_mm": dict(zip(names, rig.landmarks.tolist(), strict=True)),
         "thresholds_mm": {
             "residual": rig.limits.residual_mm,
-            "margin": rig.limits.margin_mm,
+            "tolerance": rig.tolerance_mm,
         },
         "table": {
             "format": table.format,

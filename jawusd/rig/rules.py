@@ -10,6 +10,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom
 
 from jawusd.errors import JawusdError
 from jawusd.evaluator import JawRig
+from jawusd.evaluator.verdicts import OUTSIDE, place
 from jawusd.geometry.arrays import Array
 from jawusd.rig import _gf
 from jawusd.rig.layout import ONNX_ATTRIBUTES, PARAMETERS, SIDECAR_HASH
@@ -98,7 +99,7 @@ def check_onnx(prim: Usd.Prim) -> Iterator[Finding]:
 
 
 def check_bounds(prim: Usd.Prim) -> Iterator[Finding]:
-    """Check that every value of d1, d2, d3, at every time, lies inside the bounds."""
+    """Check that every value of d1, d2, d3, at every time, lies inside the bound; within the tolerance is a note."""
     rig = _rig(prim)
     if rig is None:
         return
@@ -106,12 +107,13 @@ def check_bounds(prim: Usd.Prim) -> Iterator[Finding]:
     d = _parameters(prim, times)
     margin = rig.margin(d)
     worst = int(np.argmin(np.where(np.isfinite(margin), margin, -np.inf)))
-    outside = ~(margin >= rig.limits.margin_mm)
+    outside = ~rig.is_inside(d)
     if outside.any():
         values = ", ".join(f"{x:.2f}" for x in d[worst])
+        said = place(float(margin[worst]), rig.tolerance_mm)
         message = f"{outside.sum()} of {len(d)} samples are outside; worst at {times[worst]}: d = ({values}) mm, "
-        message += f"margin {margin[worst]:.2f} mm."
-        yield _finding("warning", "Bounds", prim, message)
+        message += f"margin {margin[worst]:.2f} mm, {said}."
+        yield _finding("warning" if said == OUTSIDE else "info", "Bounds", prim, message)
 
 
 def check_mandible(prim: Usd.Prim) -> Iterator[Finding]:

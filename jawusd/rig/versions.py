@@ -11,13 +11,23 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from pxr import Usd
+from pxr import Sdf, Usd
 
 from jawusd.errors import FormatError, VersionError
 from jawusd.rig.arrays import read_value
 from jawusd.rig.layout import FORMAT_VERSION
 
-STEPS: dict[int, Callable[[Usd.Prim], None]] = {}
+
+def _to_2(prim: Usd.Prim) -> None:
+    """Name the tolerance of measured poses, which version 1 held as the smallest margin of a valid pose."""
+    limit = read_value(prim, "jaw:thresholds:margin", prim.GetStage().GetRootLayer().identifier)
+    if not isinstance(limit, float):
+        raise FormatError(f"jaw:thresholds:margin is {limit!r}, expected a number.", path=str(prim.GetPath()))
+    tolerance = prim.CreateAttribute("jaw:thresholds:tolerance", Sdf.ValueTypeNames.Double)
+    tolerance.Set(-limit)
+
+
+STEPS: dict[int, Callable[[Usd.Prim], None]] = {1: _to_2}
 
 
 def upgrade_rig(prim: Usd.Prim, where: object) -> None:

@@ -129,7 +129,7 @@ def _outwards(value: float, sign: int) -> float:
 
 def reading_html(readout: Readout, d: tuple[float, float, float], limits: Array) -> str:
     """Return the numbers of a pose and its verdict as HTML."""
-    color, verdict = (GREEN, "valid") if readout.inside else (VERMILION, "OUTSIDE the bound")
+    color, verdict = (GREEN, "inside the bound") if readout.inside else (VERMILION, "OUTSIDE the bound")
     captured = f"{readout.captured_mm:.2f} mm" if math.isfinite(readout.captured_mm) else "nothing captured"
     rows = [
         ("opening", f"{_plain(readout.opening_mm)} mm"),

@@ -12,8 +12,6 @@ from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import transform_points
 
 INCISOR, CONDYLES = LANDMARKS.index("incisor"), (LANDMARKS.index("condyle_left"), LANDMARKS.index("condyle_right"))
-# Margins this little below zero are rounding errors: `ranges` and `ik` end on the bound itself.
-ON_BOUND_MM = 1e-6
 
 
 @dataclass(frozen=True)
@@ -25,7 +23,7 @@ class Readout:
         condyle_left_mm, condyle_right_mm: displacement of the condyle centres to the left, up and forward.
         margin_mm: signed distance to the bound, > 0 inside.
         captured_mm: distance in d to the nearest captured pose; infinite without any.
-        inside: the pose is valid.
+        inside: d lies inside the bound.
     """
 
     opening_mm: float
@@ -57,7 +55,7 @@ def read_out(rig: JawRig, d: Array) -> Readout:
     margin = float(rig.margin(d))
     left, right = (triple(moved[index]) for index in CONDYLES)
     captured = float(rig.captured_distance(d))
-    return Readout(-up, lateral, forward, left, right, margin, captured, margin >= -ON_BOUND_MM)
+    return Readout(-up, lateral, forward, left, right, margin, captured, bool(rig.is_inside(d)))
 
 
 def triple(values: Array) -> tuple[float, float, float]:

@@ -15,7 +15,7 @@ from jawusd.geometry import LANDMARKS
 from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import se3_inverse, transform_point
 from jawusd.viewer.motion import Clip, KeyTrack, at_frames, with_key
-from jawusd.viewer.readouts import ON_BOUND_MM, Readout, read_out, triple
+from jawusd.viewer.readouts import Readout, read_out, triple
 
 Interpolation = Literal["linear", "smooth"]
 
@@ -120,11 +120,11 @@ class Session:
         """Switch whether sliders stay inside; switching it on brings the pose inside."""
         self.keep_valid = bool(keep)
         self._gesture = None
-        if keep and float(self.rig.margin(self.d)) < -ON_BOUND_MM:
+        if keep and not self.rig.is_inside(self.d):
             self.set_pose(self.d)
 
     def _inside(self, d: Array) -> Array:
-        return d if float(self.rig.margin(d)) >= -ON_BOUND_MM else self.rig.project(d)
+        return d if self.rig.is_inside(d) else self.rig.project(d)
 
     def _kept(self, d: Array, index: int) -> Array:
         """Return d (3,) brought inside, moving the parameter `index` as little as the bound allows."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from jawusd.evaluator.verdicts import place as place_of
 from jawusd.formats.performance import STATE_COLOURS, STATE_WORDS, SolveState
 from jawusd.formats.solved import SolvedJaw
 from jawusd.formats.tracks import LOST, Tracks
@@ -79,9 +80,9 @@ def solve_words(tracks: Tracks, solved: SolvedJaw, frame: int) -> str:
     for name, value, sigma in zip(_NAMES, solved.d[row], solved.sigma_mm[row], strict=True):
         parts.append(f"{name} {value:.2f} &plusmn; {sigma:.2f} mm (1 sigma)")
     margin = float(solved.margin_mm[row])
-    where = "inside" if margin >= 0 else "outside"
     verdict = "" if solved.valid[row] else ": <b>the rig does not allow this pose</b>"
-    parts.append(f"{abs(margin):.2f} mm {where} the bound{verdict}")
+    where = place_of(margin, float(tracks.meta.get("tolerance_mm", 0.0)))
+    parts.append(f"bound: {where}, margin {margin:.2f} mm{verdict}")
     return "<br>".join(parts)
 
 

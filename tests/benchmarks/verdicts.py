@@ -53,7 +53,7 @@ def main() -> None:
     refused = np.zeros(2)
     for name, poses in rows.items():
         own = rig.validate(poses).valid
-        polygons = rig.validate(poses, bound="polygons", residual_limit_mm=np.inf, margin_limit_mm=0.0).valid
+        polygons = rig.validate(poses, bound="polygons", residual_limit_mm=np.inf, tolerance_mm=0.0).valid
         print(f"{name:<12}{len(poses):>8}{own.mean():>10.2%}{polygons.mean():>10.2%}")
         if name != "captured":
             refused += [(~own).sum(), (~polygons).sum()]

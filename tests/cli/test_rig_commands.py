@@ -62,14 +62,14 @@ def test_validate_judges_poses_and_leaves_with_a_no(actor, tmp_path):
     frames, d = example_motion(6)
     T = rig.pose(d)
     write_poses(tmp_path / "good.csv", frames, T)
-    assert "6 of 6 poses are valid" in run("validate", actor, tmp_path / "good.csv")
+    assert "6 poses: 6 inside, 0 within tolerance, 0 invalid" in run("validate", actor, tmp_path / "good.csv")
     T[2] = se3_exp([0, 0.3, 0.2, 0, 5, 0]) @ T[2]
     write_poses(tmp_path / "bad.csv", frames, T)
     found = json.loads(run("validate", actor, tmp_path / "bad.csv", "--json", code=1))
     assert found["invalid"] == 1 and found["verdicts"][2]["valid"] is False
-    assert found["verdicts"][2]["reason"] != "valid" and found["verdicts"][1]["reason"] == "valid"
+    assert found["verdicts"][2]["reason"] == "off the model, outside" and found["verdicts"][1]["reason"] == "inside"
     write_parameters(tmp_path / "d.csv", frames, d + [0, 40, 0])
-    assert "outside the bound" in run("validate", actor, tmp_path / "d.csv", code=1)
+    assert "outside (" in run("validate", actor, tmp_path / "d.csv", code=1)
 
 
 def test_validate_without_poses_checks_the_rig(actor):

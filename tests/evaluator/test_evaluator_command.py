@@ -46,8 +46,8 @@ def test_validate_says_yes_with_exit_code_0_and_no_with_1(model, poses, capsys, 
     write_poses(tmp_path / "bad.csv", np.array([1, 2]), RIG.pose([[20.0, 2.0, 1.0], [20.0, 20.0, 1.0]]))
     assert main(["validate", model, str(tmp_path / "bad.csv"), "--json"]) == 1
     first, second = json.loads(capsys.readouterr().out)
-    assert first["valid"] is True and first["reason"] == "valid"
-    assert second["valid"] is False and second["reason"] == "outside the bound"
+    assert first["valid"] is True and first["reason"] == "inside"
+    assert second["valid"] is False and second["reason"] == "outside"
     assert second["margin_mm"] == pytest.approx(float(RIG.margin([20.0, 20.0, 1.0])), abs=1e-7)
 
 

@@ -32,8 +32,8 @@ def test_a_saved_model_loads_as_a_rig(tmp_path, kind):
 
 
 def test_newer_versions_are_refused_with_advice(tmp_path):
-    with pytest.raises(VersionError, match=r"jawusd-model/2.*Update jawusd"):
-        evaluator.load(write(tmp_path / "m.npz", format="jawusd-model/2"))
+    with pytest.raises(VersionError, match=r"jawusd-model/3.*Update jawusd"):
+        evaluator.load(write(tmp_path / "m.npz", format="jawusd-model/3"))
 
 
 @pytest.mark.parametrize("found", ["jawusd-tracks/1", "jawusd-model", "jawusd-model/x", None])

@@ -216,7 +216,7 @@ def test_changing_the_given_arrays_does_not_change_the_rig():
         ({"slice_softness_mm": np.array(0.0)}, '"slice_softness_mm" is 0.0; it must be positive'),
         ({"slice_d1": np.zeros(33)}, '"slice_d1" must hold at least two rising values'),
         ({"d_range": np.zeros((3, 2))}, '"d_range"'),
-        ({"margin_limit_mm": np.array(0.5)}, '"margin_limit_mm" at most 0'),
+        ({"tolerance_mm": np.array(-0.5)}, '"tolerance_mm" not negative'),
         ({"slice_directions": np.tile([[1.0, 0.0]], (16, 1))}, "leave a side open"),
         ({"slice_directions": np.tile([[2.0, 0.0]], (16, 1))}, "unit vectors"),
         ({"polygon_d1d2_counts": np.array([3])}, '"polygon_d1d2_counts"'),

@@ -51,22 +51,22 @@ def test_each_reason_is_named():
     np.testing.assert_array_equal(verdicts.valid, [True] + [False] * 6)
     assert np.isnan(verdicts.d[1:5]).all() and np.isnan(verdicts.margin_mm[1:5]).all()
     assert verdicts.margin_mm[6] == pytest.approx(float(RIG.margin([15.0, 14.0, 1.0])))
-    assert verdicts.words()[0] == "valid" and verdicts.words()[6] == "outside the bound"
-    assert Reason(12).words == "off the model, outside the bound"
+    assert verdicts.words()[0] == "inside" and verdicts.words()[6] == "outside"
+    assert Reason(12).words == "off the model, outside"
 
 
 def test_thresholds_are_the_rigs_and_can_be_overridden():
     T = se3_exp([0.0, 0.0, 0.0, 0.0, 0.0, 0.5]) @ RIG.pose(INSIDE)
     residual_mm = RIG.encode(T)[1]
-    verdicts = RIG.validate(T, residual_limit_mm=float(np.median(residual_mm)), margin_limit_mm=-50.0)
+    verdicts = RIG.validate(T, residual_limit_mm=float(np.median(residual_mm)), tolerance_mm=50.0)
     np.testing.assert_array_equal(verdicts.valid, residual_mm <= np.median(residual_mm))
     assert RIG.limits.residual_mm == 0.9
     strict = JawRig(dict(RIG.arrays, residual_limit_mm=np.array(1e-9)), RIG.meta)
     assert not strict.validate(T).valid.any()
     outside = np.array([15.0, 9.0, 1.0])
     by_mm = -float(RIG.margin(outside))
-    assert not RIG.validate_parameters(outside, margin_limit_mm=-by_mm + 0.01).valid
-    assert RIG.validate_parameters(outside, margin_limit_mm=-by_mm - 0.01).valid
+    assert not RIG.validate_parameters(outside, tolerance_mm=by_mm - 0.01).valid
+    assert RIG.validate_parameters(outside, tolerance_mm=by_mm + 0.01).valid
 
 
 def test_speed_is_asked_for_between_consecutive_poses():

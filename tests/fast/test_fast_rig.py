@@ -185,7 +185,7 @@ def test_verdicts_agree_for_every_reason(rig, fast):
     T[100:110, :3, :3] *= 1.01
     T[110:115, :3, 0] *= -1.0
     T[115:120, 3] = [0.0, 0.0, 0.1, 1.0]
-    limits = {"residual_limit_mm": 0.6, "margin_limit_mm": -0.2}
+    limits = {"residual_limit_mm": 0.6, "tolerance_mm": 0.2}
     for given in ({}, limits, {"bound": "polygons"}, {"times_s": np.arange(800) / 25.0, "speed_limit_mm_s": 900.0}):
         found, expected = fast.validate(T, **given), rig.validate(T, **given)
         assert_same_verdicts(found, expected)
@@ -203,7 +203,7 @@ def test_verdicts_agree_for_every_reason(rig, fast):
 def test_verdicts_on_parameters_agree(rig, fast):
     d = spoil(random_d(rig, (500,)))
     speed = {"times_s": np.arange(500) / 25.0, "speed_limit_mm_s": 900.0}
-    for given in ({}, {"margin_limit_mm": -1.0}, {"bound": "polygons"}, speed):
+    for given in ({}, {"tolerance_mm": 1.0}, {"bound": "polygons"}, speed):
         assert_same_verdicts(fast.validate_parameters(d, **given), rig.validate_parameters(d, **given))
 
 

@@ -111,7 +111,7 @@ def test_decompose_agrees_with_scipy():
 def test_other_files_are_refused(rig, model_file, tmp_path):
     arrays = dict(np.load(model_file, allow_pickle=False))
     for change, message in (
-        ({"format": "jawusd-model/2"}, "knows up to 1"),
+        ({"format": "jawusd-model/3"}, "knows up to 2"),
         ({"format": "jawusd-tracks/1"}, "expected jawusd-model"),
         ({"kind": "magic"}, "magic"),
     ):
@@ -134,9 +134,9 @@ def test_newer_and_missing_rigs_in_usd_are_refused(tmp_path):
     with pytest.raises(jawusd_reader.ReaderError, match="no complete jaw rig"):
         jawusd_reader.load(tmp_path / "actor.usda", "/Actor/geo")
     layer = Sdf.Layer.OpenAsAnonymous(str(tmp_path / "actor.usda"))
-    layer.GetAttributeAtPath("/Actor.jaw:formatVersion").default = 2
+    layer.GetAttributeAtPath("/Actor.jaw:formatVersion").default = 3
     layer.Export(str(tmp_path / "actor.usda"))
-    with pytest.raises(jawusd_reader.ReaderError, match="knows up to 1"):
+    with pytest.raises(jawusd_reader.ReaderError, match="knows up to 2"):
         jawusd_reader.load(tmp_path / "actor.usda")
 
 

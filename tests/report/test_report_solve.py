@@ -29,9 +29,10 @@ def solve_data(**change):
     tracks.status[10:15, 1] = tracks.status[30] = LOST
     sigma[10:15], sigma[30] = [1.0, 0.5, 0.25], 3.0
     valid[40:42], margin[40:42] = False, -0.7
+    margin[45] = -0.2
     d = np.stack([np.linspace(0, 30, count), np.linspace(-4, 4, count), np.zeros(count)], axis=1)
     tracks.solved = SolvedJaw(d, sigma, margin, state, valid)
-    tracks.meta["margin_limit_mm"], tracks.meta["focal"] = -0.3, {"cam1": [1.02, 0.003]}
+    tracks.meta["tolerance_mm"], tracks.meta["focal"] = 0.3, {"cam1": [1.02, 0.003]}
     tracks.meta["findings"] = [{"kind": "x", "severity": "warning", "message": "masks <are> wide", "camera": "cam1"}]
     values = {
         "shot": "take & one",
@@ -62,7 +63,8 @@ def test_the_page_counts_and_names_what_was_not_seen():
     assert "take & one: solved performance" in text
     for words in ("solved 54 frames (90.0 %)", "carried 5 frames (8.3 %)", "lost 1 frame (1.7 %)"):
         assert words in text
-    assert "outside the bound 2 frames (3.3 %)" in text
+    assert "within tolerance 1 frame (1.7 %)" in text
+    assert "outside 2 frames (3.3 %)" in text
     assert f"{first + 10}–{first + 14}" in text and "masks <are> wide" in text and "lost <here>" in text
     assert "1.0200 ± 0.0030" in text and "not solved with" in text and "Limited by having one camera" in text
     runs = unseen_runs(data, data.tracks.solved)
@@ -102,7 +104,7 @@ def test_the_page_asks_for_nothing_and_draws_the_values():
         assert np.ptp(at) == pytest.approx(widest)
         assert "[mm]" in axis.get_ylabel()
     names = [label.get_text() for label in seen_figure(data.tracks, data.tracks.solved, FPS).axes[0].get_yticklabels()]
-    assert names == ["solved  54", "carried  5", "lost  1", "outside the bound  2"]
+    assert names == ["solved  54", "carried  5", "lost  1", "within tolerance  1", "outside  2"]
 
 
 def test_tracks_that_no_solve_made_are_refused():

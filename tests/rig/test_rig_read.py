@@ -52,7 +52,7 @@ def test_the_hash_follows_the_arrays(kind):
 
 def test_description_is_that_of_the_rig(folder, kind):
     found = describe(folder / "anim_capture.usdc")
-    assert (found["actor"], found["model"]["kind"], found["format_version"]) == ("example", kind, 1)
+    assert (found["actor"], found["model"]["kind"], found["format_version"]) == ("example", kind, 2)
     assert found["ranges_mm"]["d1"] == [0.0, 42.0]
     assert found["animation"] == {"samples": 40, "first": 30.0, "last": 69.0}
     assert found["table"]["format"] == ("grid" if kind == "anchored" else "curves")
@@ -62,8 +62,8 @@ def test_description_is_that_of_the_rig(folder, kind):
 
 def test_a_newer_rig_is_refused(anchored_folder):
     actor = anchored_folder / "actor.usda"
-    edit(actor, set_value("jaw:formatVersion", 2))
-    with pytest.raises(VersionError, match="version 2, this jawusd reads up to 1"):
+    edit(actor, set_value("jaw:formatVersion", 3))
+    with pytest.raises(VersionError, match="version 3, this jawusd reads up to 2"):
         load_rig(actor)
 
 

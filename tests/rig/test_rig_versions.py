@@ -8,6 +8,7 @@ from pxr import Sdf, Usd
 from jawusd.errors import VersionError
 from jawusd.rig import describe, load_rig, validate_stage, versions
 
+NEXT = versions.FORMAT_VERSION + 1
 OLD_NAME, NEW_NAME = "jaw:decoder:error", "jaw:decoder:maxError"
 
 
@@ -15,7 +16,7 @@ OLD_NAME, NEW_NAME = "jaw:decoder:error", "jaw:decoder:maxError"
 def older(anchored_folder, monkeypatch):
     """Return a rig as a version before the present one would have been: another name, inches in the incisal point.
 
-    What is present becomes version 2, and STEPS gets the step from 1 to 2.
+    What is present becomes the next version, and STEPS gets the step to it.
     """
     for file, change in (("rig.usdc", _rename), ("rig.usdc", _to_inches)):
         layer = Sdf.Layer.OpenAsAnonymous(str(anchored_folder / file))
@@ -28,8 +29,8 @@ def older(anchored_folder, monkeypatch):
         incisor = prim.GetAttribute("jaw:model:incisor")
         incisor.Set(np.array(incisor.Get()) * 25.4)
 
-    monkeypatch.setattr(versions, "FORMAT_VERSION", 2)
-    monkeypatch.setitem(versions.STEPS, 1, step)
+    monkeypatch.setattr(versions, "FORMAT_VERSION", NEXT)
+    monkeypatch.setitem(versions.STEPS, NEXT - 1, step)
     return anchored_folder
 
 
@@ -62,15 +63,15 @@ def test_reading_twice_on_one_stage_upgrades_once(older):
     prim = stage.GetPrimAtPath("/Actor")
     for _ in range(2):
         versions.upgrade_rig(prim, older)
-        assert prim.GetAttribute("jaw:formatVersion").Get() == 2
+        assert prim.GetAttribute("jaw:formatVersion").Get() == NEXT
     np.testing.assert_allclose(prim.GetAttribute("jaw:model:incisor").Get(), example_rig().arrays["incisor"])
 
 
 def test_a_version_after_the_present_one_is_refused(older):
     layer = Sdf.Layer.OpenAsAnonymous(str(older / "actor.usda"))
-    layer.GetAttributeAtPath("/Actor.jaw:formatVersion").default = 3
+    layer.GetAttributeAtPath("/Actor.jaw:formatVersion").default = NEXT + 1
     layer.Export(str(older / "actor.usda"))
-    with pytest.raises(VersionError, match="version 3, this jawusd reads up to 2"):
+    with pytest.raises(VersionError, match=f"version {NEXT + 1}, this jawusd reads up to {NEXT}"):
         load_rig(older / "actor.usda")
 
 

@@ -27,7 +27,7 @@ def example_arrays(kind="anchored", centres=40):
         "d_range": np.array([[0.0, OPENING_MM], [-9.0, 9.5], [-1.5, 7.0]]),
         "landmarks": LANDMARKS_ANATOMICAL @ to_mandible[:3, :3].T + to_mandible[:3, 3],
         "residual_limit_mm": np.array(0.9),
-        "margin_limit_mm": np.array(0.0),
+        "tolerance_mm": np.array(0.0),
         **_bounds(),
     }
     arrays |= _anchored(centres) if kind == "anchored" else _additive()
@@ -37,7 +37,7 @@ def example_arrays(kind="anchored", centres=40):
 def example_meta(kind="anchored"):
     """Return the header that goes with `example_arrays`."""
     return {
-        "format": "jawusd-model/1",
+        "format": "jawusd-model/2",
         "kind": kind,
         "method": kind,
         "actor": "example",

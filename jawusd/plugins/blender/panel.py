@@ -44,9 +44,10 @@ class JAWUSD_PT_sliders(bpy.types.Panel):
             box.label(text=actor.name)
             for name, label in zip(jawusd_reader.PARAMETERS, jawusd_reader.LABELS):
                 box.prop(actor, f'["{name}"]', text=label)
-            margin = jaw.rig_of(actor).margin(*(actor[name] for name in jawusd_reader.PARAMETERS))
-            word = "inside" if margin >= 0 else "OUTSIDE"
-            box.label(text=f"{word} the bounds by {abs(margin):.1f} mm", icon="INFO" if margin >= 0 else "ERROR")
+            rig, d = jaw.rig_of(actor), [actor[name] for name in jawusd_reader.PARAMETERS]
+            inside, distance = rig.is_inside(*d), abs(rig.margin(*d))
+            word = "inside" if inside else "OUTSIDE"
+            box.label(text=f"{word} the bound by {distance:.1f} mm", icon="INFO" if inside else "ERROR")
             captured, shown = actor.get("jawusd_fps"), context.scene.render.fps / context.scene.render.fps_base
             if captured and abs(captured - shown) > 0.01:
                 box.label(text=f"captured at {captured:g} fps, the scene has {shown:g}", icon="TIME")

@@ -7,7 +7,7 @@ from typing import cast
 
 import numpy as np
 
-from jawusd.evaluator import JawRig, Reason
+from jawusd.evaluator import JawRig
 from jawusd.formats.performance import Performance, SolveState
 from jawusd.formats.solved import SolvedJaw
 from jawusd.formats.tracks import LOST, TRACKED, Registration, Tracks, TracksMeta
@@ -41,7 +41,7 @@ def performance_of(
     """
     fits = smoothed.fits
     d = np.stack([fit.pose.d for fit in fits])
-    verdicts = jaw.validate_parameters(d)
+    verdicts = jaw.validate_parameters(d, tolerance_mm=jaw.tolerance_mm)
     found = np.stack([fit.found for fit in fits])
     missed = np.stack([fit.missed for fit in fits]).any(1)
     state = np.where(found.all(1), SolveState.SOLVED, np.where(missed, SolveState.LOST, SolveState.CARRIED))
@@ -64,6 +64,7 @@ def performance_of(
         residual_px=np.stack([nothing if f.solution is None else residual_px(f.solution) for f in fits]),
         matched_px=np.stack([np.zeros(2) if f.solution is None else matched_px(f.solution) for f in fits]),
         margin_mm=verdicts.margin_mm,
+        valid=verdicts.valid,
         verdict=verdicts.words(),
         camera_names=camera_names,
         notes=notes,
@@ -87,7 +88,7 @@ def tracks_of(performance: Performance, jaw: JawRig) -> Tracks:
     of_lower[..., JAW] = se3_adjoint(head) @ by_d
     relative_covariance = _spread(by_d, p.covariance[:, JAW, JAW])
     own = landmark_sigmas(relative, relative_covariance, jaw.landmarks)
-    meta = TracksMeta(solver="performance", margin_limit_mm=float(jaw.limits.margin_mm))
+    meta = TracksMeta(solver="performance", tolerance_mm=jaw.tolerance_mm)
     meta.update(_known_notes(p))
     moved = jaw.meta.get("registration")
     if isinstance(moved, dict) and moved.get("applied"):  # the lower scan is posed as the rig has it
@@ -119,7 +120,7 @@ def tracks_of(performance: Performance, jaw: JawRig) -> Tracks:
         matched_px=p.matched_px,
         camera_names=p.camera_names,
         meta=meta,
-        solved=SolvedJaw(p.d, p.sigma_d, p.margin_mm, p.state, np.isin(p.verdict, Reason.VALID.words)),
+        solved=SolvedJaw(p.d, p.sigma_d, p.margin_mm, p.state, p.valid),
     )
 
 

@@ -1,0 +1,96 @@
+"""What a rig says of motions: curves between keys, ranges of sliders, shares of ranges that other persons can take."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jawusd.evaluator import sections
+from jawusd.evaluator.arrays import RigArrays
+from jawusd.evaluator.batching import as_keys, as_rows, in_chunks, pairs_in_chunks
+from jawusd.evaluator.bounds import SliceHull
+from jawusd.evaluator.interpolation import interpolated
+from jawusd.evaluator.search import nearest_distance
+from jawusd.evaluator.sections import Ranges
+from jawusd.geometry.arrays import Array
+
+
+class RigAuthoring(RigArrays):
+    """A rig as far as motions of d and its bound go.
+
+    Attributes:
+        bound: The slice bound.
+    """
+
+    bound: SliceHull
+
+    def interpolate(
+        self,
+        frames: ArrayLike,
+        d_keys: ArrayLike,
+        at: ArrayLike,
+        method: Literal["linear", "smooth"] = "linear",
+    ) -> Array:
+        """Return jaw parameters between keys.
+
+        Args:
+            frames: Times of the keys, rising, shape (K,).
+            d_keys: Jaw parameters [mm] at the keys, shape (K, 3).
+            at: Times wanted, any shape; outside the keys the nearest key holds.
+            method: "linear", straight lines in d as in the paper, or "smooth", a C1 curve that stays inside the bound
+                between keys that are inside.
+
+        Returns:
+            Jaw parameters [mm], shape (*at.shape, 3).
+
+        Raises:
+            ValueError: wrong shapes, keys that are not finite or frames that do not rise, or an unknown method.
+        """
+        frames, keys = as_keys(frames, d_keys)
+        times, batch = as_rows(np.asarray(at, dtype=np.float64)[..., None], (1,), "at")
+        d = interpolated(frames, keys, times[:, 0], method, self.bound)
+        return d.reshape(*batch, 3)
+
+    def ranges(self, d1: ArrayLike, d2: ArrayLike = 0.0, d3: ArrayLike = 0.0) -> Ranges:
+        """Return how far d2 and d3 can each go alone from (d1, d2, d3).
+
+        Args:
+            d1: Opening [mm]; d1, d2, d3 broadcast to one shape (...).
+            d2: Laterotrusion [mm] at which d3 is moved.
+            d3: Protrusion [mm] at which d2 is moved.
+
+        Returns:
+            The ends [mm]; NaN where the section has no point on that line.
+        """
+        d = np.stack(np.broadcast_arrays(*(np.asarray(x, dtype=np.float64) for x in (d1, d2, d3))), axis=-1)
+        rows, batch = as_rows(d, (3,), "d")
+        ends = [pairs_in_chunks(partial(self.bound.chord, axis=axis), rows) for axis in (1, 2)]
+        return Ranges(*(end.reshape(batch) for pair in ends for end in pair))
+
+    def normalized(self, d: ArrayLike) -> Array:
+        """Return d as shares of this person's ranges, for carrying motion to another person.
+
+        The opening is divided by the full opening, d2 and d3 by the reach to their side along the habitual path at
+        that opening (at least 0.5 mm).
+
+        Args:
+            d: Jaw parameters [mm], shape (..., 3).
+
+        Returns:
+            Shares, shape (..., 3): 1 is the full range.
+        """
+        rows, batch = as_rows(d, (3,), "d")
+        return in_chunks(lambda d: sections.normalized(self.bound, self.d_range, d), rows).reshape(*batch, 3)
+
+    def denormalized(self, shares: ArrayLike) -> Array:
+        """Return the jaw parameters [mm], shape (..., 3), of shares (..., 3): the inverse of `normalized`."""
+        rows, batch = as_rows(shares, (3,), "shares")
+        return in_chunks(lambda n: sections.denormalized(self.bound, self.d_range, n), rows).reshape(*batch, 3)
+
+    def captured_distance(self, d: ArrayLike) -> Array:
+        """Return the distance [mm] (...) of d (..., 3) [mm] to the nearest captured pose, in d; inf without any."""
+        rows, batch = as_rows(d, (3,), "d")
+        return in_chunks(lambda d: nearest_distance(self.captured_d, d), rows).reshape(batch)
