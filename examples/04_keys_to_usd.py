@@ -37,10 +37,11 @@ def main() -> None:
     options.out.with_suffix(".keys.json").write_text(json.dumps(document, indent=1))
 
     times = np.arange(frames[0], frames[-1] + 1.0)
-    wanted = rig.interpolate(frames, keys, times, method="smooth")
-    d = np.where((rig.margin(wanted) < 0)[:, None], rig.project(wanted), wanted)
-    print(f"{(rig.margin(wanted) < 0).sum()} of {len(times)} frames left the bound and were moved inside")
-    write_animation(options.out, options.rig, times, d, FPS)
+    wanted = rig.interpolate(frames, keys, times, method="smooth", inside=False)
+    kept = rig.keep_inside(times, wanted)
+    moved = np.linalg.norm(kept.d[kept.given] - wanted, axis=1) > 1e-6
+    print(f"{moved.sum()} of {len(times)} frames were moved to stay inside the bound")
+    write_animation(options.out, options.rig, kept.times, kept.d, FPS)
 
     stage = Usd.Stage.Open(str(options.out))
     mandible = UsdGeom.Xformable(stage.GetPrimAtPath(MANDIBLE))
@@ -49,7 +50,7 @@ def main() -> None:
     for label, at in (("at whole frames", times), ("half way between", times[:-1] + 0.5)):
         # USD's matrices act on row vectors: transposed, they are ours.
         seen = np.array([np.array(mandible.GetLocalTransformation(float(t))).T for t in at])
-        d_at = np.stack([np.interp(at, times, column) for column in d.T], axis=1)
+        d_at = np.stack([np.interp(at, kept.times, column) for column in kept.d.T], axis=1)
         away_mm = np.linalg.norm((seen - rig.pose(d_at)) @ incisor, axis=1)
         print(f"{label}: OpenUSD and the evaluator differ by at most {away_mm.max():.4f} mm at the incisal point")
 

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from jawusd.cli.output import emit
 from jawusd.errors import FormatError
+from jawusd.evaluator.interpolation import monotone_tangents
 from jawusd.formats.arkit import read_arkit
-from jawusd.formats.keys import FARTHEST_FRAME, MOST_FRAMES, load_keys
+from jawusd.formats.keys import FARTHEST_FRAME, MOST_FRAMES, Keys, load_keys
 from jawusd.formats.poses import read_parameters, read_poses, table_columns
-from jawusd.geometry.arrays import Array
+from jawusd.geometry.arrays import Array, Mask
 
 if TYPE_CHECKING:
     from jawusd.evaluator import JawRig
 
+_MOVED_MM = 1e-6
+_OFF_CURVE_MM, _MOST_HALVINGS = 0.003, 4  # of straight lines between samples of a smooth motion
 _USD = (".usd", ".usda", ".usdc", ".usdz")
 
 
@@ -28,6 +31,7 @@ class AuthoredMotion:
     frames: Array  # frame numbers (F,), increasing
     d: Array  # parameters (F, 3) [mm], NaN in frames without parameters
     fps: float | None  # frames per second, None where the source does not say
+    keys: Keys | None = None  # what it was interpolated from
 
     def __post_init__(self) -> None:
         """Refuse what cannot be written out frame by frame."""
@@ -54,7 +58,8 @@ def read_motion(rig: JawRig, source: Path) -> AuthoredMotion:
         keys = load_keys(source)
         key_frames, key_d = keys.arrays()
         at = np.unique(np.concatenate([np.arange(np.ceil(key_frames[0]), np.floor(key_frames[-1]) + 1), key_frames]))
-        return AuthoredMotion(at, rig.interpolate(key_frames, key_d, at, method=keys.interpolation), keys.fps)
+        d = rig.interpolate(key_frames, key_d, at, method=keys.interpolation, inside=False)
+        return AuthoredMotion(at, d, keys.fps, keys)
     if "d1" in table_columns(source):
         frames, d = read_parameters(source)
     else:
@@ -101,19 +106,80 @@ def emit_motion(out: Path, rate: float, motion: AuthoredMotion, changes: Changes
 
 
 def kept_inside(rig: JawRig, motion: AuthoredMotion) -> tuple[AuthoredMotion, Changes]:
-    """Move parameters to the nearest valid ones where they lie outside the bound."""
-    outside = np.isfinite(motion.d).all(axis=1) & ~rig.is_inside(motion.d)
-    kept = motion.d.copy()
-    kept[outside] = rig.project(motion.d[outside])
-    moved_mm = np.linalg.norm(kept - motion.d, axis=1)[outside]
-    lost, clamped = int(np.isnan(kept).any(axis=1).sum()), int(outside.sum())
-    largest, mean = float(moved_mm.max(initial=0.0)), float(moved_mm.mean()) if moved_mm.size else 0.0
+    """Bring a motion inside the bound, see `JawRig.keep_inside`; frames without parameters stay so."""
+    known = np.isfinite(motion.d).all(axis=1)
+    lost = int((~known).sum())
     lines = ["", *_lost_line(lost)]
+    if not known.any():
+        return motion, Changes({"lost": lost}, lines)
+    wanted = motion.d[known]
+    inside = rig.keep_inside(motion.frames[known], wanted)
+    moved_mm = np.linalg.norm(inside.d[inside.given] - wanted, axis=1)
+    outside = ~rig.is_inside(wanted)
+    beside = ~outside & (moved_mm > _MOVED_MM)
+    clamped, largest = int(outside.sum()), float(moved_mm.max())
+    mean = float(moved_mm[outside].mean()) if clamped else 0.0
     if clamped:
-        moved = f"moved by {mean:.2f} mm on average, {largest:.2f} mm at most"
+        moved = f"moved by {mean:.2f} mm on average, {float(moved_mm[outside].max()):.2f} mm at most"
         lines.append(f"{clamped} frames lay outside the bound, {moved}")
+    if beside.any():
+        moved = f"moved by {float(moved_mm[beside].max()):.2f} mm at most"
+        lines.append(f"{int(beside.sum())} frames beside them {moved}, as the way inside is longer")
     figures = {"lost": lost, "clamped": clamped, "largest_clamp_mm": largest, "mean_clamp_mm": mean}
-    return AuthoredMotion(motion.frames, kept, motion.fps), Changes(figures, lines)
+    figures |= {"moved_beside": int(beside.sum())}
+    frames = np.union1d(inside.times, motion.frames)
+    d = np.full((len(frames), 3), np.nan)
+    d[np.searchsorted(frames, inside.times)] = inside.d
+    return AuthoredMotion(frames, d, motion.fps, motion.keys), Changes(figures, lines)
+
+
+class Knots(NamedTuple):
+    """What a spline is made of: as many keys as the motion allows."""
+
+    frames: Array  # shape (K,)
+    d: Array  # [mm], shape (K, 3)
+    slopes: Array  # tangents [mm per frame], shape (K, 3)
+    curved: Mask  # pieces that are cubic, shape (K - 1,)
+
+
+def knots_of(rig: JawRig, motion: AuthoredMotion) -> Knots:
+    """Return the keys of a motion with their tangents; all samples of a piece that the bound has changed."""
+    known = np.isfinite(motion.d).all(axis=1)
+    frames, d = motion.frames[known], motion.d[known]
+    if motion.keys is None:
+        return Knots(frames, d, np.zeros_like(d), np.zeros(max(len(d) - 1, 0), dtype=bool))
+    key_frames, key_d = motion.keys.arrays()
+    smooth = motion.keys.interpolation == "smooth"
+    slopes = monotone_tangents(key_frames, key_d) if smooth else np.zeros_like(key_d)
+    keep, tangents = np.isin(frames, key_frames), np.zeros_like(d)
+    tangents[keep] = slopes
+    own = np.abs(rig.interpolate(key_frames, key_d, frames, motion.keys.interpolation, inside=False) - d) <= _MOVED_MM
+    places = np.flatnonzero(keep)
+    cubic = np.zeros(len(d), dtype=bool)
+    for start, end in zip(places, places[1:]):
+        between = np.linspace(frames[start], frames[end], 10 * int(frames[end] - frames[start] + 1))
+        curve = rig.interpolate(key_frames, key_d, between, motion.keys.interpolation, inside=False)
+        if own[start : end + 1].all() and rig.is_inside(curve).all():
+            cubic[start] = smooth
+        else:
+            keep[start : end + 1] = True
+    return Knots(frames[keep], d[keep], tangents[keep], cubic[keep][:-1])
+
+
+def follow_curves(rig: JawRig, motion: AuthoredMotion, knots: Knots) -> AuthoredMotion:
+    """Return the motion with samples added where straight lines between samples are off the curves of its keys."""
+    if motion.keys is None or not knots.curved.any():
+        return motion
+    key_frames, key_d = motion.keys.arrays()
+    frames, d = motion.frames, motion.d
+    for _ in range(_MOST_HALVINGS):
+        middle = 0.5 * (frames[1:] + frames[:-1])
+        piece = np.clip(np.searchsorted(knots.frames, middle) - 1, 0, len(knots.curved) - 1)
+        curve = rig.interpolate(key_frames, key_d, middle, motion.keys.interpolation, inside=False)
+        off = np.linalg.norm(curve - 0.5 * (d[1:] + d[:-1]), axis=1) > _OFF_CURVE_MM
+        where = np.flatnonzero(off & knots.curved[piece]) + 1
+        frames, d = np.insert(frames, where, middle[where - 1]), np.insert(d, where, curve[where - 1], axis=0)
+    return AuthoredMotion(frames, d, motion.fps, motion.keys)
 
 
 def carried_over(source_rig: Path, source: Path, target: JawRig) -> tuple[AuthoredMotion, Changes]:

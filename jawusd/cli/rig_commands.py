@@ -281,10 +281,16 @@ def animate(
     as_json: Json = False,
 ) -> None:
     """Write an animation layer over a rig; clamping to the bound is reported."""
-    import numpy as np
-
     import jawusd
-    from jawusd.cli.motion import carried_over, emit_motion, kept_inside, read_face, read_motion
+    from jawusd.cli.motion import (
+        carried_over,
+        emit_motion,
+        follow_curves,
+        kept_inside,
+        knots_of,
+        read_face,
+        read_motion,
+    )
     from jawusd.rig import describe, write_animation, write_splines
 
     if (source is None) == (arkit is None):
@@ -301,8 +307,9 @@ def animate(
     elif arkit is not None:
         motion, changes = kept_inside(loaded, read_face(loaded, arkit, fps))
     rate = fps or motion.fps or describe(rig)["fps"]
+    knots = knots_of(loaded, motion)
+    motion = follow_curves(loaded, motion, knots)
     write_animation(out, rig, motion.frames, motion.d, rate)
     if splines is not None:
-        known = np.isfinite(motion.d).all(axis=1)
-        write_splines(splines, out, motion.frames[known], motion.d[known], rate)
+        write_splines(splines, out, knots.frames, knots.d, rate, knots.slopes, knots.curved)
     emit_motion(out, rate, motion, changes, as_json)

@@ -10,8 +10,9 @@ from numpy.typing import ArrayLike
 
 from jawusd.evaluator import sections
 from jawusd.evaluator.arrays import RigArrays
-from jawusd.evaluator.batching import as_keys, as_rows, in_chunks, pairs_in_chunks
+from jawusd.evaluator.batching import as_floats, as_keys, as_rows, in_chunks, pairs_in_chunks
 from jawusd.evaluator.bounds import SliceHull
+from jawusd.evaluator.clamping import Inside, kept_inside
 from jawusd.evaluator.interpolation import interpolated
 from jawusd.evaluator.search import nearest_distance
 from jawusd.evaluator.sections import Ranges
@@ -33,6 +34,8 @@ class RigAuthoring(RigArrays):
         d_keys: ArrayLike,
         at: ArrayLike,
         method: Literal["linear", "smooth"] = "linear",
+        *,
+        inside: bool = True,
     ) -> Array:
         """Return jaw parameters between keys.
 
@@ -40,8 +43,9 @@ class RigAuthoring(RigArrays):
             frames: Times of the keys, rising, shape (K,).
             d_keys: Jaw parameters [mm] at the keys, shape (K, 3).
             at: Times wanted, any shape; outside the keys the nearest key holds.
-            method: "linear", straight lines in d as in the paper, or "smooth", a C1 curve that stays inside the bound
-                between keys that are inside.
+            method: "linear", straight lines in d as in the paper, or "smooth", a C1 curve, monotone between keys.
+            inside: Where the smooth curve between two keys inside would leave the bound, follow the bound instead,
+                no more than continuously. See `keep_inside` for keys that are not inside.
 
         Returns:
             Jaw parameters [mm], shape (*at.shape, 3).
@@ -50,9 +54,28 @@ class RigAuthoring(RigArrays):
             ValueError: wrong shapes, keys that are not finite or frames that do not rise, or an unknown method.
         """
         frames, keys = as_keys(frames, d_keys)
-        times, batch = as_rows(np.asarray(at, dtype=np.float64)[..., None], (1,), "at")
-        d = interpolated(frames, keys, times[:, 0], method, self.bound)
+        times, batch = as_rows(as_floats(at, "at")[..., None], (1,), "at")
+        d = interpolated(frames, keys, times[:, 0], method, self.bound if inside else None)
         return d.reshape(*batch, 3)
+
+    def keep_inside(self, times: ArrayLike, d: ArrayLike) -> Inside:
+        """Return a motion brought inside the bound, at its samples and between them.
+
+        What is outside is brought in continuously, and no step becomes more than 5 % longer than it was: where the way
+        inside is longer than that, the motion takes the time from before and after.
+
+        Args:
+            times: Of the samples, rising, shape (F,).
+            d: Jaw parameters [mm], linear in between, shape (F, 3).
+
+        Returns:
+            The samples at the given times, and more where straight lines between them would leave the bound.
+
+        Raises:
+            ValueError: wrong shapes, samples that are not finite or times that do not rise.
+            EvaluatorError: the bound of the rig is empty.
+        """
+        return kept_inside(self.bound, *as_keys(times, d))
 
     def ranges(self, d1: ArrayLike, d2: ArrayLike = 0.0, d3: ArrayLike = 0.0) -> Ranges:
         """Return how far d2 and d3 can each go alone from (d1, d2, d3).
@@ -63,10 +86,14 @@ class RigAuthoring(RigArrays):
             d3: Protrusion [mm] at which d2 is moved.
 
         Returns:
-            The ends [mm]; NaN where the section has no point on that line.
+            The ends [mm]; NaN where the section has no point on that line. The bound closes some tenths of a mm before
+            the ends of ``d_range[0]``: there, the ends at the nearest opening on that line that is inside.
         """
-        d = np.stack(np.broadcast_arrays(*(np.asarray(x, dtype=np.float64) for x in (d1, d2, d3))), axis=-1)
+        each = (as_floats(x, name) for x, name in ((d1, "d1"), (d2, "d2"), (d3, "d3")))
+        d = np.stack(np.broadcast_arrays(*each), axis=-1)
         rows, batch = as_rows(d, (3,), "d")
+        within = (rows[:, 0] >= self.d_range[0, 0]) & (rows[:, 0] <= self.d_range[0, 1])
+        rows = np.where(within[:, None], in_chunks(self.bound.nearest_opening, rows), rows)
         ends = [pairs_in_chunks(partial(self.bound.chord, axis=axis), rows) for axis in (1, 2)]
         return Ranges(*(end.reshape(batch) for pair in ends for end in pair))
 

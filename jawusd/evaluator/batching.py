@@ -17,13 +17,25 @@ CHUNK_ROWS = 2048
 LARGEST = 1e9  # 1,000 km: no jaw, and squares and cubes of it still fit a float
 
 
+def as_floats(values: ArrayLike, name: str) -> Array:
+    """Return values as float64.
+
+    Raises:
+        ValueError: complex numbers.
+    """
+    found = np.asarray(values)
+    if found.dtype.kind == "c":
+        raise ValueError(f"{name} must be real numbers, got {found.dtype}")
+    return np.asarray(found, dtype=np.float64)
+
+
 def rows_of(values: ArrayLike, tail: tuple[int, ...], name: str) -> tuple[Array, tuple[int, ...]]:
     """Return values as float64 rows (n, *tail) and the batch shape.
 
     Raises:
-        ValueError: the trailing axes are not ``tail``.
+        ValueError: the trailing axes are not ``tail``, or complex numbers.
     """
-    values = np.asarray(values, dtype=np.float64)
+    values = as_floats(values, name)
     batch = values.shape[: values.ndim - len(tail)]
     if values.ndim < len(tail) or values.shape[len(batch) :] != tail:
         raise ValueError(f"{name} must have shape (..., {', '.join(map(str, tail))}), got {values.shape}")
@@ -69,7 +81,7 @@ def as_points(points: ArrayLike, name: str) -> Array:
     Raises:
         ValueError: another shape, no point, or values that are not finite.
     """
-    points = np.asarray(points, dtype=np.float64)
+    points = as_floats(points, name)
     if points.ndim not in (1, 2) or points.shape[-1] != 3 or not points.size:
         raise ValueError(f"{name} must have shape (3,) or (P, 3), got {points.shape}")
     if not np.isfinite(points).all():
@@ -83,7 +95,7 @@ def as_keys(frames: ArrayLike, d_keys: ArrayLike) -> tuple[Array, Array]:
     Raises:
         ValueError: other shapes, no key, values that are not finite, or times that do not rise.
     """
-    frames, keys = np.asarray(frames, dtype=np.float64), np.asarray(d_keys, dtype=np.float64)
+    frames, keys = as_floats(frames, "frames"), as_floats(d_keys, "d_keys")
     if frames.ndim != 1 or not frames.size or keys.shape != (len(frames), 3):
         raise ValueError(f"frames must have shape (K,) and d_keys (K, 3), K >= 1, got {frames.shape} and {keys.shape}")
     if not (np.isfinite(frames).all() and np.isfinite(keys).all()):

@@ -100,6 +100,25 @@ class SliceHull:
         """Return the ends [mm] of the valid stretch through d (n, 3) along axis 1 or 2; NaN where there is none."""
         return self._chord_end(d, axis, -1.0), self._chord_end(d, axis, 1.0)
 
+    def nearest_opening(self, d: Array) -> Array:
+        """Return d (n, 3) [mm], with openings beyond the bound's ends moved to the nearest at which d is inside.
+
+        Only what is inside at the first or last opening is moved.
+        """
+        inner = d.copy()
+        inner[:, 0] = np.clip(d[:, 0], self._first, self._last)
+        closed = self.signed_distance(d) > 0
+        moved = np.flatnonzero(closed & (inner[:, 0] != d[:, 0]) & (self.signed_distance(inner) < 0))
+        found = d.copy()
+        low, high = np.zeros(len(moved)), np.ones(len(moved))
+        for _ in range(_NEWTON_ITERATIONS):
+            share = 0.5 * (low + high)
+            found[moved] = inner[moved] + share[:, None] * (d - inner)[moved]
+            outside = self.signed_distance(found[moved]) > 0
+            high, low = np.where(outside, share, high), np.where(outside, low, share)
+        found[moved] = inner[moved] + low[:, None] * (d - inner)[moved]
+        return found
+
     def _chord_end(self, d: Array, axis: int, sign: float) -> Array:
         # Newton from the corner of the sharp polygon, which contains the soft one: the signed distance is convex along
         # the line, so the search runs inwards without overshooting, and turns back only if the line misses the section.
@@ -122,6 +141,13 @@ class SliceHull:
             if not active.size:
                 break
         return end
+
+    def section_centres(self, count: int) -> tuple[Array, Array]:
+        """Return openings (n,) [mm] from end to end, at most ``count``, and the middle (n, 2) [mm] of each section."""
+        reach = self.offset_mm - self.softness_mm
+        found = [(d1, self._sharp_outline(d1)) for d1 in np.linspace(self._first - reach, self._last + reach, count)]
+        known = [(d1, outline.mean(axis=0)) for d1, outline in found if len(outline)]
+        return np.array([d1 for d1, _ in known]), np.array([middle for _, middle in known]).reshape(-1, 2)
 
     def candidates(self) -> Array:
         """Return points (n, 3) [mm] spread over the valid volume, dense near its surface: starts for searches."""

@@ -68,7 +68,10 @@ class Kernels(Protocol):
         """Return the derivatives (n, 3) of the margins by d (n, 3) [mm]."""
 
     def encode(self, T: Array) -> tuple[Array, Array]:
-        """Return the d (n, 3) [mm] nearest to poses T_skull_mandible (n, 4, 4), and the residuals (n,) [mm]."""
+        """Return the d (n, 3) [mm] nearest to poses T_skull_mandible (n, 4, 4), and the residuals (n,) [mm].
+
+        Those of matrices that are not rigid to `RIGID_TOLERANCE` are NaN.
+        """
 
     def judge_poses(self, T: Array, limits: Limits) -> Verdicts:
         """Return verdicts on poses T_skull_mandible (n, 4, 4); the limit of speed is not looked at."""
@@ -138,14 +141,17 @@ class NumpyKernels:
 
     def encode(self, T: Array) -> tuple[Array, Array]:
         """Return the d (n, 3) [mm] nearest to poses T_skull_mandible (n, 4, 4), and the residuals (n,) [mm]."""
-        return pairs_in_chunks(self._encoder.encode, usable_rows(T))
+        T = usable_rows(T)
+        known = np.isfinite(T[:, :1, :1])
+        rigid = known[:, 0, 0] & (in_chunks(rigidity_defect, np.where(known, T, np.eye(4))) <= RIGID_TOLERANCE)
+        return pairs_in_chunks(self._encoder.encode, np.where(rigid[:, None, None], T, np.nan))
 
     def judge_poses(self, T: Array, limits: Limits) -> Verdicts:
         """Return verdicts on poses T_skull_mandible (n, 4, 4)."""
         T = usable_rows(T)
         finite = np.asarray(np.isfinite(T).all(axis=(1, 2)))
         rigid = in_chunks(rigidity_defect, np.where(finite[:, None, None], T, np.eye(4))) <= RIGID_TOLERANCE
-        d, residual_mm = self.encode(np.where((finite & rigid)[:, None, None], T, np.nan))
+        d, residual_mm = pairs_in_chunks(self._encoder.encode, np.where((finite & rigid)[:, None, None], T, np.nan))
         return judge(finite, rigid, residual_mm, self.margins(d), d, limits)
 
     def judge_parameters(self, d: Array, limits: Limits) -> Verdicts:

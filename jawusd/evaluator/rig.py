@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jawusd.evaluator.authoring import RigAuthoring
-from jawusd.evaluator.batching import CHUNK_ROWS, as_points, as_rows, in_chunks, pairs_in_chunks, rows_of
+from jawusd.evaluator.batching import CHUNK_ROWS, as_floats, as_points, as_rows, in_chunks, pairs_in_chunks, rows_of
 from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.distances import carried, handle_vectors, point_velocities
 from jawusd.evaluator.encoding import Encoder, Encoding, whitening_of
@@ -81,7 +81,7 @@ class JawRig(RigAuthoring):
 
     def pose(self, d: ArrayLike) -> Array:
         """Return the poses T_skull_mandible (..., 4, 4) for jaw parameters d (..., 3) [mm]."""
-        d = np.asarray(d, dtype=np.float64)
+        d = as_floats(d, "d")
         if d.shape == (3,):
             d1, d2, d3 = d.tolist()
             if abs(d1) + abs(d2) + abs(d3) < _SINGLE_LIMIT_MM:  # False for NaN
@@ -128,7 +128,7 @@ class JawRig(RigAuthoring):
 
         Args:
             T_skull_mandible: Poses, shape (..., 4, 4). Of a matrix that is not quite rigid, the images of the
-                landmarks are what is matched.
+                landmarks are what is matched; one that is not rigid to 1e-3 is no pose and gives NaN.
             inside: Search only inside the bound.
             covariance: If given, return the most likely instead of the nearest parameters of noisy poses: covariance
                 of xi, (omega [rad], v [mm]) in the skull frame, with ``T_true = exp(xi) T``, shape (..., 6, 6) or
@@ -149,7 +149,7 @@ class JawRig(RigAuthoring):
 
     def _encode_weighted(self, T_skull_mandible: ArrayLike, covariance: ArrayLike, inside: bool) -> Encoding:
         rows, batch = as_rows(T_skull_mandible, (4, 4), "T_skull_mandible")
-        spread = np.broadcast_to(np.asarray(covariance, dtype=np.float64), (*batch, 6, 6))
+        spread = np.broadcast_to(as_floats(covariance, "covariance"), (*batch, 6, 6))
         whitening = whitening_of(as_rows(spread, (6, 6), "covariance")[0])
         start, _ = self.kernels.encode(rows)
         start[np.isnan(whitening).any(axis=(1, 2))] = np.nan
@@ -176,7 +176,7 @@ class JawRig(RigAuthoring):
         if bound != "slices":
             rows, batch = as_rows(d, (3,), "d")
             return -in_chunks(self._polygons(bound).signed_distance, rows).reshape(batch)
-        d = np.asarray(d, dtype=np.float64)
+        d = as_floats(d, "d")
         if d.shape == (3,):
             d1, d2, d3 = d.tolist()
             if abs(d1) + abs(d2) + abs(d3) < _SINGLE_LIMIT_MM:  # False for NaN
@@ -318,7 +318,7 @@ class JawRig(RigAuthoring):
         if start is None:
             d = in_chunks(lambda target: self._search.solve_ik_multistart(vectors, target), scaled)
         else:
-            given, _ = as_rows(np.broadcast_to(np.asarray(start, float), (*batch, 3)), (3,), "start")
+            given, _ = as_rows(np.broadcast_to(as_floats(start, "start"), (*batch, 3)), (3,), "start")
             first = in_chunks(self._search.nearest, given)
             find = partial(self._search.solve_ik, vectors)
             chunked = len(scaled) > CHUNK_ROWS

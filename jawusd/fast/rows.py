@@ -20,7 +20,7 @@ from jawusd.fast.hull import signed_distance, signed_distance_gradient
 from jawusd.fast.motion import logarithm, logarithm_derivative, pose, scratch
 from jawusd.fast.packing import ADJOINT
 from jawusd.fast.rigid import device
-from jawusd.fast.searches import NOT_FINITE, encode, encoding_scratch, finite, hull_scratch, judge, outside
+from jawusd.fast.searches import NOT_FINITE, encode, encoding_scratch, finite, hull_scratch, judge, outside, rigid
 from jawusd.geometry.arrays import Array
 
 # compiles for the given argument types and keeps the code on disk
@@ -120,7 +120,7 @@ def encodings(model: Array, T: Array, d: Array, residual_mm: Array) -> None:
     e = encoding_scratch(model)
     for row in range(len(T)):
         d[row], residual_mm[row] = np.nan, np.nan
-        if finite(T[row]):
+        if finite(T[row]) and rigid(T[row]):
             residual_mm[row] = encode(model, T[row], e)
             d[row] = e.x
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jawusd.fitting.data import SubjectAnatomy, TrainingData, displacement
-from jawusd.geometry import se3_inverse, so3_log
+from jawusd.geometry import landmark_frame, se3_inverse, so3_log
 
 _OPENING_MAX_MM = 75.0
 _LATERAL_MAX_MM = 20.0
@@ -23,6 +23,7 @@ _ROTATION_MAX_DEG = 57.0
 _CONDYLE_MAX_MM = 32.0
 _CONDYLES_APART_MM = (70.0, 140.0)
 _QUANTILE = 99.5
+_SAME_FRAME = 0.01  # of rotation matrices: a frame that was found from the landmarks themselves
 
 _UNITS = {"metres": 1000.0, "centimetres": 10.0, "inches": 25.4, "micrometres": 1e-3}  # mm in one unit
 
@@ -60,6 +61,11 @@ def _frame_mistake(data: TrainingData) -> AnatomyWarning | None:
             "Left and right landmarks are exchanged: in the anatomical frame x must point to the subject's left.",
         )
     if min(condyle_left[1], condyle_right[1]) < incisor[1]:
+        if np.allclose(landmark_frame(data.landmarks)[:3, :3], np.eye(3), atol=_SAME_FRAME):
+            return AnatomyWarning(
+                "left_right_flip",
+                "Left and right landmarks are exchanged: the frame was found from them, and has the condyles below.",
+            )
         return AnatomyWarning("upside_down", "The condyles lie below the incisal point: y must point up.")
     return None
 

@@ -29,6 +29,9 @@ _TIME, _COUNT = "timecode", "blendshapecount"
 _TIMECODE = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})[:;](\d{1,3}(?:\.\d+)?)")
 _RATES = (24, 25, 30, 48, 50, 60, 100, 120)
 _DAY_S = 86_400
+# ARKit gives 0 to 1. Captures with a personal neutral face or gains go a little beyond; percent, and weights normalised
+# to mean and deviation, go far beyond.
+_LEAST_WEIGHT, _MOST_WEIGHT, _PERCENT = -0.5, 2.0, 10.0
 _MAX_BYTES = 1 << 30
 
 
@@ -75,6 +78,7 @@ def read_arkit(path: str | os.PathLike[str], fps: float | None = None) -> FaceCa
         lines.append(line)
     if not codes:
         raise FormatError("has no rows below the header.", path=path)
+    _check_weights(np.array(weights), lines, path)
     seconds = np.array([second for second, _ in codes])
     # Past midnight the time codes start over.
     seconds += _DAY_S * np.concatenate([[0], np.cumsum(np.diff(seconds) < -_DAY_S // 2)])
@@ -103,6 +107,26 @@ def _number(text: str, line: int, column: str, path: Path) -> float:
     if not math.isfinite(value):
         raise FormatError(f'line {line}, column "{column}" is {text}; all weights must be finite.', path=path)
     return value
+
+
+def _check_weights(weights: Array, lines: list[int], path: Path) -> None:
+    """Refuse weights on another scale than ARKit's 0 to 1."""
+    away = np.abs(np.nan_to_num(weights, nan=0.5) - 0.5)
+    row, column = np.unravel_index(int(np.argmax(away)), away.shape)
+    worst = float(weights[row, column])
+    if _LEAST_WEIGHT <= worst <= _MOST_WEIGHT or not np.isfinite(worst):
+        return
+    hint = (
+        "These look like percent: divide all weights by 100."
+        if worst > _PERCENT
+        else ("Export the weights as the device gives them, not normalised or scaled.")
+    )
+    raise FormatError(
+        f'line {lines[row]}, column "{JAW_COLUMNS[column]}" is {worst:g}; weights of ARKit go from 0 to 1, allowed are '
+        f"{_LEAST_WEIGHT:g} to {_MOST_WEIGHT:g}.",
+        path=path,
+        hint=hint,
+    )
 
 
 def _seconds_and_frames(text: str, line: int, path: Path) -> tuple[int, float]:

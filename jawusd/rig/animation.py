@@ -15,7 +15,7 @@ from pxr import Gf, Sdf, Ts
 
 from jawusd.errors import RigError
 from jawusd.evaluator import JawRig
-from jawusd.geometry.arrays import Array
+from jawusd.geometry.arrays import Array, Mask
 from jawusd.geometry.quaternion import wxyz_from_matrix
 from jawusd.geometry.se3 import make_transform
 from jawusd.geometry.so3 import so3_exp
@@ -175,9 +175,15 @@ def _shown(T_a: Array, T_b: Array, share: float) -> Array:
 
 
 def write_splines(
-    out: str | os.PathLike[str], animation: str | os.PathLike[str], frames: ArrayLike, d: ArrayLike, fps: float
+    out: str | os.PathLike[str],
+    animation: str | os.PathLike[str],
+    frames: ArrayLike,
+    d: ArrayLike,
+    fps: float,
+    slopes: ArrayLike | None = None,
+    curved: ArrayLike | None = None,
 ) -> Path:
-    """Write a layer that holds the keys of an animation as linear splines and sublayers that animation.
+    """Write a layer that holds the keys of an animation as splines and sublayers that animation.
 
     The splines go through the same values as the animation's samples. They stay out of every delivered layer: OpenUSD
     before 25.05 ignores splines or cannot parse them, and other readers refuse the whole file.
@@ -186,6 +192,9 @@ def write_splines(
         animation: The animation layer made from the same keys.
         frames: Key frames (F,), increasing.
         d: Keys (F, 3) [mm].
+        slopes: Tangents at the keys (F, 3) [mm per frame]; zero if None.
+        curved: Which pieces between keys are cubic, with these tangents, shape (F - 1,); the others, and all if None,
+            are straight.
 
     Raises:
         RigError: The keys do not increase or are not finite.
@@ -196,24 +205,37 @@ def write_splines(
     frames, d = np.asarray(frames, dtype=np.float64), np.asarray(d, dtype=np.float64)
     if d.shape != (len(frames), 3):
         raise ValueError(f"frames (F,) and d (F, 3) are needed, got {frames.shape} and {d.shape}")
+    tangents = np.zeros_like(d) if slopes is None else np.asarray(slopes, dtype=np.float64)
+    cubic = np.zeros(max(len(frames) - 1, 0), dtype=bool) if curved is None else np.asarray(curved, dtype=bool)
+    if tangents.shape != d.shape or len(cubic) != max(len(frames) - 1, 0):
+        raise ValueError(f"slopes (F, 3) and curved (F - 1,) are needed, got {tangents.shape} and {cubic.shape}")
     if not len(frames) or not np.isfinite(d).all() or not (np.diff(frames) > 0).all():
         raise RigError("keys need increasing frames and finite values.", path=out)
     layer = new_layer(fps)
     layer.startTimeCode, layer.endTimeCode = float(frames[0]), float(frames[-1])
     stage = stage_of(layer)
     actor = stage.OverridePrim(ACTOR)
-    for name, values in zip(PARAMETERS, d.T, strict=True):
-        actor.CreateAttribute(name, Sdf.ValueTypeNames.Double, custom=True).SetSpline(_linear(frames, values))
+    for name, values, tangent in zip(PARAMETERS, d.T, tangents.T, strict=True):
+        spline = _spline(frames, values, tangent, cubic)
+        actor.CreateAttribute(name, Sdf.ValueTypeNames.Double, custom=True).SetSpline(spline)
     layer.subLayerPaths.append(relative_path(Path(animation), out))
     return write_layer(layer, out)
 
 
-def _linear(frames: Array, values: Array) -> Ts.Spline:
+def _spline(frames: Array, values: Array, slopes: Array, curved: Mask) -> Ts.Spline:
+    """Return a Bezier spline; handles of a third of a piece make it a cubic polynomial of time."""
+    third = np.diff(frames) / 3.0
+    before, after = np.concatenate([[0.0], third]), np.concatenate([third, [0.0]])
+    cubic = np.append(curved, False)
     spline = Ts.Spline("double")
-    for frame, value in zip(frames.tolist(), values.tolist(), strict=True):
+    for i, (frame, value) in enumerate(zip(frames.tolist(), values.tolist(), strict=True)):
         knot = Ts.Knot("double")
         knot.SetTime(frame)
         knot.SetValue(value)
-        knot.SetNextInterpolation(Ts.InterpLinear)
+        knot.SetNextInterpolation(Ts.InterpCurve if cubic[i] else Ts.InterpLinear)
+        knot.SetPreTanWidth(float(before[i]))
+        knot.SetPreTanSlope(float(slopes[i]))
+        knot.SetPostTanWidth(float(after[i]))
+        knot.SetPostTanSlope(float(slopes[i]))
         spline.SetKnot(knot)
     return spline

@@ -58,6 +58,7 @@ class Session:
         self._redo: list[Work] = []
         self._gesture: str | None = None
         self._handle: Array | None = None
+        self._played: tuple[tuple[Keys, bool], Clip] | None = None  # what the clip was made of, and the clip
 
     @property
     def d(self) -> Array:
@@ -226,15 +227,20 @@ class Session:
         return Keys(fps=work.fps, interpolation=work.interpolation, keys=work.keys) if work.keys else None
 
     def key_clip(self) -> Clip | None:
-        """Return the animation of the keys, None without any: the keys, or every whole frame of a smooth one too."""
+        """Return the animation of the keys, None without any: as `jawusd animate` writes it, inside if `keep_valid`."""
         saved = self.saved_keys()
         if saved is None:
             return None
+        if self._played is None or self._played[0] != (saved, self.keep_valid):
+            self._played = (saved, self.keep_valid), self._clip_of(saved)
+        return self._played[1]
+
+    def _clip_of(self, saved: Keys) -> Clip:
         frames, d_keys = saved.arrays()
-        if saved.interpolation == "linear":
-            return Clip("keys", frames, d_keys, saved.fps)
         times = np.union1d(np.arange(np.ceil(frames[0]), np.floor(frames[-1]) + 1), frames)
-        d = self.rig.interpolate(frames, d_keys, times, saved.interpolation)
+        d = self.rig.interpolate(frames, d_keys, times, saved.interpolation, inside=False)
+        if self.keep_valid:
+            times, d, _ = self.rig.keep_inside(times, d)
         return Clip("keys", times, d, saved.fps)
 
     def undo(self) -> bool:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from example_rig import FPS, example_meshes, example_motion, example_rig, mandible_vertices, moved
 from example_tracks import make_tracks
+from key_sets import own_curve
 from pxr import Usd, UsdGeom
 
 import jawusd
@@ -138,6 +139,55 @@ def test_animate_writes_keys_as_splines_when_asked(actor, tmp_path):
     other = actor.parent / "anim_spline_other.usdc"
     refused = run("animate", actor, tmp_path / "keys.json", "-o", other, "--splines", splines, code=10)
     assert splines.name in refused and not other.exists()
+
+
+def samples(path, times):
+    """Return the d (n, 3) that a reader of a layer finds at times."""
+    stage = Usd.Stage.Open(str(path))
+    prim = stage.GetPrimAtPath("/Actor")
+    return np.array([[prim.GetAttribute(f"jaw:d{i}").Get(time) for i in (1, 2, 3)] for time in times.tolist()])
+
+
+@pytest.mark.parametrize("interpolation", ["linear", "smooth"])
+@pytest.mark.parametrize(
+    "keys",
+    [
+        {0: (20, 6, 0), 100: (20, 11, 0)},
+        {0: (0, 0, 0), 20: (20, 0, 0), 50: (20, 0, 0), 70: (5, 0, 0), 80: (0, 0, 0), 95: (0, 0, 0)},
+        {3: (5, 3, 0), 20.5: (38, -8, 4), 33: (12, 9, -3), 60: (12, 9, -3)},
+    ],
+)
+def test_animate_pops_nowhere_and_stays_inside(actor, tmp_path, keys, interpolation):
+    """As readers see it, ten times a frame: inside, never beyond the keys, no step longer than the keys' own."""
+    file = {"fps": 24, "interpolation": interpolation, "keys": [{"frame": f, "d": d} for f, d in keys.items()]}
+    (tmp_path / "keys.json").write_text(json.dumps(file))
+    name = f"anim_pops_{max(keys)}_{interpolation}"
+    out, splines = (actor.parent / f"{name}{end}.usdc" for end in ("", "_keys"))
+    run("animate", actor, tmp_path / "keys.json", "-o", out, "--splines", splines)
+    rig, frames, d = jawusd.load(actor), np.array(list(keys), dtype=float), np.array(list(keys.values()), dtype=float)
+    times = np.arange(frames[0], frames[-1] + 0.05, 0.1)
+    for path in (out, splines):
+        found = samples(path, times)
+        assert rig.margin(found).min() > -1e-6
+        assert (found >= d.min(0) - 1e-3).all() and (found <= d.max(0) + 1e-3).all()
+        own = own_curve(frames, d, times, interpolation)
+        steps, own_steps = (np.linalg.norm(np.diff(x[::10], axis=0), axis=1) for x in (found, own))
+        assert steps.max() <= 1.05 * own_steps.max()
+        inside = rig.margin(own).min() > 0
+        if inside:
+            np.testing.assert_allclose(found[::10], own[::10], atol=1e-6)
+    if inside:  # the spline is the keys themselves
+        stage = Usd.Stage.Open(str(splines))
+        knots = stage.GetPrimAtPath("/Actor").GetAttribute("jaw:d1").GetSpline().GetKnots()
+        assert sorted(knots.keys()) == frames.tolist()
+        np.testing.assert_allclose(samples(splines, times), own, atol=1e-6)
+    assert validate_stage(out) == [] and validate_stage(splines) == []
+
+
+def test_animate_refuses_arkit_weights_in_percent(actor, tmp_path):
+    csv = face_csv(tmp_path / "face.csv", [(30, 0, 0, 0), (85, 2, 0, 1)] * 40)
+    text = run("animate", actor, "--arkit", csv, "-o", tmp_path / "x.usdc", code=3)
+    assert "divide all weights by 100" in text and not (tmp_path / "x.usdc").exists()
 
 
 def test_animate_reports_what_it_clamps(actor, tmp_path):

@@ -200,3 +200,20 @@ def test_project_finds_the_nearest_of_several_valleys():
     d = d[rig.margin(d) < 0]
     nearest = np.array([np.linalg.norm(inner - x, axis=1).min() for x in d])
     assert (np.linalg.norm(rig.project(d) - d, axis=1) <= nearest + 1e-9).all()
+
+
+def test_ranges_reach_to_the_ends_of_the_opening():
+    """Where the bound has closed already: the section at the last opening on the path that is inside."""
+    arrays = ARRAYS | {"d_range": ARRAYS["d_range"] + [[-0.8, 0.8], [0, 0], [0, 0]]}
+    rig = JawRig(arrays, example_meta())
+    for d1 in rig.d_range[0]:
+        assert not rig.is_inside([d1, 0.0, 0.0])
+        ends = np.array(rig.ranges(d1))
+        assert np.isfinite(ends).all() and (ends[[0, 2]] <= 0).all() and (ends[[1, 3]] >= 0).all()
+        opening = np.clip(d1, 0.0, 42.0) + np.sign(d1 - 20) * np.linspace(0, 0.8, 8001)
+        last = opening[rig.margin(np.column_stack([opening, 0 * opening, 0 * opening])) >= 0][-1]
+        for (axis, side), end in zip(((1, 0), (1, 1), (2, 0), (2, 1)), ends):
+            corner = np.array([last, 0.0, 0.0])
+            corner[axis] = end
+            assert abs(float(rig.margin(corner))) < 1e-3, (d1, axis, side)
+    np.testing.assert_array_equal(rig.ranges(20.0), RIG.ranges(20.0))

@@ -175,3 +175,16 @@ def test_a_handle_that_hardly_moves_is_solved_without_dividing_by_zero():
     assert np.isfinite(x).all()
     for A, right, expected in zip(singular, b, x):
         np.testing.assert_allclose(solve_symmetric(A[None], right[None])[0], expected)
+
+
+def test_matrices_that_are_no_poses_are_not_encoded():
+    rig = JawRig(example_arrays(), example_meta())
+    T = rig.pose([[10.0, 1.0, 0.5]] * 5)
+    T[1] = 2 * np.eye(4)
+    T[2, :3, :3] *= 1.01
+    T[3, :3, 0] *= -1
+    T[4, :3, :3] += 1e-5  # written with few decimals
+    for found in (rig.encode(T), rig.encode(T, inside=True), rig.encode(T, covariance=np.eye(6))):
+        np.testing.assert_array_equal(np.isnan(found.d).all(1), [False, True, True, True, False])
+        np.testing.assert_array_equal(np.isnan(found.residual_mm), [False, True, True, True, False])
+    assert np.isnan(rig.encode(2 * np.eye(4)).d).all()

@@ -239,3 +239,29 @@ def test_a_rig_says_what_it_is():
     assert repr(rig) == "<JawRig example, anchored, d1 0.0 to 42.0, d2 -9.0 to 9.5, d3 -1.5 to 7.0 mm>"
     assert rig.encode(rig.pose([5.0, 0.0, 0.0])).residual_mm < 1e-9
     assert rig.ranges(5.0).d2_min < 0 < rig.ranges(5.0).d2_max
+
+
+COMPLEX = np.array([10.0, 1.0, 0.5]) + 1e-3j
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda rig: rig.pose(COMPLEX),
+        lambda rig: rig.margin(COMPLEX),
+        lambda rig: rig.margin(list(COMPLEX), bound="polygons"),
+        lambda rig: rig.project(COMPLEX[None]),
+        lambda rig: rig.encode(np.eye(4) + 0j),
+        lambda rig: rig.validate(np.eye(4) + 0j),
+        lambda rig: rig.ik(COMPLEX, COMPLEX),
+        lambda rig: rig.ik(COMPLEX.real, COMPLEX.real, start=COMPLEX),
+        lambda rig: rig.ranges(10 + 1j),
+        lambda rig: rig.interpolate([0.0], COMPLEX[None], 0.0),
+        lambda rig: rig.keep_inside([0.0], COMPLEX[None]),
+        lambda rig: rig.normalized(COMPLEX),
+    ],
+)
+def test_complex_numbers_are_refused(call):
+    with pytest.raises(ValueError, match="must be real numbers"):
+        call(JawRig(example_arrays(), example_meta()))

@@ -10,7 +10,7 @@ from jawusd.fitting.anatomy_gate import check_anatomy
 from jawusd.fitting.coverage import missing_movements, shown_parameters
 from jawusd.fitting.data import SubjectAnatomy, select_poses, select_tracks
 from jawusd.formats.tracks import Tracks
-from jawusd.geometry import make_transform, random_rotation, se3_exp, so3_exp, transform_points
+from jawusd.geometry import landmark_frame, make_transform, random_rotation, se3_exp, so3_exp, transform_points
 from jawusd.synthetic.exercises import record
 from jawusd.synthetic.person import Person
 
@@ -147,6 +147,10 @@ def test_mistaken_frames_are_recognised(person, take):
     assert codes(person, take, turned([0, np.pi, 0])) == ["front_back_flip"]
     assert codes(person, take, turned([0, 0, np.pi])) == ["left_right_flip"]
     assert codes(person, take, lambda A, lm: (A, lm[[0, 2, 1, 4, 3]])) == ["left_right_flip"]
+    exchanged = [0, 2, 1, 4, 3]  # in a frame that was found from the landmarks, which turns over with them
+    assert codes(person, take, lambda A, lm: (landmark_frame(lm), lm)) == []
+    assert codes(person, take, lambda A, lm: (landmark_frame(lm[exchanged]), lm[exchanged])) == ["left_right_flip"]
+    assert codes(person, take, turned([np.pi, 0, 0])) == ["front_back_flip"]
     assert codes(person, take, lambda A, lm: (A, lm / 1000)) == ["scan_units"]
 
 

@@ -17,7 +17,7 @@ def timecode(frame, rate, start_s=14 * 3600, sub=".207"):
 
 def take(path, frames, rate, header=HEADER, **more):
     """Write a capture whose JawOpen is a hundredth of the frame number."""
-    rows = [f"{timecode(k, rate, **more)},61,0.5,0.1,0.2,0.3,{k / 100},-3.5" for k in frames]
+    rows = [f"{timecode(k, rate, **more)},61,0.5,0.1,0.2,0.3,{k / 1000},-3.5" for k in frames]
     path.write_text("\n".join([header, *rows, ""]))
     return path
 
@@ -28,7 +28,7 @@ def test_frames_weights_and_rate_come_from_the_file(tmp_path, rate):
     found = read_arkit(take(tmp_path / "face.csv", frames, rate))
     assert found.fps == rate and found.timecode == timecode(int(frames[0]), rate)
     np.testing.assert_allclose(found.frames, frames - frames[0], atol=1e-6)
-    np.testing.assert_allclose(found.weights[:, 0], frames / 100)
+    np.testing.assert_allclose(found.weights[:, 0], frames / 1000)
     np.testing.assert_allclose(found.weights[0, 1:], [0.3, 0.2, 0.1])
 
 
@@ -93,3 +93,29 @@ def test_tables_that_are_none(tmp_path, text, words):
     (tmp_path / "face.csv").write_text(text)
     with pytest.raises(FormatError, match=words):
         read_arkit(tmp_path / "face.csv")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda w: 100 * w, ("line 5", "jawopen", "is 90", "percent", "divide all weights by 100")),
+        (lambda w: (w - w.mean(0)) / w.std(0), ("0 to 1", "normalised")),
+        (lambda w: 2 * w - 1, ("0 to 1", "normalised")),
+    ],
+)
+def test_weights_on_another_scale_are_refused(tmp_path, change, words):
+    weights = np.random.default_rng(0).uniform(0, 0.3, (60, 4))
+    weights[3, 0] = 0.9  # open, left, right, forward
+    weights[7] = 0.0
+
+    def written(values):
+        rows = [f"{timecode(k, 25)},61,0.5,{f},{r},{l},{o},0" for k, (o, l, r, f) in enumerate(values)]
+        path = tmp_path / "face.csv"
+        path.write_text("\n".join([HEADER, *rows]))
+        return path
+
+    assert read_arkit(written(weights)).weights.max() == 0.9
+    assert read_arkit(written(1.3 * weights - 0.1)).weights.max() > 1  # gains and a personal neutral face
+    with pytest.raises(FormatError) as error:
+        read_arkit(written(change(weights)))
+    assert all(word in str(error.value) for word in words)
