@@ -183,6 +183,20 @@ def test_the_keys_play_as_the_rig_interpolates(session, interpolation):
     assert saved.interpolation == interpolation and [key.frame for key in saved.keys] == [0, 12, 30]
 
 
+@pytest.mark.parametrize("interpolation", ["linear", "smooth"])
+def test_keys_outside_play_inside_unless_told_otherwise(session, interpolation):
+    keys = tuple(Key(frame=frame, d=d) for frame, d in ((0, (10, 0, 0)), (20, (15, 14, 0)), (40, (10, 0, 0))))
+    session.load_keys(Keys(fps=24, interpolation=interpolation, keys=keys))
+    at = np.arange(0, 40.05, 0.1)
+    played = session.key_clip()
+    assert RIG.margin(played.at(at)).min() > -1e-6 and session.key_clip() is played
+    session.set_keep_valid(False)
+    free = session.key_clip()
+    np.testing.assert_allclose(free.at([0, 20, 40]), [key.d for key in keys], atol=1e-12)
+    step, own = (np.linalg.norm(np.diff(clip.at(np.arange(41)), axis=0), axis=1) for clip in (played, free))
+    assert (step <= 1.05 * own + 1e-9).all()
+
+
 @pytest.mark.parametrize("fps", [0.0, -1.0, float("nan"), 1e9])
 def test_impossible_frame_rates_are_refused(session, fps):
     with pytest.raises(ValueError, match="fps"):
