@@ -26,7 +26,7 @@ from jawusd.pipeline.state import Progress
 
 # Smallest step of a motion carried over, as a share of the source's step scaled by the ratio of the ranges.
 _SLOWEST = 0.1
-_ROUNDS = 10  # of timing and bound alternating; most motions need one or two
+_ROUNDS = 400  # of timing and bound alternating; most motions need fewer than 40
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 

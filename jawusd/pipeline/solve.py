@@ -12,6 +12,7 @@ import numpy as np
 import jawusd
 from jawusd.errors import OutputError, RigError, explain_missing_packages
 from jawusd.evaluator import JawRig
+from jawusd.evaluator.verdicts import is_inside
 from jawusd.formats.capture import Capture
 from jawusd.formats.finding import Finding
 from jawusd.formats.performance import Performance, SolveState, write_performance
@@ -38,6 +39,7 @@ class SolveSummary(TypedDict):
     solved: int
     carried: list[tuple[int, int]]  # runs of frames, first and last, in which an arch is out of sight
     lost: list[tuple[int, int]]  # the same in which nothing fits the pictures
+    within_tolerance: int  # outside the bound, but no farther than measured poses may
     outside: int  # beyond what the rig allows
     cameras: list[str]
     sigma_mm: dict[str, float]  # median standard deviation of d1, d2, d3 over solved frames
@@ -187,7 +189,8 @@ def solve_summary(performance: Performance) -> SolveSummary:
         solved=int(solved.sum()),
         carried=_runs(p, SolveState.CARRIED),
         lost=_runs(p, SolveState.LOST),
-        outside=sum("outside" in verdict for verdict in p.verdict),
+        within_tolerance=int((p.valid & ~is_inside(p.margin_mm)).sum()),
+        outside=int((~p.valid).sum()),
         cameras=list(p.camera_names),
         sigma_mm={name: round(float(value), 4) for name, value in zip(names, typical, strict=True)},
         worst_sigma_mm={name: round(float(value), 4) for name, value in zip(names, sigma.max(0), strict=True)},
@@ -218,6 +221,8 @@ def solve_lines(summary: SolveSummary) -> list[str]:
             more = "" if len(runs) <= _LISTED_RUNS else f" and {len(runs) - _LISTED_RUNS} more runs"
             listed = ", ".join(f"{a}" if a == b else f"{a}-{b}" for a, b in runs[:_LISTED_RUNS])
             lines.append(f"  {word}: {sum(b - a + 1 for a, b in runs)} frames ({listed}{more})")
+    if summary["within_tolerance"]:
+        lines.append(f"  outside the rig's bound, within its tolerance: {summary['within_tolerance']} frames")
     if summary["outside"]:
         lines.append(f"  outside the rig's bound: {summary['outside']} frames")
     sigma = ", ".join(f"{name} {value:.3f}" for name, value in summary["sigma_mm"].items())

@@ -208,9 +208,23 @@ class Rig:
         return self.margin(d1, d2, d3) >= -ON_BOUND_MM
 
     def ranges(self, d1: float, d2: float = 0.0, d3: float = 0.0) -> tuple[Pair, Pair]:
-        """Return the valid (min, max) of d2 through d3, and of d3 through d2, at d1 [mm]; (nan, nan) where none is."""
+        """Return the valid (min, max) of d2 through d3, and of d3 through d2, at d1 [mm]; (nan, nan) where none is.
+
+        Where the bound has closed already, some tenths of a mm before the ends of the opening, at the last one inside.
+        """
+        d1 = self._nearest_opening(d1, d2, d3)
         along_d2 = _chord(lambda x: self.margin(d1, x, d3), *self.d_range[1])
         return along_d2, _chord(lambda x: self.margin(d1, d2, x), *self.d_range[2])
+
+    def _nearest_opening(self, d1: float, d2: float, d3: float) -> float:
+        inside, outside = min(max(d1, self._bound.first_mm), self._bound.last_mm), d1
+        beyond = inside != d1 and self.d_range[0][0] <= d1 <= self.d_range[0][1]
+        if not beyond or self.margin(d1, d2, d3) >= 0.0 or self.margin(inside, d2, d3) < 0.0:
+            return d1
+        for _ in range(_SEARCH_STEPS):
+            middle = 0.5 * (inside + outside)
+            inside, outside = (inside, middle) if self.margin(middle, d2, d3) < 0.0 else (middle, outside)
+        return inside
 
 
 def _chord(margin: Callable[[float], float], low: float, high: float) -> Pair:

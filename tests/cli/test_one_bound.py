@@ -19,6 +19,7 @@ from example_model import example_arrays, example_meta
 from example_rig import FPS, example_meshes, example_motion
 from example_tracks import make_tracks
 from pxr import Usd
+from report_data import report_data
 from scipy.interpolate import CubicHermiteSpline
 from scipy.special import logsumexp
 from typer.testing import CliRunner
@@ -31,8 +32,11 @@ from jawusd.formats.model import JawModel, save_model
 from jawusd.formats.performance import SolveState
 from jawusd.formats.poses import write_parameters, write_poses
 from jawusd.formats.solved import SolvedJaw
+from jawusd.imaging.status_bar import StatusBar
 from jawusd.pipeline.library import retarget
 from jawusd.plugins import extension
+from jawusd.report.solve_figures import seen_figure
+from jawusd.report.verdicts import judge
 from jawusd.rig import load_rig
 from jawusd.rig.animation import write_animation
 from jawusd.rig.bake import bake_rig
@@ -217,6 +221,22 @@ def test_solved_takes_in_viewer_and_report():
         text = solve_words(tracks, tracks.solved, int(frame))
         assert f"bound: {words_of_measured(margin[row])}, margin {margin[row]:.2f} mm" in text
         assert ("does not allow" in text) == (margin[row] < -TOLERANCE_MM)
+
+
+    bar = StatusBar(tracks, FPS, 1600)
+    said = [" ".join(text for text, *_ in bar._said(row)) for row in range(count)]
+    assert all(f"bound: {words_of_measured(m)}, margin" in text for m, text in zip(margin, said))
+    names = [label.get_text() for label in seen_figure(tracks, tracks.solved, FPS).axes[0].get_yticklabels()]
+    outside = int((margin < -TOLERANCE_MM).sum())
+    assert names[-2:] == [f"within tolerance  {(margin < 0).sum() - outside}", f"outside  {outside}"]
+
+
+def test_report_of_a_build():
+    data = report_data(COUNT)
+    data.model.d, data.model.arrays["tolerance_mm"] = D, np.array(TOLERANCE_MM)
+    (check,) = (c for verdict in judge(data) for c in verdict.checks if "inside the bound" in c.name)
+    assert f"inside the bound ({100 * INSIDE.mean():.1f} %) or within its tolerance of 1.00 mm" in check.name
+    assert check.found == f"{100 * (MARGIN >= -TOLERANCE_MM).mean():.1f} %"
 
 
 def test_usd_rule(actor, tmp_path):

@@ -150,9 +150,17 @@ def test_encode_and_validate_agree_for_any_batch_shape_and_type(rig, fast, shape
 
 
 def test_encode_agrees_on_and_off_the_model(rig, fast):
-    for T in (rig.pose(random_d(rig, (2000,), 0.0)), noisy_poses(rig, (2000,)), noisy_poses(rig, (500,)) * 1.001):
+    for T in (rig.pose(random_d(rig, (2000,), 0.0)), noisy_poses(rig, (2000,)), noisy_poses(rig, (500,)) * 1.0003):
         for found, expected in zip(fast.encode(T), rig.encode(T)):
             np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)
+
+
+def test_matrices_that_are_no_poses_are_not_encoded(rig, fast):
+    T = rig.pose([[10.0, 1.0, 0.5]] * 3)
+    T[1], T[2, :3, 0] = 2 * np.eye(4), -T[2, :3, 0]
+    for found in (rig.encode(T), fast.encode(T)):
+        np.testing.assert_array_equal(np.isnan(found.d).all(1), [False, True, True])
+        np.testing.assert_array_equal(np.isnan(found.residual_mm), [False, True, True])
 
 
 def test_encode_is_as_near_as_scipy_finds(fast):

@@ -8,10 +8,12 @@ import sys
 
 import numpy as np
 import pytest
+from example_model import example_arrays, example_meta
 from example_rig import FPS, example_meshes, example_motion, example_rig
 from pxr import Sdf
 from scipy.spatial.transform import Rotation
 
+from jawusd.evaluator import JawRig
 from jawusd.evaluator.formula import MODELS
 from jawusd.evaluator.schema import KINDS
 from jawusd.formats.model import JawModel, save_model
@@ -138,6 +140,17 @@ def test_newer_and_missing_rigs_in_usd_are_refused(tmp_path):
     layer.Export(str(tmp_path / "actor.usda"))
     with pytest.raises(jawusd_reader.ReaderError, match="knows up to 2"):
         jawusd_reader.load(tmp_path / "actor.usda")
+
+
+def test_ranges_reach_to_the_ends_of_the_opening():
+    """As the evaluator's: where the bound has closed already, the section at the last opening inside."""
+    wider = example_arrays() | {"d_range": example_arrays()["d_range"] + [[-0.8, 0.8], [0, 0], [0, 0]]}
+    expected = JawRig(wider, example_meta())
+    flat = {name: np.ravel(value).tolist() for name, value in wider.items()}
+    read = jawusd_reader.Rig("anchored", flat)
+    for d1 in (-0.8, -0.3, 0.0, 20.0, 42.0, 42.8):
+        np.testing.assert_allclose(np.ravel(read.ranges(d1)), expected.ranges(d1), atol=1e-3)  # flat at the tips
+    assert np.isnan(read.ranges(43.0)).all() and np.isnan(expected.ranges(43.0)).all()
 
 
 def test_packed_reader_imports_nothing_but_the_standard_library():
