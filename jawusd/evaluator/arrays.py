@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 
 import numpy as np
@@ -91,6 +92,18 @@ class RigArrays:
     def tolerance_mm(self) -> float:
         """How far outside the bound a measured pose may lie and still be possible [mm]; authored poses may not."""
         return float(self.arrays["tolerance_mm"]) + 0.0  # no -0.0, which the negated limit of older files may be
+
+    @property
+    def model_hash(self) -> str:
+        """SHA-256 of the arrays: names, shapes and little-endian float64 values, in order of name."""
+        # The tolerance counts under its first name and sign, so that rigs of version 1 keep their hash.
+        named = {name: value for name, value in self.arrays.items() if name != "tolerance_mm"}
+        named["margin_limit_mm"] = np.negative(self.arrays["tolerance_mm"])
+        digest = hashlib.sha256()
+        for name, value in sorted(named.items()):
+            digest.update(f"{name}{list(value.shape)}".encode())
+            digest.update(np.ascontiguousarray(value, dtype="<f8").tobytes())
+        return digest.hexdigest()
 
     @property
     def captured_d(self) -> Array:

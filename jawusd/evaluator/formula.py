@@ -24,7 +24,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Generic, NamedTuple, Protocol
+from typing import Generic, NamedTuple, Protocol, cast
 
 from jawusd.evaluator.operations import FloatOperations, Operations, Rows, Table, rows, triple
 from jawusd.geometry.rodrigues import N, Triple, apply_series, dot, turning
@@ -38,6 +38,7 @@ DROP_BEND = 0.15  # slope gained by the bent drop features per mm, saturating at
 DROP_SATURATION_MM2 = 16.0
 
 Arrays = Mapping[str, Sequence[float]]  # a rig's named arrays, each flat, row by row
+Numbers = tuple[object, ...]  # single numbers in tuples: floats, or what a kind of number puts in their places
 
 
 class GaugeNumbers(NamedTuple):
@@ -267,8 +268,43 @@ class JawFormula(Protocol):
 
     def __init__(self, arrays: Arrays) -> None: ...
 
-    def motion(self, d: Triple[N], tables: Mapping[str, Table], ops: Operations[N, Table]) -> RigidMotion[N]:
-        """Return the motion away from the closed bite, anatomical frame, at the jaw parameters d [mm]."""
+    @property
+    def numbers(self) -> Numbers:
+        """The single floats it needs, in tuples."""
+
+    def motion(
+        self,
+        d: Triple[N],
+        tables: Mapping[str, Table],
+        ops: Operations[N, Table],
+        numbers: Numbers | None = None,
+    ) -> RigidMotion[N]:
+        """Return the motion away from the closed bite, anatomical frame, at the jaw parameters d [mm].
+
+        Args:
+            d: Jaw parameters [mm].
+            tables: The tables of the formula, as the kind of number stores them.
+            ops: Operations on numbers.
+            numbers: The numbers of the formula where they are not floats; None for its own.
+        """
+
+
+class AnchoredNumbers(NamedTuple):
+    """The single numbers of an anchored model.
+
+    Attributes:
+        gauge: Of the gauge.
+        incisor: The incisal point at rest [mm].
+        scales: Lengths dividing the sheared displacement [mm].
+        linear: The linear terms of the spline, 3 inputs times 3 outputs [rad].
+        offset: Value of the bare spline at rest [rad].
+    """
+
+    gauge: GaugeNumbers
+    incisor: Triple[float]
+    scales: Sequence[float]
+    linear: Sequence[Sequence[float]]
+    offset: Triple[float]
 
 
 class AnchoredFormula:
@@ -276,7 +312,7 @@ class AnchoredFormula:
 
     def __init__(self, arrays: Arrays) -> None:
         path_x, path_z = rows(arrays["path_coefficients"], 5)
-        self.gauge = GaugeNumbers(
+        gauge = GaugeNumbers(
             path_x=path_x,
             path_z=path_z,
             path_scale_mm=arrays["path_scale_mm"][0],
@@ -287,23 +323,31 @@ class AnchoredFormula:
             softness_mm=arrays["glide_softness_mm"][0],
             fade_mm=arrays["glide_fade_mm"][0],
         )
-        self.incisor, self.scales = triple(arrays["incisor"]), arrays["spline_scales"]
         *weights, first, second, third = rows(arrays["spline_weights"], 3)
-        self.linear = [first, second, third]
+        linear = (first, second, third)
         self.tables = {"centres": rows(arrays["spline_centres"], 3), "weights": weights}
-        at_rest = (0.0, 0.0, 0.0)
-        self.offset = spline(at_rest, self.tables["centres"], weights, self.linear, FloatOperations())
+        offset = spline((0.0, 0.0, 0.0), self.tables["centres"], weights, linear, FloatOperations())
+        self.numbers = AnchoredNumbers(gauge, triple(arrays["incisor"]), arrays["spline_scales"], linear, offset)
 
-    def motion(self, d: Triple[N], tables: Mapping[str, Table], ops: Operations[N, Table]) -> RigidMotion[N]:
-        """Return the motion away from the closed bite, anatomical frame, at the jaw parameters d [mm]."""
-        u = displacement(self.gauge, d, ops)
-        q = spline_input(self.gauge, self.scales, u, ops)
-        omega = spline(q, tables["centres"], tables["weights"], self.linear, ops)
-        return anchored_motion(triple([x - o for x, o in zip(omega, self.offset)]), u, self.incisor, ops)
+    def motion(
+        self,
+        d: Triple[N],
+        tables: Mapping[str, Table],
+        ops: Operations[N, Table],
+        numbers: Numbers | None = None,
+    ) -> RigidMotion[N]:
+        """Return the motion away from the closed bite, see `JawFormula`."""
+        gauge, incisor, scales, linear, offset = cast("AnchoredNumbers", numbers or self.numbers)
+        u = displacement(gauge, d, ops)
+        q = spline_input(gauge, scales, u, ops)
+        omega = spline(q, tables["centres"], tables["weights"], linear, ops)
+        return anchored_motion(triple([x - o for x, o in zip(omega, offset)]), u, incisor, ops)
 
 
 class AdditiveFormula:
     """A sum of three curves in se(3): ``log M(d) = Phi1(d1) + Phi2(d2) + Phi3(d3)`` (Yang et al. 2019, eq. 5)."""
+
+    numbers: Numbers = ()
 
     def __init__(self, arrays: Arrays) -> None:
         self.tables = {}
@@ -311,8 +355,14 @@ class AdditiveFormula:
             values, slopes = (rows(arrays[f"{name}_{part}"], 6) for part in ("twists", "slopes"))
             self.tables.update(curve_tables(name, arrays[f"{name}_knots"], values, slopes))
 
-    def motion(self, d: Triple[N], tables: Mapping[str, Table], ops: Operations[N, Table]) -> RigidMotion[N]:
-        """Return the motion away from the closed bite, anatomical frame, at the jaw parameters d [mm]."""
+    def motion(
+        self,
+        d: Triple[N],
+        tables: Mapping[str, Table],
+        ops: Operations[N, Table],
+        numbers: Numbers | None = None,
+    ) -> RigidMotion[N]:
+        """Return the motion away from the closed bite, see `JawFormula`; there are no single numbers."""
         first, second, third = (curve(f"curve{i}", x, tables, ops) for i, x in enumerate(d, start=1))
         twist = ops.split([x + y + z for x, y, z in zip(first, second, third)], 6)
         return twist_motion(triple(twist[:3]), triple(twist[3:]), ops)
@@ -321,11 +371,21 @@ class AdditiveFormula:
 MODELS: dict[str, type[JawFormula]] = {"anchored": AnchoredFormula, "additive": AdditiveFormula}
 
 
+class BoundNumbers(NamedTuple):
+    """The single numbers of a bound: ends of the captured openings, rounding and offset, all in mm."""
+
+    first_mm: float
+    last_mm: float
+    softness_mm: float
+    offset_mm: float
+
+
 class BoundFormula:
     """The slice hull: which jaw parameters are anatomically possible.
 
     Attributes:
         tables: The rows of floats it needs, to be stored as the kind of number stores them.
+        numbers: The single floats it needs.
     """
 
     def __init__(self, arrays: Arrays) -> None:
@@ -336,16 +396,23 @@ class BoundFormula:
             span = knots[i + 1] - knots[i - 1]
             slopes[i] = [catmull_rom(x, y, span) for x, y in zip(supports[i - 1], supports[i + 1])]
         self.tables = {"directions": directions, **curve_tables("support", knots, supports, slopes)}
-        self.first_mm, self.last_mm = knots[0], knots[-1]
-        self.softness_mm, self.offset_mm = arrays["slice_softness_mm"][0], arrays["slice_margin_mm"][0]
+        softness_mm, offset_mm = arrays["slice_softness_mm"][0], arrays["slice_margin_mm"][0]
+        self.numbers = BoundNumbers(knots[0], knots[-1], softness_mm, offset_mm)
 
-    def margin(self, d: Triple[N], tables: Mapping[str, Table], ops: Operations[N, Table]) -> N:
+    def margin(
+        self,
+        d: Triple[N],
+        tables: Mapping[str, Table],
+        ops: Operations[N, Table],
+        numbers: Numbers | None = None,
+    ) -> N:
         """Return the signed distance of d [mm] to the bound [mm], positive inside.
 
         The soft maximum of the half-planes ``n_k . (d2, d3) <= h_k(d1)`` and of the ends of the captured openings.
         """
+        first_mm, last_mm, softness_mm, offset_mm = cast("BoundNumbers", numbers or self.numbers)
         d1, d2, d3 = d
         supports = curve("support", d1, tables, ops)
         sides = [d2 * x + d3 * y - h for x, y, h in zip(*ops.columns(tables["directions"]), supports)]
-        terms = [x / self.softness_mm for x in (*sides, self.first_mm - d1, d1 - self.last_mm)]
-        return self.offset_mm - self.softness_mm * ops.log_sum_exp(terms)
+        terms = [x / softness_mm for x in (*sides, first_mm - d1, d1 - last_mm)]
+        return offset_mm - softness_mm * ops.log_sum_exp(terms)

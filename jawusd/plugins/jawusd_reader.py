@@ -217,7 +217,7 @@ class Rig:
         return along_d2, _chord(lambda x: self.margin(d1, d2, x), *self.d_range[2])
 
     def _nearest_opening(self, d1: float, d2: float, d3: float) -> float:
-        inside, outside = min(max(d1, self._bound.first_mm), self._bound.last_mm), d1
+        inside, outside = min(max(d1, self._bound.numbers.first_mm), self._bound.numbers.last_mm), d1
         beyond = inside != d1 and self.d_range[0][0] <= d1 <= self.d_range[0][1]
         if not beyond or self.margin(d1, d2, d3) >= 0.0 or self.margin(inside, d2, d3) < 0.0:
             return d1

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-
 import numpy as np
 from pxr import Sdf, Usd
 
@@ -18,15 +16,8 @@ _TYPES = Sdf.ValueTypeNames
 
 
 def model_hash(rig: JawRig) -> str:
-    """Return the SHA-256 of a rig's arrays: names, shapes and little-endian float64 values, in order of name."""
-    # The tolerance counts under its first name and sign, so that rigs of version 1 keep their hash.
-    named = {name: value for name, value in rig.arrays.items() if name != "tolerance_mm"}
-    named["margin_limit_mm"] = np.negative(rig.arrays["tolerance_mm"])
-    digest = hashlib.sha256()
-    for name, value in sorted(named.items()):
-        digest.update(f"{name}{list(value.shape)}".encode())
-        digest.update(np.ascontiguousarray(value, dtype="<f8").tobytes())
-    return digest.hexdigest()
+    """Return the SHA-256 of a rig's arrays, see `JawRig.model_hash`."""
+    return rig.model_hash
 
 
 def write_arrays(prim: Sdf.PrimSpec, rig: JawRig, prefixes: tuple[str, ...]) -> None:

@@ -1,55 +1,101 @@
-"""A jaw rig as a torch module: poses, margins, encoding, and a prior on jaw poses that other solvers can add."""
+"""A jaw rig as a torch module: poses, margins, encoding, and priors on jaw poses that other solvers can add."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
 
+from jawusd.errors import EvaluatorError
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.distances import landmark_vectors
 from jawusd.geometry.se3 import se3_inverse
-from jawusd.solvers.motion import MarginModule, MotionModule
-
-_LEAST_CURVATURE = 1e-9  # relative; keeps encodings differentiable where a parameter hardly moves the landmarks
+from jawusd.solvers.charts import chart_of
+from jawusd.solvers.encoding import nearest
+from jawusd.solvers.hull import Hull
+from jawusd.solvers.interior import Interior
+from jawusd.solvers.solution import attached, solved
 
 
 class JawLayer(nn.Module):
     """Evaluate a rig on torch tensors, with gradients, in float32 or float64, on any device.
 
-    ``layer(d)`` is `JawRig.pose`. Nothing is trained: the rig's arrays are buffers, so ``.to(...)`` moves them.
+    ``layer(d)`` is `JawRig.pose`. Nothing is trained. All that is computed with lies in buffers: ``.to(...)`` moves it,
+    `state_dict` saves it, and `load_state_dict` takes the state of the same rig alone. Every function works under
+    `torch.func`, `torch.compile(fullgraph=True)`, `torch.export` and its ONNX exporter, for any batch shape.
+
+    `encode`, `project` and `inside` carry first derivatives, not second ones.
 
     Args:
-        rig: The rig. Encoding searches with it on the CPU.
+        rig: The rig.
+
+    Raises:
+        EvaluatorError: the bound of the rig is empty or not in one piece.
     """
 
+    to_anatomical: Tensor
     from_anatomical: Tensor
     closed: Tensor
     vectors: Tensor
+    vectors_at_rest: Tensor
+    incisor: Tensor
+    rig_hash: Tensor
 
     def __init__(self, rig: JawRig) -> None:
         super().__init__()
-        self.rig = rig
-        self.motion = MotionModule(rig.kind, rig.arrays)
-        self.bound = MarginModule(rig.arrays)
+        self.motion = chart_of(rig.kind, rig.arrays)
+        self.bound = Hull(rig.arrays)
+        self.interior = Interior(rig.arrays)
         A = rig.T_anatomical_skull
         closed = A @ rig.T_rest
-        self.register_buffer("from_anatomical", torch.tensor(se3_inverse(A)))
-        self.register_buffer("closed", torch.tensor(closed))
         vectors = landmark_vectors(rig.landmarks)
-        self.register_buffer("vectors", torch.tensor(vectors))
+        in_mandible = se3_inverse(closed) @ [*rig.incisor, 1.0]
+        buffers = {
+            "to_anatomical": A,
+            "from_anatomical": se3_inverse(A),
+            "closed": closed,
+            "vectors": vectors,
+            "vectors_at_rest": closed @ vectors,
+            "incisor": in_mandible,
+        }
+        for name, value in buffers.items():
+            self.register_buffer(name, torch.tensor(value))
+        self.register_buffer("rig_hash", torch.tensor(list(bytes.fromhex(rig.model_hash)), dtype=torch.uint8))
+        self.register_load_state_dict_pre_hook(_refuse_other_rigs)
 
     def forward(self, d: Tensor) -> Tensor:
         """Return the poses T_skull_mandible, shape (..., 4, 4), for jaw parameters d (..., 3) [mm]."""
-        rows = _rows(d, (3,))
-        return self._poses(rows).reshape(*d.shape[:-1], 4, 4)
+        rows = self._rows(d, (3,), "d")
+        return (self.from_anatomical @ self.motion(rows) @ self.closed).reshape(*d.shape[:-1], 4, 4)
 
     def margin(self, d: Tensor) -> Tensor:
         """Return the signed distance (...) of d (..., 3) to the bound [mm], positive inside."""
-        return self.bound(_rows(d, (3,))).reshape(d.shape[:-1])
+        return self.bound.margin(self._rows(d, (3,), "d")).reshape(d.shape[:-1])
 
     def penalty(self, d: Tensor) -> Tensor:
         """Return the squared distance (...) by which d (..., 3) lies outside the bound [mm^2]; zero inside."""
         return torch.relu(-self.margin(d)).square()
+
+    def project(self, d: Tensor) -> Tensor:
+        """Return the nearest jaw parameters (..., 3) [mm] with margin >= 0, as `JawRig.project` does; d (..., 3) [mm].
+
+        Inside the bound the derivative is the identity; outside, that of the nearest point of the bound.
+        """
+        rows = self._rows(d, (3,), "d")
+        x, by_d = solved(self.bound.nearest, rows)
+        return attached(x, by_d, rows).reshape(d.shape)
+
+    def inside(self, z: Tensor) -> Tensor:
+        """Return jaw parameters (..., 3) [mm] inside the bound for any vectors z (..., 3): smooth, onto, one to one.
+
+        z = 0 is a point in the middle of the valid openings; the bound is at infinity. See `Interior`.
+        """
+        rows = self._rows(z, (3,), "z")
+        d, by_z = solved(lambda z: self.interior.mapped(self.bound, z), rows)
+        return attached(d, by_z, rows).reshape(z.shape)
+
+    def unconstrained(self, d: Tensor) -> Tensor:
+        """Return the z (..., 3) with ``inside(z) = d`` for jaw parameters d (..., 3) [mm]; NaN outside the bound."""
+        return self.interior.unconstrained(self.bound, self._rows(d, (3,), "d")).reshape(d.shape)
 
     def encode(self, T_skull_mandible: Tensor) -> tuple[Tensor, Tensor]:
         """Return the nearest jaw parameters and the landmark distance to them, as `JawRig.encode` does.
@@ -69,21 +115,6 @@ class JawLayer(nn.Module):
         distance = torch.sqrt(torch.where(on_model, torch.ones_like(squared), squared))
         return d, torch.where(on_model, torch.zeros_like(squared), distance)
 
-    def _encode(self, T_skull_mandible: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the nearest d [mm], shape (..., 3), and the squared residual [mm^2], smooth at zero too."""
-        T = _rows(T_skull_mandible, (4, 4))
-        found, _ = self.rig.encode(T.detach().cpu().double().numpy())
-        at = torch.tensor(found, dtype=T.dtype, device=T.device)
-        target = (T @ self.vectors)[:, :3].reshape(-1, 12)
-        d = at
-        if T.requires_grad and torch.is_grad_enabled():
-            # a Newton step from the minimum: nowhere to go, but its derivative by the target is the minimum's own
-            slope, H = self._slope_and_curvature(at, target)
-            d = at - torch.linalg.solve(H, slope - slope.detach())
-        squared = (self._images(d) - target).square().sum(dim=1)
-        batch = T_skull_mandible.shape[:-2]
-        return d.reshape(*batch, 3), squared.reshape(batch)
-
     def loss(self, T_skull_mandible: Tensor) -> Tensor:
         """Return a prior on jaw poses (..., 4, 4) [mm^2]: squared residual plus `penalty` of the nearest parameters.
 
@@ -93,31 +124,46 @@ class JawLayer(nn.Module):
         d, squared = self._encode(T_skull_mandible)
         return squared + self.penalty(d)
 
-    def _poses(self, d: Tensor) -> Tensor:
-        return self.from_anatomical @ self.motion(d) @ self.closed
+    def _encode(self, T_skull_mandible: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the nearest d [mm], shape (..., 3), and the squared residual [mm^2], smooth at zero too."""
+        T = self._rows(T_skull_mandible, (4, 4), "T_skull_mandible")
+        d, image, by_target = solved(self._nearest, T)
+        target = self._images(T)
+        # d is where the squared residual is least: to first order its change does not change the residual
+        squared = (image - target).square().sum(dim=1)
+        batch = T_skull_mandible.shape[:-2]
+        return attached(d, by_target, target).reshape(*batch, 3), squared.reshape(batch)
 
-    def _images(self, d: Tensor) -> Tensor:
+    def _nearest(self, T: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        moved = (self.to_anatomical @ T @ self.incisor)[:, :3] - (self.closed @ self.incisor)[:3]
+        target = self._images(T).unflatten(1, (3, 4))
+        return nearest(self.motion, self.vectors_at_rest, target, moved)
+
+    def _images(self, T: Tensor) -> Tensor:
         """Return the images (n, 12) of the four vectors that represent the landmarks, see `evaluator.encoding`."""
-        return (self._poses(d) @ self.vectors)[:, :3].reshape(-1, 12)
+        return (self.to_anatomical @ T @ self.vectors)[:, :3].flatten(1)
 
-    def _slope_and_curvature(self, d: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-        """Return gradient (n, 3) and Hessian (n, 3, 3) by d of half the squared distance of images and target (n, 12).
-
-        The gradient is differentiable by the target; the Hessian is a constant.
-        """
-        with torch.enable_grad():
-            x = d.detach().requires_grad_()
-            image = self._images(x)
-            (slope,) = torch.autograd.grad(image, x, image.detach() - target, create_graph=True)
-            half = 0.5 * (image - target.detach()).square().sum()
-            (gradient,) = torch.autograd.grad(half, x, create_graph=True)
-            columns = [torch.autograd.grad(gradient[:, i].sum(), x, retain_graph=True)[0] for i in range(3)]
-        H = torch.stack(columns, dim=2)
-        floor = _LEAST_CURVATURE * H.diagonal(dim1=1, dim2=2).abs().mean(dim=1)
-        return slope, H + floor[:, None, None] * torch.eye(3, dtype=d.dtype, device=d.device)
+    def _rows(self, values: Tensor, tail: tuple[int, ...], name: str) -> Tensor:
+        if values.shape[max(values.ndim - len(tail), 0) :] != tail:
+            raise ValueError(f"the shape of {name} must end in {tail}, got {tuple(values.shape)}")
+        if values.dtype != self.closed.dtype:
+            raise TypeError(
+                f"{name} is {values.dtype}, the layer computes in {self.closed.dtype}. "
+                f"Convert one of them: layer.to({values.dtype}) or {name}.to({self.closed.dtype})."
+            )
+        return values.reshape(-1, *tail)
 
 
-def _rows(values: Tensor, tail: tuple[int, ...]) -> Tensor:
-    if values.shape[values.ndim - len(tail) :] != tail:
-        raise ValueError(f"the shape must end in {tail}, got {tuple(values.shape)}")
-    return values.reshape(-1, *tail)
+def _refuse_other_rigs(layer: nn.Module, state: dict[str, Tensor], prefix: str, *_: object) -> None:
+    """Refuse the state of another rig before any of it is loaded.
+
+    Raises:
+        EvaluatorError: the state is of another rig, or does not say of which.
+    """
+    found, own = state.get(f"{prefix}rig_hash"), layer.get_buffer("rig_hash").tolist()
+    if found is None or found.tolist() != own:
+        theirs = "does not say of which rig it is" if found is None else f"is of rig {bytes(found.tolist()).hex()[:12]}"
+        raise EvaluatorError(
+            f"the state {theirs}; this JawLayer is of rig {bytes(own).hex()[:12]}.",
+            hint="Build the layer from the rig the state was saved with.",
+        )

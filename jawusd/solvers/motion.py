@@ -5,13 +5,14 @@ A number is a column of a batch, shape (n, 1); a wide number, see `jawusd.evalua
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import cast
 
 import torch
 from torch import Tensor, nn
 
 from jawusd.evaluator.arrays import flat_arrays
-from jawusd.evaluator.formula import MODELS, BoundFormula, RigidMotion
+from jawusd.evaluator.formula import MODELS, Numbers, RigidMotion
 from jawusd.evaluator.operations import Rows, triple
 from jawusd.geometry.arrays import Array
 from jawusd.geometry.rodrigues import SMALL_SQUARED_ANGLE, Triple, angle_quotients, angle_series
@@ -66,7 +67,7 @@ class TensorOperations:
     @staticmethod
     def lookup(x: Tensor, knots: Tensor, tables: Sequence[Tensor]) -> list[tuple[Tensor]]:
         """Return, of each table, the rows (n, k) whose index is the number of knots (m, 1) at or below x."""
-        interval = torch.searchsorted(knots[:, 0].contiguous(), x.detach()[:, 0].contiguous(), right=True)
+        interval = (x.detach() >= knots[:, 0]).sum(dim=1)
         return [(table[interval],) for table in tables]
 
     @staticmethod
@@ -78,42 +79,46 @@ class TensorOperations:
 OPERATIONS = TensorOperations()
 
 
-class _Formula(nn.Module):
-    """A formula with its tables as buffers."""
+class Formula(nn.Module):
+    """A formula with its tables and its single numbers as buffers: nothing it computes with lies elsewhere.
 
-    def __init__(self, tables: Mapping[str, Rows]) -> None:
+    Args:
+        tables: Rows of floats by name.
+        numbers: Floats in tuples.
+    """
+
+    singles: Tensor
+
+    def __init__(self, tables: Mapping[str, Rows], numbers: Numbers) -> None:
         super().__init__()
+        self._names = tuple(tables)
         for name, table in tables.items():
             self.register_buffer(name, torch.tensor(table, dtype=torch.float64))
+        self._nesting = numbers
+        self.register_buffer("singles", torch.tensor(list(_leaves(numbers)), dtype=torch.float64))
 
-    def _tables(self) -> dict[str, Tensor]:
-        return dict(self.named_buffers())
+    def tables(self) -> dict[str, Tensor]:
+        """Return the tables by name."""
+        return {name: self.get_buffer(name) for name in self._names}
+
+    def numbers(self) -> Numbers:
+        """Return the single numbers in their tuples, each a tensor of no axes."""
+        return cast("Numbers", _nested(self._nesting, iter(self.singles.unbind())))
 
 
-class MotionModule(_Formula):
+class MotionModule(Formula):
     """The motion of a model of any kind, anatomical frame."""
 
     def __init__(self, kind: str, arrays: Mapping[str, Array]) -> None:
         formula = MODELS[kind](flat_arrays(arrays))
-        super().__init__(formula.tables)
+        super().__init__(formula.tables, formula.numbers)
         self._formula = formula
 
     def forward(self, d: Tensor) -> Tensor:
         """Return M(d), shape (n, 4, 4) [mm], for d (n, 3) [mm]."""
-        return transforms(self._formula.motion(triple(d.split(1, dim=1)), self._tables(), OPERATIONS))
-
-
-class MarginModule(_Formula):
-    """The signed distance to the slice hull."""
-
-    def __init__(self, arrays: Mapping[str, Array]) -> None:
-        formula = BoundFormula(flat_arrays(arrays))
-        super().__init__(formula.tables)
-        self._formula = formula
-
-    def forward(self, d: Tensor) -> Tensor:
-        """Return the margins (n,) [mm] of d (n, 3) [mm], positive inside."""
-        return self._formula.margin(triple(d.split(1, dim=1)), self._tables(), OPERATIONS)[:, 0]
+        return transforms(
+            self._formula.motion(triple(d.split(1, dim=1)), self.tables(), OPERATIONS, numbers=self.numbers())
+        )
 
 
 def transforms(motion: RigidMotion[Tensor]) -> Tensor:
@@ -121,3 +126,18 @@ def transforms(motion: RigidMotion[Tensor]) -> Tensor:
     columns = torch.cat([x for row, shift in zip(motion.turn, motion.t) for x in (*row, shift)], dim=1)
     change = torch.cat([columns, torch.zeros_like(columns[:, :4])], dim=1).reshape(-1, 4, 4)
     return change + torch.eye(4, dtype=columns.dtype, device=columns.device)
+
+
+def _leaves(numbers: object) -> Iterator[float]:
+    if isinstance(numbers, tuple | list):
+        for each in numbers:
+            yield from _leaves(each)
+    else:
+        yield cast("float", numbers)
+
+
+def _nested(like: object, leaves: Iterator[Tensor]) -> object:
+    if not isinstance(like, tuple | list):
+        return next(leaves)
+    parts = [_nested(each, leaves) for each in like]
+    return type(like)(*parts) if hasattr(like, "_fields") else parts  # type: ignore[arg-type]

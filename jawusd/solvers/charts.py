@@ -1,0 +1,223 @@
+"""The two kinds of models with derivatives, in the coordinates x (n, 3) [mm] in which nearest poses are searched.
+
+As in `jawusd.evaluator.models`: for an anchored model x is the displacement u of the incisal point, for an additive one
+d itself; derivatives are spatial, S (n, 6, 3) with ``M(x + e) = exp(S e) M(x)``, twists being (omega [rad], v [mm]).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Protocol, cast
+
+import torch
+from torch import Tensor
+
+from jawusd.evaluator import derivatives
+from jawusd.evaluator.derivatives import (
+    INVERSE_ITERATIONS,
+    INVERSE_STEP_MM,
+    LEAST_INVERSE_SLOPE,
+    MOST_DOUBLINGS,
+    PATIENCE,
+    Elementary,
+    gradient_by_u,
+    spline_input,
+)
+from jawusd.evaluator.formula import AnchoredNumbers
+from jawusd.evaluator.models import AdditiveModel
+from jawusd.evaluator.operations import triple
+from jawusd.evaluator.schema import ADDITIVE, ANCHORED
+from jawusd.geometry.arrays import Array
+from jawusd.solvers.motion import OPERATIONS, MotionModule
+from jawusd.solvers.solution import capturing, finished, inverse
+
+_STEPS_CAPTURED = 7  # of the inverse gauge; five do for parameters a jaw has
+_GAUGE_NUMBERS = 26
+_SERIES_SQUARED = 0.09  # rad^2; below, derivatives of the angle coefficients come from their series
+TENSORS: Elementary[Tensor] = Elementary(torch.sqrt, torch.exp, OPERATIONS.clip)
+
+
+class Chart(Protocol):
+    """What the search for the nearest pose needs of a kind of model."""
+
+    def start(self, u: Tensor) -> Tensor:
+        """Return where to start, x (n, 3), for displacements u (n, 3) [mm] of the incisal point."""
+
+    def derivative(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return rotation (n, 3, 3), translation (n, 3) [mm] and spatial derivative S (n, 6, 3) at x."""
+
+    def decoded(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Return d (n, 3) [mm] of x, and dd/dx (n, 3, 3)."""
+
+
+class AnchoredMotion(MotionModule):
+    """An anchored model; x is the displacement u of the incisal point."""
+
+    centres: Tensor
+    weights: Tensor
+
+    def __init__(self, arrays: Mapping[str, Array]) -> None:
+        super().__init__(ANCHORED, arrays)
+
+    def start(self, u: Tensor) -> Tensor:
+        """Return u: it is read off the pose."""
+        return u
+
+    def derivative(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return rotation, translation [mm] and spatial derivative at u (n, 3) [mm]."""
+        gauge, _, scales, *_ = self._anchored_numbers()
+        # the order of `AnchoredNumbers`
+        incisor, _, tail, offset = self.singles[_GAUGE_NUMBERS:].split([3, 3, 9, 3])
+        tail = tail.reshape(3, 3)
+        sheared, slopes = spline_input(gauge, scales, triple(x.unbind(dim=1)), TENSORS)
+        q = torch.stack(sheared, dim=1)
+        away = q[:, None] - self.centres
+        r = away.norm(dim=2)
+        omega = (r * r * r) @ self.weights + q @ tail - offset
+        by_q = 3.0 * self.weights.T @ (away * r[:, :, None]) + tail.T
+        by_u = torch.stack(gradient_by_u(triple(by_q.unbind(dim=2)), scales, _columns(slopes)), dim=2)
+        R, J = _rotations(omega)
+        moved = x + incisor
+        turning = J @ by_u
+        # the incisal point itself moves by dx: w x (x + p) + v = dx
+        sliding = torch.linalg.cross(moved[:, :, None], turning, dim=1) + torch.eye(3, dtype=x.dtype, device=x.device)
+        t = moved - R @ incisor
+        return R, t, torch.cat([turning, sliding], dim=1)
+
+    def decoded(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Return d (n, 3) [mm] of u (n, 3) [mm], and dd/du (n, 3, 3); NaN where the search does not converge."""
+        gauge = self._anchored_numbers().gauge
+        d = self._inverse(x)
+        _, (x_1, y_1, y_2, y_3, z_1, z_2) = derivatives.displacement(gauge, d[:, 0], d[:, 1], d[:, 2], TENSORS)
+        one, zero = torch.ones_like(x_1), torch.zeros_like(x_1)
+        rows = ((x_1, one, zero), (y_1, y_2, y_3), (z_1, z_2, one))
+        return d, inverse(torch.stack([torch.stack(row, dim=1) for row in rows], dim=1))
+
+    def _anchored_numbers(self) -> AnchoredNumbers:
+        return cast("AnchoredNumbers", self.numbers())
+
+    def _inverse(self, u: Tensor) -> Tensor:
+        """Return the d (n, 3) of u (n, 3) [mm]: `jawusd.evaluator.gauge.Gauge.inverse`."""
+        gauge = self._anchored_numbers().gauge
+        tolerance = 500 * torch.finfo(u.dtype).eps
+        d1 = -u[:, 1]
+        low, high = torch.full_like(d1, -torch.inf), torch.full_like(d1, torch.inf)
+        wanted = triple(u.unbind(dim=1))
+        for iteration in range(_STEPS_CAPTURED if capturing() else INVERSE_ITERATIONS):
+            _, _, remainder, slope = derivatives.opening_equation(gauge, wanted, d1, TENSORS)
+            step = -remainder / torch.where(slope > LEAST_INVERSE_SLOPE, slope, torch.ones_like(slope))
+            step = step.clamp(-INVERSE_STEP_MM, INVERSE_STEP_MM)
+            moving = step.abs() > tolerance * (1.0 + d1.abs())
+            if finished(moving):
+                break
+            low, high = torch.where(remainder < 0, d1, low), torch.where(remainder > 0, d1, high)
+            d1 = torch.where(moving, _next_opening(d1, step, low, high, iteration), d1)
+        else:
+            d1 = torch.where(moving, torch.nan, d1) if not capturing() else d1
+        d2, d3, _, _ = derivatives.opening_equation(gauge, wanted, d1, TENSORS)
+        return torch.stack([d1, d2, d3], dim=1)
+
+
+class AdditiveMotion(MotionModule):
+    """An additive model; x is d."""
+
+    starts: Tensor
+    displacements: Tensor
+
+    def __init__(self, arrays: Mapping[str, Array]) -> None:
+        super().__init__(ADDITIVE, arrays)
+        starts = AdditiveModel.from_arrays(arrays).starts
+        self.register_buffer("starts", torch.tensor(starts.d))
+        self.register_buffer("displacements", torch.tensor(starts.displacements))
+
+    def start(self, u: Tensor) -> Tensor:
+        """Return the start whose displacement is nearest to u (n, 3) [mm]."""
+        grid = self.displacements
+        return self.starts[(grid.square().sum(dim=1) - 2.0 * u @ grid.T).argmin(dim=1)]
+
+    def derivative(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return rotation, translation [mm] and spatial derivative at d (n, 3) [mm]."""
+        values, slopes = zip(*(self._curve(f"curve{i + 1}", x[:, i : i + 1]) for i in range(3)))
+        return _twist_derivative(sum(values), torch.stack(slopes, dim=2))
+
+    def decoded(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Return x, which is d, and the identity."""
+        return x, torch.eye(3, dtype=x.dtype, device=x.device).expand(x.shape[0], 3, 3)
+
+    def _curve(self, name: str, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Return point and slope (n, 6) of a curve at x (n, 1)."""
+        parts = [self.get_buffer(f"{name}_{part}") for part in ("start", "power0", "power1", "power2", "power3")]
+        (start,), (c0,), (c1,), (c2,), (c3,) = OPERATIONS.lookup(x, self.get_buffer(f"{name}_knot"), parts)
+        s = x - start
+        return ((c3 * s + c2) * s + c1) * s + c0, (3.0 * c3 * s + 2.0 * c2) * s + c1
+
+
+def chart_of(kind: str, arrays: Mapping[str, Array]) -> AnchoredMotion | AdditiveMotion:
+    """Return the model of a kind."""
+    return AnchoredMotion(arrays) if kind == ANCHORED else AdditiveMotion(arrays)
+
+
+def _columns(slopes: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    return slopes[0][:, None], slopes[1][:, None]
+
+
+def _next_opening(x: Tensor, step: Tensor, low: Tensor, high: Tensor, iteration: int) -> Tensor:
+    """Return the next d1 to try, as `jawusd.evaluator.gauge` does."""
+    bounded = torch.isfinite(low) & torch.isfinite(high)
+    late = max(iteration - PATIENCE, 0)
+    stride = (step * 2.0 ** min(late, MOST_DOUBLINGS)).clamp(-INVERSE_STEP_MM, INVERSE_STEP_MM)
+    newton = x + torch.where(bounded, step, stride)
+    middle = torch.where(bounded, 0.5 * (low + high), newton)
+    halve = (newton <= low) | (newton >= high) | (bounded if late % 2 == 1 else torch.zeros_like(bounded))
+    return torch.where(bounded & halve, middle, newton)
+
+
+def _skew(w: Tensor) -> Tensor:
+    x, y, z = w.unbind(dim=1)
+    o = torch.zeros_like(x)
+    return torch.stack([o, -z, y, z, o, -x, -y, x, o], dim=1).reshape(-1, 3, 3)
+
+
+def _rotations(omega: Tensor) -> tuple[Tensor, Tensor]:
+    """Return rotations and left Jacobians (n, 3, 3) of rotation vectors (n, 3) [rad]."""
+    a, b, c = (x[:, :, None] for x in OPERATIONS.angle_coefficients(omega.square().sum(dim=1, keepdim=True)))
+    W = _skew(omega)
+    WW = W @ W
+    identity = torch.eye(3, dtype=omega.dtype, device=omega.device)
+    return identity + a * W + b * WW, identity + b * W + c * WW
+
+
+def _twist_derivative(twist: Tensor, by_x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return R, t and the spatial derivative of exp(twist), twists (n, 6), that change by (n, 6, 3).
+
+    With t = v + b w x v + c w x (w x v) the translation, a change of the twist turns by s = J dw and shifts the origin
+    by dt - s x t.
+    """
+    omega, v = twist[:, :3, None], twist[:, 3:, None]
+    R, J = _rotations(twist[:, :3])
+    squared = omega.square().sum(dim=1, keepdim=True)
+    a, b, c = OPERATIONS.angle_coefficients(squared)
+    b_1, c_1 = _coefficient_slopes(squared, a, b, c)
+    e, s = by_x[:, :3], J @ by_x[:, :3]
+    x = _cross(omega, v)
+    y = _cross(omega, x)
+    t = v + b * x + c * y
+    bend = b * _cross(e, v) + c * (_cross(omega, _cross(e, v)) + _cross(e, x))
+    along = 2.0 * (omega * e).sum(dim=1, keepdim=True)
+    sliding = J @ by_x[:, 3:] + bend + along * (b_1 * x + c_1 * y) - _cross(s, t)
+    return R, t[:, :, 0], torch.cat([s, sliding], dim=1)
+
+
+def _cross(a: Tensor, b: Tensor) -> Tensor:
+    return torch.linalg.cross(a, b, dim=1)
+
+
+def _coefficient_slopes(x: Tensor, a: Tensor, b: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the derivatives by the squared angle x [rad^2] of b and c, see `jawusd.fast.rigid.coefficient_slopes`."""
+    small = x < _SERIES_SQUARED
+    far = torch.where(small, torch.ones_like(x), x)
+    series_b = -1 / 24 + x * (1 / 360 + x * (-1 / 13440 + x * (1 / 907200 - x / 95800320)))
+    series_c = -1 / 120 + x * (1 / 2520 + x * (-1 / 120960 + x * (1 / 9979200 - x * 5 / 6227020800)))
+    slope_b = (0.5 * a - b) / far
+    slope_c = (-0.5 * (torch.cos(torch.sqrt(far)) - a) / far - c) / far
+    return torch.where(small, series_b, slope_b), torch.where(small, series_c, slope_c)

@@ -1,0 +1,102 @@
+"""The nearest pose of the model, for batches on any device: damped Gauss-Newton as in `jawusd.evaluator.solver`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from jawusd.evaluator.solver import ITERATIONS, LARGEST_DAMPING, LEAST_STIFFNESS, SMALLEST_DAMPING, START_DAMPING
+from jawusd.solvers.charts import Chart
+from jawusd.solvers.solution import applied, capturing, finished, inverse
+
+# x (n, 3), targets (n, 3, m) -> residuals (n, 3 m) and their derivatives by x (n, 3 m, 3)
+Residual = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+
+_STEPS_CAPTURED = 6
+_NEWTON_STEPS, _NEWTON_STEPS_CAPTURED = 4, 2  # off the model Gauss-Newton nears the bottom slowly
+_LEAST_CURVATURE = 1e-9  # relative; keeps encodings differentiable where a parameter hardly moves the landmarks
+
+
+def nearest(chart: Chart, vectors: Tensor, target: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the parameters whose motion carries vectors nearest to their targets.
+
+    Args:
+        chart: The model.
+        vectors: Homogeneous vectors (4, m), anatomical frame [mm].
+        target: Where they should go [mm], shape (n, 3, m).
+        u: Displacements (n, 3) [mm] of the incisal point, from which the search starts.
+
+    Returns:
+        d (n, 3) [mm]; where its motion carries the vectors (n, 3 m) [mm]; and the derivative (n, 3, 3 m) of d by the
+        targets, by the implicit function theorem on ``grad |image(x) - target|^2 = 0``.
+    """
+
+    def residual(x: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+        R, t, S = chart.derivative(x)
+        image = R @ vectors[:3] + t[:, :, None] * vectors[3]
+        # a vector (b, h) moves by w x image + v h under the spatial velocity (w, v)
+        turned = torch.linalg.cross(S[:, :3, None], image[..., None], dim=1)
+        J = turned + S[:, 3:, None] * vectors[3][:, None]
+        return (image - target).flatten(1), J.flatten(1, 2)
+
+    x, r, J = _descended(residual, chart.start(u), target)
+    H = _curvature(residual, x, target)
+    g = applied(J.transpose(1, 2), r)
+    for _ in range(_NEWTON_STEPS_CAPTURED if capturing() else _NEWTON_STEPS):
+        step = applied(inverse(H), g)
+        if finished(step.abs().amax(dim=1) > 1e-3 * _tolerance_mm(x)):
+            break
+        r_trial, J_trial = residual(x - step, target)
+        g_trial = applied(J_trial.transpose(1, 2), r_trial)
+        # this near to the bottom the residual itself no longer tells which is lower
+        better = g_trial.square().sum(dim=1) <= g.square().sum(dim=1)
+        x, r = torch.where(better[:, None], x - step, x), torch.where(better[:, None], r_trial, r)
+        J, g = torch.where(better[:, None, None], J_trial, J), torch.where(better[:, None], g_trial, g)
+        H = _curvature(residual, x, target)
+    d, by_x = chart.decoded(x)
+    return d, r + target.flatten(1), by_x @ inverse(H) @ J.transpose(1, 2)
+
+
+def _tolerance_mm(x: Tensor) -> float:
+    return 1e-6 if x.dtype == torch.float64 else 1e-4
+
+
+def _descended(residual: Residual, x: Tensor, target: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the bottom x (n, 3) [mm], and the residual and its derivative there."""
+    tolerance_mm = _tolerance_mm(x)
+    r, J = residual(x, target)
+    cost = r.square().sum(dim=1)
+    damping = torch.full_like(cost, START_DAMPING)
+    identity = torch.eye(3, dtype=x.dtype, device=x.device)
+    for _ in range(_STEPS_CAPTURED if capturing() else ITERATIONS):
+        slopes = J.transpose(1, 2)
+        A = slopes @ J
+        amount = damping * A.diagonal(dim1=1, dim2=2).mean(dim=1) + LEAST_STIFFNESS
+        step = applied(inverse(A + amount[:, None, None] * identity), applied(slopes, r))
+        trial = x - step
+        r_trial, J_trial = residual(trial, target)
+        cost_trial = r_trial.square().sum(dim=1)
+        moving = (step.abs().amax(dim=1) > tolerance_mm) & (damping < LARGEST_DAMPING)
+        # the last step doubles the digits, and is taken though rounding may hide that it is better
+        taken = (cost_trial <= cost) | ~moving
+        damping = torch.where(taken, (damping * 0.1).clamp(min=SMALLEST_DAMPING), damping * 10.0)
+        x, r = torch.where(taken[:, None], trial, x), torch.where(taken[:, None], r_trial, r)
+        J, cost = torch.where(taken[:, None, None], J_trial, J), torch.where(taken, cost_trial, cost)
+        if finished(moving):
+            break
+    return x, r, J
+
+
+def _curvature(residual: Residual, x: Tensor, target: Tensor) -> Tensor:
+    """Return the Hessian (n, 3, 3) by x of half the squared residual, by central differences of its exact gradient."""
+    h = 1e-4 if x.dtype == torch.float64 else 2e-2
+    shifts = h * torch.eye(3, dtype=x.dtype, device=x.device)
+    around = torch.cat([x[:, None] + shifts, x[:, None] - shifts], dim=1)
+    r, J = residual(around.flatten(0, 1), target[:, None].expand(-1, 6, -1, -1).flatten(0, 1))
+    g = applied(J.transpose(1, 2), r).reshape(-1, 2, 3, 3)
+    H = (g[:, 0] - g[:, 1]) / (2.0 * h)
+    H = 0.5 * (H + H.transpose(1, 2))
+    floor = _LEAST_CURVATURE * H.diagonal(dim1=1, dim2=2).abs().mean(dim=1)
+    return H + floor[:, None, None] * torch.eye(3, dtype=x.dtype, device=x.device)

@@ -1,0 +1,158 @@
+"""All of the valid volume as the image of an unconstrained vector: smooth, onto, one to one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from jawusd.errors import EvaluatorError
+from jawusd.evaluator.bounds import SliceHull
+from jawusd.evaluator.curves import HermiteCurve
+from jawusd.evaluator.formula import catmull_rom, curve, curve_tables
+from jawusd.geometry.arrays import Array, Mask
+from jawusd.solvers.hull import Hull
+from jawusd.solvers.motion import OPERATIONS, Formula
+from jawusd.solvers.solution import capturing, finished
+
+_STEPS, _STEPS_CAPTURED = 60, 12
+_SOFTNESS_MM = 1.0  # rounding with which the middle of a section is found: keeps the line of middles straight
+_CHECKED = 400  # openings at which the line of middles must lie inside
+_NEWTON_STEPS, _SMALLEST_SHARE, _STIFFNESS = 200, 1e-9, 1e-12
+_END_TOLERANCE_MM = 1e-13
+
+
+class Interior(Formula):
+    """A map from vectors z (n, 3) onto the inside of a hull.
+
+    ``d1`` is a sigmoid of z1 onto the valid openings. With m the margin and c(d1) a line inside the volume,
+    ``(d2, d3) = c + (z2, z3) m(d1, d2, d3)``: sections are convex and m is concave in them, so along every ray from c
+    the ratio ``|(d2, d3) - c| / m`` rises from 0 to infinity, and each z has exactly one solution.
+
+    Raises:
+        EvaluatorError: no line from the smallest to the largest opening lies inside.
+    """
+
+    def __init__(self, arrays: Mapping[str, Array]) -> None:
+        bound = SliceHull.from_arrays(arrays)
+        knots, middles = bound.supports.knots, _middles(bound)
+        slopes = np.zeros_like(middles)
+        slopes[1:-1] = catmull_rom(middles[:-2], middles[2:], (knots[2:] - knots[:-2])[:, None])
+        ends = _ends(bound, HermiteCurve(knots, middles, slopes))
+        super().__init__(curve_tables("middle", knots.tolist(), middles.tolist(), slopes.tolist()), ends)
+
+    def mapped(self, hull: Hull, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Return d (n, 3) [mm] of z (n, 3), and its derivative (n, 3, 3)."""
+        low, high = self.singles.unbind()
+        root = torch.sqrt(1.0 + z[:, :1].square())
+        on_line, slope = self._on_line(0.5 * (low + high) + 0.5 * (high - low) * z[:, :1] / root)
+        side = torch.cat([torch.zeros_like(root), z[:, 1:]], dim=1)
+        # Newton from above: mu - m(c + z mu) is convex in mu, so that it comes down to the root without overshooting
+        mu = hull.most(on_line)[:, None]
+        tolerance_mm = 500 * torch.finfo(z.dtype).eps
+        for _ in range(_STEPS_CAPTURED if capturing() else _STEPS):
+            at = hull.expansion(on_line + side * mu)
+            change = (mu[:, 0] + at.distance) / (1.0 + (at.gradient * side).sum(dim=1))
+            mu = mu - change[:, None]
+            if finished(change.abs() > tolerance_mm):
+                break
+        d = on_line + side * mu
+        at = hull.expansion(d)
+        inward = -at.gradient
+        # implicit function theorem on x = c(d1) + z m(d1, x)
+        by_d1 = slope + side * inward[:, :1]
+        direct = torch.cat([by_d1[:, :, None] * (0.5 * (high - low) / root**3)[..., None], self._sideways(mu)], dim=2)
+        across = torch.cat([torch.zeros_like(root), inward[:, 1:]], dim=1)
+        lead = (across[:, None] @ direct) / (1.0 - (across * side).sum(dim=1))[:, None, None]
+        return d, direct + side[:, :, None] * lead
+
+    def unconstrained(self, hull: Hull, d: Tensor) -> Tensor:
+        """Return the z (n, 3) of d (n, 3) [mm] inside the hull; NaN outside."""
+        low, high = self.singles.unbind()
+        share = (2.0 * d[:, :1] - low - high) / (high - low)
+        z1 = share / torch.sqrt(1.0 - share.square())
+        margin = hull.margin(d)[:, None]
+        z = torch.cat([z1, (d - self._on_line(d[:, :1])[0])[:, 1:] / margin], dim=1)
+        return torch.where(margin > 0, z, torch.nan)
+
+    def _on_line(self, d1: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the points (n, 3) [mm] of the line of middles at d1 (n, 1), and their derivatives."""
+        parts = [self.get_buffer(f"middle_{part}") for part in ("start", "power0", "power1", "power2", "power3")]
+        (start,), _, (c1,), (c2,), (c3,) = OPERATIONS.lookup(d1, self.get_buffer("middle_knot"), parts)
+        s = d1 - start
+        (at,) = curve("middle", d1, self.tables(), OPERATIONS)
+        slope = (3.0 * c3 * s + 2.0 * c2) * s + c1
+        return torch.cat([d1, at], dim=1), torch.cat([torch.ones_like(d1), slope], dim=1)
+
+    @staticmethod
+    def _sideways(mu: Tensor) -> Tensor:
+        zero = torch.zeros_like(mu)
+        return torch.stack([torch.cat([zero, zero], 1), torch.cat([mu, zero], 1), torch.cat([zero, mu], 1)], dim=1)
+
+
+def _middles(bound: SliceHull) -> Array:
+    """Return points (k, 2) [mm] in the sections at the knots: inside all, and the deepest of the first and the last.
+
+    Beyond those two sections stay as they are but for the rounding of the ends, which closes around the deepest point.
+    """
+    reach = bound.supports.values
+    found = np.zeros((len(reach), 2))
+    for i, h in enumerate(reach):
+        own = max(_SOFTNESS_MM, bound.softness_mm)
+        while True:
+            found[i] = _deepest(bound.directions, h, own, found[i])
+            if i not in (0, len(reach) - 1) or own == bound.softness_mm:
+                break
+            own = max(0.5 * own, bound.softness_mm)
+    return found
+
+
+def _deepest(normals: Array, reach: Array, softness_mm: float, y: Array) -> Array:
+    """Return where the soft maximum of ``normals @ y - reach`` is least, by damped Newton steps from y (2,) [mm]."""
+
+    def value(y: Array) -> tuple[float, Array]:
+        v = (normals @ y - reach) / softness_mm
+        weights = np.exp(v - v.max())
+        return float(softness_mm * (v.max() + np.log(weights.sum()))), weights / weights.sum()
+
+    least, weights = value(y)
+    for _ in range(_NEWTON_STEPS):
+        gradient = weights @ normals
+        away = normals - gradient
+        H = away.T @ (away * weights[:, None]) / softness_mm + _STIFFNESS * np.eye(2)
+        step = -np.linalg.solve(H, gradient)
+        share = min(1.0, 1.0 / max(float(np.linalg.norm(step)), 1e-300))
+        while share > _SMALLEST_SHARE:
+            trial, found = value(y + share * step)
+            if trial < least:
+                break
+            share *= 0.5
+        else:
+            break
+        y, least, weights = y + share * step, trial, found
+    return y
+
+
+def _ends(bound: SliceHull, line: HermiteCurve) -> tuple[float, float]:
+    """Return the openings [mm] between which the line of middles lies inside the bound."""
+
+    def inside(d1: Array) -> Mask:
+        return bound.signed_distance(np.column_stack([d1, line.value(d1)])) < 0
+
+    beyond = abs(bound.offset_mm) + bound.softness_mm
+    d1 = np.linspace(line.knots[0] - beyond, line.knots[-1] + beyond, _CHECKED)
+    valid = np.flatnonzero(inside(d1))
+    if not len(valid) or np.diff(valid).max(initial=1) > 1:
+        raise EvaluatorError(
+            "the bound of this rig is not one piece from the smallest to the largest opening.",
+            hint="Fit the model again with a wider margin.",
+        )
+    ends = []
+    for within, outside in ((d1[valid[0]], d1[valid[0] - 1]), (d1[valid[-1]], d1[valid[-1] + 1])):
+        while abs(within - outside) > _END_TOLERANCE_MM:
+            middle = 0.5 * (within + outside)
+            within, outside = (middle, outside) if inside(np.array([middle]))[0] else (within, middle)
+        ends.append(float(within))
+    return ends[0], ends[1]
