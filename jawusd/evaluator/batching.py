@@ -36,6 +36,8 @@ def rows_of(values: ArrayLike, tail: tuple[int, ...], name: str) -> tuple[Array,
         ValueError: the trailing axes are not ``tail``, or complex numbers.
     """
     values = as_floats(values, name)
+    if values.shape == tail:  # one row, the call that must be quick
+        return values[None], ()
     batch = values.shape[: values.ndim - len(tail)]
     if values.ndim < len(tail) or values.shape[len(batch) :] != tail:
         raise ValueError(f"{name} must have shape (..., {', '.join(map(str, tail))}), got {values.shape}")

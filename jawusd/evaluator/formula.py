@@ -281,24 +281,12 @@ class JawFormula(Protocol):
     ) -> RigidMotion[N]:
         """Return the motion away from the closed bite, anatomical frame, at the jaw parameters d [mm].
 
-        Args:
-            d: Jaw parameters [mm].
-            tables: The tables of the formula, as the kind of number stores them.
-            ops: Operations on numbers.
-            numbers: The numbers of the formula where they are not floats; None for its own.
+        Of the formula, the tables as the kind of number stores them, and its numbers where they are not floats.
         """
 
 
 class AnchoredNumbers(NamedTuple):
-    """The single numbers of an anchored model.
-
-    Attributes:
-        gauge: Of the gauge.
-        incisor: The incisal point at rest [mm].
-        scales: Lengths dividing the sheared displacement [mm].
-        linear: The linear terms of the spline, 3 inputs times 3 outputs [rad].
-        offset: Value of the bare spline at rest [rad].
-    """
+    """The single numbers of an anchored model, see `AnchoredModel`; linear: 3 inputs times 3 outputs [rad]."""
 
     gauge: GaugeNumbers
     incisor: Triple[float]
@@ -381,12 +369,7 @@ class BoundNumbers(NamedTuple):
 
 
 class BoundFormula:
-    """The slice hull: which jaw parameters are anatomically possible.
-
-    Attributes:
-        tables: The rows of floats it needs, to be stored as the kind of number stores them.
-        numbers: The single floats it needs.
-    """
+    """The slice hull: which jaw parameters are anatomically possible; tables and numbers as in `JawFormula`."""
 
     def __init__(self, arrays: Arrays) -> None:
         knots, directions = arrays["slice_d1"], rows(arrays["slice_directions"], 2)

@@ -141,6 +141,8 @@ class JawRig(RigAuthoring):
             return self._encode_weighted(T_skull_mandible, covariance, inside)
         rows, batch = rows_of(T_skull_mandible, (4, 4), "T_skull_mandible")
         d, residual_mm = self.kernels.encode(rows)
+        if not batch and not inside:
+            return Encoding(d[0], residual_mm[0])
         if inside and (out := np.flatnonzero(self.kernels.margins(d) < 0)).size:
             targets = self._encoder.targets(rows[out])
             d[out] = in_chunks(lambda target: self._search.solve_ik_multistart(self._vectors, target), targets)

@@ -78,6 +78,9 @@ class Verdicts(NamedTuple):
 
     def finished(self, batch: tuple[int, ...], fast: Mask | None = None) -> Verdicts:
         """Return the verdicts in a batch shape, with the frames marked in ``fast`` (of that shape) too fast."""
+        if not batch and fast is None:
+            valid, reason, residual_mm, margin_mm, d, tolerance_mm = self
+            return Verdicts(valid[0], reason[0], residual_mm[0], margin_mm[0], d[0], tolerance_mm)
         reason = self.reason.reshape(batch)
         if fast is not None:
             reason = reason | np.where(fast, Reason.TOO_FAST.value, 0).astype(np.uint8)

@@ -16,7 +16,8 @@ __all__ = ["accelerate"]
 def accelerate(rig: JawRig) -> JawRig:
     """Return the rig with its most used functions compiled: the same results to 1e-10.
 
-    The first use after an installation compiles for about a minute; the code is kept on disk.
+    The first use after an installation compiles for some 20 seconds; the code is kept on disk. Where no folder can be
+    written every process compiles, and a RuntimeWarning says so.
     """
     if isinstance(rig.kernels, CompiledKernels):
         return rig

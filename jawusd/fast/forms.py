@@ -12,7 +12,7 @@ from jawusd.evaluator import derivatives
 from jawusd.evaluator.derivatives import gradient_by_u, spline_input
 from jawusd.evaluator.formula import GaugeNumbers
 from jawusd.fast.packing import ARCH, COUNT, CURVES, DROP, FADE, LINEAR, OFFSET, PATH, SCALES, SOFTNESS, SPLINE
-from jawusd.fast.rigid import FLOATS, Vector, device
+from jawusd.fast.rigid import FLOATS, Vector, device, summing
 from jawusd.geometry.arrays import Array
 
 
@@ -56,7 +56,7 @@ def _input(model: Array, u: Vector) -> tuple[Vector, tuple[float, float]]:
     return spline_input(gauge_of(model), scales, u, FLOATS)
 
 
-@device
+@summing
 def spline(model: Array, u: Vector, work: Array) -> Vector:
     """Return the rotation vector f(u) [rad] for the incisal displacement u [mm]."""
     count = int(model[COUNT])
@@ -85,7 +85,7 @@ def _with_linear(model: Array, q0: float, q1: float, q2: float, k0: float, k1: f
     )
 
 
-@device
+@summing
 def spline_derivative(model: Array, u: Vector, work: Array, by_u: Array) -> Vector:
     """Return f(u) [rad]; write df/du [rad/mm] to by_u (3, 3)."""
     count = int(model[COUNT])

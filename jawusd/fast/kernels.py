@@ -60,18 +60,16 @@ class CompiledKernels:
 
     def encode(self, T: Array) -> tuple[Array, Array]:
         """Return the d (n, 3) [mm] nearest to poses T_skull_mandible (n, 4, 4), and the residuals (n,) [mm]."""
-        d, residual_mm = np.empty((len(T), 3)), np.empty(len(T))
-        rows.encodings(self._model, _owned(T), d, residual_mm)
-        return d, residual_mm
+        out = np.empty((len(T), 6))
+        rows.judgements(self._model, self._hull, _owned(T), False, 0.0, 0.0, out)
+        return out[:, :3], out[:, 3]
 
     def judge_poses(self, T: Array, limits: Limits) -> Verdicts:
         """Return verdicts on poses T_skull_mandible (n, 4, 4)."""
-        count, (residual_limit, margin_limit) = len(T), (limits.residual_mm, limits.margin_mm)
-        d, residual_mm, margin_mm = np.empty((count, 3)), np.empty(count), np.empty(count)
-        reason = np.empty(count, dtype=np.uint8)
-        found = d, residual_mm, margin_mm, reason
-        rows.judgements(self._model, self._hull, _owned(T), residual_limit, margin_limit, *found)
-        return Verdicts(reason == 0, reason, residual_mm, margin_mm, d)
+        out = np.empty((len(T), 6))
+        rows.judgements(self._model, self._hull, _owned(T), True, limits.residual_mm, limits.margin_mm, out)
+        reason = out[:, 5].astype(np.uint8)
+        return Verdicts(reason == 0, reason, out[:, 3], out[:, 4], out[:, :3])
 
     def judge_parameters(self, d: Array, limits: Limits) -> Verdicts:
         """Return verdicts on d (n, 3) [mm]."""

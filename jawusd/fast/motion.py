@@ -49,7 +49,12 @@ def motion(model: Array, d1: float, d2: float, d3: float, w: Scratch) -> None:
         summed_curves(model, d1, d2, d3, w.twist, w.twist_d)
         move(w.twist, w.M)
         return
-    u = displacement(model, d1, d2, d3, w.u_d)
+    displaced(model, displacement(model, d1, d2, d3, w.u_d), w)
+
+
+@device
+def displaced(model: Array, u: Vector, w: Scratch) -> None:
+    """Write to w.M the motion of an anchored model that carries the incisal point by u, and its rotation vector."""
     w.twist[0], w.twist[1], w.twist[2] = spline(model, u, w.centres)
     _anchor(model, u, w)
 

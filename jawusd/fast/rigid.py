@@ -18,6 +18,8 @@ Vector = tuple[float, float, float]
 
 # inlined into the functions of `rows` and `searches`, which are the ones kept on disk
 device = numba.njit(nogil=True, error_model="numpy")
+# the same, with sums in whatever order is quickest
+summing = numba.njit(nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
 
 # Plain functions of other modules that compiled code calls. Inlined, or else the functions in an `Elementary` would
 # be addresses in the machine code, which then cannot be kept on disk.

@@ -2,29 +2,24 @@
 
 Everything here releases the GIL and keeps no state, so any number of threads may call it at once. The argument types
 are fixed (C-contiguous, writable float64 arrays): a call with others is a TypeError and never a second compilation.
-The compiled code is cached on disk by this file's date; after a change in another module of this package alone, the
-cache has to go (``rm -r jawusd/fast/__pycache__``).
+The compiled code is cached on disk, where that can be written, by this file's date; after a change in another module
+of this package alone, the cache has to go (``rm -r jawusd/fast/__pycache__``).
 """
 
 from __future__ import annotations
 
-from functools import partial
-
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.evaluator.batching import LARGEST
+from jawusd.fast.compiling import compiled
 from jawusd.fast.descent import Problem, descend_inside, edge_scratch, normal_scratch
 from jawusd.fast.hull import signed_distance, signed_distance_gradient
 from jawusd.fast.motion import logarithm, logarithm_derivative, pose, scratch
 from jawusd.fast.packing import ADJOINT
 from jawusd.fast.rigid import device
-from jawusd.fast.searches import NOT_FINITE, encode, encoding_scratch, finite, hull_scratch, judge, outside, rigid
+from jawusd.fast.searches import NOT_FINITE, encoding_scratch, hull_scratch, judge, outside
 from jawusd.geometry.arrays import Array
-
-# compiles for the given argument types and keeps the code on disk
-compiled = partial(numba.njit, nogil=True, cache=True, error_model="numpy")
 
 
 @device
@@ -114,34 +109,25 @@ def margin_gradients(bound: Array, d: Array, out: Array) -> None:
             out[row] = np.nan
 
 
-@compiled("void(f8[::1], f8[:,:,::1], f8[:,::1], f8[::1])")
-def encodings(model: Array, T: Array, d: Array, residual_mm: Array) -> None:
-    """Write the d (n, 3) [mm] nearest to poses T (n, 4, 4), and the residuals (n,) [mm]."""
-    e = encoding_scratch(model)
-    for row in range(len(T)):
-        d[row], residual_mm[row] = np.nan, np.nan
-        if finite(T[row]) and rigid(T[row]):
-            residual_mm[row] = encode(model, T[row], e)
-            d[row] = e.x
-
-
-@compiled("void(f8[::1], f8[::1], f8[:,:,::1], f8, f8, f8[:,::1], f8[::1], f8[::1], u1[::1])")
+@compiled("void(f8[::1], f8[::1], f8[:,:,::1], b1, f8, f8, f8[:,::1])")
 def judgements(
     model: Array,
     bound: Array,
     T: Array,
+    judging: bool,
     residual_limit_mm: float,
     margin_limit_mm: float,
-    d: Array,
-    residual_mm: Array,
-    margin_mm: Array,
-    reason: NDArray[np.uint8],
+    out: Array,
 ) -> None:
-    """Write d (n, 3), residuals and margins (n,) [mm] and reasons (n,) of poses T (n, 4, 4)."""
+    """Write d, residual, margin [mm] and reason (n, 6) of poses T (n, 4, 4); without `judging` see `searches.judge`.
+
+    Encoding and judging are one function, because it takes a tenth of the time all of this takes to compile.
+    """
     e, v = encoding_scratch(model), hull_scratch(bound)
     for row in range(len(T)):
-        why, residual, margin = judge(model, bound, T[row], residual_limit_mm, margin_limit_mm, e, v)
-        d[row], residual_mm[row], margin_mm[row], reason[row] = e.x, residual, margin, why
+        why, residual, margin = judge(model, bound, T[row], judging, residual_limit_mm, margin_limit_mm, e, v)
+        out[row, 0], out[row, 1], out[row, 2] = e.x[0], e.x[1], e.x[2]
+        out[row, 3], out[row, 4], out[row, 5] = residual, margin, why
 
 
 @compiled("void(f8[::1], f8[:,::1], f8, f8[::1], f8[::1], u1[::1])")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import sqrt
+from math import isnan, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +13,7 @@ from jawusd.evaluator.verdicts import RIGID_TOLERANCE, Reason
 from jawusd.fast.descent import DISPLACEMENT, PARAMETERS, Normal, Problem, descend, normal_scratch
 from jawusd.fast.forms import parameters_at
 from jawusd.fast.hull import signed_distance
-from jawusd.fast.motion import Scratch, motion, scratch
+from jawusd.fast.motion import Scratch, displaced, motion, scratch
 from jawusd.fast.packing import (
     ANCHORED_KIND,
     FROM_CLOSED,
@@ -66,11 +66,16 @@ def encode(model: Array, T: Array, e: Encoding) -> float:
     if model[KIND] == ANCHORED_KIND:
         # the nearest pose does not depend on the chart: searching over the displacement spares the gauge
         descend(model, Problem(DISPLACEMENT, vectors, e.target), e.x, e.w, e.n)
-        e.x[0], e.x[1], e.x[2] = parameters_at(model, (e.x[0], e.x[1], e.x[2]))
+        u = (e.x[0], e.x[1], e.x[2])
+        displaced(model, u, e.w)
+        e.x[0], e.x[1], e.x[2] = parameters_at(model, u)
+        if isnan(e.x[0]):
+            return np.nan
     else:
         _read_off(model, e.x)
         descend(model, Problem(PARAMETERS, vectors, e.target), e.x, e.w, e.n)
-    return _residual_mm(model, vectors, e)
+        motion(model, e.x[0], e.x[1], e.x[2], e.w)
+    return _residual_mm(vectors, e)
 
 
 @device
@@ -106,8 +111,8 @@ def _read_off(model: Array, x: Array) -> None:
 
 
 @device
-def _residual_mm(model: Array, vectors: Array, e: Encoding) -> float:
-    motion(model, e.x[0], e.x[1], e.x[2], e.w)
+def _residual_mm(vectors: Array, e: Encoding) -> float:
+    """Return the distance [mm] of the images under the motion in e.w to their targets."""
     total = 0.0
     for i in range(3):
         for j in range(4):
@@ -144,15 +149,27 @@ def rigid(T: Array) -> bool:
 
 @device
 def judge(
-    model: Array, bound: Array, T: Array, residual_limit: float, margin_limit: float, e: Encoding, v: Array
+    model: Array,
+    bound: Array,
+    T: Array,
+    judging: bool,
+    residual_limit: float,
+    margin_limit: float,
+    e: Encoding,
+    v: Array,
 ) -> tuple[int, float, float]:
-    """Return reason, residual and margin [mm] of a pose T (4, 4), its d in e.x: `evaluator.verdicts.judge`."""
+    """Return reason, residual and margin [mm] of a pose T (4, 4), its d in e.x: `evaluator.verdicts.judge`.
+
+    Without `judging` only d and the residual; the reason is 0 wherever there are any.
+    """
     e.x[:] = np.nan
     if not finite(T):
         return NOT_FINITE, np.nan, np.nan
     if not rigid(T):
         return _NOT_RIGID, np.nan, np.nan
     residual = encode(model, T, e)
+    if not judging:
+        return 0, residual, np.nan
     out, _, _ = signed_distance(bound, e.x[0], e.x[1], e.x[2], v)
     reason = 0 if residual <= residual_limit else _OFF_MODEL
     return reason | outside(-out, margin_limit), residual, -out

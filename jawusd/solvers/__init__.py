@@ -9,5 +9,6 @@ except ModuleNotFoundError as error:
 
 from jawusd.solvers.face_model import jaw_pose_from_axis_angle
 from jawusd.solvers.layer import JawLayer
+from jawusd.solvers.temporal import TemporalPrior
 
-__all__ = ["JawLayer", "jaw_pose_from_axis_angle"]
+__all__ = ["JawLayer", "TemporalPrior", "jaw_pose_from_axis_angle"]
