@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jawusd.errors import EvaluatorError
+from jawusd.evaluator.contact import contact_arrays
 from jawusd.evaluator.schema import ANCHORED, KINDS, arrays_of
 from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import rigidity_defect
@@ -127,6 +128,7 @@ def checked_arrays(arrays: Mapping[str, ArrayLike], kind: str) -> dict[str, Arra
     checked = {name: _checked(name, arrays, spec.shape, lengths) for name, spec in arrays_of(kind).items()}
     _check_values(checked)
     _check_sections(checked)
+    checked |= contact_arrays(arrays)
     if kind == ANCHORED and lengths["weights"] != lengths["centres"] + 3:
         raise EvaluatorError(
             f'"spline_weights" has {lengths["weights"]} rows for {lengths["centres"]} centres; '

@@ -9,9 +9,11 @@ from typing import Literal, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jawusd.errors import EvaluatorError
 from jawusd.evaluator.authoring import RigAuthoring
 from jawusd.evaluator.batching import CHUNK_ROWS, as_floats, as_points, as_rows, in_chunks, pairs_in_chunks, rows_of
 from jawusd.evaluator.bounds import SliceHull
+from jawusd.evaluator.contact import AUTHORED_MM, Clearance, ContactField
 from jawusd.evaluator.distances import carried, handle_vectors, point_velocities
 from jawusd.evaluator.encoding import Encoder, Encoding, whitening_of
 from jawusd.evaluator.frames import RigFrames
@@ -42,6 +44,7 @@ class JawRig(RigAuthoring):
         model: The function from d to motions.
         bound: The slice bound.
         polygons: The paper's bound.
+        contact: The clearance of the teeth over d; None if the scans do not show it.
         limits: Thresholds of `validate`, for measured poses, stored in the rig.
         kernels: What computes rows.
     """
@@ -67,6 +70,7 @@ class JawRig(RigAuthoring):
         self.model = FORMS[self.kind](self.arrays)
         self.bound = SliceHull.from_arrays(self.arrays)
         self.polygons = PolygonBound.from_arrays(self.arrays)
+        self.contact = ContactField.from_arrays(self.arrays)
         self.limits = Limits(float(self.arrays["residual_limit_mm"]), self.tolerance_mm)
         self._frames = RigFrames(self.T_anatomical_skull, self.T_rest, self.model.single.anchor)
         parts = RigParts(self.model, self.bound, self._frames, self.landmarks)
@@ -203,6 +207,28 @@ class JawRig(RigAuthoring):
         rows, batch = rows_of(d, (3,), "d")
         return self.kernels.margin_gradients(rows).reshape(*batch, 3)
 
+    def clearance(self, d: ArrayLike) -> Clearance:
+        """Return how far the teeth are from running deeper into each other than in the scans' closed bite.
+
+        Args:
+            d: Jaw parameters [mm], shape (..., 3).
+
+        Returns:
+            The clearance [mm], shape (...), and its derivative by d [mm/mm], shape (..., 3). 0 is the closed bite; it
+            ends at some 1.5 mm, and at the nearest sampled parameters far outside the bound.
+
+        Raises:
+            EvaluatorError: The rig has no clearances, see `JawRig.contact`.
+        """
+        if self.contact is None:
+            raise EvaluatorError(
+                "this rig does not know how the teeth meet.",
+                hint="Fit or bake it with scans of both rows of teeth in occlusion.",
+            )
+        rows, batch = rows_of(d, (3,), "d")
+        value, gradient = pairs_in_chunks(self.contact.clearance, rows)
+        return Clearance(value.reshape(batch), gradient.reshape(*batch, 3))
+
     def project(self, d: ArrayLike) -> Array:
         """Return the nearest valid jaw parameters: d itself inside the bound, else the nearest point with margin >= 0.
 
@@ -249,6 +275,8 @@ class JawRig(RigAuthoring):
         verdicts = self.kernels.judge_poses(rows, limits)
         if bound != "slices":
             verdicts = verdicts.with_margin(self.margin(verdicts.d, bound=bound), limits)
+        if self.contact is not None:
+            verdicts = verdicts.with_collisions(self.contact.collides(verdicts.d, self.contact.limit_mm))
         return self._with_speed(verdicts, rows, batch, times_s, limits)
 
     def validate_parameters(
@@ -272,6 +300,8 @@ class JawRig(RigAuthoring):
         verdicts = self.kernels.judge_parameters(rows, limits)
         if bound != "slices":
             verdicts = verdicts.with_margin(self.margin(verdicts.d, bound=bound), limits)
+        if self.contact is not None:
+            verdicts = verdicts.with_collisions(self.contact.collides(verdicts.d, -AUTHORED_MM))
         poses = rows if speed_limit_mm_s is None else self.kernels.poses(rows)
         return self._with_speed(verdicts, poses, batch, times_s, limits)
 

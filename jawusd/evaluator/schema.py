@@ -72,6 +72,18 @@ ARRAYS: dict[str, ArraySpec] = {
 }
 
 
+#: Arrays of rigs whose scans show how the teeth meet: all of them or none; see `jawusd.evaluator.contact`.
+CONTACT_ARRAYS: dict[str, ArraySpec] = {
+    "contact_first_mm": ArraySpec("jaw:contact:first", (3,)),
+    "contact_step_mm": ArraySpec("jaw:contact:step", (3,)),
+    "contact_shape": ArraySpec("jaw:contact:shape", (3,), integer=True),
+    "contact_values": ArraySpec("jaw:contact:clearances", ("clearances",), integer=True),
+    "contact_closed_mm": ArraySpec("jaw:contact:closed"),
+    "contact_error_mm": ArraySpec("jaw:contact:error"),
+    "contact_limit_mm": ArraySpec("jaw:contact:limit"),
+}
+
+
 def arrays_of(kind: str) -> dict[str, ArraySpec]:
     """Return the arrays that a rig of a model kind has, by name."""
     return {name: spec for name, spec in ARRAYS.items() if spec.kind in (None, kind)}

@@ -27,6 +27,7 @@ class Reason(IntFlag):
     OFF_MODEL = 4
     OUTSIDE_BOUNDS = 8
     TOO_FAST = 16
+    TEETH_COLLIDE = 32
 
     def __str__(self) -> str:
         return self.name or "VALID"
@@ -43,6 +44,7 @@ _WORDS = {
     Reason.OFF_MODEL: "off the model",
     Reason.OUTSIDE_BOUNDS: OUTSIDE,
     Reason.TOO_FAST: "too fast",
+    Reason.TEETH_COLLIDE: "teeth collide",
 }
 
 
@@ -75,6 +77,11 @@ class Verdicts(NamedTuple):
         reason = self.reason & ~np.uint8(Reason.OUTSIDE_BOUNDS.value)
         reason[self.measured() & _outside(margin_mm, limits)] |= Reason.OUTSIDE_BOUNDS.value
         return self._replace(valid=reason == 0, reason=reason, margin_mm=margin_mm)
+
+    def with_collisions(self, collide: Mask) -> Verdicts:
+        """Return the verdicts with the poses marked in ``collide`` (n,) refused."""
+        reason = self.reason | np.where(collide, Reason.TEETH_COLLIDE.value, 0).astype(np.uint8)
+        return self._replace(valid=reason == 0, reason=reason)
 
     def finished(self, batch: tuple[int, ...], fast: Mask | None = None) -> Verdicts:
         """Return the verdicts in a batch shape, with the frames marked in ``fast`` (of that shape) too fast."""

@@ -12,6 +12,7 @@ from jawusd.formats.capture import Capture
 from jawusd.formats.model import JawModel
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import LANDMARKS
+from jawusd.pipeline.contact import with_contact
 from jawusd.pipeline.prepare import BONES, Subject, load_cameras, registered_subject, tracked_cameras
 from jawusd.pipeline.state import Progress, no_progress
 
@@ -59,6 +60,8 @@ def bake_subject(
     subject = registered_subject(subject, model.meta)
     # Bones come from segmented scans with all their faults; teeth scans stay as they are, vertex for vertex.
     meshes = {key: manifold(mesh) if key in BONES else mesh for key, mesh in subject.meshes.items()}
+    if "contact" not in model.meta:  # fitted without the scans
+        model = with_contact(model, subject, progress)
     moving = len(model.frames) > 0
     progress("bake", 0, 1)
     files = bake_rig(

@@ -27,6 +27,7 @@ from jawusd.formats.poses import read_poses
 from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.geometry import make_transform, matrix_from_wxyz, rigidity_defect, se3_inverse
 from jawusd.geometry.arrays import Array
+from jawusd.pipeline.contact import ContactSummary, contact_words, with_contact
 from jawusd.pipeline.prepare import Subject, registered_subject
 from jawusd.pipeline.state import Progress, no_progress
 
@@ -70,6 +71,7 @@ class FitSummary(TypedDict, total=False):
     ranges_mm: dict[str, tuple[float, float]]
     warnings: list[dict[str, str]]
     inferred: list[str]
+    contact: ContactSummary
     trimmed_frames: list[int]
 
 
@@ -105,7 +107,7 @@ def fit_subject(
         model.meta["fps"] = subject.fps
     if registration is not None:
         model.meta["registration"] = registration
-    return model
+    return with_contact(model, subject, progress)
 
 
 def fit_summary(model: JawModel) -> FitSummary:
@@ -121,6 +123,8 @@ def fit_lines(summary: FitSummary) -> list[str]:
         for place, figures in places.items():
             values = "".join(f"{figures[key]:8.3f}" for key in ("mean", "median", "p95", "max"))
             lines.append(f"  {table:<8} {place:<28}{values}")
+    if contact := summary.get("contact"):
+        lines.append(f"  teeth: {contact_words(contact)}")
     if frames := summary.get("trimmed_frames"):
         lines.append(f"  frames left out as outliers: {', '.join(map(str, frames))}")
     return lines + [f"  warning: {warning['message']}" for warning in summary.get("warnings", [])]

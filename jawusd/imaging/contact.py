@@ -1,0 +1,138 @@
+"""How the teeth of a person meet: both scans as solids, and the clearance of every pose of a jaw model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+
+from jawusd.evaluator import JawRig
+from jawusd.evaluator.contact import AUTHORED_MM, UNIT_MM, ContactField
+from jawusd.formats.mesh import BASE, Mesh
+from jawusd.geometry.arrays import Array
+from jawusd.geometry.se3 import se3_inverse, transform_points
+from jawusd.imaging.collision import FARTHEST_MM, Pair, Solid, solid
+
+_CROWN_MM = 14.0  # from the tips of the teeth to where gums begin, at most
+_LEAST_WOUND = 0.6  # share of lines that enter a scan where they first meet it; 0.93 and more for scans wound alike
+_WIDEST_GAP_MM = 1.0
+_DEEPEST_MM = 2.5
+_COARSEST_MM = 1.5
+
+_STEP_MM = 0.4
+_BEYOND_MM = 1.0  # outside the bound, still sampled
+_FREE_MM = 0.8  # teeth so far apart at all valid parameters of an opening end the field
+_MOST_OPENING_MM = 16.0
+_ERROR_SAMPLES = 3000
+_NEAR_MM = 0.5  # errors count where the clearance is less
+_CAPTURED_QUANTILE = 0.01
+_LARGEST_LIMIT_MM = 1.0
+
+
+class NoContact(Exception):
+    """The scans do not show how the teeth meet; the message says why."""
+
+
+@dataclass(frozen=True, eq=False)
+class Teeth:
+    """Both rows of teeth in the anatomical frame, the lower ones in the closed bite.
+
+    Attributes:
+        pair: Both as solids.
+        closed_mm: How deep they run into each other in the closed bite; negative if they leave a gap.
+        T_anatomical_skull: Skull to anatomical coordinates, shape (4, 4).
+        T_rest: T_skull_mandible of the closed bite, shape (4, 4).
+    """
+
+    pair: Pair
+    closed_mm: float
+    T_anatomical_skull: Array
+    T_rest: Array
+
+    def clearances(self, T_skull_mandible: Array) -> Array:
+        """Return the clearance [mm], shape (n,), of poses (n, 4, 4): closed bite's depth less theirs."""
+        A = self.T_anatomical_skull
+        return self.closed_mm - self.pair.depth(A @ T_skull_mandible @ se3_inverse(A @ self.T_rest))
+
+
+def find_teeth(upper: Mesh, lower: Mesh, T_anatomical_skull: Array, T_rest: Array) -> Teeth:
+    """Return both rows of teeth as solids.
+
+    Args:
+        upper: Upper scan, skull frame [mm].
+        lower: Lower scan, mandible frame [mm].
+
+    Raises:
+        NoContact: A scan is too coarse or wound at random, or there is no closed bite.
+    """
+    placed = (("upper", upper, T_anatomical_skull, 1.0), ("lower", lower, T_anatomical_skull @ T_rest, -1.0))
+    solids = [_solid(name, mesh, T, up) for name, mesh, T, up in placed]
+    pair = Pair(*solids)
+    closed = float(pair.depth(np.eye(4)[None])[0])
+    if closed < -_WIDEST_GAP_MM:
+        raise NoContact(f"the closed bite leaves more than {_WIDEST_GAP_MM:g} mm between the rows of teeth")
+    if closed > _DEEPEST_MM:
+        raise NoContact(
+            f"in the closed bite the teeth run {closed:.1f} mm into each other (at most {_DEEPEST_MM:g} mm is allowed)"
+        )
+    return Teeth(pair, closed, T_anatomical_skull, T_rest)
+
+
+def _solid(name: str, mesh: Mesh, T: Array, up: float) -> Solid:
+    faces = mesh.faces if mesh.labels is None else mesh.faces[(mesh.labels[mesh.faces] != BASE).all(axis=1)]
+    corners = transform_points(T, mesh.vertices)[faces]
+    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+    if not len(corners) or np.median(edges) > _COARSEST_MM:
+        raise NoContact(f"the {name} scan is coarse: edges of {np.median(edges) if len(edges) else 0:.1f} mm")
+    found = solid(corners, up, _CROWN_MM)
+    if found.entering < 0.5:  # wound the other way round
+        found = solid(np.ascontiguousarray(corners[:, ::-1]), up, _CROWN_MM)
+    if found.entering < _LEAST_WOUND:
+        raise NoContact(f"the triangles of the {name} scan are not wound alike")
+    return found
+
+
+def sample_field(teeth: Teeth, rig: JawRig) -> ContactField:
+    """Sample the clearance of a rig's poses over its bound."""
+    box = _box(teeth, rig)
+    axes = [low + _STEP_MM * np.arange(int(np.ceil((high - low) / _STEP_MM)) + 1) for low, high in box]
+    d = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    wanted = rig.margin(d) > -(_BEYOND_MM + _STEP_MM)
+    values = np.zeros(d.shape[:3])
+    values[wanted] = teeth.clearances(rig.pose(d[wanted]))
+    nearest = distance_transform_edt(~wanted, return_distances=False, return_indices=True)
+    values = np.round(values[tuple(nearest)] / UNIT_MM) * UNIT_MM
+    field = ContactField(box[:, 0], np.full(3, _STEP_MM), values, teeth.closed_mm, 0.0, -AUTHORED_MM)
+    captured = rig.captured_d
+    least = float(np.quantile(field.clearance(captured).clearance_mm, _CAPTURED_QUANTILE)) if len(captured) else 0.0
+    limit = -float(np.clip(-least, AUTHORED_MM, _LARGEST_LIMIT_MM))
+    return ContactField(box[:, 0], field.step_mm, values, teeth.closed_mm, _error(teeth, rig, field), limit)
+
+
+def _box(teeth: Teeth, rig: JawRig) -> Array:
+    """Return the parameters (3, 2) [mm] that the field spans: those near the bound at which teeth are close."""
+    wide = rig.d_range + np.array([-_BEYOND_MM, _BEYOND_MM])
+    wide[0, 1] = min(wide[0, 1], _MOST_OPENING_MM)
+    axes = [np.linspace(low, high, n) for (low, high), n in zip(wide, (33, 9, 7))]
+    d = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    clearances = np.full(d.shape[:3], np.inf)
+    valid = rig.margin(d) > -_BEYOND_MM
+    clearances[valid] = teeth.clearances(rig.pose(d[valid])) - teeth.closed_mm
+    close = np.flatnonzero((clearances < _FREE_MM).any(axis=(1, 2)))
+    top = axes[0][min(close.max(initial=0) + 1, len(axes[0]) - 1)]
+    wide[0, 1] = max(top, wide[0, 0] + 2 * _STEP_MM)
+    return wide
+
+
+def _error(teeth: Teeth, rig: JawRig, field: ContactField) -> float:
+    """Return the largest error [mm] of the field at random valid parameters where the teeth are close."""
+    rng = np.random.default_rng(0)
+    low = field.first_mm
+    d = rng.uniform(low, low + field.step_mm * (np.array(field.values.shape) - 1), (_ERROR_SAMPLES, 3))
+    d = d[rig.margin(d) >= 0]
+    read = field.clearance(d).clearance_mm
+    d, read = d[read < _NEAR_MM], read[read < _NEAR_MM]
+    if not len(d):
+        return 0.0
+    return float(np.abs(np.minimum(teeth.clearances(rig.pose(d)), FARTHEST_MM) - read).max())

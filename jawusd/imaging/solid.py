@@ -1,0 +1,241 @@
+"""Signed distances to what a scan encloses, on a grid: negative inside the crowns, also of scans that are open above.
+
+The inside of a scan is found along vertical lines that come from the other jaw: a line is inside wherever it has
+entered more surfaces than it has left (the winding number of closed surfaces; Jacobson et al. 2013, ACM TOG 32:33, on
+why counts and not parity stand overlapping parts). It needs no closed surface, only one whose triangles are wound
+alike. Faces that lie inside other parts, as where neighbouring teeth overlap, are no surface and left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+
+from jawusd.geometry.arrays import Array, Mask
+
+_BUCKET_MM = 1.0
+_BAND_CELLS = 3.0  # cells around each triangle whose distance to it is computed, the others' follow from these
+_OFF_FACE_MM = 0.01  # how far before a face its outside is looked at
+_JITTER_MM = np.array([1.23e-4, 0.0, 2.71e-4])  # lines through vertices and edges of round coordinates are ambiguous
+_MOST_CROSSINGS = 256
+
+
+@dataclass(frozen=True, eq=False)
+class DistanceGrid:
+    """Hold signed distances on a grid.
+
+    Attributes:
+        origin: of the first value [mm], shape (3,).
+        step_mm: between values, along every axis.
+        values: signed distances [mm], negative inside, shape (nx, ny, nz), float32.
+    """
+
+    origin: Array
+    step_mm: float
+    values: NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class _Columns:
+    """The triangles over every square of the (x, z) plane: numbers of those over square i are list[start[i]:end[i]]."""
+
+    low: Array
+    shape: tuple[int, int]
+    start: NDArray[np.int64]
+    faces: NDArray[np.int64]
+
+
+def outer_faces(corners: Array, up: float) -> tuple[Mask, float]:
+    """Tell which faces bound a solid that is open to one side, and how well they are wound.
+
+    Args:
+        corners: of the triangles [mm], shape (F, 3, 3), y vertical.
+        up: 1.0 if the solid is entered upwards (upper teeth), -1.0 if downwards (lower teeth).
+
+    Returns:
+        Outer faces, shape (F,); and the share of vertical lines that enter the solid where they first meet it: 1 for
+        triangles that are counter-clockwise seen from outside, 0 for the opposite.
+    """
+    flipped = _upwards(corners, up)
+    columns = _columns_of(flipped)
+    normals = np.cross(flipped[:, 1] - flipped[:, 0], flipped[:, 2] - flipped[:, 0])
+    length = np.linalg.norm(normals, axis=1)
+    before = flipped.mean(axis=1) + _OFF_FACE_MM * normals / np.maximum(length, 1e-12)[:, None]
+    count, first = _crossings(before + _JITTER_MM, flipped, columns.low, columns.shape, columns.start, columns.faces)
+    met = first[first != 0]
+    entering = float((met > 0).mean()) if len(met) else 0.0
+    return (count <= 0) & (length > 0), entering
+
+
+def distance_grid(corners: Array, outer: Mask, box: Array, step_mm: float, up: float) -> DistanceGrid:
+    """Sample the signed distance to a solid.
+
+    Args:
+        corners: of all triangles [mm], shape (F, 3, 3), y vertical, counter-clockwise seen from outside.
+        outer: those that bound the solid, see `outer_faces`, shape (F,).
+        box: what the grid spans, rows low and high [mm], shape (2, 3).
+        step_mm: between values.
+        up: see `outer_faces`.
+    """
+    shape = tuple(int(n) for n in np.ceil((box[1] - box[0]) / step_mm) + 1)
+    kept = np.ascontiguousarray(corners[outer])
+    nearest = _nearest_faces(kept, box[0], step_mm, shape, _BAND_CELLS)
+    where = distance_transform_edt(nearest < 0, return_distances=False, return_indices=True)
+    values = _distances(kept, nearest[tuple(where)], box[0], step_mm)
+    flipped = _upwards(corners, up)
+    columns = _columns_of(flipped)
+    _set_signs(values, flipped, box[0], step_mm, up, columns.low, columns.shape, columns.start, columns.faces)
+    return DistanceGrid(np.array(box[0]), step_mm, values)
+
+
+def _upwards(corners: Array, up: float) -> Array:
+    """Return triangles with the open side up, wound as they were."""
+    if up > 0:
+        return np.ascontiguousarray(corners)
+    return np.ascontiguousarray((corners * [1.0, -1.0, 1.0])[:, ::-1])
+
+
+def _columns_of(corners: Array) -> _Columns:
+    low, high = corners.min(axis=1)[:, [0, 2]], corners.max(axis=1)[:, [0, 2]]
+    origin = low.min(axis=0) - 1e-6
+    first, last = (np.floor((ends - origin) / _BUCKET_MM).astype(np.int64) for ends in (low, high))
+    shape = last.max(axis=0) + 1
+    count = np.prod(last - first + 1, axis=1)
+    face = np.repeat(np.arange(len(corners)), count)
+    within = np.arange(len(face)) - np.repeat(np.cumsum(count) - count, count)
+    width = (last - first + 1)[face, 1]
+    square = (first[face, 0] + within // width) * shape[1] + first[face, 1] + within % width
+    order = np.argsort(square, kind="stable")
+    start = np.searchsorted(square[order], np.arange(shape[0] * shape[1] + 1))
+    return _Columns(origin, (int(shape[0]), int(shape[1])), start, face[order])
+
+
+@numba.njit(nogil=True, cache=True)
+def _crossing(corners: Array, f: int, x: float, z: float) -> tuple[int, float]:
+    """Return how a vertical line meets a triangle, 1 entering, -1 leaving, 0 not at all; and the height."""
+    ax, ay, az = corners[f, 0, 0] - x, corners[f, 0, 1], corners[f, 0, 2] - z
+    bx, by, bz = corners[f, 1, 0] - x, corners[f, 1, 1], corners[f, 1, 2] - z
+    cx, cy, cz = corners[f, 2, 0] - x, corners[f, 2, 1], corners[f, 2, 2] - z
+    u, v, w = bx * cz - cx * bz, cx * az - ax * cz, ax * bz - bx * az
+    area = u + v + w  # y of the normal is minus this
+    if not ((u >= 0 and v >= 0 and w >= 0) or (u <= 0 and v <= 0 and w <= 0)) or area == 0:
+        return 0, 0.0
+    return (1 if area > 0 else -1), (u * ay + v * by + w * cy) / area
+
+
+@numba.njit(nogil=True, cache=True)
+def _crossings(points, corners, low, shape, start, faces):  # type: ignore[no-untyped-def]  # compiled
+    """Return the winding count below each point, and the kind of the lowest crossing below it."""
+    count = np.zeros(len(points), np.int64)
+    first = np.zeros(len(points), np.int64)
+    for p in range(len(points)):
+        i = int(np.floor((points[p, 0] - low[0]) / _BUCKET_MM))
+        k = int(np.floor((points[p, 2] - low[1]) / _BUCKET_MM))
+        if i < 0 or k < 0 or i >= shape[0] or k >= shape[1]:
+            continue
+        lowest = np.inf
+        square = i * shape[1] + k
+        for j in range(start[square], start[square + 1]):
+            kind, height = _crossing(corners, faces[j], points[p, 0], points[p, 2])
+            if kind != 0 and height < points[p, 1]:
+                count[p] += kind
+                if height < lowest:
+                    lowest = height
+                    first[p] = kind
+    return count, first
+
+
+@numba.njit(nogil=True, cache=True)
+def _set_signs(values, corners, origin, step, up, low, shape, start, faces):  # type: ignore[no-untyped-def]
+    heights, kinds = np.empty(_MOST_CROSSINGS), np.empty(_MOST_CROSSINGS, np.int64)
+    nx, ny, nz = values.shape
+    for i in range(nx):
+        x = origin[0] + i * step + 1.23e-4
+        for k in range(nz):
+            z = origin[2] + k * step + 2.71e-4
+            a, b = int(np.floor((x - low[0]) / _BUCKET_MM)), int(np.floor((z - low[1]) / _BUCKET_MM))
+            if a < 0 or b < 0 or a >= shape[0] or b >= shape[1]:
+                continue
+            found, square = 0, a * shape[1] + b
+            for j in range(start[square], start[square + 1]):
+                kind, height = _crossing(corners, faces[j], x, z)
+                if kind != 0 and found < _MOST_CROSSINGS:
+                    heights[found], kinds[found] = height, kind
+                    found += 1
+            for y in range(ny):
+                at = up * (origin[1] + y * step)
+                count = 0
+                for j in range(found):
+                    if heights[j] < at:
+                        count += kinds[j]
+                if count > 0:
+                    values[i, y, k] = -values[i, y, k]
+
+
+@numba.njit(nogil=True, cache=True)
+def _squared_distance(corners: Array, f: int, x: float, y: float, z: float) -> float:
+    """Return the squared distance of a point to a triangle (Ericson 2005, Real-time collision detection, 5.1.5)."""
+    ax, ay, az = corners[f, 0, 0], corners[f, 0, 1], corners[f, 0, 2]
+    ux, uy, uz = corners[f, 1, 0] - ax, corners[f, 1, 1] - ay, corners[f, 1, 2] - az
+    vx, vy, vz = corners[f, 2, 0] - ax, corners[f, 2, 1] - ay, corners[f, 2, 2] - az
+    px, py, pz = x - ax, y - ay, z - az
+    uu, uv, vv = ux * ux + uy * uy + uz * uz, ux * vx + uy * vy + uz * vz, vx * vx + vy * vy + vz * vz
+    pu, pv = px * ux + py * uy + pz * uz, px * vx + py * vy + pz * vz
+    area = uu * vv - uv * uv
+    s, t = pu * vv - pv * uv, pv * uu - pu * uv
+    if area > 0 and s >= 0 and t >= 0 and s + t <= area:
+        s, t = s / area, t / area
+        return (px - s * ux - t * vx) ** 2 + (py - s * uy - t * vy) ** 2 + (pz - s * uz - t * vz) ** 2
+    best = np.inf
+    for edge in range(3):  # the nearest point lies on an edge
+        if edge == 0:
+            s, t = min(max(pu / uu, 0.0), 1.0), 0.0
+        elif edge == 1:
+            s, t = 0.0, min(max(pv / vv, 0.0), 1.0)
+        else:
+            along = (pv - pu + uu - uv) / max(uu - 2 * uv + vv, 1e-300)
+            t = min(max(along, 0.0), 1.0)
+            s = 1.0 - t
+        best = min(best, (px - s * ux - t * vx) ** 2 + (py - s * uy - t * vy) ** 2 + (pz - s * uz - t * vz) ** 2)
+    return best
+
+
+@numba.njit(nogil=True, cache=True)
+def _nearest_faces(corners, origin, step, shape, band):  # type: ignore[no-untyped-def]
+    """Return the number of the nearest triangle at the values near triangles, shape (nx, ny, nz); -1 elsewhere."""
+    nearest = np.full(shape, -1, np.int32)
+    # beyond the band, a triangle whose box reaches a value is not always the nearest one
+    best = np.full(shape, np.float32((band * step) ** 2), np.float32)
+    for f in range(len(corners)):
+        low, high = np.empty(3, np.int64), np.empty(3, np.int64)
+        for c in range(3):
+            a, b = corners[f, :, c].min(), corners[f, :, c].max()
+            low[c] = max(0, int(np.ceil((a - origin[c]) / step - band)))
+            high[c] = min(shape[c] - 1, int(np.floor((b - origin[c]) / step + band)))
+        for i in range(low[0], high[0] + 1):
+            for j in range(low[1], high[1] + 1):
+                for k in range(low[2], high[2] + 1):
+                    found = _squared_distance(
+                        corners, f, origin[0] + i * step, origin[1] + j * step, origin[2] + k * step
+                    )
+                    if found < best[i, j, k]:
+                        best[i, j, k], nearest[i, j, k] = found, f
+    return nearest
+
+
+@numba.njit(nogil=True, cache=True)
+def _distances(corners, nearest, origin, step):  # type: ignore[no-untyped-def]
+    values = np.empty(nearest.shape, np.float32)
+    nx, ny, nz = nearest.shape
+    for i in range(nx):
+        for j in range(ny):
+            for k in range(nz):
+                squared = _squared_distance(
+                    corners, nearest[i, j, k], origin[0] + i * step, origin[1] + j * step, origin[2] + k * step
+                )
+                values[i, j, k] = np.sqrt(squared)
+    return values

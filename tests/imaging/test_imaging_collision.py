@@ -1,0 +1,72 @@
+"""Signed distances and depths of shapes that have them in closed form."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from jawusd.imaging.collision import FARTHEST_MM, Pair, solid
+from jawusd.imaging.solid import outer_faces
+
+RADIUS = 6.0
+
+
+def ball(centre=(0.0, 0.0, 0.0), radius=RADIUS):
+    mesh = trimesh.creation.icosphere(4, radius)
+    return np.asarray(mesh.triangles) + centre
+
+
+def shifted(shift):
+    T = np.eye(4)
+    T[:3, 3] = shift
+    return T
+
+
+def test_depth_of_two_balls_is_their_overlap():
+    # the deepest point of a ball of the same size inside another is as deep as both overlap
+    pair = Pair(solid(ball(), 1.0, 20.0), solid(ball(), -1.0, 20.0))
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(60, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    apart = rng.uniform(2 * RADIUS - 3.0, 2 * RADIUS + 1.0, 60)
+    depth = pair.depth(np.array([shifted(a * n) for a, n in zip(apart, directions)]))
+    np.testing.assert_allclose(depth, 2 * RADIUS - apart, atol=0.06)
+
+
+def test_surfaces_far_apart_are_as_far_as_can_be_told():
+    pair = Pair(solid(ball(), 1.0, 20.0), solid(ball(), -1.0, 20.0))
+    assert pair.depth(shifted([0.0, -40.0, 0.0])[None]) == -FARTHEST_MM
+
+
+def test_a_scan_open_above_has_an_inside():
+    corners = ball()
+    cap = corners[corners[:, :, 1].max(axis=1) < 3.0]  # the upper part is missing, as behind the gum of a scan
+    found = solid(cap, 1.0, 20.0)
+    assert found.entering > 0.9
+    grid = found.grid
+    points = grid.origin + grid.step_mm * np.stack(np.indices(grid.values.shape), axis=-1)
+    exact = np.linalg.norm(points, axis=-1) - RADIUS
+    low = (points[..., 1] < 0.0) & (np.abs(exact) < 2.5)
+    np.testing.assert_allclose(grid.values[low], exact[low], atol=0.03)
+
+
+def test_faces_inside_other_parts_are_no_surface():
+    corners = np.concatenate([ball(), ball((5.0, 0.0, 0.0))])
+    outer, entering = outer_faces(corners, 1.0)
+    middle = corners.mean(axis=1)
+    inside = np.minimum(np.linalg.norm(middle, axis=1), np.linalg.norm(middle - [5.0, 0.0, 0.0], axis=1)) < RADIUS - 0.1
+    assert entering > 0.9
+    assert outer[~inside].mean() > 0.99
+    assert not outer[inside].any()
+
+
+def test_triangles_wound_the_other_way_are_told():
+    assert outer_faces(ball()[:, ::-1], 1.0)[1] < 0.1
+    assert outer_faces(ball()[:, ::-1], -1.0)[1] < 0.1
+
+
+@pytest.mark.parametrize("up", [1.0, -1.0])
+def test_depth_grows_with_height_on_either_side(up):
+    pair = Pair(solid(ball(), up, 20.0), solid(ball(), -up, 20.0))
+    heights = np.linspace(10.0, 13.0, 7)
+    depth = pair.depth(np.array([shifted([0.0, -up * h, 0.0]) for h in heights]))
+    np.testing.assert_allclose(depth, 12.0 - heights, atol=0.05)
