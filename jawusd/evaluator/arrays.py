@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jawusd.errors import EvaluatorError
-from jawusd.evaluator.contact import contact_arrays
-from jawusd.evaluator.schema import ANCHORED, KINDS, arrays_of
+from jawusd.evaluator.contact import check_contact
+from jawusd.evaluator.schema import ANCHORED, KINDS, OPTIONAL, arrays_of
 from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import rigidity_defect
 
@@ -18,7 +18,7 @@ _RIGID_TOLERANCE = 1e-6
 
 _POSITIVE = ("slice_softness_mm", "path_scale_mm", "glide_softness_mm", "glide_fade_mm", "spline_scales")
 _LARGEST = 1e9  # [mm, rad]: far beyond any jaw, and squares and their sums still fit
-_RISING = ("slice_d1", "path_limits", "curve1_knots", "curve2_knots", "curve3_knots")
+_RISING = ("slice_d1", "path_limits", "glide_d2", "glide_d3", "curve1_knots", "curve2_knots", "curve3_knots")
 
 
 class RigArrays:
@@ -126,9 +126,13 @@ def checked_arrays(arrays: Mapping[str, ArrayLike], kind: str) -> dict[str, Arra
         raise EvaluatorError(f'the model is of kind "{kind}"; this jawusd knows {", ".join(KINDS)}.')
     lengths: dict[str, int] = {}
     checked = {name: _checked(name, arrays, spec.shape, lengths) for name, spec in arrays_of(kind).items()}
+    for first, group in OPTIONAL.items():
+        if first in arrays and all(spec.kind in (None, kind) for spec in group.values()):
+            checked |= {name: _checked(name, arrays, spec.shape, lengths) for name, spec in group.items()}
     _check_values(checked)
     _check_sections(checked)
-    checked |= contact_arrays(arrays)
+    if "contact_values" in checked:
+        check_contact(checked)
     if kind == ANCHORED and lengths["weights"] != lengths["centres"] + 3:
         raise EvaluatorError(
             f'"spline_weights" has {lengths["weights"]} rows for {lengths["centres"]} centres; '

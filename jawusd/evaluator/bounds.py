@@ -16,8 +16,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from jawusd.evaluator.curve_formula import catmull_rom
 from jawusd.evaluator.curves import HermiteCurve
-from jawusd.evaluator.formula import catmull_rom
 from jawusd.geometry.arrays import Array
 
 _NEWTON_ITERATIONS = 60

@@ -12,18 +12,14 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from jawusd.errors import EvaluatorError
-from jawusd.evaluator.schema import CONTACT_ARRAYS
 from jawusd.geometry.arrays import Array, Mask
 
 #: Values are stored as whole numbers of this length [mm].
 UNIT_MM = 0.01
 #: How much deeper than in the closed bite teeth may run in a pose that is authored [mm].
 AUTHORED_MM = 0.15
-
-_MOST_VALUES = 4_000_000
 
 
 class Clearance(NamedTuple):
@@ -77,7 +73,7 @@ class ContactField:
             "contact_first_mm": self.first_mm,
             "contact_step_mm": self.step_mm,
             "contact_shape": np.array(self.values.shape, dtype=np.float64),
-            "contact_values": np.round(self.values.ravel() / UNIT_MM),
+            "contact_values": np.round(self.values.ravel() / UNIT_MM) + 0.0,  # no -0: whole numbers have none
             "contact_closed_mm": np.array(self.closed_mm),
             "contact_error_mm": np.array(self.error_mm),
             "contact_limit_mm": np.array(self.limit_mm),
@@ -119,35 +115,18 @@ class ContactField:
 _CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-def contact_arrays(arrays: Mapping[str, ArrayLike]) -> dict[str, Array]:
-    """Return read-only float64 arrays of the clearance of a rig, none if it has none.
+def check_contact(arrays: Mapping[str, Array]) -> None:
+    """Check the clearances among the named arrays of a rig.
 
     Raises:
-        EvaluatorError: Some are missing, of a wrong shape, not finite or out of range.
+        EvaluatorError: Values out of range, or of numbers that do not match.
     """
-    if "contact_values" not in arrays:
-        return {}
-    checked = {}
-    for name, spec in CONTACT_ARRAYS.items():
-        if name not in arrays:
-            raise EvaluatorError(f'the model has clearances but no array "{name}".')
-        try:
-            value = np.array(arrays[name], dtype=np.float64)
-        except (TypeError, ValueError, OverflowError) as error:
-            raise EvaluatorError(f'"{name}" does not hold numbers ({error}).') from error
-        wanted = tuple(value.size if isinstance(n, str) else n for n in spec.shape)
-        if value.shape != wanted or not np.isfinite(value).all() or value.size > _MOST_VALUES:
-            raise EvaluatorError(f'"{name}" must hold finite numbers of shape {wanted}, not {value.shape}.')
-        value.flags.writeable = False
-        checked[name] = value
-    shape = checked["contact_shape"]
-    if (shape != np.round(shape)).any() or (shape < 2).any() or shape.prod() != checked["contact_values"].size:
+    shape, count = arrays["contact_shape"], arrays["contact_values"].size
+    if (shape != np.round(shape)).any() or (shape < 2).any() or shape.prod() != count:
         raise EvaluatorError(
-            f'"contact_shape" is {shape.tolist()}; it must give the {checked["contact_values"].size} clearances three '
-            "axes of 2 or more."
+            f'"contact_shape" is {shape.tolist()}; it must give the {count} clearances three axes of 2 or more.'
         )
-    if (checked["contact_step_mm"] <= 0).any() or checked["contact_limit_mm"] > 0 or checked["contact_error_mm"] < 0:
+    if (arrays["contact_step_mm"] <= 0).any() or arrays["contact_limit_mm"] > 0 or arrays["contact_error_mm"] < 0:
         raise EvaluatorError(
             '"contact_step_mm" must be positive, "contact_limit_mm" at most 0 and "contact_error_mm" not negative.'
         )
-    return checked

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from jawusd.evaluator.formula import cubic
+from jawusd.evaluator.curve_formula import cubic
 from jawusd.geometry.arrays import Array
 
 

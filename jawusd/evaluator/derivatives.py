@@ -21,6 +21,7 @@ from jawusd.evaluator.formula import (
     LIMIT_SOFTNESS_MM,
     GaugeNumbers,
 )
+from jawusd.evaluator.glide import GlideTable
 from jawusd.geometry.arrays import Array
 from jawusd.geometry.rodrigues import N, Triple
 
@@ -38,6 +39,7 @@ class Elementary(NamedTuple, Generic[N]):
     sqrt: Callable[[N], N]
     exp: Callable[[N], N]
     clip: Callable[[N, float, float], N]
+    glide: Callable[[object, N, N], Triple[N]]  # the table of a gauge, d2, d3 -> drop [mm], and its slopes by both
 
 
 def _clip_float(x: float, low: float, high: float) -> float:
@@ -48,8 +50,16 @@ def _clip_array(x: Array, low: float, high: float) -> Array:
     return np.minimum(np.maximum(x, low), high)
 
 
-FLOATS: Elementary[float] = Elementary(math.sqrt, math.exp, _clip_float)
-ARRAYS: Elementary[Array] = Elementary(np.sqrt, np.exp, _clip_array)
+def _glide_floats(table: object, d2: float, d3: float) -> Triple[float]:
+    return table.at_floats(d2, d3) if isinstance(table, GlideTable) else (0.0, 0.0, 0.0)
+
+
+def _glide_arrays(table: object, d2: Array, d3: Array) -> Triple[Array]:
+    return table.at_arrays(d2, d3) if isinstance(table, GlideTable) else (np.zeros(1), np.zeros(1), np.zeros(1))
+
+
+FLOATS: Elementary[float] = Elementary(math.sqrt, math.exp, _clip_float, _glide_floats)
+ARRAYS: Elementary[Array] = Elementary(np.sqrt, np.exp, _clip_array, _glide_arrays)
 
 
 def path(gauge: GaugeNumbers, d1: N, f: Elementary[N]) -> tuple[N, N, N, N]:
@@ -100,7 +110,9 @@ def drop(gauge: GaugeNumbers, d2: N, d3: N, f: Elementary[N]) -> tuple[N, N, N]:
     c0, c1, c2, c3 = gauge.drop
     down = (c0 + c2 * side_bend) * side + (c1 + c3 * front_bend) * front
     down_2 = (c0 + c2 * side_bend * (1.0 + v) / v) * (d2 / side_root)
-    return down, down_2, (c1 + c3 * front_bend * (1.0 + w) / w) * 0.5 * (1.0 + d3 / front_root)
+    down_3 = (c1 + c3 * front_bend * (1.0 + w) / w) * 0.5 * (1.0 + d3 / front_root)
+    table, table_2, table_3 = f.glide(gauge.glide, d2, d3)
+    return down + table, down_2 + table_2, down_3 + table_3
 
 
 def fade(gauge: GaugeNumbers, d1: N, f: Elementary[N]) -> tuple[N, N]:

@@ -16,7 +16,8 @@ lower incisal point, anatomical frame (x left, y up, z anterior):
     z = gz(d1) + rho(d2, d1) + d3
 
 gx, gz: the habitual opening path; rho: the gothic arch of a lateral excursion; drop: the tooth-glide surface that the
-jaw clears when it slides with the teeth together, fading out with opening.
+jaw clears when it slides with the teeth together, fading out with opening; where scans show it, a table is added:
+``sum_r a_r(d2) b_r(d3)``.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Generic, NamedTuple, Protocol, cast
 
+from jawusd.evaluator.curve_formula import curve, curve_tables, flat_ended_slopes
 from jawusd.evaluator.operations import FloatOperations, Operations, Rows, Table, rows, triple
 from jawusd.geometry.rodrigues import N, Triple, apply_series, dot, turning
 
@@ -54,6 +56,7 @@ class GaugeNumbers(NamedTuple):
         drop: Coefficients of drop, 4.
         softness_mm: Radius of the softened absolute value and ramp.
         fade_mm: Opening over which the glide surface fades out.
+        glide: What `derivatives.Elementary.glide` takes: the table of the glide surface; None without one.
     """
 
     path_x: Sequence[float]
@@ -65,6 +68,7 @@ class GaugeNumbers(NamedTuple):
     drop: Sequence[float]
     softness_mm: float
     fade_mm: float
+    glide: object = None
 
 
 def polynomial(coefficients: Sequence[N | float], x: N) -> N:
@@ -134,11 +138,21 @@ def fade(gauge: GaugeNumbers, d1: N, ops: Operations[N, Table]) -> N:
     return ops.exp(-(x * x))
 
 
-def displacement(gauge: GaugeNumbers, d: Triple[N], ops: Operations[N, Table]) -> Triple[N]:
-    """Return the displacement u [mm] of the incisal point at the jaw parameters d [mm]."""
+def glide(width: int, d2: N, d3: N, tables: Mapping[str, Table], ops: Operations[N, Table]) -> N:
+    """Return the glide surface's table [mm] at d2, d3 [mm]: the sum of the products of ``width`` pairs of curves."""
+    side, front = (ops.split(curve(name, x, tables, ops), width) for name, x in (("glide2", d2), ("glide3", d3)))
+    total = side[0] * front[0]
+    for a, b in zip(side[1:], front[1:]):
+        total = total + a * b
+    return total
+
+
+def displacement(gauge: GaugeNumbers, d: Triple[N], ops: Operations[N, Table], table: N | None = None) -> Triple[N]:
+    """Return the displacement u [mm] of the incisal point at the jaw parameters d [mm]; `table` as from `glide`."""
     d1, d2, d3 = d
     gx, gz = path(gauge, d1, ops)
-    down = d1 + drop(gauge, d2, d3, ops) * fade(gauge, d1, ops)
+    surface = drop(gauge, d2, d3, ops)
+    down = d1 + (surface if table is None else surface + table) * fade(gauge, d1, ops)
     return gx + d2, -down, gz + arch(gauge, d1, d2, ops) + d3
 
 
@@ -205,58 +219,6 @@ def twist_motion(omega: Triple[N], v: Triple[N], ops: Operations[N, Table]) -> R
     return RigidMotion(omega, turning(omega, a, b), apply_series(omega, v, b, c))
 
 
-def cubic(h: N, y0: N, y1: N, m0: N, m1: N) -> tuple[N, N, N, N]:
-    """Return the powers 0..3 of the cubic Hermite polynomial over an interval of length h.
-
-    Args:
-        h: Length of the interval.
-        y0: Value at its start.
-        y1: Value at its end.
-        m0: Slope at its start.
-        m1: Slope at its end.
-    """
-    rise = (y1 - y0) / h
-    return y0, m0, (3.0 * rise - 2.0 * m0 - m1) / h, (m0 + m1 - 2.0 * rise) / (h * h)
-
-
-def catmull_rom(before: N, after: N, span: N) -> N:
-    """Return the slope at a knot from the values before and after it, span apart."""
-    return (after - before) / span
-
-
-_CURVE_TABLES = ("start", "power0", "power1", "power2", "power3")
-
-
-def curve_tables(name: str, knots: Sequence[float], values: Rows, slopes: Rows) -> dict[str, Rows]:
-    """Return the tables of a C1 cubic Hermite curve that goes on straight outside its knots, see `curve`.
-
-    Args:
-        name: Prefix of the names of the tables.
-        knots: n rising parameter values.
-        values: Points of the curve at the knots, n rows.
-        slopes: Derivatives at the knots, n rows.
-
-    Returns:
-        The knots, and for each of the n + 1 intervals, the straight ends among them, its start and its powers 0..3.
-    """
-    still = [0.0] * len(values[0])
-    pieces = [[[knots[0]], values[0], slopes[0], still, still]]
-    for i in range(len(knots) - 1):
-        ends = zip(values[i], values[i + 1], slopes[i], slopes[i + 1])
-        powers = zip(*(cubic(knots[i + 1] - knots[i], *end) for end in ends))
-        pieces.append([[knots[i]], *map(list, powers)])
-    pieces.append([[knots[-1]], values[-1], slopes[-1], still, still])
-    tables = {f"{name}_{part}": list(table) for part, table in zip(_CURVE_TABLES, zip(*pieces))}
-    return {f"{name}_knot": [[knot] for knot in knots], **tables}
-
-
-def curve(name: str, x: N, tables: Mapping[str, Table], ops: Operations[N, Table]) -> list[N]:
-    """Return the point at x of the curve of `curve_tables`, a row."""
-    found = ops.lookup(x, tables[f"{name}_knot"], [tables[f"{name}_{part}"] for part in _CURVE_TABLES])
-    s = x - found[0][0]
-    return [((c3 * s + c2) * s + c1) * s + c0 for c0, c1, c2, c3 in zip(*found[1:])]
-
-
 class JawFormula(Protocol):
     """The motion of one kind of model.
 
@@ -314,6 +276,12 @@ class AnchoredFormula:
         *weights, first, second, third = rows(arrays["spline_weights"], 3)
         linear = (first, second, third)
         self.tables = {"centres": rows(arrays["spline_centres"], 3), "weights": weights}
+        self._glide_width = 0
+        if "glide_d2" in arrays:
+            self._glide_width = len(arrays["glide_d2_factors"]) // len(arrays["glide_d2"])
+            for name, d in (("glide2", "d2"), ("glide3", "d3")):
+                knots, factors = arrays[f"glide_{d}"], rows(arrays[f"glide_{d}_factors"], self._glide_width)
+                self.tables.update(curve_tables(name, knots, factors, flat_ended_slopes(knots, factors)))
         offset = spline((0.0, 0.0, 0.0), self.tables["centres"], weights, linear, FloatOperations())
         self.numbers = AnchoredNumbers(gauge, triple(arrays["incisor"]), arrays["spline_scales"], linear, offset)
 
@@ -326,7 +294,8 @@ class AnchoredFormula:
     ) -> RigidMotion[N]:
         """Return the motion away from the closed bite, see `JawFormula`."""
         gauge, incisor, scales, linear, offset = cast("AnchoredNumbers", numbers or self.numbers)
-        u = displacement(gauge, d, ops)
+        table = glide(self._glide_width, d[1], d[2], tables, ops) if self._glide_width else None
+        u = displacement(gauge, d, ops, table)
         q = spline_input(gauge, scales, u, ops)
         omega = spline(q, tables["centres"], tables["weights"], linear, ops)
         return anchored_motion(triple([x - o for x, o in zip(omega, offset)]), u, incisor, ops)
@@ -374,10 +343,7 @@ class BoundFormula:
     def __init__(self, arrays: Arrays) -> None:
         knots, directions = arrays["slice_d1"], rows(arrays["slice_directions"], 2)
         supports = rows(arrays["slice_support"], len(directions))
-        slopes = [[0.0] * len(directions) for _ in knots]  # flat ends: beyond them the supports stay as they are
-        for i in range(1, len(knots) - 1):
-            span = knots[i + 1] - knots[i - 1]
-            slopes[i] = [catmull_rom(x, y, span) for x, y in zip(supports[i - 1], supports[i + 1])]
+        slopes = flat_ended_slopes(knots, supports)  # beyond the ends the supports stay as they are
         self.tables = {"directions": directions, **curve_tables("support", knots, supports, slopes)}
         softness_mm, offset_mm = arrays["slice_softness_mm"][0], arrays["slice_margin_mm"][0]
         self.numbers = BoundNumbers(knots[0], knots[-1], softness_mm, offset_mm)

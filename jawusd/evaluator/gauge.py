@@ -21,6 +21,7 @@ from jawusd.evaluator.derivatives import (
     PATIENCE,
 )
 from jawusd.evaluator.formula import GaugeNumbers
+from jawusd.evaluator.glide import GlideTable
 from jawusd.geometry.arrays import Array
 
 
@@ -37,6 +38,7 @@ class Gauge:
         glide_drop: Coefficients of drop, shape (4,).
         glide_softness_mm: Radius ``e`` of the softened absolute value and ramp.
         glide_fade_mm: Opening over which the glide surface fades out.
+        glide: Table added to drop; None without one.
         numbers: All of these as floats.
     """
 
@@ -47,6 +49,7 @@ class Gauge:
     glide_drop: Array
     glide_softness_mm: float
     glide_fade_mm: float
+    glide: GlideTable | None = None
     numbers: GaugeNumbers = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -60,13 +63,15 @@ class Gauge:
             tuple(self.glide_drop.tolist()),
             self.glide_softness_mm,
             self.glide_fade_mm,
+            self.glide,
         )
         object.__setattr__(self, "numbers", numbers)
 
     def arrays(self) -> dict[str, Array]:
         """Return the gauge's arrays by their names in a rig."""
         names = ("path_coefficients", "path_scale_mm", "path_limits", "glide_arch", "glide_drop")
-        return {name: np.array(getattr(self, name)) for name in (*names, "glide_softness_mm", "glide_fade_mm")}
+        own = {name: np.array(getattr(self, name)) for name in (*names, "glide_softness_mm", "glide_fade_mm")}
+        return own if self.glide is None else {**own, **self.glide.arrays()}
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Array]) -> Gauge:
@@ -80,6 +85,7 @@ class Gauge:
             glide_drop=np.asarray(arrays["glide_drop"], dtype=float),
             glide_softness_mm=float(arrays["glide_softness_mm"]),
             glide_fade_mm=float(arrays["glide_fade_mm"]),
+            glide=GlideTable.from_arrays(arrays),
         )
 
     def path(self, d1: Array) -> tuple[Array, Array, Array, Array]:

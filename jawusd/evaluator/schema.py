@@ -72,6 +72,14 @@ ARRAYS: dict[str, ArraySpec] = {
 }
 
 
+#: Arrays of anchored models whose glide surface was measured on scans: all or none; see `jawusd.evaluator.glide`.
+GLIDE_ARRAYS: dict[str, ArraySpec] = {
+    "glide_d2": ArraySpec("jaw:model:glideD2", ("glide knots of d2",), ANCHORED),
+    "glide_d2_factors": ArraySpec("jaw:model:glideD2Factors", ("glide knots of d2", "glide factors"), ANCHORED),
+    "glide_d3": ArraySpec("jaw:model:glideD3", ("glide knots of d3",), ANCHORED),
+    "glide_d3_factors": ArraySpec("jaw:model:glideD3Factors", ("glide knots of d3", "glide factors"), ANCHORED),
+}
+
 #: Arrays of rigs whose scans show how the teeth meet: all of them or none; see `jawusd.evaluator.contact`.
 CONTACT_ARRAYS: dict[str, ArraySpec] = {
     "contact_first_mm": ArraySpec("jaw:contact:first", (3,)),
@@ -82,6 +90,10 @@ CONTACT_ARRAYS: dict[str, ArraySpec] = {
     "contact_error_mm": ArraySpec("jaw:contact:error"),
     "contact_limit_mm": ArraySpec("jaw:contact:limit"),
 }
+
+
+#: Groups of arrays that a rig may lack, by the name of an array of each.
+OPTIONAL = {"glide_d2": GLIDE_ARRAYS, "contact_values": CONTACT_ARRAYS}
 
 
 def arrays_of(kind: str) -> dict[str, ArraySpec]:

@@ -12,7 +12,7 @@ from jawusd.evaluator import derivatives
 from jawusd.evaluator.derivatives import gradient_by_u, spline_input
 from jawusd.evaluator.formula import GaugeNumbers
 from jawusd.fast.packing import ARCH, COUNT, CURVES, DROP, FADE, LINEAR, OFFSET, PATH, SCALES, SOFTNESS, SPLINE
-from jawusd.fast.rigid import FLOATS, Vector, device, summing
+from jawusd.fast.rigid import FLOATS, Vector, device, interval, summing
 from jawusd.geometry.arrays import Array
 
 
@@ -31,6 +31,7 @@ def gauge_of(model: Array) -> GaugeNumbers:
         (drop[0], drop[1], drop[2], drop[3]),
         model[SOFTNESS],
         model[FADE],
+        model[SPLINE + 6 * int(model[COUNT]) :],
     )
 
 
@@ -111,19 +112,6 @@ def spline_derivative(model: Array, u: Vector, work: Array, by_u: Array) -> Vect
         by_q = (3.0 * a + m[k], 3.0 * b + m[3 + k], 3.0 * c + m[6 + k])
         by_u[k, 0], by_u[k, 1], by_u[k, 2] = gradient_by_u(by_q, scales, slopes)
     return _with_linear(model, q0, q1, q2, k0, k1, k2)
-
-
-@device
-def interval(knots: Array, count: int, x: float) -> int:
-    """Return how many of the first ``count`` knots are <= x."""
-    low, high = 0, count
-    while low < high:
-        middle = (low + high) // 2
-        if knots[middle] <= x:
-            low = middle + 1
-        else:
-            high = middle
-    return low
 
 
 @device

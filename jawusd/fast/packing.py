@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from jawusd.evaluator.bounds import SliceHull
 from jawusd.evaluator.curves import HermiteCurve
 from jawusd.evaluator.frames import RigFrames
+from jawusd.evaluator.glide import GlideTable
 from jawusd.evaluator.models import AdditiveModel, AnchoredModel, JawModelForm
 from jawusd.evaluator.schema import ADDITIVE, ANCHORED, KINDS
 from jawusd.geometry.arrays import Array
@@ -38,7 +39,9 @@ ARCH = REST + 28  # (7,)
 DROP = REST + 35  # (4,)
 SOFTNESS = REST + 39  # [mm]
 FADE = REST + 40  # [mm]
-SPLINE = REST + 41  # centres column by column (3, m), then kernel weights (m, 3)
+SPLINE = REST + 41  # centres column by column (3, m), then kernel weights (m, 3), then the table of the glide surface
+# the table: numbers n2, n3 of its knots, 0 without one; knots of d2 (n2,), starts (n2 + 1,), the same of d3,
+# coefficients (n2 + 1, n3 + 1, 4, 4)
 
 # additive
 CURVES = REST  # where each of the three curves begins
@@ -96,7 +99,15 @@ def _anchored(model: AnchoredModel) -> list[ArrayLike]:
         [gauge.glide_softness_mm, gauge.glide_fade_mm],
         model.centres.T,
         model.weights[:count],
+        *_glide(gauge.glide),
     ]
+
+
+def _glide(table: GlideTable | None) -> list[ArrayLike]:
+    if table is None:
+        return [[0.0, 0.0]]
+    (k2, k3), (s2, s3) = table.knots, table.starts
+    return [[len(k2), len(k3)], k2, s2, k3, s3, table.coefficients]
 
 
 def _additive(model: AdditiveModel) -> list[ArrayLike]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from math import cos, sqrt, tan
+from typing import cast
 
 import numba
 from numba.extending import register_jitable
@@ -49,7 +51,40 @@ def _clip(x: float, low: float, high: float) -> float:
     return min(max(x, low), high)
 
 
-FLOATS = Elementary(_sqrt, _exp, _clip)
+@device
+def interval(knots: Array, count: int, x: float) -> int:
+    """Return how many of the first ``count`` knots are <= x."""
+    low, high = 0, count
+    while low < high:
+        middle = (low + high) // 2
+        if knots[middle] <= x:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@device
+def _glide(table: Array, d2: float, d3: float) -> Vector:
+    """Return what `glide.GlideTable.at_floats` does; `table` as `packing` lays it out, all zero without one."""
+    count2, count3 = int(table[0]), int(table[1])
+    if count2 == 0:
+        return 0.0, 0.0, 0.0
+    side, front = table[2:], table[3 + 2 * count2 :]
+    i, j = interval(side, count2, d2), interval(front, count3, d3)
+    s, t = d2 - side[count2 + i], d3 - front[count3 + j]
+    c = table[4 + 2 * count2 + 2 * count3 + 16 * (i * (count3 + 1) + j) :]
+    down = down_2 = down_3 = 0.0
+    for k in range(3, -1, -1):  # powers of d3
+        a = ((c[12 + k] * s + c[8 + k]) * s + c[4 + k]) * s + c[k]
+        b = (3.0 * c[12 + k] * s + 2.0 * c[8 + k]) * s + c[4 + k]
+        down_3 = down_3 * t + down
+        down = down * t + a
+        down_2 = down_2 * t + b
+    return down, down_2, down_3
+
+
+FLOATS = Elementary(_sqrt, _exp, _clip, cast("Callable[[object, float, float], Vector]", _glide))
 
 
 @device

@@ -90,17 +90,22 @@ def _circumradius(corners: Array) -> Array:
     return np.where(doubled_area > _SLIVER, sides.prod(1) / np.maximum(2 * doubled_area, _SLIVER), np.inf)
 
 
-def fit_slice_hull(d: Array) -> tuple[dict[str, Array], float]:
+def fit_slice_hull(d: Array, closed_mm: float | None = None) -> tuple[dict[str, Array], float]:
     """Build the slice hull of captured parameters (N, 3) [mm] in the order of time.
+
+    Args:
+        closed_mm: where the hull ends at closed teeth, d1; None: where nearly all captured poses do.
 
     Returns:
         The `slice_*` arrays of a model; and how far outside of it measured poses may lie [mm]: the 95 % quantile over
         frames left out, as other exercises go a little farther than those captured.
     """
     blocks = np.arange(len(d)) // min(_BLOCK, max(1, len(d) // _FOLDS)) % _FOLDS
-    excess = [SliceHull.from_arrays(_hull(d[blocks != k])).signed_distance(d[blocks == k]) for k in range(_FOLDS)]
+    excess = [
+        SliceHull.from_arrays(_hull(d[blocks != k], closed_mm)).signed_distance(d[blocks == k]) for k in range(_FOLDS)
+    ]
     tolerance = np.quantile(np.concatenate(excess), _TOLERANCE_QUANTILE)
-    return _hull(d), float(np.clip(tolerance, 0.0, _LARGEST_TOLERANCE_MM))
+    return _hull(d, closed_mm), float(np.clip(tolerance, 0.0, _LARGEST_TOLERANCE_MM))
 
 
 def valid_box(arrays: Mapping[str, Array]) -> Array:
@@ -111,12 +116,12 @@ def valid_box(arrays: Mapping[str, Array]) -> Array:
     return box + arrays["slice_margin_mm"] * np.array([-1.0, 1.0])
 
 
-def _hull(d: Array) -> dict[str, Array]:
+def _hull(d: Array, closed_mm: float | None) -> dict[str, Array]:
     angle = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
     directions = np.stack([np.cos(angle), np.sin(angle) * _PROTRUSION_STRETCH], axis=-1)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     # The margin also extends the hull beyond closed teeth: subtract it there.
-    closed = float(np.sort(d[:, 0])[len(d) // _FRAMES_PER_SLIP])
+    closed = float(np.sort(d[:, 0])[len(d) // _FRAMES_PER_SLIP]) if closed_mm is None else closed_mm
     low, high = closed + _MARGIN_MM - _CONTACT_TOLERANCE_MM, float(d[:, 0].max())
     knots = np.linspace(low, max(high, low + _SHORTEST_RANGE_MM), KNOTS)
     reach = d[:, 1:] @ directions.T

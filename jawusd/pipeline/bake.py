@@ -61,7 +61,7 @@ def bake_subject(
     # Bones come from segmented scans with all their faults; teeth scans stay as they are, vertex for vertex.
     meshes = {key: manifold(mesh) if key in BONES else mesh for key, mesh in subject.meshes.items()}
     if "contact" not in model.meta:  # fitted without the scans
-        model = with_contact(model, subject, progress)
+        model = with_contact(model, subject, progress, regauge=False)
     moving = len(model.frames) > 0
     progress("bake", 0, 1)
     files = bake_rig(

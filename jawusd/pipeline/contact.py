@@ -30,25 +30,32 @@ def contact_words(contact: ContactSummary) -> str:
     return f"{meet} in the closed bite; clearances to {contact['error_mm']:.2f} mm"
 
 
-def with_contact(model: JawModel, subject: Subject, progress: Progress = no_progress) -> JawModel:
+def with_contact(
+    model: JawModel, subject: Subject, progress: Progress = no_progress, *, regauge: bool = True
+) -> JawModel:
     """Return a model with the clearance of its teeth; ``meta["contact"]`` says how deep, or why there is none.
 
     Args:
         subject: The person, scans registered as the model's poses are.
+        regauge: Count d1 from where the teeth touch, and end the bound there.
     """
+    from jawusd.fitting.glide import follow_teeth
     from jawusd.imaging.contact import NoContact, find_teeth, sample_field
 
     if not all(name in subject.meshes for name in TEETH.values()):
         return replace(model, meta={**model.meta, "contact": {"missing": "there are no scans of both rows of teeth"}})
-    progress("contact", 0, 2)
+    progress("contact", 0, 3)
     upper, lower = (subject.meshes[TEETH[row]] for row in ("upper", "lower"))
     try:
         teeth = find_teeth(upper, lower, model.arrays["T_anatomical_skull"], model.arrays["T_rest"])
-        progress("contact", 1, 2)
+        progress("contact", 1, 3)
+        if regauge:
+            model = follow_teeth(model, teeth)
+        progress("contact", 2, 3)
         field = sample_field(teeth, JawRig(model.arrays, model.meta))
     except NoContact as reason:
         return replace(model, meta={**model.meta, "contact": {"missing": str(reason)}})
     finally:
-        progress("contact", 2, 2)
+        progress("contact", 3, 3)
     found: ContactSummary = {"closed_mm": field.closed_mm, "error_mm": field.error_mm, "limit_mm": field.limit_mm}
     return replace(model, arrays={**model.arrays, **field.arrays()}, meta={**model.meta, "contact": found})

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING
 
 from jawusd.evaluator.formula import MODELS, ON_BOUND_MM, BoundFormula
 from jawusd.evaluator.operations import FloatOperations, Rows, rows
-from jawusd.evaluator.schema import D_RANGE_ATTRIBUTES, arrays_of
+from jawusd.evaluator.schema import D_RANGE_ATTRIBUTES, GLIDE_ARRAYS, arrays_of
 from jawusd.geometry.rodrigues import Triple
 
 if TYPE_CHECKING:
@@ -104,7 +104,8 @@ def from_prim(prim: Usd.Prim) -> Rig:
 
     _check_version(value("jaw:formatVersion"))
     kind = str(value("jaw:model:kind"))
-    attributes = _attributes_of(kind)
+    first = prim.GetAttribute(str(GLIDE_ARRAYS["glide_d2"].attribute))
+    attributes = _attributes_of(kind, bool(first) and first.HasAuthoredValue())
     return Rig(kind, {name: [x for key in keys for x in _flat(value(key))] for name, keys in attributes.items()})
 
 
@@ -118,11 +119,12 @@ def _flat(value: float | Sequence[float] | str) -> list[float]:
     return [float(value)] if isinstance(value, (int, float)) else [float(x) for x in value]
 
 
-def _attributes_of(kind: str) -> dict[str, tuple[str, ...]]:
-    """Return the attributes of every array that poses and margins of a kind need."""
+def _attributes_of(kind: str, gliding: bool) -> dict[str, tuple[str, ...]]:
+    """Return the attributes of every array that poses and margins of a kind need; ``gliding`` ones have a table."""
     if kind not in MODELS:
         raise ReaderError(f"model kind {kind!r} is unknown to this reader")
-    specs = {name: spec for name, spec in arrays_of(kind).items() if not name.startswith(_NOT_NEEDED)}
+    every = {**arrays_of(kind), **(GLIDE_ARRAYS if gliding else {})}
+    specs = {name: spec for name, spec in every.items() if not name.startswith(_NOT_NEEDED)}
     return {name: (spec.attribute,) if spec.attribute else D_RANGE_ATTRIBUTES for name, spec in specs.items()}
 
 
@@ -142,7 +144,7 @@ def _from_npz(path: str) -> Rig:
         raise ReaderError(f"{path} is of format {meta.get('format')}, expected jawusd-model")
     _check_version(version)
     arrays = {}
-    for name in _attributes_of(meta.get("kind")):
+    for name in _attributes_of(meta.get("kind"), "glide_d2" in raw):
         if name not in raw:
             raise ReaderError(f"{path} has no array {name}")
         arrays[name] = _numbers(*_npy(raw[name]))

@@ -7,7 +7,7 @@ from pxr import Sdf, Usd
 
 from jawusd.errors import FormatError
 from jawusd.evaluator import JawRig
-from jawusd.evaluator.schema import CONTACT_ARRAYS, D_RANGE_ATTRIBUTES, arrays_of
+from jawusd.evaluator.schema import D_RANGE_ATTRIBUTES, OPTIONAL, ArraySpec, arrays_of
 from jawusd.geometry.arrays import Array
 from jawusd.rig import _gf
 from jawusd.rig.layers import set_attribute
@@ -22,8 +22,9 @@ def model_hash(rig: JawRig) -> str:
 
 def write_arrays(prim: Sdf.PrimSpec, rig: JawRig, prefixes: tuple[str, ...]) -> None:
     """Write the model arrays whose attribute names start with one of the prefixes."""
-    for name, spec in {**arrays_of(rig.kind), **CONTACT_ARRAYS}.items():
-        if name not in rig.arrays or spec.attribute is None or not spec.attribute.startswith(prefixes):
+    optional = {name: spec for group in OPTIONAL.values() for name, spec in group.items() if name in rig.arrays}
+    for name, spec in {**arrays_of(rig.kind), **optional}.items():
+        if spec.attribute is None or not spec.attribute.startswith(prefixes):
             continue
         value = rig.arrays[name]
         if spec.integer:
@@ -42,8 +43,7 @@ def read_arrays(prim: Usd.Prim, kind: str, where: object) -> dict[str, Array]:
     """
     arrays: dict[str, Array] = {}
     lengths: dict[str, int] = {}
-    touching = prim.GetAttribute(CONTACT_ARRAYS["contact_values"].attribute or "").HasAuthoredValue()
-    for name, spec in {**arrays_of(kind), **(CONTACT_ARRAYS if touching else {})}.items():
+    for name, spec in {**arrays_of(kind), **_optional_of(prim)}.items():
         if spec.attribute is None:
             ranges = [read_value(prim, attribute, where) for attribute in D_RANGE_ATTRIBUTES]
             arrays[name] = np.array(ranges, dtype=np.float64)
@@ -60,6 +60,15 @@ def read_arrays(prim: Usd.Prim, kind: str, where: object) -> dict[str, Array]:
             raise FormatError(message, path=str(where)) from error
         lengths.update((n, found) for n, found in zip(spec.shape, arrays[name].shape) if isinstance(n, str))
     return arrays
+
+
+def _optional_of(prim: Usd.Prim) -> dict[str, ArraySpec]:
+    """Return the arrays that not every rig has and this one does."""
+    found: dict[str, ArraySpec] = {}
+    for first, group in OPTIONAL.items():
+        if prim.GetAttribute(group[first].attribute or "").HasAuthoredValue():
+            found |= group
+    return found
 
 
 def read_value(prim: Usd.Prim, name: str, where: object) -> object:

@@ -1,7 +1,7 @@
 """Format versions: refuse newer rigs, upgrade older ones.
 
 A new version of the format takes four steps: raise `layout.FORMAT_VERSION`; write here the upgrade from the version
-before it, `STEPS[1]` from 1 to 2, which derives a prim's new attributes from its old ones; let
+before it, `STEPS[2]` from 2 to 3, which derives a prim's new attributes from its old ones; let
 `tests/golden/make_golden_rig.py` write golden rigs of the new version beside the old ones, which the tests upgrade; do
 the same in `plugins/jawusd_reader.py`. Files are never rewritten: `jawusd bake` on the model gives a rig of the present
 version.
@@ -19,7 +19,10 @@ from jawusd.rig.layout import FORMAT_VERSION
 
 
 def _to_2(prim: Usd.Prim) -> None:
-    """Name the tolerance of measured poses, which version 1 held as the smallest margin of a valid pose."""
+    """Name the tolerance of measured poses, which version 1 held as the smallest margin of a valid pose.
+
+    What else version 2 adds a rig may lack: the table of the glide surface and the clearances of the teeth.
+    """
     limit = read_value(prim, "jaw:thresholds:margin", prim.GetStage().GetRootLayer().identifier)
     if not isinstance(limit, float):
         raise FormatError(f"jaw:thresholds:margin is {limit!r}, expected a number.", path=str(prim.GetPath()))

@@ -34,7 +34,26 @@ from jawusd.solvers.solution import capturing, finished, inverse
 _STEPS_CAPTURED = 7  # of the inverse gauge; five do for parameters a jaw has
 _GAUGE_NUMBERS = 26
 _SERIES_SQUARED = 0.09  # rad^2; below, derivatives of the angle coefficients come from their series
-TENSORS: Elementary[Tensor] = Elementary(torch.sqrt, torch.exp, OPERATIONS.clip)
+
+
+def _glide(table: object, d2: Tensor, d3: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the table [mm] of a glide surface, the module it belongs to, and its slopes at d2 (n,), d3 (n,) [mm]."""
+    if not isinstance(table, MotionModule):
+        return torch.zeros_like(d2), torch.zeros_like(d2), torch.zeros_like(d2)
+    a, a_2 = _curve(table, "glide2", d2[:, None])
+    b, b_3 = _curve(table, "glide3", d3[:, None])
+    return (a * b).sum(dim=1), (a_2 * b).sum(dim=1), (a * b_3).sum(dim=1)
+
+
+def _curve(module: MotionModule, name: str, x: Tensor) -> tuple[Tensor, Tensor]:
+    """Return point and slope (n, k) of a curve of a module at x (n, 1)."""
+    parts = [module.get_buffer(f"{name}_{part}") for part in ("start", "power0", "power1", "power2", "power3")]
+    (start,), (c0,), (c1,), (c2,), (c3,) = OPERATIONS.lookup(x, module.get_buffer(f"{name}_knot"), parts)
+    s = x - start
+    return ((c3 * s + c2) * s + c1) * s + c0, (3.0 * c3 * s + 2.0 * c2) * s + c1
+
+
+TENSORS: Elementary[Tensor] = Elementary(torch.sqrt, torch.exp, OPERATIONS.clip, _glide)
 
 
 class Chart(Protocol):
@@ -58,6 +77,7 @@ class AnchoredMotion(MotionModule):
 
     def __init__(self, arrays: Mapping[str, Array]) -> None:
         super().__init__(ANCHORED, arrays)
+        self._gliding = "glide_d2" in arrays
 
     def start(self, u: Tensor) -> Tensor:
         """Return u: it is read off the pose."""
@@ -94,7 +114,8 @@ class AnchoredMotion(MotionModule):
         return d, inverse(torch.stack([torch.stack(row, dim=1) for row in rows], dim=1))
 
     def _anchored_numbers(self) -> AnchoredNumbers:
-        return cast("AnchoredNumbers", self.numbers())
+        found = cast("AnchoredNumbers", self.numbers())
+        return found._replace(gauge=found.gauge._replace(glide=self)) if self._gliding else found
 
     def _inverse(self, u: Tensor) -> Tensor:
         """Return the d (n, 3) of u (n, 3) [mm]: `jawusd.evaluator.gauge.Gauge.inverse`."""
@@ -137,19 +158,12 @@ class AdditiveMotion(MotionModule):
 
     def derivative(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return rotation, translation [mm] and spatial derivative at d (n, 3) [mm]."""
-        values, slopes = zip(*(self._curve(f"curve{i + 1}", x[:, i : i + 1]) for i in range(3)))
+        values, slopes = zip(*(_curve(self, f"curve{i + 1}", x[:, i : i + 1]) for i in range(3)))
         return _twist_derivative(sum(values), torch.stack(slopes, dim=2))
 
     def decoded(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Return x, which is d, and the identity."""
         return x, torch.eye(3, dtype=x.dtype, device=x.device).expand(x.shape[0], 3, 3)
-
-    def _curve(self, name: str, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Return point and slope (n, 6) of a curve at x (n, 1)."""
-        parts = [self.get_buffer(f"{name}_{part}") for part in ("start", "power0", "power1", "power2", "power3")]
-        (start,), (c0,), (c1,), (c2,), (c3,) = OPERATIONS.lookup(x, self.get_buffer(f"{name}_knot"), parts)
-        s = x - start
-        return ((c3 * s + c2) * s + c1) * s + c0, (3.0 * c3 * s + 2.0 * c2) * s + c1
 
 
 def chart_of(kind: str, arrays: Mapping[str, Array]) -> AnchoredMotion | AdditiveMotion:

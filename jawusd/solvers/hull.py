@@ -12,7 +12,8 @@ from torch import Tensor
 from jawusd.errors import EvaluatorError
 from jawusd.evaluator.arrays import flat_arrays
 from jawusd.evaluator.bounds import SliceHull
-from jawusd.evaluator.formula import BoundFormula, curve
+from jawusd.evaluator.curve_formula import curve
+from jawusd.evaluator.formula import BoundFormula
 from jawusd.evaluator.operations import triple
 from jawusd.evaluator.solver import (
     INSIDE_MM,

@@ -84,7 +84,7 @@ class Formula(nn.Module):
 
     Args:
         tables: Rows of floats by name.
-        numbers: Floats in tuples.
+        numbers: Floats in tuples; None where there is nothing.
     """
 
     singles: Tensor
@@ -132,11 +132,13 @@ def _leaves(numbers: object) -> Iterator[float]:
     if isinstance(numbers, tuple | list):
         for each in numbers:
             yield from _leaves(each)
-    else:
+    elif numbers is not None:
         yield cast("float", numbers)
 
 
 def _nested(like: object, leaves: Iterator[Tensor]) -> object:
+    if like is None:
+        return None
     if not isinstance(like, tuple | list):
         return next(leaves)
     parts = [_nested(each, leaves) for each in like]

@@ -54,7 +54,7 @@ def test_colliding_poses_are_refused():
     assert rig.validate_parameters(d).reason.tolist() == [0, Reason.TEETH_COLLIDE]
     found = rig.validate(rig.pose(d))
     assert found.reason.tolist() == [0, Reason.TEETH_COLLIDE]
-    assert found.words() == ["valid", "teeth collide"]
+    assert found.words() == ["inside", "teeth collide"]
     # measured poses may come as close as captured ones did
     near = touching_rig(contact_values=values.ravel() / 2)
     assert near.validate(near.pose(d)).valid.all()

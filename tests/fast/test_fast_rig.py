@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import reference_jaw as reference
-from example_model import example_arrays, example_meta
+from example_model import example_arrays, example_meta, touching_arrays
 from scipy.optimize import least_squares
 
 from jawusd.evaluator import JawRig, Reason
@@ -294,3 +294,15 @@ def test_inverse_kinematics_takes_any_batch_shape(rig, fast, shape, started):
     (found, left_mm), (expected, expected_mm) = (each.ik([0.0] * 3, T[..., :3, 3], start=start) for each in (fast, rig))
     assert found.shape == expected.shape and left_mm.shape == expected_mm.shape
     np.testing.assert_allclose(left_mm, expected_mm, rtol=0, atol=1e-5)
+
+
+def test_a_rig_whose_teeth_meet_gives_what_the_evaluator_gives():
+    rig = JawRig({**example_arrays(), **touching_arrays()}, example_meta())
+    fast, d = accelerate(rig), random_d(rig, (200,))
+    for name in FROM_D:
+        np.testing.assert_allclose(getattr(fast, name)(d), getattr(rig, name)(d), atol=1e-9, err_msg=name)
+    np.testing.assert_allclose(fast.pose(d[0]), rig.pose(d[0]), atol=1e-12)
+    T = noisy_poses(rig, (50,))
+    np.testing.assert_allclose(fast.encode(T).d, rig.encode(T).d, atol=1e-7)
+    for name in VERDICT[:2]:
+        np.testing.assert_array_equal(getattr(fast.validate(T), name), getattr(rig.validate(T), name))

@@ -13,7 +13,7 @@ import numpy as np
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent / "support"))
 
-from example_rig import example_meshes, example_rig  # noqa: E402
+from example_rig import example_meshes, touching_rig  # noqa: E402
 
 from jawusd.rig.author import decoder_layer, interface_layer  # noqa: E402
 from jawusd.rig.geo import build_geometry  # noqa: E402
@@ -26,7 +26,7 @@ from jawusd.rig.table import build_table  # noqa: E402
 def write(kind):
     """Write the rig of one kind and what it must say: poses and margins inside the bounds, at rest and far outside."""
     folder = HERE / f"rig_v{FORMAT_VERSION}_{kind}"
-    rig, meshes = example_rig(kind), example_meshes()
+    rig, meshes = touching_rig(kind), example_meshes()
     moving = np.concatenate([meshes[name].vertices for name in ("mandible", "lower_teeth")])
     write_layer(build_geometry(meshes, rig.arrays["T_rest"]), folder / GEO_FILE)
     write_layer(decoder_layer(rig, build_table(rig, moving, 17)), folder / RIG_FILE)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from example_model import example_arrays, example_meta
+from example_model import example_arrays, example_meta, touching_arrays
 from scipy.spatial.transform import Rotation
 
 from jawusd.evaluator import JawRig
@@ -11,6 +11,7 @@ from jawusd.geometry.se3 import se3_exp
 from jawusd.solvers import JawLayer, jaw_pose_from_axis_angle
 
 RIGS = {kind: JawRig(example_arrays(kind), example_meta(kind)) for kind in ("anchored", "additive")}
+RIGS["touching"] = JawRig({**example_arrays(), **touching_arrays()}, example_meta())
 LAYERS = {kind: JawLayer(rig) for kind, rig in RIGS.items()}
 
 

@@ -34,6 +34,29 @@ def example_arrays(kind="anchored", centres=40):
     return arrays
 
 
+def touching_arrays(kind="anchored"):
+    """Return what rigs have whose scans meet: a rough glide surface (anchored ones) and clearances."""
+    rng = np.random.default_rng(21)
+    shape, first, step = (7, 9, 6), np.array([-1.0, -8.0, -2.0]), np.array([0.5, 2.0, 1.6])
+    values = np.round(100 * (0.4 * np.arange(7)[:, None, None] + rng.uniform(0.01, 0.5, shape)))
+    arrays = {
+        "contact_first_mm": first,
+        "contact_step_mm": step,
+        "contact_shape": np.array(shape, dtype=float),
+        "contact_values": values.ravel(),
+        "contact_closed_mm": np.array(0.4),
+        "contact_error_mm": np.array(0.05),
+        "contact_limit_mm": np.array(-0.3),
+    }
+    if kind == "additive":
+        return arrays
+    d2, d3 = np.arange(-9.0, 10.0, 1.5), np.arange(-2.0, 8.0, 1.0)
+    side = np.stack([0.3 * np.cos(d2), 0.2 * np.sin(0.7 * d2 + 0.5), np.zeros(len(d2))], axis=1)
+    front = np.stack([np.cos(0.8 * d3), np.sin(d3 + 0.3), np.ones(len(d3))], axis=1)
+    side[:, 2] = -(side[d2 == 0, :2] * front[d3 == 0, :2]).sum()
+    return {**arrays, "glide_d2": d2, "glide_d2_factors": side, "glide_d3": d3, "glide_d3_factors": front}
+
+
 def example_meta(kind="anchored"):
     """Return the header that goes with `example_arrays`."""
     return {

@@ -1,7 +1,7 @@
 """A small rig for tests: the example model, coarse meshes around its landmarks, and a motion inside its bounds."""
 
 import numpy as np
-from example_model import example_arrays, example_meta
+from example_model import example_arrays, example_meta, touching_arrays
 
 from jawusd.evaluator import JawRig
 from jawusd.formats.mesh import Mesh
@@ -13,6 +13,11 @@ FPS = 24.0
 def example_rig(kind="anchored"):
     """Return the evaluator of the example model."""
     return JawRig(example_arrays(kind), example_meta(kind))
+
+
+def touching_rig(kind="anchored"):
+    """Return that of a person whose scans meet."""
+    return JawRig({**example_arrays(kind), **touching_arrays(kind)}, example_meta(kind))
 
 
 def example_meshes():

@@ -1,0 +1,169 @@
+"""Let d1 = 0 be tooth contact: the glide surface of a gauge measured on the scans, and the bounds in its parameters.
+
+The gauge that is fitted to captured poses knows the glide surface only as a smooth bowl. Teeth make it rough: of the
+openings at which the scans touch, all over d2 and d3, a surface is made that no opening lies above, as far as its
+slopes are limited, for a gauge must not fold. The poses of the model stay what they are; only their parameters change.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt, gaussian_filter
+
+from jawusd.evaluator import JawRig
+from jawusd.evaluator.gauge import Gauge
+from jawusd.evaluator.glide import GlideTable
+from jawusd.evaluator.models import AnchoredModel
+from jawusd.fitting.bounds import alpha_shapes, fit_slice_hull, valid_box
+from jawusd.fitting.coverage import PARAMETERS
+from jawusd.fitting.gauge_fit import SMALLEST_MINOR, smallest_minor
+from jawusd.formats.model import JawModel
+from jawusd.geometry.arrays import Array, Indices, Mask
+from jawusd.geometry.se3 import make_transform
+from jawusd.imaging.contact import Teeth
+
+_STEP_MM = 0.5  # between knots: cusps and fossae are a few times as wide
+_BEYOND_MM = 1.5  # outside the captured parameters, still measured
+_HIGHEST_MM, _LOWEST_MM = 5.0, -2.5  # drops searched; no contact there is none at all
+_HALVINGS = 4  # of the search step: to 0.03 mm
+_SMOOTHING = 0.7  # standard deviation, in knots
+_RAISES = 3  # times that what smoothing took away is given back
+_REST_MM = 2.0  # within which the surface is brought to 0 at the closed bite, the deepest point of its fossae
+# Slopes along d2 and d3 from the steepest to the flattest tried; steeper ones would hover less above deep fossae.
+_SLOPES = ((1.5, 1.0), (1.0, 0.7), (0.6, 0.4))
+_RANK_ERROR_MM = 0.03
+_GAUGE_ROOM_MM = 3.0
+
+
+def follow_teeth(model: JawModel, teeth: Teeth) -> JawModel:
+    """Return an anchored model whose d1 counts from where the teeth touch, with bounds that end there.
+
+    Returns:
+        The model as it was if its form has no gauge or if every surface would fold the gauge.
+    """
+    form = JawRig(model.arrays, model.meta).model
+    if not isinstance(form, AnchoredModel):
+        return model
+    known = np.isfinite(model.d).all(axis=1)
+    d2, d3 = (_axis(model.d[known, axis]) for axis in (1, 2))
+    down = _contact_drop(form, teeth, d2, d3, model.d[known])
+    for slopes in _SLOPES:
+        gauge = replace(form.gauge, glide_drop=np.zeros(4), glide=_factored(d2, d3, _hull(d2, d3, down, slopes)))
+        d = _carried(form.gauge, gauge, model.d)
+        if not np.isfinite(d[known]).all():
+            continue
+        room = np.array([-_GAUGE_ROOM_MM, _GAUGE_ROOM_MM])
+        if (
+            smallest_minor(gauge, np.stack([d[known].min(axis=0), d[known].max(axis=0)], axis=1) + room)
+            > SMALLEST_MINOR
+        ):
+            return _regauged(model, form.gauge, gauge, d)
+    return model
+
+
+def _regauged(model: JawModel, old: Gauge, gauge: Gauge, d: Array) -> JawModel:
+    """Return the model with another gauge, its parameters d (F, 3) and bounds that end at closed teeth."""
+    trained = d[model.trained]
+    hull, tolerance_mm = fit_slice_hull(trained, closed_mm=0.0)
+    config = model.meta["config"]
+    alpha = float(config["alpha"]) if isinstance(config, dict) else 1.0
+    arrays = {
+        **model.arrays,
+        **gauge.arrays(),
+        **hull,
+        **alpha_shapes(trained, alpha),
+        "d_range": valid_box(hull),
+        "codes": _carried(old, gauge, model.arrays["codes"]),
+        "tolerance_mm": np.array(tolerance_mm),
+    }
+    ends = zip(trained.min(axis=0).tolist(), trained.max(axis=0).tolist())
+    meta = {**model.meta, "ranges_mm": {name: [low, high] for name, (low, high) in zip(PARAMETERS, ends)}}
+    return replace(model, arrays=arrays, d=d, meta=meta)
+
+
+def _carried(old: Gauge, new: Gauge, d: Array) -> Array:
+    """Return the parameters (n, 3) [mm] in a new gauge of the same poses; NaN for NaN."""
+    out = np.full(d.shape, np.nan)
+    known = np.isfinite(d).all(axis=1)
+    out[known] = new.inverse(old.displacement(d[known]))
+    return out
+
+
+def _axis(values: Array) -> Array:
+    """Return knots [mm] around captured values, 0 among them."""
+    low, high = min(values.min(), 0.0) - _BEYOND_MM, max(values.max(), 0.0) + _BEYOND_MM
+    return _STEP_MM * np.arange(np.floor(low / _STEP_MM), np.ceil(high / _STEP_MM) + 1)
+
+
+def _contact_drop(form: AnchoredModel, teeth: Teeth, d2: Array, d3: Array, captured: Array) -> Array:
+    """Return how far the incisal point must drop for the teeth to pass [mm], shape (n2, n3)."""
+    side, front = (x.ravel() for x in np.meshgrid(d2, d3, indexing="ij"))
+    wanted = _near(np.stack([side, front], axis=1), captured[:, 1:])
+    ahead = front + form.gauge.arch(np.zeros_like(side), side)[0]
+
+    def touches(rows: Indices, down: Array) -> Mask:
+        R, t, _ = form.chart_derivative(np.stack([side[rows], -down, ahead[rows]], axis=1))
+        return teeth.pair.depth(make_transform(R, t)) > teeth.closed_mm
+
+    found = np.full(len(side), np.nan)
+    left = np.flatnonzero(wanted)
+    for height in np.arange(_HIGHEST_MM, _LOWEST_MM, -_STEP_MM):
+        hit = touches(left, np.full(len(left), height))
+        rows, low, high = left[hit], np.full(hit.sum(), height), np.full(hit.sum(), height + _STEP_MM)
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (low + high)
+            inside = touches(rows, middle)
+            low, high = np.where(inside, middle, low), np.where(inside, high, middle)
+        found[rows] = 0.5 * (low + high)
+        left = left[~hit]
+    found[left] = _LOWEST_MM
+    down = found.reshape(len(d2), len(d3))
+    nearest = distance_transform_edt(np.isnan(down), return_distances=False, return_indices=True)
+    return np.asarray(down[tuple(nearest)])
+
+
+def _near(points: Array, captured: Array) -> Mask:
+    """Tell which points (n, 2) lie within `_BEYOND_MM` of a captured one (m, 2), or of the rest, by cells."""
+    reach = int(np.ceil(_BEYOND_MM / _STEP_MM)) + 1
+    cells = {(int(a), int(b)) for a, b in np.round(np.vstack([captured, [[0.0, 0.0]]]) / _STEP_MM)}
+    around = [(a, b) for a in range(-reach, reach + 1) for b in range(-reach, reach + 1)]
+    grown = {(a + i, b + j) for a, b in cells for i, j in around}
+    return np.array([(int(a), int(b)) in grown for a, b in np.round(points / _STEP_MM)])
+
+
+def _hull(d2: Array, d3: Array, down: Array, slopes: tuple[float, float]) -> Array:
+    """Return a smooth surface (n2, n3) [mm] on or above the contact, of limited slopes; 0 at the closed bite."""
+    limited = _dilated(down, slopes)
+    surface = gaussian_filter(limited, _SMOOTHING, mode="nearest")
+    for _ in range(_RAISES):
+        missing = _dilated(np.maximum(limited - surface, 0.0), slopes)
+        surface = surface + gaussian_filter(missing, _SMOOTHING, mode="nearest")
+    away = (d2[:, None] ** 2 + d3**2) / _REST_MM**2
+    rest = surface[np.argmin(np.abs(d2)), np.argmin(np.abs(d3))]
+    return np.asarray(surface - rest * np.maximum(1.0 - away, 0.0) ** 2)
+
+
+def _dilated(surface: Array, slopes: tuple[float, float]) -> Array:
+    """Return the least surface on or above one (n2, n3) [mm] whose slopes [mm/mm] along both axes are limited."""
+    out = surface
+    for axis, slope in enumerate(slopes):
+        n = surface.shape[axis]
+        below = slope * _STEP_MM * np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+        out = np.moveaxis((np.moveaxis(out, axis, -1)[..., None, :] - below).max(axis=-1), -1, axis)
+    return np.asarray(out)
+
+
+def _factored(d2: Array, d3: Array, surface: Array) -> GlideTable:
+    """Return a surface (n2, n3) as the fewest products of curves that give it, exactly 0 at the closed bite."""
+    left, sizes, right = np.linalg.svd(surface, full_matrices=False)
+    rank = 1
+    while np.abs(surface - (left[:, :rank] * sizes[:rank]) @ right[:rank]).max() > _RANK_ERROR_MM:
+        rank += 1
+    root = np.sqrt(sizes[:rank])
+    side, front = left[:, :rank] * root, right[:rank].T * root
+    rest = side[np.argmin(np.abs(d2))] @ front[np.argmin(np.abs(d3))]
+    return GlideTable(
+        (d2, d3), (np.column_stack([side, np.full(len(d2), -rest)]), np.column_stack([front, np.ones(len(d3))]))
+    )
