@@ -55,6 +55,8 @@ def info(
 
 
 def _info_lines(found: Description) -> list[str]:
+    from jawusd.pipeline.contact import contact_words
+
     lines = [
         f"actor {found['actor']}, format {found['format_version']}, prim {found['prim']}",
         f"model: {found['model']['kind']} ({found['model']['method']}), onnx: {', '.join(found['onnx']) or 'none'}",
@@ -67,6 +69,7 @@ def _info_lines(found: Description) -> list[str]:
         f"tolerance {limits['tolerance']:.2f} mm outside the bound"
     )
     lines.append(f"table: {table['format']} {table['shape']}, worst error {table['max_error_mm']:.4f} mm")
+    lines.append(f"teeth: {contact_words(found['contact'])}")
     for name, count in found["meshes"].items():
         mark = ", a placeholder, no anatomy" if name in found["placeholders"] else ""
         lines.append(f"mesh {name}: {count} points{mark}")

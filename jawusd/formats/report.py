@@ -32,6 +32,15 @@ class Overlay:
 
 
 @dataclass(frozen=True, eq=False)
+class ContactPicture:
+    """Hold the contacts of the teeth in one pose, both arches side by side."""
+
+    title: str
+    clearance_mm: float
+    jpeg: bytes  # the picture, a JPEG file
+
+
+@dataclass(frozen=True, eq=False)
 class ReplayPart:
     """Hold a mesh of the replay."""
 
@@ -68,6 +77,7 @@ class ReportData:
     parts: tuple[ReplayPart, ...]
     left_out: tuple[str, ...]  # what the report does not show, and why
     findings: tuple[Finding, ...] = ()  # of the check before the first stage
+    contacts: tuple[ContactPicture, ...] = ()  # of the teeth; empty where the scans do not show them
 
 
 @dataclass(frozen=True, eq=False)

@@ -80,6 +80,13 @@ class Pair:
         return found
 
 
+def distances(grid: DistanceGrid, points: Array) -> Array:
+    """Return the signed distances at points (n, 3) [mm], shape (n,); outside the grid at least `FARTHEST_MM`."""
+    found = np.empty(len(points))
+    _look_up_all(found, np.ascontiguousarray(points), grid.values, grid.origin, 1.0 / grid.step_mm)
+    return found
+
+
 def solid(corners: Array, up: float, height_mm: float) -> Solid:
     """Build a solid from triangles.
 
@@ -161,6 +168,12 @@ def _look_up(values, origin, per_mm, x, y, z):  # type: ignore[no-untyped-def]  
         values[i + 1, j + 1, k] * (1 - c) + values[i + 1, j + 1, k + 1] * c
     ) * b
     return low * (1 - a) + high * a
+
+
+@numba.njit(nogil=True, cache=True)
+def _look_up_all(found, points, values, origin, per_mm):  # type: ignore[no-untyped-def]
+    for i in range(len(points)):
+        found[i] = _look_up(values, origin, per_mm, points[i, 0], points[i, 1], points[i, 2])
 
 
 @numba.njit(nogil=True, cache=True)

@@ -95,19 +95,21 @@ def _solid(name: str, mesh: Mesh, T: Array, up: float) -> Solid:
 
 def sample_field(teeth: Teeth, rig: JawRig) -> ContactField:
     """Sample the clearance of a rig's poses over its bound."""
-    box = _box(teeth, rig)
-    axes = [low + _STEP_MM * np.arange(int(np.ceil((high - low) / _STEP_MM)) + 1) for low, high in box]
+    # 0 is one of the values, so that the closed bite is exact
+    ends = [(np.floor(low / _STEP_MM), np.ceil(high / _STEP_MM)) for low, high in _box(teeth, rig)]
+    axes = [_STEP_MM * np.arange(first, last + 1) for first, last in ends]
+    first = np.array([axis[0] for axis in axes])
     d = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     wanted = rig.margin(d) > -(_BEYOND_MM + _STEP_MM)
     values = np.zeros(d.shape[:3])
     values[wanted] = teeth.clearances(rig.pose(d[wanted]))
     nearest = distance_transform_edt(~wanted, return_distances=False, return_indices=True)
     values = np.round(values[tuple(nearest)] / UNIT_MM) * UNIT_MM
-    field = ContactField(box[:, 0], np.full(3, _STEP_MM), values, teeth.closed_mm, 0.0, -AUTHORED_MM)
+    field = ContactField(first, np.full(3, _STEP_MM), values, teeth.closed_mm, 0.0, -AUTHORED_MM)
     captured = rig.captured_d
     least = float(np.quantile(field.clearance(captured).clearance_mm, _CAPTURED_QUANTILE)) if len(captured) else 0.0
     limit = -float(np.clip(-least, AUTHORED_MM, _LARGEST_LIMIT_MM))
-    return ContactField(box[:, 0], field.step_mm, values, teeth.closed_mm, _error(teeth, rig, field), limit)
+    return ContactField(first, field.step_mm, values, teeth.closed_mm, _error(teeth, rig, field), limit)
 
 
 def _box(teeth: Teeth, rig: JawRig) -> Array:

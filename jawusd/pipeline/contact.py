@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import TypedDict
+from typing import TYPE_CHECKING, TypedDict
 
+import numpy as np
+
+from jawusd.errors import RigError
 from jawusd.evaluator import JawRig
+from jawusd.formats.mesh import Mesh
 from jawusd.formats.model import JawModel
+from jawusd.formats.report import ContactPicture
 from jawusd.pipeline.prepare import Subject
 from jawusd.pipeline.scan_labels import TEETH
 from jawusd.pipeline.state import Progress, no_progress
+
+if TYPE_CHECKING:
+    from jawusd.imaging.contact import Teeth
+
+_QUALITY = 88  # of the pictures, JPEG
 
 
 class ContactSummary(TypedDict, total=False):
@@ -21,13 +32,63 @@ class ContactSummary(TypedDict, total=False):
     limit_mm: float  # measured poses of less clearance collide
 
 
-def contact_words(contact: ContactSummary) -> str:
-    """Return a summary as text."""
-    if "missing" in contact:
-        return f"nothing keeps them from passing through each other: {contact['missing']}"
-    closed = contact["closed_mm"]
+def contact_words(contact: object) -> str:
+    """Return a `ContactSummary` as text; of anything else, as files of others may hold it, that nothing is known."""
+    found = contact if isinstance(contact, dict) else {}
+    closed, error = found.get("closed_mm"), found.get("error_mm")
+    if not isinstance(closed, float) or not isinstance(error, float):
+        return f"nothing keeps them from passing through each other: {found.get('missing', 'contact was not measured')}"
     meet = f"the scans run {closed:.2f} mm into each other" if closed > 0 else f"the scans leave {-closed:.2f} mm"
-    return f"{meet} in the closed bite; clearances to {contact['error_mm']:.2f} mm"
+    return f"{meet} in the closed bite; clearances to {error:.2f} mm"
+
+
+def contact_pictures(model: JawModel, subject: Subject) -> tuple[ContactPicture, ...]:
+    """Return the contacts of the closed bite, and half way of gliding forward and to both sides.
+
+    Args:
+        subject: The person, scans registered as the model's poses are.
+
+    Raises:
+        RigError: The scans do not show them.
+    """
+    from jawusd.imaging.contact_map import ContactMap
+    from jawusd.imaging.overlay import encode_jpeg
+
+    rig = JawRig(model.arrays, model.meta)
+    drawn, closed = ContactMap(teeth_of(rig, subject.meshes)), rig.ranges(0.0)
+    poses = {
+        "closed bite": [0.0, 0.0, 0.0],
+        "gliding forward": [0.0, 0.0, 0.5 * float(closed.d3_max)],
+        "gliding to the left": [0.0, 0.5 * float(closed.d2_max), 0.0],
+        "gliding to the right": [0.0, 0.5 * float(closed.d2_min), 0.0],
+    }
+    return tuple(
+        ContactPicture(
+            f"{name} (d = {', '.join(f'{x:.1f}' for x in d)} mm)",
+            float(rig.clearance(d).clearance_mm),
+            encode_jpeg(drawn.draw(rig.pose(d)), _QUALITY),
+        )
+        for name, d in poses.items()
+        if np.isfinite(d).all()
+    )
+
+
+def teeth_of(rig: JawRig, meshes: Mapping[str, Mesh]) -> Teeth:
+    """Return both rows of teeth among meshes (skull and mandible frame) as solids.
+
+    Raises:
+        RigError: The rig has no clearances, or the meshes do not show how the teeth meet.
+    """
+    from jawusd.imaging.contact import NoContact, find_teeth
+
+    missing = [name for name in TEETH.values() if name not in meshes]
+    if rig.contact is None or missing:
+        raise RigError("does not know how the teeth meet.", hint="Fit it with scans of both rows in occlusion.")
+    upper, lower = (meshes[TEETH[row]] for row in ("upper", "lower"))
+    try:
+        return find_teeth(upper, lower, rig.T_anatomical_skull, rig.T_rest)
+    except NoContact as reason:
+        raise RigError(f"does not show how the teeth meet: {reason}.") from reason
 
 
 def with_contact(

@@ -18,6 +18,7 @@ from jawusd.formats.finding import Finding
 from jawusd.formats.model import load_model
 from jawusd.formats.report import CameraFacts, Overlay, ReportData, RigFacts
 from jawusd.formats.tracks import Tracks, load_tracks
+from jawusd.pipeline.contact import contact_pictures
 from jawusd.pipeline.fit import Poses, fit_summary
 from jawusd.pipeline.media import draw_worst_frames, replay_parts
 from jawusd.pipeline.prepare import Subject, load_cameras, open_capture, subject_of_build
@@ -86,6 +87,7 @@ def write_build_report(
         left_out.append("the mandible in 3-D: no mesh of it was given, and the rig's placeholder is no anatomy.")
     progress("report", 1, 4)
     overlays = attempt("pictures of the footage", left_out, lambda: _overlays(facts, tracks)) or ()
+    contacts = attempt("contacts of the teeth", left_out, lambda: contact_pictures(model, subject)) or ()
     progress("report", 2, 4)
     data = ReportData(
         actor=subject.name,
@@ -103,6 +105,7 @@ def write_build_report(
         parts=attempt("3-D replay", left_out, lambda: replay_parts(folder, model)) or (),
         left_out=tuple(dict.fromkeys(left_out)),
         findings=_check_findings(facts.stages),
+        contacts=contacts,
     )
     progress("report", 3, 4)
     write_document(folder / REPORT_FILE, data)

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import os
 import re
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from jawusd.errors import FormatError, OutputError, RigError, explain_missing_packages
 from jawusd.evaluator import JawRig
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import load_tracks
-from jawusd.geometry.arrays import Mask
+from jawusd.geometry.arrays import Array, Mask
 from jawusd.pipeline.bake import DEFAULT_FPS
+from jawusd.pipeline.contact import teeth_of
 
 if TYPE_CHECKING:
+    from jawusd.imaging.contact_map import ContactMap
     from jawusd.viewer.motion import Clip
     from jawusd.viewer.server import Viewer
     from jawusd.viewer.viewed import Look, ViewedActor
@@ -75,7 +78,32 @@ def viewed_actor(path: str | os.PathLike[str]) -> ViewedActor:
         clip_names=partial(motion_names, path.parent),
         load_clip=partial(load_motion, path.parent, rig, float(about["fps"] or DEFAULT_FPS)),
         save_layer=partial(save_motion, path, rig),
+        contacts=None if rig.contact is None else ContactView(path, rig).draw,
     )
+
+
+class ContactView:
+    """Draw the contacts of a rig's teeth; the scans are read when the first picture is wanted."""
+
+    def __init__(self, path: Path, rig: JawRig) -> None:
+        self._path, self._rig = path, rig
+
+    @cached_property
+    def _map(self) -> ContactMap:
+        from jawusd.imaging.contact_map import ContactMap
+        from jawusd.rig.geo import read_geometry
+
+        return ContactMap(teeth_of(self._rig, read_geometry(self._path)))
+
+    @explain_missing_packages()
+    def draw(self, d: Array) -> NDArray[np.uint8]:
+        """Return a picture, RGB (h, w, 3), of both arches at d (3,) [mm].
+
+        Raises:
+            RigError: the meshes of the rig do not show how the teeth meet.
+            MissingDependencyError: a package is missing.
+        """
+        return self._map.draw(self._rig.pose(d))
 
 
 def screen_meshes(path: Path) -> dict[str, Mesh]:

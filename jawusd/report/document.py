@@ -13,6 +13,7 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from jawusd.formats.atomic import write_text_atomic
+from jawusd.formats.contact import DEEP, TOUCHING
 from jawusd.formats.finding import Finding
 from jawusd.formats.report import ReportData
 from jawusd.formats.tracks import LOST, LostReason
@@ -60,6 +61,8 @@ def document(data: ReportData) -> str:
             replay=replay_data(data),
             figures=_figures(data),
             pictures=[(one, base64.b64encode(one.jpeg).decode("ascii")) for one in data.overlays],
+            contacts=[(one, base64.b64encode(one.jpeg).decode("ascii")) for one in data.contacts],
+            paper=(DEEP, *TOUCHING),
             ranges=human_ranges(data.tracks, data.model),
             errors=_error_tables(data),
             frames=_frame_lists(data),

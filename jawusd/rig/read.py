@@ -174,6 +174,7 @@ class Description(TypedDict):
     animation: dict[str, float] | None
     meshes: dict[str, int]
     placeholders: list[str]
+    contact: object
     errors: object
 
 
@@ -213,6 +214,7 @@ def describe(path: PathArg, prim_path: str | None = None) -> Description:
         "animation": animation,
         "meshes": _meshes(prim),
         "placeholders": [p.GetName() for p in Usd.PrimRange(prim) if p.GetAttribute("jaw:placeholder").Get()],
+        "contact": rig.meta.get("contact"),
         "errors": rig.meta.get("errors"),
     }
 

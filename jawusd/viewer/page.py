@@ -7,6 +7,7 @@ import viser
 
 from jawusd.evaluator import JawRig
 from jawusd.geometry.se3 import transform_point
+from jawusd.viewer.contact_panel import ContactPanel
 from jawusd.viewer.file_panel import FilePanel
 from jawusd.viewer.motion_panel import MotionPanel
 from jawusd.viewer.plots import VERMILION, bound_plot, posselt_plot, posselt_point
@@ -23,6 +24,7 @@ _PLACEHOLDER = small_text(
     "and condyles go, not the bone.",
     f"color:{VERMILION}",
 )
+_NO_CONTACTS = small_text("The scans do not show how the teeth meet: nothing keeps them apart.", "opacity:.7")
 _PLOT_HELP = (
     '<div style="font-size:11px;opacity:.7;padding:0 12px">blue: bound of this person; dashed: outline of the captured '
     "poses; grey: captured poses</div>"
@@ -84,6 +86,7 @@ class Page:
             if "mandible" in actor.placeholders:
                 gui.add_html(_PLACEHOLDER)
             self.pose = PosePanel(client, self.session, self.scene, self.refresh)
+            self.contacts = self._add_contacts(actor)
         with tabs.add_tab("Animate"):
             self.motion = MotionPanel(client, self.session, actor, self.refresh)
         with tabs.add_tab("Files"):
@@ -94,6 +97,13 @@ class Page:
         for grip in self.scene.grips:
             grip.on_drag(guarded(client, self._drag))
         self.refresh()
+
+    def _add_contacts(self, actor: ViewedActor) -> ContactPanel | None:
+        with self.client.gui.add_folder("Contacts of the teeth"):
+            if actor.contacts is None:
+                self.client.gui.add_html(_NO_CONTACTS)
+                return None
+            return ContactPanel(self.client, actor.rig, actor.contacts, self.refresh)
 
     async def _drag(self, event: viser.SceneNodeDragEvent[viser.MeshHandle]) -> None:
         session, scene = self.session, self.scene
@@ -121,6 +131,8 @@ class Page:
                 {pin.name: transform_point(session.pose(), pin.p_mandible) for pin in session.work.pins}
             )
             self.pose.refresh(readout)
+            if self.contacts is not None:
+                self.contacts.refresh(session.work.d)
             self.plots.refresh(session.work.d, readout.inside)
             self.motion.refresh()
 

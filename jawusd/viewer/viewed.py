@@ -42,6 +42,9 @@ class ViewedActor:
     load_clip: Callable[[str], Clip]  # reads one of them; raises a JawusdError
     # writes an animation layer (file name, clip, overwrite) beside the rig and returns its path; raises a JawusdError
     save_layer: Callable[[str, Clip, bool], Path]
+    # d (3,) [mm] to a picture of both arches with their contacts, RGB (h, w, 3); raises a JawusdError; None where the
+    # rig does not know how the teeth meet
+    contacts: Callable[[Array], NDArray[np.uint8]] | None = None
 
 
 @dataclass(frozen=True, eq=False)

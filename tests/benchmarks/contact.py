@@ -19,6 +19,7 @@ What is said of depth is beyond the depth of the closed bite by the same oracle 
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -46,8 +47,8 @@ from jawusd.synthetic.short_capture import ShortConfig, draw_capture
 FRAMES = 600
 NOISE = np.array([0.0004] * 3 + [0.04] * 3)  # of a tracked pose [rad, mm]
 APART_MM = 0.12  # random points of a surface
-REACH_MM = 12.0  # points farther from the other jaw in the closed bite are left out
-NEAR_MM = 3.0
+REACH_MM = 7.0  # points farther from the other jaw in the closed bite are left out
+NEAR_MM = 1.8
 DEEP_MM = 0.2
 THROUGH_MM = 1.0
 
@@ -93,14 +94,18 @@ class Surface:
         free[chosen] = winding(centres, self.corners) < 0.6
         self.points, self.normals = points[free[face]], outward[free[face]]
         self.tree = cKDTree(self.points)
-        self.moving = self.points[rng.random(len(self.points)) < 0.15]
+        self.moving = self.points[rng.random(len(self.points)) < 0.06]
 
     def depth(self, points: np.ndarray, floor: float) -> float:
         """Return how deep the deepest of points (n, 3) lies [mm]; `floor` if none is deeper."""
+        if self.tree.query(points[::20])[0].min() > NEAR_MM:
+            return floor
         away, nearest = self.tree.query(points, distance_upper_bound=NEAR_MM)
         rows = np.flatnonzero((away < np.inf) & (away > floor))
-        inward = np.einsum("nc,nc->n", points[rows] - self.points[nearest[rows]], self.normals[nearest[rows]]) < 0
-        rows = rows[inward]
+        # behind all of the nearest points; before a sharp edge it is behind one of them only
+        _, nearest = self.tree.query(points[rows], k=4)
+        before = points[rows, None] - self.points[nearest]
+        rows = rows[(np.einsum("nkc,nkc->nk", before, self.normals[nearest]) < 0).all(axis=1)]
         for k in rows[np.argsort(-away[rows])]:
             if winding(points[k : k + 1], self.corners)[0] > 0.5:
                 return float(away[k])
@@ -170,6 +175,7 @@ def measure(case: Case, count: int) -> str:
     noisy = se3_exp(rng.normal(size=(len(case.poses), 6)) * NOISE) @ case.poses
     frames = np.arange(len(noisy))
     plain = fit_subject(Subject(**{**vars(case.subject), "meshes": {}}), (frames, noisy))
+    print(f"  fitted after {time.process_time():.0f} s", file=sys.stderr)
     start = time.process_time()
     model = with_contact(plain, case.subject)
     bake_s = time.process_time() - start
@@ -177,6 +183,7 @@ def measure(case: Case, count: int) -> str:
     if rig.contact is None:
         return f"{case.name:<28} {model.meta['contact']}"
     oracle = Oracle(case.subject.meshes["upper_teeth"], case.subject.meshes["lower_teeth"], rig.T_rest)
+    print(f"  oracle ready after {time.process_time():.0f} s", file=sys.stderr)
     inside = oracle.beyond(rig.pose(sample_valid(rig, count, 1)))
     near = oracle.beyond(rig.pose(low_openings(rig, count, rng)))
     closed = low_openings(rig, 300, rng)
