@@ -27,6 +27,7 @@ from pathlib import Path
 
 import numba
 import numpy as np
+from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
 
 from jawusd.evaluator import JawRig
@@ -94,11 +95,21 @@ class Surface:
         free[chosen] = winding(centres, self.corners) < 0.6
         self.points, self.normals = points[free[face]], outward[free[face]]
         self.tree = cKDTree(self.points)
-        self.moving = self.points[rng.random(len(self.points)) < 0.06]
+        # cells of a millimetre with a point within NEAR_MM
+        self.low = np.floor(self.points.min(axis=0)) - 4.0
+        cells = np.floor(self.points - self.low).astype(int)
+        self.near = np.zeros(cells.max(axis=0) + 5, dtype=bool)
+        self.near[tuple(cells.T)] = True
+        self.near = binary_dilation(self.near, np.ones((3, 3, 3)), iterations=int(np.ceil(NEAR_MM)))
+        self.moving = self.points[rng.random(len(self.points)) < 0.08]
 
     def depth(self, points: np.ndarray, floor: float) -> float:
         """Return how deep the deepest of points (n, 3) lies [mm]; `floor` if none is deeper."""
-        if self.tree.query(points[::20])[0].min() > NEAR_MM:
+        cells = np.floor(points - self.low).astype(int)
+        near = ((cells >= 0) & (cells < self.near.shape)).all(axis=1)
+        near[near] = self.near[tuple(cells[near].T)]
+        points = points[near]
+        if not len(points):
             return floor
         away, nearest = self.tree.query(points, distance_upper_bound=NEAR_MM)
         rows = np.flatnonzero((away < np.inf) & (away > floor))

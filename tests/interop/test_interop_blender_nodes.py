@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from example_rig import FPS, example_meshes, example_motion, example_rig, moved
+from example_rig import FPS, example_meshes, example_motion, example_rig, moved, touching_rig
 from foreign import run_in
 
 from jawusd.plugins.extension import copy_scripts
@@ -15,10 +15,10 @@ MESHES = {"MandibleMesh": "mandible", "LowerTeethMesh": "lower_teeth"}
 
 
 @pytest.mark.parametrize("blender", ["blender45", "blender50"])
-@pytest.mark.parametrize("kind", ["anchored", "additive"])
+@pytest.mark.parametrize("kind", ["anchored", "additive", "touching"])
 @pytest.mark.parametrize("file", ["anim_capture.usdc", "actor.usdz"])
 def test_nodes_pose_the_mandible_without_scripts(tmp_path, blender, kind, file):
-    rig, meshes = example_rig(kind), example_meshes()
+    rig, meshes = touching_rig() if kind == "touching" else example_rig(kind), example_meshes()
     frames, d = example_motion()
     bake_rig(tmp_path / "actor", rig, meshes, name="x", fps=FPS, frames=frames, d=d, table_size=17)
     # also at rest, and beyond the ends of the model's curves
