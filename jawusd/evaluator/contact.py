@@ -12,8 +12,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jawusd.errors import EvaluatorError
+from jawusd.evaluator.batching import pairs_in_chunks, rows_of
+from jawusd.evaluator.verdicts import Verdicts
 from jawusd.geometry.arrays import Array, Mask
 
 #: Values are stored as whole numbers of this length [mm].
@@ -113,6 +116,45 @@ class ContactField:
 
 
 _CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+class TouchingTeeth:
+    """What a rig says of its teeth.
+
+    Attributes:
+        contact: The clearance of the teeth over d; None if the scans do not show it.
+    """
+
+    contact: ContactField | None
+
+    def clearance(self, d: ArrayLike) -> Clearance:
+        """Return how far the teeth are from running deeper into each other than in the scans' closed bite.
+
+        Args:
+            d: Jaw parameters [mm], shape (..., 3).
+
+        Returns:
+            The clearance [mm], shape (...), and its derivative by d [mm/mm], shape (..., 3). 0 is the closed bite; it
+            ends at some 1.5 mm, and at the nearest sampled parameters far outside the bound.
+
+        Raises:
+            EvaluatorError: The rig has no clearances, see `contact`.
+        """
+        if self.contact is None:
+            raise EvaluatorError(
+                "this rig does not know how the teeth meet.",
+                hint="Fit or bake it with scans of both rows of teeth in occlusion.",
+            )
+        rows, batch = rows_of(d, (3,), "d")
+        value, gradient = pairs_in_chunks(self.contact.clearance, rows)
+        return Clearance(value.reshape(batch), gradient.reshape(*batch, 3))
+
+    def _without_collisions(self, verdicts: Verdicts, *, measured: bool) -> Verdicts:
+        """Return the verdicts with poses in which the teeth collide refused."""
+        if self.contact is None:
+            return verdicts
+        limit_mm = self.contact.limit_mm if measured else -AUTHORED_MM
+        return verdicts.with_collisions(self.contact.collides(verdicts.d, limit_mm))
 
 
 def check_contact(arrays: Mapping[str, Array]) -> None:

@@ -9,11 +9,10 @@ from typing import Literal, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jawusd.errors import EvaluatorError
 from jawusd.evaluator.authoring import RigAuthoring
 from jawusd.evaluator.batching import CHUNK_ROWS, as_floats, as_points, as_rows, in_chunks, pairs_in_chunks, rows_of
 from jawusd.evaluator.bounds import SliceHull
-from jawusd.evaluator.contact import AUTHORED_MM, Clearance, ContactField
+from jawusd.evaluator.contact import ContactField, TouchingTeeth
 from jawusd.evaluator.distances import carried, handle_vectors, point_velocities
 from jawusd.evaluator.encoding import Encoder, Encoding, whitening_of
 from jawusd.evaluator.frames import RigFrames
@@ -31,7 +30,7 @@ _scalar = cast("Callable[[float], Array]", np.float64)  # numpy types its scalar
 _SINGLE_LIMIT_MM = 1e4  # beyond, functions of one d might raise where those of rows give infinities
 
 
-class JawRig(RigAuthoring):
+class JawRig(TouchingTeeth, RigAuthoring):
     """One person's jaw: pure functions from d = (opening, laterotrusion, protrusion) [mm] to poses and back.
 
     ``pose(d) = A^-1 M(d) A rest`` with A = T_anatomical_skull and rest = T_skull_mandible of the closed bite;
@@ -44,7 +43,6 @@ class JawRig(RigAuthoring):
         model: The function from d to motions.
         bound: The slice bound.
         polygons: The paper's bound.
-        contact: The clearance of the teeth over d; None if the scans do not show it.
         limits: Thresholds of `validate`, for measured poses, stored in the rig.
         kernels: What computes rows.
     """
@@ -207,28 +205,6 @@ class JawRig(RigAuthoring):
         rows, batch = rows_of(d, (3,), "d")
         return self.kernels.margin_gradients(rows).reshape(*batch, 3)
 
-    def clearance(self, d: ArrayLike) -> Clearance:
-        """Return how far the teeth are from running deeper into each other than in the scans' closed bite.
-
-        Args:
-            d: Jaw parameters [mm], shape (..., 3).
-
-        Returns:
-            The clearance [mm], shape (...), and its derivative by d [mm/mm], shape (..., 3). 0 is the closed bite; it
-            ends at some 1.5 mm, and at the nearest sampled parameters far outside the bound.
-
-        Raises:
-            EvaluatorError: The rig has no clearances, see `JawRig.contact`.
-        """
-        if self.contact is None:
-            raise EvaluatorError(
-                "this rig does not know how the teeth meet.",
-                hint="Fit or bake it with scans of both rows of teeth in occlusion.",
-            )
-        rows, batch = rows_of(d, (3,), "d")
-        value, gradient = pairs_in_chunks(self.contact.clearance, rows)
-        return Clearance(value.reshape(batch), gradient.reshape(*batch, 3))
-
     def project(self, d: ArrayLike) -> Array:
         """Return the nearest valid jaw parameters: d itself inside the bound, else the nearest point with margin >= 0.
 
@@ -254,12 +230,13 @@ class JawRig(RigAuthoring):
         times_s: ArrayLike | None = None,
         speed_limit_mm_s: float | None = None,
     ) -> Verdicts:
-        """Judge measured poses: finite, rigid, on the model, inside the bound or its tolerance, and reachable in time.
+        """Judge measured poses: finite, rigid, on the model, in the bound or its tolerance, teeth apart, and in time.
 
         Args:
             T_skull_mandible: Poses, shape (..., 4, 4).
             residual_limit_mm: Largest landmark distance to the model; the rig's own if None.
-            tolerance_mm: How far outside the bound a measured pose may lie; the rig's own if None, 0 for authored ones.
+            tolerance_mm: How far outside the bound a measured pose may lie; the rig's own if None. Of 0, the poses are
+                judged as authored ones, whose teeth may not run as deep into each other as measured ones do.
             bound: Which bound, see `margin`.
             times_s: Times of the poses along the last batch axis, shape (F,); needed for a speed limit.
             speed_limit_mm_s: Largest speed of a landmark between consecutive poses; None disables the check.
@@ -275,22 +252,21 @@ class JawRig(RigAuthoring):
         verdicts = self.kernels.judge_poses(rows, limits)
         if bound != "slices":
             verdicts = verdicts.with_margin(self.margin(verdicts.d, bound=bound), limits)
-        if self.contact is not None:
-            verdicts = verdicts.with_collisions(self.contact.collides(verdicts.d, self.contact.limit_mm))
+        verdicts = self._without_collisions(verdicts, measured=tolerance_mm != 0)
         return self._with_speed(verdicts, rows, batch, times_s, limits)
 
     def validate_parameters(
         self,
         d: ArrayLike,
         *,
-        tolerance_mm: float = 0.0,
+        tolerance_mm: float | None = 0.0,
         bound: BoundName = "slices",
         times_s: ArrayLike | None = None,
         speed_limit_mm_s: float | None = None,
     ) -> Verdicts:
         """Judge jaw parameters d (..., 3) [mm] as `validate` does poses; the residual is 0.
 
-        They count as authored, without a tolerance; give that of the rig to judge measured ones.
+        They count as authored, without a tolerance; None, for that of the rig, or another judges them as measured.
 
         Raises:
             ValueError: wrong shapes, a tolerance below 0, or a speed limit without rising times.
@@ -300,8 +276,7 @@ class JawRig(RigAuthoring):
         verdicts = self.kernels.judge_parameters(rows, limits)
         if bound != "slices":
             verdicts = verdicts.with_margin(self.margin(verdicts.d, bound=bound), limits)
-        if self.contact is not None:
-            verdicts = verdicts.with_collisions(self.contact.collides(verdicts.d, -AUTHORED_MM))
+        verdicts = self._without_collisions(verdicts, measured=tolerance_mm != 0)
         poses = rows if speed_limit_mm_s is None else self.kernels.poses(rows)
         return self._with_speed(verdicts, poses, batch, times_s, limits)
 

@@ -190,7 +190,7 @@ def _bounds(data: ReportData) -> Verdict:
     model, meta = data.model, model_facts(data)
     rig = JawRig(model.arrays, model.meta)
     used = model.trained & np.all(np.isfinite(model.d), axis=1)
-    verdicts = rig.validate_parameters(model.d[used], tolerance_mm=rig.tolerance_mm)
+    verdicts = rig.validate_parameters(model.d[used], tolerance_mm=None)
     inside, valid = (float(found.mean()) if used.any() else 0.0 for found in (verdicts.inside(), verdicts.valid))
     name = (
         f"captured poses inside the bound ({100 * inside:.1f} %) or within its tolerance of {rig.tolerance_mm:.2f} mm"

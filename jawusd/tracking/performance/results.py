@@ -41,7 +41,7 @@ def performance_of(
     """
     fits = smoothed.fits
     d = np.stack([fit.pose.d for fit in fits])
-    verdicts = jaw.validate_parameters(d, tolerance_mm=jaw.tolerance_mm)
+    verdicts = jaw.validate_parameters(d, tolerance_mm=None)
     found = np.stack([fit.found for fit in fits])
     missed = np.stack([fit.missed for fit in fits]).any(1)
     state = np.where(found.all(1), SolveState.SOLVED, np.where(missed, SolveState.LOST, SolveState.CARRIED))
@@ -88,7 +88,7 @@ def tracks_of(performance: Performance, jaw: JawRig) -> Tracks:
     of_lower[..., JAW] = se3_adjoint(head) @ by_d
     relative_covariance = _spread(by_d, p.covariance[:, JAW, JAW])
     own = landmark_sigmas(relative, relative_covariance, jaw.landmarks)
-    meta = TracksMeta(solver="performance", tolerance_mm=jaw.tolerance_mm)
+    meta = TracksMeta(solver="performance", tolerance_mm=None)
     meta.update(_known_notes(p))
     moved = jaw.meta.get("registration")
     if isinstance(moved, dict) and moved.get("applied"):  # the lower scan is posed as the rig has it
