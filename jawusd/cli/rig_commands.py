@@ -84,15 +84,17 @@ def pose(
     d: Annotated[Triple, typer.Option("--d", help="Opening, lateral (+ left), protrusion (+ forward) [mm].")],
     as_json: Json = False,
 ) -> None:
-    """Print the jaw pose of parameters d: 4x4 matrix, twist, landmarks, margin to the bound."""
+    """Print the jaw pose of parameters d: 4x4 matrix, twist, landmarks, clearance of the teeth, margin to the bound."""
     import jawusd
+    from jawusd.evaluator import Reason
     from jawusd.geometry import LANDMARKS, transform_points
 
     loaded = jawusd.load(rig)
     _check_finite(d, "--d")
     T = loaded.pose(d)
-    margin = float(loaded.margin(d))
-    twist, valid = loaded.twist(d), bool(loaded.is_inside(d))
+    twist, verdict = loaded.twist(d), loaded.validate_parameters(d)
+    margin, inside, valid = float(verdict.margin_mm), bool(verdict.inside()), bool(verdict.valid)
+    clearance = None if loaded.contact is None else float(loaded.clearance(d).clearance_mm)
     landmarks = dict(zip(LANDMARKS, transform_points(T, loaded.landmarks), strict=True))
 
     def lines() -> list[str]:
@@ -101,10 +103,13 @@ def pose(
         found.append("twist (omega rad, v mm): " + " ".join(f"{value:.6f}" for value in twist))
         for name, place in landmarks.items():
             found.append(f"  {name}: " + " ".join(f"{value:.3f}" for value in place) + " mm")
-        return [*found, f"margin {margin:.3f} mm: {'inside' if valid else 'OUTSIDE'} the bound"]
+        if clearance is not None:
+            collide = Reason.TEETH_COLLIDE in Reason(int(verdict.reason))
+            found.append(f"clearance {clearance:.3f} mm: teeth {'COLLIDE' if collide else 'do not collide'}")
+        return [*found, f"margin {margin:.3f} mm: {'inside' if inside else 'OUTSIDE'} the bound"]
 
     result = {"T_skull_mandible": T, "twist": twist, "landmarks_mm": landmarks, "margin_mm": margin, "valid": valid}
-    emit({"d": list(d), **result}, as_json, lines)
+    emit({"d": list(d), **result, "clearance_mm": clearance}, as_json, lines)
 
 
 def _check_finite(values: Triple, option: str) -> None:
