@@ -15,7 +15,7 @@ import numpy as np
 import onnxruntime
 import pytest
 import torch
-from example_model import example_arrays, example_meta
+from example_model import example_arrays, example_meta, touching_arrays
 from example_rig import FPS, example_meshes, example_motion
 from example_tracks import make_tracks
 from pxr import Usd
@@ -174,6 +174,20 @@ def test_commands(actor, tmp_path):
         assert told["valid"] == inside
         assert ("inside the bound" if inside else "OUTSIDE the bound") in run("pose", actor, "--d", *d)
     assert "tolerance 1.00 mm outside the bound" in run("info", actor)
+
+
+def test_collisions_are_told_apart_from_the_bound(tmp_path):
+    deep = {**touching_arrays(), "contact_values": np.full(7 * 9 * 6, -25.0)}  # 0.25 mm, measured poses may by 0.3 mm
+    rig = JawRig({**ARRAYS, **deep}, example_meta())
+    bake_rig(tmp_path, rig, example_meshes(), name="someone", fps=FPS, table_size=17)
+    actor, table = tmp_path / "actor.usda", tmp_path / "d.csv"
+    told = json.loads(run("pose", actor, "--json", "--d", 5, 0, 0.5))
+    assert not told["valid"] and told["margin_mm"] > 0 and told["clearance_mm"] == pytest.approx(-0.25)
+    said = run("pose", actor, "--d", 5, 0, 0.5)
+    assert "clearance -0.250 mm: teeth COLLIDE" in said and "inside the bound" in said
+    write_parameters(table, np.arange(1), np.array([[5.0, 0.0, 0.5]]))
+    assert "1 inside" in run("validate", actor, table)
+    assert "teeth collide" in run("validate", actor, table, "--tolerance-mm", 0, codes=(1,))
 
 
 def test_command_with_numpy_alone(tmp_path, capsys):

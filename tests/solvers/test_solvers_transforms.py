@@ -5,7 +5,7 @@ import copy
 import numpy as np
 import pytest
 import torch
-from example_model import example_arrays, example_meta
+from example_model import example_arrays, example_meta, touching_arrays
 
 from jawusd.errors import EvaluatorError
 from jawusd.evaluator import JawRig
@@ -13,6 +13,7 @@ from jawusd.geometry.se3 import se3_exp
 from jawusd.solvers import JawLayer
 
 RIGS = {kind: JawRig(example_arrays(kind), example_meta(kind)) for kind in ("anchored", "additive")}
+RIGS["touching"] = JawRig({**example_arrays(), **touching_arrays()}, example_meta())
 LAYERS = {kind: JawLayer(rig) for kind, rig in RIGS.items()}
 EVERY = ("forward", "margin", "penalty", "project", "inside", "unconstrained", "encode", "loss")
 
@@ -137,9 +138,9 @@ def test_nothing_but_buffers_decides_what_is_computed(pair, name):
     rig, layer = pair
     changed = {key: value * 1.05 for key, value in example_arrays(rig.kind).items() if key in ("landmarks", "incisor")}
     changed["slice_support"] = rig.arrays["slice_support"] * 0.9
-    decoder = ("path_coefficients", "glide_drop", "spline_weights", "curve1_twists")
+    decoder = ("path_coefficients", "glide_drop", "glide_d2_factors", "spline_weights", "curve1_twists")
     changed |= {key: rig.arrays[key] * 1.1 for key in decoder if key in rig.arrays}
-    other = JawLayer(JawRig(dict(example_arrays(rig.kind), **changed), example_meta(rig.kind)))
+    other = JawLayer(JawRig({**rig.arrays, **changed}, example_meta(rig.kind)))
     x = arguments(rig, name)
     assert not torch.equal(call(other, name)(x), call(layer, name)(x))
     found = torch.func.functional_call(
