@@ -205,7 +205,7 @@ class _Follower:
             yield self._told(fit, at, begin, round(frames) - 1)
 
     def _told(self, fit: FrameFit, at: float, begin: float, dropped: int) -> LiveFrame:
-        verdict = self._jaw.validate_parameters(fit.pose.d[None])
+        verdict = self._jaw.validate_parameters(fit.pose.d[None], tolerance_mm=None)
         return LiveFrame(
             time_s=at - begin,
             d=fit.pose.d,

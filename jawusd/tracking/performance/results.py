@@ -88,7 +88,7 @@ def tracks_of(performance: Performance, jaw: JawRig) -> Tracks:
     of_lower[..., JAW] = se3_adjoint(head) @ by_d
     relative_covariance = _spread(by_d, p.covariance[:, JAW, JAW])
     own = landmark_sigmas(relative, relative_covariance, jaw.landmarks)
-    meta = TracksMeta(solver="performance", tolerance_mm=None)
+    meta = TracksMeta(solver="performance", tolerance_mm=jaw.tolerance_mm)
     meta.update(_known_notes(p))
     moved = jaw.meta.get("registration")
     if isinstance(moved, dict) and moved.get("applied"):  # the lower scan is posed as the rig has it
