@@ -74,7 +74,11 @@ class LiveTake:
         return self._tracker.step(cut, frames)
 
     def sigma_d(self, fit: FrameFit) -> Array:
-        """Return the standard deviations of d after the last step [mm], shape (3,)."""
+        """Return the standard deviations of d after the last step [mm], shape (3,).
+
+        Raises:
+            ValueError: nothing was begun.
+        """
         if self._tracker is None:
             raise ValueError("sigma before begin")
         precision = np.diag(self._tracker.expected.precision)
