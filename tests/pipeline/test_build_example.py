@@ -113,7 +113,9 @@ def test_the_report_shows_the_take_and_stays_small(built):
     out, summary = built
     text = (out / "report.html").read_text()
     assert len(text.encode()) < 6e6 and summary["report"]["file"] == "report.html"
-    assert text.count("data:image/jpeg;base64,") == 6 and text.count("video/cam") == 0
+    assert text.count('with the tracked scans drawn over it" src="data:image/jpeg;base64,') == 6
+    assert text.count('<img alt="contacts: ') == 4 and text.count("data:image/jpeg;base64,") == 10
+    assert text.count("video/cam") == 0
     for words in ("jaw rig report", "light flash", "cam0.mp4", "replay-data", "Paper Fig. 13"):
         assert words in text
     assert "<li>pictures" not in text and "<li>experiments" not in text
