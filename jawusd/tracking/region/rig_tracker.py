@@ -12,6 +12,7 @@ import numpy as np
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.quality import matched_px, score_px
+from jawusd.tracking.contour.scan import CROWN
 from jawusd.tracking.contour.solver import Matched, Rendering
 from jawusd.tracking.contour.views import present_masks
 from jawusd.tracking.performance.attempts import MOST_UNSURE, FrameFit
@@ -34,6 +35,7 @@ _FIRST_ROUNDS = 3  # picks are a few tenths of a millimetre off; each round take
 # Share of the usual contour that fits, below which a pose is doubted, others are searched, an arch is given up,
 # and one that was lost is not trusted again.
 _DOUBTED, _SEARCHED, _LOST, _AGAIN = 0.8, 0.6, 0.33, 0.5
+_UNSURE_FRAMES = 3.0  # left out, after which an arch counts as lost
 _USUAL_FRAMES = 15  # over which the usual contour is measured; it is no less than a share of that of the first frame
 _LEAST_USUAL = 0.7
 # Poses of the jaw among which a search looks, that it tries, and follows to the end, and of the head.
@@ -67,6 +69,8 @@ class RigTracker:
         self._instants, self._coordinates, self._colours = instants, instants.coordinates, colours
         self._head, self._free_focal, self._brief = head, free_focal, brief
         self._jaws = spread_out(instants.coordinates.jaw, _JAWS)
+        places = instants.coordinates.jaw.pose(self._jaws)
+        self._widest = places[np.argmax(np.linalg.norm(places[:, :3, 3], axis=1))]
         self._usual: deque[Array] = deque(maxlen=_USUAL_FRAMES)
         self._least_px = instants.config.least_matched_px
         self._failed = self._frame = 0
@@ -99,19 +103,20 @@ class RigTracker:
     def step(self, cut: Cut, frames: float = 1.0) -> FrameFit:
         """Align the next frame, or one some frames on."""
         self.expected = expected = self._motion.expected(frames)
-        pictures = cut(self._coordinates.arches(expected.pose))
-        look = _Look(self._instants, self._colours, pictures, self._coordinates.arches(self._motion.last))
+        look = self._look(cut, self._coordinates.arches(expected.pose))
         if not look.use.any():
             self._motion.take(expected.pose, np.zeros(2, bool))
             return FrameFit(expected.pose, None, look.use, look.use, np.full(look.use.shape, np.nan))
-        found = self._best(expected, look)
+        found, look = self._best(expected, look, cut)
         share = _share(found.solution)
-        least = np.where(self._motion.blind > 0, _AGAIN, _LOST) * self._usual_share()
+        unsure = (self._motion.blind > 0) | (frames > _UNSURE_FRAMES)
+        least = np.where(unsure, _AGAIN, _LOST) * self._usual_share()
         trusted = (share >= least) & (matched_px(found.solution) >= self._least_px)
         if not trusted.any():
             found = replace(found, pose=expected.pose)
         self._frame += 1
         if trusted.all():
+            self._failed = 0
             if not self._brief or self._frame % _LEARN_EVERY == 0:
                 look.learn(found.pose, RATES)
             self._usual.append(share)
@@ -121,26 +126,31 @@ class RigTracker:
     def _usual_share(self) -> Array:
         return np.maximum(np.median(self._usual, axis=0), _LEAST_USUAL * self._first)
 
-    def _best(self, expected: Expected, look: _Look) -> Aligned:
-        """Align from the prediction, and from other starts where that may have failed."""
+    def _look(self, cut: Cut, around: Array) -> _Look:
+        """Return the pictures around both arches at poses (2, 4, 4)."""
+        before = self._coordinates.arches(self._motion.last)
+        return _Look(self._instants, self._colours, cut(around), before)
+
+    def _best(self, expected: Expected, look: _Look, cut: Cut) -> tuple[Aligned, _Look]:
+        """Align from the prediction, and from other starts where that may have failed; then in more of the pictures."""
         gates = _FEW_GATES_PX if self._brief else _GATES_PX
         found, usual = look.align(expected.pose, expected, gates), self._usual_share()
         if not (_share(found.solution) < _DOUBTED * usual).any():
-            self._failed = 0
-            return found
+            return found, look
         others = (self._motion.last,) if self._brief else (expected.pose, self._motion.last)
         for start in others:
             found = _better(found, look.align(start, expected, gates if self._brief else _WIDE_GATES_PX))
         if not (_share(found.solution) < _SEARCHED * usual).any():
-            self._failed = 0
-            return found
+            return found, look
         self._failed += 1
         pause = _BRIEF_PAUSE if self._brief else 1 if self._failed <= _SEARCHES else _SEARCHES
-        if self._failed % pause:
-            return found
+        if (self._failed - 1) % pause:
+            return found, look
+        look = self._look(cut, np.stack([found.pose.head, found.pose.head @ self._widest]))
+        found = look.align(found.pose, expected, gates)
         if self._head == 1.0 and _share(found.solution)[0] < _SEARCHED * usual[0]:
             found = self._with_head_searched(found, expected, look)
-        return self._searched(found, expected, look)
+        return self._searched(found, expected, look), look
 
     def _with_head_searched(self, found: Aligned, expected: Expected, look: _Look) -> Aligned:
         """Try shifted poses of the head, which the jaw goes with."""
@@ -158,7 +168,7 @@ class RigTracker:
         """Try poses of the jaw all over its range, those first whose teeth lie where it looks like teeth."""
         head, jaw = found.pose.head, self._coordinates.jaw
         places = [head @ jaw.pose(d) for d in self._jaws]
-        order = likeliest(places, look.views, self._instants.solver.scans, 1)
+        order = likeliest(places, look.views, self._instants.solver.scans, 1, look.upper_crowns(found.pose))
         brief, loose = [], expected.precision.copy()
         loose[JAW] = MOST_UNSURE[JAW] ** -2.0
         for k in order[: _FEW_JAWS if self._brief else _TRIED_JAWS]:
@@ -186,6 +196,11 @@ class _Look:
         """Return the likeliest pose near a start."""
         weight = np.full(2, 1.0 / _BORDER_PX3)
         return self._instants.align(start, self.views, self.use, gates_px, expected, weight, self._rendering)
+
+    def upper_crowns(self, pose: Pose) -> list[Mask]:
+        """Return the pixels of each view that show upper crowns at a pose."""
+        self._instants.linearise(pose, self.views, self.use, self._rendering, self._instants.config.final_gate_px[1])
+        return [labels[0] == CROWN for labels in self._rendering.labels]
 
     def learn(self, pose: Pose, rates: tuple[float, float]) -> None:
         """Take up the colours beside the borders found at a pose."""

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from jawusd.geometry import se3_exp, transform_points
-from jawusd.geometry.arrays import Array
+from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.contour.equations import translation
 from jawusd.tracking.contour.scan import Scan
 from jawusd.tracking.contour.views import View
@@ -54,14 +54,23 @@ def starts_everywhere(condyles: CondyleMotion) -> list[Array]:
     return [condyles.placed(*place) for place in _PLACES_MM]
 
 
-def likeliest(places: Sequence[Array], views: Sequence[View], scans: Sequence[Scan], arch: int) -> list[int]:
-    """Return the order of poses T_world_arch (4, 4) by how much the pixels under their crowns look like teeth."""
+def likeliest(
+    places: Sequence[Array], views: Sequence[View], scans: Sequence[Scan], arch: int, taken: Sequence[Mask] = ()
+) -> list[int]:
+    """Return the order of poses T_world_arch (4, 4) by how much the pixels under their crowns look like teeth.
+
+    Args:
+        places, views, scans, arch: the poses, and what they are judged by.
+        taken: by view, pixels (h, w) that show the other arch and count for nothing; empty if that is not known.
+    """
     points = scans[arch].crown_vertices(_POINTS)
     worth = np.zeros(len(places))
-    for view in views:
+    for c, view in enumerate(views):
         if not isinstance(view.edges, RegionView):
             continue
         like = view.edges.likeness(arch)
+        if taken:
+            like = np.where(taken[c], 0.0, like)
         for k, pose in enumerate(places):
             h = transform_points(pose, points) @ view.matrix[:, :3].T + view.matrix[:, 3]
             x, y = np.rint(h[:, :2] / h[:, 2:]).astype(int).T
