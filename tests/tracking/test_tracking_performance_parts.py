@@ -13,6 +13,7 @@ from jawusd.tracking.performance.coordinates import Pose
 from jawusd.tracking.performance.motion import measured_motion
 from jawusd.tracking.performance.results import tracks_of
 from jawusd.tracking.performance.system import TakeSystem
+from jawusd.tracking.performance.unknowns import DRAWN, HabitPrior, TakeState, Unknowns
 
 COUNT = 7
 
@@ -73,6 +74,41 @@ def test_motion_is_told_from_the_noise_of_the_poses(jaw):
     np.testing.assert_allclose(np.sqrt(found[3:]), np.sqrt(wanted[3:]), rtol=0.5)
     none = measured_motion(coordinates, shaken, ~good, 24.0)  # nothing seen: as the take behind the rig moved
     assert (none.bend > 0).all() and (none.step > 0).all()
+
+
+def inside_by(bias_px, jaw, frames, habits):
+    """Return the bias of free edges told by borders on random normals that all lie so far off."""
+    from types import SimpleNamespace
+
+    from jawusd.tracking.performance.coordinates import Coordinates
+
+    rng, scan = np.random.default_rng(4), SimpleNamespace(centre=np.array([0.0, 4.0, -9.0]))
+    coordinates = Coordinates(jaw, (scan, scan))
+    unknowns, none = Unknowns(coordinates, frames, habits=habits), TakeState.unknown(1)
+    system, pose = TakeSystem(frames, unknowns.local, unknowns.shared), Pose(np.eye(4), np.array([8.0, 0.0, 0.0]))
+    for k in range(frames):
+        twist, free = rng.normal(0, 5, (2, 200, 6)), np.zeros((200, 3))
+        free[:150, 0] = free[150:, 1] = 1.0
+        moved = free[:, 0] * bias_px + rng.normal(0, 0.3, (2, 200))
+        outline = SimpleNamespace(
+            precision=np.swapaxes(twist, 1, 2)[:, None] @ twist[:, None],
+            gradient=np.einsum("rni,rn->ri", twist, moved)[:, None],
+            habit_slope=(free.T @ twist)[:, None],
+            habit_weight=np.tile(free.T @ free, (2, 1, 1, 1)),
+            habit_distance=(moved @ free)[:, None],
+        )
+        fit = SimpleNamespace(
+            pose=pose, solution=SimpleNamespace(outline=outline), found=np.ones(2, bool), growth=None
+        )
+        system.add_frame(k, *unknowns.frame(fit, np.full(2, 1.0 / 10.0)))
+    system.add_shared(*unknowns.prior(none))
+    return unknowns.moved([pose] * frames, none, *system.solve())[1].habits[:, 0]
+
+
+def test_borders_of_colours_may_lie_inside_farther_than_drawn_ones(jaw):
+    """Light moves borders by more than a hand's habits; both are told from many frames alike."""
+    np.testing.assert_allclose(inside_by(-0.5, jaw, 40, HabitPrior((0.4, 0.08, 0.02), 5.0)), -0.5, atol=0.1)
+    assert (inside_by(-0.5, jaw, 40, DRAWN) > -0.3).all()
 
 
 @pytest.fixture

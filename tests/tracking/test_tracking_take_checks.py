@@ -7,6 +7,8 @@ import pytest
 from small_take import CAMERAS, LANDMARKS, MESHES, OFFSETS, errors_mm, make_capture, track, write_masks
 
 from jawusd.tracking import track_capture
+from jawusd.tracking.initialization.magnification import Magnification
+from jawusd.tracking.sequence.take_checks import lens_findings
 
 FRAMES = 16
 
@@ -60,3 +62,17 @@ def test_scans_of_a_wrong_size_are_named(capture):
     tracks = track_capture(capture, CAMERAS, OFFSETS, *larger, LANDMARKS)
     assert "scan_size" in {kind for kind, _ in _kinds(tracks)}
     assert np.isfinite(tracks.T_upper_lower).all()
+
+
+def lens_kinds(bend):
+    """Return what is found where the first of three cameras shows side teeth so much larger."""
+    bends, none, small = np.array([bend, 0.0, 0.0]), np.zeros(3), np.full(3, 1e-4)
+    found = Magnification(none, small, bends, small, np.zeros((3, 2)), np.full((3, 2), 0.1), 0.5)
+    return [(f.kind, f.camera) for f in lens_findings(["cam0", "cam1", "cam2"], found)]
+
+
+def test_only_what_a_lens_can_do_is_put_down_to_it():
+    """Masks that end in the shadow of the cheeks make side teeth smaller than any lens does."""
+    assert lens_kinds(0.005) == lens_kinds(-0.005) == [("lens_distortion", "cam0")]
+    assert lens_kinds(-0.03) == lens_kinds(0.03) == [("side_teeth", "cam0")]
+    assert lens_kinds(-0.001) == []

@@ -19,7 +19,7 @@ from jawusd.tracking.performance.instant import InstantSolver
 from jawusd.tracking.performance.instants import Views
 from jawusd.tracking.performance.motion import Motion, head_bends, measured_motion
 from jawusd.tracking.performance.system import TakeSystem
-from jawusd.tracking.performance.unknowns import TakeState, Unknowns
+from jawusd.tracking.performance.unknowns import DRAWN, HabitPrior, TakeState, Unknowns
 
 # How often outlines are matched anew; a third time changes less than a hundredth of a millimetre.
 _ROUNDS = 2
@@ -55,12 +55,14 @@ class Smoother:
         fixed_head: bool = False,
         free_focal: bool = False,
         length_px: float | None = None,
+        habits: HabitPrior = DRAWN,
     ) -> None:
         """Take what aligns instants, the pictures, the frames in order, and how many cameras there are.
 
         Args:
             views: None for fits whose outlines are matched where they are; with a fixed head these have the same one.
             length_px: over which outlines err alike, where residuals do not show it.
+            habits: what is known of how far outlines reach over the teeth.
         """
         self._cameras, self._rounds, self._length_px = cameras, _FOCAL_ROUNDS if free_focal else _ROUNDS, length_px
         if views is None:
@@ -68,7 +70,9 @@ class Smoother:
         self._instants, self._views, self._frames, self._fps = instants, views, frames, fps
         self._coordinates: Coordinates = instants.coordinates
         free = cameras if free_focal else 0
-        self._unknowns = Unknowns(instants.coordinates, len(frames), fixed_head=fixed_head, free_focal=free)
+        self._unknowns = Unknowns(
+            instants.coordinates, len(frames), fixed_head=fixed_head, free_focal=free, habits=habits
+        )
 
     def run(self, fits: Sequence[FrameFit], done: Callable[[int, int], None] = lambda done, total: None) -> Smoothed:
         """Return the most likely take.

@@ -20,10 +20,23 @@ from jawusd.tracking.performance.focal import PRIOR_LOG_FOCAL, with_focal
 from jawusd.tracking.performance.instant import bound_equations
 
 _HABITS = 3  # of an arch, as in `OutlineSums`
-# What is known of them without the take: one hand's habits from arch to arch [px, px, mm].
-_PRIOR_HABITS = np.tile([0.15, 0.15, 0.05], 2)
-# Frames whose outline errors are independent of one another: the same hand draws the same teeth all over the take.
-_INDEPENDENT_FRAMES = 1.5
+
+
+@dataclass(frozen=True)
+class HabitPrior:
+    """Say what is known of how far outlines reach over the teeth before a take is seen.
+
+    Attributes:
+        sigma: standard deviations at free edges [px], at the gum line [px], along the gum [mm].
+        frames: as many frames of independent outlines tell as much about it as a whole take.
+    """
+
+    sigma: tuple[float, float, float]
+    frames: float
+
+
+#: One hand's habits from arch to arch; it draws the same teeth all over the take.
+DRAWN = HabitPrior((0.15, 0.15, 0.05), 1.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,9 +67,18 @@ class Unknowns:
         head: the same of the head, None if it is fixed.
     """
 
-    def __init__(self, coordinates: Coordinates, frames: int, *, fixed_head: bool = False, free_focal: int = 0) -> None:
+    def __init__(
+        self,
+        coordinates: Coordinates,
+        frames: int,
+        *,
+        fixed_head: bool = False,
+        free_focal: int = 0,
+        habits: HabitPrior = DRAWN,
+    ) -> None:
         """Lay them out for a take of so many frames, and so many cameras of unknown focal length: all, or none."""
         self._coordinates, self.fixed_head, self.free_focal = coordinates, fixed_head, free_focal
+        self._sigma_habits = np.tile(habits.sigma, 2)
         self.local = LOCAL - 6 if fixed_head else LOCAL
         self.jaw = slice(self.local - 3, self.local)
         self.head = None if fixed_head else HEAD
@@ -65,12 +87,12 @@ class Unknowns:
         self.shared = self.focal.stop
         # A take overrates what its frames tell about habits by so much.
         self.redundancy = np.ones(self.shared)
-        self.redundancy[self._habits] = max(1.0, frames / _INDEPENDENT_FRAMES)
+        self.redundancy[self._habits] = max(1.0, frames / habits.frames)
 
     def prior(self, state: TakeState) -> tuple[Array, Array]:
         """Return precision and right side of what is known of the take without its frames, shapes (G,)."""
         precision, off = np.zeros(self.shared), np.zeros(self.shared)
-        precision[self._habits] = self.redundancy[self._habits] * _PRIOR_HABITS**-2.0
+        precision[self._habits] = self.redundancy[self._habits] * self._sigma_habits**-2.0
         off[self._habits] = state.habits.ravel()
         precision[self.focal] = PRIOR_LOG_FOCAL**-2.0
         off[self.focal] = state.log_focal if self.free_focal else ()
