@@ -70,6 +70,11 @@ def _info_lines(found: Description) -> list[str]:
     )
     lines.append(f"table: {table['format']} {table['shape']}, worst error {table['max_error_mm']:.4f} mm")
     lines.append(f"teeth: {contact_words(found['contact'])}")
+    if found["speeds"]:
+        speed, acceleration = (
+            ", ".join(f"{x:.0f}" for x in found["speeds"][name]) for name in ("rms_mm_s", "rms_mm_s2")
+        )
+        lines.append(f"moves: d1, d2, d3 at {speed} mm/s and {acceleration} mm/s^2 (rms over the take)")
     for name, count in found["meshes"].items():
         mark = ", a placeholder, no anatomy" if name in found["placeholders"] else ""
         lines.append(f"mesh {name}: {count} points{mark}")

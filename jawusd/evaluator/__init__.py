@@ -2,6 +2,7 @@
 
 from jawusd.evaluator.files import load
 from jawusd.evaluator.rig import JawRig
+from jawusd.evaluator.speeds import Speeds
 from jawusd.evaluator.verdicts import Reason, Verdicts
 
-__all__ = ["JawRig", "Reason", "Verdicts", "load"]
+__all__ = ["JawRig", "Reason", "Speeds", "Verdicts", "load"]

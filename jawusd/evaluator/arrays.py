@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from jawusd.errors import EvaluatorError
 from jawusd.evaluator.contact import check_contact
 from jawusd.evaluator.schema import ANCHORED, KINDS, OPTIONAL, arrays_of
+from jawusd.evaluator.speeds import check_speeds
 from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import rigidity_defect
 
@@ -133,6 +134,8 @@ def checked_arrays(arrays: Mapping[str, ArrayLike], kind: str) -> dict[str, Arra
     _check_sections(checked)
     if "contact_values" in checked:
         check_contact(checked)
+    if "velocity_covariance" in checked:
+        check_speeds(checked)
     if kind == ANCHORED and lengths["weights"] != lengths["centres"] + 3:
         raise EvaluatorError(
             f'"spline_weights" has {lengths["weights"]} rows for {lengths["centres"]} centres; '

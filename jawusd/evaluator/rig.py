@@ -20,6 +20,7 @@ from jawusd.evaluator.kernels import Kernels, NumpyKernels, RigParts
 from jawusd.evaluator.models import FORMS
 from jawusd.evaluator.polygons import PolygonBound
 from jawusd.evaluator.search import BoundedSearch, IkResult
+from jawusd.evaluator.speeds import Speeds
 from jawusd.evaluator.verdicts import Limits, Verdicts, is_inside, too_fast
 from jawusd.geometry.arrays import Array, Indices, Mask
 from jawusd.geometry.se3 import transform_points
@@ -43,6 +44,7 @@ class JawRig(TouchingTeeth, RigAuthoring):
         model: The function from d to motions.
         bound: The slice bound.
         polygons: The paper's bound.
+        speeds: How fast the jaw moved in its take; None if the rig does not know.
         limits: Thresholds of `validate`, for measured poses, stored in the rig.
         kernels: What computes rows.
     """
@@ -69,6 +71,7 @@ class JawRig(TouchingTeeth, RigAuthoring):
         self.bound = SliceHull.from_arrays(self.arrays)
         self.polygons = PolygonBound.from_arrays(self.arrays)
         self.contact = ContactField.from_arrays(self.arrays)
+        self.speeds = Speeds.from_arrays(self.arrays)
         self.limits = Limits(float(self.arrays["residual_limit_mm"]), self.tolerance_mm)
         self._frames = RigFrames(self.T_anatomical_skull, self.T_rest, self.model.single.anchor)
         parts = RigParts(self.model, self.bound, self._frames, self.landmarks)

@@ -92,8 +92,15 @@ CONTACT_ARRAYS: dict[str, ArraySpec] = {
 }
 
 
+#: Arrays of rigs whose take has a frame rate: both or none; see `jawusd.evaluator.speeds`.
+SPEED_ARRAYS: dict[str, ArraySpec] = {
+    "velocity_covariance": ArraySpec("jaw:motion:velocityCovariance", (3, 3)),
+    "acceleration_covariance": ArraySpec("jaw:motion:accelerationCovariance", (3, 3)),
+}
+
+
 #: Groups of arrays that a rig may lack, by the name of an array of each.
-OPTIONAL = {"glide_d2": GLIDE_ARRAYS, "contact_values": CONTACT_ARRAYS}
+OPTIONAL = {"glide_d2": GLIDE_ARRAYS, "contact_values": CONTACT_ARRAYS, "velocity_covariance": SPEED_ARRAYS}
 
 
 def arrays_of(kind: str) -> dict[str, ArraySpec]:

@@ -54,6 +54,7 @@ def bake_subject(
     Raises:
         RigError, OutputError: the rig cannot be written.
     """
+    from jawusd.fitting.speeds import with_speeds
     from jawusd.imaging.mesh_cleaning import manifold
     from jawusd.rig.bake import bake_rig
 
@@ -62,6 +63,8 @@ def bake_subject(
     meshes = {key: manifold(mesh) if key in BONES else mesh for key, mesh in subject.meshes.items()}
     if "contact" not in model.meta:  # fitted without the scans
         model = with_contact(model, subject, progress, regauge=False)
+    if "velocity_covariance" not in model.arrays and subject.fps is not None:
+        model = with_speeds(model, subject.fps)
     moving = len(model.frames) > 0
     progress("bake", 0, 1)
     files = bake_rig(

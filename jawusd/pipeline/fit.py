@@ -88,6 +88,7 @@ def fit_subject(
         FittingError: the poses cannot carry a model.
     """
     from jawusd.fitting import FittingConfig, fit_model
+    from jawusd.fitting.speeds import with_speeds
 
     registration = motion.meta.get("registration") if isinstance(motion, Tracks) else None
     if registration is not None:
@@ -103,11 +104,13 @@ def fit_subject(
         progress=partial(progress, "fit"),
     )
     model.meta["inferred"] = list(subject.inferred)
-    if subject.fps is not None:
-        model.meta["fps"] = subject.fps
     if registration is not None:
         model.meta["registration"] = registration
-    return with_contact(model, subject, progress)
+    model = with_contact(model, subject, progress)
+    if subject.fps is None:
+        return model
+    model.meta["fps"] = subject.fps
+    return with_speeds(model, subject.fps)
 
 
 def fit_summary(model: JawModel) -> FitSummary:

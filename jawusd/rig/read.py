@@ -175,6 +175,7 @@ class Description(TypedDict):
     meshes: dict[str, int]
     placeholders: list[str]
     contact: object
+    speeds: dict[str, list[float]] | None
     errors: object
 
 
@@ -215,8 +216,16 @@ def describe(path: PathArg, prim_path: str | None = None) -> Description:
         "meshes": _meshes(prim),
         "placeholders": [p.GetName() for p in Usd.PrimRange(prim) if p.GetAttribute("jaw:placeholder").Get()],
         "contact": rig.meta.get("contact"),
+        "speeds": _speeds(rig),
         "errors": rig.meta.get("errors"),
     }
+
+
+def _speeds(rig: JawRig) -> dict[str, list[float]] | None:
+    """Return the root mean square speeds [mm/s] and accelerations [mm/s^2] of (d1, d2, d3) in the take."""
+    if rig.speeds is None:
+        return None
+    return {"rms_mm_s": rig.speeds.rms_mm_s.tolist(), "rms_mm_s2": rig.speeds.rms_mm_s2.tolist()}
 
 
 def _meshes(prim: Usd.Prim) -> dict[str, int]:

@@ -14,6 +14,7 @@ from jawusd.solvers.encoding import nearest
 from jawusd.solvers.hull import Hull
 from jawusd.solvers.interior import Interior
 from jawusd.solvers.solution import attached, solved
+from jawusd.solvers.temporal import TemporalPrior
 
 
 class JawLayer(nn.Module):
@@ -24,6 +25,9 @@ class JawLayer(nn.Module):
     `torch.func`, `torch.compile(fullgraph=True)`, `torch.export` and its ONNX exporter, for any batch shape.
 
     `encode`, `project` and `inside` carry first derivatives, not second ones.
+
+    ``layer.temporal(d, fps)`` is a prior on motion from frame to frame, see `TemporalPrior`; None if the rig does not
+    know how fast the jaw moves.
 
     Args:
         rig: The rig.
@@ -45,6 +49,7 @@ class JawLayer(nn.Module):
         self.motion = chart_of(rig.kind, rig.arrays)
         self.bound = Hull(rig.arrays)
         self.interior = Interior(rig.arrays)
+        self.temporal = None if rig.speeds is None else TemporalPrior(rig.speeds)
         A = rig.T_anatomical_skull
         closed = A @ rig.T_rest
         vectors = landmark_vectors(rig.landmarks)

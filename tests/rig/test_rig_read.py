@@ -2,15 +2,18 @@
 
 import numpy as np
 import pytest
-from example_rig import assert_valid_usd, example_motion, example_rig, moved
+from example_model import example_arrays, example_meta, moving_arrays, touching_arrays
+from example_rig import FPS, assert_valid_usd, example_meshes, example_motion, example_rig, moved
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 from scipy.spatial.transform import Rotation
 
 import jawusd
 from jawusd.errors import FormatError, RigError, UnitsError, VersionError
+from jawusd.evaluator import JawRig
 from jawusd.geometry import make_transform
 from jawusd.rig import describe, load_rig, write_animation
 from jawusd.rig.arrays import model_hash
+from jawusd.rig.bake import bake_rig
 from jawusd.rig.untrusted import escapes
 
 
@@ -41,6 +44,20 @@ def test_what_is_baked_is_read_back_exactly(folder, kind):
         assert model_hash(rig) == model_hash(expected)
     d = example_motion()[1]
     np.testing.assert_array_equal(jawusd.load(folder / "actor.usda").pose(d), expected.pose(d))
+
+
+def test_what_not_every_rig_has_is_read_back_exactly(kind, tmp_path):
+    arrays = {**example_arrays(kind), **touching_arrays(kind), **moving_arrays()}
+    rig = JawRig(arrays, example_meta(kind))
+    bake_rig(tmp_path, rig, example_meshes(), name="example", fps=FPS, table_size=17)
+    found = load_rig(tmp_path / "actor.usda")
+    assert set(found.arrays) == set(rig.arrays)
+    for name, value in rig.arrays.items():
+        np.testing.assert_array_equal(found.arrays[name], value, err_msg=name)
+    assert found.model_hash == rig.model_hash
+    speeds = describe(tmp_path / "actor.usda")["speeds"]
+    assert speeds == {"rms_mm_s": rig.speeds.rms_mm_s.tolist(), "rms_mm_s2": rig.speeds.rms_mm_s2.tolist()}
+    assert_valid_usd(tmp_path / "actor.usda")
 
 
 def test_the_hash_follows_the_arrays(kind):

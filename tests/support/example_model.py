@@ -57,6 +57,12 @@ def touching_arrays(kind="anchored"):
     return {**arrays, "glide_d2": d2, "glide_d2_factors": side, "glide_d3": d3, "glide_d3_factors": front}
 
 
+def moving_arrays():
+    """Return what rigs have whose take has a frame rate: covariances of velocity and acceleration."""
+    mixing = np.array([[30.0, 0.0, 0.0], [4.0, 12.0, 0.0], [-3.0, 1.0, 7.0]])
+    return {"velocity_covariance": mixing @ mixing.T, "acceleration_covariance": 90.0 * mixing.T @ mixing}
+
+
 def example_meta(kind="anchored"):
     """Return the header that goes with `example_arrays`."""
     return {
