@@ -55,7 +55,7 @@ def info(
 
 
 def _info_lines(found: Description) -> list[str]:
-    from jawusd.pipeline.contact import contact_words
+    from jawusd.pipeline.contact import contact_words, joint_words
 
     lines = [
         f"actor {found['actor']}, format {found['format_version']}, prim {found['prim']}",
@@ -70,6 +70,7 @@ def _info_lines(found: Description) -> list[str]:
     )
     lines.append(f"table: {table['format']} {table['shape']}, worst error {table['max_error_mm']:.4f} mm")
     lines.append(f"teeth: {contact_words(found['contact'])}")
+    lines.append(f"condyles: {joint_words(found['joints'])}")
     if found["speeds"]:
         speed, acceleration = (
             ", ".join(f"{x:.0f}" for x in found["speeds"][name]) for name in ("rms_mm_s", "rms_mm_s2")
@@ -100,6 +101,7 @@ def pose(
     twist, verdict = loaded.twist(d), loaded.validate_parameters(d)
     margin, inside, valid = float(verdict.margin_mm), bool(verdict.inside()), bool(verdict.valid)
     clearance = None if loaded.contact is None else float(loaded.clearance(d).clearance_mm)
+    joints = None if loaded.joints is None else float(loaded.clearance(d, of="condyles").clearance_mm)
     landmarks = dict(zip(LANDMARKS, transform_points(T, loaded.landmarks), strict=True))
 
     def lines() -> list[str]:
@@ -111,10 +113,12 @@ def pose(
         if clearance is not None:
             collide = Reason.TEETH_COLLIDE in Reason(int(verdict.reason))
             found.append(f"clearance {clearance:.3f} mm: teeth {'COLLIDE' if collide else 'do not collide'}")
+        if joints is not None:
+            found.append(f"clearance of the condyles {joints:.3f} mm")
         return [*found, f"margin {margin:.3f} mm: {'inside' if inside else 'OUTSIDE'} the bound"]
 
     result = {"T_skull_mandible": T, "twist": twist, "landmarks_mm": landmarks, "margin_mm": margin, "valid": valid}
-    emit({"d": list(d), **result, "clearance_mm": clearance}, as_json, lines)
+    emit({"d": list(d), **result, "clearance_mm": clearance, "condyle_clearance_mm": joints}, as_json, lines)
 
 
 def _check_finite(values: Triple, option: str) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jawusd.errors import EvaluatorError
-from jawusd.evaluator.contact import check_contact
+from jawusd.evaluator.contact import PREFIXES, check_contact
 from jawusd.evaluator.schema import ANCHORED, KINDS, OPTIONAL, arrays_of
 from jawusd.evaluator.speeds import check_speeds
 from jawusd.geometry.arrays import Array
@@ -132,8 +132,9 @@ def checked_arrays(arrays: Mapping[str, ArrayLike], kind: str) -> dict[str, Arra
             checked |= {name: _checked(name, arrays, spec.shape, lengths) for name, spec in group.items()}
     _check_values(checked)
     _check_sections(checked)
-    if "contact_values" in checked:
-        check_contact(checked)
+    for name in PREFIXES.values():
+        if f"{name}_values" in checked:
+            check_contact(checked, name)
     if "velocity_covariance" in checked:
         check_speeds(checked)
     if kind == ANCHORED and lengths["weights"] != lengths["centres"] + 3:

@@ -1,4 +1,4 @@
-"""Clearance: how far the teeth are from running deeper into each other than the scans' closed bite does.
+"""Clearance: how far teeth, or condyles and skull, are from running deeper into each other than in the closed bite.
 
 Sampled over d when a rig is made, from the scans: at each of a grid of parameters, the depth of the closed bite less
 that of the pose. Between the values it is linear along each axis; beyond the grid, where the mouth is open, the nearest
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,11 +25,16 @@ UNIT_MM = 0.01
 AUTHORED_MM = 0.15
 
 
+#: What a clearance is of, and the first word of the names of its arrays.
+Meeting = Literal["teeth", "condyles"]
+PREFIXES: dict[Meeting, str] = {"teeth": "contact", "condyles": "joint"}
+
+
 class Clearance(NamedTuple):
     """What `JawRig.clearance` found.
 
     Attributes:
-        clearance_mm: Below 0 where the teeth run deeper into each other than in the closed bite, shape (...).
+        clearance_mm: Below 0 where surfaces run deeper into each other than in the closed bite, shape (...).
         gradient: Its derivative by d [mm/mm], shape (..., 3).
     """
 
@@ -47,7 +52,7 @@ class ContactField:
         values: Clearances [mm], shape (n1, n2, n3).
         closed_mm: How deep the scans run into each other in the closed bite; negative if they leave a gap.
         error_mm: Largest error found at random valid parameters where the clearance is below 0.5 mm.
-        limit_mm: Measured poses of less clearance collide: the most that captured poses needed.
+        limit_mm: The most that captured poses needed: of teeth, measured poses of less clearance collide.
     """
 
     first_mm: Array
@@ -58,29 +63,31 @@ class ContactField:
     limit_mm: float
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, Array]) -> ContactField | None:
-        """Pick the field out of the named arrays of a rig; None if the rig has none."""
-        if "contact_values" not in arrays:
+    def from_arrays(cls, arrays: Mapping[str, Array], of: Meeting) -> ContactField | None:
+        """Pick a field out of the named arrays of a rig; None if the rig has none."""
+        name = PREFIXES[of]
+        if f"{name}_values" not in arrays:
             return None
-        shape = tuple(int(n) for n in arrays["contact_shape"])
+        shape = tuple(int(n) for n in arrays[f"{name}_shape"])
         return cls(
-            arrays["contact_first_mm"],
-            arrays["contact_step_mm"],
-            UNIT_MM * arrays["contact_values"].reshape(shape),
-            *(float(arrays[f"contact_{name}_mm"]) for name in ("closed", "error", "limit")),
+            arrays[f"{name}_first_mm"],
+            arrays[f"{name}_step_mm"],
+            UNIT_MM * arrays[f"{name}_values"].reshape(shape),
+            *(float(arrays[f"{name}_{each}_mm"]) for each in ("closed", "error", "limit")),
         )
 
-    def arrays(self) -> dict[str, Array]:
+    def arrays(self, of: Meeting) -> dict[str, Array]:
         """Return the field's arrays by their names in a rig."""
-        return {
-            "contact_first_mm": self.first_mm,
-            "contact_step_mm": self.step_mm,
-            "contact_shape": np.array(self.values.shape, dtype=np.float64),
-            "contact_values": np.round(self.values.ravel() / UNIT_MM) + 0.0,  # no -0: whole numbers have none
-            "contact_closed_mm": np.array(self.closed_mm),
-            "contact_error_mm": np.array(self.error_mm),
-            "contact_limit_mm": np.array(self.limit_mm),
+        named = {
+            "first_mm": self.first_mm,
+            "step_mm": self.step_mm,
+            "shape": np.array(self.values.shape, dtype=np.float64),
+            "values": np.round(self.values.ravel() / UNIT_MM) + 0.0,  # no -0: whole numbers have none
+            "closed_mm": np.array(self.closed_mm),
+            "error_mm": np.array(self.error_mm),
+            "limit_mm": np.array(self.limit_mm),
         }
+        return {f"{PREFIXES[of]}_{name}": value for name, value in named.items()}
 
     def clearance(self, d: Array) -> Clearance:
         """Return the clearance (n,) [mm] and its gradient (n, 3) at d (n, 3) [mm]; NaN for NaN."""
@@ -119,35 +126,53 @@ _CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1)
 
 
 class TouchingTeeth:
-    """What a rig says of its teeth.
+    """What a rig says of its teeth and condyles.
 
     Attributes:
         contact: The clearance of the teeth over d; None if the scans do not show it.
+        joints: That of the condyles; None if there is no scanned bone of both jaws. It is what the bones of the scans
+            say: cartilage and disc are not among them, so no pose is refused for it.
     """
 
     contact: ContactField | None
+    joints: ContactField | None
 
-    def clearance(self, d: ArrayLike) -> Clearance:
-        """Return how far the teeth are from running deeper into each other than in the scans' closed bite.
+    def clearance(self, d: ArrayLike, *, of: Meeting = "teeth") -> Clearance:
+        """Return how far teeth are from running deeper into each other than in the scans' closed bite.
 
         Args:
             d: Jaw parameters [mm], shape (..., 3).
+            of: "teeth", or "condyles": how far these are from running into the skull, where they do in the closed bite
+                deeper than there.
 
         Returns:
-            The clearance [mm], shape (...), and its derivative by d [mm/mm], shape (..., 3). 0 is the closed bite; it
-            ends at some 1.5 mm, and at the nearest sampled parameters far outside the bound.
+            The clearance [mm], shape (...), and its derivative by d [mm/mm], shape (..., 3). It ends at some 1.5 mm,
+            and at the nearest sampled parameters far outside the bound. That of teeth is 0 in the closed bite.
 
         Raises:
-            EvaluatorError: The rig has no clearances, see `contact`.
+            EvaluatorError: The rig has no such clearances, see `contact` and `joints`.
+            ValueError: Neither teeth nor condyles.
         """
-        if self.contact is None:
+        field = self._field(of)
+        rows, batch = rows_of(d, (3,), "d")
+        value, gradient = pairs_in_chunks(field.clearance, rows)
+        return Clearance(value.reshape(batch), gradient.reshape(*batch, 3))
+
+    def _field(self, of: Meeting) -> ContactField:
+        if of not in PREFIXES:
+            raise ValueError(f'clearance is of "teeth" or "condyles", not of {of!r}')
+        field = self.contact if of == "teeth" else self.joints
+        if field is not None:
+            return field
+        if of == "teeth":
             raise EvaluatorError(
                 "this rig does not know how the teeth meet.",
                 hint="Fit or bake it with scans of both rows of teeth in occlusion.",
             )
-        rows, batch = rows_of(d, (3,), "d")
-        value, gradient = pairs_in_chunks(self.contact.clearance, rows)
-        return Clearance(value.reshape(batch), gradient.reshape(*batch, 3))
+        raise EvaluatorError(
+            "this rig does not know how the condyles meet the skull.",
+            hint="Fit or bake it with meshes of skull and mandible that show the joints.",
+        )
 
     def _without_collisions(self, verdicts: Verdicts, *, measured: bool) -> Verdicts:
         """Return the verdicts with poses in which the teeth collide refused."""
@@ -157,18 +182,19 @@ class TouchingTeeth:
         return verdicts.with_collisions(self.contact.collides(verdicts.d, limit_mm))
 
 
-def check_contact(arrays: Mapping[str, Array]) -> None:
-    """Check the clearances among the named arrays of a rig.
+def check_contact(arrays: Mapping[str, Array], name: str) -> None:
+    """Check clearances among the named arrays of a rig, by the first word of their names.
 
     Raises:
         EvaluatorError: Values out of range, or of numbers that do not match.
     """
-    shape, count = arrays["contact_shape"], arrays["contact_values"].size
+    shape, count = arrays[f"{name}_shape"], arrays[f"{name}_values"].size
     if (shape != np.round(shape)).any() or (shape < 2).any() or shape.prod() != count:
         raise EvaluatorError(
-            f'"contact_shape" is {shape.tolist()}; it must give the {count} clearances three axes of 2 or more.'
+            f'"{name}_shape" is {shape.tolist()}; it must give the {count} clearances three axes of 2 or more.'
         )
-    if (arrays["contact_step_mm"] <= 0).any() or arrays["contact_limit_mm"] > 0 or arrays["contact_error_mm"] < 0:
+    step, limit, error = (arrays[f"{name}_{each}_mm"] for each in ("step", "limit", "error"))
+    if (step <= 0).any() or limit > 0 or error < 0:
         raise EvaluatorError(
-            '"contact_step_mm" must be positive, "contact_limit_mm" at most 0 and "contact_error_mm" not negative.'
+            f'"{name}_step_mm" must be positive, "{name}_limit_mm" at most 0 and "{name}_error_mm" not negative.'
         )

@@ -92,6 +92,17 @@ CONTACT_ARRAYS: dict[str, ArraySpec] = {
 }
 
 
+#: The same of condyles and skull, for rigs with scanned bones.
+JOINT_ARRAYS: dict[str, ArraySpec] = {
+    "joint_first_mm": ArraySpec("jaw:joints:first", (3,)),
+    "joint_step_mm": ArraySpec("jaw:joints:step", (3,)),
+    "joint_shape": ArraySpec("jaw:joints:shape", (3,), integer=True),
+    "joint_values": ArraySpec("jaw:joints:clearances", ("joint clearances",), integer=True),
+    "joint_closed_mm": ArraySpec("jaw:joints:closed"),
+    "joint_error_mm": ArraySpec("jaw:joints:error"),
+    "joint_limit_mm": ArraySpec("jaw:joints:limit"),
+}
+
 #: Arrays of rigs whose take has a frame rate: both or none; see `jawusd.evaluator.speeds`.
 SPEED_ARRAYS: dict[str, ArraySpec] = {
     "velocity_covariance": ArraySpec("jaw:motion:velocityCovariance", (3, 3)),
@@ -100,7 +111,12 @@ SPEED_ARRAYS: dict[str, ArraySpec] = {
 
 
 #: Groups of arrays that a rig may lack, by the name of an array of each.
-OPTIONAL = {"glide_d2": GLIDE_ARRAYS, "contact_values": CONTACT_ARRAYS, "velocity_covariance": SPEED_ARRAYS}
+OPTIONAL = {
+    "glide_d2": GLIDE_ARRAYS,
+    "contact_values": CONTACT_ARRAYS,
+    "joint_values": JOINT_ARRAYS,
+    "velocity_covariance": SPEED_ARRAYS,
+}
 
 
 def arrays_of(kind: str) -> dict[str, ArraySpec]:

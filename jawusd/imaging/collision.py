@@ -87,20 +87,25 @@ def distances(grid: DistanceGrid, points: Array) -> Array:
     return found
 
 
-def solid(corners: Array, up: float, height_mm: float) -> Solid:
-    """Build a solid from triangles.
-
-    Args:
-        corners: triangles counter-clockwise seen from outside [mm], shape (F, 3, 3), y vertical.
-        up: see `outer_faces`.
-        height_mm: how far from its tips towards its base the solid matters.
-    """
-    outer, entering = outer_faces(corners, up)
+def tips_box(corners: Array, up: float, height_mm: float) -> Array:
+    """Return the box (2, 3) [mm] around a solid from its tips so far towards its base; see `solid`."""
     box = np.array([corners.min(axis=(0, 1)) - FARTHEST_MM, corners.max(axis=(0, 1)) + FARTHEST_MM])
     if up > 0:
         box[1, 1] = min(box[1, 1], box[0, 1] + height_mm + FARTHEST_MM)
     else:
         box[0, 1] = max(box[0, 1], box[1, 1] - height_mm - FARTHEST_MM)
+    return box
+
+
+def solid(corners: Array, up: float, box: Array) -> Solid:
+    """Build a solid from triangles.
+
+    Args:
+        corners: triangles counter-clockwise seen from outside [mm], shape (F, 3, 3), y vertical.
+        up: see `outer_faces`.
+        box: where the solid matters, rows low and high [mm], shape (2, 3).
+    """
+    outer, entering = outer_faces(corners, up)
     grid = distance_grid(corners, outer, box, _STEP_MM, up)
     near = ((corners <= box[1]) & (corners >= box[0])).all(axis=2).any(axis=1)
     return Solid(grid, clustered(surface_points(corners[outer & near], _SAMPLE_MM)), entering)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt
@@ -12,7 +13,7 @@ from jawusd.evaluator.contact import AUTHORED_MM, UNIT_MM, ContactField
 from jawusd.formats.mesh import BASE, Mesh
 from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import se3_inverse, transform_points
-from jawusd.imaging.collision import FARTHEST_MM, Pair, Solid, solid
+from jawusd.imaging.collision import FARTHEST_MM, Pair, Solid, solid, tips_box
 
 _CROWN_MM = 14.0  # from the tips of the teeth to where gums begin, at most
 _LEAST_WOUND = 0.6  # share of lines that enter a scan where they first meet it; 0.93 and more for scans wound alike
@@ -20,10 +21,9 @@ _WIDEST_GAP_MM = 1.0
 _DEEPEST_MM = 2.5
 _COARSEST_MM = 1.5
 
-_STEP_MM = 0.4
+_STEP_MM, _MOST_OPENING_MM = 0.4, 16.0  # of teeth
 _BEYOND_MM = 1.0  # outside the bound, still sampled
-_FREE_MM = 0.8  # teeth so far apart at all valid parameters of an opening end the field
-_MOST_OPENING_MM = 16.0
+_FREE_MM = 0.8  # surfaces so far apart at all valid parameters of larger openings end the field
 _ERROR_SAMPLES = 3000
 _NEAR_MM = 0.5  # errors count where the clearance is less
 _CAPTURED_QUANTILE = 0.01
@@ -32,6 +32,17 @@ _LARGEST_LIMIT_MM = 1.0
 
 class NoContact(Exception):
     """The scans do not show how the teeth meet; the message says why."""
+
+
+class Surfaces(Protocol):
+    """Surfaces of skull and mandible that meet: teeth, or condyles and their fossae."""
+
+    @property
+    def closed_mm(self) -> float:
+        """How deep they run into each other in the closed bite."""
+
+    def clearances(self, T_skull_mandible: Array) -> Array:
+        """Return what they leave [mm], shape (n,), in poses (n, 4, 4), compared with the closed bite."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,50 +96,69 @@ def _solid(name: str, mesh: Mesh, T: Array, up: float) -> Solid:
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
     if not len(corners) or np.median(edges) > _COARSEST_MM:
         raise NoContact(f"the {name} scan is coarse: edges of {np.median(edges) if len(edges) else 0:.1f} mm")
-    found = solid(corners, up, _CROWN_MM)
+    return wound_solid(f"{name} scan", corners, up, tips_box(corners, up, _CROWN_MM))
+
+
+def wound_solid(name: str, corners: Array, up: float, box: Array) -> Solid:
+    """Return the solid of triangles wound either way, see `jawusd.imaging.collision.solid`.
+
+    Raises:
+        NoContact: They are not wound alike; naming the mesh.
+    """
+    found = solid(corners, up, box)
     if found.entering < 0.5:  # wound the other way round
-        found = solid(np.ascontiguousarray(corners[:, ::-1]), up, _CROWN_MM)
+        found = solid(np.ascontiguousarray(corners[:, ::-1]), up, box)
     if found.entering < _LEAST_WOUND:
-        raise NoContact(f"the triangles of the {name} scan are not wound alike")
+        raise NoContact(f"the triangles of the {name} are not wound alike")
     return found
 
 
-def sample_field(teeth: Teeth, rig: JawRig) -> ContactField:
-    """Sample the clearance of a rig's poses over its bound."""
+def sample_field(
+    surfaces: Surfaces, rig: JawRig, step_mm: float = _STEP_MM, most_opening_mm: float = _MOST_OPENING_MM
+) -> ContactField:
+    """Sample the clearance of a rig's poses over its bound.
+
+    Args:
+        surfaces: What meets.
+        rig: The rig.
+        step_mm: Between values.
+        most_opening_mm: Where the field ends, if the surfaces have not parted before.
+    """
     # 0 is one of the values, so that the closed bite is exact
-    ends = [(np.floor(low / _STEP_MM), np.ceil(high / _STEP_MM)) for low, high in _box(teeth, rig)]
-    axes = [_STEP_MM * np.arange(first, last + 1) for first, last in ends]
+    box = _box(surfaces, rig, step_mm, most_opening_mm)
+    ends = [(np.floor(low / step_mm), np.ceil(high / step_mm)) for low, high in box]
+    axes = [step_mm * np.arange(first, last + 1) for first, last in ends]
     first = np.array([axis[0] for axis in axes])
     d = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    wanted = rig.margin(d) > -(_BEYOND_MM + _STEP_MM)
+    wanted = rig.margin(d) > -(_BEYOND_MM + step_mm)
     values = np.zeros(d.shape[:3])
-    values[wanted] = teeth.clearances(rig.pose(d[wanted]))
+    values[wanted] = surfaces.clearances(rig.pose(d[wanted]))
     nearest = distance_transform_edt(~wanted, return_distances=False, return_indices=True)
     values = np.round(values[tuple(nearest)] / UNIT_MM) * UNIT_MM
-    field = ContactField(first, np.full(3, _STEP_MM), values, teeth.closed_mm, 0.0, -AUTHORED_MM)
+    field = ContactField(first, np.full(3, step_mm), values, surfaces.closed_mm, 0.0, -AUTHORED_MM)
     captured = rig.captured_d
     least = float(np.quantile(field.clearance(captured).clearance_mm, _CAPTURED_QUANTILE)) if len(captured) else 0.0
     limit = -float(np.clip(-least, AUTHORED_MM, _LARGEST_LIMIT_MM))
-    return ContactField(first, field.step_mm, values, teeth.closed_mm, _error(teeth, rig, field), limit)
+    return replace(field, error_mm=_error(surfaces, rig, field), limit_mm=limit)
 
 
-def _box(teeth: Teeth, rig: JawRig) -> Array:
-    """Return the parameters (3, 2) [mm] that the field spans: those near the bound at which teeth are close."""
+def _box(surfaces: Surfaces, rig: JawRig, step_mm: float, most_opening_mm: float) -> Array:
+    """Return the parameters (3, 2) [mm] that the field spans: those near the bound at which surfaces are close."""
     wide = rig.d_range + np.array([-_BEYOND_MM, _BEYOND_MM])
-    wide[0, 1] = min(wide[0, 1], _MOST_OPENING_MM)
+    wide[0, 1] = min(wide[0, 1], most_opening_mm)
     axes = [np.linspace(low, high, n) for (low, high), n in zip(wide, (33, 9, 7))]
     d = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     clearances = np.full(d.shape[:3], np.inf)
     valid = rig.margin(d) > -_BEYOND_MM
-    clearances[valid] = teeth.clearances(rig.pose(d[valid])) - teeth.closed_mm
+    clearances[valid] = surfaces.clearances(rig.pose(d[valid])) - max(surfaces.closed_mm, 0.0)
     close = np.flatnonzero((clearances < _FREE_MM).any(axis=(1, 2)))
     top = axes[0][min(close.max(initial=0) + 1, len(axes[0]) - 1)]
-    wide[0, 1] = max(top, wide[0, 0] + 2 * _STEP_MM)
+    wide[0, 1] = max(top, wide[0, 0] + 2 * step_mm)
     return wide
 
 
-def _error(teeth: Teeth, rig: JawRig, field: ContactField) -> float:
-    """Return the largest error [mm] of the field at random valid parameters where the teeth are close."""
+def _error(surfaces: Surfaces, rig: JawRig, field: ContactField) -> float:
+    """Return the largest error [mm] of the field at random valid parameters where the surfaces are close."""
     rng = np.random.default_rng(0)
     low = field.first_mm
     d = rng.uniform(low, low + field.step_mm * (np.array(field.values.shape) - 1), (_ERROR_SAMPLES, 3))
@@ -137,4 +167,4 @@ def _error(teeth: Teeth, rig: JawRig, field: ContactField) -> float:
     d, read = d[read < _NEAR_MM], read[read < _NEAR_MM]
     if not len(d):
         return 0.0
-    return float(np.abs(np.minimum(teeth.clearances(rig.pose(d)), FARTHEST_MM) - read).max())
+    return float(np.abs(np.minimum(surfaces.clearances(rig.pose(d)), FARTHEST_MM) - read).max())

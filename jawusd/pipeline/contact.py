@@ -1,4 +1,4 @@
-"""Add to a jaw model what the scans say of its teeth: where they meet, and how deep each pose lets them in."""
+"""Add to a jaw model what the scans say of teeth and condyles: where they meet, and how deep each pose lets them in."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ import numpy as np
 
 from jawusd.errors import RigError
 from jawusd.evaluator import JawRig
+from jawusd.evaluator.contact import AUTHORED_MM, ContactField
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.model import JawModel
 from jawusd.formats.report import ContactPicture
-from jawusd.pipeline.prepare import Subject
+from jawusd.pipeline.prepare import BONES, Subject
 from jawusd.pipeline.scan_labels import TEETH
 from jawusd.pipeline.state import Progress, no_progress
 
@@ -21,15 +22,16 @@ if TYPE_CHECKING:
     from jawusd.imaging.contact import Teeth
 
 _QUALITY = 88  # of the pictures, JPEG
+_FARTHEST_MM = 1.5  # distances that are told, see `imaging.collision`
 
 
 class ContactSummary(TypedDict, total=False):
-    """Hold what is known of the contact of the teeth."""
+    """Hold what is known of the contact of the teeth, or of the condyles."""
 
     missing: str  # why nothing is
     closed_mm: float  # how deep the scans run into each other in the closed bite
     error_mm: float  # largest error of the clearances
-    limit_mm: float  # measured poses of less clearance collide
+    limit_mm: float  # what captured poses need; measured poses of less clearance of the teeth collide
 
 
 def contact_words(contact: object) -> str:
@@ -40,6 +42,21 @@ def contact_words(contact: object) -> str:
         return f"nothing keeps them from passing through each other: {found.get('missing', 'contact was not measured')}"
     meet = f"the scans run {closed:.2f} mm into each other" if closed > 0 else f"the scans leave {-closed:.2f} mm"
     return f"{meet} in the closed bite; clearances to {error:.2f} mm"
+
+
+def joint_words(joints: object) -> str:
+    """Return the `ContactSummary` of the condyles as text; of anything else, that nothing is known."""
+    found = joints if isinstance(joints, dict) else {}
+    closed, error, limit = (found.get(name) for name in ("closed_mm", "error_mm", "limit_mm"))
+    if not isinstance(closed, float) or not isinstance(error, float) or not isinstance(limit, float):
+        return f"not compared with the skull: {found.get('missing', 'that was not measured')}"
+    where = (
+        f"{closed:.2f} mm in the bone of the skull" if closed > 0 else f"{-closed:.2f} mm from the bone of the skull"
+    )
+    if closed <= -_FARTHEST_MM:
+        where = f"more than {_FARTHEST_MM:g} mm from the bone of the skull"
+    deeper = f"up to {-limit:.2f} mm into it in captured poses; " if limit < -AUTHORED_MM else ""
+    return f"{where} in the closed bite; {deeper}clearances to {error:.2f} mm, no pose is refused for them"
 
 
 def contact_pictures(model: JawModel, subject: Subject) -> tuple[ContactPicture, ...]:
@@ -94,17 +111,23 @@ def teeth_of(rig: JawRig, meshes: Mapping[str, Mesh]) -> Teeth:
 def with_contact(
     model: JawModel, subject: Subject, progress: Progress = no_progress, *, regauge: bool = True
 ) -> JawModel:
-    """Return a model with the clearance of its teeth; ``meta["contact"]`` says how deep, or why there is none.
+    """Return a model with the clearances of teeth and condyles.
+
+    ``meta["contact"]`` and ``meta["joints"]`` say how deep these run in, or why there are none.
 
     Args:
         subject: The person, scans registered as the model's poses are.
         regauge: Count d1 from where the teeth touch, and end the bound there.
     """
+    return _with_joints(_with_teeth(model, subject, progress, regauge), subject)
+
+
+def _with_teeth(model: JawModel, subject: Subject, progress: Progress, regauge: bool) -> JawModel:
     from jawusd.fitting.glide import follow_teeth
     from jawusd.imaging.contact import NoContact, find_teeth, sample_field
 
     if not all(name in subject.meshes for name in TEETH.values()):
-        return replace(model, meta={**model.meta, "contact": {"missing": "there are no scans of both rows of teeth"}})
+        return _known(model, "contact", {"missing": "there are no scans of both rows of teeth"})
     progress("contact", 0, 3)
     upper, lower = (subject.meshes[TEETH[row]] for row in ("upper", "lower"))
     try:
@@ -115,8 +138,31 @@ def with_contact(
         progress("contact", 2, 3)
         field = sample_field(teeth, JawRig(model.arrays, model.meta))
     except NoContact as reason:
-        return replace(model, meta={**model.meta, "contact": {"missing": str(reason)}})
+        return _known(model, "contact", {"missing": str(reason)})
     finally:
         progress("contact", 3, 3)
-    found: ContactSummary = {"closed_mm": field.closed_mm, "error_mm": field.error_mm, "limit_mm": field.limit_mm}
-    return replace(model, arrays={**model.arrays, **field.arrays()}, meta={**model.meta, "contact": found})
+    return replace(_known(model, "contact", _summary(field)), arrays={**model.arrays, **field.arrays("teeth")})
+
+
+def _with_joints(model: JawModel, subject: Subject) -> JawModel:
+    from jawusd.imaging.contact import NoContact, sample_field
+    from jawusd.imaging.joints import STEP_MM, find_joints
+
+    if not all(name in subject.meshes for name in BONES):
+        return _known(model, "joints", {"missing": "there are no meshes of both skull and mandible"})
+    skull, mandible = (subject.meshes[name] for name in ("skull", "mandible"))
+    arrays = model.arrays
+    try:
+        joints = find_joints(skull, mandible, arrays["landmarks"], arrays["T_anatomical_skull"], arrays["T_rest"])
+    except NoContact as reason:
+        return _known(model, "joints", {"missing": str(reason)})
+    field = sample_field(joints, JawRig(arrays, model.meta), STEP_MM, np.inf)
+    return replace(_known(model, "joints", _summary(field)), arrays={**arrays, **field.arrays("condyles")})
+
+
+def _known(model: JawModel, name: str, found: ContactSummary) -> JawModel:
+    return replace(model, meta={**model.meta, name: found})
+
+
+def _summary(field: ContactField) -> ContactSummary:
+    return {"closed_mm": field.closed_mm, "error_mm": field.error_mm, "limit_mm": field.limit_mm}

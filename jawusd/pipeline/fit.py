@@ -27,7 +27,7 @@ from jawusd.formats.poses import read_poses
 from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.geometry import make_transform, matrix_from_wxyz, rigidity_defect, se3_inverse
 from jawusd.geometry.arrays import Array
-from jawusd.pipeline.contact import ContactSummary, contact_words, with_contact
+from jawusd.pipeline.contact import ContactSummary, contact_words, joint_words, with_contact
 from jawusd.pipeline.prepare import Subject, registered_subject
 from jawusd.pipeline.state import Progress, no_progress
 
@@ -72,6 +72,7 @@ class FitSummary(TypedDict, total=False):
     warnings: list[dict[str, str]]
     inferred: list[str]
     contact: ContactSummary
+    joints: ContactSummary
     trimmed_frames: list[int]
 
 
@@ -128,6 +129,8 @@ def fit_lines(summary: FitSummary) -> list[str]:
             lines.append(f"  {table:<8} {place:<28}{values}")
     if contact := summary.get("contact"):
         lines.append(f"  teeth: {contact_words(contact)}")
+    if joints := summary.get("joints"):
+        lines.append(f"  condyles: {joint_words(joints)}")
     if frames := summary.get("trimmed_frames"):
         lines.append(f"  frames left out as outliers: {', '.join(map(str, frames))}")
     return lines + [f"  warning: {warning['message']}" for warning in summary.get("warnings", [])]

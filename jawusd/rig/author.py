@@ -26,7 +26,7 @@ _TYPES = Sdf.ValueTypeNames
 
 # The interface is text and stays short; long arrays go to the binary layer.
 _INTERFACE_ARRAYS = ("jaw:landmarks:", "jaw:thresholds:")
-_DECODER_ARRAYS = ("jaw:model:", "jaw:bounds:", "jaw:contact:", "jaw:motion:")
+_DECODER_ARRAYS = ("jaw:model:", "jaw:bounds:", "jaw:contact:", "jaw:joints:", "jaw:motion:")
 
 
 def interface_layer(rig: JawRig, name: str, meshes: Mapping[str, Mesh], fps: float) -> Sdf.Layer:

@@ -175,6 +175,7 @@ class Description(TypedDict):
     meshes: dict[str, int]
     placeholders: list[str]
     contact: object
+    joints: object
     speeds: dict[str, list[float]] | None
     errors: object
 
@@ -216,6 +217,7 @@ def describe(path: PathArg, prim_path: str | None = None) -> Description:
         "meshes": _meshes(prim),
         "placeholders": [p.GetName() for p in Usd.PrimRange(prim) if p.GetAttribute("jaw:placeholder").Get()],
         "contact": rig.meta.get("contact"),
+        "joints": rig.meta.get("joints"),
         "speeds": _speeds(rig),
         "errors": rig.meta.get("errors"),
     }

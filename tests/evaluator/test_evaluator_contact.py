@@ -15,7 +15,7 @@ FIRST, STEP, SHAPE = np.array([-1.0, -6.0, -2.0]), np.array([0.5, 1.0, 0.8]), (9
 
 def contact_arrays(seed=0):
     values = np.random.default_rng(seed).uniform(-2.0, 2.0, SHAPE)
-    return ContactField(FIRST, STEP, values, 0.4, 0.05, -0.3).arrays()
+    return ContactField(FIRST, STEP, values, 0.4, 0.05, -0.3).arrays("teeth")
 
 
 def touching_rig(**changes):
@@ -61,6 +61,23 @@ def test_colliding_poses_are_refused():
     assert near.validate_parameters(d, tolerance_mm=None).valid.all()
     for authored in (near.validate_parameters(d), near.validate(near.pose(d), tolerance_mm=0.0)):
         assert authored.reason.tolist() == [0, Reason.TEETH_COLLIDE]
+
+
+def test_condyles_are_told_of_and_refuse_nothing():
+    values = np.random.default_rng(2).uniform(-1.0, 1.5, SHAPE)
+    field = ContactField(FIRST, STEP, np.round(values, 2), -0.4, 0.05, -0.3)
+    rig = JawRig({**example_arrays(), **contact_arrays(), **field.arrays("condyles")}, example_meta())
+    d = np.random.default_rng(1).uniform(FIRST, FIRST + STEP * (np.array(SHAPE) - 1), (200, 3))
+    found = rig.clearance(d, of="condyles")
+    np.testing.assert_allclose(found.clearance_mm, field.clearance(d).clearance_mm, atol=1e-12)
+    np.testing.assert_array_equal(rig.clearance(d).clearance_mm, touching_rig().clearance(d).clearance_mm)
+    plain = touching_rig()
+    np.testing.assert_array_equal(rig.validate(rig.pose(d)).reason, plain.validate(plain.pose(d)).reason)
+    assert rig.model_hash != plain.model_hash
+    with pytest.raises(EvaluatorError, match="how the condyles meet"):
+        plain.clearance(d, of="condyles")
+    with pytest.raises(ValueError, match="tongue"):
+        rig.clearance(d, of="tongue")
 
 
 def test_a_rig_without_scans_says_so():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from jawusd.imaging.collision import FARTHEST_MM, Pair, solid
+from jawusd.imaging.collision import FARTHEST_MM, Pair, solid, tips_box
 from jawusd.imaging.solid import outer_faces
 
 RADIUS = 6.0
@@ -21,9 +21,13 @@ def shifted(shift):
     return T
 
 
+def whole(corners, up):
+    return solid(corners, up, tips_box(corners, up, 20.0))
+
+
 def test_depth_of_two_balls_is_their_overlap():
     # the deepest point of a ball of the same size inside another is as deep as both overlap
-    pair = Pair(solid(ball(), 1.0, 20.0), solid(ball(), -1.0, 20.0))
+    pair = Pair(whole(ball(), 1.0), whole(ball(), -1.0))
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(60, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -33,14 +37,14 @@ def test_depth_of_two_balls_is_their_overlap():
 
 
 def test_surfaces_far_apart_are_as_far_as_can_be_told():
-    pair = Pair(solid(ball(), 1.0, 20.0), solid(ball(), -1.0, 20.0))
+    pair = Pair(whole(ball(), 1.0), whole(ball(), -1.0))
     assert pair.depth(shifted([0.0, -40.0, 0.0])[None]) == -FARTHEST_MM
 
 
 def test_a_scan_open_above_has_an_inside():
     corners = ball()
     cap = corners[corners[:, :, 1].max(axis=1) < 3.0]  # the upper part is missing, as behind the gum of a scan
-    found = solid(cap, 1.0, 20.0)
+    found = whole(cap, 1.0)
     assert found.entering > 0.9
     grid = found.grid
     points = grid.origin + grid.step_mm * np.stack(np.indices(grid.values.shape), axis=-1)
@@ -67,7 +71,7 @@ def test_triangles_wound_the_other_way_are_told():
 
 @pytest.mark.parametrize("up", [1.0, -1.0])
 def test_depth_grows_with_height_on_either_side(up):
-    pair = Pair(solid(ball(), up, 20.0), solid(ball(), -up, 20.0))
+    pair = Pair(whole(ball(), up), whole(ball(), -up))
     heights = np.linspace(10.0, 13.0, 7)
     depth = pair.depth(np.array([shifted([0.0, -up * h, 0.0]) for h in heights]))
     np.testing.assert_allclose(depth, 12.0 - heights, atol=0.05)

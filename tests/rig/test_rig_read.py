@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from example_model import example_arrays, example_meta, moving_arrays, touching_arrays
+from example_model import example_arrays, example_meta, joint_arrays, moving_arrays, touching_arrays
 from example_rig import FPS, assert_valid_usd, example_meshes, example_motion, example_rig, moved
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 from scipy.spatial.transform import Rotation
@@ -47,7 +47,7 @@ def test_what_is_baked_is_read_back_exactly(folder, kind):
 
 
 def test_what_not_every_rig_has_is_read_back_exactly(kind, tmp_path):
-    arrays = {**example_arrays(kind), **touching_arrays(kind), **moving_arrays()}
+    arrays = {**example_arrays(kind), **touching_arrays(kind), **joint_arrays(), **moving_arrays()}
     rig = JawRig(arrays, example_meta(kind))
     bake_rig(tmp_path, rig, example_meshes(), name="example", fps=FPS, table_size=17)
     found = load_rig(tmp_path / "actor.usda")

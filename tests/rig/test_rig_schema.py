@@ -88,6 +88,7 @@ def test_rig_attributes_are_those_of_the_schema(folder, kind):
     other = "jaw:model:curve" if kind == "anchored" else ("jaw:model:path", "jaw:model:glide", "jaw:model:spline")
     without = (
         "jaw:contact:",
+        "jaw:joints:",
         "jaw:motion:",
         "jaw:model:glideD2",
         "jaw:model:glideD3",

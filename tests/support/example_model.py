@@ -57,6 +57,20 @@ def touching_arrays(kind="anchored"):
     return {**arrays, "glide_d2": d2, "glide_d2_factors": side, "glide_d3": d3, "glide_d3_factors": front}
 
 
+def joint_arrays():
+    """Return what rigs have whose bones are scanned: clearances of the condyles."""
+    values = np.round(100 * np.random.default_rng(22).uniform(-0.5, 1.5, (9, 5, 4)))
+    return {
+        "joint_first_mm": np.array([-1.0, -8.0, -2.0]),
+        "joint_step_mm": np.array([5.0, 4.0, 3.0]),
+        "joint_shape": np.array(values.shape, dtype=float),
+        "joint_values": values.ravel(),
+        "joint_closed_mm": np.array(-0.4),
+        "joint_error_mm": np.array(0.1),
+        "joint_limit_mm": np.array(-0.5),
+    }
+
+
 def moving_arrays():
     """Return what rigs have whose take has a frame rate: covariances of velocity and acceleration."""
     mixing = np.array([[30.0, 0.0, 0.0], [4.0, 12.0, 0.0], [-3.0, 1.0, 7.0]])
