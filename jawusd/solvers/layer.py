@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import torch
 from torch import Tensor, nn
 
 from jawusd.errors import EvaluatorError
 from jawusd.evaluator import JawRig
+from jawusd.evaluator.contact import Meeting
 from jawusd.evaluator.distances import landmark_vectors
 from jawusd.geometry.se3 import se3_inverse
 from jawusd.solvers.charts import chart_of
+from jawusd.solvers.clearance import Clearances
 from jawusd.solvers.encoding import nearest
 from jawusd.solvers.hull import Hull
 from jawusd.solvers.interior import Interior
@@ -49,6 +53,8 @@ class JawLayer(nn.Module):
         self.motion = chart_of(rig.kind, rig.arrays)
         self.bound = Hull(rig.arrays)
         self.interior = Interior(rig.arrays)
+        self.teeth = None if rig.contact is None else Clearances(rig.contact)
+        self.condyles = None if rig.joints is None else Clearances(rig.joints)
         self.temporal = None if rig.speeds is None else TemporalPrior(rig.speeds)
         A = rig.T_anatomical_skull
         closed = A @ rig.T_rest
@@ -79,6 +85,20 @@ class JawLayer(nn.Module):
     def penalty(self, d: Tensor) -> Tensor:
         """Return the squared distance (...) by which d (..., 3) lies outside the bound [mm^2]; zero inside."""
         return torch.relu(-self.margin(d)).square()
+
+    def clearance(self, d: Tensor, of: Meeting = "teeth") -> Tensor:
+        """Return the clearance (...) [mm] of teeth or condyles at d (..., 3) [mm], as `JawRig.clearance` does.
+
+        Below 0 where they run deeper into each other than in the closed bite; linear between sampled values, so its
+        derivative has steps.
+
+        Raises:
+            EvaluatorError: the rig has no such clearances.
+        """
+        field = {"teeth": self.teeth, "condyles": self.condyles}[of]
+        if field is None:
+            raise EvaluatorError(f"the rig of this JawLayer has no clearances of the {of}.")
+        return cast("Tensor", field(self._rows(d, (3,), "d"))).reshape(d.shape[:-1])
 
     def project(self, d: Tensor) -> Tensor:
         """Return the nearest jaw parameters (..., 3) [mm] with margin >= 0, as `JawRig.project` does; d (..., 3) [mm].

@@ -5,7 +5,7 @@ import copy
 import numpy as np
 import pytest
 import torch
-from example_model import example_arrays, example_meta, touching_arrays
+from example_model import example_arrays, example_meta, joint_arrays, moving_arrays, touching_arrays
 
 from jawusd.errors import EvaluatorError
 from jawusd.evaluator import JawRig
@@ -13,7 +13,9 @@ from jawusd.geometry.se3 import se3_exp
 from jawusd.solvers import JawLayer
 
 RIGS = {kind: JawRig(example_arrays(kind), example_meta(kind)) for kind in ("anchored", "additive")}
-RIGS["touching"] = JawRig({**example_arrays(), **touching_arrays()}, example_meta())
+RIGS["touching"] = JawRig(
+    {**example_arrays(), **touching_arrays(), **joint_arrays(), **moving_arrays()}, example_meta()
+)
 LAYERS = {kind: JawLayer(rig) for kind, rig in RIGS.items()}
 EVERY = ("forward", "margin", "penalty", "project", "inside", "unconstrained", "encode", "loss")
 
