@@ -28,7 +28,7 @@ from dataclasses import dataclass
 from typing import Generic, NamedTuple, Protocol, cast
 
 from jawusd.evaluator.curve_formula import curve, curve_tables, flat_ended_slopes
-from jawusd.evaluator.operations import FloatOperations, Operations, Rows, Table, rows, triple
+from jawusd.evaluator.operations import FloatOperations, Operations, Rows, Table, polynomial, rows, triple
 from jawusd.geometry.rodrigues import N, Triple, apply_series, dot, turning
 
 # A margin this little below zero still counts as inside: parameters on the bound itself may round to either side of it.
@@ -71,18 +71,12 @@ class GaugeNumbers(NamedTuple):
     glide: object = None
 
 
-def polynomial(coefficients: Sequence[N | float], x: N) -> N:
-    """Return ``sum_k coefficients[k] x^k`` of two coefficients or more (Horner's scheme)."""
-    value = x * coefficients[-1] + coefficients[-2]
-    for coefficient in reversed(coefficients[:-2]):
-        value = value * x + coefficient
-    return value
+def long_angle_series() -> list[list[float]]:
+    """Return the coefficients of a, b and c of `jawusd.geometry.rodrigues` as series of the squared angle [rad^2].
 
-
-def long_angle_series(squared: N) -> Triple[N]:
-    """Return a, b and c of `jawusd.geometry.rodrigues` from eight terms: to 1e-8 up to 2 rad [squared in rad^2]."""
-    series = [[(-1.0) ** k / math.factorial(2 * k + start) for k in range(8)] for start in (1, 2, 3)]
-    return triple([polynomial(terms, squared) for terms in series])
+    Eight terms each: to 1e-8 up to 2 rad.
+    """
+    return [[(-1.0) ** k / math.factorial(2 * k + start) for k in range(8)] for start in (1, 2, 3)]
 
 
 def soft_absolute(x: N, softness_mm: float, ops: Operations[N, Table]) -> N:
@@ -105,12 +99,10 @@ def path(gauge: GaugeNumbers, d1: N, ops: Operations[N, Table]) -> tuple[N, N]:
     """Return gx and gz [mm] at opening d1 [mm]."""
     inside = ops.clip(d1, gauge.low_mm, gauge.high_mm)
     s, beyond = inside / gauge.path_scale_mm, d1 - inside
-
-    def along(c: Sequence[float]) -> N:
-        slope = polynomial([k * x / gauge.path_scale_mm for k, x in enumerate(c, start=1)], s)
-        return polynomial(c, s) * s + slope * beyond
-
-    return along(gauge.path_x), along(gauge.path_z)
+    both = (gauge.path_x, gauge.path_z)
+    slopes = [[k * x / gauge.path_scale_mm for k, x in enumerate(c, start=1)] for c in both]
+    x, z, slope_x, slope_z = ops.polynomials([*both, *slopes], s)
+    return x * s + slope_x * beyond, z * s + slope_z * beyond
 
 
 def arch(gauge: GaugeNumbers, d1: N, d2: N, ops: Operations[N, Table]) -> N:

@@ -19,6 +19,14 @@ Rows = list[list[float]]
 Table = TypeVar("Table", contravariant=True)  # how a kind of number stores rows of floats
 
 
+def polynomial(coefficients: Sequence[N | float], x: N) -> N:
+    """Return ``sum_k coefficients[k] x^k`` of two coefficients or more (Horner's scheme)."""
+    value = x * coefficients[-1] + coefficients[-2]
+    for coefficient in reversed(coefficients[:-2]):
+        value = value * x + coefficient
+    return value
+
+
 class Operations(Protocol[N, Table]):
     """What the formulas need of a kind of number beyond arithmetic."""
 
@@ -33,6 +41,9 @@ class Operations(Protocol[N, Table]):
 
     def angle_coefficients(self, squared: N) -> Triple[N]:
         """Return the coefficients a, b and c of `jawusd.geometry.rodrigues` at a squared angle [rad^2]."""
+
+    def polynomials(self, coefficients: Sequence[Sequence[float]], x: N) -> Sequence[N]:
+        """Return several polynomials of x, see `polynomial`."""
 
     def log_sum_exp(self, terms: Sequence[N]) -> N:
         """Return the logarithm of the sum of the exponentials of all terms."""
@@ -96,6 +107,11 @@ class FloatOperations:
     def clip(x: float, low: float, high: float) -> float:
         """Return x limited to [low, high]."""
         return min(max(x, low), high)
+
+    @staticmethod
+    def polynomials(coefficients: Sequence[Sequence[float]], x: float) -> list[float]:
+        """Return several polynomials of x."""
+        return [polynomial(each, x) for each in coefficients]
 
     @staticmethod
     def log_sum_exp(terms: Sequence[float]) -> float:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
 import jawusd_reader
-from jawusd_reader import PARAMETERS, Rows, Triple, dot, long_angle_series, triple
+from jawusd_reader import PARAMETERS, Rows, Triple, dot, long_angle_series, polynomial, triple
 
 MODIFIER = "Jaw"
 _LABELS = ("Opening", "Laterotrusion", "Protrusion")
@@ -216,11 +216,15 @@ class _Nodes:
 
     def angle_coefficients(self, squared: _Number) -> Triple[_Number]:
         """Return a, b and c of Rodrigues' formula, to single precision up to 2 rad."""
-        return long_angle_series(squared)
+        return triple(self.polynomials(long_angle_series(), squared))
 
     def columns(self, table: _Table) -> list[tuple[_Number]]:
         """Return the columns of a table as fields."""
         return [(x,) for name in table.attributes for x in self.separated(self._field(name))][: table.width]
+
+    def polynomials(self, coefficients: Sequence[Sequence[float]], x: _Number) -> list[_Number]:
+        """Return several polynomials of x."""
+        return [polynomial(each, x) for each in coefficients]
 
     def weighted_sum(self, factors: Sequence[_Number], weights: _Table) -> Triple[_Number]:
         """Return the sum of the rows of a table with three columns, each times its factor."""

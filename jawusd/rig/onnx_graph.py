@@ -11,13 +11,14 @@ import onnx
 from numpy.typing import ArrayLike
 from onnx import TensorProto, helper, numpy_helper
 
-from jawusd.evaluator.formula import long_angle_series, polynomial
+from jawusd.evaluator.formula import long_angle_series
 from jawusd.evaluator.operations import Symbol, triple
 from jawusd.geometry.arrays import Array
 from jawusd.geometry.rodrigues import Triple, angle_quotients
 
 # |B_2k|, k = 1..8, of the series of the inverse left Jacobian
 _BERNOULLI = (1 / 6, 1 / 30, 1 / 42, 1 / 30, 5 / 66, 691 / 2730, 7 / 6, 3617 / 510)
+_INVERSE_SERIES = [number / factorial(2 * k) for k, number in enumerate(_BERNOULLI, start=1)]
 # Below this squared angle the closed forms lose digits in float32 to cancellation, above it the series would.
 _SERIES_BELOW_RAD2 = 0.25
 
@@ -58,6 +59,7 @@ class Graph:
     nodes: list[onnx.NodeProto] = field(default_factory=list)
     initializers: list[onnx.TensorProto] = field(default_factory=list)
     _found: dict[tuple[str, ...], Value] = field(default_factory=dict)
+    _polynomials: dict[tuple[str, bytes], list[Value]] = field(default_factory=dict)
     _constants: dict[tuple[str, tuple[int, ...], bytes], Value] = field(default_factory=dict)
 
     @property
@@ -123,16 +125,32 @@ class Graph:
         small, far = self._near_and_far(squared)
         angle = self.sqrt(far)
         quotients = angle_quotients(far, angle, self.op("Sin", angle), self.op("Sin", 0.5 * angle))
-        return triple([self.op("Where", small, x, y) for x, y in zip(long_angle_series(squared), quotients)])
+        series = self.polynomials([*long_angle_series(), _INVERSE_SERIES], squared)
+        return triple([self.op("Where", small, x, y) for x, y in zip(series, quotients)])
 
     def inverse_coefficient(self, squared: Value, a: Value, b: Value) -> Value:
         """Return e of the inverse left Jacobian ``I - W / 2 + e W W``: ``(1 - a / (2 b)) / x`` (Barfoot 2017, 7.77)."""
         small, far = self._near_and_far(squared)
-        series = [number / factorial(2 * k) for k, number in enumerate(_BERNOULLI, start=1)]
-        return self.op("Where", small, polynomial(series, squared), (1.0 - a / (2.0 * b)) / far)
+        series = self.polynomials([*long_angle_series(), _INVERSE_SERIES], squared)
+        return self.op("Where", small, series[3], (1.0 - a / (2.0 * b)) / far)
 
     def _near_and_far(self, squared: Value) -> tuple[Value, Value]:
         return self.op("Less", squared, _SERIES_BELOW_RAD2), self.op("Max", squared, _SERIES_BELOW_RAD2)
+
+    def polynomials(self, coefficients: Sequence[Sequence[float]], x: Value) -> list[Value]:
+        """Return several polynomials of x: its powers times one matrix, a third of the operators of Horner's scheme."""
+        degree = max(map(len, coefficients)) - 1
+        powers = [x]
+        while len(powers) < degree:
+            half = len(powers) // 2
+            powers.append(powers[half] * powers[len(powers) - half - 1])
+        table = np.array([[*each, *[0.0] * (degree + 1 - len(each))] for each in coefficients]).T
+        key = (x.name, table.tobytes())
+        if key not in self._polynomials:
+            self._polynomials[key] = self.parts(
+                self.concat(powers) @ table[1:] + self.constant(table[:1]), len(table.T)
+            )
+        return self._polynomials[key]
 
     def log_sum_exp(self, terms: Sequence[Value]) -> Value:
         """Return the logarithm of the sum of exponentials, free of overflow."""

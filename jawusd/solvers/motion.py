@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from jawusd.evaluator.arrays import flat_arrays
 from jawusd.evaluator.formula import MODELS, Numbers, RigidMotion
-from jawusd.evaluator.operations import Rows, triple
+from jawusd.evaluator.operations import Rows, polynomial, triple
 from jawusd.geometry.arrays import Array
 from jawusd.geometry.rodrigues import SMALL_SQUARED_ANGLE, Triple, angle_quotients, angle_series
 
@@ -48,6 +48,11 @@ class TensorOperations:
         angle = torch.sqrt(far)
         quotients = angle_quotients(far, angle, torch.sin(angle), torch.sin(0.5 * angle))
         return triple([torch.where(small, x, y) for x, y in zip(angle_series(near), quotients)])
+
+    @staticmethod
+    def polynomials(coefficients: Sequence[Sequence[float]], x: Tensor) -> list[Tensor]:
+        """Return several polynomials of x; their coefficients may be tensors."""
+        return [polynomial(each, x) for each in coefficients]
 
     @staticmethod
     def log_sum_exp(terms: Sequence[Tensor]) -> Tensor:
