@@ -23,6 +23,8 @@ from jawusd.geometry.arrays import Array, Mask
 UNIT_MM = 0.01
 #: How much deeper than in the closed bite teeth may run in a pose that is authored [mm].
 AUTHORED_MM = 0.15
+#: Errors of clearances are measured where there is less than this [mm].
+NEAR_MM = 0.5
 
 
 #: What a clearance is of, and the first word of the names of its arrays.
@@ -51,7 +53,7 @@ class ContactField:
         step_mm: Between values along each axis, shape (3,).
         values: Clearances [mm], shape (n1, n2, n3).
         closed_mm: How deep the scans run into each other in the closed bite; negative if they leave a gap.
-        error_mm: Largest error found at random valid parameters where the clearance is below 0.5 mm.
+        error_mm: Largest error found at random valid parameters where the clearance is below `NEAR_MM`; 0 if none is.
         limit_mm: The most that captured poses needed: of teeth, measured poses of less clearance collide.
     """
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 
 from jawusd.evaluator import JawRig
-from jawusd.evaluator.contact import AUTHORED_MM, UNIT_MM, ContactField
+from jawusd.evaluator.contact import AUTHORED_MM, NEAR_MM, UNIT_MM, ContactField
 from jawusd.formats.mesh import BASE, Mesh
 from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import se3_inverse, transform_points
@@ -25,7 +25,6 @@ _STEP_MM, _MOST_OPENING_MM = 0.4, 16.0  # of teeth
 _BEYOND_MM = 1.0  # outside the bound, still sampled
 _FREE_MM = 0.8  # surfaces so far apart at all valid parameters of larger openings end the field
 _ERROR_SAMPLES = 3000
-_NEAR_MM = 0.5  # errors count where the clearance is less
 _CAPTURED_QUANTILE = 0.01
 _LARGEST_LIMIT_MM = 1.0
 
@@ -164,7 +163,7 @@ def _error(surfaces: Surfaces, rig: JawRig, field: ContactField) -> float:
     d = rng.uniform(low, low + field.step_mm * (np.array(field.values.shape) - 1), (_ERROR_SAMPLES, 3))
     d = d[rig.margin(d) >= 0]
     read = field.clearance(d).clearance_mm
-    d, read = d[read < _NEAR_MM], read[read < _NEAR_MM]
+    d, read = d[read < NEAR_MM], read[read < NEAR_MM]
     if not len(d):
         return 0.0
     return float(np.abs(np.minimum(surfaces.clearances(rig.pose(d)), FARTHEST_MM) - read).max())

@@ -10,7 +10,7 @@ import numpy as np
 
 from jawusd.errors import RigError
 from jawusd.evaluator import JawRig
-from jawusd.evaluator.contact import AUTHORED_MM, ContactField
+from jawusd.evaluator.contact import AUTHORED_MM, NEAR_MM, ContactField
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.model import JawModel
 from jawusd.formats.report import ContactPicture
@@ -55,6 +55,8 @@ def joint_words(joints: object) -> str:
     )
     if closed <= -_FARTHEST_MM:
         where = f"more than {_FARTHEST_MM:g} mm from the bone of the skull"
+    if error == 0.0:  # measured where there is less
+        return f"{where} in the closed bite, and not within {NEAR_MM:g} mm of it anywhere inside the bound"
     deeper = f"up to {-limit:.2f} mm into it in captured poses; " if limit < -AUTHORED_MM else ""
     return f"{where} in the closed bite; {deeper}clearances to {error:.2f} mm, no pose is refused for them"
 

@@ -13,7 +13,8 @@ What is said of depth is beyond the depth of the closed bite by the same oracle 
                 less than 3 mm of opening
     gap         at d1 = 0, over d2 and d3: median and 95th percentile of what the teeth are apart
     captured    share of captured poses inside the bound or within the rig's tolerance of it, and of those judged valid
-    through     poses driven 1 mm and more through the closed teeth: share refused
+    through     poses driven 1 mm and more through the closed teeth (less where scans overlap so far in the closed bite
+                that the oracle cannot tell): share refused
 """
 
 from __future__ import annotations
@@ -204,7 +205,8 @@ def measure(case: Case, count: int) -> str:
     kept = (captured.margin_mm >= rig.limits.margin_mm).mean()
     through = low_openings(rig, 600, rng) - [3.0, 0.0, 0.0] * rng.uniform(0.3, 1.0, (600, 1))
     T = rig.pose(through)
-    T = T[oracle.beyond(T, 0.9) > THROUGH_MM]
+    deep = min(THROUGH_MM, NEAR_MM - oracle.closed - 0.1)
+    T = T[oracle.beyond(T, deep - 0.1) > deep]
     refused = (~rig.validate(T).valid).mean() if len(T) else np.nan
     before = oracle.beyond(old.pose(low_openings(old, count // 4, rng)))
     grows = (layer_size(rig) - layer_size(old)) / 2**20

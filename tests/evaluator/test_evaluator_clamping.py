@@ -63,7 +63,7 @@ def test_random_keys(rig, method, spread):
     sets = [measured(rig, *random_keys(rig, seed, spread), method) for seed in range(12)]
     for found in sets:
         assert found.ratio <= 1.05 and found.local_ratio <= 1.05 and found.margin_mm >= -1e-8
-    assert np.mean([found.overshoot_mm > 0.05 for found in sets]) < 0.1
+        assert found.overshoot_mm <= 0.1 or found.forced
 
 
 def test_projecting_frame_by_frame_pops():

@@ -14,7 +14,8 @@ class Measured(NamedTuple):
 
     ratio: largest step over the largest step of the keys' own curve; local_ratio: the largest of any frame over that of
     the curve in the same frame; margin_mm: smallest, at ten times the frame rate; overshoot_mm: how far the motion goes
-    beyond the range of the keys where the bound would let it stay within; missed_mm: how far keys inside are moved.
+    beyond the range of the keys; forced: at some opening on its way, nothing in that range is inside the bound;
+    missed_mm: how far keys inside are moved.
     """
 
     ratio: float
@@ -22,6 +23,7 @@ class Measured(NamedTuple):
     margin_mm: float
     overshoot_mm: float
     missed_mm: float
+    forced: bool
 
 
 def hollow_rig():
@@ -50,6 +52,14 @@ def own_curve(frames, keys, at, method):
     return PchipInterpolator(held, np.concatenate([keys[:1], keys, keys[-1:]]))(at)
 
 
+def leaves_range(rig, keys, openings):
+    """Tell whether at one of the openings [mm] passed no d2 and d3 in the range of the keys are inside the bound."""
+    (low2, low3), (high2, high3) = keys[:, 1:].min(axis=0), keys[:, 1:].max(axis=0)
+    d1 = np.linspace(openings.min(), openings.max(), 60)
+    d = np.stack(np.meshgrid(d1, np.linspace(low2, high2, 41), np.linspace(low3, high3, 41), indexing="ij"), axis=-1)
+    return bool((rig.margin(d).max(axis=(1, 2)) < 0).any())
+
+
 def measured(rig, frames, keys, method):
     """Return the figures of keys brought inside as `jawusd animate` does it."""
     at = np.arange(frames[0], frames[-1] + 1)
@@ -61,10 +71,12 @@ def measured(rig, frames, keys, method):
     between = np.stack([np.interp(tenth, kept.times, column) for column in kept.d.T], axis=1)
     nearest = np.clip(between, keys.min(0), keys.max(0))
     beyond = np.abs(between - nearest).max(axis=1)[rig.margin(nearest) >= 0]
+    overshoot_mm = beyond.max(initial=0.0)
+    forced = overshoot_mm > 0.05 and leaves_range(rig, keys, between[:, 0])
     valid = rig.is_inside(keys)
     missed = np.linalg.norm(d[np.isin(at, frames)] - keys, axis=1)[valid].max(initial=0.0)
     still = own_step <= 1e-9
     assert step[still].max(initial=0.0) <= 1e-9
     local = ((step - 1e-9)[~still] / own_step[~still]).max(initial=0.0)
     largest = own_step.max()
-    return Measured(step.max() / largest, local, rig.margin(between).min(), beyond.max(initial=0.0), missed)
+    return Measured(step.max() / largest, local, rig.margin(between).min(), overshoot_mm, missed, forced)
