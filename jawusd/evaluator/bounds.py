@@ -35,24 +35,27 @@ class SliceHull:
         directions: Unit normals n_k in (d2, d3), shape (K, 2), pointing all around.
         softness_mm: Radius of the rounding where half-spaces meet.
         offset_mm: Distance by which the bound is wider than its supports.
+        slopes: Derivatives of the half-spaces by d, those of the sides by d1 left 0, shape (K + 2, 3).
+        first_mm: First captured opening.
+        last_mm: Last captured opening.
     """
 
     supports: HermiteCurve
     directions: Array
     softness_mm: float
     offset_mm: float
-    _gradients: Array = field(init=False, repr=False)
-    _first: float = field(init=False, repr=False)
-    _last: float = field(init=False, repr=False)
+    slopes: Array = field(init=False, repr=False)
+    first_mm: float = field(init=False, repr=False)
+    last_mm: float = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         # d v_j / dd of the K sides (their d1 column is -h_k' and filled in per row), then of v_low and v_high
         gradients = np.zeros((len(self.directions) + 2, 3))
         gradients[:-2, 1:] = self.directions
         gradients[-2:, 0] = -1.0, 1.0
-        object.__setattr__(self, "_gradients", gradients)
-        object.__setattr__(self, "_first", float(self.supports.knots[0]))
-        object.__setattr__(self, "_last", float(self.supports.knots[-1]))
+        object.__setattr__(self, "slopes", gradients)
+        object.__setattr__(self, "first_mm", float(self.supports.knots[0]))
+        object.__setattr__(self, "last_mm", float(self.supports.knots[-1]))
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Array]) -> SliceHull:
@@ -76,7 +79,7 @@ class SliceHull:
         """Return the signed distance (n,) [mm] and its gradient by d, shape (n, 3)."""
         reach, reach_1 = self.supports.value_and_slope(d[:, 0])
         distance, weights = self._joined(d, reach)
-        gradient = weights @ self._gradients
+        gradient = weights @ self.slopes
         gradient[:, 0] -= np.einsum("nk,nk->n", weights[:, :-2], reach_1)
         return distance, gradient
 
@@ -88,8 +91,8 @@ class SliceHull:
         """
         reach, reach_1 = self.supports.value_and_slope(d[:, 0])
         distance, weights = self._joined(d, reach)
-        slopes = np.empty((len(d), *self._gradients.shape))
-        slopes[:] = self._gradients
+        slopes = np.empty((len(d), *self.slopes.shape))
+        slopes[:] = self.slopes
         slopes[:, :-2, 0] = -reach_1
         gradient = (weights[:, None, :] @ slopes)[:, 0]
         slopes -= gradient[:, None, :]
@@ -106,7 +109,7 @@ class SliceHull:
         Only what is inside at the first or last opening is moved.
         """
         inner = d.copy()
-        inner[:, 0] = np.clip(d[:, 0], self._first, self._last)
+        inner[:, 0] = np.clip(d[:, 0], self.first_mm, self.last_mm)
         closed = self.signed_distance(d) > 0
         moved = np.flatnonzero(closed & (inner[:, 0] != d[:, 0]) & (self.signed_distance(inner) < 0))
         found = d.copy()
@@ -145,14 +148,16 @@ class SliceHull:
     def section_centres(self, count: int) -> tuple[Array, Array]:
         """Return openings (n,) [mm] from end to end, at most ``count``, and the middle (n, 2) [mm] of each section."""
         reach = self.offset_mm - self.softness_mm
-        found = [(d1, self._sharp_outline(d1)) for d1 in np.linspace(self._first - reach, self._last + reach, count)]
+        found = [
+            (d1, self._sharp_outline(d1)) for d1 in np.linspace(self.first_mm - reach, self.last_mm + reach, count)
+        ]
         known = [(d1, outline.mean(axis=0)) for d1, outline in found if len(outline)]
         return np.array([d1 for d1, _ in known]), np.array([middle for _, middle in known]).reshape(-1, 2)
 
     def candidates(self) -> Array:
         """Return points (n, 3) [mm] spread over the valid volume, dense near its surface: starts for searches."""
         reach = self.offset_mm - self.softness_mm  # at the very ends the rounding leaves no section
-        low, high = self._first - reach, self._last + reach
+        low, high = self.first_mm - reach, self.last_mm + reach
         points = []
         for d1 in np.linspace(low, high, _CANDIDATE_SLICES):
             outline = self._sharp_outline(d1)
@@ -185,8 +190,8 @@ class SliceHull:
         v = np.empty((len(d), len(self.directions) + 2))
         np.matmul(d[:, 1:], self.directions.T, out=v[:, :-2])
         v[:, :-2] -= reach
-        np.subtract(self._first, d[:, 0], out=v[:, -2])
-        np.subtract(d[:, 0], self._last, out=v[:, -1])
+        np.subtract(self.first_mm, d[:, 0], out=v[:, -2])
+        np.subtract(d[:, 0], self.last_mm, out=v[:, -1])
         peak = v.max(axis=1)
         v -= peak[:, None]
         v /= self.softness_mm

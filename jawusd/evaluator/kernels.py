@@ -16,10 +16,13 @@ from jawusd.evaluator.distances import distance_residual, landmark_vectors
 from jawusd.evaluator.encoding import Encoder
 from jawusd.evaluator.frames import RigFrames
 from jawusd.evaluator.models import JawModelForm
+from jawusd.evaluator.nearest import nearest_in_valley
 from jawusd.evaluator.solver import Residual, minimise
 from jawusd.evaluator.verdicts import RIGID_TOLERANCE, Limits, Verdicts, judge
 from jawusd.geometry.arrays import Array, Indices
 from jawusd.geometry.se3 import rigidity_defect, transform_points
+
+_FEW_ROWS = 3  # searched one by one sooner than together
 
 
 @dataclass(frozen=True)
@@ -162,6 +165,10 @@ class NumpyKernels:
 
     def approach(self, wanted: Array, start: Array) -> tuple[Array, Array]:
         """Return the points (n, 3) [mm] inside nearest to those wanted, and the squared distances (n,)."""
+        if len(start) <= _FEW_ROWS:
+            each = [nearest_in_valley(self._bound, *row) for row in zip(wanted, start)]
+            found = np.array(each).reshape(-1, 3)
+            return found, ((found - wanted) ** 2).sum(axis=1)
         identity = np.eye(3)
 
         def residual(x: Array, rows: Indices) -> tuple[Array, Array]:

@@ -6,8 +6,8 @@ For the example rig, the same with a waist, and every rig named: sets of three t
 and up to 30 % beyond them, joined by straight lines and by smooth curves, brought inside as `jawusd animate` does.
 Columns: largest step over the largest step of the keys' own curve (numpy, scipy); the largest of the same by frame;
 smallest margin at ten times the frame rate; the largest way beyond the keys' range of motions that the bound lets stay
-within; the share of sets that it does not (more than 0.05 mm beyond, and at some opening on the way nothing in the range
-is inside), and the largest way of those; how far keys that are inside were moved at most; ms per set.
+within; the share of sets that it does not (more than 0.05 mm beyond, and at some opening on the way nothing in the
+range is inside), and the largest way of those; how far keys that are inside were moved at most; ms per set.
 The last columns are what the nearest valid point of every frame does: largest step over that of the keys' own.
 """
 
