@@ -142,7 +142,7 @@ class _Scan:
 
     def __init__(self, points: Array, R: Array, t: Array) -> None:
         """Keep the points and their motions R (p, 3, 3), t (p, 3) [mm]."""
-        self.points = points
+        self.points, self._lengths = points, _squared_lengths(points)
         self._motions = np.concatenate([R, t[:, :, None]], axis=2).reshape(-1, 4)
         self._first = np.flatnonzero(np.diff(points[:, 0], prepend=-np.inf) > 0)
 
@@ -160,7 +160,7 @@ class _Scan:
             wanted: What it should be, shape (n, k).
         """
         found = np.full((len(wanted), _MOST_VALLEYS), -1, dtype=np.intp)
-        squared = np.einsum("pk,pk->p", features, features)
+        squared = self._lengths if features is self.points else _squared_lengths(features)
         for i in range(0, len(wanted), _SCAN_ROWS):
             distance = squared - 2.0 * wanted[i : i + _SCAN_ROWS] @ features.T
             found[i : i + _SCAN_ROWS] = self._deepest(distance)
@@ -193,8 +193,12 @@ def nearest_distance(points: Array, queries: Array) -> Array:
 
 def _nearest_rows(points: Array, queries: Array) -> Indices:
     """Return for each query (n, k) the number of the nearest point (p, k); 0 for NaN."""
-    squared = np.einsum("pk,pk->p", points, points)
+    squared = _squared_lengths(points)
     found = np.zeros(len(queries), dtype=np.intp)
     for i in range(0, len(queries), _SCAN_ROWS):
         found[i : i + _SCAN_ROWS] = np.argmin(squared - 2.0 * queries[i : i + _SCAN_ROWS] @ points.T, axis=1)
     return found
+
+
+def _squared_lengths(points: Array) -> Array:
+    return np.einsum("pk,pk->p", points, points)
