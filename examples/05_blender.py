@@ -1,7 +1,7 @@
 """Bring the captured motion into Blender and save a .blend: python examples/05_blender.py [out/anim_capture.usdc]
 
 Runs with the Python of `pip install bpy`, or inside Blender: blender -b -P examples/05_blender.py. It needs no jawusd:
-the motion is baked into the file as plain transforms. For sliders with live ranges make the add-on with
+the motion is baked into the file as plain transforms. For sliders, keys and cameras make the add-on with
 `python -m jawusd.plugins jawusd_blender.zip`.
 """
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import bpy
@@ -59,30 +59,63 @@ def make_file(usd: str, blend: str) -> None:
 
 def add_sliders(rig: jawusd_reader.Rig, meshes: Sequence[bpy.types.Object], prim: Usd.Prim) -> None:
     """Give the meshes of a mandible the modifier; the first one carries the sliders, with the keys of the prim."""
-    group, inputs = _node_group(rig)
-    for mesh in meshes:
-        modifier = mesh.modifiers.new(MODIFIER, "NODES")
-        modifier.node_group = group
+    inputs = _add_nodes(rig, meshes)
     first = meshes[0]
     for name, identifier in zip(PARAMETERS, inputs):
-        path = f'modifiers["{MODIFIER}"]["{identifier}"]'
+        path = _path(identifier)
         attribute = prim.GetAttribute(f"jaw:{name}")
         first.modifiers[MODIFIER][identifier] = float(attribute.Get() or 0.0)
         for time in attribute.GetTimeSamples():
             first.modifiers[MODIFIER][identifier] = attribute.Get(time)
             first.keyframe_insert(path, frame=time)
         for mesh in meshes[1:]:
-            driver = mesh.driver_add(path).driver
-            driver.type = "SUM"  # of one value: no Python
-            variable = driver.variables.new()
-            variable.targets[0].id = first
-            variable.targets[0].data_path = path
+            _copy(mesh, path, first, path)
     action = first.animation_data.action if first.animation_data else None
     for layer in action.layers if action else ():
         for strip in layer.strips:
             for curve in [curve for bag in strip.channelbags for curve in bag.fcurves]:
                 for point in curve.keyframe_points:
                     point.interpolation = "LINEAR"
+
+
+def add_driven_nodes(
+    kind: str, arrays: Mapping[str, Iterable[float]], meshes: Sequence[bpy.types.Object], actor: bpy.types.Object
+) -> None:
+    """Give the meshes of a mandible the modifier, driven by the properties d1, d2, d3 of an actor.
+
+    Args:
+        kind: Of the model.
+        arrays: The model's arrays, of any shape.
+    """
+    flat = {name: [float(x) for x in _flattened(values)] for name, values in arrays.items()}
+    for name, identifier in zip(PARAMETERS, _add_nodes(jawusd_reader.Rig(kind, flat), meshes)):
+        for mesh in meshes:
+            _copy(mesh, _path(identifier), actor, f'["{name}"]')
+
+
+def _flattened(values: Iterable[float]) -> Iterable[float]:
+    return values.ravel() if hasattr(values, "ravel") else values
+
+
+def _add_nodes(rig: jawusd_reader.Rig, meshes: Sequence[bpy.types.Object]) -> list[str]:
+    """Give the meshes the modifier; return the identifiers of its three inputs."""
+    group, inputs = _node_group(rig)
+    for mesh in meshes:
+        mesh.modifiers.new(MODIFIER, "NODES").node_group = group
+    return inputs
+
+
+def _path(identifier: str) -> str:
+    return f'modifiers["{MODIFIER}"]["{identifier}"]'
+
+
+def _copy(mesh: bpy.types.Object, path: str, source: bpy.types.Object, source_path: str) -> None:
+    """Drive a property by another one."""
+    driver = mesh.driver_add(path).driver
+    driver.type = "SUM"  # of one value: no Python
+    variable = driver.variables.new()
+    variable.targets[0].id = source
+    variable.targets[0].data_path = source_path
 
 
 def _mandible_meshes(prim: Usd.Prim) -> list[bpy.types.Object]:

@@ -9,6 +9,8 @@ import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
+from jawusd.plugins.carrying import carried_files
+
 _HERE = Path(__file__).parent
 _READER = "jawusd_reader.py"
 _SCRIPTS = ("jawusd_recipes.py", "blender_nodes.py")
@@ -24,7 +26,10 @@ def build_extension(out: Path) -> Path:
     """
     sources = [*sorted((_HERE / "blender").glob("*.py")), _HERE / "blender" / "blender_manifest.toml"]
     contents = {source.name: source.read_bytes() for source in sources}
-    contents[_READER] = packed_reader().encode()
+    carried = carried_files(sorted((_HERE / "blender").glob("*.pyi")))
+    # as one file, the reader also has the names of the formulas that the nodes are made of
+    carried[f"jawusd/plugins/{_READER}"] = packed_reader()
+    contents |= {name: source.encode() for name, source in sorted(carried.items())}
     with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in contents.items():
             archive.writestr(zipfile.ZipInfo(name, _ZIP_TIME), content, zipfile.ZIP_DEFLATED)

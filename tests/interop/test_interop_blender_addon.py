@@ -1,39 +1,102 @@
-"""The Blender add-on: sliders, live ranges, keys; saved and reopened."""
+"""The Blender add-on, installed from its zip: playback, sliders, bound, handle, export, nodes, cameras."""
 
 import json
 
 import numpy as np
 import pytest
-from example_rig import FPS, example_meshes, example_motion, example_rig, moved
+from example_rig import FPS, assert_valid_usd, example_meshes, example_motion, example_rig, mandible_vertices, moved
 from foreign import run_in
 
 from jawusd.plugins.extension import build_extension
+from jawusd.rig.animation import write_animation
 from jawusd.rig.bake import bake_rig
+from jawusd.rig.motion_read import read_parameters_of_stage
 from jawusd.rig.sampling import sample_valid
 
+BLENDERS = ["blender45", "blender50"]
+EXACT_MM = 1e-4
 
-@pytest.mark.parametrize("blender", ["blender45", "blender50"])
-@pytest.mark.parametrize("kind", ["anchored", "additive"])
-def test_sliders_ranges_and_keys_survive_saving(tmp_path, blender, kind):
-    rig, vertices = example_rig(kind), example_meshes()["mandible"].vertices
+
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory):
+    """Return the zip of the extension."""
+    return build_extension(tmp_path_factory.mktemp("zip") / "jawusd_blender.zip")
+
+
+@pytest.fixture(scope="module", params=["anchored", "additive"])
+def actor(request, tmp_path_factory):
+    """Return a rig and its folder."""
+    rig, (frames, d) = example_rig(request.param), example_motion()
+    folder = tmp_path_factory.mktemp(request.param)
+    bake_rig(folder, rig, example_meshes(), name="x", fps=FPS, frames=frames, d=d, table_size=17)
+    return rig, folder
+
+
+def distance_mm(matrices, rig, d):
+    """Return the largest distance of the mandible's vertices from where the evaluator puts them."""
+    points = mandible_vertices()
+    return np.linalg.norm(moved(np.array(matrices), points) - moved(rig.pose(d), points), axis=-1).max()
+
+
+@pytest.mark.parametrize("blender", BLENDERS)
+def test_takes_play_as_the_evaluator_says(tmp_path, archive, actor, blender):
+    """Imported at 59.94 per second, and keyed, in any order of frames, and after saving on any frame."""
+    rig, folder = actor
     frames, d = example_motion()
-    bake_rig(tmp_path / "actor", rig, example_meshes(), name="x", fps=FPS, frames=frames, d=d)
-    archive = build_extension(tmp_path / "jawusd_blender.zip")
-    # near the closed bite as well: its quaternions are nearly whole numbers
-    poses = np.concatenate([sample_valid(rig, 50, seed=5), 0.1 * sample_valid(rig, 20, seed=6)])
-    (tmp_path / "poses.json").write_text(json.dumps(poses.tolist()))
-    (tmp_path / "work").mkdir()
-    for arguments in (["import", tmp_path / "actor" / "anim_capture.usdc"], ["reopen"]):
-        found = run_in(blender, "blender_addon.py", archive, tmp_path / "work", *arguments, tmp_path / "poses.json")
-        distance = np.linalg.norm(np.array(found["poses"]) - moved(rig.pose(poses), vertices), axis=-1)
-        assert distance.max() < 0.001
-        expected = np.array([rig.ranges(*row) for row in poses])
-        np.testing.assert_allclose(np.array(found["ranges"]).reshape(-1, 4), expected, atol=1e-6)
-        for frame, shown in found["frames"].items():
-            k = int(frame) - frames[0]
-            np.testing.assert_allclose(shown["d"], d[k], atol=1e-5)
-            assert np.abs(np.array(shown["places"]) - moved(rig.pose(d[k])[None], vertices)[0]).max() < 0.01
-        assert all(found["drivers"]) and len(found["drivers"]) == 7
-        if arguments[0] == "import":
-            assert found["keys"] == 3 * len(frames)
-            assert found["second"] == ["Actor", "Actor.001"]
+    write_animation(tmp_path / "anim.usdc", folder / "actor.usda", frames, d, 60000 / 1001)
+    keyed = []
+    for seed in range(30):
+        times = np.cumsum(np.random.default_rng(seed).integers(2, 9, 6))
+        # 0, 6, 0 was shown as 0, 2.83, 0 once; beyond the limits of the sliders nothing may be clamped either
+        keyed.append(np.column_stack([times, sample_valid(rig, 6, seed=seed)]).tolist())
+    (tmp_path / "keyed.json").write_text(json.dumps(keyed))
+    arguments = (archive, tmp_path, tmp_path / "anim.usdc", tmp_path / "keyed.json", "30,42,69")
+    found = run_in(blender, "blender_playback.py", *arguments)
+    for take, values, keys in zip(found["takes"], found["d"], [None, *keyed], strict=True):
+        for frame, matrices in take.items():
+            assert len(matrices) == 5
+            shown = np.array(values[frame])
+            assert distance_mm(matrices, rig, shown[None]) < EXACT_MM
+            if keys is None:
+                np.testing.assert_allclose(shown, d[int(frame) - frames[0]], atol=1e-5)
+        for frame, *wanted in keys or ():
+            np.testing.assert_allclose(values[str(int(frame))], wanted, atol=1e-5)
+    assert found["scene"] == [pytest.approx(60000 / 1001, rel=1e-6), "MILLIMETERS"]
+
+
+@pytest.mark.parametrize("blender", BLENDERS)
+def test_sliders_bound_handle_export_and_nodes(tmp_path, archive, actor, blender):
+    rig, folder = actor
+    frames, d = example_motion()
+    poses = {
+        # near the closed bite as well: its quaternions are nearly whole numbers
+        "inside": np.concatenate([sample_valid(rig, 30, seed=5), 0.1 * sample_valid(rig, 10, seed=6)]),
+        "outside": np.array([[20.0, 9.0, 1.0], [0.0, 6.0, 0.0], [60.0, 0.0, 0.0], [5.0, -8.0, -5.0]]),
+    }
+    (tmp_path / "poses.json").write_text(json.dumps({name: rows.tolist() for name, rows in poses.items()}))
+    arguments = (archive, tmp_path, folder / "anim_capture.usdc", tmp_path / "poses.json")
+    found = run_in(blender, "blender_addon.py", *arguments)
+    assert found["keys"] == 3 * len(frames) and found["frames"] == [frames[0], frames[-1]]
+    for name in ("inside", "outside"):
+        assert distance_mm(found["poses" if name == "inside" else name], rig, poses[name]) < EXACT_MM
+    for (hard_low, low, high, hard_high), limits in zip(found["limits"], rig.d_range):
+        np.testing.assert_allclose([low, high], limits)
+        assert hard_low <= low - 1 and hard_high >= high + 1
+    inside, outside = found["readout"]
+    assert inside[0].startswith("inside") and outside[0].startswith("OUTSIDE") and len(inside) == 2
+    kept = np.array([rig.keep_inside([0.0], row[None]).d[0] for row in poses["outside"]])
+    assert distance_mm(found["kept"], rig, kept) < EXACT_MM
+    np.testing.assert_allclose(found["sliders"], poses["outside"][-1])  # only what is shown is brought inside
+    dragged = found["dragged"]
+    expected = rig.ik(rig.landmarks[0], dragged["target"], start=poses["inside"][0])
+    np.testing.assert_allclose(dragged["d"], expected.d, atol=1e-3)
+    reached = moved(rig.pose(np.array(dragged["d"]))[None], rig.landmarks[:1])[0, 0]
+    np.testing.assert_allclose([dragged["at"], dragged["played"]], [reached, reached], atol=1e-4)
+    nodes = np.array(found["nodes"]) - moved(rig.pose(poses["inside"][:1]), example_meshes()["mandible"].vertices)[0]
+    assert np.linalg.norm(nodes, axis=1).max() < 0.002
+    for name in ("exported.usdc", "kept.usdc"):
+        assert_valid_usd(tmp_path / name)
+    times, exported, fps = read_parameters_of_stage(tmp_path / "exported.usdc")
+    np.testing.assert_array_equal(times, frames)
+    np.testing.assert_allclose(exported, d, atol=1e-5)
+    assert fps == FPS

@@ -1,5 +1,6 @@
 """Blender shows a take as the cameras recorded it: through its own cameras the jaw is where the calibration sees it."""
 
+import cv2
 import numpy as np
 import pytest
 from example_rig import FPS, example_meshes, example_motion, example_rig, moved
@@ -7,8 +8,9 @@ from foreign import run_in
 from scipy.spatial.transform import Rotation
 
 from jawusd.geometry import Camera, make_transform
+from jawusd.plugins.extension import build_extension
 from jawusd.rig.bake import bake_rig
-from jawusd.rig.cameras import write_cameras
+from jawusd.rig.cameras import PLATE, write_cameras
 
 SIZE = (1920, 1080)
 
@@ -46,3 +48,18 @@ def test_blenders_cameras_see_the_jaw_where_the_calibration_does(tmp_path, blend
         for camera in cameras():
             difference = np.array(found[str(frames[k])][camera.name]) - camera.project_pinhole(in_world)
             assert np.abs(difference).max() < 0.05
+
+
+@pytest.mark.parametrize("blender", ["blender45", "blender50"])
+def test_the_add_on_puts_plates_behind_the_cameras(tmp_path, blender):
+    frames, d = example_motion()
+    bake_rig(tmp_path, example_rig(), example_meshes(), name="x", fps=FPS, frames=frames, d=d, table_size=17)
+    heads = np.broadcast_to(np.eye(4), (len(d), 4, 4))
+    write_cameras(tmp_path / "cameras.usda", cameras(), tmp_path / "anim_capture.usdc", frames, heads, FPS)
+    plate = tmp_path / (PLATE.format(name="cam0") % frames[3])
+    plate.parent.mkdir(parents=True)
+    plate.write_bytes(cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))[1].tobytes())
+    archive = build_extension(tmp_path / "jawusd_blender.zip")
+    found = run_in(blender, "blender_plates.py", archive, tmp_path, tmp_path / "cameras.usda")
+    assert found["cameras"] == {"cam0": [str(plate), "SEQUENCE", 0], "cam1": None}
+    assert found["scene"] == ["cam0", *SIZE]

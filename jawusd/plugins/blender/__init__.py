@@ -1,40 +1,50 @@
-"""Blender add-on: an imported USD file with a jaw rig gets three sliders, live ranges and keys.
+"""Blender add-on: a jaw rig imported from USD gets sliders, keys, a handle, its cameras, and a way back to USD.
 
-The extension is built by `python -m jawusd.plugins FILE.zip`, which puts `jawusd_reader.py` beside these modules.
+The extension is built by `python -m jawusd.plugins FILE.zip`, which puts what it uses of jawusd beside these modules.
 """
 
 from __future__ import annotations
 
 import bpy
 
-from . import jaw, jawusd_reader, panel
+from . import carried, handle, jaw, operators, panel, scene
 
 
 class JawUsdHook(bpy.types.USDHook):
-    """Add sliders and drivers to the rigs of an imported stage."""
+    """Link the rigs of an imported stage."""
 
     bl_idname = "jawusd_hook"
     bl_label = "jawusd jaw rigs"
 
     @staticmethod
     def on_import(context: bpy.types.Context) -> bool:
-        """Link every rig of the stage; Blender calls this at the end of an import."""
-        return jaw.link_rigs(context.get_stage(), context.get_prim_map())
+        """Link every rig and camera of the stage; Blender calls this at the end of an import."""
+        stage, prim_map = context.get_stage(), context.get_prim_map()
+        alone = not jaw.actors()
+        linked = jaw.link_rigs(stage, prim_map)
+        if linked and alone:
+            scene.take_rate(stage)
+        scene.add_plates(stage, prim_map)
+        return linked
 
 
 def register() -> None:
     """Register the hook, the panel and the handlers that restore rigs in reopened files."""
-    jawusd_reader.find_blender_pxr(bpy.utils.resource_path)
+    carried.find_blender_pxr(bpy.utils.resource_path)
     # Blender aborts when a hook is registered and pxr cannot be imported: fail before
     import pxr.Usd  # noqa: F401
 
     bpy.utils.register_class(JawUsdHook)
+    operators.register()
     panel.register()
     jaw.register()
+    handle.register()
 
 
 def unregister() -> None:
     """Remove them."""
+    handle.unregister()
     jaw.unregister()
     panel.unregister()
+    operators.unregister()
     bpy.utils.unregister_class(JawUsdHook)

@@ -1,34 +1,42 @@
-"""Jaw rigs in a scene: drivers of the mandible, slider ranges that follow the opening, keys from the file."""
+"""Jaw rigs in a scene: sliders, drivers of the mandible, keys from the file."""
 
 from __future__ import annotations
 
+import base64
+import io
+import json
+import zlib
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import bpy
+import numpy as np
 
-from . import jawusd_reader
+from . import carried
 
 if TYPE_CHECKING:
     from pxr import Sdf, Usd
 
 PrimMap = Mapping["Sdf.Path", list[bpy.types.ID]]  # prim path to the objects and data made from it
 
-_STORE, _ACTOR, _FPS = "jawusd_rig", "jawusd_actor", "jawusd_fps"
+SOURCE, KEEP, FPS = "jawusd_source", "keep_valid", "jawusd_fps"
+_STORE, _ACTOR = "jawusd_rig", "jawusd_actor"
 _FUNCTION = "jawusd_channel"
 _CHANNELS = (("location", 3), ("rotation_quaternion", 4))
-# Blender 5.0 snaps driven values within 1e-4 of a whole number to it, in a unit quaternion up to 0.02 mm at the chin.
-# It normalises quaternions before use, so longer ones lose nothing.
-_QUATERNION_LENGTH = 1024.0
+# Blender 5.0 sets driven values within 1e-4 of 0 or 1 to it: in a unit quaternion up to 0.02 mm at the chin. Places are
+# driven this far from where they are, and moved back by `delta_location`; quaternions are normalised before use, so
+# longer ones lose nothing.
+_AWAY_MM, _QUATERNION_LENGTH = 256.0, 1024.0
 
-_rigs: dict[str, jawusd_reader.Rig] = {}  # by the text stored in the actor
-_poses: dict[tuple[str, float, float, float], tuple[float, ...]] = {}
-_parameters: dict[str, tuple[float, float, float]] = {}  # by actor, as last seen
+_rigs: dict[str, carried.JawRig] = {}  # by the text stored in the actor
+_poses: dict[tuple[str, float, float, float, bool], tuple[float, ...]] = {}
 
 
 def link_rigs(stage: Usd.Stage, prim_map: PrimMap) -> bool:
     """Add sliders, drivers and keys to the rigs of an imported stage; return whether there is one."""
-    prims = jawusd_reader.find_rigs(stage)
+    from . import carried_usd
+
+    prims = carried.find_rigs(stage)
     for prim in prims:
         mandible_path = prim.GetRelationship("jaw:mandible").GetTargets()[0]
         actor = _object_of(prim_map, prim.GetPath())
@@ -36,13 +44,14 @@ def link_rigs(stage: Usd.Stage, prim_map: PrimMap) -> bool:
         if actor is None or mandible is None:
             print(f"jawusd: {prim.GetPath()} was not imported with its mandible; the rig stays as baked")
             continue
-        rig = jawusd_reader.from_prim(prim)
-        actor[_STORE] = rig.to_json()
-        actor[_FPS] = stage.GetTimeCodesPerSecond()
-        _add_sliders(actor, rig, [prim.GetAttribute(f"jaw:{name}").Get() or 0.0 for name in jawusd_reader.PARAMETERS])
-        _drive(mandible, actor)
+        actor[SOURCE] = _source_of(prim)
+        actor[FPS] = stage.GetTimeCodesPerSecond()
+        rig = carried_usd.rig_of(prim, actor[SOURCE])
+        actor[_STORE] = _text_of(rig)
+        values = [prim.GetAttribute(f"jaw:{name}").Get() or 0.0 for name in carried.PARAMETERS]
+        _add_sliders(actor, rig, values)
+        drive(mandible, actor)
         _key(actor, prim)
-        update_ranges(actor)
     return bool(prims)
 
 
@@ -51,24 +60,61 @@ def actors() -> list[bpy.types.Object]:
     return [found for found in bpy.data.objects if _STORE in found]
 
 
-def rig_of(actor: bpy.types.Object) -> jawusd_reader.Rig:
-    """Return the evaluator of an actor, built once per stored text."""
+def mandible_of(actor: bpy.types.Object) -> bpy.types.Object:
+    """Return the object that an actor moves."""
+    return next(found for found in bpy.data.objects if found.get(_ACTOR) == actor)
+
+
+def meshes_of(mandible: bpy.types.Object) -> list[bpy.types.Object]:
+    """Return the meshes that a mandible carries, its own among them."""
+    return [found for found in (mandible, *mandible.children_recursive) if found.type == "MESH"]
+
+
+def rig_of(actor: bpy.types.Object) -> carried.JawRig:
+    """Return the evaluator of an actor, built once per stored text.
+
+    Raises:
+        carried.JawusdError: An older version of the add-on stored it.
+    """
     text = actor[_STORE]
     if text not in _rigs:
-        _rigs[text] = jawusd_reader.from_json(text)
+        if text.startswith("{"):
+            raise carried.JawusdError("was imported by an older version of the add-on.", hint="Import the rig again.")
+        with np.load(io.BytesIO(zlib.decompress(base64.b64decode(text))), allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in stored.files}
+        _rigs[text] = carried.JawRig(arrays, json.loads(str(arrays.pop("meta"))))
     return _rigs[text]
 
 
-def update_ranges(actor: bpy.types.Object) -> None:
-    """Set the slider limits of d2 and d3 to what is valid at the present d1, with the other one as it is."""
+def parameters(actor: bpy.types.Object) -> tuple[float, float, float]:
+    """Return d1, d2, d3 [mm] as the sliders show them."""
+    d1, d2, d3 = (float(actor[name]) for name in carried.PARAMETERS)
+    return d1, d2, d3
+
+
+def shown(actor: bpy.types.Object, d: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Return the parameters [mm] that the mandible takes: d, brought inside the bound where the actor keeps valid."""
     rig = rig_of(actor)
-    d1, d2, d3 = (actor[name] for name in jawusd_reader.PARAMETERS)
-    _parameters[actor.name_full] = (d1, d2, d3)
-    # along each axis through the present value of the other; where that leaves nothing, through the path itself
-    for name, found, fallback in zip(jawusd_reader.PARAMETERS[1:], rig.ranges(d1, d2, d3), rig.ranges(d1)):
-        low, high = found if found[0] == found[0] else fallback
-        if low == low:
-            actor.id_properties_ui(name).update(min=low, max=high, soft_min=low, soft_max=high)
+    if not actor.get(KEEP) or rig.is_inside(d):
+        return d
+    d1, d2, d3 = rig.keep_inside([0.0], [d]).d[0].tolist()
+    return d1, d2, d3
+
+
+def _text_of(rig: carried.JawRig) -> str:
+    """Return a rig as text that a scene can store."""
+    packed = io.BytesIO()
+    # Blender's numpy has no argument `allow_pickle`, which the types expect
+    np.savez(packed, **{**rig.arrays, "meta": np.array(json.dumps(rig.meta))})  # type: ignore[arg-type]
+    return base64.b64encode(zlib.compress(packed.getvalue())).decode()
+
+
+def _source_of(prim: Usd.Prim) -> str:
+    """Return the file that defines a rig, `actor.usda` as a rule, also where a stage references it."""
+    for spec in prim.GetPrimStack():
+        if spec.HasInfo("apiSchemas") and spec.layer.realPath:
+            return str(spec.layer.realPath).split("[")[0]
+    return str(prim.GetStage().GetRootLayer().realPath)
 
 
 def _object_of(prim_map: PrimMap, path: Sdf.Path) -> bpy.types.Object | None:
@@ -84,39 +130,58 @@ def _object_of(prim_map: PrimMap, path: Sdf.Path) -> bpy.types.Object | None:
     return None
 
 
-def _add_sliders(actor: bpy.types.Object, rig: jawusd_reader.Rig, values: list[float]) -> None:
-    for name, label, value, (low, high) in zip(jawusd_reader.PARAMETERS, jawusd_reader.LABELS, values, rig.d_range):
+def _add_sliders(actor: bpy.types.Object, rig: carried.JawRig, values: list[float]) -> None:
+    for name, value in zip(carried.PARAMETERS, values):
         actor[name] = float(value)
-        ui = actor.id_properties_ui(name)
-        ui.update(min=low, max=high, soft_min=low, soft_max=high, description=label, precision=2)
+    actor[KEEP] = False
+    actor.id_properties_ui(KEEP).update(description="Show the nearest valid jaw where the sliders leave the bound")
+    _set_limits(actor, rig)
+    for name in (*carried.PARAMETERS, KEEP):
         actor.property_overridable_library_set(f'["{name}"]', True)
 
 
-def _drive(mandible: bpy.types.Object, actor: bpy.types.Object) -> None:
+def _set_limits(actor: bpy.types.Object, rig: carried.JawRig) -> None:
+    """Let sliders end at the whole range; Blender clamps keyed values to the hard limits, so these lie far beyond."""
+    for name, label, (low, high) in zip(carried.PARAMETERS, carried.LABELS, rig.d_range.tolist()):
+        slack = high - low
+        ui = actor.id_properties_ui(name)
+        ui.update(min=low - slack, max=high + slack, soft_min=low, soft_max=high, description=label, precision=2)
+
+
+def drive(mandible: bpy.types.Object, actor: bpy.types.Object) -> None:
     """Let d1, d2, d3 of the actor drive the mandible, instead of the cached motion of the file."""
     for constraint in list(mandible.constraints):
         if constraint.type == "TRANSFORM_CACHE":
             mandible.constraints.remove(constraint)
     mandible[_ACTOR] = actor
     mandible.rotation_mode = "QUATERNION"
+    mandible.delta_location = [-_AWAY_MM] * 3
     channel = 0
     for path, count in _CHANNELS:
         for index in range(count):
             driver = mandible.driver_add(path, index).driver
             driver.type = "SCRIPTED"
             driver.use_self = True
-            for name in jawusd_reader.PARAMETERS:
+            for name in (*carried.PARAMETERS, KEEP):
                 variable = driver.variables.new()
                 variable.name = name
                 variable.targets[0].id = actor
                 variable.targets[0].data_path = f'["{name}"]'
-            driver.expression = f"{_FUNCTION}(self, d1, d2, d3, {channel})"
+            driver.expression = f"{_FUNCTION}(self, d1, d2, d3, {KEEP}, {channel})"
             channel += 1
+
+
+def release(mandible: bpy.types.Object) -> None:
+    """Remove the drivers of a mandible; it goes back to where it is at rest in its parent."""
+    for path, _ in _CHANNELS:
+        mandible.driver_remove(path)
+    mandible.delta_location = [0.0] * 3
+    mandible.location, mandible.rotation_quaternion = [0.0] * 3, [1.0, 0.0, 0.0, 0.0]
 
 
 def _key(actor: bpy.types.Object, prim: Usd.Prim) -> None:
     """Give the sliders the samples of the file as linearly interpolated keys."""
-    for name in jawusd_reader.PARAMETERS:
+    for name in carried.PARAMETERS:
         attribute = prim.GetAttribute(f"jaw:{name}")
         times = attribute.GetTimeSamples()
         for time in times:
@@ -138,14 +203,15 @@ def curves(actor: bpy.types.Object) -> list[bpy.types.FCurve]:
     return [curve for bag in bags for curve in bag.fcurves]
 
 
-def _channel(mandible: bpy.types.Object, d1: float, d2: float, d3: float, channel: int) -> float:
+def _channel(mandible: bpy.types.Object, d1: float, d2: float, d3: float, keep: float, channel: int) -> float:
     """Return one channel of the mandible's location (mm, the actor is scaled) and quaternion: the driver function."""
     actor = mandible[_ACTOR]
-    key = (actor.name_full, d1, d2, d3)
+    key = (actor[_STORE], d1, d2, d3, bool(keep))
     if key not in _poses:
         _poses.clear()  # the seven channels of one pose follow one another
-        translation, wxyz = jawusd_reader.decompose(rig_of(actor).pose(d1, d2, d3))
-        _poses[key] = (*translation, *(_QUATERNION_LENGTH * x for x in wxyz))
+        T = rig_of(actor).pose(shown(actor, (d1, d2, d3)) if keep else (d1, d2, d3))
+        turn = _QUATERNION_LENGTH * carried.wxyz_from_matrix(T[:3, :3])
+        _poses[key] = (*(T[:3, 3] + _AWAY_MM).tolist(), *turn.tolist())
     return _poses[key][channel]
 
 
@@ -154,29 +220,19 @@ def _install(*_: object) -> None:
     """Register the driver function, which Blender drops with every file it opens."""
     bpy.app.driver_namespace[_FUNCTION] = _channel
     _poses.clear()
-    _parameters.clear()
-
-
-@bpy.app.handlers.persistent
-def _follow(*_: object) -> None:
-    """Update the ranges of every actor whose sliders have moved."""
-    for actor in actors():
-        if _parameters.get(actor.name_full) != tuple(actor[name] for name in jawusd_reader.PARAMETERS):
-            update_ranges(actor)
-
-
-_HANDLERS = (("load_post", _install), ("depsgraph_update_post", _follow), ("frame_change_post", _follow))
+    for mandible in bpy.data.objects:
+        # Blender marks a driver whose function was missing as broken and does not try again
+        for curve in mandible.animation_data.drivers if _ACTOR in mandible and mandible.animation_data else ():
+            curve.driver.expression = str(curve.driver.expression)
 
 
 def register() -> None:
-    """Install the driver function and the handlers."""
-    _install()
-    for name, handler in _HANDLERS:
-        getattr(bpy.app.handlers, name).append(handler)
+    """Install the driver function, also in files to be opened."""
+    bpy.app.driver_namespace[_FUNCTION] = _channel
+    bpy.app.handlers.load_post.append(_install)
 
 
 def unregister() -> None:
-    """Remove them."""
-    for name, handler in _HANDLERS:
-        getattr(bpy.app.handlers, name).remove(handler)
+    """Remove it."""
+    bpy.app.handlers.load_post.remove(_install)
     bpy.app.driver_namespace.pop(_FUNCTION, None)

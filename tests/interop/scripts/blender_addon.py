@@ -1,91 +1,99 @@
-"""Run inside Blender's Python: import a rig with the add-on, pose, key, save; or reopen the saved file.
+"""Run inside Blender's Python: try what the add-on offers on an imported take, print what came out as JSON.
 
-Usage: python blender_addon.py ZIP FOLDER import USD POSES.json
-       python blender_addon.py ZIP FOLDER reopen POSES.json
-Prints {"poses": mesh vertices per pose, "ranges": per pose, "keys", "frames"} as JSON, in the frame of /Actor [mm].
+Usage: python blender_addon.py ZIP FOLDER TAKE.usd POSES.json
+Matrices are the mandible's in the actor [mm].
 """
 
 import json
 import os
 import sys
-import zipfile
 
 import bpy
 
-MESH = "MandibleMesh"
+sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
+from blender_playback import NAMES, matrix
+from extension import install
 
 
-def add_on(archive, folder):
-    """Unpack the extension and register it, as Blender does."""
-    package = os.path.join(folder, "jawusd_blender")
-    with zipfile.ZipFile(archive) as opened:
-        opened.extractall(package)
-    sys.path.insert(0, folder)
-    import jawusd_blender
-
-    jawusd_blender.register()
-    return jawusd_blender
+def posed(d):
+    """Set the sliders and return the mandible's matrix."""
+    actor = bpy.data.objects["Actor"]
+    for name, value in zip(NAMES, d):
+        actor[name] = value
+    actor.update_tag()
+    bpy.context.view_layer.update()
+    return matrix()
 
 
-def vertices():
-    """Return the mandible's evaluated vertices in the frame of the actor."""
+def limits():
+    """Return hard and soft limits of the sliders."""
+    found = [bpy.data.objects["Actor"].id_properties_ui(name).as_dict() for name in NAMES]
+    return [[ui[end] for end in ("min", "soft_min", "soft_max", "max")] for ui in found]
+
+
+def readout(package, d):
+    """Return the lines that the panel shows."""
+    actor = bpy.data.objects["Actor"]
+    return [text for text, _ in package.panel._readout(package.jaw.rig_of(actor), d)]
+
+
+def dragged(way):
+    """Drag a handle at the incisor by a way [mm]; return the sliders and where handle and its target are."""
+    bpy.ops.jawusd.handle(actor="Actor", at="INCISOR")
+    handle = bpy.data.objects["Actor incisor"]
+    target = [a + b for a, b in zip(handle.location, way)]
+    handle.location = target
+    bpy.context.view_layer.update()
+    found = {"d": [bpy.data.objects["Actor"][name] for name in NAMES], "at": list(handle.location), "target": target}
+    bpy.context.scene.frame_set(bpy.context.scene.frame_current + 1)
+    found["played"] = list(handle.location)
+    bpy.ops.jawusd.handle(actor="Actor", at="CHIN")
+    return found
+
+
+def with_nodes(d):
+    """Let geometry nodes pose the mandible, the add-on disabled; return the vertices of its mesh."""
+    bpy.ops.jawusd.nodes(actor="Actor")
+    bpy.ops.preferences.addon_disable(module="bl_ext.test_repository.jawusd_blender")
+    posed(d)
     depsgraph = bpy.context.evaluated_depsgraph_get()
     root = bpy.data.objects["Actor"].evaluated_get(depsgraph)
-    mesh = bpy.data.objects[MESH].evaluated_get(depsgraph)
+    mesh = bpy.data.objects["MandibleMesh"].evaluated_get(depsgraph)
     to_root = root.matrix_world.inverted() @ mesh.matrix_world
     return [list(to_root @ vertex.co) for vertex in mesh.to_mesh().vertices]
 
 
-def posed(poses):
-    """Set the sliders to every pose and return what the mandible and the ranges become."""
-    actor = bpy.data.objects["Actor"]
-    places, ranges = [], []
-    for pose in poses:
-        for name, value in zip(("d1", "d2", "d3"), pose):
-            actor[name] = value
-        actor.update_tag()
-        bpy.context.view_layer.update()
-        places.append(vertices())
-        found = [actor.id_properties_ui(name).as_dict() for name in ("d2", "d3")]
-        ranges.append([[ui["min"], ui["max"]] for ui in found])
-    return places, ranges
-
-
-def main(archive, folder, what, *arguments):
-    """Do what was asked and print the result."""
+def main(archive, folder, take, poses):
+    """Try everything."""
     bpy.ops.wm.read_homefile(use_empty=True)
-    package = add_on(archive, folder)
-    saved = os.path.join(folder, "saved.blend")
-    result = {}
-    if what == "import":
-        bpy.ops.wm.usd_import(filepath=arguments[0])
-        actor = bpy.data.objects["Actor"]
-        action = actor.animation_data.action if actor.animation_data else None
-        result["keys"] = sum(len(curve.keyframe_points) for curve in package.jaw.curves(actor)) if action else 0
-    else:
-        bpy.ops.wm.open_mainfile(filepath=saved)
-        actor = bpy.data.objects["Actor"]
-    frames = {}
-    for frame in (30, 38, 55):
-        bpy.context.scene.frame_set(frame)
-        frames[frame] = {"d": [actor[name] for name in ("d1", "d2", "d3")], "places": vertices()}
-    result["frames"] = frames
-    if actor.animation_data:
-        actor.animation_data.action = None
-    with open(arguments[-1]) as opened:
-        result["poses"], result["ranges"] = posed(json.load(opened))
-    mandible = bpy.data.objects["Mandible"]
-    result["drivers"] = [curve.driver.is_valid for curve in mandible.animation_data.drivers]
-    if what == "import":
-        bpy.ops.wm.usd_import(filepath=arguments[0])  # a second one, so that names like Actor.001 work too
-        result["second"] = [found.name for found in package.jaw.actors()]
-        bpy.ops.wm.read_homefile(use_empty=True)
-        bpy.ops.wm.usd_import(filepath=arguments[0])
-        bpy.ops.wm.save_as_mainfile(filepath=saved)
-    package.unregister()
+    package = install(archive, folder)
+    with open(poses) as opened:
+        poses = json.load(opened)
+    bpy.ops.wm.usd_import(filepath=take)
+    actor, scene, result = bpy.data.objects["Actor"], bpy.context.scene, {}
+    result["keys"] = sum(len(curve.keyframe_points) for curve in package.jaw.curves(actor))
+    bpy.ops.jawusd.export(actor="Actor", filepath=os.path.join(folder, "exported.usdc"))
+    actor.animation_data.action = None
+    result["poses"] = [posed(d) for d in poses["inside"]]
+    result["limits"] = limits()
+    result["readout"] = [readout(package, d) for d in (poses["inside"][0], poses["outside"][0])]
+    result["outside"] = [posed(d) for d in poses["outside"]]
+    actor[package.jaw.KEEP] = True
+    result["kept"] = [posed(d) for d in poses["outside"]]
+    result["sliders"] = [actor[name] for name in NAMES]
+    bpy.ops.jawusd.key(actor="Actor")
+    posed((0.0, 0.0, 0.0))
+    bpy.ops.jawusd.key(actor="Actor")
+    bpy.ops.jawusd.export(actor="Actor", filepath=os.path.join(folder, "kept.usdc"))
+    actor.animation_data.action, actor[package.jaw.KEEP] = None, False
+    posed(poses["inside"][0])
+    result["dragged"] = dragged((1.0, -3.0, 1.0))
+    result["nodes"] = with_nodes(poses["inside"][0])
+    result["frames"] = [scene.frame_start, scene.frame_end]
     print("RESULT " + json.dumps(result))
 
 
-main(*sys.argv[1:])
-sys.stdout.flush()
-os._exit(0)  # the module hangs at a normal exit in some versions
+if __name__ == "__main__":
+    main(*sys.argv[1:])
+    sys.stdout.flush()
+    os._exit(0)  # the module hangs at a normal exit in some versions

@@ -1,0 +1,135 @@
+"""The buttons of the panel: key, handle, export, geometry nodes."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+from bpy_extras.io_utils import ExportHelper
+
+from . import carried, handle, jaw
+
+_CHIN_HALF_WIDTH_MM = 10.0
+
+
+def _actor(operator: bpy.types.Operator) -> bpy.types.Object:
+    return bpy.data.objects[operator.actor]
+
+
+class JAWUSD_OT_key(bpy.types.Operator):
+    """The operator behind the key button."""
+
+    bl_idname = "jawusd.key"
+    bl_label = "Key Jaw"
+    bl_description = "Set a key on all three jaw parameters at the current frame"
+    bl_options = {"REGISTER", "UNDO"}
+
+    __annotations__ = {"actor": bpy.props.StringProperty()}  # Blender reads properties from annotations
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Insert the keys."""
+        for name in carried.PARAMETERS:
+            _actor(self).keyframe_insert(f'["{name}"]')
+        return {"FINISHED"}
+
+
+class JAWUSD_OT_handle(bpy.types.Operator):
+    """The operator behind the handle buttons."""
+
+    bl_idname = "jawusd.handle"
+    bl_label = "Add Jaw Handle"
+    bl_description = "Add an empty to drag the jaw by; the sliders follow, inside the bound"
+    bl_options = {"REGISTER", "UNDO"}
+
+    __annotations__ = {
+        "actor": bpy.props.StringProperty(),
+        "at": bpy.props.EnumProperty(
+            items=[("INCISOR", "Incisor", "The lower incisal point"), ("CHIN", "Chin", "The front of the mandible")]
+        ),
+    }
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Add the handle."""
+        actor = _actor(self)
+        rig = jaw.rig_of(actor)
+        point = rig.landmarks[0] if self.at == "INCISOR" else _chin(actor, rig)
+        made = handle.add(actor, tuple(point.tolist()), f"{actor.name} {self.at.lower()}")
+        context.view_layer.objects.active = made
+        return {"FINISHED"}
+
+
+def _chin(actor: bpy.types.Object, rig: carried.JawRig) -> carried.Array:
+    """Return the lowest vertex of the mandible below the incisal point [mm], mandible frame."""
+    meshes = jaw.meshes_of(jaw.mandible_of(actor))
+    points = np.concatenate([np.array([v.co for v in mesh.data.vertices], dtype=np.float64) for mesh in meshes])
+    side, up, _ = (rig.T_anatomical_skull @ rig.T_rest)[:3, :3] @ (points - rig.landmarks[0]).T
+    return points[int(np.argmin(np.where(np.abs(side) < _CHIN_HALF_WIDTH_MM, up, np.inf)))]
+
+
+class JAWUSD_OT_export(bpy.types.Operator, ExportHelper):
+    """The operator behind the export button."""
+
+    bl_idname = "jawusd.export"
+    bl_label = "Export Jaw Animation"
+    bl_description = "Write d and the baked mandible of every frame to a USD layer over the rig, kept inside the bound"
+    filename_ext = ".usdc"
+
+    __annotations__ = {"actor": bpy.props.StringProperty()}
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Write the layer."""
+        from . import carried_usd
+
+        actor, scene = _actor(self), context.scene
+        present = scene.frame_current
+        frames, d = np.arange(scene.frame_start, scene.frame_end + 1.0), []
+        for frame in frames.astype(int).tolist():
+            scene.frame_set(frame)
+            d.append(jaw.shown(actor, jaw.parameters(actor)))
+        scene.frame_set(present)
+        rig, rate = jaw.rig_of(actor), scene.render.fps / scene.render.fps_base
+        try:
+            inside = rig.keep_inside(frames, d)
+            carried_usd.write_animation(self.filepath, actor[jaw.SOURCE], inside.times, inside.d, rate, rig=rig)
+        except carried.JawusdError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        moved = float(np.linalg.norm(inside.d[inside.given] - np.array(d), axis=1).max())
+        self.report({"INFO"}, f"{len(frames)} frames, moved by {moved:.2f} mm at most to stay inside the bound")
+        return {"FINISHED"}
+
+
+class JAWUSD_OT_nodes(bpy.types.Operator):
+    """The operator behind the geometry nodes button."""
+
+    bl_idname = "jawusd.nodes"
+    bl_label = "Use Geometry Nodes"
+    bl_description = (
+        "Pose the meshes by geometry nodes, which need neither the add-on nor scripts; sliders and keys stay"
+    )
+    bl_options = {"REGISTER", "UNDO"}
+
+    __annotations__ = {"actor": bpy.props.StringProperty()}
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Replace the drivers by nodes."""
+        actor = _actor(self)
+        mandible = jaw.mandible_of(actor)
+        jaw.release(mandible)
+        rig = jaw.rig_of(actor)
+        carried.add_driven_nodes(rig.kind, rig.arrays, jaw.meshes_of(mandible), actor)
+        return {"FINISHED"}
+
+
+_CLASSES = (JAWUSD_OT_key, JAWUSD_OT_handle, JAWUSD_OT_export, JAWUSD_OT_nodes)
+
+
+def register() -> None:
+    """Register the operators."""
+    for cls in _CLASSES:
+        bpy.utils.register_class(cls)
+
+
+def unregister() -> None:
+    """Unregister them."""
+    for cls in reversed(_CLASSES):
+        bpy.utils.unregister_class(cls)

@@ -1,0 +1,91 @@
+"""Carry modules of jawusd inside another package, where none is installed: with all they import."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+_ROOT = Path(__file__).parents[1]
+_OURS = re.compile(r"^(\s*)from jawusd((?:\.\w+)*) import", re.MULTILINE)
+# Scripts look for the reader beside themselves; carried, it is a module of the package.
+_BESIDE = re.compile(r"^sys\.path\.insert\(.*\)\n|^import jawusd_reader$|^from jawusd_reader import", re.MULTILINE)
+_VERSION = re.compile(r"^__version__ = .*$", re.MULTILINE)
+_READER = "jawusd.plugins.jawusd_reader"
+
+
+def carried_files(stubs: Iterable[Path]) -> dict[str, str]:
+    """Return the files to be put into a package, by their path in it.
+
+    Args:
+        stubs: `.pyi` files that import the names wanted, each in the form `from jawusd.x import y as y`.
+
+    Returns:
+        The modules that the stubs describe, and below `jawusd/` what they import.
+
+    Raises:
+        ValueError: A module imports jawusd in another form than `from jawusd.x import y`.
+    """
+    sources: dict[str, str] = {}
+    version = _VERSION.search((_ROOT / "__init__.py").read_text(encoding="utf-8"))
+    files = {"jawusd/__init__.py": version[0] + "\n" if version else ""}
+    for stub in stubs:
+        text = stub.read_text(encoding="utf-8")
+        _collect(ast.parse(text), sources)
+        files[stub.with_suffix(".py").name] = _OURS.sub(r"\1from .jawusd\2 import", text)
+    for module, source in sources.items():
+        files[_name(module)] = _relative(module, source)
+        for parent in _parents(module):
+            files.setdefault(_name(parent), "")
+    return files
+
+
+def _collect(tree: ast.Module, sources: dict[str, str]) -> None:
+    """Add the modules of jawusd that a module imports, and those they import."""
+    for module in _imported(tree):
+        if module == "jawusd" or module in sources:
+            continue
+        sources[module] = _file(module).read_text(encoding="utf-8")
+        _collect(ast.parse(sources[module]), sources)
+
+
+def _imported(tree: ast.Module) -> Iterator[str]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names if alias.name.split(".")[0] in ("jawusd", "jawusd_reader")]
+            if names and names != ["jawusd_reader"]:
+                raise ValueError(f"line {node.lineno}: {ast.unparse(node)!r} cannot be carried")
+            yield from [_READER] if names else ()
+        elif isinstance(node, ast.ImportFrom) and str(node.module).split(".")[0] == "jawusd":
+            for alias in node.names:
+                below = f"{node.module}.{alias.name}"
+                yield below if _file(below).is_file() and _file(below).stem != "__init__" else str(node.module)
+
+
+def _relative(module: str, source: str) -> str:
+    """Return the source of a module with its imports of jawusd relative to where it is carried."""
+    inside = module.split(".")[1:]
+    dots = "." * (len(inside) + (_file(module).name == "__init__.py"))
+    source = _OURS.sub(lambda found: f"{found[1]}from {dots}{found[2][1:]} import", source)
+
+    def beside(found: re.Match[str]) -> str:
+        if found[0].startswith("sys"):
+            return ""
+        return "from . import jawusd_reader" if found[0].startswith("import") else "from .jawusd_reader import"
+
+    return _BESIDE.sub(beside, source)
+
+
+def _file(module: str) -> Path:
+    path = _ROOT.joinpath(*module.split(".")[1:])
+    return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+
+
+def _name(module: str) -> str:
+    return f"jawusd/{_file(module).relative_to(_ROOT).as_posix()}"
+
+
+def _parents(module: str) -> list[str]:
+    parts = module.split(".")
+    return [".".join(parts[:end]) for end in range(2, len(parts))]

@@ -1,0 +1,18 @@
+"""Install the extension from its zip as "Install from Disk" does, in folders of its own, inside Blender's Python."""
+
+import importlib
+import os
+
+import bpy
+
+
+def install(archive, folder):
+    """Install and enable it; return the module of its package."""
+    repository = os.path.join(folder, "extensions")
+    os.makedirs(repository, exist_ok=True)
+    repositories = bpy.context.preferences.extensions.repos
+    for found in list(repositories):
+        repositories.remove(found)
+    made = repositories.new(name="Test", module="test_repository", custom_directory=repository)
+    bpy.ops.extensions.package_install_files(filepath=archive, repo=made.module, enable_on_install=True)
+    return importlib.import_module(f"bl_ext.{made.module}.jawusd_blender")
