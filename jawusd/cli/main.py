@@ -15,6 +15,7 @@ from jawusd.cli import (
     report_commands,
     rig_commands,
     solve_commands,
+    stage_commands,
 )
 from jawusd.errors import JawusdError, explain_missing_packages
 
@@ -45,6 +46,7 @@ for _command in (
     rig_commands.validate,
     rig_commands.ik,
     rig_commands.animate,
+    stage_commands.rebake,
     solve_commands.solve,
     live_commands.live,
     library_commands.retarget,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from jawusd.cli.options import USD_SUFFIXES
 from jawusd.cli.output import emit
 from jawusd.errors import FormatError
 from jawusd.evaluator.interpolation import monotone_tangents
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
 
 _MOVED_MM = 1e-6
 _OFF_CURVE_MM, _MOST_HALVINGS = 0.003, 4  # of straight lines between samples of a smooth motion
-_USD = (".usd", ".usda", ".usdc", ".usdz")
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,7 +221,7 @@ def _motion_of(rig: JawRig, path: Path) -> AuthoredMotion:
     from jawusd.rig.motion_read import read_parameters_of_stage, read_poses_of_stage
     from jawusd.rig.read import open_stage
 
-    if path.suffix.lower() not in _USD:
+    if path.suffix.lower() not in USD_SUFFIXES:
         return read_motion(rig, path)
     sampled = read_parameters_of_stage(path)
     if sampled is not None:

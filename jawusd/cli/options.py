@@ -30,10 +30,13 @@ class LengthUnit(StrEnum):
     m = "m"
 
 
+USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
+
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 Force = Annotated[bool, typer.Option("--force", help="Overwrite an existing output.")]
 Outside = Annotated[bool, typer.Option("--allow-outside", help="Let paths in the capture leave its folder.")]
 CaptureArg = Annotated[Path, typer.Argument(help="capture.toml, or the folder that holds it.", show_default=False)]
+Prim = Annotated[str | None, typer.Option("--prim", help="Which rig, where a stage has several: the path of its prim.")]
 RigArg = Annotated[Path, typer.Argument(help="actor.usda, another layer of it, or model.npz.", show_default=False)]
 
 # whose jaw it is

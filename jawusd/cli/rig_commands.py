@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from jawusd.cli.options import Force, Json, RigArg
+from jawusd.cli.options import USD_SUFFIXES, Force, Json, Prim, RigArg
 from jawusd.cli.output import emit, refuse_existing
 
 if TYPE_CHECKING:
@@ -23,7 +23,6 @@ Triple = tuple[float, float, float]
 
 #: Exit code of a "no": an invalid pose, a rig with errors.
 NO = 1
-_USD = (".usd", ".usda", ".usdc", ".usdz")
 
 
 def info(
@@ -177,6 +176,7 @@ def validate(
         float | None,
         typer.Option(min=0.0, help="How far outside the bound a pose may lie; 0 for authored poses; the rig's else."),
     ] = None,
+    prim: Prim = None,
     as_json: Json = False,
 ) -> None:
     """Check a rig, or judge poses as measured ones; leaves with exit code 1 when something is invalid.
@@ -189,7 +189,8 @@ def validate(
     import jawusd
 
     loaded = jawusd.load(rig)
-    frames, T = _poses_or_parameters(loaded, poses)
+    unbaked = _unbaked(loaded, poses, prim)
+    frames, T = _poses_or_parameters(loaded, poses, prim)
     verdicts = loaded.validate(T, residual_limit_mm=residual_mm, tolerance_mm=tolerance_mm)
     rows = [
         {"frame": int(frame), "valid": bool(ok), "reason": words, "residual_mm": float(res), "margin_mm": float(margin)}
@@ -205,12 +206,13 @@ def validate(
         "within_tolerance": len(rows) - len(invalid) - inside,
         "invalid": len(invalid),
         "tolerance_mm": verdicts.tolerance_mm,
+        **({"unbaked": unbaked["figures"]} if unbaked else {}),
         "verdicts": rows,
     }
     counts = f"{inside} inside, {result['within_tolerance']} within tolerance, {len(invalid)} invalid"
     summary = f"{len(rows)} poses: {counts} (tolerance of measured poses {verdicts.tolerance_mm:.2f} mm)"
-    emit(result, as_json, lambda: [*_verdict_lines(rows), summary])
-    if invalid:
+    emit(result, as_json, lambda: [*_verdict_lines(rows), *unbaked.get("lines", []), summary])
+    if invalid or unbaked:
         raise typer.Exit(NO)
 
 
@@ -221,13 +223,25 @@ def _verdict_lines(rows: Sequence[Mapping[str, object]]) -> list[str]:
     return [shown.format(**row) for row in rows if row["reason"] != INSIDE]
 
 
-def _poses_or_parameters(rig: JawRig, path: Path) -> tuple[NDArray[np.int64], Array]:
+def _unbaked(rig: JawRig, path: Path, prim: str | None) -> dict[str, list[str] | dict[str, float]]:
+    """Return how far the mandible of a stage is from where its d puts it; nothing where both agree."""
+    from jawusd.rig.rebake import departure
+
+    away = departure(path, rig, prim) if path.suffix.lower() in USD_SUFFIXES else None
+    if away is None or not away.frames:
+        return {}
+    message = f"the mandible is not where d puts it in {away.frames} of {away.of} frames and keys, by up to "
+    message += f"{away.largest_mm:.2f} mm: bake it with `jawusd rebake`"
+    return {"lines": [message], "figures": away._asdict()}
+
+
+def _poses_or_parameters(rig: JawRig, path: Path, prim: str | None) -> tuple[NDArray[np.int64], Array]:
     from jawusd.formats.poses import read_parameters, table_columns
 
-    if path.suffix.lower() in _USD:
+    if path.suffix.lower() in USD_SUFFIXES:
         from jawusd.rig.motion_read import read_poses_of_stage
 
-        return read_poses_of_stage(path)
+        return read_poses_of_stage(path, prim)
     if path.suffix != ".npz" and "d1" in table_columns(path):
         frames, d = read_parameters(path)
         return frames, rig.pose(d)

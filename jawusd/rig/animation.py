@@ -92,7 +92,7 @@ def write_animation(
     if not known.all():
         lost = _gf.int_array(np.floor(frames[~known]))
         layer.customLayerData = {**layer.customLayerData, LOST: lost}
-    _author(layer, rig, frames[known], d[known], frames[[0, -1]])
+    author_motion(layer, rig, frames[known], d[known], frames[[0, -1]])
     return write_layer(layer, out)
 
 
@@ -126,15 +126,25 @@ def bake_times(rig: JawRig, frames: Array, d: Array, span: Array) -> tuple[Array
     return times, poses
 
 
-def _author(layer: Sdf.Layer, rig: JawRig, frames: Array, d: Array, span: Array) -> None:
-    actor = Sdf.CreatePrimInLayer(layer, ACTOR)
+def author_motion(
+    layer: Sdf.Layer, rig: JawRig, frames: Array, d: Array, span: Array, paths: tuple[str, str] = (ACTOR, MANDIBLE)
+) -> None:
+    """Write samples of d and the baked ops of a mandible into a layer.
+
+    Args:
+        frames: Times of the samples of d, increasing, shape (F,).
+        d: Their values [mm], shape (F, 3).
+        span: First and last time to cover.
+        paths: The prims of the actor and of its mandible.
+    """
+    actor = Sdf.CreatePrimInLayer(layer, paths[0])
     for i, parameter in enumerate(PARAMETERS):
         attribute = Sdf.AttributeSpec(
             actor, parameter, Sdf.ValueTypeNames.Double, Sdf.VariabilityVarying, declaresCustom=True
         )
         _set_samples(layer, attribute, frames, d[:, i].tolist())
     times, poses = bake_times(rig, frames, d, span)
-    mandible = Sdf.CreatePrimInLayer(layer, MANDIBLE)
+    mandible = Sdf.CreatePrimInLayer(layer, paths[1])
     translate = Sdf.AttributeSpec(mandible, "xformOp:translate", Sdf.ValueTypeNames.Double3)
     _set_samples(layer, translate, times, _gf.translations(poses))
     orient = Sdf.AttributeSpec(mandible, "xformOp:orient", Sdf.ValueTypeNames.Quatd)

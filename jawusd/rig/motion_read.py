@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pxr import Usd, UsdGeom
 
 from jawusd.errors import FormatError
@@ -37,22 +37,31 @@ def read_poses_of_stage(path: str | os.PathLike[str], prim_path: str | None = No
     """
     stage = open_stage(path)
     actor = find_rig_prim(stage, path, prim_path)
-    mandible = _mandible(stage, actor, path)
-    times = _whole_frames(stage, path)
+    times = frames_of_stage(stage, path)
+    return times, poses_at(mandible_of(stage, actor, path), actor, times, path)
+
+
+def poses_at(mandible: Usd.Prim, actor: Usd.Prim, times: ArrayLike, path: object) -> Array:
+    """Return T_skull_mandible (F, 4, 4) [mm] of a mandible in its actor at times (F,).
+
+    Raises:
+        FormatError: The motion is not rigid.
+    """
+    times = np.asarray(times, dtype=np.float64)
     poses = np.empty((len(times), 4, 4))
-    for k, time in enumerate(times):
-        cache = UsdGeom.XformCache(Usd.TimeCode(float(time)))
+    for k, time in enumerate(times.tolist()):
+        cache = UsdGeom.XformCache(Usd.TimeCode(time))
         moved, _ = cache.ComputeRelativeTransform(mandible, actor)
         poses[k] = np.array(moved).T  # USD multiplies rows from the left
     defect = rigidity_defect(poses)
     if not defect.max() <= _RIGID:
         worst = int(np.argmax(np.where(np.isfinite(defect), defect, np.inf)))
         raise FormatError(
-            f"the mandible is not rigid at frame {times[worst]} (off by {defect[worst]:.2g}, allowed {_RIGID:g}).",
+            f"the mandible is not rigid at frame {times[worst]:g} (off by {defect[worst]:.2g}, allowed {_RIGID:g}).",
             path=str(path),
             hint="Samples of matrices shear in between: key translate and orient.",
         )
-    return times, poses
+    return poses
 
 
 @raises_format_error(0)
@@ -72,7 +81,7 @@ def read_parameters_of_stage(
     stage = open_stage(path)
     actor = find_rig_prim(stage, path, prim_path)
     attributes = [actor.GetAttribute(name) for name in PARAMETERS]
-    sampled = [attribute.GetTimeSamples() for attribute in attributes if attribute]
+    sampled = [key_times(attribute) for attribute in attributes if attribute]
     times = np.unique(np.concatenate([np.zeros(0), *sampled]))
     if len(sampled) < len(PARAMETERS) or not len(times):
         return None
@@ -88,7 +97,23 @@ def read_parameters_of_stage(
     return np.concatenate([times, lost])[order], all_d[order], float(stage.GetTimeCodesPerSecond())
 
 
-def _mandible(stage: Usd.Stage, actor: Usd.Prim, path: object) -> Usd.Prim:
+def key_times(attribute: Usd.Attribute) -> list[float]:
+    """Return the times at which an attribute has samples; of a spline its knots and the whole frames between them."""
+    if not hasattr(attribute, "HasSpline") or not attribute.HasSpline():  # OpenUSD before 25.05 has no splines
+        return list(attribute.GetTimeSamples())
+    knots = np.array(sorted(attribute.GetSpline().GetKnots()))
+    first, last = np.ceil(knots.min(initial=np.inf)), np.floor(knots.max(initial=-np.inf))
+    if not last - first < _MOST_FRAMES:
+        return knots.tolist()
+    return np.union1d(knots, np.arange(first, last + 1)).tolist()
+
+
+def mandible_of(stage: Usd.Stage, actor: Usd.Prim, path: object) -> Usd.Prim:
+    """Return the prim that a rig moves.
+
+    Raises:
+        FormatError: There is none.
+    """
     targets = actor.GetRelationship("jaw:mandible").GetTargets() if actor.HasRelationship("jaw:mandible") else []
     default = actor.GetPath().AppendPath(MANDIBLE.removeprefix(f"{ACTOR}/"))
     prim = stage.GetPrimAtPath(targets[0] if targets else default)
@@ -97,7 +122,12 @@ def _mandible(stage: Usd.Stage, actor: Usd.Prim, path: object) -> Usd.Prim:
     return prim
 
 
-def _whole_frames(stage: Usd.Stage, path: object) -> NDArray[np.int64]:
+def frames_of_stage(stage: Usd.Stage, path: object) -> NDArray[np.int64]:
+    """Return the whole frames between start and end of a stage.
+
+    Raises:
+        FormatError: The stage has no start and end, or too many frames between them.
+    """
     if not stage.HasAuthoredTimeCodeRange():
         raise FormatError(
             "has no start and end time code: nothing says which frames to read.",

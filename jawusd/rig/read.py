@@ -76,7 +76,7 @@ def find_rig_prim(stage: Usd.Stage, where: object, prim_path: str | None = None)
         raise FormatError("holds no jaw rig (no prim with JawRigAPI).", path=str(where))
     if len(prims) > 1:
         names = ", ".join(str(prim.GetPath()) for prim in prims)
-        raise FormatError(f"holds several jaw rigs: {names}.", path=str(where), hint="Name the prim.")
+        raise FormatError(f"holds several jaw rigs: {names}.", path=str(where), hint="Name the prim with --prim.")
     return prims[0]
 
 

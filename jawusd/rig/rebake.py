@@ -1,0 +1,198 @@
+"""Bring d and the mandible of a stage together again, where only one of them was keyed or moved."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+from pxr import Sdf, Usd, UsdGeom, Vt
+
+from jawusd.errors import FormatError, RigError
+from jawusd.evaluator import JawRig
+from jawusd.geometry.arrays import Array
+from jawusd.rig.animation import author_motion
+from jawusd.rig.layers import new_layer, relative_path, write_layer
+from jawusd.rig.layout import PARAMETERS
+from jawusd.rig.motion_read import (
+    frames_of_stage,
+    key_times,
+    mandible_of,
+    poses_at,
+    read_parameters_of_stage,
+)
+from jawusd.rig.read import find_rig_prim, open_stage
+from jawusd.rig.rules import BAKED_MM
+from jawusd.rig.schema import has_jaw_api
+from jawusd.rig.table import landmark_distance
+from jawusd.rig.untrusted import raises_format_error
+
+Origin = Literal["d", "mandible"]
+
+
+class StageMotion(NamedTuple):
+    """A motion of a rig in a stage.
+
+    Attributes:
+        frames: Times, increasing, shape (F,).
+        d: Jaw parameters [mm], shape (F, 3), NaN in lost frames.
+        fps: Frames per second.
+        origin: What it was read from, the keys of d or the mandible's transforms.
+        residual_mm: Distance of the mandible's poses from the model, shape (F,); zero for d.
+    """
+
+    frames: Array
+    d: Array
+    fps: float
+    origin: Origin
+    residual_mm: Array
+
+
+class Departure(NamedTuple):
+    """How far a mandible is from where d puts it: in how many of the frames looked at, and the largest distance."""
+
+    frames: int
+    of: int
+    largest_mm: float
+
+
+@raises_format_error(0)
+def departure(path: str | os.PathLike[str], rig: JawRig, prim_path: str | None = None) -> Departure | None:
+    """Return how far the mandible of a stage departs from its d; None where d has no keys.
+
+    Raises:
+        RigError: Not a stage.
+        FormatError: No rig or several, no mandible, or parameters that are not finite.
+    """
+    stage = open_stage(path)
+    actor = _actor(stage, path, rig, prim_path)
+    sampled = read_parameters_of_stage(path, str(actor.GetPath()))
+    if sampled is None:
+        return None
+    known = np.isfinite(sampled[1]).all(axis=1)
+    times, d = sampled[0][known], sampled[1][known]
+    if stage.HasAuthoredTimeCodeRange():
+        shown = frames_of_stage(stage, path)
+        wanted = [np.interp(shown, times, column) for column in d.T]
+        times, d = np.concatenate([times, shown]), np.concatenate([d, np.stack(wanted, axis=1)])
+    T = poses_at(mandible_of(stage, actor, path), actor, times, path)
+    away = landmark_distance(rig, T, rig.pose(d))
+    return Departure(int((away > BAKED_MM).sum()), len(away), float(away.max(initial=0.0)))
+
+
+@raises_format_error(0)
+def motion_of_stage(
+    path: str | os.PathLike[str], rig: JawRig, prim_path: str | None = None, origin: Origin | None = None
+) -> StageMotion:
+    """Read the motion of a rig in a stage, from what was edited: keys of d, or transforms of the mandible.
+
+    Args:
+        prim_path: Which rig, where the stage has several.
+        origin: Which of both; None: the one that moves, or where both do and disagree, the one in the stronger layer.
+
+    Raises:
+        RigError: Not a stage, or d and mandible disagree and nothing says which one counts.
+        FormatError: No rig or several, no mandible, or a motion that is not rigid or not finite.
+    """
+    stage = open_stage(path)
+    actor = _actor(stage, path, rig, prim_path)
+    mandible = mandible_of(stage, actor, path)
+    away = departure(path, rig, str(actor.GetPath()))
+    if origin is None:
+        origin = _origin(stage, actor, mandible, away, path)
+    sampled = read_parameters_of_stage(path, str(actor.GetPath()))
+    if origin == "d":
+        if sampled is None:
+            raise FormatError("has no keys of d.", path=str(path))
+        return StageMotion(*sampled, origin, np.zeros(len(sampled[0])))
+    frames = frames_of_stage(stage, path)
+    d, residual_mm = rig.encode(poses_at(mandible, actor, frames, path))
+    return StageMotion(frames.astype(np.float64), d, float(stage.GetTimeCodesPerSecond()), origin, residual_mm)
+
+
+def _origin(stage: Usd.Stage, actor: Usd.Prim, mandible: Usd.Prim, away: Departure | None, path: object) -> Origin:
+    if away is None:
+        return "mandible"
+    if not away.frames:
+        return "d"
+    ops = [op.GetAttr() for op in UsdGeom.Xformable(mandible).GetOrderedXformOps()]
+    if not any(key_times(op) for op in ops):
+        return "d"
+    ranks = [
+        min((_rank(stage, attribute) for attribute in attributes), default=np.inf)
+        for attributes in ([actor.GetAttribute(name) for name in PARAMETERS], ops)
+    ]
+    if ranks[0] == ranks[1]:
+        raise RigError(
+            f"d and the mandible disagree by up to {away.largest_mm:.2f} mm, and both have keys in one layer.",
+            path=str(path),
+            hint="Say which one counts: --from d or --from mandible.",
+        )
+    return "d" if ranks[0] < ranks[1] else "mandible"
+
+
+def _actor(stage: Usd.Stage, path: object, rig: JawRig, prim_path: str | None) -> Usd.Prim:
+    """Return the prim that carries a rig; of several the only one made from the same model."""
+    if prim_path is None:
+        prims = [prim for prim in stage.Traverse() if has_jaw_api(prim)]
+        alike = [prim for prim in prims if prim.GetAttribute("jaw:modelHash").Get() == rig.model_hash]
+        if len(prims) > 1 and len(alike) == 1:
+            return alike[0]
+    return find_rig_prim(stage, path, prim_path)
+
+
+def _rank(stage: Usd.Stage, attribute: Usd.Attribute) -> float:
+    """Return how many layers of a stage are stronger than the strongest opinion of an attribute."""
+    stack = attribute.GetPropertyStack()
+    layers = stage.GetLayerStack(includeSessionLayers=False)
+    return float(layers.index(stack[0].layer)) if stack and stack[0].layer in layers else np.inf
+
+
+def write_rebaked(
+    out: str | os.PathLike[str],
+    shot: str | os.PathLike[str],
+    rig: JawRig,
+    frames: Array,
+    d: Array,
+    prim_path: str | None = None,
+) -> Path:
+    """Write a layer over a stage that gives a rig in it d and the mandible's ops that belong to it.
+
+    An instance is made editable: its mandible could not be moved otherwise.
+
+    Args:
+        out: File to write; it sublayers the stage.
+        frames: Times, increasing, shape (F,).
+        d: Jaw parameters [mm], shape (F, 3).
+
+    Raises:
+        RigError: Not a stage, or the output is the stage itself.
+        FormatError: No rig or several, or no mandible.
+        OutputError: The file cannot be written.
+    """
+    out = Path(out)
+    if out.resolve() == Path(shot).resolve():
+        raise RigError("the layer written goes over the stage and cannot replace it.", path=out)
+    stage = open_stage(shot)
+    actor = _actor(stage, shot, rig, prim_path)
+    mandible = mandible_of(stage, actor, shot)
+    layer = new_layer(float(stage.GetTimeCodesPerSecond()))
+    layer.pseudoRoot.SetInfo(UsdGeom.Tokens.metersPerUnit, UsdGeom.GetStageMetersPerUnit(stage))
+    layer.pseudoRoot.SetInfo(UsdGeom.Tokens.upAxis, UsdGeom.GetStageUpAxis(stage))
+    layer.defaultPrim = stage.GetRootLayer().defaultPrim or actor.GetPath().GetPrefixes()[0].name
+    layer.subLayerPaths.append(relative_path(Path(shot), out))
+    first, last = float(frames[0]), float(frames[-1])
+    if stage.HasAuthoredTimeCodeRange():
+        first, last = stage.GetStartTimeCode(), stage.GetEndTimeCode()
+    layer.startTimeCode, layer.endTimeCode = first, last
+    author_motion(
+        layer, rig, frames, d, np.array([frames[0], frames[-1]]), (str(actor.GetPath()), str(mandible.GetPath()))
+    )
+    moved = layer.GetPrimAtPath(mandible.GetPath())
+    order = Sdf.AttributeSpec(moved, "xformOpOrder", Sdf.ValueTypeNames.TokenArray, Sdf.VariabilityUniform)
+    order.default = Vt.TokenArray(["xformOp:translate", "xformOp:orient"])  # whatever it was moved by
+    for prefix in mandible.GetPath().GetPrefixes():
+        if stage.GetPrimAtPath(prefix).IsInstance():
+            layer.GetPrimAtPath(prefix).instanceable = False
+    return write_layer(layer, out)

@@ -1,0 +1,157 @@
+"""Shots in which d alone, or the mandible alone, was keyed: found, and baked again."""
+
+import json
+
+import numpy as np
+import pytest
+from example_rig import assert_valid_usd, example_motion, example_rig
+from pxr import Gf, Sdf, Ts, Usd, UsdGeom
+from typer.testing import CliRunner
+
+from jawusd.cli.main import app
+from jawusd.errors import FormatError, RigError
+from jawusd.rig import write_animation
+from jawusd.rig.motion_read import read_parameters_of_stage, read_poses_of_stage
+from jawusd.rig.rebake import departure, motion_of_stage
+
+KEYS = {1: (0.0, 0.0, 0.0), 13: (15.0, 2.0, 1.0), 25: (4.0, -2.0, 0.5)}
+
+
+def run(*arguments, code=0):
+    done = CliRunner().invoke(app, [str(x) for x in arguments])
+    assert done.exit_code == code, done.output
+    return done.stdout
+
+
+def shot(folder, change, name="shot.usda", actors=("Person",), source="actor.usda"):
+    """Write a shot that references the actor, once or more, and is changed."""
+    stage = Usd.Stage.CreateNew(str(folder / name))
+    stage.SetStartTimeCode(1)
+    stage.SetEndTimeCode(25)
+    stage.SetTimeCodesPerSecond(24)
+    stage.SetDefaultPrim(stage.DefinePrim("/Shot", "Xform"))
+    UsdGeom.SetStageUpAxis(stage, "Y")
+    UsdGeom.SetStageMetersPerUnit(stage, 0.001)
+    for actor in actors:
+        prim = stage.DefinePrim(f"/Shot/{actor}", "Xform")
+        prim.GetReferences().AddReference(f"./{source}")
+        change(prim)
+    stage.Save()
+    return folder / name
+
+
+def key_d(prim):
+    for i in range(3):
+        for time, d in KEYS.items():
+            prim.GetAttribute(f"jaw:d{i + 1}").Set(d[i], time)
+
+
+def key_splines(prim):
+    for i in range(3):
+        spline = Ts.Spline("double")
+        for time, d in KEYS.items():
+            knot = Ts.Knot("double")
+            knot.SetTime(time)
+            knot.SetValue(d[i])
+            knot.SetNextInterpolation(Ts.InterpLinear)
+            spline.SetKnot(knot)
+        prim.GetAttribute(f"jaw:d{i + 1}").SetSpline(spline)
+
+
+def keyed(frames):
+    return np.stack([np.interp(frames, list(KEYS), column) for column in np.transpose(list(KEYS.values()))], axis=1)
+
+
+@pytest.mark.parametrize("change", [key_d, key_splines])
+def test_keys_of_d_alone_are_found_and_baked(folder, kind, change):
+    path = shot(folder, change)
+    out = run("validate", path, code=1)
+    assert "Only d is keyed" in out
+    judged = json.loads(run("validate", folder / "actor.usda", path, "--json", code=1))
+    assert judged["unbaked"]["frames"] >= 24 and judged["unbaked"]["largest_mm"] > 10
+    run("rebake", folder / "actor.usda", path, "-o", folder / "baked.usdc")
+    run("validate", folder / "actor.usda", folder / "baked.usdc")
+    frames, T = read_poses_of_stage(folder / "baked.usdc")
+    np.testing.assert_array_equal(frames, np.arange(1, 26))
+    np.testing.assert_allclose(T, example_rig(kind).pose(keyed(frames)), atol=1e-6)
+    assert_valid_usd(folder / "baked.usdc")
+
+
+def test_a_mandible_moved_by_hand_gives_d_inside_the_bound(folder, kind):
+    rig = example_rig(kind)
+    wanted = keyed(np.arange(1, 26.0))
+    wanted[20] = [15.0, 9.0, 1.0]
+    assert rig.margin(wanted[20]) < -1 and rig.is_inside(np.delete(wanted, 20, 0)).all()
+
+    def move(prim):
+        mandible = UsdGeom.Xformable(prim.GetStage().GetPrimAtPath(f"{prim.GetPath()}/geo/Mandible"))
+        op = mandible.MakeMatrixXform()
+        for time, T in enumerate(rig.pose(wanted), start=1):
+            op.Set(Gf.Matrix4d(T.T.tolist()), time)
+
+    path = shot(folder, move)
+    found = json.loads(run("rebake", folder / "actor.usda", path, "-o", folder / "baked.usdc", "--json"))
+    assert found["from"] == "mandible" and found["outside"] == 1 and found["worst_frame"] == 21
+    assert found["worst_margin_mm"] == pytest.approx(float(rig.margin(wanted[20])), abs=1e-3)
+    times, d, _ = read_parameters_of_stage(folder / "baked.usdc")
+    assert rig.is_inside(d).all()
+    # the way back inside is continuous, so neighbours of the pose outside may move, too
+    far = [k for k in range(25) if abs(k - 20) > 3]
+    np.testing.assert_allclose(d[np.searchsorted(times, np.array(far) + 1)], wanted[far], atol=1e-3)
+    run("validate", folder / "actor.usda", folder / "baked.usdc")
+    assert_valid_usd(folder / "baked.usdc")
+
+
+def test_what_was_edited_last_counts(folder, kind):
+    """In a layer over an animation: its own keys; in the animation itself nothing tells."""
+    rig, (frames, d) = example_rig(kind), example_motion()
+    animation = write_animation(folder / "anim.usdc", folder / "actor.usda", frames, d, 24)
+    for name, expected in (("xformOp:translate", "mandible"), ("jaw:d1", "d")):
+        layer = Sdf.Layer.CreateNew(str(folder / f"over_{expected}.usda"))
+        layer.subLayerPaths.append("./anim.usdc")
+        layer.startTimeCode, layer.endTimeCode = float(frames[0]), float(frames[-1])
+        stage = Usd.Stage.Open(layer)
+        path = "/Actor" if expected == "d" else "/Actor/geo/Mandible"
+        attribute = stage.GetPrimAtPath(path).GetAttribute(name)
+        for frame in frames.tolist():
+            value = attribute.Get(frame)
+            attribute.Set(value + (0.5 if expected == "d" else Gf.Vec3d(0, -0.5, 0)), frame)
+        layer.Save()
+        assert motion_of_stage(layer.realPath, rig).origin == expected
+    assert departure(animation, rig).frames == 0 and motion_of_stage(animation, rig).origin == "d"
+    with pytest.raises(RigError, match="goes over the stage"):
+        run_rebake_onto_itself(folder, animation)
+    layer = Sdf.Layer.FindOrOpen(str(animation))
+    for frame in frames.tolist():
+        layer.SetTimeSample("/Actor.jaw:d1", frame, 0.0)
+    layer.Save()
+    with pytest.raises(RigError, match="both have keys in one layer"):
+        motion_of_stage(animation, rig)
+    assert motion_of_stage(animation, rig, origin="d").d[:, 0].max() == 0
+
+
+def run_rebake_onto_itself(folder, path):
+    done = CliRunner().invoke(app, ["rebake", str(folder / "actor.usda"), str(path), "-o", str(path), "--force"])
+    raise done.exception
+
+
+def test_one_of_several_rigs_is_named(folder, kind):
+    path = shot(folder, key_d, actors=("Anna", "Ben"))
+    with pytest.raises(FormatError, match="Name the prim"):
+        motion_of_stage(path, example_rig(kind))
+    run("rebake", folder / "actor.usda", path, "-o", folder / "baked.usdc", "--prim", "/Shot/Ben")
+    for name, moves in (("Anna", False), ("Ben", True)):
+        _, T = read_poses_of_stage(folder / "baked.usdc", f"/Shot/{name}")
+        assert (np.ptp(T[:, :3, 3], axis=0).max() > 1) == moves
+    run("validate", folder / "actor.usda", folder / "baked.usdc", "--prim", "/Shot/Ben")
+
+
+def test_an_instance_is_made_editable(folder, kind):
+    def instanced(prim):
+        prim.SetInstanceable(True)
+        key_d(prim)
+
+    path = shot(folder, instanced)
+    run("rebake", folder / "actor.usda", path, "-o", folder / "baked.usdc")
+    frames, T = read_poses_of_stage(folder / "baked.usdc")
+    np.testing.assert_allclose(T, example_rig(kind).pose(keyed(frames)), atol=1e-6)
