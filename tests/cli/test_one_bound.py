@@ -261,24 +261,28 @@ def test_usd_rule(actor, tmp_path):
 
 
 def test_plain_reader_and_add_on(actor, tmp_path, monkeypatch):
-    """As shipped: the packed reader, and the panel of the Blender add-on, which draws with it."""
+    """As shipped: the packed reader, and the panel of the Blender add-on with the evaluator it carries."""
+    extension.copy_scripts(tmp_path / "scripts")
+    monkeypatch.syspath_prepend(tmp_path / "scripts")
+    reader = importlib.import_module("jawusd_reader")
+    rig = reader.load(str(actor))
+    assert disagreements([rig.is_inside(*d) for d in D.tolist()]) == 0
+    assert disagreements([rig.margin(*d) >= 0 for d in D.tolist()]) == 0
     built = extension.build_extension(tmp_path / "jaw.zip")
     package = tmp_path / "shipped"
     zipfile.ZipFile(built).extractall(package)
     (package / "__init__.py").write_text("")  # that of the add-on registers it with Blender
     labels = _stand_in_for_blender(monkeypatch)
     monkeypatch.syspath_prepend(tmp_path)
-    reader, panel = (importlib.import_module(f"shipped.{name}") for name in ("jawusd_reader", "panel"))
-    rig = reader.load(str(actor))
-    assert disagreements([rig.is_inside(*d) for d in D.tolist()]) == 0
-    assert disagreements([rig.margin(*d) >= 0 for d in D.tolist()]) == 0
+    panel = importlib.import_module("shipped.panel")
+    carried = panel.carried.JawRig(RIG.arrays, RIG.meta)
 
     class Actor(dict):
         name = "someone"
 
     shown = Actor()
     monkeypatch.setattr(panel.jaw, "actors", lambda: [shown])
-    monkeypatch.setattr(panel.jaw, "rig_of", lambda _: rig)
+    monkeypatch.setattr(panel.jaw, "rig_of", lambda _: carried)
     drawn = panel.JAWUSD_PT_sliders()
     drawn.layout = _Layout(labels)
     render = types.SimpleNamespace(fps=FPS, fps_base=1.0)
@@ -302,23 +306,30 @@ class _Layout:
     def box(self):
         return self
 
+    def row(self):
+        return self
+
     def label(self, text, icon=None):
         self._labels.append(text)
 
     def prop(self, *_, **__):
         pass
 
-    def operator(self, _):
+    def operator(self, _, text=None):
         return types.SimpleNamespace()
 
 
 def _stand_in_for_blender(monkeypatch):
     bpy = types.ModuleType("bpy")
     names = ("ID", "Object", "FCurve", "Context", "Operator", "Panel")
-    bpy.types = types.SimpleNamespace(**dict.fromkeys(names, object))
-    bpy.props = types.SimpleNamespace(StringProperty=lambda: None)
+    bpy.types = types.SimpleNamespace(**{name: type(name, (), {}) for name in names})
+    bpy.props = types.SimpleNamespace(StringProperty=lambda: None, EnumProperty=lambda items: None)
     bpy.app = types.SimpleNamespace(handlers=types.SimpleNamespace(persistent=lambda function: function))
     monkeypatch.setitem(sys.modules, "bpy", bpy)
+    helpers = types.ModuleType("bpy_extras.io_utils")
+    helpers.ExportHelper = type("ExportHelper", (), {})
+    monkeypatch.setitem(sys.modules, "bpy_extras", types.ModuleType("bpy_extras"))
+    monkeypatch.setitem(sys.modules, "bpy_extras.io_utils", helpers)
     return []
 
 
