@@ -37,11 +37,12 @@ def __dir__() -> list[str]:
     return __all__
 
 
-def load(path: str | PathLike[str], *, fast: bool = False) -> JawRig:
+def load(path: str | PathLike[str], *, prim: str | None = None, fast: bool = False) -> JawRig:
     """Load a rig for posing, validation and inverse kinematics.
 
     Args:
         path: `actor.usda` (or any layer or package that carries the rig), or a `model.npz`.
+        prim: Path of the rig's prim, where a stage holds several.
         fast: Compile the most used functions with numba: the same results to 1e-10, several times faster. Needs
             `pip install 'jawusd[fast]'`; the first use after an installation compiles for about a minute.
 
@@ -57,7 +58,7 @@ def load(path: str | PathLike[str], *, fast: bool = False) -> JawRig:
     else:
         from jawusd.rig import load_rig
 
-        rig = load_rig(path)
+        rig = load_rig(path, prim)
     if not fast:
         return rig
     from jawusd.fast import accelerate

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from jawusd.cli.options import Force, Json
+from jawusd.cli.options import Allow, Force, Json, Prim
 from jawusd.cli.output import emit, progress, refuse_existing
 
 if TYPE_CHECKING:
@@ -43,12 +43,14 @@ def retarget(
         typer.Option("-o", "--out", help="Layer of the motion (retargeted.usdc) or model of the person (model.npz)."),
     ] = None,
     force: Force = False,
+    prim: Prim = None,
+    allow: Allow = None,
     as_json: Json = False,
 ) -> None:
     """Carry a motion to another rig, or make a rig for a person from landmarks and a library."""
     others = (landmarks, library_folder)
     if anim and source and target and not any(others):
-        _retarget_motion(anim, source, target, fps, out or Path("retargeted.usdc"), force, as_json)
+        _retarget_motion(anim, source, target, prim, fps, out or Path("retargeted.usdc"), force, as_json)
     elif landmarks and library_folder and not any((anim, source, target, fps)):
         _personal(landmarks, library_folder, use, out or Path("model.npz"), force, as_json)
     else:
@@ -56,7 +58,14 @@ def retarget(
 
 
 def _retarget_motion(
-    anim: Path, source: Path, target: Path, fps: float | None, out: Path, force: bool, as_json: bool
+    anim: Path,
+    source: Path,
+    target: Path,
+    prim: str | None,
+    fps: float | None,
+    out: Path,
+    force: bool,
+    as_json: bool,
 ) -> None:
     from jawusd.cli.motion import carried_over, emit_motion
     from jawusd.pipeline.library import load_any_rig
@@ -68,7 +77,7 @@ def _retarget_motion(
         if place.suffix not in (".usd", ".usda", ".usdc"):
             raise typer.BadParameter("must be a USD layer: .usda, .usdc or .usd.", param_hint=option)
     taker = load_any_rig(target)
-    motion, changes = carried_over(source, anim, taker)
+    motion, changes = carried_over(source, anim, taker, prim)
     rate = fps or motion.fps or describe(target)["fps"]
     write_animation(out, target, motion.frames, motion.d, rate, rig=taker)
     emit_motion(out, rate, motion, changes, as_json)
@@ -109,6 +118,7 @@ def library(
         Path | None, typer.Option(help="Folder for ranges.png and ranges.svg: those listed, side by side.")
     ] = None,
     force: Force = False,
+    allow: Allow = None,
     as_json: Json = False,
 ) -> None:
     """Keep many actors: bring the index library.json up to date, list, search, compare and plot."""

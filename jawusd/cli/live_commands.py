@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from jawusd.cli.options import Outside, RigArg
+from jawusd.cli.options import Allow, Outside, RigArg
 from jawusd.cli.solve_commands import Head, ShotArg
 
 
@@ -31,6 +31,7 @@ def live(
     seconds: Annotated[float | None, typer.Option(min=0.1, help="End after so long.", show_default=False)] = None,
     jobs: Annotated[int, typer.Option(min=1, max=64, help="Threads that search the teeth.")] = 2,
     allow_outside: Outside = False,
+    allow: Allow = None,
 ) -> None:
     """Follow the jaw of the person of a rig in cameras as they run: a line of JSON per instant, OSC, a page.
 

@@ -42,7 +42,7 @@ for _command in (
     photo_commands.photos,
     rig_commands.info,
     rig_commands.pose,
-    rig_commands.encode,
+    stage_commands.encode,
     rig_commands.validate,
     rig_commands.ik,
     rig_commands.animate,

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from jawusd.cli.options import USD_SUFFIXES
 from jawusd.cli.output import emit
@@ -15,6 +16,7 @@ from jawusd.evaluator.interpolation import monotone_tangents
 from jawusd.formats.arkit import read_arkit
 from jawusd.formats.keys import FARTHEST_FRAME, MOST_FRAMES, Keys, load_keys
 from jawusd.formats.poses import read_parameters, read_poses, table_columns
+from jawusd.formats.tracks import load_tracks
 from jawusd.geometry.arrays import Array, Mask
 
 if TYPE_CHECKING:
@@ -68,6 +70,18 @@ def read_motion(rig: JawRig, source: Path) -> AuthoredMotion:
     return AuthoredMotion(frames.astype(np.float64), d, None)
 
 
+def read_pose_table(path: Path) -> tuple[NDArray[np.int64], Array]:
+    """Return frames (F,) and poses (F, 4, 4) of a table or of tracks.
+
+    Raises:
+        FormatError: not such a file.
+    """
+    if path.suffix == ".npz":
+        tracks = load_tracks(path)
+        return tracks.frames, tracks.T_upper_lower
+    return read_poses(path)
+
+
 def read_face(rig: JawRig, source: Path, fps: float | None) -> AuthoredMotion:
     """Read the jaw of an ARKit face capture, its weights taken as shares of the person's own ranges.
 
@@ -87,6 +101,20 @@ def read_face(rig: JawRig, source: Path, fps: float | None) -> AuthoredMotion:
     if not np.isfinite(d).any():
         raise FormatError("no row has a face (BlendShapeCount is 0 in all of them).", path=source)
     return AuthoredMotion(capture.frames, d, capture.fps)
+
+
+def write_over(out: Path, stage: Path, rig: JawRig, motion: AuthoredMotion, rate: float, prim: str) -> None:
+    """Write a motion as a layer over a stage, for one of its rigs; its frames pass at their own rate.
+
+    Raises:
+        JawusdError: no such stage or prim, or a file that cannot be written.
+    """
+    from jawusd.rig.read import open_stage
+    from jawusd.rig.rebake import write_rebaked
+
+    known = np.isfinite(motion.d).all(axis=1)
+    codes = motion.frames[known] * (float(open_stage(stage).GetTimeCodesPerSecond()) / rate)
+    write_rebaked(out, stage, rig, codes, motion.d[known], prim)
 
 
 @dataclass(frozen=True)
@@ -182,11 +210,14 @@ def follow_curves(rig: JawRig, motion: AuthoredMotion, knots: Knots) -> Authored
     return AuthoredMotion(frames, d, motion.fps, motion.keys)
 
 
-def carried_over(source_rig: Path, source: Path, target: JawRig) -> tuple[AuthoredMotion, Changes]:
+def carried_over(
+    source_rig: Path, source: Path, target: JawRig, prim: str | None = None
+) -> tuple[AuthoredMotion, Changes]:
     """Read a motion of one rig and carry it to another, see `pipeline.library.retarget`.
 
     Args:
         source: an animation layer, keys, or a table of d or of poses.
+        prim: which rig, where the source is a stage with several.
 
     Raises:
         FormatError: no such motion or rig.
@@ -195,7 +226,7 @@ def carried_over(source_rig: Path, source: Path, target: JawRig) -> tuple[Author
     from jawusd.pipeline.library import load_any_rig, retarget
 
     rig = load_any_rig(source_rig)
-    motion = _motion_of(rig, source)
+    motion = _motion_of(rig, source, prim)
     carried = retarget(rig, target, motion.frames, motion.d)
     known = np.isfinite(carried.d).all(axis=1)
     samples, lost = int(known.size), int((~known).sum())
@@ -216,16 +247,16 @@ def _lost_line(lost: int) -> list[str]:
     return [f"{lost} frames say nothing and were bridged"] if lost else []
 
 
-def _motion_of(rig: JawRig, path: Path) -> AuthoredMotion:
+def _motion_of(rig: JawRig, path: Path, prim: str | None) -> AuthoredMotion:
     """Return a motion of a rig: samples of d of a stage, its transforms where it has none, or a table."""
     from jawusd.rig.motion_read import read_parameters_of_stage, read_poses_of_stage
     from jawusd.rig.read import open_stage
 
     if path.suffix.lower() not in USD_SUFFIXES:
         return read_motion(rig, path)
-    sampled = read_parameters_of_stage(path)
+    sampled = read_parameters_of_stage(path, prim)
     if sampled is not None:
         return AuthoredMotion(*sampled)
-    frames, poses = read_poses_of_stage(path)
+    frames, poses = read_poses_of_stage(path, prim)
     rate = float(open_stage(path).GetTimeCodesPerSecond())
     return AuthoredMotion(frames.astype(np.float64), rig.encode(poses)[0], rate)

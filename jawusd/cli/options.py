@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    from jawusd.evaluator import JawRig
     from jawusd.pipeline.fit import TrajectoryOptions
     from jawusd.pipeline.prepare import Subject
 
@@ -36,8 +37,39 @@ Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
 Force = Annotated[bool, typer.Option("--force", help="Overwrite an existing output.")]
 Outside = Annotated[bool, typer.Option("--allow-outside", help="Let paths in the capture leave its folder.")]
 CaptureArg = Annotated[Path, typer.Argument(help="capture.toml, or the folder that holds it.", show_default=False)]
+
+
+def _allow(folders: list[Path] | None) -> list[Path] | None:
+    from jawusd.formats.allowed_folders import allow_folders
+
+    allow_folders(folders or ())
+    return folders
+
+
+Allow = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--allow",
+        callback=_allow,
+        help="Folder that a rig or shot may name files in, as a library of actors; may be repeated. JAWUSD_ALLOW too.",
+        show_default=False,
+    ),
+]
 Prim = Annotated[str | None, typer.Option("--prim", help="Which rig, where a stage has several: the path of its prim.")]
 RigArg = Annotated[Path, typer.Argument(help="actor.usda, another layer of it, or model.npz.", show_default=False)]
+
+
+def load_named(rig: Path, prim: str | None, stage: Path | None = None) -> JawRig:
+    """Load a rig; `--prim` names the one in a stage beside it, or else the one in the rig's own file.
+
+    Raises:
+        JawusdError: it is no rig.
+    """
+    import jawusd
+
+    beside = stage is not None and stage.suffix.lower() in USD_SUFFIXES and stage.resolve() != rig.resolve()
+    return jawusd.load(rig, prim=None if beside or rig.suffix == ".npz" else prim)
+
 
 # whose jaw it is
 CaptureOption = Annotated[Path | None, typer.Option(help="The capture: gives scans and landmarks.", show_default=False)]

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from jawusd.cli.options import (
+    Allow,
     CaptureOption,
     ColumnsOption,
     GroupOption,
@@ -150,6 +151,7 @@ def view(
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port; the next free one if it is taken.")] = 8080,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open a browser.")] = True,
     allow_outside: Outside = False,
+    allow: Allow = None,
 ) -> None:
     """See a rig in the browser, drag it, key it; or a capture's footage, to judge its poses and to set its picks."""
     import webbrowser

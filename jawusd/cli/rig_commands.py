@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from jawusd.cli.options import USD_SUFFIXES, Force, Json, Prim, RigArg
+from jawusd.cli.options import USD_SUFFIXES, Allow, Force, Json, Prim, RigArg, load_named
 from jawusd.cli.output import emit, refuse_existing
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from jawusd.cli.motion import AuthoredMotion
     from jawusd.evaluator import JawRig
     from jawusd.geometry.arrays import Array
     from jawusd.rig.read import Description
@@ -30,6 +31,8 @@ def info(
         Path, typer.Argument(help="actor.usda, another layer, model.npz or tracks.npz.", show_default=False)
     ],
     frame: Annotated[int | None, typer.Option(help="Of tracks.npz: say how this frame was tracked.")] = None,
+    prim: Prim = None,
+    allow: Allow = None,
     as_json: Json = False,
 ) -> None:
     """Say what a rig file or tracks hold."""
@@ -49,7 +52,7 @@ def info(
         return
     if frame is not None:
         raise typer.BadParameter("--frame belongs to tracks.npz.")
-    found = describe(rig)
+    found = describe(rig, prim)
     emit(found, as_json, lambda: _info_lines(found))
 
 
@@ -87,6 +90,8 @@ def _info_lines(found: Description) -> list[str]:
 def pose(
     rig: RigArg,
     d: Annotated[Triple, typer.Option("--d", help="Opening, lateral (+ left), protrusion (+ forward) [mm].")],
+    prim: Prim = None,
+    allow: Allow = None,
     as_json: Json = False,
 ) -> None:
     """Print the jaw pose of parameters d: 4x4 matrix, twist, landmarks, clearance of the teeth, margin to the bound."""
@@ -94,7 +99,7 @@ def pose(
     from jawusd.evaluator import Reason
     from jawusd.geometry import LANDMARKS, transform_points
 
-    loaded = jawusd.load(rig)
+    loaded = jawusd.load(rig, prim=prim)
     _check_finite(d, "--d")
     T = loaded.pose(d)
     twist, verdict = loaded.twist(d), loaded.validate_parameters(d)
@@ -127,45 +132,6 @@ def _check_finite(values: Triple, option: str) -> None:
         raise typer.BadParameter("values must be finite", param_hint=option)
 
 
-def _read_poses(path: Path) -> tuple[NDArray[np.int64], Array]:
-    """Return frames (F,) and poses (F, 4, 4) of a table or a tracks file."""
-    from jawusd.formats.poses import read_poses
-    from jawusd.formats.tracks import load_tracks
-
-    if path.suffix == ".npz":
-        tracks = load_tracks(path)
-        return tracks.frames, tracks.T_upper_lower
-    return read_poses(path)
-
-
-def encode(
-    rig: RigArg,
-    poses: Annotated[Path, typer.Argument(help="CSV or JSON of poses, or tracks.npz.", show_default=False)],
-    out: Annotated[Path, typer.Option("-o", "--out", help="CSV of frame, d1, d2, d3, residual_mm.")] = Path("d.csv"),
-    force: Force = False,
-    as_json: Json = False,
-) -> None:
-    """Find the parameters d whose poses are nearest to given ones."""
-    import numpy as np
-
-    import jawusd
-    from jawusd.formats.poses import PARAMETER_COLUMNS, write_table
-
-    refuse_existing(out, force)
-    frames, T = _read_poses(poses)
-    d, residual_mm = jawusd.load(rig).encode(T)
-    known = np.isfinite(d).all(1)
-    values = np.column_stack([d, residual_mm])
-    write_table(out, ("frame", *PARAMETER_COLUMNS, "residual_mm"), frames[known], values[known])
-    residual = residual_mm[known]
-    size = {
-        "mean": float(residual.mean()) if residual.size else None,
-        "max": float(residual.max()) if residual.size else None,
-    }
-    result = {"file": str(out), "poses": len(T), "encoded": int(known.sum()), "residual_mm": size}
-    emit(result, as_json, lambda: [f"{out}: {result['encoded']} of {len(T)} poses, residual {size}"])
-
-
 def validate(
     rig: RigArg,
     poses: Annotated[
@@ -177,6 +143,7 @@ def validate(
         typer.Option(min=0.0, help="How far outside the bound a pose may lie; 0 for authored poses; the rig's else."),
     ] = None,
     prim: Prim = None,
+    allow: Allow = None,
     as_json: Json = False,
 ) -> None:
     """Check a rig, or judge poses as measured ones; leaves with exit code 1 when something is invalid.
@@ -186,9 +153,8 @@ def validate(
     if poses is None:
         _validate_rig(rig, as_json)
         return
-    import jawusd
 
-    loaded = jawusd.load(rig)
+    loaded = load_named(rig, prim, poses)
     unbaked = _unbaked(loaded, poses, prim)
     frames, T = _poses_or_parameters(loaded, poses, prim)
     verdicts = loaded.validate(T, residual_limit_mm=residual_mm, tolerance_mm=tolerance_mm)
@@ -236,6 +202,7 @@ def _unbaked(rig: JawRig, path: Path, prim: str | None) -> dict[str, list[str] |
 
 
 def _poses_or_parameters(rig: JawRig, path: Path, prim: str | None) -> tuple[NDArray[np.int64], Array]:
+    from jawusd.cli.motion import read_pose_table
     from jawusd.formats.poses import read_parameters, table_columns
 
     if path.suffix.lower() in USD_SUFFIXES:
@@ -245,7 +212,7 @@ def _poses_or_parameters(rig: JawRig, path: Path, prim: str | None) -> tuple[NDA
     if path.suffix != ".npz" and "d1" in table_columns(path):
         frames, d = read_parameters(path)
         return frames, rig.pose(d)
-    return _read_poses(path)
+    return read_pose_table(path)
 
 
 def _validate_rig(path: Path, as_json: bool) -> None:
@@ -276,6 +243,8 @@ def ik(
     point: Annotated[Triple, typer.Option(help="Point on the mandible at rest [mm].")],
     target: Annotated[Triple, typer.Option(help="Where it should go, skull frame [mm].")],
     start: Annotated[Triple | None, typer.Option(help="Parameters to start from [mm].")] = None,
+    prim: Prim = None,
+    allow: Allow = None,
     as_json: Json = False,
 ) -> None:
     """Find the valid parameters that bring a point of the mandible nearest to a target."""
@@ -284,7 +253,7 @@ def ik(
 
     for values, option in ((point, "--point"), (target, "--target"), (start or point, "--start")):
         _check_finite(values, option)
-    loaded = jawusd.load(rig)
+    loaded = jawusd.load(rig, prim=prim)
     d, distance = loaded.ik(point, target, start=start)
     distance_mm = float(distance)
     reached = transform_point(loaded.pose(d), point)
@@ -292,10 +261,20 @@ def ik(
     emit(result, as_json, lambda: [f"d {d[0]:.3f} {d[1]:.3f} {d[2]:.3f} mm, {distance_mm:.3f} mm from the target"])
 
 
+def _source_motion(loaded: JawRig, rig: Path, source: Path) -> AuthoredMotion:
+    from jawusd.cli.motion import AuthoredMotion, read_motion
+    from jawusd.cli.stage_commands import read_stage_motion
+
+    if source.suffix.lower() not in USD_SUFFIXES:
+        return read_motion(loaded, source)
+    found = read_stage_motion(loaded, rig, source, None, None, None, None)
+    return AuthoredMotion(found.frames, found.d, found.fps)
+
+
 def animate(
     rig: RigArg,
     source: Annotated[
-        Path | None, typer.Argument(help="keys.json, or a CSV of d or of poses.", show_default=False)
+        Path | None, typer.Argument(help="keys.json, a CSV of d or of poses, or a stage.", show_default=False)
     ] = None,
     retarget_from: Annotated[
         Path | None, typer.Option(help="Rig the source was made for; also animation layers then.", show_default=False)
@@ -309,6 +288,8 @@ def animate(
     ] = None,
     splines: Annotated[Path | None, typer.Option(help="Also write the keys as USD splines, to this layer.")] = None,
     force: Force = False,
+    prim: Prim = None,
+    allow: Allow = None,
     as_json: Json = False,
 ) -> None:
     """Write an animation layer over a rig; clamping to the bound is reported."""
@@ -320,7 +301,7 @@ def animate(
         kept_inside,
         knots_of,
         read_face,
-        read_motion,
+        write_over,
     )
     from jawusd.rig import describe, write_animation, write_splines
 
@@ -328,19 +309,24 @@ def animate(
         raise typer.BadParameter("give either a source or --arkit.", param_hint="SOURCE")
     if arkit is not None and retarget_from is not None:
         raise typer.BadParameter("goes with a source; weights of --arkit are nobody's.", param_hint="--retarget-from")
+    if prim is not None and splines is not None:
+        raise typer.BadParameter("goes with the actor's own file, not with --prim.", param_hint="--splines")
     for path in filter(None, (out, splines)):
         refuse_existing(path, force)
-    loaded = jawusd.load(rig)
+    loaded = jawusd.load(rig, prim=prim)
     if source is not None and retarget_from is not None:
         motion, changes = carried_over(retarget_from, source, loaded)
     elif source is not None:
-        motion, changes = kept_inside(loaded, read_motion(loaded, source))
+        motion, changes = kept_inside(loaded, _source_motion(loaded, rig, source))
     elif arkit is not None:
         motion, changes = kept_inside(loaded, read_face(loaded, arkit, fps))
-    rate = fps or motion.fps or describe(rig)["fps"]
+    rate = fps or motion.fps or describe(rig, prim)["fps"]
     knots = knots_of(loaded, motion)
     motion = follow_curves(loaded, motion, knots)
-    write_animation(out, rig, motion.frames, motion.d, rate)
+    if prim is not None:
+        write_over(out, rig, loaded, motion, rate, prim)
+    else:
+        write_animation(out, rig, motion.frames, motion.d, rate)
     if splines is not None:
         write_splines(splines, out, knots.frames, knots.d, rate, knots.slopes, knots.curved)
     emit_motion(out, rate, motion, changes, as_json)

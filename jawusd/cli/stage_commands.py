@@ -4,16 +4,24 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from jawusd.cli.options import Force, Json, Prim, RigArg
+from jawusd.cli.options import USD_SUFFIXES, Allow, Force, Json, Prim, RigArg, load_named
 from jawusd.cli.output import emit, refuse_existing
 
 if TYPE_CHECKING:
     from jawusd.evaluator import JawRig
+    from jawusd.geometry.arrays import Array
     from jawusd.rig.rebake import StageMotion
+
+
+MandiblePrim = Annotated[
+    str | None,
+    typer.Option("--mandible", help="Of a stage: prim that holds the mandible's meshes, where names do not tell."),
+]
+SkullPrim = Annotated[str | None, typer.Option("--skull", help="The same of skull or upper teeth.")]
 
 
 class Origin(StrEnum):
@@ -21,6 +29,56 @@ class Origin(StrEnum):
 
     d = "d"
     mandible = "mandible"
+
+
+def encode(
+    rig: RigArg,
+    poses: Annotated[
+        Path,
+        typer.Argument(
+            help="CSV or JSON of poses, tracks.npz, or any stage with the actor's meshes.", show_default=False
+        ),
+    ],
+    out: Annotated[Path, typer.Option("-o", "--out", help="CSV of frame, d1, d2, d3, residual_mm, margin_mm.")] = Path(
+        "d.csv"
+    ),
+    mandible: MandiblePrim = None,
+    skull: SkullPrim = None,
+    force: Force = False,
+    prim: Prim = None,
+    allow: Allow = None,
+    as_json: Json = False,
+) -> None:
+    """Find the parameters d whose poses are nearest to given ones, and how far these are from the model.
+
+    Of a stage, the mandible may be moved by transforms, bones or a point cache; `jawusd rebake` writes it back.
+    """
+    import numpy as np
+
+    from jawusd.cli.motion import read_pose_table
+    from jawusd.formats.poses import PARAMETER_COLUMNS, write_table
+
+    refuse_existing(out, force)
+    loaded = load_named(rig, prim, poses)
+    if poses.suffix.lower() in USD_SUFFIXES:
+        motion = read_stage_motion(loaded, rig, poses, prim, mandible, skull, "mandible")
+        frames, d, residual_mm = motion.frames.astype(int), motion.d, motion.residual_mm
+    else:
+        frames, T = read_pose_table(poses)
+        d, residual_mm = loaded.encode(T)
+    known = np.isfinite(d).all(1)
+    margin_mm = loaded.margin(d)
+    values = np.column_stack([d, residual_mm, margin_mm])
+    write_table(out, ("frame", *PARAMETER_COLUMNS, "residual_mm", "margin_mm"), frames[known], values[known])
+    residual = residual_mm[known]
+    size = {
+        "mean": float(residual.mean()) if residual.size else None,
+        "max": float(residual.max()) if residual.size else None,
+    }
+    judged = judged_motion(loaded, frames, d, residual_mm)
+    result = {**judged, "file": str(out), "poses": len(d), "encoded": int(known.sum()), "residual_mm": size}
+    head = f"{out}: {result['encoded']} of {len(d)} poses, residual {size}"
+    emit(result, as_json, lambda: [head, *judged_lines(judged)[1:]])
 
 
 def rebake(
@@ -32,26 +90,35 @@ def rebake(
     origin: Annotated[
         Origin | None, typer.Option("--from", help="What counts where d and mandible disagree.", show_default=False)
     ] = None,
+    mandible: MandiblePrim = None,
+    skull: SkullPrim = None,
     prim: Prim = None,
+    allow: Allow = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Give a stage the d and the mandible that belong together, where only one was keyed or moved.
 
-    The motion is brought inside the bound; what lay outside is reported with its margin.
+    The motion is brought inside the bound; what lay outside is reported with its margin. A stage without the rig, that
+    holds copies of its meshes, moved by transforms, bones or point caches, gives a layer over RIG.
     """
-    import jawusd
+    import numpy as np
+
     from jawusd.cli.motion import AuthoredMotion, kept_inside
-    from jawusd.rig.rebake import motion_of_stage, write_rebaked
+    from jawusd.rig import write_animation
+    from jawusd.rig.rebake import write_rebaked
 
     out = out or stage.with_name(f"{stage.stem}_baked.usdc")
     refuse_existing(out, force)
-    loaded = jawusd.load(rig)
-    found = motion_of_stage(stage, loaded, prim, origin.value if origin else None)
+    loaded = load_named(rig, prim, stage)
+    found = read_stage_motion(loaded, rig, stage, prim, mandible, skull, origin.value if origin else None)
     motion, changes = kept_inside(loaded, AuthoredMotion(found.frames, found.d, found.fps))
-    known = [i for i, row in enumerate(motion.d) if row[0] == row[0]]
-    write_rebaked(out, stage, loaded, motion.frames[known], motion.d[known], prim)
-    judged = judged_motion(loaded, found)
+    known = np.isfinite(motion.d).all(axis=1)
+    if found.fitted:
+        write_animation(out, rig, motion.frames, motion.d, found.fps, rig=loaded)
+    else:
+        write_rebaked(out, stage, loaded, motion.frames[known], motion.d[known], prim)
+    judged = judged_motion(loaded, found.frames, found.d, found.residual_mm)
     result = {"file": str(out), "from": found.origin, **judged, **changes.figures}
     first, last = float(motion.frames[0]), float(motion.frames[-1])
     head = f"{out}: frames {first:g} .. {last:g} at {found.fps:g} fps, from the {_ORIGINS[found.origin]}"
@@ -61,26 +128,56 @@ def rebake(
 _ORIGINS = {"d": "keys of d", "mandible": "mandible's transforms"}
 
 
-def judged_motion(rig: JawRig, motion: StageMotion) -> dict[str, object]:
+def read_stage_motion(
+    loaded: JawRig,
+    rig: Path,
+    stage: Path,
+    prim: str | None,
+    mandible: str | None,
+    skull: str | None,
+    origin: Literal["d", "mandible"] | None,
+) -> StageMotion:
+    """Read the motion of a jaw from any stage: of the rig it carries, or else of the rig's meshes fitted to it.
+
+    Raises:
+        JawusdError: no such motion.
+    """
+    from jawusd.rig.rebake import StageMotion, motion_of_stage
+    from jawusd.rig.stage_poses import carries_rig, fit_poses_of_stage
+
+    if mandible is None and skull is None and carries_rig(stage):
+        return motion_of_stage(stage, loaded, prim, origin)
+    if rig.suffix.lower() not in USD_SUFFIXES:
+        raise typer.BadParameter("must be the rig's USD file here: its meshes are fitted.", param_hint="RIG")
+    found = fit_poses_of_stage(stage, rig, mandible, skull)
+    d, residual_mm = loaded.encode(found.T)
+    return StageMotion(found.frames.astype(float), d, found.fps, "mandible", residual_mm, fitted=True)
+
+
+def judged_motion(rig: JawRig, frames: Array, d: Array, residual_mm: Array) -> dict[str, float]:
     """Return how far a motion is from the model and from the bound."""
     import numpy as np
 
-    known = np.isfinite(motion.d).all(axis=1)
-    margin = np.where(known, rig.margin(motion.d), np.inf)
-    outside = known & ~rig.is_inside(motion.d)
+    known = np.isfinite(d).all(axis=1)
+    margin = np.where(known, rig.margin(d), np.inf)
+    outside = known & ~rig.is_inside(d)
     worst = int(np.argmin(margin))
     return {
-        "frames": len(motion.frames),
-        "residual_mm": float(np.nanmax(motion.residual_mm, initial=0.0)),
+        "frames": len(frames),
+        "largest_residual_mm": float(np.nanmax(residual_mm, initial=0.0)),
+        "off_model": int((residual_mm > rig.limits.residual_mm).sum()),
         "outside": int(outside.sum()),
-        "worst_frame": float(motion.frames[worst]),
+        "beyond_tolerance": int((margin < -rig.tolerance_mm).sum()),
+        "worst_frame": float(frames[worst]),
         "worst_margin_mm": float(margin[worst]),
     }
 
 
-def judged_lines(judged: dict[str, object]) -> list[str]:
+def judged_lines(judged: dict[str, float]) -> list[str]:
     """Return the same in words."""
-    lines = [f"at most {judged['residual_mm']:.3f} mm from the model"]
+    lines = [f"at most {judged['largest_residual_mm']:.3f} mm from the model"]
+    if judged["off_model"]:
+        lines.append(f"{judged['off_model']} of {judged['frames']} poses are farther from the model than measured ones")
     if judged["outside"]:
         where = f"worst at frame {judged['worst_frame']:g}, margin {judged['worst_margin_mm']:.2f} mm"
         lines.append(f"{judged['outside']} of {judged['frames']} samples lay outside the bound; {where}")

@@ -3,6 +3,7 @@
 `jawusd.rig.bake` and `jawusd.rig.onnx_sidecar` need the package onnx (`jawusd[build]`); nothing else here does.
 """
 
+from jawusd.formats.allowed_folders import allow_folders
 from jawusd.rig.animation import write_animation, write_splines
 from jawusd.rig.nvidia import find_nvidia_validator, nvidia_findings
 from jawusd.rig.read import describe, load_rig
@@ -14,6 +15,7 @@ register_schema()
 
 __all__ = [
     "Finding",
+    "allow_folders",
     "describe",
     "find_nvidia_validator",
     "load_rig",

@@ -40,6 +40,7 @@ class StageMotion(NamedTuple):
         fps: Frames per second.
         origin: What it was read from, the keys of d or the mandible's transforms.
         residual_mm: Distance of the mandible's poses from the model, shape (F,); zero for d.
+        fitted: Whether the rig's meshes were fitted to a stage that does not carry the rig.
     """
 
     frames: Array
@@ -47,6 +48,7 @@ class StageMotion(NamedTuple):
     fps: float
     origin: Origin
     residual_mm: Array
+    fitted: bool = False
 
 
 class Departure(NamedTuple):

@@ -11,6 +11,7 @@ from typing import ParamSpec, TypeVar
 from pxr import Sdf, Tf, UsdUtils
 
 from jawusd.errors import FormatError, RigError
+from jawusd.formats.allowed_folders import is_allowed
 from jawusd.rig.schema import SCHEMA_NAME
 
 P = ParamSpec("P")
@@ -22,6 +23,7 @@ _FAULTS = (
 )  # fmt: skip
 # OpenUSD's text parser recurses for every bracket and ends the process when its stack overflows.
 _NESTED = re.compile(rb"(?:[(\[{]\s*){500}")
+_ALLOW = "If you trust it, allow its folder with --allow or the setting JAWUSD_ALLOW."
 _OF_A_RIG = ("jaw:formatVersion", "jaw:model", "jaw:bounds", "jaw:decoder")
 
 
@@ -50,7 +52,8 @@ def check_reach(path: Path) -> list[Sdf.Layer]:
     """Check, before a layer or package is composed, that a rig's layers name only files in their own folder or below.
 
     Layers that only use a rig (animation, shots) may name it outside their folder, and nothing else. Files that a rig's
-    layers name must lie in the rig's folder, with links resolved.
+    layers name must lie in the rig's folder, with links resolved. Any may lie in folders that were allowed, see
+    `formats.allowed_folders`.
 
     Returns:
         The layers, which stay loaded as long as they are referenced.
@@ -72,14 +75,17 @@ def check_reach(path: Path) -> list[Sdf.Layer]:
         if home is None and _carries_rig(layer):
             home = _file(name).resolve().parent
         if home is None and user is not None:
-            raise RigError(f"names the file {name:.200}, outside its own folder and no rig.", path=user)
+            raise RigError(f"names the file {name:.200}, outside its own folder and no rig.", path=user, hint=_ALLOW)
         for asset in _assets(layer):
             target = layer.ComputeAbsolutePath(asset)
-            inside = _file(target).resolve().is_relative_to(home or _file(name).resolve().parent)
-            if home is not None and (escapes(asset) or not inside):
-                raise RigError(f"names the file {asset:.200}, outside its own folder.", path=layer.identifier)
+            allowed = is_allowed(_file(target))
+            inside = allowed or _file(target).resolve().is_relative_to(home or _file(name).resolve().parent)
+            if home is not None and not allowed and (escapes(asset) or not inside):
+                raise RigError(
+                    f"names the file {asset:.200}, outside its own folder.", path=layer.identifier, hint=_ALLOW
+                )
             if asset in layer.GetCompositionAssetDependencies() or Path(asset).suffix.startswith(".usd"):
-                waiting.append((target, home, None if inside else layer.identifier))
+                waiting.append((target, None if allowed else home, None if inside else layer.identifier))
     return layers
 
 

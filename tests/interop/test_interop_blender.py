@@ -6,6 +6,7 @@ from example_rig import FPS, example_meshes, example_motion, example_rig, moved
 from foreign import run_in
 
 from jawusd.rig.bake import bake_rig
+from jawusd.rig.stage_poses import fit_poses_of_stage
 
 MESHES = {"MandibleMesh": "mandible", "LowerTeethMesh": "lower_teeth", "SkullMesh": "skull"}
 
@@ -36,3 +37,15 @@ def test_vertices_are_where_the_model_puts_them(folder, blender, name):
         assert found["bones"] == ["skull", "jaw"] and max(found["actions"].values()) == len(frames)
     else:
         assert {"jaw:d1", "jaw:d1:range", "jaw:formatVersion", "jaw:modelHash"} <= set(found["properties"])
+
+
+@pytest.mark.parametrize("blender", ["blender45", "blender50"])
+@pytest.mark.parametrize("name", ["anim_capture.usdc", "actor_skel.usdc"])
+def test_what_blender_exports_comes_back_to_d(folder, tmp_path, blender, name):
+    frames, d = example_motion()
+    run_in(blender, "blender_export.py", folder / name, tmp_path / "out.usdc", frames[0], frames[-1])
+    found = fit_poses_of_stage(tmp_path / "out.usdc", folder / "actor.usda")
+    np.testing.assert_array_equal(found.frames, frames)
+    back, residual_mm = example_rig().encode(found.T)
+    np.testing.assert_allclose(back, d, atol=1e-3)
+    assert residual_mm.max() < 1e-3

@@ -1,0 +1,164 @@
+"""Read how the jaw moves in a stage that carries no rig: from Xforms, bones or point caches of the actor's meshes.
+
+What programs export keeps vertices and their order, and little else: names, units, axes and hierarchy change. So the
+meshes of the rig are found by their number of vertices and fitted, frame by frame, to where the stage puts them.
+"""
+
+from __future__ import annotations
+
+import os
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pxr import Sdf, Usd, UsdGeom, UsdSkel, Vt
+
+from jawusd.errors import FormatError
+from jawusd.geometry.arrays import Array
+from jawusd.geometry.rigid import rigid_fit
+from jawusd.geometry.se3 import se3_inverse, transform_points
+from jawusd.rig.geo import read_geometry
+from jawusd.rig.motion_read import frames_of_stage
+from jawusd.rig.read import open_stage
+from jawusd.rig.schema import has_jaw_api
+from jawusd.rig.untrusted import raises_format_error
+
+_POINTS = 2000  # of a mesh, evenly spread over its vertices, are fitted
+# Exports in single precision, also in metres, stay far below; a mesh of as many vertices that is another one does not.
+_MOST_MISFIT_MM = 0.5
+_SKULL, _MANDIBLE = ("upper_teeth", "skull"), ("lower_teeth", "mandible")
+
+
+class StagePoses(NamedTuple):
+    """Poses fitted to a stage.
+
+    Attributes:
+        frames: Whole frames, shape (F,).
+        T: T_skull_mandible [mm], shape (F, 4, 4).
+        fps: Frames per second.
+        misfit_mm: Largest root mean squared distance of a mesh from its place in the rig, over the frames.
+        meshes: Paths of the prims fitted, of skull and mandible.
+    """
+
+    frames: NDArray[np.int64]
+    T: Array
+    fps: float
+    misfit_mm: float
+    meshes: tuple[str, str]
+
+
+def carries_rig(path: str | os.PathLike[str]) -> bool:
+    """Tell whether a stage holds a rig whose mandible is moved by transforms: then nothing has to be fitted.
+
+    Raises:
+        RigError: Not a stage.
+    """
+    stage = open_stage(path)
+    meshes = [UsdGeom.Mesh(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh)]
+    deforming = any(mesh.GetPointsAttr().ValueMightBeTimeVarying() for mesh in meshes)
+    return not deforming and any(has_jaw_api(prim) for prim in stage.Traverse())
+
+
+@raises_format_error(0)
+def fit_poses_of_stage(
+    path: str | os.PathLike[str],
+    actor: str | os.PathLike[str],
+    mandible: str | None = None,
+    skull: str | None = None,
+) -> StagePoses:
+    """Fit the meshes of an actor to a stage at every whole frame.
+
+    Args:
+        path: Any stage that holds copies of the actor's meshes, moved by transforms, bones or time-sampled points.
+        actor: The rig's own file, which gives the meshes in their frames.
+        mandible: Prim to look below for the lower teeth or the mandible; None: everywhere.
+        skull: The same for the upper teeth or the skull.
+
+    Raises:
+        RigError: Not a stage.
+        FormatError: No mesh with as many vertices, one that is another mesh, or no start and end.
+    """
+    stage = open_stage(path)
+    rest = read_geometry(actor, placeholders=True) | read_geometry(actor)
+    sources = {name: mesh.vertices for name, mesh in rest.items()}
+    places = [_find(stage, sources, names, below, path) for names, below in ((_SKULL, skull), (_MANDIBLE, mandible))]
+    frames = frames_of_stage(stage, path)
+    fitted, misfit_mm = np.empty((2, len(frames), 4, 4)), 0.0
+    for k, frame in enumerate(frames.tolist()):
+        seen = [place.points(Usd.TimeCode(frame)) for place in places]
+        # one size for both: a stage in cm, or an actor scaled to it
+        size = _spread(seen[0]) / _spread(places[0].source)
+        for i, (place, points) in enumerate(zip(places, seen, strict=True)):
+            fitted[i, k] = rigid_fit(place.source, points / size)
+            off = transform_points(fitted[i, k], place.source) - points / size
+            misfit_mm = max(misfit_mm, float(np.sqrt((off**2).sum(axis=1).mean())))
+    if not misfit_mm <= _MOST_MISFIT_MM:
+        raise FormatError(
+            f"its meshes {places[0].path} and {places[1].path} are up to {misfit_mm:.2f} mm from those of the rig, "
+            f"allowed are {_MOST_MISFIT_MM} mm: other meshes, or bent ones.",
+            path=str(path),
+            hint="Name the prims of skull and mandible with --skull and --mandible.",
+        )
+    T = se3_inverse(fitted[0]) @ fitted[1]
+    return StagePoses(frames, T, float(stage.GetTimeCodesPerSecond()), misfit_mm, (places[0].path, places[1].path))
+
+
+def _spread(points: Array) -> float:
+    return float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum()))
+
+
+class _Place:
+    """A mesh of the rig as a stage holds it."""
+
+    def __init__(self, prim: Usd.Prim, source: Array) -> None:
+        chosen = np.unique(np.linspace(0, len(source) - 1, _POINTS).astype(int))
+        self.path, self.source, self._chosen = str(prim.GetPath()), source[chosen], chosen
+        self._mesh, self._skinning = UsdGeom.Mesh(prim), None
+        root = UsdSkel.Root.Find(prim)
+        if not root:
+            return
+        self._cache = UsdSkel.Cache()
+        self._cache.Populate(root, Usd.TraverseInstanceProxies())
+        skinning, skeleton = self._cache.GetSkinningQuery(prim), UsdSkel.BindingAPI(prim).GetInheritedSkeleton()
+        if skinning and skeleton and skinning.HasJointInfluences():
+            self._skinning, self._skeleton = skinning, self._cache.GetSkelQuery(skeleton)
+
+    def points(self, time: Usd.TimeCode) -> Array:
+        """Return the chosen vertices in the world of the stage, shape (n, 3)."""
+        points, moved_by = self._mesh.GetPointsAttr().Get(time), self._mesh.GetPrim()
+        if self._skinning is not None:
+            points = Vt.Vec3fArray(points)
+            transforms = self._skeleton.ComputeSkinningTransforms(time)
+            self._skinning.ComputeSkinnedPoints(transforms, points, time)
+            moved_by = self._skeleton.GetPrim()
+        M = np.array(UsdGeom.XformCache(time).GetLocalToWorldTransform(moved_by))
+        return np.array(points, dtype=np.float64)[self._chosen] @ M[:3, :3] + M[3, :3]
+
+
+def _find(
+    stage: Usd.Stage, sources: dict[str, Array], names: tuple[str, ...], below: str | None, path: object
+) -> _Place:
+    """Return the mesh of the stage that has as many vertices as one of those named; teeth before bone."""
+    if below is not None and not (Sdf.Path.IsValidPathString(below) and stage.GetPrimAtPath(below)):
+        raise FormatError(f"has no prim {below}.", path=str(path))
+    start = stage.GetPrimAtPath(below) if below is not None else stage.GetPseudoRoot()
+    meshes = [p for p in Usd.PrimRange(start, Usd.TraverseInstanceProxies()) if p.IsA(UsdGeom.Mesh)]
+    counts = [len(UsdGeom.Mesh(p).GetPointsAttr().Get(Usd.TimeCode.EarliestTime()) or ()) for p in meshes]
+    wanted = {name: len(sources[name]) for name in names if name in sources}
+    for name, count in wanted.items():
+        alike = [mesh for mesh, found in zip(meshes, counts, strict=True) if found == count]
+        # both rows may have as many vertices: then the name has to tell
+        named = [mesh for mesh in alike if _plain(name) in _plain(str(mesh.GetPath()))]
+        if named or len(alike) == 1:
+            return _Place((named or alike)[0], sources[name])
+    sizes = " or ".join(f"{count} ({name})" for name, count in wanted.items())
+    where = f" below {below}" if below is not None else ""
+    raise FormatError(
+        f"has no mesh{where} with {sizes} vertices, as the rig's.",
+        path=str(path),
+        hint="Name the prims of skull and mandible with --skull and --mandible; vertices must not be merged or split.",
+    )
+
+
+def _plain(name: str) -> str:
+    return name.lower().replace("_", "")

@@ -1,0 +1,104 @@
+"""A studio: two actors in a library, shots elsewhere that reference their motion, several rigs in one stage."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from example_rig import FPS, example_meshes, example_motion, example_rig
+from pxr import Gf, Sdf, Usd, UsdGeom
+from typer.testing import CliRunner
+
+import jawusd
+from jawusd.cli.main import app
+from jawusd.rig import allow_folders
+from jawusd.rig.bake import bake_rig
+from jawusd.rig.motion_read import read_poses_of_stage
+
+KINDS = {"hero": "anchored", "villain": "additive"}
+OFFSET, COUNT = 100, 12
+
+
+def run(*arguments, code=0):
+    done = CliRunner().invoke(app, [str(x) for x in arguments])
+    assert done.exit_code == code, (done.output, done.exception)
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory):
+    """Return a folder with two baked actors."""
+    folder = tmp_path_factory.mktemp("studio") / "lib"
+    frames, d = example_motion(COUNT)
+    for name, kind in KINDS.items():
+        options = {"name": name, "fps": FPS, "frames": frames, "d": d, "table_size": 17}
+        bake_rig(folder / name, example_rig(kind), example_meshes(), **options)
+    return folder
+
+
+@pytest.fixture
+def shot(library, tmp_path):
+    """Return a shot in cm with both actors, moved, one of them later, and a crowd of instances."""
+    shutil.copytree(library, tmp_path / "lib")
+    (tmp_path / "shots").mkdir()
+    stage = Usd.Stage.CreateNew(str(tmp_path / "shots" / "sh010.usda"))
+    UsdGeom.SetStageMetersPerUnit(stage, 0.01)
+    UsdGeom.SetStageUpAxis(stage, "Y")
+    frames, _ = example_motion(COUNT)
+    stage.SetTimeCodesPerSecond(FPS)
+    stage.SetStartTimeCode(float(frames[0]))
+    stage.SetEndTimeCode(float(frames[-1] + OFFSET))
+    stage.SetDefaultPrim(stage.DefinePrim("/Shot", "Xform"))
+    for name, offset in (("hero", 0), ("villain", OFFSET)):
+        prim = stage.DefinePrim(f"/Shot/{name}", "Xform")
+        prim.GetReferences().AddReference(f"../lib/{name}/anim_capture.usdc", Sdf.LayerOffset(offset))
+        place = UsdGeom.XformCommonAPI(prim)
+        place.SetTranslate(Gf.Vec3d(offset, 3, 4))
+        place.SetScale(Gf.Vec3f(0.1))
+    for i in range(2):
+        prim = stage.DefinePrim(f"/Shot/crowd{i}", "Xform")
+        prim.GetReferences().AddReference("../lib/hero/anim_capture.usdc")
+        prim.SetInstanceable(True)
+    stage.Save()
+    return tmp_path / "shots" / "sh010.usda"
+
+
+def test_a_library_is_refused_until_it_is_allowed(shot, monkeypatch):
+    allow = ("--allow", shot.parents[1] / "lib")
+    refused = CliRunner().invoke(app, ["info", str(shot), "--prim", "/Shot/hero"])
+    assert "--allow" in refused.exception.hint and "no rig" in str(refused.exception)
+    for name, kind in KINDS.items():
+        found = json.loads(run("info", shot, "--prim", f"/Shot/{name}", *allow, "--json"))
+        assert found["actor"] == name and found["model"]["kind"] == kind
+        posed = json.loads(run("pose", shot, "--prim", f"/Shot/{name}", *allow, "--d", 12, 1, 1, "--json"))
+        np.testing.assert_allclose(posed["T_skull_mandible"], example_rig(kind).pose([12, 1, 1]), atol=1e-12)
+    assert CliRunner().invoke(app, ["info", str(shot), "--prim", "/Shot/hero"]).exit_code != 0, "allowed for one run"
+    monkeypatch.setenv("JAWUSD_ALLOW", str(shot.parents[1] / "lib"))
+    assert jawusd.load(shot, prim="/Shot/villain").kind == "additive"
+
+
+def test_every_command_takes_the_right_actor(shot, tmp_path):
+    allow = ("--allow", tmp_path / "lib")
+    run("validate", shot, *allow)
+    frames, d = example_motion(COUNT)
+    for name, kind in KINDS.items():
+        prim, actor = f"/Shot/{name}", tmp_path / "lib" / name / "actor.usda"
+        first = frames[0] + (OFFSET if name == "villain" else 0)
+        run("validate", actor, shot, "--prim", prim, *allow)
+        run("encode", actor, shot, "-o", tmp_path / f"{name}.csv", "--prim", prim, *allow)
+        read = np.loadtxt(tmp_path / f"{name}.csv", delimiter=",", skiprows=1)
+        inside = (read[:, 0] >= first) & (read[:, 0] < first + COUNT)
+        np.testing.assert_allclose(read[inside, 1:4], d, atol=1e-5)
+        keys = tmp_path / "keys.json"
+        keys.write_text(json.dumps({"fps": 12, "keys": [{"frame": 20 + k, "d": [2 * k, 0, 0]} for k in range(5)]}))
+        out = shot.with_name(f"{name}_keyed.usdc")
+        run("animate", shot, keys, "-o", out, "--prim", prim, *allow)
+        run("validate", out, *allow)
+        allow_folders([tmp_path / "lib"])
+        times, T = read_poses_of_stage(out, prim)
+        keyed = np.interp(times, [40, 48], [0, 8])[:, None] * [1, 0, 0]  # at half the rate of the shot
+        np.testing.assert_allclose(T, example_rig(kind).pose(keyed), atol=1e-6)
+        times, T = read_poses_of_stage(shot, prim)
+        shown = np.isin(times, np.arange(COUNT) + first)
+        np.testing.assert_allclose(T[shown], example_rig(kind).pose(d), atol=1e-6)
+        allow_folders([])
