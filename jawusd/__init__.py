@@ -1,12 +1,15 @@
 """jawusd: capture in, jaw rig out.
 
-Importing this package loads nothing heavy; what its names need is loaded when they are first used.
+Importing this package loads nothing heavy; what its names need is loaded when they are first used. It tells OpenUSD
+where the schema `JawRigAPI` is (`jawusd info --schema`).
 """
 
 from __future__ import annotations
 
 import importlib
 from typing import TYPE_CHECKING
+
+from jawusd.plugin_path import announce_schema
 
 if TYPE_CHECKING:
     from os import PathLike
@@ -25,6 +28,9 @@ _MODULES = {
     "build": "jawusd.pipeline.build",
     "track": "jawusd.pipeline.track",
 }
+
+
+announce_schema()
 
 
 def __getattr__(name: str) -> object:

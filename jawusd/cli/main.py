@@ -7,6 +7,7 @@ import sys
 import typer
 
 from jawusd.cli import (
+    animate_command,
     build_commands,
     capture_commands,
     library_commands,
@@ -45,7 +46,7 @@ for _command in (
     stage_commands.encode,
     rig_commands.validate,
     rig_commands.ik,
-    rig_commands.animate,
+    animate_command.animate,
     stage_commands.rebake,
     solve_commands.solve,
     live_commands.live,

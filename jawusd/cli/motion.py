@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from jawusd.cli.options import USD_SUFFIXES
 from jawusd.cli.output import emit
 from jawusd.errors import FormatError
+from jawusd.evaluator.clamping import Inside
 from jawusd.evaluator.interpolation import monotone_tangents
 from jawusd.formats.arkit import read_arkit
-from jawusd.formats.keys import FARTHEST_FRAME, MOST_FRAMES, Keys, load_keys
+from jawusd.formats.keys import FARTHEST_FRAME, MOST_FRAMES, Key, Keys, load_keys
 from jawusd.formats.poses import read_parameters, read_poses, table_columns
 from jawusd.formats.tracks import load_tracks
 from jawusd.geometry.arrays import Array, Mask
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from jawusd.evaluator import JawRig
 
 _MOVED_MM = 1e-6
+_FINE = 10  # looks at a curve per frame
 _OFF_CURVE_MM, _MOST_HALVINGS = 0.003, 4  # of straight lines between samples of a smooth motion
 
 
@@ -134,14 +136,23 @@ def emit_motion(out: Path, rate: float, motion: AuthoredMotion, changes: Changes
 
 
 def kept_inside(rig: JawRig, motion: AuthoredMotion) -> tuple[AuthoredMotion, Changes]:
-    """Bring a motion inside the bound, see `JawRig.keep_inside`; frames without parameters stay so."""
+    """Bring a motion inside the bound, see `JawRig.keep_inside`; frames without parameters stay so.
+
+    Where the keys of a smooth motion alone lay outside, they are brought inside and keep their curves.
+    """
     known = np.isfinite(motion.d).all(axis=1)
     lost = int((~known).sum())
     lines = ["", *_lost_line(lost)]
     if not known.any():
         return motion, Changes({"lost": lost}, lines)
     wanted = motion.d[known]
-    inside = rig.keep_inside(motion.frames[known], wanted)
+    keys = _valid_keys(rig, motion)
+    if keys is None:
+        keys = motion.keys
+        inside = rig.keep_inside(motion.frames[known], wanted)
+    else:
+        curve = rig.interpolate(*keys.arrays(), motion.frames, method="smooth", inside=False)
+        inside = Inside(motion.frames, curve, np.ones(len(curve), dtype=bool))
     moved_mm = np.linalg.norm(inside.d[inside.given] - wanted, axis=1)
     outside = ~rig.is_inside(wanted)
     beside = ~outside & (moved_mm > _MOVED_MM)
@@ -152,13 +163,28 @@ def kept_inside(rig: JawRig, motion: AuthoredMotion) -> tuple[AuthoredMotion, Ch
         lines.append(f"{clamped} frames lay outside the bound, {moved}")
     if beside.any():
         moved = f"moved by {float(moved_mm[beside].max()):.2f} mm at most"
-        lines.append(f"{int(beside.sum())} frames beside them {moved}, as the way inside is longer")
+        why = "as the way inside is longer" if keys is motion.keys else "with their keys"
+        lines.append(f"{int(beside.sum())} frames beside them {moved}, {why}")
     figures = {"lost": lost, "clamped": clamped, "largest_clamp_mm": largest, "mean_clamp_mm": mean}
     figures |= {"moved_beside": int(beside.sum())}
     frames = np.union1d(inside.times, motion.frames)
     d = np.full((len(frames), 3), np.nan)
     d[np.searchsorted(frames, inside.times)] = inside.d
-    return AuthoredMotion(frames, d, motion.fps, motion.keys), Changes(figures, lines)
+    return AuthoredMotion(frames, d, motion.fps, keys), Changes(figures, lines)
+
+
+def _valid_keys(rig: JawRig, motion: AuthoredMotion) -> Keys | None:
+    """Return the keys of a smooth motion brought inside the bound; None where the curves through them leave it."""
+    if motion.keys is None or motion.keys.interpolation != "smooth":
+        return None
+    frames, d = motion.keys.arrays()
+    inside = rig.keep_inside(frames, d)
+    d = inside.d[inside.given]
+    fine = np.linspace(frames[0], frames[-1], int(_FINE * (frames[-1] - frames[0])) + 1)
+    if not rig.is_inside(rig.interpolate(frames, d, fine, method="smooth", inside=False)).all():
+        return None
+    keys = tuple(Key(frame=frame, d=tuple(row)) for frame, row in zip(frames.tolist(), d.tolist(), strict=True))
+    return motion.keys.model_copy(update={"keys": keys})
 
 
 class Knots(NamedTuple):

@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from jawusd.cli.options import USD_SUFFIXES, Allow, Force, Json, Prim, RigArg, load_named
-from jawusd.cli.output import emit, refuse_existing
+from jawusd.cli.options import USD_SUFFIXES, Allow, Json, Prim, RigArg, load_named
+from jawusd.cli.output import emit
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from jawusd.cli.motion import AuthoredMotion
     from jawusd.evaluator import JawRig
     from jawusd.geometry.arrays import Array
     from jawusd.rig.read import Description
@@ -28,8 +27,11 @@ NO = 1
 
 def info(
     rig: Annotated[
-        Path, typer.Argument(help="actor.usda, another layer, model.npz or tracks.npz.", show_default=False)
-    ],
+        Path | None, typer.Argument(help="actor.usda, another layer, model.npz or tracks.npz.", show_default=False)
+    ] = None,
+    schema: Annotated[
+        bool, typer.Option("--schema", help="Say where the USD schema JawRigAPI is, and how other programs find it.")
+    ] = False,
     frame: Annotated[int | None, typer.Option(help="Of tracks.npz: say how this frame was tracked.")] = None,
     prim: Prim = None,
     allow: Allow = None,
@@ -37,8 +39,12 @@ def info(
 ) -> None:
     """Say what a rig file or tracks hold."""
     from jawusd.formats.tracks import is_tracks, load_tracks
-    from jawusd.rig import describe
 
+    if schema:
+        _print_schema(as_json)
+        return
+    if rig is None:
+        raise typer.BadParameter("name a file, or give --schema.", param_hint="RIG")
     if rig.suffix == ".npz" and is_tracks(rig):
         from jawusd.pipeline.track import frame_lines, frame_summary, track_lines, track_summary
 
@@ -52,8 +58,22 @@ def info(
         return
     if frame is not None:
         raise typer.BadParameter("--frame belongs to tracks.npz.")
+    from jawusd.rig import describe
+
     found = describe(rig, prim)
     emit(found, as_json, lambda: _info_lines(found))
+
+
+def _print_schema(as_json: bool) -> None:
+    from jawusd.plugin_path import VARIABLE, schema_folder
+
+    folder = str(schema_folder() or "")
+    lines = [
+        f"JawRigAPI: {folder or 'not installed'}",
+        f"other programs find it by {VARIABLE}={folder}",
+        "`import jawusd` registers it, before the first stage of a process is opened",
+    ]
+    emit({"schema": "JawRigAPI", "folder": folder, "variable": VARIABLE}, as_json, lambda: lines)
 
 
 def _info_lines(found: Description) -> list[str]:
@@ -259,74 +279,3 @@ def ik(
     reached = transform_point(loaded.pose(d), point)
     result = {"d": d, "reached": reached, "distance_mm": distance_mm, "margin_mm": float(loaded.margin(d))}
     emit(result, as_json, lambda: [f"d {d[0]:.3f} {d[1]:.3f} {d[2]:.3f} mm, {distance_mm:.3f} mm from the target"])
-
-
-def _source_motion(loaded: JawRig, rig: Path, source: Path) -> AuthoredMotion:
-    from jawusd.cli.motion import AuthoredMotion, read_motion
-    from jawusd.cli.stage_commands import read_stage_motion
-
-    if source.suffix.lower() not in USD_SUFFIXES:
-        return read_motion(loaded, source)
-    found = read_stage_motion(loaded, rig, source, None, None, None, None)
-    return AuthoredMotion(found.frames, found.d, found.fps)
-
-
-def animate(
-    rig: RigArg,
-    source: Annotated[
-        Path | None, typer.Argument(help="keys.json, a CSV of d or of poses, or a stage.", show_default=False)
-    ] = None,
-    retarget_from: Annotated[
-        Path | None, typer.Option(help="Rig the source was made for; also animation layers then.", show_default=False)
-    ] = None,
-    arkit: Annotated[
-        Path | None, typer.Option(help="Instead: ARKit face capture, the CSV of Live Link Face.", show_default=False)
-    ] = None,
-    out: Annotated[Path, typer.Option("-o", "--out", help="Animation layer.")] = Path("anim.usdc"),
-    fps: Annotated[
-        float | None, typer.Option(min=0.001, help="Frames per second; else from the keys or time codes, or the rig's.")
-    ] = None,
-    splines: Annotated[Path | None, typer.Option(help="Also write the keys as USD splines, to this layer.")] = None,
-    force: Force = False,
-    prim: Prim = None,
-    allow: Allow = None,
-    as_json: Json = False,
-) -> None:
-    """Write an animation layer over a rig; clamping to the bound is reported."""
-    import jawusd
-    from jawusd.cli.motion import (
-        carried_over,
-        emit_motion,
-        follow_curves,
-        kept_inside,
-        knots_of,
-        read_face,
-        write_over,
-    )
-    from jawusd.rig import describe, write_animation, write_splines
-
-    if (source is None) == (arkit is None):
-        raise typer.BadParameter("give either a source or --arkit.", param_hint="SOURCE")
-    if arkit is not None and retarget_from is not None:
-        raise typer.BadParameter("goes with a source; weights of --arkit are nobody's.", param_hint="--retarget-from")
-    if prim is not None and splines is not None:
-        raise typer.BadParameter("goes with the actor's own file, not with --prim.", param_hint="--splines")
-    for path in filter(None, (out, splines)):
-        refuse_existing(path, force)
-    loaded = jawusd.load(rig, prim=prim)
-    if source is not None and retarget_from is not None:
-        motion, changes = carried_over(retarget_from, source, loaded)
-    elif source is not None:
-        motion, changes = kept_inside(loaded, _source_motion(loaded, rig, source))
-    elif arkit is not None:
-        motion, changes = kept_inside(loaded, read_face(loaded, arkit, fps))
-    rate = fps or motion.fps or describe(rig, prim)["fps"]
-    knots = knots_of(loaded, motion)
-    motion = follow_curves(loaded, motion, knots)
-    if prim is not None:
-        write_over(out, rig, loaded, motion, rate, prim)
-    else:
-        write_animation(out, rig, motion.frames, motion.d, rate)
-    if splines is not None:
-        write_splines(splines, out, knots.frames, knots.d, rate, knots.slopes, knots.curved)
-    emit_motion(out, rate, motion, changes, as_json)

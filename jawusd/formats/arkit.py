@@ -3,7 +3,9 @@
     Timecode,BlendShapeCount,...,JawForward,JawRight,JawLeft,JawOpen,...
     14:03:52:28.207,61,...,0.01,0,0.02,0.31,...
 
-A time code is HH:MM:SS:FF.fff, FF counted at the rate of the take. Column names count without regard to case, any other
+A time code is HH:MM:SS:FF.fff, FF counted at the rate of the take. At 29.97 and 59.94 frames per second, it may leave
+out the first two or four numbers of every minute that is no tenth ("drop frame", SMPTE ST 12-1), to keep to the clock:
+a semicolon before the frames says so, and so do numbers left out. Column names count without regard to case, any other
 column is ignored. A row whose count is 0 is a moment without a face.
 """
 
@@ -28,6 +30,7 @@ JAW_COLUMNS = ("jawopen", "jawleft", "jawright", "jawforward")
 _TIME, _COUNT = "timecode", "blendshapecount"
 _TIMECODE = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})[:;](\d{1,3}(?:\.\d+)?)")
 _RATES = (24, 25, 30, 48, 50, 60, 100, 120)
+_NTSC_SLACK = 0.006
 _DAY_S = 86_400
 # ARKit gives 0 to 1. Captures with a personal neutral face or gains go a little beyond; percent, and weights normalised
 # to mean and deviation, go far beyond.
@@ -84,7 +87,12 @@ def read_arkit(path: str | os.PathLike[str], fps: float | None = None) -> FaceCa
     seconds += _DAY_S * np.concatenate([[0], np.cumsum(np.diff(seconds) < -_DAY_S // 2)])
     inside = np.array([frame for _, frame in codes])
     rate = _rate(seconds, inside, lines, fps, path)
-    return FaceCapture(_frames(seconds, inside, lines, rate, path), np.array(weights), rate, rows[1][1][at[0]].strip())
+    dropped = _dropped(seconds, inside, rate, fps is None, any(";" in row[at[0]] for _, row in rows[1:]))
+    if dropped or _is_of_ntsc(rate):
+        rate = math.ceil(rate) * 1000 / 1001
+    return FaceCapture(
+        _frames(seconds, inside, lines, rate, dropped, path), np.array(weights), rate, rows[1][1][at[0]].strip()
+    )
 
 
 def _rows(path: Path) -> list[tuple[int, list[str]]]:
@@ -162,9 +170,32 @@ def _rate(seconds: NDArray[np.int64], inside: Array, lines: list[int], fps: floa
     return float(fps)
 
 
-def _frames(seconds: NDArray[np.int64], inside: Array, lines: list[int], rate: float, path: Path) -> Array:
+def _is_of_ntsc(rate: float) -> bool:
+    """Tell whether a rate is one like 29.97, short for 30000 / 1001."""
+    return abs(rate - math.ceil(rate) * 1000 / 1001) < _NTSC_SLACK
+
+
+def _dropped(seconds: NDArray[np.int64], inside: Array, rate: float, found: bool, marked: bool) -> int:
+    """Return how many numbers the time codes leave out at the start of a minute, 0 where they count them all."""
+    number = math.ceil(rate)
+    if number not in (30, 60) or not (found or _is_of_ntsc(rate)):
+        return 0
+    count = number // 15
+    if marked:
+        return count
+    # unmarked: none of these numbers, and a step from the last one of a minute to the one after those left out
+    first = (seconds % 60 == 0) & (seconds // 60 % 10 != 0)
+    stepped = first[1:] & (np.floor(inside[1:]) == count) & (np.floor(inside[:-1]) == number - 1)
+    stepped &= np.diff(seconds) == 1
+    return count if stepped.any() and (inside[first] >= count).all() else 0
+
+
+def _frames(
+    seconds: NDArray[np.int64], inside: Array, lines: list[int], rate: float, dropped: int, path: Path
+) -> Array:
     # A rate like 29.97 counts whole frames: 30 numbers per second of time code.
-    frames = seconds * math.ceil(rate) + inside
+    minutes = seconds // 60
+    frames = seconds * math.ceil(rate) + inside - dropped * (minutes - minutes // 10)
     steps = np.diff(frames)
     if (steps <= 0).any():
         line = lines[int(np.argmax(steps <= 0)) + 1]

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from pxr import Sdf, Tf, Usd, UsdGeom
+from pxr import Sdf, Tf, Usd, UsdGeom, UsdUtils
 
 from jawusd import __version__
 from jawusd.errors import OutputError, RigError
@@ -95,6 +96,19 @@ def relative_path(target: Path, layer: Path) -> str:
     """Return the path of a file as a layer should name it: relative to the layer's folder, starting with a dot."""
     relative = Path(os.path.relpath(target.resolve(), layer.resolve().parent)).as_posix()
     return relative if relative.startswith(".") else f"./{relative}"
+
+
+@contextlib.contextmanager
+def without_warning(words: str) -> Iterator[None]:
+    """Keep OpenUSD's warnings with these words from stderr; others are printed afterwards."""
+    delegate = UsdUtils.CoalescingDiagnosticDelegate()
+    try:
+        yield
+    finally:
+        other = [found.commentary for found in delegate.TakeUncoalescedDiagnostics() if words not in found.commentary]
+        del delegate
+        for commentary in other:
+            Tf.Warn(commentary)
 
 
 def write_layer(layer: Sdf.Layer, path: Path) -> Path:

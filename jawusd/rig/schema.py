@@ -6,31 +6,29 @@ by name, and the applied schema from the raw `apiSchemas` metadata.
 
 from __future__ import annotations
 
-from pathlib import Path
+import warnings
 
 from pxr import Plug, Usd
 
+from jawusd.plugin_path import schema_folder
+
 SCHEMA_NAME = "JawRigAPI"
-
-# In a wheel the files lie inside the package; in an editable install and a checkout, in the repository's `schemas`.
-_FOLDERS = (Path(__file__).parent / "schemas", Path(__file__).parents[2] / "schemas")
-
-
-def schema_folder() -> Path | None:
-    """Return the folder that holds plugInfo.json and generatedSchema.usda, or None if they are not installed."""
-    return next((folder for folder in _FOLDERS if (folder / "plugInfo.json").is_file()), None)
 
 
 def register_schema() -> bool:
     """Register the schema with OpenUSD, once or more, and return whether this process knows it.
 
     OpenUSD builds its schema registry when a process first uses a stage; a plugin registered later stays unknown
-    (OpenUSD issue 3596).
+    (OpenUSD issue 3596), which is a warning.
     """
     folder = schema_folder()
     if folder is not None:
         Plug.Registry().RegisterPlugins(str(folder))
-    return schema_is_live()
+    live = schema_is_live()
+    if folder is not None and not live:
+        message = f"{SCHEMA_NAME} stays unknown to OpenUSD: a stage was opened before. Import jawusd first, or set "
+        warnings.warn(f"{message}PXR_PLUGINPATH_NAME={folder}. Rigs are read and written all the same.", stacklevel=2)
+    return live
 
 
 def schema_is_live() -> bool:

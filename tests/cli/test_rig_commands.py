@@ -237,6 +237,64 @@ def test_animate_says_how_far_arkit_weights_were_clamped(actor, tmp_path):
     assert "30 frames lay outside" in run("animate", actor, "--arkit", csv, "-o", out, "--force")
 
 
+@pytest.mark.parametrize("lost", [False, True])
+def test_face_takes_come_to_the_rate_of_the_scene(actor, tmp_path, lost):
+    """60 to 24 frames per second: on the motion at the new frames, peaks where they were."""
+    rig = jawusd.load(actor)
+    opening = 0.25 - 0.25 * np.cos(2 * np.pi * np.arange(301) / 60 * 1.3)
+    weights = [(x, 0, 0, 0) for x in opening]
+    if lost:
+        weights[100:130] = [None] * 30
+    out = actor.parent / "anim_24.usdc"
+    csv = face_csv(tmp_path / "face.csv", weights, fps=60)
+    found = json.loads(run("animate", actor, "--arkit", csv, "--resample", 24, "-o", out, "--force", "--json"))
+    assert found["fps"] == 24 and found["frames"] == [0, 120] and found["lost"] == (12 if lost else 0)
+    stage = Usd.Stage.Open(str(out))
+    stage.Reload()
+    assert stage.GetTimeCodesPerSecond() == 24
+    at = np.setdiff1d(np.arange(121), np.arange(40, 52) if lost else [])
+    d1 = np.array([stage.GetPrimAtPath("/Actor").GetAttribute("jaw:d1").Get(float(frame)) for frame in at])
+    expected = rig.d_range[0, 1] * (0.25 - 0.25 * np.cos(2 * np.pi * at / 24 * 1.3))
+    edges = np.abs(at - 45.5) < 8 if lost else np.zeros(len(at), bool)
+    np.testing.assert_allclose(d1[~edges], expected[~edges], atol=0.02)
+    assert validate_stage(out) == []
+
+
+def test_keys_move_to_another_rate_and_keep_their_curves(actor, tmp_path):
+    keys = [{"frame": 30, "d": [0.5, 0, 0]}, {"frame": 60, "d": [15, 1, 0.5]}, {"frame": 90, "d": [4, -1, 0]}]
+    (tmp_path / "keys.json").write_text(json.dumps({"fps": 60, "interpolation": "smooth", "keys": keys}))
+    splines = tmp_path / "splines.usda"
+    out = tmp_path / "anim.usdc"
+    done = subprocess.run(
+        [sys.executable, "-m", "jawusd", "animate", actor, tmp_path / "keys.json", "--resample", "24", "-o", out]
+        + ["--splines", splines],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stderr == ""
+    stage = Usd.Stage.Open(str(splines))
+    knots = stage.GetPrimAtPath("/Actor").GetAttribute("jaw:d1").GetSpline().GetKnots()
+    assert sorted(knots.keys()) == [12, 24, 36]
+
+
+def test_keys_outside_come_inside_and_keep_their_tangents(actor, tmp_path):
+    rig = jawusd.load(actor)
+    far = [float(rig.d_range[0, 1]) + 1.5, 0.0, 0.0]
+    assert rig.margin(far) < 0
+    keys = [{"frame": 1, "d": [2, 0, 0]}, {"frame": 13, "d": far}, {"frame": 25, "d": [2, 0, 0]}]
+    (tmp_path / "keys.json").write_text(json.dumps({"fps": 24, "interpolation": "smooth", "keys": keys}))
+    splines, out = tmp_path / "splines.usda", tmp_path / "anim.usdc"
+    summary = json.loads(
+        run("animate", actor, tmp_path / "keys.json", "-o", out, "--splines", splines, "--json")
+    )
+    assert summary["clamped"] >= 1
+    stage = Usd.Stage.Open(str(splines))
+    knots = stage.GetPrimAtPath("/Actor").GetAttribute("jaw:d1").GetSpline().GetKnots()
+    assert sorted(knots.keys()) == [1, 13, 25]
+    assert validate_stage(out) == [] and validate_stage(splines) == []
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [

@@ -59,7 +59,7 @@ def test_a_short_take_does_not_tell_its_rate(tmp_path):
     path = take(tmp_path / "face.csv", range(20), 60)
     with pytest.raises(FormatError, match="--fps"):
         read_arkit(path)
-    assert read_arkit(path, fps=59.94).fps == 59.94
+    assert read_arkit(path, fps=59.94).fps == 60000 / 1001
 
 
 @pytest.mark.parametrize(
@@ -119,3 +119,43 @@ def test_weights_on_another_scale_are_refused(tmp_path, change, words):
     with pytest.raises(FormatError) as error:
         read_arkit(written(change(weights)))
     assert all(word in str(error.value) for word in words)
+
+
+def drop_frame_codes(count, number, left_out, separator, start=0):
+    """Count time codes on, as SMPTE ST 12-1 describes: the first numbers of a minute are left out but every tenth."""
+    codes, minute, second, frame = [], 0, 0, 0
+    for k in range(start + count):
+        if k >= start:
+            codes.append(f"{minute // 60:02d}:{minute % 60:02d}:{second:02d}{separator}{frame:02d}.000")
+        frame += 1
+        if frame == number:
+            frame, second = 0, second + 1
+        if second == 60:
+            second, minute = 0, minute + 1
+            frame = left_out if minute % 10 else 0
+    return codes
+
+
+@pytest.mark.parametrize(("number", "left_out"), [(30, 2), (60, 4)])
+@pytest.mark.parametrize(("separator", "fps"), [(";", None), (":", None), (";", True), (":", True)])
+def test_drop_frame_keeps_to_the_clock(tmp_path, number, left_out, separator, fps):
+    """Over an hour, within a millisecond of the frames counted one by one; every 7th row, and all of two minutes."""
+    count = 3600 * number
+    kept = sorted({*range(0, count, 7), *range(50 * number, 130 * number)})
+    codes = np.array(drop_frame_codes(count, number, left_out, separator))[kept]
+    path = tmp_path / "face.csv"
+    path.write_text("\n".join([HEADER, *(f"{code},61,0,0,0,0,0,0" for code in codes)]))
+    found = read_arkit(path, fps=round(number * 1000 / 1001, 2) if fps else None)
+    assert found.fps == number * 1000 / 1001
+    times, expected = found.frames / found.fps, np.array(kept) * 1001 / 1000 / number
+    np.testing.assert_allclose(times, expected, atol=1e-3)
+
+
+@pytest.mark.parametrize(("number", "fps"), [(30, 29.97), (60, 59.94), (24, 23.976)])
+def test_codes_that_leave_nothing_out_count_every_number(tmp_path, number, fps):
+    path = tmp_path / "face.csv"
+    codes = [timecode(k, number, sub=".000") for k in range(130 * number)]
+    path.write_text("\n".join([HEADER, *(f"{code},61,0,0,0,0,0,0" for code in codes)]))
+    np.testing.assert_allclose(read_arkit(path, fps=fps).frames, np.arange(130 * number))
+    assert read_arkit(path, fps=fps).fps == number * 1000 / 1001
+    assert read_arkit(path).fps == number

@@ -107,7 +107,8 @@ def test_delivered_text_layers_avoid_what_other_readers_fail_on(folder):
 def run_python(code, *arguments, blocked=()):
     lines = ["import sys", *(f"sys.modules[{name!r}] = None" for name in blocked), code]
     command = [sys.executable, "-c", "\n".join(lines), *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
+    environment = {name: value for name, value in os.environ.items() if name != "PXR_PLUGINPATH_NAME"}
+    done = subprocess.run(command, capture_output=True, text=True, env={**environment, "OMP_NUM_THREADS": "1"})
     assert done.returncode == 0, done.stderr
     return done.stdout.split()
 
@@ -151,3 +152,34 @@ print([(finding.severity, finding.rule) for finding in validate_stage(actor)])
     heavy = ("onnx", "scipy", "numba", "cv2", "torch", "trimesh", "av", "shapely")
     found = run_python(code, anchored_folder / "actor.usda", blocked=heavy)
     assert " ".join(found) == "(4, 4) example [('info', 'Onnx')]"
+
+
+def told(code):
+    environment = {name: value for name, value in os.environ.items() if name != "PXR_PLUGINPATH_NAME"}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True)
+    return done.stdout.strip(), done.stderr
+
+
+KNOWN = "print(Usd.SchemaRegistry().FindAppliedAPIPrimDefinition('JawRigAPI') is not None)"
+
+
+def test_import_jawusd_is_enough():
+    """Before OpenUSD is loaded, and between its import and the first stage; it loads nothing itself."""
+    assert told("import sys, jawusd; print('pxr' in sys.modules)")[0] == "False"
+    assert told(f"import jawusd; from pxr import Usd; {KNOWN}")[0] == "True"
+    assert told(f"from pxr import Plug, Usd; import jawusd; {KNOWN}")[0] == "True"
+
+
+def test_too_late_is_a_warning():
+    used = "s = Usd.Stage.CreateInMemory(); s.DefinePrim('/a', 'Xform').HasAPI('CollectionAPI')"
+    out, warned = told(f"from pxr import Usd; {used}; import jawusd.rig; {KNOWN}")
+    assert out == "False" and "Import jawusd first" in warned
+
+
+def test_info_says_where_it_is():
+    done = subprocess.run([sys.executable, "-m", "jawusd", "info", "--schema"], capture_output=True, text=True)
+    assert done.returncode == 0 and f"PXR_PLUGINPATH_NAME={SCHEMAS}" in done.stdout
+    environment = {**os.environ, "PXR_PLUGINPATH_NAME": str(SCHEMAS)}
+    code = f"from pxr import Usd; {KNOWN}"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
+    assert done.stdout.strip() == "True"

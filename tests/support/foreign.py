@@ -26,7 +26,10 @@ def run_in(name, script, *arguments, timeout_s=240):
 
 def run(command, timeout_s=240):
     """Run a command and return the JSON it prints after RESULT."""
-    done = subprocess.run([str(part) for part in command], capture_output=True, text=True, timeout=timeout_s)
+    # this process has told OpenUSD of the schema; programs without jawusd do not know it
+    alone = {name: value for name, value in os.environ.items() if name != "PXR_PLUGINPATH_NAME"}
+    command = [str(part) for part in command]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, env=alone)
     results = [line for line in done.stdout.splitlines() if line.startswith("RESULT ")]
     assert results, done.stdout[-3000:] + done.stderr[-3000:]
     return json.loads(results[-1].removeprefix("RESULT "))

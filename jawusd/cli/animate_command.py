@@ -1,0 +1,97 @@
+"""The command `animate`: keys, tables, face captures and stages become an animation layer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from jawusd.cli.options import USD_SUFFIXES, Allow, Force, Json, Prim, RigArg
+from jawusd.cli.output import refuse_existing
+
+if TYPE_CHECKING:
+    from jawusd.cli.motion import AuthoredMotion
+    from jawusd.evaluator import JawRig
+
+
+def _source_motion(loaded: JawRig, rig: Path, source: Path) -> AuthoredMotion:
+    from jawusd.cli.motion import AuthoredMotion, read_motion
+    from jawusd.cli.stage_commands import read_stage_motion
+
+    if source.suffix.lower() not in USD_SUFFIXES:
+        return read_motion(loaded, source)
+    found = read_stage_motion(loaded, rig, source, None, None, None, None)
+    return AuthoredMotion(found.frames, found.d, found.fps)
+
+
+def animate(
+    rig: RigArg,
+    source: Annotated[
+        Path | None, typer.Argument(help="keys.json, a CSV of d or of poses, or a stage.", show_default=False)
+    ] = None,
+    retarget_from: Annotated[
+        Path | None, typer.Option(help="Rig the source was made for; also animation layers then.", show_default=False)
+    ] = None,
+    arkit: Annotated[
+        Path | None, typer.Option(help="Instead: ARKit face capture, the CSV of Live Link Face.", show_default=False)
+    ] = None,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Animation layer.")] = Path("anim.usdc"),
+    fps: Annotated[
+        float | None, typer.Option(min=0.001, help="Frames per second; else from the keys or time codes, or the rig's.")
+    ] = None,
+    resample: Annotated[
+        float | None,
+        typer.Option("--resample", min=0.001, help="Frames per second of the layer, where the source has others."),
+    ] = None,
+    splines: Annotated[Path | None, typer.Option(help="Also write the keys as USD splines, to this layer.")] = None,
+    force: Force = False,
+    prim: Prim = None,
+    allow: Allow = None,
+    as_json: Json = False,
+) -> None:
+    """Write an animation layer over a rig; clamping to the bound is reported."""
+    import jawusd
+    from jawusd.cli.motion import (
+        carried_over,
+        emit_motion,
+        follow_curves,
+        kept_inside,
+        knots_of,
+        read_face,
+        write_over,
+    )
+    from jawusd.cli.resampling import resampled
+    from jawusd.rig import describe, write_animation, write_splines
+
+    if (source is None) == (arkit is None):
+        raise typer.BadParameter("give either a source or --arkit.", param_hint="SOURCE")
+    if arkit is not None and retarget_from is not None:
+        raise typer.BadParameter("goes with a source; weights of --arkit are nobody's.", param_hint="--retarget-from")
+    if resample is not None and retarget_from is not None:
+        raise typer.BadParameter("goes with a source of this rig; retarget first.", param_hint="--resample")
+    if prim is not None and splines is not None:
+        raise typer.BadParameter("goes with the actor's own file, not with --prim.", param_hint="--splines")
+    for path in filter(None, (out, splines)):
+        refuse_existing(path, force)
+    loaded = jawusd.load(rig, prim=prim)
+    if source is not None and retarget_from is not None:
+        motion, changes = carried_over(retarget_from, source, loaded)
+    elif source is not None:
+        motion = _source_motion(loaded, rig, source)
+    elif arkit is not None:
+        motion = read_face(loaded, arkit, fps)
+    rate = (arkit is None and fps) or motion.fps or describe(rig, prim)["fps"]
+    if resample is not None:
+        motion, rate = resampled(loaded, motion, rate, resample), resample
+    if retarget_from is None:
+        motion, changes = kept_inside(loaded, motion)
+    knots = knots_of(loaded, motion)
+    motion = follow_curves(loaded, motion, knots)
+    if prim is not None:
+        write_over(out, rig, loaded, motion, rate, prim)
+    else:
+        write_animation(out, rig, motion.frames, motion.d, rate)
+    if splines is not None:
+        write_splines(splines, out, knots.frames, knots.d, rate, knots.slopes, knots.curved)
+    emit_motion(out, rate, motion, changes, as_json)
