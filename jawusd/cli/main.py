@@ -48,6 +48,7 @@ for _command in (
     rig_commands.ik,
     animate_command.animate,
     stage_commands.rebake,
+    stage_commands.publish,
     solve_commands.solve,
     live_commands.live,
     library_commands.retarget,

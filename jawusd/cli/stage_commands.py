@@ -1,4 +1,4 @@
-"""Commands that bring stages edited elsewhere back to d."""
+"""Commands on rigs among other files: stages edited elsewhere come back to d, rigs get names of their own."""
 
 from __future__ import annotations
 
@@ -123,6 +123,23 @@ def rebake(
     first, last = float(motion.frames[0]), float(motion.frames[-1])
     head = f"{out}: frames {first:g} .. {last:g} at {found.fps:g} fps, from the {_ORIGINS[found.origin]}"
     emit(result, as_json, lambda: [head, *judged_lines(judged), *changes.lines[1:]])
+
+
+def publish(
+    folder: Annotated[Path, typer.Argument(help="Folder of a rig, with actor.usda.", show_default=False)],
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder to write to.", show_default=False)],
+    prefix: Annotated[
+        str | None, typer.Option(help="Start of every file's name; the actor's name if not given.", show_default=False)
+    ] = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Copy a rig under file names of its own, so that actors can be packed together."""
+    from jawusd.rig.publish import publish_rig
+
+    refuse_existing(out, force)
+    files = [str(path) for path in publish_rig(folder, out, prefix)]
+    emit({"files": files}, as_json, lambda: files)
 
 
 _ORIGINS = {"d": "keys of d", "mandible": "mandible's transforms"}
