@@ -1,26 +1,29 @@
-"""The package for viewers: one `.usdz` with everything flattened into a text layer."""
+"""The package for viewers: one `.usdz` with everything flattened into one layer."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
 
-from pxr import Sdf, Usd, UsdUtils
+from pxr import Gf, Sdf, Usd, UsdUtils
 
 from jawusd.errors import RigError
 from jawusd.formats.atomic import atomic_path, scratch_folder
-from jawusd.rig.layout import ACTOR, ACTOR_FILE, ONNX_ATTRIBUTES
+from jawusd.rig.layout import ACTOR, MANDIBLE, ONNX_ATTRIBUTES
 from jawusd.rig.read import open_stage
 
 # Archives store the times of their files. A fixed one gives equal packages: the first a zip can hold in any time zone.
 _ZIP_EPOCH = 315_619_200
+_INSIDE = "actor.usdc"
+# Binary layers store vectors of small whole numbers in another way, which three.js (r187) reads as NaN.
+_NOT_WHOLE_MM = 1e-9
 
 
 def write_package(out: str | os.PathLike[str], source: str | os.PathLike[str]) -> Path:
     """Flatten a stage of one actor, `actor.usda` or an animation layer on it, into a `.usdz`.
 
-    The layer inside is text: three.js turns a whole-number translation of a binary layer into NaN. The ONNX files stay
-    outside: packages may hold USD, images and sound only.
+    The layer inside is binary: a third of the size of text, and open at once. The ONNX files stay outside: packages may
+    hold USD, images and sound only.
 
     Raises:
         RigError: The source cannot be opened or packed.
@@ -29,12 +32,12 @@ def write_package(out: str | os.PathLike[str], source: str | os.PathLike[str]) -
     out = Path(out)
     layer = _flattened(open_stage(source))
     with scratch_folder(out) as scratch:
-        text = scratch / ACTOR_FILE
-        if not layer.Export(str(text)):
+        flat = scratch / _INSIDE
+        if not layer.Export(str(flat)):
             raise RigError("OpenUSD could not flatten the actor.", path=source)
-        os.utime(text, (_ZIP_EPOCH, _ZIP_EPOCH))
+        os.utime(flat, (_ZIP_EPOCH, _ZIP_EPOCH))
         with atomic_path(out) as temporary:
-            if not UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(text)), str(temporary)):
+            if not UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(flat)), str(temporary)):
                 raise RigError("OpenUSD could not pack the actor.", path=out)
     return out
 
@@ -48,6 +51,22 @@ def _flattened(stage: Usd.Stage) -> Sdf.Layer:
             prop.custom = True
     for attribute in ONNX_ATTRIBUTES:
         actor.RemoveProperty(layer.GetPropertyAtPath(f"{ACTOR}.{attribute}"))
+    _avoid_whole(layer, Sdf.Path(MANDIBLE).AppendProperty("xformOp:translate"))
     # the identifier is an asset path too: it would be packed
     actor.assetInfo = {key: value for key, value in dict(actor.assetInfo).items() if key != "identifier"}
     return layer
+
+
+def _avoid_whole(layer: Sdf.Layer, path: Sdf.Path) -> None:
+    """Move translations of whole numbers by a millionth of a micrometre."""
+
+    def moved(value: Gf.Vec3d) -> Gf.Vec3d:
+        return value + Gf.Vec3d(_NOT_WHOLE_MM, 0, 0) if all(x == round(x) for x in value) else value
+
+    attribute = layer.GetAttributeAtPath(path)
+    if attribute is None:
+        return
+    if attribute.default is not None:
+        attribute.default = moved(attribute.default)
+    for time in layer.ListTimeSamplesForPath(path):
+        layer.SetTimeSample(path, time, moved(layer.QueryTimeSample(path, time)))

@@ -11,6 +11,7 @@ from foreign import SCRIPTS, environment, run, run_in
 from scipy.spatial.transform import Rotation
 
 import jawusd
+from jawusd.evaluator import JawRig
 from jawusd.geometry import Camera, make_transform
 from jawusd.rig.bake import bake_rig
 from jawusd.rig.cameras import write_cameras
@@ -91,6 +92,18 @@ def test_three_js_animates_the_mandible(folder):
     found = run(["node", SCRIPTS / "three_read.mjs", modules, folder / "actor.usdz", times, "MandibleMesh"])
     shown = np.array([found["matrices"][str(frame / FPS).removesuffix(".0")] for frame in frames]).reshape(-1, 4, 4)
     assert landmark_distance(shown, poses) < 0.01
+
+
+def test_three_js_reads_whole_numbers(tmp_path):
+    """A closed bite that is the identity, as scans in occlusion give: all of its translation is whole."""
+    rig = JawRig({**example_rig().arrays, "T_rest": np.eye(4)}, example_rig().meta)
+    d = np.array([[0.0, 0, 0], [8, 1, 0.5], [0, 0, 0]])
+    bake_rig(tmp_path, rig, example_meshes(), name="x", fps=FPS, frames=[0, 1, 2], d=d, table_size=17)
+    modules, times = environment("threejs") / "node_modules", [k / FPS for k in range(3)]
+    arguments = (modules, tmp_path / "actor.usdz", ",".join(map(str, times)), "MandibleMesh")
+    found = run(["node", SCRIPTS / "three_read.mjs", *arguments])
+    shown = [found["matrices"][str(time).removesuffix(".0")] for time in times]
+    assert landmark_distance(np.array(shown, dtype=float).reshape(-1, 4, 4), rig.pose(d)) < 0.01
 
 
 @pytest.mark.parametrize(
