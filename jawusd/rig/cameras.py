@@ -22,8 +22,8 @@ TAKE, TAKE_ACTOR, TAKE_CAMERAS = "/Take", "/Take/Actor", "/Take/Cameras"
 # Undistorted images of a camera, relative to the take, numbered by time code.
 PLATE = "plates/{name}/{name}.%06d.jpg"
 
-# Only ratios of apertures and focal lengths matter; tools that read them in mm see a 36 mm sensor.
-_SENSOR_WIDTH = 36.0
+# A sensor of 36 mm, in tenths of a scene unit as UsdGeomCamera measures apertures and focal lengths.
+_SENSOR_WIDTH = 360.0
 _CLIPPING_MM = (1.0, 10_000.0)
 _LARGEST_SKEW = 1e-6
 # Camera and world axes of OpenCV are x right, y down, z forward; those of USD x right, y up, z backward.

@@ -63,3 +63,6 @@ def test_the_add_on_puts_plates_behind_the_cameras(tmp_path, blender):
     found = run_in(blender, "blender_plates.py", archive, tmp_path, tmp_path / "cameras.usda")
     assert found["cameras"] == {"cam0": [str(plate), "SEQUENCE", 0], "cam1": None}
     assert found["scene"] == ["cam0", *SIZE]
+    for camera in cameras():
+        lens = 36.0 * camera.K[0, 0] / SIZE[0]
+        np.testing.assert_allclose(found["lenses"][camera.name], [lens, 36.0], rtol=1e-4)

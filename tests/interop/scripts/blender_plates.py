@@ -25,6 +25,7 @@ def main(archive, folder, path):
         shown = found.data.background_images[0] if found.data.background_images else None
         row = shown and [shown.image.filepath, shown.image.source, shown.image_user.frame_offset]
         result["cameras"][found.name] = row
+        result.setdefault("lenses", {})[found.name] = [found.data.lens, found.data.sensor_width]
     result["scene"] = [scene.camera.name, scene.render.resolution_x, scene.render.resolution_y]
     print("RESULT " + json.dumps(result))
 
