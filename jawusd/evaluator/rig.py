@@ -105,6 +105,15 @@ class JawRig(TouchingTeeth, RigAuthoring):
         rows, batch = rows_of(d, (3,), "d")
         return self.kernels.jacobians(rows).reshape(*batch, 6, 3)
 
+    def spatial_jacobian(self, d: ArrayLike) -> Array:
+        """Return the spatial velocity (omega [rad/mm], v [mm/mm]) per unit of each d, skull frame, (..., 6, 3).
+
+        The left twists that pose the mandible next to where d (..., 3) [mm] poses it (Barfoot 2017, section 7.1.5).
+        """
+        rows, batch = as_rows(d, (3,), "d")
+        spatial = in_chunks(lambda d: self._frames.adjoint @ self.model.decode_derivative(d)[2], rows)
+        return spatial.reshape(*batch, 6, 3)
+
     def point_jacobian(self, d: ArrayLike, p_mandible: ArrayLike) -> Array:
         """Return the derivative by d of where points of the mandible are in the skull frame.
 

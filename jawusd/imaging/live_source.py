@@ -18,7 +18,7 @@ from jawusd.errors import CaptureError
 from jawusd.imaging.pixels import converted
 from jawusd.imaging.video import Video
 
-_KEPT = 4  # last pictures: cameras are read at the same instant, which the slowest one tells
+_KEPT = 8  # last pictures: more than those of an instant that waits for its turn
 # How PyAV names cameras of this machine, by the beginning of their address.
 _DEVICES = {"linux": ("/dev/", "v4l2"), "darwin": ("avfoundation:", "avfoundation"), "win32": ("video=", "dshow")}
 
@@ -67,15 +67,16 @@ class LiveSource:
         self._stopped.set()
         self._playing.set()
 
-    def newest_s(self) -> float | None:
-        """Return the time of the newest picture, None before the first one.
+    def times_s(self) -> list[float]:
+        """Return the times of the pictures kept, the newest last.
 
         Raises:
             CaptureError: the source cannot be read.
         """
         if self._error is not None:
             raise self._error
-        return self._kept[-1].time_s if self._kept else None
+        with self._changed:
+            return [picture.time_s for picture in self._kept]
 
     def at(self, time_s: float) -> LivePicture | None:
         """Return the kept picture nearest to a time, None before the first one."""

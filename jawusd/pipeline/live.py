@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -45,6 +45,7 @@ if TYPE_CHECKING:
 
 _PATIENCE_S = 2.0  # without the teeth after which they are searched again from nothing
 _WAIT_S = 0.25
+_MOST_BEHIND_S = 0.15  # the newest pictures, beyond which some are left out
 _BEFORE = 6  # frames of files that are followed before they are played: until the motion is known
 
 
@@ -120,6 +121,23 @@ def live(
         follower = _Follower(capture, jaw, sources or {}, fixed_head, pool)
         stack.callback(follower.stop)
         yield from follower.run(seconds)
+
+
+def next_instant(times_s: Sequence[Sequence[float]], after_s: float) -> float | None:
+    """Return which instant to look at next, None if there is none yet that all sources have.
+
+    It is the first one that is not too old: a search takes as long as a few steps, which are quicker than pictures
+    come and catch up.
+
+    Args:
+        times_s: of the pictures kept of each source, rising.
+        after_s: when it is at the earliest.
+    """
+    if not all(len(kept) for kept in times_s):
+        return None
+    slowest = min(times_s, key=lambda kept: kept[-1])
+    since = max(after_s, slowest[-1] - _MOST_BEHIND_S)
+    return next((time_s for time_s in slowest if time_s > since), None)
 
 
 def _with_sources(capture: Capture, sources: Mapping[str, str]) -> tuple[Capture, dict[str, str]]:
@@ -258,17 +276,14 @@ class _Follower:
             self._learn(pictures, near)
 
     def _next(self, last: float) -> float | None:
-        """Wait for an instant that all sources have; return its time, None at the end."""
+        """Wait for an instant after the last one that all sources have; return its time, None at the end."""
+        after = last + 0.5 * self._period_s
         while True:
-            newest = [source.newest_s() for source in self._sources.values()]
-            if all(time_s is not None for time_s in newest):
-                at = min(time_s for time_s in newest if time_s is not None)
-                if at > last + 0.5 * self._period_s:
-                    return at
-            if any(source.ended for source in self._sources.values()):
-                return None
+            at = next_instant([source.times_s() for source in self._sources.values()], after)
+            if at is not None or any(source.ended for source in self._sources.values()):
+                return at
             for source in self._sources.values():
-                source.wait(last + 0.5 * self._period_s, _WAIT_S)
+                source.wait(after, _WAIT_S)
 
     def _pictures(self, at: float) -> Pictures:
         """Return the pictures of an instant, None of sources that have none near it."""

@@ -153,6 +153,14 @@ def test_jacobian_agrees_with_differences_of_the_twist(rig):
     np.testing.assert_allclose(rig.jacobian(d), numeric, atol=2e-8)
 
 
+def test_spatial_jacobian_agrees_with_differences_of_poses(rig):
+    d, h = random_d(rig, (200,)), 1e-5
+    apart = [rig.pose(d + h * e) @ np.linalg.inv(rig.pose(d - h * e)) for e in np.eye(3)]
+    numeric = np.stack([se3_log(T) / (2 * h) for T in apart], axis=-1)
+    np.testing.assert_allclose(rig.spatial_jacobian(d), numeric, atol=1e-7)
+    np.testing.assert_allclose(rig.spatial_jacobian(d[0]), rig.spatial_jacobian(d)[0], atol=1e-12)
+
+
 def test_point_jacobian_agrees_with_differences_of_points(rig):
     d, h = random_d(rig, (3, 2)), 1e-4
     points = rig.landmarks[:3]

@@ -51,27 +51,59 @@ def contour_samples(
         towards_gum: unit vector in scan coordinates, shape (3,), for scans that end at the gum without showing it:
             outlines that face this way are gum line.
     """
-    scan_tables = (scan.vertices, scan.crown_faces, scan.planes, scan.edges)
-    px_per_mm = _px_per_mm(matrix, scan.centre)
-    candidates = _silhouette(*scan_tables, eye, matrix, step_px, labels.shape)
-    facing = np.zeros(2) if towards_gum is None else _picture_axes(matrix) @ towards_gum
-    silhouette = _visible(candidates, labels, inverse_depth, depth_tolerance_mm, px_per_mm, facing)
-    segments, towards_gum = scan.gingival_margin, scan.margin_directions
-    margin = _gingival_margin(segments, towards_gum, matrix, labels, inverse_depth, depth_tolerance_mm)
-    return np.concatenate([silhouette, margin]), len(silhouette)
+    gum = np.zeros(3) if towards_gum is None else towards_gum
+    tables = (scan.vertices, scan.crown_faces, scan.planes, scan.edges, scan.gingival_margin, scan.margin_directions)
+    samples, count = _samples(
+        *tables, scan.centre, eye, matrix, labels, inverse_depth, step_px, depth_tolerance_mm, gum
+    )
+    return samples, count
 
 
+@numba.njit(nogil=True, cache=True)
+def _samples(
+    vertices: Array,
+    faces: Faces,
+    planes: Array,
+    edges: Faces,
+    margin: Array,
+    margin_directions: Array,
+    centre: Array,
+    eye: Array,
+    matrix: Array,
+    labels: NDArray[np.uint8],
+    inverse_depth: NDArray[np.float32],
+    step_px: float,
+    tolerance_mm: float,
+    towards_gum: Array,
+) -> tuple[Array, int]:
+    """Return what `contour_samples` does, of the tables of a scan."""
+    px_per_mm = _px_per_mm(matrix, centre)
+    candidates = _silhouette(vertices, faces, planes, edges, eye, matrix, step_px, labels.shape)
+    facing = _in_picture(matrix, towards_gum)
+    silhouette = _visible(candidates, labels, inverse_depth, tolerance_mm, px_per_mm, facing)
+    line = _gingival_margin(margin, margin_directions, matrix, labels, inverse_depth, tolerance_mm)
+    return np.concatenate((silhouette, line)), len(silhouette)
+
+
+@numba.njit(nogil=True, cache=True)
 def _px_per_mm(matrix: Array, point: Array) -> float:
     """Return the scale of the picture at a point (3,) of the scan [px/mm]."""
-    depth = float(matrix[2, :3] @ point + matrix[2, 3])
-    return float(np.linalg.norm(np.cross(matrix[0, :3], matrix[2, :3]))) / max(depth, 1e-9)
+    depth = matrix[2, 0] * point[0] + matrix[2, 1] * point[1] + matrix[2, 2] * point[2] + matrix[2, 3]
+    x = matrix[0, 1] * matrix[2, 2] - matrix[0, 2] * matrix[2, 1]
+    y = matrix[0, 2] * matrix[2, 0] - matrix[0, 0] * matrix[2, 2]
+    z = matrix[0, 0] * matrix[2, 1] - matrix[0, 1] * matrix[2, 0]
+    return np.sqrt(x * x + y * y + z * z) / max(depth, 1e-9)
 
 
-def _picture_axes(matrix: Array) -> Array:
-    """Return the directions right and down of the picture in scan coordinates, shape (2, 3)."""
-    away = matrix[2, :3] / np.linalg.norm(matrix[2, :3])
-    axes = matrix[:2, :3] - (matrix[:2, :3] @ away)[:, None] * away
-    return np.asarray(axes / np.linalg.norm(axes, axis=1, keepdims=True), np.float64)
+@numba.njit(nogil=True, cache=True)
+def _in_picture(matrix: Array, direction: Array) -> Array:
+    """Return how far a direction (3,) of the scan points right and down in the picture, shape (2,)."""
+    away = matrix[2, :3] / np.sqrt((matrix[2, :3] ** 2).sum())
+    out = np.empty(2)
+    for k in range(2):
+        axis = matrix[k, :3] - (matrix[k, :3] * away).sum() * away
+        out[k] = (axis * direction).sum() / np.sqrt((axis**2).sum())
+    return out
 
 
 @numba.njit(nogil=True, cache=True, inline="always")

@@ -194,8 +194,10 @@ class ContourSolver:
         else:
             drawn = Drawn(rendering.labels[c][r], rendering.labels[c][1 - r], depths[1 - r])
             distances, weights = view.edges.search(samples, silhouettes, r, drawn, search_limits)
-            visible = float(samples[~np.isnan(weights), LENGTH].sum())
-            samples[:, LENGTH] *= np.nan_to_num(weights)
+            hidden = np.isnan(weights)
+            visible -= float(samples[hidden, LENGTH].sum())
+            weights[hidden] = 0.0
+            samples[:, LENGTH] *= weights
         return samples, silhouettes, distances - samples[:, HABITS] @ view.habits[r], visible
 
     def _final_gate(self, distances: list[Array], gate: float) -> float:

@@ -18,7 +18,6 @@ from jawusd.geometry import (
     se3_adjoint,
     se3_exp,
     se3_inverse,
-    se3_left_jacobian,
     se3_log,
     transform_point,
 )
@@ -71,8 +70,7 @@ class Coordinates:
         upper[:, HEAD] = turn
         centre = transform_point(relative, self._lower_centre)
         lower[:, HEAD] = turn @ se3_adjoint(make_transform(np.eye(3), self.pivot - centre))
-        # The left twist of the mandible in the skull frame by d (Barfoot 2017, eq. 7.85 for the derivative of exp).
-        by_d = se3_left_jacobian(self.jaw.twist(pose.d)) @ self.jaw.jacobian(pose.d)
+        by_d = self.jaw.spatial_jacobian(pose.d)
         lower[:, JAW] = turn @ se3_adjoint(make_transform(np.eye(3), -centre)) @ by_d
         return upper, lower
 

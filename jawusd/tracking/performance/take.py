@@ -136,6 +136,13 @@ class _Take:
         """Return all frames refined together."""
         frames = sorted(self.fits)
         shot, cameras = self._shot, len(self._shot.camera_names)
-        options = {"fixed_head": shot.fixed_head, "free_focal": shot.free_focal}
-        smoother = Smoother(self._full, self._views, frames, shot.fps, cameras, **options)
+        smoother = Smoother(
+            self._full,
+            self._views,
+            frames,
+            shot.fps,
+            cameras,
+            fixed_head=shot.fixed_head,
+            free_focal=shot.free_focal,
+        )
         return smoother.run([self.fits[frame] for frame in frames])

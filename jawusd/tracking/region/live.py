@@ -22,7 +22,7 @@ from jawusd.tracking.region.learned import CORRELATION_PX, LearnedColours
 from jawusd.tracking.region.picture import Cut
 from jawusd.tracking.region.rig_tracker import RigTracker
 
-_FACES, _SAMPLE_STEP_PX, _REDRAW_PX = 6_000, 3.0, 3.0
+_FACES, _SAMPLE_STEP_PX, _REDRAW_PX = 3_000, 3.0, 4.0
 _WIDER = 1.5  # true over computed standard deviation, as where all frames are solved together
 
 

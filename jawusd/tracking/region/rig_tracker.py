@@ -29,12 +29,14 @@ from jawusd.tracking.region.starts import head_shifts, likeliest
 _BORDER_PX3 = 0.7**2 * CORRELATION_PX
 _GATES_PX, _WIDE_GATES_PX, _BRIEF_GATES_PX = (6.0, 4.0, 3.0, 2.5, 2.0), (12.0, 8.0, 6.0, 4.0, 3.0, 2.5, 2.0), (8.0, 6.0)
 # The same with few steps, and after how many frames colours are taken up then.
-_FEW_GATES_PX, _LEARN_EVERY, _FEW_JAWS, _FEW_HEADS = (8.0, 5.0, 3.0, 2.0), 3, 4, 3
+_FEW_GATES_PX, _LEARN_EVERY, _FEW_JAWS, _FEW_HEADS = (8.0, 3.0, 2.0), 6, 4, 3
+_FAR_GATES_PX, _STEADY_FRAMES = (24.0, 14.0, 8.0, 4.0, 2.0), 1.5  # after frames that were left out
 _BRIEF_PAUSE = 2  # failed frames per one that is searched
 _FIRST_ROUNDS = 3  # picks are a few tenths of a millimetre off; each round takes most of the rest
 # Share of the usual contour that fits, below which a pose is doubted, others are searched, an arch is given up,
 # and one that was lost is not trusted again.
 _DOUBTED, _SEARCHED, _LOST, _AGAIN = 0.8, 0.6, 0.33, 0.5
+_BRIEF_DOUBTED, _BRIEF_SEARCHED = 0.6, 0.4  # the first two where few steps are taken
 _UNSURE_FRAMES = 3.0  # left out, after which an arch counts as lost
 _USUAL_FRAMES = 15  # over which the usual contour is measured; it is no less than a share of that of the first frame
 _LEAST_USUAL = 0.7
@@ -107,7 +109,7 @@ class RigTracker:
         if not look.use.any():
             self._motion.take(expected.pose, np.zeros(2, bool))
             return FrameFit(expected.pose, None, look.use, look.use, np.full(look.use.shape, np.nan))
-        found, look = self._best(expected, look, cut)
+        found, look = self._best(expected, look, cut, frames)
         share = _share(found.solution)
         unsure = (self._motion.blind > 0) | (frames > _UNSURE_FRAMES)
         least = np.where(unsure, _AGAIN, _LOST) * self._usual_share()
@@ -131,16 +133,19 @@ class RigTracker:
         before = self._coordinates.arches(self._motion.last)
         return _Look(self._instants, self._colours, cut(around), before)
 
-    def _best(self, expected: Expected, look: _Look, cut: Cut) -> tuple[Aligned, _Look]:
+    def _best(self, expected: Expected, look: _Look, cut: Cut, frames: float) -> tuple[Aligned, _Look]:
         """Align from the prediction, and from other starts where that may have failed; then in more of the pictures."""
         gates = _FEW_GATES_PX if self._brief else _GATES_PX
+        if self._brief and frames > _STEADY_FRAMES:
+            gates = _FAR_GATES_PX
         found, usual = look.align(expected.pose, expected, gates), self._usual_share()
-        if not (_share(found.solution) < _DOUBTED * usual).any():
+        doubted, searched = (_BRIEF_DOUBTED, _BRIEF_SEARCHED) if self._brief else (_DOUBTED, _SEARCHED)
+        if not (_share(found.solution) < doubted * usual).any():
             return found, look
         others = (self._motion.last,) if self._brief else (expected.pose, self._motion.last)
         for start in others:
             found = _better(found, look.align(start, expected, gates if self._brief else _WIDE_GATES_PX))
-        if not (_share(found.solution) < _SEARCHED * usual).any():
+        if not (_share(found.solution) < searched * usual).any():
             return found, look
         self._failed += 1
         pause = _BRIEF_PAUSE if self._brief else 1 if self._failed <= _SEARCHES else _SEARCHES

@@ -8,11 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.geometry.arrays import Array
-from jawusd.tracking.contour.samples import NX, NY, U, V, X, Z
-from jawusd.tracking.contour.scan import GUM
 from jawusd.tracking.contour.views import Drawn
 from jawusd.tracking.region.colours import BINS, KINDS, TABLES
 from jawusd.tracking.region.edges import count_colours, search_borders, search_creases, sharpen
+from jawusd.tracking.region.places import choose_tables, measure_blur
 
 _SHUTTER = 0.5  # share of a frame's time that it is exposed: unknown, usual for film
 _LEARNED_PX = (2, 7)  # distances from borders between which colours are learned
@@ -50,15 +49,6 @@ class RegionView:
     before: Array  # projections of both arches to this picture at the frame before, shape (2, 3, 4)
     counts: Counts | None = None  # collects what is found
 
-    def tables(self, samples: Array, count: int, arch: int, labels: NDArray[np.uint8]) -> NDArray[np.int64]:
-        """Return the table of log ratios for each sample; the first `count` are silhouette, shape (n,)."""
-        kind = np.ones(len(samples), np.int64)
-        ahead = samples[:count, [U, V]] + 2 * samples[:count, [NX, NY]]
-        i, j = np.clip(np.rint(ahead).astype(int), 0, np.array(labels.shape[::-1]) - 1).T
-        kind[:count] = labels[j, i] == GUM  # crowns before their own gum look like the gum line
-        apart = (samples[:, X : Z + 1] @ self.axes.T[:, [0, 2]])[:, None] - self.patches[arch]
-        return np.asarray(KINDS * (apart**2).sum(2).argmin(1) + kind, np.int64)
-
     def likeness(self, arch: int) -> NDArray[np.float32]:
         """Return how much every pixel looks like teeth of an arch rather than anything else, shape (h, w)."""
         return np.asarray(self.ratio[arch].mean(0)[self.bins], np.float32)
@@ -67,9 +57,10 @@ class RegionView:
         self, samples: Array, count: int, arch: int, drawn: Drawn, limits: tuple[float, float, float]
     ) -> tuple[Array, Array]:
         """Return distances and weights; see `EdgeSearch`."""
-        tables = self.tables(samples, count, arch, drawn.own)
-        blur_px = self._blur_px(samples, arch)
+        tables, blur_px = np.empty(len(samples), np.int64), np.empty(len(samples))
         distances, clearness = np.empty(len(samples)), np.empty(len(samples))
+        choose_tables(samples, count, drawn.own, self.axes, self.patches[arch], tables)
+        measure_blur(samples, self.before[arch], _SHUTTER, blur_px)
         both = (drawn.own, drawn.other, drawn.other_inverse_depth)
         search_borders(samples, tables, self.bins, self.ratio[arch], *both, *limits, _CLEAR_RATIO, distances, clearness)
         if limits[0] <= _SHARPEN_PX:
@@ -97,9 +88,3 @@ class RegionView:
         line = (tables % KINDS == 1) & (clearness > _SURE) & (np.abs(distances) < _GUM_REACH_PX)
         if line.sum() > _FEWEST_GUM:
             counts.gum_px[arch] = np.median(distances[line])
-
-    def _blur_px(self, samples: Array, arch: int) -> Array:
-        """Return how far the samples move along their normals during the exposure [px], shape (n,)."""
-        h = samples[:, X : Z + 1] @ self.before[arch, :, :3].T + self.before[arch, :, 3]
-        moved = samples[:, [U, V]] - h[:, :2] / h[:, 2:]
-        return np.asarray(_SHUTTER * np.abs((moved * samples[:, [NX, NY]]).sum(1)), np.float64)
