@@ -25,6 +25,37 @@ def _source_motion(loaded: JawRig, rig: Path, source: Path) -> AuthoredMotion:
     return AuthoredMotion(found.frames, found.d, found.fps)
 
 
+def _refuse_conflicts(
+    source: Path | None,
+    arkit: Path | None,
+    retarget_from: Path | None,
+    mapping: Path | None,
+    resample: float | None,
+    prim: str | None,
+    splines: Path | None,
+) -> None:
+    conflicts = (
+        ((source is None) == (arkit is None), "SOURCE", "give either a source or --arkit."),
+        (arkit and retarget_from, "--retarget-from", "goes with a source; weights of --arkit are nobody's."),
+        (mapping and not arkit, "--mapping", "says what the weights of --arkit mean; give both."),
+        (resample and retarget_from, "--resample", "goes with a source of this rig; retarget first."),
+        (prim and splines, "--splines", "goes with the actor's own file, not with --prim."),
+    )
+    for conflict, option, why in conflicts:
+        if conflict:
+            raise typer.BadParameter(why, param_hint=option)
+
+
+def _write(out: Path, rig: Path, loaded: JawRig, motion: AuthoredMotion, rate: float, prim: str | None) -> None:
+    from jawusd.cli.motion import write_over
+    from jawusd.rig import write_animation
+
+    if prim is not None:
+        write_over(out, rig, loaded, motion, rate, prim)
+    else:
+        write_animation(out, rig, motion.frames, motion.d, rate)
+
+
 def animate(
     rig: RigArg,
     source: Annotated[
@@ -35,6 +66,12 @@ def animate(
     ] = None,
     arkit: Annotated[
         Path | None, typer.Option(help="Instead: ARKit face capture, the CSV of Live Link Face.", show_default=False)
+    ] = None,
+    mapping: Annotated[
+        Path | None,
+        typer.Option(
+            help="The actor's own mapping of --arkit, from arkit-fit; else shares of the ranges.", show_default=False
+        ),
     ] = None,
     out: Annotated[Path, typer.Option("-o", "--out", help="Animation layer.")] = Path("anim.usdc"),
     fps: Annotated[
@@ -52,26 +89,12 @@ def animate(
 ) -> None:
     """Write an animation layer over a rig; clamping to the bound is reported."""
     import jawusd
-    from jawusd.cli.motion import (
-        carried_over,
-        emit_motion,
-        follow_curves,
-        kept_inside,
-        knots_of,
-        read_face,
-        write_over,
-    )
+    from jawusd.cli.face_commands import read_face
+    from jawusd.cli.motion import carried_over, emit_motion, follow_curves, kept_inside, knots_of
     from jawusd.cli.resampling import resampled
-    from jawusd.rig import describe, write_animation, write_splines
+    from jawusd.rig import describe, write_splines
 
-    if (source is None) == (arkit is None):
-        raise typer.BadParameter("give either a source or --arkit.", param_hint="SOURCE")
-    if arkit is not None and retarget_from is not None:
-        raise typer.BadParameter("goes with a source; weights of --arkit are nobody's.", param_hint="--retarget-from")
-    if resample is not None and retarget_from is not None:
-        raise typer.BadParameter("goes with a source of this rig; retarget first.", param_hint="--resample")
-    if prim is not None and splines is not None:
-        raise typer.BadParameter("goes with the actor's own file, not with --prim.", param_hint="--splines")
+    _refuse_conflicts(source, arkit, retarget_from, mapping, resample, prim, splines)
     for path in filter(None, (out, splines)):
         refuse_existing(path, force)
     loaded = jawusd.load(rig, prim=prim)
@@ -80,7 +103,7 @@ def animate(
     elif source is not None:
         motion = _source_motion(loaded, rig, source)
     elif arkit is not None:
-        motion = read_face(loaded, arkit, fps)
+        motion = read_face(loaded, arkit, fps, mapping)
     rate = (arkit is None and fps) or motion.fps or describe(rig, prim)["fps"]
     if resample is not None:
         motion, rate = resampled(loaded, motion, rate, resample), resample
@@ -88,10 +111,7 @@ def animate(
         motion, changes = kept_inside(loaded, motion)
     knots = knots_of(loaded, motion)
     motion = follow_curves(loaded, motion, knots)
-    if prim is not None:
-        write_over(out, rig, loaded, motion, rate, prim)
-    else:
-        write_animation(out, rig, motion.frames, motion.d, rate)
+    _write(out, rig, loaded, motion, rate, prim)
     if splines is not None:
         write_splines(splines, out, knots.frames, knots.d, rate, knots.slopes, knots.curved)
     emit_motion(out, rate, motion, changes, as_json)

@@ -14,7 +14,6 @@ from jawusd.cli.output import emit
 from jawusd.errors import FormatError
 from jawusd.evaluator.clamping import Inside
 from jawusd.evaluator.interpolation import monotone_tangents
-from jawusd.formats.arkit import read_arkit
 from jawusd.formats.keys import FARTHEST_FRAME, MOST_FRAMES, Key, Keys, load_keys
 from jawusd.formats.poses import read_parameters, read_poses, table_columns
 from jawusd.formats.tracks import load_tracks
@@ -82,27 +81,6 @@ def read_pose_table(path: Path) -> tuple[NDArray[np.int64], Array]:
         tracks = load_tracks(path)
         return tracks.frames, tracks.T_upper_lower
     return read_poses(path)
-
-
-def read_face(rig: JawRig, source: Path, fps: float | None) -> AuthoredMotion:
-    """Read the jaw of an ARKit face capture, its weights taken as shares of the person's own ranges.
-
-    JawOpen 1 is the full opening; JawLeft less JawRight, and JawForward, are shares of the reach to that side at that
-    opening. Left is the subject's left.
-
-    Args:
-        source: CSV of Live Link Face.
-        fps: rate of the time codes, None to find it from them.
-
-    Raises:
-        FormatError: not such a file, or no row with a face.
-    """
-    capture = read_arkit(source, fps)
-    opening, left, right, forward = capture.weights.T
-    d = rig.denormalized(np.stack([opening, left - right, forward], axis=1))
-    if not np.isfinite(d).any():
-        raise FormatError("no row has a face (BlendShapeCount is 0 in all of them).", path=source)
-    return AuthoredMotion(capture.frames, d, capture.fps)
 
 
 def write_over(out: Path, stage: Path, rig: JawRig, motion: AuthoredMotion, rate: float, prim: str) -> None:

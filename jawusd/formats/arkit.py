@@ -50,6 +50,12 @@ class FaceCapture:
     timecode: str  # that of the first row, as written
 
 
+def shares_of(weights: Array) -> Array:
+    """Return weights (F, 4) as shares of opening, reach to the left and reach forward, shape (F, 3)."""
+    opening, left, right, forward = weights.T
+    return np.stack([opening, left - right, forward], axis=1)
+
+
 def read_arkit(path: str | os.PathLike[str], fps: float | None = None) -> FaceCapture:
     """Read a face capture of Live Link Face.
 

@@ -237,6 +237,34 @@ def test_animate_says_how_far_arkit_weights_were_clamped(actor, tmp_path):
     assert "30 frames lay outside" in run("animate", actor, "--arkit", csv, "-o", out, "--force")
 
 
+def test_arkit_fit_learns_the_actors_own_mapping(actor, tmp_path):
+    """Weights that mean d by gains of this actor, 0.5 s apart; `animate --mapping` gives d back."""
+    rig, phase = jawusd.load(actor), 2 * np.pi * np.arange(720) / 24
+    wanted = np.stack([9 - 9 * np.cos(0.31 * phase), 4 * np.sin(0.47 * phase), 2 - 2 * np.cos(0.23 * phase)], axis=1)
+    d = rig.project(wanted)
+    write_parameters(tmp_path / "d.csv", np.arange(720), d)
+    weights = np.stack([d[:, 0] / 60, np.maximum(d[:, 1], 0) / 9, np.maximum(-d[:, 1], 0) / 7, d[:, 2] / 12], axis=1)
+    csv = face_csv(tmp_path / "face.csv", weights[12:] + [0.02, 0.03, 0.01, 0.05], fps=24)
+    mapping, out = tmp_path / "arkit.json", actor.parent / "anim_own.usdc"
+    found = json.loads(run("arkit-fit", actor, csv, tmp_path / "d.csv", "-o", mapping, "--jaw-fps", 24, "--json"))
+    assert found["offset_s"] == pytest.approx(0.5, abs=0.005)
+    assert found["error_mm"] < 0.2 < found["shares_error_mm"]
+    run("arkit-fit", actor, csv, tmp_path / "d.csv", "-o", mapping, "--jaw-fps", 24, code=10)  # it exists
+    run("animate", actor, "--arkit", csv, "--mapping", mapping, "-o", out)
+    stage = Usd.Stage.Open(str(out))
+    prim = stage.GetPrimAtPath("/Actor")
+    got = np.array([[prim.GetAttribute(f"jaw:d{i}").Get(float(frame)) for i in (1, 2, 3)] for frame in range(700)])
+    assert np.abs(got - d[12:712]).max() < 0.5
+    run("animate", actor, tmp_path / "d.csv", "--mapping", mapping, "-o", tmp_path / "x.usdc", code=2)  # no --arkit
+    other = mapping.read_text().replace(json.loads(mapping.read_text())["actor"], "somebody")
+    animate = ("animate", actor, "--arkit", csv, "--mapping", tmp_path / "other.json", "-o", tmp_path / "x.usdc")
+    (tmp_path / "other.json").write_text(other)
+    assert 'mapping of "somebody"' in run(*animate, code=3)
+    (tmp_path / "other.json").write_text(other.replace("jawusd-arkit/1", "jawusd-arkit/2"))
+    text = run(*animate, code=3)
+    assert "format" in text and "arkit-fit" in text
+
+
 @pytest.mark.parametrize("lost", [False, True])
 def test_face_takes_come_to_the_rate_of_the_scene(actor, tmp_path, lost):
     """60 to 24 frames per second: on the motion at the new frames, peaks where they were."""

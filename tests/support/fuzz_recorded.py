@@ -101,9 +101,9 @@ def motion_reader(rig):
 
 def face_reader(rig):
     def read(place, path):
-        from jawusd.cli.motion import read_face
+        from jawusd.cli.face_commands import read_face
 
-        _animated(rig, place, read_face(rig, path, None))
+        _animated(rig, place, read_face(rig, path, None, None))
 
     return read
 

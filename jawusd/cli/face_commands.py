@@ -1,0 +1,140 @@
+"""Face captures: the command `arkit-fit`, and their jaw as a motion for `animate`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from jawusd.cli.options import Allow, Force, Json, Prim, RigArg
+from jawusd.cli.output import emit, refuse_existing
+
+if TYPE_CHECKING:
+    from jawusd.cli.motion import AuthoredMotion
+    from jawusd.evaluator import JawRig
+    from jawusd.geometry.arrays import Array
+
+
+def arkit_fit(
+    rig: RigArg,
+    face: Annotated[Path, typer.Argument(help="ARKit face capture, the CSV of Live Link Face.", show_default=False)],
+    jaw: Annotated[
+        Path,
+        typer.Argument(
+            help="The jaw of the same performance: tracks.npz, d.csv, or a table of poses.", show_default=False
+        ),
+    ],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The mapping (JSON).")] = Path("arkit.json"),
+    fps: Annotated[
+        float | None, typer.Option(min=0.001, help="Frames per second of the face; else from its time codes.")
+    ] = None,
+    jaw_fps: Annotated[
+        float | None, typer.Option(min=0.001, help="Frames per second of the jaw; else the tracks', or the rig's.")
+    ] = None,
+    offset: Annotated[
+        float | None,
+        typer.Option(help="Seconds from the jaw's frame 0 to the face's first row; else found from the opening."),
+    ] = None,
+    force: Force = False,
+    prim: Prim = None,
+    allow: Allow = None,
+    as_json: Json = False,
+) -> None:
+    """Learn what a person's ARKit jaw weights mean from face and jaw captured together, for `animate --mapping`.
+
+    The performance must open wide and move to both sides and forward.
+    """
+    import jawusd
+    from jawusd.fitting.face import fit_arkit
+    from jawusd.formats.arkit import read_arkit
+    from jawusd.formats.arkit_mapping import save_mapping
+
+    refuse_existing(out, force)
+    loaded = jawusd.load(rig, prim=prim)
+    times_s, d = _jaw_of_take(loaded, rig, jaw, jaw_fps, prim)
+    found = fit_arkit(loaded, read_arkit(face, fps), times_s, d, offset)
+    save_mapping(out, found.mapping)
+    result = {
+        "file": str(out),
+        "frames": found.frames,
+        "offset_s": found.offset_s,
+        "error_mm": found.error_mm,
+        "shares_error_mm": found.shares_error_mm,
+    }
+    emit(
+        result,
+        as_json,
+        lambda: [
+            f"{out}: from {found.frames} frames, the face starts {found.offset_s:.3f} s after the jaw's frame 0",
+            f"incisal point {found.error_mm:.2f} mm off where not learned from, by shares {found.shares_error_mm:.2f}",
+        ],
+    )
+
+
+def _jaw_of_take(rig: JawRig, path: Path, source: Path, fps: float | None, prim: str | None) -> tuple[Array, Array]:
+    """Return times [s] (N,) and d [mm] (N, 3) of tracks or a table."""
+    import numpy as np
+
+    from jawusd.cli.motion import read_pose_table
+    from jawusd.formats.poses import read_parameters, table_columns
+    from jawusd.formats.tracks import load_tracks
+
+    if source.suffix != ".npz" and "d1" in table_columns(source):
+        frames, d = read_parameters(source)
+    else:
+        frames, T = read_pose_table(source)
+        d, _ = rig.encode(T)
+        if fps is None and source.suffix == ".npz":
+            fps = load_tracks(source).meta.get("fps")
+    return np.asarray(frames, dtype=np.float64) / (fps or _rate_of(path, prim)), d
+
+
+def _rate_of(rig: Path, prim: str | None) -> float:
+    from jawusd.cli.options import USD_SUFFIXES
+    from jawusd.rig import describe
+
+    if rig.suffix.lower() not in USD_SUFFIXES:
+        raise typer.BadParameter(
+            "is needed: neither the jaw nor the rig's file tells the rate.", param_hint="--jaw-fps"
+        )
+    return float(describe(rig, prim)["fps"])
+
+
+def read_face(rig: JawRig, source: Path, fps: float | None, mapping: Path | None) -> AuthoredMotion:
+    """Read the jaw of an ARKit face capture by the person's own mapping, or as shares of the person's own ranges.
+
+    As shares, JawOpen 1 is the full opening; JawLeft less JawRight, and JawForward, are shares of the reach to that
+    side at that opening. Left is the subject's left.
+
+    Args:
+        source: CSV of Live Link Face.
+        fps: rate of the time codes, None to find it from them.
+        mapping: file of `jawusd arkit-fit`, None for shares.
+
+    Raises:
+        FormatError: not such a file, no row with a face, or the mapping of another person.
+    """
+    import numpy as np
+
+    from jawusd.cli.motion import AuthoredMotion
+    from jawusd.errors import FormatError
+    from jawusd.formats.arkit import read_arkit, shares_of
+    from jawusd.formats.arkit_mapping import load_mapping
+
+    capture = read_arkit(source, fps)
+    if mapping is None:
+        d = rig.denormalized(shares_of(capture.weights))
+    else:
+        own = load_mapping(mapping)
+        actor = str(rig.meta.get("actor", ""))
+        if own.actor != actor:
+            raise FormatError(
+                f'is the mapping of "{own.actor}", the rig is of "{actor}"; d means other movements of another person.',
+                path=mapping,
+                hint="Leave --mapping out, or animate that person's rig and carry it over with `jawusd retarget`.",
+            )
+        d = own.d(capture.weights)
+    if not np.isfinite(d).any():
+        raise FormatError("no row has a face (BlendShapeCount is 0 in all of them).", path=source)
+    return AuthoredMotion(capture.frames, d, capture.fps)

@@ -1,0 +1,192 @@
+"""What the jaw weights of a face capture mean for one person, learned from the jaw captured at the same time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from jawusd.errors import FittingError
+from jawusd.evaluator import JawRig
+from jawusd.formats.arkit import FaceCapture, shares_of
+from jawusd.formats.arkit_mapping import ArkitMapping, moved_terms
+from jawusd.geometry import transform_points
+from jawusd.geometry.arrays import Array
+
+_REST_SHARE = 0.1  # of the frames: those nearest to the closed bite show the neutral weights
+_DEAD_ZONES = np.linspace(0.0, 0.12, 13)  # tried for each weight
+_ROUNDS = 2
+_COARSE_S, _FINE_S, _FINE_STEPS = 0.1, 0.01, 15  # offsets tried: all over, then so many to either side of the best
+_BLOCKS = 5  # of time, each predicted from the others
+_LEAST_SECONDS = 10.0
+# How much of the person's own range a take must show to each side. Of the 12 persons of tests/benchmarks/arkit.py,
+# exercises to every side show 0.75 and more, speech, chewing or opening alone at most 0.24 of some side.
+_LEAST_REACH = 0.4
+# Correlation of JawOpen with the opening. Of the same persons, takes that belong together have 0.87 and more (speech;
+# exercises 0.90); takes of different exercises reach 0.58 at the best of all offsets.
+_LEAST_FOLLOWING = 0.7
+_DIRECTIONS = ("opening", "movement to the left", "movement to the right", "movement forward")
+
+
+@dataclass(frozen=True)
+class ArkitFit:
+    """Hold a mapping and how well it did on parts of the take that it was not learned from."""
+
+    mapping: ArkitMapping
+    error_mm: float  # mean error of the incisal point on held-out parts
+    shares_error_mm: float  # the same of fixed shares of the person's ranges
+    offset_s: float  # clock of the jaw less that of the face, both from their first frames
+    frames: int  # of the jaw that the mapping was learned from
+
+
+def fit_arkit(rig: JawRig, face: FaceCapture, times_s: Array, d: Array, offset_s: float | None = None) -> ArkitFit:
+    """Learn a mapping from a face capture and the jaw of the same performance.
+
+    Neutral weights are the medians near the closed bite; gains and cross-talk come from least squares, dead zones from
+    a search that lowers their sum of squares.
+
+    Args:
+        times_s: times of d [s], any start, shape (N,).
+        d: jaw parameters [mm], NaN where unknown, shape (N, 3).
+        offset_s: added to the face's times, counted from its first row, gives those of d. None to find it where weights
+            follow opening and side best.
+
+    Raises:
+        FittingError: too little in common, no movement to some side, or no better than fixed shares.
+    """
+    known = np.isfinite(d).all(axis=1)
+    times_s, d = times_s[known], d[known]
+    face_s = face.frames / face.fps
+    if offset_s is None:
+        first = _best_offset(face_s, face.weights, times_s, d)
+        offset_s = _refined_offset(first, face_s, face.weights, times_s, d)
+    weights = _weights_at(face_s + offset_s, face.weights, times_s)
+    seen = np.isfinite(weights).all(axis=1)
+    weights, d, times_s = weights[seen], d[seen], times_s[seen]
+    _check_take(rig, weights, d, times_s)
+    mapping = _learned(rig, weights, d)
+    predicted = np.empty_like(d)
+    for part in np.array_split(np.arange(len(d)), _BLOCKS):
+        others = np.setdiff1d(np.arange(len(d)), part)
+        predicted[part] = _learned(rig, weights[others], d[others]).d(weights[part])
+    error = _incisal_error(rig, predicted, d)
+    shares_error = _incisal_error(rig, rig.denormalized(shares_of(weights)), d)
+    if error >= shares_error:
+        raise FittingError(
+            f"a mapping learned from this take errs by {error:.2f} mm on parts it has not seen, fixed shares of the "
+            f"ranges by {shares_error:.2f} mm: it would not help.",
+            hint="Check that both takes are of the same performance; without a mapping, `animate --arkit` uses shares.",
+        )
+    return ArkitFit(mapping, error, shares_error, offset_s, len(d))
+
+
+def _learned(rig: JawRig, weights: Array, d: Array) -> ArkitMapping:
+    near = np.argsort(np.linalg.norm(d, axis=1))[: max(int(_REST_SHARE * len(d)), 1)]
+    neutral = np.median(weights[near], axis=0)
+    dead = np.zeros(4)
+
+    def solved(dead: Array) -> tuple[float, Array]:
+        design = np.column_stack([np.ones(len(d)), moved_terms(weights, neutral, dead)])
+        found = np.linalg.lstsq(design, d, rcond=1e-6)[0]
+        return float(np.sum((design @ found - d) ** 2)), np.asarray(found, dtype=np.float64)
+
+    for _ in range(_ROUNDS):
+        for weight in range(4):
+            tried = [np.where(np.arange(4) == weight, zone, dead) for zone in _DEAD_ZONES]
+            dead = min(tried, key=lambda zones: solved(zones)[0])
+    found = solved(dead)[1]
+    return ArkitMapping.model_validate(
+        {
+            "actor": str(rig.meta.get("actor", "")),
+            "neutral": tuple(neutral.tolist()),
+            "dead_zone": tuple(dead.tolist()),
+            "rest_mm": tuple(found[0].tolist()),
+            "gain_mm": tuple(tuple(row) for row in found[1:5].T.tolist()),
+            "opened_gain_mm": tuple(tuple(row) for row in found[5:].T.tolist()),
+        }
+    )
+
+
+def _weights_at(face_s: Array, weights: Array, times_s: Array) -> Array:
+    """Return the weights at times (N,) between rows of the capture, NaN beside it and without a face, shape (N, 4)."""
+    return np.stack([np.interp(times_s, face_s, column, np.nan, np.nan) for column in weights.T], axis=1)
+
+
+def _best_offset(face_s: Array, weights: Array, times_s: Array, d: Array) -> float:
+    """Return the offset [s] at which weights follow opening and side best, over all with half of a take in common.
+
+    The opening alone repeats where somebody opens in a rhythm.
+    """
+    shorter = min(face_s[-1], times_s[-1] - times_s[0]) if len(times_s) > 1 else 0.0
+    if shorter < _LEAST_SECONDS:
+        raise FittingError(
+            f"the takes last {shorter:.1f} s, at least {_LEAST_SECONDS:g} s are needed to learn a mapping."
+        )
+    tried = np.arange(times_s[0] + shorter / 2 - face_s[-1], times_s[-1] - shorter / 2, _COARSE_S)
+    every = max(int(_COARSE_S / np.median(np.diff(times_s))), 1)
+    times_s, d = times_s[::every], d[::every]
+    following = np.empty((len(tried), 2))
+    for row, offset in enumerate(tried):
+        shares = shares_of(_weights_at(face_s + offset, weights, times_s))
+        following[row] = [_correlation(shares[:, i], d[:, i]) for i in range(2)]
+    best = int(np.argmax(following.sum(axis=1)))
+    if following[best, 0] < _LEAST_FOLLOWING:
+        raise FittingError(
+            f"JawOpen does not follow the opening of the jaw at any offset of the clocks (correlation "
+            f"{following[best, 0]:.2f} at best, {_LEAST_FOLLOWING:g} is needed).",
+            hint="Give the face capture and the jaw of the same performance, or their offset with --offset.",
+        )
+    return float(tried[best])
+
+
+def _refined_offset(offset_s: float, face_s: Array, weights: Array, times_s: Array, d: Array) -> float:
+    """Return the offset [s] near a first one at which all weights together explain d best."""
+    tried = offset_s + _FINE_S * np.arange(-_FINE_STEPS, _FINE_STEPS + 1)
+    left = []
+    for offset in tried:
+        seen = _weights_at(face_s + offset, weights, times_s)
+        rows = np.isfinite(seen).all(axis=1)
+        design = np.column_stack([np.ones(rows.sum()), seen[rows]])
+        found = np.linalg.lstsq(design, d[rows], rcond=1e-6)[0]
+        left.append(float(np.mean((design @ found - d[rows]) ** 2)))
+    best = int(np.argmin(left))
+    if not 0 < best < len(tried) - 1:
+        return float(tried[best])
+    before, low, after = left[best - 1 : best + 2]  # the bottom of the parabola through three values
+    bend = before - 2 * low + after
+    return float(tried[best] + (0.5 * _FINE_S * (before - after) / bend if bend > 0 else 0.0))
+
+
+def _correlation(a: Array, b: Array) -> float:
+    both = np.isfinite(a)
+    if both.sum() < 3 or np.ptp(a[both]) == 0 or np.ptp(b[both]) == 0:
+        return -1.0
+    return float(np.corrcoef(a[both], b[both])[0, 1])
+
+
+def _check_take(rig: JawRig, weights: Array, d: Array, times_s: Array) -> None:
+    """Refuse a take that is short or does not move to every side."""
+    step = float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0
+    if len(d) * step < _LEAST_SECONDS:
+        raise FittingError(
+            f"face and jaw have {len(d) * step:.1f} s in common, at least {_LEAST_SECONDS:g} s are needed.",
+            hint="Check rates and offset: --fps, --jaw-fps, --offset.",
+        )
+    low, high = rig.d_range.T
+    reach = [d[:, 0].max() / high[0], d[:, 1].max() / high[1], d[:, 1].min() / low[1], d[:, 2].max() / high[2]]
+    worst = int(np.argmin(reach))
+    if reach[worst] < _LEAST_REACH:
+        raise FittingError(
+            f"the take shows {max(reach[worst], 0.0):.0%} of the range of {_DIRECTIONS[worst]}, "
+            f"{_LEAST_REACH:.0%} is needed to tell what the weights mean.",
+            hint="Record wide opening, both sides and forward, teeth together and apart, for half a minute.",
+        )
+    still = np.ptp(weights, axis=0) == 0
+    if still.any():
+        raise FittingError(f"the weight of {_DIRECTIONS[int(np.argmax(still))]} never changes.")
+
+
+def _incisal_error(rig: JawRig, found: Array, d: Array) -> float:
+    incisor = rig.landmarks[:1]
+    positions = [transform_points(rig.pose(x), incisor) for x in (rig.project(found), d)]
+    return float(np.linalg.norm(positions[0] - positions[1], axis=-1).mean())
