@@ -26,6 +26,8 @@ class Mesh:
     colors: NDArray[np.uint8] | None = None  # red, green, blue per vertex, shape (V, 3), uint8, or None
     # of a teeth scan, if known otherwise than by its paint: GUM, TOOTH, BOUNDARY or BASE per vertex, shape (V,), uint8
     labels: NDArray[np.uint8] | None = None
+    # places of the corners of every face in a picture, u to the right, v upwards, shape (F, 3, 2), float64, or None
+    uv: Array | None = None
 
     def __post_init__(self) -> None:
         vertices = np.ascontiguousarray(self.vertices, dtype=np.float64)
@@ -38,6 +40,8 @@ class Mesh:
             raise ValueError(f"colors must have shape {vertices.shape}, got {np.shape(self.colors)}")
         if self.labels is not None and np.shape(self.labels) != vertices.shape[:1]:
             raise ValueError(f"labels must have shape {vertices.shape[:1]}, got {np.shape(self.labels)}")
+        if self.uv is not None and np.shape(self.uv) != (*faces.shape, 2):
+            raise ValueError(f"uv must have shape {(*faces.shape, 2)}, got {np.shape(self.uv)}")
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", faces)
 
@@ -55,6 +59,13 @@ def painted_labels(mesh: Mesh) -> NDArray[np.uint8] | None:
     labels[red - np.maximum(green, blue) > _PAINT_CONTRAST] = TOOTH
     labels[green - np.maximum(red, blue) > _PAINT_CONTRAST] = BOUNDARY
     return labels if np.count_nonzero(labels) >= max(_FEWEST_PAINTED * len(labels), 1) else None
+
+
+def natural_colors(mesh: Mesh) -> NDArray[np.uint8] | None:
+    """Return colours that show how a scan looks, shape (V, 3); None for paint, one colour all over, and no colours."""
+    if mesh.colors is None or painted_labels(mesh) is not None or (mesh.colors == mesh.colors[:1]).all():
+        return None
+    return mesh.colors
 
 
 def tooth_labels(mesh: Mesh) -> NDArray[np.uint8]:

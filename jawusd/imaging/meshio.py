@@ -30,8 +30,8 @@ def load_mesh(path: str | os.PathLike[str], kind: Literal["scan", "bone"] = "sca
     """Read a triangle mesh [mm] from PLY, STL, OBJ or 3Shape DCM, its vertices in the order of the file.
 
     Larger polygons are cut into triangles; STL files, which share no vertices, give three per triangle. Materials and
-    textures are not read. A closed mesh that is inside out has its triangles turned; open ones stay as they are.
-    The kind, teeth scan or bone, sets which sizes are accepted.
+    textures are not read, the places of corners in a texture are, of OBJ and PLY. A closed mesh that is inside out has
+    its triangles turned; open ones stay as they are. The kind, teeth scan or bone, sets which sizes are accepted.
 
     Raises:
         CaptureError: the file is missing or damaged, holds no triangles or coordinates that are not finite, or is of
@@ -44,11 +44,8 @@ def load_mesh(path: str | os.PathLike[str], kind: Literal["scan", "bone"] = "sca
     if path.suffix.lower() == ".dcm":
         return _checked(path, *_read_dcm(path), kind)
     try:
-        # As a stream and not by name, so that no file named inside (materials, textures) is opened.
-        with open(path, "rb") as stream:
-            loaded = trimesh.load_mesh(
-                stream, file_type=path.suffix[1:].lower(), process=False, maintain_order=True, skip_materials=True
-            )
+        loaded = _parsed(path, maintain_order=True)
+        uv = _corner_uv(path, loaded)
     except FileNotFoundError as error:
         raise CaptureError("no such mesh.", path=path, hint="Check the path in capture.toml.") from error
     except Exception as error:  # trimesh reports damaged files by whatever its parsers stumble over
@@ -57,10 +54,44 @@ def load_mesh(path: str | os.PathLike[str], kind: Literal["scan", "bone"] = "sca
         raise CaptureError("the file holds no triangles.", path=path, hint="Export the surface, not a point cloud.")
     if np.shape(loaded.vertices)[1:] != (3,) or np.shape(loaded.faces)[1:] != (3,):
         raise CaptureError("its vertices do not have three coordinates each.", path=path, hint="Export it again.")
-    visual, colors = loaded.visual, None
+    return _checked(path, np.asarray(loaded.vertices), np.asarray(loaded.faces), _vertex_colors(loaded), kind, uv)
+
+
+def _parsed(path: Path, *, maintain_order: bool) -> trimesh.Trimesh:
+    # As a stream and not by name, so that no file named inside (materials, textures) is opened.
+    with open(path, "rb") as stream:
+        return trimesh.load_mesh(
+            stream, file_type=path.suffix[1:].lower(), process=False, maintain_order=maintain_order, skip_materials=True
+        )
+
+
+def _vertex_colors(loaded: trimesh.Trimesh) -> NDArray[np.uint8] | None:
+    visual = loaded.visual
     if isinstance(visual, trimesh.visual.ColorVisuals) and visual.kind == "vertex":
-        colors = visual.vertex_colors[:, :3].astype(np.uint8)
-    return _checked(path, np.asarray(loaded.vertices), np.asarray(loaded.faces), colors, kind)
+        return np.asarray(visual.vertex_colors[:, :3], dtype=np.uint8)
+    # beside texture coordinates, the colours of an OBJ are left as numbers
+    beside = np.asarray(loaded.vertex_attributes.get("color", ()))
+    if len(beside) != len(loaded.vertices) or beside.shape[1:] not in ((3,), (4,)):
+        return None
+    return np.asarray(trimesh.visual.to_rgba(beside)[:, :3], dtype=np.uint8)
+
+
+def _corner_uv(path: Path, loaded: trimesh.Trimesh) -> Array | None:
+    """Return the places of the corners of all faces in a texture, shape (F, 3, 2); None where not all have one.
+
+    A point on a seam has several. Read in the order of the file it keeps one of them, so the file is read once more
+    with a vertex for each.
+    """
+    if not isinstance(loaded, trimesh.Trimesh) or not isinstance(loaded.visual, trimesh.visual.TextureVisuals):
+        return None
+    split = _parsed(path, maintain_order=False) if path.suffix.lower() == ".obj" else loaded
+    found = getattr(split.visual, "uv", None)
+    if found is None or split.faces.shape != loaded.faces.shape:
+        return None
+    if not np.array_equal(split.vertices[split.faces], loaded.vertices[loaded.faces]):
+        return None
+    uv = np.asarray(found, dtype=np.float64)[split.faces]
+    return uv if uv.shape[2:] == (2,) and np.isfinite(uv).all() else None
 
 
 @explain_missing_packages("dcm")
@@ -104,7 +135,12 @@ def _texture_colors(
 
 
 def _checked(
-    path: Path, vertices: Array, faces: NDArray[np.int64], colors: NDArray[np.uint8] | None, kind: str
+    path: Path,
+    vertices: Array,
+    faces: NDArray[np.int64],
+    colors: NDArray[np.uint8] | None,
+    kind: str,
+    uv: Array | None = None,
 ) -> Mesh:
     bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
     if bad.size:
@@ -131,10 +167,10 @@ def _checked(
             path=path,
             hint="Lengths must be in mm: scale the mesh and export it again.",
         )
-    mesh = Mesh(vertices.astype(np.float64), faces.astype(np.int32), colors)
+    mesh = Mesh(vertices.astype(np.float64), faces.astype(np.int32), colors, uv=uv)
     turned = winding(mesh)
     if turned.closed and not turned.outward:
-        return Mesh(mesh.vertices, mesh.faces[:, ::-1], colors)
+        return Mesh(mesh.vertices, mesh.faces[:, ::-1], colors, uv=None if uv is None else uv[:, ::-1])
     return mesh
 
 

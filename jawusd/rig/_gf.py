@@ -33,6 +33,11 @@ def vec3f_array(values: ArrayLike) -> Vt.Vec3fArray:
     return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values, dtype=np.float32))
 
 
+def vec2f_array(values: ArrayLike) -> Vt.Vec2fArray:
+    """Return a Vt.Vec2fArray of pairs (n, 2); rounds to float32."""
+    return Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(values, dtype=np.float32))
+
+
 def vec2d(pair: ArrayLike) -> Gf.Vec2d:
     """Return a Gf.Vec2d of two numbers."""
     return Gf.Vec2d(*np.asarray(pair, dtype=np.float64).tolist())

@@ -16,6 +16,7 @@ from jawusd.rig import _gf
 from jawusd.rig.layers import add_pose, define_prim, new_layer, set_attribute, stage_of
 from jawusd.rig.layout import ACTOR, GEO, MANDIBLE, MATERIALS, SKULL
 from jawusd.rig.read import open_stage
+from jawusd.rig.scan_look import read_look, write_look
 from jawusd.rig.untrusted import raises_format_error
 
 # Every mesh name is unique: Blender merges an Xform with an only child and keeps the child's name.
@@ -127,7 +128,7 @@ def _define_mesh(
     prim.CreateNormalsAttr(_gf.vec3f_array(corner_normals(mesh)))
     prim.SetNormalsInterpolation(UsdGeom.Tokens.faceVarying)
     gum = ~crown_face_mask(mesh) if base == "Enamel" else np.zeros(len(mesh.faces), dtype=bool)
-    prim.CreateDisplayColorAttr([Gf.Vec3f(*_MATERIALS[base][0])])
+    write_look(prim, mesh, _MATERIALS[base][0])
     binding = UsdShade.MaterialBindingAPI.Apply(prim.GetPrim())
     binding.Bind(materials[base])
     if gum.any():
@@ -159,7 +160,8 @@ def read_geometry(path: str | os.PathLike[str], *, placeholders: bool = False) -
 
     Returns:
         Meshes by the names of `MESH_PATHS`, skull ones in the skull frame, mandible ones in the mandible frame
-        [mm], with the layer's single precision. Meshes the rig lacks are missing.
+        [mm], with the layer's single precision, and colours and texture coordinates of scans that had them. Meshes
+        the rig lacks are missing.
 
     Raises:
         RigError: Not a USD file, or a mesh that is not made of triangles.
@@ -175,7 +177,8 @@ def read_geometry(path: str | os.PathLike[str], *, placeholders: bool = False) -
             raise RigError(f"{prim_path} must be made of triangles.", path=Path(path))
         vertices = np.array(mesh.GetPointsAttr().Get(), dtype=np.float64)
         faces = np.array(mesh.GetFaceVertexIndicesAttr().Get(), dtype=np.int32).reshape(-1, 3)
-        found[name] = Mesh(vertices, faces)
+        colors, uv = read_look(mesh, len(vertices), len(faces))
+        found[name] = Mesh(vertices, faces, colors, uv=uv)
     return found
 
 

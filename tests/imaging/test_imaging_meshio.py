@@ -45,6 +45,48 @@ def test_vertex_order_faces_and_colours_survive(tmp_path: Path, name: str) -> No
     assert np.array_equal(labels, np.select([x > 20, x > 0], [BOUNDARY, TOOTH], GUM))
 
 
+@pytest.mark.parametrize("inside_out", [False, True])
+@pytest.mark.parametrize("coloured", [False, True])
+def test_texture_coordinates_stay_at_their_corners(tmp_path: Path, inside_out: bool, coloured: bool) -> None:
+    """Every third corner of an OBJ lies on a seam: the same point has another place in the texture."""
+    source = arch()
+    faces = source.faces[:, ::-1] if inside_out else source.faces
+    rng = np.random.default_rng(1)
+    places = rng.random((len(source.vertices) + faces.size, 2))
+    at = np.where(np.arange(faces.size) % 3 == 0, len(source.vertices) + np.arange(faces.size), faces.ravel())
+    colors = rng.integers(0, 256, (len(source.vertices), 3)) if coloured else None
+    lines = []
+    for row, vertex in enumerate(source.vertices):
+        shown = "" if colors is None else " " + " ".join(f"{c / 255:.6f}" for c in colors[row])
+        lines.append("v " + " ".join(f"{x:.9g}" for x in vertex) + shown)
+    lines += [f"vt {u:.9g} {v:.9g}" for u, v in places]
+    for face, texture in zip(faces + 1, at.reshape(-1, 3) + 1, strict=True):
+        lines.append("f " + " ".join(f"{v}/{t}" for v, t in zip(face, texture, strict=True)))
+    (tmp_path / "a.obj").write_text("\n".join(lines))
+    mesh = meshio.load_mesh(tmp_path / "a.obj")
+    assert np.allclose(mesh.vertices, source.vertices) and np.array_equal(mesh.faces, source.faces)
+    expected = places[at].reshape(-1, 3, 2)
+    np.testing.assert_allclose(mesh.uv, expected[:, ::-1] if inside_out else expected, atol=1e-8)
+    if colors is None:
+        assert mesh.colors is None
+    else:
+        np.testing.assert_array_equal(mesh.colors, colors)
+
+
+def test_texture_coordinates_of_a_ply_stay_at_their_vertices(tmp_path: Path) -> None:
+    source = arch()
+    places = np.random.default_rng(1).random((len(source.vertices), 2))
+    head = f"ply\nformat ascii 1.0\nelement vertex {len(places)}\n"
+    head += "".join(f"property float {name}\n" for name in ("x", "y", "z", "texture_u", "texture_v"))
+    head += f"element face {len(source.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    rows = [" ".join(f"{x:.9g}" for x in row) for row in np.c_[source.vertices, places]]
+    rows += [" ".join(map(str, [3, *face])) for face in source.faces]
+    (tmp_path / "a.ply").write_text(head + "\n".join(rows) + "\n")
+    mesh = meshio.load_mesh(tmp_path / "a.ply")
+    np.testing.assert_allclose(mesh.vertices[mesh.faces], source.triangles, atol=1e-5)
+    np.testing.assert_allclose(mesh.uv, places[source.faces], atol=1e-6)
+
+
 def test_stl_keeps_the_triangles(tmp_path: Path) -> None:
     source = arch()
     source.export(tmp_path / "a.stl")

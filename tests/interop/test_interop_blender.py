@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
-from example_rig import FPS, example_meshes, example_motion, example_rig, moved
+from example_rig import FPS, example_meshes, example_motion, example_rig, moved, scanned_meshes
 from foreign import run_in
 
 from jawusd.rig.bake import bake_rig
+from jawusd.rig.scan_look import linear_from_srgb
 from jawusd.rig.stage_poses import fit_poses_of_stage
 
 MESHES = {"MandibleMesh": "mandible", "LowerTeethMesh": "lower_teeth", "SkullMesh": "skull"}
@@ -16,7 +17,7 @@ def folder(tmp_path_factory):
     """Return a baked example rig, whose scans are not quite in occlusion."""
     frames, d = example_motion()
     made = tmp_path_factory.mktemp("actor")
-    bake_rig(made, example_rig(), example_meshes(), name="example", fps=FPS, frames=frames, d=d)
+    bake_rig(made, example_rig(), scanned_meshes(), name="example", fps=FPS, frames=frames, d=d)
     return made
 
 
@@ -37,6 +38,15 @@ def test_vertices_are_where_the_model_puts_them(folder, blender, name):
         assert found["bones"] == ["skull", "jaw"] and max(found["actions"].values()) == len(frames)
     else:
         assert {"jaw:d1", "jaw:d1:range", "jaw:formatVersion", "jaw:modelHash"} <= set(found["properties"])
+
+
+@pytest.mark.parametrize("blender", ["blender45", "blender50"])
+def test_colours_and_texture_coordinates_arrive(folder, blender):
+    arguments = (folder / "actor.usdz", "30", "UpperTeethMesh,LowerTeethMesh")
+    looks, upper = run_in(blender, "blender_import.py", *arguments)["looks"], scanned_meshes()["upper_teeth"]
+    np.testing.assert_allclose(looks["UpperTeethMesh"]["colors"], linear_from_srgb(upper.colors), atol=1e-6)
+    np.testing.assert_array_equal(np.float32(looks["UpperTeethMesh"]["uv"]), upper.uv.reshape(-1, 2))
+    assert looks["LowerTeethMesh"]["uv"] is None
 
 
 @pytest.mark.parametrize("blender", ["blender45", "blender50"])

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from example_rig import FPS, example_meshes, example_motion, example_rig
+from example_rig import FPS, example_meshes, example_motion, example_rig, scanned_meshes
 from foreign import SCRIPTS, environment, run, run_in
 from scipy.spatial.transform import Rotation
 
@@ -25,7 +25,7 @@ def folder(tmp_path_factory):
     """Return a baked example rig."""
     frames, d = example_motion()
     made = tmp_path_factory.mktemp("actor")
-    bake_rig(made, example_rig(), example_meshes(), name="example", fps=FPS, frames=frames, d=d)
+    bake_rig(made, example_rig(), scanned_meshes(), name="example", fps=FPS, frames=frames, d=d)
     K = np.array([[2000.0, 0, 959.5], [0, 2000, 539.5], [0, 0, 1]])
     camera = Camera("cam0", (1920, 1080), K, np.array([-0.1, 0.02, 0, 0, 0]), make_transform(np.eye(3), [0, 0, 250]))
     heads = make_transform(np.eye(3), np.outer(np.arange(len(frames)), [0.1, 0, 0.05]))
@@ -92,6 +92,7 @@ def test_three_js_animates_the_mandible(folder):
     found = run(["node", SCRIPTS / "three_read.mjs", modules, folder / "actor.usdz", times, "MandibleMesh"])
     shown = np.array([found["matrices"][str(frame / FPS).removesuffix(".0")] for frame in frames]).reshape(-1, 4, 4)
     assert landmark_distance(shown, poses) < 0.01
+    assert found["looks"]["UpperTeethMesh"] == ["normal", "position", "uv"]
 
 
 def test_three_js_reads_whole_numbers(tmp_path):

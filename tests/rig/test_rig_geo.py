@@ -1,12 +1,16 @@
 """Meshes written into a rig come back as they were; a placeholder does not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from example_rig import FPS, example_meshes, example_motion, example_rig
+from example_rig import FPS, assert_valid_usd, example_meshes, example_motion, example_rig, scanned_meshes
+from pxr import Usd, UsdGeom
 
 from jawusd.errors import RigError
 from jawusd.rig.bake import bake_rig
-from jawusd.rig.geo import read_geometry
+from jawusd.rig.geo import read_geometry, read_gum
+from jawusd.rig.scan_look import linear_from_srgb, srgb_from_linear
 
 
 def bake(folder, meshes):
@@ -22,6 +26,44 @@ def test_meshes_come_back_in_single_precision(tmp_path):
     for name, mesh in meshes.items():
         np.testing.assert_array_equal(found[name].vertices, mesh.vertices.astype(np.float32))
         np.testing.assert_array_equal(found[name].faces, mesh.faces)
+
+
+def test_colours_and_texture_coordinates_of_scans_are_kept(tmp_path):
+    meshes = scanned_meshes()
+    upper = meshes["upper_teeth"]
+    path = bake(tmp_path, meshes)
+    for file in (path, tmp_path / "actor.usdz"):
+        stage = Usd.Stage.Open(str(file))
+        prim = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath("/Actor/geo/Skull/UpperTeethMesh"))
+        shown, places = prim.GetPrimvar("displayColor"), prim.GetPrimvar("st")
+        assert (shown.GetInterpolation(), places.GetInterpolation()) == ("vertex", "faceVarying")
+        assert (str(shown.GetTypeName()), str(places.GetTypeName())) == ("color3f[]", "texCoord2f[]")
+        np.testing.assert_allclose(np.array(shown.Get()), linear_from_srgb(upper.colors), atol=1e-7)
+        np.testing.assert_array_equal(np.array(places.Get()), upper.uv.reshape(-1, 2))
+        other = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath("/Actor/geo/Mandible/LowerTeethMesh"))
+        assert other.GetPrimvar("displayColor").GetInterpolation() == "constant" and not other.HasPrimvar("st")
+        assert_valid_usd(file)
+    found = read_geometry(path)
+    np.testing.assert_array_equal(found["upper_teeth"].colors, upper.colors)
+    np.testing.assert_array_equal(found["upper_teeth"].uv, upper.uv)
+    assert all(found[name].colors is None and found[name].uv is None for name in found if name != "upper_teeth")
+    painted = read_gum(bake(tmp_path / "painted", example_meshes()))
+    np.testing.assert_array_equal(read_gum(path)["upper_teeth"], painted["upper_teeth"])
+
+
+@pytest.mark.parametrize("colors", [np.full((1, 3), 200), np.full((1, 3), [215, 45, 40])])
+def test_one_colour_all_over_says_nothing(tmp_path, colors):
+    meshes = example_meshes()
+    skull = meshes["skull"]
+    meshes["skull"] = replace(skull, colors=np.repeat(colors, len(skull.vertices), axis=0).astype(np.uint8))
+    assert read_geometry(bake(tmp_path, meshes))["skull"].colors is None
+
+
+def test_colours_are_linear_in_usd():
+    """Values of the sRGB standard's own curve: 128 of 255 is 0.2159 of light; and all codes come back."""
+    np.testing.assert_allclose(linear_from_srgb(np.array([0, 10, 128, 255])), [0, 0.003035, 0.215861, 1], atol=1e-6)
+    codes = np.arange(256, dtype=np.uint8)
+    np.testing.assert_array_equal(srgb_from_linear(linear_from_srgb(codes).astype(np.float32)), codes)
 
 
 def test_a_placeholder_is_no_bone(tmp_path):

@@ -4,7 +4,7 @@ import numpy as np
 from example_model import example_arrays, example_meta, touching_arrays
 
 from jawusd.evaluator import JawRig
-from jawusd.formats.mesh import Mesh
+from jawusd.formats.mesh import Mesh, tooth_labels
 from jawusd.rig.validate import validate_stage
 
 FPS = 24.0
@@ -30,6 +30,16 @@ def example_meshes():
     upper = _painted(_joined([_ball(p + [0, 8, 1], (4, 6, 4)) for p in (incisor, molar_left, molar_right)]))
     skull = _joined([_ball(middle + [0, 60, 0], (70, 50, 80))])
     return {"skull": skull, "upper_teeth": upper, "mandible": mandible, "lower_teeth": lower}
+
+
+def scanned_meshes():
+    """Return the same, the upper scan in natural colours and with texture coordinates instead of paint."""
+    meshes = example_meshes()
+    upper, rng = meshes["upper_teeth"], np.random.default_rng(3)
+    natural = np.where((tooth_labels(upper) > 0)[:, None], (226, 214, 190), (196, 112, 108))
+    colors = (natural + rng.integers(-12, 13, natural.shape)).astype(np.uint8)
+    uv = rng.random((len(upper.faces), 3, 2)).astype(np.float32)
+    return {**meshes, "upper_teeth": Mesh(upper.vertices, upper.faces, colors, tooth_labels(upper), uv)}
 
 
 def mandible_vertices():

@@ -1,7 +1,8 @@
 """Run inside Blender's Python: import a USD file and print where the vertices of meshes are, as JSON.
 
 Usage: python blender_import.py FILE FRAME,FRAME,... MESH,MESH,...
-Prints {"version", "actions", "properties", "frames": {frame: {mesh: [[x, y, z], ...]}}} in the frame of /Actor [mm].
+Prints {"version", "actions", "properties", "looks": {mesh: {"colors", "uv"}}, "frames": {frame: {mesh: [[x, y, z],
+...]}}}, places in the frame of /Actor [mm].
 """
 
 import json
@@ -32,6 +33,16 @@ def editable_keys():
     return found
 
 
+def look(name):
+    """Return linear colours per vertex and texture coordinates per corner of a mesh object, None without."""
+    mesh = bpy.data.objects[name].data
+    colors, layers = mesh.color_attributes.get("displayColor"), mesh.uv_layers
+    return {
+        "colors": None if colors is None else [list(item.color)[:3] for item in colors.data],
+        "uv": [list(item.uv) for item in layers[0].data] if len(layers) else None,
+    }
+
+
 def main(path, frames, meshes):
     """Import the file and print what became of it."""
     bpy.ops.wm.read_homefile(use_empty=True)
@@ -45,6 +56,7 @@ def main(path, frames, meshes):
     properties = {key: str(value) for key, value in root.items() if key.startswith("jaw:")}
     result = {"version": bpy.app.version_string, "actions": editable_keys(), "properties": properties, "frames": places}
     result["bones"] = [bone.name for armature in bpy.data.armatures for bone in armature.bones]
+    result["looks"] = {name: look(name) for name in meshes}
     print("RESULT " + json.dumps(result))
 
 

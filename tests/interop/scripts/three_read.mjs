@@ -21,4 +21,9 @@ for (const time of times.split(",").map(Number)) {
   const relative = actor.matrixWorld.clone().invert().multiply(mesh.matrixWorld);
   found[time] = relative.clone().transpose().elements; // row by row
 }
-console.log("RESULT " + JSON.stringify({ revision: THREE.REVISION, clips: clips.length, tracks: clips[0]?.tracks.length ?? 0, matrices: found, points: mesh.geometry.attributes.position.count }));
+function named(root) {
+  const rows = [];
+  root.traverse((node) => node.isMesh && rows.push([node.name, Object.keys(node.geometry.attributes).sort()]));
+  return rows;
+}
+console.log("RESULT " + JSON.stringify({ revision: THREE.REVISION, clips: clips.length, tracks: clips[0]?.tracks.length ?? 0, matrices: found, points: mesh.geometry.attributes.position.count, looks: Object.fromEntries(scene.children.length ? named(scene) : []) }));

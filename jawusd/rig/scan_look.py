@@ -1,0 +1,56 @@
+"""How a scan looks: its colours and texture coordinates as primvars of its mesh, written and read."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pxr import Sdf, UsdGeom
+
+from jawusd.formats.mesh import Mesh, natural_colors
+from jawusd.geometry.arrays import Array
+from jawusd.rig import _gf
+
+_UV = "st"  # the name readers look for
+
+
+def write_look(prim: UsdGeom.Mesh, mesh: Mesh, plain: tuple[float, float, float]) -> None:
+    """Write displayColor, per vertex where the scan has natural colours, else the plain one; and texture coordinates.
+
+    Args:
+        plain: linear red, green, blue.
+    """
+    colors = natural_colors(mesh)
+    if colors is None:
+        prim.CreateDisplayColorAttr([plain])
+    else:
+        shown = prim.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
+        shown.Set(_gf.vec3f_array(linear_from_srgb(colors)))
+    if mesh.uv is not None:
+        kind = Sdf.ValueTypeNames.TexCoord2fArray
+        places = UsdGeom.PrimvarsAPI(prim).CreatePrimvar(_UV, kind, UsdGeom.Tokens.faceVarying)
+        places.Set(_gf.vec2f_array(mesh.uv.reshape(-1, 2)))
+
+
+def read_look(prim: UsdGeom.Mesh, vertices: int, faces: int) -> tuple[NDArray[np.uint8] | None, Array | None]:
+    """Return colours per vertex (V, 3) and texture coordinates of the corners (F, 3, 2); None where there are none."""
+    shown = prim.GetDisplayColorPrimvar()
+    colors = np.array(shown.ComputeFlattened() or ()) if shown.GetInterpolation() == UsdGeom.Tokens.vertex else ()
+    places = UsdGeom.PrimvarsAPI(prim).GetPrimvar(_UV)
+    corners = np.array(places.ComputeFlattened() or ()) if places else ()
+    return (
+        srgb_from_linear(np.asarray(colors)) if np.shape(colors) == (vertices, 3) else None,
+        np.reshape(corners, (faces, 3, 2)).astype(np.float64) if np.shape(corners) == (3 * faces, 2) else None,
+    )
+
+
+def linear_from_srgb(colors: NDArray[np.uint8]) -> Array:
+    """Return linear values 0 .. 1, as USD has them, of 8 bit sRGB ones (IEC 61966-2-1)."""
+    coded = colors / 255.0
+    return np.where(coded <= 0.04045, coded / 12.92, ((coded + 0.055) / 1.055) ** 2.4)
+
+
+def srgb_from_linear(values: Array) -> NDArray[np.uint8]:
+    """Return 8 bit sRGB values of linear ones (IEC 61966-2-1), those beyond 0 .. 1 clipped."""
+    linear = np.clip(np.asarray(values, dtype=np.float64), 0.0, 1.0)
+    coded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    return np.round(255 * coded).astype(np.uint8)
