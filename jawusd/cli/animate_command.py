@@ -33,6 +33,7 @@ def _refuse_conflicts(
     resample: float | None,
     prim: str | None,
     splines: Path | None,
+    out: Path,
 ) -> None:
     conflicts = (
         ((source is None) == (arkit is None), "SOURCE", "give either a source or --arkit."),
@@ -40,17 +41,26 @@ def _refuse_conflicts(
         (mapping and not arkit, "--mapping", "says what the weights of --arkit mean; give both."),
         (resample and retarget_from, "--resample", "goes with a source of this rig; retarget first."),
         (prim and splines, "--splines", "goes with the actor's own file, not with --prim."),
+        (_is_glb(out) and prim, "--prim", "goes with a layer; a .glb is made of the actor's own file."),
+        (_is_glb(out) and splines, "--splines", "goes with a layer, not with a .glb."),
     )
     for conflict, option, why in conflicts:
         if conflict:
             raise typer.BadParameter(why, param_hint=option)
 
 
+def _is_glb(path: Path) -> bool:
+    return path.suffix.lower() == ".glb"
+
+
 def _write(out: Path, rig: Path, loaded: JawRig, motion: AuthoredMotion, rate: float, prim: str | None) -> None:
     from jawusd.cli.motion import write_over
     from jawusd.rig import write_animation
+    from jawusd.rig.glb import write_glb
 
-    if prim is not None:
+    if _is_glb(out):
+        write_glb(out, rig, loaded, motion.frames, motion.d, rate)
+    elif prim is not None:
         write_over(out, rig, loaded, motion, rate, prim)
     else:
         write_animation(out, rig, motion.frames, motion.d, rate)
@@ -73,7 +83,7 @@ def animate(
             help="The actor's own mapping of --arkit, from arkit-fit; else shares of the ranges.", show_default=False
         ),
     ] = None,
-    out: Annotated[Path, typer.Option("-o", "--out", help="Animation layer.")] = Path("anim.usdc"),
+    out: Annotated[Path, typer.Option("-o", "--out", help="Animation layer, or .glb for the web.")] = Path("anim.usdc"),
     fps: Annotated[
         float | None, typer.Option(min=0.001, help="Frames per second; else from the keys or time codes, or the rig's.")
     ] = None,
@@ -87,14 +97,14 @@ def animate(
     allow: Allow = None,
     as_json: Json = False,
 ) -> None:
-    """Write an animation layer over a rig; clamping to the bound is reported."""
+    """Write an animation layer over a rig, or meshes and motion as .glb; clamping to the bound is reported."""
     import jawusd
     from jawusd.cli.face_commands import read_face
     from jawusd.cli.motion import carried_over, emit_motion, follow_curves, kept_inside, knots_of
     from jawusd.cli.resampling import resampled
     from jawusd.rig import describe, write_splines
 
-    _refuse_conflicts(source, arkit, retarget_from, mapping, resample, prim, splines)
+    _refuse_conflicts(source, arkit, retarget_from, mapping, resample, prim, splines, out)
     for path in filter(None, (out, splines)):
         refuse_existing(path, force)
     loaded = jawusd.load(rig, prim=prim)

@@ -33,6 +33,18 @@ def wxyz_from_matrix(R: ArrayLike) -> Array:
     return np.where(q[..., :1] < 0, -q, q)
 
 
+def continuous_wxyz(R: ArrayLike) -> Array:
+    """Return the unit quaternions (n, 4) of rotations (n, 3, 3) of a motion, each in the half-space of its predecessor.
+
+    Slerp follows the shorter arc between two samples, but readers that interpolate the four numbers do not.
+    """
+    wxyz = wxyz_from_matrix(R)
+    if len(wxyz) > 1:
+        turn = np.where(np.einsum("ij,ij->i", wxyz[1:], wxyz[:-1]) < 0, -1.0, 1.0)
+        wxyz = wxyz * np.concatenate([[1.0], np.cumprod(turn)])[:, None]
+    return wxyz
+
+
 def matrix_from_wxyz(q: ArrayLike) -> Array:
     """Return the rotation matrices (..., 3, 3) of quaternions (..., 4), which are normalised first.
 

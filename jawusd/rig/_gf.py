@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from pxr import Gf, Vt
 
 from jawusd.geometry.arrays import Array
-from jawusd.geometry.quaternion import matrix_from_wxyz, wxyz_from_matrix
+from jawusd.geometry.quaternion import continuous_wxyz, matrix_from_wxyz
 
 
 def double_array(values: ArrayLike) -> Vt.DoubleArray:
@@ -50,21 +50,12 @@ def translations(T: ArrayLike) -> list[Gf.Vec3d]:
 
 def rotations(T: ArrayLike) -> list[Gf.Quatd]:
     """Return the rotations of transforms (n, 4, 4) as unit quaternions, each in the half-space of its predecessor."""
-    return [Gf.Quatd(w, x, y, z) for w, x, y, z in _continuous_wxyz(T).tolist()]
+    return [Gf.Quatd(w, x, y, z) for w, x, y, z in continuous_wxyz(np.asarray(T)[:, :3, :3]).tolist()]
 
 
 def quatf_arrays(T: ArrayLike) -> list[Vt.QuatfArray]:
     """Return the same as arrays of one single-precision quaternion each, the values of a one-joint animation."""
-    return [Vt.QuatfArray([Gf.Quatf(w, x, y, z)]) for w, x, y, z in _continuous_wxyz(T).tolist()]
-
-
-def _continuous_wxyz(T: ArrayLike) -> Array:
-    # USD's slerp follows the shorter arc between two samples, but readers that interpolate the four numbers do not.
-    wxyz = wxyz_from_matrix(np.asarray(T, dtype=np.float64)[:, :3, :3])
-    if len(wxyz) > 1:
-        turn = np.where(np.einsum("ij,ij->i", wxyz[1:], wxyz[:-1]) < 0, -1.0, 1.0)
-        wxyz = wxyz * np.concatenate([[1.0], np.cumprod(turn)])[:, None]
-    return wxyz
+    return [Vt.QuatfArray([Gf.Quatf(w, x, y, z)]) for w, x, y, z in continuous_wxyz(np.asarray(T)[:, :3, :3]).tolist()]
 
 
 def row_matrix(T: ArrayLike) -> Gf.Matrix4d:

@@ -29,7 +29,7 @@ MESH_PATHS = {
 _REQUIRED = ("upper_teeth", "lower_teeth")
 
 # base colour (linear RGB) and roughness
-_MATERIALS = {
+MATERIAL_LOOKS = {
     "Enamel": ((0.85, 0.80, 0.70), 0.25),
     "Gum": ((0.55, 0.16, 0.15), 0.45),
     "Bone": ((0.75, 0.68, 0.54), 0.70),
@@ -64,7 +64,7 @@ def build_geometry(meshes: Mapping[str, Mesh], T_rest: Array, placeholder: str |
         Usd.ModelAPI(stage.GetPrimAtPath(path)).SetKind(Kind.Tokens.subcomponent)
     add_pose(stage.GetPrimAtPath(MANDIBLE), T_rest)
     replaced = "mandible" if placeholder is not None else None
-    used = [name for name in _MATERIALS if name != "Placeholder" or replaced]
+    used = [name for name in MATERIAL_LOOKS if name != "Placeholder" or replaced]
     materials = {name: _material(stage, name) for name in used}
     for name, path in MESH_PATHS.items():
         if name in meshes:
@@ -104,7 +104,7 @@ def check_meshes(meshes: Mapping[str, Mesh]) -> None:
 
 
 def _material(stage: Usd.Stage, name: str) -> UsdShade.Material:
-    color, roughness = _MATERIALS[name]
+    color, roughness = MATERIAL_LOOKS[name]
     material = UsdShade.Material.Define(stage, f"{MATERIALS}/{name}")
     surface = UsdShade.Shader.Define(stage, f"{MATERIALS}/{name}/Surface")
     surface.CreateIdAttr("UsdPreviewSurface")
@@ -128,7 +128,7 @@ def _define_mesh(
     prim.CreateNormalsAttr(_gf.vec3f_array(corner_normals(mesh)))
     prim.SetNormalsInterpolation(UsdGeom.Tokens.faceVarying)
     gum = ~crown_face_mask(mesh) if base == "Enamel" else np.zeros(len(mesh.faces), dtype=bool)
-    write_look(prim, mesh, _MATERIALS[base][0])
+    write_look(prim, mesh, MATERIAL_LOOKS[base][0])
     binding = UsdShade.MaterialBindingAPI.Apply(prim.GetPrim())
     binding.Bind(materials[base])
     if gum.any():
@@ -141,7 +141,12 @@ def _define_mesh(
 
 
 def corner_normals(mesh: Mesh) -> Array:
-    """Return smooth unit normals at every corner of every face, shape (3 F, 3): faces weighted by their area."""
+    """Return smooth unit normals at every corner of every face, shape (3 F, 3)."""
+    return vertex_normals(mesh)[mesh.faces.reshape(-1)]
+
+
+def vertex_normals(mesh: Mesh) -> Array:
+    """Return smooth unit normals, shape (V, 3): faces weighted by their area."""
     a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
     area = np.cross(b - a, c - a)
     normals = np.empty_like(mesh.vertices)
@@ -150,8 +155,7 @@ def corner_normals(mesh: Mesh) -> Array:
         normals[:, axis] = np.bincount(corners, np.repeat(area[:, axis], 3), minlength=len(mesh.vertices))
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     # corners of degenerate faces only: any unit vector is as good as another
-    normals = np.where(length > 0, normals / np.where(length > 0, length, 1.0), [0.0, 1.0, 0.0])
-    return normals[corners]
+    return np.where(length > 0, normals / np.where(length > 0, length, 1.0), [0.0, 1.0, 0.0])
 
 
 @raises_format_error(0)

@@ -237,6 +237,16 @@ def test_animate_says_how_far_arkit_weights_were_clamped(actor, tmp_path):
     assert "30 frames lay outside" in run("animate", actor, "--arkit", csv, "-o", out, "--force")
 
 
+def test_animate_writes_glb(actor, tmp_path):
+    keys, glb = tmp_path / "keys.json", tmp_path / "take.glb"
+    keys.write_text('{"fps": 24, "keys": [{"frame": 1, "d": [0, 0, 0]}, {"frame": 9, "d": [12, 0, 0]}]}')
+    assert "frames 1 .. 9 at 24 fps" in run("animate", actor, keys, "-o", glb)
+    assert glb.read_bytes()[:4] == b"glTF" and b'"animations"' in glb.read_bytes()
+    run("animate", actor, keys, "-o", glb, code=10)  # it exists
+    for option, value in (("--splines", tmp_path / "s.usda"), ("--prim", "/Actor")):
+        assert option in run("animate", actor, keys, "-o", tmp_path / "b.glb", option, value, code=2)
+
+
 def test_arkit_fit_learns_the_actors_own_mapping(actor, tmp_path):
     """Weights that mean d by gains of this actor, 0.5 s apart; `animate --mapping` gives d back."""
     rig, phase = jawusd.load(actor), 2 * np.pi * np.arange(720) / 24

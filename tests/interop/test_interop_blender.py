@@ -6,6 +6,7 @@ from example_rig import FPS, example_meshes, example_motion, example_rig, moved,
 from foreign import run_in
 
 from jawusd.rig.bake import bake_rig
+from jawusd.rig.glb import write_glb
 from jawusd.rig.scan_look import linear_from_srgb
 from jawusd.rig.stage_poses import fit_poses_of_stage
 
@@ -38,6 +39,20 @@ def test_vertices_are_where_the_model_puts_them(folder, blender, name):
         assert found["bones"] == ["skull", "jaw"] and max(found["actions"].values()) == len(frames)
     else:
         assert {"jaw:d1", "jaw:d1:range", "jaw:formatVersion", "jaw:modelHash"} <= set(found["properties"])
+
+
+@pytest.mark.parametrize("blender", ["blender45", "blender50"])
+def test_glb_moves_as_the_model_does(folder, tmp_path, blender):
+    frames, d = example_motion()
+    glb = write_glb(tmp_path / "take.glb", folder / "actor.usda", example_rig(), frames, d, FPS)
+    shown = np.arange(0, len(frames), 4)
+    found = run_in(blender, "blender_gltf.py", glb, int(FPS), ",".join(map(str, shown)), "MandibleMesh")
+    vertices = example_meshes()["mandible"].vertices
+    for k in shown:
+        expected = moved(example_rig().pose(d[k])[None], vertices)[0]
+        places = np.array(found["frames"][str(k)])
+        assert np.linalg.norm(places - expected, axis=1).max() < 1e-3
+    assert found["looks"]["UpperTeethMesh"] == [1, 1] and found["looks"]["MandibleMesh"] == [0, 0]
 
 
 @pytest.mark.parametrize("blender", ["blender45", "blender50"])

@@ -15,6 +15,7 @@ from jawusd.evaluator import JawRig
 from jawusd.geometry import Camera, make_transform
 from jawusd.rig.bake import bake_rig
 from jawusd.rig.cameras import write_cameras
+from jawusd.rig.glb import write_glb
 from jawusd.rig.nvidia import nvidia_findings
 
 SHOWN = (0, 9, 17, 30, 39)
@@ -93,6 +94,20 @@ def test_three_js_animates_the_mandible(folder):
     shown = np.array([found["matrices"][str(frame / FPS).removesuffix(".0")] for frame in frames]).reshape(-1, 4, 4)
     assert landmark_distance(shown, poses) < 0.01
     assert found["looks"]["UpperTeethMesh"] == ["normal", "position", "uv"]
+
+
+def test_three_js_plays_glb(folder, tmp_path):
+    """Times count from the first frame, lengths are metres."""
+    all_frames, d = example_motion()
+    frames, poses = expected_poses()
+    glb = write_glb(tmp_path / "take.glb", folder / "actor.usda", example_rig(), all_frames, d, FPS)
+    seconds = [(frame - all_frames[0]) / FPS for frame in frames]
+    modules, times = environment("threejs") / "node_modules", ",".join(map(str, seconds))
+    found = run(["node", SCRIPTS / "three_read.mjs", modules, glb, times, "MandibleMesh"])
+    shown = np.array([found["matrices"][str(time).removesuffix(".0")] for time in seconds]).reshape(-1, 4, 4)
+    shown[:, :3, 3] *= 1000
+    assert landmark_distance(shown, poses) < 1e-4
+    assert {"color", "uv"} < set(found["looks"]["UpperTeethMesh"])
 
 
 def test_three_js_reads_whole_numbers(tmp_path):

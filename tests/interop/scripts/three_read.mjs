@@ -1,19 +1,22 @@
-// Run by node: parse a .usdz with three.js and print where the mandible's mesh is, as JSON.
+// Run by node: parse a .usdz or .glb with three.js and print where the mandible's mesh is, as JSON.
 // Usage: node three_read.mjs NODE_MODULES FILE TIME,TIME,... MESH     (times in seconds)
 import { readFileSync } from "node:fs";
 import { pathToFileURL } from "node:url";
 
 const [, , modules, file, times, meshName] = process.argv;
 const THREE = await import(pathToFileURL(`${modules}/three/build/three.module.js`));
-const { USDLoader } = await import(pathToFileURL(`${modules}/three/examples/jsm/loaders/USDLoader.js`));
+const kind = file.endsWith(".glb") ? "GLTFLoader" : "USDLoader";
+const { [kind]: Loader } = await import(pathToFileURL(`${modules}/three/examples/jsm/loaders/${kind}.js`));
 
 const bytes = readFileSync(file);
-const scene = new USDLoader().parse(bytes.buffer.slice(bytes.byteOffset, bytes.byteOffset + bytes.byteLength));
+const data = bytes.buffer.slice(bytes.byteOffset, bytes.byteOffset + bytes.byteLength);
+const parsed = kind === "USDLoader" ? new Loader().parse(data) : await new Loader().parseAsync(data, "");
+const scene = parsed.scene ?? parsed;
 const mesh = scene.getObjectByName(meshName);
-const clips = scene.animations ?? [];
+const clips = parsed.animations ?? [];
 const mixer = new THREE.AnimationMixer(scene);
 clips.forEach((clip) => mixer.clipAction(clip).play());
-const actor = scene.getObjectByName("Actor");
+const actor = scene.getObjectByName("Actor") ?? scene.children[0];
 const found = {};
 for (const time of times.split(",").map(Number)) {
   mixer.setTime(time);

@@ -1,0 +1,177 @@
+"""Binary glTF 2.0 (.glb): meshes under named nodes, and their motion, for the web.
+
+Khronos Group, "glTF 2.0 Specification", 2021. Lengths are metres in the file and mm here, y is up; nodes move by
+translation and quaternion, which readers interpolate linearly and by slerp.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jawusd.formats.atomic import write_bytes_atomic
+from jawusd.geometry.arrays import Array
+from jawusd.geometry.quaternion import continuous_wxyz
+
+_MM = 1e-3  # in metres
+_FLOAT, _UINT16, _UINT32 = 5126, 5123, 5125
+_Values = NDArray[np.float32] | NDArray[np.uint16] | NDArray[np.uint32]
+_TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
+_VERTICES, _INDICES = 34962, 34963  # targets of buffer views
+
+
+@dataclass(frozen=True)
+class Material:
+    """Hold how a surface looks where it has no colours of its own."""
+
+    color: tuple[float, float, float]  # linear red, green, blue, 0 .. 1
+    roughness: float
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Hold a mesh whose faces have materials."""
+
+    name: str
+    vertices: Array  # positions [mm], shape (V, 3)
+    normals: Array  # unit, shape (V, 3)
+    parts: Mapping[str, NDArray[np.int32]]  # faces (F, 3) by the names of their materials
+    colors: Array | None = None  # linear red, green, blue per vertex, shape (V, 3), which multiply the material's
+    uv: Array | None = None  # places in a picture, u to the right, v upwards, shape (V, 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Node:
+    """Hold surfaces that move together."""
+
+    name: str
+    pose: Array  # at rest, shape (4, 4) [mm]
+    surfaces: Sequence[Surface]
+    times_s: Array = field(default_factory=lambda: np.empty(0))  # of the motion, increasing, not negative, shape (n,)
+    poses: Array = field(default_factory=lambda: np.empty((0, 4, 4)))  # at these times, shape (n, 4, 4) [mm]
+
+
+def save_glb(
+    path: str | os.PathLike[str], name: str, materials: Mapping[str, Material], nodes: Sequence[Node], generator: str
+) -> None:
+    """Write nodes under one root of a name, atomically; times that single precision cannot tell apart are left out.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    builder = _Builder()
+    order = list(materials)
+    meshes: list[dict[str, object]] = []
+    top: list[int] = []
+    listed: list[dict[str, object]] = [{"name": name, "children": top}]
+    channels: list[dict[str, object]] = []
+    samplers: list[dict[str, int]] = []
+    for node in nodes:
+        at, below = len(listed), range(len(listed) + 1, len(listed) + 1 + len(node.surfaces))
+        top.append(at)
+        listed.append({"name": node.name, "children": list(below), **_placed(node.pose)})
+        for surface in node.surfaces:
+            listed.append({"name": surface.name, "mesh": len(meshes)})
+            meshes.append({"name": surface.name, "primitives": builder.primitives(surface, order)})
+        for target, times, values in _motion(node):
+            channels.append({"sampler": len(samplers), "target": {"node": at, "path": target}})
+            samplers.append({"input": builder.add(times, limits=True), "output": builder.add(values)})
+    document: dict[str, object] = {
+        "asset": {"version": "2.0", "generator": generator},
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": listed,
+        "meshes": meshes,
+        "materials": [_look(key, materials[key]) for key in order],
+        "accessors": builder.accessors,
+        "bufferViews": builder.views,
+        "buffers": [{"byteLength": len(builder.data)}],
+    }
+    if channels:
+        document["animations"] = [{"name": name, "channels": channels, "samplers": samplers}]
+    write_bytes_atomic(path, _container(document, bytes(builder.data)))
+
+
+class _Builder:
+    """Collect arrays in one buffer, and what describes them."""
+
+    def __init__(self) -> None:
+        self.data = bytearray()
+        self.views: list[dict[str, int]] = []
+        self.accessors: list[dict[str, object]] = []
+
+    def add(self, values: _Values, *, target: int | None = None, limits: bool = False) -> int:
+        """Append an array, shape (n,) or (n, k); return the number of its accessor."""
+        kind = {np.dtype("<f4"): _FLOAT, np.dtype("<u2"): _UINT16, np.dtype("<u4"): _UINT32}[values.dtype]
+        view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": values.nbytes}
+        self.views.append(view if target is None else {**view, "target": target})
+        self.data += np.ascontiguousarray(values).tobytes()
+        self.data += bytes(-len(self.data) % 4)
+        rows = values.reshape(len(values), -1)
+        accessor: dict[str, object] = {
+            "bufferView": len(self.views) - 1,
+            "componentType": kind,
+            "count": len(rows),
+            "type": _TYPES[rows.shape[1]],
+        }
+        if limits:
+            accessor |= {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
+        if kind == _UINT16:
+            accessor["normalized"] = True
+        self.accessors.append(accessor)
+        return len(self.accessors) - 1
+
+    def primitives(self, surface: Surface, materials: Sequence[str]) -> list[dict[str, object]]:
+        """Append a surface; return its primitives, one per material, which share their vertices."""
+        attributes = {
+            "POSITION": self.add(np.asarray(surface.vertices * _MM, "<f4"), target=_VERTICES, limits=True),
+            "NORMAL": self.add(np.asarray(surface.normals, "<f4"), target=_VERTICES),
+        }
+        if surface.uv is not None:  # v goes downwards in the file
+            attributes["TEXCOORD_0"] = self.add(np.asarray(surface.uv * [1, -1] + [0, 1], "<f4"), target=_VERTICES)
+        if surface.colors is not None:
+            opaque = np.column_stack([np.clip(surface.colors, 0, 1), np.ones(len(surface.colors))])
+            attributes["COLOR_0"] = self.add(np.round(65535 * opaque).astype("<u2"), target=_VERTICES)
+        return [
+            {
+                "attributes": attributes,
+                "indices": self.add(np.asarray(faces, "<u4").ravel(), target=_INDICES),
+                "material": materials.index(material),
+            }
+            for material, faces in surface.parts.items()
+            if len(faces)
+        ]
+
+
+def _motion(node: Node) -> list[tuple[str, NDArray[np.float32], NDArray[np.float32]]]:
+    """Return targets, times [s] and values of a node's channels."""
+    if not len(node.times_s):
+        return []
+    times, first = np.unique(np.asarray(node.times_s, "<f4"), return_index=True)
+    poses = node.poses[first]
+    wxyz = continuous_wxyz(poses[:, :3, :3])
+    moved = np.asarray(poses[:, :3, 3] * _MM, "<f4")
+    return [("translation", times, moved), ("rotation", times, np.asarray(np.roll(wxyz, -1, axis=1), "<f4"))]
+
+
+def _placed(pose: Array) -> dict[str, list[float]]:
+    wxyz = continuous_wxyz(pose[None, :3, :3])[0]
+    return {"translation": (pose[:3, 3] * _MM).tolist(), "rotation": np.roll(wxyz, -1).tolist()}
+
+
+def _look(name: str, material: Material) -> dict[str, object]:
+    surface = {"baseColorFactor": [*material.color, 1.0], "metallicFactor": 0.0, "roughnessFactor": material.roughness}
+    return {"name": name, "pbrMetallicRoughness": surface, "doubleSided": True}  # scans are open surfaces
+
+
+def _container(document: Mapping[str, object], data: bytes) -> bytes:
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(data), b"BIN\0") + data
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
