@@ -13,7 +13,10 @@ from jawusd.cli.output import emit, refuse_existing
 if TYPE_CHECKING:
     from jawusd.cli.motion import AuthoredMotion
     from jawusd.evaluator import JawRig
+    from jawusd.formats.arkit_mapping import ArkitMapping
     from jawusd.geometry.arrays import Array
+
+_CLAMPED_MM = 0.005  # what is less shows as 0.00
 
 
 def arkit_fit(
@@ -72,6 +75,36 @@ def arkit_fit(
     )
 
 
+def arkit_table(
+    rig: RigArg,
+    out: Annotated[Path, typer.Option("-o", "--out", help="The table (CSV).")] = Path("joint.csv"),
+    mapping: Annotated[
+        Path | None,
+        typer.Option(help="The actor's own mapping, from arkit-fit; else shares of the ranges.", show_default=False),
+    ] = None,
+    force: Force = False,
+    prim: Prim = None,
+    allow: Allow = None,
+    as_json: Json = False,
+) -> None:
+    """Write what the jaw joint does for each ARKit shape at half and full weight, for rigs that add up joint deltas.
+
+    Millimetres and degrees relative to the neutral face, about the point midway between the condyles, skull axes.
+    """
+    import jawusd
+    from jawusd.formats.joint_table import save_joint_table
+    from jawusd.pipeline.joint_table import joint_deltas
+
+    refuse_existing(out, force)
+    loaded = jawusd.load(rig, prim=prim)
+    rows = joint_deltas(loaded, None if mapping is None else _own_mapping(loaded, mapping))
+    save_joint_table(out, rows)
+    clamped = [row for row in rows if row.clamped_mm > _CLAMPED_MM]
+    lines = [f"{out}: {len(rows)} rows"]
+    lines += [f"{row.shape} {row.weight:g} lay {row.clamped_mm:.2f} mm outside the bound" for row in clamped]
+    emit({"file": str(out), "rows": len(rows), "clamped": len(clamped)}, as_json, lambda: lines)
+
+
 def _jaw_of_take(rig: JawRig, path: Path, source: Path, fps: float | None, prim: str | None) -> tuple[Array, Array]:
     """Return times [s] (N,) and d [mm] (N, 3) of tracks or a table."""
     import numpy as np
@@ -120,21 +153,26 @@ def read_face(rig: JawRig, source: Path, fps: float | None, mapping: Path | None
     from jawusd.cli.motion import AuthoredMotion
     from jawusd.errors import FormatError
     from jawusd.formats.arkit import read_arkit, shares_of
-    from jawusd.formats.arkit_mapping import load_mapping
 
     capture = read_arkit(source, fps)
     if mapping is None:
         d = rig.denormalized(shares_of(capture.weights))
     else:
-        own = load_mapping(mapping)
-        actor = str(rig.meta.get("actor", ""))
-        if own.actor != actor:
-            raise FormatError(
-                f'is the mapping of "{own.actor}", the rig is of "{actor}"; d means other movements of another person.',
-                path=mapping,
-                hint="Leave --mapping out, or animate that person's rig and carry it over with `jawusd retarget`.",
-            )
-        d = own.d(capture.weights)
+        d = _own_mapping(rig, mapping).d(capture.weights)
     if not np.isfinite(d).any():
         raise FormatError("no row has a face (BlendShapeCount is 0 in all of them).", path=source)
     return AuthoredMotion(capture.frames, d, capture.fps)
+
+
+def _own_mapping(rig: JawRig, path: Path) -> ArkitMapping:
+    from jawusd.errors import FormatError
+    from jawusd.formats.arkit_mapping import load_mapping
+
+    own, actor = load_mapping(path), str(rig.meta.get("actor", ""))
+    if own.actor != actor:
+        raise FormatError(
+            f'is the mapping of "{own.actor}", the rig is of "{actor}"; d means other movements of another person.',
+            path=path,
+            hint="Leave --mapping out, or animate that person's rig and carry it over with `jawusd retarget`.",
+        )
+    return own

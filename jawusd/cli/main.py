@@ -49,6 +49,7 @@ for _command in (
     rig_commands.ik,
     animate_command.animate,
     face_commands.arkit_fit,
+    face_commands.arkit_table,
     stage_commands.rebake,
     stage_commands.publish,
     solve_commands.solve,

@@ -47,11 +47,9 @@ def write_skel(
     layer = new_layer(fps)
     root = define_prim(layer, ACTOR, "SkelRoot")
     root.kind = Kind.Tokens.component
-    hinge = np.eye(4)
-    hinge[:3, 3] = _hinge(rig)
     stage = stage_of(layer)
-    _define_skeleton(stage, hinge)
-    keys = _define_motion(stage, rig, hinge, frames, d)
+    _define_skeleton(stage, _hinge(rig))
+    keys = _define_motion(stage, rig, frames, d)
     if keys is not None:
         layer.startTimeCode, layer.endTimeCode = float(keys[0]), float(keys[-1])
     # The bind transforms place the meshes; Blender would apply the ops of the payload on top.
@@ -68,10 +66,19 @@ def _moves(name: str) -> bool:
     return name in ("mandible", "lower_teeth")
 
 
+def joint_poses(rig: JawRig, d: Array) -> Array:
+    """Return the joint `skull/jaw` in skull coordinates, shape (n, 4, 4), for parameters (n, 3) [mm].
+
+    It moves as D hinge, D = pose rest^-1: a vertex bound at rest is carried to D rest p = pose p.
+    """
+    moved = rig.pose(d) @ se3_inverse(rig.T_rest)
+    return make_transform(moved[:, :3, :3], (moved @ _hinge(rig))[:, :3, 3])
+
+
 def _hinge(rig: JawRig) -> Array:
-    """Return the point midway between the condyles in the closed bite, skull coordinates [mm]."""
+    """Return the joint in the closed bite, midway between the condyles, in the skull's axes, shape (4, 4) [mm]."""
     condyles = [LANDMARKS.index(name) for name in ("condyle_left", "condyle_right")]
-    return transform_points(rig.T_rest, rig.landmarks[condyles]).mean(axis=0)
+    return make_transform(np.eye(3), transform_points(rig.T_rest, rig.landmarks[condyles]).mean(axis=0))
 
 
 def _define_skeleton(stage: Usd.Stage, hinge: Array) -> None:
@@ -84,25 +91,19 @@ def _define_skeleton(stage: Usd.Stage, hinge: Array) -> None:
     binding.CreateAnimationSourceRel().SetTargets([Sdf.Path(MOTION)])
 
 
-def _define_motion(
-    stage: Usd.Stage, rig: JawRig, hinge: Array, frames: ArrayLike | None, d: ArrayLike | None
-) -> Array | None:
-    """Define the animation of the joint skull/jaw and return its key frames.
-
-    The joint moves as D hinge, D = pose rest^-1: a vertex bound at rest is carried to D rest p = pose p.
-    """
+def _define_motion(stage: Usd.Stage, rig: JawRig, frames: ArrayLike | None, d: ArrayLike | None) -> Array | None:
+    """Define the animation of the joint skull/jaw and return its key frames."""
     motion = UsdSkel.Animation.Define(stage, MOTION)
     motion.CreateJointsAttr(Vt.TokenArray([JOINTS[1]]))
     motion.CreateScalesAttr(Vt.Vec3hArray([(1, 1, 1)]))
     translations, rotations = motion.CreateTranslationsAttr(), motion.CreateRotationsAttr()
-    translations.Set(_gf.vec3f_array(hinge[None, :3, 3]))
+    translations.Set(_gf.vec3f_array(_hinge(rig)[None, :3, 3]))
     rotations.Set(_gf.quatf_arrays(np.eye(4)[None])[0])
     if frames is None or d is None:
         return None
     frames, d = np.asarray(frames, dtype=np.float64), np.asarray(d, dtype=np.float64)
     known = np.isfinite(d).all(axis=1)
-    moved = rig.pose(d[known]) @ se3_inverse(rig.T_rest)
-    joint = make_transform(moved[:, :3, :3], (moved @ hinge)[:, :3, 3])
+    joint = joint_poses(rig, d[known])
     for frame, T, rotation in zip(frames[known].tolist(), joint, _gf.quatf_arrays(joint), strict=True):
         translations.Set(_gf.vec3f_array(T[None, :3, 3]), frame)
         rotations.Set(rotation, frame)

@@ -275,6 +275,16 @@ def test_arkit_fit_learns_the_actors_own_mapping(actor, tmp_path):
     assert "format" in text and "arkit-fit" in text
 
 
+def test_arkit_table_lists_shapes(actor, tmp_path):
+    out = tmp_path / "joint.csv"
+    assert json.loads(run("arkit-table", actor, "-o", out, "--json"))["rows"] == 8
+    lines = out.read_text().splitlines()
+    assert lines[0].startswith("shape,weight,d1") and lines[2].startswith("JawOpen,1,")
+    run("arkit-table", actor, "-o", out, code=10)  # it exists
+    (tmp_path / "bad.json").write_text("{}")
+    assert "arkit-fit" in run("arkit-table", actor, "-o", out, "--mapping", tmp_path / "bad.json", "--force", code=3)
+
+
 @pytest.mark.parametrize("lost", [False, True])
 def test_face_takes_come_to_the_rate_of_the_scene(actor, tmp_path, lost):
     """60 to 24 frames per second: on the motion at the new frames, peaks where they were."""
