@@ -9,6 +9,7 @@ import numpy as np
 import pyfqmr
 from numpy.typing import NDArray
 
+from jawusd.formats.mesh import GUM, TOOTH, Mesh, crown_face_mask
 from jawusd.geometry.arrays import Array
 
 
@@ -25,6 +26,28 @@ def decimated(vertices: Array, faces: NDArray[np.int32], count: int) -> tuple[Ar
     simplifier.simplify_mesh(target_count=count, preserve_border=True, verbose=False)
     points, kept, _ = simplifier.getMesh()
     return np.asarray(points, np.float64), np.asarray(kept, np.int32)
+
+
+def proxy_of(mesh: Mesh, count: int) -> Mesh:
+    """Return a mesh of about `count` faces, and one more for each edge of a border; crowns and gum stay apart.
+
+    Borders, that between crown and gum among them, stay where they are. Labels say what is crown; colours and texture
+    coordinates are left out.
+    """
+    crown = crown_face_mask(mesh)
+    parts = []
+    for faces, label in ((mesh.faces[crown], TOOTH), (mesh.faces[~crown], GUM)):
+        share = int(count * len(faces) / max(len(mesh.faces), count))
+        points, kept = decimated(mesh.vertices, faces, min(share + _border_edges(faces), len(faces)))
+        parts.append((points, kept, np.full(len(points), label, np.uint8)))
+    (crowns, first, tooth), (gums, second, gum) = parts
+    faces = np.concatenate([first, second + np.int32(len(crowns))])
+    return Mesh(np.concatenate([crowns, gums]), faces, labels=np.concatenate([tooth, gum]))
+
+
+def _border_edges(faces: NDArray[np.int32]) -> int:
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    return int((np.unique(edges, axis=0, return_counts=True)[1] == 1).sum())
 
 
 def decimated_scan(

@@ -17,6 +17,7 @@ from jawusd.pipeline.prepare import BONES, Subject, load_cameras, registered_sub
 from jawusd.pipeline.state import Progress, no_progress
 
 DEFAULT_FPS = 24.0
+_PROXY_FACES = 1500  # of a mesh; those along its borders come on top, see `proxy_of`
 _TEETH_APART_MM = 15.0  # molars are picked by hand in one case and found by rule in the other
 
 
@@ -55,6 +56,7 @@ def bake_subject(
         RigError, OutputError: the rig cannot be written.
     """
     from jawusd.fitting.speeds import with_speeds
+    from jawusd.imaging.decimation import proxy_of
     from jawusd.imaging.mesh_cleaning import manifold
     from jawusd.rig.bake import bake_rig
 
@@ -76,6 +78,7 @@ def bake_subject(
         frames=model.frames if moving else None,
         d=model.d if moving else None,
         table_size=table_size,
+        proxies={key: proxy_of(mesh, _PROXY_FACES) for key, mesh in meshes.items() if len(mesh.faces) > _PROXY_FACES},
     )
     progress("bake", 1, 1)
     return files

@@ -17,6 +17,7 @@ from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import transform_points
 from jawusd.rig import _gf, layout
 from jawusd.rig.arrays import model_hash, write_arrays
+from jawusd.rig.detail import offer_detail
 from jawusd.rig.geo import extent
 from jawusd.rig.layers import apply_jaw_api, define_prim, new_layer, set_attribute, set_relationship
 from jawusd.rig.sampling import grid_points, sample_valid
@@ -29,8 +30,16 @@ _INTERFACE_ARRAYS = ("jaw:landmarks:", "jaw:thresholds:")
 _DECODER_ARRAYS = ("jaw:model:", "jaw:bounds:", "jaw:contact:", "jaw:joints:", "jaw:motion:")
 
 
-def interface_layer(rig: JawRig, name: str, meshes: Mapping[str, Mesh], fps: float) -> Sdf.Layer:
-    """Build `actor.usda`, the prim that users and tools see; meshes as for `build_geometry`, fps the time code rate."""
+def interface_layer(
+    rig: JawRig, name: str, meshes: Mapping[str, Mesh], fps: float, *, proxies: bool = False
+) -> Sdf.Layer:
+    """Build `actor.usda`, the prim that users and tools see.
+
+    Args:
+        meshes: As for `build_geometry`.
+        fps: Time codes per second.
+        proxies: Whether there is a `proxy.usdc`, offered as a variant.
+    """
     layer = new_layer(fps)
     layer.subLayerPaths.append(f"./{layout.RIG_FILE}")
     actor = define_prim(layer, layout.ACTOR, "Xform")
@@ -42,6 +51,8 @@ def interface_layer(rig: JawRig, name: str, meshes: Mapping[str, Mesh], fps: flo
     }
     apply_jaw_api(actor, "GeomModelAPI")
     actor.payloadList.prependedItems = [Sdf.Payload(f"./{layout.GEO_FILE}")]
+    if proxies:
+        offer_detail(actor)
     hint = Sdf.AttributeSpec(actor, "extentsHint", _TYPES.Float3Array, Sdf.VariabilityVarying)
     hint.default = _gf.vec3f_array(reach(rig, meshes))
 

@@ -14,9 +14,19 @@ from jawusd.evaluator import JawRig
 from jawusd.formats.mesh import Mesh
 from jawusd.rig.animation import write_animation
 from jawusd.rig.author import decoder_layer, interface_layer, record_sidecars
+from jawusd.rig.detail import proxy_layer
 from jawusd.rig.geo import build_geometry, check_meshes
 from jawusd.rig.layers import write_layer
-from jawusd.rig.layout import ACTOR_FILE, ENCODE_FILE, GEO_FILE, ONNX_FILE, PACKAGE_FILE, RIG_FILE, SKEL_FILE
+from jawusd.rig.layout import (
+    ACTOR_FILE,
+    ENCODE_FILE,
+    GEO_FILE,
+    ONNX_FILE,
+    PACKAGE_FILE,
+    PROXY_FILE,
+    RIG_FILE,
+    SKEL_FILE,
+)
 from jawusd.rig.onnx_sidecar import decode_model, encode_model, write_onnx
 from jawusd.rig.package import write_package
 from jawusd.rig.placeholder import grow_placeholder
@@ -36,6 +46,7 @@ def bake_rig(
     frames: ArrayLike | None = None,
     d: ArrayLike | None = None,
     table_size: int = DEFAULT_SIZE,
+    proxies: Mapping[str, Mesh] | None = None,
 ) -> list[Path]:
     """Write a rig: interface, decoder, geometry, ONNX graphs, captured motion if there is one, skeleton, package.
 
@@ -50,6 +61,7 @@ def bake_rig(
         frames: Captured frame numbers (F,), increasing.
         d: Parameters of the captured frames (F, 3) [mm], NaN where lost.
         table_size: Values per axis of the sampled decoder, 17, 33 or 65.
+        proxies: Stand-ins of few faces for some of the meshes, by the same names; they make a variant.
 
     Returns:
         The files, in the order written.
@@ -72,13 +84,16 @@ def bake_rig(
     geometry = build_geometry(meshes, rig.T_rest, placeholder)
     moving = np.concatenate([meshes[key].vertices for key in ("mandible", "lower_teeth")])
     table = build_table(rig, moving, table_size)
-    written = [
-        write_layer(geometry, folder / GEO_FILE),
+    written = [write_layer(geometry, folder / GEO_FILE)]
+    if proxies:
+        thinned = proxy_layer(proxies, meshes, rig.T_rest, placeholder)
+        written.append(write_layer(thinned, folder / PROXY_FILE))
+    written += [
         write_layer(decoder_layer(rig, table), folder / RIG_FILE),
         write_onnx(folder / ONNX_FILE, decode_model(rig)),
         write_onnx(folder / ENCODE_FILE, encode_model(rig)),
     ]
-    interface = interface_layer(rig, name, meshes, fps)
+    interface = interface_layer(rig, name, meshes, fps, proxies=bool(proxies))
     record_sidecars(interface, folder)
     written.append(write_layer(interface, folder / ACTOR_FILE))
     shown = folder / ACTOR_FILE

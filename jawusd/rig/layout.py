@@ -8,6 +8,9 @@ SKULL, MANDIBLE = "/Actor/geo/Skull", "/Actor/geo/Mandible"
 ACTOR_FILE, RIG_FILE, GEO_FILE = "actor.usda", "rig.usdc", "geo.usdc"
 ONNX_FILE, ENCODE_FILE = "actor.onnx", "actor_encode.onnx"
 SKEL_FILE, PACKAGE_FILE = "actor_skel.usdc", "actor.usdz"
+PROXY_FILE = "proxy.usdc"
+
+DETAIL, SCAN, PROXY = "detail", "scan", "proxy"  # a variant set and its variants
 
 PARAMETERS = ("jaw:d1", "jaw:d2", "jaw:d3")
 ONNX_ATTRIBUTES = ("jaw:onnx", "jaw:onnx:encode")

@@ -12,13 +12,13 @@ from pxr import Sdf, UsdUtils
 from jawusd.errors import RigError
 from jawusd.formats.atomic import atomic_path
 from jawusd.rig.layers import write_layer
-from jawusd.rig.layout import ACTOR_FILE, ENCODE_FILE, GEO_FILE, ONNX_FILE, PACKAGE_FILE, RIG_FILE
+from jawusd.rig.layout import ACTOR_FILE, ENCODE_FILE, GEO_FILE, ONNX_FILE, PACKAGE_FILE, PROXY_FILE, RIG_FILE
 from jawusd.rig.package import write_package
 from jawusd.rig.read import describe, open_stage
 
 _PREFIX = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,63}")
 _LAYERS, _COPIED = (".usda", ".usdc", ".usd"), (".onnx",)
-_FIRST = (GEO_FILE, RIG_FILE, ONNX_FILE, ENCODE_FILE, ACTOR_FILE)  # written before what refers to them
+_FIRST = (GEO_FILE, PROXY_FILE, RIG_FILE, ONNX_FILE, ENCODE_FILE, ACTOR_FILE)  # written before what refers to them
 _CAPTURED = "anim_capture.usdc"
 
 

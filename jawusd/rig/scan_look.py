@@ -31,6 +31,14 @@ def write_look(prim: UsdGeom.Mesh, mesh: Mesh, plain: tuple[float, float, float]
         places.Set(_gf.vec2f_array(mesh.uv.reshape(-1, 2)))
 
 
+def hide_look(prim: UsdGeom.Mesh, mesh: Mesh, below: Mesh) -> None:
+    """Keep the look of a weaker layer's mesh, which has other points, from showing through that of this one."""
+    if natural_colors(mesh) is None and natural_colors(below) is not None:
+        prim.GetDisplayColorPrimvar().SetInterpolation(UsdGeom.Tokens.constant)
+    if mesh.uv is None and below.uv is not None:
+        UsdGeom.PrimvarsAPI(prim).CreatePrimvar(_UV, Sdf.ValueTypeNames.TexCoord2fArray).GetAttr().Block()
+
+
 def read_look(prim: UsdGeom.Mesh, vertices: int, faces: int) -> tuple[NDArray[np.uint8] | None, Array | None]:
     """Return colours per vertex (V, 3) and texture coordinates of the corners (F, 3, 2); None where there are none."""
     shown = prim.GetDisplayColorPrimvar()

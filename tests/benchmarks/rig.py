@@ -28,7 +28,7 @@ from jawusd.rig import load_rig  # noqa: E402
 from jawusd.rig.onnx_sidecar import decode_model  # noqa: E402
 from jawusd.rig.sampling import sample_valid  # noqa: E402
 
-MESHES = {"geo.usdc", "actor.usdz"}  # files that hold meshes
+MESHES = {"geo.usdc", "proxy.usdc", "actor.usdz"}  # files that hold meshes
 RIG = {"actor.usda", "rig.usdc", "actor.onnx", "actor_encode.onnx", "actor_skel.usdc", "anim_capture.usdc"}
 RIG |= {"cameras.usda", "cameras_motion.usdc"}
 RECORDS = {"tracks.npz", "first_pass.npz", "model.npz", "build.json"}  # of the build; they grow with the capture

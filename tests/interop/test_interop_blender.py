@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
-from example_rig import FPS, example_meshes, example_motion, example_rig, moved, scanned_meshes
+from example_rig import FPS, example_meshes, example_motion, example_proxies, example_rig, moved, scanned_meshes
 from foreign import run_in
+from pxr import Sdf
 
 from jawusd.rig.bake import bake_rig
 from jawusd.rig.glb import write_glb
@@ -18,7 +19,8 @@ def folder(tmp_path_factory):
     """Return a baked example rig, whose scans are not quite in occlusion."""
     frames, d = example_motion()
     made = tmp_path_factory.mktemp("actor")
-    bake_rig(made, example_rig(), scanned_meshes(), name="example", fps=FPS, frames=frames, d=d)
+    options = {"name": "example", "fps": FPS, "proxies": example_proxies()}
+    bake_rig(made, example_rig(), scanned_meshes(), frames=frames, d=d, **options)
     return made
 
 
@@ -53,6 +55,20 @@ def test_glb_moves_as_the_model_does(folder, tmp_path, blender):
         places = np.array(found["frames"][str(k)])
         assert np.linalg.norm(places - expected, axis=1).max() < 1e-3
     assert found["looks"]["UpperTeethMesh"] == [1, 1] and found["looks"]["MandibleMesh"] == [0, 0]
+
+
+def test_a_selected_proxy_moves_like_the_scan(folder, tmp_path):
+    proxies, (frames, d) = example_proxies(), example_motion()
+    layer = Sdf.Layer.CreateNew(str(folder / "crowd.usda"))
+    layer.subLayerPaths.append("./anim_capture.usdc")
+    layer.defaultPrim = "Actor"
+    Sdf.CreatePrimInLayer(layer, "/Actor").variantSelections["detail"] = "proxy"
+    layer.Save()
+    found = run_in("blender45", "blender_import.py", folder / "crowd.usda", str(frames[20]), "LowerTeethMesh,SkullMesh")
+    shown = found["frames"][str(frames[20])]
+    expected = moved(example_rig().pose(d[20])[None], proxies["lower_teeth"].vertices)[0]
+    assert np.linalg.norm(np.array(shown["LowerTeethMesh"]) - expected, axis=1).max() < 0.01
+    assert np.linalg.norm(np.array(shown["SkullMesh"]) - proxies["skull"].vertices, axis=1).max() < 0.01
 
 
 @pytest.mark.parametrize("blender", ["blender45", "blender50"])

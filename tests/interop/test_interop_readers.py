@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from example_rig import FPS, example_meshes, example_motion, example_rig, scanned_meshes
+from example_rig import FPS, example_meshes, example_motion, example_proxies, example_rig, scanned_meshes
 from foreign import SCRIPTS, environment, run, run_in
 from scipy.spatial.transform import Rotation
 
@@ -26,7 +26,8 @@ def folder(tmp_path_factory):
     """Return a baked example rig."""
     frames, d = example_motion()
     made = tmp_path_factory.mktemp("actor")
-    bake_rig(made, example_rig(), scanned_meshes(), name="example", fps=FPS, frames=frames, d=d)
+    options = {"name": "example", "fps": FPS, "proxies": example_proxies()}
+    bake_rig(made, example_rig(), scanned_meshes(), frames=frames, d=d, **options)
     K = np.array([[2000.0, 0, 959.5], [0, 2000, 539.5], [0, 0, 1]])
     camera = Camera("cam0", (1920, 1080), K, np.array([-0.1, 0.02, 0, 0, 0]), make_transform(np.eye(3), [0, 0, 250]))
     heads = make_transform(np.eye(3), np.outer(np.arange(len(frames)), [0.1, 0, 0.05]))

@@ -42,6 +42,16 @@ def scanned_meshes():
     return {**meshes, "upper_teeth": Mesh(upper.vertices, upper.faces, colors, tooth_labels(upper), uv)}
 
 
+def example_proxies():
+    """Return stand-ins of fewer faces for the teeth and the skull: balls of their sizes."""
+    meshes = example_meshes()
+    out = {}
+    for name in ("skull", "upper_teeth", "lower_teeth"):
+        vertices, faces = _ball(meshes[name].vertices.mean(axis=0), np.ptp(meshes[name].vertices, axis=0) / 2)
+        out[name] = Mesh(vertices, faces, labels=(vertices[:, 1] > vertices[:, 1].mean()).astype(np.uint8))
+    return out
+
+
 def mandible_vertices():
     """Return all vertices that move with the jaw, shape (V, 3)."""
     meshes = example_meshes()
