@@ -42,13 +42,18 @@ def hide_look(prim: UsdGeom.Mesh, mesh: Mesh, below: Mesh) -> None:
 def read_look(prim: UsdGeom.Mesh, vertices: int, faces: int) -> tuple[NDArray[np.uint8] | None, Array | None]:
     """Return colours per vertex (V, 3) and texture coordinates of the corners (F, 3, 2); None where there are none."""
     shown = prim.GetDisplayColorPrimvar()
-    colors = np.array(shown.ComputeFlattened() or ()) if shown.GetInterpolation() == UsdGeom.Tokens.vertex else ()
-    places = UsdGeom.PrimvarsAPI(prim).GetPrimvar(_UV)
-    corners = np.array(places.ComputeFlattened() or ()) if places else ()
+    colors = _values(shown, (vertices, 3)) if shown.GetInterpolation() == UsdGeom.Tokens.vertex else None
+    places = _values(UsdGeom.PrimvarsAPI(prim).GetPrimvar(_UV), (3 * faces, 2))
     return (
-        srgb_from_linear(np.asarray(colors)) if np.shape(colors) == (vertices, 3) else None,
-        np.reshape(corners, (faces, 3, 2)).astype(np.float64) if np.shape(corners) == (3 * faces, 2) else None,
+        None if colors is None else srgb_from_linear(colors),
+        None if places is None else places.reshape(faces, 3, 2),
     )
+
+
+def _values(primvar: UsdGeom.Primvar, shape: tuple[int, int]) -> Array | None:
+    """Return the values of a primvar if they have a shape and are finite."""
+    found = np.array((primvar.ComputeFlattened() if primvar else None) or (), dtype=np.float64)
+    return found if found.shape == shape and np.isfinite(found).all() else None
 
 
 def linear_from_srgb(colors: NDArray[np.uint8]) -> Array:

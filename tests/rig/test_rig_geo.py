@@ -51,6 +51,17 @@ def test_colours_and_texture_coordinates_of_scans_are_kept(tmp_path):
     np.testing.assert_array_equal(read_gum(path)["upper_teeth"], painted["upper_teeth"])
 
 
+@pytest.mark.parametrize("values", [[(0.5, np.nan, 0.5)] * 258, [(0.5, 0.5, 0.5)] * 3])
+def test_colours_that_fit_no_mesh_are_left_out(tmp_path, values):
+    path = bake(tmp_path, scanned_meshes())
+    stage = Usd.Stage.Open(str(path))
+    for name, given in (("displayColor", values), ("st", [value[:2] for value in values])):
+        UsdGeom.PrimvarsAPI(stage.GetPrimAtPath("/Actor/geo/Skull/UpperTeethMesh")).GetPrimvar(name).Set(given)
+    stage.Save()
+    found = read_geometry(path)["upper_teeth"]
+    assert found.colors is None and found.uv is None
+
+
 @pytest.mark.parametrize("colors", [np.full((1, 3), 200), np.full((1, 3), [215, 45, 40])])
 def test_one_colour_all_over_says_nothing(tmp_path, colors):
     meshes = example_meshes()
