@@ -18,7 +18,7 @@ from jawusd.rig.arrays import read_arrays, read_value
 from jawusd.rig.layout import ONNX_ATTRIBUTES, PARAMETERS
 from jawusd.rig.schema import has_jaw_api
 from jawusd.rig.table import DecoderTable
-from jawusd.rig.untrusted import check_reach, raises_format_error
+from jawusd.rig.untrusted import check_composed, check_reach, raises_format_error
 from jawusd.rig.versions import upgrade_rig
 
 PathArg = str | os.PathLike[str]
@@ -57,6 +57,7 @@ def open_stage(path: PathArg) -> Usd.Stage:
         raise RigError("is not a USD file that OpenUSD can read.", path=path) from error
     if not layers or stage is None:
         raise RigError("is not a USD file that OpenUSD can read.", path=path)
+    check_composed(stage, layers)
     return stage
 
 

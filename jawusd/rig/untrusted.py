@@ -8,11 +8,23 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import ParamSpec, TypeVar
 
-from pxr import Sdf, Tf, UsdUtils
+from pxr import Sdf, Tf, Usd
 
 from jawusd.errors import FormatError, RigError
 from jawusd.formats.allowed_folders import is_allowed
+from jawusd.rig.asset_paths import (
+    asset_paths,
+    clip_templates,
+    escapes,
+    file_of,
+    has_variable_paths,
+    is_layer,
+    of_template,
+)
 from jawusd.rig.schema import SCHEMA_NAME
+
+# an asset path, the folder of the rig that it is part of, and the layer outside whose folder it lies
+_Named = tuple[str, Path | None, str | None]
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -24,6 +36,7 @@ _FAULTS = (
 # OpenUSD's text parser recurses for every bracket and ends the process when its stack overflows.
 _NESTED = re.compile(rb"(?:[(\[{]\s*){500}")
 _ALLOW = "If you trust it, allow its folder with --allow or the setting JAWUSD_ALLOW."
+_WRITE_OUT = "Write asset paths out, without expressionVariables."
 _OF_A_RIG = ("jaw:formatVersion", "jaw:model", "jaw:bounds", "jaw:decoder")
 
 
@@ -61,8 +74,9 @@ def check_reach(path: Path) -> list[Sdf.Layer]:
     Raises:
         RigError: A path that is not allowed.
     """
-    layers, seen = [], set()
-    waiting: list[tuple[str, Path | None, str | None]] = [(str(path), None, None)]
+    layers: list[Sdf.Layer] = []
+    seen = set()
+    waiting: list[_Named] = [(str(path), None, None)]
     while waiting:
         name, home, user = waiting.pop()
         if (name, home) in seen:
@@ -73,41 +87,64 @@ def check_reach(path: Path) -> list[Sdf.Layer]:
             continue
         layers.append(layer)
         if home is None and _carries_rig(layer):
-            home = _file(name).resolve().parent
+            home = file_of(name).resolve().parent
         if home is None and user is not None:
             raise RigError(f"names the file {name:.200}, outside its own folder and no rig.", path=user, hint=_ALLOW)
-        for asset in _assets(layer):
-            target = layer.ComputeAbsolutePath(asset)
-            allowed = is_allowed(_file(target))
-            inside = allowed or _file(target).resolve().is_relative_to(home or _file(name).resolve().parent)
-            if home is not None and not allowed and (escapes(asset) or not inside):
-                raise RigError(
-                    f"names the file {asset:.200}, outside its own folder.", path=layer.identifier, hint=_ALLOW
-                )
-            if asset in layer.GetCompositionAssetDependencies() or Path(asset).suffix.startswith(".usd"):
-                waiting.append((target, None if allowed else home, None if inside else layer.identifier))
+        waiting += _layers_named(layer, home)
+    if has_variable_paths(layers):
+        raise RigError("names files by variables, which any layer may set.", path=path, hint=_WRITE_OUT)
     return layers
 
 
-def escapes(asset: str) -> bool:
-    """Return whether an asset path leaves the folder of the layer that names it."""
-    parts = asset.replace("\\", "/").split("/")
-    depth = 0
-    for part in parts:
-        depth += {"..": -1, ".": 0, "": 0}.get(part, 1)
-        if depth < 0:
-            return True
-    return asset.startswith(("/", "\\")) or ":" in parts[0]
+def check_composed(stage: Usd.Stage, checked: list[Sdf.Layer]) -> None:
+    """Check that a stage holds no layers but those of `check_reach`.
+
+    Raises:
+        RigError: It holds another.
+    """
+    known = {file_of(layer.identifier).resolve() for layer in checked}
+    for layer in stage.GetUsedLayers():
+        if not layer.anonymous and file_of(layer.identifier).resolve() not in known:
+            raise RigError(
+                f"is composed of {layer.identifier:.200}, which it does not name.", path=checked[0].identifier
+            )
 
 
-def _file(name: str) -> Path:
-    """Return the file of a layer's name: that of the package for a layer inside one."""
-    return Path(name.split("[")[0])
+def _layers_named(layer: Sdf.Layer, home: Path | None) -> list[_Named]:
+    """Return the layers that a layer names, after checking all files that it names.
+
+    Args:
+        home: Folder of the rig that the layer is part of; None where it only uses rigs.
+    """
+    folder = home or file_of(layer.identifier).resolve().parent
+    templates = clip_templates(layer)
+    named: list[_Named] = []
+    for template in templates:  # first: OpenUSD lists their folders when it is asked for asset paths
+        pattern = file_of(layer.ComputeAbsolutePath(template))
+        _check_inside(layer, template, pattern, folder)
+        for file in of_template(pattern):
+            _check_inside(layer, file.name, file, folder)
+            named.append((str(file), None if is_allowed(file) else home, None))
+    composed = layer.GetCompositionAssetDependencies()
+    for asset in asset_paths(layer):
+        target = layer.ComputeAbsolutePath(asset)
+        file = file_of(target)
+        if home is not None:
+            _check_inside(layer, asset, file, folder)
+        if asset in composed or is_layer(asset):
+            inside = is_allowed(file) or file.resolve().is_relative_to(folder)
+            named.append((target, None if is_allowed(file) else home, None if inside else layer.identifier))
+    return named
+
+
+def _check_inside(layer: Sdf.Layer, asset: str, file: Path, folder: Path) -> None:
+    if not is_allowed(file) and (escapes(asset) or not file.resolve().is_relative_to(folder)):
+        raise RigError(f"names the file {asset:.200}, outside its own folder.", path=layer.identifier, hint=_ALLOW)
 
 
 def _layer(name: str) -> Sdf.Layer | None:
     """Open a layer; None if it cannot be opened, which its reader reports later."""
-    file = _file(name)
+    file = file_of(name)
     if not file.exists():
         return None
     if not file.is_file():
@@ -134,18 +171,6 @@ def _is_whole(layer: Sdf.Layer) -> bool:
 
     layer.Traverse(Sdf.Path.absoluteRootPath, visit)
     return not missing
-
-
-def _assets(layer: Sdf.Layer) -> list[str]:
-    """Return every file path in a layer: of layers, values, clips and other metadata."""
-    found: list[str] = []
-
-    def note(asset: str) -> str:
-        found.append(asset)
-        return asset
-
-    UsdUtils.ModifyAssetPaths(layer, note)
-    return [asset for asset in dict.fromkeys(found) if asset]
 
 
 def _carries_rig(layer: Sdf.Layer) -> bool:

@@ -13,8 +13,8 @@ from jawusd.evaluator import JawRig
 from jawusd.geometry import make_transform
 from jawusd.rig import describe, load_rig, write_animation
 from jawusd.rig.arrays import model_hash
+from jawusd.rig.asset_paths import escapes
 from jawusd.rig.bake import bake_rig
-from jawusd.rig.untrusted import escapes
 
 
 def edit(path, change):

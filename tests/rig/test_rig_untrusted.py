@@ -1,0 +1,133 @@
+"""Rigs from strangers: no file outside their folder is read, whatever names it."""
+
+import pytest
+from pxr import Sdf
+
+from jawusd.errors import RigError
+from jawusd.formats.allowed_folders import SETTING
+from jawusd.rig import describe
+from jawusd.rig.asset_paths import file_of
+from jawusd.rig.read import open_stage
+
+OUTSIDE = '#usda 1.0\nover "Actor" {\n    string jaw:actor = "evil"\n    double jaw:d1 = 7\n}\n'
+
+
+@pytest.fixture
+def elsewhere(tmp_path):
+    """Return a folder with layers that no rig may read."""
+    folder = tmp_path / "elsewhere"
+    folder.mkdir()
+    for name in ("evil.usda", "clip.1.usda", "clip.2.usda"):
+        (folder / name).write_text(OUTSIDE)
+    return folder
+
+
+def clips(values):
+    return f'#usda 1.0\nover "Actor" (\n    clips = {{ dictionary default = {{\n{values}\n    }} }}\n)\n{{\n}}\n'
+
+
+def named_by(how, elsewhere):
+    """Return the text of a layer that names a file elsewhere."""
+    template = f'string templateAssetPath = "{elsewhere}/clip.#.usda"\ndouble templateStartTime = 1'
+    template += "\ndouble templateEndTime = 2\ndouble templateStride = 1"
+    times = "double2[] active = [(0, 0)]\ndouble2[] times = [(0, 0), (9, 9)]"
+    arguments = "SDF_FORMAT_ARGS:a=b.c/d"
+    return {
+        "format arguments": f"#usda 1.0\n( subLayers = [@{elsewhere}/evil.usda:SDF_FORMAT_ARGS:a=b@] )\n",
+        "dotted arguments": f'#usda 1.0\nover "A" ( references = @{elsewhere}/evil.usda:{arguments}@ ) {{}}\n',
+        "expression": f"#usda 1.0\n( subLayers = [@`\"{elsewhere}/evil.usda\"`@] )\n",
+        "clip template": clips(f'{template}\nstring primPath = "/Actor"'),
+        "clips": clips(f'asset[] assetPaths = [@{elsewhere}/evil.usda@]\nstring primPath = "/Actor"\n{times}'),
+        "clip manifest": clips(
+            f'asset[] assetPaths = [@./rig.usdc@]\nasset manifestAssetPath = @{elsewhere}/evil.usda@\n'
+            f'string primPath = "/Actor"\n{times}'
+        ),
+    }[how]  # fmt: skip
+
+
+WAYS = ["format arguments", "dotted arguments", "expression", "clip template", "clips", "clip manifest"]
+
+
+@pytest.mark.parametrize("how", WAYS)
+def test_a_shot_reads_nothing_elsewhere_but_rigs(how, anchored_folder, elsewhere):
+    shot = anchored_folder / "shot.usda"
+    shot.write_text(named_by(how, elsewhere))
+    with pytest.raises(RigError, match="outside its own folder"):
+        open_stage(shot)
+
+
+@pytest.mark.parametrize("how", WAYS)
+def test_a_rig_reads_nothing_elsewhere(how, anchored_folder, elsewhere):
+    (anchored_folder / "more.usda").write_text(named_by(how, elsewhere))
+    layer = Sdf.Layer.OpenAsAnonymous(str(anchored_folder / "actor.usda"))
+    layer.subLayerPaths.insert(0, "./more.usda")
+    layer.Export(str(anchored_folder / "actor.usda"))
+    with pytest.raises(RigError, match="outside its own folder"):
+        describe(anchored_folder / "actor.usda")
+
+
+def test_clips_that_link_elsewhere_are_not_read(anchored_folder, elsewhere):
+    (anchored_folder / "clip.1.usda").symlink_to(elsewhere / "clip.1.usda")
+    text = named_by("clip template", elsewhere).replace(str(elsewhere), ".")
+    (anchored_folder / "shot.usda").write_text(text)
+    with pytest.raises(RigError, match="outside its own folder"):
+        open_stage(anchored_folder / "shot.usda")
+
+
+@pytest.mark.parametrize("how", WAYS)
+def test_folders_that_were_allowed_are_read_by_every_way(how, anchored_folder, elsewhere, monkeypatch):
+    monkeypatch.setenv(SETTING, str(elsewhere))
+    shot = anchored_folder / "shot.usda"
+    shot.write_text(named_by(how, elsewhere))
+    assert open_stage(shot)
+
+
+def test_clips_in_the_own_folder_are_read(anchored_folder, elsewhere):
+    for name in ("clip.1.usda", "clip.2.usda"):
+        (elsewhere / name).rename(anchored_folder / name)
+    shot = anchored_folder / "shot.usda"
+    shot.write_text(named_by("clip template", elsewhere).replace(str(elsewhere), "."))
+    assert open_stage(shot).GetAttributeAtPath("/Actor.jaw:d1") is not None
+
+
+def test_expressions_that_another_layer_turns_elsewhere_are_not_read(anchored_folder, elsewhere):
+    """Variables of a stronger layer decide which file an expression names."""
+    inner = '#usda 1.0\n( expressionVariables = { string X = "./rig.usdc" }\n subLayers = [@`"${X}"`@] )\n'
+    (anchored_folder / "inner.usda").write_text(inner)
+    shot = anchored_folder / "shot.usda"
+    variables = f'expressionVariables = {{ string X = "{elsewhere}/evil.usda" }}'
+    shot.write_text(f"#usda 1.0\n( {variables}\n subLayers = [@./inner.usda@] )\n")
+    with pytest.raises(RigError, match="outside its own folder|by variables"):
+        open_stage(shot)
+
+
+def test_variables_without_expressions_for_paths_are_read(anchored_folder):
+    shot = anchored_folder / "shot.usda"
+    shot.write_text('#usda 1.0\n( expressionVariables = { string SHOT = "010" }\n subLayers = [@./actor.usda@] )\n')
+    assert describe(shot)
+
+
+def test_files_of_package_paths():
+    """The package that OpenUSD opens, and of folders with brackets in their names the file itself."""
+    wanted = {
+        "/a/rig.usdz[actor.usda]": "/a/rig.usdz",
+        "/a/rig.usdz[in.usdz[actor.usda]]": "/a/rig.usdz",
+        "/a/x[1]/rig.usdz[actor.usda]": "/a/x[1]/rig.usdz",
+        "/a/x[1]/actor.usda": "/a/x[1]/actor.usda",
+        "/a/link.usdz[1]/evil.usda": "/a/link.usdz[1]/evil.usda",
+        "/a/actor.usda:SDF_FORMAT_ARGS:b=c": "/a/actor.usda",
+    }
+    assert {name: str(file_of(name)) for name in wanted} == wanted
+
+
+@pytest.mark.parametrize("name", ["x[1]", "x[", "x]", "rig.usdz[1]"])
+def test_rigs_in_folders_of_any_name_are_read(name, anchored_folder, tmp_path):
+    folder = anchored_folder.rename(tmp_path / name)
+    assert describe(folder / "actor.usda") and describe(folder / "actor.usdz")
+
+
+def test_links_in_folders_named_like_packages_are_not_read(anchored_folder, elsewhere):
+    (anchored_folder / "a.usdz[1]").symlink_to(elsewhere)
+    (anchored_folder / "shot.usda").write_text("#usda 1.0\n( subLayers = [@./a.usdz[1]/evil.usda@] )\n")
+    with pytest.raises(RigError, match="outside its own folder"):
+        open_stage(anchored_folder / "shot.usda")
