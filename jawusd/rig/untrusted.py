@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import ParamSpec, TypeVar
@@ -21,6 +20,7 @@ from jawusd.rig.asset_paths import (
     is_layer,
     of_template,
 )
+from jawusd.rig.nesting import MOST_LEVELS, is_too_deep
 from jawusd.rig.schema import SCHEMA_NAME
 
 # an asset path, the folder of the rig that it is part of, and the layer outside whose folder it lies
@@ -33,9 +33,8 @@ R = TypeVar("R")
 _FAULTS = (
     ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError, Tf.ErrorException,
 )  # fmt: skip
-# OpenUSD's text parser recurses for every bracket and ends the process when its stack overflows.
-_NESTED = re.compile(rb"(?:[(\[{]\s*){500}")
 _ALLOW = "If you trust it, allow its folder with --allow or the setting JAWUSD_ALLOW."
+_TOO_DEEP = f"is nested too deeply, at most {MOST_LEVELS} levels are read."
 _WRITE_OUT = "Write asset paths out, without expressionVariables."
 _OF_A_RIG = ("jaw:formatVersion", "jaw:model", "jaw:bounds", "jaw:decoder")
 
@@ -149,8 +148,8 @@ def _layer(name: str) -> Sdf.Layer | None:
         return None
     if not file.is_file():
         raise RigError("is not a file.", path=file)
-    if _NESTED.search(file.read_bytes()):
-        raise RigError("is nested too deeply.", path=file)
+    if is_too_deep(file):
+        raise RigError(_TOO_DEEP, path=file)
     try:
         layer = Sdf.Layer.FindOrOpen(name)
     except Tf.ErrorException:
@@ -161,10 +160,16 @@ def _layer(name: str) -> Sdf.Layer | None:
 
 
 def _is_whole(layer: Sdf.Layer) -> bool:
-    """Return whether a layer holds all prims and properties it names; OpenUSD ends the process where it does not."""
+    """Return whether a layer holds all prims and properties it names; OpenUSD ends the process where it does not.
+
+    Raises:
+        RigError: A prim lies too deep.
+    """
     missing = []
 
     def visit(path: Sdf.Path) -> None:
+        if path.pathElementCount > MOST_LEVELS:
+            raise RigError(_TOO_DEEP, path=layer.identifier)
         named = path.IsPropertyPath() or path.IsPrimPath() or path.IsPrimVariantSelectionPath()
         if path.isEmpty or (named and not layer.GetObjectAtPath(path)):
             missing.append(path)
