@@ -14,6 +14,7 @@ from jawusd.evaluator import JawRig
 from jawusd.formats.mesh import Mesh
 from jawusd.rig.animation import write_animation
 from jawusd.rig.author import decoder_layer, interface_layer, record_sidecars
+from jawusd.rig.checksums import record_checksums
 from jawusd.rig.detail import proxy_layer
 from jawusd.rig.geo import build_geometry, check_meshes
 from jawusd.rig.layers import write_layer
@@ -95,6 +96,7 @@ def bake_rig(
     ]
     interface = interface_layer(rig, name, meshes, fps, proxies=bool(proxies))
     record_sidecars(interface, folder)
+    record_checksums(interface, folder, [path.name for path in written if path.suffix == ".usdc"])
     written.append(write_layer(interface, folder / ACTOR_FILE))
     shown = folder / ACTOR_FILE
     if frames is not None and d is not None:

@@ -9,6 +9,7 @@ from pxr import Gf, Sdf, Usd, UsdUtils
 
 from jawusd.errors import RigError
 from jawusd.formats.atomic import atomic_path, scratch_folder
+from jawusd.rig.checksums import CHECKSUMS
 from jawusd.rig.layout import ACTOR, MANDIBLE, ONNX_ATTRIBUTES
 from jawusd.rig.read import open_stage
 
@@ -44,6 +45,7 @@ def write_package(out: str | os.PathLike[str], source: str | os.PathLike[str]) -
 
 def _flattened(stage: Usd.Stage) -> Sdf.Layer:
     layer = stage.Flatten(addSourceFileComment=False)
+    layer.customLayerData = {key: value for key, value in layer.customLayerData.items() if key != CHECKSUMS}
     actor = layer.GetPrimAtPath(ACTOR)
     for prop in actor.properties:
         # flattening drops `custom` where the schema is known, and Blender imports no other attribute

@@ -11,6 +11,7 @@ from pxr import Sdf, UsdUtils
 
 from jawusd.errors import RigError
 from jawusd.formats.atomic import atomic_path
+from jawusd.rig.checksums import record_checksums
 from jawusd.rig.layers import write_layer
 from jawusd.rig.layout import ACTOR_FILE, ENCODE_FILE, GEO_FILE, ONNX_FILE, PACKAGE_FILE, PROXY_FILE, RIG_FILE
 from jawusd.rig.package import write_package
@@ -77,4 +78,6 @@ def _copy(source: Path, target: Path, names: dict[str, str]) -> Path:
         return f"./{names[parts[0]]}" if len(parts) == 1 and parts[0] in names else asset
 
     UsdUtils.ModifyAssetPaths(layer, renamed)
+    if source.name == ACTOR_FILE:
+        record_checksums(layer, target.parent, [names[name] for name in (GEO_FILE, PROXY_FILE, RIG_FILE) if name in names])
     return write_layer(layer, target)

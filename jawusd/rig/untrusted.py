@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import ParamSpec, TypeVar
 
@@ -20,6 +20,7 @@ from jawusd.rig.asset_paths import (
     is_layer,
     of_template,
 )
+from jawusd.rig.checksums import check_checksum, recorded_checksums
 from jawusd.rig.nesting import MOST_LEVELS, is_too_deep
 from jawusd.rig.schema import SCHEMA_NAME
 
@@ -71,20 +72,22 @@ def check_reach(path: Path) -> list[Sdf.Layer]:
         The layers, which stay loaded as long as they are referenced.
 
     Raises:
-        RigError: A path that is not allowed.
+        RigError: A path that is not allowed, or a layer that is damaged.
     """
     layers: list[Sdf.Layer] = []
     seen = set()
+    sums: dict[Path, str] = {}
     waiting: list[_Named] = [(str(path), None, None)]
     while waiting:
         name, home, user = waiting.pop()
         if (name, home) in seen:
             continue
         seen.add((name, home))
-        layer = _layer(name)
+        layer = _layer(name, sums)
         if layer is None:
             continue
         layers.append(layer)
+        sums |= recorded_checksums(layer)
         if home is None and _carries_rig(layer):
             home = file_of(name).resolve().parent
         if home is None and user is not None:
@@ -141,8 +144,12 @@ def _check_inside(layer: Sdf.Layer, asset: str, file: Path, folder: Path) -> Non
         raise RigError(f"names the file {asset:.200}, outside its own folder.", path=layer.identifier, hint=_ALLOW)
 
 
-def _layer(name: str) -> Sdf.Layer | None:
-    """Open a layer; None if it cannot be opened, which its reader reports later."""
+def _layer(name: str, sums: Mapping[Path, str]) -> Sdf.Layer | None:
+    """Open a layer, after comparing its file with the checksum that a rig has for it; None if there is no such file.
+
+    Raises:
+        RigError: It is damaged, or no layer.
+    """
     file = file_of(name)
     if not file.exists():
         return None
@@ -150,10 +157,12 @@ def _layer(name: str) -> Sdf.Layer | None:
         raise RigError("is not a file.", path=file)
     if is_too_deep(file):
         raise RigError(_TOO_DEEP, path=file)
+    if (wanted := sums.get(file.resolve())) is not None:
+        check_checksum(file, wanted)
     try:
         layer = Sdf.Layer.FindOrOpen(name)
-    except Tf.ErrorException:
-        return None
+    except Tf.ErrorException as error:
+        raise RigError("is not a USD file that OpenUSD can read.", path=file) from error
     if layer is not None and not _is_whole(layer):
         raise RigError("is damaged: it names prims or properties that it does not hold.", path=file)
     return layer

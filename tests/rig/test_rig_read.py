@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from example_model import example_arrays, example_meta, joint_arrays, moving_arrays, touching_arrays
-from example_rig import FPS, assert_valid_usd, example_meshes, example_motion, example_rig, moved
+from example_rig import FPS, assert_valid_usd, example_meshes, example_motion, example_rig, forget_checksums, moved
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 from scipy.spatial.transform import Rotation
 
@@ -22,6 +22,8 @@ def edit(path, change):
     layer = Sdf.Layer.OpenAsAnonymous(str(path))
     change(layer)
     layer.Export(str(path))
+    if path.suffix == ".usdc":
+        forget_checksums(path.parent)
 
 
 def set_value(name, value):

@@ -3,7 +3,7 @@
 import numpy as np
 import onnx
 import pytest
-from example_rig import assert_valid_usd, example_rig
+from example_rig import assert_valid_usd, example_rig, forget_checksums
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdValidation, Vt
 
 from jawusd.evaluator import JawRig
@@ -16,6 +16,8 @@ def edit(path, change):
     layer = Sdf.Layer.OpenAsAnonymous(str(path))
     change(layer)
     layer.Export(str(path))
+    if path.suffix == ".usdc":
+        forget_checksums(path.parent)
 
 
 def set_value(name, value):

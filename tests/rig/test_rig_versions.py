@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from example_rig import example_rig
+from example_rig import example_rig, forget_checksums
 from pxr import Sdf, Usd
 
 from jawusd.errors import VersionError
@@ -22,6 +22,7 @@ def older(anchored_folder, monkeypatch):
         layer = Sdf.Layer.OpenAsAnonymous(str(anchored_folder / file))
         change(layer)
         layer.Export(str(anchored_folder / file))
+    forget_checksums(anchored_folder)
 
     def step(prim):
         error = prim.CreateAttribute(NEW_NAME, Sdf.ValueTypeNames.Double)

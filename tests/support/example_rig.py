@@ -108,3 +108,12 @@ def _painted(mesh):
     colors[height.reshape(-1) > -1.0] = (200, 40, 40)
     colors[height.reshape(-1) > 3.0] = (40, 200, 40)
     return Mesh(mesh.vertices, mesh.faces, colors)
+
+
+def forget_checksums(folder):
+    """Make a rig one whose layers may be changed, as rigs were before they had checksums."""
+    from pxr import Sdf
+
+    layer = Sdf.Layer.OpenAsAnonymous(str(folder / "actor.usda"))
+    layer.customLayerData = {"creator": "an older jawusd"}
+    layer.Export(str(folder / "actor.usda"))

@@ -1,7 +1,7 @@
 """Valid rigs of both kinds, and what reads them."""
 
 import numpy as np
-from example_rig import example_meshes, example_motion, example_rig
+from example_rig import example_meshes, example_motion, example_rig, forget_checksums
 
 
 def write_rig(folder, kind):
@@ -10,6 +10,7 @@ def write_rig(folder, kind):
 
     frames, d = example_motion(8)
     bake_rig(folder, example_rig(kind), example_meshes(), name="a", fps=24.0, frames=frames, d=d, table_size=17)
+    forget_checksums(folder)  # damage shall reach the readers
     for name in ("anim.usda", "anim.usdc"):
         write_animation(folder / name, folder / "actor.usda", frames, d, 24.0)
     return folder
