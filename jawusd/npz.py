@@ -15,6 +15,7 @@ import numpy as np
 
 from jawusd.errors import FormatError, UnitsError, VersionError
 from jawusd.geometry.arrays import Array
+from jawusd.inputs import check_input
 
 UNITS = {"length": "mm", "angle": "rad"}
 TWIST_ORDER = ["omega", "v"]
@@ -45,6 +46,7 @@ def read_npz(path: str | os.PathLike[str], family: str, version: int) -> tuple[N
         UnitsError: other units or twist order.
     """
     path = Path(path)
+    check_input(path)
     arrays: NamedArrays = {}
     try:
         with zipfile.ZipFile(path) as archive:

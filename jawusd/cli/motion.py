@@ -18,6 +18,7 @@ from jawusd.formats.keys import FARTHEST_FRAME, MOST_FRAMES, Key, Keys, load_key
 from jawusd.formats.poses import read_parameters, read_poses, table_columns
 from jawusd.formats.tracks import load_tracks
 from jawusd.geometry.arrays import Array, Mask
+from jawusd.inputs import check_input
 
 if TYPE_CHECKING:
     from jawusd.evaluator import JawRig
@@ -57,6 +58,7 @@ def read_motion(rig: JawRig, source: Path) -> AuthoredMotion:
     Raises:
         FormatError: not such a file.
     """
+    check_input(source)
     if source.suffix.lower() == ".json" and source.read_bytes().lstrip()[:1] == b"{":
         keys = load_keys(source)
         key_frames, key_d = keys.arrays()

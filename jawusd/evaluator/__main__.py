@@ -24,6 +24,7 @@ from jawusd.errors import FormatError, JawusdError
 from jawusd.evaluator.files import load
 from jawusd.evaluator.rig import JawRig
 from jawusd.geometry.arrays import Array
+from jawusd.inputs import check_input
 
 _MATRIX_COLUMNS = [f"m{row}{column}" for row in range(4) for column in range(4)]
 
@@ -150,6 +151,7 @@ def _read_poses(path: Path) -> tuple[list[int], Array]:
         FormatError: not such a table, or a cell that is not a number.
     """
     try:
+        check_input(path)
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError as error:
         raise FormatError("there is no such file.", path=path) from error

@@ -20,6 +20,7 @@ from jawusd.errors import CalibrationError
 from jawusd.formats.calibration import load_calibration
 from jawusd.geometry import Camera, make_transform, matrix_from_wxyz, rigidity_defect, se3_inverse
 from jawusd.geometry.arrays import Array
+from jawusd.inputs import check_input
 
 _COLMAP = ("cameras.txt", "images.txt")
 _HALF_PX = 0.5
@@ -137,6 +138,7 @@ def load_nerfstudio(path: str | os.PathLike[str]) -> list[Camera]:
 
 def _rows(path: Path, every: int = 1) -> list[list[str]]:
     """Return the words of every n-th line; an image's second line lists its points and may be empty."""
+    check_input(path, CalibrationError)
     try:
         if path.stat().st_size > _MAX_BYTES:
             raise CalibrationError(f"is {path.stat().st_size} bytes, at most {_MAX_BYTES} are read.", path=path)
@@ -230,6 +232,7 @@ def _add(cameras: dict[str, Camera], camera: Camera, path: Path) -> None:
 
 
 def _json(path: Path) -> dict[str, object]:
+    check_input(path, CalibrationError)
     try:
         if path.stat().st_size > _MAX_BYTES:
             raise CalibrationError(f"is {path.stat().st_size} bytes, at most {_MAX_BYTES} are read.", path=path)

@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from jawusd.errors import FormatError, OutputError
 from jawusd.formats.atomic import write_bytes_atomic
 from jawusd.formats.capture import Bootstrap
+from jawusd.inputs import check_input
 
 _TABLE = "bootstrap"
 
@@ -25,6 +26,7 @@ def write_bootstrap(path: str | os.PathLike[str], picks: Bootstrap, expected: Bo
             safely, or the file cannot be written. Nothing has changed then.
     """
     path = Path(path).resolve()  # a link stays a link
+    check_input(path)
     try:
         text = path.read_bytes().decode("utf-8")
         found = tomllib.loads(text).get(_TABLE)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.formats.atomic import write_npz_atomic
+from jawusd.formats.header import ModelHeader, check_header
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.npz import TWIST_ORDER, UNITS, read_npz, take, upgraded_model
 
@@ -54,11 +55,12 @@ def load_model(path: str | os.PathLike[str]) -> JawModel:
     """Read a model.
 
     Raises:
-        FormatError: not a model file, or wrong shapes.
+        FormatError: not a model file, wrong shapes, or a header whose values have other types.
         VersionError: written by a newer version.
         UnitsError: other units or twist order.
     """
     arrays, meta = read_npz(path, FAMILY, VERSION)
+    check_header(meta, ModelHeader, path)
     arrays = upgraded_model(arrays, path)
     frames = take(arrays, "captured_frames", (None,), path)
     count = len(frames)

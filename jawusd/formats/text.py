@@ -8,6 +8,7 @@ import tomllib
 from pathlib import Path
 
 from jawusd.errors import FormatError
+from jawusd.inputs import check_input
 
 _MOST_TOML_BYTES = 4 << 20
 
@@ -16,8 +17,9 @@ def read_text(path: Path, most_bytes: int, encoding: str = "utf-8") -> str:
     """Return what a text file holds; the encoding "utf-8-sig" drops the byte order mark that spreadsheets write.
 
     Raises:
-        FormatError: missing, too large or not UTF-8.
+        FormatError: missing, no file, too large or not UTF-8.
     """
+    check_input(path)
     try:
         size = path.stat().st_size
         if size > most_bytes:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from jawusd.errors import FormatError
 from jawusd.formats.atomic import write_npz_atomic
+from jawusd.formats.header import TracksHeader, check_header
 from jawusd.formats.solved import SolvedJaw, take_solved
 from jawusd.geometry import LANDMARKS, rigidity_defect
 from jawusd.geometry.arrays import Array, Mask
@@ -263,6 +264,7 @@ def load_tracks(path: str | os.PathLike[str]) -> Tracks:
     limit = meta.pop("margin_limit_mm", None)  # of older files: the smallest margin, which is below zero
     if isinstance(limit, float):
         meta["tolerance_mm"] = -limit
+    check_header(meta, TracksHeader, path)
     names = meta.get("camera_names")
     if not isinstance(names, list) or not all(isinstance(n, str) for n in names):
         raise FormatError('"meta" has no list "camera_names".', path=path)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.errors import CaptureError
+from jawusd.inputs import check_input
 
 
 class Sound(NamedTuple):
@@ -28,6 +29,7 @@ def read_sound(path: str | os.PathLike[str], rate_hz: int) -> Sound | None:
     """
     parts: list[NDArray[np.float32]] = []
     start_s = 0.0
+    check_input(path, CaptureError)
     try:
         with av.open(os.fspath(path), metadata_errors="replace") as container:
             if not container.streams.audio:

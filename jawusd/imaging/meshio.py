@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from jawusd.errors import CaptureError, explain_missing_packages
 from jawusd.formats.mesh import Mesh, tooth_labels
 from jawusd.geometry.arrays import Array
+from jawusd.inputs import check_input
 
 # People who read scans with this module label them next; scripts outside the package import both from here.
 __all__ = ["Winding", "load_mesh", "tooth_labels", "winding"]
@@ -39,6 +40,7 @@ def load_mesh(path: str | os.PathLike[str], kind: Literal["scan", "bone"] = "sca
         MissingDependencyError: the mesh is a DCM file and open3sdcm is not installed.
     """
     path = Path(path)
+    check_input(path, CaptureError)
     if path.suffix.lower() not in _KINDS:
         raise CaptureError(f"meshes are read from {', '.join(_KINDS)} files.", path=path, hint="Convert the mesh.")
     if path.suffix.lower() == ".dcm":

@@ -9,6 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from jawusd.errors import CaptureError
+from jawusd.inputs import check_input
+
 RawPicture = NDArray[np.uint8] | NDArray[np.uint16]
 
 _PNG = b"\x89PNG\r\n\x1a\n"
@@ -18,6 +21,7 @@ _MOST_PX = 1 << 27  # four times 8K; a few bytes can declare a picture that fill
 def read_picture(path: Path, flags: int) -> NDArray[np.uint8] | NDArray[np.uint16] | None:
     """Return a picture, or None where the file is none that can be decoded."""
     try:
+        check_input(path, CaptureError)
         with open(path, "rb") as file:
             head = file.read(24)
         if head.startswith(_PNG) and int.from_bytes(head[16:20]) * int.from_bytes(head[20:24]) > _MOST_PX:
@@ -26,7 +30,7 @@ def read_picture(path: Path, flags: int) -> NDArray[np.uint8] | NDArray[np.uint1
         if image is None or image.dtype == np.uint8:
             return None if image is None else np.asarray(image, np.uint8)
         return np.asarray(image, np.uint16)
-    except (OSError, cv2.error, MemoryError):
+    except (OSError, cv2.error, MemoryError, CaptureError):
         return None
 
 

@@ -14,6 +14,7 @@ from typing import Generic, TypeVar
 
 from jawusd.errors import FormatError, OutputError
 from jawusd.formats.atomic import clear_unfinished, write_text_atomic
+from jawusd.inputs import check_input
 from jawusd.npz import check_format
 
 FAMILY, VERSION = "jawusd-build", 1
@@ -36,6 +37,7 @@ def hash_files(paths: Iterable[Path]) -> str:
     """Return the SHA-256 of files' names and contents, in the given order; raises OSError for an unreadable file."""
     total = hashlib.sha256()
     for path in paths:
+        check_input(path)
         total.update(path.name.encode() + b"\0")
         with open(path, "rb") as handle:
             while chunk := handle.read(_CHUNK_BYTES):

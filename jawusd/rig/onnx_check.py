@@ -13,6 +13,7 @@ from onnx.reference import ReferenceEvaluator
 from jawusd.errors import FormatError, JawusdError
 from jawusd.evaluator import JawRig
 from jawusd.geometry.arrays import Array
+from jawusd.inputs import check_input
 from jawusd.rig.arrays import model_hash
 from jawusd.rig.onnx_graph import float_type
 from jawusd.rig.onnx_sidecar import FORMAT
@@ -58,6 +59,7 @@ def _error_mm(model: onnx.ModelProto, rig: JawRig, d: Array) -> float:
 
 
 def _load(path: str | os.PathLike[str], rig: JawRig, recorded: str | None) -> onnx.ModelProto:
+    check_input(path)
     try:
         content = Path(path).read_bytes()
     except OSError as error:

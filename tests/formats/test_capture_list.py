@@ -47,6 +47,6 @@ def test_a_wrong_line_is_one_clear_error(tmp_path, text, words):
 
 def test_a_list_that_is_no_text_or_not_there_is_one_clear_error(tmp_path):
     (tmp_path / "b").write_bytes(b"\xff\xfe\x00")
-    for name, words in (("b", "UTF-8"), ("c", "no such file"), (".", "cannot be read")):
+    for name, words in (("b", "UTF-8"), ("c", "no such file"), (".", "is not a file")):
         with pytest.raises(FormatError, match=words):
             load_capture_list(tmp_path / name)
