@@ -1,8 +1,9 @@
-"""Files to read are files: pipes that nobody writes to and devices would be waited for, or read, for ever."""
+"""Which paths can be used: files to read are files, and OpenUSD follows no names with control characters."""
 
 from __future__ import annotations
 
 import os
+import unicodedata
 from pathlib import Path
 
 from jawusd.errors import FormatError, JawusdError
@@ -10,6 +11,8 @@ from jawusd.errors import FormatError, JawusdError
 
 def check_input(path: str | os.PathLike[str], error: type[JawusdError] = FormatError) -> None:
     """Check that something to read is a file. What is missing is left to its reader, which says so.
+
+    Pipes that nobody writes to would be waited for, and devices read, for ever.
 
     Pipes without a name are allowed: shells hand over what another program writes in that way.
 
@@ -23,3 +26,17 @@ def check_input(path: str | os.PathLike[str], error: type[JawusdError] = FormatE
         return
     if wrong:
         raise error("is not a file.", path=path)
+
+
+def check_path(path: str | os.PathLike[str], error: type[JawusdError]) -> None:
+    """Check that OpenUSD can follow a path: it allows no line breaks and other control characters.
+
+    Raises:
+        JawusdError: of the given class; it cannot.
+    """
+    if any(unicodedata.category(letter) == "Cc" for letter in os.path.abspath(path)):
+        raise error(
+            "a line break or another control character is in the path; OpenUSD cannot follow it.",
+            path=path,
+            hint="Rename the folder, or name another one.",
+        )

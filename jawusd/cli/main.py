@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import sys
 
 import typer
@@ -19,7 +21,7 @@ from jawusd.cli import (
     solve_commands,
     stage_commands,
 )
-from jawusd.errors import JawusdError, explain_missing_packages
+from jawusd.errors import JawusdError, OutputError, explain_missing_packages
 
 app = typer.Typer(
     name="jawusd",
@@ -90,3 +92,23 @@ def main() -> None:
         # The reader of the pipe (head, less) has closed it.
         sys.stderr.close()
         sys.exit(0)
+    except (OSError, RuntimeError) as error:
+        sys.exit(_unwritable(error))
+
+
+def _unwritable(error: OSError | RuntimeError) -> int:
+    """Print what no command reports by itself, a full disk behind `>` or a name no file can have; return the exit code.
+
+    Raises:
+        RuntimeError: the error is another one.
+    """
+    if isinstance(error, OSError):
+        message = f"{str(error.filename or 'the output'):.200}: {error.strerror or error}."
+    elif str(error).startswith("Symlink loop"):  # Path.resolve
+        message = f"{error}."
+    else:
+        raise error
+    typer.echo(f"jawusd: {message}", err=True)
+    with contextlib.suppress(OSError):  # what could not be printed would be tried again at the end
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return OutputError.exit_code

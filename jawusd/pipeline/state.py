@@ -14,7 +14,7 @@ from typing import Generic, TypeVar
 
 from jawusd.errors import FormatError, OutputError
 from jawusd.formats.atomic import clear_unfinished, write_text_atomic
-from jawusd.inputs import check_input
+from jawusd.inputs import check_input, check_path
 from jawusd.npz import check_format
 
 FAMILY, VERSION = "jawusd-build", 1
@@ -134,8 +134,9 @@ def make_folder(path: Path) -> None:
     """Make a folder that may exist.
 
     Raises:
-        OutputError: it cannot be made.
+        OutputError: it cannot be made, or OpenUSD could not follow its path.
     """
+    check_path(path, OutputError)
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:

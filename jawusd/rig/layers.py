@@ -13,6 +13,7 @@ from jawusd import __version__
 from jawusd.errors import OutputError, RigError
 from jawusd.formats.atomic import atomic_path
 from jawusd.geometry.arrays import Array
+from jawusd.inputs import check_path
 from jawusd.rig import _gf
 from jawusd.rig.layout import ACTOR
 from jawusd.rig.schema import SCHEMA_NAME
@@ -115,9 +116,10 @@ def write_layer(layer: Sdf.Layer, path: Path) -> Path:
     """Write a layer to a file atomically; a copy of that file already open in this process is reloaded.
 
     Raises:
-        OutputError: The file cannot be written.
+        OutputError: The file cannot be written, or OpenUSD could not follow its path.
     """
     path = Path(path)
+    check_path(path, OutputError)
     with atomic_path(path) as temporary:
         try:
             written = layer.Export(str(temporary))

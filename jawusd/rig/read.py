@@ -14,6 +14,7 @@ from pxr import Sdf, Tf, Usd, UsdGeom
 from jawusd.errors import EvaluatorError, FormatError, RigError, UnitsError
 from jawusd.evaluator import JawRig
 from jawusd.geometry.arrays import Array
+from jawusd.inputs import check_path
 from jawusd.rig.arrays import read_arrays, read_value
 from jawusd.rig.layout import ONNX_ATTRIBUTES, PARAMETERS
 from jawusd.rig.schema import has_jaw_api
@@ -50,6 +51,7 @@ def open_stage(path: PathArg) -> Usd.Stage:
     path = Path(path)
     if not path.is_file():
         raise RigError("there is no such file.", path=path)
+    check_path(path, RigError)
     try:
         layers = check_reach(path)
         stage = Usd.Stage.Open(str(path))

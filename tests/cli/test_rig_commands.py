@@ -3,12 +3,14 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 from example_rig import FPS, example_meshes, example_motion, example_rig, mandible_vertices, moved
 from example_tracks import make_tracks
 from key_sets import own_curve
+from package_copy import ROOT
 from pxr import Usd, UsdGeom
 
 import jawusd
@@ -367,6 +369,29 @@ def test_bad_input_is_one_clear_error(actor, tmp_path, arguments, code, words):
     (tmp_path / "bad.json").write_text(json.dumps({"fps": 24, "keys": [key, key]}))
     text = run(*(a.format(actor=actor, tmp=tmp_path) for a in arguments), code=code)
     assert words in text
+
+
+@pytest.mark.parametrize("command", ["encode", "publish", "animate", "build"])
+@pytest.mark.parametrize("out", ["circle/x", "n" * 300, "a\nb/x"])
+def test_names_that_no_file_can_have_are_one_line(command, out, actor, tmp_path):
+    (tmp_path / "circle").symlink_to("circle")
+    given = {"publish": [actor.parent], "build": [ROOT / "examples" / "capture"]}
+    given = given.get(command, [actor, actor.parent / "anim_capture.usdc"])
+    line = [sys.executable, "-m", "jawusd", command, *map(str, given), "-o", str(tmp_path / out)]
+    done = subprocess.run(line, capture_output=True, text=True, timeout=120, check=False)
+    assert "Traceback" not in done.stderr
+    if command != "encode" or "\n" not in out:  # a table may lie anywhere
+        assert done.returncode >= 2 and "jawusd: " in done.stderr
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
+@pytest.mark.parametrize("arguments", [["pose", "--d", "5", "0", "0"], ["info", "--json"]])
+def test_a_full_disk_behind_the_output_is_one_line(arguments, actor):
+    line = [sys.executable, "-m", "jawusd", arguments[0], str(actor), *arguments[1:]]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(line, stdout=full, stderr=subprocess.PIPE, text=True, timeout=120, check=False)
+    assert done.returncode == 10
+    assert done.stderr.splitlines() == ["jawusd: the output: No space left on device."]
 
 
 def test_a_rig_of_a_newer_version_is_refused(actor, tmp_path):

@@ -126,6 +126,12 @@ def test_rigs_in_folders_of_any_name_are_read(name, anchored_folder, tmp_path):
     assert describe(folder / "actor.usda") and describe(folder / "actor.usdz")
 
 
+def test_rigs_in_folders_that_openusd_cannot_follow_say_so(anchored_folder, tmp_path):
+    folder = anchored_folder.rename(tmp_path / "a\nb")
+    with pytest.raises(RigError, match="line break"):
+        describe(folder / "actor.usda")
+
+
 def test_links_in_folders_named_like_packages_are_not_read(anchored_folder, elsewhere):
     (anchored_folder / "a.usdz[1]").symlink_to(elsewhere)
     (anchored_folder / "shot.usda").write_text("#usda 1.0\n( subLayers = [@./a.usdz[1]/evil.usda@] )\n")
