@@ -32,6 +32,37 @@ _HEAD_START_S = 0.5
 _SHOW_EVERY_S = 0.1  # poses that come live
 
 
+class _OneLine(logging.Filter):
+    """Report a connection that ended by an error in one line: any program may send bytes that mean nothing."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Replace a traceback by the error's name; keep every record."""
+        if record.exc_info and record.exc_info[1] is not None:
+            log.debug("a connection ended by an error", exc_info=record.exc_info)
+            record.msg, record.args = (
+                "a page was disconnected, it sent what cannot be read (%s)",
+                (_words(record.exc_info[1]),),
+            )
+            record.exc_info = record.exc_text = None
+        return True
+
+
+_ONE_LINE = _OneLine()
+
+
+def _report_task(loop: asyncio.AbstractEventLoop, context: dict[str, object]) -> None:
+    """Report in one line that a message of a page could not be followed."""
+    error = context.get("exception")
+    log.warning("a message of a page could not be followed (%s)", _words(error or context.get("message")))
+    if isinstance(error, BaseException):
+        log.debug("its error", exc_info=error)
+
+
+def _words(error: object) -> str:
+    text = " ".join(str(error).split())
+    return f"{type(error).__name__}: {text:.100}" if isinstance(error, BaseException) else f"{text:.100}"
+
+
 class _LocalServer(viser.ViserServer):
     """A viser server that opens no public tunnel, which any page could request."""
 
@@ -60,6 +91,8 @@ class PageServer(ABC):
         _check_address(host)
         with contextlib.redirect_stdout(sys.stderr):  # viser prints a greeting; stdout is for results
             self._server = _LocalServer(host=host, port=port, label=name, verbose=False)
+        logging.getLogger("websockets.server").addFilter(_ONE_LINE)  # adding it again changes nothing
+        self._server.get_event_loop().set_exception_handler(_report_task)
         set_theme(self._server.gui)
         self._server.on_client_connect(self._welcome)
         self._server.on_client_disconnect(self._farewell)

@@ -1,8 +1,11 @@
 """Who may look: addresses, foreign pages, and a warning when the world is let in."""
 
+import contextlib
+import logging
 import signal
 import subprocess
 import sys
+import time
 
 import pytest
 
@@ -74,3 +77,46 @@ def test_listening_to_the_world_is_warned_about(folder):
     line, _, errors, code = run_view(folder, "--host", "0.0.0.0")
     assert line.startswith("http://0.0.0.0:") and code == 0
     assert "warning: listening on 0.0.0.0" in errors
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        b"garbage",
+        "text",
+        b"",
+        b"\x81\xa4type\xa4Nope",
+        b"\x92\x01\x02",
+        b"\x05",
+        b"\x81\xa4type\xb0GuiUpdateMessage",
+        b"\x83\xa4type\xb0GuiUpdateMessage\xa4uuid\xa1x\xa7updates\x05",
+    ],
+)
+def test_messages_that_mean_nothing_are_one_line(message, viewer, caplog):
+    import viser
+    from websockets.exceptions import ConnectionClosed
+    from websockets.sync.client import connect
+
+    address = viewer.url.replace("http", "ws")
+    protocol = f"viser-v{viser.__version__}"
+    with connect(address, subprotocols=[protocol], origin=viewer.url, max_size=None) as page:
+        page.send(message)
+        with contextlib.suppress(ConnectionClosed, TimeoutError):
+            while True:
+                page.recv(timeout=3)
+    assert all(record.exc_info is None for record in caplog.records if record.levelno > logging.DEBUG)
+    assert all("\n" not in record.getMessage() for record in caplog.records)
+    with connect(address, subprotocols=[protocol], origin=viewer.url, max_size=None) as page:
+        assert page.recv(timeout=20)  # others are served as before
+
+
+def test_tasks_that_fail_are_one_line(viewer, caplog):
+    loop = viewer._server.get_event_loop()
+    error = KeyError("a\nb")
+    loop.call_soon_threadsafe(loop.call_exception_handler, {"message": "Task exception", "exception": error})
+    for _ in range(100):
+        if caplog.records:
+            break
+        time.sleep(0.05)
+    (record,) = [record for record in caplog.records if record.levelno >= logging.WARNING]
+    assert "could not be followed" in record.getMessage() and record.exc_info is None
