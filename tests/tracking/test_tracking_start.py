@@ -116,13 +116,14 @@ def test_two_cameras_are_enough(pictures, short_search):
 
 
 def test_masks_of_something_else_are_refused_with_what_was_tried(tmp_path, short_search, monkeypatch):
-    monkeypatch.setattr(take_start, "refuse_by_cause", lambda *arguments: None)
+    monkeypatch.setattr(take_start, "refuse_by_cause", lambda *arguments: "No mistake explains it.")
     folder = write_masks(tmp_path / "take", FRAMES)
     for k, path in enumerate(sorted(folder.rglob("*.png"))):
         picture = np.zeros_like(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
         place = (260 + 29 * (k % 5), 150 + 31 * (k % 4) + 60 * ("lower" in str(path)))
         cv2.imwrite(str(path), cv2.circle(picture, place, 45, 255, -1))
-    with pytest.raises(TrackingError, match=r"failed on all 1 frames tried. Frame \d+: .* Give \[bootstrap\] picks"):
+    words = r"failed on all 1 frames tried. Frame \d+: .* No mistake explains it. Give \[bootstrap\] picks"
+    with pytest.raises(TrackingError, match=words):
         _start(_capture(folder, bootstrap=None))
 
 

@@ -6,9 +6,10 @@ from small_take import CAMERAS, OFFSETS
 
 from jawusd.errors import TrackingError
 from jawusd.formats.capture import CameraSource, Masks
-from jawusd.tracking.initialization import mixups
+from jawusd.tracking.initialization import mixups, start_causes
 from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.initialization.start_causes import refuse_lone_arch
+from jawusd.tracking.initialization.start_search import Found
 
 TABLE = {camera.name: camera for camera in CAMERAS}
 
@@ -50,3 +51,54 @@ def test_a_scan_that_fits_nowhere_while_the_other_does_is_named(fits, named):
     else:
         with pytest.raises(TrackingError, match=named):
             refuse_lone_arch(fits)
+
+
+class _Searches:
+    """Answer searches with a fit per search, every one of which takes a minute of a clock."""
+
+    def __init__(self, fits=()):
+        self.fits, self.count = dict(fits), 0
+
+    def mirrored(self):
+        return self
+
+    def at(self, footage, frame):
+        self.count += 1
+        if self.count not in self.fits:
+            raise TrackingError("nothing found")
+        return Found(np.stack([np.eye(4)] * 2), 1000.0, np.full(2, self.fits[self.count]))
+
+    def clock(self):
+        return 60.0 * self.count
+
+
+def _refused(searches, monkeypatch):
+    monkeypatch.setattr(start_causes, "aligned", lambda search, footage, poses, frame: poses)
+    sources = [
+        CameraSource(name=name, masks=Masks(upper=f"{name}/upper/%06d.png", lower=f"{name}/lower/%06d.png"))
+        for name in ("cam0", "cam1", "cam2")
+    ]
+    footage = Footage(sources, TABLE, OFFSETS, (0, 10))
+    return start_causes.refuse_by_cause(searches, footage, 3, set(), searches.clock)
+
+
+def test_the_search_for_a_mistake_ends_and_says_what_was_tried(monkeypatch):
+    searches = _Searches()
+    words = _refused(searches, monkeypatch)
+    assert searches.count == 6  # those begun within 300 s
+    assert "any of 6 mistakes" in words and "14 more were not tried, as 300 s had passed" in words
+
+
+def test_quick_searches_try_every_mistake(monkeypatch):
+    searches = _Searches()
+    monkeypatch.setattr(searches, "clock", lambda: 0.0)
+    assert _refused(searches, monkeypatch) == (
+        "Undoing any of 20 mistakes in masks, scans and calibration does not help."
+    )
+    assert searches.count == 20
+
+
+def test_of_mistakes_that_are_not_all_tried_only_one_beyond_doubt_counts(monkeypatch):
+    assert "not tried" in _refused(_Searches({5: 0.2}), monkeypatch)
+    with pytest.raises(TrackingError, match="found only with that undone"):
+        _refused(_Searches({5: 0.5}), monkeypatch)

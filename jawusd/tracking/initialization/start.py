@@ -206,11 +206,11 @@ def search_start(search: StartSearch, footage: Footage) -> Start:
         if found.fit >= CLEAR_FIT:
             break
     if best is None:
-        refuse_by_cause(search, footage, frames[0], accused)
+        tried = refuse_by_cause(search, footage, frames[0], accused)
         refuse_lone_arch(fits)
         raise TrackingError(
             f"there are no [bootstrap] picks, and searching the teeth failed on all {len(frames)} frames tried. "
-            + " ".join(f"Frame {frame}: {message}." for frame, message in failed.items()),
+            + " ".join([*(f"Frame {frame}: {message}." for frame, message in failed.items()), tried]),
             hint="Give [bootstrap] picks, three or more per row of teeth, each seen by two cameras; and check the "
             "masks, the calibration and the time offsets.",
         )

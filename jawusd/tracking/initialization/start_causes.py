@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -21,6 +22,8 @@ from jawusd.tracking.initialization.start_search import StartSearch
 CLEAR_FIT = 0.3
 _EXPLAINS = 0.1  # least fit with a mistake undone, which wrong poses do not reach
 _MOST_CAMERAS = 4  # whose exchanges are tried; every one costs a search
+# Time after which no further search for the mistake begins [s]; the time of a search grows with the number of cameras.
+_MOST_SECONDS = 300.0
 # Sizes of the scans that are tried, each of which finds teeth that are 5 % off it.
 _SIZES = (0.95, 1.05, 0.86, 1.16, 0.77, 1.28)
 
@@ -46,22 +49,44 @@ def aligned(search: StartSearch, footage: Footage, poses: Array, frame: int) -> 
         return first_record(solver, solver.config, poses, masks.at(frame), frame).solution.poses
 
 
-def refuse_by_cause(search: StartSearch, footage: Footage, frame: int, accused: set[str]) -> None:
-    """Refuse a capture for the mistake with which undone the search succeeds on a frame; return if there is none.
+def refuse_by_cause(
+    search: StartSearch,
+    footage: Footage,
+    frame: int,
+    accused: set[str],
+    clock: Callable[[], float] = time.monotonic,
+) -> str:
+    """Refuse a capture for the mistake with which undone the search succeeds on a frame.
 
     Mistakes whose hints are among the `accused` are tried first. What is wrong with one camera alone, or with the size
-    of the scans, is looked for last, since leaving out what contradicts makes many poses fit.
+    of the scans, is looked for last, since leaving out what contradicts makes many poses fit. No search begins once the
+    time is up; what was found in a group of mistakes that are not all tried counts if it fits beyond doubt.
+
+    Returns:
+        What was tried, as a sentence, if there is no such mistake among it.
 
     Raises:
         TrackingError: names the mistake.
     """
     exchanges = sorted(_exchanges(search, footage), key=lambda cause: cause.hint not in accused)
-    for causes in (_mirrored(search, footage), exchanges, _sizes(search, footage), _cameras(search, footage)):
-        explained = [(_fit(cause, frame), cause) for cause in causes]
-        fit, cause = max(explained, key=lambda one: one[0], default=(0.0, None))
-        if cause is not None and fit >= _EXPLAINS:
-            message = f"{cause.message}: the teeth are found only with that undone"
-            raise TrackingError(message, frame=frame, hint=cause.hint)
+    groups = ([*_mirrored(search, footage)], exchanges, [*_sizes(search, footage)], [*_cameras(search, footage)])
+    count, tried, end = sum(map(len, groups)), 0, clock() + _MOST_SECONDS
+    for causes in groups:
+        explained: list[tuple[float, _Cause]] = []
+        for cause in causes:
+            if clock() > end:
+                break
+            explained.append((_fit(cause, frame), cause))
+        tried += len(explained)
+        least = _EXPLAINS if len(explained) == len(causes) else CLEAR_FIT
+        fit, best = max(explained, key=lambda one: one[0], default=(0.0, None))
+        if best is not None and fit >= least:
+            message = f"{best.message}: the teeth are found only with that undone"
+            raise TrackingError(message, frame=frame, hint=best.hint)
+    sentence = f"Undoing any of {tried} mistakes in masks, scans and calibration does not help"
+    if tried == count:
+        return f"{sentence}."
+    return f"{sentence}; {count - tried} more were not tried, as {_MOST_SECONDS:.0f} s had passed."
 
 
 def refuse_lone_arch(fits: Mapping[int, Array]) -> None:
