@@ -72,3 +72,15 @@ def _levels(text: bytes) -> int:
         levels = level + np.cumsum(steps[first : first + _CHUNK], dtype=np.int32)
         level, deepest = int(levels[-1]), max(deepest, int(levels.max()))
     return deepest
+
+
+def has_deep_arc(prim: Sdf.PrimSpec) -> bool:
+    """Tell whether a prim inherits from, specializes or refers to one that lies deeper than `MOST_LEVELS`."""
+    paths: list[Sdf.Path] = []
+    for name in ("inheritPaths", "specializes"):
+        if prim.HasInfo(name):
+            paths += prim.GetInfo(name).GetAddedOrExplicitItems()
+    for name in ("references", "payload"):
+        if prim.HasInfo(name):
+            paths += [arc.primPath for arc in prim.GetInfo(name).GetAddedOrExplicitItems()]
+    return any(path.pathElementCount > MOST_LEVELS for path in paths)

@@ -21,7 +21,7 @@ from jawusd.rig.asset_paths import (
     of_template,
 )
 from jawusd.rig.checksums import check_checksum, recorded_checksums
-from jawusd.rig.nesting import MOST_LEVELS, is_too_deep
+from jawusd.rig.nesting import MOST_LEVELS, has_deep_arc, is_too_deep
 from jawusd.rig.schema import SCHEMA_NAME
 
 # an asset path, the folder of the rig that it is part of, and the layer outside whose folder it lies
@@ -172,16 +172,17 @@ def _is_whole(layer: Sdf.Layer) -> bool:
     """Return whether a layer holds all prims and properties it names; OpenUSD ends the process where it does not.
 
     Raises:
-        RigError: A prim lies too deep.
+        RigError: A prim lies too deep, or names one that does.
     """
     missing = []
 
     def visit(path: Sdf.Path) -> None:
-        if path.pathElementCount > MOST_LEVELS:
-            raise RigError(_TOO_DEEP, path=layer.identifier)
         named = path.IsPropertyPath() or path.IsPrimPath() or path.IsPrimVariantSelectionPath()
-        if path.isEmpty or (named and not layer.GetObjectAtPath(path)):
+        spec = layer.GetObjectAtPath(path) if named else None
+        if path.isEmpty or (named and not spec):
             missing.append(path)
+        elif path.pathElementCount > MOST_LEVELS or (isinstance(spec, Sdf.PrimSpec) and has_deep_arc(spec)):
+            raise RigError(_TOO_DEEP, path=layer.identifier)
 
     layer.Traverse(Sdf.Path.absoluteRootPath, visit)
     return not missing

@@ -59,6 +59,15 @@ def test_binary_layers_with_deep_prims_are_refused(tmp_path):
         open_stage(tmp_path / "deep.usdc")
 
 
+@pytest.mark.parametrize("arc", ["inherits", "specializes", "references", "payload"])
+def test_binary_layers_that_name_deep_prims_are_refused(arc, tmp_path):
+    layer = Sdf.Layer.CreateAnonymous(".usda")
+    layer.ImportFromString(f'{HEADER}def "A" (\n{arc} = <{"/a" * 400}>\n) {{\n}}\n')
+    layer.Export(str(tmp_path / "deep.usdc"))
+    with pytest.raises(RigError, match="nested too deeply"):
+        open_stage(tmp_path / "deep.usdc")
+
+
 @pytest.mark.parametrize("kind", ["prims", "dictionaries", "variant sets", "lists"])
 def test_nesting_below_the_limit_is_read(kind, tmp_path):
     (tmp_path / "layer.usda").write_text(nested(kind, MOST_LEVELS // 2 - 2))
