@@ -79,5 +79,7 @@ def _copy(source: Path, target: Path, names: dict[str, str]) -> Path:
 
     UsdUtils.ModifyAssetPaths(layer, renamed)
     if source.name == ACTOR_FILE:
-        record_checksums(layer, target.parent, [names[name] for name in (GEO_FILE, PROXY_FILE, RIG_FILE) if name in names])
+        record_checksums(
+            layer, target.parent, [names[name] for name in (GEO_FILE, PROXY_FILE, RIG_FILE) if name in names]
+        )
     return write_layer(layer, target)
