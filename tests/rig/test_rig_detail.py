@@ -41,7 +41,10 @@ def test_by_default_nothing_is_different(baked):
     for file in ("geo.usdc", "rig.usdc", "anim_capture.usdc", "actor_skel.usdc"):
         assert (baked / "with" / file).read_bytes() == (baked / "without" / file).read_bytes()
     stages = [Usd.Stage.Open(str(baked / name / "actor.usda")) for name in ("with", "without")]
-    flat = [stage.Flatten(False).ExportToString().replace("/without/", "/with/") for stage in stages]
+    layers = [stage.Flatten(False) for stage in stages]
+    for layer in layers:
+        layer.ClearCustomLayerData()  # the checksum of proxy.usdc
+    flat = [layer.ExportToString().replace("/without/", "/with/") for layer in layers]
     assert flat[0] == flat[1] and "variant" not in flat[1]
     actor = Sdf.Layer.FindOrOpen(str(baked / "with" / "actor.usda")).GetPrimAtPath("/Actor")
     assert [payload.assetPath for payload in actor.payloadList.prependedItems] == ["./geo.usdc"]
