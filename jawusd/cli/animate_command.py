@@ -54,14 +54,14 @@ def _is_glb(path: Path) -> bool:
 
 
 def _write(out: Path, rig: Path, loaded: JawRig, motion: AuthoredMotion, rate: float, prim: str | None) -> None:
-    from jawusd.cli.motion import write_over
     from jawusd.rig import write_animation
     from jawusd.rig.glb import write_glb
+    from jawusd.rig.rebake import write_over
 
     if _is_glb(out):
         write_glb(out, rig, loaded, motion.frames, motion.d, rate)
     elif prim is not None:
-        write_over(out, rig, loaded, motion, rate, prim)
+        write_over(out, rig, loaded, motion.frames, motion.d, rate, prim)
     else:
         write_animation(out, rig, motion.frames, motion.d, rate)
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from jawusd.cli.options import Allow, Outside, RigArg
+from jawusd.cli.options import Allow, Outside, Prim, RigArg
 from jawusd.cli.solve_commands import Head, ShotArg
 
 
@@ -31,6 +31,7 @@ def live(
     seconds: Annotated[float | None, typer.Option(min=0.1, help="End after so long.", show_default=False)] = None,
     jobs: Annotated[int, typer.Option(min=1, max=64, help="Threads that search the teeth.")] = 2,
     allow_outside: Outside = False,
+    prim: Prim = None,
     allow: Allow = None,
 ) -> None:
     """Follow the jaw of the person of a rig in cameras as they run: a line of JSON per instant, OSC, a page.
@@ -43,13 +44,13 @@ def live(
 
     sources = dict(_named(entry) for entry in source or [])
     sender = None if osc is None else OscSender(osc)
-    viewer = open_viewer(rig, "127.0.0.1", port) if view else None
+    viewer = open_viewer(rig, "127.0.0.1", port, prim) if view else None
     if viewer is not None:
         typer.echo(f"{viewer.url}  (Ctrl+C stops)", err=True)
     fixed = head is Head.fixed
     try:
         for found in follow(
-            rig, shot, sources, fixed_head=fixed, jobs=jobs, seconds=seconds, allow_outside=allow_outside
+            rig, shot, sources, prim=prim, fixed_head=fixed, jobs=jobs, seconds=seconds, allow_outside=allow_outside
         ):
             if sender is not None:
                 sender.send(found)

@@ -85,20 +85,6 @@ def read_pose_table(path: Path) -> tuple[NDArray[np.int64], Array]:
     return read_poses(path)
 
 
-def write_over(out: Path, stage: Path, rig: JawRig, motion: AuthoredMotion, rate: float, prim: str) -> None:
-    """Write a motion as a layer over a stage, for one of its rigs; its frames pass at their own rate.
-
-    Raises:
-        JawusdError: no such stage or prim, or a file that cannot be written.
-    """
-    from jawusd.rig.read import open_stage
-    from jawusd.rig.rebake import write_rebaked
-
-    known = np.isfinite(motion.d).all(axis=1)
-    codes = motion.frames[known] * (float(open_stage(stage).GetTimeCodesPerSecond()) / rate)
-    write_rebaked(out, stage, rig, codes, motion.d[known], prim)
-
-
 @dataclass(frozen=True)
 class Changes:
     """Say what was changed in a motion."""

@@ -19,6 +19,7 @@ from jawusd.cli.options import (
     LowerOption,
     MandibleOption,
     Outside,
+    Prim,
     RestOption,
     UnitOption,
     UpperOption,
@@ -151,6 +152,7 @@ def view(
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port; the next free one if it is taken.")] = 8080,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open a browser.")] = True,
     allow_outside: Outside = False,
+    prim: Prim = None,
     allow: Allow = None,
 ) -> None:
     """See a rig in the browser, drag it, key it; or a capture's footage, to judge its poses and to set its picks."""
@@ -163,6 +165,8 @@ def view(
     capture = is_capture(rig)
     if tracks is not None and not capture:
         raise typer.BadParameter("--tracks belongs to a capture; a rig has its own poses.")
+    if prim is not None and capture:
+        raise typer.BadParameter("--prim belongs to a rig; a capture has none.")
     if not is_loopback(host):
         may = "write picks into the capture" if capture else "write animations beside the rig"
         typer.echo(
@@ -175,7 +179,7 @@ def view(
         with progress() as report:
             viewer = open_capture_viewer(rig, tracks, host, port, report, allow_outside=allow_outside)
     else:
-        viewer = open_viewer(rig, host, port)
+        viewer = open_viewer(rig, host, port, prim)
     try:
         typer.echo(f"{viewer.url}  (Ctrl+C stops)")
         if browser:

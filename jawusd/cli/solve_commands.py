@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from jawusd.cli.options import Allow, Force, Json, Outside, RigArg
+from jawusd.cli.options import Allow, Force, Json, Outside, Prim, RigArg
 from jawusd.cli.output import emit, progress, refuse_existing
 
 
@@ -58,6 +58,7 @@ def solve(
     jobs: Annotated[int, typer.Option(min=1, max=64, help="Threads that search for the start.")] = 2,
     force: Force = False,
     allow_outside: Outside = False,
+    prim: Prim = None,
     allow: Allow = None,
     as_json: Json = False,
 ) -> None:
@@ -73,6 +74,7 @@ def solve(
             rig,
             shot,
             out,
+            prim=prim,
             overlay=overlay,
             report=report,
             fixed_head=head is Head.fixed,

@@ -92,6 +92,7 @@ def live(
     shot: Capture | str | os.PathLike[str],
     sources: Mapping[str, str] | None = None,
     *,
+    prim: str | None = None,
     fixed_head: bool = False,
     jobs: int = 2,
     seconds: float | None = None,
@@ -104,6 +105,7 @@ def live(
         shot: a capture with these cameras' calibration and the scans of the rig; its videos are played at their own
             rate where no other source is named.
         sources: by camera name a device, an address or a file.
+        prim: which rig, where a stage has several.
         fixed_head: the cameras are worn: the head hardly moves before them.
         jobs: threads that search the teeth.
         seconds: after which to end; None goes on until the sources end.
@@ -115,7 +117,7 @@ def live(
         TrackingError: the scans cannot be in occlusion.
     """
     capture = open_capture(shot, allow_outside=allow_outside)
-    jaw = jawusd.load(rig)
+    jaw = jawusd.load(rig, prim=prim)
     with ExitStack() as stack:
         pool = stack.enter_context(ThreadPoolExecutor(jobs))
         follower = _Follower(capture, jaw, sources or {}, fixed_head, pool)

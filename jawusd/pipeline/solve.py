@@ -55,6 +55,7 @@ def solve(
     shot: Capture | str | os.PathLike[str],
     out: str | os.PathLike[str] | None = None,
     *,
+    prim: str | None = None,
     overlay: str | os.PathLike[str] | None = None,
     report: str | os.PathLike[str] | None = None,
     fixed_head: bool = False,
@@ -70,6 +71,7 @@ def solve(
         shot: the capture of the shot, its capture.toml or the folder that holds it. If no camera has masks, the
             videos themselves are followed by their colours.
         out: file to write: a table of d (.csv), tracks (.npz), or an animation layer on the rig (.usdc, .usda).
+        prim: which rig, where a stage has several; an animation layer then goes over the stage.
         overlay: video to write (.mp4) of the solved scans over all cameras side by side.
         report: page to write (.html): d with sigma, what could not be seen, verdicts, findings and pictures.
         fixed_head: the cameras are worn, as on a helmet: the head does not move before them.
@@ -89,7 +91,7 @@ def solve(
     check_output(rig, out, overlay, report)
     progress = progress or no_progress
     capture = open_capture(shot, allow_outside=allow_outside)
-    jaw = jawusd.load(rig)
+    jaw = jawusd.load(rig, prim=prim)
     offsets = sync_cameras(capture, progress)["offsets"]
     with naming_file(capture.folder / "capture.toml"):
         cameras = load_cameras(capture)
@@ -118,7 +120,7 @@ def solve(
     known = cast("list[dict[str, str | float | int]]", found.notes.get("findings", []))
     found.notes["findings"] = [*known, *(finding.as_json() for finding in findings)]
     if out is not None:
-        write_solved(out, found, jaw, rig, capture.fps)
+        write_solved(out, found, jaw, rig, capture.fps, prim)
     if overlay is not None:
         write_overlay(capture, offsets, tracks_of(found, jaw), Path(overlay), progress)
     if report is not None:
@@ -128,7 +130,12 @@ def solve(
 
 @explain_missing_packages()
 def write_solved(
-    out: str | os.PathLike[str], performance: Performance, jaw: JawRig, rig: str | os.PathLike[str], fps: float
+    out: str | os.PathLike[str],
+    performance: Performance,
+    jaw: JawRig,
+    rig: str | os.PathLike[str],
+    fps: float,
+    prim: str | None = None,
 ) -> None:
     """Write a performance as the suffix of the file says; see `solve`.
 
@@ -145,9 +152,13 @@ def write_solved(
         save_tracks(out, tracks_of(performance, jaw))
     else:
         from jawusd.rig import write_animation
+        from jawusd.rig.rebake import write_over
 
         unseen = performance.frames[performance.state != SolveState.SOLVED]
-        write_animation(out, rig, performance.frames, performance.d, fps, rig=jaw, carried=unseen)
+        if prim is not None:
+            write_over(out, rig, jaw, performance.frames, performance.d, fps, prim, unseen)
+        else:
+            write_animation(out, rig, performance.frames, performance.d, fps, rig=jaw, carried=unseen)
 
 
 def check_output(

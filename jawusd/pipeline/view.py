@@ -37,7 +37,7 @@ _FILL: dict[Look, float] = {"outlines": 0.0, "tinted": 0.3}
 
 
 @explain_missing_packages()
-def open_viewer(path: str | os.PathLike[str], host: str, port: int) -> Viewer:
+def open_viewer(path: str | os.PathLike[str], host: str, port: int, prim: str | None = None) -> Viewer:
     """Serve the rig at a path to browsers; see `viewed_actor` for what it raises.
 
     Raises:
@@ -46,14 +46,15 @@ def open_viewer(path: str | os.PathLike[str], host: str, port: int) -> Viewer:
     """
     from jawusd.viewer.server import Viewer
 
-    return Viewer(viewed_actor(path), host, port)
+    return Viewer(viewed_actor(path, prim), host, port)
 
 
-def viewed_actor(path: str | os.PathLike[str]) -> ViewedActor:
+def viewed_actor(path: str | os.PathLike[str], prim: str | None = None) -> ViewedActor:
     """Read what the viewer shows of a rig.
 
     Args:
         path: `actor.usda`, another layer or package that carries the rig, or the folder of a build.
+        prim: which rig, where a stage has several; motions are then those of layers over the stage.
 
     Raises:
         FormatError: not a rig, or one without geometry.
@@ -67,33 +68,34 @@ def viewed_actor(path: str | os.PathLike[str]) -> ViewedActor:
     path = path / "actor.usda" if path.is_dir() else path
     if path.suffix == ".npz":
         raise FormatError("holds a model without meshes; nothing to see.", path=path, hint="Name the actor.usda.")
-    rig, about = load_rig(path), describe(path)
+    rig, about = load_rig(path, prim), describe(path, prim)
+    place, fps = about["prim"], float(about["fps"] or DEFAULT_FPS)
     return ViewedActor(
         name=str(about["actor"] or path.stem),
         rig=rig,
-        meshes=screen_meshes(path),
-        placeholders=frozenset(read_geometry(path, placeholders=True)),
-        fps=float(about["fps"] or DEFAULT_FPS),
+        meshes=screen_meshes(path, place),
+        placeholders=frozenset(read_geometry(path, place, placeholders=True)),
+        fps=fps,
         folder=path.parent,
         clip_names=partial(motion_names, path.parent),
-        load_clip=partial(load_motion, path.parent, rig, float(about["fps"] or DEFAULT_FPS)),
-        save_layer=partial(save_motion, path, rig),
-        contacts=None if rig.contact is None else ContactView(path, rig).draw,
+        load_clip=partial(load_motion, path.parent, rig, fps, prim=prim),
+        save_layer=partial(save_motion, path, rig, prim=prim),
+        contacts=None if rig.contact is None else ContactView(path, rig, place).draw,
     )
 
 
 class ContactView:
     """Draw the contacts of a rig's teeth; the scans are read when the first picture is wanted."""
 
-    def __init__(self, path: Path, rig: JawRig) -> None:
-        self._path, self._rig = path, rig
+    def __init__(self, path: Path, rig: JawRig, prim: str) -> None:
+        self._path, self._rig, self._prim = path, rig, prim
 
     @cached_property
     def _map(self) -> ContactMap:
         from jawusd.imaging.contact_map import ContactMap
         from jawusd.rig.geo import read_geometry
 
-        return ContactMap(teeth_of(self._rig, read_geometry(self._path)))
+        return ContactMap(teeth_of(self._rig, read_geometry(self._path, self._prim)))
 
     @explain_missing_packages()
     def draw(self, d: Array) -> NDArray[np.uint8]:
@@ -106,7 +108,7 @@ class ContactView:
         return self._map.draw(self._rig.pose(d))
 
 
-def screen_meshes(path: Path) -> dict[str, Mesh]:
+def screen_meshes(path: Path, prim: str) -> dict[str, Mesh]:
     """Return the meshes of a rig by the viewer's names, teeth and gum apart, decimated; placeholders too.
 
     Raises:
@@ -115,7 +117,8 @@ def screen_meshes(path: Path) -> dict[str, Mesh]:
     from jawusd.rig.geo import read_geometry, read_gum
     from jawusd.viewer.decimate import for_view
 
-    meshes, gum = read_geometry(path) | read_geometry(path, placeholders=True), read_gum(path)
+    meshes = read_geometry(path, prim) | read_geometry(path, prim, placeholders=True)
+    gum = read_gum(path, prim)
     if not {"mandible", "lower_teeth"} & set(meshes):
         raise RigError("has no mandible to look at.", path=path)
     parted: dict[str, Mesh] = {}
@@ -142,11 +145,12 @@ def motion_names(folder: Path) -> tuple[str, ...]:
     return ((CAPTURED,) if (folder / _TRACKS).is_file() else ()) + tuple(layers)
 
 
-def load_motion(folder: Path, rig: JawRig, fps: float, name: str) -> Clip:
+def load_motion(folder: Path, rig: JawRig, fps: float, name: str, *, prim: str | None = None) -> Clip:
     """Read one of `motion_names`, as the nearest parameters of its poses.
 
     Args:
         fps: frames per second of the take.
+        prim: which rig, where layers have several.
 
     Raises:
         FormatError: there is no such motion, or it cannot be read.
@@ -162,14 +166,14 @@ def load_motion(folder: Path, rig: JawRig, fps: float, name: str) -> Clip:
         tracks = load_tracks(folder / _TRACKS)
         frames, poses = tracks.frames, tracks.T_upper_lower
     else:
-        frames, poses = read_poses_of_stage(folder / name)
-        fps = float(describe(folder / name)["fps"])
+        frames, poses = read_poses_of_stage(folder / name, prim)
+        fps = float(describe(folder / name, prim)["fps"])
     d, _ = rig.encode(poses)
     return Clip.of(name, frames, d, fps)
 
 
-def save_motion(actor: Path, rig: JawRig, name: str, clip: Clip, overwrite: bool) -> Path:
-    """Write a motion as an animation layer beside an actor.
+def save_motion(actor: Path, rig: JawRig, name: str, clip: Clip, overwrite: bool, *, prim: str | None = None) -> Path:
+    """Write a motion as an animation layer beside an actor, or beside a stage for one of its rigs.
 
     Args:
         name: of the file, anim... .usda or .usdc, without a folder.
@@ -178,6 +182,7 @@ def save_motion(actor: Path, rig: JawRig, name: str, clip: Clip, overwrite: bool
         OutputError: the name is not allowed or taken, or the file cannot be written.
     """
     from jawusd.rig.animation import write_animation
+    from jawusd.rig.rebake import write_over
 
     if not _ANIMATION.fullmatch(name):
         raise OutputError(
@@ -186,5 +191,6 @@ def save_motion(actor: Path, rig: JawRig, name: str, clip: Clip, overwrite: bool
     target = actor.parent / name
     if target.exists() and not overwrite:
         raise OutputError("exists already.", path=target, hint="Choose another name, or tick overwrite.")
-    write_animation(target, actor, clip.frames, clip.d, clip.fps, rig=rig)
-    return target
+    if prim is not None:
+        return write_over(target, actor, rig, clip.frames, clip.d, clip.fps, prim)
+    return write_animation(target, actor, clip.frames, clip.d, clip.fps, rig=rig)

@@ -159,8 +159,15 @@ def vertex_normals(mesh: Mesh) -> Array:
 
 
 @raises_format_error(0)
-def read_geometry(path: str | os.PathLike[str], *, placeholders: bool = False) -> dict[str, Mesh]:
-    """Read the meshes of `geo.usdc`: those of anatomy, or the placeholders.
+def read_geometry(
+    path: str | os.PathLike[str], prim_path: str = ACTOR, *, placeholders: bool = False
+) -> dict[str, Mesh]:
+    """Read the meshes of a rig, as in `geo.usdc`: those of anatomy, or the placeholders.
+
+    Args:
+        path: A layer or package with the meshes, or a stage that references them.
+        prim_path: The prim that carries the rig.
+        placeholders: Which of both.
 
     Returns:
         Meshes by the names of `MESH_PATHS`, skull ones in the skull frame, mandible ones in the mandible frame
@@ -172,13 +179,13 @@ def read_geometry(path: str | os.PathLike[str], *, placeholders: bool = False) -
     """
     stage = open_stage(path)
     found = {}
-    for name, prim_path in MESH_PATHS.items():
-        mesh = UsdGeom.Mesh(stage.GetPrimAtPath(prim_path))
+    for name, place in _mesh_paths(prim_path).items():
+        mesh = UsdGeom.Mesh(stage.GetPrimAtPath(place))
         if not mesh or bool(mesh.GetPrim().GetAttribute("jaw:placeholder").Get()) != placeholders:
             continue
         counts = np.array(mesh.GetFaceVertexCountsAttr().Get() or [])
         if not counts.size or (counts != 3).any():
-            raise RigError(f"{prim_path} must be made of triangles.", path=Path(path))
+            raise RigError(f"{place} must be made of triangles.", path=Path(path))
         vertices = np.array(mesh.GetPointsAttr().Get(), dtype=np.float64)
         faces = np.array(mesh.GetFaceVertexIndicesAttr().Get(), dtype=np.int32).reshape(-1, 3)
         colors, uv = read_look(mesh, len(vertices), len(faces))
@@ -187,7 +194,7 @@ def read_geometry(path: str | os.PathLike[str], *, placeholders: bool = False) -
 
 
 @raises_format_error(0)
-def read_gum(path: str | os.PathLike[str]) -> dict[str, Mask]:
+def read_gum(path: str | os.PathLike[str], prim_path: str = ACTOR) -> dict[str, Mask]:
     """Return which faces (F,) of the teeth meshes are gum, by the names of `MESH_PATHS`.
 
     Meshes without such a subset are missing.
@@ -197,11 +204,15 @@ def read_gum(path: str | os.PathLike[str]) -> dict[str, Mask]:
     """
     stage = open_stage(path)
     found = {}
-    for name, prim_path in MESH_PATHS.items():
-        mesh = UsdGeom.Mesh(stage.GetPrimAtPath(prim_path))
-        subset = UsdGeom.Subset(stage.GetPrimAtPath(f"{prim_path}/{prim_path.rsplit('/', 1)[1]}Gum"))
+    for name, place in _mesh_paths(prim_path).items():
+        mesh = UsdGeom.Mesh(stage.GetPrimAtPath(place))
+        subset = UsdGeom.Subset(stage.GetPrimAtPath(f"{place}/{place.rsplit('/', 1)[1]}Gum"))
         if mesh and subset:
             gum = np.zeros(len(mesh.GetFaceVertexCountsAttr().Get()), dtype=bool)
             gum[np.array(subset.GetIndicesAttr().Get())] = True
             found[name] = gum
     return found
+
+
+def _mesh_paths(prim_path: str) -> dict[str, str]:
+    return {name: prim_path + path.removeprefix(ACTOR) for name, path in MESH_PATHS.items()}

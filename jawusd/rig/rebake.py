@@ -7,12 +7,14 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pxr import Sdf, Usd, UsdGeom, Vt
 
 from jawusd.errors import FormatError, RigError
 from jawusd.evaluator import JawRig
 from jawusd.geometry.arrays import Array
-from jawusd.rig.animation import author_motion
+from jawusd.rig import _gf
+from jawusd.rig.animation import CARRIED, author_motion
 from jawusd.rig.layers import new_layer, relative_path, write_layer
 from jawusd.rig.layout import PARAMETERS
 from jawusd.rig.motion_read import (
@@ -151,6 +153,42 @@ def _rank(stage: Usd.Stage, attribute: Usd.Attribute) -> float:
     return float(layers.index(stack[0].layer)) if stack and stack[0].layer in layers else np.inf
 
 
+def write_over(
+    out: str | os.PathLike[str],
+    stage: str | os.PathLike[str],
+    rig: JawRig,
+    frames: ArrayLike,
+    d: Array,
+    fps: float,
+    prim_path: str,
+    carried: ArrayLike = (),
+) -> Path:
+    """Write a motion as a layer over a stage, for one of its rigs; its frames pass at their own rate.
+
+    Args:
+        out: File to write; it sublayers the stage.
+        frames: Frame numbers, increasing, shape (F,).
+        d: Jaw parameters [mm], shape (F, 3); rows with NaN are bridged.
+        fps: Frames per second.
+        prim_path: Which rig of the stage.
+        carried: Frames whose d was not seen.
+
+    Raises:
+        JawusdError: As `write_rebaked`.
+    """
+    step = float(open_stage(stage).GetTimeCodesPerSecond()) / fps
+    known = np.isfinite(d).all(axis=1)
+    return write_rebaked(
+        out,
+        stage,
+        rig,
+        np.asarray(frames, dtype=np.float64)[known] * step,
+        d[known],
+        prim_path,
+        np.asarray(carried) * step,
+    )
+
+
 def write_rebaked(
     out: str | os.PathLike[str],
     shot: str | os.PathLike[str],
@@ -158,6 +196,7 @@ def write_rebaked(
     frames: Array,
     d: Array,
     prim_path: str | None = None,
+    carried: ArrayLike = (),
 ) -> Path:
     """Write a layer over a stage that gives a rig in it d and the mandible's ops that belong to it.
 
@@ -167,6 +206,7 @@ def write_rebaked(
         out: File to write; it sublayers the stage.
         frames: Times, increasing, shape (F,).
         d: Jaw parameters [mm], shape (F, 3).
+        carried: Times whose d was not seen; see `write_animation`.
 
     Raises:
         RigError: Not a stage, or the output is the stage itself.
@@ -188,6 +228,8 @@ def write_rebaked(
     if stage.HasAuthoredTimeCodeRange():
         first, last = stage.GetStartTimeCode(), stage.GetEndTimeCode()
     layer.startTimeCode, layer.endTimeCode = first, last
+    if len(np.atleast_1d(carried)):
+        layer.customLayerData = {**layer.customLayerData, CARRIED: _gf.int_array(np.floor(np.asarray(carried)))}
     author_motion(
         layer, rig, frames, d, np.array([frames[0], frames[-1]]), (str(actor.GetPath()), str(mandible.GetPath()))
     )

@@ -11,9 +11,12 @@ from typer.testing import CliRunner
 
 import jawusd
 from jawusd.cli.main import app
+from jawusd.errors import FormatError
+from jawusd.pipeline.view import viewed_actor
 from jawusd.rig import allow_folders
 from jawusd.rig.bake import bake_rig
 from jawusd.rig.motion_read import read_poses_of_stage
+from jawusd.viewer.motion import Clip
 
 KINDS = {"hero": "anchored", "villain": "additive"}
 OFFSET, COUNT = 100, 12
@@ -102,3 +105,25 @@ def test_every_command_takes_the_right_actor(shot, tmp_path):
         shown = np.isin(times, np.arange(COUNT) + first)
         np.testing.assert_allclose(T[shown], example_rig(kind).pose(d), atol=1e-6)
         allow_folders([])
+
+
+def test_the_viewer_shows_the_named_actor_and_keys_it(shot, tmp_path):
+    allow_folders([tmp_path / "lib"])
+    with pytest.raises(FormatError, match="several jaw rigs"):
+        viewed_actor(shot)
+    actor, alone = viewed_actor(shot, "/Shot/villain"), viewed_actor(tmp_path / "lib" / "villain")
+    assert actor.name == "villain" and actor.rig.model_hash == alone.rig.model_hash
+    assert {name: len(mesh.faces) for name, mesh in actor.meshes.items()} == {
+        name: len(mesh.faces) for name, mesh in alone.meshes.items()
+    }
+    frames, d = example_motion(COUNT)
+    clip = Clip("keys", np.array([0.0, 3, 6]) + frames[0] / 2, np.array([[0.0, 0, 0], [9, 1, 0], [3, 0, 0]]), FPS / 2)
+    actor.save_layer("anim_villain.usdc", clip, False)
+    shown = actor.load_clip("anim_villain.usdc")
+    keyed = (shown.frames >= 2 * clip.frames[0]) & (shown.frames <= 2 * clip.frames[-1])  # at half the shot's rate
+    wanted = np.stack([np.interp(shown.frames[keyed], 2 * clip.frames, column) for column in clip.d.T], axis=1)
+    assert keyed.sum() == 13
+    np.testing.assert_allclose(shown.d[keyed], wanted, atol=1e-4)
+    times, T = read_poses_of_stage(tmp_path / "shots" / "anim_villain.usdc", "/Shot/hero")
+    np.testing.assert_allclose(T[np.isin(times, frames)], example_rig().pose(d), atol=1e-6)
+    allow_folders([])

@@ -13,7 +13,7 @@ from package_copy import ROOT
 from pythonosc.osc_packet import OscPacket
 
 import jawusd
-from jawusd.errors import CaptureError, OutputError
+from jawusd.errors import CaptureError, FormatError, OutputError
 from jawusd.formats.performance import SolveState
 from jawusd.geometry import transform_point
 from jawusd.imaging.live_source import LiveSource
@@ -97,6 +97,15 @@ def test_instants_are_taken_in_turn_and_left_out_when_too_old():
 def test_sources_of_unknown_cameras_are_refused(rig):
     with pytest.raises(CaptureError, match="named for nobody"):
         next(live(rig, EXAMPLE, {"nobody": "/dev/video0"}))
+
+
+def test_one_of_several_rigs_is_followed(rig, tmp_path):
+    references = "".join(f'def "{name}" (references = @{rig}@) {{}}\n' for name in "ab")
+    (tmp_path / "two.usda").write_text(f"#usda 1.0\n{references}")
+    with pytest.raises(FormatError, match="several jaw rigs: /a, /b"):
+        next(live(tmp_path / "two.usda", EXAMPLE, {"nobody": "/dev/video0"}))
+    with pytest.raises(CaptureError, match="named for nobody"):
+        next(live(tmp_path / "two.usda", EXAMPLE, {"nobody": "/dev/video0"}, prim="/b"))
 
 
 def frame():

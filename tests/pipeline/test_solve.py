@@ -138,6 +138,22 @@ def test_frames_that_were_not_seen_are_named(rig, shot, tmp_path):
     assert solve_summary(found)["carried"] == [(frame, frame)]
 
 
+def test_one_of_several_rigs_is_solved(rig, shot, tmp_path):
+    stage = tmp_path / "two.usda"
+    references = "".join(f'    def "{name}" (references = @{rig}@) {{}}\n' for name in "ab")
+    header = "defaultPrim = 'Shot' metersPerUnit = 0.001 upAxis = 'Y' timeCodesPerSecond = 12 startTimeCode = 0"
+    stage.write_text(f'#usda 1.0\n({header} endTimeCode = 400)\ndef Xform "Shot" {{\n{references}}}\n')
+    assert "--prim" in run("solve", stage, shot, "-o", tmp_path / "take.usda", code=6)
+    run("solve", stage, shot, "--prim", "/Shot/b", "-o", tmp_path / "take.usda")
+    found = solve(rig, shot)
+    at = found.frames * 12 / open_capture(shot).fps  # the stage runs at 12 a second
+    times, T = read_poses_of_stage(tmp_path / "take.usda", "/Shot/b")
+    shown = (times >= at[0]) & (times <= at[-1])
+    d = np.stack([np.interp(times[shown], at, column) for column in found.d.T], axis=1)
+    np.testing.assert_allclose(T[shown], jawusd.load(rig).pose(d), atol=1e-6)
+    assert (np.ptp(read_poses_of_stage(tmp_path / "take.usda", "/Shot/a")[1], axis=0) == 0).all()
+
+
 def test_one_camera_will_do(rig, shot):
     capture = open_capture(shot)
     alone = capture.model_copy(update={"cameras": capture.cameras[:1], "bootstrap": None})
