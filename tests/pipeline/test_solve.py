@@ -141,9 +141,10 @@ def test_frames_that_were_not_seen_are_named(rig, shot, tmp_path):
 def test_one_of_several_rigs_is_solved(rig, shot, tmp_path):
     stage = tmp_path / "two.usda"
     references = "".join(f'    def "{name}" (references = @{rig}@) {{}}\n' for name in "ab")
-    header = "defaultPrim = 'Shot' metersPerUnit = 0.001 upAxis = 'Y' timeCodesPerSecond = 12 startTimeCode = 0"
-    stage.write_text(f'#usda 1.0\n({header} endTimeCode = 400)\ndef Xform "Shot" {{\n{references}}}\n')
-    assert "--prim" in run("solve", stage, shot, "-o", tmp_path / "take.usda", code=6)
+    header = "defaultPrim = 'Shot'; metersPerUnit = 0.001; upAxis = 'Y'; timeCodesPerSecond = 12; startTimeCode = 0"
+    text = f'#usda 1.0\n({header}; endTimeCode = 400)\ndef Xform "Shot"\n{{\n{references}}}\n'
+    stage.write_text(text)
+    assert "--prim" in run("solve", stage, shot, "-o", tmp_path / "take.usda", code=3)
     run("solve", stage, shot, "--prim", "/Shot/b", "-o", tmp_path / "take.usda")
     found = solve(rig, shot)
     at = found.frames * 12 / open_capture(shot).fps  # the stage runs at 12 a second
