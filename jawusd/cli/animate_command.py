@@ -15,13 +15,14 @@ if TYPE_CHECKING:
     from jawusd.evaluator import JawRig
 
 
-def _source_motion(loaded: JawRig, rig: Path, source: Path) -> AuthoredMotion:
+def _source_motion(loaded: JawRig, rig: Path, source: Path, prim: str | None) -> AuthoredMotion:
     from jawusd.cli.motion import AuthoredMotion, read_motion
-    from jawusd.cli.stage_commands import read_stage_motion
+    from jawusd.cli.stage_commands import holds_stage, read_stage_motion
 
-    if source.suffix.lower() not in USD_SUFFIXES:
+    if not holds_stage(source):
         return read_motion(loaded, source)
-    found = read_stage_motion(loaded, rig, source, None, None, None, None)
+    own = None if source.suffix.lower() in USD_SUFFIXES else prim  # a stage may have the rig elsewhere
+    found = read_stage_motion(loaded, rig, source, own, None, None, None)
     return AuthoredMotion(found.frames, found.d, found.fps)
 
 
@@ -69,7 +70,8 @@ def _write(out: Path, rig: Path, loaded: JawRig, motion: AuthoredMotion, rate: f
 def animate(
     rig: RigArg,
     source: Annotated[
-        Path | None, typer.Argument(help="keys.json, a CSV of d or of poses, or a stage.", show_default=False)
+        Path | None,
+        typer.Argument(help="keys.json, a CSV of d or of poses, a stage, .fbx or .glb.", show_default=False),
     ] = None,
     retarget_from: Annotated[
         Path | None, typer.Option(help="Rig the source was made for; also animation layers then.", show_default=False)
@@ -111,7 +113,7 @@ def animate(
     if source is not None and retarget_from is not None:
         motion, changes = carried_over(retarget_from, source, loaded)
     elif source is not None:
-        motion = _source_motion(loaded, rig, source)
+        motion = _source_motion(loaded, rig, source, prim)
     elif arkit is not None:
         motion = read_face(loaded, arkit, fps, mapping)
     rate = (arkit is None and fps) or motion.fps or describe(rig, prim)["fps"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -10,6 +11,7 @@ import typer
 
 from jawusd.cli.options import USD_SUFFIXES, Allow, Force, Json, Prim, RigArg, load_named
 from jawusd.cli.output import emit, refuse_existing
+from jawusd.errors import JawusdError
 
 if TYPE_CHECKING:
     from jawusd.evaluator import JawRig
@@ -36,7 +38,8 @@ def encode(
     poses: Annotated[
         Path,
         typer.Argument(
-            help="CSV or JSON of poses, tracks.npz, or any stage with the actor's meshes.", show_default=False
+            help="CSV or JSON of poses, tracks.npz, or a stage, .fbx or .glb with the actor's meshes.",
+            show_default=False,
         ),
     ],
     out: Annotated[Path, typer.Option("-o", "--out", help="CSV of frame, d1, d2, d3, residual_mm, margin_mm.")] = Path(
@@ -51,7 +54,8 @@ def encode(
 ) -> None:
     """Find the parameters d whose poses are nearest to given ones, and how far these are from the model.
 
-    Of a stage, the mandible may be moved by transforms, bones or a point cache; `jawusd rebake` writes it back.
+    Of a stage, the mandible may be moved by transforms, bones or a point cache; `jawusd rebake` writes it back. FBX and
+    glTF are read through Blender.
     """
     import numpy as np
 
@@ -60,7 +64,7 @@ def encode(
 
     refuse_existing(out, force)
     loaded = load_named(rig, prim, poses)
-    if poses.suffix.lower() in USD_SUFFIXES:
+    if holds_stage(poses):
         motion = read_stage_motion(loaded, rig, poses, prim, mandible, skull, "mandible")
         frames, d, residual_mm = motion.frames.astype(int), motion.d, motion.residual_mm
     else:
@@ -83,7 +87,9 @@ def encode(
 
 def rebake(
     rig: RigArg,
-    stage: Annotated[Path, typer.Argument(help="Shot or animation layer that holds the rig.", show_default=False)],
+    stage: Annotated[
+        Path, typer.Argument(help="Shot or animation layer, or what was exported of it.", show_default=False)
+    ],
     out: Annotated[
         Path | None, typer.Option("-o", "--out", help="Layer over the stage; <stage>_baked.usdc if not given.")
     ] = None,
@@ -100,13 +106,14 @@ def rebake(
     """Give a stage the d and the mandible that belong together, where only one was keyed or moved.
 
     The motion is brought inside the bound; what lay outside is reported with its margin. A stage without the rig, that
-    holds copies of its meshes, moved by transforms, bones or point caches, gives a layer over RIG.
+    holds copies of its meshes, moved by transforms, bones or point caches, gives a layer over RIG. FBX and glTF
+    are read through Blender.
     """
     import numpy as np
 
     from jawusd.cli.motion import AuthoredMotion, kept_inside
     from jawusd.rig import write_animation
-    from jawusd.rig.rebake import write_rebaked
+    from jawusd.rig.rebake import write_over, write_rebaked
 
     out = out or stage.with_name(f"{stage.stem}_baked.usdc")
     refuse_existing(out, force)
@@ -114,7 +121,9 @@ def rebake(
     found = read_stage_motion(loaded, rig, stage, prim, mandible, skull, origin.value if origin else None)
     motion, changes = kept_inside(loaded, AuthoredMotion(found.frames, found.d, found.fps))
     known = np.isfinite(motion.d).all(axis=1)
-    if found.fitted:
+    if found.fitted and prim is not None:
+        write_over(out, rig, loaded, motion.frames, motion.d, found.fps, prim)
+    elif found.fitted:
         write_animation(out, rig, motion.frames, motion.d, found.fps, rig=loaded)
     else:
         write_rebaked(out, stage, loaded, motion.frames[known], motion.d[known], prim)
@@ -156,19 +165,58 @@ def read_stage_motion(
 ) -> StageMotion:
     """Read the motion of a jaw from any stage: of the rig it carries, or else of the rig's meshes fitted to it.
 
+    Args:
+        loaded, rig: The rig and its file.
+        stage: A stage, or a file that Blender makes one of.
+        prim: Which rig, where the stage has several, or the rig's file if the stage comes from Blender.
+        mandible, skull: Prims to look below for the meshes.
+        origin: What counts, see `motion_of_stage`.
+
     Raises:
         JawusdError: no such motion.
     """
-    from jawusd.rig.rebake import StageMotion, motion_of_stage
-    from jawusd.rig.stage_poses import carries_rig, fit_poses_of_stage
+    from jawusd.plugins.conversion import SUFFIXES, converted
+    from jawusd.rig import describe
+    from jawusd.rig.rebake import motion_of_stage
+    from jawusd.rig.stage_poses import carries_rig
 
+    if stage.suffix.lower() in SUFFIXES:
+        _refuse_model(rig)
+        rate = float(describe(rig, prim)["fps"])
+        with tempfile.TemporaryDirectory() as folder:
+            try:
+                return _fitted(loaded, rig, converted(stage, folder, rate), mandible, skull, prim)
+            except JawusdError as error:
+                error.path = str(stage)
+                raise
     if mandible is None and skull is None and carries_rig(stage):
         return motion_of_stage(stage, loaded, prim, origin)
-    if rig.suffix.lower() not in USD_SUFFIXES:
-        raise typer.BadParameter("must be the rig's USD file here: its meshes are fitted.", param_hint="RIG")
-    found = fit_poses_of_stage(stage, rig, mandible, skull)
+    return _fitted(loaded, rig, stage, mandible, skull, None)
+
+
+def holds_stage(path: Path) -> bool:
+    """Tell whether a file is a stage, or one that Blender makes a stage of."""
+    from jawusd.plugins.conversion import SUFFIXES
+
+    return path.suffix.lower() in (*USD_SUFFIXES, *SUFFIXES)
+
+
+def _fitted(
+    loaded: JawRig, rig: Path, stage: Path, mandible: str | None, skull: str | None, prim: str | None
+) -> StageMotion:
+    from jawusd.rig.layout import ACTOR
+    from jawusd.rig.rebake import StageMotion
+    from jawusd.rig.stage_poses import fit_poses_of_stage
+
+    _refuse_model(rig)
+    found = fit_poses_of_stage(stage, rig, mandible, skull, prim or ACTOR)
     d, residual_mm = loaded.encode(found.T)
     return StageMotion(found.frames.astype(float), d, found.fps, "mandible", residual_mm, fitted=True)
+
+
+def _refuse_model(rig: Path) -> None:
+    if rig.suffix.lower() not in USD_SUFFIXES:
+        raise typer.BadParameter("must be the rig's USD file here: its meshes are fitted.", param_hint="RIG")
 
 
 def judged_motion(rig: JawRig, frames: Array, d: Array, residual_mm: Array) -> dict[str, float]:

@@ -1,7 +1,8 @@
 """Read how the jaw moves in a stage that carries no rig: from Xforms, bones or point caches of the actor's meshes.
 
-What programs export keeps vertices and their order, and little else: names, units, axes and hierarchy change. So the
-meshes of the rig are found by their number of vertices and fitted, frame by frame, to where the stage puts them.
+What programs export keeps vertices and little else: names, units, axes and hierarchy change, and formats such as glTF
+split vertices and order them anew. So the meshes of the rig are found by their number of vertices, or of different
+ones, and fitted, frame by frame, to where the stage puts them.
 """
 
 from __future__ import annotations
@@ -14,10 +15,13 @@ from numpy.typing import NDArray
 from pxr import Sdf, Usd, UsdGeom, UsdSkel, Vt
 
 from jawusd.errors import FormatError
+from jawusd.formats.mesh import Mesh
 from jawusd.geometry.arrays import Array
+from jawusd.geometry.matching import match_points
 from jawusd.geometry.rigid import rigid_fit
 from jawusd.geometry.se3 import se3_inverse, transform_points
 from jawusd.rig.geo import read_geometry
+from jawusd.rig.layout import ACTOR
 from jawusd.rig.motion_read import frames_of_stage
 from jawusd.rig.read import open_stage
 from jawusd.rig.schema import has_jaw_api
@@ -26,6 +30,7 @@ from jawusd.rig.untrusted import raises_format_error
 _POINTS = 2000  # of a mesh, evenly spread over its vertices, are fitted
 # Exports in single precision, also in metres, stay far below; a mesh of as many vertices that is another one does not.
 _MOST_MISFIT_MM = 0.5
+_SAME_POINT_MM = 0.02  # far above single precision, below the distance of a scan's vertices
 _SKULL, _MANDIBLE = ("upper_teeth", "skull"), ("lower_teeth", "mandible")
 
 
@@ -65,6 +70,7 @@ def fit_poses_of_stage(
     actor: str | os.PathLike[str],
     mandible: str | None = None,
     skull: str | None = None,
+    rig_prim: str = ACTOR,
 ) -> StagePoses:
     """Fit the meshes of an actor to a stage at every whole frame.
 
@@ -73,15 +79,15 @@ def fit_poses_of_stage(
         actor: The rig's own file, which gives the meshes in their frames.
         mandible: Prim to look below for the lower teeth or the mandible; None: everywhere.
         skull: The same for the upper teeth or the skull.
+        rig_prim: Which rig of the file.
 
     Raises:
         RigError: Not a stage.
         FormatError: No mesh with as many vertices, one that is another mesh, or no start and end.
     """
     stage = open_stage(path)
-    rest = read_geometry(actor, placeholders=True) | read_geometry(actor)
-    sources = {name: mesh.vertices for name, mesh in rest.items()}
-    places = [_find(stage, sources, names, below, path) for names, below in ((_SKULL, skull), (_MANDIBLE, mandible))]
+    rest = read_geometry(actor, rig_prim, placeholders=True) | read_geometry(actor, rig_prim)
+    places = [_find(stage, rest, names, below, path) for names, below in ((_SKULL, skull), (_MANDIBLE, mandible))]
     frames = frames_of_stage(stage, path)
     fitted, misfit_mm = np.empty((2, len(frames), 4, 4)), 0.0
     for k, frame in enumerate(frames.tolist()):
@@ -110,9 +116,8 @@ def _spread(points: Array) -> float:
 class _Place:
     """A mesh of the rig as a stage holds it."""
 
-    def __init__(self, prim: Usd.Prim, source: Array) -> None:
-        chosen = np.unique(np.linspace(0, len(source) - 1, _POINTS).astype(int))
-        self.path, self.source, self._chosen = str(prim.GetPath()), source[chosen], chosen
+    def __init__(self, prim: Usd.Prim, source: Array, own: NDArray[np.int64], there: NDArray[np.int64]) -> None:
+        self.path, self.source, self._chosen = str(prim.GetPath()), source[own], there
         self._mesh, self._skinning = UsdGeom.Mesh(prim), None
         root = UsdSkel.Root.Find(prim)
         if not root:
@@ -135,29 +140,71 @@ class _Place:
         return np.array(points, dtype=np.float64)[self._chosen] @ M[:3, :3] + M[3, :3]
 
 
-def _find(
-    stage: Usd.Stage, sources: dict[str, Array], names: tuple[str, ...], below: str | None, path: object
-) -> _Place:
-    """Return the mesh of the stage that has as many vertices as one of those named; teeth before bone."""
+def _find(stage: Usd.Stage, rest: dict[str, Mesh], names: tuple[str, ...], below: str | None, path: object) -> _Place:
+    """Return the mesh of the stage that has the vertices of one of those named; teeth before bone."""
     if below is not None and not (Sdf.Path.IsValidPathString(below) and stage.GetPrimAtPath(below)):
         raise FormatError(f"has no prim {below}.", path=str(path))
     start = stage.GetPrimAtPath(below) if below is not None else stage.GetPseudoRoot()
     meshes = [p for p in Usd.PrimRange(start, Usd.TraverseInstanceProxies()) if p.IsA(UsdGeom.Mesh)]
-    counts = [len(UsdGeom.Mesh(p).GetPointsAttr().Get(Usd.TimeCode.EarliestTime()) or ()) for p in meshes]
-    wanted = {name: len(sources[name]) for name in names if name in sources}
-    for name, count in wanted.items():
-        alike = [mesh for mesh, found in zip(meshes, counts, strict=True) if found == count]
+    found = {str(prim.GetPath()): _used_points(prim) for prim in meshes}
+    wanted = {name: rest[name] for name in names if name in rest}
+    for name, mesh in wanted.items():
+        alike = [prim for prim in meshes if len(found[str(prim.GetPath())].all) == len(mesh.vertices)]
+        alike = alike or [prim for prim in meshes if found[str(prim.GetPath())].different == _different(mesh)]
         # both rows may have as many vertices: then the name has to tell
-        named = [mesh for mesh in alike if _plain(name) in _plain(str(mesh.GetPath()))]
+        named = [prim for prim in alike if _plain(name) in _plain(str(prim.GetPath()))]
         if named or len(alike) == 1:
-            return _Place((named or alike)[0], sources[name])
-    sizes = " or ".join(f"{count} ({name})" for name, count in wanted.items())
+            prim = (named or alike)[0]
+            return _Place(prim, mesh.vertices, *_correspondence(mesh, found[str(prim.GetPath())]))
+    sizes = " or ".join(f"{len(mesh.vertices)} ({name})" for name, mesh in wanted.items())
     where = f" below {below}" if below is not None else ""
     raise FormatError(
         f"has no mesh{where} with {sizes} vertices, as the rig's.",
         path=str(path),
-        hint="Name the prims of skull and mandible with --skull and --mandible; vertices must not be merged or split.",
+        hint="Name the prims of skull and mandible with --skull and --mandible; vertices must not be merged or moved.",
     )
+
+
+class _Points(NamedTuple):
+    """Points of a mesh (n, 3), which of them faces use, and how many places these have."""
+
+    all: Array
+    used: NDArray[np.int64]
+    different: int
+
+
+def _used_points(prim: Usd.Prim) -> _Points:
+    mesh, first = UsdGeom.Mesh(prim), Usd.TimeCode.EarliestTime()
+    points = np.array(mesh.GetPointsAttr().Get(first) or np.empty((0, 3)), dtype=np.float64)
+    used = np.unique(np.array(mesh.GetFaceVertexIndicesAttr().Get(first) or [], dtype=np.int64))
+    used = used[used < len(points)]
+    return _Points(points, used, len(np.unique(points[used], axis=0)))
+
+
+def _different(mesh: Mesh) -> int:
+    return len(np.unique(mesh.vertices[np.unique(mesh.faces)], axis=0))
+
+
+def _correspondence(mesh: Mesh, found: _Points) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return indices of vertices of a rig's mesh, and those of the same ones in a stage: by shape, else by order."""
+    used = np.unique(mesh.faces).astype(np.int64)
+    spread = np.unique(np.linspace(0, len(used) - 1, _POINTS).astype(int))
+    same = len(mesh.vertices) == len(found.all)
+    if not same or not _in_order(mesh.vertices, found.all):
+        there = match_points(mesh.vertices[used], found.all[found.used], spread, _SAME_POINT_MM)
+        if there is not None:
+            return used[spread], found.used[there]
+    chosen = np.unique(np.linspace(0, min(len(mesh.vertices), len(found.all)) - 1, _POINTS).astype(int))
+    return chosen, chosen
+
+
+def _in_order(source: Array, points: Array) -> bool:
+    """Tell whether points are those of a mesh in its order, moved and scaled."""
+    chosen = np.unique(np.linspace(0, len(source) - 1, _POINTS).astype(int))
+    a, b = source[chosen], points[chosen]
+    b = b * (_spread(a) / _spread(b))
+    off = transform_points(rigid_fit(a, b), a) - b
+    return bool(np.sqrt((off**2).sum(axis=1).mean()) <= _MOST_MISFIT_MM)
 
 
 def _plain(name: str) -> str:

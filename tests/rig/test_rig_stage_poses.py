@@ -107,6 +107,26 @@ def test_a_point_cache_of_the_rig_itself_counts(folder, kind):
     np.testing.assert_allclose(np.loadtxt(folder / "d.csv", delimiter=",", skiprows=1)[:, 1:4], D, atol=1e-3)
 
 
+@pytest.mark.parametrize("split", [True, False])
+def test_vertices_may_be_split_or_shuffled(folder, kind, split):
+    rig, rng = example_rig(kind), np.random.default_rng(5)
+    path = exported(folder / "shot.usda", rig.pose(D))
+    stage = Usd.Stage.Open(str(path))
+    for name, mesh in (("UpperTeethMesh", "upper_teeth"), ("LowerTeethMesh", "lower_teeth")):
+        shape, prim = example_meshes()[mesh], UsdGeom.Mesh(stage.GetPrimAtPath(f"/root/{name}"))
+        twice = np.arange(0, len(shape.vertices), 4) if split else np.arange(0)
+        of = np.concatenate([np.arange(len(shape.vertices)), twice])
+        place = np.argsort(of, kind="stable") if split else rng.permutation(len(of))
+        where = np.argsort(place)
+        prim.GetPointsAttr().Set(Vt.Vec3fArray.FromNumpy(shape.vertices[of[place]].astype(np.float32)))
+        corners = shape.faces.astype(np.int32).ravel().copy()
+        for k, vertex in enumerate(twice):  # every other corner of it uses the second one
+            corners[np.flatnonzero(shape.faces.ravel() == vertex)[::2]] = len(shape.vertices) + k
+        prim.GetFaceVertexIndicesAttr().Set(Vt.IntArray.FromNumpy(where[corners].astype(np.int32)))
+    stage.Save()
+    np.testing.assert_allclose(fit_poses_of_stage(path, folder / "actor.usda").T, rig.pose(D), atol=1e-3)
+
+
 def test_names_tell_or_are_told(folder, kind):
     rig, actor = example_rig(kind), folder / "actor.usda"
     path = exported(folder / "shot.usda", rig.pose(D), names=("a", "b"))

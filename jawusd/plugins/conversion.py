@@ -1,0 +1,71 @@
+"""Read FBX and glTF through Blender, in a process of its own: what comes back is a USD stage."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+from jawusd.errors import FormatError, MissingDependencyError
+
+#: Files that Blender reads for jawusd.
+SUFFIXES = (".fbx", ".glb", ".gltf")
+#: Environment variable that names a Blender program, or a Python that has `bpy`.
+SETTING = "JAWUSD_BLENDER"
+
+_SCRIPT = Path(__file__).with_name("blender_convert.py")
+_TIMEOUT_S = 900
+
+
+def converted(path: str | os.PathLike[str], folder: str | os.PathLike[str], fps: float) -> Path:
+    """Convert a file to a USD stage in a folder; a time of 0 is frame 0.
+
+    Args:
+        path: An .fbx, .glb or .gltf file.
+        folder: Where the stage is written.
+        fps: Frames per second of files that do not say, as glTF ones.
+
+    Raises:
+        MissingDependencyError: There is no Blender.
+        FormatError: Blender cannot read the file.
+    """
+    path, target = Path(path), Path(folder) / f"{Path(path).stem}.usdc"
+    if not path.is_file():
+        raise FormatError("there is no such file.", path=path)
+    command = [*_blender(path), "--", str(path.resolve()), str(target), repr(fps)]
+    # plugins of this process are not meant for Blender's own OpenUSD
+    alone = {name: value for name, value in os.environ.items() if name != "PXR_PLUGINPATH_NAME"}
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT_S, env=alone, check=False)
+        said = done.stderr or done.stdout
+    except OSError as error:
+        raise MissingDependencyError(f"{command[0]} cannot be run ({error.strerror}).", hint=_hint()) from error
+    except subprocess.TimeoutExpired as error:
+        raise FormatError(f"Blender did not finish in {_TIMEOUT_S} s.", path=path) from error
+    if "No module named 'bpy'" in said:
+        raise MissingDependencyError(f"{command[0]} is neither Blender nor a Python with bpy.", hint=_hint())
+    if done.returncode or not target.is_file():
+        last = (said.strip().splitlines() or ["it said nothing"])[-1]
+        raise FormatError(f"Blender cannot read it ({last:.200}).", path=path)
+    return target
+
+
+def _blender(path: Path) -> list[str]:
+    """Return the command that runs the script in Blender."""
+    named = os.environ.get(SETTING) or shutil.which("blender")
+    if not os.environ.get(SETTING) and importlib.util.find_spec("bpy") is not None:
+        named = sys.executable
+    if not named:
+        raise MissingDependencyError(
+            "FBX and glTF are read through Blender, and there is none.", path=path, hint=_hint()
+        )
+    if Path(named).stem.lower().startswith("blender"):
+        return [named, "--background", "--factory-startup", "--python-exit-code", "1", "--python", str(_SCRIPT)]
+    return [named, str(_SCRIPT)]
+
+
+def _hint() -> str:
+    return f"Set {SETTING} to a Blender program (4.2 or later), or to a Python with `pip install bpy`; or export USD."
