@@ -135,19 +135,31 @@ def rebake(
 
 
 def publish(
-    folder: Annotated[Path, typer.Argument(help="Folder of a rig, with actor.usda.", show_default=False)],
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder to write to.", show_default=False)],
+    source: Annotated[
+        Path,
+        typer.Argument(help="Folder of a rig, with actor.usda, or a shot.", metavar="FOLDER|SHOT", show_default=False),
+    ],
+    out: Annotated[
+        Path, typer.Option("-o", "--out", help="Folder to write to, or of a shot the .usdz.", show_default=False)
+    ],
     prefix: Annotated[
         str | None, typer.Option(help="Start of every file's name; the actor's name if not given.", show_default=False)
     ] = None,
     force: Force = False,
+    allow: Allow = None,
     as_json: Json = False,
 ) -> None:
-    """Copy a rig under file names of its own, so that actors can be packed together."""
+    """Copy a rig under file names of its own, so that actors can be packed together; or pack a whole shot as .usdz."""
+    from jawusd.rig.package import write_package
     from jawusd.rig.publish import publish_rig
 
     refuse_existing(out, force)
-    files = [str(path) for path in publish_rig(folder, out, prefix)]
+    if not source.is_dir():
+        if out.suffix.lower() != ".usdz" or prefix is not None:
+            raise typer.BadParameter("of a shot, name a .usdz and no prefix.", param_hint="--out")
+        files = [str(write_package(out, source))]
+    else:
+        files = [str(path) for path in publish_rig(source, out, prefix)]
     emit({"files": files}, as_json, lambda: files)
 
 

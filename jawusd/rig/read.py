@@ -218,7 +218,7 @@ def describe(path: PathArg, prim_path: str | None = None) -> Description:
         "fps": stage.GetTimeCodesPerSecond(),
         "animation": animation,
         "meshes": _meshes(prim),
-        "placeholders": [p.GetName() for p in Usd.PrimRange(prim) if p.GetAttribute("jaw:placeholder").Get()],
+        "placeholders": [p.GetName() for p in _below(prim) if p.GetAttribute("jaw:placeholder").Get()],
         "contact": rig.meta.get("contact"),
         "joints": rig.meta.get("joints"),
         "speeds": _speeds(rig),
@@ -235,5 +235,10 @@ def _speeds(rig: JawRig) -> dict[str, list[float]] | None:
 
 def _meshes(prim: Usd.Prim) -> dict[str, int]:
     """Return the number of points of every mesh below a prim, by name."""
-    meshes = [UsdGeom.Mesh(p) for p in Usd.PrimRange(prim) if p.IsA(UsdGeom.Mesh)]
+    meshes = [UsdGeom.Mesh(p) for p in _below(prim) if p.IsA(UsdGeom.Mesh)]
     return {mesh.GetPrim().GetName(): len(mesh.GetPointsAttr().Get() or []) for mesh in meshes}
+
+
+def _below(prim: Usd.Prim) -> Usd.PrimRange:
+    """Return a prim and all below it, of an instance too."""
+    return Usd.PrimRange(prim, Usd.TraverseInstanceProxies())

@@ -56,3 +56,9 @@ def test_a_source_that_is_no_usd_leaves_the_old_package(anchored_folder):
     with pytest.raises(RigError, match="no such file"):
         write_package(package, anchored_folder / "nothing.usda")
     assert package.read_bytes() == before
+
+
+def test_a_stage_without_a_rig_is_not_packed(tmp_path):
+    (tmp_path / "empty.usda").write_text('#usda 1.0\ndef Xform "Shot" {}\n')
+    with pytest.raises(RigError, match="no jaw rig"):
+        write_package(tmp_path / "empty.usdz", tmp_path / "empty.usda")
