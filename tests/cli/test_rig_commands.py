@@ -12,6 +12,7 @@ from example_tracks import make_tracks
 from key_sets import own_curve
 from package_copy import ROOT
 from pxr import Usd, UsdGeom
+from scipy.signal import find_peaks
 
 import jawusd
 from jawusd.formats.poses import read_parameters, write_parameters, write_poses
@@ -308,6 +309,33 @@ def test_face_takes_come_to_the_rate_of_the_scene(actor, tmp_path, lost):
     edges = np.abs(at - 45.5) < 8 if lost else np.zeros(len(at), bool)
     np.testing.assert_allclose(d1[~edges], expected[~edges], atol=0.02)
     assert validate_stage(out) == []
+
+
+def test_peaks_of_speech_keep_their_time_and_height(actor, tmp_path):
+    """60 to 24 frames per second: a chewed sentence, looked at between the frames for where it peaks."""
+    rig = jawusd.load(actor)
+
+    def d_at(seconds):
+        opening = 0.3 + 0.1 * np.sin(2 * np.pi * 0.7 * seconds) + 0.08 * np.sin(2 * np.pi * 3.1 * seconds + 1)
+        side = 0.35 * np.sin(2 * np.pi * 1.3 * seconds)
+        return opening, np.maximum(side, 0.0) ** 2, np.maximum(-side, 0.0) ** 2
+
+    opening, left, right = d_at(np.arange(0, 1201) / 60)
+    csv = face_csv(tmp_path / "face.csv", np.column_stack([opening, left, right, 0 * left]), fps=60)
+    out = actor.parent / "anim_peaks.usdc"
+    found = json.loads(run("animate", actor, "--arkit", csv, "--resample", 24, "-o", out, "--json"))
+    assert found["frames"] == [0, 480] and found["clamped"] == 0
+    stage = Usd.Stage.Open(str(out))
+    shown = stage.GetPrimAtPath("/Actor").GetAttribute("jaw:d1")
+    d1 = np.array([shown.Get(float(frame)) for frame in range(481)])
+    truth = rig.d_range[0, 1] * d_at(np.arange(481) / 24)[0]
+    np.testing.assert_allclose(d1[1:-1], truth[1:-1], atol=0.02)
+    fine = rig.d_range[0, 1] * d_at(np.arange(0, 20, 0.001))[0]
+    for sign in (1, -1):
+        peaks = find_peaks(sign * fine, prominence=1.0)[0] / 1000 * 24
+        peaks = peaks[(peaks > 2) & (peaks < 478)]
+        found = find_peaks(sign * d1)[0]
+        assert len(peaks) > 50 and np.abs(peaks[:, None] - found).min(axis=1).max() <= 1.0
 
 
 def test_keys_move_to_another_rate_and_keep_their_curves(actor, tmp_path):
