@@ -26,7 +26,7 @@ _CANDIDATE_SLICES = 48
 _CANDIDATE_RADII = (0.4, 0.75, 0.9, 0.97, 1.0)  # denser towards the outline, where nearest points lie
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SliceHull:
     """The bound of a rig.
 

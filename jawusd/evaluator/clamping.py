@@ -11,6 +11,7 @@ to where it would be (the mean of the two envelopes of McShane and Whitney 1934)
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -63,8 +64,9 @@ class Spine:
     middle: Array
 
     @classmethod
+    @lru_cache(maxsize=16)
     def of(cls, bound: SliceHull) -> Spine:
-        """Find the spine of a bound.
+        """Find the spine of a bound; that of one looked at before is kept.
 
         Raises:
             EvaluatorError: the bound is empty.
@@ -166,6 +168,8 @@ def kept_inside(bound: SliceHull, times: Array, d: Array, *, ends_stay: bool = F
     Raises:
         EvaluatorError: the bound is empty.
     """
+    if len(d) == 1:
+        return Inside(times, drawn_inside(bound, Spine.of(bound), d), np.array([True]))
     spine = Spine.of(bound).towards(bound, d[:, 1:].min(axis=0), d[:, 1:].max(axis=0))
     fine, wanted, given = _pieces(bound, times, d)
     drawn = drawn_inside(bound, spine, wanted, 0.0)

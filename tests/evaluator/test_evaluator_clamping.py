@@ -66,6 +66,21 @@ def test_random_keys(rig, method, spread):
         assert found.overshoot_mm <= 0.1 or found.forced
 
 
+@pytest.mark.parametrize("rig", [RIG, hollow_rig()], ids=["example", "hollow"])
+def test_one_pose_is_brought_where_it_would_stay(rig):
+    """As a motion that stands still there, inside, and in small steps for small steps."""
+    low, high = rig.d_range.T
+    start, end = np.random.default_rng(2).uniform(low - 4, high + 4, (2, 12, 3))
+    ways = start[:, None] + np.linspace(0, 1, 401)[:, None] * (end - start)[:, None]
+    for way in ways:
+        found = np.array([rig.keep_inside([0.0], [d]).d[0] for d in way])
+        assert rig.is_inside(found).all()
+        np.testing.assert_array_equal(found[rig.is_inside(way)], way[rig.is_inside(way)])
+        still = np.array([rig.keep_inside([0.0, 1.0], [d, d]).d[0] for d in way[::40]])
+        np.testing.assert_allclose(found[::40], still, atol=2e-3)
+        assert np.linalg.norm(np.diff(found, axis=0), axis=1).max() < 0.6
+
+
 def test_projecting_frame_by_frame_pops():
     """What the bound's own nearest points would do to the same keys: the guard above can fail."""
     rig, worst = hollow_rig(), []
