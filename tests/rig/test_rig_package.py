@@ -62,3 +62,22 @@ def test_a_stage_without_a_rig_is_not_packed(tmp_path):
     (tmp_path / "empty.usda").write_text('#usda 1.0\ndef Xform "Shot" {}\n')
     with pytest.raises(RigError, match="no jaw rig"):
         write_package(tmp_path / "empty.usdz", tmp_path / "empty.usda")
+
+
+def test_no_transform_of_a_shot_is_whole(anchored_folder, tmp_path):
+    stage = Usd.Stage.CreateNew(str(anchored_folder / "shot.usda"))
+    prim = stage.DefinePrim("/Shot/Person", "Xform")
+    prim.GetReferences().AddReference("./actor.usda")
+    place = UsdGeom.XformCommonAPI(prim)
+    values = {"translate": (3, 0, -4), "rotateXYZ": (0, 90, 0), "scale": (1, 1, 1)}
+    for time in (0.0, 1.0):
+        place.SetXformVectors(
+            *(values[key] for key in ("translate", "rotateXYZ", "scale")), (0, 0, 0), place.RotationOrderXYZ, time
+        )
+    stage.Save()
+    package = Usd.Stage.Open(str(write_package(tmp_path / "shot.usdz", anchored_folder / "shot.usda")))
+    for key, value in values.items():
+        attribute = package.GetPrimAtPath("/Shot/Person").GetAttribute(f"xformOp:{key}")
+        for time in (0.0, 1.0):
+            assert tuple(attribute.Get(time)) != value
+            np.testing.assert_allclose(attribute.Get(time), value, atol=1e-6)
