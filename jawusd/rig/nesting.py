@@ -6,12 +6,13 @@ import re
 from pathlib import Path
 
 import numpy as np
-from pxr import Sdf, Tf
+from pxr import Sdf, Tf, Usd
 
 #: Brackets within brackets, and elements of a path, that are read. Stages of studios have some twenty; OpenUSD ends the
 #: process at 1,000 where a thread has a stack of 512 kB, as on macOS, and between 3,000 and 20,000 where it has 8 MB.
 MOST_LEVELS = 256
 
+_ZipFile = Sdf.ZipFile if hasattr(Sdf, "ZipFile") else Usd.ZipFile  # where OpenUSD 24.11 and 25.05 have it
 _OPENING, _CLOSING = b"([{", b")]}"
 _STEPS = bytes.maketrans(_OPENING + _CLOSING, b"\x01" * 3 + b"\xff" * 3)
 _OTHERS = bytes(set(range(256)) - set(_OPENING + _CLOSING))
@@ -42,7 +43,7 @@ def is_too_deep(file: Path) -> bool:
         if not first.startswith(b"PK"):
             return _is_deep(first + opened.read())
     try:
-        package = Sdf.ZipFile.Open(str(file))  # finds what OpenUSD finds, where a package contradicts itself
+        package = _ZipFile.Open(str(file))  # finds what OpenUSD finds, where a package contradicts itself
     except Tf.ErrorException:
         return False
     names = package.GetFileNames() if package else []
