@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 from jawusd.errors import FormatError, MissingDependencyError
+from jawusd.inputs import check_input
 
 #: Files that Blender reads for jawusd.
 SUFFIXES = (".fbx", ".glb", ".gltf")
@@ -33,6 +34,7 @@ def converted(path: str | os.PathLike[str], folder: str | os.PathLike[str], fps:
         FormatError: Blender cannot read the file.
     """
     path, target = Path(path), Path(folder) / f"{Path(path).stem}.usdc"
+    check_input(path)
     if not path.is_file():
         raise FormatError("there is no such file.", path=path)
     command = [*_blender(path), "--", str(path.resolve()), str(target), repr(fps)]

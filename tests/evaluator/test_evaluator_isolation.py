@@ -42,7 +42,7 @@ def test_import_loads_nothing_third_party_but_numpy():
     third_party, own = done.stdout.splitlines()
     assert third_party == "numpy"
     layers = {name.split(".")[1] for name in own.split()}
-    assert layers == {"errors", "evaluator", "geometry", "npz", "plugin_path"}
+    assert layers == {"errors", "evaluator", "geometry", "inputs", "npz", "plugin_path"}
 
 
 def test_the_probe_sees_a_planted_import():
