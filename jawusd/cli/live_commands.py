@@ -29,7 +29,7 @@ def live(
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page; the next free one if taken.")] = 8080,
     head: Annotated[Head, typer.Option(help="fixed: the cameras are worn, and move with the head.")] = Head.free,
     seconds: Annotated[float | None, typer.Option(min=0.1, help="End after so long.", show_default=False)] = None,
-    jobs: Annotated[int, typer.Option(min=1, max=64, help="Threads that search the teeth.")] = 2,
+    jobs: Annotated[int, typer.Option(min=1, max=64, help="Threads that search and follow the teeth.")] = 2,
     allow_outside: Outside = False,
     prim: Prim = None,
     allow: Allow = None,

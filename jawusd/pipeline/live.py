@@ -107,7 +107,7 @@ def live(
         sources: by camera name a device, an address or a file.
         prim: which rig, where a stage has several.
         fixed_head: the cameras are worn: the head hardly moves before them.
-        jobs: threads that search the teeth.
+        jobs: threads that search and follow the teeth.
         seconds: after which to end; None goes on until the sources end.
         allow_outside: let paths in the capture leave its folder.
 
@@ -187,7 +187,8 @@ class _Follower:
             meshes = registered_meshes(load_labelled(capture)[0], jaw.meta)
         self._teeth = PreparedTeeth(self._capture, meshes, jaw, pool.map)
         cameras = tuple(self._cameras.values())
-        self._take = LiveTake(jaw, self._teeth.scans, self._teeth.axes, cameras, fixed_head=fixed_head)
+        scans, axes = self._teeth.scans, self._teeth.axes
+        self._take = LiveTake(jaw, scans, axes, cameras, fixed_head=fixed_head, executor=pool)
         self._sources: dict[str, LiveSource] = {
             name: LiveSource(where[name], camera.size_px, -self._offsets[name] * self._period_s)
             for name, camera in self._cameras.items()

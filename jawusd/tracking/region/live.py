@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from dataclasses import replace
 
 import numpy as np
@@ -37,6 +38,7 @@ class LiveTake:
         cameras: Sequence[Camera],
         *,
         fixed_head: bool = False,
+        executor: Executor | None = None,
     ) -> None:
         """Prepare.
 
@@ -46,12 +48,13 @@ class LiveTake:
             axes: rotation from scan to anatomical axes: left, up, front; shape (3, 3).
             cameras: in the order of the pictures.
             fixed_head: the cameras are worn: the head hardly moves before them.
+            executor: threads that match the contours of all cameras side by side.
         """
         self._scans, self._axes, self._cameras = [thinned(scan, _FACES) for scan in scans], axes, cameras
         self._head = STEADY if fixed_head else 1.0
         self.coordinates = Coordinates(jaw, self._scans)
         config = replace(TrackingConfig(), sample_step_px=_SAMPLE_STEP_PX, redraw_px=_REDRAW_PX)
-        self._instants = InstantSolver(ContourSolver(self._scans, config), self.coordinates)
+        self._instants = InstantSolver(ContourSolver(self._scans, config, executor), self.coordinates)
         self._tracker: RigTracker | None = None
 
     def begin(self, cut: Cut, near: Pose) -> float:

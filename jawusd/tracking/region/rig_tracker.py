@@ -32,6 +32,8 @@ _GATES_PX, _WIDE_GATES_PX, _BRIEF_GATES_PX = (6.0, 4.0, 3.0, 2.5, 2.0), (12.0, 8
 _FEW_GATES_PX, _LEARN_EVERY, _FEW_JAWS, _FEW_HEADS = (8.0, 3.0, 2.0), 6, 4, 3
 _FAR_GATES_PX, _STEADY_FRAMES = (24.0, 14.0, 8.0, 4.0, 2.0), 1.5  # after frames that were left out
 _BRIEF_PAUSE = 2  # failed frames per one that is searched
+# Failed frames after which teeth are out of sight, and how many then share one search of the jaw and one of the head.
+_BRIEF_SEARCHES, _BRIEF_TURNS = 4, 6
 _FIRST_ROUNDS = 3  # picks are a few tenths of a millimetre off; each round takes most of the rest
 # Share of the usual contour that fits, below which a pose is doubted, others are searched, an arch is given up,
 # and one that was lost is not trusted again.
@@ -136,18 +138,21 @@ class RigTracker:
     def _best(self, expected: Expected, look: _Look, cut: Cut, frames: float) -> tuple[Aligned, _Look]:
         """Align from the prediction, and from other starts where that may have failed; then in more of the pictures."""
         gates = _FEW_GATES_PX if self._brief else _GATES_PX
-        if self._brief and frames > _STEADY_FRAMES:
+        blind = self._brief and self._failed > _BRIEF_SEARCHES
+        if self._brief and frames > _STEADY_FRAMES and not blind:
             gates = _FAR_GATES_PX
         found, usual = look.align(expected.pose, expected, gates), self._usual_share()
         doubted, searched = (_BRIEF_DOUBTED, _BRIEF_SEARCHED) if self._brief else (_DOUBTED, _SEARCHED)
         if not (_share(found.solution) < doubted * usual).any():
             return found, look
         others = (self._motion.last,) if self._brief else (expected.pose, self._motion.last)
-        for start in others:
+        for start in () if blind else others:
             found = _better(found, look.align(start, expected, gates if self._brief else _WIDE_GATES_PX))
         if not (_share(found.solution) < searched * usual).any():
             return found, look
         self._failed += 1
+        if blind:
+            return self._best_in_turn(found, expected, look, cut)
         pause = _BRIEF_PAUSE if self._brief else 1 if self._failed <= _SEARCHES else _SEARCHES
         if (self._failed - 1) % pause:
             return found, look
@@ -156,6 +161,16 @@ class RigTracker:
         if self._head == 1.0 and _share(found.solution)[0] < _SEARCHED * usual[0]:
             found = self._with_head_searched(found, expected, look)
         return self._searched(found, expected, look), look
+
+    def _best_in_turn(self, found: Aligned, expected: Expected, look: _Look, cut: Cut) -> tuple[Aligned, _Look]:
+        """Search the jaw in one frame and the head in a later one: teeth out of sight hold up no pictures."""
+        turn = self._failed % _BRIEF_TURNS
+        if turn == 0:
+            look = self._look(cut, np.stack([found.pose.head, found.pose.head @ self._widest]))
+            return self._searched(found, expected, look), look
+        if turn == _BRIEF_TURNS // 2 and self._head == 1.0:
+            return self._with_head_searched(found, expected, look), look
+        return found, look
 
     def _with_head_searched(self, found: Aligned, expected: Expected, look: _Look) -> Aligned:
         """Try shifted poses of the head, which the jaw goes with."""
