@@ -20,6 +20,7 @@ from jawusd.tracking.performance.coordinates import JAW, Coordinates, Pose
 from jawusd.tracking.performance.instant import InstantSolver
 from jawusd.tracking.performance.prediction import STEADY
 from jawusd.tracking.region.learned import CORRELATION_PX, LearnedColours
+from jawusd.tracking.region.pace import BRIEF
 from jawusd.tracking.region.picture import Cut
 from jawusd.tracking.region.rig_tracker import RigTracker
 
@@ -60,7 +61,7 @@ class LiveTake:
     def begin(self, cut: Cut, near: Pose) -> float:
         """Learn the colours of an instant near a pose; return how much of the contour in sight fits, 0 .. 1."""
         colours = LearnedColours(self._scans, self._cameras, self._axes)
-        self._tracker = RigTracker(self._instants, colours, head=self._head, brief=True)
+        self._tracker = RigTracker(self._instants, colours, head=self._head, pace=BRIEF)
         solution = self._tracker.begin(cut, near).solution
         if solution is None:
             return 0.0

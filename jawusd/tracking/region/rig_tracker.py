@@ -22,29 +22,22 @@ from jawusd.tracking.performance.instant import Aligned, Expected, InstantSolver
 from jawusd.tracking.performance.prediction import Prediction
 from jawusd.tracking.performance.single_start import spread_out
 from jawusd.tracking.region.learned import CORRELATION_PX, FIRST_RATES, RATES, LearnedColours
+from jawusd.tracking.region.pace import THOROUGH, Pace
 from jawusd.tracking.region.picture import Cut, Picture
 from jawusd.tracking.region.starts import head_shifts, likeliest
 
 # Variance of the borders of colours times the length over which they err alike [px^3]: as for both arches alone.
 _BORDER_PX3 = 0.7**2 * CORRELATION_PX
-_GATES_PX, _WIDE_GATES_PX, _BRIEF_GATES_PX = (6.0, 4.0, 3.0, 2.5, 2.0), (12.0, 8.0, 6.0, 4.0, 3.0, 2.5, 2.0), (8.0, 6.0)
-# The same with few steps, and after how many frames colours are taken up then.
-_FEW_GATES_PX, _LEARN_EVERY, _FEW_JAWS, _FEW_HEADS = (8.0, 3.0, 2.0), 6, 4, 3
-_FAR_GATES_PX, _STEADY_FRAMES = (24.0, 14.0, 8.0, 4.0, 2.0), 1.5  # after frames that were left out
-_BRIEF_PAUSE = 2  # failed frames per one that is searched
-# Failed frames after which teeth are out of sight, and how many then share one search of the jaw and one of the head.
-_BRIEF_SEARCHES, _BRIEF_TURNS = 4, 6
+_FIRST_GATES_PX = (12.0, 8.0, 6.0, 4.0, 3.0, 2.5, 2.0)
+_TRIAL_GATES_PX = (8.0, 6.0)  # of the many poses that a search tries
+_STEADY_FRAMES = 1.5  # since the last step, up to which its motion tells where the teeth are
 _FIRST_ROUNDS = 3  # picks are a few tenths of a millimetre off; each round takes most of the rest
-# Share of the usual contour that fits, below which a pose is doubted, others are searched, an arch is given up,
-# and one that was lost is not trusted again.
-_DOUBTED, _SEARCHED, _LOST, _AGAIN = 0.8, 0.6, 0.33, 0.5
-_BRIEF_DOUBTED, _BRIEF_SEARCHED = 0.6, 0.4  # the first two where few steps are taken
+# Share of the usual contour that fits, below which an arch is given up, and one that was lost not trusted again.
+_LOST, _AGAIN = 0.33, 0.5
 _UNSURE_FRAMES = 3.0  # left out, after which an arch counts as lost
 _USUAL_FRAMES = 15  # over which the usual contour is measured; it is no less than a share of that of the first frame
 _LEAST_USUAL = 0.7
-# Poses of the jaw among which a search looks, that it tries, and follows to the end, and of the head.
-_JAWS, _TRIED_JAWS, _FINALISTS, _HEADS = 96, 16, 3, 12
-_SEARCHES = 8  # frames in a row that are searched; then every so many
+_JAWS = 96  # poses of the jaw among which a search looks for those to try
 
 
 class RigTracker:
@@ -61,17 +54,17 @@ class RigTracker:
         *,
         head: float = 1.0,
         free_focal: bool = False,
-        brief: bool = False,
+        pace: Pace = THOROUGH,
     ) -> None:
         """Take what aligns instants and where the colours are kept; `begin` comes first.
 
         Args:
             head: how far the head moves, see `Prediction`.
             free_focal: tell how outlines grow with focal lengths.
-            brief: take fewer steps, and up colours less often, for pictures that wait for nobody.
+            pace: how much work an instant is worth.
         """
         self._instants, self._coordinates, self._colours = instants, instants.coordinates, colours
-        self._head, self._free_focal, self._brief = head, free_focal, brief
+        self._head, self._free_focal, self._pace = head, free_focal, pace
         self._jaws = spread_out(instants.coordinates.jaw, _JAWS)
         places = instants.coordinates.jaw.pose(self._jaws)
         self._widest = places[np.argmax(np.linalg.norm(places[:, :3, 3], axis=1))]
@@ -87,7 +80,7 @@ class RigTracker:
         for _ in range(_FIRST_ROUNDS):
             arches = self._coordinates.arches(pose)
             look = _Look(self._instants, self._colours, cut(arches), arches)
-            found = look.align(pose, Expected(pose, sigma**-2.0), _WIDE_GATES_PX)
+            found = look.align(pose, Expected(pose, sigma**-2.0), _FIRST_GATES_PX)
             pose = found.pose
             look.learn(pose, FIRST_RATES)
         self.expected = Expected(pose, sigma**-2.0)
@@ -121,7 +114,7 @@ class RigTracker:
         self._frame += 1
         if trusted.all():
             self._failed = 0
-            if not self._brief or self._frame % _LEARN_EVERY == 0:
+            if self._frame % self._pace.learn_every == 0:
                 look.learn(found.pose, RATES)
             self._usual.append(share)
         self._motion.take(found.pose, trusted)
@@ -135,40 +128,41 @@ class RigTracker:
         before = self._coordinates.arches(self._motion.last)
         return _Look(self._instants, self._colours, cut(around), before)
 
+    def _wide_look(self, found: Aligned, cut: Cut) -> _Look:
+        """Return the pictures around all that the jaw reaches from a pose of the head."""
+        return self._look(cut, np.stack([found.pose.head, found.pose.head @ self._widest]))
+
     def _best(self, expected: Expected, look: _Look, cut: Cut, frames: float) -> tuple[Aligned, _Look]:
         """Align from the prediction, and from other starts where that may have failed; then in more of the pictures."""
-        gates = _FEW_GATES_PX if self._brief else _GATES_PX
-        blind = self._brief and self._failed > _BRIEF_SEARCHES
-        if self._brief and frames > _STEADY_FRAMES and not blind:
-            gates = _FAR_GATES_PX
-        found, usual = look.align(expected.pose, expected, gates), self._usual_share()
-        doubted, searched = (_BRIEF_DOUBTED, _BRIEF_SEARCHED) if self._brief else (_DOUBTED, _SEARCHED)
-        if not (_share(found.solution) < doubted * usual).any():
+        pace, usual = self._pace, self._usual_share()
+        in_turn = pace.in_turn and self._failed > pace.searches
+        gates = pace.far_px if frames > _STEADY_FRAMES and not in_turn else pace.gates_px
+        found = look.align(expected.pose, expected, gates)
+        if not (_share(found.solution) < pace.doubted * usual).any():
             return found, look
-        others = (self._motion.last,) if self._brief else (expected.pose, self._motion.last)
-        for start in () if blind else others:
-            found = _better(found, look.align(start, expected, gates if self._brief else _WIDE_GATES_PX))
-        if not (_share(found.solution) < searched * usual).any():
+        if not in_turn:
+            for start in (self._motion.last,) if pace.wide_px is None else (expected.pose, self._motion.last):
+                found = _better(found, look.align(start, expected, pace.wide_px or gates))
+        if not (_share(found.solution) < pace.searched * usual).any():
             return found, look
         self._failed += 1
-        if blind:
+        if in_turn:
             return self._best_in_turn(found, expected, look, cut)
-        pause = _BRIEF_PAUSE if self._brief else 1 if self._failed <= _SEARCHES else _SEARCHES
-        if (self._failed - 1) % pause:
+        if (self._failed - 1) % (pace.search_every if self._failed <= pace.searches else pace.later_every):
             return found, look
-        look = self._look(cut, np.stack([found.pose.head, found.pose.head @ self._widest]))
+        look = self._wide_look(found, cut)
         found = look.align(found.pose, expected, gates)
-        if self._head == 1.0 and _share(found.solution)[0] < _SEARCHED * usual[0]:
+        if self._head == 1.0 and _share(found.solution)[0] < pace.searched * usual[0]:
             found = self._with_head_searched(found, expected, look)
         return self._searched(found, expected, look), look
 
     def _best_in_turn(self, found: Aligned, expected: Expected, look: _Look, cut: Cut) -> tuple[Aligned, _Look]:
         """Search the jaw in one frame and the head in a later one: teeth out of sight hold up no pictures."""
-        turn = self._failed % _BRIEF_TURNS
+        turn = self._failed % self._pace.later_every
         if turn == 0:
-            look = self._look(cut, np.stack([found.pose.head, found.pose.head @ self._widest]))
+            look = self._wide_look(found, cut)
             return self._searched(found, expected, look), look
-        if turn == _BRIEF_TURNS // 2 and self._head == 1.0:
+        if turn == self._pace.later_every // 2 and self._head == 1.0:
             return self._with_head_searched(found, expected, look), look
         return found, look
 
@@ -176,12 +170,12 @@ class RigTracker:
         """Try shifted poses of the head, which the jaw goes with."""
         shifts = head_shifts(expected.pose.head, self._colours.axes)
         order = likeliest(list(shifts @ expected.pose.head), look.views, self._instants.solver.scans, 0)
-        order = order[: _FEW_HEADS if self._brief else _HEADS]
+        order = order[: self._pace.heads]
         for head in (shifts[k] @ expected.pose.head for k in order):
             start = replace(expected.pose, head=head)
             around = Expected(start, MOST_UNSURE**-2.0)
-            found = _better(found, look.align(start, around, _BRIEF_GATES_PX))
-        gates = _FEW_GATES_PX if self._brief else _WIDE_GATES_PX
+            found = _better(found, look.align(start, around, _TRIAL_GATES_PX))
+        gates = self._pace.wide_px or self._pace.gates_px
         return look.align(found.pose, Expected(found.pose, MOST_UNSURE**-2.0), gates)
 
     def _searched(self, found: Aligned, expected: Expected, look: _Look) -> Aligned:
@@ -191,13 +185,13 @@ class RigTracker:
         order = likeliest(places, look.views, self._instants.solver.scans, 1, look.upper_crowns(found.pose))
         brief, loose = [], expected.precision.copy()
         loose[JAW] = MOST_UNSURE[JAW] ** -2.0
-        for k in order[: _FEW_JAWS if self._brief else _TRIED_JAWS]:
+        for k in order[: self._pace.jaws]:
             start = replace(found.pose, d=self._jaws[k])
-            brief.append(look.align(start, Expected(start, loose), _BRIEF_GATES_PX))
+            brief.append(look.align(start, Expected(start, loose), _TRIAL_GATES_PX))
         brief.sort(key=lambda trial: -float(score_px(trial.solution).sum()))
-        for trial in brief[: 1 if self._brief else _FINALISTS]:
+        for trial in brief[: self._pace.finalists]:
             around = Expected(trial.pose, loose)
-            found = _better(found, look.align(trial.pose, around, _FEW_GATES_PX if self._brief else _WIDE_GATES_PX))
+            found = _better(found, look.align(trial.pose, around, self._pace.wide_px or self._pace.gates_px))
         return found
 
 
