@@ -35,7 +35,7 @@ def exported(path, T, cached=False, names=("UpperTeethMesh", "LowerTeethMesh"), 
     heads[:, :3, :3] = size * Rotation.from_rotvec(np.linspace(0, 1, len(T))[:, None] * [0.3, 1, 0.2]).as_matrix()
     heads[:, :3, 3] = np.linspace(0, 2, len(T))[:, None] * [1, 2, 3]
     for name, mesh, poses in zip(names, ("upper_teeth", "lower_teeth"), (heads, heads @ T), strict=True):
-        prim = UsdGeom.Mesh.Define(stage, f"/root/{name}")
+        prim = UsdGeom.Mesh.Define(stage, f"/World/{name}")
         shape = example_meshes()[mesh]
         vertices = change(shape.vertices) if change else shape.vertices
         prim.CreateFaceVertexCountsAttr(Vt.IntArray([3] * len(shape.faces)))
@@ -113,7 +113,7 @@ def test_vertices_may_be_split_or_shuffled(folder, kind, split):
     path = exported(folder / "shot.usda", rig.pose(D))
     stage = Usd.Stage.Open(str(path))
     for name, mesh in (("UpperTeethMesh", "upper_teeth"), ("LowerTeethMesh", "lower_teeth")):
-        shape, prim = example_meshes()[mesh], UsdGeom.Mesh(stage.GetPrimAtPath(f"/root/{name}"))
+        shape, prim = example_meshes()[mesh], UsdGeom.Mesh(stage.GetPrimAtPath(f"/World/{name}"))
         twice = np.arange(0, len(shape.vertices), 4) if split else np.arange(0)
         of = np.concatenate([np.arange(len(shape.vertices)), twice])
         place = np.argsort(of, kind="stable") if split else rng.permutation(len(of))
@@ -132,11 +132,11 @@ def test_names_tell_or_are_told(folder, kind):
     path = exported(folder / "shot.usda", rig.pose(D), names=("a", "b"))
     with pytest.raises(FormatError, match="vertices"):
         fit_poses_of_stage(path, actor)
-    found = fit_poses_of_stage(path, actor, mandible="/root/b", skull="/root/a")
+    found = fit_poses_of_stage(path, actor, mandible="/World/b", skull="/World/a")
     np.testing.assert_allclose(found.T, rig.pose(D), atol=1e-3)
-    assert found.meshes == ("/root/a", "/root/b") and found.misfit_mm < 1e-3
+    assert found.meshes == ("/World/a", "/World/b") and found.misfit_mm < 1e-3
     with pytest.raises(FormatError, match="no prim /nowhere"):
-        fit_poses_of_stage(path, actor, mandible="/nowhere", skull="/root/a")
+        fit_poses_of_stage(path, actor, mandible="/nowhere", skull="/World/a")
 
 
 def test_another_mesh_of_as_many_vertices_is_refused(folder, kind):
