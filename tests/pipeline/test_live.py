@@ -180,11 +180,11 @@ def test_the_command_follows_the_example(rig):
             tip = jaw.landmarks[0]
             wanted = transform_point(relative[frames.index(number)], tip)
             errors.append(np.linalg.norm(transform_point(jaw.pose(line["d"]), tip) - wanted))
-    assert errors and np.median(errors) < 0.6
+    assert len(errors) > 0.3 * len(lines) and np.median(errors) < 0.6
 
 
 def test_teeth_are_found_again_after_frames_left_out(rig):
-    """A quarter of a second is missing time and again; poses that are found are as near as they are said to be."""
+    """A quarter of a second is missing time and again; poses that are said to be found are never far off."""
     capture = open_capture(EXAMPLE)
     jaw = jawusd.load(rig)
     cameras = {camera.name: camera for camera in load_cameras(capture)}
@@ -209,5 +209,5 @@ def test_teeth_are_found_again_after_frames_left_out(rig):
             tip = jaw.landmarks[0]
             wanted = transform_point(relative[frame], tip)
             errors.append(np.linalg.norm(transform_point(jaw.pose(fit.pose.d), tip) - wanted))
-            assert (take.sigma_d(fit) > 0).all() and errors[-1] < max(0.6, take.sigma_d(fit).max())
-    assert found >= 7 and np.median(errors) < 0.25
+            assert (take.sigma_d(fit) > 0).all() and take.sigma_d(fit).max() < 2.0
+    assert found >= 7 and max(errors) < 1.0 and np.median(errors) < 0.25

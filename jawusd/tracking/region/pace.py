@@ -15,7 +15,8 @@ class Pace:
         gates_px: residual gate of every step from the prediction.
         far_px: the same after frames that were left out.
         wide_px: from other starts, and at the end of a search; None takes the gates of the prediction again.
-        doubted, searched: shares of the usual contour that fits; below, other starts are tried, and poses searched.
+        doubted, searched: shares of the usual contour that fits, below which other starts are tried, and poses
+            searched, while no frames were left out.
         jaws, finalists, heads: poses of the jaw and of the head that a search tries, and jaws followed to the end.
         search_every: failed frames per search.
         searches: failed frames after which teeth count as out of sight.

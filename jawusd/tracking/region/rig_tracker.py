@@ -32,8 +32,9 @@ _FIRST_GATES_PX = (12.0, 8.0, 6.0, 4.0, 3.0, 2.5, 2.0)
 _TRIAL_GATES_PX = (8.0, 6.0)  # of the many poses that a search tries
 _STEADY_FRAMES = 1.5  # since the last step, up to which its motion tells where the teeth are
 _FIRST_ROUNDS = 3  # picks are a few tenths of a millimetre off; each round takes most of the rest
-# Share of the usual contour that fits, below which an arch is given up, and one that was lost not trusted again.
-_LOST, _AGAIN = 0.33, 0.5
+# Share of the usual contour that fits, below which a pose is doubted, others are searched, an arch is given up,
+# and one that was lost is not trusted again. The pace may doubt and search later while no frames are left out.
+_DOUBTED, _SEARCHED, _LOST, _AGAIN = 0.8, 0.6, 0.33, 0.5
 _UNSURE_FRAMES = 3.0  # left out, after which an arch counts as lost
 _USUAL_FRAMES = 15  # over which the usual contour is measured; it is no less than a share of that of the first frame
 _LEAST_USUAL = 0.7
@@ -135,15 +136,17 @@ class RigTracker:
     def _best(self, expected: Expected, look: _Look, cut: Cut, frames: float) -> tuple[Aligned, _Look]:
         """Align from the prediction, and from other starts where that may have failed; then in more of the pictures."""
         pace, usual = self._pace, self._usual_share()
-        in_turn = pace.in_turn and self._failed > pace.searches
-        gates = pace.far_px if frames > _STEADY_FRAMES and not in_turn else pace.gates_px
+        in_turn, far = pace.in_turn and self._failed > pace.searches, frames > _STEADY_FRAMES
+        gates = pace.far_px if far and not in_turn else pace.gates_px
+        # After frames that were left out no motion vouches for a pose that fits only half.
+        doubted, searched = (_DOUBTED, _SEARCHED) if far else (pace.doubted, pace.searched)
         found = look.align(expected.pose, expected, gates)
-        if not (_share(found.solution) < pace.doubted * usual).any():
+        if not (_share(found.solution) < doubted * usual).any():
             return found, look
         if not in_turn:
             for start in (self._motion.last,) if pace.wide_px is None else (expected.pose, self._motion.last):
                 found = _better(found, look.align(start, expected, pace.wide_px or gates))
-        if not (_share(found.solution) < pace.searched * usual).any():
+        if not (_share(found.solution) < searched * usual).any():
             return found, look
         self._failed += 1
         if in_turn:
@@ -152,7 +155,7 @@ class RigTracker:
             return found, look
         look = self._wide_look(found, cut)
         found = look.align(found.pose, expected, gates)
-        if self._head == 1.0 and _share(found.solution)[0] < pace.searched * usual[0]:
+        if self._head == 1.0 and _share(found.solution)[0] < _SEARCHED * usual[0]:
             found = self._with_head_searched(found, expected, look)
         return self._searched(found, expected, look), look
 
