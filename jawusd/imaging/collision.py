@@ -176,13 +176,13 @@ def _look_up(values, origin, per_mm, x, y, z):  # type: ignore[no-untyped-def]  
 
 
 @numba.njit(nogil=True, cache=True)
-def _look_up_all(found, points, values, origin, per_mm):  # type: ignore[no-untyped-def]
+def _look_up_all(found, points, values, origin, per_mm):  # type: ignore[no-untyped-def]  # compiled
     for i in range(len(points)):
         found[i] = _look_up(values, origin, per_mm, points[i, 0], points[i, 1], points[i, 2])
 
 
 @numba.njit(nogil=True, cache=True)
-def _away(M, point, values, origin, per_mm):  # type: ignore[no-untyped-def]
+def _away(M, point, values, origin, per_mm):  # type: ignore[no-untyped-def]  # compiled
     """Return the distance at the image of a point under M."""
     x, y, z = point[0], point[1], point[2]
     return _look_up(
@@ -196,7 +196,7 @@ def _away(M, point, values, origin, per_mm):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(nogil=True, cache=True)
-def _deepen(depth, T, values, origin, per_mm, points, start, balls, group_start, groups):  # type: ignore[no-untyped-def]
+def _deepen(depth, T, values, origin, per_mm, points, start, balls, group_start, groups):  # type: ignore[no-untyped-def]  # compiled
     """Raise each depth to that of the deepest of the points under T[i]."""
     last = 0
     for i in range(len(T)):

@@ -150,7 +150,7 @@ def _crossings(points, corners, low, shape, start, faces):  # type: ignore[no-un
 
 
 @numba.njit(nogil=True, cache=True)
-def _set_signs(values, corners, origin, step, up, low, shape, start, faces):  # type: ignore[no-untyped-def]
+def _set_signs(values, corners, origin, step, up, low, shape, start, faces):  # type: ignore[no-untyped-def]  # compiled
     heights, kinds = np.empty(_MOST_CROSSINGS), np.empty(_MOST_CROSSINGS, np.int64)
     nx, ny, nz = values.shape
     for i in range(nx):
@@ -205,7 +205,7 @@ def _squared_distance(corners: Array, f: int, x: float, y: float, z: float) -> f
 
 
 @numba.njit(nogil=True, cache=True)
-def _nearest_faces(corners, origin, step, shape, band):  # type: ignore[no-untyped-def]
+def _nearest_faces(corners, origin, step, shape, band):  # type: ignore[no-untyped-def]  # compiled
     """Return the number of the nearest triangle at the values near triangles, shape (nx, ny, nz); -1 elsewhere."""
     nearest = np.full(shape, -1, np.int32)
     # beyond the band, a triangle whose box reaches a value is not always the nearest one
@@ -228,7 +228,7 @@ def _nearest_faces(corners, origin, step, shape, band):  # type: ignore[no-untyp
 
 
 @numba.njit(nogil=True, cache=True)
-def _distances(corners, nearest, origin, step):  # type: ignore[no-untyped-def]
+def _distances(corners, nearest, origin, step):  # type: ignore[no-untyped-def]  # compiled
     values = np.empty(nearest.shape, np.float32)
     nx, ny, nz = nearest.shape
     for i in range(nx):

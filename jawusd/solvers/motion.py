@@ -147,4 +147,5 @@ def _nested(like: object, leaves: Iterator[Tensor]) -> object:
     if not isinstance(like, tuple | list):
         return next(leaves)
     parts = [_nested(each, leaves) for each in like]
+    # a named tuple takes its fields one by one, which mypy does not know of `type(like)`
     return type(like)(*parts) if hasattr(like, "_fields") else parts  # type: ignore[arg-type]
