@@ -97,7 +97,7 @@ def track(
     allow_outside: Outside = False,
     as_json: Json = False,
 ) -> None:
-    """Track both rows of teeth through the masks."""
+    """Track both rows of teeth through the masks, or the videos alone."""
     from jawusd.formats.model import load_model
     from jawusd.pipeline import track as stage
     from jawusd.pipeline.overlay import overlay_files

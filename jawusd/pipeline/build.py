@@ -28,8 +28,7 @@ from jawusd.pipeline.fit import FitSummary, fit_lines, fit_subject, fit_summary
 from jawusd.pipeline.prepare import input_hashes, naming_file, open_capture, rescaled_cameras, subject_of_capture
 from jawusd.pipeline.report import BuildFacts, missing_packages, place_of, write_build_report
 from jawusd.pipeline.scans import all_labelled, store_labels, with_stored_labels
-from jawusd.pipeline.segment import SegmentOptions, segment_capture, with_masks
-from jawusd.pipeline.segment_record import SegmentSummary, delete_masks, segment_lines
+from jawusd.pipeline.segment_record import delete_masks
 from jawusd.pipeline.state import (
     BUILD_FILE,
     CALIBRATION,
@@ -45,7 +44,7 @@ from jawusd.pipeline.state import (
 )
 from jawusd.pipeline.track import TrackSummary, first_pass, model_pass, track_lines, track_summary
 
-MASKS = "masks"  # folder of the masks made when the capture names none
+OLD_MASKS = "masks"  # folder in which version 0.1 made masks where the capture named none
 
 R = TypeVar("R", bound=Mapping[str, object])
 
@@ -98,7 +97,7 @@ class BuildSummary(TypedDict):
         seconds: per stage, also of those reused.
         reused: stages kept from an earlier build.
         findings: `Finding.as_json` of what the check before the first stage found.
-        calibrate, segment: None if the capture names a calibration, or masks.
+        calibrate: None if the capture names a calibration.
         track: of the final tracks.
     """
 
@@ -110,7 +109,6 @@ class BuildSummary(TypedDict):
     findings: NotRequired[list[FoundJson]]
     calibrate: CalibrationSummary | None
     sync: SyncResult
-    segment: SegmentSummary | None
     track: TrackSummary
     fit: FitSummary
     report: ReportSummary
@@ -143,7 +141,7 @@ def build(
         state = BuildState(folder)
         if options.fresh:
             state.clear()
-            delete_masks(folder / MASKS)
+            delete_masks(folder / OLD_MASKS)
         return _Build(capture, folder, options, state, progress or no_progress).run(tell)
 
 
@@ -187,7 +185,6 @@ class _Build:
         capture, options = self.capture, self.options
         names = [camera.name for camera in capture.cameras]
         sync = self._stage("sync", self._inputs([], videos, capture.sync.model_dump(), names, capture.fps), self._sync)
-        segment = self._segmented(sync.result["offsets"], videos)
         # Contents are hashed, not paths: a capture may be moved.
         described = capture.model_dump(mode="json", include={"frames", "bootstrap", "anatomy", "calibration_unit_mm"})
         masks = [camera.masks and camera.masks.labels for camera in capture.cameras]
@@ -201,6 +198,7 @@ class _Build:
                 rescaled_cameras(self.capture),
                 sync.result["offsets"],
                 [options.solver, options.backend],
+                [] if any(camera.masks for camera in capture.cameras) else videos,
             ),
             lambda: self._track(sync.result["offsets"]),
         )
@@ -215,7 +213,7 @@ class _Build:
         missing = missing_packages()
         inputs = self._inputs([], bake.outputs, bake.inputs, videos, sync.result, missing)
         report = self._stage("report", inputs, lambda: self._report(missing))
-        stages = (labels, calibrate, segment, track, fit, aid, bake, report)
+        stages = (labels, calibrate, track, fit, aid, bake, report)
         outputs = {name for stage in stages if stage for name in stage.outputs}
         return {
             "capture": capture.name,
@@ -226,7 +224,6 @@ class _Build:
             "findings": check.result["findings"],
             "calibrate": calibrate.result if calibrate else None,
             "sync": sync.result,
-            "segment": segment.result if segment else None,
             "track": aid.result,
             "fit": fit.result,
             "report": report.result,
@@ -287,26 +284,6 @@ class _Build:
         self.capture = capture.model_copy(update={"calibration": path, "calibration_unit_mm": 1.0})
         return record
 
-    def _segmented(self, offsets: dict[str, int], videos: dict[str, str]) -> StageRecord[SegmentSummary] | None:
-        """Make masks from the videos if the capture names none.
-
-        The masks themselves are no outputs of the record: they may be edited, and tracking starts over if they are.
-        """
-        capture = self.capture
-        if any(camera.masks for camera in capture.cameras):
-            return None
-        folder = self.folder / MASKS
-        described = capture.model_dump(mode="json", include={"name", "frames", "bootstrap", "calibration_unit_mm"})
-        record = self._stage(
-            "segment",
-            self._inputs(["teeth", "calibration"], videos, described, offsets),
-            lambda: segment_capture(
-                capture, offsets, folder, SegmentOptions(None, True, self.options.jobs), self.progress
-            ),
-        )
-        self.capture = with_masks(capture, folder)
-        return record
-
     def _sync(self) -> tuple[list[Path], SyncResult]:
         return [], sync_cameras(self.capture, self.progress)
 
@@ -362,8 +339,6 @@ def build_lines(summary: BuildSummary) -> list[str]:
         ]
     lines += [f"sync ({summary['sync']['method']}): {offsets} frames"]
     lines += [f"  note: {note}" for note in summary["sync"].get("notes", [])]
-    if summary["segment"]:
-        lines += ["the capture names no masks: made them from its videos", *segment_lines(summary["segment"])]
     lines += track_lines(summary["track"])
     lines += fit_lines(summary["fit"])
     seconds = ", ".join(

@@ -20,6 +20,7 @@ from jawusd.formats.performance import SolveState
 from jawusd.geometry.arrays import Array
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.cuts import Cutter
+from jawusd.pipeline.picture_search import LEAST_FIT, MOST_BRIDGED, masked_cameras
 from jawusd.pipeline.prepare import (
     load_cameras,
     load_labelled,
@@ -27,14 +28,7 @@ from jawusd.pipeline.prepare import (
     open_capture,
     registered_meshes,
 )
-from jawusd.pipeline.solve_pictures import (
-    LEAST_FIT,
-    MOST_BRIDGED,
-    PreparedTeeth,
-    VideoOptions,
-    VideoShot,
-    masked_cameras,
-)
+from jawusd.pipeline.solve_pictures import PreparedTeeth, VideoOptions, VideoShot
 from jawusd.pipeline.state import no_progress
 
 if TYPE_CHECKING:

@@ -17,17 +17,15 @@ from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.capture import Capture, Masks
 from jawusd.formats.tracks import LOST
 from jawusd.geometry.arrays import Array
+from jawusd.pipeline.follow import Follower
 from jawusd.pipeline.media import open_footage
 from jawusd.pipeline.prepare import input_hashes, load_meshes, subject_of_capture
-from jawusd.pipeline.segment_guide import followed_teeth, known_guide, save_guide
+from jawusd.pipeline.segment_guide import known_guide, save_guide
 from jawusd.pipeline.segment_record import (
     LEARNED,
-    SUMMARY,
     CameraEntry,
     FrameEntry,
     Journal,
-    SegmentSummary,
-    write_summary,
 )
 from jawusd.pipeline.state import Progress, hash_files, hash_value
 
@@ -47,19 +45,6 @@ class SegmentOptions:
     keys: Path | None = None  # folder with masks or strokes a person drew for some frames, or None
     resume: bool = False  # keep the frames that were finished before
     jobs: int = 2  # threads
-
-
-def segment_capture(
-    capture: Capture, offsets: dict[str, int], folder: Path, options: SegmentOptions, progress: Progress
-) -> tuple[list[Path], SegmentSummary]:
-    """Segment a capture and sum it up; see `segment_teeth`.
-
-    Returns:
-        segment.json, and what it holds but for the confidences.
-    """
-    summary = write_summary(capture, segment_teeth(capture, offsets, folder, options, progress), folder)
-    del summary["confidence"]
-    return [folder / SUMMARY], summary
 
 
 @explain_missing_packages()
@@ -183,11 +168,9 @@ class _Segmentation:
 
     def _follow(self, start: int, poses: Array) -> None:
         """Find the teeth in all frames by their colours, from poses on one of them."""
-        frames = range(self._first, self._stop)
-        known = (start, poses)
-        self._guide = followed_teeth(
-            self._footage, self._cameras, self._meshes, self._subject, frames, known, self._progress, self._pool
-        )
+        follower = Follower(self._footage, self._cameras, self._tracker.scans, self._subject, self._pool)
+        follower.begun(start, poses)
+        self._guide = follower.run(range(self._first, self._stop), self._progress)
         save_guide(self._folder, self._guide_inputs, self._guide)
 
     @property

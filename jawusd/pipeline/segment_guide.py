@@ -1,11 +1,10 @@
-"""Where the teeth are in every frame by colours alone: what masks are made around."""
+"""What colours alone show of the teeth, kept beside the masks that were made around it, and compared with them."""
 
 from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterator, Mapping
-from concurrent.futures import Executor
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,100 +14,20 @@ from jawusd.errors import JawusdError
 from jawusd.formats.atomic import write_bytes_atomic
 from jawusd.formats.capture import Capture
 from jawusd.formats.finding import Finding
-from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import Tracks
-from jawusd.geometry import Camera, relative_pose, se3_inverse, transform_points
+from jawusd.geometry import relative_pose, se3_inverse, transform_points
 from jawusd.geometry.arrays import Array
 from jawusd.npz import TWIST_ORDER, UNITS, read_npz, take
-from jawusd.pipeline.cuts import Cutter
-from jawusd.pipeline.prepare import Subject, registration_of
+from jawusd.pipeline.prepare import registration_of
 from jawusd.pipeline.segment_record import auto_masks_folder
-from jawusd.pipeline.state import Progress
 
 if TYPE_CHECKING:
-    from jawusd.segmentation.footage import ColourFootage
     from jawusd.tracking.region.tracker import RegionPose
 
 # Distance of the jaw by masks and by colours from which one is wrong [mm]: right ones of three takes were at most 0.9
 # apart. Shares of such frames, or lost ones, from which a take is doubtful, and not usable.
 _APART_MM, _FEW, _MANY = 1.0, 0.03, 0.2
-# Change of the jaw's motion from frame to frame [mm] after which the frames before are looked at again, and distance of
-# poses that are the same. Speech and chewing reach 1 mm at 24 frames a second: needless looks end after a frame.
-_JUMP_MM, _SAME_MM = 0.8, 0.15
 GUIDE, _FAMILY = "guide.npz", "jawusd-guide"
-STAGE = "follow"
-
-
-def followed_teeth(
-    footage: ColourFootage,
-    cameras: Mapping[str, Camera],
-    teeth: tuple[Mesh, Mesh],
-    subject: Subject,
-    frames: range,
-    start: tuple[int, Array],
-    progress: Progress,
-    pool: Executor | None,
-) -> dict[int, RegionPose]:
-    """Follow both arches from one frame to both ends of a take, by colours alone.
-
-    Args:
-        footage, cameras: pictures, and the calibrated cameras by the same names.
-        teeth: upper and lower scan.
-        subject: gives axes and condyles.
-        frames: of the reference camera.
-        start: one of them, and T_world_upper and T_world_lower there, shape (2, 4, 4).
-
-    Raises:
-        CaptureError: a picture cannot be decoded.
-        TrackingError: a scan cannot be tracked.
-    """
-    from jawusd.tracking.contour.scan import prepare_scan, teeth_centre
-    from jawusd.tracking.region.tracker import RegionTracker
-
-    scans = [prepare_scan(mesh, name) for mesh, name in zip(teeth, ("upper", "lower"), strict=True)]
-    frame, poses = start
-    centre = teeth_centre(scans, poses)
-    cutter = Cutter(cameras, scans, centre)
-    axes = subject.T_anatomical_skull[:3, :3]
-    tracker = RegionTracker(scans, list(cameras.values()), subject.landmarks, axes, executor=pool)
-    out = {frame: tracker.begin(cutter.cut(footage.at(frame)), poses)}
-    progress(STAGE, 1, len(frames))
-
-    for way in (range(frame + 1, frames.stop), range(frame - 1, frames.start - 1, -1)):
-        for at, found in zip(way, tracker.follow(cutter.walk(footage, way), out[frame].poses), strict=True):
-            out[at] = found
-            progress(STAGE, len(out), len(frames))
-        for jump in _jumps(way, out, subject.landmarks[:3]):
-            back = range(jump - way.step, frame, -way.step)
-            _follow_back(back, tracker.follow(cutter.walk(footage, back), out[jump].poses), out, subject.landmarks[:3])
-    return out
-
-
-def _places(found: RegionPose, points: Array) -> Array:
-    """Return where points of the lower teeth (N, 3) are against the upper ones [mm], shape (N, 3)."""
-    return transform_points(relative_pose(found.poses[0], found.poses[1]), points)
-
-
-def _jumps(way: range, known: Mapping[int, RegionPose], points: Array) -> list[int]:
-    """Return the frames of a way on which the jaw changes its motion more suddenly than jaws do."""
-    if len(way) < 3:
-        return []
-    places = np.stack([_places(known[frame], points) for frame in way])
-    bend_mm = np.linalg.norm(np.diff(places, 2, axis=0), axis=-1).mean(-1)
-    return [way[k + 2] for k in np.flatnonzero(bend_mm > _JUMP_MM).tolist()]
-
-
-def _follow_back(back: range, again: Iterator[RegionPose], known: dict[int, RegionPose], points: Array) -> None:
-    """Put in poses followed the other way, as long as they differ and more contour fits them.
-
-    A jaw that is found again has been followed wrongly before; the frames up to there look right one by one.
-    """
-    for frame, found in zip(back, again, strict=False):
-        apart_mm = np.linalg.norm(_places(found, points) - _places(known[frame], points), axis=-1).mean()
-        better = found.worth_px > known[frame].worth_px or not known[frame].found.all()
-        if apart_mm < _SAME_MM or not found.found.all() or not better:
-            return
-        known[frame] = found
 
 
 def save_guide(folder: Path, inputs: str, guide: Mapping[int, RegionPose]) -> None:

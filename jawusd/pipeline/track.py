@@ -34,6 +34,7 @@ from jawusd.pipeline.prepare import (
 from jawusd.pipeline.segment_guide import take_up_guide
 from jawusd.pipeline.segment_record import auto_masks_folder
 from jawusd.pipeline.state import Progress, no_progress
+from jawusd.pipeline.track_pictures import track_videos
 
 if TYPE_CHECKING:
     from jawusd.tracking import TrackingConfig
@@ -54,8 +55,8 @@ class TrackSummary(TypedDict):
     calibration_rescaled_px: dict[str, tuple[Size, Size]]  # sizes calibrated and recorded, by camera
     sigma_mm: dict[str, float | None]  # median standard deviation of the landmarks, None if not known
     coverage_error_percent: float | None  # share of the masks used that is left uncovered, None without any
-    frames_used: NotRequired[dict[str, int]]  # frames in which masks of a camera took part, by camera
-    outline_bias_px: NotRequired[dict[str, list[float]]]  # how far the masks reach over free edges, by camera and arch
+    frames_used: NotRequired[dict[str, int]]  # frames that a camera took part in, by camera
+    outline_bias_px: NotRequired[dict[str, list[float]]]  # how far outlines reach over free edges, by camera and arch
     gum_bias_px: NotRequired[dict[str, list[float]]]  # the same at the gum line
     gum_line_mm: NotRequired[list[float]]  # of both arches, towards the gum along the surface
     registration: NotRequired[Registration]  # of the lower scan, from frames with the teeth together
@@ -161,6 +162,8 @@ def first_pass(
                 threads=jobs,
                 progress=report,
             )
+        elif not any(camera.masks for camera in capture.cameras):
+            tracks = track_videos(capture, offsets, meshes, jobs, progress)
         else:
             subject = subject_of_capture(capture, meshes)
             landmarks = subject.landmarks
@@ -189,6 +192,8 @@ def model_pass(
     """
     from jawusd.tracking.sequence.model_refinement import refine_tracks
 
+    if not any(camera.masks for camera in capture.cameras):
+        return tracks  # colours have expected the condyles where the jaw's own motion takes them
     with naming_file(capture.folder / "capture.toml"):
         meshes = registered_meshes(load_meshes(capture), tracks.meta)
         return refine_tracks(
@@ -325,22 +330,23 @@ def track_lines(summary: TrackSummary) -> list[str]:
     sigma = ", ".join(f"{name} {value}" for name, value in known.items()) or "not known"
     lines.append(f"  expected error (1 sigma, median) [mm]: {sigma}")
     uncovered = summary["coverage_error_percent"]
-    lines.append("  mask left uncovered: " + ("not known" if uncovered is None else f"{uncovered} %"))
+    if uncovered is not None:
+        lines.append(f"  mask left uncovered: {uncovered} %")
     if "frames_used" in summary:
         used = ", ".join(f"{name} {count}" for name, count in summary["frames_used"].items())
-        lines.append(f"  frames in which masks took part: {used}")
+        lines.append(f"  frames that cameras took part in: {used}")
     lines += _take_lines(summary)
     return [*lines, *(f"  {Finding.from_json(found).line()}" for found in summary.get("findings", []))]
 
 
 def _take_lines(summary: TrackSummary) -> list[str]:
-    """Return what was estimated from all frames together: how the masks were drawn, and the scans' registration."""
+    """Return what was estimated from all frames together: where outlines lie, and the scans' registration."""
     lines = []
     reaches = (("free edges", summary.get("outline_bias_px")), ("gum line", summary.get("gum_bias_px")))
     for what, found in reaches:
         if found is not None:
             reach = ", ".join(f"{name} {upper:+.2f} {lower:+.2f}" for name, (upper, lower) in found.items())
-            lines.append(f"  masks reach beyond the {what}, upper and lower arch [px]: {reach}")
+            lines.append(f"  outlines reach beyond the {what}, upper and lower arch [px]: {reach}")
     if "gum_line_mm" in summary:
         upper, lower = summary["gum_line_mm"]
         lines.append(

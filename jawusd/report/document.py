@@ -207,7 +207,7 @@ def _cameras(data: ReportData) -> list[dict[str, str]]:
 
 
 def _drawn(meta: TracksFacts, camera: str) -> str:
-    """Return how far a camera's masks reach beyond the teeth, upper and lower arch."""
+    """Return how far outlines reach beyond the teeth in a camera, upper and lower arch."""
     edges, gum = meta.get("outline_bias_px", {}).get(camera), meta.get("gum_bias_px", {}).get(camera)
     if edges is None or gum is None:
         return ""

@@ -58,6 +58,8 @@ class TrackingConfig:
     typical_noise_px3: float = 3.0
     # Contour length over which outline errors move together [px], until it has been measured on the take.
     correlation_px: float = 18.0
+    # The same, of outlines whose residuals do not show it; None takes what is measured.
+    known_correlation_px: float | None = None
     # Side of the tiles within which errors are measured together [px]: estimates change little from 20 to 45.
     tile_px: int = 30
     # True over measured correlation length [-]: the fit takes part of the error out of the residuals, and the Tukey

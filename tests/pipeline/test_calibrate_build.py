@@ -112,7 +112,7 @@ def test_the_summary_of_a_build_says_what_was_made(calibrated):
     record = json.loads((out / "build.json").read_text())["stages"]
     summary = {
         "calibrate": record["calibrate"]["result"], "sync": record["sync"]["result"], "fit": {}, "reused": [],
-        "segment": None, "seconds": {}, "folder": str(out), "report": {"file": "report.html"},
+        "seconds": {}, "folder": str(out), "report": {"file": "report.html"},
         "track": {"tracked": 1, "frames": 1, "lost": [], "recovered": 0, "without_a_camera": 0, "prior_aided": 0,
                   "calibration_rescaled_px": {}, "sigma_mm": {}, "coverage_error_percent": 0.1},
     }  # fmt: skip

@@ -120,7 +120,6 @@ def test_missing_packages_are_named_with_the_cure(monkeypatch):
         "seconds": {},
         "reused": [],
         "calibrate": None,
-        "segment": None,
         "folder": "out",
         "report": {"capture": "..", "missing": missing},
     }

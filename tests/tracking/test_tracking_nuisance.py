@@ -16,7 +16,7 @@ from jawusd.tracking.contour.frame_record import FrameRecord
 from jawusd.tracking.sequence.delays import bridge, delay_motions, interpolation_errors
 from jawusd.tracking.sequence.extrinsics import Extrinsics, corrected_cameras
 from jawusd.tracking.sequence.frame_tracker import FrameTracker
-from jawusd.tracking.sequence.nuisance import Nuisances
+from jawusd.tracking.sequence.nuisance import Nuisances, corrected_pose
 
 FRAMES = 16
 WITHOUT = TrackingConfig(refine_rounds=0)
@@ -289,3 +289,22 @@ def test_a_focal_length_that_was_found_bends_pictures_pixel_by_pixel_as_before(c
     spread = points * [1.08, 1.08, 1.0]
     seen = cv2.projectPoints(spread, np.zeros(3), np.zeros(3), camera.K, lens if coefficients else None)[0]
     np.testing.assert_allclose(longer.project(points), seen.reshape(-1, 2), atol=1e-9)
+
+
+def test_delays_and_habits_move_a_pose_as_least_squares_over_its_samples_would():
+    rng = np.random.default_rng(3)
+    J, h, speed = rng.normal(size=(2, 2, 40, 6)), rng.uniform(size=(2, 2, 40, 3)), np.array([0, 0, 0, 0.4, -0.3, 0.2])
+    sums = OutlineSums.zeros(2)._replace(
+        precision=np.einsum("rcni,rcnj->rcij", J, J), habit_slope=np.einsum("rcnh,rcni->rchi", h, J)
+    )
+    none = np.zeros((2, 6, 6))
+    records = {}
+    for frame in (4, 5, 6):
+        poses = np.stack([se3_exp((frame - 5) * speed)] * 2)
+        solution = Solution(poses, sums, OutlineSums.zeros(2), np.zeros((2, 3)), none, none, np.ones((2, 2)), 0)
+        records[frame] = FrameRecord(solution, np.full(2, TRACKED), np.ones((2, 2), bool), np.zeros((2, 2)))
+    nuisances = _nuisances(delays=np.array([0.0, 0.2]), habits=0.01 * rng.normal(size=(2, 2, 3)))
+    for arch in (0, 1):
+        moved = J[arch] @ speed * nuisances.delays[:, None] + np.einsum("cnh,ch->cn", h[arch], nuisances.habits[arch])
+        twist = np.linalg.lstsq(J[arch].reshape(-1, 6), -moved.ravel(), rcond=None)[0]
+        assert corrected_pose(records, 5, arch, nuisances) == pytest.approx(se3_exp(twist), abs=1e-12)

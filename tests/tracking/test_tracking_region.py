@@ -8,12 +8,13 @@ from package_copy import ROOT
 
 from jawusd.formats.capture import load_capture
 from jawusd.geometry import relative_pose
+from jawusd.pipeline.follow import Follower
 from jawusd.pipeline.media import open_footage
 from jawusd.pipeline.prepare import load_meshes, subject_of_capture
-from jawusd.pipeline.segment_guide import followed_teeth, known_guide, save_guide
+from jawusd.pipeline.segment_guide import known_guide, save_guide
 from jawusd.segmentation.footage import ColourFootage
 from jawusd.tracking.contour.samples import COLUMNS, INVERSE_DEPTH, LENGTH, NX, NY, U, V
-from jawusd.tracking.contour.scan import CROWN
+from jawusd.tracking.contour.scan import CROWN, prepare_scan
 from jawusd.tracking.region.colours import BINS, PATCHES, TABLES, Areas, CameraColours, colour_bins
 from jawusd.tracking.region.edges import search_borders, search_creases, sharpen
 from jawusd.tracking.sequence.guided import GuidedTracker
@@ -29,6 +30,10 @@ def disc(seed=0, noise=4.0, radius=RADIUS):
     share = np.clip(radius - np.hypot(x - MIDDLE, y - MIDDLE) + 0.5, 0, 1)[..., None]
     picture = share * TOOTH + (1 - share) * LIP + np.random.default_rng(seed).normal(0, noise, (SIZE, SIZE, 3))
     return np.clip(picture, 0, 255).astype(np.uint8), share[..., 0]
+
+
+def prepared(teeth):
+    return [prepare_scan(mesh, arch) for mesh, arch in zip(teeth, ("upper", "lower"), strict=True)]
 
 
 def samples_at(radius):
@@ -133,9 +138,9 @@ def test_the_example_is_followed_by_its_colours(tmp_path):
     chosen = range(max(start - 2, int(frames[0])), start + 6)
     done = []
     footage, subject = ColourFootage(videos, offsets), subject_of_capture(capture, meshes)
-    guide = followed_teeth(
-        footage, cameras, teeth, subject, chosen, (start, picked), lambda *step: done.append(step), None
-    )
+    follower = Follower(footage, cameras, prepared(teeth), subject)
+    assert follower.begun(start, picked)[1] > 0.3
+    guide = follower.run(chosen, lambda *step: done.append(step))
     assert sorted(guide) == list(chosen) and done[-1] == ("follow", len(chosen), len(chosen))
     for frame, found in guide.items():
         true = poses[list(frames).index(frame)]
@@ -172,9 +177,9 @@ def test_teeth_are_found_again_when_lips_open_over_an_open_jaw():
     cameras, videos = open_footage(capture)
     start = capture.bootstrap.frame
     picked = GuidedTracker(*teeth, lambda *_: [], 1).picked(capture.bootstrap, cameras)
-    known, subject = (start, picked), subject_of_capture(capture, meshes)
-    footage = Covered(videos, offsets)
-    guide = followed_teeth(footage, cameras, teeth, subject, range(20, 25), known, lambda *_: None, None)
+    follower = Follower(Covered(videos, offsets), cameras, prepared(teeth), subject_of_capture(capture, meshes))
+    follower.begun(start, picked)
+    guide = follower.run(range(20, 25), lambda *_: None)
     assert not guide[22].found.any()
     exact = {frame: relative[Covered.SHOWN[frame] - first] for frame in (23, 24)}
     assert np.linalg.norm((exact[23] @ incisor - incisor)[:3]) > 10.0  # mm; the head moved by 4 mm

@@ -65,6 +65,7 @@ class ContourSolver:
         use: Mask | None = None,
         terms: Sequence[ResidualTerm] = (),
         outline_weight: Array | None = None,
+        rendering: Rendering | None = None,
     ) -> Solution:
         """Align both arches, starting from given poses.
 
@@ -75,13 +76,14 @@ class ContourSolver:
             use: masks that take part, shape (2, C); by default all present ones.
             terms: what constrains the poses besides the masks.
             outline_weight: as in `NormalEquations`; needed if the terms are log-likelihoods.
+            rendering: of these views by this solver, to share with other looks at them.
         """
         use = present_masks(views) if use is None else use
         if self._thin is None or not gates_px:
-            return self._descend(poses, poses, views, gates_px, use, terms, outline_weight)
+            return self._descend(poses, poses, views, gates_px, use, terms, outline_weight, rendering)
         rough = self._thin.solve(poses, views, gates_px, use, terms, outline_weight)
         gates = tuple(gates_px[-1:]) * _DENSE_STEPS
-        last = self._descend(poses, rough.poses, views, gates, use, terms, outline_weight)
+        last = self._descend(poses, rough.poses, views, gates, use, terms, outline_weight, rendering)
         return replace(last, iterations=rough.iterations + last.iterations)
 
     def _descend(
@@ -93,10 +95,11 @@ class ContourSolver:
         use: Mask,
         terms: Sequence[ResidualTerm],
         outline_weight: Array | None,
+        rendering: Rendering | None,
     ) -> Solution:
         """Take one step per gate from the given poses."""
         poses = np.array(poses, np.float64)
-        rendering = Rendering(self, views)
+        rendering = rendering or Rendering(self, views)
         pull = StartTerm(start, self._start_strength)
         all_terms: tuple[ResidualTerm, ...] = (SilhouetteTerm(), GingivalMarginTerm(), pull, *terms)
         iterations = 0

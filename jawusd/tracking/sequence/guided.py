@@ -18,7 +18,7 @@ from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import FOR_AUTO_MASKS, TrackingConfig
 from jawusd.tracking.contour.frame_record import FrameRecord, FrameSummary
 from jawusd.tracking.contour.quality import coverage_error, uncovered_px
-from jawusd.tracking.contour.scan import prepare_scan
+from jawusd.tracking.contour.scan import Scan, prepare_scan
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import View, present_masks
 from jawusd.tracking.initialization.bootstrap import pose_from_picks
@@ -60,6 +60,11 @@ class GuidedTracker:
         scans = [prepare_scan(mesh, arch) for arch, mesh in self._meshes.items()]
         self._solver = ContourSolver(scans, self._config, executor)
         self._see, self._rounds = see, rounds
+
+    @property
+    def scans(self) -> tuple[Scan, ...]:
+        """The scans, prepared."""
+        return self._solver.scans
 
     def picked(self, bootstrap: Bootstrap | None, cameras: Mapping[str, Camera]) -> Array:
         """Return T_world_upper and T_world_lower that agree with the picks, shape (2, 4, 4).

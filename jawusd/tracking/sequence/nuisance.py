@@ -9,7 +9,7 @@ import numpy as np
 
 from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import TrackingConfig
-from jawusd.tracking.contour.equations import Solution
+from jawusd.tracking.contour.equations import Solution, motion_about
 from jawusd.tracking.contour.frame_record import FrameRecord
 from jawusd.tracking.contour.scan import ARCHES
 from jawusd.tracking.sequence.delays import interpolation_errors, velocity_twist
@@ -71,23 +71,40 @@ class Nuisances:
         return bool(clear and self.contour_px > config.refine_shift_px)
 
 
-# Prior standard deviations, which keep the estimates finite where a take does not constrain them. Cameras are
-# synchronised to whole frames.
+# Prior standard deviation, which keeps the estimate finite where a take does not constrain it: cameras are synchronised
+# to whole frames.
 _PRIOR_DELAY_FRAMES = 0.5
-# The habits of one hand: edges and gum line drawn too wide [px], the gum line apart from edges [px], the gum line along
-# the surface [mm]; by how much arches [px, mm] and cameras [px] differ from these.
-_PRIOR_EDGE_PX, _PRIOR_GUM_PX, _PRIOR_GUM_MM = 0.5, 0.4, 0.1
-_PRIOR_ARCH_PX, _PRIOR_ARCH_MM, _PRIOR_CAMERA_PX = 0.15, 0.05, 0.1
-# Frames whose outline errors are independent of one another [-]: the same hand draws the same lips and teeth all over
-# the take, so that more frames tell little more about its habits.
-_INDEPENDENT_FRAMES = 1.5
+
+
+@dataclass(frozen=True)
+class Hand:
+    """Say what is known of how outlines reach over the teeth before a take is seen: prior standard deviations.
+
+    Attributes:
+        edge_px, gum_px, gum_mm: edges and gum line too wide, the gum line apart from edges, and along the surface.
+        arch_px, arch_mm, camera_px: by how much arches and cameras differ from these.
+        frames: whose errors are independent of one another [-]: the same lips and teeth are seen all over the take, so
+            that more frames tell little more.
+    """
+
+    edge_px: float
+    gum_px: float
+    gum_mm: float
+    arch_px: float
+    arch_mm: float
+    camera_px: float
+    frames: float
+
+
+#: Of one person who draws masks.
+DRAWN = Hand(edge_px=0.5, gum_px=0.4, gum_mm=0.1, arch_px=0.15, arch_mm=0.05, camera_px=0.1, frames=1.5)
 
 
 class _Layout:
     """Say where the unknowns of a take stand: delays, habits, camera twists."""
 
-    def __init__(self, cameras: int) -> None:
-        self.cameras = cameras
+    def __init__(self, cameras: int, hand: Hand = DRAWN) -> None:
+        self.cameras, self._hand = cameras, hand
         self.twists = cameras + 9 + 4 * cameras
         self.size = self.twists + 6 * cameras
 
@@ -108,14 +125,15 @@ class _Layout:
 
     def prior_sigma(self) -> Array:
         """Return the prior standard deviations of delays and habits, shape (twists,)."""
-        arch = [_PRIOR_ARCH_PX, _PRIOR_ARCH_PX, _PRIOR_ARCH_MM]
-        hand = [_PRIOR_EDGE_PX, _PRIOR_GUM_PX, _PRIOR_GUM_MM, *arch, *arch]
-        return np.r_[np.full(self.cameras, _PRIOR_DELAY_FRAMES), hand, np.full(4 * self.cameras, _PRIOR_CAMERA_PX)]
+        of = self._hand
+        arch = [of.arch_px, of.arch_px, of.arch_mm]
+        hand = [of.edge_px, of.gum_px, of.gum_mm, *arch, *arch]
+        return np.r_[np.full(self.cameras, _PRIOR_DELAY_FRAMES), hand, np.full(4 * self.cameras, of.camera_px)]
 
     def redundancy(self, frames: int) -> Array:
         """Return by how much a take of so many frames overrates what it tells about each unknown, shape (size,)."""
         out = np.ones(self.size)
-        out[self.cameras : self.twists] = max(1.0, frames / _INDEPENDENT_FRAMES)
+        out[self.cameras : self.twists] = max(1.0, frames / self._hand.frames)
         return out
 
 
@@ -134,6 +152,7 @@ class TakeEquations:
         variance_px3: Array,
         extrinsics: Extrinsics,
         frames: Iterable[int] | None = None,
+        hand: Hand = DRAWN,
     ) -> None:
         """Sum up the given frames, by default all; lost arches and frames without both neighbours are left out.
 
@@ -141,9 +160,10 @@ class TakeEquations:
             records: by frame.
             variance_px3: outline variance times correlation length per arch [px^3], shape (2,).
             extrinsics: the camera poses the records were aligned with.
+            hand: what is known of the outlines beforehand.
         """
         self._extrinsics = extrinsics
-        self._layout = _Layout(len(extrinsics.twists))
+        self._layout = _Layout(len(extrinsics.twists), hand)
         size, C = self._layout.size, self._layout.cameras
         self._S, self._r, self._weight = np.zeros((size, size)), np.zeros(size), 0.0
         self._gum = np.zeros((2, C, 2))  # sums of weights and slopes of the gum line
@@ -221,6 +241,18 @@ def pose_response(records: Mapping[int, FrameRecord], frame: int, arch: int, ext
     solution, layout = records[frame].solution, _Layout(len(extrinsics.twists))
     velocity = np.zeros(6) if velocity is None else velocity
     return _reduced(solution, velocity, arch, extrinsics.pivot, layout)[2]
+
+
+def corrected_pose(records: Mapping[int, FrameRecord], frame: int, arch: int, nuisances: Nuisances) -> Array:
+    """Return the pose of an arch, shape (4, 4), as delays and habits move it to first order; twists are left out."""
+    velocity = velocity_twist(records, frame, arch)
+    solution = records[frame].solution
+    outline, habits = solution.outline, nuisances.habits[arch]
+    moved = np.einsum("chi,ch->i", outline.habit_slope[arch], habits)
+    if velocity is not None:
+        moved = moved + np.einsum("cij,j,c->i", outline.precision[arch], velocity, nuisances.delays)
+    twist = -np.linalg.lstsq(outline.precision[arch].sum(0), moved, rcond=1e-10)[0]
+    return np.asarray(motion_about(solution.centres[arch], twist) @ solution.poses[arch], np.float64)
 
 
 def interpolation_covariance(records: Mapping[int, FrameRecord], frame: int, arch: int, delays: Array) -> Array:

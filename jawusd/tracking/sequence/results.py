@@ -168,6 +168,8 @@ def outline_variance(records: Mapping[int, FrameRecord], config: TrackingConfig)
 
 def take_correlation_px(records: Mapping[int, FrameRecord], config: TrackingConfig) -> float:
     """Return the correlation length of the outline errors of a take, the median over its frames [px]."""
+    if config.known_correlation_px is not None:
+        return config.known_correlation_px
     values = _of_tracked(records, lambda solution: correlation_px(solution, config))
     values = values[np.isfinite(values)]
     return float(np.median(values)) if len(values) else config.correlation_px

@@ -1,0 +1,108 @@
+"""Captures without masks are tracked from their pictures: from picks, or from where a search finds the teeth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from package_copy import ROOT
+
+from jawusd.errors import CaptureError, TrackingError
+from jawusd.formats.capture import load_capture
+from jawusd.formats.tracks import LOST
+from jawusd.geometry import transform_points
+from jawusd.pipeline.prepare import load_meshes
+from jawusd.pipeline.state import no_progress
+from jawusd.pipeline.track import first_pass, model_pass, track_lines, track_summary
+from jawusd.pipeline.track_pictures import track_videos
+from jawusd.tracking.region.strained import footage_doubts
+
+EXAMPLE = ROOT / "examples" / "capture"
+
+
+@pytest.fixture(scope="module")
+def truth():
+    with np.load(EXAMPLE / "truth" / "truth.npz", allow_pickle=False) as archive:
+        return {name: archive[name] for name in archive.files}
+
+
+@pytest.fixture(scope="module")
+def offsets(truth):
+    return dict(zip(truth["camera_names"].tolist(), truth["offsets"].tolist(), strict=True))
+
+
+def unmasked(frames, **changes):
+    """Return the example without masks."""
+    capture = load_capture(EXAMPLE)
+    cameras = tuple(camera.model_copy(update={"masks": None}) for camera in capture.cameras)
+    return capture.model_copy(update={"cameras": cameras, "frames": frames, **changes})
+
+
+def off_mm(tracks, truth):
+    rows = np.searchsorted(truth["frames"], tracks.frames)
+    points = truth["landmarks"][:1]
+    away = transform_points(tracks.T_upper_lower, points) - transform_points(truth["T_upper_lower"][rows], points)
+    return np.linalg.norm(away, axis=-1)[:, 0]
+
+
+@pytest.fixture(scope="module")
+def tracked(offsets):
+    start = load_capture(EXAMPLE).bootstrap.frame
+    steps = []
+    capture = unmasked((start - 3, start + 9))
+    return capture, first_pass(capture, offsets, 1, lambda *step: steps.append(step)), steps
+
+
+def test_the_jaw_is_followed_from_picks(tracked, truth):
+    capture, tracks, steps = tracked
+    assert tracks.frames.tolist() == list(range(*capture.frames)) and not (tracks.status == LOST).any()
+    assert off_mm(tracks, truth).mean() < 0.2
+    assert steps[-1] == ("follow", 12, 12) and tracks.meta["start"]["by"] == "picks"
+    assert np.isfinite(tracks.sigma_mm).all() and np.isnan(tracks.coverage_error).all()
+    lines = "\n".join(track_lines(track_summary(tracks)))
+    assert "12 of 12" in lines and "mask" not in lines
+
+
+def test_the_model_changes_nothing_that_colours_said(tracked, offsets):
+    capture, tracks, _ = tracked
+    assert model_pass(capture, offsets, tracks, None, 1, no_progress) is tracks
+
+
+def test_without_picks_the_teeth_are_searched(offsets, truth):
+    capture = unmasked((48, 52), bootstrap=None)
+    tracks = first_pass(capture, offsets, 1, no_progress)
+    assert tracks.meta["start"]["by"] == "search" and off_mm(tracks, truth).mean() < 0.3
+
+
+def test_picks_beside_the_teeth_are_refused(offsets):
+    capture = load_capture(EXAMPLE)
+    picks = capture.bootstrap
+
+    def shifted(picked):
+        moved = [tuple(view.model_copy(update={"x": view.x + 90.0}) for view in pick.views) for pick in picked]
+        return tuple(pick.model_copy(update={"views": views}) for pick, views in zip(picked, moved, strict=True))
+
+    wrong = picks.model_copy(update={"upper": shifted(picks.upper), "lower": shifted(picks.lower)})
+    with pytest.raises(TrackingError, match="not seen where they are picked"):
+        first_pass(unmasked((picks.frame, picks.frame + 2), bootstrap=wrong), offsets, 1, no_progress)
+    away = unmasked((picks.frame + 5, picks.frame + 9))
+    with pytest.raises(TrackingError, match="frames run from"):
+        first_pass(away, offsets, 1, no_progress)
+
+
+def test_one_video_is_not_enough(offsets):
+    capture = unmasked((30, 34))
+    blind = tuple(camera.model_copy(update={"video": None}) for camera in capture.cameras[1:])
+    capture = capture.model_copy(update={"cameras": (capture.cameras[0], *blind)})
+    with pytest.raises(CaptureError, match="1 of 3 cameras"):
+        track_videos(capture, offsets, load_meshes(capture), 1, no_progress)
+
+
+@pytest.mark.parametrize(
+    ("lost", "unsure", "words"), [(0, 0, None), (0, 1, "in parts"), (2, 0, "in parts"), (1, 2, "not usable")]
+)
+def test_frames_that_tell_little_make_footage_doubtful(tracked, lost, unsure, words):
+    sigma = np.full((12, 5), 0.3)
+    sigma[:unsure] = 1.2
+    sigma[11 : 11 - lost : -1] = np.nan
+    found = footage_doubts(replace(tracked[1], sigma_mm=sigma))
+    assert found == [] if words is None else words in found[0].message and f"{lost + unsure} of 12" in found[0].message
