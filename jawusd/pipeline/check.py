@@ -21,8 +21,8 @@ from jawusd.pipeline.state import Progress, no_progress
 # What the stages from capture to rig cannot do without, and what only the report needs.
 _NEEDED = ("av", "cv2", "numba", "scipy", "torch", "onnx", "shapely", "trimesh", "pyfqmr", "PIL")
 _FOR_REPORT = ("matplotlib", "jinja2")
-# Space that a build fills: rig, tracks and report; and masks where they are made from footage [MB].
-_RIG_MB, _MASK_MB, _LEAST_MB = 200.0, 0.06, 20.0
+# Space that a build fills, rig, tracks and report, and without which it cannot begin [MB].
+_RIG_MB, _LEAST_MB = 200.0, 20.0
 
 
 class CheckSummary(TypedDict):
@@ -57,13 +57,10 @@ def _packages(parts: Parts) -> Iterator[Finding]:
 def _disk(parts: Parts) -> Iterator[Finding]:
     place = next(folder for folder in (parts.out, *parts.out.parents) if folder.exists())
     free_mb = shutil.disk_usage(place).free / 1e6
-    need_mb = _RIG_MB
-    if parts.capture is not None and not any(camera.masks for camera in parts.capture.cameras):
-        need_mb += _MASK_MB * 2 * sum(video.count for video in parts.videos.values())
-    if free_mb < need_mb:
-        message = f"{free_mb:.0f} MB are free on the disk, a build may need {need_mb:.0f} MB"
+    if free_mb < _RIG_MB:
+        message = f"{free_mb:.0f} MB are free on the disk, a build may need {_RIG_MB:.0f} MB"
         severity: Severity = "error" if free_mb < _LEAST_MB else "warning"
-        yield Finding("disk_space", severity, message, free_mb, need_mb, path=str(place), hint="Free some space.")
+        yield Finding("disk_space", severity, message, free_mb, _RIG_MB, path=str(place), hint="Free some space.")
 
 
 _CHECKS = (
@@ -122,6 +119,8 @@ def check_capture(
 
 def _run(check: _Check, parts: Parts) -> list[Finding]:
     lacking = [name for name in check.needs if not getattr(parts, name)]
+    if lacking == ["samples"] and parts.capture is not None and not any(c.masks for c in parts.capture.cameras):
+        return []  # there are no masks to look at
     if lacking:
         return [Finding("not_checked", "note", f"{check.what}: not checked, because what it needs cannot be read")]
     found: list[Finding] = []

@@ -15,6 +15,7 @@ from package_copy import ROOT
 
 from jawusd.capture.mask_ranges import exchanged_by_frames
 from jawusd.errors import CaptureError
+from jawusd.formats.capture import load_capture
 from jawusd.formats.finding import Finding
 from jawusd.imaging.video_writer import VideoWriter
 from jawusd.pipeline import check as checks
@@ -290,3 +291,9 @@ def test_a_black_picture_in_between_does_not_end_the_masks(tmp_path):
         sample = sample_masks(CameraSource(name="cam", masks=masks), (160, 90), files)
         assert sample.first_last[0] == (7, 33) and sample.first_frame == 7
         assert len(sample.pixels(0, 8)) > 100 and len(sample.pixels(0, 3)) == 0
+
+
+def test_nothing_is_said_of_masks_that_a_capture_does_not_have():
+    capture = load_capture(EXAMPLE)
+    cameras = tuple(camera.model_copy(update={"masks": None}) for camera in capture.cameras)
+    assert check_capture(capture.model_copy(update={"cameras": cameras})) == []
