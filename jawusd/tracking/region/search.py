@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -40,6 +41,13 @@ _FAST_MM = 1.0  # predicted motion from which they are as well
 _HOPEFUL, _FINALISTS = 24, 3  # starts of a search that are tried, and that are followed to the end
 
 
+class Look(NamedTuple):
+    """Hold the views of an instant, and the rendering that all alignments there share."""
+
+    views: Sequence[View]
+    rendering: Rendering
+
+
 class PoseSearch:
     """Align both arches in the views of an instant."""
 
@@ -59,15 +67,15 @@ class PoseSearch:
         self._loose, self._firm = (CondyleTerm(self.condyles, noise) for noise in (_LOOSE_PX3, _FIRM_PX3))
         self._bite, self._axes = BiteTerm(landmarks[:3], axes[1], _BORDER_PX3), axes
 
-    def near(self, start: Array, views: Sequence[View], *, firm: bool = False) -> Solution:
+    def near(self, start: Array, look: Look, *, firm: bool = False) -> Solution:
         """Return an alignment from a start some tenths of a millimetre off, T_world_upper and T_world_lower (2, 4, 4).
 
         Args:
             firm: hold the condyles where they are expected, as doubtful frames need it.
         """
-        return self._align(start, views, _FAR_GATES_PX, firm)
+        return self._align(start, look, _FAR_GATES_PX, firm)
 
-    def best(self, starts: list[Array], views: Sequence[View], last: Array, usual: Array) -> Solution:
+    def best(self, starts: list[Array], look: Look, last: Array, usual: Array) -> Solution:
         """Return an alignment from the prediction; of teeth that are fast or fit badly from other starts as well.
 
         Args:
@@ -75,14 +83,14 @@ class PoseSearch:
             last: poses of the frame before.
             usual: share of the contour in sight that usually fits, shape (2,).
         """
-        solution = self._align(starts[0], views, _NEAR_GATES_PX)
+        solution = self._align(starts[0], look, _NEAR_GATES_PX)
         if (fitting_share(solution) < _DOUBTED * usual).any():
-            solution = self._better(solution, self._align(starts[0], views, _FAR_GATES_PX))
-            solution = self._better(solution, self._align(last, views, _NEAR_GATES_PX))
+            solution = self._better(solution, self._align(starts[0], look, _FAR_GATES_PX))
+            solution = self._better(solution, self._align(last, look, _NEAR_GATES_PX))
         if np.abs(starts[0][:, :3, 3] - last[:, :3, 3]).max() > _FAST_MM:
             carried = solution.poses[0] @ se3_inverse(last[0]) @ last[1]
             for start in (last, np.stack([solution.poses[0], carried])):
-                solution = self._better(solution, self._align(start, views, _FAR_GATES_PX))
+                solution = self._better(solution, self._align(start, look, _FAR_GATES_PX))
         return solution
 
     def with_jaw_searched(
@@ -90,7 +98,7 @@ class PoseSearch:
         solution: Solution,
         predicted: Array,
         last: Array,
-        views: Sequence[View],
+        look: Look,
         motion: MotionPredictor,
         everywhere: bool,
     ) -> Solution:
@@ -101,27 +109,31 @@ class PoseSearch:
         if everywhere:
             jaws += starts_everywhere(self.condyles)
         head = solution.poses[0]
-        order = likeliest([head @ jaw for jaw in jaws], views, self._thin.scans, 1)[:_HOPEFUL]
+        order = likeliest([head @ jaw for jaw in jaws], look.views, self._thin.scans, 1)[:_HOPEFUL]
         pairs = (np.stack([head, head @ jaws[k]]) for k in order)
-        brief = [self._align(pair, views, _TRIAL_GATES_PX, True) for pair in pairs]
+        brief = [self._align(pair, look, _TRIAL_GATES_PX, True) for pair in pairs]
         brief.sort(key=lambda trial: -self.worth_px(trial))
         for trial in brief[:_FINALISTS]:
-            solution = self._better(solution, self.near(trial.poses, views, firm=True))
+            solution = self._better(solution, self.near(trial.poses, look, firm=True))
         return solution
 
-    def with_head_searched(self, solution: Solution, predicted: Array, views: Sequence[View]) -> Solution:
+    def with_head_searched(self, solution: Solution, predicted: Array, look: Look) -> Solution:
         """Try shifted poses of the head, which the jaw goes with."""
         shifts = head_shifts(predicted[0], self._axes)
-        order = likeliest(list(shifts @ predicted[0]), views, self._thin.scans, 0)[: _HOPEFUL // 2]
-        brief = [self._align(shifts[k] @ predicted, views, _TRIAL_GATES_PX, True) for k in order]
+        order = likeliest(list(shifts @ predicted[0]), look.views, self._thin.scans, 0)[: _HOPEFUL // 2]
+        brief = [self._align(shifts[k] @ predicted, look, _TRIAL_GATES_PX, True) for k in order]
         brief.sort(key=lambda trial: -float(score_px(trial)[0].sum()))
-        best = [self.near(trial.poses, views, firm=True) for trial in brief[:_FINALISTS]]
+        best = [self.near(trial.poses, look, firm=True) for trial in brief[:_FINALISTS]]
         return max((solution, *best), key=lambda trial: float(score_px(trial)[0].sum()))
 
-    def polished(self, solution: Solution, views: Sequence[View], rendering: Rendering, *, firm: bool) -> Solution:
-        """Return the alignment with all faces of the scans, whose rendering is given."""
+    def look(self, views: Sequence[View]) -> Look:
+        """Return the views of an instant with a rendering to share."""
+        return Look(views, Rendering(self._thin, views))
+
+    def polished(self, solution: Solution, views: Sequence[View], look: Look, *, firm: bool) -> Solution:
+        """Return the alignment with all faces of the scans, in views of the same instant; hidden parts are as before."""
         terms = (self._firm if firm else self._loose, self._bite)
-        return self.solver.solve(solution.poses, views, _LAST_GATES_PX, None, terms, rendering=rendering)
+        return self.solver.solve(solution.poses, views, _LAST_GATES_PX, None, terms, rendering=look.rendering)
 
     def worth_px(self, solution: Solution) -> float:
         """Return how much contour fits, less what it costs to have the condyles where they are not expected [px]."""
@@ -131,8 +143,9 @@ class PoseSearch:
         """Return the likelier one."""
         return other if self.worth_px(other) > self.worth_px(one) else one
 
-    def _align(self, start: Array, views: Sequence[View], gates_px: Sequence[float], firm: bool = False) -> Solution:
-        return self._thin.solve(start, views, gates_px, None, (self._firm if firm else self._loose, self._bite))
+    def _align(self, start: Array, look: Look, gates_px: Sequence[float], firm: bool = False) -> Solution:
+        terms = (self._firm if firm else self._loose, self._bite)
+        return self._thin.solve(start, look.views, gates_px, None, terms, rendering=look.rendering)
 
 
 def fitting_share(solution: Solution) -> Array:

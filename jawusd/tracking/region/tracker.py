@@ -15,11 +15,9 @@ from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.quality import matched_px, relative_covariance, residual_px, twist_covariance
 from jawusd.tracking.contour.scan import ARCHES, Scan, probe_points
-from jawusd.tracking.contour.solver import Rendering
-from jawusd.tracking.contour.views import View, present_masks
 from jawusd.tracking.region.learned import CORRELATION_PX, FIRST_RATES, RATES, LearnedColours
 from jawusd.tracking.region.picture import Cut, Picture
-from jawusd.tracking.region.search import PoseSearch, fitting_share
+from jawusd.tracking.region.search import Look, PoseSearch, fitting_share
 from jawusd.tracking.sequence.history import MotionPredictor
 
 _FIRST_ROUNDS = 3  # picks are a few tenths of a millimetre off; each round takes most of the rest
@@ -75,11 +73,11 @@ class RegionTracker:
         self._colours.begin(cut(poses), poses)
         for _ in range(_FIRST_ROUNDS):
             pictures = cut(poses)
-            instant = _Instant(self._search, pictures, self._colours.views(pictures, poses))
-            rough = self._search.near(poses, instant.views)
+            instant = _Instant(self._search, self._colours, pictures, poses)
+            rough = self._search.near(poses, instant.look)
             solution = instant.polished(rough)
             poses = solution.poses
-            instant.learn(self._colours, poses, FIRST_RATES)
+            instant.learn(poses, FIRST_RATES)
         self._first_share = fitting_share(rough)
         worth_px = self._search.worth_px(solution)
         return RegionPose(poses, np.ones(2, bool), _covariance(solution), worth_px, solution)
@@ -104,19 +102,20 @@ class RegionTracker:
 class _Instant:
     """Look at the pictures of one instant."""
 
-    def __init__(self, search: PoseSearch, pictures: Sequence[Picture | None], views: list[View]) -> None:
-        self._search, self._pictures, self.views = search, pictures, views
-        self._rendering = Rendering(search.solver, views)
+    def __init__(
+        self, search: PoseSearch, colours: LearnedColours, pictures: Sequence[Picture | None], before: Array
+    ) -> None:
+        self._search, self._colours, self._pictures = search, colours, pictures
+        self.look = search.look(colours.views(pictures, before))
+        self._counting = colours.counting(self.look.views)
 
     def polished(self, solution: Solution, *, firm: bool = False) -> Solution:
         """Return an alignment with all faces of the scans."""
-        return self._search.polished(solution, self.views, self._rendering, firm=firm)
+        return self._search.polished(solution, self._counting, self.look, firm=firm)
 
-    def learn(self, colours: LearnedColours, poses: Array, rates: tuple[float, float]) -> None:
-        """Take up the colours beside the borders found at poses."""
-        solver, views = self._search.solver, colours.counting(self.views)
-        solver.linearise(poses, views, present_masks(views), self._search.config.final_gate_px[1], self._rendering)
-        colours.learn(views, self._pictures, poses, rates)
+    def learn(self, poses: Array, rates: tuple[float, float]) -> None:
+        """Take up the colours beside the borders found on the way to the last alignment, near its poses."""
+        self._colours.learn(self._counting, self._pictures, poses, rates)
 
 
 class _Way:
@@ -135,23 +134,23 @@ class _Way:
             starts = self._motion.starts()
             head, wide = starts[0][0], self._search.condyles.placed(0.0, _WIDE_MM, 0.0)
             pictures = cut(starts[0] if self._found[1] else np.stack([head, head @ wide]))
-            instant = _Instant(self._search, pictures, self._colours.views(pictures, self._poses))
+            instant = _Instant(self._search, self._colours, pictures, self._poses)
             usual = np.median([*self._usual] or [self._first_share], axis=0)
             usual = np.maximum(usual, _LEAST_USUAL * self._first_share)
-            rough, searched = self._located(starts, instant.views, usual)
+            rough, searched = self._located(starts, instant.look, usual)
             yield self._taken(instant, rough, searched, usual, any(picture is not None for picture in pictures))
 
-    def _located(self, starts: list[Array], views: list[View], usual: Array) -> tuple[Solution, bool]:
+    def _located(self, starts: list[Array], look: Look, usual: Array) -> tuple[Solution, bool]:
         """Return a rough alignment, and whether it came from a search."""
         search, searched = self._search, False
-        solution = search.best(starts, views, self._poses, usual)
+        solution = search.best(starts, look, self._poses, usual)
         share = fitting_share(solution)
         self._absent = self._absent + 1 if share[0] < _SUSPECT * usual[0] and not self._found[0] else 0
         if self._absent % _OFTEN == 1:
-            solution, searched = search.with_head_searched(solution, starts[0], views), True
+            solution, searched = search.with_head_searched(solution, starts[0], look), True
             share = fitting_share(solution)
         elif share[1] < _SUSPECT * usual[1]:
-            solution, searched = search.near(starts[0], views, firm=True), True
+            solution, searched = search.near(starts[0], look, firm=True), True
             share = fitting_share(solution)
         missed = share[0] >= _SUSPECT * usual[0] and share[1] < _SUSPECT * usual[1]
         self._missed = self._missed + 1 if missed else 0
@@ -159,7 +158,7 @@ class _Way:
         late = self._missed & (self._missed - 1) == 0
         if missed and (late if self._found[1] else self._missed <= _EAGER or self._missed % _OFTEN == 0):
             lost = not self._found[1]
-            solution = search.with_jaw_searched(solution, starts[0], self._poses, views, self._motion, lost)
+            solution = search.with_jaw_searched(solution, starts[0], self._poses, look, self._motion, lost)
         return solution, searched
 
     def _taken(self, instant: _Instant, rough: Solution, searched: bool, usual: Array, seen: bool) -> RegionPose:
@@ -170,7 +169,7 @@ class _Way:
         poses = np.where(found[:, None, None], solution.poses, self._motion.predict())
         covariance = np.where(found[:, None, None], _covariance(solution), np.nan)
         if found.all():
-            instant.learn(self._colours, poses, RATES)
+            instant.learn(poses, RATES)
             self._search.condyles.learn(poses, relative_covariance(poses[0], *covariance))
             self._usual.append(share)
         self._motion.update(poses, found, np.full(2, seen))
