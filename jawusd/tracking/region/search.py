@@ -131,7 +131,7 @@ class PoseSearch:
         return Look(views, Rendering(self._thin, views))
 
     def polished(self, solution: Solution, views: Sequence[View], look: Look, *, firm: bool) -> Solution:
-        """Return the alignment with all faces of the scans, in views of the same instant; hidden parts are as before."""
+        """Return the alignment with all faces of the scans, in views of its instant; hidden parts are as before."""
         terms = (self._firm if firm else self._loose, self._bite)
         return self.solver.solve(solution.poses, views, _LAST_GATES_PX, None, terms, rendering=look.rendering)
 
