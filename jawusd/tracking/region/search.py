@@ -36,8 +36,7 @@ _BORDER_PX3 = 0.7**2 * CORRELATION_PX  # the same as residuals show it
 # Contour that fits worth as much as a standard deviation squared of the condyles [px]: a sample beyond the gate costs
 # Tukey's loss of 4.685^2 / 6, and samples err alike over the length above.
 _STRAIN_PX = 0.5 * CORRELATION_PX * 6.0 / 4.685**2
-_DOUBTED = 0.8  # share of the usual contour that fits from which other starts are tried
-_FAST_MM = 1.0  # predicted motion from which they are as well
+_FAST_MM = 1.0  # predicted motion from which other starts are tried
 _HOPEFUL, _FINALISTS = 24, 3  # starts of a search that are tried, and that are followed to the end
 
 
@@ -75,23 +74,24 @@ class PoseSearch:
         """
         return self._align(start, look, _FAR_GATES_PX, firm)
 
-    def best(self, starts: list[Array], look: Look, last: Array, usual: Array) -> Solution:
-        """Return an alignment from the prediction; of teeth that are fast or fit badly from other starts as well.
+    def best(self, starts: list[Array], look: Look, last: Array) -> Solution:
+        """Return an alignment from the prediction; of teeth that are fast from other starts as well.
 
         Args:
             starts: poses, the prediction first.
             last: poses of the frame before.
-            usual: share of the contour in sight that usually fits, shape (2,).
         """
         solution = self._align(starts[0], look, _NEAR_GATES_PX)
-        if (fitting_share(solution) < _DOUBTED * usual).any():
-            solution = self._better(solution, self._align(starts[0], look, _FAR_GATES_PX))
-            solution = self._better(solution, self._align(last, look, _NEAR_GATES_PX))
         if np.abs(starts[0][:, :3, 3] - last[:, :3, 3]).max() > _FAST_MM:
             carried = solution.poses[0] @ se3_inverse(last[0]) @ last[1]
             for start in (last, np.stack([solution.poses[0], carried])):
                 solution = self._better(solution, self._align(start, look, _FAR_GATES_PX))
         return solution
+
+    def from_farther(self, solution: Solution, start: Array, last: Array, look: Look) -> Solution:
+        """Return a better alignment from farther away, or from the poses of the frame before; else the one given."""
+        solution = self._better(solution, self._align(start, look, _FAR_GATES_PX))
+        return self._better(solution, self._align(last, look, _NEAR_GATES_PX))
 
     def with_jaw_searched(
         self,

@@ -21,14 +21,15 @@ from jawusd.tracking.region.search import Look, PoseSearch, fitting_share
 from jawusd.tracking.sequence.history import MotionPredictor
 
 _FIRST_ROUNDS = 3  # picks are a few tenths of a millimetre off; each round takes most of the rest
-# Of the usual share of contour that fits, below which a jaw is searched, what was lost is not trusted again, and poses
-# are given up. Wrong poses under closed lips had 0.25 at most, a jaw whose edges front teeth and lips hide 0.28. The
-# usual share is that of the last frames, but no less than the last number times that of the first: lips that close
-# slowly must not get to be usual.
-_SUSPECT, _AGAIN, _LOST, _LEAST_USUAL = 0.6, 0.5, 0.25, 0.7
+# Of the usual share of contour that fits, below which poses are looked for farther away, a jaw is searched, what was
+# lost is not trusted again, and poses are given up. Wrong poses under closed lips had 0.25 at most, a jaw whose edges
+# front teeth and lips hide 0.28. The usual share is that of the last frames, but no less than the last number times
+# that of the first: lips that close slowly must not get to be usual.
+_DOUBTED, _SUSPECT, _AGAIN, _LOST, _LEAST_USUAL = 0.8, 0.6, 0.5, 0.25, 0.7
 _USUAL_FRAMES = 15  # over which the usual contour is measured
 # A lost jaw is searched on so many frames each once the head is found, then on every so-many-th, as a lost head always.
 _EAGER, _OFTEN = 6, 4
+_RESTING = 4  # frames without looking farther away after that was of no use: closed lips stay closed for a while
 _WIDE_MM = 40.0  # how far open a jaw is expected at most that was out of sight
 
 
@@ -126,7 +127,7 @@ class _Way:
         self._motion = MotionPredictor(poses, probe_points(search.solver.scans))
         self._motion.remember(poses, np.ones(2, bool))
         self._usual: deque[Array] = deque(maxlen=_USUAL_FRAMES)
-        self._found, self._missed, self._absent = np.ones(2, bool), 0, 0
+        self._found, self._missed, self._absent, self._rest = np.ones(2, bool), 0, 0, 0
 
     def follow(self, cuts: Iterator[Cut]) -> Iterator[RegionPose]:
         """Yield the poses of instant after instant."""
@@ -143,8 +144,12 @@ class _Way:
     def _located(self, starts: list[Array], look: Look, usual: Array) -> tuple[Solution, bool]:
         """Return a rough alignment, and whether it came from a search."""
         search, searched = self._search, False
-        solution = search.best(starts, look, self._poses, usual)
+        solution = search.best(starts, look, self._poses)
         share = fitting_share(solution)
+        self._rest = max(self._rest - 1, 0)
+        if (share < _DOUBTED * usual).any() and not self._rest:
+            near, solution = solution, search.from_farther(solution, starts[0], self._poses, look)
+            share, self._rest = fitting_share(solution), _RESTING if solution is near else 0
         self._absent = self._absent + 1 if share[0] < _SUSPECT * usual[0] and not self._found[0] else 0
         if self._absent % _OFTEN == 1:
             solution, searched = search.with_head_searched(solution, starts[0], look), True
