@@ -7,6 +7,7 @@ samples would shear, and products of one transform per parameter are millimetres
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from jawusd.rig import _gf
 from jawusd.rig.layers import new_layer, relative_path, stage_of, without_warning, write_layer
 from jawusd.rig.layout import ACTOR, MANDIBLE, PARAMETERS
 from jawusd.rig.read import load_rig
+from jawusd.rig.skel import offer_skeleton
 from jawusd.rig.table import landmark_distance
 
 # Between two baked samples, at these shares of the interval, no landmark may be farther from the model than this.
@@ -47,6 +49,7 @@ def write_animation(
     *,
     rig: JawRig | None = None,
     carried: ArrayLike = (),
+    skinned: Iterable[str] = (),
 ) -> Path:
     """Write an animation layer that sublayers an actor; a time code is a frame number.
 
@@ -59,6 +62,8 @@ def write_animation(
         rig: The evaluator; read from `actor` if None.
         carried: Frames whose d was not seen but follows from those around; listed in
             `customLayerData["carriedFrames"]`.
+        skinned: Paths of the meshes that can also follow the `actor_skel.usdc` beside it, which has the same motion;
+            they make it a variant, see `offer_skeleton`.
 
     Raises:
         RigError: Frames do not increase, nothing to animate, or the frame rate is not positive.
@@ -93,6 +98,8 @@ def write_animation(
         lost = _gf.int_array(np.floor(frames[~known]))
         layer.customLayerData = {**layer.customLayerData, LOST: lost}
     author_motion(layer, rig, frames[known], d[known], frames[[0, -1]])
+    if paths := list(skinned):
+        offer_skeleton(layer, rig, paths)
     return write_layer(layer, out)
 
 

@@ -16,7 +16,7 @@ from jawusd.rig.animation import write_animation
 from jawusd.rig.author import decoder_layer, interface_layer, record_sidecars
 from jawusd.rig.checksums import record_checksums
 from jawusd.rig.detail import proxy_layer
-from jawusd.rig.geo import build_geometry, check_meshes
+from jawusd.rig.geo import MESH_PATHS, build_geometry, check_meshes
 from jawusd.rig.layers import write_layer
 from jawusd.rig.layout import (
     ACTOR_FILE,
@@ -98,10 +98,11 @@ def bake_rig(
     record_sidecars(interface, folder)
     record_checksums(interface, folder, [path.name for path in written if path.suffix == ".usdc"])
     written.append(write_layer(interface, folder / ACTOR_FILE))
+    written.append(write_skel(folder / SKEL_FILE, rig, list(meshes), fps, frames, d))
     shown = folder / ACTOR_FILE
     if frames is not None and d is not None:
-        shown = write_animation(folder / CAPTURED_MOTION, folder / ACTOR_FILE, frames, d, fps, rig=rig)
+        skinned = [MESH_PATHS[key] for key in meshes]
+        shown = write_animation(folder / CAPTURED_MOTION, folder / ACTOR_FILE, frames, d, fps, rig=rig, skinned=skinned)
         written.append(shown)
-    written.append(write_skel(folder / SKEL_FILE, rig, list(meshes), fps, frames, d))
     written.append(write_package(folder / PACKAGE_FILE, shown))
     return written

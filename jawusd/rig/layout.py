@@ -11,6 +11,7 @@ SKEL_FILE, PACKAGE_FILE = "actor_skel.usdc", "actor.usdz"
 PROXY_FILE = "proxy.usdc"
 
 DETAIL, SCAN, PROXY = "detail", "scan", "proxy"  # a variant set and its variants
+MOTION, TRANSFORMS, SKELETON = "motion", "transforms", "skeleton"  # the one of the captured motion
 
 PARAMETERS = ("jaw:d1", "jaw:d2", "jaw:d3")
 ONNX_ATTRIBUTES = ("jaw:onnx", "jaw:onnx:encode")

@@ -1,4 +1,4 @@
-"""Read how the mandible moves in a stage, from its transforms or from samples of d."""
+"""Read how the mandible moves in a stage, from its transforms or bones or from samples of d."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from jawusd.errors import FormatError
 from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import rigidity_defect
 from jawusd.rig.animation import LOST
+from jawusd.rig.bones import bones_of
 from jawusd.rig.layout import ACTOR, MANDIBLE, PARAMETERS
 from jawusd.rig.read import find_rig_prim, open_stage
 from jawusd.rig.untrusted import raises_format_error
@@ -42,17 +43,17 @@ def read_poses_of_stage(path: str | os.PathLike[str], prim_path: str | None = No
 
 
 def poses_at(mandible: Usd.Prim, actor: Usd.Prim, times: ArrayLike, path: object) -> Array:
-    """Return T_skull_mandible (F, 4, 4) [mm] of a mandible in its actor at times (F,).
+    """Return T_skull_mandible (F, 4, 4) [mm] of a mandible in its actor at times (F,), by transforms or by bones.
 
     Raises:
         FormatError: The motion is not rigid.
     """
     times = np.asarray(times, dtype=np.float64)
-    poses = np.empty((len(times), 4, 4))
-    for k, time in enumerate(times.tolist()):
-        cache = UsdGeom.XformCache(Usd.TimeCode(time))
-        moved, _ = cache.ComputeRelativeTransform(mandible, actor)
-        poses[k] = np.array(moved).T  # USD multiplies rows from the left
+    bones = bones_of(mandible)
+    if bones is not None:
+        poses = bones.poses(actor, [Usd.TimeCode(time) for time in times.tolist()], path)
+    else:
+        poses = np.array([_placed(mandible, actor, time) for time in times.tolist()])
     defect = rigidity_defect(poses)
     if not defect.max() <= _RIGID:
         worst = int(np.argmax(np.where(np.isfinite(defect), defect, np.inf)))
@@ -62,6 +63,11 @@ def poses_at(mandible: Usd.Prim, actor: Usd.Prim, times: ArrayLike, path: object
             hint="Samples of matrices shear in between: key translate and orient.",
         )
     return poses
+
+
+def _placed(mandible: Usd.Prim, actor: Usd.Prim, time: float) -> Array:
+    moved, _ = UsdGeom.XformCache(Usd.TimeCode(time)).ComputeRelativeTransform(mandible, actor)
+    return np.array(moved).T  # USD multiplies rows from the left
 
 
 @raises_format_error(0)

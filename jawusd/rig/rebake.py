@@ -15,8 +15,9 @@ from jawusd.evaluator import JawRig
 from jawusd.geometry.arrays import Array
 from jawusd.rig import _gf
 from jawusd.rig.animation import CARRIED, author_motion
+from jawusd.rig.bones import bones_of
 from jawusd.rig.layers import new_layer, relative_path, write_layer
-from jawusd.rig.layout import PARAMETERS
+from jawusd.rig.layout import MOTION, PARAMETERS, SKELETON, TRANSFORMS
 from jawusd.rig.motion_read import (
     frames_of_stage,
     key_times,
@@ -76,11 +77,13 @@ def departure(path: str | os.PathLike[str], rig: JawRig, prim_path: str | None =
         return None
     known = np.isfinite(sampled[1]).all(axis=1)
     times, d = sampled[0][known], sampled[1][known]
-    if stage.HasAuthoredTimeCodeRange():
+    mandible = mandible_of(stage, actor, path)
+    # bones have keys where d has: in between each is interpolated in its own way
+    if bones_of(mandible) is None and stage.HasAuthoredTimeCodeRange():
         shown = frames_of_stage(stage, path)
         wanted = [np.interp(shown, times, column) for column in d.T]
         times, d = np.concatenate([times, shown]), np.concatenate([d, np.stack(wanted, axis=1)])
-    T = poses_at(mandible_of(stage, actor, path), actor, times, path)
+    T = poses_at(mandible, actor, times, path)
     away = landmark_distance(rig, T, rig.pose(d))
     return Departure(int((away > BAKED_MM).sum()), len(away), float(away.max(initial=0.0)))
 
@@ -120,7 +123,8 @@ def _origin(stage: Usd.Stage, actor: Usd.Prim, mandible: Usd.Prim, away: Departu
         return "mandible"
     if not away.frames:
         return "d"
-    ops = [op.GetAttr() for op in UsdGeom.Xformable(mandible).GetOrderedXformOps()]
+    bones = bones_of(mandible)
+    ops = bones.keyed() if bones else [op.GetAttr() for op in UsdGeom.Xformable(mandible).GetOrderedXformOps()]
     if not any(key_times(op) for op in ops):
         return "d"
     ranks = [
@@ -200,7 +204,8 @@ def write_rebaked(
 ) -> Path:
     """Write a layer over a stage that gives a rig in it d and the mandible's ops that belong to it.
 
-    An instance is made editable: its mandible could not be moved otherwise.
+    An instance is made editable: its mandible could not be moved otherwise. A rig that follows its skeleton follows its
+    transforms from then on.
 
     Args:
         out: File to write; it sublayers the stage.
@@ -209,7 +214,7 @@ def write_rebaked(
         carried: Times whose d was not seen; see `write_animation`.
 
     Raises:
-        RigError: Not a stage, or the output is the stage itself.
+        RigError: Not a stage, the output is the stage itself, or bones move the mandible that are not those of the rig.
         FormatError: No rig or several, or no mandible.
         OutputError: The file cannot be written.
     """
@@ -236,6 +241,14 @@ def write_rebaked(
     moved = layer.GetPrimAtPath(mandible.GetPath())
     order = Sdf.AttributeSpec(moved, "xformOpOrder", Sdf.ValueTypeNames.TokenArray, Sdf.VariabilityUniform)
     order.default = Vt.TokenArray(["xformOp:translate", "xformOp:orient"])  # whatever it was moved by
+    if bones_of(mandible) is not None:
+        if actor.GetVariantSet(MOTION).GetVariantSelection() != SKELETON:
+            raise RigError(
+                f"bones move {mandible.GetPath()}, and would over what is written.",
+                path=str(shot),
+                hint="Give the motion to the actor itself: jawusd encode, then jawusd animate.",
+            )
+        layer.GetPrimAtPath(actor.GetPath()).variantSelections[MOTION] = TRANSFORMS
     for prefix in mandible.GetPath().GetPrefixes():
         if stage.GetPrimAtPath(prefix).IsInstance():
             layer.GetPrimAtPath(prefix).instanceable = False

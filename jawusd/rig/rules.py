@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom
 
-from jawusd.errors import JawusdError
+from jawusd.errors import FormatError, JawusdError
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.verdicts import OUTSIDE, place
 from jawusd.geometry.arrays import Array
 from jawusd.rig import _gf
+from jawusd.rig.bones import bones_of
 from jawusd.rig.layout import ONNX_ATTRIBUTES, PARAMETERS, SIDECAR_HASH
 from jawusd.rig.motion_read import key_times
 from jawusd.rig.read import read_table, rig_of
@@ -23,6 +24,7 @@ _TABLE_SLACK_MM = 0.01  # the table states its error over more parameters than a
 _ONNX_MM = 0.01
 #: Largest distance [mm] of a baked pose from that of d.
 BAKED_MM = 0.01
+_OPS = [("xformOp:translate", "double3"), ("xformOp:orient", "quatd")]
 _PROBES = 500
 _ONNX_PROBES = 100
 
@@ -119,7 +121,7 @@ def check_bounds(prim: Usd.Prim) -> Iterator[Finding]:
 
 
 def check_mandible(prim: Usd.Prim) -> Iterator[Finding]:
-    """Check that the mandible moves by translate (double3) and orient (quatd) alone, as the model does."""
+    """Check that the mandible moves as the model does: by translate (double3) and orient (quatd) alone, or by bones."""
     targets = prim.GetRelationship("jaw:mandible").GetTargets() if prim.HasRelationship("jaw:mandible") else []
     if len(targets) != 1:
         yield _finding("error", "Mandible", prim, f"jaw:mandible names {len(targets)} prims, expected 1.")
@@ -130,28 +132,55 @@ def check_mandible(prim: Usd.Prim) -> Iterator[Finding]:
     if not mandible:
         yield _finding("error", "Mandible", prim, f"{targets[0]}, named by jaw:mandible, is no Xformable prim.")
         return
+    bones = bones_of(mandible.GetPrim())
     ops = mandible.GetOrderedXformOps()
     names = [(op.GetOpName(), op.GetTypeName()) for op in ops]
-    if names != [("xformOp:translate", "double3"), ("xformOp:orient", "quatd")] or mandible.GetResetXformStack():
+    if bones is None and (names != _OPS or mandible.GetResetXformStack()):
         message = f"the ops are {names}, expected translate (double3) and orient (quatd)."
         yield _finding("error", "Mandible", mandible.GetPrim(), message)
         return
     rig = _rig(prim)
-    if rig is not None:
-        yield from _check_baked(prim, rig, mandible.GetPrim(), *(op.GetAttr() for op in ops))
+    if rig is None:
+        return
+    moving = bones.keyed() if bones else [op.GetAttr() for op in ops]
+    # at the keys of d, too: where only d is keyed, the jaw stays still
+    times = _times(prim, [*moving, *(prim.GetAttribute(name) for name in PARAMETERS)])
+    try:
+        baked = bones.poses(prim, times, _where(prim)) if bones else _transforms(moving, times)
+        away_mm = _skull_moved(prim, rig, times)
+    except FormatError as error:
+        yield _finding("error", "Mandible", mandible.GetPrim(), error.message)
+        return
+    still = not any(attribute.GetNumTimeSamples() for attribute in moving)
+    yield from _check_baked(rig, mandible.GetPrim(), times, baked, _parameters(prim, times), still)
+    if not away_mm <= BAKED_MM:
+        yield _finding("error", "Mandible", prim, f"bones move the skull by {away_mm:.3f} mm ({BAKED_MM} allowed).")
+
+
+def _skull_moved(prim: Usd.Prim, rig: JawRig, times: list[Usd.TimeCode]) -> float:
+    """Return how far bones move the skull in the actor [mm]."""
+    targets = prim.GetRelationship("jaw:skull").GetTargets() if prim.HasRelationship("jaw:skull") else []
+    skull = prim.GetStage().GetPrimAtPath(targets[0]) if targets else None
+    bones = bones_of(skull) if skull else None
+    if bones is None:
+        return 0.0
+    poses = bones.poses(prim, times, _where(prim))
+    return float(landmark_distance(rig, poses, np.broadcast_to(np.eye(4), poses.shape)).max())
+
+
+def _transforms(ops: list[Usd.Attribute], times: list[Usd.TimeCode]) -> Array:
+    translate, orient = ops
+    return np.stack([_gf.transform_from_ops(_at(translate, time), _at(orient, time)) for time in times])
 
 
 def _check_baked(
-    prim: Usd.Prim, rig: JawRig, mandible: Usd.Prim, translate: Usd.Attribute, orient: Usd.Attribute
+    rig: JawRig, mandible: Usd.Prim, times: list[Usd.TimeCode], baked: Array, d: Array, still: bool
 ) -> Iterator[Finding]:
-    # at the keys of d, too: where only d is keyed, the jaw stays still
-    times = _times(prim, [translate, orient, *(prim.GetAttribute(name) for name in PARAMETERS)])
-    baked = np.stack([_gf.transform_from_ops(_at(translate, time), _at(orient, time)) for time in times])
-    error_mm = landmark_distance(rig, baked, rig.pose(_parameters(prim, times)))
+    error_mm = landmark_distance(rig, baked, rig.pose(d))
     worst = int(np.argmax(np.where(np.isfinite(error_mm), error_mm, np.inf)))
     if not error_mm[worst] <= BAKED_MM:
         message = f"the baked pose at {times[worst]} is {error_mm[worst]:.3f} mm from that of d ({BAKED_MM} allowed)."
-        if not translate.GetNumTimeSamples() and not orient.GetNumTimeSamples():
+        if still:
             message += " Only d is keyed, the mandible is not: bake it with `jawusd rebake`."
         yield _finding("error", "Mandible", mandible, message)
 

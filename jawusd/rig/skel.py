@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +17,13 @@ from jawusd.geometry.se3 import make_transform, se3_inverse, transform_points
 from jawusd.rig import _gf
 from jawusd.rig.geo import MESH_PATHS
 from jawusd.rig.layers import define_prim, new_layer, stage_of, write_layer
-from jawusd.rig.layout import ACTOR, GEO_FILE, MANDIBLE
+from jawusd.rig.layout import ACTOR, GEO, GEO_FILE, MANDIBLE, MOTION, SKEL_FILE, SKELETON, TRANSFORMS
+
+_TYPES = Sdf.ValueTypeNames
 
 JOINTS = ("skull", "skull/jaw")
-SKELETON, MOTION = f"{ACTOR}/Skel", f"{ACTOR}/Skel/Motion"
+SKEL, KEYS = f"{ACTOR}/Skel", f"{ACTOR}/Skel/Motion"
+_SKEL_IN_GEO = f"{GEO}/Skel"
 
 
 def write_skel(
@@ -52,18 +56,36 @@ def write_skel(
     keys = _define_motion(stage, rig, frames, d)
     if keys is not None:
         layer.startTimeCode, layer.endTimeCode = float(keys[0]), float(keys[-1])
-    # The bind transforms place the meshes; Blender would apply the ops of the payload on top.
-    mandible = Sdf.CreatePrimInLayer(layer, MANDIBLE)
-    order = Sdf.AttributeSpec(mandible, "xformOpOrder", Sdf.ValueTypeNames.TokenArray, Sdf.VariabilityUniform)
-    order.default = Vt.TokenArray()
-    for name in mesh_names:
-        _bind(layer, MESH_PATHS[name], rig.T_rest if _moves(name) else np.eye(4), int(_moves(name)))
+    _bind(layer, rig, [Sdf.Path(MESH_PATHS[name]) for name in mesh_names], Sdf.Path(SKEL), Sdf.Path(MANDIBLE))
     root.payloadList.prependedItems = [Sdf.Payload(f"./{GEO_FILE}")]
     return write_layer(layer, Path(out))
 
 
-def _moves(name: str) -> bool:
-    return name in ("mandible", "lower_teeth")
+def offer_skeleton(layer: Sdf.Layer, rig: JawRig, meshes: Iterable[str]) -> None:
+    """Give the actor of an animation layer the variants `transforms`, which is selected and empty, and `skeleton`.
+
+    The bones and their keys are those of `actor_skel.usdc` beside the layer, by reference. The prim above the meshes
+    becomes the SkelRoot: a variant cannot change the type that `actor.usda` itself gives to the actor.
+
+    Args:
+        meshes: Paths of the meshes that follow the bones.
+    """
+    actor = Sdf.CreatePrimInLayer(layer, ACTOR)
+    variants = Sdf.VariantSetSpec(actor, MOTION)
+    Sdf.VariantSpec(variants, TRANSFORMS)
+    Sdf.VariantSpec(variants, SKELETON)
+    actor.variantSetNameList.prependedItems = [MOTION]
+    actor.variantSelections[MOTION] = TRANSFORMS
+    inside = Sdf.Path(ACTOR).AppendVariantSelection(MOTION, SKELETON)
+
+    def place(path: str) -> Sdf.Path:
+        return Sdf.Path(path).ReplacePrefix(Sdf.Path(ACTOR), inside)
+
+    # overs all: without the payload there is nothing to move
+    Sdf.CreatePrimInLayer(layer, place(GEO)).typeName = "SkelRoot"
+    skeleton = Sdf.CreatePrimInLayer(layer, place(_SKEL_IN_GEO))
+    skeleton.referenceList.prependedItems = [Sdf.Reference(f"./{SKEL_FILE}", SKEL)]
+    _bind(layer, rig, [place(path) for path in meshes], Sdf.Path(_SKEL_IN_GEO), place(MANDIBLE))
 
 
 def joint_poses(rig: JawRig, d: Array) -> Array:
@@ -82,18 +104,18 @@ def _hinge(rig: JawRig) -> Array:
 
 
 def _define_skeleton(stage: Usd.Stage, hinge: Array) -> None:
-    skeleton = UsdSkel.Skeleton.Define(stage, SKELETON)
+    skeleton = UsdSkel.Skeleton.Define(stage, SKEL)
     rest = Vt.Matrix4dArray([_gf.row_matrix(np.eye(4)), _gf.row_matrix(hinge)])
     skeleton.CreateJointsAttr(Vt.TokenArray(JOINTS))
     skeleton.CreateBindTransformsAttr(rest)
     skeleton.CreateRestTransformsAttr(rest)
     binding = UsdSkel.BindingAPI.Apply(skeleton.GetPrim())
-    binding.CreateAnimationSourceRel().SetTargets([Sdf.Path(MOTION)])
+    binding.CreateAnimationSourceRel().SetTargets([Sdf.Path(KEYS)])
 
 
 def _define_motion(stage: Usd.Stage, rig: JawRig, frames: ArrayLike | None, d: ArrayLike | None) -> Array | None:
     """Define the animation of the joint skull/jaw and return its key frames."""
-    motion = UsdSkel.Animation.Define(stage, MOTION)
+    motion = UsdSkel.Animation.Define(stage, KEYS)
     motion.CreateJointsAttr(Vt.TokenArray([JOINTS[1]]))
     motion.CreateScalesAttr(Vt.Vec3hArray([(1, 1, 1)]))
     translations, rotations = motion.CreateTranslationsAttr(), motion.CreateRotationsAttr()
@@ -110,18 +132,27 @@ def _define_motion(stage: Usd.Stage, rig: JawRig, frames: ArrayLike | None, d: A
     return frames[known] if known.any() else None
 
 
-def _bind(layer: Sdf.Layer, path: str, bind: Array, joint: int) -> None:
-    """Bind a mesh of the payload, which is not loaded here, rigidly to a joint."""
-    mesh = Sdf.CreatePrimInLayer(layer, path)
+def _bind(layer: Sdf.Layer, rig: JawRig, meshes: Iterable[Sdf.Path], skeleton: Sdf.Path, mandible: Sdf.Path) -> None:
+    """Bind meshes of the payload, which is not loaded here, rigidly to the joints: those of the mandible to the jaw."""
+    # The bind transforms place the meshes; Blender would apply the ops of the payload on top.
+    order = Sdf.AttributeSpec(
+        Sdf.CreatePrimInLayer(layer, mandible), "xformOpOrder", _TYPES.TokenArray, Sdf.VariabilityUniform
+    )
+    order.default = Vt.TokenArray()
+    for path in meshes:
+        moves = path.HasPrefix(mandible)
+        _bind_mesh(Sdf.CreatePrimInLayer(layer, path), skeleton, rig.T_rest if moves else np.eye(4), int(moves))
+
+
+def _bind_mesh(mesh: Sdf.PrimSpec, skeleton: Sdf.Path, bind: Array, joint: int) -> None:
     schemas = Sdf.TokenListOp()
     schemas.prependedItems = ["SkelBindingAPI"]
     mesh.SetInfo("apiSchemas", schemas)
-    skeleton = Sdf.RelationshipSpec(mesh, "skel:skeleton", custom=False)
-    skeleton.targetPathList.explicitItems = [Sdf.Path(SKELETON)]
-    types = Sdf.ValueTypeNames
-    matrix = Sdf.AttributeSpec(mesh, "primvars:skel:geomBindTransform", types.Matrix4d)
+    relationship = Sdf.RelationshipSpec(mesh, "skel:skeleton", custom=False)
+    relationship.targetPathList.explicitItems = [skeleton]
+    matrix = Sdf.AttributeSpec(mesh, "primvars:skel:geomBindTransform", _TYPES.Matrix4d)
     matrix.default = _gf.row_matrix(bind)
-    values = (("jointIndices", types.IntArray, Vt.IntArray([joint])), ("jointWeights", types.FloatArray, [1.0]))
+    values = (("jointIndices", _TYPES.IntArray, Vt.IntArray([joint])), ("jointWeights", _TYPES.FloatArray, [1.0]))
     for name, type_name, value in values:
         primvar = Sdf.AttributeSpec(mesh, f"primvars:skel:{name}", type_name)
         primvar.default = value

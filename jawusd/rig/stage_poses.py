@@ -53,7 +53,7 @@ class StagePoses(NamedTuple):
 
 
 def carries_rig(path: str | os.PathLike[str]) -> bool:
-    """Tell whether a stage holds a rig whose mandible is moved by transforms: then nothing has to be fitted.
+    """Tell whether a stage holds a rig whose mandible moves by transforms or its bones: nothing has to be fitted.
 
     Raises:
         RigError: Not a stage.

@@ -2,9 +2,17 @@
 
 import numpy as np
 import pytest
-from example_rig import FPS, example_meshes, example_motion, example_proxies, example_rig, moved, scanned_meshes
+from example_rig import (
+    FPS,
+    choose_variants,
+    example_meshes,
+    example_motion,
+    example_proxies,
+    example_rig,
+    moved,
+    scanned_meshes,
+)
 from foreign import run_in
-from pxr import Sdf
 
 from jawusd.rig.bake import bake_rig
 from jawusd.rig.glb import write_glb
@@ -21,11 +29,12 @@ def folder(tmp_path_factory):
     made = tmp_path_factory.mktemp("actor")
     options = {"name": "example", "fps": FPS, "proxies": example_proxies()}
     bake_rig(made, example_rig(), scanned_meshes(), frames=frames, d=d, **options)
+    choose_variants(made / "anim_capture.usdc", made / "skeleton.usda", motion="skeleton")
     return made
 
 
 @pytest.mark.parametrize("blender", ["blender45", "blender50"])
-@pytest.mark.parametrize("name", ["anim_capture.usdc", "actor.usdz", "actor_skel.usdc"])
+@pytest.mark.parametrize("name", ["anim_capture.usdc", "actor.usdz", "actor_skel.usdc", "skeleton.usda"])
 def test_vertices_are_where_the_model_puts_them(folder, blender, name):
     frames, d = example_motion()
     shown = np.arange(0, len(frames), 2)
@@ -37,9 +46,11 @@ def test_vertices_are_where_the_model_puts_them(folder, blender, name):
             expected = moved(T[None], example_meshes()[key].vertices)[0]
             places = np.array(found["frames"][str(frames[k])][mesh])
             assert np.linalg.norm(places - expected, axis=1).max() < 0.01
-    if name == "actor_skel.usdc":
+    if name in ("actor_skel.usdc", "skeleton.usda"):
         assert found["bones"] == ["skull", "jaw"] and max(found["actions"].values()) == len(frames)
     else:
+        assert not found["bones"]
+    if name != "actor_skel.usdc":
         assert {"jaw:d1", "jaw:d1:range", "jaw:formatVersion", "jaw:modelHash"} <= set(found["properties"])
 
 
@@ -59,12 +70,8 @@ def test_glb_moves_as_the_model_does(folder, tmp_path, blender):
 
 def test_a_selected_proxy_moves_like_the_scan(folder, tmp_path):
     proxies, (frames, d) = example_proxies(), example_motion()
-    layer = Sdf.Layer.CreateNew(str(folder / "crowd.usda"))
-    layer.subLayerPaths.append("./anim_capture.usdc")
-    layer.defaultPrim = "Actor"
-    Sdf.CreatePrimInLayer(layer, "/Actor").variantSelections["detail"] = "proxy"
-    layer.Save()
-    found = run_in("blender45", "blender_import.py", folder / "crowd.usda", str(frames[20]), "LowerTeethMesh,SkullMesh")
+    crowd = choose_variants(folder / "anim_capture.usdc", folder / "crowd.usda", detail="proxy")
+    found = run_in("blender45", "blender_import.py", crowd, str(frames[20]), "LowerTeethMesh,SkullMesh")
     shown = found["frames"][str(frames[20])]
     expected = moved(example_rig().pose(d[20])[None], proxies["lower_teeth"].vertices)[0]
     assert np.linalg.norm(np.array(shown["LowerTeethMesh"]) - expected, axis=1).max() < 0.01

@@ -6,7 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from example_rig import FPS, example_meshes, example_motion, example_proxies, example_rig, scanned_meshes
+from example_rig import (
+    FPS,
+    choose_variants,
+    example_meshes,
+    example_motion,
+    example_proxies,
+    example_rig,
+    scanned_meshes,
+)
 from foreign import SCRIPTS, environment, run, run_in
 from scipy.spatial.transform import Rotation
 
@@ -28,6 +36,7 @@ def folder(tmp_path_factory):
     made = tmp_path_factory.mktemp("actor")
     options = {"name": "example", "fps": FPS, "proxies": example_proxies()}
     bake_rig(made, example_rig(), scanned_meshes(), frames=frames, d=d, **options)
+    choose_variants(made / "anim_capture.usdc", made / "skeleton.usda", motion="skeleton")
     K = np.array([[2000.0, 0, 959.5], [0, 2000, 539.5], [0, 0, 1]])
     camera = Camera("cam0", (1920, 1080), K, np.array([-0.1, 0.02, 0, 0, 0]), make_transform(np.eye(3), [0, 0, 250]))
     heads = make_transform(np.eye(3), np.outer(np.arange(len(frames)), [0.1, 0, 0.05]))
@@ -64,7 +73,8 @@ def test_jawusd_itself_runs_on_older_openusd(folder, tmp_path, name, monkeypatch
     found = run_in(name, "jawusd_read.py", shutil.copytree(folder, tmp_path / "actor"))
     np.testing.assert_allclose(found["poses"], example_rig().pose([[10.0, 1.0, 0.5], [0.0, 0.0, 0.0]]), atol=1e-12)
     assert found["kind"] == "anchored"
-    assert found["findings"] == [["info", "Onnx"], ["info", "Stock"]]
+    assert found["findings"] == found["bone_findings"] == [["info", "Onnx"], ["info", "Stock"]]
+    assert landmark_distance(np.array(found["bones"]), example_rig().pose(example_motion()[1])) < 1e-4
 
 
 def test_tinyusdz_reads_rig_and_motion(folder):
@@ -124,7 +134,16 @@ def test_three_js_reads_whole_numbers(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "name", ["actor.usda", "anim_capture.usdc", "actor.usdz", "actor_skel.usdc", "cameras.usda", "cameras_motion.usdc"]
+    "name",
+    [
+        "actor.usda",
+        "anim_capture.usdc",
+        "skeleton.usda",
+        "actor.usdz",
+        "actor_skel.usdc",
+        "cameras.usda",
+        "cameras_motion.usdc",
+    ],
 )
 def test_nvidia_validator_finds_nothing(folder, name):
     program = environment("nvidia") / "bin" / "nvidia_usd_validate"

@@ -110,6 +110,24 @@ def _painted(mesh):
     return Mesh(mesh.vertices, mesh.faces, colors)
 
 
+def choose_variants(source, out, **chosen):
+    """Write a layer over one of a rig that chooses variants of the actor, `motion="skeleton"`; return its path."""
+    from pxr import Sdf, Usd
+
+    below = Usd.Stage.Open(str(source))
+    layer = Sdf.Layer.CreateNew(str(out))
+    layer.subLayerPaths = [f"./{source.name}"]
+    layer.defaultPrim = "Actor"
+    layer.pseudoRoot.SetInfo("upAxis", "Y")
+    layer.pseudoRoot.SetInfo("metersPerUnit", 0.001)
+    layer.timeCodesPerSecond = below.GetTimeCodesPerSecond()
+    layer.startTimeCode, layer.endTimeCode = below.GetStartTimeCode(), below.GetEndTimeCode()
+    for name, variant in chosen.items():
+        Sdf.CreatePrimInLayer(layer, "/Actor").variantSelections[name] = variant
+    layer.Save()
+    return out
+
+
 def forget_checksums(folder):
     """Make a rig one whose layers may be changed, as rigs were before they had checksums."""
     from pxr import Sdf
