@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -31,14 +31,14 @@ _DECODER_ARRAYS = ("jaw:model:", "jaw:bounds:", "jaw:contact:", "jaw:joints:", "
 
 
 def interface_layer(
-    rig: JawRig, name: str, meshes: Mapping[str, Mesh], fps: float, *, proxies: bool = False
+    rig: JawRig, name: str, meshes: Mapping[str, Mesh], fps: float, proxies: Iterable[str] = ()
 ) -> Sdf.Layer:
     """Build `actor.usda`, the prim that users and tools see.
 
     Args:
         meshes: As for `build_geometry`.
         fps: Time codes per second.
-        proxies: Whether there is a `proxy.usdc`, offered as a variant.
+        proxies: Names of the meshes that have one in `proxy.usdc`, which makes variants.
     """
     layer = new_layer(fps)
     layer.subLayerPaths.append(f"./{layout.RIG_FILE}")
@@ -51,8 +51,8 @@ def interface_layer(
     }
     apply_jaw_api(actor, "GeomModelAPI")
     actor.payloadList.prependedItems = [Sdf.Payload(f"./{layout.GEO_FILE}")]
-    if proxies:
-        offer_detail(actor)
+    if names := list(proxies):
+        offer_detail(actor, names)
     hint = Sdf.AttributeSpec(actor, "extentsHint", _TYPES.Float3Array, Sdf.VariabilityVarying)
     hint.default = _gf.vec3f_array(reach(rig, meshes))
 

@@ -94,7 +94,7 @@ def bake_rig(
         write_onnx(folder / ONNX_FILE, decode_model(rig)),
         write_onnx(folder / ENCODE_FILE, encode_model(rig)),
     ]
-    interface = interface_layer(rig, name, meshes, fps, proxies=bool(proxies))
+    interface = interface_layer(rig, name, meshes, fps, proxies or ())
     record_sidecars(interface, folder)
     record_checksums(interface, folder, [path.name for path in written if path.suffix == ".usdc"])
     written.append(write_layer(interface, folder / ACTOR_FILE))

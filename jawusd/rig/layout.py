@@ -10,7 +10,7 @@ ONNX_FILE, ENCODE_FILE = "actor.onnx", "actor_encode.onnx"
 SKEL_FILE, PACKAGE_FILE = "actor_skel.usdc", "actor.usdz"
 PROXY_FILE = "proxy.usdc"
 
-DETAIL, SCAN, PROXY = "detail", "scan", "proxy"  # a variant set and its variants
+DETAIL, SCAN, PROXY, BOTH = "detail", "scan", "proxy", "both"  # a variant set and its variants
 MOTION, TRANSFORMS, SKELETON = "motion", "transforms", "skeleton"  # the one of the captured motion
 
 PARAMETERS = ("jaw:d1", "jaw:d2", "jaw:d3")

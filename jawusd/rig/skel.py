@@ -17,7 +17,7 @@ from jawusd.geometry.se3 import make_transform, se3_inverse, transform_points
 from jawusd.rig import _gf
 from jawusd.rig.geo import MESH_PATHS
 from jawusd.rig.layers import define_prim, new_layer, stage_of, write_layer
-from jawusd.rig.layout import ACTOR, GEO, GEO_FILE, MANDIBLE, MOTION, SKEL_FILE, SKELETON, TRANSFORMS
+from jawusd.rig.layout import ACTOR, GEO, GEO_FILE, MANDIBLE, MOTION, SKEL_FILE, SKELETON, SKULL, TRANSFORMS
 
 _TYPES = Sdf.ValueTypeNames
 
@@ -85,7 +85,9 @@ def offer_skeleton(layer: Sdf.Layer, rig: JawRig, meshes: Iterable[str]) -> None
     Sdf.CreatePrimInLayer(layer, place(GEO)).typeName = "SkelRoot"
     skeleton = Sdf.CreatePrimInLayer(layer, place(_SKEL_IN_GEO))
     skeleton.referenceList.prependedItems = [Sdf.Reference(f"./{SKEL_FILE}", SKEL)]
-    _bind(layer, rig, [place(path) for path in meshes], Sdf.Path(_SKEL_IN_GEO), place(MANDIBLE))
+    # what lies beside the meshes inherits the binding of the prims above, as proxies do in the variant with both
+    paths = [place(path) for path in (SKULL, MANDIBLE, *meshes)]
+    _bind(layer, rig, paths, Sdf.Path(_SKEL_IN_GEO), place(MANDIBLE))
 
 
 def joint_poses(rig: JawRig, d: Array) -> Array:

@@ -30,11 +30,12 @@ def folder(tmp_path_factory):
     options = {"name": "example", "fps": FPS, "proxies": example_proxies()}
     bake_rig(made, example_rig(), scanned_meshes(), frames=frames, d=d, **options)
     choose_variants(made / "anim_capture.usdc", made / "skeleton.usda", motion="skeleton")
+    choose_variants(made / "anim_capture.usdc", made / "both.usda", detail="both")
     return made
 
 
 @pytest.mark.parametrize("blender", ["blender45", "blender50"])
-@pytest.mark.parametrize("name", ["anim_capture.usdc", "actor.usdz", "actor_skel.usdc", "skeleton.usda"])
+@pytest.mark.parametrize("name", ["anim_capture.usdc", "actor.usdz", "actor_skel.usdc", "skeleton.usda", "both.usda"])
 def test_vertices_are_where_the_model_puts_them(folder, blender, name):
     frames, d = example_motion()
     shown = np.arange(0, len(frames), 2)

@@ -37,6 +37,7 @@ def folder(tmp_path_factory):
     options = {"name": "example", "fps": FPS, "proxies": example_proxies()}
     bake_rig(made, example_rig(), scanned_meshes(), frames=frames, d=d, **options)
     choose_variants(made / "anim_capture.usdc", made / "skeleton.usda", motion="skeleton")
+    choose_variants(made / "anim_capture.usdc", made / "both.usda", motion="skeleton", detail="both")
     K = np.array([[2000.0, 0, 959.5], [0, 2000, 539.5], [0, 0, 1]])
     camera = Camera("cam0", (1920, 1080), K, np.array([-0.1, 0.02, 0, 0, 0]), make_transform(np.eye(3), [0, 0, 250]))
     heads = make_transform(np.eye(3), np.outer(np.arange(len(frames)), [0.1, 0, 0.05]))
@@ -139,6 +140,7 @@ def test_three_js_reads_whole_numbers(tmp_path):
         "actor.usda",
         "anim_capture.usdc",
         "skeleton.usda",
+        "both.usda",
         "actor.usdz",
         "actor_skel.usdc",
         "cameras.usda",

@@ -1,14 +1,24 @@
-"""The variant `detail`: by default a rig is what it was without it; the proxy replaces meshes and nothing else."""
+"""The variant `detail`: by default a rig is what it was without it; proxies replace meshes, or lie beside them."""
 
 import numpy as np
 import pytest
-from example_rig import FPS, assert_valid_usd, example_motion, example_proxies, example_rig, scanned_meshes
-from pxr import Sdf, Usd, UsdGeom
+from example_rig import (
+    FPS,
+    assert_valid_usd,
+    choose_variants,
+    example_motion,
+    example_proxies,
+    example_rig,
+    moved,
+    scanned_meshes,
+)
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel
 
 from jawusd.formats.mesh import crown_face_mask
 from jawusd.rig import load_rig
 from jawusd.rig.bake import bake_rig
-from jawusd.rig.geo import read_geometry, read_gum
+from jawusd.rig.geo import MESH_PATHS, read_geometry, read_gum
+from jawusd.rig.motion_read import read_poses_of_stage
 from jawusd.rig.publish import publish_rig
 
 PROXIES = example_proxies()
@@ -26,14 +36,7 @@ def baked(tmp_path_factory):
 
 def shot(folder, source="anim_capture.usdc"):
     """Write a layer beside a rig that selects the proxy; return its path."""
-    layer = Sdf.Layer.CreateNew(str(folder / f"crowd_{source.split('.')[0]}.usda"))
-    layer.TransferContent(Sdf.Layer.FindOrOpen(str(folder / source)))
-    layer.subLayerPaths = [f"./{source}"]
-    for prim in list(layer.rootPrims):
-        del layer.rootPrims[prim.name]
-    Sdf.CreatePrimInLayer(layer, "/Actor").variantSelections["detail"] = "proxy"
-    layer.Save()
-    return layer.realPath
+    return choose_variants(folder / source, folder / f"crowd_{source.split('.')[0]}.usda", detail="proxy")
 
 
 def test_by_default_nothing_is_different(baked):
@@ -58,7 +61,7 @@ def test_the_proxy_replaces_meshes_and_nothing_else(baked):
         np.testing.assert_array_equal(found[name].faces, mesh.faces)
         assert found[name].colors is None and found[name].uv is None
     np.testing.assert_array_equal(gum["upper_teeth"], ~crown_face_mask(PROXIES["upper_teeth"]))
-    stage, rig = Usd.Stage.Open(path), load_rig(path)
+    stage, rig = Usd.Stage.Open(str(path)), load_rig(path)
     mandible = UsdGeom.Xformable(stage.GetPrimAtPath("/Actor/geo/Mandible"))
     for frame, d in zip(*example_motion()):
         np.testing.assert_allclose(np.array(mandible.GetLocalTransformation(float(frame))).T, rig.pose(d), atol=1e-9)
@@ -76,3 +79,62 @@ def test_published_rigs_keep_their_proxies(baked, tmp_path):
     stage.GetPrimAtPath("/Actor").GetVariantSet("detail").SetVariantSelection("proxy")
     points = UsdGeom.Mesh(stage.GetPrimAtPath("/Actor/geo/Skull/SkullMesh")).GetPointsAttr().Get()
     np.testing.assert_array_equal(points, PROXIES["skull"].vertices.astype(np.float32))
+    stage.GetPrimAtPath("/Actor").GetVariantSet("detail").SetVariantSelection("both")
+    points = UsdGeom.Mesh(stage.GetPrimAtPath("/Actor/geo/Skull/SkullProxy")).GetPointsAttr().Get()
+    np.testing.assert_array_equal(points, PROXIES["skull"].vertices.astype(np.float32))
+
+
+def both(folder, motion="transforms"):
+    """Return the path of a stage that selects scans and proxies."""
+    out = folder / f"both_{motion}.usda"
+    return choose_variants(folder / "anim_capture.usdc", out, detail="both", motion=motion)
+
+
+def test_scans_are_for_rendering_and_proxies_for_showing(baked):
+    path = both(baked / "with")
+    assert_valid_usd(path)
+    stage, scans = Usd.Stage.Open(str(path)), scanned_meshes()
+    assert not stage.GetCompositionErrors()
+    for name, place in MESH_PATHS.items():
+        scan = UsdGeom.Mesh(stage.GetPrimAtPath(place))
+        assert len(scan.GetPointsAttr().Get()) == len(scans[name].vertices)
+        if name not in PROXIES:  # it has few faces as it is
+            assert scan.ComputePurpose() == "default"
+            continue
+        found, purpose = scan.ComputeProxyPrim()
+        proxy = UsdGeom.Mesh(found)
+        assert scan.ComputePurpose() == "render" and proxy.ComputePurpose() == "proxy" and purpose == scan.GetPrim()
+        points = np.array(proxy.GetPointsAttr().Get())
+        np.testing.assert_array_equal(points, PROXIES[name].vertices.astype(np.float32))
+        materials = [UsdShade.MaterialBindingAPI(mesh).ComputeBoundMaterial()[0] for mesh in (scan, proxy)]
+        assert materials[0] and materials[0].GetPath() == materials[1].GetPath()
+    names = [prim.GetName() for prim in Usd.PrimRange(stage.GetPrimAtPath("/Actor/geo"))]
+    assert len(names) == len(set(names))  # Blender and others mix up equal ones
+    stage.Unload("/Actor")
+    assert not [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh)]
+
+
+def test_with_both_the_rig_reads_as_its_scans(baked):
+    path = both(baked / "with")
+    expected, found = read_geometry(baked / "with" / "anim_capture.usdc"), read_geometry(path)
+    assert set(found) == set(expected)
+    for name, mesh in expected.items():
+        np.testing.assert_array_equal(found[name].vertices, mesh.vertices)
+        np.testing.assert_array_equal(found[name].faces, mesh.faces)
+    assert (found["upper_teeth"].colors is None) == (expected["upper_teeth"].colors is None)
+
+
+@pytest.mark.parametrize("motion", ["transforms", "skeleton"])
+def test_proxies_beside_the_scans_move_with_them(baked, motion):
+    path, (frames, d) = both(baked / "with", motion), example_motion()
+    assert_valid_usd(path)
+    np.testing.assert_allclose(read_poses_of_stage(path)[1], example_rig().pose(d), atol=2e-5)
+    stage = Usd.Stage.Open(Usd.Stage.Open(str(path)).Flatten())
+    if motion == "skeleton":
+        assert UsdSkel.BakeSkinning(UsdSkel.Root(stage.GetPrimAtPath("/Actor/geo")), Gf.Interval(0, 100))
+    for k in (9, 30):
+        mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/Actor/geo/Mandible/LowerTeethProxy"))
+        world = np.array(UsdGeom.XformCache(float(frames[k])).GetLocalToWorldTransform(mesh.GetPrim())).T
+        shown = moved(world[None], np.array(mesh.GetPointsAttr().Get(float(frames[k])), dtype=float))[0]
+        expected = moved(example_rig().pose(d[k])[None], PROXIES["lower_teeth"].vertices)[0]
+        assert np.abs(shown - expected).max() < 1e-4

@@ -115,8 +115,7 @@ def choose_variants(source, out, **chosen):
     from pxr import Sdf, Usd
 
     below = Usd.Stage.Open(str(source))
-    layer = Sdf.Layer.CreateNew(str(out))
-    layer.subLayerPaths = [f"./{source.name}"]
+    layer = Sdf.Layer.CreateAnonymous(".usda")
     layer.defaultPrim = "Actor"
     layer.pseudoRoot.SetInfo("upAxis", "Y")
     layer.pseudoRoot.SetInfo("metersPerUnit", 0.001)
@@ -124,7 +123,8 @@ def choose_variants(source, out, **chosen):
     layer.startTimeCode, layer.endTimeCode = below.GetStartTimeCode(), below.GetEndTimeCode()
     for name, variant in chosen.items():
         Sdf.CreatePrimInLayer(layer, "/Actor").variantSelections[name] = variant
-    layer.Save()
+    layer.subLayerPaths = [f"./{source.name}"]
+    layer.Export(str(out))
     return out
 
 
