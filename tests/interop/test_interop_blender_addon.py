@@ -4,7 +4,16 @@ import json
 
 import numpy as np
 import pytest
-from example_rig import FPS, assert_valid_usd, example_meshes, example_motion, example_rig, mandible_vertices, moved
+from example_rig import (
+    FPS,
+    assert_valid_usd,
+    choose_variants,
+    example_meshes,
+    example_motion,
+    example_rig,
+    mandible_vertices,
+    moved,
+)
 from foreign import run_in
 
 from jawusd.plugins.extension import build_extension
@@ -65,7 +74,7 @@ def test_takes_play_as_the_evaluator_says(tmp_path, archive, actor, blender):
 
 
 @pytest.mark.parametrize("blender", BLENDERS)
-def test_sliders_bound_handle_export_and_nodes(tmp_path, archive, actor, blender):
+def test_sliders_bound_handle_export_nodes_and_two_actors(tmp_path, archive, actor, blender):
     rig, folder = actor
     frames, d = example_motion()
     poses = {
@@ -74,7 +83,8 @@ def test_sliders_bound_handle_export_and_nodes(tmp_path, archive, actor, blender
         "outside": np.array([[20.0, 9.0, 1.0], [0.0, 6.0, 0.0], [60.0, 0.0, 0.0], [5.0, -8.0, -5.0]]),
     }
     (tmp_path / "poses.json").write_text(json.dumps({name: rows.tolist() for name, rows in poses.items()}))
-    arguments = (archive, tmp_path, folder / "anim_capture.usdc", tmp_path / "poses.json")
+    bones = choose_variants(folder / "anim_capture.usdc", folder / f"bones_{blender}.usda", motion="skeleton")
+    arguments = (archive, tmp_path, folder / "anim_capture.usdc", tmp_path / "poses.json", bones)
     found = run_in(blender, "blender_addon.py", *arguments)
     assert found["keys"] == 3 * len(frames) and found["frames"] == [frames[0], frames[-1]]
     for name in ("inside", "outside"):
@@ -84,9 +94,18 @@ def test_sliders_bound_handle_export_and_nodes(tmp_path, archive, actor, blender
         assert hard_low <= low - 1 and hard_high >= high + 1
     inside, outside = found["readout"]
     assert inside[0].startswith("inside") and outside[0].startswith("OUTSIDE") and len(inside) == 2
+    ranges = np.array([rig.ranges(*row) for row in poses["inside"]])
+    np.testing.assert_allclose(found["ranges"], ranges, atol=1e-6)
+    line = "here: d2 {:.1f} .. {:.1f}, d3 {:.1f} .. {:.1f} mm"
+    assert found["shown_ranges"] == [line.format(*row) for row in found["ranges"]]
     kept = np.array([rig.keep_inside([0.0], row[None]).d[0] for row in poses["outside"]])
     assert distance_mm(found["kept"], rig, kept) < EXACT_MM
     np.testing.assert_allclose(found["sliders"], poses["outside"][-1])  # only what is shown is brought inside
+    check_two_actors(rig, found["two"], poses["inside"])
+    # what bones move already is left to them
+    assert found["bones"]["actors"] == []
+    expected = moved(rig.pose(d[[42 - frames[0]]]), example_meshes()["mandible"].vertices)[0]
+    assert np.linalg.norm(np.array(found["bones"]["places"]) - expected, axis=1).max() < EXACT_MM
     dragged = found["dragged"]
     expected = rig.ik(rig.landmarks[0], dragged["target"], start=poses["inside"][0])
     np.testing.assert_allclose(dragged["d"], expected.d, atol=1e-3)
@@ -100,3 +119,12 @@ def test_sliders_bound_handle_export_and_nodes(tmp_path, archive, actor, blender
     np.testing.assert_array_equal(times, frames)
     np.testing.assert_allclose(exported, d, atol=1e-5)
     assert fps == FPS
+
+
+def check_two_actors(rig, two, inside):
+    """Check that two imports of one actor are two actors, the second playing, each posed by its own sliders."""
+    frames, d = example_motion()
+    assert two["names"] == ["Actor", "Actor.001"]
+    assert distance_mm(two["played"][1:], rig, d[[42 - frames[0]]]) < EXACT_MM
+    for place, wanted in ((0, inside), (1, inside[::-1])):
+        assert distance_mm([matrices[place] for matrices in two["posed"]], rig, wanted) < EXACT_MM

@@ -33,7 +33,10 @@ _poses: dict[tuple[str, float, float, float, bool], tuple[float, ...]] = {}
 
 
 def link_rigs(stage: Usd.Stage, prim_map: PrimMap) -> bool:
-    """Add sliders, drivers and keys to the rigs of an imported stage; return whether there is one."""
+    """Add sliders, drivers and keys to the rigs of an imported stage; return whether there is one.
+
+    Rigs that bones move are left to them: drivers would move the mandible once more.
+    """
     from . import carried_usd
 
     prims = carried.find_rigs(stage)
@@ -43,6 +46,9 @@ def link_rigs(stage: Usd.Stage, prim_map: PrimMap) -> bool:
         mandible = _object_of(prim_map, mandible_path)
         if actor is None or mandible is None:
             print(f"jawusd: {prim.GetPath()} was not imported with its mandible; the rig stays as baked")
+            continue
+        if any(modifier.type == "ARMATURE" for mesh in meshes_of(mandible) for modifier in mesh.modifiers):
+            print(f"jawusd: bones move {prim.GetPath()}; for sliders import it with motion = transforms")
             continue
         actor[SOURCE] = _source_of(prim)
         actor[FPS] = stage.GetTimeCodesPerSecond()

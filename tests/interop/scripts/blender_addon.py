@@ -1,6 +1,7 @@
 """Run inside Blender's Python: try what the add-on offers on an imported take, print what came out as JSON.
 
-Usage: python blender_addon.py ZIP FOLDER TAKE.usd POSES.json
+Usage: python blender_addon.py ZIP FOLDER TAKE.usd POSES.json BONES.usd
+BONES is the same take with its skeleton selected.
 Matrices are the mandible's in the actor [mm].
 """
 
@@ -15,14 +16,14 @@ from blender_playback import NAMES, matrix
 from extension import install
 
 
-def posed(d):
-    """Set the sliders and return the mandible's matrix."""
-    actor = bpy.data.objects["Actor"]
+def posed(d, actor="Actor", mandible="Mandible"):
+    """Set the sliders of an actor and return its mandible's matrix."""
+    actor = bpy.data.objects[actor]
     for name, value in zip(NAMES, d):
         actor[name] = value
     actor.update_tag()
     bpy.context.view_layer.update()
-    return matrix()
+    return matrix(mandible)
 
 
 def limits():
@@ -35,6 +36,29 @@ def readout(package, d):
     """Return the lines that the panel shows."""
     actor = bpy.data.objects["Actor"]
     return [text for text, _ in package.panel._readout(package.jaw.rig_of(actor), d)]
+
+
+def two_actors(package, take, poses):
+    """Import the take again; return both actors, the second as it plays, and both posed in different ways."""
+    bpy.ops.wm.usd_import(filepath=take)
+    actors = package.jaw.actors()
+    names = [(actor.name, package.jaw.mandible_of(actor).name) for actor in actors]
+    bpy.context.scene.frame_set(42)
+    found = {"names": [name for name, _ in names], "played": [matrix(name) for _, name in names], "posed": []}
+    actors[1].animation_data.action = None
+    for rows in zip(poses, poses[::-1]):
+        for d, (actor, mandible) in zip(rows, names):
+            posed(d, actor, mandible)
+        found["posed"].append([matrix(mandible) for _, mandible in names])
+    return found
+
+
+def by_bones(package, take):
+    """Import a take that bones move into an empty scene; return its actors and the vertices of the mandible."""
+    bpy.ops.wm.read_homefile(use_empty=True)
+    bpy.ops.wm.usd_import(filepath=take)
+    bpy.context.scene.frame_set(42)
+    return {"actors": [actor.name for actor in package.jaw.actors()], "places": vertices()}
 
 
 def dragged(way):
@@ -56,6 +80,11 @@ def with_nodes(d):
     bpy.ops.jawusd.nodes(actor="Actor")
     bpy.ops.preferences.addon_disable(module="bl_ext.test_repository.jawusd_blender")
     posed(d)
+    return vertices()
+
+
+def vertices():
+    """Return the vertices of the mandible's mesh in the actor."""
     depsgraph = bpy.context.evaluated_depsgraph_get()
     root = bpy.data.objects["Actor"].evaluated_get(depsgraph)
     mesh = bpy.data.objects["MandibleMesh"].evaluated_get(depsgraph)
@@ -63,7 +92,7 @@ def with_nodes(d):
     return [list(to_root @ vertex.co) for vertex in mesh.to_mesh().vertices]
 
 
-def main(archive, folder, take, poses):
+def main(archive, folder, take, poses, bones):
     """Try everything."""
     bpy.ops.wm.read_homefile(use_empty=True)
     package = install(archive, folder)
@@ -77,6 +106,9 @@ def main(archive, folder, take, poses):
     result["poses"] = [posed(d) for d in poses["inside"]]
     result["limits"] = limits()
     result["readout"] = [readout(package, d) for d in (poses["inside"][0], poses["outside"][0])]
+    rig = package.jaw.rig_of(actor)
+    result["ranges"] = [[float(x) for x in rig.ranges(*d)] for d in poses["inside"]]
+    result["shown_ranges"] = [readout(package, d)[1] for d in poses["inside"]]
     result["outside"] = [posed(d) for d in poses["outside"]]
     actor[package.jaw.KEEP] = True
     result["kept"] = [posed(d) for d in poses["outside"]]
@@ -86,10 +118,13 @@ def main(archive, folder, take, poses):
     bpy.ops.jawusd.key(actor="Actor")
     bpy.ops.jawusd.export(actor="Actor", filepath=os.path.join(folder, "kept.usdc"))
     actor.animation_data.action, actor[package.jaw.KEEP] = None, False
+    result["two"] = two_actors(package, take, poses["inside"])
     posed(poses["inside"][0])
     result["dragged"] = dragged((1.0, -3.0, 1.0))
-    result["nodes"] = with_nodes(poses["inside"][0])
     result["frames"] = [scene.frame_start, scene.frame_end]
+    result["nodes"] = with_nodes(poses["inside"][0])
+    bpy.ops.preferences.addon_enable(module="bl_ext.test_repository.jawusd_blender")
+    result["bones"] = by_bones(package, bones)
     print("RESULT " + json.dumps(result))
 
 

@@ -19,10 +19,10 @@ from extension import install
 NAMES = ("d1", "d2", "d3")
 
 
-def matrix():
-    """Return the mandible's evaluated matrix in the actor [mm], rows, in Blender's single precision."""
+def matrix(name="Mandible"):
+    """Return a mandible's evaluated matrix in the actor [mm], rows, in Blender's single precision."""
     depsgraph = bpy.context.evaluated_depsgraph_get()
-    mandible = bpy.data.objects["Mandible"].evaluated_get(depsgraph)
+    mandible = bpy.data.objects[name].evaluated_get(depsgraph)
     return [list(row) for row in mandible.matrix_local]
 
 
