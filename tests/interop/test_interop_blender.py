@@ -89,7 +89,7 @@ def test_colours_and_texture_coordinates_arrive(folder, blender):
 
 
 @pytest.mark.parametrize("blender", ["blender45", "blender50"])
-@pytest.mark.parametrize("name", ["anim_capture.usdc", "actor_skel.usdc"])
+@pytest.mark.parametrize("name", ["anim_capture.usdc", "actor_skel.usdc", "skeleton.usda"])
 def test_what_blender_exports_comes_back_to_d(folder, tmp_path, blender, name):
     frames, d = example_motion()
     run_in(blender, "blender_export.py", folder / name, tmp_path / "out.usdc", frames[0], frames[-1])
