@@ -102,6 +102,8 @@ def test_sliders_bound_handle_export_nodes_and_two_actors(tmp_path, archive, act
     assert distance_mm(found["kept"], rig, kept) < EXACT_MM
     np.testing.assert_allclose(found["sliders"], poses["outside"][-1])  # only what is shown is brought inside
     check_two_actors(rig, found["two"], poses["inside"])
+    disabled, enabled = (distance_mm([found["enabled"][k]], rig, poses["inside"][[1]]) for k in (0, 1))
+    assert disabled > 0.1 and enabled < EXACT_MM
     # what bones move already is left to them
     assert found["bones"]["actors"] == []
     expected = moved(rig.pose(d[[42 - frames[0]]]), example_meshes()["mandible"].vertices)[0]

@@ -233,12 +233,15 @@ def _install(*_: object) -> None:
 
 
 def register() -> None:
-    """Install the driver function, also in files to be opened."""
+    """Install the driver function, also in files to be opened and in the one that is open."""
     bpy.app.driver_namespace[_FUNCTION] = _channel
     bpy.app.handlers.load_post.append(_install)
+    bpy.app.timers.register(_install, first_interval=0.0)  # add-ons see no objects while they are enabled
 
 
 def unregister() -> None:
     """Remove it."""
+    if bpy.app.timers.is_registered(_install):
+        bpy.app.timers.unregister(_install)
     bpy.app.handlers.load_post.remove(_install)
     bpy.app.driver_namespace.pop(_FUNCTION, None)

@@ -61,6 +61,18 @@ def by_bones(package, take):
     return {"actors": [actor.name for actor in package.jaw.actors()], "places": vertices()}
 
 
+def enabled_again(d):
+    """Disable the add-on, whose drivers then fail, and enable it; return the mandible before and after it restores."""
+    module = "bl_ext.test_repository.jawusd_blender"
+    bpy.ops.preferences.addon_disable(module=module)
+    found = [posed(d)]
+    bpy.ops.preferences.addon_enable(module=module)
+    jaw = sys.modules[f"{module}.jaw"]
+    if bpy.app.timers.is_registered(jaw._install):  # Blender calls it as soon as it waits for events
+        jaw._install()
+    return [*found, posed(d)]
+
+
 def dragged(way):
     """Drag a handle at the incisor by a way [mm]; return the sliders and where handle and its target are."""
     bpy.ops.jawusd.handle(actor="Actor", at="INCISOR")
@@ -118,6 +130,7 @@ def main(archive, folder, take, poses, bones):
     bpy.ops.jawusd.key(actor="Actor")
     bpy.ops.jawusd.export(actor="Actor", filepath=os.path.join(folder, "kept.usdc"))
     actor.animation_data.action, actor[package.jaw.KEEP] = None, False
+    result["enabled"] = enabled_again(poses["inside"][1])
     result["two"] = two_actors(package, take, poses["inside"])
     posed(poses["inside"][0])
     result["dragged"] = dragged((1.0, -3.0, 1.0))
