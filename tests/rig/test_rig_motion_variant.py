@@ -245,3 +245,14 @@ def test_without_motion_there_is_no_choice(tmp_path):
     path = write_animation(tmp_path / "anim_take.usdc", tmp_path / "actor.usda", [1, 2], [[0, 0, 0], [5, 0, 0]], FPS)
     layer = Sdf.Layer.FindOrOpen(str(path))
     assert not layer.GetPrimAtPath("/Actor").variantSets
+
+
+def test_instances_are_read_and_rebaked(anchored_folder):
+    file = shot(anchored_folder, lambda actor: actor.SetInstanceable(True), path="/Shot/Person")
+    assert Usd.Stage.Open(str(file)).GetPrimAtPath("/Shot/Person").IsInstance()
+    np.testing.assert_allclose(read_poses_of_stage(file)[1], example_rig().pose(D), atol=2e-5)
+    out = anchored_folder / "own.usda"
+    run("rebake", anchored_folder / "actor.usda", file, "-o", out, "--from", "mandible")
+    assert_valid_usd(out)
+    np.testing.assert_allclose(read_poses_of_stage(out)[1], example_rig().pose(D), atol=1e-4)
+    assert not UsdSkel.Root.Find(Usd.Stage.Open(str(out)).GetPrimAtPath("/Shot/Person/geo/Mandible"))
