@@ -157,7 +157,7 @@ def segment(
     allow_outside: Outside = False,
     as_json: Json = False,
 ) -> None:
-    """Make masks of both rows of teeth from the videos, starting from the picks."""
+    """Make masks of both rows of teeth from the videos, starting from the picks, or from a search without them."""
     from jawusd.pipeline.calibrate import sync_cameras
     from jawusd.pipeline.prepare import open_capture
     from jawusd.pipeline.segment import SegmentOptions, segment_teeth

@@ -20,6 +20,7 @@ from jawusd.cli import (
     rig_commands,
     solve_commands,
     stage_commands,
+    start_commands,
 )
 from jawusd.errors import JawusdError, OutputError, explain_missing_packages
 
@@ -32,6 +33,7 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 for _command in (
+    start_commands.init,
     build_commands.build,
     build_commands.track,
     build_commands.fit,

@@ -56,7 +56,43 @@ Allow = Annotated[
     ),
 ]
 Prim = Annotated[str | None, typer.Option("--prim", help="Which rig, where a stage has several: the path of its prim.")]
-RigArg = Annotated[Path, typer.Argument(help="actor.usda, another layer of it, or model.npz.", show_default=False)]
+
+
+def _actor_in_folder(rig: Path | None) -> Path | None:
+    """Return the actor of a rig's folder, other paths as they are.
+
+    Raises:
+        RigError: a folder without one.
+    """
+    from jawusd.errors import RigError
+
+    if rig is None or not rig.is_dir():
+        return rig
+    actor = rig / "actor.usda"
+    if not actor.exists():
+        hint = "Name the folder of a build (jawusd build ... -o FOLDER), or a file of it."
+        if (rig / "capture.toml").exists():
+            hint = f"It is a capture; build a rig from it with: jawusd build {rig} -o out"
+        raise RigError("is a folder without actor.usda.", path=rig, hint=hint)
+    return actor
+
+
+RigArg = Annotated[
+    Path,
+    typer.Argument(
+        help="Folder of a rig, its actor.usda or another layer, or model.npz.",
+        callback=_actor_in_folder,
+        show_default=False,
+    ),
+]
+OptionalRigArg = Annotated[
+    Path | None,
+    typer.Argument(
+        help="Folder of a rig, actor.usda, another layer, model.npz or tracks.npz.",
+        callback=_actor_in_folder,
+        show_default=False,
+    ),
+]
 
 
 def load_named(rig: Path, prim: str | None, stage: Path | None = None) -> JawRig:

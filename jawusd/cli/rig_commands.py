@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from jawusd.cli.options import USD_SUFFIXES, Allow, Json, Prim, RigArg, load_named
+from jawusd.cli.options import USD_SUFFIXES, Allow, Json, OptionalRigArg, Prim, RigArg, load_named
 from jawusd.cli.output import emit
 
 if TYPE_CHECKING:
@@ -26,9 +26,7 @@ NO = 1
 
 
 def info(
-    rig: Annotated[
-        Path | None, typer.Argument(help="actor.usda, another layer, model.npz or tracks.npz.", show_default=False)
-    ] = None,
+    rig: OptionalRigArg = None,
     schema: Annotated[
         bool, typer.Option("--schema", help="Say where the USD schema JawRigAPI is, and how other programs find it.")
     ] = False,

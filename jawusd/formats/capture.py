@@ -9,7 +9,10 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from jawusd.errors import CaptureError, FormatError, JawusdError, UnitsError
+from jawusd.errors import FormatError, JawusdError, UnitsError
+from jawusd.formats.capture_errors import problems_of
+from jawusd.formats.capture_keys import Key, KeyEntry, entries
+from jawusd.formats.capture_paths import resolve_paths
 from jawusd.formats.text import read_toml
 from jawusd.geometry import rigidity_defect
 from jawusd.npz import check_format
@@ -18,20 +21,32 @@ FAMILY, VERSION = "jawusd-capture", 1
 
 
 class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True, populate_by_name=True)
 
 
 class Scans(_Strict):
     """Name the meshes, all in one frame with the teeth in occlusion [mm]."""
 
-    upper_teeth: Path
-    lower_teeth: Path
-    mandible: Path | None = None
-    skull: Path | None = None
-    #: Folder of the labels of the teeth scans; beside the scans if not given.
-    labels: Path | None = None
-    #: Whether the two scans are taken as they stand, or the lower one is moved to where the take shows the closed bite.
-    registration: Literal["scan", "take"] = "scan"
+    upper_teeth: Annotated[
+        Path, Key("Scan of the upper teeth: PLY, STL, OBJ or (with jawusd[dcm]) 3Shape DCM.", '"scans/upper.ply"', "mm")
+    ]
+    lower_teeth: Annotated[
+        Path,
+        Key("Scan of the lower teeth, in the frame of the upper one, teeth in occlusion.", '"scans/lower.ply"', "mm"),
+    ]
+    mandible: Annotated[
+        Path | None, Key("Mesh of the whole mandible, same frame; without it a placeholder.", '"mandible.ply"', "mm")
+    ] = None
+    skull: Annotated[Path | None, Key("Mesh of the skull, same frame.", '"scans/skull.ply"', "mm")] = None
+    labels: Annotated[
+        Path | None, Key("Folder of the labels of crown and gum; beside the scans if not given.", '"labels"')
+    ] = None
+    registration: Annotated[
+        Literal["scan", "take"],
+        Key(
+            '"scan": both scans stay as they are; "take": the lower one moves to where the take shows the closed bite.'
+        ),
+    ] = "scan"
 
 
 class Masks(_Strict):
@@ -42,10 +57,20 @@ class Masks(_Strict):
     lower teeth and 0 neither.
     """
 
-    upper: Path
-    lower: Path
-    upper_value: Annotated[int, Field(ge=1, le=65535)] | None = None
-    lower_value: Annotated[int, Field(ge=1, le=65535)] | None = None
+    upper: Annotated[
+        Path,
+        Key(
+            "Masks of the upper teeth: PNG files with their number as %06d, or a video.", '"masks/left/upper/%06d.png"'
+        ),
+    ]
+    lower: Annotated[Path, Key("The same of the lower teeth.", '"masks/left/lower/%06d.png"')]
+    upper_value: Annotated[
+        Annotated[int, Field(ge=1, le=65535)] | None,
+        Key("With `labels`, one file for both rows: the gray value of the upper teeth.", "1"),
+    ] = None
+    lower_value: Annotated[Annotated[int, Field(ge=1, le=65535)] | None, Key("The same of the lower teeth.", "2")] = (
+        None
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -84,8 +109,12 @@ class Masks(_Strict):
 class CameraSource(_Strict):
     """Name one camera's footage and masks."""
 
-    name: Annotated[str, Field(min_length=1, pattern=r"^[A-Za-z0-9_\-]+$")]
-    video: Path | None = None
+    name: Annotated[
+        str,
+        Field(min_length=1, pattern=r"^[A-Za-z0-9_\-]+$"),
+        Key("Name of the camera, as the calibration calls it: letters, digits, _ and -.", '"left"'),
+    ]
+    video: Annotated[Path | None, Key("Footage of the camera.", '"left.mp4"')] = None
     masks: Masks | None = None
 
     @model_validator(mode="after")
@@ -102,13 +131,28 @@ class Boards(_Strict):
     number are taken as simultaneous. A ChArUco board also needs OpenCV's name of its dictionary and its marker size.
     """
 
-    pattern: Literal["chessboard", "charuco"] = "chessboard"
-    cols: Annotated[int, Field(ge=3, le=50)]
-    rows: Annotated[int, Field(ge=3, le=50)]
-    square_mm: Annotated[float, Field(gt=0, le=200)]
-    videos: tuple[Path, ...]
-    dictionary: Annotated[str, Field(pattern=r"^DICT_[4-7]X[4-7]_(50|100|250|1000)$")] | None = None
-    marker_mm: Annotated[float, Field(gt=0, le=200)] | None = None
+    pattern: Annotated[Literal["chessboard", "charuco"], Key("Kind of board.")] = "chessboard"
+    cols: Annotated[
+        int, Field(ge=3, le=50), Key("Inner corners along a row: one less than squares. 3 to 50.", "9", "corners")
+    ]
+    rows: Annotated[int, Field(ge=3, le=50), Key("Inner corners along a column.", "6", "corners")]
+    square_mm: Annotated[
+        float, Field(gt=0, le=200), Key("Side of a square, measured on the printed board. Up to 200.", "8.0", "mm")
+    ]
+    videos: Annotated[
+        tuple[Path, ...],
+        Key(
+            "Clip of the board per camera, in the order of the cameras: videos, or numbered pictures as %04d.",
+            '["board_left.mp4", "board_right.mp4"]',
+        ),
+    ]
+    dictionary: Annotated[
+        Annotated[str, Field(pattern=r"^DICT_[4-7]X[4-7]_(50|100|250|1000)$")] | None,
+        Key("Of a ChArUco board: OpenCV's name of its markers.", '"DICT_5X5_100"'),
+    ] = None
+    marker_mm: Annotated[
+        Annotated[float, Field(gt=0, le=200)] | None, Key("Of a ChArUco board: side of a marker.", "6.0", "mm")
+    ] = None
 
     @model_validator(mode="after")
     def _describes_markers(self) -> Boards:
@@ -127,30 +171,48 @@ class Sync(_Strict):
     the reference camera.
     """
 
-    method: Literal["flash", "audio", "offsets"] = "flash"
-    reference: str | None = None
-    offsets: dict[str, int] | None = None
+    method: Annotated[
+        Literal["flash", "audio", "offsets"],
+        Key('"flash": light flashes, else sound; "audio": sound alone; "offsets": as given.'),
+    ] = "flash"
+    reference: Annotated[str | None, Key("Camera that counts the frames; the first if not given.", '"left"')] = None
+    offsets: Annotated[
+        dict[str, int] | None,
+        Key(
+            "Per camera: its frame k shows the instant of frame k + offset of the reference camera.",
+            "{ left = 0, right = 5 }",
+            "frames",
+        ),
+    ] = None
 
 
 class PickView(_Strict):
     """Give the pixel of a picked vertex in one camera (OpenCV pixels of the recorded picture)."""
 
-    camera: str
-    x: float
-    y: float
+    camera: Annotated[str, Key("Name of the camera.", '"left"')]
+    x: Annotated[float, Key("Pixel column; the middle of the first pixel is 0.", "651.5", "px")]
+    y: Annotated[float, Key("Pixel row.", "250.4", "px")]
 
 
 class Pick(_Strict):
     """Join a vertex of a teeth scan with the pixels where it is seen."""
 
-    vertex: Annotated[int, Field(ge=0)]
-    views: Annotated[tuple[PickView, ...], Field(min_length=2)]
+    vertex: Annotated[int, Field(ge=0), Key("Number of a vertex of the scan.", "1397")]
+    views: Annotated[
+        tuple[PickView, ...],
+        Field(min_length=2),
+        Key(
+            "Where it is seen, in two cameras or more.",
+            '[{ camera = "left", x = 651.5, y = 250.4 }, { camera = "right", x = 663.2, y = 290.4 }]',
+            "px",
+        ),
+    ]
 
 
 class Bootstrap(_Strict):
     """Give the picks that start the tracking, on one frame of the reference camera."""
 
-    frame: Annotated[int, Field(ge=0)]
+    frame: Annotated[int, Field(ge=0), Key("Frame of the reference camera in which the points are picked.", "120")]
     upper: tuple[Pick, ...] = ()
     lower: tuple[Pick, ...] = ()
 
@@ -158,14 +220,23 @@ class Bootstrap(_Strict):
 class MotionSection(_Strict):
     """Name a reference frame with the teeth in occlusion."""
 
-    rest_frame: Annotated[int, Field(ge=0)] | None = None
+    rest_frame: Annotated[
+        Annotated[int, Field(ge=0)] | None,
+        Key("A frame with the teeth together; the most closed ones are searched if not given.", "46"),
+    ] = None
 
 
 class AnatomySection(_Strict):
     """Override what is otherwise derived from the scans."""
 
-    T_anatomical_skull: list[list[float]] | None = None
-    landmarks: dict[str, tuple[float, float, float]] | None = None
+    T_anatomical_skull: Annotated[
+        list[list[float]] | None,
+        Key("4 x 4 matrix from the scans' frame to the anatomical one (x left, y up, z forward).", unit="mm"),
+    ] = None
+    landmarks: Annotated[
+        dict[str, tuple[float, float, float]] | None,
+        Key("Points of the mandible in the scans' frame, by name.", "{ lower_incisor = [0.0, -1.0, 2.0] }", "mm"),
+    ] = None
 
     @field_validator("T_anatomical_skull")
     @classmethod
@@ -181,14 +252,27 @@ class Capture(_Strict):
     """Describe a capture; all paths are absolute once loaded."""
 
     folder: Path
-    name: Annotated[str, Field(min_length=1, pattern=r"^[A-Za-z0-9_\-. ]+$")]
-    fps: Annotated[float, Field(gt=0, le=10000)]
-    frames: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]] | None = None
-    calibration: Path | None = None
-    #: Length of the calibration file's unit [mm]; others write metres or, from pictures alone, any unit.
-    calibration_unit_mm: Annotated[float, Field(gt=0, le=1e6)] = 1.0
+    name: Annotated[
+        str,
+        Field(min_length=1, pattern=r"^[A-Za-z0-9_\-. ]+$"),
+        Key("Name of the person or the take: letters, digits, spaces, _ - and dots.", '"anna"'),
+    ]
+    fps: Annotated[float, Field(gt=0, le=10000), Key("Rate of the clips.", "23.976", "frames per second")]
+    frames: Annotated[
+        tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]] | None,
+        Key("First frame, and one past the last, of the reference camera; all if not given.", "[30, 270]", "frames"),
+    ] = None
+    calibration: Annotated[
+        Path | None,
+        Key("Calibration of the cameras; without it one is made from [boards].", '"calibration.toml"'),
+    ] = None
+    calibration_unit_mm: Annotated[
+        float,
+        Field(gt=0, le=1e6),
+        Key("Length of the calibration's unit: 1000 where it is in metres.", "1000.0", "mm"),
+    ] = 1.0
     scans: Scans
-    cameras: Annotated[tuple[CameraSource, ...], Field(min_length=1, max_length=64)]
+    cameras: Annotated[tuple[CameraSource, ...], Field(min_length=1, max_length=64, alias="camera")]
     boards: Boards | None = None
     sync: Sync = Sync()
     bootstrap: Bootstrap | None = None
@@ -222,6 +306,49 @@ class Capture(_Strict):
         return self.sync.reference or self.cameras[0].name
 
 
+_MOST_LOOKED_AT = 4096
+
+
+def _refuse_other_files(path: Path) -> None:
+    """Refuse what cannot be a capture.toml, with what to do instead.
+
+    Raises:
+        FormatError: it is missing, or is no text.
+    """
+    if not path.exists():
+        hint = None
+        if path.parent.is_dir():
+            hint = f"`jawusd init {path.parent}` writes one from the footage and scans in that folder."
+        raise FormatError("there is no such file.", path=path, hint=hint)
+    if path.is_file() and path.suffix.lower() != ".toml":
+        with open(path, "rb") as file:
+            is_text = b"\0" not in file.read(_MOST_LOOKED_AT)
+        if not is_text:
+            raise FormatError(
+                f'is no text, "{path.suffix}" is no capture: a capture is a folder with a capture.toml.',
+                path=path,
+                hint=f"Write one for the footage beside it: jawusd init {path.parent}",
+            )
+
+
+#: Keys that are read from the file before the models are.
+_BEFORE = (
+    KeyEntry("", "format", "text", "", Key("Kind and version of the file.", f'"{FAMILY}/{VERSION}"')),
+    KeyEntry("", "units", '"mm"', '"mm"', Key("Unit of all lengths.", '"mm"')),
+)
+_LABELS = Key("Instead of `upper` and `lower`: one label image per frame, by its gray values.", '"labels/%06d.png"')
+
+
+def capture_keys() -> list[KeyEntry]:
+    """Return every key that a capture.toml may have, in the order of the file."""
+    out = list(_BEFORE)
+    for entry in entries(Capture, skipped=("folder",)):
+        out.append(entry)
+        if entry.name == "masks.lower":
+            out.append(KeyEntry(entry.table, "masks.labels", "path", "none", _LABELS))
+    return out
+
+
 def load_capture(path: str | os.PathLike[str], *, allow_outside: bool = False) -> Capture:
     """Read `capture.toml`, given itself or by its folder; the paths of the capture are absolute.
 
@@ -248,6 +375,7 @@ def read_capture(
     if path.is_dir():
         path = path / "capture.toml"
     try:
+        _refuse_other_files(path)
         data = read_toml(path)
         check_format(data.pop("format", None), FAMILY, VERSION, path)
     except JawusdError as error:
@@ -257,68 +385,11 @@ def read_capture(
         return None, [UnitsError(f'units are "{units}", allowed is "mm".', path=path)]
     folder = path.resolve().parent
     data["folder"] = folder
-    if "camera" in data:
-        data["cameras"] = data.pop("camera")
     try:
         capture = Capture.model_validate(data)
     except ValidationError as error:
-        return None, [FormatError(problem, path=path) for problem in _problems(error)]
+        return None, [FormatError(text, path=path, hint=hint) for text, hint in problems_of(error, Capture, data)]
     except RecursionError:
         return None, [FormatError("is nested too deeply.", path=path)]
-    problems: list[JawusdError] = []
-    return _resolve(capture, folder, path, allow_outside, problems), problems
-
-
-def _problems(error: ValidationError) -> list[str]:
-    out = []
-    # A misspelt key also makes the right one missing; the misspelling is the cause.
-    for problem in sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden"):
-        where = ".".join("camera" if part == "cameras" else str(part) for part in problem["loc"])
-        found = problem.get("input")
-        shown = "" if isinstance(found, dict | list | tuple) or problem["type"] == "missing" else f' (found "{found}")'
-        out.append(f"{where or 'the file'}: {problem['msg']}{shown}.")
-    return out
-
-
-def _resolve(capture: Capture, folder: Path, source: Path, allow_outside: bool, problems: list[JawusdError]) -> Capture:
-    """Make every path absolute, and add to the problems each that leads out of the folder or does not exist."""
-
-    def absolute(value: Path, key: str) -> Path:
-        full = Path(os.path.normpath(folder / value))
-        # Resolve links as well: a link may lead out of the folder though its name does not.
-        anchor = full.parent if "%" in full.name else full
-        try:
-            inside, exists = anchor.resolve().is_relative_to(folder), anchor.exists()
-        except (OSError, ValueError, RuntimeError) as error:  # too long, a null byte, links in a circle
-            problems.append(CaptureError(f"{key} is no path that can be followed ({error!s:.100}).", path=source))
-            return full
-        if not allow_outside and not inside:
-            problems.append(
-                CaptureError(
-                    f'{key} = "{value}" leads out of the folder of the capture.',
-                    path=source,
-                    hint="Move the file inside, or allow it with --allow-outside.",
-                )
-            )
-        elif not exists:
-            kind = "folder" if "%" in full.name else "file"
-            message = f"{key}: there is no {kind} {anchor}."
-            problems.append(CaptureError(message, path=source, hint="Check the path in the file."))
-        return full
-
-    def walk(value: object, key: str) -> object:
-        if isinstance(value, BaseModel):
-            changed = {
-                name: walk(getattr(value, name), f"{key}.{name}" if key else name)
-                for name in type(value).model_fields
-                if name != "folder"
-            }
-            return value.model_copy(update=changed)
-        if isinstance(value, tuple):
-            return tuple(walk(item, f"{key}[{i}]") for i, item in enumerate(value))
-        return absolute(value, key) if isinstance(value, Path) else value
-
-    resolved = walk(capture, "")
-    if not isinstance(resolved, Capture):
-        raise TypeError("resolving a capture must give a capture")
-    return resolved
+    resolved, problems = resolve_paths(capture, path, data, allow_outside=allow_outside)
+    return resolved.model_copy(update={"folder": folder}), problems

@@ -14,7 +14,7 @@ import numpy as np
 
 from jawusd.errors import CaptureError, TrackingError, explain_missing_packages
 from jawusd.formats.atomic import write_text_atomic
-from jawusd.formats.capture import Capture, Masks
+from jawusd.formats.capture import Capture
 from jawusd.formats.tracks import LOST
 from jawusd.geometry.arrays import Array
 from jawusd.pipeline.follow import Follower
@@ -28,6 +28,7 @@ from jawusd.pipeline.segment_record import (
     Journal,
 )
 from jawusd.pipeline.state import Progress, hash_files, hash_value
+from jawusd.pipeline.track_pictures import searched_start
 
 if TYPE_CHECKING:
     from jawusd.segmentation.camera import CameraSegmenter, Segment
@@ -63,26 +64,11 @@ def segment_teeth(
 
     Raises:
         CaptureError: fewer than two cameras have a video, or one cannot be decoded.
-        TrackingError: no picks, or the teeth are not found where they say.
+        TrackingError: the teeth are not found, where picks say they are or, without picks, in the footage.
         OutputError: a file cannot be written.
     """
     with ThreadPoolExecutor(options.jobs) as pool:
         return _Segmentation(capture, offsets, folder, options, progress, pool).run()
-
-
-def with_masks(capture: Capture, folder: Path) -> Capture:
-    """Return the capture with the masks that `segment_teeth` wrote to a folder."""
-    from jawusd.segmentation.files import mask_pattern
-
-    cameras = tuple(
-        camera
-        if camera.video is None
-        else camera.model_copy(
-            update={"masks": Masks(**{arch: mask_pattern(folder, camera.name, arch) for arch in ARCHES})}
-        )
-        for camera in capture.cameras
-    )
-    return capture.model_copy(update={"cameras": cameras})
 
 
 @dataclass(eq=False)
@@ -120,7 +106,7 @@ class _Segmentation:
         self._cameras = {name: camera for name, camera in cameras.items() if name in videos}
         meshes = load_meshes(capture)
         self._meshes = meshes["upper_teeth"], meshes["lower_teeth"]
-        self._footage = ColourFootage(videos, offsets)
+        self._footage, self._offsets = ColourFootage(videos, offsets), offsets
         self._keys = KeyMasks(options.keys, {name: camera.size_px for name, camera in self._cameras.items()})
         self._config = SegmentationConfig()
         self._subject = subject_of_capture(capture, meshes)
@@ -145,10 +131,7 @@ class _Segmentation:
         """Segment all frames that are not finished, and again those that drawn masks improve."""
         from jawusd.segmentation.state import state_files
 
-        poses = self._tracker.picked(self._capture.bootstrap, self._cameras)
-        start = self._start
-        if not self._first <= start < self._stop:
-            raise TrackingError(f"bootstrap.frame is {start}, frames run from {self._first} to {self._stop - 1}")
+        start, poses = self._begun()
         if not self._guide:
             self._follow(start, poses)
         if start not in self._journal.entries:
@@ -173,9 +156,33 @@ class _Segmentation:
         self._guide = follower.run(range(self._first, self._stop), self._progress)
         save_guide(self._folder, self._guide_inputs, self._guide)
 
-    @property
-    def _start(self) -> int:
-        return self._capture.bootstrap.frame if self._capture.bootstrap else self._first
+    def _begun(self) -> tuple[int, Array]:
+        """Return the frame to begin on and the poses there, shape (2, 4, 4): by picks, or else by search.
+
+        Raises:
+            TrackingError: the picks cannot be, or the teeth were not found.
+        """
+        from jawusd.tracking.region.picture_start import RowStart
+
+        picks = self._capture.bootstrap
+        frames = range(self._first, self._stop)
+        if picks is not None:
+            if picks.frame not in frames:
+                raise TrackingError(
+                    f"bootstrap.frame is {picks.frame}, frames run from {self._first} to {self._stop - 1}"
+                )
+            self._start = picks.frame
+            return picks.frame, self._tracker.picked(picks, self._cameras)
+        if self._journal.entries and self._guide:
+            self._start = next(iter(self._journal.entries))  # frames are recorded in the order of the work
+            return self._start, self._guide[self._start].poses
+        follower = Follower(self._footage, self._cameras, self._tracker.scans, self._subject, self._pool)
+        upper, lower = self._tracker.scans
+        rows = RowStart(self._meshes, (upper, lower), self._capture.anatomy.T_anatomical_skull, self._pool.map)
+        capture, footage = self._capture, self._footage
+        begin = searched_start(capture, self._offsets, footage, rows, follower, frames, self._progress)
+        self._start = begin.frame
+        return begin.frame, begin.pose
 
     def _advance(self, stage_name: str, done: int) -> None:
         self._progress(stage_name, done, self._stop - self._first)

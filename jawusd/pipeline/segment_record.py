@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from jawusd.errors import FormatError, OutputError, explain_missing_packages
 from jawusd.formats.atomic import write_text_atomic
-from jawusd.formats.capture import Capture
+from jawusd.formats.capture import Capture, Masks
 from jawusd.formats.text import read_text
 from jawusd.formats.tracks import LOST
 from jawusd.geometry.arrays import Array
@@ -337,3 +337,18 @@ def segment_lines(summary: SegmentSummary) -> list[str]:
         where = f"  {row['camera']} frame {row['own_frame']:>5}  {row['row']:<5}"
         lines.append(f"{where}  confidence {row['confidence']:.2f}  {row['reason']}")
     return lines
+
+
+def with_masks(capture: Capture, folder: Path) -> Capture:
+    """Return the capture with the masks that `segment_teeth` wrote to a folder."""
+    from jawusd.segmentation.files import ARCHES, mask_pattern
+
+    cameras = tuple(
+        camera
+        if camera.video is None
+        else camera.model_copy(
+            update={"masks": Masks(**{arch: mask_pattern(folder, camera.name, arch) for arch in ARCHES})}
+        )
+        for camera in capture.cameras
+    )
+    return capture.model_copy(update={"cameras": cameras})

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from jawusd.errors import CaptureError
@@ -64,9 +63,11 @@ def track_videos(
     with ThreadPoolExecutor(jobs) as pool:
         rows = RowStart(teeth, scans, capture.anatomy.T_anatomical_skull, pool.map)
         follower = Follower(footage, cameras, scans, subject, pool)
-        start = _Start(capture, offsets, rows, follower)
         picks = capture.bootstrap
-        begin = start.searched(footage, frames, progress) if picks is None else start.picked(picks, frames)
+        if picks is None:
+            begin = searched_start(capture, offsets, footage, rows, follower, frames, progress)
+        else:
+            begin = _picked_start(rows, follower, picks, frames)
         followed = follower.run(frames, progress)
     facts = TakeFacts(
         tuple(cameras.values()),
@@ -84,44 +85,44 @@ def track_videos(
     return tracks
 
 
-@dataclass(frozen=True, eq=False)
-class _Start:
-    """Find where to begin."""
+def _picked_start(rows: RowStart, follower: Follower, picks: Bootstrap, frames: range) -> Begin[Array]:
+    """Return where the teeth are picked.
 
-    capture: Capture
-    offsets: Mapping[str, int]
-    rows: RowStart
-    follower: Follower
+    Raises:
+        TrackingError: the picks cannot be, or do not fit what is seen.
+    """
+    if picks.frame not in frames:
+        raise outside(picks.frame, frames)
+    found, fit = follower.begun(picks.frame, rows.picked(picks, follower.cameras))
+    if fit < _LEAST_PICKED_FIT:
+        raise unseen_picks(picks.frame, fit, _LEAST_PICKED_FIT)
+    return Begin(picks.frame, found.poses, fit, "picks")
 
-    def picked(self, picks: Bootstrap, frames: range) -> Begin[Array]:
-        """Return where the teeth are picked.
 
-        Raises:
-            TrackingError: the picks cannot be, or do not fit what is seen.
-        """
-        if picks.frame not in frames:
-            raise outside(picks.frame, frames)
-        found, fit = self.follower.begun(picks.frame, self.rows.picked(picks, self.follower.cameras))
-        if fit < _LEAST_PICKED_FIT:
-            raise unseen_picks(picks.frame, fit, _LEAST_PICKED_FIT)
-        return Begin(picks.frame, found.poses, fit, "picks")
+def searched_start(
+    capture: Capture,
+    offsets: Mapping[str, int],
+    footage: ColourFootage,
+    rows: RowStart,
+    follower: Follower,
+    frames: range,
+    progress: Progress,
+) -> Begin[Array]:
+    """Return where a search finds the teeth, T_world_upper and T_world_lower (2, 4, 4); the follower has begun there.
 
-    def searched(self, footage: ColourFootage, frames: range, progress: Progress) -> Begin[Array]:
-        """Return where a search finds the teeth.
+    Raises:
+        TrackingError: nowhere.
+        CaptureError: a picture cannot be decoded.
+    """
 
-        Raises:
-            TrackingError: nowhere.
-        """
-        names = self.follower.cameras
+    def near(sources: Sequence[CameraSource], frame: int) -> Array | None:
+        return rows.at(sources, follower.cameras, offsets, frame)
 
-        def near(sources: Sequence[CameraSource], frame: int) -> Array | None:
-            return self.rows.at(sources, names, self.offsets, frame)
+    def judged(frame: int, poses: Array) -> tuple[Array, float]:
+        found, fit = follower.begun(frame, poses)
+        return found.poses, fit
 
-        def judged(frame: int, poses: Array) -> tuple[Array, float]:
-            found, fit = self.follower.begun(frame, poses)
-            return found.poses, fit
-
-        search = PictureSearch(self.capture, self.offsets, footage, len(names), near, judged)
-        begin = search.run(frames, progress)
-        self.follower.begun(begin.frame, begin.pose)  # the last one tried may have been another
-        return begin
+    search = PictureSearch(capture, offsets, footage, len(follower.cameras), near, judged)
+    begin = search.run(frames, progress)
+    follower.begun(begin.frame, begin.pose)  # the last one tried may have been another
+    return begin

@@ -21,8 +21,8 @@ from jawusd.imaging.masks import MaskReader
 from jawusd.imaging.video import Video
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.prepare import load_meshes, subject_of_capture
-from jawusd.pipeline.segment import SegmentOptions, segment_teeth, with_masks
-from jawusd.pipeline.segment_record import write_summary
+from jawusd.pipeline.segment import SegmentOptions, segment_teeth
+from jawusd.pipeline.segment_record import with_masks, write_summary
 from jawusd.pipeline.track import first_pass
 
 

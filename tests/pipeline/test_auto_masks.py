@@ -9,9 +9,8 @@ from jawusd.formats.capture import load_capture
 from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, Tracks
 from jawusd.geometry import make_transform
 from jawusd.pipeline.follow import _follow_back, _jumps
-from jawusd.pipeline.segment import with_masks
 from jawusd.pipeline.segment_guide import GUIDE, save_guide, take_up_guide
-from jawusd.pipeline.segment_record import SUMMARY, auto_masks_folder
+from jawusd.pipeline.segment_record import SUMMARY, auto_masks_folder, with_masks
 from jawusd.pipeline.track import tracking_config
 from jawusd.tracking import TrackingConfig
 from jawusd.tracking.region.tracker import RegionPose

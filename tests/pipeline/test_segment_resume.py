@@ -7,8 +7,8 @@ from package_copy import ROOT
 
 from jawusd.formats.capture import load_capture
 from jawusd.imaging.overlay import LOWER_COLOUR, UPPER_COLOUR
-from jawusd.pipeline.segment import SegmentOptions, segment_teeth, with_masks
-from jawusd.pipeline.segment_record import LEARNED, RECORD, write_summary
+from jawusd.pipeline.segment import SegmentOptions, segment_teeth
+from jawusd.pipeline.segment_record import LEARNED, RECORD, with_masks, write_summary
 from jawusd.segmentation.files import mask_path, write_mask
 from jawusd.segmentation.sheet import write_sheet
 

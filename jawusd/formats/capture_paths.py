@@ -1,0 +1,97 @@
+"""Make the paths in a capture.toml absolute, and say which lead nowhere or out of its folder."""
+
+from __future__ import annotations
+
+import difflib
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TypeVar
+
+from pydantic import BaseModel
+
+from jawusd.errors import CaptureError, JawusdError
+from jawusd.formats.capture_errors import Location, place
+from jawusd.formats.numbered import is_pattern
+
+M = TypeVar("M", bound=BaseModel)
+_SHOWN = 3  # names like a missing one
+
+
+def resolve_paths(
+    model: M, source: Path, data: Mapping[str, object], *, allow_outside: bool
+) -> tuple[M, list[JawusdError]]:
+    """Return a model with every path absolute, and an error for each that is outside the folder or does not exist.
+
+    Args:
+        model: read from a file.
+        source: that file; paths are relative to its folder.
+        data: its contents, for the names of tables.
+        allow_outside: let paths leave the folder.
+    """
+    folder = source.resolve().parent
+    problems: list[JawusdError] = []
+
+    def absolute(value: Path, location: Location) -> Path:
+        full = Path(os.path.normpath(folder / value))
+        try:
+            problem = _problem(value, full, folder, allow_outside)
+        except (OSError, ValueError, RuntimeError) as error:  # too long, a null byte, links in a circle
+            problem = f"is no path that can be followed ({error!s:.100}).", None
+        if problem is not None:
+            text, hint = problem
+            where = _where(location, data)
+            problems.append(CaptureError(f'{where} = "{value!s:.200}" {text}', path=source, hint=hint))
+        return full
+
+    def walk(value: object, location: Location) -> object:
+        if isinstance(value, BaseModel):
+            changed = {}
+            for name, field in type(value).model_fields.items():
+                changed[name] = walk(getattr(value, name), (*location, field.alias or name))
+            return value.model_copy(update=changed)
+        if isinstance(value, tuple):
+            return tuple(walk(item, (*location, i)) for i, item in enumerate(value))
+        return absolute(value, location) if isinstance(value, Path) and location != ("folder",) else value
+
+    resolved = walk(model, ())
+    if not isinstance(resolved, type(model)):
+        raise TypeError("resolving a model must give a model of its kind")
+    return resolved, problems
+
+
+def _where(location: Location, data: Mapping[str, object]) -> str:
+    """Return table and key, as `[[camera]] 2 ("left") video`."""
+    keys = len(location) - 1
+    while keys > 0 and isinstance(location[keys], int):
+        keys -= 1
+    table = place(location[:keys], data)
+    number = "".join(f"[{part}]" for part in location[keys + 1 :])
+    return f"{table} {location[keys]}{number}".strip()
+
+
+def _problem(value: Path, full: Path, folder: Path, allow_outside: bool) -> tuple[str, str | None] | None:
+    """Return what is wrong with a path and what to do, None if nothing is."""
+    # Resolve links as well: a link may lead out of the folder though its name does not.
+    anchor = full.parent if is_pattern(full) else full
+    inside, exists = anchor.resolve().is_relative_to(folder), anchor.exists()
+    if not allow_outside and not inside:
+        text = "leads out of the folder of the capture."
+        return text, "Move the file inside, or allow it with --allow-outside."
+    if exists:
+        return None
+    kind = "folder" if is_pattern(full) else "file"
+    return f"does not exist: there is no {kind} {anchor}.", _similar(anchor)
+
+
+def _similar(path: Path) -> str:
+    """Return advice that names what there is of nearly that name."""
+    parent = path.parent
+    if not parent.is_dir():
+        return f"There is no folder {parent} either."
+    names = sorted(entry.name for entry in parent.iterdir() if not entry.name.startswith("."))
+    lower = {name.lower(): name for name in names}
+    close = [lower[found] for found in difflib.get_close_matches(path.name.lower(), lower, n=_SHOWN)]
+    stems = [name for name in names if Path(name).stem == path.stem and name not in close]
+    found = [*stems, *close][:_SHOWN]
+    return f"Did you mean {' or '.join(found)}?" if found else "Check the path in the file."

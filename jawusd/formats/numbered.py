@@ -1,0 +1,119 @@
+"""Numbered files, as sequences of pictures are stored: which names belong to a pattern, and which number each has.
+
+Patterns, in the last part of a path: `%06d` or `%d` as printf has them, `####` with a sign per digit, or a glob with
+`*` or `?`, of whose files the last digits of the name count. Folders are never searched below.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from jawusd.errors import CaptureError
+
+_PRINTF = re.compile(r"%(?:0(\d+))?d")
+_HASHES = re.compile(r"#+")
+_DIGITS = re.compile(r"(\d+)(?=\D*$)")
+_GAPS_SHOWN = 4
+
+
+def is_pattern(path: Path) -> bool:
+    """Tell whether a path names numbered files rather than one."""
+    try:
+        return any(sign in path.name for sign in "%#*?") and not path.is_file()
+    except (OSError, ValueError):  # too long, a null byte: its reader says so
+        return False
+
+
+def numbered_files(pattern: Path) -> dict[int, Path]:
+    """Return the files of a pattern by their numbers, increasing.
+
+    Raises:
+        CaptureError: the pattern has no number or several, the folder is missing or holds no such file, or two files
+            have one number.
+    """
+    name = pattern.name
+    folder = pattern.parent
+    if not folder.is_dir():
+        raise CaptureError(f"there is no folder {folder}.", path=pattern, hint="Correct the path in capture.toml.")
+    matches = _matching(pattern)
+    found: dict[int, Path] = {}
+    for entry in sorted(folder.iterdir()):
+        match = matches.fullmatch(entry.name)
+        digits = match and (match[1] if match.re.groups else (_DIGITS.search(Path(entry.name).stem) or [None])[0])
+        if not digits or entry.name.startswith("."):
+            continue
+        number = int(digits)
+        if number in found:
+            raise CaptureError(
+                f"{found[number].name} and {entry.name} both have the number {number}.",
+                path=pattern,
+                hint=f"Name one of them, as {_one_of(entry.name)}.",
+            )
+        found[number] = entry
+    if not found:
+        raise CaptureError(f"no file of the folder is named like {name}.", path=pattern, hint=_offer(folder))
+    return dict(sorted(found.items()))
+
+
+def _matching(pattern: Path) -> re.Pattern[str]:
+    """Return what matches the file names of a pattern; its group, if it has one, is the number."""
+    name = pattern.name
+    for sign, width in ((_PRINTF, lambda m: int(m[1] or 1)), (_HASHES, lambda m: len(m[0]))):
+        places = list(sign.finditer(name))
+        if len(places) > 1:
+            raise CaptureError(
+                "the name has two numbers; one is allowed.", path=pattern, hint="Write the fixed one in digits."
+            )
+        if places:
+            start, end = places[0].span()
+            digits = rf"(\d{{{width(places[0])},}})"
+            return re.compile(re.escape(name[:start]) + digits + re.escape(name[end:]))
+    if "%" in name:
+        raise CaptureError("the name needs one number such as %06d.", path=pattern, hint="Correct it in capture.toml.")
+    return re.compile(fnmatch.translate(name))
+
+
+def groups(names: Iterable[str]) -> Mapping[str, list[int]]:
+    """Return the numbers of files by the pattern of their names, as `%06d`; names without digits are left out."""
+    out: dict[str, list[int]] = defaultdict(list)
+    widths: dict[str, set[int]] = defaultdict(set)
+    for name in names:
+        stem, suffix = Path(name).stem, Path(name).suffix
+        match = _DIGITS.search(stem)
+        if match is None:
+            continue
+        key = f"{stem[: match.start()]}\0{stem[match.end() :]}{suffix}"
+        out[key].append(int(match[1]))
+        widths[key].add(len(match[1]))
+    named: dict[str, list[int]] = {}
+    for key, numbers in out.items():
+        width = min(widths[key])
+        named[key.replace("\0", "%d" if width == 1 or len(widths[key]) > 1 else f"%0{width}d")] = sorted(numbers)
+    return named
+
+
+def gaps(numbers: Iterable[int]) -> str:
+    """Return which numbers are missing between the first and the last, as "1007, 1010 to 1012", "" if none is."""
+    there = sorted(numbers)
+    out = []
+    for before, after in zip(there, there[1:]):
+        if after - before > 1:
+            out.append(f"{before + 1}" if after - before == 2 else f"{before + 1} to {after - 1}")
+    more = f" and {len(out) - _GAPS_SHOWN} more gaps" if len(out) > _GAPS_SHOWN else ""
+    return ", ".join(out[:_GAPS_SHOWN]) + more
+
+
+def _one_of(name: str) -> str:
+    return next(iter(groups([name])), name)
+
+
+def _offer(folder: Path) -> str:
+    """Return advice that names the patterns there are in a folder."""
+    found = groups(entry.name for entry in folder.iterdir() if not entry.name.startswith("."))
+    if not found:
+        return "Correct the path in capture.toml."
+    return f"There is {' and '.join(sorted(found, key=lambda key: -len(found[key]))[:2])}."

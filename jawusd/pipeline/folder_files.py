@@ -1,0 +1,166 @@
+"""Tell by names what the files of a folder are: footage, clips of a board, masks, scans, calibration."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path, PurePath
+
+from jawusd.formats.capture_template import CameraSketch
+from jawusd.formats.numbered import groups
+
+CLIPS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v", ".mxf", ".mts", ".mpg", ".y4m")
+PICTURES = (".png", ".tif", ".tiff", ".exr", ".dpx", ".jpg", ".jpeg")
+SCANS = (".ply", ".stl", ".obj", ".dcm")
+_CALIBRATIONS = (".toml", ".json", ".xml", ".csv", ".yaml", ".yml", ".txt", ".usda", ".usdc", ".usd")
+_FEWEST_PICTURES = 5  # fewer numbered pictures are no sequence
+_DEPTH = 4
+
+_BOARD = {"board", "boards", "calib", "calibration", "calibrate", "checker", "checkerboard", "chess", "chessboard"}
+_BOARD |= {"charuco", "chart", "grid", "aruco"}
+_MASK = {"mask", "masks", "matte", "mattes", "roto", "segmentation", "seg"}
+_UPPER = {"upper", "maxilla", "maxillary", "maxillar", "oberkiefer", "ok", "oben", "superior", "top", "u"}
+_LOWER = {"lower", "mandibular", "unterkiefer", "uk", "unten", "inferior", "bottom", "l"}
+_MANDIBLE = {"mandible", "mandibula", "jawbone"}
+_SKULL = {"skull", "cranium", "schaedel", "head"}
+_TEETH = {"teeth", "tooth", "scan", "arch", "dentition", "row", "crowns"}
+_SAID = {"video", "videos", "clip", "clips", "footage", "take", "camera", "cameras", "plates", "png", "exr", "dpx"}
+
+
+@dataclass
+class FoundFiles:
+    """Hold files by what their names say, relative to the folder."""
+
+    clips: list[PurePath] = field(default_factory=list)
+    boards: list[PurePath] = field(default_factory=list)
+    masks: dict[PurePath, str] = field(default_factory=dict)  # with the row they show
+    scans: dict[str, list[PurePath]] = field(default_factory=lambda: defaultdict(list))  # by the keys of [scans], or ""
+    calibrations: list[PurePath] = field(default_factory=list)
+
+
+def words(path: PurePath) -> list[str]:
+    """Return the words of a path in lower case: split at signs, at capital letters and before digits' neighbours."""
+    plain = path.with_suffix("").as_posix()
+    plain = re.sub(r"%0?\d*d", "", plain)
+    parts = re.split(r"[^A-Za-z0-9]+", re.sub(r"([a-z0-9])([A-Z])", r"\1 \2", plain))
+    return [part.lower() for part in parts if part]
+
+
+def find_files(folder: Path) -> FoundFiles:
+    """Sort the files of a folder and those below it; numbered pictures count as one, by their pattern.
+
+    Folders of rigs and hidden ones are left out.
+    """
+    out = FoundFiles()
+    for path in sorted(_files(folder)):
+        suffix, said = path.suffix.lower(), set(words(path))
+        if suffix in CLIPS or "%" in path.name:
+            row = _row(path)
+            if row and (said & _MASK or "%" in path.name):
+                out.masks[path] = row
+            elif said & _MASK:
+                continue
+            elif said & _BOARD:
+                out.boards.append(path)
+            else:
+                out.clips.append(path)
+        elif suffix in SCANS:
+            out.scans[_part(path)].append(path)
+        elif suffix in _CALIBRATIONS and path.name not in ("capture.toml", "build.json"):
+            out.calibrations.append(path)
+    scans = out.scans
+    if not scans["lower_teeth"] and scans["upper_teeth"] and len(scans["mandible"]) == 1:
+        scans["lower_teeth"] = scans.pop(
+            "mandible"
+        )  # maxilla.stl and mandible.stl are how clinics call a pair of scans
+    return out
+
+
+def _files(folder: Path) -> Iterable[PurePath]:
+    for place, folders, names in os.walk(folder):
+        inside = PurePath(place).relative_to(folder)
+        is_rig = "build.json" in names or "actor.usda" in names
+        if is_rig or len(inside.parts) >= _DEPTH:
+            folders.clear()
+        if is_rig:
+            continue
+        folders[:] = sorted(name for name in folders if not name.startswith(".") and name != "truth")
+        pictures = [name for name in names if Path(name).suffix.lower() in PICTURES]
+        for pattern, numbers in groups(pictures).items():
+            if len(numbers) >= _FEWEST_PICTURES:
+                yield inside / pattern
+        yield from (inside / name for name in names if name not in pictures and not name.startswith("."))
+
+
+def _row(path: PurePath) -> str:
+    said = set(words(path))
+    upper, lower = said & _UPPER, said & _LOWER
+    return "" if bool(upper) == bool(lower) else "upper" if upper else "lower"
+
+
+def _part(path: PurePath) -> str:
+    """Return the key of [scans] for a mesh, "" if its name does not tell; the file's own name goes before folders."""
+    for said in (set(words(PurePath(path.name))), set(words(path))):
+        upper, lower = bool(said & _UPPER), bool(said & _LOWER)
+        if upper != lower and not (said & (_MANDIBLE | _SKULL) and not said & _TEETH and not said & {"upper", "lower"}):
+            return "upper_teeth" if upper else "lower_teeth"
+        if said & _MANDIBLE:
+            return "lower_teeth" if said & _TEETH else "mandible"
+        if said & _SKULL:
+            return "skull"
+    return ""
+
+
+def camera_names(paths: Sequence[PurePath]) -> dict[PurePath, str]:
+    """Return a name of its own for each clip: the words in which its path differs from the others."""
+    said = {path: [word for word in words(path)] for path in paths}
+    shared = set.intersection(*(set(own) for own in said.values())) if len(said) > 1 else set()
+    out: dict[PurePath, str] = {}
+    for path, own in said.items():
+        telling = [word for word in own if word not in shared | _BOARD | _SAID]
+        unique = list(dict.fromkeys(telling))
+        out[path] = "_".join(unique) or "_".join(words(PurePath(path.name))) or "camera"
+    stems = [PurePath(path.name).stem for path in paths]
+    plain = [re.sub(r"[^A-Za-z0-9_\-]+", "_", re.sub(r"%0?\d*d", "", stem)).strip("_.-") for stem in stems]
+    if len(set(out.values())) < len(paths) or any(len(name) > 40 for name in out.values()):
+        out = {path: f"{name or 'cam'}_{number}" for number, (path, name) in enumerate(zip(paths, plain))}
+    elif all(sorted(words(PurePath(name))) == sorted(words(PurePath(out[path]))) for path, name in zip(paths, plain)):
+        out = dict(zip(paths, plain))  # the file's own spelling, where it holds the same words
+    return out
+
+
+def pair(names: Mapping[PurePath, str], others: Sequence[PurePath]) -> tuple[dict[PurePath, PurePath], bool]:
+    """Return which of the other files belongs to which clip, and whether their names say so (else: their order).
+
+    Args:
+        names: of the cameras by their clips.
+        others: files that belong to one camera each.
+    """
+    found: dict[PurePath, PurePath] = {}
+    for clip, name in names.items():
+        telling = set(words(PurePath(name)))
+        fits = [other for other in others if telling <= set(words(other))]
+        if len(fits) == 1 and fits[0] not in found.values():
+            found[clip] = fits[0]
+    if len(found) == len(names):
+        return found, True
+    if not found and len(others) == len(names):
+        return dict(zip(names, others)), False
+    return found, True
+
+
+def with_masks(cameras: Sequence[CameraSketch], masks: Mapping[PurePath, str]) -> list[CameraSketch]:
+    """Return cameras with the masks whose paths hold the words of their names."""
+    out = []
+    for camera in cameras:
+        telling = set(words(PurePath(camera.name)))
+        rows = {
+            row: [path for path, own in masks.items() if own == row and telling <= set(words(path))]
+            for row in ("upper", "lower")
+        }
+        own = {row: paths[0] for row, paths in rows.items() if len(paths) == 1}
+        out.append(CameraSketch(camera.name, camera.video, own, camera.board, camera.remark))
+    return out

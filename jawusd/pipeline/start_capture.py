@@ -1,0 +1,246 @@
+"""Look at a folder of footage and scans, and write a capture.toml for it that says what is missing."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path, PurePath
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jawusd.errors import CaptureError, JawusdError, explain_missing_packages
+from jawusd.formats.atomic import write_text_atomic
+from jawusd.formats.camera_files import load_cameras_file
+from jawusd.formats.capture_template import BoardSketch, CameraSketch, CaptureSketch, capture_text
+from jawusd.pipeline.folder_files import FoundFiles, camera_names, find_files, pair, with_masks, words
+from jawusd.pipeline.state import Progress
+
+if TYPE_CHECKING:
+    from jawusd.imaging.video import Video
+
+_PICTURES = 5  # of a board clip that are looked at
+_USUAL_RATES = tuple(Fraction(n, d) for d in (1, 1001) for n in (24 * d, 25 * d, 30 * d, 50 * d, 60 * d, 120 * d)) + (
+    *(Fraction(n * 1000, 1001) for n in (24, 30, 60, 120)),
+)
+_RATE_TOLERANCE = 2e-4  # 24 and 23.976 differ by 1e-3
+
+
+@dataclass
+class CaptureStart:
+    """Hold a capture begun from a folder: its description, what was found, and what is missing or to be looked at."""
+
+    path: Path
+    sketch: CaptureSketch
+    found: list[str] = field(default_factory=list)
+    missing: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+@explain_missing_packages()
+def start_capture(folder: Path, square_mm: float | None, fps: float | None, progress: Progress) -> CaptureStart:
+    """Look at a folder and return the capture begun from it; nothing is written.
+
+    Args:
+        folder: with footage, scans, and clips of a board or a calibration.
+        square_mm: side of the board's squares, which no picture tells [mm].
+        fps: rate of the clips; theirs if None.
+
+    Raises:
+        CaptureError: it is no folder.
+    """
+    if not folder.is_dir():
+        what = "is a file" if folder.exists() else "there is no such folder"
+        raise CaptureError(f"{what}.", path=folder, hint="Name the folder that holds footage and scans.")
+    files = find_files(folder)
+    name = re.sub(r"[^A-Za-z0-9_\-. ]+", "_", folder.resolve().name).strip() or "capture"
+    out = CaptureStart(folder / "capture.toml", CaptureSketch(name))
+    progress("look", 0, 3)
+    scans = _scans(files, out)
+    calibration, calibrated = _calibration(folder, files, out)
+    progress("look", 1, 3)
+    cameras, rate = _cameras(folder, files, calibrated, out)
+    progress("look", 2, 3)
+    board = _board(folder, cameras, square_mm, calibration is not None, out)
+    if calibration is None and board is None:
+        out.missing.append("a calibration of the cameras, or a clip of a chessboard per camera")
+    fps = fps or rate
+    if fps is None and cameras:
+        out.missing.append("fps, the rate of the pictures: no file says it")
+    out.sketch = CaptureSketch(name, fps, scans, tuple(cameras), calibration, board)
+    progress("look", 3, 3)
+    return out
+
+
+def write_start(start: CaptureStart) -> None:
+    """Write the capture.toml of a capture begun.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    write_text_atomic(start.path, capture_text(start.sketch))
+
+
+def start_lines(start: CaptureStart) -> list[str]:
+    """Return what was found and what is missing as text."""
+    folder = start.path.parent
+    lines = [f"{start.path}", *(f"  {line}" for line in start.found), *(f"note: {line}." for line in start.notes)]
+    if start.missing:
+        return [
+            *lines,
+            *(f"missing: {line}." for line in start.missing),
+            f"Fill in {start.path}, then: jawusd check {folder}",
+        ]
+    return [*lines, f"next: jawusd check {folder}"]
+
+
+def _scans(files: FoundFiles, out: CaptureStart) -> dict[str, PurePath]:
+    found: dict[str, PurePath] = {}
+    for key, what in (("upper_teeth", "upper teeth"), ("lower_teeth", "lower teeth"), ("mandible", ""), ("skull", "")):
+        paths = files.scans.get(key, [])
+        if len(paths) == 1:
+            found[key] = paths[0]
+            out.found.append(f"{key}: {paths[0]}")
+        elif len(paths) > 1:
+            out.missing.append(f"{key}: {_listed(paths)} may all be it; name one (one folder is one person)")
+        elif what:
+            unknown = files.scans.get("", [])
+            more = f"; {_listed(unknown)} may be it, but the name does not say" if unknown else ""
+            out.missing.append(f"{key}, the scan of the {what} (PLY, STL or OBJ){more}")
+    return found
+
+
+def _calibration(folder: Path, files: FoundFiles, out: CaptureStart) -> tuple[PurePath | None, list[str]]:
+    """Return the file that holds cameras, and their names."""
+    readable: dict[PurePath, list[str]] = {}
+    for path in files.calibrations:
+        if path.name == "images.txt":
+            continue
+        try:
+            readable[path] = [camera.name for camera in load_cameras_file(folder / path)]
+        except JawusdError:
+            continue
+    if len(readable) > 1:
+        out.notes.append(f"{_listed(list(readable))} hold cameras; the first is taken")
+    for path, names in readable.items():
+        out.found.append(f"calibration: {path} ({', '.join(names)})")
+        return path, names
+    return None, []
+
+
+def _cameras(
+    folder: Path, files: FoundFiles, calibrated: Sequence[str], out: CaptureStart
+) -> tuple[list[CameraSketch], float | None]:
+    """Return the cameras with footage, masks and board clips, and the rate of the clips."""
+    opened = _opened(folder, files.clips, out)
+    names = camera_names(list(opened))
+    if calibrated:
+        names = _named_as_calibrated(names, calibrated, out)
+    boards, by_name = pair(names, files.boards)
+    if boards and not by_name:
+        listed = ", ".join(f"{names[clip]}: {board}" for clip, board in boards.items())
+        out.notes.append(f"the names do not say which board clip is whose; taken in order ({listed})")
+    cameras = [
+        CameraSketch(names[clip], clip, board=boards.get(clip), remark=_remark(video)) for clip, video in opened.items()
+    ]
+    cameras = with_masks(cameras, files.masks)
+    for camera in cameras:
+        masks = ", masks" if camera.masks else ""
+        board = f", board {camera.board}" if camera.board else ""
+        out.found.append(f"camera {camera.name}: {camera.video} ({camera.remark}){masks}{board}")
+        if files.boards and not camera.board and not calibrated:
+            out.missing.append(f"the board clip of camera {camera.name}")
+    if len(cameras) < 2:
+        out.missing.append(f"footage of two cameras or more; found {len(cameras)}")
+    if 0 < sum(bool(camera.masks) for camera in cameras) < len(cameras):
+        out.notes.append("some cameras have masks and some have none; those without are not tracked with")
+    return cameras, _rate(opened, out)
+
+
+def _opened(folder: Path, clips: Sequence[PurePath], out: CaptureStart) -> dict[PurePath, Video]:
+    from jawusd.imaging.video import Video
+
+    found: dict[PurePath, Video] = {}
+    for clip in clips:
+        try:
+            found[clip] = Video(folder / clip)
+        except JawusdError as error:
+            out.notes.append(f"{clip} is left out: {error.statement().rstrip('.')}")
+    return found
+
+
+def _remark(video: Video) -> str:
+    width, height = video.size_px
+    return f"{width} x {height} px, {video.count} pictures, {video.timeline.rate:.5g} per second"
+
+
+def _rate(opened: Mapping[PurePath, Video], out: CaptureStart) -> float | None:
+    rates = {path: video.timeline.rate for path, video in opened.items()}
+    if not rates:
+        return None
+    found = float(np.median(list(rates.values())))
+    for path, rate in rates.items():
+        if abs(rate / found - 1) > 5e-3:
+            out.notes.append(f"{path} has {rate:.5g} pictures per second, the others {found:.5g}")
+    usual = min(_USUAL_RATES, key=lambda rate: abs(float(rate) / found - 1))
+    return round(float(usual) if abs(float(usual) / found - 1) < _RATE_TOLERANCE else found, 5)
+
+
+def _named_as_calibrated(
+    names: dict[PurePath, str], calibrated: Sequence[str], out: CaptureStart
+) -> dict[PurePath, str]:
+    """Return the calibration's names for the cameras, by the words they share with the clips."""
+    fits: dict[PurePath, str] = {}
+    for clip in names:
+        own = set(words(clip))
+        found = [name for name in calibrated if set(words(PurePath(name))) <= own]
+        if len(found) == 1 and found[0] not in fits.values():
+            fits[clip] = found[0]
+    if len(fits) == len(names):
+        return fits
+    out.missing.append(
+        f"the cameras' names: the calibration has {', '.join(calibrated)}, the clips are {_listed(list(names))}; "
+        "give each [[camera]] the calibration's name"
+    )
+    return names
+
+
+def _board(
+    folder: Path, cameras: Sequence[CameraSketch], square_mm: float | None, calibrated: bool, out: CaptureStart
+) -> BoardSketch | None:
+    from jawusd.capture.board_guess import BoardSeen, seen_board
+
+    clips = [camera.board for camera in cameras if camera.board is not None]
+    if not clips:
+        return None
+    seen: list[BoardSeen] = []
+    for clip in clips:
+        video = next(iter(_opened(folder, [clip], out).values()), None)
+        if video is not None and (found := seen_board(_some_pictures(video))) is not None:
+            seen.append(found)
+    board = max(seen, key=seen.count, default=BoardSeen("chessboard"))
+    sketch = BoardSketch(board.pattern, board.cols, board.rows, square_mm, board.dictionary)
+    if calibrated:
+        return sketch
+    if not seen:
+        out.missing.append("[boards] cols and rows: no chessboard was found in the board clips")
+    elif board.pattern == "charuco":
+        out.missing.append("[boards] cols, rows and marker_mm of the ChArUco board")
+    if seen:
+        size = f"{board.cols} x {board.rows} inner corners" if board.cols else f"markers of {board.dictionary}"
+        out.found.append(f"board: {board.pattern}, {size}")
+    if square_mm is None:
+        out.missing.append("[boards] square_mm, the side of a square: measure the printed board (or give --square-mm)")
+    return sketch
+
+
+def _some_pictures(video: Video) -> list[np.typing.NDArray[np.uint8]]:
+    wanted = np.unique(np.linspace(0, video.count - 1, _PICTURES + 2).astype(int)[1:-1])
+    return [picture for picture in video.pictures(wanted.tolist()) if picture is not None]
+
+
+def _listed(paths: Sequence[PurePath]) -> str:
+    shown = ", ".join(str(path) for path in paths[:6])
+    return shown + (f" and {len(paths) - 6} more" if len(paths) > 6 else "")
