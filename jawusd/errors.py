@@ -28,6 +28,7 @@ from os import PathLike
 _EXTRA_OF_PACKAGE = {
     "moderngl": "demo",
     "viser": "view",
+    "PyOpenColorIO": "colour",
     "h5py": "hdf5",
     "pythonosc": "live",
     "dask": "many",

@@ -10,12 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.errors import CalibrationError, CaptureError
+from jawusd.formats.numbered import is_pattern, numbered_files
+from jawusd.imaging.display import to_display
 from jawusd.imaging.pictures import read_picture
+from jawusd.imaging.stored_picture import read_header, read_stored
 from jawusd.imaging.video import Video
 
 
 class BoardClip:
-    """Hold the board pictures of one camera: a video, or numbered pictures (a pattern with %d).
+    """Hold the board pictures of one camera: a video, or numbered pictures.
 
     Attributes:
         path: video or pattern.
@@ -30,10 +33,12 @@ class BoardClip:
             CaptureError: there are none, or the first cannot be read.
         """
         self.path = path
-        if "%" in path.name:
+        self._files: dict[int, Path] = {}
+        if is_pattern(path):
             self._video = None
-            self.numbers = _numbered(path)
-            self.size_px = _read(Path(str(path) % self.numbers[0])).shape[::-1]
+            self._files = numbered_files(path)
+            self.numbers = list(self._files)
+            self.size_px = _read(self._files[self.numbers[0]]).shape[::-1]
         else:
             self._video = Video(path)
             self.numbers = sorted(set(self._video.timeline.numbers.tolist()))
@@ -53,7 +58,7 @@ class BoardClip:
         """
         if self._video is None:
             for number in wanted:
-                path = Path(str(self.path) % number)
+                path = self._files[number]
                 image = _read(path)
                 if image.shape[::-1] != self.size_px:
                     raise CalibrationError(
@@ -70,24 +75,18 @@ class BoardClip:
                 yield needed[frame.index], frame.image
 
 
-def _numbered(pattern: Path) -> list[int]:
-    numbers = []
-    head, _, tail = pattern.name.partition("%")
-    tail = tail[tail.find("d") + 1 :]
-    for file in pattern.parent.iterdir():
-        digits = file.name[len(head) : len(file.name) - len(tail)]
-        if digits.isdigit() and file.name == pattern.name % int(digits):
-            numbers.append(int(digits))
-    if not numbers:
-        raise CaptureError("no picture matches.", path=pattern, hint="Check [boards] videos in capture.toml.")
-    return sorted(numbers)
-
-
 def _read(path: Path) -> NDArray[np.uint8]:
     image = read_picture(path, cv2.IMREAD_GRAYSCALE)
-    if image is None:
-        raise CaptureError("is not a picture that can be read.", path=path, hint="Use PNG, JPEG or TIFF.")
-    return np.asarray(image, np.uint8)
+    if image is not None:
+        return np.asarray(image, np.uint8)
+    try:  # what OpenCV does not read: EXR, DPX
+        stored = read_stored(path)
+    except CaptureError as error:
+        raise CaptureError(
+            "is not a picture that can be read.", path=path, hint="Use PNG, JPEG, TIFF, EXR or DPX."
+        ) from error
+    shown = to_display(stored.pixels, stored.largest, read_header(path).colour_space, None)
+    return shown if shown.ndim == 2 else np.asarray(cv2.cvtColor(shown, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
 def sharpness(image: NDArray[np.uint8]) -> float:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from jawusd.errors import SyncError
 from jawusd.geometry.arrays import Array
-from jawusd.imaging.video import Video
+from jawusd.imaging.clip import Clip
 
 _FIRST_WINDOW_S = 4.0  # searched at either end; doubled until a flash is found
 _SPARSE = 8  # the mean brightness is that of every 8th pixel in both directions
@@ -156,7 +156,7 @@ def on_grid(steps: list[Step], numbers: NDArray[np.int64]) -> list[Step]:
     return out
 
 
-def find_flashes(video: Video) -> Flashes:
+def find_flashes(video: Clip) -> Flashes:
     """Find the steps near both ends of a video, looking further in until there are some.
 
     Raises:
@@ -185,7 +185,7 @@ def find_flashes(video: Video) -> Flashes:
     )
 
 
-def _brightness(video: Video, first: int, last: int) -> Array:
+def _brightness(video: Clip, first: int, last: int) -> Array:
     return np.array([mean_brightness(frame.image) for frame in video.frames(first, last, threads=1)])
 
 

@@ -14,12 +14,16 @@ from pathlib import Path
 
 import numpy as np
 
+from jawusd.capture.clocks import offsets_by_clock
 from jawusd.capture.light import Offset, find_flashes, find_steps, match_steps, mean_brightness, on_grid
 from jawusd.capture.sound import RATE_HZ, match_sounds
 from jawusd.errors import SyncError
 from jawusd.formats.capture import Capture
+from jawusd.formats.clip_source import ClipSource
 from jawusd.formats.light_curve import LightCurve
 from jawusd.imaging.audio import Sound, read_sound
+from jawusd.imaging.clip import Clip
+from jawusd.imaging.footage import open_clip
 from jawusd.imaging.video import Video
 
 _RATE_TOLERANCE = 1e-3
@@ -33,7 +37,7 @@ class Alignment:
 
     reference: str  # the camera that counts the frames
     cameras: dict[str, Offset]  # the offset per camera, in the order of the capture
-    method: str = "light flash"  # "light flash" or "sound"
+    method: str = "light flash"  # "light flash", "sound", "time code" or "picture numbers"
     notes: tuple[str, ...] = ()  # remarks on the clips for the user
 
     @property
@@ -48,13 +52,13 @@ class Alignment:
 
 
 def estimate_offsets(capture: Capture) -> Alignment:
-    """Align the cameras of a capture by the light flashes or the sound of their videos; see `align_videos`.
+    """Align the cameras of a capture by the light flashes, the sound or the clocks of their videos; see `align_videos`.
 
     Raises:
         SyncError: a camera has no video, or there are neither flashes nor sound to align by.
         CaptureError: a video cannot be read.
     """
-    videos = {camera.name: camera.video for camera in capture.cameras if camera.video is not None}
+    videos = {camera.name: camera.clip for camera in capture.cameras if camera.clip is not None}
     for camera in capture.cameras:
         if camera.video is None:
             raise SyncError(
@@ -62,8 +66,11 @@ def estimate_offsets(capture: Capture) -> Alignment:
                 path=capture.folder / "capture.toml",
                 hint=_offsets_hint([camera.name for camera in capture.cameras]),
             )
+    if capture.sync.method in ("timecode", "numbers"):
+        by = "time code" if capture.sync.method == "timecode" else "picture numbers"
+        return Alignment(capture.reference, offsets_by_clock(capture), by)
     found = align_videos(videos, capture.reference, by_light=capture.sync.method != "audio")
-    rate = Video(videos[capture.reference]).timeline.rate
+    rate = open_clip(videos[capture.reference]).timeline.rate
     if abs(rate / capture.fps - 1) < _FPS_TOLERANCE:
         return found
     said = f"capture.toml says fps = {capture.fps:g}: motion is timed by it"
@@ -71,7 +78,7 @@ def estimate_offsets(capture: Capture) -> Alignment:
     return replace(found, notes=(*found.notes, note))
 
 
-def align_videos(videos: Mapping[str, Path], reference: str, *, by_light: bool = True) -> Alignment:
+def align_videos(videos: Mapping[str, Path | ClipSource], reference: str, *, by_light: bool = True) -> Alignment:
     """Find the light flashes in all videos and align them with those of the reference camera.
 
     Only the beginning and the end of each video are decoded, more of it only while no flash is found. If a video shows
@@ -81,7 +88,7 @@ def align_videos(videos: Mapping[str, Path], reference: str, *, by_light: bool =
         SyncError: neither flash nor sound, rates that differ, or steps that do not fit together.
         CaptureError: a video cannot be read.
     """
-    opened = {name: Video(path) for name, path in videos.items()}
+    opened = {name: open_clip(clip) for name, clip in videos.items()}
     hint = _offsets_hint(videos)
     rate = opened[reference].timeline.rate
     for name, video in opened.items():
@@ -104,7 +111,9 @@ def align_videos(videos: Mapping[str, Path], reference: str, *, by_light: bool =
                 for name, video in opened.items()
             }
             return Alignment(reference, offsets, "light flash", (*notes, *_stopped_early(opened, offsets, rate)))
-        found_sounds = pool.map(lambda video: read_sound(video.path, RATE_HZ), opened.values())
+        found_sounds = pool.map(
+            lambda video: read_sound(video.path, RATE_HZ) if isinstance(video, Video) else None, opened.values()
+        )
         sounds = {name: sound for name, sound in zip(opened, found_sounds) if sound is not None}
     why = "" if dark is None else f"camera {dark} {found[dark].reason}; "
     silent = [name for name in opened if name not in sounds]
@@ -119,13 +128,13 @@ def align_videos(videos: Mapping[str, Path], reference: str, *, by_light: bool =
     return Alignment(reference, offsets, "sound", (*by_sound, *notes, *_stopped_early(opened, offsets, rate)))
 
 
-def light_curve(path: Path) -> LightCurve:
+def light_curve(clip: Path | ClipSource) -> LightCurve:
     """Return the mean brightness of every picture of a video, and the sudden changes in it.
 
     Raises:
         CaptureError: the video cannot be read.
     """
-    video = Video(path)
+    video = open_clip(clip)
     brightness = np.array([mean_brightness(frame.image) for frame in video.frames(threads=1)])
     numbers = video.timeline.numbers
     steps = on_grid(find_steps(brightness), numbers)
@@ -133,7 +142,7 @@ def light_curve(path: Path) -> LightCurve:
     return LightCurve(video.times_s, numbers, brightness, off, on)
 
 
-def _missing_pictures(videos: Mapping[str, Video]) -> tuple[str, ...]:
+def _missing_pictures(videos: Mapping[str, Clip]) -> tuple[str, ...]:
     return tuple(
         f"camera {name} has a variable rate: {video.timeline.missing} of {video.timeline.count} frames have no picture "
         "of their own. Frames are counted by time; masks as PNG files are numbered by the pictures of their video."
@@ -142,7 +151,7 @@ def _missing_pictures(videos: Mapping[str, Video]) -> tuple[str, ...]:
     )
 
 
-def _stopped_early(videos: Mapping[str, Video], offsets: Mapping[str, Offset], rate: float) -> tuple[str, ...]:
+def _stopped_early(videos: Mapping[str, Clip], offsets: Mapping[str, Offset], rate: float) -> tuple[str, ...]:
     """Return a note for every clip that ends long before the last one."""
     ends = {name: offsets[name].frames + video.timeline.count for name, video in videos.items()}
     last = max(ends, key=lambda name: ends[name])
@@ -154,9 +163,7 @@ def _stopped_early(videos: Mapping[str, Video], offsets: Mapping[str, Offset], r
     )
 
 
-def _by_sound(
-    name: str, reference: str, sounds: Mapping[str, Sound], videos: Mapping[str, Video], fps: float
-) -> Offset:
+def _by_sound(name: str, reference: str, sounds: Mapping[str, Sound], videos: Mapping[str, Clip], fps: float) -> Offset:
     if name == reference:
         return Offset(0, 0.0, 0.0, 0, 1.0)
     match = match_sounds(sounds[name], sounds[reference])
@@ -164,9 +171,7 @@ def _by_sound(
     return Offset(round(exact), exact, 0.0, 0, match.confidence)
 
 
-def _against(
-    name: str, reference: str, video: Video, hint: str, work: Callable[[], Offset], before: str = ""
-) -> Offset:
+def _against(name: str, reference: str, video: Clip, hint: str, work: Callable[[], Offset], before: str = "") -> Offset:
     """Name the cameras in errors of comparing them."""
     try:
         return work()

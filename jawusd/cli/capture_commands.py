@@ -99,7 +99,7 @@ def sync(
     if single and reference is not None:
         raise typer.BadParameter("--reference is for clips; a capture names its own in [sync].")
     capture = open_capture(clips[0], allow_outside=allow_outside) if single else None
-    videos = {c.name: c.video for c in capture.cameras if c.video} if capture else _named(clips)
+    videos = {c.name: c.clip for c in capture.cameras if c.clip} if capture else _named(clips)
     if reference is not None and reference not in videos:
         raise typer.BadParameter(f"--reference {reference} is none of {', '.join(videos)}.")
     result, failure = None, None

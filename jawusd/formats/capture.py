@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from jawusd.errors import FormatError, JawusdError, UnitsError
 from jawusd.formats.capture_errors import problems_of
 from jawusd.formats.capture_keys import Key, KeyEntry, entries
+from jawusd.formats.capture_parts import Boards, CameraSource, Scans, Strict
 from jawusd.formats.capture_paths import resolve_paths
 from jawusd.formats.text import read_toml
 from jawusd.geometry import rigidity_defect
@@ -20,160 +21,20 @@ from jawusd.npz import check_format
 FAMILY, VERSION = "jawusd-capture", 1
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True, populate_by_name=True)
-
-
-class Scans(_Strict):
-    """Name the meshes, all in one frame with the teeth in occlusion [mm]."""
-
-    upper_teeth: Annotated[
-        Path, Key("Scan of the upper teeth: PLY, STL, OBJ or (with jawusd[dcm]) 3Shape DCM.", '"scans/upper.ply"', "mm")
-    ]
-    lower_teeth: Annotated[
-        Path,
-        Key("Scan of the lower teeth, in the frame of the upper one, teeth in occlusion.", '"scans/lower.ply"', "mm"),
-    ]
-    mandible: Annotated[
-        Path | None, Key("Mesh of the whole mandible, same frame; without it a placeholder.", '"mandible.ply"', "mm")
-    ] = None
-    skull: Annotated[Path | None, Key("Mesh of the skull, same frame.", '"scans/skull.ply"', "mm")] = None
-    labels: Annotated[
-        Path | None, Key("Folder of the labels of crown and gum; beside the scans if not given.", '"labels"')
-    ] = None
-    registration: Annotated[
-        Literal["scan", "take"],
-        Key(
-            '"scan": both scans stay as they are; "take": the lower one moves to where the take shows the closed bite.'
-        ),
-    ] = "scan"
-
-
-class Masks(_Strict):
-    """Name the teeth masks of one camera: a PNG pattern with %06d, or a video.
-
-    A mask is white on black, or the transparency of a picture with an alpha channel. Instead of `upper` and `lower`,
-    `labels` names one pattern or lossless video in which the gray value `upper_value` means upper teeth, `lower_value`
-    lower teeth and 0 neither.
-    """
-
-    upper: Annotated[
-        Path,
-        Key(
-            "Masks of the upper teeth: PNG files with their number as %06d, or a video.", '"masks/left/upper/%06d.png"'
-        ),
-    ]
-    lower: Annotated[Path, Key("The same of the lower teeth.", '"masks/left/lower/%06d.png"')]
-    upper_value: Annotated[
-        Annotated[int, Field(ge=1, le=65535)] | None,
-        Key("With `labels`, one file for both rows: the gray value of the upper teeth.", "1"),
-    ] = None
-    lower_value: Annotated[Annotated[int, Field(ge=1, le=65535)] | None, Key("The same of the lower teeth.", "2")] = (
-        None
-    )
-
-    @model_validator(mode="before")
-    @classmethod
-    def _one_file_for_both(cls, data: object) -> object:
-        if not isinstance(data, dict) or "labels" not in data:
-            return data
-        rest = {key: value for key, value in data.items() if key != "labels"}
-        if rest.keys() & {"upper", "lower"}:
-            raise ValueError("give either labels, or upper and lower")
-        return rest | {"upper": data["labels"], "lower": data["labels"]}
-
-    @model_validator(mode="after")
-    def _values_tell_the_arches(self) -> Masks:
-        values = (self.upper_value, self.lower_value)
-        if self.upper == self.lower and None in values:
-            raise ValueError("one file for both rows needs upper_value and lower_value, their gray values")
-        if self.upper != self.lower and values != (None, None):
-            raise ValueError("upper_value and lower_value are for labels, one file for both rows")
-        if self.upper_value is not None and self.upper_value == self.lower_value:
-            raise ValueError(f"upper_value and lower_value are both {self.upper_value}")
-        return self
-
-    @property
-    def labels(self) -> tuple[int, int] | None:
-        """Return the gray values of upper and lower teeth in label images, None where each arch has its own file."""
-        if self.upper_value is None or self.lower_value is None:
-            return None
-        return self.upper_value, self.lower_value
-
-    @property
-    def exchanged(self) -> Masks:
-        """Return the masks with upper and lower exchanged."""
-        return Masks(upper=self.lower, lower=self.upper, upper_value=self.lower_value, lower_value=self.upper_value)
-
-
-class CameraSource(_Strict):
-    """Name one camera's footage and masks."""
-
-    name: Annotated[
-        str,
-        Field(min_length=1, pattern=r"^[A-Za-z0-9_\-]+$"),
-        Key("Name of the camera, as the calibration calls it: letters, digits, _ and -.", '"left"'),
-    ]
-    video: Annotated[Path | None, Key("Footage of the camera.", '"left.mp4"')] = None
-    masks: Masks | None = None
-
-    @model_validator(mode="after")
-    def _has_source(self) -> CameraSource:
-        if self.video is None and self.masks is None:
-            raise ValueError("needs a video or masks")
-        return self
-
-
-class Boards(_Strict):
-    """Describe the calibration boards; counts are inner corners.
-
-    `videos` names, per camera in camera order, a video or a pattern of numbered pictures (`%04d`); pictures of one
-    number are taken as simultaneous. A ChArUco board also needs OpenCV's name of its dictionary and its marker size.
-    """
-
-    pattern: Annotated[Literal["chessboard", "charuco"], Key("Kind of board.")] = "chessboard"
-    cols: Annotated[
-        int, Field(ge=3, le=50), Key("Inner corners along a row: one less than squares. 3 to 50.", "9", "corners")
-    ]
-    rows: Annotated[int, Field(ge=3, le=50), Key("Inner corners along a column.", "6", "corners")]
-    square_mm: Annotated[
-        float, Field(gt=0, le=200), Key("Side of a square, measured on the printed board. Up to 200.", "8.0", "mm")
-    ]
-    videos: Annotated[
-        tuple[Path, ...],
-        Key(
-            "Clip of the board per camera, in the order of the cameras: videos, or numbered pictures as %04d.",
-            '["board_left.mp4", "board_right.mp4"]',
-        ),
-    ]
-    dictionary: Annotated[
-        Annotated[str, Field(pattern=r"^DICT_[4-7]X[4-7]_(50|100|250|1000)$")] | None,
-        Key("Of a ChArUco board: OpenCV's name of its markers.", '"DICT_5X5_100"'),
-    ] = None
-    marker_mm: Annotated[
-        Annotated[float, Field(gt=0, le=200)] | None, Key("Of a ChArUco board: side of a marker.", "6.0", "mm")
-    ] = None
-
-    @model_validator(mode="after")
-    def _describes_markers(self) -> Boards:
-        if self.pattern == "charuco" and (self.dictionary is None or self.marker_mm is None):
-            raise ValueError('a "charuco" board needs dictionary (as "DICT_5X5_100") and marker_mm')
-        if self.marker_mm is not None and self.marker_mm >= self.square_mm:
-            raise ValueError(f"marker_mm = {self.marker_mm:g} must be smaller than square_mm = {self.square_mm:g}")
-        return self
-
-
-class Sync(_Strict):
+class Sync(Strict):
     """Say how the cameras are aligned in time.
 
     `flash` looks for light flashes and, where a clip shows none, listens to the sound; `audio` only listens.
-    `offsets` gives, per camera, the whole number with: frame k of the camera shows the instant of frame k + offset of
-    the reference camera.
+    `timecode` compares the time codes of the clips, `numbers` those of their pictures. `offsets` gives, per camera, the
+    whole number with: frame k of the camera shows the instant of frame k + offset of the reference camera.
     """
 
     method: Annotated[
-        Literal["flash", "audio", "offsets"],
-        Key('"flash": light flashes, else sound; "audio": sound alone; "offsets": as given.'),
+        Literal["flash", "audio", "timecode", "numbers", "offsets"],
+        Key(
+            '"flash": light flashes, else sound; "audio": sound alone; "timecode": by the time codes of the clips; '
+            '"numbers": by the numbers of the pictures; "offsets": as given.'
+        ),
     ] = "flash"
     reference: Annotated[str | None, Key("Camera that counts the frames; the first if not given.", '"left"')] = None
     offsets: Annotated[
@@ -186,7 +47,7 @@ class Sync(_Strict):
     ] = None
 
 
-class PickView(_Strict):
+class PickView(Strict):
     """Give the pixel of a picked vertex in one camera (OpenCV pixels of the recorded picture)."""
 
     camera: Annotated[str, Key("Name of the camera.", '"left"')]
@@ -194,7 +55,7 @@ class PickView(_Strict):
     y: Annotated[float, Key("Pixel row.", "250.4", "px")]
 
 
-class Pick(_Strict):
+class Pick(Strict):
     """Join a vertex of a teeth scan with the pixels where it is seen."""
 
     vertex: Annotated[int, Field(ge=0), Key("Number of a vertex of the scan.", "1397")]
@@ -209,7 +70,7 @@ class Pick(_Strict):
     ]
 
 
-class Bootstrap(_Strict):
+class Bootstrap(Strict):
     """Give the picks that start the tracking, on one frame of the reference camera."""
 
     frame: Annotated[int, Field(ge=0), Key("Frame of the reference camera in which the points are picked.", "120")]
@@ -217,7 +78,7 @@ class Bootstrap(_Strict):
     lower: tuple[Pick, ...] = ()
 
 
-class MotionSection(_Strict):
+class MotionSection(Strict):
     """Name a reference frame with the teeth in occlusion."""
 
     rest_frame: Annotated[
@@ -226,7 +87,7 @@ class MotionSection(_Strict):
     ] = None
 
 
-class AnatomySection(_Strict):
+class AnatomySection(Strict):
     """Override what is otherwise derived from the scans."""
 
     T_anatomical_skull: Annotated[
@@ -248,7 +109,7 @@ class AnatomySection(_Strict):
         return value
 
 
-class Capture(_Strict):
+class Capture(Strict):
     """Describe a capture; all paths are absolute once loaded."""
 
     folder: Path
@@ -271,6 +132,9 @@ class Capture(_Strict):
         Field(gt=0, le=1e6),
         Key("Length of the calibration's unit: 1000 where it is in metres.", "1000.0", "mm"),
     ] = 1.0
+    colour_config: Annotated[
+        Path | None, Key("OpenColorIO config for colour spaces of the footage by name.", '"config.ocio"')
+    ] = None
     scans: Scans
     cameras: Annotated[tuple[CameraSource, ...], Field(min_length=1, max_length=64, alias="camera")]
     boards: Boards | None = None
@@ -281,6 +145,12 @@ class Capture(_Strict):
 
     @model_validator(mode="after")
     def _consistent(self) -> Capture:
+        own = {"fps": self.fps, "colour_config": self.colour_config}
+        told = tuple(
+            camera.model_copy(update={key: value for key, value in own.items() if getattr(camera, key) is None})
+            for camera in self.cameras
+        )
+        object.__setattr__(self, "cameras", told)  # the capture itself cannot be changed otherwise
         names = [camera.name for camera in self.cameras]
         if len(set(names)) != len(names):
             raise ValueError(f"camera names must differ, found {', '.join(names)}")

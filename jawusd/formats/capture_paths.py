@@ -28,6 +28,9 @@ def resolve_paths(
         source: that file; paths are relative to its folder.
         data: its contents, for the names of tables.
         allow_outside: let paths leave the folder.
+
+    Raises:
+        TypeError: what is given is no model.
     """
     folder = source.resolve().parent
     problems: list[JawusdError] = []

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from jawusd.errors import CaptureError
 from jawusd.formats.capture import CameraSource
+from jawusd.imaging.footage import open_clip
 from jawusd.imaging.frame_reader import FrameReader
 from jawusd.imaging.masks import mask_size_px, open_masks
-from jawusd.imaging.video import Video
 
 #: Gray of masks of the upper and the lower teeth, and of what is neither.
 _UPPER, _LOWER, _NEITHER = 150, 105, 25
@@ -34,9 +34,9 @@ class Backdrop:
         """
         self._offset = offset
         self._lock = threading.Lock()
-        self.is_footage = source.video is not None
-        if source.video is not None:
-            self._reader = FrameReader(Video(source.video))
+        self.is_footage = source.clip is not None
+        if source.clip is not None:
+            self._reader = FrameReader(open_clip(source.clip))
             self.size_px, self.count = self._reader.video.size_px, self._reader.video.timeline.count
         elif source.masks is not None:
             self.size_px = mask_size_px(source.masks.upper)

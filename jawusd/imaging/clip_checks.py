@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 
 from jawusd.errors import JawusdError
 from jawusd.formats.finding import Finding
-from jawusd.imaging.video import Video
+from jawusd.imaging.clip import Clip
 
 # Cameras that drift apart by less than this over a take keep their offset [frames].
 _DRIFT_FRAMES = 0.5
@@ -15,7 +15,7 @@ _RATE_TOLERANCE = 0.005
 _MISSING_SHARE = 0.01  # of the frames without a picture of their own that a constant rate may show
 
 
-def decoded_findings(video: Video, camera: str) -> Iterator[Finding]:
+def decoded_findings(video: Clip, camera: str) -> Iterator[Finding]:
     """Decode the first, the middle and the last picture of a clip; yield an error for each that cannot be."""
     for number in sorted({0, video.count // 2, video.count - 1}):
         try:
@@ -32,7 +32,7 @@ def decoded_findings(video: Video, camera: str) -> Iterator[Finding]:
             )
 
 
-def rate_findings(videos: Mapping[str, Video], fps: float, path: str) -> Iterator[Finding]:
+def rate_findings(videos: Mapping[str, Clip], fps: float, path: str) -> Iterator[Finding]:
     """Compare the rates of clips with that of the capture [frames per second] and with one another.
 
     Args:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.errors import CaptureError
-from jawusd.imaging.video import Video, VideoFrame
+from jawusd.imaging.clip import Clip, VideoFrame
 
 _AHEAD = 24  # pictures: decoding on is faster than starting over at a key frame
 _BACK = 8  # pictures decoded at once when stepping backwards
@@ -24,7 +24,7 @@ class FrameReader:
     kept. A jump starts at the key frame before.
     """
 
-    def __init__(self, video: Video) -> None:
+    def __init__(self, video: Clip) -> None:
         """Take the video."""
         self.video = video
         width, height = video.size_px

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from jawusd.errors import CaptureError
+from jawusd.formats.numbered import numbered_files
 from jawusd.imaging.mask_levels import MaskImage, RawImage
 from jawusd.imaging.mask_source import SourceLevels, load_png, png_levels, video_levels
 from jawusd.imaging.pictures import read_palette_numbers
@@ -52,6 +53,16 @@ class PngMasks:
         """
         self._pattern, self._size_px, self._labels, self._is_other = pattern, size_px, labels, is_other
         self.odd: dict[int, str] = {}
+        self._files = numbered_files(pattern) if "%" not in pattern.name else self._found(pattern)
+        self.count = max(self._files) + 1
+
+    @property
+    def numbers(self) -> set[int]:
+        """Return the numbers of the files."""
+        return set(self._files)
+
+    @staticmethod
+    def _found(pattern: Path) -> dict[int, Path]:
         number = _NUMBER.search(pattern.name)
         if number is None or pattern.name.count("%") != 1:
             raise CaptureError(
@@ -65,12 +76,12 @@ class PngMasks:
         before, after = (re.escape(part) for part in (pattern.name[: number.start()], pattern.name[number.end() :]))
         name = re.compile(f"{before}({digits}){after}")
         found = (name.fullmatch(entry.name) for entry in os.scandir(pattern.parent))
-        self._files = {int(match[1]): pattern.parent / match[0] for match in found if match}
-        if not self._files:
+        files = {int(match[1]): pattern.parent / match[0] for match in found if match}
+        if not files:
             raise CaptureError(
                 "no file of the folder has such a name.", path=pattern, hint="Correct `masks` in capture.toml."
             )
-        self.count = max(self._files) + 1
+        return files
 
     @cached_property
     def levels(self) -> SourceLevels:

@@ -13,6 +13,9 @@ from types import TracebackType
 
 from jawusd.errors import CaptureError
 from jawusd.formats.capture import CameraSource
+from jawusd.formats.clip_source import ClipSource
+from jawusd.formats.numbered import is_pattern
+from jawusd.imaging.footage import open_clip
 from jawusd.imaging.mask_files import LabelValues, PngMasks, VideoMasks
 from jawusd.imaging.mask_levels import MaskImage, MaskLevels
 from jawusd.imaging.timeline import Timeline
@@ -61,12 +64,13 @@ class MaskReader:
         self.path = Path(path)
         self._source: PngMasks | VideoMasks
         self._timeline: Timeline | None
-        if "%" in self.path.name:
+        if is_pattern(self.path):
             self._source = pngs = PngMasks(self.path, size_px, labels)
             self._timeline = _timeline_of_pngs(self.path, pngs, timeline)
         else:
             self._source = pictures = VideoMasks(self.path, size_px, labels)
             self._timeline = _timeline_of_video(self.path, pictures, timeline)
+        self._place = _place_of(self._timeline, self._source)
         self.count = self._source.count if self._timeline is None else self._timeline.count
         self.levels: MaskLevels | None = None if labels else self._source.levels.levels
         self._prepare = prepare
@@ -140,7 +144,7 @@ class MaskReader:
             return
         pictures, at = None, 0
         for frame in range(first, self.count):
-            picture = self._timeline.picture(frame)
+            picture = self._place(frame)
             if picture is None or picture >= self._source.count:
                 yield None
                 continue
@@ -155,8 +159,17 @@ class MaskReader:
 
 def _timeline_of_pngs(path: Path, source: PngMasks, video: Timeline | None) -> Timeline | None:
     """Return the timeline that maps frames to file numbers; None where they are equal."""
-    if video is None or not video.missing:
+    if video is None or not (video.missing or video.is_numbered):
         return None
+    if video.is_numbered:
+        if not source.numbers & set(video.stored.tolist()):
+            raise CaptureError(
+                f"the masks are numbered {min(source.numbers)} to {max(source.numbers)}, the camera's pictures "
+                f"{video.stored[0]} to {video.stored[-1]}.",
+                path=path,
+                hint="Number masks as the pictures that they belong to.",
+            )
+        return video
     if source.count > len(video.numbers):
         raise CaptureError(
             f"the masks are numbered up to {source.count - 1}, but the camera's video, of variable rate, has only "
@@ -165,6 +178,13 @@ def _timeline_of_pngs(path: Path, source: PngMasks, video: Timeline | None) -> T
             hint="Number masks by the pictures of the video, or convert it to a constant rate before making masks.",
         )
     return video
+
+
+def _place_of(timeline: Timeline | None, source: PngMasks | VideoMasks) -> Callable[[int], int | None]:
+    """Return what maps frames to the numbers of masks in their source."""
+    if timeline is None:
+        return lambda frame: frame
+    return timeline.number if isinstance(source, PngMasks) else timeline.picture
 
 
 def _timeline_of_video(path: Path, source: VideoMasks, video: Timeline | None) -> Timeline:
@@ -193,7 +213,7 @@ def open_masks(
     masks = source.masks
     if masks is None:
         raise ValueError(f"camera {source.name} has no masks")
-    timeline = None if source.video is None else _timeline(source.video, source.video.stat().st_mtime_ns)
+    timeline = None if source.clip is None else _timeline(source.clip, _changed_ns(source.clip.path))
     labels = masks.labels
     upper = MaskReader(masks.upper, size_px, timeline=timeline, labels=labels, prepare=prepare)
     lower = MaskReader(masks.lower, size_px, timeline=timeline, labels=labels and labels[::-1], prepare=prepare)
@@ -201,9 +221,13 @@ def open_masks(
 
 
 @lru_cache(maxsize=64)
-def _timeline(video: Path, changed_ns: int) -> Timeline:
-    """Return the timeline of a video; the time of its last change identifies its version."""
-    return Video(video).timeline
+def _timeline(clip: ClipSource, changed_ns: int) -> Timeline:
+    """Return the timeline of a clip; the time of its last change identifies its version."""
+    return open_clip(clip).timeline
+
+
+def _changed_ns(path: Path) -> int:
+    return (path.parent if is_pattern(path) else path).stat().st_mtime_ns
 
 
 def mask_size_px(path: str | os.PathLike[str]) -> tuple[int, int]:
@@ -213,7 +237,7 @@ def mask_size_px(path: str | os.PathLike[str]) -> tuple[int, int]:
         CaptureError: the folder or file is missing, holds no masks, or cannot be decoded.
     """
     path = Path(path)
-    if "%" not in path.name:
+    if not is_pattern(path):
         return Video(path).size_px
     return PngMasks(path, None).first_size_px()
 

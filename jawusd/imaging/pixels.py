@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from functools import lru_cache
 from typing import Literal, TypeAlias
 
 import av
@@ -9,27 +11,52 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.imaging.display import to_display
+
 Colour = Literal["gray", "rgb", "rgba"]
 #: Rows and columns of a part of a picture.
 Slices: TypeAlias = "tuple[slice[int, int, int], slice[int, int, int]]"
 
 # ITU-R BT.709 / BT.601 video range: 16 is black, 235 is white.
 _STRETCH = np.clip(np.round((np.arange(256) - 16.0) * 255 / 219), 0, 255).astype(np.uint8)
+_BYTE_BITS = 8
 _FULL_RANGE = 2  # AVCOL_RANGE_JPEG
 _PLANAR_VIDEO_RANGE = ("yuv420p", "yuv422p", "yuv444p", "nv12", "nv21")
 _PLANAR_FULL_RANGE = ("gray", "yuvj420p", "yuvj422p", "yuvj444p")
+# Planar formats of more than 8 bits in two bytes each, lowest first; p010 and its like have them in the highest.
+_DEEP = re.compile(r"(yuva?4\d\dp|p0)(10|12|14|16)le")
+
+
+@lru_cache(maxsize=16)
+def _deep_table(bits: int, high: bool, full: bool) -> NDArray[np.uint8]:
+    """Return the gray of each value of luma, (65536,) uint8; video range is 16 to 235 of 8 bits, BT.709."""
+    luma = np.arange(1 << 16) / (1 << (16 - bits) if high else 1)
+    low, span = (0.0, (1 << bits) - 1.0) if full else (16.0 * (1 << (bits - 8)), 219.0 * (1 << (bits - 8)))
+    return np.asarray(np.clip(np.rint((luma - low) * 255 / span), 0, 255), np.uint8)
 
 
 def converted(frame: av.VideoFrame, colour: Colour, rotation_deg: int, window: Slices) -> NDArray[np.uint8]:
     """Return a window (h, w), (h, w, 3) or (h, w, 4) of a decoded picture after its turn."""
     if colour == "gray":
         return _gray(frame, rotation_deg, window)
-    pixels = frame.to_ndarray(format="rgb24" if colour == "rgb" else "rgba")
+    pixels: NDArray[np.uint8]
+    if colour == "rgb" and max(part.bits for part in frame.format.components) > _BYTE_BITS:
+        # The way from 10 bits to 8 loses up to two levels in ffmpeg; rounding from 16 bits does not.
+        pixels = to_display(frame.to_ndarray(format="rgb48le"), 65535, None, None)
+    else:
+        pixels = np.asarray(frame.to_ndarray(format="rgb24" if colour == "rgb" else "rgba"), np.uint8)
     return np.ascontiguousarray(np.rot90(pixels, rotation_deg // 90)[window])
 
 
 def _gray(frame: av.VideoFrame, rotation_deg: int, window: Slices) -> NDArray[np.uint8]:
     name = frame.format.name
+    deep = _DEEP.fullmatch(name)
+    if deep is not None:
+        # ffmpeg's own way to gray mixes colour into it: up to 11 levels of 255.
+        plane = frame.planes[0]
+        stored = np.frombuffer(memoryview(plane), "<u2").reshape(-1, plane.line_size // 2)
+        luma = np.rot90(stored[: frame.height, : frame.width], rotation_deg // 90)[window]
+        return _deep_table(int(deep[2]), deep[1] == "p0", frame.color_range == _FULL_RANGE)[luma]
     full = name in _PLANAR_FULL_RANGE or (name in _PLANAR_VIDEO_RANGE and frame.color_range == _FULL_RANGE)
     if not full and name not in _PLANAR_VIDEO_RANGE:
         frame = frame.reformat(format="gray")
@@ -39,3 +66,14 @@ def _gray(frame: av.VideoFrame, rotation_deg: int, window: Slices) -> NDArray[np
     if name in _PLANAR_VIDEO_RANGE and not full:
         return np.asarray(cv2.LUT(np.ascontiguousarray(image), _STRETCH), np.uint8)
     return image
+
+
+def coloured(shown: NDArray[np.uint8], colour: Colour) -> NDArray[np.uint8]:
+    """Return a picture (h, w) or (h, w, 3) RGB in the form asked for; its transparency is none."""
+    if colour == "gray":
+        gray = shown if shown.ndim == 2 else cv2.cvtColor(shown, cv2.COLOR_RGB2GRAY)
+        return np.ascontiguousarray(gray, np.uint8)
+    rgb = np.repeat(shown[..., None], 3, axis=2) if shown.ndim == 2 else shown
+    if colour == "rgb":
+        return np.ascontiguousarray(rgb)
+    return np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)])

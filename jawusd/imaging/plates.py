@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 
+import av
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.formats.atomic import write_bytes_atomic
+from jawusd.formats.atomic import atomic_path, write_bytes_atomic
 from jawusd.geometry import Camera
 from jawusd.imaging.working_view import WorkingView
 
@@ -16,7 +17,7 @@ _QUALITY = 95
 
 
 class PlateWriter:
-    """Undistort the pictures of one camera at full size and write them as JPEG.
+    """Undistort the pictures of one camera at full size and write them as JPEG, or light as EXR.
 
     A plate has the intrinsics K and the size of the recorded picture, so that the same pinhole camera fits it; the
     corners that the lens did not record are black.
@@ -34,3 +35,18 @@ class PlateWriter:
         """
         plate = self._view.picture(image)[..., ::-1]
         write_bytes_atomic(path, cv2.imencode(".jpg", plate, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes())
+
+    def write_light(self, path: str | os.PathLike[str], image: NDArray[np.float32]) -> None:
+        """Write the plate of light (h, w, 3) RGB as EXR of half floats, ZIP compressed.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        planes = np.ascontiguousarray(self._view.light(image))
+        height, width = planes.shape[:2]
+        with atomic_path(path) as temporary, av.open(str(temporary), "w", "image2", options={"update": "1"}) as out:
+            stream = out.add_stream("exr", rate=1)
+            stream.width, stream.height, stream.pix_fmt = width, height, "gbrpf32le"
+            stream.options = {"format": "half", "compression": "zip16"}
+            frame = av.VideoFrame.from_ndarray(planes, format="gbrpf32le")
+            out.mux([*stream.encode(frame), *stream.encode(None)])

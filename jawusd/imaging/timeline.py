@@ -17,14 +17,35 @@ class Timeline:
     Attributes:
         numbers: frame of each picture, increasing, shape (n,).
         count: one past the frame of the last picture.
+        stored: number of each picture in its files, increasing, shape (n,); in a video 0, 1, 2, ...
     """
 
     def __init__(self, times_s: Array, fps: float) -> None:
         """Fit the grid to presentation times (n,) [s]; the file's average rate is used for one or two pictures."""
-        self.numbers, self.rate = _grid(times_s, fps)
-        self.count = int(self.numbers[-1]) + 1
+        self._set(*_grid(times_s, fps), np.arange(len(times_s)))
+
+    @classmethod
+    def of_files(cls, stored: NDArray[np.int64], fps: float) -> Timeline:
+        """Return the line of numbered pictures, (n,) increasing: the first is frame 0, gaps are frames without one."""
+        line = cls.__new__(cls)
+        line._set(stored - stored[0], fps, stored)
+        return line
+
+    def _set(self, numbers: NDArray[np.int64], rate: float, stored: NDArray[np.int64]) -> None:
+        self.numbers, self.rate, self.stored = numbers, rate, stored
+        self.count = int(numbers[-1]) + 1
         # Of two pictures in one frame, the first counts.
-        self._picture = dict(zip(self.numbers[::-1].tolist(), range(len(times_s) - 1, -1, -1)))
+        self._picture = dict(zip(numbers[::-1].tolist(), range(len(numbers) - 1, -1, -1)))
+
+    @property
+    def is_numbered(self) -> bool:
+        """Tell whether the pictures are numbered otherwise than 0, 1, 2, ..."""
+        return bool(self.stored[0] != 0 or self.stored[-1] != len(self.stored) - 1)
+
+    def number(self, frame: int) -> int | None:
+        """Return the number in its files of the picture shown at a frame; None where there is none."""
+        picture = self.picture(frame)
+        return None if picture is None else int(self.stored[picture])
 
     @property
     def missing(self) -> int:

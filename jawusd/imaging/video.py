@@ -8,8 +8,7 @@ decoded picture is placed by its time stamp, so that B-frames, edit lists and va
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
 
 import av
@@ -17,7 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.errors import CaptureError
-from jawusd.imaging.pixels import Colour, Slices, converted
+from jawusd.imaging.clip import Clip, VideoFrame
+from jawusd.imaging.display import to_display
+from jawusd.imaging.pixels import Colour, Slices, coloured, converted
 from jawusd.imaging.timeline import Timeline
 
 _REENCODE = "Re-encode it, for example: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp4."
@@ -25,39 +26,27 @@ _REENCODE = "Re-encode it, for example: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp
 _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
 
 
-@dataclass(frozen=True, eq=False)
-class VideoFrame:
-    """One decoded picture."""
+class Video(Clip):
+    """Give access to the pictures of a video file."""
 
-    index: int  # number in order of presentation, the first is 0
-    time_s: float  # presentation time after the first picture [s]
-    image: NDArray[np.uint8]  # (h, w) gray, (h, w, 3) RGB or (h, w, 4) RGBA, uint8, 0..255, read-only
-
-
-class Video:
-    """Give access to the pictures of a video file; holds no open file, so threads may share it.
-
-    Attributes:
-        count: number of pictures.
-        times_s: presentation times after the first picture [s], shape (count,), increasing.
-        timeline: which picture is shown at which frame.
-        keys: numbers of pictures that decode by themselves, shape (n,).
-        start_s: presentation time of the first picture in the file, where its sound counts from too [s].
-        fps: average pictures per second.
-        rotation_deg: counter-clockwise turn stored in the file: 0, 90, 180 or 270. It is applied to every picture.
-        size_px: (width, height) after rotation.
-        has_alpha: the pictures carry transparency.
-        is_gray: they are stored as one channel.
-        is_rgb: they are stored as red, green and blue.
-    """
-
-    def __init__(self, path: str | os.PathLike[str]) -> None:
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        colour_space: str | None = None,
+        colour_config: Path | None = None,
+    ) -> None:
         """Read the table of frames and the first picture.
+
+        Args:
+            path: of the file.
+            colour_space, colour_config: of its pictures, if a display does not show them as they are; see `display`.
 
         Raises:
             CaptureError: the file is missing, empty, truncated, not a video, or carries no presentation times.
         """
         self.path = Path(path)
+        self._space = None if colour_space == "display" else colour_space
+        self._config = colour_config
         if not self.path.is_file():
             raise CaptureError("no such video.", path=path, hint="Check the path in capture.toml.")
         if self.path.stat().st_size == 0:
@@ -68,6 +57,8 @@ class Video:
             self._time_base = float(stream.time_base or 1)
             self._pts, self._seek_dts, stored = self._packet_table(container, stream)
             self.fps = float(stream.average_rate or 0)
+            stored_aspect = stream.sample_aspect_ratio
+            self.timecode = _timecode(container, stream)
             hidden = {key.lower(): value for key, value in stream.metadata.items()}.get("alpha_mode") == "1"
             self._alpha_decoder = _ALPHA_DECODERS.get(stream.codec_context.name) if hidden else None
         self.count = len(self._pts)
@@ -92,6 +83,8 @@ class Video:
                 hint=_REENCODE,
             )
         self.rotation_deg = first.rotation % 360
+        aspect = float(stored_aspect or 1) or 1.0  # 0 is not known
+        self.pixel_aspect = 1 / aspect if self.rotation_deg in (90, 270) else aspect
         turned = self.rotation_deg in (90, 270)
         self.size_px = (first.height, first.width) if turned else (first.width, first.height)
         stored_as = first.format
@@ -99,59 +92,17 @@ class Video:
         self.is_rgb = stored_as.is_rgb or stored_as.has_palette
         self.is_gray = not self.is_rgb and len(stored_as.components) == 1
 
-    def frames(
-        self,
-        first: int = 0,
-        last: int | None = None,
-        *,
-        colour: Colour = "gray",
-        region: tuple[int, int, int, int] | None = None,
-        threads: int = 0,
-    ) -> Iterator[VideoFrame]:
-        """Return an iterator over the pictures first, first + 1, .. last - 1.
-
-        Gray is the luma at full range (black 0, white 255); for gray and full-range files it is the decoder's own
-        buffer, without a copy.
-
-        Args:
-            last: one after the last picture; None = to the end.
-            region: (x0, y0, x1, y1) [px], x1 and y1 exclusive, in the turned picture; None = all of it.
-            threads: decoder threads; 0 lets the codec choose.
-
-        Raises:
-            CaptureError: a picture lies outside the file or cannot be decoded.
-            ValueError: the region is empty or outside the picture.
-        """
-        last = self.count if last is None else last
-        if not 0 <= first <= last <= self.count:
-            raise CaptureError(
-                f"frames {first} to {last - 1} asked for, the video holds frames 0 to {self.count - 1}.",
-                path=self.path,
-                hint="Correct `frames` in capture.toml, or copy the video again if it should be longer.",
-            )
-        width, height = self.size_px
-        x0, y0, x1, y1 = region or (0, 0, width, height)
-        if not (0 <= x0 < x1 <= width and 0 <= y0 < y1 <= height):
-            raise ValueError(f"region {region} is not inside the picture of {width} x {height} px")
-        window = (slice(y0, y1), slice(x0, x1))
-        return self._converted(first, last, colour, window, threads)
-
-    def pictures(self, wanted: Sequence[int | None], *, colour: Colour = "gray") -> Iterator[NDArray[np.uint8] | None]:
-        """Yield a picture for each of increasing numbers, None for None, decoding what lies between only once.
-
-        Raises:
-            CaptureError: a picture lies outside the file or cannot be decoded.
-        """
-        known = [number for number in wanted if number is not None]
-        decoded = self.frames(known[0], known[-1] + 1, colour=colour) if known else iter(())
-        for number in wanted:
-            yield None if number is None else next(frame.image for frame in decoded if frame.index == number)
-
     def _converted(self, first: int, last: int, colour: Colour, window: Slices, threads: int) -> Iterator[VideoFrame]:
         for index, frame in self._decode(first, last, threads, alpha=colour == "rgba"):
-            image = converted(frame, colour, self.rotation_deg, window)
+            image = self._image(frame, colour, window)
             image.flags.writeable = False  # the gray buffer may be a reference the decoder still needs
             yield VideoFrame(index, float(self.times_s[index]), image)
+
+    def _image(self, frame: av.VideoFrame, colour: Colour, window: Slices) -> NDArray[np.uint8]:
+        if self._space is None:
+            return converted(frame, colour, self.rotation_deg, window)
+        stored = np.rot90(frame.to_ndarray(format="rgb48le"), self.rotation_deg // 90)[window]
+        return coloured(to_display(stored, 65535, self._space, self._config), colour)
 
     def _open(self) -> av.container.InputContainer:
         try:
@@ -237,3 +188,9 @@ class Video:
             path=self.path,
             hint="Copy the video again from the camera, or cut it to the part that is whole.",
         )
+
+
+def _timecode(container: av.container.InputContainer, stream: av.VideoStream) -> str:
+    """Return the time code of the first picture: that of the video, of a track of its own, or of the file."""
+    tables = [stream.metadata, *(other.metadata for other in container.streams), container.metadata]
+    return next((table["timecode"] for table in tables if table.get("timecode")), "")

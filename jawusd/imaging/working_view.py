@@ -87,6 +87,16 @@ class WorkingView:
         width, height = self.camera.size_px
         return self._averaged(image, (slice(0, height), slice(0, width)))
 
+    def light(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return recorded light (H, W, 3) without distortion, at its own size; 0 where none was recorded.
+
+        Raises:
+            ValueError: the picture has not the size of the recorded ones, or the view is smaller than they are.
+        """
+        if image.shape[1::-1] != self.source.size_px or self._map.shape[1::-1] != self.source.size_px:
+            raise ValueError(f"light must be of {self.source.size_px} px and stay so, got {image.shape}")
+        return remap(image, self._map)
+
     def part(self, image: NDArray[np.uint8], window: Slices) -> NDArray[np.uint8]:
         """Return the part of `picture` at rows and columns whose start and stop lie inside it.
 

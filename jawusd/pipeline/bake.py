@@ -101,4 +101,5 @@ def write_take(capture: Capture, tracks: Tracks, folder: Path) -> list[Path]:
         tracks.frames,
         tracks.T_world_upper,
         capture.fps,
+        [camera.name for camera in capture.cameras if camera.clip is not None and camera.clip.is_light],
     )

@@ -12,6 +12,7 @@ from jawusd.errors import SyncError, TrackingError, explain_missing_packages
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.calibration import save_calibration
 from jawusd.formats.capture import Capture
+from jawusd.formats.clip_source import ClipSource
 from jawusd.formats.light_curve import LightCurve
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera
@@ -165,7 +166,7 @@ def sync_cameras(capture: Capture, progress: Progress) -> SyncResult:
 
 
 @explain_missing_packages()
-def sync_videos(videos: Mapping[str, Path], reference: str, progress: Progress) -> SyncResult:
+def sync_videos(videos: Mapping[str, Path | ClipSource], reference: str, progress: Progress) -> SyncResult:
     """Return the frame offset of every clip to the reference, as `sync_cameras` does for a capture.
 
     Args:
@@ -195,7 +196,7 @@ def _sync_result(alignment: Alignment) -> SyncResult:
 
 
 @explain_missing_packages()
-def light_curves(videos: Mapping[str, Path], progress: Progress) -> dict[str, LightCurve]:
+def light_curves(videos: Mapping[str, Path | ClipSource], progress: Progress) -> dict[str, LightCurve]:
     """Return the brightness of every picture of every video, by camera; decodes all of them.
 
     Raises:

@@ -13,11 +13,12 @@ from jawusd.errors import JawusdError
 from jawusd.formats.capture import CameraSource, Capture
 from jawusd.formats.finding import Finding
 from jawusd.formats.mesh import Mesh
+from jawusd.formats.numbered import is_pattern
 from jawusd.geometry import Camera
 
 if TYPE_CHECKING:
+    from jawusd.imaging.clip import Clip
     from jawusd.imaging.mask_samples import MaskSamples
-    from jawusd.imaging.video import Video
     from jawusd.tracking.contour.scan import Scan
 
 Size = tuple[int, int]
@@ -32,7 +33,7 @@ class Parts:
     allow_outside: bool
     meshes: dict[str, Mesh] = field(default_factory=dict)
     scans: tuple[Scan, ...] = ()  # upper and lower, if both can be used
-    videos: dict[str, Video] = field(default_factory=dict)
+    videos: dict[str, Clip] = field(default_factory=dict)
     cameras: dict[str, Camera] = field(default_factory=dict)
     samples: dict[str, MaskSamples] = field(default_factory=dict)
     open_files: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)
@@ -55,7 +56,7 @@ class Parts:
 
     def usable(self, path: Path) -> bool:
         """Tell whether a file may be opened: it exists, or its folder does, and lies where it may."""
-        place = path.parent if "%" in path.name else path
+        place = path.parent if is_pattern(path) else path
         try:
             inside = self.allow_outside or place.resolve().is_relative_to(self.given.folder)
             return inside and place.exists()

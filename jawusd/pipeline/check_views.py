@@ -22,13 +22,13 @@ _CROWN_POINTS = 6000
 def clips(parts: Parts) -> Iterator[Finding]:
     """Open every clip and decode three pictures of it."""
     from jawusd.imaging.clip_checks import decoded_findings, rate_findings
-    from jawusd.imaging.video import Video
+    from jawusd.imaging.footage import open_clip
 
     for camera in parts.given.cameras:
-        if camera.video is None or not parts.usable(camera.video):
+        if camera.clip is None or not parts.usable(camera.clip.path):
             continue
         try:
-            video = Video(camera.video)
+            video = open_clip(camera.clip)
         except JawusdError as error:
             yield found_error("clip", error)
             continue
@@ -75,16 +75,16 @@ def _rescaled(parts: Parts) -> Iterator[Finding]:
 def boards(parts: Parts) -> Iterator[Finding]:
     """Open the board clips, where a calibration must be made from them."""
     from jawusd.imaging.clip_checks import decoded_findings
-    from jawusd.imaging.video import Video
+    from jawusd.imaging.footage import open_clip
 
     capture = parts.given
     if capture.boards is None or capture.calibration is not None:
         return
     for path, camera in zip(capture.boards.videos, capture.cameras, strict=True):
-        if "%" in path.name or not parts.usable(path):
+        if not parts.usable(path):
             continue
         try:
-            video = Video(path)
+            video = open_clip(path)
         except JawusdError as error:
             yield found_error("board_clip", error)
             continue

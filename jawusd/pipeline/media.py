@@ -22,7 +22,7 @@ from jawusd.pipeline.state import Progress, make_folder
 
 if TYPE_CHECKING:
     from jawusd.imaging.backdrop import Backdrop
-    from jawusd.imaging.video import Video
+    from jawusd.imaging.clip import Clip
 
 _UNCOVERED, _UNCERTAIN = 3, 2  # frames shown for either reason; one typical frame is added, to compare with
 _MOST_CAMERAS = 4
@@ -32,25 +32,25 @@ _MOST_FACES = 6000  # per mesh of the report
 
 
 @explain_missing_packages()
-def open_videos(capture: Capture) -> dict[str, Video]:
+def open_videos(capture: Capture) -> dict[str, Clip]:
     """Return the videos of a capture by the names of their cameras.
 
     Raises:
         CaptureError: no camera has a video, or one cannot be decoded.
     """
-    from jawusd.imaging.video import Video
+    from jawusd.imaging.footage import open_clip
 
-    sources = {source.name: source.video for source in capture.cameras if source.video}
+    sources = {source.name: source.clip for source in capture.cameras if source.clip}
     if not sources:
         raise CaptureError(
             "no camera has a video, so there is no footage.",
             path=capture.folder / "capture.toml",
             hint="Name the footage there (video = ...).",
         )
-    return {name: Video(path) for name, path in sources.items()}
+    return {name: open_clip(clip) for name, clip in sources.items()}
 
 
-def open_footage(capture: Capture, tracks: Tracks | None = None) -> tuple[dict[str, Camera], dict[str, Video]]:
+def open_footage(capture: Capture, tracks: Tracks | None = None) -> tuple[dict[str, Camera], dict[str, Clip]]:
     """Return the calibrated cameras of a capture, and the videos of those that have one, by name.
 
     Args:
@@ -172,7 +172,7 @@ def chosen_frames(tracks: Tracks, fps: float) -> list[tuple[int, str]]:
 def write_plates(
     capture: Capture, offsets: Mapping[str, int], frames: NDArray[np.int64], folder: Path, progress: Progress
 ) -> list[str]:
-    """Write one JPEG per frame and camera, where `cameras.usda` says they are, numbered by its time codes.
+    """Write a picture per frame and camera, EXR of EXR and JPEG else, where `cameras.usda` says, numbered by time code.
 
     Args:
         offsets: frame offset by camera.
@@ -187,22 +187,32 @@ def write_plates(
         CaptureError, CalibrationError: see `open_footage`.
         OutputError: the files cannot be written.
     """
+    from jawusd.imaging.picture_sequence import PictureSequence
     from jawusd.imaging.plates import PlateWriter
-    from jawusd.rig.cameras import PLATE
+    from jawusd.rig.cameras import LIGHT_PLATE, PLATE
 
     cameras, videos = open_footage(capture)
+    light = {name for name, video in videos.items() if isinstance(video, PictureSequence) and video.is_fractional}
+    patterns = {name: (LIGHT_PLATE if name in light else PLATE).format(name=name) for name in videos}
     done, total = 0, len(videos) * len(frames)
     for name, video in videos.items():
         plates = PlateWriter(cameras[name])
-        files = str(folder / PLATE.format(name=name))
+        files = str(folder / patterns[name])
         make_folder(Path(files).parent)
         wanted = [video.timeline.picture(frame - offsets[name]) for frame in frames.tolist()]
+        if isinstance(video, PictureSequence) and name in light:
+            for frame, index in zip(frames.tolist(), wanted):
+                if index is not None:
+                    plates.write_light(files % frame, video.light(index))
+                done += 1
+                progress("plates", done, total)
+            continue
         for frame, image in zip(frames.tolist(), video.pictures(wanted, colour="rgb")):
             if image is not None:
                 plates.write(files % frame, image)
             done += 1
             progress("plates", done, total)
-    return [PLATE.format(name=name) for name in videos]
+    return [patterns[name] for name in videos]
 
 
 def replay_parts(folder: Path, model: JawModel) -> tuple[ReplayPart, ...]:

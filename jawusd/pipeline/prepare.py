@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -19,6 +18,7 @@ from jawusd.formats.finding import Finding
 from jawusd.formats.landmarks import load_landmarks
 from jawusd.formats.mesh import Mesh, tooth_labels
 from jawusd.formats.model import load_model
+from jawusd.formats.numbered import is_pattern, numbered_files
 from jawusd.formats.scan_labels import labels_path
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import (
@@ -31,7 +31,7 @@ from jawusd.geometry import (
 )
 from jawusd.geometry.arrays import Array
 from jawusd.pipeline.scan_labels import TEETH, LabelledScan, label_teeth
-from jawusd.pipeline.state import hash_files
+from jawusd.pipeline.state import hash_files, hash_value
 
 BONES = ("mandible", "skull")
 MESHES = ("upper_teeth", "lower_teeth", *BONES)
@@ -117,11 +117,13 @@ def _calibrated(capture: Capture) -> list[tuple[Camera, CameraSource]]:
 
 
 def _at_recorded_size(camera: Camera, capture: Capture, source: CameraSource) -> Camera:
+    from jawusd.imaging.footage import open_clip
     from jawusd.imaging.masks import mask_size_px
-    from jawusd.imaging.video import Video
 
-    if source.video is not None:
-        recorded, path = Video(source.video).size_px, source.video
+    aspect = 1.0
+    if source.clip is not None:
+        opened = open_clip(source.clip)
+        recorded, aspect, path = opened.size_px, opened.pixel_aspect, opened.path
     elif source.masks is not None:
         path = source.masks.upper
         recorded = mask_size_px(path)
@@ -131,7 +133,8 @@ def _at_recorded_size(camera: Camera, capture: Capture, source: CameraSource) ->
     if tuple(recorded) == (width, height):
         return camera
     # One pixel is what rounding of a scaled height makes.
-    if abs(recorded[0] * height / width - recorded[1]) > 1.0:
+    # An anamorphic picture is stored narrower (or, as DV, wider) than it is shown, and may be calibrated either way.
+    if min(abs(recorded[0] * share * height / width - recorded[1]) for share in (1.0, aspect)) > 1.0:
         raise CalibrationError(
             f"calibrated for pictures of {width} x {height} px, but {path.name} has "
             f"{recorded[0]} x {recorded[1]} px, another shape.",
@@ -350,7 +353,8 @@ def input_files(capture: Capture, names: Iterable[str]) -> dict[str, list[Path]]
         elif name == "boards" and capture.boards is not None:
             parts |= {f"boards {k}": _sequence_files(path) for k, path in enumerate(capture.boards.videos)}
         elif name == "videos":
-            parts |= {f"video {camera.name}": [camera.video] for camera in capture.cameras if camera.video is not None}
+            clips = {camera.name: camera.video for camera in capture.cameras if camera.video is not None}
+            parts |= {f"video {camera}": _sequence_files(path) for camera, path in clips.items()}
         elif name == "masks":
             for camera in capture.cameras:
                 arches = {camera.masks.upper: "upper", camera.masks.lower: "lower"} if camera.masks else {}
@@ -365,16 +369,23 @@ def input_hashes(capture: Capture, names: Iterable[str]) -> dict[str, str]:
         CaptureError: a file cannot be read.
     """
     try:
-        return {part: hash_files(files) for part, files in input_files(capture, names).items()}
+        names = list(names)
+        found = {part: hash_files(files) for part, files in input_files(capture, names).items()}
     except OSError as error:
         raise CaptureError(f"cannot be read: {error.strerror}.", path=error.filename) from error
+    if "videos" in names:  # how footage is read is part of what it shows
+        keys = {"timecode", "start_frame", "fps", "colour_space", "pixel_aspect"}
+        found["footage as read"] = hash_value([camera.model_dump(include=keys) for camera in capture.cameras])
+        if capture.colour_config is not None:
+            found["colour config"] = hash_files([capture.colour_config])
+    return found
 
 
 def _sequence_files(path: Path) -> list[Path]:
     """Return a video as it is, and the numbered files of a picture pattern; others may lie beside them."""
-    head, sign, tail = path.name.partition("%")
-    if not sign:
+    if not is_pattern(path):
         return [path]
-    tail = tail.partition("d")[2]
-    numbered = re.compile(rf"{re.escape(head)}\d+{re.escape(tail)}")
-    return sorted(file for file in path.parent.iterdir() if numbered.fullmatch(file.name))
+    try:
+        return list(numbered_files(path).values())
+    except CaptureError:  # its reader says so
+        return []

@@ -258,7 +258,7 @@ class _Segmentation:
         return [
             frame
             for frame in range(self._first, self._stop)
-            if any(self._footage.own(name, frame) in drawn[name] for name in self._cameras)
+            if any(self._footage.number(name, frame) in drawn[name] for name in self._cameras)
             and LOST not in self._journal.entries[frame]["status"]
         ]
 
@@ -271,7 +271,7 @@ class _Segmentation:
         for frame in keyed:
             pictures, poses = self._footage.at(frame), self._journal.known(frame)[0]
             for name, segmenter in self._segmenters.items():
-                image, own = pictures[name], self._footage.own(name, frame)
+                image, own = pictures[name], self._footage.number(name, frame)
                 if image is not None and own is not None and any(keys := self._keys.of(name, own)):
                     examples.append(segmenter.study(image, poses, keys))
         finished = [example for example in examples if example is not None]
@@ -295,7 +295,7 @@ class _Segmentation:
         shown = self._open[frame]
 
         def one(name: str) -> Segment | None:
-            image, own = shown.pictures[name], self._footage.own(name, frame)
+            image, own = shown.pictures[name], self._footage.number(name, frame)
             if image is None or own is None:
                 return None
             found = self._segmenters[name].segment(image, poses, turn, self._keys.of(name, own))
@@ -319,7 +319,7 @@ class _Segmentation:
         residual = view_residual_px(record.solution)
         cameras: dict[str, CameraEntry] = {}
         for k, (name, found) in enumerate(segments.items()):
-            own = self._footage.own(name, frame)
+            own = self._footage.number(name, frame)
             if found is not None and own is not None:
                 cameras[name] = {
                     "frame": own,

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from jawusd.errors import FormatError, OutputError, explain_missing_packages
 from jawusd.formats.atomic import write_text_atomic
-from jawusd.formats.capture import Capture, Masks
+from jawusd.formats.capture import Capture
+from jawusd.formats.capture_parts import Masks
 from jawusd.formats.text import read_text
 from jawusd.formats.tracks import LOST
 from jawusd.geometry.arrays import Array
@@ -270,7 +271,7 @@ def write_summary(capture: Capture, entries: Mapping[int, FrameEntry], folder: P
     """
     rows = summarise(entries)
     doubtful = sorted((row for row in rows if row["confidence"] < _DOUBTFUL), key=lambda row: row["confidence"])
-    videos = {camera.name: camera.video for camera in capture.cameras if camera.video is not None}
+    videos = {camera.name: camera.clip for camera in capture.cameras if camera.clip is not None}
     summary: SegmentSummary = {
         "format": FORMAT,
         "capture": capture.name,

@@ -19,7 +19,7 @@ from jawusd.pipeline.folder_files import FoundFiles, camera_names, find_files, p
 from jawusd.pipeline.state import Progress
 
 if TYPE_CHECKING:
-    from jawusd.imaging.video import Video
+    from jawusd.imaging.clip import Clip
 
 _PICTURES = 5  # of a board clip that are looked at
 _USUAL_RATES = tuple(Fraction(n, d) for d in (1, 1001) for n in (24 * d, 25 * d, 30 * d, 50 * d, 60 * d, 120 * d)) + (
@@ -159,24 +159,24 @@ def _cameras(
     return cameras, _rate(opened, out)
 
 
-def _opened(folder: Path, clips: Sequence[PurePath], out: CaptureStart) -> dict[PurePath, Video]:
-    from jawusd.imaging.video import Video
+def _opened(folder: Path, clips: Sequence[PurePath], out: CaptureStart) -> dict[PurePath, Clip]:
+    from jawusd.imaging.footage import open_clip
 
-    found: dict[PurePath, Video] = {}
+    found: dict[PurePath, Clip] = {}
     for clip in clips:
         try:
-            found[clip] = Video(folder / clip)
+            found[clip] = open_clip(folder / clip)
         except JawusdError as error:
             out.notes.append(f"{clip} is left out: {error.statement().rstrip('.')}")
     return found
 
 
-def _remark(video: Video) -> str:
+def _remark(video: Clip) -> str:
     width, height = video.size_px
     return f"{width} x {height} px, {video.count} pictures, {video.timeline.rate:.5g} per second"
 
 
-def _rate(opened: Mapping[PurePath, Video], out: CaptureStart) -> float | None:
+def _rate(opened: Mapping[PurePath, Clip], out: CaptureStart) -> float | None:
     rates = {path: video.timeline.rate for path, video in opened.items()}
     if not rates:
         return None
@@ -236,7 +236,7 @@ def _board(
     return sketch
 
 
-def _some_pictures(video: Video) -> list[np.typing.NDArray[np.uint8]]:
+def _some_pictures(video: Clip) -> list[np.typing.NDArray[np.uint8]]:
     wanted = np.unique(np.linspace(0, video.count - 1, _PICTURES + 2).astype(int)[1:-1])
     return [picture for picture in video.pictures(wanted.tolist()) if picture is not None]
 

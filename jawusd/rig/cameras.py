@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +21,7 @@ TAKE, TAKE_ACTOR, TAKE_CAMERAS = "/Take", "/Take/Actor", "/Take/Cameras"
 
 # Undistorted images of a camera, relative to the take, numbered by time code.
 PLATE = "plates/{name}/{name}.%06d.jpg"
+LIGHT_PLATE = "plates/{name}/{name}.%06d.exr"  # of a camera whose footage is light in fractions
 
 # A sensor of 36 mm, in tenths of a scene unit as UsdGeomCamera measures apertures and focal lengths.
 _SENSOR_WIDTH = 360.0
@@ -37,6 +38,7 @@ def write_cameras(
     frames: ArrayLike,
     T_world_skull: ArrayLike,
     fps: float,
+    light: Container[str] = (),
 ) -> list[Path]:
     """Write the take: one `UsdGeom.Camera` per camera, and the actor carried by the tracked head.
 
@@ -49,6 +51,8 @@ def write_cameras(
         actor: The layer to show, `anim_capture.usdc` or `actor.usda`.
         frames: Frame numbers (F,), increasing.
         T_world_skull: Poses of the skull (F, 4, 4) [mm], NaN where lost.
+        fps: Frames per second.
+        light: Names of cameras whose plates are EXR.
 
     Returns:
         The motion's file and the take's, in the order written.
@@ -77,7 +81,8 @@ def write_cameras(
     stage = stage_of(layer)
     add_pose(stage.GetPrimAtPath(TAKE), _FLIP)
     for name, camera in zip(names, cameras, strict=True):
-        _define_camera(stage, name, camera)
+        plate = LIGHT_PLATE if camera.name in light else PLATE
+        _define_camera(stage, name, camera, plate.format(name=camera.name))
     # A stage still open on the nameless layer would look for the files beside it, and complain.
     del stage
     layer.subLayerPaths.append(relative_path(motion, out))
@@ -106,7 +111,7 @@ def _motion_layer(frames: Array, T_world_skull: Array, fps: float) -> Sdf.Layer:
     return layer
 
 
-def _define_camera(stage: Usd.Stage, path: Sdf.Path, camera: Camera) -> None:
+def _define_camera(stage: Usd.Stage, path: Sdf.Path, camera: Camera, plate: str) -> None:
     """Define one camera: the image spans pixel edges, half a pixel outside the first and last centres."""
     (fx, skew, cx), (_, fy, cy) = camera.K[:2]
     width, height = camera.size_px
@@ -125,4 +130,4 @@ def _define_camera(stage: Usd.Stage, path: Sdf.Path, camera: Camera) -> None:
     spec = stage.GetRootLayer().GetPrimAtPath(path)
     set_attribute(spec, "jaw:distortion", Sdf.ValueTypeNames.DoubleArray, _gf.double_array(camera.distortion))
     set_attribute(spec, "jaw:imageSize", Sdf.ValueTypeNames.Int2, Gf.Vec2i(width, height))
-    set_attribute(spec, "jaw:plate", Sdf.ValueTypeNames.String, "./" + PLATE.format(name=camera.name))
+    set_attribute(spec, "jaw:plate", Sdf.ValueTypeNames.String, "./" + plate)

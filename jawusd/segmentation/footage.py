@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.imaging.video import Video
+from jawusd.imaging.clip import Clip
 
 _CHUNK = 16  # instants held at once when going backwards: 100 MB per full HD camera
 
@@ -18,13 +18,17 @@ _Frames = range  # inside the class below, `range` is its method
 class ColourFootage:
     """Read the pictures of one instant in all cameras, in either direction."""
 
-    def __init__(self, videos: Mapping[str, Video], offsets: Mapping[str, int]) -> None:
+    def __init__(self, videos: Mapping[str, Clip], offsets: Mapping[str, int]) -> None:
         """Take the videos and, by the same names, reference frame minus own frame number."""
         self._videos, self._offsets = dict(videos), dict(offsets)
 
     def own(self, name: str, frame: int) -> int | None:
         """Return the picture of a camera at a frame of the reference camera; None where it has none."""
         return self._videos[name].timeline.picture(frame - self._offsets[name])
+
+    def number(self, name: str, frame: int) -> int | None:
+        """Return the number in its files of a camera's picture at a frame of the reference camera, as masks have it."""
+        return self._videos[name].timeline.number(frame - self._offsets[name])
 
     def range(self) -> tuple[int, int]:
         """Return the first frame that two cameras show, and one past the last."""

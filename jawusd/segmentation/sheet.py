@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.formats.clip_source import ClipSource
 from jawusd.geometry.arrays import Mask
+from jawusd.imaging.footage import open_clip
 from jawusd.imaging.overlay import LOWER_COLOUR, UPPER_COLOUR, captioned, contact_sheet, save_png
-from jawusd.imaging.video import Video
 from jawusd.segmentation.files import ARCHES, KeyMasks
 
 _COLUMNS = 3
@@ -19,18 +20,21 @@ _TILE_PX = (480, 270)
 _MARGIN = 0.15  # of the teeth's extent, left around them
 
 
-def write_sheet(path: Path, shown: Sequence[tuple[str, int, str]], videos: Mapping[str, Path], folder: Path) -> None:
+def write_sheet(
+    path: Path, shown: Sequence[tuple[str, int, str]], videos: Mapping[str, ClipSource | Path], folder: Path
+) -> None:
     """Write a PNG with a tile per (camera, its own frame, remark), upper and lower arch outlined.
 
     Raises:
         CaptureError: a picture or mask cannot be decoded.
         OutputError: the file cannot be written.
     """
-    opened = {name: Video(videos[name]) for name in {camera for camera, _, _ in shown}}
+    opened = {name: open_clip(videos[name]) for name in {camera for camera, _, _ in shown}}
     masks = KeyMasks(folder, {name: video.size_px for name, video in opened.items()})
     tiles = []
     for name, own, remark in shown:
-        picture = next(opened[name].frames(own, own + 1, colour="rgb")).image.copy()
+        index = int(np.searchsorted(opened[name].timeline.stored, own))
+        picture = next(opened[name].frames(index, index + 1, colour="rgb")).image.copy()
         drawn = [None if key is None else key.mask for key in masks.of(name, own)]
         tiles.append(_tile(picture, drawn, f"{name}  frame {own}  {remark}"))
     save_png(path, contact_sheet(tiles, _COLUMNS))

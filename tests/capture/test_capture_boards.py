@@ -207,7 +207,7 @@ def test_pictures_that_cannot_be_read_are_named(tmp_path):
     (tmp_path / "c0" / "board_0003.png").write_bytes(b"no picture")
     with pytest.raises(CaptureError, match=r"board_0003\.png: is not a picture"):
         find_boards(NAMES, board(videos=videos), quiet)
-    with pytest.raises(CaptureError, match="no picture matches"):
+    with pytest.raises(CaptureError, match="no file of the folder is named like"):
         find_boards(("c0",), board(videos=(tmp_path / "c1" / "bord_%04d.png",)), quiet)
     cv2.imwrite(str(tmp_path / "c0" / "board_0003.png"), np.zeros((100, 100), np.uint8))
     with pytest.raises(CalibrationError, match="is 100 x 100 px, the first picture 640 x 480"):

@@ -183,7 +183,7 @@ HEAD = (
         ('labels = "l.mkv", upper = "u.mkv", upper_value = 1, lower_value = 2', "either labels, or upper and lower"),
         ('upper = "u.mkv", lower = "l.mkv", upper_value = 1', "are for labels, one file for both rows"),
         ('upper = "l.mkv", lower = "l.mkv"', "one file for both rows needs"),
-        ('labels = "l.mkv", upper_value = 0, lower_value = 2', "greater than or equal to 1"),
+        ('labels = "l.mkv", upper_value = 0, lower_value = 2', "must be 1 or more"),
     ],
 )
 def test_a_capture_says_what_labels_mean(tmp_path, keys, message):

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image, ImageDraw
 
 from jawusd.errors import CaptureError
-from jawusd.formats.capture import CameraSource, Masks
+from jawusd.formats.capture_parts import CameraSource, Masks
 from jawusd.imaging.mask_levels import MOST_SOFT
 from jawusd.imaging.mask_survey import survey_masks
 from jawusd.imaging.masks import MaskReader, open_masks

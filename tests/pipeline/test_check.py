@@ -276,7 +276,7 @@ def test_the_program_prints_findings_and_leaves_with_5(capture):
 
 
 def test_a_black_picture_in_between_does_not_end_the_masks(tmp_path):
-    from jawusd.formats.capture import CameraSource, Masks
+    from jawusd.formats.capture_parts import CameraSource, Masks
     from jawusd.imaging.mask_samples import sample_masks
 
     for k in range(40):

@@ -82,3 +82,28 @@ def test_the_command_needs_a_built_rig(capture, tmp_path):
     command = [sys.executable, "-m", "jawusd", "plates", str(tmp_path / "copy"), str(tmp_path / "no_rig")]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 3 and "tracks.npz" in done.stderr
+
+
+def test_plates_of_light_are_light(capture, tmp_path):
+    """The same ball as EXR far above white: undistorted, and as bright as it was."""
+    from clip_files import write_picture
+
+    from jawusd.imaging.stored_picture import read_stored
+    from jawusd.imaging.video import Video
+    from jawusd.rig.cameras import LIGHT_PLATE
+
+    pictures = [frame.image for frame in Video(capture / "left.mp4").frames(colour="rgb")]
+    for number, image in enumerate(pictures, 1001):
+        write_picture(capture / "exr" / f"left.{number}.exr", image, "exr")
+    text = (capture / "capture.toml").read_text().replace('"left.mp4"', '"exr/left.####.exr"')
+    (capture / "capture.toml").write_text(text)
+    opened = open_capture(capture)
+    patterns = write_plates(opened, OFFSETS, FRAMES, tmp_path / "rig", lambda *_: None)
+    assert patterns == [LIGHT_PLATE.format(name="left"), PLATE.format(name="right")]
+    for frame in FRAMES:
+        light = read_stored(tmp_path / "rig" / (patterns[0] % frame)).pixels.astype(np.float32)
+        weight = np.clip(light.mean(-1) - 0.2, 0, None)
+        y, x = np.mgrid[: weight.shape[0], : weight.shape[1]]
+        centre = np.array([(weight * x).sum(), (weight * y).sum()]) / weight.sum()
+        assert np.abs(centre - CAMERAS[0].project_pinhole(point(frame)[None])[0]).max() < 0.25
+        assert light.max() == pytest.approx((250 / 255) ** 2.2, abs=0.03)

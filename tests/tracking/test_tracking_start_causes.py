@@ -5,7 +5,7 @@ import pytest
 from small_take import CAMERAS, OFFSETS
 
 from jawusd.errors import TrackingError
-from jawusd.formats.capture import CameraSource, Masks
+from jawusd.formats.capture_parts import CameraSource, Masks
 from jawusd.tracking.initialization import mixups, start_causes
 from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.initialization.start_causes import refuse_lone_arch

@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 
 from jawusd.errors import CaptureError, TrackingError
-from jawusd.formats.capture import CameraSource, Masks
+from jawusd.formats.capture_parts import CameraSource, Masks
 from jawusd.geometry.arrays import Array
 from jawusd.tracking.contour.quality import coverage_error, uncovered_px
 from jawusd.tracking.contour.scan import teeth_centre

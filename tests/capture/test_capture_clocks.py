@@ -1,0 +1,86 @@
+"""Cameras aligned by time code and by the numbers of their pictures."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from clip_files import write_prores, write_sequence
+
+from jawusd.capture.sync import estimate_offsets
+from jawusd.errors import SyncError
+from jawusd.formats.capture import Capture
+from jawusd.formats.clip_source import ClipSource
+from jawusd.imaging.footage import open_clip
+from jawusd.imaging.masks import MaskReader
+
+IMAGES = np.full((8, 32, 32, 3), 90, np.uint8)
+
+
+def capture(folder, method, cameras, fps=24.0):
+    scans = {"upper_teeth": "u.ply", "lower_teeth": "l.ply"}
+    rows = [{"name": name, **rest} for name, rest in cameras.items()]
+    return Capture(folder=folder, name="x", fps=fps, scans=scans, cameras=rows, sync={"method": method})
+
+
+def test_time_codes_of_clips(tmp_path):
+    clips = {
+        "a": {"video": write_prores(tmp_path / "a.mov", IMAGES, Fraction(24), "01:00:00:23")},
+        "b": {"video": write_prores(tmp_path / "b.mov", IMAGES, Fraction(24), "01:00:01:02")},
+        "c": {"video": write_sequence(tmp_path / "c", IMAGES, "png8"), "timecode": "01:00:00:20"},
+    }
+    found = estimate_offsets(capture(tmp_path, "timecode", clips))
+    assert found.offsets == {"a": 0, "b": 3, "c": -3} and found.method == "time code"
+
+
+def test_time_codes_over_midnight_and_with_dropped_numbers(tmp_path):
+    pattern = write_sequence(tmp_path / "c", IMAGES, "png8")
+    for first, second, fps, offset in (
+        ("23:59:59:22", "00:00:00:01", 24.0, 3),
+        ("00:00:59;28", "00:01:00;03", 30000 / 1001, 3),
+    ):
+        clips = {name: {"video": pattern, "timecode": code} for name, code in (("a", first), ("b", second))}
+        assert estimate_offsets(capture(tmp_path, "timecode", clips, fps)).offsets == {"a": 0, "b": offset}
+
+
+def test_clocks_that_tell_nothing(tmp_path):
+    pattern = write_sequence(tmp_path / "c", IMAGES, "png8")
+    clips = {"a": {"video": pattern, "timecode": "00:00:00:00"}, "b": {"video": pattern}}
+    with pytest.raises(SyncError, match="camera b: its clip carries no time code") as error:
+        raise_with_place(tmp_path, clips)
+    assert "timecode = " in error.value.hint
+    clips["b"]["timecode"] = "00:00:09:00"
+    with pytest.raises(SyncError, match="begins 216 frames after camera a by its timecode"):
+        raise_with_place(tmp_path, clips)
+    clips["b"]["timecode"] = "noon"
+    with pytest.raises(SyncError, match=r'the time code "noon" is not HH:MM:SS:FF'):
+        raise_with_place(tmp_path, clips)
+
+
+def raise_with_place(folder, clips):
+    try:
+        estimate_offsets(capture(folder, "timecode", clips))
+    except SyncError as error:
+        raise SyncError(error.statement(), hint=error.hint) from error
+
+
+def test_numbers_of_pictures(tmp_path):
+    clips = {
+        "a": {"video": write_sequence(tmp_path / "a", IMAGES, "png8", first=1001)},
+        "b": {"video": write_sequence(tmp_path / "b", IMAGES, "png8", first=1004)},
+        "c": {"video": write_sequence(tmp_path / "c", IMAGES, "png8", first=0), "start_frame": 999},
+    }
+    assert estimate_offsets(capture(tmp_path, "numbers", clips)).offsets == {"a": 0, "b": 3, "c": -2}
+
+
+def test_masks_carry_the_numbers_of_the_pictures(tmp_path):
+    import cv2
+
+    clip = open_clip(ClipSource(write_sequence(tmp_path / "v", IMAGES, "png8", left_out=(1003,)), fps=24.0))
+    (tmp_path / "m").mkdir()
+    for number in (1001, 1002, 1004, 1005):
+        mask = np.zeros((32, 32), np.uint8)
+        mask[: number - 1000, :] = 255
+        cv2.imwrite(str(tmp_path / "m" / f"{number}.png"), mask)
+    with MaskReader(tmp_path / "m" / "%d.png", (32, 32), timeline=clip.timeline) as masks:
+        rows = [None if (mask := masks.read(k)) is None else int((mask[:, 0] > 127).sum()) for k in range(8)]
+    assert rows == [1, 2, None, 4, 5, None, None, None]
