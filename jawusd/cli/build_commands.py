@@ -60,6 +60,9 @@ def build(
     backend: BackendOption = Backend.cpu,
     resume: Annotated[bool, typer.Option("--resume", help="Continue an earlier build in this folder.")] = False,
     fresh: Annotated[bool, typer.Option("--fresh", help="Delete an earlier build in this folder first.")] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Say which stages would run, which are kept, and about how long.")
+    ] = False,
     jobs: Jobs = 2,
     allow_outside: Outside = False,
     as_json: Json = False,
@@ -71,6 +74,14 @@ def build(
     options = stages.BuildOptions(
         model.value, solver.value, backend.value, jobs=jobs, resume=resume, fresh=fresh, allow_outside=allow_outside
     )
+    if dry_run:
+        from dataclasses import asdict
+
+        from jawusd.pipeline.plan import plan_build, plan_lines
+
+        plan = plan_build(capture, out, options)
+        emit({"stages": [asdict(stage) for stage in plan]}, as_json, lambda: plan_lines(plan))
+        return
     with progress() as report:
         summary = stages.build(capture, out, options, report, lambda found: typer.echo(found.line(), err=True))
     emit(summary, as_json, lambda: stages.build_lines(summary))

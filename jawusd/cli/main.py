@@ -5,6 +5,9 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+import traceback
+from pathlib import Path
+from typing import Annotated
 
 import typer
 
@@ -22,18 +25,24 @@ from jawusd.cli import (
     stage_commands,
     start_commands,
 )
+from jawusd.cli.command import CONTEXT, Command
+from jawusd.cli.log import logged
+from jawusd.cli.summaries import EXIT_CODES, SUMMARIES
 from jawusd.errors import JawusdError, OutputError, explain_missing_packages
 
 app = typer.Typer(
     name="jawusd",
     help="Capture in, jaw rig out: person-specific jaw kinematics from video as an OpenUSD rig.",
+    epilog=EXIT_CODES,
+    context_settings=CONTEXT,
     no_args_is_help=True,
-    add_completion=False,
+    add_completion=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
 for _command in (
     start_commands.init,
+    start_commands.doctor,
     build_commands.build,
     build_commands.track,
     build_commands.fit,
@@ -64,19 +73,34 @@ for _command in (
     report_commands.report,
     report_commands.view,
 ):
-    app.command()(_command)
-
-#: Exit code of a run stopped with Ctrl+C, as shells report it.
-INTERRUPTED = 130
+    _name = _command.__name__.replace("_", "-")
+    app.command(_name, cls=Command, context_settings=CONTEXT, short_help=SUMMARIES[_name])(_command)
 
 
 @app.callback(invoke_without_command=True)
-def _root(version: bool = typer.Option(False, "--version", help="Print the version and stop.")) -> None:
+def _root(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Print the version and stop.")] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="With an error, also print where in the program it arose.")
+    ] = False,
+    log: Annotated[
+        Path | None,
+        typer.Option("--log", metavar="FILE", help="Also write what is printed, with times and versions, to a file."),
+    ] = None,
+) -> None:
     if version:
         from jawusd import __version__
 
         typer.echo(f"jawusd {__version__}")
         raise typer.Exit
+    global _verbose  # errors are printed outside of every context
+    _verbose = verbose
+    if log is not None:
+        context.obj = context.with_resource(logged(log, sys.argv[1:]))
+
+
+_verbose = False
 
 
 def main() -> None:
@@ -85,11 +109,10 @@ def main() -> None:
         with explain_missing_packages():
             app()
     except JawusdError as error:
+        if _verbose:
+            traceback.print_exception(error)
         typer.echo(f"jawusd: {error}", err=True)
         sys.exit(error.exit_code)
-    except KeyboardInterrupt:
-        typer.echo("jawusd: stopped; finished stages are kept, continue with --resume.", err=True)
-        sys.exit(INTERRUPTED)
     except BrokenPipeError:
         # The reader of the pipe (head, less) has closed it.
         sys.stderr.close()

@@ -55,3 +55,16 @@ def _print_reference(as_json: bool) -> None:
 
     keys = capture_keys()
     emit({"keys": [asdict(entry) for entry in keys]}, as_json, lambda: reference_lines(keys, 80))
+
+
+def doctor(as_json: Json = False) -> None:
+    """Say what is installed and what works here: versions, extras, OpenGL, codecs, cores, the cache of compiled code.
+
+    Exit code 1 if something that a build needs does not work.
+    """
+    from jawusd.pipeline.doctor import examine, examined_lines
+
+    found = examine()
+    emit(found, as_json, lambda: examined_lines(found))
+    if found["problems"]:
+        raise typer.Exit(1)

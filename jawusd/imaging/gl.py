@@ -13,7 +13,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import MissingDependencyError
+from jawusd.errors import JawusdError, MissingDependencyError
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.imaging.pixel_counts import checked_screens
 
@@ -102,6 +102,18 @@ def open_context() -> moderngl.Context:
             hint="Update the graphics driver, or use the CPU backend.",
         )
     return context
+
+
+def describe_graphics() -> str:
+    """Return the name and version of OpenGL here, or why it cannot be used."""
+    try:
+        context = open_context()
+    except JawusdError as error:
+        return f"none ({error.message.rstrip('.')})"
+    try:
+        return f"{context.info['GL_VERSION']}, {context.info['GL_RENDERER']}"
+    finally:
+        context.release()
 
 
 class _Releasable(Protocol):

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NotRequired, TypedDict, TypeVar, cast
+from typing import TYPE_CHECKING, NotRequired, TypedDict, TypeVar, cast
 
 from jawusd import __version__
 from jawusd.errors import OutputError, explain_missing_packages
@@ -43,6 +43,9 @@ from jawusd.pipeline.state import (
     no_progress,
 )
 from jawusd.pipeline.track import TrackSummary, first_pass, model_pass, track_lines, track_summary
+
+if TYPE_CHECKING:
+    from jawusd.report.verdicts import BuildVerdict
 
 OLD_MASKS = "masks"  # folder in which version 0.1 made masks where the capture named none
 
@@ -86,6 +89,7 @@ class ReportSummary(TypedDict):
 
     capture: str
     file: NotRequired[str]
+    verdict: NotRequired[BuildVerdict]
     missing: NotRequired[str]
 
 
@@ -142,7 +146,7 @@ def build(
         if options.fresh:
             state.clear()
             delete_masks(folder / OLD_MASKS)
-        return _Build(capture, folder, options, state, progress or no_progress).run(tell)
+        return StagedBuild(capture, folder, options, state, progress or no_progress).run(tell)
 
 
 def check_folder(folder: Path, options: BuildOptions) -> None:
@@ -163,7 +167,7 @@ def check_folder(folder: Path, options: BuildOptions) -> None:
         raise OutputError("exists and is not empty.", path=folder, hint="Name a new folder.")
 
 
-class _Build:
+class StagedBuild:
     """One run of the stages over one capture."""
 
     def __init__(
@@ -321,8 +325,8 @@ class _Build:
         if missing is not None:
             # The rig is complete without; the summary says what is missing and how to get it.
             return [], {"capture": place, "missing": missing}
-        path = write_build_report(self.folder, BuildFacts(self.state.stages, self.capture), self.progress)
-        return [path], {"capture": place, "file": path.name}
+        path, verdict = write_build_report(self.folder, BuildFacts(self.state.stages, self.capture), self.progress)
+        return [path], {"capture": place, "file": path.name, "verdict": verdict}
 
 
 def build_lines(summary: BuildSummary) -> list[str]:
@@ -347,4 +351,23 @@ def build_lines(summary: BuildSummary) -> list[str]:
     )
     report = summary["report"]
     shown = f"{summary['folder']}/{report['file']}" if "file" in report else f"none: {report['missing']}"
-    return [*lines, f"time: {seconds}", f"rig: {summary['folder']}/actor.usda", f"report: {shown}"]
+    ends = [f"time: {seconds}", f"rig: {summary['folder']}/actor.usda", f"report: {shown}"]
+    return [*lines, *ends, *_verdict_lines(report)]
+
+
+_MOST_REASONS = 4
+
+
+def _verdict_lines(report: ReportSummary) -> list[str]:
+    """Return the verdict on the build: what the report says, with the figures that make it so."""
+    if "verdict" not in report:
+        return ["verdict: none, there is no report that judges it"]
+    grade, because = report["verdict"]["grade"], report["verdict"]["because"]
+    words = {
+        "good": "good",
+        "look": "usable; look at this in the report first:",
+        "bad": "not usable as it is, because of:",
+        "open": "none, there is nothing to judge it by",
+    }
+    more = [f"and {len(because) - _MOST_REASONS} more"] if len(because) > _MOST_REASONS else []
+    return [f"verdict: {words.get(grade, grade)}", *(f"  {one}" for one in (*because[:_MOST_REASONS], *more))]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from importlib import metadata
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import TYPE_CHECKING, TypeVar, cast
 
 from jawusd import __version__
 from jawusd.errors import FormatError, JawusdError, MissingDependencyError, explain_missing_packages
@@ -35,6 +35,9 @@ from jawusd.pipeline.state import (
     no_progress,
 )
 
+if TYPE_CHECKING:
+    from jawusd.report.verdicts import BuildVerdict
+
 T = TypeVar("T")
 
 REPORT_FILE = "report.html"
@@ -58,8 +61,8 @@ class BuildFacts:
 @explain_missing_packages()
 def write_build_report(
     folder: Path, facts: BuildFacts, progress: Progress, experiments: Experiments | None = None
-) -> Path:
-    """Write report.html of a finished build and return its path.
+) -> tuple[Path, BuildVerdict]:
+    """Write report.html of a finished build; return its path and what it says in short.
 
     Args:
         experiments: already done in full; without them those that take seconds are done.
@@ -108,9 +111,9 @@ def write_build_report(
         contacts=contacts,
     )
     progress("report", 3, 4)
-    write_document(folder / REPORT_FILE, data)
+    verdict = write_document(folder / REPORT_FILE, data)
     progress("report", 4, 4)
-    return folder / REPORT_FILE
+    return folder / REPORT_FILE, verdict
 
 
 def report_build(
@@ -143,10 +146,12 @@ def report_build(
         state = BuildState(folder)
         given = open_capture(capture, allow_outside=allow_outside) if capture is not None else None
         facts = build_facts(folder, state, given, allow_outside=allow_outside)
-        path = write_build_report(folder, facts, progress, experiments)
+        path, verdict = write_build_report(folder, facts, progress, experiments)
         # The next --resume must find the file as recorded, or it would write the report again.
         known = state.stages.get("report")
-        result = {"capture": place_of(facts.capture, folder)} if facts.capture else dict(known.result if known else {})
+        result = dict(known.result if known else {}) | {"file": path.name, "verdict": verdict}
+        if facts.capture:
+            result["capture"] = place_of(facts.capture, folder)
         state.finish("report", known.inputs if known else "", [path], known.seconds if known else 0.0, result)
     return path
 

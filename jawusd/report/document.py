@@ -29,19 +29,20 @@ from jawusd.report.ranges import human_ranges
 from jawusd.report.replay import replay_data
 from jawusd.report.style import inline_svg
 from jawusd.report.timeline import model_figure, tracking_figure
-from jawusd.report.verdicts import MARKS, WORDS, judge, overall
+from jawusd.report.verdicts import MARKS, WORDS, BuildVerdict, in_short, judge, overall
 
 _LISTED = 60  # frames named one by one
 _PLACES = ("mandible", "incisor", "molar_left", "molar_right", "condyle_left", "condyle_right")
 
 
-def write_document(path: str | os.PathLike[str], data: ReportData) -> None:
-    """Write the report to an HTML file.
+def write_document(path: str | os.PathLike[str], data: ReportData) -> BuildVerdict:
+    """Write the report to an HTML file; return what it says in short.
 
     Raises:
         OutputError: the file cannot be written.
     """
     write_text_atomic(path, document(data))
+    return in_short(judge(data))
 
 
 def document(data: ReportData) -> str:

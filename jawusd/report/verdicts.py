@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TypedDict
 
 import numpy as np
 
@@ -82,6 +83,22 @@ def judge(data: ReportData) -> list[Verdict]:
 def overall(verdicts: Iterable[Verdict]) -> str:
     """Return the worst grade of verdicts."""
     return _worst([verdict.grade for verdict in verdicts])
+
+
+class BuildVerdict(TypedDict):
+    """Hold the verdict on a build: the worst grade of its stages, and which figures make it so."""
+
+    grade: str
+    because: list[str]
+
+
+def in_short(verdicts: Iterable[Verdict]) -> BuildVerdict:
+    """Return the worst grade, and the figures that have it, with their limits."""
+    verdicts = list(verdicts)
+    grade = overall(verdicts)
+    checks = [(verdict.stage, check) for verdict in verdicts for check in verdict.checks if check.grade == grade]
+    because = [f"{stage}: {check.name} {check.found} ({check.limit})" for stage, check in checks]
+    return {"grade": grade, "because": because if grade in (LOOK, BAD) else []}
 
 
 def _worst(grades: list[str]) -> str:

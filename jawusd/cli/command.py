@@ -1,0 +1,69 @@
+"""What all commands share on the command line: -h, vectors with commas, and what Ctrl+C leaves behind."""
+
+from __future__ import annotations
+
+import re
+from typing import NoReturn
+
+import typer
+from typer.core import TyperCommand
+
+from jawusd.cli.log import RunLog
+from jawusd.errors import JawusdError
+
+#: Exit code of a run stopped with Ctrl+C, as shells report it.
+INTERRUPTED = 130
+CONTEXT = {"help_option_names": ["-h", "--help"]}
+
+_VECTOR = re.compile(r"[-+]?[\d.eE+-]+(,[-+]?[\d.eE+-]+){2}")
+_VECTORS = ("--d", "--point", "--target", "--start")
+
+# What is kept of each command's work, and how to go on; all other commands write whole files at their end only.
+_KEPT = {
+    "build": "finished stages are kept; go on with the same command and --resume, start over with --fresh",
+    "build-many": "captures and stages that were finished are kept; go on with the same command and --resume",
+    "segment": "finished frames are kept; go on with the same command and --resume",
+    "plates": "the pictures written so far are kept; start over with --force",
+    "demo": "the files written so far are kept, and no capture without its capture.toml; start over with --force",
+    "bake": "the files written so far are kept, and are no rig before all are there; start over with --force",
+}
+_ELSE = "nothing was written that is not whole"
+
+
+class Command(TyperCommand):
+    """A command of jawusd."""
+
+    def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]
+        """Take vectors as `--d 20,2,1` too."""
+        return super().parse_args(ctx, with_vectors_split(args))
+
+    def invoke(self, ctx: typer.Context) -> object:  # type: ignore[override]
+        """Run, and say on Ctrl+C what is kept."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            interrupted(self.name or "")
+        except (JawusdError, OSError, RuntimeError) as error:
+            if isinstance(ctx.obj, RunLog) and not isinstance(error, typer.Exit):
+                ctx.obj.error(error)
+            raise
+
+
+def with_vectors_split(args: list[str]) -> list[str]:
+    """Return arguments with a,b,c after the options of vectors as three words."""
+    out: list[str] = []
+    for word in args:
+        option, sign, value = word.partition("=")
+        if sign and option in _VECTORS and _VECTOR.fullmatch(value):
+            out += [option, *value.split(",")]
+        elif out and out[-1] in _VECTORS and _VECTOR.fullmatch(word):
+            out += word.split(",")
+        else:
+            out.append(word)
+    return out
+
+
+def interrupted(command: str) -> NoReturn:
+    """Say that a command was stopped and what is kept of it, and end with the exit code of that."""
+    typer.echo(f"jawusd {command}: stopped; {_KEPT.get(command, _ELSE)}.", err=True)
+    raise typer.Exit(INTERRUPTED)

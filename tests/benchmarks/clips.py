@@ -1,0 +1,121 @@
+"""Track the same frames of a capture from its footage, stored in different ways; print how far the tracks are apart.
+
+    python tests/benchmarks/clips.py CAPTURE [--first 30] [--frames 8] [--kinds png8 exr ...]
+
+CAPTURE has videos and picks on its first frame. Each kind is made from the decoded pictures of its videos: numbered
+pictures, ProRes 422 HQ of 10 bits, a phone's clip (H.264, variable rate, stored turned by 90 degrees). Masks are made
+from the footage, so that every pixel counts. "away" is the largest distance of lower teeth vertices, against the upper
+ones, from where the videos as they are put them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "support"))
+
+from clip_files import KINDS, write_prores, write_sequence
+
+from jawusd.formats.capture import Capture, load_capture
+from jawusd.geometry import relative_pose, transform_points
+from jawusd.imaging.video import Video
+from jawusd.pipeline.calibrate import sync_cameras
+from jawusd.pipeline.prepare import load_meshes
+from jawusd.pipeline.segment import SegmentOptions, segment_teeth
+
+_AFTER = 2  # pictures after the last frame, so that clips end behind it
+
+
+def quiet(stage: str, done: int, total: int) -> None:
+    """Print nothing."""
+
+
+def write_phone(path: Path, images: np.ndarray, fps: float) -> Path:
+    """Write H.264 with jittered times, stored turned, to be turned back by 90 degrees."""
+    rng = np.random.default_rng(0)
+    base = Fraction(1, 90000)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001), options={"crf": "10"})
+        turned = np.rot90(images, 1, axes=(1, 2))
+        stream.height, stream.width = turned.shape[1:3]
+        stream.pix_fmt, stream.codec_context.time_base = "yuv420p", base
+        stream.time_base = base
+        for k, image in enumerate(turned):
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
+            frame.pts, frame.time_base = round(90000 * (k + (rng.uniform(-0.2, 0.2) if k else 0)) / fps), base
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    return path
+
+
+def restored(capture: Capture, offsets: dict[str, int], kind: str, folder: Path, first: int, count: int) -> tuple:
+    """Return the capture with clips of another kind, and their offsets; frames count from the first."""
+    cameras, shifted = [], {}
+    lead = min(offsets.values()) - max(offsets.values())
+    for camera in capture.cameras:
+        video = Video(camera.video)
+        start = max(0, first - offsets[camera.name] + lead)
+        stop = min(video.count, first + count - offsets[camera.name] + _AFTER)
+        images = np.stack([frame.image for frame in video.frames(start, stop, colour="rgb", threads=1)])
+        place = folder / camera.name
+        place.mkdir(parents=True)
+        if kind in KINDS:
+            path = write_sequence(place, images, kind, first=1000 + start)
+        elif kind == "prores":
+            path = write_prores(place / "clip.mov", images, Fraction(capture.fps).limit_denominator(1001))
+        else:
+            path = write_phone(place / "clip.mp4", images, capture.fps)
+        cameras.append(camera.model_copy(update={"video": path, "masks": None}))
+        shifted[camera.name] = offsets[camera.name] + start
+    zero = shifted[capture.reference]
+    picks = capture.bootstrap.model_copy(update={"frame": capture.bootstrap.frame - zero})
+    update = {"cameras": tuple(cameras), "frames": (first - zero, first + count - zero), "bootstrap": picks}
+    return capture.model_copy(update=update), {name: offset - zero for name, offset in shifted.items()}, zero
+
+
+def poses(capture: Capture, offsets: dict[str, int], folder: Path) -> dict[int, np.ndarray]:
+    """Return the pose of the lower teeth against the upper ones by frame, made from the footage."""
+    entries = segment_teeth(capture, offsets, folder, SegmentOptions(jobs=1), quiet)
+    found = {frame: np.array(entry["poses"]) for frame, entry in entries.items()}
+    return {frame: relative_pose(pair[0], pair[1]) for frame, pair in found.items()}
+
+
+def main() -> None:
+    """Run."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("capture", type=Path)
+    parser.add_argument("--first", type=int, default=30)
+    parser.add_argument("--frames", type=int, default=8)
+    parser.add_argument("--kinds", nargs="*", default=["png8", "png16", "tiff16", "dpx10", "exr", "prores", "phone"])
+    given = parser.parse_args()
+    capture = load_capture(given.capture)
+    offsets = sync_cameras(capture, quiet)["offsets"]
+    points = load_meshes(capture)["lower_teeth"].vertices
+    own = capture.model_copy(
+        update={
+            "frames": (given.first, given.first + given.frames),
+            "cameras": tuple(camera.model_copy(update={"masks": None}) for camera in capture.cameras),
+        }
+    )
+    with tempfile.TemporaryDirectory() as scratch:
+        wanted = poses(own, offsets, Path(scratch) / "own")
+        print(f"{'footage':10} {'frames':>6} {'away mean':>10} {'max [mm]':>9}")
+        for kind in given.kinds:
+            place = Path(scratch) / kind
+            other, shifted, zero = restored(capture, offsets, kind, place, given.first, given.frames)
+            found = poses(other, shifted, place / "masks")
+            pairs = [(T, wanted[frame + zero]) for frame, T in found.items()]
+            apart = [transform_points(T, points) - transform_points(true, points) for T, true in pairs]
+            away = [np.linalg.norm(one, axis=1).max() for one in apart]
+            print(f"{kind:10} {len(away):6} {np.mean(away):10.5f} {np.max(away):9.5f}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,159 @@
+"""What people expect of a program in a shell: help, versions, completion, logs, Ctrl+C, plans, exit codes."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import typer
+from package_copy import ROOT
+from short_example import write_short
+from typer.testing import CliRunner
+
+from jawusd import __version__, errors
+from jawusd.cli.command import with_vectors_split
+from jawusd.cli.main import app
+from jawusd.cli.summaries import EXIT_CODES, SUMMARIES
+from jawusd.pipeline.build import _verdict_lines
+from jawusd.pipeline.plan import about
+
+COMMANDS = typer.main.get_command(app).commands
+WIDTH = {"COLUMNS": "80", "TERMINAL_WIDTH": "80"}
+
+
+def run(*words):
+    return CliRunner(env=WIDTH).invoke(app, [str(word) for word in words])
+
+
+def test_help_fits_80_columns_and_every_summary_is_whole():
+    for flag in ("-h", "--help"):
+        printed = run(flag).stdout
+        assert max(map(len, printed.splitlines())) <= 80 and "..." not in printed.split("Commands:")[1]
+        for name, command in COMMANDS.items():
+            assert f"{name} " in printed and SUMMARIES[name] in printed and command.short_help == SUMMARIES[name]
+    assert set(COMMANDS) == set(SUMMARIES)
+
+
+@pytest.mark.parametrize("name", sorted(COMMANDS))
+def test_every_command_explains_itself(name):
+    for flag in ("-h", "--help"):
+        done = run(name, flag)
+        assert done.exit_code == 0 and max(map(len, done.stdout.splitlines())) <= 80
+    assert COMMANDS[name].help.strip().endswith(".")
+    assert SUMMARIES[name].endswith(".") and len(SUMMARIES[name]) <= 62
+
+
+def test_versions_and_completion():
+    assert run("--version").stdout == f"jawusd {__version__}\n"
+    env = {**os.environ, "_JAWUSD_COMPLETE": "complete_bash", "COMP_WORDS": "jawusd che", "COMP_CWORD": "1"}
+    words = [sys.executable, "-c", "import sys; sys.argv[0] = 'jawusd'; from jawusd.cli.main import app; app()"]
+    done = subprocess.run(words, env=env, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+    assert "check" in done.stdout.split()
+
+
+def test_exit_codes_are_those_of_the_errors():
+    told = {int(number) for number in re.findall(r"\b(\d+)\b", EXIT_CODES)}
+    kinds = [value for value in vars(errors).values() if isinstance(value, type) and issubclass(value, Exception)]
+    assert {kind.exit_code for kind in kinds} <= told and {0, 1, 2, 130} <= told
+    assert EXIT_CODES.split(":")[0] in run("-h").stdout
+
+
+@pytest.mark.parametrize(
+    ("given", "wanted"),
+    [
+        (["--d", "20,2,1"], ["--d", "20", "2", "1"]),
+        (["--d=20,-2,1.5"], ["--d", "20", "-2", "1.5"]),
+        (["--d", "-1,2e-1,.5", "x"], ["--d", "-1", "2e-1", ".5", "x"]),
+        (["--d", "20", "2", "1"], ["--d", "20", "2", "1"]),
+        (["--point", "1,2,3", "--target=4,5,6"], ["--point", "1", "2", "3", "--target", "4", "5", "6"]),
+        (["--columns", "1,2,3"], ["--columns", "1,2,3"]),
+        (["--d", "20,2"], ["--d", "20,2"]),
+    ],
+)
+def test_vectors_may_have_commas(given, wanted):
+    assert with_vectors_split(given) == wanted
+
+
+def program(*words, **options):
+    words = [sys.executable, "-m", "jawusd", *map(str, words)]
+    return subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False, **options)
+
+
+def test_a_log_holds_what_was_printed_and_where_an_error_arose(tmp_path):
+    log = tmp_path / "run.log"
+    done = program("--log", log, "check", tmp_path)
+    text = log.read_text()
+    assert done.returncode == 5 and f"check {tmp_path}" in text and __version__ in text
+    assert all(line.strip() in text for line in done.stdout.splitlines() if line.strip())
+    done = program("--log", log, "info", tmp_path / "none.usda")
+    assert done.returncode > 2 and "Traceback" not in done.stderr and "Traceback" in log.read_text()
+    assert "Traceback" in program("--verbose", "info", tmp_path / "none.usda").stderr
+    refused = program("--log", tmp_path / "none" / "run.log", "info", tmp_path / "none.usda")
+    assert refused.returncode == errors.OutputError.exit_code and "the log cannot be written" in refused.stderr
+
+
+def test_ctrl_c_says_what_is_kept_and_how_to_go_on(tmp_path):
+    capture = write_short(tmp_path / "capture", 40)
+    words = [sys.executable, "-m", "jawusd", "build", str(capture), "-o", str(tmp_path / "out"), "--jobs", "1"]
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)  # what a shell's child has
+    try:
+        process = subprocess.Popen(words, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    finally:
+        signal.signal(signal.SIGINT, handler)
+    try:
+        until = time.monotonic() + 300
+        while not (tmp_path / "out" / "build.json").exists() and time.monotonic() < until:
+            time.sleep(0.1)
+        process.send_signal(signal.SIGINT)
+        _, told = process.communicate(timeout=120)
+    finally:
+        process.kill()
+    assert process.returncode == 130
+    assert told.splitlines()[-1].startswith("jawusd build: stopped; finished stages are kept") and "--resume" in told
+    assert "Traceback" not in told
+    # What it says is true: a plan keeps what was finished, and runs the rest.
+    plan = json.loads(run("build", capture, "-o", tmp_path / "out", "--resume", "--dry-run", "--json").stdout)
+    kept = {stage["name"]: stage["keeps"] for stage in plan["stages"]}
+    assert kept["check"] and not kept["report"]
+
+
+def test_a_dry_run_writes_nothing(tmp_path):
+    capture = write_short(tmp_path / "capture", 4)
+    done = run("build", capture, "-o", tmp_path / "out", "--dry-run")
+    assert done.exit_code == 0 and not (tmp_path / "out").exists()
+    *stages, total = done.stdout.splitlines()
+    names = [line.split()[0] for line in stages]
+    assert [name for name in names if name != "scans"] == ["check", "sync", "track", "fit", "aid", "bake", "report"]
+    assert all("runs, about" in line for line in stages) and "nothing was written" in total
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"), [(1, "5 seconds"), (61, "60 seconds"), (600, "10 minutes"), (9000, "2.5 hours")]
+)
+def test_times_in_words(seconds, words):
+    assert about(seconds) == words
+
+
+def test_a_build_ends_with_its_verdict():
+    because = [f"track: figure {k} 3 % (good up to 1 %)" for k in range(6)]
+    file = {"capture": "x", "file": "report.html"}
+    assert _verdict_lines({**file, "verdict": {"grade": "good", "because": []}}) == ["verdict: good"]
+    assert _verdict_lines({**file, "verdict": {"grade": "bad", "because": because}}) == [
+        "verdict: not usable as it is, because of:",
+        *(f"  {one}" for one in because[:4]),
+        "  and 2 more",
+    ]
+    assert "no report" in _verdict_lines({"capture": "x", "missing": "jinja2"})[0]
+
+
+def test_the_doctor_looks_at_what_a_build_needs():
+    done = run("doctor", "--json")
+    found = json.loads(done.stdout)
+    assert found["jawusd"] == __version__ and found["cores"] >= 1 and found["versions"]["numpy"]
+    assert found["codecs"]["h264"] and found["codecs"]["prores"] and {"build", "view"} <= set(found["extras"])
+    assert done.exit_code == (1 if found["problems"] else 0)
+    assert "OpenGL:" in run("doctor").stdout
