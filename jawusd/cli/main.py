@@ -43,6 +43,7 @@ app = typer.Typer(
 for _command in (
     start_commands.init,
     start_commands.doctor,
+    start_commands.cameras,
     build_commands.build,
     build_commands.track,
     build_commands.fit,

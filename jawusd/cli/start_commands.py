@@ -1,4 +1,4 @@
-"""Commands of a first hour: init, which begins a capture from a folder."""
+"""Commands of a first hour: init, which begins a capture from a folder, doctor, and cameras of other programs."""
 
 from __future__ import annotations
 
@@ -68,3 +68,37 @@ def doctor(as_json: Json = False) -> None:
     emit(found, as_json, lambda: examined_lines(found))
     if found["problems"]:
         raise typer.Exit(1)
+
+
+def cameras(
+    source: Annotated[
+        Path,
+        typer.Argument(
+            help="TOML (aniposelib, Pose2Sim, Caliscope), Metashape XML, RealityScan CSV or XMP, COLMAP, "
+            "transforms.json, OpenCV YAML, or a USD stage.",
+            show_default=False,
+        ),
+    ],
+    out: Annotated[Path, typer.Option("-o", "--out", help=".toml, .usda, or a folder for COLMAP.", show_default=False)],
+    unit_mm: Annotated[
+        float, typer.Option(min=1e-6, help="Length of the source's unit: 1000 if it is in metres.")
+    ] = 1.0,
+    size: Annotated[
+        str | None, typer.Option(help="Size of the pictures, 1920x1080, if the source has none.", show_default=False)
+    ] = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Carry calibrated cameras from the files of one program to those of another, in mm."""
+    from jawusd.pipeline.camera_convert import camera_lines, convert_cameras
+
+    given = None
+    if size is not None:
+        words = size.lower().split("x")
+        if len(words) != 2 or not all(word.isdecimal() and int(word) > 0 for word in words):
+            raise typer.BadParameter(f'"{size}" is not of the form 1920x1080.', param_hint="--size")
+        given = int(words[0]), int(words[1])
+    refuse_existing(out, force)
+    found, files = convert_cameras(source, out, unit_mm, given)
+    data = {"cameras": [camera.name for camera in found], "files": [str(path) for path in files]}
+    emit(data, as_json, lambda: camera_lines(found, files))

@@ -31,6 +31,7 @@ SUMMARIES = {
     "plates": "Write the footage without lens distortion.",
     "report": "Write the report of a build or a solve again.",
     "view": "See a rig or a capture in the browser.",
+    "cameras": "Carry calibrated cameras between programs.",
     "doctor": "Say what is installed and what works here.",
 }
 

@@ -1,7 +1,8 @@
-"""Camera calibration: the TOML of aniposelib, lengths in mm.
+"""Camera calibration: the TOML of aniposelib, lengths in mm; Pose2Sim and Caliscope write the same keys, in metres.
 
 Each table `[cam_0]`, `[cam_1]`, ... holds name, size, matrix, distortions, rotation (Rodrigues vector) and
-translation; the last two take world to camera coordinates.
+translation; the last two take world to camera coordinates. Pose2Sim calls the tables after its cameras, Caliscope puts
+them below `[cameras]`, by port.
 """
 
 from __future__ import annotations
@@ -33,6 +34,11 @@ def load_calibration(path: str | os.PathLike[str]) -> list[Camera]:
     path = Path(path)
     data = read_toml(path)
     tables = sorted((k for k in data if _CAMERA_TABLE.match(k)), key=lambda k: int(k[4:]))
+    if not tables:
+        below = data.get("cameras")
+        if isinstance(below, dict):  # Caliscope
+            data = {f"cam_{port}": table for port, table in below.items()}
+        tables = [key for key, table in data.items() if isinstance(table, dict) and "matrix" in table]
     if not tables:
         raise CalibrationError('has no camera tables "[cam_0]", "[cam_1]", ...', path=path)
     cameras = [_camera(path, table, data[table]) for table in tables]

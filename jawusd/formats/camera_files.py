@@ -1,4 +1,7 @@
-"""Calibrations of other programs, recognised by their names: aniposelib TOML, COLMAP text, nerfstudio JSON.
+"""Calibrations of other programs, recognised by their names.
+
+TOML of aniposelib, Pose2Sim and Caliscope: `calibration`. XML of Metashape and XMP of RealityScan: `camera_xml`. CSV of
+RealityScan and YAML of OpenCV: `camera_tables`. Here: COLMAP text and nerfstudio JSON.
 
 COLMAP: `cameras.txt` and `images.txt` (https://colmap.github.io/format.html); rotation (w, x, y, z) and translation
 take world to camera. nerfstudio: `transforms.json` (https://docs.nerf.studio/quickstart/data_conventions.html);
@@ -10,7 +13,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
@@ -18,11 +21,14 @@ import numpy as np
 
 from jawusd.errors import CalibrationError
 from jawusd.formats.calibration import load_calibration
+from jawusd.formats.camera_tables import load_opencv_yaml, load_realityscan_csv
+from jawusd.formats.camera_xml import load_metashape, load_realityscan_xmp
 from jawusd.geometry import Camera, make_transform, matrix_from_wxyz, rigidity_defect, se3_inverse
 from jawusd.geometry.arrays import Array
 from jawusd.inputs import check_input
 
 _COLMAP = ("cameras.txt", "images.txt")
+_YAML = (".yml", ".yaml")
 _HALF_PX = 0.5
 # Per COLMAP model: which parameters are fx, fy, cx, cy and, from there on, OpenCV's distortion; SIMPLE ones share f.
 _MODELS = {
@@ -41,21 +47,35 @@ _MOST_VALUE = 1e300
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def load_cameras_file(path: str | os.PathLike[str], unit_mm: float = 1.0) -> list[Camera]:
+def load_cameras_file(
+    path: str | os.PathLike[str], unit_mm: float = 1.0, sizes: Mapping[str, tuple[int, int]] | None = None
+) -> list[Camera]:
     """Read cameras of any known kind of calibration, in the file's order: lengths in mm, OpenCV axes and pixels.
 
     Args:
-        path: aniposelib TOML, a COLMAP text model (its folder or one of its files) or nerfstudio's transforms.json.
+        path: TOML of aniposelib, Pose2Sim or Caliscope, a COLMAP text model (its folder or one of its files),
+            nerfstudio's transforms.json, Metashape XML, RealityScan CSV or (a folder of) XMP, OpenCV YAML.
+        unit_mm: length of the file's unit.
+        sizes: (width, height) [px] of the pictures by camera, for formats that do not hold them; see `lacks_sizes`.
 
     Raises:
         CalibrationError: a value is missing or wrong, or the camera model is not supported.
         FormatError: the file is damaged.
     """
     path = Path(path)
-    if path.is_dir() or path.name in _COLMAP:
+    suffix, known = path.suffix.lower(), {} if sizes is None else sizes
+    if path.name in _COLMAP or (path.is_dir() and not _others(path)):
         cameras = load_colmap(path if path.is_dir() else path.parent)
-    elif path.suffix == ".json":
+    elif suffix == ".json":
         cameras = load_nerfstudio(path)
+    elif suffix == ".xml":
+        cameras = load_metashape(path)
+    elif suffix == ".csv":
+        cameras = load_realityscan_csv(path, known)
+    elif suffix == ".xmp" or _others(path, ".xmp"):
+        cameras = load_realityscan_xmp(path if path.is_dir() else path.parent, known)
+    elif suffix in _YAML or path.is_dir():
+        cameras = load_opencv_yaml(calibration_files(path), known)
     else:
         cameras = load_calibration(path)
     poses = [make_transform(camera.T_cam_world[:3, :3], unit_mm * camera.T_cam_world[:3, 3]) for camera in cameras]
@@ -64,9 +84,27 @@ def load_cameras_file(path: str | os.PathLike[str], unit_mm: float = 1.0) -> lis
 
 def calibration_files(path: Path) -> list[Path]:
     """Return the files that make up a calibration."""
+    folder = path if path.is_dir() else path.parent
+    if path.suffix.lower() == ".xmp" or _others(path, ".xmp"):
+        return sorted(folder.glob("*.xmp"))
+    if path.is_dir() and (found := _others(path)):
+        return found
     if path.is_dir() or path.name in _COLMAP:
-        return [(path if path.is_dir() else path.parent) / name for name in _COLMAP]
-    return [path]
+        return [folder / name for name in _COLMAP]
+    pair = folder / f"extri{path.suffix}"
+    return [path, pair] if path.stem == "intri" and pair.exists() else [path]
+
+
+def lacks_sizes(path: Path) -> bool:
+    """Tell whether a calibration's format does not hold the size of the pictures."""
+    return path.is_dir() or path.suffix.lower() in (".csv", ".xmp", *_YAML)
+
+
+def _others(path: Path, *suffixes: str) -> list[Path]:
+    """Return the files in a folder that are a calibration with a file per camera."""
+    if not path.is_dir():
+        return []
+    return sorted(file for file in path.iterdir() if file.suffix.lower() in (suffixes or (".xmp", *_YAML)))
 
 
 def load_colmap(folder: str | os.PathLike[str]) -> list[Camera]:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jawusd.errors import CalibrationError, CaptureError, JawusdError, explain_missing_packages
-from jawusd.formats.camera_files import calibration_files, load_cameras_file
+from jawusd.formats.camera_files import calibration_files
 from jawusd.formats.capture import CameraSource, Capture, load_capture
 from jawusd.formats.finding import Finding
 from jawusd.formats.landmarks import load_landmarks
@@ -30,6 +30,7 @@ from jawusd.geometry import (
     transform_points,
 )
 from jawusd.geometry.arrays import Array
+from jawusd.pipeline.camera_convert import read_calibration
 from jawusd.pipeline.scan_labels import TEETH, LabelledScan, label_teeth
 from jawusd.pipeline.state import hash_files, hash_value
 
@@ -106,7 +107,7 @@ def _calibrated(capture: Capture) -> list[tuple[Camera, CameraSource]]:
             path=capture.folder / "capture.toml",
             hint="Name a calibration file there; jawusd calibrate makes one from [boards].",
         )
-    found = load_cameras_file(capture.calibration, capture.calibration_unit_mm)
+    found = read_calibration(capture.calibration, capture.calibration_unit_mm, lambda: _recorded_sizes(capture))
     known = {camera.name: camera for camera in found}
     missing = [source.name for source in capture.cameras if source.name not in known]
     if missing:
@@ -114,6 +115,12 @@ def _calibrated(capture: Capture) -> list[tuple[Camera, CameraSource]]:
             f"does not know camera {missing[0]} of the capture; it names {', '.join(known)}.", path=capture.calibration
         )
     return [(known[source.name], source) for source in capture.cameras]
+
+
+def _recorded_sizes(capture: Capture) -> dict[str, Size]:
+    from jawusd.imaging.footage import open_clip
+
+    return {camera.name: open_clip(camera.clip).size_px for camera in capture.cameras if camera.clip is not None}
 
 
 def _at_recorded_size(camera: Camera, capture: Capture, source: CameraSource) -> Camera:

@@ -13,8 +13,8 @@ import numpy as np
 
 from jawusd.errors import CaptureError, JawusdError, explain_missing_packages
 from jawusd.formats.atomic import write_text_atomic
-from jawusd.formats.camera_files import load_cameras_file
 from jawusd.formats.capture_template import BoardSketch, CameraSketch, CaptureSketch, capture_text
+from jawusd.pipeline.camera_convert import SameSize, read_calibration
 from jawusd.pipeline.folder_files import FoundFiles, camera_names, find_files, pair, with_masks, words
 from jawusd.pipeline.state import Progress
 
@@ -119,7 +119,9 @@ def _calibration(folder: Path, files: FoundFiles, out: CaptureStart) -> tuple[Pu
         if path.name == "images.txt":
             continue
         try:
-            readable[path] = [camera.name for camera in load_cameras_file(folder / path)]
+            readable[path] = [
+                camera.name for camera in read_calibration(folder / path, 1.0, lambda: SameSize((1920, 1080)))
+            ]
         except JawusdError:
             continue
     if len(readable) > 1:

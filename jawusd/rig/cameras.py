@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Container, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pxr import Gf, Kind, Sdf, Usd, UsdGeom
+from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom
 
-from jawusd.errors import RigError
+from jawusd.errors import CalibrationError, RigError
 from jawusd.geometry.arrays import Array
 from jawusd.geometry.camera import Camera
-from jawusd.geometry.se3 import se3_inverse
+from jawusd.geometry.se3 import make_transform, se3_inverse
+from jawusd.inputs import check_input
 from jawusd.rig import _gf
 from jawusd.rig.layers import add_pose, define_prim, new_layer, relative_path, set_attribute, stage_of, write_layer
 
@@ -109,6 +110,83 @@ def _motion_layer(frames: Array, T_world_skull: Array, fps: float) -> Sdf.Layer:
         translate.Set(translation, frame)
         orient.Set(rotation, frame)
     return layer
+
+
+def write_camera_stage(out: str | os.PathLike[str], cameras: Sequence[Camera]) -> Path:
+    """Write calibrated cameras alone as a stage in mm, in their own world; for attributes see `write_cameras`.
+
+    Raises:
+        RigError: Two cameras of one name, or one with skewed pixels.
+        OutputError: The file cannot be written.
+    """
+    out = Path(out)
+    names = [Sdf.Path(TAKE_CAMERAS).AppendChild(_prim_name(camera.name)) for camera in cameras]
+    if not names or len(set(names)) < len(names):
+        raise RigError("a stage of cameras needs some, each with a name of its own.", path=out)
+    layer = new_layer(24.0, TAKE)
+    define_prim(layer, TAKE, "Xform").kind = Kind.Tokens.assembly
+    define_prim(layer, TAKE_CAMERAS, "Scope")
+    stage = stage_of(layer)
+    for name, camera in zip(names, cameras, strict=True):
+        _define_camera(stage, name, camera, PLATE.format(name=camera.name))
+    del stage
+    return write_layer(layer, out)
+
+
+def read_cameras(path: str | os.PathLike[str], sizes: Callable[[], Mapping[str, tuple[int, int]]]) -> list[Camera]:
+    """Read the perspective cameras of a stage, by the names of their prims; lengths in mm, OpenCV axes and pixels.
+
+    The picture spans the aperture, shifted by its offsets; `jaw:imageSize` says its size [px], else the footage, and
+    `jaw:distortion` OpenCV's coefficients. Cameras that move are read at their first time.
+
+    Args:
+        path: A stage; Alembic only where OpenUSD has its plug-in.
+        sizes: Returns (width, height) [px] by camera, for cameras without `jaw:imageSize`.
+
+    Raises:
+        RigError: The stage cannot be opened, or holds no perspective camera.
+        CalibrationError: A size is not known.
+    """
+    check_input(path, RigError)
+    try:
+        stage = Usd.Stage.Open(str(path))
+    except Tf.ErrorException as error:
+        raise RigError("cannot be opened as a stage; export cameras as .usd, .usda or .usdc.", path=path) from error
+    mm = UsdGeom.GetStageMetersPerUnit(stage) * 1000.0
+    prims = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Camera)]
+    known: Mapping[str, tuple[int, int]] | None = None
+    out = []
+    for prim in prims:
+        size = prim.GetAttribute("jaw:imageSize").Get() if prim.HasAttribute("jaw:imageSize") else None
+        if size is None:
+            known = sizes() if known is None else known
+            if prim.GetName() not in known:
+                raise CalibrationError(
+                    f"camera {prim.GetName()} has no jaw:imageSize, and there is no footage of that name.",
+                    path=path,
+                    hint="Name each [[camera]] as the camera's prim, or give --size.",
+                )
+            size = known[prim.GetName()]
+        out.append(_read_camera(prim, (int(size[0]), int(size[1])), mm))
+    if not out:
+        raise RigError("holds no camera.", path=path)
+    return out
+
+
+def _read_camera(prim: Usd.Prim, size: tuple[int, int], mm: float) -> Camera:
+    camera = UsdGeom.Camera(prim)
+    samples = UsdGeom.Xformable(prim).GetTimeSamples()
+    time = Usd.TimeCode(samples[0]) if samples else Usd.TimeCode.Default()
+    optics = camera.GetCamera(time)
+    wide, high, focal = optics.horizontalAperture, optics.verticalAperture, optics.focalLength
+    cx = size[0] * (0.5 - optics.horizontalApertureOffset / wide) - 0.5
+    cy = size[1] * (0.5 + optics.verticalApertureOffset / high) - 0.5
+    K = np.array([[focal / wide * size[0], 0.0, cx], [0.0, focal / high * size[1], cy], [0.0, 0.0, 1.0]])
+    placed = np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(time), np.float64).T
+    u, _, vt = np.linalg.svd(placed[:3, :3])  # scales of parents move cameras and change no picture
+    T_world_cam = make_transform(u @ vt @ _FLIP[:3, :3], mm * placed[:3, 3])
+    lens = prim.GetAttribute("jaw:distortion").Get() if prim.HasAttribute("jaw:distortion") else None
+    return Camera(prim.GetName(), size, K, np.zeros(0) if lens is None else np.array(lens), se3_inverse(T_world_cam))
 
 
 def _define_camera(stage: Usd.Stage, path: Sdf.Path, camera: Camera, plate: str) -> None:

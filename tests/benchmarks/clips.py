@@ -47,6 +47,7 @@ def write_phone(path: Path, images: np.ndarray, fps: float) -> Path:
         stream.height, stream.width = turned.shape[1:3]
         stream.pix_fmt, stream.codec_context.time_base = "yuv420p", base
         stream.time_base = base
+        stream.set_display_rotation(-90)
         for k, image in enumerate(turned):
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
             frame.pts, frame.time_base = round(90000 * (k + (rng.uniform(-0.2, 0.2) if k else 0)) / fps), base

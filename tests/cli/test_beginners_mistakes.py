@@ -1,0 +1,112 @@
+"""What a newcomer gets wrong at the shell, as opposed to in the file (tests/formats/test_capture_errors.py).
+
+Each is one message, without a traceback, that names what was given and what to do.
+"""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from package_copy import ROOT
+
+from jawusd.imaging.video_writer import VideoWriter
+
+CAPTURE = """format = "jawusd-capture/1"
+name = "x"
+fps = 24.0
+calibration = "cal.toml"
+[scans]
+upper_teeth = "u.ply"
+lower_teeth = "l.ply"
+[[camera]]
+name = "left"
+video = "left.mp4"
+[[camera]]
+name = "right"
+video = "right.mp4"
+"""
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """Return a folder with a capture, clips, a rig's folder that is none, and files of other kinds."""
+    import trimesh
+
+    folder = tmp_path_factory.mktemp("newcomer")
+    for name in ("left", "right"):
+        with VideoWriter(folder / f"{name}.mp4", (64, 48), 24.0) as writer:
+            for k in range(8):
+                writer.write(np.full((48, 64), 25 * k, np.uint8))
+    for name in ("u", "l"):
+        trimesh.creation.box((60, 10, 50)).subdivide().subdivide().export(folder / f"{name}.ply")
+    (folder / "capture.toml").write_text(CAPTURE)
+    (folder / "cal.toml").write_text("[cam_0]\n")
+    (folder / "empty").mkdir()
+    (folder / "full").mkdir()
+    (folder / "full" / "diary.txt").touch()
+    (folder / "two").mkdir()
+    for name in ("anna_upper.stl", "bob_upper.stl", "anna_lower.stl", "bob_lower.stl"):
+        (folder / "two" / name).touch()
+    for name in ("plates", "sequence"):
+        (folder / name).mkdir()
+    for number in (1, 2):
+        (folder / "plates" / f"left.{number:04d}.exr").write_bytes(b"no picture")
+    text = CAPTURE.replace('"left.mp4"', '"plates/lefft.####.exr"')
+    (folder / "sequence" / "capture.toml").write_text(text.replace('"plates', '"../plates'))
+    (folder / "spaces in.toml").write_text("this is no TOML")
+    return folder
+
+
+MISTAKES = [
+    ("a capture that is not there", ["check", "nowhere"], ["there is no such file", "nowhere"]),
+    ("a folder without capture.toml", ["check", "empty"], ["there is no such file", "jawusd init"]),
+    ("a video in place of a capture", ["build", "left.mp4", "-o", "out"], ["no capture", "jawusd init"]),
+    ("a scan in place of a capture", ["build", "u.ply", "-o", "out"], ["u.ply"]),
+    ("text that is no TOML", ["check", "spaces in.toml"], ["is not valid TOML"]),
+    ("no output folder", ["build", "."], ["--out"]),
+    ("an output that is a file", ["build", ".", "-o", "u.ply"], ["is a file; the rig needs a folder"]),
+    ("an output with other files", ["build", ".", "-o", "full"], ["exists and is not empty", "Name a new folder"]),
+    ("a calibration that lacks all", ["build", ".", "-o", "out"], ['[cam_0] has no "size"']),
+    ("a capture in place of a rig", ["info", "."], ["without actor.usda", "jawusd build"]),
+    (
+        "a folder in place of a rig",
+        ["pose", "empty", "--d", "1,2,3"],
+        ["without actor.usda", "Name the folder of a build"],
+    ),
+    ("a rig that is not there", ["info", "out/actor.usda"], ["out/actor.usda"]),
+    ("a video in place of a rig", ["info", "left.mp4"], ["left.mp4"]),
+    ("two numbers of three", ["pose", "u.ply", "--d", "20,2"], ["--d"]),
+    ("words in place of numbers", ["pose", "u.ply", "--d", "open", "2", "1"], ["valid number", "--d"]),
+    ("a command that is none", ["bild", "."], ["bild"]),
+    ("an option that is none", ["build", ".", "--output", "out"], ["--output"]),
+    ("a model that is none", ["build", ".", "-o", "out", "--model", "linear"], ["linear", "anchored"]),
+    ("both of two opposites", ["build", ".", "-o", "empty", "--resume", "--fresh"], ["cal.toml"]),
+    ("a folder for init that is none", ["init", "nowhere"], ["there is no such folder"]),
+    ("a video for init", ["init", "left.mp4"], ["is a file", "Name the folder"]),
+    ("a second init", ["init", "."], ["exists already", "--force"]),
+    ("two people in one folder", ["init", "two"], ["anna_upper.stl, bob_upper.stl", "one folder is one person"]),
+    ("one clip to align", ["sync", "left.mp4"], ["left.mp4"]),
+    ("clips without a flash", ["sync", "left.mp4", "right.mp4"], ["shows no light flash"]),
+    ("a clip twice", ["sync", "left.mp4", "left.mp4"], ["given twice"]),
+    ("a sequence that is not there", ["check", "sequence", "--allow-outside"], ["lefft.####.exr", "left.%04d.exr"]),
+    ("a calibration of nothing", ["cameras", "u.ply", "-o", "a.toml"], ["u.ply"]),
+    ("cameras to a format that is not written", ["cameras", "cal.toml", "-o", "a.fbx"], ["cal.toml"]),
+    ("a size that is none", ["cameras", "cal.toml", "-o", "a.toml", "--size", "big"], ["1920x1080"]),
+]
+
+
+@pytest.mark.parametrize(("name", "words", "told"), MISTAKES, ids=[name for name, _, _ in MISTAKES])
+def test_a_mistake_is_one_message(place, name, words, told):
+    done = subprocess.run(
+        [sys.executable, "-m", "jawusd", *words],
+        cwd=place,
+        env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin", "OMP_NUM_THREADS": "1", "HOME": str(place)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    said = done.stderr + done.stdout
+    assert done.returncode not in (0, 70) and "Traceback" not in said, said
+    assert all(word in " ".join(said.split()) for word in told), said
