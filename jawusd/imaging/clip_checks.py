@@ -6,7 +6,9 @@ from collections.abc import Iterator, Mapping
 
 from jawusd.errors import JawusdError
 from jawusd.formats.finding import Finding
+from jawusd.formats.numbered import gaps
 from jawusd.imaging.clip import Clip
+from jawusd.imaging.picture_sequence import PictureSequence
 
 # Cameras that drift apart by less than this over a take keep their offset [frames].
 _DRIFT_FRAMES = 0.5
@@ -53,7 +55,17 @@ def rate_findings(videos: Mapping[str, Clip], fps: float, path: str) -> Iterator
                 camera=name,
                 hint="Correct fps, or convert the clip: speeds and times would be wrong.",
             )
-        if (share := video.timeline.missing / video.timeline.count) > _MISSING_SHARE:
+        if isinstance(video, PictureSequence) and video.timeline.missing:
+            yield Finding(
+                "pictures_missing",
+                "warning",
+                f"pictures {gaps(video.numbers.tolist())} are missing",
+                video.timeline.missing / video.timeline.count,
+                path=str(video.path),
+                camera=name,
+                hint="Export them again, or leave it: those frames are tracked without this camera.",
+            )
+        elif (share := video.timeline.missing / video.timeline.count) > _MISSING_SHARE:
             yield Finding(
                 "pictures_missing",
                 "warning",

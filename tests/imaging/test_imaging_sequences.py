@@ -12,6 +12,7 @@ from clip_files import KINDS, with_exr_header, write_picture, write_prores, writ
 from jawusd.errors import CaptureError
 from jawusd.formats.clip_source import ClipSource
 from jawusd.formats.numbered import gaps, groups, numbered_files
+from jawusd.imaging.clip_checks import rate_findings
 from jawusd.imaging.display import to_display
 from jawusd.imaging.footage import open_clip
 from jawusd.imaging.stored_picture import read_header, read_stored
@@ -50,6 +51,8 @@ def test_gaps_are_frames_without_a_picture(images, tmp_path):
     for found, wanted in zip(shown, (0, None, 2, 5)):
         assert found is None if wanted is None else np.array_equal(found, images[wanted])
     assert gaps(clip.numbers.tolist()) == "1002, 1004"
+    (told,) = rate_findings({"a": clip}, 25.0, "capture.toml")
+    assert told.kind == "pictures_missing" and told.message == "pictures 1002, 1004 are missing"
 
 
 @pytest.mark.parametrize(
