@@ -33,7 +33,7 @@ from jawusd.geometry.lens_fit import opencv_radial
 Size = tuple[int, int]
 
 _MOST_BYTES = 64 << 20
-_HALF_PX = 0.5
+_HALF_PX, _MOST_PX = 0.5, 1e6
 _FILM_MM = 36.0
 _LARGEST_ERROR_PX = 0.05  # of a lens written with other coefficients
 _LARGEST_DEFECT = 1e-3
@@ -162,7 +162,9 @@ def _metashape_lens(path: Path, sensor: ElementTree.Element) -> tuple[Size, Arra
     def value(key: str, other: float = 0.0) -> float:
         return other if key not in values else float(_numbers(path, values[key], 1, f"sensor {label} {key}")[0])
 
-    size = (int(resolution.get("width", 0)), int(resolution.get("height", 0)))
+    sides = (_numbers(path, resolution.get(side, "0"), 1, f"sensor {label} {side}")[0] for side in ("width", "height"))
+    width, height = (int(min(side, _MOST_PX)) for side in sides)
+    size = (width, height)
     focal = value("f", value("fy"))
     if not focal > 0 or min(size) < 1:
         raise CalibrationError(f"sensor {label} has no focal length or no resolution.", path=path)

@@ -8,15 +8,16 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom
+from pxr import Gf, Kind, Sdf, Usd, UsdGeom
 
 from jawusd.errors import CalibrationError, RigError
 from jawusd.geometry.arrays import Array
 from jawusd.geometry.camera import Camera
 from jawusd.geometry.se3 import make_transform, se3_inverse
-from jawusd.inputs import check_input
 from jawusd.rig import _gf
 from jawusd.rig.layers import add_pose, define_prim, new_layer, relative_path, set_attribute, stage_of, write_layer
+from jawusd.rig.read import open_stage
+from jawusd.rig.untrusted import raises_format_error
 
 TAKE, TAKE_ACTOR, TAKE_CAMERAS = "/Take", "/Take/Actor", "/Take/Cameras"
 
@@ -133,6 +134,7 @@ def write_camera_stage(out: str | os.PathLike[str], cameras: Sequence[Camera]) -
     return write_layer(layer, out)
 
 
+@raises_format_error(0)
 def read_cameras(path: str | os.PathLike[str], sizes: Callable[[], Mapping[str, tuple[int, int]]]) -> list[Camera]:
     """Read the perspective cameras of a stage, by the names of their prims; lengths in mm, OpenCV axes and pixels.
 
@@ -144,14 +146,11 @@ def read_cameras(path: str | os.PathLike[str], sizes: Callable[[], Mapping[str, 
         sizes: Returns (width, height) [px] by camera, for cameras without `jaw:imageSize`.
 
     Raises:
-        RigError: The stage cannot be opened, or holds no perspective camera.
+        RigError: The stage cannot be opened, names files outside its folder, or holds no perspective camera.
         CalibrationError: A size is not known.
+        FormatError: A value has an unexpected type.
     """
-    check_input(path, RigError)
-    try:
-        stage = Usd.Stage.Open(str(path))
-    except Tf.ErrorException as error:
-        raise RigError("cannot be opened as a stage; export cameras as .usd, .usda or .usdc.", path=path) from error
+    stage = open_stage(path)
     mm = UsdGeom.GetStageMetersPerUnit(stage) * 1000.0
     prims = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Camera)]
     known: Mapping[str, tuple[int, int]] | None = None
