@@ -67,7 +67,7 @@ def build(
     allow_outside: Outside = False,
     as_json: Json = False,
 ) -> None:
-    """Turn a capture into a rig: calibrate and segment if need be, sync, track, fit, track hard frames again, bake."""
+    """Turn a capture into a rig: calibrate if need be, sync, track, fit, track hard frames again, bake."""
     from jawusd.pipeline import build as stages
 
     _check_backend(solver, backend)

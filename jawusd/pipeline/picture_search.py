@@ -58,14 +58,13 @@ class PictureSearch(Generic[T]):
     """Search the teeth.
 
     Attributes:
-        capture, offsets, footage: frame offset by camera; pictures of the cameras that have a video.
+        capture, footage: pictures of the cameras that have a video.
         cameras: how many those are.
         near: returns a pose on a frame by cameras with rough masks, None if there is none.
         judged: returns a better pose near one on a frame, and the share of the contour in sight that fits, 0 .. 1.
     """
 
     capture: Capture
-    offsets: Mapping[str, int]
     footage: ColourFootage
     cameras: int
     near: Callable[[Sequence[CameraSource], int], T | None]
@@ -114,7 +113,8 @@ class PictureSearch(Generic[T]):
         return out
 
     def _at(self, look: _Look) -> Begin[T] | None:
-        numbers = {name: look.frame - self.offsets[name] for name in look.rows}
+        known = {name: self.footage.number(name, look.frame) for name in look.rows}
+        numbers = {name: number for name, number in known.items() if number is not None}
         with tempfile.TemporaryDirectory() as folder:
             masked = masked_cameras(self.capture, look.rows, numbers, Path(folder))
             near = self.near(masked, look.frame)

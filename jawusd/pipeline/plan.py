@@ -25,7 +25,6 @@ _SECONDS = {
     "scans": (5.0, 0.0),
     "calibrate": (60.0, 0.0),
     "sync": (3.0, 0.0),
-    "segment": (30.0, 1.2),
     "track": (10.0, 0.15),
     "fit": (15.0, 0.0),
     "aid": (5.0, 0.03),
@@ -91,8 +90,6 @@ def _stages(capture: Capture) -> list[str]:
         left_out.add("scans")
     if capture.calibration is not None or capture.boards is None:
         left_out.add("calibrate")
-    if any(camera.masks for camera in capture.cameras):
-        left_out.add("segment")
     return [name for name in _SECONDS if name not in left_out]
 
 

@@ -122,7 +122,7 @@ def searched_start(
         found, fit = follower.begun(frame, poses)
         return found.poses, fit
 
-    search = PictureSearch(capture, offsets, footage, len(follower.cameras), near, judged)
+    search = PictureSearch(capture, footage, len(follower.cameras), near, judged)
     begin = search.run(frames, progress)
     follower.begun(begin.frame, begin.pose)  # the last one tried may have been another
     return begin
