@@ -18,7 +18,12 @@ def allow_folders(folders: Iterable[str | os.PathLike[str]]) -> None:
     _given.set(tuple(Path(folder).resolve() for folder in folders))
 
 
+def allowed_folders() -> list[Path]:
+    """Return the folders that are allowed, links resolved."""
+    named = [Path(folder).resolve() for folder in os.environ.get(SETTING, "").split(os.pathsep) if folder]
+    return [*_given.get(), *named]
+
+
 def is_allowed(path: Path) -> bool:
     """Tell whether a file lies in an allowed folder, with links resolved."""
-    named = [Path(folder).resolve() for folder in os.environ.get(SETTING, "").split(os.pathsep) if folder]
-    return any(path.resolve().is_relative_to(folder) for folder in (*_given.get(), *named))
+    return any(path.resolve().is_relative_to(folder) for folder in allowed_folders())

@@ -9,17 +9,19 @@ from pathlib import Path
 from typing import TypedDict
 
 import numpy as np
-from pxr import Sdf, Tf, Usd, UsdGeom
+from pxr import Sdf, Usd, UsdGeom
 
 from jawusd.errors import EvaluatorError, FormatError, RigError, UnitsError
 from jawusd.evaluator import JawRig
 from jawusd.geometry.arrays import Array
 from jawusd.inputs import check_path
 from jawusd.rig.arrays import read_arrays, read_value
+from jawusd.rig.asset_paths import file_of
+from jawusd.rig.child_process import remember, try_in_child
 from jawusd.rig.layout import ONNX_ATTRIBUTES, PARAMETERS
 from jawusd.rig.schema import has_jaw_api
 from jawusd.rig.table import DecoderTable
-from jawusd.rig.untrusted import check_composed, check_reach, raises_format_error
+from jawusd.rig.untrusted import open_checked, raises_format_error
 from jawusd.rig.versions import upgrade_rig
 
 PathArg = str | os.PathLike[str]
@@ -46,20 +48,19 @@ def open_stage(path: PathArg) -> Usd.Stage:
     """Open a stage.
 
     Raises:
-        RigError: There is no such file, it is not USD, or it names files that `check_reach` forbids.
+        RigError: There is no such file, it is not USD, names files that `check_reach` forbids, or OpenUSD crashes or
+            takes too much memory or time on it.
     """
     path = Path(path)
     if not path.is_file():
         raise RigError("there is no such file.", path=path)
     check_path(path, RigError)
     try:
-        layers = check_reach(path)
-        stage = Usd.Stage.Open(str(path))
-    except (Tf.ErrorException, RuntimeError, MemoryError, ValueError, OSError) as error:
-        raise RigError("is not a USD file that OpenUSD can read.", path=path) from error
-    if not layers or stage is None:
-        raise RigError("is not a USD file that OpenUSD can read.", path=path)
-    check_composed(stage, layers)
+        try_in_child(path)
+        stage = open_checked(path)
+    except MemoryError as error:
+        raise RigError("needs more memory than there is.", path=path) from error
+    remember(path, [file_of(layer.identifier) for layer in stage.GetUsedLayers() if not layer.anonymous])
     return stage
 
 

@@ -36,6 +36,7 @@ _FAULTS = (
 )  # fmt: skip
 _ALLOW = "If you trust it, allow its folder with --allow or the setting JAWUSD_ALLOW."
 _TOO_DEEP = f"is nested too deeply, at most {MOST_LEVELS} levels are read."
+_UNREADABLE = "is not a USD file that OpenUSD can read."
 _WRITE_OUT = "Write asset paths out, without expressionVariables."
 _OF_A_RIG = ("jaw:formatVersion", "jaw:model", "jaw:bounds", "jaw:decoder")
 
@@ -59,6 +60,23 @@ def raises_format_error(argument: int) -> Callable[[Callable[P, R]], Callable[P,
         return wrapped
 
     return decorate
+
+
+def open_checked(path: Path) -> Usd.Stage:
+    """Open a stage that names no files but those it may.
+
+    Raises:
+        RigError: It is not USD, or names files that `check_reach` forbids.
+    """
+    try:
+        layers = check_reach(path)
+        stage = Usd.Stage.Open(str(path))
+    except (Tf.ErrorException, RuntimeError, ValueError, OSError) as error:
+        raise RigError(_UNREADABLE, path=path) from error
+    if not layers or stage is None:
+        raise RigError(_UNREADABLE, path=path)
+    check_composed(stage, layers)
+    return stage
 
 
 def check_reach(path: Path) -> list[Sdf.Layer]:
@@ -162,7 +180,7 @@ def _layer(name: str, sums: Mapping[Path, str]) -> Sdf.Layer | None:
     try:
         layer = Sdf.Layer.FindOrOpen(name)
     except Tf.ErrorException as error:
-        raise RigError("is not a USD file that OpenUSD can read.", path=file) from error
+        raise RigError(_UNREADABLE, path=file) from error
     if layer is not None and not _is_whole(layer):
         raise RigError("is damaged: it names prims or properties that it does not hold.", path=file)
     return layer

@@ -1,0 +1,133 @@
+"""What OpenUSD ends or hangs on ends a child process; whole rigs cost a child once."""
+
+import os
+import signal
+import sys
+import threading
+
+import pytest
+
+from jawusd.errors import RigError
+from jawusd.formats.allowed_folders import SETTING
+from jawusd.rig import child_process, load_rig
+from jawusd.rig.read import open_stage
+
+HEADER = "#usda 1.0\n"
+
+
+def doubling(levels):
+    """Return the text of a layer of few lines whose stage has 2^levels prims."""
+    twice = 'def "L%d" {\ndef "a" (references = </L%d>) {}\ndef "b" (references = </L%d>) {}\n}\n'
+    return HEADER + 'def "L0" {}\n' + "".join(twice % (i + 1, i, i) for i in range(levels))
+
+
+@pytest.fixture
+def children(monkeypatch):
+    """Return the paths that children were asked to read."""
+    asked = []
+    for name in ("_forked", "_started"):
+        real = getattr(child_process, name)
+        monkeypatch.setattr(child_process, name, lambda path, real=real: asked.append(path) or real(path))
+    return asked
+
+
+@pytest.fixture
+def bomb(tmp_path):
+    path = tmp_path / "shot.usda"
+    path.write_text(doubling(28))
+    return path
+
+
+def in_thread(function):
+    """Return what a function raises in a program of several threads, which is not forked."""
+    caught, done = [], threading.Event()
+    other = threading.Thread(target=done.wait)
+    other.start()
+    try:
+        function()
+    except RigError as error:
+        caught.append(error)
+    finally:
+        done.set()
+        other.join()
+    return caught
+
+
+def test_stages_that_take_for_ever_are_one_message(bomb, monkeypatch):
+    monkeypatch.setattr(child_process, "MOST_CPU_S", 1)
+    with pytest.raises(RigError, match="takes OpenUSD more than"):
+        open_stage(bomb)
+
+
+def test_stages_that_take_all_memory_are_one_message(bomb, monkeypatch):
+    monkeypatch.setattr(child_process, "MOST_MEMORY", 150 << 20)
+    monkeypatch.setattr(child_process, "_started", lambda path: None)
+    with pytest.raises(RigError, match="GB to be read|ends OpenUSD"):
+        open_stage(bomb)
+
+
+@pytest.mark.parametrize("way", [signal.SIGSEGV, signal.SIGABRT])
+def test_crashes_are_one_message(way, anchored_folder, monkeypatch):
+    monkeypatch.setattr(child_process, "open_checked", lambda path: os.kill(os.getpid(), way))
+    monkeypatch.setattr(child_process, "_started", lambda path: None)
+    with pytest.raises(RigError, match="ends OpenUSD"):
+        open_stage(anchored_folder / "actor.usda")
+
+
+def test_a_crash_of_a_copy_is_asked_again_of_a_new_process(anchored_folder, monkeypatch, children):
+    """The copy may have crashed for the state of this process; the file is whole."""
+    monkeypatch.setattr(child_process, "open_checked", lambda path: os.kill(os.getpid(), signal.SIGSEGV))
+    assert open_stage(anchored_folder / "actor.usda")
+    assert len(children) == 2
+
+
+def test_programs_of_several_threads_start_a_new_process(anchored_folder, bomb, children, monkeypatch):
+    def opened():
+        load_rig(anchored_folder / "actor.usda")
+        open_stage(bomb)
+
+    monkeypatch.setattr(child_process, "MOST_WAIT_S", 4)
+    monkeypatch.setattr(child_process, "_forked", lambda path: pytest.fail("this process has several threads"))
+    (error,) = in_thread(opened)
+    assert "takes OpenUSD more than" in str(error) and len(children) == 2
+
+
+def test_a_rig_costs_a_child_once(anchored_folder, children):
+    actor = anchored_folder / "actor.usda"
+    for _ in range(3):
+        load_rig(actor)
+    assert children == [actor]
+    os.utime(anchored_folder / "geo.usdc", ns=(1, 1))
+    load_rig(actor)
+    assert children == [actor, actor]
+
+
+def test_allowed_folders_are_read_without_a_child(anchored_folder, children, monkeypatch):
+    monkeypatch.setenv(SETTING, str(anchored_folder))
+    assert load_rig(anchored_folder / "actor.usda")
+    assert children == []
+
+
+def test_new_processes_know_the_folders_that_were_allowed(anchored_folder, tmp_path, monkeypatch):
+    """What the child refuses, it does not read."""
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "elsewhere" / "more.usda").write_text(doubling(28))
+    (anchored_folder / "shot.usda").write_text(f"{HEADER}( subLayers = [@../elsewhere/more.usda@] )\n")
+    monkeypatch.setattr(child_process, "MOST_WAIT_S", 4)
+    monkeypatch.setenv(SETTING, str(tmp_path / "elsewhere"))
+    assert "takes OpenUSD" in str(in_thread(lambda: open_stage(anchored_folder / "shot.usda"))[0])
+
+
+def test_programs_that_python_is_part_of_read_without_a_child(anchored_folder, monkeypatch):
+    monkeypatch.setattr(sys, "executable", "/opt/maya/bin/maya.bin")
+    assert in_thread(lambda: load_rig(anchored_folder / "actor.usda")) == []
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of Linux")
+def test_a_child_writes_no_files_and_leaves_no_core(anchored_folder, tmp_path, monkeypatch):
+    def write(path):
+        (tmp_path / "written").write_text("x")
+
+    monkeypatch.setattr(child_process, "open_checked", write)
+    child_process.try_in_child(anchored_folder / "actor.usda")
+    assert not (tmp_path / "written").exists() or (tmp_path / "written").stat().st_size == 0
