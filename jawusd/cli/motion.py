@@ -41,6 +41,10 @@ class AuthoredMotion:
         """Refuse what cannot be written out frame by frame."""
         if not len(self.frames):
             raise FormatError("the motion has no frames.")
+        falls = np.flatnonzero(np.diff(self.frames) <= 0)
+        if falls.size:
+            before, after = self.frames[falls[0] : falls[0] + 2]
+            raise FormatError(f"frames must rise: frame {after:g} follows {before:g}.")
         first, last = self.frames[0], self.frames[-1]
         if not (last - first <= MOST_FRAMES and max(abs(first), abs(last)) <= FARTHEST_FRAME):
             raise FormatError(

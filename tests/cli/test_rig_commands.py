@@ -102,6 +102,7 @@ def test_ik_reaches_a_reachable_target(actor):
         (("encode", "{actor}", "{tmp}/nan.csv"), 3, 'column "tx" is nan'),
         (("validate", "{actor}", "{tmp}/empty.csv"), 3, "empty"),
         (("animate", "{actor}", "{tmp}/bad.json"), 3, "must rise"),
+        (("animate", "{actor}", "{tmp}/falling.csv"), 3, "frame 2 follows 3"),
         (("animate", "{actor}"), 2, "either a source or --arkit"),
         (("animate", "{actor}", "{tmp}/bad.json", "--arkit", "{tmp}/nan.csv"), 2, "either a source or --arkit"),
         (("animate", "{actor}", "--arkit", "{tmp}/nan.csv"), 3, "timecode"),
@@ -112,6 +113,7 @@ def test_ik_reaches_a_reachable_target(actor):
 def test_bad_input_is_one_clear_error(actor, tmp_path, arguments, code, words):
     (tmp_path / "nan.csv").write_text("frame,tx,ty,tz,qw,qx,qy,qz\n1,nan,0,0,1,0,0,0\n")
     (tmp_path / "empty.csv").write_text("")
+    (tmp_path / "falling.csv").write_text("frame,d1,d2,d3\n3,1,0,0\n2,1,0,0\n")
     face_csv(tmp_path / "faceless.csv", [None] * 90)
     key = {"frame": 3, "d": [0, 0, 0]}
     (tmp_path / "bad.json").write_text(json.dumps({"fps": 24, "keys": [key, key]}))

@@ -1,9 +1,13 @@
 """Every reader with valid files to damage: what is written, what is damaged and how, and what is called."""
 
+import json
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
+from random import Random
 
 import fuzz_captured as captured
+import fuzz_grammar as grammar
 import fuzz_mutate as mutate
 import fuzz_recorded as recorded
 import fuzz_rigged as rigged
@@ -75,4 +79,26 @@ def make_targets(folder):
         add("usdz", place, "actor.usdz", mutate.damaged_zip, rigged.read_rig)
         for file in ("actor.onnx", "actor_encode.onnx"):
             add("ONNX", place, file, mutate.damaged_bytes, rigged.onnx_reader(example_rig(kind)))
+        add("USD grammar", place, "anim.usda", _from_grammar, rigged.read_rig)
+    for reader, suffix, write in (("TOML schemas", ".toml", grammar.toml_text), ("JSON schemas", ".json", json.dumps)):
+        known = {t.file: t for targets in list(found.values()) for t in targets if t.file.endswith(suffix)}
+        for t in known.values():
+            add(reader, t.folder, t.file, _from_schema(write), t.read)
     return found
+
+
+def _from_grammar(rng, data):
+    return grammar.usd_text(Random(int(rng.integers(2**62)))).encode("utf-8", "surrogatepass")
+
+
+def _from_schema(write):
+    """Return a damager that takes the words of a valid file, and its schema, and writes another file that has it."""
+
+    def damaged(rng, data):
+        is_toml = write is grammar.toml_text
+        valid = tomllib.loads(data.decode()) if is_toml else json.loads(data)
+        schema = grammar.capture_schema() if "scans" in valid else grammar.schema_of(valid)
+        made = grammar.from_schema(schema, Random(int(rng.integers(2**62))), valid, grammar.words_of(valid))
+        return write(made if isinstance(made, dict) or not is_toml else {"": made}).encode("utf-8", "surrogatepass")
+
+    return damaged

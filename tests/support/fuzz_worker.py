@@ -63,7 +63,7 @@ class Guard:
                 self.look(event, path)
         elif event in self._PATHS:
             self.look(event, args[0])
-        elif event in self._NEVER:
+        elif event in self._NEVER and args[:1] != (sys.executable,):  # which reads once more what ended a child
             Guard.found = f"{event} {args!r:.100}"
 
     @staticmethod
