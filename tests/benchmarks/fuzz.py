@@ -1,7 +1,8 @@
 """Damage files and read them, reader by reader: python tests/benchmarks/fuzz.py [--inputs 20000] [--seed 1].
 
 Valid files of every format are damaged (bytes, words, numbers, paths, structure; see tests/support/fuzz_mutate.py and
-fuzz_structures.py), or made from the grammar of USD and from schemas (fuzz_grammar.py), and read in a worker process that may use 2 GB of address space. One row per reader:
+fuzz_structures.py), or made from the grammar of USD and from schemas (fuzz_grammar.py), and read in a worker process
+that may use 2 GB of address space. One row per reader:
 
     accepted, refused   the input was read, or ended in a JawusdError
     tracebacks          ended in any other exception, or killed the process (crashes: how many of them)

@@ -81,8 +81,9 @@ def _prim_metadata(rng):
 def _clips(rng):
     lines = ['string primPath = "/Actor"', "double2[] active = [(0, 0)]", "double2[] times = [(0, 0), (9, 9)]"]
     if rng.random() < 0.5:
+        first, last = rng.choice(VALUES), rng.choice(VALUES)
         lines += [f'string templateAssetPath = "{rng.choice(TEMPLATES)}"', "double templateStride = 1",
-                  f"double templateStartTime = {rng.choice(VALUES)}", f"double templateEndTime = {rng.choice(VALUES)}"]  # fmt: skip
+                  f"double templateStartTime = {first}", f"double templateEndTime = {last}"]  # fmt: skip
     else:
         lines += [f"asset[] assetPaths = [{_asset(rng)}]"]
     if rng.random() < 0.3:
