@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -19,6 +20,7 @@ from jawusd.rig.motion_read import key_times
 from jawusd.rig.read import read_table, rig_of
 from jawusd.rig.sampling import sample_valid
 from jawusd.rig.table import landmark_distance
+from jawusd.rig.untrusted import FAULTS, fault_message
 
 _TABLE_SLACK_MM = 0.01  # the table states its error over more parameters than are tried here
 _ONNX_MM = 0.01
@@ -185,12 +187,28 @@ def _check_baked(
         yield _finding("error", "Mandible", mandible, message)
 
 
+def _with_any_values(name: str, rule: Rule) -> Rule:
+    """Return a rule that finds values of unexpected types, which any layer may hold, to be an error."""
+
+    @functools.wraps(rule)
+    def checked(prim: Usd.Prim) -> Iterator[Finding]:
+        try:
+            yield from rule(prim)
+        except FAULTS as error:
+            yield _finding("error", name, prim, fault_message(error))
+
+    return checked
+
+
 RULES: dict[str, Rule] = {
-    "Model": check_model,
-    "Table": check_table,
-    "Onnx": check_onnx,
-    "Bounds": check_bounds,
-    "Mandible": check_mandible,
+    name: _with_any_values(name, rule)
+    for name, rule in {
+        "Model": check_model,
+        "Table": check_table,
+        "Onnx": check_onnx,
+        "Bounds": check_bounds,
+        "Mandible": check_mandible,
+    }.items()
 }
 
 

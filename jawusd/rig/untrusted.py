@@ -30,8 +30,8 @@ _Named = tuple[str, Path | None, str | None]
 P = ParamSpec("P")
 R = TypeVar("R")
 
-# A value in USD has whatever type its file declares; code that expects another type raises one of these.
-_FAULTS = (
+#: A value in USD has whatever type its file declares; code that expects another type raises one of these.
+FAULTS = (
     ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError, Tf.ErrorException,
 )  # fmt: skip
 _ALLOW = "If you trust it, allow its folder with --allow or the setting JAWUSD_ALLOW."
@@ -53,13 +53,18 @@ def raises_format_error(argument: int) -> Callable[[Callable[P, R]], Callable[P,
         def wrapped(*args: P.args, **named: P.kwargs) -> R:
             try:
                 return function(*args, **named)
-            except _FAULTS as error:
-                found = (str(error).strip().splitlines() or [type(error).__name__])[-1]
-                raise FormatError(f"holds values that cannot be ({found:.200}).", path=str(args[argument])) from error
+            except FAULTS as error:
+                raise FormatError(fault_message(error), path=str(args[argument])) from error
 
         return wrapped
 
     return decorate
+
+
+def fault_message(error: BaseException) -> str:
+    """Return what a fault of a file's values is called."""
+    found = (str(error).strip().splitlines() or [type(error).__name__])[-1]
+    return f"holds values that cannot be ({found:.200})."
 
 
 def open_checked(path: Path) -> Usd.Stage:

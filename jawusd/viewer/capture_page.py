@@ -19,6 +19,7 @@ from jawusd.viewer.picks import ARCHES
 from jawusd.viewer.picks_panel import PicksPanel
 from jawusd.viewer.scan_brush import BRUSHES
 from jawusd.viewer.scan_labels_panel import ScanLabelsPanel
+from jawusd.viewer.uploads import limit_uploads
 from jawusd.viewer.viewed import Region, ViewedCapture
 from jawusd.viewer.widgets import errors_shown, guarded, set_theme
 
@@ -57,6 +58,7 @@ class CapturePage:
             self.picks = PicksPanel(client, capture, self.footage, self.turn, self.refresh)
         with tabs.add_tab("Scans"):
             self.labels = ScanLabelsPanel(client, capture, self._turn_painting, self._show_labels)
+        limit_uploads(client, None)
         gui.main_panel.dock_right()
         gui.main_panel.set_width(_PANEL_PX)
         client.scene.on_click()(guarded(client, self._clicked))  # type: ignore[arg-type]  # viser awaits coroutines

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import viser
-from viser import _messages
 
 from jawusd.errors import FormatError
 from jawusd.formats.keys import load_keys, save_keys
@@ -17,10 +16,9 @@ from jawusd.formats.poses import read_parameters, write_parameters
 from jawusd.viewer.motion import Clip
 from jawusd.viewer.motion_panel import MotionPanel
 from jawusd.viewer.session import Session
+from jawusd.viewer.uploads import limit_uploads, named
 from jawusd.viewer.viewed import ViewedActor
 from jawusd.viewer.widgets import guarded, say
-
-MOST_BYTES = 8 << 20
 
 
 class FilePanel:
@@ -46,7 +44,7 @@ class FilePanel:
             self.overwrite = gui.add_checkbox("overwrite", False)
             gui.add_button("write animation").on_click(guarded(client, self._write))
         gui.add_button("save CSV of d").on_click(guarded(client, self._save_csv))
-        _limit_uploads(client)
+        limit_uploads(client, self.load)
 
     async def _save(self, _: object) -> None:
         saved = self._session.saved_keys()
@@ -56,12 +54,12 @@ class FilePanel:
 
     async def _load(self, _: object) -> None:
         upload = self.load.value
-        name = Path(upload.name).name
+        name, suffix = named(upload, (".json", ".csv"))
         with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / f"upload{Path(name).suffix.lower()}"
+            path = Path(folder) / f"upload{suffix}"
             path.write_bytes(upload.content)
             try:
-                if path.suffix == ".csv":
+                if suffix == ".csv":
                     frames, d = read_parameters(path)
                     self._motion.add_clip(Clip.of(name, frames, d, self._session.work.fps))
                 else:
@@ -99,31 +97,3 @@ def _written(write: Callable[[Path], None], name: str) -> bytes:
         path = Path(folder) / name
         write(path)
         return path.read_bytes()
-
-
-def _limit_uploads(client: viser.ClientHandle) -> None:
-    """Drop uploads larger than `MOST_BYTES` while they arrive, and say so once per file.
-
-    viser keeps the parts of an upload until the last one has arrived, without a limit; its handlers run before these.
-    """
-    gui = client.gui
-    pending = gui._current_file_upload_states
-
-    def drop(transfer: str, size: int) -> None:
-        state = pending.pop(transfer, None)
-        if state is not None:
-            body = f"{state['filename']}: is {size} bytes, at most {MOST_BYTES} are read."
-            say(client, "That did not work", body, bad=True)
-
-    async def started(_: int, message: _messages.FileTransferStartUpload) -> None:
-        if message.size_bytes > MOST_BYTES:
-            drop(message.transfer_uuid, message.size_bytes)
-
-    async def part_received(_: int, message: _messages.FileTransferPart) -> None:
-        state = pending.get(message.transfer_uuid)
-        # A page may announce less than it sends.
-        if state is not None and state["transferred_bytes"] > MOST_BYTES:
-            drop(message.transfer_uuid, state["transferred_bytes"])
-
-    gui._websock_interface.register_handler(_messages.FileTransferStartUpload, started)
-    gui._websock_interface.register_handler(_messages.FileTransferPart, part_received)

@@ -163,6 +163,13 @@ def test_each_rule_finds_its_fault(folder, damage, name, rule, severity, message
     assert findings[0].path.startswith("/Actor")
 
 
+@pytest.mark.parametrize("declared", ["double[] jaw:d1 = [1, 2]", 'string jaw:d2 = "x"', "asset jaw:d3 = @./a@"])
+def test_values_of_other_types_are_findings(declared, anchored_folder):
+    shot = anchored_folder / "shot.usda"
+    shot.write_text(f'#usda 1.0\n( subLayers = [@./actor.usda@] )\nover "Actor" {{\n    {declared}\n}}\n')
+    assert {"Bounds", "Mandible"} <= {found.rule for found in validate_stage(shot) if found.severity == "error"}
+
+
 def test_every_rule_has_a_failing_fixture():
     assert {rule for _, _, rule, _, _ in BROKEN} == set(RULES)
 

@@ -79,7 +79,7 @@ def make_targets(folder):
         add("usdz", place, "actor.usdz", mutate.damaged_zip, rigged.read_rig)
         for file in ("actor.onnx", "actor_encode.onnx"):
             add("ONNX", place, file, mutate.damaged_bytes, rigged.onnx_reader(example_rig(kind)))
-        add("USD grammar", place, "anim.usda", _from_grammar, rigged.read_rig)
+        add("USD grammar", place, "anim.usda", _from_grammar, rigged.read_shot)
     for reader, suffix, write in (("TOML schemas", ".toml", grammar.toml_text), ("JSON schemas", ".json", json.dumps)):
         known = {t.file: t for targets in list(found.values()) for t in targets if t.file.endswith(suffix)}
         for t in known.values():

@@ -42,6 +42,14 @@ def read_rig(place, path):
     _check_inside(place)
 
 
+def read_shot(place, path):
+    from jawusd.rig import validate_stage
+
+    validate_stage(path)
+    _check_inside(place)
+    read_rig(place, path)
+
+
 def _check_inside(place):
     from pxr import Sdf
 

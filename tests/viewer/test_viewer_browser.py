@@ -12,9 +12,9 @@ from jawusd.formats.poses import read_parameters
 from jawusd.pipeline.view import open_viewer
 from jawusd.rig.bake import bake_rig
 from jawusd.rig.motion_read import read_poses_of_stage
-from jawusd.viewer.file_panel import MOST_BYTES
 from jawusd.viewer.readouts import CONDYLES, INCISOR, landmark_places, rest_places
 from jawusd.viewer.scene import _OUTSIDE, PRESETS, preset_view
+from jawusd.viewer.uploads import MOST_BYTES
 
 
 @pytest.fixture

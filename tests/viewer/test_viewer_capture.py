@@ -1,5 +1,6 @@
 """A capture as the viewer is given it, and its page without a browser."""
 
+import asyncio
 import shutil
 import time
 import tomllib
@@ -12,6 +13,7 @@ from package_copy import ROOT
 from quiet_capture_page import QuietCapturePage
 from short_example import write_short
 from typer.testing import CliRunner
+from viser._messages import FileTransferStartUpload
 
 from jawusd.cli.main import app
 from jawusd.errors import CaptureError, FormatError
@@ -82,6 +84,18 @@ def page(viewed):
     opened.settle()
     yield opened
     viewer.stop()
+
+
+def test_pages_of_captures_take_no_files(page):
+    widget = next(iter(page.client.gui._gui_input_handle_from_uuid))
+    message = FileTransferStartUpload(widget, "transfer", "capture.toml", "text/plain", 2, 100)
+    api = page.client.gui
+
+    async def send():
+        await api._websock_interface._handle_incoming_message(0, message)
+
+    asyncio.run_coroutine_threadsafe(send(), page.loop).result(60)
+    assert api._current_file_upload_states == {} and "takes no such files" in page.notices[-1][1]
 
 
 def test_the_capture_is_read_with_its_poses(viewed):
