@@ -12,12 +12,13 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 import warnings
 from collections.abc import Iterable
 from enum import Enum
 from pathlib import Path
 
-from pxr import Sdf, Usd
+from pxr import Sdf, Usd, Work
 
 from jawusd.errors import RigError
 from jawusd.formats.allowed_folders import SETTING, allowed_folders, is_allowed
@@ -27,6 +28,8 @@ from jawusd.rig.untrusted import open_checked
 #: that are slow. Rigs of scans take .02 s, stages of a million prims some five.
 MOST_CPU_S, MOST_MEMORY, MOST_WAIT_S = 10, 4 << 30, 60
 
+_MOST_SLEEP_S = 3  # of a copy of this process: then a new one decides
+_TRIES = 50  # to find all other threads asleep, a millisecond apart
 _FULL, _IS_STARTED = 3, 4  # exit codes of a child that needs more memory, and of a new process that did its work
 _NEW_NETWORK = 0x40000000 | 0x10000000  # CLONE_NEWNET | CLONE_NEWUSER of linux/sched.h
 _TRUST = f"If you trust it, allow its folder with --allow or the setting {SETTING}: then it is read without limits."
@@ -80,8 +83,30 @@ def _state(file: Path) -> tuple[int, ...]:
 
 
 def _can_fork() -> bool:
-    """Return whether a fork is safe enough to try: on Linux, where no other thread of Python may hold a lock."""
-    return sys.platform == "linux" and threading.active_count() == 1
+    """Return whether no other thread can hold a lock that a copy of this process would wait for: on Linux, all sleep.
+
+    Threads of OpenUSD end what they have begun within milliseconds; threads of Python may stand anywhere.
+    """
+    if sys.platform != "linux" or threading.active_count() > 1:
+        return False
+    for _ in range(_TRIES):
+        if all(_state_and_time(f"self/task/{thread}")[0] == "S" for thread in _other_threads()):
+            return True
+        time.sleep(0.001)
+    return False
+
+
+def _other_threads() -> list[int]:
+    return [int(name) for name in os.listdir("/proc/self/task") if int(name) != os.getpid()]
+
+
+def _state_and_time(process: str) -> tuple[str, int]:
+    """Return what a process or thread does (R runs, S sleeps) and its processor time [ticks]; S if it has ended."""
+    try:
+        fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return "S", 0
+    return fields[0], int(fields[11]) + int(fields[12])
 
 
 def _forked(path: Path) -> _End | None:
@@ -92,21 +117,36 @@ def _forked(path: Path) -> _End | None:
         child = os.fork()
     if child == 0:
         try:
+            Work.SetConcurrencyLimit(1)  # the threads of the parent are not here
             os._exit(_read(path))
         finally:  # nothing else of the parent's runs here
             os._exit(1)
     os.close(writing)
     ended = False
     try:
-        with selectors.DefaultSelector() as selector:
-            selector.register(reading, selectors.EVENT_READ)
-            ended = bool(selector.select(MOST_WAIT_S))  # the pipe closes with the child
+        ended = _ends(child, reading)
     finally:
         os.close(reading)
         if not ended:
             os.kill(child, signal.SIGKILL)
         status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     return _end(status, whole=0) if ended else None
+
+
+def _ends(child: int, reading: int) -> bool:
+    """Wait for a child to close its end of a pipe; return False where it has slept too long, or worked too long."""
+    slept_s, worked = 0, 0
+    with selectors.DefaultSelector() as selector:
+        selector.register(reading, selectors.EVENT_READ)
+        for _ in range(MOST_WAIT_S):
+            if selector.select(1.0):
+                return True
+            state, ticks = _state_and_time(str(child))
+            slept_s = slept_s + 1 if state == "S" and ticks == worked else 0
+            worked = ticks
+            if slept_s > _MOST_SLEEP_S:
+                return False
+    return False
 
 
 def _started(path: Path) -> _End | None:

@@ -24,7 +24,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 from fuzz_driver import READERS, run
 
 # Text formats and archives are read in a millisecond or two; these take longer or are read by careful libraries.
-FEWER = {"video masks": 0.5, "ARKit CSV": 0.5, "usdz": 0.4, "ONNX": 0.4, "PNG masks": 0.8}
+FEWER = {"video masks": 0.5, "ARKit CSV": 0.5, "usdz": 0.4, "ONNX": 0.4, "PNG masks": 0.8, "usda": 0.5, "usdc": 0.5,
+         "USD grammar": 0.5}  # fmt: skip
 
 
 def main() -> None:

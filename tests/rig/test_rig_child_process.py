@@ -4,6 +4,7 @@ import os
 import signal
 import sys
 import threading
+import time
 
 import pytest
 
@@ -79,6 +80,23 @@ def test_a_crash_of_a_copy_is_asked_again_of_a_new_process(anchored_folder, monk
     monkeypatch.setattr(child_process, "open_checked", lambda path: os.kill(os.getpid(), signal.SIGSEGV))
     assert open_stage(anchored_folder / "actor.usda")
     assert len(children) == 2
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="forks are for Linux")
+def test_a_copy_that_waits_for_ever_is_left_soon(anchored_folder, monkeypatch, children):
+    """As one does that was made while another thread held a lock of OpenUSD."""
+    monkeypatch.setattr(child_process, "open_checked", lambda path: time.sleep(1000))
+    monkeypatch.setattr(child_process, "_MOST_SLEEP_S", 1)
+    assert open_stage(anchored_folder / "actor.usda")
+    assert len(children) == 2
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="forks are for Linux")
+def test_no_copy_is_made_while_another_thread_works(monkeypatch):
+    assert child_process._can_fork()
+    monkeypatch.setattr(child_process, "_state_and_time", lambda process: ("R", 0))
+    monkeypatch.setattr(child_process, "_other_threads", lambda: [1])
+    assert not child_process._can_fork()
 
 
 def test_programs_of_several_threads_start_a_new_process(anchored_folder, bomb, children, monkeypatch):
