@@ -15,6 +15,7 @@ from jawusd.formats.capture_errors import Location, place
 from jawusd.formats.numbered import is_pattern
 
 M = TypeVar("M", bound=BaseModel)
+_MOVE = "Move the file inside, or allow it with --allow-outside."
 _SHOWN = 3  # names like a missing one
 
 
@@ -79,12 +80,22 @@ def _problem(value: Path, full: Path, folder: Path, allow_outside: bool) -> tupl
     anchor = full.parent if is_pattern(full) else full
     inside, exists = anchor.resolve().is_relative_to(folder), anchor.exists()
     if not allow_outside and not inside:
-        text = "leads out of the folder of the capture."
-        return text, "Move the file inside, or allow it with --allow-outside."
+        return "leads out of the folder of the capture.", _MOVE
+    if not allow_outside and (link := _link_out(anchor, folder)) is not None:
+        return f"is not safe: the link {link} leads out of the folder of the capture.", _MOVE
     if exists:
         return None
     kind = "folder" if is_pattern(full) else "file"
     return f"does not exist: there is no {kind} {anchor}.", _similar(anchor)
+
+
+def _link_out(place: Path, folder: Path) -> str | None:
+    """Return a link in a folder of pictures or labels that leads out of the capture's folder; None if none does."""
+    if not place.is_dir():
+        return None
+    with os.scandir(place) as entries:
+        links = sorted(entry.path for entry in entries if entry.is_symlink())
+    return next((link for link in links if not Path(os.path.realpath(link)).is_relative_to(folder)), None)
 
 
 def _similar(path: Path) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.errors import CaptureError
+from jawusd.imaging.containers import open_container
 from jawusd.inputs import check_input
 
 
@@ -31,7 +32,7 @@ def read_sound(path: str | os.PathLike[str], rate_hz: int) -> Sound | None:
     start_s = 0.0
     check_input(path, CaptureError)
     try:
-        with av.open(os.fspath(path), metadata_errors="replace") as container:
+        with open_container(path) as container:
             if not container.streams.audio:
                 return None
             resampler = av.AudioResampler(format="flt", layout="mono", rate=rate_hz)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import cv2
@@ -15,16 +16,15 @@ from jawusd.inputs import check_input
 RawPicture = NDArray[np.uint8] | NDArray[np.uint16]
 
 _PNG = b"\x89PNG\r\n\x1a\n"
-_MOST_PX = 1 << 27  # four times 8K; a few bytes can declare a picture that fills the memory
+#: Most pixels of a picture, four times 8K: a few bytes can declare one that fills the memory.
+MOST_PX = 1 << 27
 
 
 def read_picture(path: Path, flags: int) -> NDArray[np.uint8] | NDArray[np.uint16] | None:
     """Return a picture, or None where the file is none that can be decoded."""
     try:
         check_input(path, CaptureError)
-        with open(path, "rb") as file:
-            head = file.read(24)
-        if head.startswith(_PNG) and int.from_bytes(head[16:20]) * int.from_bytes(head[20:24]) > _MOST_PX:
+        if _pixels(path) > MOST_PX:
             return None
         image = cv2.imread(str(path), flags)
         if image is None or image.dtype == np.uint8:
@@ -32,6 +32,23 @@ def read_picture(path: Path, flags: int) -> NDArray[np.uint8] | NDArray[np.uint1
         return np.asarray(image, np.uint16)
     except (OSError, cv2.error, MemoryError, CaptureError):
         return None
+
+
+def _pixels(path: Path) -> int:
+    """Return how many pixels a file says it has; of formats that say so."""
+    with open(path, "rb") as file:
+        head = file.read(24)
+    if head.startswith(_PNG):  # most are, and there are thousands
+        return int.from_bytes(head[16:20]) * int.from_bytes(head[20:24])
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(path) as image:
+                return image.width * image.height
+    except Image.DecompressionBombError:
+        return MOST_PX + 1
+    except Exception:  # what Pillow does not know, OpenCV may: it has a limit of its own
+        return 0
 
 
 def read_gray(path: Path) -> NDArray[np.uint8] | None:

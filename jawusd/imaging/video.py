@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 
 from jawusd.errors import CaptureError
 from jawusd.imaging.clip import Clip, VideoFrame
+from jawusd.imaging.containers import open_container
 from jawusd.imaging.display import to_display
+from jawusd.imaging.pictures import MOST_PX
 from jawusd.imaging.pixels import Colour, Slices, coloured, converted
 from jawusd.imaging.timeline import Timeline
 
@@ -106,7 +108,7 @@ class Video(Clip):
 
     def _open(self) -> av.container.InputContainer:
         try:
-            container = av.open(str(self.path), metadata_errors="replace")
+            container = open_container(self.path)
         except (av.FFmpegError, OSError) as error:
             raise CaptureError(
                 f"the video cannot be opened ({error.strerror}).",
@@ -116,9 +118,17 @@ class Video(Clip):
         if not container.streams.video:
             container.close()
             raise CaptureError("the file holds no video stream.", path=self.path, hint="Check capture.toml.")
-        if container.streams.video[0].codec_context is None:
+        context = container.streams.video[0].codec_context
+        if context is None:
             container.close()
             raise CaptureError("the pictures are in a codec that is not known here.", path=self.path, hint=_REENCODE)
+        if context.width * context.height > MOST_PX:
+            container.close()
+            raise CaptureError(
+                f"pictures have {context.width} x {context.height} px, at most {MOST_PX} in all are read.",
+                path=self.path,
+                hint="Scale it down.",
+            )
         return container
 
     def _packet_table(

@@ -117,6 +117,17 @@ def test_a_link_out_of_the_folder_is_refused_unless_allowed(folder):
     assert load_capture(folder, allow_outside=True).scans.upper_teeth == folder / "upper.ply"
 
 
+@pytest.mark.parametrize("target", ["/dev/zero", "../outside.png", "missing/../../outside.png"])
+def test_a_mask_that_links_out_of_the_folder_is_refused_unless_allowed(target, folder):
+    (folder / "masks" / "000000.png").write_bytes(b"x")
+    (folder / "masks" / "000001.png").symlink_to("000000.png")
+    assert load_capture(folder)
+    (folder / "masks" / "000007.png").symlink_to(target if target[0] == "/" else f"../{target}")
+    with pytest.raises(CaptureError, match="000007.png leads out"):
+        load_capture(folder)
+    assert load_capture(folder, allow_outside=True)
+
+
 def test_missing_capture_is_one_error(tmp_path):
     with pytest.raises(FormatError, match="no such file"):
         load_capture(tmp_path / "nothing")

@@ -1,0 +1,25 @@
+"""Open files of pictures and sound: one that is what it holds, and names no others."""
+
+from __future__ import annotations
+
+import os
+
+import av
+
+#: Formats of one file. FFmpeg also follows playlists (HLS, DASH, concat, SDP), which name other files and addresses.
+FORMATS = (
+    "mov,mp4,m4a,3gp,3g2,mj2", "matroska,webm", "avi", "mpegts", "mpeg", "mpegvideo", "mxf", "flv", "ogg", "asf", "nut",
+    "ivf", "dv", "h264", "hevc", "av1", "obu", "m4v", "mjpeg", "yuv4mpegpipe", "gif", "apng", "rm", "gxf", "wtv", "y4m",
+    "wav", "w64", "aiff", "au", "caf", "flac", "mp3", "aac", "ac3", "mp2",
+)  # fmt: skip
+
+
+def open_container(path: str | os.PathLike[str]) -> av.container.InputContainer:
+    """Open a video or sound file.
+
+    Raises:
+        av.FFmpegError: it is none, or one that names other files.
+        OSError: it cannot be read.
+    """
+    options = {"format_whitelist": ",".join(FORMATS), "protocol_whitelist": "file"}
+    return av.open(os.fspath(path), metadata_errors="replace", options=options)
