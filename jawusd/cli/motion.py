@@ -14,7 +14,7 @@ from jawusd.cli.output import emit
 from jawusd.errors import FormatError
 from jawusd.evaluator.clamping import Inside
 from jawusd.evaluator.interpolation import monotone_tangents
-from jawusd.formats.keys import FARTHEST_FRAME, MOST_FRAMES, Key, Keys, load_keys
+from jawusd.formats.keys import FARTHEST_FRAME, FARTHEST_MM, MOST_FRAMES, Key, Keys, load_keys
 from jawusd.formats.poses import read_parameters, read_poses, table_columns
 from jawusd.formats.tracks import load_tracks
 from jawusd.geometry.arrays import Array, Mask
@@ -45,6 +45,8 @@ class AuthoredMotion:
         if falls.size:
             before, after = self.frames[falls[0] : falls[0] + 2]
             raise FormatError(f"frames must rise: frame {after:g} follows {before:g}.")
+        if (np.abs(self.d) > FARTHEST_MM).any():
+            raise FormatError(f"a parameter is {np.nanmax(np.abs(self.d)):g} mm; allowed are +-{FARTHEST_MM:g} mm.")
         first, last = self.frames[0], self.frames[-1]
         if not (last - first <= MOST_FRAMES and max(abs(first), abs(last)) <= FARTHEST_FRAME):
             raise FormatError(

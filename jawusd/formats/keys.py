@@ -18,7 +18,10 @@ from jawusd.geometry.arrays import Array
 #: Keys are written out frame by frame: an hour at 60 per second fits.
 MOST_FRAMES, FARTHEST_FRAME = 220_000, 1e9
 _MAX_BYTES = 64 << 20
+#: Largest parameter [mm], a kilometre: squares and products of larger ones overflow on the way into the bound.
+FARTHEST_MM = 1e6
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+_Parameter = Annotated[float, Field(allow_inf_nan=False, ge=-FARTHEST_MM, le=FARTHEST_MM)]
 
 
 class Key(BaseModel):
@@ -27,7 +30,7 @@ class Key(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     frame: Finite
-    d: tuple[Finite, Finite, Finite]
+    d: tuple[_Parameter, _Parameter, _Parameter]
 
 
 class Keys(BaseModel):

@@ -29,7 +29,7 @@ from jawusd.rig.untrusted import open_checked
 MOST_CPU_S, MOST_MEMORY, MOST_WAIT_S = 10, 4 << 30, 60
 
 _MOST_SLEEP_S = 3  # of a copy of this process: then a new one decides
-_TRIES = 50  # to find all other threads asleep, a millisecond apart
+_TRIES = 200  # to find all other threads asleep, a millisecond apart
 _FULL, _IS_STARTED = 3, 4  # exit codes of a child that needs more memory, and of a new process that did its work
 _NEW_NETWORK = 0x40000000 | 0x10000000  # CLONE_NEWNET | CLONE_NEWUSER of linux/sched.h
 _TRUST = f"If you trust it, allow its folder with --allow or the setting {SETTING}: then it is read without limits."

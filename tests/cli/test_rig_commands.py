@@ -103,6 +103,7 @@ def test_ik_reaches_a_reachable_target(actor):
         (("validate", "{actor}", "{tmp}/empty.csv"), 3, "empty"),
         (("animate", "{actor}", "{tmp}/bad.json"), 3, "must rise"),
         (("animate", "{actor}", "{tmp}/falling.csv"), 3, "frame 2 follows 3"),
+        (("animate", "{actor}", "{tmp}/far.csv"), 3, "allowed are +-1e+06 mm"),
         (("animate", "{actor}"), 2, "either a source or --arkit"),
         (("animate", "{actor}", "{tmp}/bad.json", "--arkit", "{tmp}/nan.csv"), 2, "either a source or --arkit"),
         (("animate", "{actor}", "--arkit", "{tmp}/nan.csv"), 3, "timecode"),
@@ -113,6 +114,7 @@ def test_ik_reaches_a_reachable_target(actor):
 def test_bad_input_is_one_clear_error(actor, tmp_path, arguments, code, words):
     (tmp_path / "nan.csv").write_text("frame,tx,ty,tz,qw,qx,qy,qz\n1,nan,0,0,1,0,0,0\n")
     (tmp_path / "empty.csv").write_text("")
+    (tmp_path / "far.csv").write_text("frame,d1,d2,d3\n1,1e308,0,0\n2,0,0,0\n")
     (tmp_path / "falling.csv").write_text("frame,d1,d2,d3\n3,1,0,0\n2,1,0,0\n")
     face_csv(tmp_path / "faceless.csv", [None] * 90)
     key = {"frame": 3, "d": [0, 0, 0]}

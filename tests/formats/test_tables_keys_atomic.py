@@ -81,6 +81,7 @@ def test_keys_round_trip_and_faults(tmp_path):
         ('{"fps": 24, "keys": [{"frame": 1, "d": [0,0,0]}, {"frame": 1, "d": [0,0,0]}]}', "must rise"),
         ('{"fps": 0, "keys": [{"frame": 1, "d": [0,0,0]}]}', "fps"),
         ('{"fps": 24, "keys": [{"frame": 1, "d": [0,0]}]}', r"keys\.0\.d"),
+        ('{"fps": 24, "keys": [{"frame": 1, "d": [1e300,0,0]}]}', r"keys\.0\.d\.0"),
         ('{"fps": 24, "interpolation": "cubic", "keys": [{"frame": 1, "d": [0,0,0]}]}', "interpolation"),
         ("{", "k2.json"),
     ]:
