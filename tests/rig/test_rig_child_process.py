@@ -33,6 +33,12 @@ def children(monkeypatch):
 
 
 @pytest.fixture
+def forks(monkeypatch):
+    """Let copies be made at any time: on a busy machine, threads may take long to fall asleep."""
+    monkeypatch.setattr(child_process, "_can_fork", lambda: sys.platform == "linux")
+
+
+@pytest.fixture
 def bomb(tmp_path):
     path = tmp_path / "shot.usda"
     path.write_text(doubling(28))
@@ -54,13 +60,13 @@ def in_thread(function):
     return caught
 
 
-def test_stages_that_take_for_ever_are_one_message(bomb, monkeypatch):
+def test_stages_that_take_for_ever_are_one_message(bomb, forks, monkeypatch):
     monkeypatch.setattr(child_process, "MOST_CPU_S", 1)
     with pytest.raises(RigError, match="takes OpenUSD more than"):
         open_stage(bomb)
 
 
-def test_stages_that_take_all_memory_are_one_message(bomb, monkeypatch):
+def test_stages_that_take_all_memory_are_one_message(bomb, forks, monkeypatch):
     monkeypatch.setattr(child_process, "MOST_MEMORY", 150 << 20)
     monkeypatch.setattr(child_process, "_started", lambda path: None)
     with pytest.raises(RigError, match="GB to be read|ends OpenUSD"):
@@ -68,14 +74,14 @@ def test_stages_that_take_all_memory_are_one_message(bomb, monkeypatch):
 
 
 @pytest.mark.parametrize("way", [signal.SIGSEGV, signal.SIGABRT])
-def test_crashes_are_one_message(way, anchored_folder, monkeypatch):
+def test_crashes_are_one_message(way, anchored_folder, forks, monkeypatch):
     monkeypatch.setattr(child_process, "open_checked", lambda path: os.kill(os.getpid(), way))
     monkeypatch.setattr(child_process, "_started", lambda path: None)
     with pytest.raises(RigError, match="ends OpenUSD"):
         open_stage(anchored_folder / "actor.usda")
 
 
-def test_a_crash_of_a_copy_is_asked_again_of_a_new_process(anchored_folder, monkeypatch, children):
+def test_a_crash_of_a_copy_is_asked_again_of_a_new_process(anchored_folder, forks, monkeypatch, children):
     """The copy may have crashed for the state of this process; the file is whole."""
     monkeypatch.setattr(child_process, "open_checked", lambda path: os.kill(os.getpid(), signal.SIGSEGV))
     assert open_stage(anchored_folder / "actor.usda")
@@ -83,7 +89,7 @@ def test_a_crash_of_a_copy_is_asked_again_of_a_new_process(anchored_folder, monk
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="forks are for Linux")
-def test_a_copy_that_waits_for_ever_is_left_soon(anchored_folder, monkeypatch, children):
+def test_a_copy_that_waits_for_ever_is_left_soon(anchored_folder, forks, monkeypatch, children):
     """As one does that was made while another thread held a lock of OpenUSD."""
     monkeypatch.setattr(child_process, "open_checked", lambda path: time.sleep(1000))
     monkeypatch.setattr(child_process, "_MOST_SLEEP_S", 1)
@@ -93,10 +99,10 @@ def test_a_copy_that_waits_for_ever_is_left_soon(anchored_folder, monkeypatch, c
 
 @pytest.mark.skipif(sys.platform != "linux", reason="forks are for Linux")
 def test_no_copy_is_made_while_another_thread_works(monkeypatch):
-    assert child_process._can_fork()
-    monkeypatch.setattr(child_process, "_state_and_time", lambda process: ("R", 0))
-    monkeypatch.setattr(child_process, "_other_threads", lambda: [1])
-    assert not child_process._can_fork()
+    for others, state, allowed in (([], "R", True), ([1, 2], "S", True), ([1], "R", False), ([1], "D", False)):
+        monkeypatch.setattr(child_process, "_other_threads", lambda others=others: others)
+        monkeypatch.setattr(child_process, "_state_and_time", lambda process, state=state: (state, 0))
+        assert child_process._can_fork() is allowed
 
 
 def test_programs_of_several_threads_start_a_new_process(anchored_folder, bomb, children, monkeypatch):
@@ -110,7 +116,7 @@ def test_programs_of_several_threads_start_a_new_process(anchored_folder, bomb, 
     assert "takes OpenUSD more than" in str(error) and len(children) == 2
 
 
-def test_a_rig_costs_a_child_once(anchored_folder, children):
+def test_a_rig_costs_a_child_once(anchored_folder, forks, children):
     actor = anchored_folder / "actor.usda"
     for _ in range(3):
         load_rig(actor)
@@ -142,7 +148,7 @@ def test_programs_that_python_is_part_of_read_without_a_child(anchored_folder, m
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits of Linux")
-def test_a_child_writes_no_files_and_leaves_no_core(anchored_folder, tmp_path, monkeypatch):
+def test_a_child_writes_no_files_and_leaves_no_core(anchored_folder, forks, tmp_path, monkeypatch):
     def write(path):
         (tmp_path / "written").write_text("x")
 
