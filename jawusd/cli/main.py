@@ -106,6 +106,9 @@ _verbose = False
 
 def main() -> None:
     """Run the command line and leave with its exit code: 0 ok, 1 a "no", 2 usage, 3 and up one per error family."""
+    if "PXR_WORK_THREAD_LIMIT" not in os.environ:
+        # Before OpenUSD is loaded: rigs are small, and where it has no threads it can be tried in a fork at any moment.
+        os.environ |= {"PXR_WORK_THREAD_LIMIT": "1", "TF_ENV_SETTING_ALERTS_ENABLED": "0"}
     try:
         with explain_missing_packages():
             app()

@@ -60,7 +60,8 @@ def track_memory(folder: Path, counts: list[int]) -> None:
     for count in counts:
         take = looped_take(folder / f"take{count}", count)
         start = time.perf_counter()
-        process = subprocess.Popen(program("track", take, "-o", folder / f"{count}.npz", "--jobs", 1), stdout=subprocess.DEVNULL)
+        line = program("track", take, "-o", folder / f"{count}.npz", "--jobs", 1)
+        process = subprocess.Popen(line, stdout=subprocess.DEVNULL)
         _, status, usage = os.wait4(process.pid, 0)
         peaks.append(usage.ru_maxrss / 1024)
         took = time.perf_counter() - start

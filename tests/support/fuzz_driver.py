@@ -67,6 +67,7 @@ class Worker:
     def _start(self):
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE.parents[1]), str(HERE)])}
         environment |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "TF_FATAL_THROW": "0"}
+        environment |= {"PXR_WORK_THREAD_LIMIT": "1", "TF_ENV_SETTING_ALERTS_ENABLED": "0"}  # as the program
         self.process = subprocess.Popen(
             [sys.executable, str(HERE / "fuzz_worker.py"), str(self.folder)],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment,

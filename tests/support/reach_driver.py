@@ -57,6 +57,7 @@ def watch(folder):
     line = [STRACE, "-f", "-y", "-qq", "-s", "4096", "--seccomp-bpf", "-e", "trace=open,openat,openat2,connect",
             "-o", str(log), sys.executable, str(HERE / "reach_driver.py"), str(folder)]  # fmt: skip
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(HERE)]), "OMP_NUM_THREADS": "1"}
+    environment |= {"PXR_WORK_THREAD_LIMIT": "1", "TF_ENV_SETTING_ALERTS_ENABLED": "0"}  # as the program
     done = subprocess.run(line, capture_output=True, text=True, env=environment, check=False)
     if done.returncode:
         raise RuntimeError(done.stderr[-2000:])
