@@ -14,12 +14,19 @@ FORMATS = (
 )  # fmt: skip
 
 
-def open_container(path: str | os.PathLike[str]) -> av.container.InputContainer:
-    """Open a video or sound file.
+#: Formats of single pictures.
+PICTURES = (
+    "image2", "png_pipe", "exr_pipe", "dpx_pipe", "tiff_pipe", "bmp_pipe", "jpeg_pipe", "j2k_pipe", "webp_pipe",
+    "pam_pipe", "pgm_pipe", "ppm_pipe", "sgi_pipe", "cin_pipe", "hdr_pipe",
+)  # fmt: skip
+
+
+def open_container(path: str | os.PathLike[str], formats: tuple[str, ...] = FORMATS) -> av.container.InputContainer:
+    """Open a video or sound file, or one of other formats.
 
     Raises:
         av.FFmpegError: it is none, or one that names other files.
         OSError: it cannot be read.
     """
-    options = {"format_whitelist": ",".join(FORMATS), "protocol_whitelist": "file"}
+    options = {"format_whitelist": ",".join(formats), "protocol_whitelist": "file"}
     return av.open(os.fspath(path), metadata_errors="replace", options=options)

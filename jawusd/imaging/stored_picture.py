@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.errors import CaptureError
+from jawusd.imaging.containers import PICTURES, open_container
 from jawusd.imaging.display import Stored
 from jawusd.inputs import check_input
 
@@ -50,7 +51,7 @@ def read_stored(path: Path) -> StoredPicture:
     """
     check_input(path, CaptureError)
     try:
-        with av.open(str(path)) as container:
+        with open_container(path, PICTURES) as container:
             frame = next(container.decode(video=0))
             return StoredPicture(*_pixels(frame))
     except (av.FFmpegError, OSError, StopIteration, IndexError, ValueError) as error:
