@@ -14,6 +14,7 @@ import os
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[variable] = "1"
 
+import ctypes  # noqa: E402
 import platform  # noqa: E402
 import sys  # noqa: E402
 import time  # noqa: E402
@@ -244,18 +245,36 @@ def checks(rigs: dict[str, evaluator.JawRig], table: dict[str, dict[int, float]]
             print(f"{kind:6} {text:50}{found:12.3g}   bar {wanted}")
 
 
-def blended(turn: torch.Tensor, shift: torch.Tensor, vertices: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
-    """Return vertices (n, v, 3) of the usual jaw joint, axis-angle (n, 3) and translation (n, 3), linearly blended."""
+def blended(R: torch.Tensor, t: torch.Tensor, vertices: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
+    """Return vertices (n, v, 3) moved by rotations (n, 3, 3) and translations (n, 3), linearly blended."""
+    return vertices + weights * (vertices @ R.transpose(1, 2) + t[:, None] - vertices)
+
+
+def rotations(turn: torch.Tensor) -> torch.Tensor:
+    """Return the rotations (n, 3, 3) of the usual jaw joint, axis-angle (n, 3)."""
     angle = turn.norm(dim=1)[:, None, None]
     x, y, z = (turn / angle[:, :, 0]).unbind(dim=1)
     o = torch.zeros_like(x)
     K = torch.stack([o, -z, y, z, o, -x, -y, x, o], dim=1).reshape(-1, 3, 3)
-    R = torch.eye(3, dtype=turn.dtype) + torch.sin(angle) * K + (1 - torch.cos(angle)) * (K @ K)
-    return vertices + weights * (vertices @ R.transpose(1, 2) + shift[:, None] - vertices)
+    return torch.eye(3, dtype=turn.dtype) + torch.sin(angle) * K + (1 - torch.cos(angle)) * (K @ K)
+
+
+def keep_memory() -> None:
+    """Let glibc keep what tensors of 25 MB free.
+
+    Or else some processes ask the system for it at each call and others never do: 6,000 page faults, as much time again
+    as the whole joint takes, on whichever of two alike functions has a tensor more alive (mallopt(3): M_MMAP_THRESHOLD
+    is -3 and at most 32 MiB, M_TRIM_THRESHOLD -1).
+    """
+    if platform.libc_ver()[0] == "glibc":
+        libc = ctypes.CDLL(None)
+        libc.mallopt(-3, 32 << 20)
+        libc.mallopt(-1, 1 << 30)
 
 
 def torch_checks(rig: evaluator.JawRig) -> None:
     """Print what the torch layer costs, forwards and backwards, for 256 frames."""
+    keep_memory()
     torch.set_num_threads(1)
     rng = np.random.default_rng(5)
     layer = JawLayer(rig)
@@ -267,19 +286,20 @@ def torch_checks(rig: evaluator.JawRig) -> None:
 
     def skinned() -> torch.Tensor:
         T = layer(d)
-        R = T[:, :3, :3].contiguous()
-        moved = vertices @ R.transpose(1, 2) + T[:, None, :3, 3]
-        return vertices + weights * (moved - vertices)
+        return blended(T[:, :3, :3], T[:, :3, 3], vertices, weights)
 
     calls = {
-        "joint": lambda: blended(turn, shift, vertices, weights),
+        "joint": lambda: blended(rotations(turn), shift, vertices, weights),
         "pose": lambda: layer(d),
         "pose, 4,000 vertices": skinned,
         "loss": lambda: layer.loss(T),
         "project": lambda: layer.project(d * 1.4),
         "inside": lambda: layer.inside(d * 0.1),
     }
-    spent = {name: seconds(lambda call=call: call().sum().backward()) for name, call in calls.items()}
+    spent = dict.fromkeys(calls, np.inf)
+    for _ in range(5):  # in turn, so that a busy machine slows all
+        for name, call in calls.items():
+            spent[name] = min(spent[name], seconds(lambda call=call: call().sum().backward()))
     rows = [
         ("pose / jaw joint of 4,000 vertices", spent["pose"] / spent["joint"], "<= 1.2"),
         ("pose and its 4,000 vertices / the same", spent["pose, 4,000 vertices"] / spent["joint"], "<= 1.2"),
