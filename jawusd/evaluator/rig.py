@@ -297,12 +297,11 @@ class JawRig(TouchingTeeth, RigAuthoring):
         self, verdicts: Verdicts, poses: Array, batch: tuple[int, ...], times_s: ArrayLike | None, limits: Limits
     ) -> Verdicts:
         """Return the verdicts in batch shape; frames reached too fast are marked if there is a speed limit."""
-        verdicts = verdicts._replace(tolerance_mm=limits.tolerance_mm)
         if limits.speed_mm_s is None:
-            return verdicts.finished(batch)
+            return verdicts.finished(batch, limits.tolerance_mm)
         measured = np.where(verdicts.measured()[:, None, None], poses, np.nan)
         positions = transform_points(measured, self.landmarks[None]).reshape(*batch, -1, 3)
-        return verdicts.finished(batch, too_fast(positions, times_s, limits.speed_mm_s))
+        return verdicts.finished(batch, limits.tolerance_mm, too_fast(positions, times_s, limits.speed_mm_s))
 
     def ik(
         self,

@@ -83,16 +83,16 @@ class Verdicts(NamedTuple):
         reason = self.reason | np.where(collide, Reason.TEETH_COLLIDE.value, 0).astype(np.uint8)
         return self._replace(valid=reason == 0, reason=reason)
 
-    def finished(self, batch: tuple[int, ...], fast: Mask | None = None) -> Verdicts:
-        """Return the verdicts in a batch shape, with the frames marked in ``fast`` (of that shape) too fast."""
+    def finished(self, batch: tuple[int, ...], tolerance_mm: float, fast: Mask | None = None) -> Verdicts:
+        """Return the verdicts in a batch shape, with their tolerance; frames in ``fast`` (same shape) are too fast."""
         if not batch and fast is None:
-            valid, reason, residual_mm, margin_mm, d, tolerance_mm = self
+            valid, reason, residual_mm, margin_mm, d, _ = self
             return Verdicts(valid[0], reason[0], residual_mm[0], margin_mm[0], d[0], tolerance_mm)
         reason = self.reason.reshape(batch)
         if fast is not None:
             reason = reason | np.where(fast, Reason.TOO_FAST.value, 0).astype(np.uint8)
         residual_mm, margin_mm = self.residual_mm.reshape(batch), self.margin_mm.reshape(batch)
-        return Verdicts(reason == 0, reason, residual_mm, margin_mm, self.d.reshape(*batch, 3), self.tolerance_mm)
+        return Verdicts(reason == 0, reason, residual_mm, margin_mm, self.d.reshape(*batch, 3), tolerance_mm)
 
     def inside(self) -> Mask:
         """Tell which poses lie inside the bound, shape (...), whatever else is wrong with them."""

@@ -68,15 +68,15 @@ class CompiledKernels:
         """Return verdicts on poses T_skull_mandible (n, 4, 4)."""
         out = np.empty((len(T), 6))
         rows.judgements(self._model, self._hull, _owned(T), True, limits.residual_mm, limits.margin_mm, out)
-        reason = out[:, 5].astype(np.uint8)
-        return Verdicts(reason == 0, reason, out[:, 3], out[:, 4], out[:, :3])
+        why = out[:, 5]  # `logical_not` takes a third of the time of `== 0`
+        return Verdicts(np.logical_not(why), why.astype(np.uint8), out[:, 3], out[:, 4], out[:, :3])
 
     def judge_parameters(self, d: Array, limits: Limits) -> Verdicts:
         """Return verdicts on d (n, 3) [mm]."""
         d = usable_rows(d)  # NaN where not finite: they are part of the verdicts
         residual_mm, margin_mm, reason = np.empty(len(d)), np.empty(len(d)), np.empty(len(d), dtype=np.uint8)
         rows.parameter_judgements(self._hull, _owned(d), limits.margin_mm, residual_mm, margin_mm, reason)
-        return Verdicts(reason == 0, reason, residual_mm, margin_mm, d)
+        return Verdicts(np.logical_not(reason), reason, residual_mm, margin_mm, d)
 
     def approach(self, wanted: Array, start: Array) -> tuple[Array, Array]:
         """Return the points (n, 3) [mm] inside nearest to those wanted, and the squared distances (n,)."""
