@@ -7,8 +7,9 @@ value holds.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -63,6 +64,12 @@ class ContactField:
     closed_mm: float
     error_mm: float
     limit_mm: float
+    _floats: tuple[Callable[[int], float], list[float], list[float], list[int]] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        ends = [n - 1 for n in self.values.shape]
+        read = np.ascontiguousarray(self.values).ravel().item
+        object.__setattr__(self, "_floats", (read, self.first_mm.tolist(), self.step_mm.tolist(), ends))
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Array], of: Meeting) -> ContactField | None:
@@ -121,7 +128,34 @@ class ContactField:
 
     def collides(self, d: Array, limit_mm: float) -> Mask:
         """Tell at which d (n, 3) [mm] there is less clearance than ``limit_mm``; False for NaN."""
-        return self.clearance(d).clearance_mm < limit_mm - self.error_mm
+        least = limit_mm - self.error_mm
+        if len(d) == 1:  # the call that must be quick
+            return np.array([self._single(*d[0].tolist()) < least])
+        return self.clearance(d).clearance_mm < least
+
+    def _single(self, d1: float, d2: float, d3: float) -> float:
+        """Return the clearance [mm] at one d [mm], in floats; NaN for NaN."""
+        if not (math.isfinite(d1) and math.isfinite(d2) and math.isfinite(d3)):
+            return math.nan
+        flat, (first1, first2, first3), (step1, step2, step3), (last1, last2, last3) = self._floats
+        x, y, z = (d1 - first1) / step1, (d2 - first2) / step2, (d3 - first3) / step3
+        x = 0.0 if x < 0.0 else last1 if x > last1 else x
+        y = 0.0 if y < 0.0 else last2 if y > last2 else y
+        z = 0.0 if z < 0.0 else last3 if z > last3 else z
+        i = int(x) if x < last1 else last1 - 1
+        j = int(y) if y < last2 else last2 - 1
+        k = int(z) if z < last3 else last3 - 1
+        a, b, c = x - i, y - j, z - k
+        wide = last3 + 1
+        near = (i * (last2 + 1) + j) * wide + k
+        far = near + (last2 + 1) * wide
+        low = (flat(near) * (1 - c) + flat(near + 1) * c) * (1 - b) + (
+            flat(near + wide) * (1 - c) + flat(near + wide + 1) * c
+        ) * b
+        high = (flat(far) * (1 - c) + flat(far + 1) * c) * (1 - b) + (
+            flat(far + wide) * (1 - c) + flat(far + wide + 1) * c
+        ) * b
+        return float(low * (1 - a) + high * a)
 
 
 _CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(-1, 3)

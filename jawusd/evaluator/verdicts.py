@@ -80,6 +80,8 @@ class Verdicts(NamedTuple):
 
     def with_collisions(self, collide: Mask) -> Verdicts:
         """Return the verdicts with the poses marked in ``collide`` (n,) refused."""
+        if not np.count_nonzero(collide):  # a tenth of the time of `any`
+            return self
         reason = self.reason | np.where(collide, Reason.TEETH_COLLIDE.value, 0).astype(np.uint8)
         return self._replace(valid=reason == 0, reason=reason)
 

@@ -46,6 +46,19 @@ def test_outside_the_grid_the_nearest_value_holds():
     assert np.isnan(gone.clearance_mm) and np.isnan(gone.gradient).all()
 
 
+def test_one_pose_is_judged_as_many_are():
+    """One is computed in floats, many as arrays."""
+    field = touching_rig().contact
+    last = FIRST + STEP * (np.array(SHAPE) - 1)
+    d = np.random.default_rng(2).uniform(FIRST - 2.0, last + 2.0, (300, 3))
+    d = np.concatenate([d, [FIRST, last, [np.nan, 0, 0], [0, np.inf, 0], [1e8, -1e8, 0]]])
+    together = field.clearance(d).clearance_mm
+    np.testing.assert_allclose([field._single(*row) for row in d.tolist()], together, atol=1e-12)
+    limits = np.nan_to_num(together, nan=0.0) + field.error_mm + np.where(np.arange(len(d)) % 2, 1e-6, -1e-6)
+    for row, value, limit in zip(d, together, limits):
+        assert field.collides(row[None], limit).tolist() == [bool(value < limit - field.error_mm)]
+
+
 def test_colliding_poses_are_refused():
     values = np.zeros(SHAPE)
     values[:3] = -50  # half a millimetre below an opening of 0 mm
