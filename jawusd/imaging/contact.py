@@ -21,10 +21,11 @@ _WIDEST_GAP_MM = 1.0
 _DEEPEST_MM = 2.5
 _COARSEST_MM = 1.5
 
-_STEP_MM, _MOST_OPENING_MM = 0.4, 16.0  # of teeth
+_STEP_MM, _MOST_OPENING_MM = 0.3, 16.0  # of teeth
+_CLOSE_MM = 1.0  # larger clearances are taken from the coarser field; twice what errors are measured below
 _BEYOND_MM = 1.0  # outside the bound, still sampled
 _FREE_MM = 0.8  # surfaces so far apart at all valid parameters of larger openings end the field
-_ERROR_SAMPLES = 3000
+_ERROR_SAMPLES = 30000  # all over the field; one in twenty is of a valid pose of close teeth
 _CAPTURED_QUANTILE = 0.01
 _LARGEST_LIMIT_MM = 1.0
 
@@ -115,30 +116,44 @@ def wound_solid(name: str, corners: Array, up: float, box: Array) -> Solid:
 def sample_field(
     surfaces: Surfaces, rig: JawRig, step_mm: float = _STEP_MM, most_opening_mm: float = _MOST_OPENING_MM
 ) -> ContactField:
-    """Sample the clearance of a rig's poses over its bound.
+    """Sample the clearance of a rig's poses over its bound, finely where surfaces are close.
 
     Args:
         surfaces: What meets.
         rig: The rig.
-        step_mm: Between values.
+        step_mm: Between values; those of surfaces that are apart are measured twice as far from each other.
         most_opening_mm: Where the field ends, if the surfaces have not parted before.
     """
-    # 0 is one of the values, so that the closed bite is exact
     box = _box(surfaces, rig, step_mm, most_opening_mm)
-    ends = [(np.floor(low / step_mm), np.ceil(high / step_mm)) for low, high in box]
-    axes = [step_mm * np.arange(first, last + 1) for first, last in ends]
-    first = np.array([axis[0] for axis in axes])
-    d = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    wanted = rig.margin(d) > -(_BEYOND_MM + step_mm)
-    values = np.zeros(d.shape[:3])
-    values[wanted] = surfaces.clearances(rig.pose(d[wanted]))
-    nearest = distance_transform_edt(~wanted, return_distances=False, return_indices=True)
-    values = np.round(values[tuple(nearest)] / UNIT_MM) * UNIT_MM
-    field = ContactField(first, np.full(3, step_mm), values, surfaces.closed_mm, 0.0, -AUTHORED_MM)
+    field = _sampled(surfaces, rig, box, step_mm, _sampled(surfaces, rig, box, 2.0 * step_mm))
     captured = rig.captured_d
     least = float(np.quantile(field.clearance(captured).clearance_mm, _CAPTURED_QUANTILE)) if len(captured) else 0.0
     limit = -float(np.clip(-least, AUTHORED_MM, _LARGEST_LIMIT_MM))
     return replace(field, error_mm=_error(surfaces, rig, field), limit_mm=limit)
+
+
+def _sampled(
+    surfaces: Surfaces, rig: JawRig, box: Array, step_mm: float, coarse: ContactField | None = None
+) -> ContactField:
+    """Sample the clearance over a box (3, 2) [mm]; given a coarse field, anew only where that says surfaces are close.
+
+    0 is one of the values along every axis, so that the closed bite is exact.
+    """
+    ends = [(np.floor(low / step_mm), np.ceil(high / step_mm)) for low, high in box]
+    axes = [step_mm * np.arange(first, last + 1) for first, last in ends]
+    d = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    wanted = rig.margin(d) > -(_BEYOND_MM + step_mm)
+    values = np.zeros(d.shape[:3])
+    if coarse is not None:
+        values = coarse.clearance(d.reshape(-1, 3)).clearance_mm.reshape(values.shape)
+        wanted &= values < _CLOSE_MM
+    values[wanted] = surfaces.clearances(rig.pose(d[wanted]))
+    if coarse is None:
+        nearest = distance_transform_edt(~wanted, return_distances=False, return_indices=True)
+        values = values[tuple(nearest)]
+    first = np.array([axis[0] for axis in axes])
+    values = np.round(values / UNIT_MM) * UNIT_MM
+    return ContactField(first, np.full(3, step_mm), values, surfaces.closed_mm, 0.0, -AUTHORED_MM)
 
 
 def _box(surfaces: Surfaces, rig: JawRig, step_mm: float, most_opening_mm: float) -> Array:

@@ -18,7 +18,7 @@ from scipy.ndimage import distance_transform_edt
 from jawusd.geometry.arrays import Array, Mask
 
 _BUCKET_MM = 1.0
-_BAND_CELLS = 3.0  # cells around each triangle whose distance to it is computed, the others' follow from these
+_BAND_CELLS = 3.0  # cells around each triangle whose distance to it is computed, the others take a nearby triangle
 _OFF_FACE_MM = 0.01  # how far before a face its outside is looked at
 _JITTER_MM = np.array([1.23e-4, 0.0, 2.71e-4])  # lines through vertices and edges of round coordinates are ambiguous
 _MOST_CROSSINGS = 256
@@ -72,7 +72,9 @@ def outer_faces(corners: Array, up: float) -> tuple[Mask, float]:
 
 
 def distance_grid(corners: Array, outer: Mask, box: Array, step_mm: float, up: float) -> DistanceGrid:
-    """Sample the signed distance to a solid, close to its surface to rounding, farther away some 0.1 mm too large.
+    """Sample the signed distance to a solid: near its surface to rounding, farther away at times a little too large.
+
+    More than 0.01 mm in 0.4 % of values 0.5 to 1 mm inside teeth, in 2 % of those 1 to 2 mm inside, 0.12 at most.
 
     Args:
         corners: of all triangles [mm], shape (F, 3, 3), y vertical, counter-clockwise seen from outside.
@@ -85,7 +87,8 @@ def distance_grid(corners: Array, outer: Mask, box: Array, step_mm: float, up: f
     kept = np.ascontiguousarray(corners[outer])
     nearest = _nearest_faces(kept, box[0], step_mm, shape, _BAND_CELLS)
     where = distance_transform_edt(nearest < 0, return_distances=False, return_indices=True)
-    values = _distances(kept, nearest[tuple(where)], box[0], step_mm)
+    nearest = _nearer_faces(kept, nearest[tuple(where)], box[0], step_mm)
+    values = _distances(kept, nearest, box[0], step_mm)
     flipped = _upwards(corners, up)
     columns = _columns_of(flipped)
     _set_signs(values, flipped, box[0], step_mm, up, columns.low, columns.shape, columns.start, columns.faces)
@@ -225,6 +228,31 @@ def _nearest_faces(corners, origin, step, shape, band):  # type: ignore[no-untyp
                     if found < best[i, j, k]:
                         best[i, j, k], nearest[i, j, k] = found, f
     return nearest
+
+
+@numba.njit(nogil=True, cache=True)
+def _nearer_faces(corners, nearest, origin, step):  # type: ignore[no-untyped-def]  # compiled
+    """Return, at every value, the nearest of its own triangle and those of its six neighbours."""
+    found = nearest.copy()
+    nx, ny, nz = nearest.shape
+    for i in range(nx):
+        for j in range(ny):
+            for k in range(nz):
+                x, y, z = origin[0] + i * step, origin[1] + j * step, origin[2] + k * step
+                best = -1.0
+                for di, dj, dk in ((-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1)):
+                    a, b, c = i + di, j + dj, k + dk
+                    if a < 0 or b < 0 or c < 0 or a >= nx or b >= ny or c >= nz:
+                        continue
+                    other = nearest[a, b, c]
+                    if other == nearest[i, j, k] or other == found[i, j, k]:
+                        continue
+                    if best < 0:
+                        best = _squared_distance(corners, nearest[i, j, k], x, y, z)
+                    squared = _squared_distance(corners, other, x, y, z)
+                    if squared < best:
+                        best, found[i, j, k] = squared, other
+    return found
 
 
 @numba.njit(nogil=True, cache=True)

@@ -54,6 +54,20 @@ def test_a_scan_open_above_has_an_inside():
         np.testing.assert_allclose(grid.values[low], exact[low], atol=error_mm)
 
 
+def test_distances_deep_inside_a_rough_solid_are_those_to_its_nearest_face():
+    """Beyond the values near faces the nearest face has to be found among those of other values."""
+    corners = ball()
+    corners = corners * (1.0 + 0.15 * np.sin(9.0 * corners / RADIUS).prod(axis=2, keepdims=True))
+    grid = whole(corners, 1.0).grid
+    points = grid.origin + grid.step_mm * np.stack(np.indices(grid.values.shape), axis=-1)
+    deep = (grid.values < -1.0) & (grid.values > -3.0)
+    oracle = trimesh.Trimesh(**trimesh.triangles.to_kwargs(corners))
+    exact = trimesh.proximity.closest_point_naive(oracle, points[deep][::60])[1]
+    excess = -grid.values[deep][::60] - exact
+    assert len(exact) > 300 and np.abs(excess).max() < 0.05
+    assert (excess > 0.01).mean() < 0.02
+
+
 def test_faces_inside_other_parts_are_no_surface():
     corners = np.concatenate([ball(), ball((5.0, 0.0, 0.0))])
     outer, entering = outer_faces(corners, 1.0)
