@@ -362,3 +362,20 @@ def test_search_is_the_same_in_threads(pictures, short_search):
     with ThreadPoolExecutor(2) as pool:
         both = [StartSearch(MESHES, solver, T, m).at(footage, FIRST + 1) for m in (map, pool.map)]
     assert (both[0].poses == both[1].poses).all() and both[0].objective_px == both[1].objective_px
+
+
+def test_a_row_found_a_tooth_aside_is_found_from_the_other_one(pictures, monkeypatch):
+    capture = _capture(pictures)
+    solver = ContourSolver(SCANS, TrackingConfig())
+    axes, _ = check_occlusion(SCANS, capture.anatomy.T_anatomical_skull)
+    search = StartSearch(MESHES, solver, axes)
+    true = jaw_poses(FRAMES)[0]
+    aside = make_transform(np.eye(3), [7.5, 0.0, 0.0])  # mm: a tooth
+    monkeypatch.setattr(search, "_searched", lambda r, views, base, grid: [true[r] if r == 0 else true[r] @ aside])
+    footage = Footage(masked_sources(capture.cameras, TABLE, OFFSETS), TABLE, OFFSETS, capture.frames)
+    found = search.at(footage, FIRST)
+    assert [vertex_error_mm(MESHES[r], found.poses[r], true[r]) < 0.3 for r in (0, 1)] == [True, True]
+    monkeypatch.setattr(start_search, "_OPENINGS_MM", ())
+    alone = StartSearch(MESHES, solver, axes)
+    monkeypatch.setattr(alone, "_searched", lambda r, views, base, grid: [true[r] if r == 0 else true[r] @ aside])
+    assert vertex_error_mm(MESHES[1], alone.at(footage, FIRST).poses[1], true[1]) > 1.0

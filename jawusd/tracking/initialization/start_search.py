@@ -9,7 +9,7 @@ import numpy as np
 
 from jawusd.errors import TrackingError
 from jawusd.formats.mesh import Mesh
-from jawusd.geometry import make_transform, se3_inverse, so3_log, transform_point, transform_points
+from jawusd.geometry import make_transform, se3_inverse, so3_exp, so3_log, transform_point, transform_points
 from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import Mapper
 from jawusd.tracking.contour.equations import Solution
@@ -39,6 +39,9 @@ _NEAR_GRID = Grid(
     roll_rad=np.radians(np.arange(-20, 21, 10.0)),
     reach_mm=(6.0, 6.0, 6.0),
 )
+# How far open a jaw is tried against an arch that was found alone [mm], turning about a point so far above and behind
+# the front teeth [mm], as condyles are: rows of teeth look alike when shifted by a tooth, jaws cannot be.
+_OPENINGS_MM, _CONDYLES_MM = (0.0, 6.0, 14.0, 24.0, 36.0), (40.0, -90.0)
 _WIDEST_JAW_RAD = 0.8  # turn between the arches beyond which a jaw does not open
 _FARTHEST_JAW_MM = 75.0  # distance of the arches' front teeth beyond which it does not either
 
@@ -80,6 +83,7 @@ class StartSearch:
         self._coarse = tuple(coarse_scan(m, n) for m, n in zip(meshes, ARCH_NAMES, strict=True))
         self._hinges = [hinge_at_front(s.crown_vertices(), T_anatomical_scan) for s in self._coarse]
         self._coarse_solver = ContourSolver(self._coarse, solver.config)
+        self._jaws = _opened(self._coarse[1].crown_vertices(), T_anatomical_scan)
 
     def mirrored(self) -> StartSearch:
         """Return the search of the same scans mirrored, left and right exchanged."""
@@ -151,15 +155,20 @@ class StartSearch:
 
     def _refined_pairs(self, finalists: Sequence[Sequence[Array]], views: Sequence[View]) -> list[Array]:
         """Refine the finalists coarsely and return up to four pairs a jaw can take, shape (2, 4, 4) each."""
-        ranked = []
-        for r in ARCHES:
+
+        def ranked(r: int, poses: Sequence[Array], others: Array) -> list[tuple[float, Array]]:
             ends = []
-            for pose in finalists[r]:
-                start = np.stack([finalists[q][0] if q != r else pose for q in ARCHES])
+            for pose in poses:
+                start = np.stack([others if q != r else pose for q in ARCHES])
                 end = self._coarse_solver.solve(start, views, self._config.wide_gates_px)
-                ends.append((self._objective(self._coarse_solver, end, views)[r], end.poses[r]))
-            ranked.append(sorted(ends, key=lambda e: -e[0]))
-        pairs = [(u[0] + v[0], np.stack([u[1], v[1]])) for u in ranked[0] for v in ranked[1]]
+                ends.append((float(self._objective(self._coarse_solver, end, views)[r]), end.poses[r]))
+            return sorted(ends, key=lambda e: -e[0])
+
+        alone = [ranked(r, finalists[r], finalists[1 - r][0]) for r in ARCHES]
+        upper, lower = (ends[0][1] for ends in alone)
+        alone[0] += ranked(0, [lower @ se3_inverse(jaw) for jaw in self._jaws], lower)
+        alone[1] += ranked(1, [upper @ jaw for jaw in self._jaws], upper)
+        pairs = [(u[0] + v[0], np.stack([u[1], v[1]])) for u in alone[0] for v in alone[1]]
         pairs = [p for p in pairs if self._possible(p[1])]
         return [poses for _, poses in sorted(pairs, key=lambda p: -p[0])[:4]]
 
@@ -178,6 +187,24 @@ class StartSearch:
         if solver is self._coarse_solver:
             price *= self._config.working_px_per_mm / _PX_PER_MM
         return (score_px(solution) - price * uncovered).sum(1)
+
+
+def _opened(crowns: Array, T_anatomical_scan: Array) -> list[Array]:
+    """Return T_upper_lower of jaws that are closed, or opened as a hinge does, shape (4, 4) each.
+
+    Args:
+        crowns: of the lower teeth, scan coordinates [mm], shape (N, 3).
+        T_anatomical_scan: scan frame to (left, up, front) axes, shape (4, 4).
+    """
+    points = transform_points(T_anatomical_scan, crowns)
+    up, front = _CONDYLES_MM
+    hinge = points[points[:, 2].argmax()] * [0.0, 1.0, 1.0] + [0.0, up, front]
+    out = []
+    for opening in _OPENINGS_MM:
+        turn = so3_exp(np.array([opening / np.hypot(up, front), 0.0, 0.0]))
+        moved = make_transform(turn, hinge - turn @ hinge)
+        out.append(se3_inverse(T_anatomical_scan) @ moved @ T_anatomical_scan)
+    return out
 
 
 def guessed_axes(places: Array, eyes: Array) -> Array:
