@@ -23,8 +23,9 @@ if TYPE_CHECKING:
 
 FEWEST_VIDEOS = 2
 # Share of the contour in sight that fits colours, below which teeth are not where they are picked: of six path-traced
-# mouths it was 0.26 to 0.5; of three of them in the dark, with noise or without colours 0.13 to 0.2, and these were
-# tracked to 0.2 mm; spoilt by blur, or with focal lengths 15 % off, 0.05 to 0.09, and these were not.
+# mouths it was 0.26 to 0.5, of three of them in the dark, with noise or without colours 0.13 to 0.27, and these were
+# tracked to 0.3 mm. With focal lengths 15 % off it was 0.05, with another person's lower scan 0.08 and 0.12, and these
+# were a millimetre off and more.
 _LEAST_PICKED_FIT = 0.1
 
 

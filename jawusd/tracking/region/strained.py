@@ -20,8 +20,9 @@ from jawusd.tracking.region.condyles import CondyleMotion
 # had more than 2.3.
 _STRAINED = 2.0
 # Standard deviation of the lower teeth from which a frame tells little [mm], and shares of such frames from which a
-# take is doubtful, and not usable. Of six path-traced mouths none had such a frame but under closed lips; spoilt by
-# blur, or by a resolution of 1.4 px/mm, a third of the frames or more, which were half a millimetre to three off.
+# take is doubtful, and not usable. Of six path-traced mouths none had such a frame but under closed lips. Of 28 takes
+# that three of them were spoilt to, all 6 with frames a millimetre off are called so, or refused at their start, and so
+# are 10 without: those of flickering light, blur, and a resolution of 1.4 px/mm.
 _UNKNOWN_MM, _FEW, _MANY = 1.0, 0.03, 0.2
 _USUAL, _LEAST = 0.9, 0.25  # quantile of the take with which a strained frame is compared, and its least value
 
