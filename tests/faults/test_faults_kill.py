@@ -30,7 +30,7 @@ def stub(number, name):
                 (folder / "half").write_bytes(b"x")
                 write_npz_atomic(path, {"a": rng.normal(size=20_000)})
         return paths, {"offsets": {"cam0": 0, "cam1": 2, "cam2": -1}, "stage": name}
-    setattr(build._Build, f"_{name}", work)
+    setattr(build.StagedBuild, f"_{name}", work)
 
 for number, name in enumerate(("sync", "track", "fit", "aid", "bake", "report")):
     stub(number, name)

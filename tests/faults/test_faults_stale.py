@@ -36,7 +36,7 @@ def rebuilt(monkeypatch, tmp_path, capture):
             path.write_text(write(self))
             return [path], {"offsets": self.capture.sync.offsets or OFFSETS}
 
-        monkeypatch.setattr(build._Build, f"_{name}", work)
+        monkeypatch.setattr(build.StagedBuild, f"_{name}", work)
 
     for name in ("sync", "track", "aid", "bake", "report"):
         stub(name, lambda _: "always the same")

@@ -54,7 +54,9 @@ def test_a_report_without_its_capture_says_what_it_lacks(built):
     assert "example: jaw rig report" in text and "the capture is not at hand" in text
     assert "report DIR --experiments" in text and "replay-data" in text
     record = BuildState(built).valid("report", "as built")  # what --resume asks
-    assert record is not None and list(record.outputs) == ["report.html"] and record.result == {"capture": "../gone"}
+    assert record is not None and list(record.outputs) == ["report.html"]
+    verdict = {"grade": "good", "because": []}
+    assert record.result == {"capture": "../gone", "file": "report.html", "verdict": verdict}
 
 
 def test_a_placeholder_is_not_shown_as_a_mandible(built):
@@ -123,7 +125,8 @@ def test_missing_packages_are_named_with_the_cure(monkeypatch):
         "folder": "out",
         "report": {"capture": "..", "missing": missing},
     }
-    assert build_lines(summary)[-1].startswith("report: none: ") and json.dumps(summary)
+    report, verdict = build_lines(summary)[-2:]
+    assert report.startswith("report: none: ") and verdict.startswith("verdict: none") and json.dumps(summary)
 
 
 def test_the_worst_frames_are_chosen_apart_and_one_usual_one():

@@ -284,6 +284,5 @@ def capture_schema():
     schema = Capture.model_json_schema()
     parts = schema["properties"]
     del parts["folder"]
-    parts["camera"] = parts.pop("cameras")
     parts |= {"format": {"enum": ["jawusd-capture/1"]}, "units": {"enum": ["mm"]}}
     return schema | {"required": ["name", "fps", "scans", "camera", "format", "units"]}
