@@ -33,6 +33,8 @@ _ELSE = "nothing was written that is not whole"
 class Command(TyperCommand):
     """A command of jawusd."""
 
+    # typer hands its public Context to both methods; the base class in its private copy of click declares that one's.
+
     def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]
         """Take vectors as `--d 20,2,1` too."""
         return super().parse_args(ctx, with_vectors_split(args))

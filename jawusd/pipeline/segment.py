@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jawusd.errors import CaptureError, TrackingError, explain_missing_packages
+from jawusd.errors import CaptureError, explain_missing_packages
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.capture import Capture
 from jawusd.formats.tracks import LOST
 from jawusd.geometry.arrays import Array
 from jawusd.pipeline.follow import Follower
 from jawusd.pipeline.media import open_footage
+from jawusd.pipeline.picture_search import outside
 from jawusd.pipeline.prepare import input_hashes, load_meshes, subject_of_capture
 from jawusd.pipeline.segment_guide import known_guide, save_guide
 from jawusd.pipeline.segment_record import (
@@ -168,9 +169,7 @@ class _Segmentation:
         frames = range(self._first, self._stop)
         if picks is not None:
             if picks.frame not in frames:
-                raise TrackingError(
-                    f"bootstrap.frame is {picks.frame}, frames run from {self._first} to {self._stop - 1}"
-                )
+                raise outside(picks.frame, frames)
             self._start = picks.frame
             return picks.frame, self._tracker.picked(picks, self._cameras)
         if self._journal.entries and self._guide:

@@ -8,24 +8,12 @@ import sys
 
 import numpy as np
 import pytest
+from capture_texts import HEAD, TABLES
 from package_copy import ROOT
 
 from jawusd.imaging.video_writer import VideoWriter
 
-CAPTURE = """format = "jawusd-capture/1"
-name = "x"
-fps = 24.0
-calibration = "cal.toml"
-[scans]
-upper_teeth = "u.ply"
-lower_teeth = "l.ply"
-[[camera]]
-name = "left"
-video = "left.mp4"
-[[camera]]
-name = "right"
-video = "right.mp4"
-"""
+CAPTURE = f'{HEAD}calibration = "cal.toml"\n{TABLES}'
 
 
 @pytest.fixture(scope="module")

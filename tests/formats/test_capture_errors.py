@@ -1,23 +1,12 @@
 """What people get wrong in a capture.toml, and what they are told: table, key, what was found, what is allowed."""
 
 import pytest
+from capture_texts import HEAD, TABLES
 
 from jawusd.formats.capture import Capture, capture_keys, read_capture
 from jawusd.formats.capture_keys import reference_lines
 
-GOOD = """format = "jawusd-capture/1"
-name = "x"
-fps = 24.0
-[scans]
-upper_teeth = "u.ply"
-lower_teeth = "l.ply"
-[[camera]]
-name = "left"
-video = "left.mp4"
-[[camera]]
-name = "right"
-video = "right.mp4"
-[boards]
+GOOD = f"""{HEAD}{TABLES}[boards]
 cols = 9
 rows = 6
 square_mm = 8.0
