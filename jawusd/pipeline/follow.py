@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
+from itertools import tee
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,11 +18,13 @@ from jawusd.pipeline.state import Progress
 if TYPE_CHECKING:
     from jawusd.segmentation.footage import ColourFootage
     from jawusd.tracking.contour.scan import Scan
+    from jawusd.tracking.contour.views import View
     from jawusd.tracking.region.tracker import RegionPose, RegionTracker
 
 # Change of the jaw's motion from frame to frame [mm] after which the frames before are looked at again, and distance of
 # poses that are the same. Speech and chewing reach 1 mm at 24 frames a second: needless looks end after a frame.
 _JUMP_MM, _SAME_MM = 0.8, 0.15
+_LOOKS = 10  # frames that are kept to look at them again: a few MB
 STAGE = "follow"
 
 
@@ -30,6 +33,7 @@ class Follower:
 
     Attributes:
         cameras: calibrated, those that have a video, by name.
+        looks: poses and views of some frames of the last run, all over the take.
     """
 
     def __init__(
@@ -51,6 +55,7 @@ class Follower:
         self.cameras = cameras
         self._footage, self._scans, self._subject = footage, scans, subject
         self._pool = pool
+        self.looks: list[tuple[Array, list[View]]] = []
 
     def begun(self, frame: int, poses: Array) -> tuple[RegionPose, float]:
         """Return better poses on a frame than T_world_upper, T_world_lower (2, 4, 4), and how well they fit.
@@ -79,12 +84,16 @@ class Follower:
             CaptureError: a picture cannot be decoded.
         """
         frame, begin, tracker, cutter = self._begun
+        self.looks.clear()
+        looked = set(np.linspace(frames.start, frames.stop - 1, _LOOKS).astype(int).tolist())
         out, points = {frame: begin}, self._subject.landmarks[:3]
         progress(STAGE, 1, len(frames))
         for way in (range(frame + 1, frames.stop), range(frame - 1, frames.start - 1, -1)):
-            cuts = cutter.walk(self._footage, way)
-            for at, found in zip(way, tracker.follow(cuts, begin.poses), strict=True):
+            cuts, again = tee(cutter.walk(self._footage, way))
+            for at, found, cut in zip(way, tracker.follow(cuts, begin.poses), again, strict=True):
                 out[at] = found
+                if at in looked and found.found.all():
+                    self.looks.append((found.poses, tracker.views(cut(found.poses), found.poses)))
                 progress(STAGE, len(out), len(frames))
             for jump in _jumps(way, out, points):
                 back = range(jump - way.step, frame, -way.step)

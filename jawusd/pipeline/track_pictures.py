@@ -78,7 +78,7 @@ def track_videos(
         capture.motion.rest_frame,
         capture.scans.registration == "take",
     )
-    tracks = tracks_of(followed, facts)
+    tracks = tracks_of(followed, facts, follower.looks)
     tracks.meta["start"] = {"by": begin.by, "frame": begin.frame, "fit": begin.fit}
     tracks = widen_strained(tracks, subject.landmarks, facts.axes)
     findings = [finding.as_json() for finding in (*rows.findings, *footage_doubts(tracks))]

@@ -9,7 +9,9 @@ from package_copy import ROOT
 from jawusd.errors import CaptureError, TrackingError
 from jawusd.formats.capture import load_capture
 from jawusd.formats.tracks import LOST
-from jawusd.geometry import transform_points
+from jawusd.geometry import se3_exp, transform_points
+from jawusd.pipeline import track_pictures
+from jawusd.pipeline.media import open_footage
 from jawusd.pipeline.prepare import load_meshes
 from jawusd.pipeline.state import no_progress
 from jawusd.pipeline.track import first_pass, model_pass, track_lines, track_summary
@@ -57,9 +59,42 @@ def test_the_jaw_is_followed_from_picks(tracked, truth):
     assert tracks.frames.tolist() == list(range(*capture.frames)) and not (tracks.status == LOST).any()
     assert off_mm(tracks, truth).mean() < 0.2
     assert steps[-1] == ("follow", 12, 12) and tracks.meta["start"]["by"] == "picks"
+    assert {found["kind"] for found in tracks.meta["findings"]} == {"registration_unknown"}
     assert np.isfinite(tracks.sigma_mm).all() and np.isnan(tracks.coverage_error).all()
     lines = "\n".join(track_lines(track_summary(tracks)))
     assert "12 of 12" in lines and "mask" not in lines
+
+
+def with_longer_lens(camera):
+    return replace(camera, K=camera.K * np.array([[1.06, 1, 1], [1, 1.06, 1], [1, 1, 1]]))
+
+
+def turned(camera):
+    return replace(camera, T_cam_world=se3_exp(np.deg2rad([0.6, 0.4, 0, 0, 0, 0])) @ camera.T_cam_world)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "size", "kind", "camera"),
+    [
+        (with_longer_lens, 1.0, "focal_length", "cam1"),
+        (turned, 1.0, "camera_rarely_used", "cam1"),
+        (None, 1.03, "scan_size", None),
+    ],
+)
+def test_wrong_cameras_and_scans_are_named(offsets, monkeypatch, spoil, size, kind, camera):
+    def opened(capture):
+        cameras, videos = open_footage(capture)
+        return {name: spoil(one) if spoil and name == camera else one for name, one in cameras.items()}, videos
+
+    monkeypatch.setattr(track_pictures, "open_footage", opened)
+    start = load_capture(EXAMPLE).bootstrap.frame
+    capture = unmasked((start - 3, start + 9))
+    meshes = {
+        name: replace(mesh, vertices=size * mesh.vertices) if name in ("upper_teeth", "lower_teeth") else mesh
+        for name, mesh in load_meshes(capture).items()
+    }
+    found = track_videos(capture, offsets, meshes, 1, no_progress).meta["findings"]
+    assert (kind, camera) in {(one["kind"], one.get("camera")) for one in found}
 
 
 def test_the_model_changes_nothing_that_colours_said(tracked, offsets):

@@ -16,9 +16,9 @@ from jawusd.geometry import transform_point, transform_points
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.correspondences import search_edges
-from jawusd.tracking.contour.samples import LENGTH, NX, NY, U, V, X, Z, contour_samples
+from jawusd.tracking.contour.samples import HABITS, LENGTH, NX, NY, U, V, X, Z, contour_samples
 from jawusd.tracking.contour.scan import ARCHES, Scan
-from jawusd.tracking.contour.views import View
+from jawusd.tracking.contour.views import Drawn, View
 
 # How far contours are looked for [px]: a focal length off by 5 % moves the molars' by 9 px at 7 px/mm.
 _REACH_PX = 16.0
@@ -83,7 +83,7 @@ def measure_magnification(
         cameras = len(views)
         pivot = np.mean([transform_point(poses[r], scans[r].centre) for r in ARCHES], axis=0)
         for r in ARCHES:
-            rows = (_rows(scans[r], r, c, poses, view, pivot, config) for c, view in enumerate(views) if use[r, c])
+            rows = (_rows(scans, r, c, poses, view, pivot, config) for c, view in enumerate(views) if use[r, c])
             parts = [part for part in rows if part is not None]
             if len(parts) >= 2:
                 blocks.append(_joined(parts))
@@ -92,19 +92,12 @@ def measure_magnification(
     return _solved(blocks, cameras, config)
 
 
-def _rows(scan: Scan, r: int, c: int, poses: Array, view: View, pivot: Array, config: TrackingConfig) -> _Rows | None:
-    """Match the contour of an arch in one view with its mask, from far; None if nothing matches."""
-    pose = view.T_delay[r] @ poses[r]
-    shape = view.masks.shape[1:]
-    labels, depth = np.zeros(shape, np.uint8), np.zeros(shape, np.float32)
-    scan.draw(view.matrix @ pose, depth, labels)
-    eye = pose[:3, :3].T @ (view.eye - pose[:3, 3])
-    limits = (config.sample_step_px, config.depth_tolerance_mm)
-    samples, _ = contour_samples(scan, view.matrix @ pose, eye, labels, depth, *limits)
-    distance = np.empty(len(samples))
-    nothing = (np.zeros(shape, np.uint8), np.zeros(shape, np.float32))
-    search_edges(samples, view.masks[r], *nothing, _REACH_PX, config.overlap_tolerance_mm, 0.8, distance)
-    samples, distance = samples[np.isfinite(distance)], distance[np.isfinite(distance)]
+def _rows(
+    scans: Sequence[Scan], r: int, c: int, poses: Array, view: View, pivot: Array, config: TrackingConfig
+) -> _Rows | None:
+    """Match the contour of an arch in one view with its edges, from far; None if nothing matches."""
+    scan, pose = scans[r], view.T_delay[r] @ poses[r]
+    samples, distance = _matched(scans, r, view, poses, config)
     if not len(samples):
         return None
     points = transform_points(pose, samples[:, X : Z + 1])
@@ -132,6 +125,30 @@ def _rows(scan: Scan, r: int, c: int, poses: Array, view: View, pivot: Array, co
     )
     own = np.column_stack([np.cross(points - centre, slope), slope])
     return _Rows(distance, samples[:, LENGTH], own, np.full(len(samples), c), shared)
+
+
+def _matched(scans: Sequence[Scan], r: int, view: View, poses: Array, config: TrackingConfig) -> tuple[Array, Array]:
+    """Return the contour samples of an arch that have an edge in reach, (n, COLUMNS), and its distances [px], (n,)."""
+    labels = np.zeros((2, *view.masks.shape[1:]), np.uint8)
+    depth = np.zeros(labels.shape, np.float32)
+    drawn = [r] if view.edges is None else ARCHES  # masks show both arches apart
+    for arch in drawn:
+        scans[arch].draw(view.matrix @ view.T_delay[arch] @ poses[arch], depth[arch], labels[arch])
+    pose = view.T_delay[r] @ poses[r]
+    eye = pose[:3, :3].T @ (view.eye - pose[:3, 3])
+    limits = (config.sample_step_px, config.depth_tolerance_mm)
+    samples, count = contour_samples(scans[r], view.matrix @ pose, eye, labels[r], depth[r], *limits)
+    reach = (_REACH_PX, config.overlap_tolerance_mm, 0.8)
+    if view.edges is None:
+        distance = np.empty(len(samples))
+        search_edges(samples, view.masks[r], labels[1 - r], depth[1 - r], *reach, distance)
+    else:
+        both = Drawn(labels[r], labels[1 - r], depth[1 - r])
+        distance, weights = view.edges.search(samples, count, r, both, reach)
+        distance = distance - samples[:, HABITS] @ view.habits[r]
+        samples[:, LENGTH] *= np.nan_to_num(weights)
+    found = np.isfinite(distance) & (samples[:, LENGTH] > 0)
+    return samples[found], distance[found]
 
 
 def _joined(parts: Sequence[_Rows]) -> _Rows:

@@ -15,7 +15,9 @@ from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.frame_record import NO_LOSS, FrameRecord, Loss
 from jawusd.tracking.contour.quality import matched_px
 from jawusd.tracking.contour.scan import ARCHES, Scan
+from jawusd.tracking.contour.views import View
 from jawusd.tracking.region.learned import CORRELATION_PX
+from jawusd.tracking.region.take_checks import camera_findings, size_findings
 from jawusd.tracking.region.tracker import RegionPose
 from jawusd.tracking.sequence.closed_bite import observe_bite
 from jawusd.tracking.sequence.extrinsics import Extrinsics
@@ -51,8 +53,13 @@ class TakeFacts:
     registers: bool = False
 
 
-def tracks_of(followed: Mapping[int, RegionPose], take: TakeFacts) -> Tracks:
+def tracks_of(
+    followed: Mapping[int, RegionPose], take: TakeFacts, looks: Sequence[tuple[Array, Sequence[View]]] = ()
+) -> Tracks:
     """Return the tracks of frames; delays between cameras and where borders lie are told from all of them.
+
+    Args:
+        looks: poses and views of some of the frames, which sizes and focal lengths are told from.
 
     Raises:
         TrackingError: the registration of the scans is to be corrected, and the mouth was not closed.
@@ -70,8 +77,15 @@ def tracks_of(followed: Mapping[int, RegionPose], take: TakeFacts) -> Tracks:
     observe_bite(equations, records, rest, extrinsics, variance)
     nuisances = equations.solve(config, False)
     names = tuple(camera.name for camera in take.cameras)
-    late = time_findings(names, records, nuisances, extrinsics, config)
-    notes: TracksMeta = {"painted": [s.painted for s in take.scans], "findings": [found.as_json() for found in late]}
+    findings = [
+        *camera_findings(names, [solution for _, _, solution in solved]),
+        *size_findings(names, take.scans, looks, config),
+        *time_findings(names, records, nuisances, extrinsics, config),
+    ]
+    notes: TracksMeta = {
+        "painted": [s.painted for s in take.scans],
+        "findings": [found.as_json() for found in findings],
+    }
     moved = {f: np.stack([corrected_pose(records, f, arch, nuisances) for arch in ARCHES]) for f in records}
     records = {f: replace(r, solution=replace(r.solution, poses=moved[f])) for f, r in records.items()}
     return assemble(records, names, take.landmarks, nuisances, extrinsics, config, rest, notes)

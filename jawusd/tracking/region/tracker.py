@@ -15,6 +15,7 @@ from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.quality import matched_px, relative_covariance, residual_px, twist_covariance
 from jawusd.tracking.contour.scan import ARCHES, Scan, probe_points
+from jawusd.tracking.contour.views import View
 from jawusd.tracking.region.learned import CORRELATION_PX, FIRST_RATES, RATES, LearnedColours
 from jawusd.tracking.region.picture import Cut, Picture
 from jawusd.tracking.region.search import Look, PoseSearch, fitting_share
@@ -82,6 +83,15 @@ class RegionTracker:
         self._first_share = fitting_share(rough)
         worth_px = self._search.worth_px(solution)
         return RegionPose(poses, np.ones(2, bool), _covariance(solution), worth_px, solution)
+
+    def views(self, pictures: Sequence[Picture | None], poses: Array) -> list[View]:
+        """Return the views of an instant by the colours learned so far.
+
+        Args:
+            pictures: one per camera.
+            poses: T_world_upper and T_world_lower there, shape (2, 4, 4).
+        """
+        return self._colours.views(pictures, poses)
 
     @property
     def first_fit(self) -> float:

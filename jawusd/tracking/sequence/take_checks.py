@@ -9,6 +9,7 @@ them; lens distortion at 3 was a false alarm on one of these.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,27 +22,47 @@ from jawusd.tracking.sequence.extrinsics import Extrinsics
 from jawusd.tracking.sequence.nuisance import Nuisances
 from jawusd.tracking.sequence.results import outline_variance
 
-# Magnification of one camera against the others, and of all [-]; change of it over 25 mm at the teeth [-]. The second
-# was a false alarm on 2 of 51 valid persons (0.028 and 0.030); at 0.035 it would miss scans 3 % too large. The
-# third, of distortion with a wrong sign, finds 7 of 10 persons and 1 of 35 valid ones; at 0.006 4 of 10 and the same 1.
-_SCALE, _COMMON, _BEND = 0.02, 0.015, 0.002
+
+@dataclass(frozen=True)
+class LensLimits:
+    """Say from what on a magnification is worth a warning.
+
+    Attributes:
+        scale, common: of one camera against the others, and of all [-].
+        bend: change of it over 25 mm at the teeth [-].
+        bias_px: outline bias of a camera against the others [px].
+        clear: standard deviations of the first two.
+    """
+
+    scale: float
+    common: float
+    bend: float
+    bias_px: float
+    clear: float
+
+
+#: Of drawn masks. The second was a false alarm on 2 of 51 valid persons (0.028 and 0.030); at 0.035 it would miss scans
+#: 3 % too large. The third, of distortion with a wrong sign, finds 7 of 10 persons and 1 of 35 valid ones; at 0.006 4
+#: of 10 and the same 1. The sigmas of magnifications hold cameras that moved along their axis.
+OF_MASKS = LensLimits(0.02, 0.015, 0.002, 2.5, 3.0)
+#: Of colours, whose sigmas are wide. None of 8 takes of 7 mouths came near (0.019 at 1.0 sigma, 0.005 at 0.4), which
+#: bounds the rate of false alarms to 31 % (95 %). 4 of 4 of these with a focal length 5 % off (1.9 sigma at
+#: least), and 2 of 2 with scans 3 % too large (2.4), are found. Lens distortion is not: true lenses showed 0.04 at 3.
+OF_COLOURS = LensLimits(0.03, 0.015, np.inf, np.inf, 1.6)
 # Change that a lens of radial distortion k1 = -0.4 makes at the teeth from 130 mm away, without any calibration. Masks
 # made from the footage of three of five path-traced mouths with true lenses showed 0.019 to 0.068.
 _MOST_BEND = 0.015
-# Outline bias of a camera against the others [px].
-_BIAS_PX = 2.5
 # Motion of a camera since its calibration, which the take corrects.
 _TURN_DEG, _MOVE_MM = 0.25, 0.7
 _TELLING_CAMERAS = 3  # of two that differ, either may be wrong
 _CLEARLY = 4.0  # standard deviations
-_CLEAR_LENS = 3.0  # the same of magnifications: their sigma holds cameras that moved along their axis
 _LATE_FRAMES = 0.7  # cameras that run freely are up to half a frame apart
 # Step of a delay in mid take [frames]. The one valid take of a drawn person that was looked at (30 frames) showed 0.02;
 # a rate of false alarms is not known. Steps are missed where the jaw is so fast that the late masks are left out.
 _STEP_FRAMES = 0.5
 
 
-def lens_findings(names: Sequence[str], found: Magnification) -> list[Finding]:
+def lens_findings(names: Sequence[str], found: Magnification, limits: LensLimits = OF_MASKS) -> list[Finding]:
     """Return what the magnification of the cameras tells of scans, focal lengths, lenses and masks.
 
     Kinds: "scan_size" [%], "focal_length" [%], "lens_distortion" [%], "side_teeth" [%], "masks_wide" [px].
@@ -49,40 +70,40 @@ def lens_findings(names: Sequence[str], found: Magnification) -> list[Finding]:
     out = []
     common = found.common
     sigma = float(np.sqrt(np.mean(found.sigma_scale**2) / len(found.scale)))  # cameras move independently
-    if abs(common) > max(_COMMON, _CLEAR_LENS * sigma) and (np.sign(found.scale) == np.sign(common)).all():
+    if abs(common) > max(limits.common, limits.clear * sigma) and (np.sign(found.scale) == np.sign(common)).all():
         out.append(
             Finding(
                 "scan_size",
                 "warning",
                 f"every camera shows the teeth {_than(common)} than the scans: the scans' scale is wrong, or the "
-                f"calibration's lengths; at most {_COMMON:.1%} is usual.",
+                f"calibration's lengths; at most {limits.common:.1%} is usual.",
                 value=round(100 * common, 2),
-                limit=100 * _COMMON,
+                limit=100 * limits.common,
                 hint="Check the scans' unit and scaling, and the square size of the calibration board.",
             )
         )
     for c, name in enumerate(names):
         own = float(found.scale[c] - common)
-        if len(names) >= _TELLING_CAMERAS and abs(own) > max(_SCALE, _CLEAR_LENS * found.sigma_scale[c]):
+        if len(names) >= _TELLING_CAMERAS and abs(own) > max(limits.scale, limits.clear * found.sigma_scale[c]):
             out.append(
                 Finding(
                     "focal_length",
                     "warning",
                     f"it shows the teeth {_than(own)} than its calibration and the other cameras say; at most "
-                    f"{_SCALE:.0%} is usual. Its focal length is wrong, or its distance.",
+                    f"{limits.scale:.0%} is usual. Its focal length is wrong, or its distance.",
                     value=round(100 * own, 2),
-                    limit=100 * _SCALE,
+                    limit=100 * limits.scale,
                     camera=name,
                     hint="Calibrate it again with the lens, zoom and focus of the recording.",
                 )
             )
-        elif abs(found.bend[c]) > max(_BEND, _CLEARLY * found.sigma_bend[c]):
-            out.append(_bent(name, float(found.bend[c])))
-        out += _wide(name, c, found)
+        elif abs(found.bend[c]) > max(limits.bend, _CLEARLY * found.sigma_bend[c]):
+            out.append(_bent(name, float(found.bend[c]), limits))
+        out += _wide(name, c, found, limits)
     return out
 
 
-def _bent(name: str, bend: float) -> Finding:
+def _bent(name: str, bend: float, limits: LensLimits) -> Finding:
     """Say that teeth away from the middle of a camera's pictures are shown larger or smaller."""
     if abs(bend) > _MOST_BEND:
         return Finding(
@@ -98,10 +119,10 @@ def _bent(name: str, bend: float) -> Finding:
     return Finding(
         "lens_distortion",
         "warning",
-        f"25 mm from the optical axis it shows the teeth {_than(bend)} than its calibration says; at most {_BEND:.1%} "
-        "is usual. Its lens distortion is wrong.",
+        f"25 mm from the optical axis it shows the teeth {_than(bend)} than its calibration says; at most "
+        f"{limits.bend:.1%} is usual. Its lens distortion is wrong.",
         value=round(100 * bend, 2),
-        limit=100 * _BEND,
+        limit=100 * limits.bend,
         camera=name,
         hint="Check the signs and the order of the distortion coefficients, or calibrate it again.",
     )
@@ -111,22 +132,25 @@ def _than(share: float) -> str:
     return f"{abs(share):.1%} {'larger' if share > 0 else 'smaller'}"
 
 
-def _wide(name: str, c: int, found: Magnification) -> list[Finding]:
+def _wide(name: str, c: int, found: Magnification, limits: LensLimits) -> list[Finding]:
     """Say that a camera's masks are drawn wider or narrower than the others' by far."""
     own = found.bias_px[c] - np.median(found.bias_px, axis=0)
     bias = float(own.mean())
     if len(found.bias_px) < _TELLING_CAMERAS:
         return []
-    if np.abs(own).min() < max(_BIAS_PX, _CLEARLY * float(found.sigma_bias_px[c].max())) or own.min() * own.max() < 0:
+    if (
+        np.abs(own).min() < max(limits.bias_px, _CLEARLY * float(found.sigma_bias_px[c].max()))
+        or own.min() * own.max() < 0
+    ):
         return []
     return [
         Finding(
             "masks_wide",
             "warning",
             f"its masks are drawn {abs(bias):.1f} px {'wider' if bias > 0 else 'narrower'} than those of the other "
-            f"cameras; at most {_BIAS_PX} px is usual.",
+            f"cameras; at most {limits.bias_px} px is usual.",
             value=round(bias, 2),
-            limit=_BIAS_PX,
+            limit=limits.bias_px,
             camera=name,
             hint="Draw them again, or leave this camera out.",
         )
