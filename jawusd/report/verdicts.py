@@ -228,10 +228,15 @@ def _bounds(data: ReportData) -> Verdict:
     return _verdict("bounds", checks)
 
 
+# Only readers that know neither the exact model nor ONNX pose by the table. Its worst vertex was 0.007 to 0.136 mm off
+# in rigs of 11 persons, 0.154 mm in one of rough teeth that was tracked (`tests/benchmarks/contact.py`).
+_TABLE_MM = (0.06, 0.5)
+
+
 def _rig(data: ReportData) -> Verdict:
     errors = [finding for finding in data.rig.findings if finding.startswith("error")]
     checks = [
         Check("validators", f"{len(errors)} errors", "no errors", BAD if errors else GOOD),
-        _below("sampled decoder against the exact model, worst vertex", data.rig.table_error_mm, 0.06, 0.2, "mm", 3),
+        _below("sampled decoder against the exact model, worst vertex", data.rig.table_error_mm, *_TABLE_MM, "mm", 3),
     ]
     return _verdict("rig", checks)

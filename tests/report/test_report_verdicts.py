@@ -63,7 +63,7 @@ def broken(data):
 
 
 def coarse(data):
-    return replace(data, rig=RigFacts(0.5, ()))
+    return replace(data, rig=RigFacts(0.7, ()))
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ from jawusd.formats.mesh import Mesh, crown_face_mask
 from jawusd.geometry import so3_left_jacobian
 from jawusd.rig.bake import bake_rig
 from jawusd.rig.geo import corner_normals
-from jawusd.rig.sampling import grid_axes, sample_valid, valid_box
+from jawusd.rig.sampling import grid_axes, grid_points, sample_valid, valid_box
 from jawusd.rig.table import SIZES, build_table, table_error
 
 GRAPHS = {"actor.onnx", "actor_encode.onnx"}
@@ -130,6 +130,15 @@ def test_knots_span_the_valid_box_and_hold_the_closed_bite(kind):
         assert (axis[0], axis[-1], len(axis)) == (low, high, 33)
         assert 0.0 in axis and (np.diff(axis) > 0).all()
     assert np.abs(table.twist(np.zeros((1, 3)))).max() < 1e-12
+
+
+def test_a_table_errs_less_than_interpolated_values():
+    rig = example_rig("anchored")
+    table = build_table(rig, mandible_vertices())
+    d = sample_valid(rig, 2000, seed=3)
+    exact = RegularGridInterpolator(table.axes, rig.twist(grid_points(table.axes)).reshape(33, 33, 33, 6))(d)
+    away = [np.linalg.norm(found - rig.twist(d), axis=1) for found in (table.twist(d), exact)]
+    assert away[0].mean() < 0.7 * away[1].mean() and away[0].max() < 0.9 * away[1].max()
 
 
 class BentAtTen:
