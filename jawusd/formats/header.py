@@ -52,6 +52,7 @@ class TracksHeader(_Header):
 
     fps: float | None = None
     tolerance_mm: float = 0.0
+    prior_spread_mm: float = 0.0
     correlation_px: float = 0.0
     findings: list[dict[str, str | float | int]] = []
     start: dict[str, object] = {}

@@ -75,6 +75,7 @@ class TracksMeta(TypedDict, total=False):
     evaluations_per_row_and_frame: float
     calibration_rescaled_px: dict[str, tuple[tuple[int, int], tuple[int, int]]]
     fps: float  # frames per second of a performance
+    prior_spread_mm: float  # width of the model's prior that all final poses were weighed with, where they were
     tolerance_mm: float  # how far outside the bound the rig allows poses of a performance
     findings: list[dict[str, str | float | int]]  # `Finding.as_json` of everything doubtful about the take
 
@@ -139,7 +140,8 @@ class Tracks:
         T_world_upper, T_world_lower, T_upper_lower: final poses, shape (F, 4, 4); the last is T_skull_mandible.
         raw_T_world_upper, raw_T_world_lower, raw_T_upper_lower: first-pass poses, shape (F, 4, 4).
         status: `TrackStatus` of (upper, lower), shape (F, 2).
-        prior_aided: a kinematic prior took part in the final pose, shape (F,).
+        prior_aided: the frame was found again with a kinematic prior, shape (F,). `prior_spread_mm` in the meta data
+            says that all final poses were weighed with one, as those of colours are.
         coverage_error: mask pixels the projected scan leaves uncovered, as a fraction of the mask (E_SP of paper
             eq. 8 over segmented pixels), shape (F, 2, C); NaN without a mask.
         masks_used: the masks that took part in the raw poses, shape (F, 2, C); the others are missing or spoiled.

@@ -52,6 +52,7 @@ class TrackSummary(TypedDict):
     recovered: int
     without_a_camera: int
     prior_aided: int
+    prior_spread_mm: NotRequired[float]  # width of the model's prior that all final poses were weighed with
     calibration_rescaled_px: dict[str, tuple[Size, Size]]  # sizes calibrated and recorded, by camera
     sigma_mm: dict[str, float | None]  # median standard deviation of the landmarks, None if not known
     coverage_error_percent: float | None  # share of the masks used that is left uncovered, None without any
@@ -184,21 +185,25 @@ def first_pass(
 def model_pass(
     capture: Capture, offsets: dict[str, int], tracks: Tracks, model: JawModel, jobs: int, progress: Progress
 ) -> Tracks:
-    """Track uncertain frames again with the fitted model as a prior; parameters and errors as `track`.
+    """Track uncertain frames again with the fitted model as a prior, or weigh poses of colours with it.
+
+    Parameters and errors as `track`.
 
     Args:
         offsets: frame offset by camera.
         tracks: the first pass.
     """
     from jawusd.tracking.sequence.model_refinement import refine_tracks
+    from jawusd.tracking.sequence.model_weighting import weigh_with_model
 
+    jaw = JawRig(model.arrays, model.meta)
     if not any(camera.masks for camera in capture.cameras):
-        return tracks  # colours have expected the condyles where the jaw's own motion takes them
+        return weigh_with_model(tracks, jaw)
     with naming_file(capture.folder / "capture.toml"):
         meshes = registered_meshes(load_meshes(capture), tracks.meta)
         return refine_tracks(
             tracks,
-            JawRig(model.arrays, model.meta),
+            jaw,
             capture,
             load_cameras(capture),
             offsets,
@@ -241,6 +246,8 @@ def track_summary(tracks: Tracks) -> TrackSummary:
     if "outline_bias_px" in tracks.meta:
         summary["outline_bias_px"] = tracks.meta["outline_bias_px"]
         summary["gum_bias_px"], summary["gum_line_mm"] = tracks.meta["gum_bias_px"], tracks.meta["gum_line_mm"]
+    if "prior_spread_mm" in tracks.meta:
+        summary["prior_spread_mm"] = tracks.meta["prior_spread_mm"]
     if "registration" in tracks.meta:
         summary["registration"] = tracks.meta["registration"]
     return summary
@@ -326,6 +333,8 @@ def track_lines(summary: TrackSummary) -> list[str]:
         )
     if summary["prior_aided"]:
         lines.append(f"  {summary['prior_aided']} uncertain frames tracked again with the fitted model's help")
+    if "prior_spread_mm" in summary:
+        lines.append(f"  final poses weighed with the fitted model, {summary['prior_spread_mm']:.2f} mm from it (rms)")
     known = {name: value for name, value in summary["sigma_mm"].items() if value is not None}
     sigma = ", ".join(f"{name} {value}" for name, value in known.items()) or "not known"
     lines.append(f"  expected error (1 sigma, median) [mm]: {sigma}")

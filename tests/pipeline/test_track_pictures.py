@@ -14,7 +14,7 @@ from jawusd.pipeline import track_pictures
 from jawusd.pipeline.media import open_footage
 from jawusd.pipeline.prepare import load_meshes
 from jawusd.pipeline.state import no_progress
-from jawusd.pipeline.track import first_pass, model_pass, track_lines, track_summary
+from jawusd.pipeline.track import first_pass, track_lines, track_summary
 from jawusd.pipeline.track_pictures import track_videos
 from jawusd.tracking.region.strained import footage_doubts
 
@@ -95,11 +95,6 @@ def test_wrong_cameras_and_scans_are_named(offsets, monkeypatch, spoil, size, ki
     }
     found = track_videos(capture, offsets, meshes, 1, no_progress).meta["findings"]
     assert (kind, camera) in {(one["kind"], one.get("camera")) for one in found}
-
-
-def test_the_model_changes_nothing_that_colours_said(tracked, offsets):
-    capture, tracks, _ = tracked
-    assert model_pass(capture, offsets, tracks, None, 1, no_progress) is tracks
 
 
 def test_without_picks_the_teeth_are_searched(offsets, truth):

@@ -41,15 +41,18 @@ class KinematicPrior:
         """Add the log-likelihood of the deviation from the model, linearised."""
         poses = state.poses
         relative = relative_pose(poses[0], poses[1])
-        d = self.jaw.encode(relative)[0]
-        pose = self.jaw.pose(d)
-        deviation = se3_log(relative @ se3_inverse(pose))
-        precision = self._precision(d, pose)
+        deviation, precision = self.deviation(relative)
         to_skull = se3_adjoint(se3_inverse(poses[0]))
         about = [se3_adjoint(make_transform(np.eye(3), centre)) for centre in state.centres]
         # To first order exp(xi') = exp(Ad(T_u^-1) (x_l - x_u)) exp(xi).
         slope = np.hstack([-to_skull @ about[0], to_skull @ about[1]])
         equations.add_joint(slope.T @ precision @ slope, -slope.T @ precision @ deviation)
+
+    def deviation(self, relative: Array) -> tuple[Array, Array]:
+        """Return the twist (6,) of T_upper_lower (4, 4) from the model, at its nearest pose, and P there (6, 6)."""
+        d = self.jaw.encode(relative)[0]
+        pose = self.jaw.pose(d)
+        return se3_log(relative @ se3_inverse(pose)), self._precision(d, pose)
 
     def _precision(self, d: Array, pose: Array) -> Array:
         """Return P at a model pose, shape (6, 6)."""
