@@ -73,9 +73,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("captures", type=Path, nargs="+")
     options = parser.parse_args()
-    print(
-        f"{'':<16}{'core s':>7}{'tracked':>11}{'incisor':>7}{'':>14}{'condyles':>9}{'over 1 mm':>11}{'NEES':>7}{'weighed':>11}"
-    )
+    numbers = f"{'condyles':>9}{'over 1 mm':>11}{'NEES':>7}{'weighed':>11}"
+    print(f"{'':<16}{'core s':>7}{'tracked':>11}{'incisor':>7}{'':>14}{numbers}")
     for path in options.captures:
         capture = unmasked(load_capture(path, allow_outside=True))
         offsets = sync_cameras(capture, lambda *_: None)["offsets"]
