@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from itertools import tee
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,6 +18,7 @@ if TYPE_CHECKING:
     from jawusd.segmentation.footage import ColourFootage
     from jawusd.tracking.contour.scan import Scan
     from jawusd.tracking.contour.views import View
+    from jawusd.tracking.region.picture import Cut
     from jawusd.tracking.region.tracker import RegionPose, RegionTracker
 
 # Change of the jaw's motion from frame to frame [mm] after which the frames before are looked at again, and distance of
@@ -89,16 +89,27 @@ class Follower:
         out, points = {frame: begin}, self._subject.landmarks[:3]
         progress(STAGE, 1, len(frames))
         for way in (range(frame + 1, frames.stop), range(frame - 1, frames.start - 1, -1)):
-            cuts, again = tee(cutter.walk(self._footage, way))
-            for at, found, cut in zip(way, tracker.follow(cuts, begin.poses), again, strict=True):
+            cuts = _Latest(cutter.walk(self._footage, way))
+            for at, found in zip(way, tracker.follow(cuts, begin.poses), strict=True):
                 out[at] = found
                 if at in looked and found.found.all():
-                    self.looks.append((found.poses, tracker.views(cut(found.poses), found.poses)))
+                    self.looks.append((found.poses, tracker.views(cuts.latest(found.poses), found.poses)))
                 progress(STAGE, len(out), len(frames))
             for jump in _jumps(way, out, points):
                 back = range(jump - way.step, frame, -way.step)
                 _follow_back(back, tracker.follow(cutter.walk(self._footage, back), out[jump].poses), out, points)
         return out
+
+
+class _Latest(Iterator["Cut"]):
+    """Pass on what cuts the pictures, and keep the one passed on last; `itertools.tee` would keep up to 57 of them."""
+
+    def __init__(self, cuts: Iterator[Cut]) -> None:
+        self._cuts = cuts
+
+    def __next__(self) -> Cut:
+        self.latest = next(self._cuts)
+        return self.latest
 
 
 def _places(found: RegionPose, points: Array) -> Array:

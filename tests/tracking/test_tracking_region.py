@@ -1,5 +1,6 @@
 """Borders of teeth found in colours, against pictures whose borders are known by construction."""
 
+import weakref
 from typing import ClassVar
 
 import numpy as np
@@ -137,10 +138,11 @@ def test_the_example_is_followed_by_its_colours(tmp_path):
     picked = GuidedTracker(*teeth, lambda *_: [], 1).picked(capture.bootstrap, cameras)
     chosen = range(max(start - 2, int(frames[0])), start + 6)
     done = []
-    footage, subject = ColourFootage(videos, offsets), subject_of_capture(capture, meshes)
+    footage, subject = Counted(videos, offsets), subject_of_capture(capture, meshes)
     follower = Follower(footage, cameras, prepared(teeth), subject)
     assert follower.begun(start, picked)[1] > 0.3
     guide = follower.run(chosen, lambda *step: done.append(step))
+    assert 1 <= footage.most <= 2  # or long takes fill the memory
     assert sorted(guide) == list(chosen) and done[-1] == ("follow", len(chosen), len(chosen))
     for frame, found in guide.items():
         true = poses[list(frames).index(frame)]
@@ -152,6 +154,21 @@ def test_the_example_is_followed_by_its_colours(tmp_path):
     again = known_guide(tmp_path, "abc")
     assert all(np.array_equal(again[frame].poses, guide[frame].poses) for frame in guide)
     assert known_guide(tmp_path, "other inputs") == {} == known_guide(tmp_path / "empty", "abc")
+
+
+class Counted(ColourFootage):
+    """Count the instants whose pictures are held when the next one is asked for, going forwards."""
+
+    most = 0
+
+    def walk(self, frames):
+        shown = []
+        for frame, pictures in super().walk(frames):
+            shown.append([weakref.ref(image) for image in pictures.values()])
+            yield frame, pictures
+            del pictures
+            if frames.step > 0:
+                self.most = max(self.most, sum(any(one() is not None for one in held) for held in shown))
 
 
 class Covered(ColourFootage):
