@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from jawusd.cli.command import command_line
 from jawusd.cli.options import (
     CaptureArg,
     CaptureOption,
@@ -53,6 +54,7 @@ Jobs = Annotated[int, typer.Option(min=1, max=64, help="Threads that draw and co
 
 
 def build(
+    context: typer.Context,
     capture: CaptureArg,
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the rig.", show_default=False)],
     model: Annotated[Method, typer.Option(help="Form of the jaw model.")] = Method.anchored,
@@ -72,7 +74,14 @@ def build(
 
     _check_backend(solver, backend)
     options = stages.BuildOptions(
-        model.value, solver.value, backend.value, jobs=jobs, resume=resume, fresh=fresh, allow_outside=allow_outside
+        model.value,
+        solver.value,
+        backend.value,
+        jobs=jobs,
+        resume=resume,
+        fresh=fresh,
+        allow_outside=allow_outside,
+        command=command_line(context),
     )
     if dry_run:
         from dataclasses import asdict
@@ -226,6 +235,7 @@ def demo(
 
 
 def build_many(
+    context: typer.Context,
     captures: Annotated[
         Path,
         typer.Argument(
@@ -265,7 +275,14 @@ def build_many(
 
     if cluster is not None and workers is not None:
         raise typer.BadParameter("--workers are processes of this machine; a --cluster has its own.")
-    build = BuildOptions(model.value, jobs=jobs, resume=resume, fresh=fresh, allow_outside=allow_outside)
+    build = BuildOptions(
+        model.value,
+        jobs=jobs,
+        resume=resume,
+        fresh=fresh,
+        allow_outside=allow_outside,
+        command=command_line(context),
+    )
     outcomes = many.build_many(
         load_capture_list(captures),
         out,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from typing import NoReturn
 
 import typer
@@ -15,6 +16,7 @@ from jawusd.errors import JawusdError
 INTERRUPTED = 130
 CONTEXT = {"help_option_names": ["-h", "--help"]}
 
+_WORDS = "jawusd.words"  # key of the words of a command in its context
 _VECTOR = re.compile(r"[-+]?[\d.eE+-]+(,[-+]?[\d.eE+-]+){2}")
 _VECTORS = ("--d", "--point", "--target", "--start")
 
@@ -36,7 +38,8 @@ class Command(TyperCommand):
     # typer hands its public Context to both methods; the base class in its private copy of click declares that one's.
 
     def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]
-        """Take vectors as `--d 20,2,1` too."""
+        """Take vectors as `--d 20,2,1` too, and keep the words for `command_line`."""
+        ctx.meta[_WORDS] = list(args)
         return super().parse_args(ctx, with_vectors_split(args))
 
     def invoke(self, ctx: typer.Context) -> object:  # type: ignore[override]
@@ -49,6 +52,11 @@ class Command(TyperCommand):
             if isinstance(ctx.obj, RunLog) and not isinstance(error, typer.Exit):
                 ctx.obj.error(error)
             raise
+
+
+def command_line(ctx: typer.Context) -> str:
+    """Return the command line of the command that runs, quoted as a shell needs it."""
+    return shlex.join(["jawusd", str(ctx.info_name), *ctx.meta[_WORDS]])
 
 
 def with_vectors_split(args: list[str]) -> list[str]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from jawusd.errors import FittingError
 from jawusd.fitting.condyle_paths import condyle_paths, parameter_paths, path_distances, sagittal_section
-from jawusd.fitting.coverage import missing_movements, shown_parameters
+from jawusd.fitting.coverage import FAR_MM, bound_not_reached, missing_movements, shown_parameters
 from jawusd.fitting.data import Source, SubjectAnatomy, TrainingData, select
 from jawusd.fitting.fit import FittingConfig, Progress, fit_form
 from jawusd.fitting.form import FittedForm
@@ -39,7 +39,6 @@ _LARGEST = "largest vertex distance"
 _OPENING_QUANTILE = 0.995  # where the sweep of Fig. 5 ends, so that a single frame does not decide
 _SKULL_AROUND_MM = 30.0
 _GRID_MM = 0.5
-_FAR_MM = np.array([3.0, 2.0, 2.0])  # a pose farther than this from all captured ones lies in a gap
 _SLICES = 60
 
 
@@ -201,16 +200,17 @@ def _coverage(d: Array, bounds: Bounds, sentences: tuple[str, ...]) -> Coverage:
     at = np.zeros((_SLICES, 3))
     at[:, 0] = openings
     slices = np.stack([np.stack(bounds.slices.chord(at, axis), axis=1) for axis in (1, 2)])
-    gaps = _gaps(d, bounds, 1), _gaps(d, bounds, 2)
-    return Coverage(d, bounds.rings, openings, slices, gaps, sentences)
+    (lateral, lateral_share), (forward, forward_share) = (_gaps(d, bounds, axis) for axis in (1, 2))
+    gaps, shares = (lateral, forward), (lateral_share, forward_share)
+    return Coverage(d, bounds.rings, openings, slices, gaps, (*sentences, *bound_not_reached(gaps, shares)))
 
 
-def _gaps(d: Array, bounds: Bounds, axis: int) -> Array:
-    """Return points (d1, d_axis) of the slice hull, the other parameter zero, that are far from every captured pose."""
+def _gaps(d: Array, bounds: Bounds, axis: int) -> tuple[Array, float]:
+    """Return points (d1, d_axis) of the slice hull, the other parameter zero, far from every pose, and their share."""
     first, second = (np.arange(low, high, _GRID_MM) for low, high in bounds.slices_box[[0, axis]])
     grid = np.zeros((len(first) * len(second), 3))
     grid[:, 0], grid[:, axis] = (part.ravel() for part in np.meshgrid(first, second))
     grid = grid[bounds.slices.signed_distance(grid) <= 0][:, [0, axis]]
-    scale = _FAR_MM[[0, axis]]
+    scale = FAR_MM[[0, axis]]
     far = np.array([((((d[:, [0, axis]] - point) / scale) ** 2).sum(1) > 1).all() for point in grid], dtype=bool)
-    return grid[far]
+    return grid[far], float(far.mean()) if len(far) else 0.0

@@ -13,6 +13,15 @@ from jawusd.formats.tracks import Tracks
 
 
 @dataclass(frozen=True)
+class Origin:
+    """Say how a build was made; empty where that is not recorded."""
+
+    finished: str  # date and time
+    command: str  # the command line; "" also where a program called the build
+    versions: Mapping[str, str]  # by package
+
+
+@dataclass(frozen=True)
 class CameraFacts:
     """Describe the input of one camera."""
 
@@ -70,7 +79,7 @@ class ReportData:
     inferred: tuple[str, ...]  # what was derived instead of being given
     seconds: Mapping[str, float]  # per stage [s]
     hashes: Mapping[str, str]  # SHA-256 by file name of the build
-    versions: Mapping[str, str]  # by package
+    origin: Origin
     rig: RigFacts
     experiments: Experiments | None  # the paper's experiments, None if they could not be done
     overlays: tuple[Overlay, ...]  # frames of the footage, the worst first

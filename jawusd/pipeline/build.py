@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NotRequired, TypedDict, TypeVar, cast
 
@@ -25,6 +25,7 @@ from jawusd.pipeline.calibrate import (
 )
 from jawusd.pipeline.check import check_capture, refuse_errors
 from jawusd.pipeline.fit import FitSummary, fit_lines, fit_subject, fit_summary
+from jawusd.pipeline.origin import origin_now
 from jawusd.pipeline.prepare import input_hashes, naming_file, open_capture, rescaled_cameras, subject_of_capture
 from jawusd.pipeline.report import BuildFacts, missing_packages, place_of, write_build_report
 from jawusd.pipeline.scans import all_labelled, store_labels, with_stored_labels
@@ -64,6 +65,7 @@ class BuildOptions:
         resume: continue an earlier build in the folder.
         fresh: delete an earlier build in the folder first.
         allow_outside: let paths in the capture leave its folder.
+        command: the command line that asks for it, for the report.
     """
 
     model: str = "anchored"
@@ -73,6 +75,7 @@ class BuildOptions:
     resume: bool = False
     fresh: bool = False
     allow_outside: bool = False
+    command: str = ""
 
 
 FoundJson = dict[str, str | float | int]
@@ -85,9 +88,10 @@ class CheckResult(TypedDict):
 
 
 class ReportSummary(TypedDict):
-    """Hold the capture's path relative to the rig, and the report's file, or which package it lacks."""
+    """Hold the capture's path relative to the rig, `Origin`, and the report's file, or which package it lacks."""
 
     capture: str
+    origin: NotRequired[dict[str, object]]
     file: NotRequired[str]
     verdict: NotRequired[BuildVerdict]
     missing: NotRequired[str]
@@ -321,12 +325,13 @@ class StagedBuild:
         return [*files, *take], {}
 
     def _report(self, missing: str | None) -> tuple[list[Path], ReportSummary]:
-        place = place_of(self.capture, self.folder)
+        place, origin = place_of(self.capture, self.folder), origin_now(self.options.command)
         if missing is not None:
             # The rig is complete without; the summary says what is missing and how to get it.
-            return [], {"capture": place, "missing": missing}
-        path, verdict = write_build_report(self.folder, BuildFacts(self.state.stages, self.capture), self.progress)
-        return [path], {"capture": place, "file": path.name, "verdict": verdict}
+            return [], {"capture": place, "origin": asdict(origin), "missing": missing}
+        facts = BuildFacts(self.state.stages, self.capture, origin)
+        path, verdict = write_build_report(self.folder, facts, self.progress)
+        return [path], {"capture": place, "origin": asdict(origin), "file": path.name, "verdict": verdict}
 
 
 def build_lines(summary: BuildSummary) -> list[str]:

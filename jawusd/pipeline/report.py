@@ -6,21 +6,20 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar, cast
 
-from jawusd import __version__
 from jawusd.errors import FormatError, JawusdError, MissingDependencyError, explain_missing_packages
 from jawusd.formats.capture import Capture
 from jawusd.formats.experiments import Experiments, save_table
 from jawusd.formats.finding import Finding
 from jawusd.formats.model import load_model
-from jawusd.formats.report import CameraFacts, Overlay, ReportData, RigFacts
+from jawusd.formats.report import CameraFacts, Origin, Overlay, ReportData, RigFacts
 from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.pipeline.contact import contact_pictures
 from jawusd.pipeline.fit import Poses, fit_summary
 from jawusd.pipeline.media import draw_worst_frames, replay_parts
+from jawusd.pipeline.origin import recorded_origin
 from jawusd.pipeline.prepare import Subject, load_cameras, open_capture, subject_of_build
 from jawusd.pipeline.scans import with_stored_labels
 from jawusd.pipeline.state import (
@@ -42,7 +41,6 @@ T = TypeVar("T")
 
 REPORT_FILE = "report.html"
 TABLE_FILE = "experiments.csv"
-_PACKAGES = ("numpy", "scipy", "numba", "usd-core", "opencv-contrib-python-headless")
 _NETWORKS = (
     "The paper's own models (NLPCA) take about a minute to train: `jawusd report DIR --experiments` adds them to the "
     "figures."
@@ -55,6 +53,7 @@ class BuildFacts:
 
     stages: Stages  # record of each stage
     capture: Capture | None  # the capture it was made from, None where it is not available
+    origin: Origin
     why_not: str = ""  # why there is no capture
 
 
@@ -101,7 +100,7 @@ def write_build_report(
         inferred=tuple(fit_summary(model).get("inferred", ())),
         seconds={name: record.seconds for name, record in facts.stages.items() if name != "report"},
         hashes=_hashes(facts.stages),
-        versions=package_versions(),
+        origin=facts.origin,
         rig=_rig_facts(folder),
         experiments=experiments,
         overlays=overlays,
@@ -184,17 +183,18 @@ def build_facts(folder: Path, state: BuildState, capture: Capture | None, *, all
         capture: None to look where it was.
         allow_outside: let paths in the capture leave its folder.
     """
-    if capture is not None:
-        return BuildFacts(state.stages, as_built(capture, folder))
     record = state.stages.get("report")
-    place = record.result.get("capture") if record else None
+    found = record.result if record else {}
+    stages, origin, place = state.stages, recorded_origin(found), found.get("capture")
+    if capture is not None:
+        return BuildFacts(stages, as_built(capture, folder), origin)
     if not place:
-        return BuildFacts(state.stages, None, "the build does not say where its capture is: name it with --capture.")
+        return BuildFacts(stages, None, origin, "the build does not say where its capture is: name it with --capture.")
     path = folder / str(place)
     try:
-        return BuildFacts(state.stages, as_built(open_capture(path, allow_outside=allow_outside), folder))
+        return BuildFacts(stages, as_built(open_capture(path, allow_outside=allow_outside), folder), origin)
     except JawusdError as error:
-        return BuildFacts(state.stages, None, f"the capture is not at hand ({error}): name it with --capture.")
+        return BuildFacts(stages, None, origin, f"the capture is not at hand ({error}): name it with --capture.")
 
 
 def as_built(capture: Capture, folder: Path) -> Capture:
@@ -277,17 +277,6 @@ def _check_findings(stages: Stages) -> tuple[Finding, ...]:
 def _hashes(stages: Stages) -> dict[str, str]:
     found = {name: value for key, record in stages.items() if key != "report" for name, value in record.outputs.items()}
     return dict(sorted(found.items()))
-
-
-def package_versions() -> dict[str, str]:
-    """Return the versions of this package and of those that results depend on."""
-    found = {"jawusd": __version__}
-    for name in _PACKAGES:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found
 
 
 @explain_missing_packages()

@@ -17,8 +17,9 @@ from jawusd.formats.report import Overlay, SolveReportData
 from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.media import check_same_cameras, draw_frames, open_backdrops, tracked_scans
+from jawusd.pipeline.origin import package_versions
 from jawusd.pipeline.prepare import load_cameras, naming_file, open_capture, tracked_cameras
-from jawusd.pipeline.report import attempt, camera_facts, package_versions
+from jawusd.pipeline.report import attempt, camera_facts
 from jawusd.pipeline.state import Progress, make_folder
 
 PAGE = ".html"

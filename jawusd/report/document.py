@@ -5,11 +5,12 @@ from __future__ import annotations
 import base64
 import math
 import os
+import re
 from importlib import resources
 
 import jinja2
 import numpy as np
-from markupsafe import Markup
+from markupsafe import Markup, escape
 from numpy.typing import NDArray
 
 from jawusd.formats.atomic import write_text_atomic
@@ -78,13 +79,26 @@ def document(data: ReportData) -> str:
 
 def page_environment() -> jinja2.Environment:
     """Return what fills in the templates of pages; it escapes what files say."""
-    return jinja2.Environment(
+    environment = jinja2.Environment(
         loader=jinja2.PackageLoader("jawusd.report", "page"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters |= {"worded": worded, "figure": figure}
+    return environment
+
+
+def worded(text: str) -> Markup:
+    """Return a sentence as HTML, what stands between two backticks as code."""
+    parts = re.split(r"`([^`]*)`", str(text))  # what the group holds comes at odd places
+    return Markup().join(Markup("<code>{}</code>").format(p) if k % 2 else escape(p) for k, p in enumerate(parts))
+
+
+def figure(value: float) -> str:
+    """Return a length in mm with three decimals, a dash for one that is not known."""
+    return f"{value:.3f}" if math.isfinite(value) else "\u2013"
 
 
 def own_file(name: str) -> Markup:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ _HEADS = (PALE, SKY, BLUE, BLACK)  # colours of the condyle from closed to wide 
 _BINS = 40
 _SCALE_QUANTILE = 0.8  # of the models' 95 % quantiles: the end of the axis of all histograms
 _BONES_MM, _CLOSE_MM = 12.0, 1.5  # shown around the paths
+_ADVICE_LETTERS = 140  # in a line above the coverage plot
 _FEW_MM = 1.0  # the smallest range of a histogram
 _MANY = 2500  # points; more of them are rasterised to limit the file size
 _MOVES = ("opening d1", "laterotrusion d2", "protrusion d3")
@@ -45,6 +47,8 @@ def condyle_figure(found: Experiments) -> Figure:
     Above with the bones, below the path alone, enlarged.
     """
     paths = found.condyle_paths
+    if not paths:
+        return _nothing_to_draw(f"{found.actor}: no model opens the jaw")
     figure, axes = new_figure(3.7 * len(paths), 7.4, 2, len(paths))
     for column, path in enumerate(paths):
         bones, close = axes[column], axes[len(paths) + column]
@@ -90,6 +94,8 @@ def parameter_figure(found: Experiments) -> Figure:
 
     After paper Figs. 5 and 6; above seen from the side, below from above, one column per parameter.
     """
+    if not found.parameter_paths:
+        return _nothing_to_draw(f"{found.actor}: no model moves by single parameters")
     figure, axes = new_figure(11.0, 7.6, 2, 3)
     captured = found.captured_condyles[0]
     # (horizontal, vertical) coordinate of each row, and the names of the axes
@@ -112,7 +118,8 @@ def parameter_figure(found: Experiments) -> Figure:
     for column, name in enumerate(_MOVES):
         swept = [path.values_mm for path in found.parameter_paths if path.parameter == column]
         if swept:
-            axes[column].set_title(f"{name}, {swept[0].min():.0f} to {swept[0].max():.0f} mm")
+            reach = f", {swept[0].min():.0f} to {swept[0].max():.0f} mm" if swept else ""
+        axes[column].set_title(f"{name}{reach}")
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
     figure.suptitle("left condyle while one parameter moves alone; above: from the side, below: from above")
@@ -132,8 +139,10 @@ def reconstruction_figure(found: Experiments) -> Figure:
 
 def synthesis_figure(found: Experiments) -> Figure:
     """Draw paper Fig. 13: histograms of the distances of random poses to the nearest captured one."""
-    reference, *samples = found.of("synthesis")
-    title = f"{found.actor}: distance of random poses to the nearest captured pose (outline: {reference.model})"
+    samples = found.of("synthesis")
+    reference = samples.pop(0) if samples else None
+    outline = f" (outline: {reference.model})" if reference else ""
+    title = f"{found.actor}: distance of random poses to the nearest captured pose{outline}"
     labels = [f"{one.model}\n{one.quantity}" for one in samples]
     return _histograms(samples, title, labels, 3, reference)
 
@@ -141,6 +150,10 @@ def synthesis_figure(found: Experiments) -> Figure:
 def _histograms(
     samples: list[Distances], title: str, labels: list[str], columns: int, reference: Distances | None
 ) -> Figure:
+    drawn = [(one, label) for one, label in zip(samples, labels, strict=True) if len(one.values_mm)]
+    if not drawn:
+        return _nothing_to_draw(f"{title}: no poses")
+    samples, labels = [one for one, _ in drawn], [label for _, label in drawn]
     columns = min(columns, len(samples))
     rows = -(-len(samples) // columns)
     figure, axes = new_figure(11.0, 1.9 * rows + 0.6, rows, columns, sharex=True, sharey=True)
@@ -151,7 +164,7 @@ def _histograms(
         values = one.values_mm
         mean = float(values.mean())
         axis.hist(values, bins=bins, weights=_shares(values), color=BLUE)
-        if reference is not None:
+        if reference is not None and len(reference.values_mm):
             known = reference.values_mm
             axis.hist(known, bins=bins, weights=_shares(known), histtype="step", color=BLACK, lw=0.9)
         if mean < end:
@@ -168,6 +181,14 @@ def _histograms(
     figure.supxlabel("largest distance of a mandible vertex [mm]   (line: mean)")
     figure.supylabel("share of poses [%]")
     figure.suptitle(title)
+    return figure
+
+
+def _nothing_to_draw(why: str) -> Figure:
+    """Return a figure that says why there is nothing in it."""
+    figure, (axis,) = new_figure(11.0, 1.0, 1, 1)
+    axis.set_axis_off()
+    axis.text(0.5, 0.5, why, ha="center", va="center")
     return figure
 
 
@@ -193,6 +214,6 @@ def coverage_figure(coverage: Coverage, actor: str) -> Figure:
         axis.set_ylabel(names[index])
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
-    advice = "\n".join(coverage.sentences) or "No exercise is missing."
+    advice = "\n".join(textwrap.fill(one, _ADVICE_LETTERS) for one in coverage.sentences) or "No exercise is missing."
     figure.suptitle(f"{actor}: captured part of the envelope\n{advice}", fontsize=9)
     return figure

@@ -13,6 +13,7 @@ from jawusd.formats.coverage import used_coverage
 from jawusd.formats.finding import Finding
 from jawusd.formats.report import ReportData
 from jawusd.formats.tracks import LOST, RECOVERED, Tracks
+from jawusd.geometry.arrays import Mask
 from jawusd.report.facts import model_facts, sync_facts, tracks_facts
 
 #: Grades, the best first; "open" means that there is nothing to judge.
@@ -22,6 +23,7 @@ MARKS = {GOOD: "\u2714", LOOK: "!", BAD: "\u2716", OPEN: "?"}
 
 # Yang et al. (2019): mask left uncovered on average, and the mean and worst reconstruction error of their Fig. 12.
 _PAPER_COVERAGE_PERCENT, _PAPER_MEAN_MM, _PAPER_WORST_MM = 0.754, 1.73, 7.22
+_UNKNOWN = "not known"
 _EXERCISES = "full opening, slides to both sides and protrusion, closed and half open"
 _UNUSED = {"camera_without_masks", "masks_black", "camera_not_used", "camera_rarely_used"}  # findings of tracks
 _LACKING = {"take_lacks", "not_shown"}  # warnings of the fit about movements that are missing or too small
@@ -109,7 +111,7 @@ def _below(name: str, value: float, good: float, fair: float, unit: str, digits:
     """Judge a figure that should be small."""
     limit = f"good up to {good:g} {unit}, acceptable up to {fair:g} {unit}"
     if not np.isfinite(value):
-        return Check(name, "not known", limit, OPEN)
+        return Check(name, _UNKNOWN, limit, OPEN)
     grade = GOOD if value <= good else LOOK if value <= fair else BAD
     return Check(name, f"{value:.{digits}f} {unit}", limit, grade)
 
@@ -117,7 +119,14 @@ def _below(name: str, value: float, good: float, fair: float, unit: str, digits:
 def _share(name: str, share: float, good: float, fair: float) -> Check:
     """Judge a share, 0 .. 1, that should be large."""
     limit = f"good from {100 * good:g} %, acceptable from {100 * fair:g} %"
+    if not np.isfinite(share):
+        return Check(name, _UNKNOWN, limit, OPEN)
     return Check(name, f"{100 * share:.1f} %", limit, GOOD if share >= good else LOOK if share >= fair else BAD)
+
+
+def _mean(has: Mask) -> float:
+    """Return the share of a mask (F,) that is true, NaN of an empty one."""
+    return float(has.mean()) if has.size else np.nan
 
 
 def _verdict(stage: str, checks: list[Check]) -> Verdict:
@@ -131,7 +140,7 @@ def _sync(data: ReportData) -> Verdict:
     if len(data.tracks.camera_names) == 1:
         return Verdict("sync", "There is one camera: nothing to align in time.", (), GOOD)
     checks = [_below("offset that the teeth themselves show beyond the whole frames", rest, 0.6, 1.0, "frames")]
-    if "confidence" in sync:
+    if sync.get("confidence"):
         least = min(float(value) for value in sync["confidence"].values())
         checks.append(_share("flashes or sounds that both cameras show", least, 0.8, 0.5))
     method = str(sync.get("method", "not known"))
@@ -149,8 +158,8 @@ def _track(tracks: Tracks) -> Verdict:
     helped = np.any(tracks.status == RECOVERED, axis=1) | tracks.prior_aided
     residual = tracks.residual_px[(tracks.status != LOST) & np.isfinite(tracks.residual_px)]
     checks = [
-        _share("frames tracked", float(tracked.mean()), 0.98, 0.9),
-        _share("frames sure enough without the model's help or a new search", float((~helped).mean()), 0.6, 0.3),
+        _share("frames tracked", _mean(tracked), 0.98, 0.9),
+        _share("frames sure enough without the model's help or a new search", _mean(~helped), 0.6, 0.3),
         _below(
             f"mask left uncovered, mean (the paper: {_PAPER_COVERAGE_PERCENT} %)",
             100 * float(np.nanmean(coverage)) if np.isfinite(coverage).any() else np.nan,
@@ -176,7 +185,7 @@ def _fit(data: ReportData) -> Verdict:
     kind = "poses held out of the fit" if errors.get("holdout") else "poses of the fit"
     mandible = table.get("mandible", {})
     out = sum(map(len, meta.get("excluded_frames", {}).values())) + len(meta.get("trimmed_frames", []))
-    count = max(len(data.model.frames), 1)
+    count = len(data.model.frames)
     checks = [
         _below(
             f"error of {kind}, mean of the largest vertex distance (the paper, its own poses: {_PAPER_MEAN_MM} mm)",
@@ -192,7 +201,7 @@ def _fit(data: ReportData) -> Verdict:
             _PAPER_WORST_MM,
             "mm",
         ),
-        _share("frames that shaped the model", 1 - out / count, 0.9, 0.7),
+        _share("frames that shaped the model", 1 - out / count if count else np.nan, 0.9, 0.7),
     ]
     for warning in meta.get("warnings", []):
         if warning["code"] == "few_poses":
@@ -208,10 +217,9 @@ def _bounds(data: ReportData) -> Verdict:
     rig = JawRig(model.arrays, model.meta)
     used = model.trained & np.all(np.isfinite(model.d), axis=1)
     verdicts = rig.validate_parameters(model.d[used], tolerance_mm=None)
-    inside, valid = (float(found.mean()) if used.any() else 0.0 for found in (verdicts.inside(), verdicts.valid))
-    name = (
-        f"captured poses inside the bound ({100 * inside:.1f} %) or within its tolerance of {rig.tolerance_mm:.2f} mm"
-    )
+    inside, valid = _mean(verdicts.inside()), _mean(verdicts.valid)
+    counted = f" ({100 * inside:.1f} %)" if used.any() else ""
+    name = f"captured poses inside the bound{counted} or within its tolerance of {rig.tolerance_mm:.2f} mm"
     checks = [_share(name, valid, 0.97, 0.9)]
     synthesis = data.experiments.of("synthesis") if data.experiments else []
     known = next((one for one in synthesis if one.model.startswith("captured")), None)
@@ -221,10 +229,13 @@ def _bounds(data: ReportData) -> Verdict:
         checks.append(
             _below("random valid poses: distance to the take, against captured ones left out", ratio, 3.0, 6.0, "times")
         )
-    lacks = [w["message"] for w in meta.get("warnings", []) if w["code"] in _LACKING]
+    # The plot shows what the experiments found: the verdict must not say otherwise.
+    warned = [w["message"] for w in meta.get("warnings", []) if w["code"] in _LACKING]
+    lacks = data.experiments.coverage.sentences if data.experiments else warned
     checks += [Check("captured movements", sentence, _EXERCISES, LOOK) for sentence in lacks]
     if not lacks:
-        checks.append(Check("captured movements", "nothing missing", _EXERCISES, GOOD))
+        words, grade = ("nothing missing", GOOD) if used.any() else (_UNKNOWN, OPEN)
+        checks.append(Check("captured movements", words, _EXERCISES, grade))
     return _verdict("bounds", checks)
 
 

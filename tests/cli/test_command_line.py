@@ -138,6 +138,13 @@ def test_times_in_words(seconds, words):
     assert about(seconds) == words
 
 
+def test_a_build_is_told_its_command_line_for_the_report(monkeypatch):
+    asked = []
+    monkeypatch.setattr("jawusd.pipeline.build.build", lambda *given: asked.append(given[2].command) or sys.exit(0))
+    run("build", "some where", "-o", "out", "--jobs=1")
+    assert asked == ["jawusd build 'some where' -o out --jobs=1"]
+
+
 def test_a_build_ends_with_its_verdict():
     because = [f"track: figure {k} 3 % (good up to 1 %)" for k in range(6)]
     file = {"capture": "x", "file": "report.html"}

@@ -7,7 +7,7 @@ from jawusd.errors import FittingError
 from jawusd.evaluator import JawRig
 from jawusd.fitting import FittingConfig, fit_model
 from jawusd.fitting.anatomy_gate import check_anatomy
-from jawusd.fitting.coverage import missing_movements, shown_parameters
+from jawusd.fitting.coverage import bound_not_reached, missing_movements, shown_parameters
 from jawusd.fitting.data import SubjectAnatomy, select_poses, select_tracks
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import landmark_frame, make_transform, random_rotation, se3_exp, so3_exp, transform_points
@@ -272,7 +272,7 @@ def test_full_take_lacks_nothing_and_poor_takes_are_told_what_to_record(person):
         "to the right": d[d[:, 1] > -3],
         "mm forward": d[d[:, 2] < 3],
         "no protrusion between": d[~half | (d[:, 2] < 1)],
-        "no slides to the left between": d[~half | (d[:, 1] < 1)],
+        "no slide to the left between": d[~half | (d[:, 1] < 1)],
         "no frames between": d[~half],
         "directions are covered": d[~half | (np.abs(d[:, 1]) < 0.3)],
     }
@@ -280,3 +280,11 @@ def test_full_take_lacks_nothing_and_poor_takes_are_told_what_to_record(person):
     for words, poor in cases.items():
         assert any(words in sentence for sentence in missing_movements(poor, shown)), words
     assert missing_movements(d[~half], np.array([True, True, False])) == []
+
+
+def test_a_bound_with_room_for_uncaptured_poses_is_named_with_the_openings_to_record():
+    none, places = np.empty((0, 2)), np.array([[12.0, 3.0], [26.4, 3.5]])
+    assert bound_not_reached((none, none), (0.0, 0.0)) == []
+    assert bound_not_reached((places, places), (0.01, 0.02)) == []
+    (said,) = bound_not_reached((none, places), (0.0, 0.184))
+    assert said.startswith("18 % of the bound of protrusion") and "12 to 26 mm of opening" in said

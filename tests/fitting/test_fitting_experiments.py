@@ -9,6 +9,7 @@ import trimesh
 
 from jawusd.fitting import FittingConfig, experiments, paper
 from jawusd.fitting.condyle_paths import condyle_paths, path_distances, principal_opening, sagittal_section
+from jawusd.fitting.coverage import PARAMETERS
 from jawusd.fitting.data import SubjectAnatomy, select_poses
 from jawusd.fitting.experiments import MODELS, run_experiments
 from jawusd.fitting.nlpca import train_nlpca
@@ -164,6 +165,10 @@ def test_gaps_are_inside_the_bound_and_far_from_every_pose(found):
     for index, gaps in enumerate(coverage.gaps):
         scaled = (gaps[:, None] - coverage.d[None, :, [0, index + 1]]) / [3.0, 2.0]
         assert not len(gaps) or np.linalg.norm(scaled, axis=-1).min() > 1
+        named = any(f"of the bound of {PARAMETERS[index + 1]}" in sentence for sentence in coverage.sentences)
+        width = np.nan_to_num(np.diff(coverage.slices[index], axis=1)[:, 0])
+        area = np.trapezoid(width, coverage.slices_d1)
+        assert named == (0.25 * len(gaps) / area > 0.02)  # gaps lie on a grid of 0.5 mm
         low, high = np.nanmin(coverage.slices[index]), np.nanmax(coverage.slices[index])
         assert (gaps[:, 1] > low - 0.3).all() and (gaps[:, 1] < high + 0.3).all()
 

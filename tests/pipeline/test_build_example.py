@@ -2,6 +2,7 @@
 
 import json
 import os
+import platform
 import shutil
 import subprocess
 import sys
@@ -118,6 +119,8 @@ def test_the_report_shows_the_take_and_stays_small(built):
     assert text.count("video/cam") == 0
     for words in ("jaw rig report", "light flash", "cam0.mp4", "replay-data", "Paper Fig. 13"):
         assert words in text
+    origin = summary["report"]["origin"]
+    assert f"built {origin['finished']}" in text and f"Python {platform.python_version()}" in text
     assert "<li>pictures" not in text and "<li>experiments" not in text
 
 

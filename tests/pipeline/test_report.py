@@ -59,6 +59,16 @@ def test_a_report_without_its_capture_says_what_it_lacks(built):
     assert record.result == {"capture": "../gone", "file": "report.html", "verdict": verdict}
 
 
+def test_a_report_written_again_tells_of_the_build_as_it_was_made(built):
+    state = BuildState(built)
+    made = {"finished": "2031-02-03 04:05:06 UTC", "command": "jawusd build there", "versions": {"numpy": "9.8.7"}}
+    state.finish("report", "as built", [], 1.0, {"capture": "../gone", "origin": made})
+    report_build(built, None, quiet)
+    text = (built / "report.html").read_text()
+    assert made["finished"] in text and made["command"] in text and "numpy 9.8.7" in text
+    assert BuildState(built).stages["report"].result["origin"] == made
+
+
 def test_a_placeholder_is_not_shown_as_a_mandible(built):
     report_build(built, None, quiet)
     assert "placeholder is no anatomy" not in (built / "report.html").read_text()

@@ -1,10 +1,15 @@
 """The report in a real browser, opened from disk: light and dark, no request, no console error, the replay moves."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import trimesh
 from browser import headless_chromium, keep_picture
-from report_data import report_data
+from report_data import experiments, report_data
 
+from jawusd.formats.mesh import Mesh
+from jawusd.formats.report import Origin, ReplayPart
 from jawusd.report.document import write_document
 
 PATIENCE_MS = 120_000
@@ -48,6 +53,45 @@ def picture(page):
 
 def move_to(page, row):
     part(page, "slider").evaluate("(e, v) => { e.value = v; e.dispatchEvent(new Event('input')); }", row)
+
+
+def ball(name, kind, radius, place=(0.0, 0.0, 0.0)):
+    """Return a ball of the replay that stands still."""
+    made = trimesh.creation.icosphere(subdivisions=4, radius=radius)
+    return ReplayPart(name, kind, False, Mesh(np.asarray(made.vertices) + place, np.asarray(made.faces, np.int32)))
+
+
+@pytest.mark.parametrize(("bone_mm", "seen"), [(10.8, "tooth"), (13.0, "bone")])
+def test_bone_that_nearly_coincides_with_teeth_stays_behind_them(chromium, tmp_path, bone_mm, seen):
+    parts = (ball("mandible", "bone", bone_mm), ball("lower_teeth", "tooth", 10.0))
+    write_document(tmp_path / "report.html", report_data(parts=parts))
+    page = chromium.new_page(viewport={"width": 1200, "height": 900})
+    page.goto((tmp_path / "report.html").as_uri())
+    drawn = picture(page)
+    red, green, blue = drawn[drawn.shape[0] // 2, drawn.shape[1] // 2]
+    page.close()
+    colour = {"tooth": 0.90 / 0.95, "bone": 0.72 / 0.84}[seen]  # as replay.js paints them
+    assert blue / red == pytest.approx(colour, abs=0.02)
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1440, 390])
+def test_no_width_scrolls_the_page_sideways(chromium, tmp_path, scheme, width):
+    long = "x" * 300
+    data = report_data(experiments=experiments(sentences=("Record slow circling with the mouth half open. " * 6,)))
+    data = replace(data, actor=long, origin=Origin("today", f"jawusd build {long}", {"jawusd": "1"}), left_out=(long,))
+    write_document(tmp_path / "report.html", data)
+    context = chromium.new_context(color_scheme=scheme, viewport={"width": width, "height": 844})
+    page = context.new_page()
+    page.goto((tmp_path / "report.html").as_uri())
+    wide = page.evaluate("[document.documentElement.scrollWidth, innerWidth]")
+    links = page.locator("nav a").evaluate_all("all => all.map(e => e.getBoundingClientRect().right)")
+    letters = page.locator("#tracking svg text").first.evaluate("e => e.getBoundingClientRect().height")
+    keep_picture(page, f"report_{width}_{scheme}", full_page=True)
+    context.close()
+    assert wide[0] <= wide[1] == width
+    assert len(links) > 5 and max(links) <= width
+    assert letters > 8  # drawings are legible, and scrolled by themselves
 
 
 def luminance(color):

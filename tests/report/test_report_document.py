@@ -13,9 +13,10 @@ from example_rig import moved
 from package_copy import ROOT
 from report_data import experiments, report_data
 
-from jawusd.formats.report import Overlay
+from jawusd.formats.finding import Finding
+from jawusd.formats.report import Origin, Overlay, RigFacts
 from jawusd.formats.tracks import LostReason
-from jawusd.report.document import _frame_lists, document
+from jawusd.report.document import _frame_lists, document, worded
 from jawusd.report.replay import replay_data
 
 SECTIONS = (
@@ -54,7 +55,7 @@ def outside(text):
 
 @pytest.fixture(scope="module")
 def page():
-    return document(report_data(lost=(20, 21)))
+    return document(report_data(lost=(20, 21), experiments=experiments(sentences=("Record protrusion.",))))
 
 
 def test_reasons_of_losses_are_listed_with_their_frames():
@@ -138,6 +139,29 @@ def test_text_from_files_stays_text():
     assert sum(tag == "script" for tag, _ in shown.tags) == 2 and "onerror" not in dict(shown.tags)
     assert not any("onerror" in attrs for _, attrs in shown.tags)
     assert HOSTILE in "".join(shown.text)
+
+
+def test_when_how_and_with_what_a_build_was_made_is_told():
+    text = " ".join(Page(document(report_data())).text)
+    for words in ("Capture someone", "built 2031-02-03 04:05:06 UTC with jawusd 1.2.3", "jawusd build 'some where' -o"):
+        assert words in text
+    text = " ".join(Page(document(report_data(origin=Origin("", "", {})))).text)
+    assert "built at a time that is not recorded" in text and "Versions: not recorded" in text
+
+
+def test_commands_are_set_as_code_and_no_backtick_is_seen():
+    said = "Run `jawusd check <it>` first."
+    data = report_data(rig=RigFacts(0.02, ("error: see `jawusd validate`",)), inferred=(said,), left_out=(said,))
+    data.model.meta["warnings"] = [{"code": "rotation_range", "message": said}]
+    data.model.meta["excluded_frames"] = {said: [1]}
+    data.tracks.meta["start"] = {"by": said, "frame": 3}
+    data.tracks.meta["findings"] = [Finding("x", "warning", said).as_json()]
+    data = replace(data, experiments=replace(experiments(), notes=(said,)), overlays=(Overlay(3, said, b""),))
+    text = document(data)
+    shown = re.sub(r"<(script|style).*?</\1>", "", text, flags=re.DOTALL)
+    assert "`" not in shown
+    assert shown.count("<code>jawusd check &lt;it&gt;</code>") == 8
+    assert worded("one ` alone") == "one ` alone"
 
 
 def test_a_long_take_stays_small():

@@ -57,7 +57,7 @@ def test_histograms_count_every_pose_and_say_what_lies_beyond():
 
 
 def test_coverage_shows_every_pose_and_the_advice():
-    found = experiments()
+    found = experiments(sentences=("Record protrusion.",))
     figure = coverage_figure(found.coverage, "someone")
     for index, axis in enumerate(figure.axes):
         captured = axis.lines[0].get_xydata()

@@ -6,45 +6,11 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from report_data import report_data
+from report_data import FPS, report_data, solve_data
 
 from jawusd.errors import FormatError
-from jawusd.formats.performance import SolveState
-from jawusd.formats.report import CameraFacts, Overlay, SolveReportData
-from jawusd.formats.solved import SolvedJaw
-from jawusd.formats.tracks import LOST
 from jawusd.report.solve_figures import jaw_figure, seen_figure
 from jawusd.report.solve_page import solve_page, unseen_runs
-
-FPS = 24.0
-
-
-def solve_data(**change):
-    """Return a performance of 60 frames: 10-14 out of sight (lower arch), 30 lost (both), 40 and 41 outside."""
-    tracks = report_data().tracks
-    count = len(tracks.frames)
-    state, valid, margin = np.ones(count, np.int8), np.ones(count, bool), np.full(count, 2.0)
-    sigma = np.full((count, 3), 0.05)
-    state[10:15], state[30] = SolveState.CARRIED, SolveState.LOST
-    tracks.status[10:15, 1] = tracks.status[30] = LOST
-    sigma[10:15], sigma[30] = [1.0, 0.5, 0.25], 3.0
-    valid[40:42], margin[40:42] = False, -0.7
-    margin[45] = -0.2
-    d = np.stack([np.linspace(0, 30, count), np.linspace(-4, 4, count), np.zeros(count)], axis=1)
-    tracks.solved = SolvedJaw(d, sigma, margin, state, valid)
-    tracks.meta["tolerance_mm"], tracks.meta["focal"] = 0.3, {"cam1": [1.02, 0.003]}
-    tracks.meta["findings"] = [{"kind": "x", "severity": "warning", "message": "masks <are> wide", "camera": "cam1"}]
-    values = {
-        "shot": "take & one",
-        "tracks": tracks,
-        "fps": FPS,
-        "limits": "having one camera",
-        "cameras": (CameraFacts("cam0", "cam0.mp4", "", (640, 360)), CameraFacts("cam2", "", "", (640, 360))),
-        "overlays": (Overlay(int(tracks.frames[30]), "lost <here>", b"\xff\xd8\xff\xd9"),),
-        "versions": {"jawusd": "1.2.3"},
-        "left_out": (),
-    }
-    return replace(SolveReportData(**values), **change)
 
 
 def text_of(page):

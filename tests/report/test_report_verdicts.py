@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from report_data import report_data
+from report_data import experiments, report_data
 
 from jawusd.formats.finding import Finding
 from jawusd.formats.report import RigFacts
+from jawusd.report.figures import coverage_figure
 from jawusd.report.ranges import human_ranges
 from jawusd.report.timeline import tracking_figure
 from jawusd.report.verdicts import BAD, GOOD, LOOK, judge, overall
@@ -97,11 +98,21 @@ def test_a_camera_that_is_not_used_asks_for_a_look():
 
 @pytest.mark.parametrize("code", ["take_lacks", "not_shown"])
 def test_missing_movements_and_unproven_times_ask_for_a_look(code):
-    data = report_data(sync={"offsets": {}, "method": "taken as simultaneous"})
+    data = report_data(sync={"offsets": {}, "method": "taken as simultaneous"}, experiments=None)
     data.model.meta["warnings"] = [{"code": code, "message": "Record protrusion."}]
     assert grades(data) == {"sync": LOOK, "track": GOOD, "fit": GOOD, "bounds": LOOK, "rig": GOOD}
     bounds = next(verdict for verdict in judge(data) if verdict.stage == "bounds")
     assert [c.found for c in bounds.checks if c.name == "captured movements"] == ["Record protrusion."]
+
+
+@pytest.mark.parametrize(("sentences", "grade"), [((), GOOD), (("Record slow circling.",), LOOK)])
+def test_the_verdict_on_coverage_says_what_its_plot_says(sentences, grade):
+    data = report_data(experiments=experiments(sentences=sentences))
+    bounds = next(verdict for verdict in judge(data) if verdict.stage == "bounds")
+    said = coverage_figure(data.experiments.coverage, data.actor).get_suptitle()
+    assert bounds.grade == grade
+    assert all(s in said and s in [check.found for check in bounds.checks] for s in sentences)
+    assert ("No exercise is missing" in said) == (grade == GOOD) == ("covers the envelope" in bounds.sentence)
 
 
 @pytest.mark.parametrize(

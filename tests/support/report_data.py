@@ -9,13 +9,16 @@ from example_rig import example_meshes, example_motion
 from jawusd.evaluator import JawRig
 from jawusd.formats.experiments import CondylePath, Coverage, Distances, Experiments, ParameterPath
 from jawusd.formats.model import JawModel
-from jawusd.formats.report import CameraFacts, Overlay, ReplayPart, ReportData, RigFacts
+from jawusd.formats.performance import SolveState
+from jawusd.formats.report import CameraFacts, Origin, Overlay, ReplayPart, ReportData, RigFacts, SolveReportData
+from jawusd.formats.solved import SolvedJaw
 from jawusd.formats.tracks import LOST, TRACKED, Tracks
 
+FPS = 24.0
 CAMERAS = ("cam0", "cam1")
 
 
-def experiments(bones=True, gaps=True):
+def experiments(bones=True, gaps=True, sentences=()):
     """Return results of the paper's experiments; `bones` and `gaps` may be missing."""
     rng = np.random.default_rng(0)
     opening = np.linspace(0, 40, 30)
@@ -29,7 +32,7 @@ def experiments(bones=True, gaps=True):
     square = np.array([[0.0, -9], [40, -9], [40, 9], [0, 9]])
     holes = rng.uniform([0, -3], [40, 3], (20, 2)) if gaps else np.empty((0, 2))
     slices = np.stack([np.stack([np.full(30, -9.0), np.full(30, 9.0)], 1)] * 2)
-    coverage = Coverage(d, ((square,), (square, square / 2)), opening, slices, (holes, holes), ("Record protrusion.",))
+    coverage = Coverage(d, ((square,), (square, square / 2)), opening, slices, (holes, holes), sentences)
     skull = lines if bones else np.empty((0, 2, 2))
     captured = points + rng.normal(size=points.shape) * 0.1
     swept = tuple(ParameterPath(name, k, opening, points[0] + k) for name in ("pca", "anchored") for k in range(3))
@@ -53,7 +56,7 @@ def report_data(count=60, lost=(), **change):
         "inferred": ("anatomical axes, from the scans",),
         "seconds": {"sync": 1.0, "track": 20.0},
         "hashes": {"actor.usda": "ab" * 32},
-        "versions": {"jawusd": "1.2.3"},
+        "origin": Origin("2031-02-03 04:05:06 UTC", "jawusd build 'some where' -o out", {"jawusd": "1.2.3"}),
         "rig": RigFacts(0.02, ()),
         "experiments": experiments(),
         "overlays": (Overlay(int(frames[7]), "1.00 % of the masks left uncovered", b"\xff\xd8\xff\xd9"),),
@@ -61,6 +64,34 @@ def report_data(count=60, lost=(), **change):
         "left_out": ("the networks",),
     }
     return replace(ReportData(**values), **change)
+
+
+def solve_data(**change):
+    """Return a performance of 60 frames: 10-14 out of sight (lower arch), 30 lost (both), 40 and 41 outside."""
+    tracks = report_data().tracks
+    count = len(tracks.frames)
+    state, valid, margin = np.ones(count, np.int8), np.ones(count, bool), np.full(count, 2.0)
+    sigma = np.full((count, 3), 0.05)
+    state[10:15], state[30] = SolveState.CARRIED, SolveState.LOST
+    tracks.status[10:15, 1] = tracks.status[30] = LOST
+    sigma[10:15], sigma[30] = [1.0, 0.5, 0.25], 3.0
+    valid[40:42], margin[40:42] = False, -0.7
+    margin[45] = -0.2
+    d = np.stack([np.linspace(0, 30, count), np.linspace(-4, 4, count), np.zeros(count)], axis=1)
+    tracks.solved = SolvedJaw(d, sigma, margin, state, valid)
+    tracks.meta["tolerance_mm"], tracks.meta["focal"] = 0.3, {"cam1": [1.02, 0.003]}
+    tracks.meta["findings"] = [{"kind": "x", "severity": "warning", "message": "masks <are> wide", "camera": "cam1"}]
+    values = {
+        "shot": "take & one",
+        "tracks": tracks,
+        "fps": FPS,
+        "limits": "having one camera",
+        "cameras": (CameraFacts("cam0", "cam0.mp4", "", (640, 360)), CameraFacts("cam2", "", "", (640, 360))),
+        "overlays": (Overlay(int(tracks.frames[30]), "lost <here>", b"\xff\xd8\xff\xd9"),),
+        "versions": {"jawusd": "1.2.3"},
+        "left_out": (),
+    }
+    return replace(SolveReportData(**values), **change)
 
 
 def _meta():
@@ -71,7 +102,7 @@ def _meta():
         "excluded_frames": {"uncertain": [31, 32, 33, 40]},
         "trimmed_frames": [],
         "warnings": [],
-        "fps": 24.0,
+        "fps": FPS,
     }
 
 

@@ -69,13 +69,19 @@
     const lens = new Float32Array([
       f / aspect, 0, 0, 0, 0, f, 0, 0, 0, 0, (far + near) / (near - far), -1, 0, 0, (2 * far * near) / (near - far), 0,
     ]);
-    return { view, both: multiply(lens, view) };
+    return { view, both: multiply(lens, view), lens };
   };
 
   // -- drawing -------------------------------------------------------------------------------------------------------
+  // Bone that nearly coincides with a scan, as roots and sockets do, is compared as if it lay this far behind [mm].
+  const BEHIND = { bone: 1.5, tooth: 0, gum: 0 };
   const vertexShader = `#version 300 es
-    in vec3 place; in vec3 normal; uniform mat4 all, body, view; out vec3 n;
-    void main() { n = mat3(view) * mat3(body) * normal; gl_Position = all * body * vec4(place, 1.0); }`;
+    in vec3 place; in vec3 normal; uniform mat4 all, body, view; uniform float behind, slope; out vec3 n;
+    void main() {
+      n = mat3(view) * mat3(body) * normal;
+      vec4 seen = all * body * vec4(place, 1.0);
+      gl_Position = vec4(seen.xy, seen.w * (seen.z - slope * behind) / (seen.w + behind), seen.w);
+    }`;
   const fragmentShader = `#version 300 es
     precision highp float; in vec3 n; uniform vec4 color; uniform float lit; out vec4 shown;
     void main() {
@@ -97,7 +103,7 @@
     if (!gl.getProgramParameter(program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(program));
     gl.useProgram(program);
     at = {};
-    for (const name of ["all", "body", "view", "color", "lit"]) at[name] = gl.getUniformLocation(program, name);
+    for (const name of ["all", "body", "view", "color", "lit", "behind", "slope"]) at[name] = gl.getUniformLocation(program, name);
     for (const part of parts) {
       part.array = gl.createVertexArray();
       gl.bindVertexArray(part.array);
@@ -130,6 +136,7 @@
     gl.vertexAttribPointer(0, 3, gl.FLOAT, false, 0, 0);
     gl.uniformMatrix4fv(at.body, false, identity);
     gl.uniform1f(at.lit, 0);
+    gl.uniform1f(at.behind, 0);
     gl.uniform4f(at.color, ...color, 1);
     gl.drawArrays(gl.LINE_STRIP, 0, places.length / 3);
     gl.uniform1f(at.lit, 1);
@@ -140,19 +147,21 @@
     const height = Math.round(canvas.clientHeight * devicePixelRatio);
     if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
     const poses = source.value === "fitted" ? fitted : captured;
-    const { view, both } = camera(width / Math.max(height, 1));
+    const { view, both, lens } = camera(width / Math.max(height, 1));
     gl.viewport(0, 0, width, height);
     gl.clearColor(0, 0, 0, 0);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     gl.uniformMatrix4fv(at.all, false, both);
     gl.uniformMatrix4fv(at.view, false, view);
     gl.uniform1f(at.lit, 1);
+    gl.uniform1f(at.slope, lens[10]);
     const body = known(poses, now) ? rigid(poses, now) : null;
     for (const glassy of [false, true]) { // the skull last: what shines through it must be there already
       for (const part of parts) {
         if ((part.name === "skull") !== glassy || (part.moves && !body)) continue;
         gl.uniformMatrix4fv(at.body, false, part.moves ? body : identity);
         gl.uniform4f(at.color, ...colors[part.kind], glassy ? 0.3 : 1);
+        gl.uniform1f(at.behind, BEHIND[part.kind]);
         gl.depthMask(!glassy);
         gl.bindVertexArray(part.array);
         gl.drawElements(gl.TRIANGLES, part.faces.length, gl.UNSIGNED_SHORT, 0);
