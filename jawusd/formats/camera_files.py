@@ -1,7 +1,8 @@
 """Calibrations of other programs, recognised by their names.
 
 TOML of aniposelib, Pose2Sim and Caliscope: `calibration`. XML of Metashape and XMP of RealityScan: `camera_xml`. CSV of
-RealityScan and YAML of OpenCV: `camera_tables`. Here: COLMAP text and nerfstudio JSON.
+RealityScan and YAML of OpenCV: `camera_tables`. Nuke script of 3DEqualizer: `camera_3de`. Here: COLMAP text and
+nerfstudio JSON.
 
 COLMAP: `cameras.txt` and `images.txt` (https://colmap.github.io/format.html); rotation (w, x, y, z) and translation
 take world to camera. nerfstudio: `transforms.json` (https://docs.nerf.studio/quickstart/data_conventions.html);
@@ -21,6 +22,7 @@ import numpy as np
 
 from jawusd.errors import CalibrationError
 from jawusd.formats.calibration import load_calibration
+from jawusd.formats.camera_3de import files_of_3de, load_3de
 from jawusd.formats.camera_tables import load_opencv_yaml, load_realityscan_csv
 from jawusd.formats.camera_xml import load_metashape, load_realityscan_xmp
 from jawusd.geometry import Camera, make_transform, matrix_from_wxyz, rigidity_defect, se3_inverse
@@ -30,6 +32,15 @@ from jawusd.inputs import check_input
 _COLMAP = ("cameras.txt", "images.txt")
 _YAML = (".yml", ".yaml")
 _HALF_PX = 0.5
+_NOT_READ = {
+    ".3de": "3DEqualizer's project",
+    ".mel": "MEL",
+    ".ma": "Maya",
+    ".mb": "Maya",
+    ".fbx": "FBX",
+    ".chan": "curves",
+}
+_INSTEAD = "Export the cameras for Nuke (.nk, from 3DEqualizer) or as USD; `jawusd cameras -h` lists what is read."
 # Per COLMAP model: which parameters are fx, fy, cx, cy and, from there on, OpenCV's distortion; SIMPLE ones share f.
 _MODELS = {
     "SIMPLE_PINHOLE": ("f", 0),
@@ -54,7 +65,8 @@ def load_cameras_file(
 
     Args:
         path: TOML of aniposelib, Pose2Sim or Caliscope, a COLMAP text model (its folder or one of its files),
-            nerfstudio's transforms.json, Metashape XML, RealityScan CSV or (a folder of) XMP, OpenCV YAML.
+            nerfstudio's transforms.json, Metashape XML, RealityScan CSV or (a folder of) XMP, OpenCV YAML, or
+            3DEqualizer's Nuke script (or its folder).
         unit_mm: length of the file's unit.
         sizes: (width, height) [px] of the pictures by camera, for formats that do not hold them; see `lacks_sizes`.
 
@@ -64,7 +76,9 @@ def load_cameras_file(
     """
     path = Path(path)
     suffix, known = path.suffix.lower(), {} if sizes is None else sizes
-    if path.name in _COLMAP or (path.is_dir() and not _others(path)):
+    if suffix == ".nk" or _others(path, ".nk"):
+        cameras = load_3de(path, known)
+    elif path.name in _COLMAP or (path.is_dir() and not _others(path)):
         cameras = load_colmap(path if path.is_dir() else path.parent)
     elif suffix == ".json":
         cameras = load_nerfstudio(path)
@@ -76,6 +90,8 @@ def load_cameras_file(
         cameras = load_realityscan_xmp(path if path.is_dir() else path.parent, known)
     elif suffix in _YAML or path.is_dir():
         cameras = load_opencv_yaml(calibration_files(path), known)
+    elif suffix in _NOT_READ:
+        raise CalibrationError(f"is a file of {_NOT_READ[suffix]}, which is not read.", path=path, hint=_INSTEAD)
     else:
         cameras = load_calibration(path)
     poses = [make_transform(camera.T_cam_world[:3, :3], unit_mm * camera.T_cam_world[:3, 3]) for camera in cameras]
@@ -85,19 +101,21 @@ def load_cameras_file(
 def calibration_files(path: Path) -> list[Path]:
     """Return the files that make up a calibration."""
     folder = path if path.is_dir() else path.parent
+    if path.suffix.lower() == ".nk" or _others(path, ".nk"):
+        return files_of_3de(path)
     if path.suffix.lower() == ".xmp" or _others(path, ".xmp"):
         return sorted(folder.glob("*.xmp"))
     if path.is_dir() and (found := _others(path)):
         return found
     if path.is_dir() or path.name in _COLMAP:
         return [folder / name for name in _COLMAP]
-    pair = folder / f"extri{path.suffix}"
-    return [path, pair] if path.stem == "intri" and pair.exists() else [path]
+    pair = folder / path.name.replace("intri", "extri", 1)
+    return [path, pair] if path.stem in ("intri", "intrinsics") and pair.exists() else [path]
 
 
 def lacks_sizes(path: Path) -> bool:
     """Tell whether a calibration's format does not hold the size of the pictures."""
-    return path.is_dir() or path.suffix.lower() in (".csv", ".xmp", *_YAML)
+    return path.is_dir() or path.suffix.lower() in (".csv", ".xmp", ".nk", *_YAML)
 
 
 def _others(path: Path, *suffixes: str) -> list[Path]:

@@ -45,6 +45,7 @@ _ROLES = {
     "height": r"(?:image_height|imageheight|height|h)",
 }
 _LARGEST_DEFECT = 1e-4
+_MOST_PX = 1e6
 
 
 def load_realityscan_csv(path: Path, sizes: Mapping[str, Size]) -> list[Camera]:
@@ -60,7 +61,10 @@ def load_realityscan_csv(path: Path, sizes: Mapping[str, Size]) -> list[Camera]:
     """
     lines = [line for line in read_text(path, _MOST_BYTES, "utf-8-sig").splitlines() if line.strip()]
     lines = [line for line in lines if not line.startswith("#cameras")]
-    rows = list(csv.reader(io.StringIO("\n".join(lines))))
+    try:
+        rows = list(csv.reader(io.StringIO("\n".join(lines))))
+    except csv.Error as error:
+        raise CalibrationError(f"is no table that can be read ({error}).", path=path) from error
     header = [word.strip().lstrip("#").lower() for word in rows[0]] if rows else []
     lacking = [key for key in _NEEDED if key not in header]
     if lacking:
@@ -94,7 +98,8 @@ def load_opencv_yaml(paths: list[Path], sizes: Mapping[str, Size]) -> list[Camer
     """Read cameras from OpenCV's YAML: one file per camera, named after it, or files that hold several.
 
     Args:
-        paths: the files; what one says of a camera is joined with what others say.
+        paths: the files; what one says of a camera is joined with what others say, and cameras whose lens alone is
+            known are left out.
         sizes: of the pictures by camera, where the files do not say them.
 
     Raises:
@@ -109,7 +114,9 @@ def load_opencv_yaml(paths: list[Path], sizes: Mapping[str, Size]) -> list[Camer
     if set(found) == {"1", "2"} and {"R", "T"} <= set(shared):  # a stereo pair: the first camera is the world
         found["1"] |= {"R": np.eye(3), "T": np.zeros(3)}
         found["2"] |= {"R": shared["R"], "T": shared["T"]}
-    cameras = [_yaml_camera(paths[0], name, shared | parts, sizes) for name, parts in found.items() if "K" in parts]
+    known = {name: shared | parts for name, parts in found.items() if "K" in parts}
+    posed = {name: parts for name, parts in known.items() if "R" in parts or "T" in parts}
+    cameras = [_yaml_camera(paths[0], name, parts, sizes) for name, parts in (posed or known).items()]
     if not cameras:
         raise CalibrationError("holds no camera matrix.", path=paths[0])
     return sorted(cameras, key=lambda camera: camera.name)
@@ -147,7 +154,12 @@ def _yaml_camera(path: Path, name: str, parts: Mapping[str, Array], sizes: Mappi
             f"camera {name} has no {lacking[0]}.", path=path, hint="Pose (R, T) and intrinsics (K, D) are both needed."
         )
     if "width" in parts and "height" in parts:
-        size = (int(parts["width"]), int(parts["height"]))
+        sides = np.array([parts["width"], parts["height"]], np.float64).ravel()
+        if sides.size != 2 or not ((sides >= 1) & (sides <= _MOST_PX)).all():
+            raise CalibrationError(
+                f"camera {name} has pictures of {sides.tolist()} px, allowed are 1 to 1e6.", path=path
+            )
+        size = (int(sides[0]), int(sides[1]))
     elif name in sizes:
         size = sizes[name]
     else:

@@ -37,6 +37,7 @@ _HALF_PX, _MOST_PX = 0.5, 1e6
 _FILM_MM = 36.0
 _LARGEST_ERROR_PX = 0.05  # of a lens written with other coefficients
 _LARGEST_DEFECT = 1e-3
+_LARGEST_SKEW = 1e-6
 _RDF = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}"
 _XCR = "{http://www.capturingreality.com/ns/xcr/1.1#}"
 
@@ -103,6 +104,11 @@ def load_realityscan_xmp(folder: Path, sizes: Mapping[str, Size]) -> list[Camera
                 hint="Choose Brown3 or Brown4 with tangential as distortion model, and align again.",
             )
         terms = _numbers(path, values.get("DistortionCoeficients", "0 0 0 0 0 0"), 6, "DistortionCoeficients")
+        for key, square in (("Skew", 0.0), ("AspectRatio", 1.0)):
+            if abs(_numbers(path, values.get(key, str(square)), 1, key)[0] - square) > _LARGEST_SKEW:
+                raise CalibrationError(
+                    f"has {key} {values[key]}, allowed is {square:g}.", path=path, hint="Align with square pixels."
+                )
         K, lens = realityscan_lens(path, path.stem, size, f35, (principal[0], principal[1]), terms)
         rotation = _numbers(path, values["Rotation"], 9, "Rotation").reshape(3, 3)
         centre = _numbers(path, values["Position"], 3, "Position")

@@ -15,7 +15,7 @@ from jawusd.formats.numbered import groups
 CLIPS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v", ".mxf", ".mts", ".mpg", ".y4m")
 PICTURES = (".png", ".tif", ".tiff", ".exr", ".dpx", ".jpg", ".jpeg")
 SCANS = (".ply", ".stl", ".obj", ".dcm")
-_CALIBRATIONS = (".toml", ".json", ".xml", ".csv", ".yaml", ".yml", ".txt", ".usda", ".usdc", ".usd")
+_CALIBRATIONS = (".toml", ".json", ".xml", ".csv", ".yaml", ".yml", ".txt", ".usda", ".usdc", ".usd", ".nk")
 _FEWEST_PICTURES = 5  # fewer numbered pictures are no sequence
 _DEPTH = 4
 

@@ -142,7 +142,7 @@ def read_cameras(path: str | os.PathLike[str], sizes: Callable[[], Mapping[str, 
     `jaw:distortion` OpenCV's coefficients. Cameras that move are read at their first time.
 
     Args:
-        path: A stage; Alembic only where OpenUSD has its plug-in.
+        path: A stage, or Alembic (in cm) where OpenUSD has the plugin for it, as its wheels have not.
         sizes: Returns (width, height) [px] by camera, for cameras without `jaw:imageSize`.
 
     Raises:
@@ -150,6 +150,13 @@ def read_cameras(path: str | os.PathLike[str], sizes: Callable[[], Mapping[str, 
         CalibrationError: A size is not known.
         FormatError: A value has an unexpected type.
     """
+    if Path(path).suffix.lower() == ".abc" and Sdf.FileFormat.FindByExtension("abc") is None:
+        raise RigError(
+            "is Alembic, which OpenUSD reads with its plugin usdAbc only; it is not installed.",
+            path=path,
+            hint="Export the cameras as USD from the program that wrote them (Blender, Houdini and Maya read Alembic "
+            "and write USD), or use a build of OpenUSD with Alembic.",
+        )
     stage = open_stage(path)
     mm = UsdGeom.GetStageMetersPerUnit(stage) * 1000.0
     prims = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Camera)]

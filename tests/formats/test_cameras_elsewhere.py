@@ -1,4 +1,11 @@
-"""Cameras of other programs: 1,000 points through the model that each states, and through the camera that was read."""
+"""Cameras of other programs: 1,000 points through the model that each states, and through the camera that was read.
+
+The structure of the files follows samples in public repositories, with other numbers: cameras.xml of
+bitbyt3r/metashape-automation (Metashape), tests/testfiles/img/IMG_8834.xmp of KU-Leuven-Geomatics/geomapi
+(RealityScan), tests/sessions/4_cam_recording/camera_array.toml of mprib/caliscope, intri.yml and extri.yml of
+zhu-lebin/trackmesh_gui (EasyMocap), data/intrinsics.yml and data/extrinsics.yml of PRiME-project/PRiMEStereoMatch
+(OpenCV's stereo sample).
+"""
 
 import numpy as np
 import pytest
@@ -157,6 +164,10 @@ def test_realityscan_xmp(tmp_path):
     assert [path.name for path in calibration_files(tmp_path)] == ["left.xmp", "right.xmp"]
     with pytest.raises(CalibrationError, match="does not write the size of pictures"):
         load_cameras_file(tmp_path, 1000.0, {"left": SIZE})
+    for square, bent in (('Skew="0"', 'Skew="0.01"'), ('AspectRatio="1"', 'AspectRatio="1.2"')):
+        (tmp_path / "left.xmp").write_text(xmp(*POSES["left"]).replace(square, bent))
+        with pytest.raises(CalibrationError, match=bent.split("=")[0]):
+            load_cameras_file(tmp_path, 1000.0, sizes)
     (tmp_path / "left.xmp").write_text(xmp(*POSES["left"]).replace("brown3t2", "division"))
     with pytest.raises(CalibrationError, match='distortion model "division"'):
         load_cameras_file(tmp_path, 1000.0, sizes)
@@ -232,12 +243,25 @@ def test_opencv_yaml_by_camera_in_one_file_and_as_a_stereo_pair(tmp_path):
     (tmp_path / "intri.yml").write_text(intri)
     (tmp_path / "extri.yml").write_text(extri)
     assert away_px(load_cameras_file(tmp_path / "intri.yml", 1000.0, dict.fromkeys(POSES, SIZE)), opencv) < PIXEL
+    # A camera whose lens alone is known is none of the cameras.
+    (tmp_path / "intri.yml").write_text(intri + matrix("K_third", K) + matrix("dist_third", np.array(LENS)))
+    assert away_px(load_cameras_file(tmp_path / "intri.yml", 1000.0, dict.fromkeys(POSES, SIZE)), opencv) < PIXEL
     R, t = Rotation.from_euler("y", 30, degrees=True).as_matrix(), np.array([0.2, 0, 0.05])
     pair = "".join(matrix(f"{key}{n}", value) for n in (1, 2) for key, value in (("M", K), ("D", np.array(LENS))))
     (tmp_path / "pair.yml").write_text("%YAML:1.0\n---\n" + pair + matrix("R", R) + matrix("T", t[:, None]))
     first, second = load_cameras_file(tmp_path / "pair.yml", 1000.0, {"1": SIZE, "2": SIZE})
     assert np.allclose(first.T_cam_world, np.eye(4))
     assert np.allclose(second.T_cam_world, make_transform(R, 1000 * t))
+    # As OpenCV's stereo_calib writes it: two files, and the rotations of the rectified pair beside that of the cameras.
+    sample = tmp_path / "sample"
+    sample.mkdir()
+    (sample / "intrinsics.yml").write_text("%YAML:1.0\n---\n" + pair)
+    rectified = matrix("R1", np.eye(3)[[1, 2, 0]]) + matrix("R2", np.eye(3)) + matrix("P1", np.ones((3, 4)))
+    (sample / "extrinsics.yml").write_text("%YAML:1.0\n---\n" + matrix("R", R) + matrix("T", t[:, None]) + rectified)
+    for path in (sample, sample / "intrinsics.yml"):
+        first, second = load_cameras_file(path, 1000.0, {"1": SIZE, "2": SIZE})
+        assert np.allclose(first.T_cam_world, np.eye(4))
+        assert np.allclose(second.T_cam_world, make_transform(R, 1000 * t))
     (tmp_path / "half.yml").write_text("%YAML:1.0\n---\n" + matrix("camera_matrix", K))
     with pytest.raises(CalibrationError, match="camera half has no R"):
         load_cameras_file(tmp_path / "half.yml", 1.0)
@@ -296,6 +320,16 @@ def test_cameras_of_any_stage(tmp_path):
     Usd.Stage.CreateNew(str(tmp_path / "none.usda")).Save()
     with pytest.raises(RigError, match="holds no camera"):
         read_cameras(tmp_path / "none.usda", dict)
+
+
+def test_alembic_needs_its_plugin(tmp_path):
+    from pxr import Sdf
+
+    if Sdf.FileFormat.FindByExtension("abc") is not None:
+        pytest.skip("this OpenUSD reads Alembic")
+    (tmp_path / "cameras.abc").write_bytes(b"Ogawa\xff\x00\x01")
+    with pytest.raises(RigError, match=r"cameras\.abc: is Alembic, .* usdAbc .* Export the cameras as USD"):
+        read_cameras(tmp_path / "cameras.abc", dict)
 
 
 def test_lenses_that_opencv_cannot_write():

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -61,6 +62,90 @@ def write_cameras(folder):
             camera.projection_matrix()
 
     return [(folder, name, read) for name in ("calibration.toml", "cameras.txt", "images.txt", "transforms.json")]
+
+
+_METASHAPE = """<document><chunk><sensors><sensor id="0" label="s" type="frame"><resolution width="1280" height="720"/>
+<calibration type="frame" class="adjusted"><resolution width="1280" height="720"/><f>1000</f><cx>3</cx><k1>-0.1</k1>
+<k4>0.01</k4><p1>0.001</p1></calibration></sensor></sensors><cameras><camera id="0" sensor_id="0" label="cam0.jpg">
+<transform>1 0 0 1 0 1 0 2 0 0 1 3 0 0 0 1</transform></camera></cameras><transform><scale>0.5</scale></transform>
+</chunk></document>
+"""
+_XMP = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
+<rdf:Description xmlns:xcr="http://www.capturingreality.com/ns/xcr/1.1#" xcr:DistortionModel="brown3"
+xcr:FocalLength35mm="38" xcr:PrincipalPointU="0.01" xcr:PrincipalPointV="0">
+<xcr:Rotation>1 0 0 0 1 0 0 0 1</xcr:Rotation><xcr:Position>1 2 3</xcr:Position>
+<xcr:DistortionCoeficients>-0.1 0.1 0 0 0 0</xcr:DistortionCoeficients>
+</rdf:Description></rdf:RDF></x:xmpmeta>
+"""
+_YAML = """%YAML:1.0
+---
+image_width: 1280
+image_height: 720
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 1000., 0., 640., 0., 1000., 360., 0., 0., 1. ]
+R: !!opencv-matrix
+   rows: 3
+   cols: 1
+   dt: d
+   data: [ 0.1, 0.2, 0.3 ]
+T: !!opencv-matrix
+   rows: 3
+   cols: 1
+   dt: d
+   data: [ 1., 2., 3. ]
+"""
+_NUKE = """#! nuke
+Axis {
+ inputs 0
+ translate {1 2 3}
+ scaling {2 2 2}
+}
+Camera {
+ rot_order ZXY
+ translate {{curve i x1 1.0 x2 1.0} {curve i x1 2.0 x2 2.0} {curve i x1 60.0 x2 60.0}}
+ rotate {{curve i x1 1.0 x2 1.0} 10 {curve i x1 3.0 x2 3.0}}
+ focal {{curve i x1 35 x2 35}}
+ haperture 36
+ vaperture 20.25
+ name cam0
+}
+set N1 [stack 0]
+push $N1
+"""
+_LENS = """cam0
+3.6 2.025 3.5 1.7778 0.0 0.0 1.0
+0
+3DE4 Radial - Standard, Degree 4
+Distortion - Degree 2
+0.03
+1
+35.0 0.03 -1.0 0.0 1.0 0.0 SMOOTH
+Quartic Distortion - Degree 4
+0.01
+0
+<end_of_file>
+"""
+
+
+def write_foreign_cameras(folder):
+    from jawusd.formats.camera_files import load_cameras_file
+
+    texts = {"metashape/cameras.xml": _METASHAPE, "xmp/cam0.xmp": _XMP, "yaml/cam0.yml": _YAML}
+    texts["csv/cameras.csv"] = "#name,x,y,alt,heading,pitch,roll,f,k1\ncam0.jpg,1,2,3,10,20,30,35,-0.1\n"
+    texts |= {"nuke/shot.nk": _NUKE, "nuke/cam0.txt": _LENS}
+    for name, text in texts.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+
+    def read(place, path):
+        source = place / "shot.nk" if path.suffix == ".txt" else path
+        for camera in load_cameras_file(source, 10.0, {"cam0": (1280, 720)}):
+            camera.projection_matrix()
+
+    return [(folder / Path(name).parent, Path(name).name, read) for name in texts]
 
 
 def _picture(k):

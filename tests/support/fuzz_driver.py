@@ -14,7 +14,7 @@ MOST_CPU_S, MOST_WALL_S = 10.0, 180.0
 READERS = (
     "capture.toml", "calibration", "PNG masks", "video masks", "PLY, STL, OBJ", "tracks npz", "model npz", "keys",
     "CSV", "ARKit CSV", "landmarks", "HDF5", "library", "build.json", "journal", "usda", "usdc", "usdz", "ONNX",
-    "USD grammar", "TOML schemas", "JSON schemas",
+    "USD grammar", "TOML schemas", "JSON schemas", "foreign cameras",
 )  # fmt: skip
 
 

@@ -84,6 +84,8 @@ def make_targets(folder):
         known = {t.file: t for targets in list(found.values()) for t in targets if t.file.endswith(suffix)}
         for t in known.values():
             add(reader, t.folder, t.file, _from_schema(write), t.read)
+    for place, file, read in captured.write_foreign_cameras(folder / "foreign"):
+        add("foreign cameras", place, file, text, read)
     return found
 
 
