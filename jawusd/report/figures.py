@@ -117,8 +117,7 @@ def parameter_figure(found: Experiments) -> Figure:
         axes[3 * row].set_ylabel(along)
     for column, name in enumerate(_MOVES):
         swept = [path.values_mm for path in found.parameter_paths if path.parameter == column]
-        if swept:
-            reach = f", {swept[0].min():.0f} to {swept[0].max():.0f} mm" if swept else ""
+        reach = f", {swept[0].min():.0f} to {swept[0].max():.0f} mm" if swept else ""
         axes[column].set_title(f"{name}{reach}")
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)

@@ -77,6 +77,14 @@ def test_experiments_without_paths_or_captured_poses():
     assert document(report_data(experiments=few))
 
 
+@pytest.mark.parametrize("alone", range(3))
+def test_experiments_of_one_parameter(alone):
+    found = experiments()
+    paths = tuple(path for path in found.parameter_paths if path.parameter == alone)
+    figure = parameter_figure(replace(found, parameter_paths=paths))
+    assert paths and ["mm" in axis.get_title() for axis in figure.axes[:3]] == [k == alone for k in range(3)]
+
+
 @pytest.mark.parametrize("rows", [slice(0, 0), slice(7, 8)], ids=["no frame", "one frame"])
 def test_a_performance_of_no_frame_or_one(rows):
     data = solve_data()
