@@ -182,7 +182,7 @@ def registration_findings(found: Registration) -> list[Finding]:
     if not shifted and not turned:
         return []
     frames = f"{found['frames'][0]} to {found['frames'][-1]}"
-    where = f"in frames {frames}" if found["named"] else f"in frames {frames}, where the mouth is closed farthest,"
+    where = f"in frames {frames}" + ("" if found["named"] else ", those closed farthest")
     off = f"the lower scan is {shift:.2f} mm and {turn:.1f} degrees off the bite that the take shows {where}"
     if found["applied"]:
         return [Finding("scan_registration", "note", f"{off}: corrected", value=shift, limit=_OFF_MM)]
