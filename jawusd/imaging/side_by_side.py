@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 
 import cv2
 import numpy as np
@@ -26,6 +26,7 @@ _MOST_FRAMES, _MOST_POINTS = 200, 300  # of a take and of a scan, that tell wher
 _STRAYS_PERCENT = 1.0  # frames whose teeth may leave the part that is shown, at each side
 _ROOM = 0.25  # of the teeth's extent, left around them
 _LEAST_PX = 32
+_SHOW_PARTLY_S = 0.3  # what takes longer is shown as it comes
 
 
 class CameraWall:
@@ -61,18 +62,36 @@ class CameraWall:
         rows = -(-count // self._columns)
         self.size_px = (self._columns * tile_px[0], rows * (tile_px[1] + CAPTION_PX))
 
-    def draw(self, frame: int, scans: Sequence[PlacedScan], *, fill: float) -> NDArray[np.uint8]:
+    def draw(
+        self,
+        frame: int,
+        scans: Sequence[PlacedScan],
+        *,
+        fill: float,
+        partly: Callable[[NDArray[np.uint8]], None] | None = None,
+    ) -> NDArray[np.uint8]:
         """Return the picture of a frame of the reference camera, (h, w, 3) RGB.
 
         Args:
             scans: what to draw over it.
             fill: opacity of the crowns.
+            partly: called with the picture so far as cameras are decoded, if that takes a while.
 
         Raises:
             CaptureError: a camera's picture cannot be decoded.
         """
-        tiles = list(self._pool.map(lambda name: self._tile(name, frame, scans, fill), self._cells))
-        return contact_sheet(tiles, self._columns)
+        tiles = {name: self._pool.submit(self._tile, name, frame, scans, fill) for name in self._cells}
+        if partly is not None:
+            _, missing = wait(tiles.values(), _SHOW_PARTLY_S)
+            while missing:
+                partly(contact_sheet([self._so_far(name, frame, tile) for name, tile in tiles.items()], self._columns))
+                _, missing = wait(missing, return_when=FIRST_COMPLETED)
+        return contact_sheet([tile.result() for tile in tiles.values()], self._columns)
+
+    def _so_far(self, name: str, frame: int, tile: Future[NDArray[np.uint8]]) -> NDArray[np.uint8]:
+        if tile.done() and tile.exception() is None:
+            return tile.result()
+        return captioned(self._cells[name].draw(None, (), 0.0), f"{name}   frame {frame}   loading")
 
     def _tile(self, name: str, frame: int, scans: Sequence[PlacedScan], fill: float) -> NDArray[np.uint8]:
         backdrop = self._backdrops[name]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -208,9 +208,15 @@ class _Footage:
             return image
         return draw_overlay(image, self.cameras[name], placed, fill=_FILL[look])
 
-    def picture_of_all(self, frame: int, poses: tuple[Array, Array] | None, look: Look) -> NDArray[np.uint8]:
-        """Return the pictures of all cameras side by side, with the teeth drawn over them."""
-        return self.wall.draw(frame, self._placed(frame, poses, look), fill=_FILL.get(look, 0.0))
+    def picture_of_all(
+        self,
+        frame: int,
+        poses: tuple[Array, Array] | None,
+        look: Look,
+        partly: Callable[[NDArray[np.uint8]], None] | None = None,
+    ) -> NDArray[np.uint8]:
+        """Return the pictures of all cameras side by side, teeth drawn over them; `partly` as in `CameraWall.draw`."""
+        return self.wall.draw(frame, self._placed(frame, poses, look), fill=_FILL.get(look, 0.0), partly=partly)
 
     def _placed(self, frame: int, poses: tuple[Array, Array] | None, look: Look) -> list[PlacedScan]:
         from jawusd.imaging.overlay import LOWER_COLOUR, UPPER_COLOUR, PlacedScan, arch_colours

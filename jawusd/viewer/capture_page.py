@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 
 import numpy as np
 import viser
+from numpy.typing import NDArray
 
 from jawusd.errors import JawusdError
 from jawusd.formats.capture import Bootstrap
@@ -13,17 +15,19 @@ from jawusd.geometry import make_transform, transform_points
 from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import se3_inverse
 from jawusd.viewer.capture_scene import UP, CaptureScene
-from jawusd.viewer.footage_panel import FootagePanel
+from jawusd.viewer.footage_panel import ALL, FootagePanel
 from jawusd.viewer.picking_layout import PickingLayout, eye_to_see, hit_vertex, region_around
 from jawusd.viewer.picks import ARCHES
 from jawusd.viewer.picks_panel import PicksPanel
 from jawusd.viewer.scan_brush import BRUSHES
 from jawusd.viewer.scan_labels_panel import ScanLabelsPanel
+from jawusd.viewer.scene import PHONE
 from jawusd.viewer.uploads import limit_uploads
 from jawusd.viewer.viewed import Region, ViewedCapture
-from jawusd.viewer.widgets import errors_shown, guarded, set_theme
+from jawusd.viewer.widgets import begin_panel, errors_shown, guarded
 
 _PANEL_PX = 370
+_SLOW_S = 0.3  # a picture that takes longer is said to be loading
 _USUAL_MM, _USUAL_WEIGHT = 250.0, 1e-3  # from a camera to the mouth
 _SPACE_SIDE = (0.9, -0.7, 0.0)  # offset of the view direction in space from that of the first camera
 
@@ -42,8 +46,7 @@ class CapturePage:
         """Draw the page."""
         self.client, self._capture = client, capture
         gui = client.gui
-        set_theme(gui)
-        gui.set_panel_label(capture.name)
+        begin_panel(client, capture.name)
         self.scene = CaptureScene(client, capture)
         self.layout: PickingLayout | None = None
         self.poses: dict[str, Array] = {}
@@ -89,9 +92,12 @@ class CapturePage:
         while self.drawn != self._wanted:
             wanted, aim = self._wanted, self._aim
             self._aim = False
+            slow = asyncio.get_running_loop().call_later(_SLOW_S, self.footage.say_loading, True)
             with errors_shown(self.client):
                 await self._fit_picks()
                 await self._draw_once(aim)
+            slow.cancel()
+            self.footage.say_loading(False)
             self.drawn = wanted
 
     async def _draw_once(self, aim: bool) -> None:
@@ -100,21 +106,23 @@ class CapturePage:
         tracked = self._poses_at(frame)
         if footage.in_space:
             names = [name for name in capture.sizes_px if name in capture.cameras]
-            images = {name: await asyncio.to_thread(capture.picture, name, frame, tracked, look) for name in names}
-            self.scene.show_thumbnails(images)
+            for name in names:
+                image = await asyncio.to_thread(capture.picture, name, frame, tracked, look)
+                self.scene.show_thumbnail(name, image)
             default = self._default_pose()
             shown = tracked or (default, default)
             self.poses = {arch: self.scene.T_page_world @ T for arch, T in zip(ARCHES, shown, strict=True)}
         else:
             if footage.on_wall:
-                image = await asyncio.to_thread(capture.wall, frame, tracked, look)
+                image = await asyncio.to_thread(capture.wall, frame, tracked, look, self._show_partly())
             else:
                 image = await asyncio.to_thread(capture.picture, view, frame, tracked, look)
             if aim or self.layout is None:
                 self.layout = await asyncio.to_thread(self._lay_out, view, frame)
             self.scene.show_picture(image, self.layout)
             self.poses = {}
-            if (self.picks.picking.value or self.labels.painting.value) and not footage.on_wall:
+            self.picks.scans_shown = (self.picks.picking.value or self.labels.painting.value) and not footage.on_wall
+            if self.picks.scans_shown:
                 self.poses = self.layout.scan_poses(capture.scans, capture.T_anatomical_skull, self.picks.side)
         self.scene.place(footage.in_space, self.poses)
         footage.follow(frame)
@@ -123,6 +131,17 @@ class CapturePage:
         self.picks.refresh()
         if aim:
             self._look()
+
+    def _show_partly(self) -> Callable[[NDArray[np.uint8]], None] | None:
+        """Return what threads call with the picture of all cameras so far; None while it plays."""
+        if self.footage.player.playing:
+            return None
+        loop, layout = asyncio.get_running_loop(), self._lay_out(ALL, self.footage.frame)
+
+        def show(image: NDArray[np.uint8]) -> None:
+            loop.call_soon_threadsafe(self.scene.show_picture, image, layout)
+
+        return show
 
     def _look(self) -> None:
         """Move the visitor's eye so that everything is in view."""
@@ -140,7 +159,10 @@ class CapturePage:
             away += _SPACE_SIDE
         elif self.layout is not None:
             seen.append(self.layout.corners())
-        self.scene.look(*eye_to_see(np.vstack(seen), away, UP, aspect))
+        points = np.vstack(seen)
+        if aspect < PHONE:
+            points = np.vstack([points, points - np.ptp(points @ UP) * np.array(UP)])  # all is seen in the upper half
+        self.scene.look(*eye_to_see(points, away, UP, aspect))
 
     def _poses_at(self, frame: int) -> tuple[Array, Array] | None:
         """Return T_world_upper and T_world_lower of a frame: tracked, else from the picks of that frame."""

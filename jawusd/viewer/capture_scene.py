@@ -117,11 +117,10 @@ class CaptureScene:
             self._picture.image = image
             self._picture.render_width, self._picture.render_height = width, height
 
-    def show_thumbnails(self, images: Mapping[str, NDArray[np.uint8]]) -> None:
-        """Show reduced pictures on the cameras in space."""
-        for name, image in images.items():
-            step = -(-image.shape[1] // _THUMB_PX)
-            self._frustums[name].image = np.ascontiguousarray(image[::step, ::step])
+    def show_thumbnail(self, name: str, image: NDArray[np.uint8]) -> None:
+        """Show a reduced picture on a camera in space."""
+        step = -(-image.shape[1] // _THUMB_PX)
+        self._frustums[name].image = np.ascontiguousarray(image[::step, ::step])
 
     def place(self, in_space: bool, poses: Mapping[str, Array]) -> None:
         """Show the picture or the cameras in space, and the scans whose poses (4, 4) are given and finite."""

@@ -50,7 +50,8 @@ class FilePanel:
         saved = self._session.saved_keys()
         if saved is None:
             raise FormatError("there are no keys to save.", hint='Press "set" under keys.')
-        self._client.send_file_download("keys.json", _written(lambda path: save_keys(path, saved), "keys.json"))
+        content = _written(lambda path: save_keys(path, saved), "keys.json")
+        self._client.send_file_download("keys.json", content, save_immediately=True)
 
     async def _load(self, _: object) -> None:
         upload = self.load.value
@@ -82,7 +83,7 @@ class FilePanel:
         first, last = clip.span
         frames = np.arange(np.ceil(first), np.floor(last) + 1)
         content = _written(lambda path: write_parameters(path, frames.astype(np.int64), clip.at(frames)), "d.csv")
-        self._client.send_file_download("d.csv", content)
+        self._client.send_file_download("d.csv", content, save_immediately=True)
 
     def _to_export(self) -> Clip:
         clip = self._motion.clip()

@@ -38,6 +38,7 @@ class FootagePanel:
     ) -> None:
         """Make the widgets in the present container; call `turned` for another view, `changed` for other changes."""
         self._client, self._capture, self._turned, self._changed = client, capture, turned, changed
+        self._loading = False
         self.view = next(iter(capture.sizes_px))
         self.frame = capture.picks.frame if capture.tracks is None and capture.picks else capture.frames[0]
         self.frame = min(max(self.frame, capture.frames[0]), capture.frames[1])
@@ -104,6 +105,12 @@ class FootagePanel:
         """Update the widgets from view and frame."""
         self._show(self.frame)
 
+    def say_loading(self, loading: bool) -> None:
+        """Say that a picture is being decoded, or no longer."""
+        if loading != self._loading:
+            self._loading = loading
+            self.refresh()
+
     def follow(self, frame: int) -> None:
         """Update the widgets to a frame that was drawn, if it plays: they are never ahead of the picture."""
         if self.player.playing:
@@ -121,6 +128,8 @@ class FootagePanel:
             lines.append(frame_words(capture.tracks, frame))
         else:
             lines.append("no poses: name the folder of a build, or what a solve wrote, with --tracks")
+        if self._loading:
+            lines.append("<b>loading the pictures of this frame</b>")
         if frame in self.worst:
             lines.append(f"number {self.worst.index(frame) + 1} of the {len(self.worst)} frames to look at")
         self._words.content = small_text("<br>".join(lines), "padding-bottom:6px")

@@ -11,12 +11,12 @@ from jawusd.viewer.contact_panel import ContactPanel
 from jawusd.viewer.file_panel import FilePanel
 from jawusd.viewer.motion_panel import MotionPanel
 from jawusd.viewer.plots import VERMILION, bound_plot, posselt_plot, posselt_point
-from jawusd.viewer.pose_panel import PosePanel
+from jawusd.viewer.pose_panel import PosePanel, verdict_html
 from jawusd.viewer.readouts import landmark_places, rest_places
-from jawusd.viewer.scene import JawScene
+from jawusd.viewer.scene import FIRST_VIEW, JawScene
 from jawusd.viewer.session import Session
 from jawusd.viewer.viewed import ViewedActor
-from jawusd.viewer.widgets import guarded, set_theme, small_text
+from jawusd.viewer.widgets import begin_panel, guarded, small_text
 
 _PANEL_PX, _PLOTS_PX = 350, 310
 _PLACEHOLDER = small_text(
@@ -68,9 +68,10 @@ class PlotPanel:
 
 def begin_page(client: viser.ClientHandle, actor: ViewedActor) -> JawScene:
     """Draw the jaw, without any panel."""
-    set_theme(client.gui)
-    client.gui.set_panel_label(actor.name)
-    return JawScene(client, actor)
+    begin_panel(client, actor.name)
+    scene = JawScene(client, actor)
+    scene.look(FIRST_VIEW)
+    return scene
 
 
 class Page:
@@ -81,6 +82,7 @@ class Page:
         self.client, self.scene = client, scene
         self.session = Session(actor.rig, actor.fps)
         gui = client.gui
+        self.verdict = gui.add_html("")
         tabs = gui.add_tab_group()
         with tabs.add_tab("Pose"):
             if "mandible" in actor.placeholders:
@@ -130,6 +132,7 @@ class Page:
             self.scene.show_pins(
                 {pin.name: transform_point(session.pose(), pin.p_mandible) for pin in session.work.pins}
             )
+            self.verdict.content = verdict_html(readout)
             self.pose.refresh(readout)
             if self.contacts is not None:
                 self.contacts.refresh(session.work.d)

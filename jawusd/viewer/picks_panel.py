@@ -11,9 +11,10 @@ from jawusd.viewer.footage_panel import FootagePanel
 from jawusd.viewer.picking_layout import SIDES
 from jawusd.viewer.picks import PickBook
 from jawusd.viewer.viewed import ViewedCapture
-from jawusd.viewer.widgets import Choice, assign, guarded, say, small_text
+from jawusd.viewer.widgets import Choice, assign, enable, guarded, say, small_text
 
 _NONE = "none"
+_PICKING_HINT = "In the picture of one camera, and on scans in 3-D; not while all cameras are side by side."
 _HELP = (
     "Click a vertex on a scan, then the same place in the picture of two or more cameras, all at one frame. Three or "
     "more of each arch, spread over it: front teeth and both sides. Wheel: zoom; right button: move."
@@ -26,6 +27,7 @@ class PicksPanel:
     Attributes:
         book: the picks.
         side: that the scans in front of the picture show, one of `picking_layout.SIDES`.
+        scans_shown: there are scans in front of the picture.
     """
 
     def __init__(
@@ -40,11 +42,11 @@ class PicksPanel:
         self._client, self._capture, self._footage = client, capture, footage
         self._turned, self._changed = turned, changed
         self.book, self.side = PickBook(capture.picks), "front"
-        self._saved = capture.picks
+        self._saved, self.scans_shown = capture.picks, False
         self._fit = ""
         gui = client.gui
         gui.add_html(small_text(_HELP))
-        self.picking = gui.add_checkbox("clicks set picks", capture.tracks is None)
+        self.picking = gui.add_checkbox("clicks set picks", capture.tracks is None, hint=_PICKING_HINT)
         self.picking.on_update(guarded(client, self._turn))
         self.sides = gui.add_button_group("scans", tuple(SIDES))
         self.sides.on_click(guarded(client, self._choose_side))
@@ -71,11 +73,18 @@ class PicksPanel:
         if self.chosen.options != (_NONE, *names):
             self.chosen.options = (_NONE, *names)
         assign(self.chosen, _NONE if book.selected is None else names[book.selected])
+        some, lacks = bool(book.picks), book.lacks()
+        enable(self.picking, not self._footage.on_wall)
+        enable(self.sides, self.scans_shown)
+        enable(self.chosen, some)
+        enable(self.edit, some)
+        enable(self.go, book.frame is not None)
+        enable(self.write, not lacks)
         lines = [f"frame {book.frame}" if book.frame is not None else "no pixels yet"]
         for number, pick in enumerate(book.picks):
             text = f"{names[number]}, vertex {pick.vertex}: {', '.join(pick.views) or 'no pixels yet'}"
             lines.append(f"<b>{text}</b>" if number == book.selected else text)
-        lines.append(book.lacks() or "complete")
+        lines.append(lacks or "complete")
         if self._fit:
             lines.append(self._fit)
         self._list.content = small_text("<br>".join(lines))

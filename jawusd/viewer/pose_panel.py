@@ -16,12 +16,20 @@ from jawusd.viewer.session import Session
 from jawusd.viewer.widgets import Choice, add_dark_checkbox, assign, guarded, small_text
 
 STEP_MM = 0.01
-LABELS = ("d1 opening", "d2 to the left", "d3 forward")
+LABELS = ("d1 opening [mm]", "d2 lateral [mm]", "d3 protrusion [mm]")
 _HINTS = (
     "Opening [mm] along this person's own path.",
     "Laterotrusion [mm] at the incisal point, + to the subject's left.",
-    "Protrusion [mm] relative to the path of opening, + forward.",
+    "Protrusion [mm] relative to this person's path of opening, which itself leads back: + before it, - behind it.",
 )
+_DRAG_HELP = small_text(
+    "Drag the jaw itself, too: what you hold follows the pointer as far as this person can move it.", "opacity:.7"
+)
+_KEYS_HELP = small_text("Undo: Ctrl+Z, redo: Ctrl+Shift+Z (Mac: Cmd)", "opacity:.7")
+_MARGIN_HELP = "How far the pose lies inside the bound of this person's jaw, in d; negative outside."
+_CAPTURED_HELP = "Distance in d to the nearest pose of the take: the farther, the more the model has made up."
+_VALID_HELP = "What this parameter may be at the present value of the others."
+_MOVED_HELP = "From its place in the closed bite, in anatomical axes: to the subject's left, down, forward."
 # How far sliders reach beyond the ranges of the rig while poses outside are allowed.
 _BEYOND = 0.25
 _PINNABLE = tuple(name for name in LANDMARKS if not name.startswith("molar"))
@@ -39,8 +47,10 @@ class PosePanel:
         self.sliders = [self._add_slider(index, label) for index, label in enumerate(LABELS)]
         self.keep_valid = gui.add_checkbox("keep valid", True, hint="Stop sliders at the bound of this person.")
         self.keep_valid.on_update(guarded(client, self._keep))
+        gui.add_html(_DRAG_HELP)
         self.reading = gui.add_html("")
         gui.add_button_group("history", ("undo", "redo", "close jaw")).on_click(guarded(client, self._step))
+        gui.add_html(_KEYS_HELP)
         with gui.add_folder("Hold while dragging"):
             self.pins = {name: self._add_pin(name) for name in _PINNABLE}
         with gui.add_folder("View"):
@@ -48,6 +58,7 @@ class PosePanel:
             gui.add_checkbox("paths and captured places", True).on_update(guarded(client, self._show_paths))
             add_dark_checkbox(client)
         gui.add_command("Undo", hotkey="Z", modifier="cmd/ctrl").on_trigger(guarded(client, self._undo))
+        gui.add_command("Redo", hotkey="Z", modifier="cmd/ctrl+shift").on_trigger(guarded(client, self._redo))
 
     def _add_slider(self, index: int, label: str) -> viser.GuiSliderHandle[float]:
         slider = self._client.gui.add_slider(label, -1.0, 1.0, STEP_MM, 0.0, hint=_HINTS[index])
@@ -84,6 +95,10 @@ class PosePanel:
 
     async def _undo(self, _: object) -> None:
         self._session.undo()
+        self._changed()
+
+    async def _redo(self, _: object) -> None:
+        self._session.redo()
         self._changed()
 
     async def _look(self, event: Choice) -> None:
@@ -127,27 +142,30 @@ def _outwards(value: float, sign: int) -> float:
     return round(sign * math.ceil(sign * value / STEP_MM - 1e-6) * STEP_MM, 6)
 
 
-def reading_html(readout: Readout, d: tuple[float, float, float], limits: Array) -> str:
-    """Return the numbers of a pose and its verdict as HTML."""
+def verdict_html(readout: Readout) -> str:
+    """Return in words and colour whether a pose is one that the person can take, as HTML."""
     color, verdict = (GREEN, "inside the bound") if readout.inside else (VERMILION, "OUTSIDE the bound")
+    margin = f'<span title="{_MARGIN_HELP}">margin {_plain(readout.margin_mm)} mm</span>'
+    return small_text(f'<b style="color:{color}">&#9679; {verdict}</b>, {margin}', "padding-top:6px")
+
+
+def reading_html(readout: Readout, d: tuple[float, float, float], limits: Array) -> str:
+    """Return the numbers of a pose as HTML."""
     captured = f"{readout.captured_mm:.2f} mm" if math.isfinite(readout.captured_mm) else "nothing captured"
     rows = [
-        ("opening", f"{_plain(readout.opening_mm)} mm"),
-        ("lateral, + left", f"{_plain(readout.lateral_mm)} mm"),
-        ("forward", f"{_plain(readout.protrusion_mm)} mm"),
-        ("left condyle moved", _moved(readout.condyle_left_mm)),
-        ("right condyle moved", _moved(readout.condyle_right_mm)),
-        ("margin", f"{_plain(readout.margin_mm)} mm"),
-        ("nearest captured", captured),
-        *((f"valid d{i + 1}", _span(d[i], *limits[i])) for i in range(3)),
+        ("incisor moved", _moved(readout.incisor_mm), _MOVED_HELP),
+        ("left condyle moved", _moved(readout.condyle_left_mm), _MOVED_HELP),
+        ("right condyle moved", _moved(readout.condyle_right_mm), _MOVED_HELP),
+        ("nearest captured", captured, _CAPTURED_HELP),
+        *((f"valid d{i + 1}", _span(d[i], *limits[i]), _VALID_HELP) for i in range(3)),
     ]
+    style = "opacity:.7;padding-right:8px;white-space:nowrap"
     cells = "".join(
-        f'<tr><td style="opacity:.7;padding-right:8px;white-space:nowrap">{name}</td><td>{text}</td></tr>'
-        for name, text in rows
+        f'<tr title="{words}" style="cursor:help"><td style="{style}">{name}</td><td>{text}</td></tr>'
+        for name, text, words in rows
     )
-    head = f'<div style="color:{color};font-weight:bold">&#9679; {verdict}</div>'
-    foot = '<div style="opacity:.6">L, D, F: to the left, down, forward [mm]</div>'
-    return small_text(f"{head}<table>{cells}</table>{foot}", "line-height:1.35")
+    foot = '<div style="opacity:.7">L, D, F: to the left, down, forward [mm]</div>'
+    return small_text(f'<div style="overflow-x:auto"><table>{cells}</table></div>{foot}', "line-height:1.35")
 
 
 def _plain(value: float) -> str:

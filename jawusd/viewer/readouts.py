@@ -19,16 +19,14 @@ class Readout:
     """Hold what is shown of one pose.
 
     Attributes:
-        opening_mm, lateral_mm, protrusion_mm: displacement of the incisal point down, to the subject's left, forward.
-        condyle_left_mm, condyle_right_mm: displacement of the condyle centres to the left, up and forward.
+        incisor_mm, condyle_left_mm, condyle_right_mm: displacement of the incisal point and of the condyle centres to
+            the subject's left, up and forward.
         margin_mm: signed distance to the bound, > 0 inside.
         captured_mm: distance in d to the nearest captured pose; infinite without any.
         inside: d lies inside the bound.
     """
 
-    opening_mm: float
-    lateral_mm: float
-    protrusion_mm: float
+    incisor_mm: tuple[float, float, float]
     condyle_left_mm: tuple[float, float, float]
     condyle_right_mm: tuple[float, float, float]
     margin_mm: float
@@ -51,11 +49,10 @@ def rest_places(rig: JawRig) -> Array:
 def read_out(rig: JawRig, d: Array) -> Readout:
     """Measure the pose of parameters d (3,) [mm]."""
     moved = landmark_places(rig, d) - rest_places(rig)
-    lateral, up, forward = moved[INCISOR].tolist()
     margin = float(rig.margin(d))
-    left, right = (triple(moved[index]) for index in CONDYLES)
+    incisor, left, right = (triple(moved[index]) for index in (INCISOR, *CONDYLES))
     captured = float(rig.captured_distance(d))
-    return Readout(-up, lateral, forward, left, right, margin, captured, bool(rig.is_inside(d)))
+    return Readout(incisor, left, right, margin, captured, bool(rig.is_inside(d)))
 
 
 def triple(values: Array) -> tuple[float, float, float]:

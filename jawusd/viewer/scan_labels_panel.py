@@ -9,7 +9,7 @@ import viser
 
 from jawusd.viewer.scan_brush import BRUSHES, ScanBrush
 from jawusd.viewer.viewed import ViewedCapture
-from jawusd.viewer.widgets import Choice, guarded, say, small_text
+from jawusd.viewer.widgets import Choice, enable, guarded, say, small_text
 
 _HELP = (
     "White is crown, red gum, blue base. Click on a scan to paint around the place clicked. Only the line between "
@@ -59,12 +59,16 @@ class ScanLabelsPanel:
         self._say_state()
 
     def _say_state(self) -> None:
+        enable(self.kinds, self.painting.value)
+        enable(self.radius, self.painting.value)
+        enable(self.undo, self.brush.strokes > 0)
         name = next(name for name, label in BRUSHES.items() if label == self.label)
         unsaved = " and ".join(sorted(self.brush.changed))
         state = f"paints {name}; {self.brush.strokes} strokes; "
         self._state.content = small_text(state + (f"not saved: {unsaved}" if unsaved else "all saved"))
 
     async def _turn(self, _: object) -> None:
+        self._say_state()
         self._turned()
 
     async def _choose(self, event: Choice) -> None:

@@ -36,9 +36,16 @@ PRESETS = {
     "front": (0.0, 10.0, 330.0),
     "left": (330.0, 10.0, 0.0),
     "right": (-330.0, 10.0, 0.0),
+    "top": (0.0, 330.0, 20.0),
     "condyle left": (105.0, 12.0, 40.0),
     "condyle right": (-105.0, 12.0, 40.0),
 }
+#: The view that pages begin with.
+FIRST_VIEW = "front"
+#: Width over height of the picture below which it is that of a phone, whose panel covers the lower half.
+PHONE = 0.6
+_NARROW = 0.75  # below this width over height the eye steps back, so that the jaw is not wider than the picture
+_LOWER = 0.25  # share of the picture's height by which the eye of a phone aims below the jaw
 _FOV_RAD, _NEAR_MM, _FAR_MM = 0.6, 1.0, 5000.0
 
 
@@ -164,23 +171,32 @@ class JawScene:
 
     def look(self, preset: str) -> None:
         """Move the camera to a preset; in a close-up the condyle's path shows through the mandible."""
-        target, eye = preset_view(self._rest, preset)
         camera = self._client.camera
+        target, eye = preset_view(self._rest, preset, camera.image_width / max(camera.image_height, 1))
         if self._mandible is not None and self._bone != _PLACEHOLDER:
             self._mandible.opacity = _CLEAR if preset.startswith("condyle") else None
         with self._client.atomic():
             camera.position, camera.look_at, camera.up_direction = tuple(eye), tuple(target), (0.0, 1.0, 0.0)
 
 
-def preset_view(rest: Array, preset: str) -> tuple[Array, Array]:
-    """Return target (3,) and eye (3,) of a preset [mm], given the landmarks (5, 3) at rest."""
+def preset_view(rest: Array, preset: str, aspect: float = 1.0) -> tuple[Array, Array]:
+    """Return target (3,) and eye (3,) of a preset [mm].
+
+    Args:
+        rest: landmarks at rest, shape (5, 3) [mm].
+        aspect: width over height of the screen.
+    """
     target = rest[list(CONDYLES) + [INCISOR]].mean(axis=0)
     if preset.startswith("condyle"):
         target = rest[CONDYLES[0] if preset.endswith("left") else CONDYLES[1]]
-    return target, target + np.array(PRESETS[preset])
+    away = np.array(PRESETS[preset]) * max(1.0, _NARROW / aspect)
+    if aspect < PHONE:
+        up = np.array([0.0, 1.0, 0.0]) if preset != "top" else np.array([0.0, 0.0, -1.0])
+        target = target - _LOWER * 2 * np.linalg.norm(away) * np.tan(_FOV_RAD / 2) * up
+    return target, target + away
 
 
-def set_first_view(server: viser.ViserServer, rest: Array, preset: str = "front") -> None:
+def set_first_view(server: viser.ViserServer, rest: Array, preset: str = FIRST_VIEW) -> None:
     """Let every page start with a preset, given the landmarks (5, 3) at rest [mm]."""
     target, eye = preset_view(rest, preset)
     server.scene.set_up_direction("+y")

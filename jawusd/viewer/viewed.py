@@ -67,8 +67,11 @@ class ViewedCapture:
     # (camera, frame of the reference camera, T_world_upper and T_world_lower or None, look) to RGB (h, w, 3) uint8,
     # gray where the camera has no picture; raises a JawusdError
     picture: Callable[[str, int, tuple[Array, Array] | None, Look], NDArray[np.uint8]]
-    # the same without a camera: all of them side by side, in pictures of the size `wall_px`
-    wall: Callable[[int, tuple[Array, Array] | None, Look], NDArray[np.uint8]]
+    # the same without a camera: all of them side by side, in pictures of the size `wall_px`; the function given last is
+    # called with the picture so far while cameras are being decoded
+    wall: Callable[
+        [int, tuple[Array, Array] | None, Look, Callable[[NDArray[np.uint8]], None] | None], NDArray[np.uint8]
+    ]
     wall_px: tuple[int, int]
     # (camera, frame) to the region of the teeth in its masks, None without masks
     teeth_region: Callable[[str, int], Region | None]

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import html
+import json
 import logging
 from collections.abc import Callable, Coroutine, Iterator
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 import viser
 
@@ -25,6 +27,22 @@ def set_theme(gui: viser.GuiApi, dark: bool = False) -> None:
     gui.configure_theme(control_width="large", show_logo=False, show_share_button=False, dark_mode=dark)
 
 
+# viser's page has no title of its own, and on phones (its breakpoint) a narrow panel that hides half of the picture.
+_STYLE = """<style onload="document.title={title}">
+@media (max-width: 36em) {{
+  .mantine-Paper-root:has(.jawusd-page) {{ width: 100% !important; max-height: 50% !important; }}
+  .mantine-Paper-root:has(.jawusd-page) div[style*="20em"] {{ width: 100% !important; }}
+}}
+</style><span class="jawusd-page"></span>"""
+
+
+def begin_panel(client: viser.ClientHandle, name: str) -> None:
+    """Set the theme, name a page after what it shows, and let its panel fill the width of a phone."""
+    set_theme(client.gui)
+    client.gui.set_panel_label(name)
+    client.gui.add_html(_STYLE.format(title=html.escape(json.dumps(f"{name} - jawusd"))))
+
+
 def add_dark_checkbox(client: viser.ClientHandle) -> None:
     """Add the checkbox that makes the page dark."""
     box = client.gui.add_checkbox("dark page", False)
@@ -39,6 +57,20 @@ def assign(widget: viser.GuiInputHandle[Value], value: Value) -> None:
     """Set the value of a widget where it differs, which saves a message to the page."""
     if widget.value != value:
         widget.value = value  # type: ignore[misc]  # viser's setter is not next to its getter, so mypy misses it
+
+
+class _Widget(Protocol):
+    disabled: bool
+    visible: bool
+
+
+def enable(widget: _Widget, on: bool) -> None:
+    """Let a widget be used, or show that it does not apply now: groups of buttons, which viser cannot disable, go."""
+    if isinstance(widget, viser.GuiButtonGroupHandle):
+        if widget.visible != on:
+            widget.visible = on
+    elif widget.disabled == on:
+        widget.disabled = not on
 
 
 def small_text(html: str, style: str = "") -> str:

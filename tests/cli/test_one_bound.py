@@ -43,7 +43,7 @@ from jawusd.rig.bake import bake_rig
 from jawusd.rig.onnx_sidecar import decode_model
 from jawusd.rig.rules import check_bounds
 from jawusd.solvers import JawLayer
-from jawusd.viewer.pose_panel import reading_html
+from jawusd.viewer.pose_panel import verdict_html
 from jawusd.viewer.readouts import read_out
 from jawusd.viewer.session import Session
 from jawusd.viewer.solve_plot import solve_words
@@ -209,8 +209,7 @@ def test_command_with_numpy_alone(tmp_path, capsys):
 def test_viewer():
     readouts = [read_out(RIG, d) for d in D]
     assert disagreements([readout.inside for readout in readouts]) == 0
-    limits = RIG.d_range
-    pages = [reading_html(readout, tuple(d), limits) for readout, d in zip(readouts, D)]
+    pages = [verdict_html(readout) for readout in readouts]
     assert disagreements(["inside the bound" in page and "OUTSIDE" not in page for page in pages]) == 0
     session = Session(RIG, FPS)
     session.set_keep_valid(False)

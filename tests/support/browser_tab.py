@@ -61,9 +61,8 @@ class Tab:
         self.web.wait_for_selector(f"text={text}")
 
     def download(self, button, path):
-        self.press(button)
         with self.web.expect_download() as found:
-            self.web.get_by_role("link").last.click()
+            self.press(button)
         found.value.save_as(path)
 
     def pixel(self, place):
@@ -81,6 +80,20 @@ class Tab:
             time.sleep(0.5)
             before, box = box, widget.bounding_box()
         return box
+
+    def keep_every_tab(self, name, names):
+        """Save a picture of each tab, light and dark; return widths (of the page, of the screen) of all of them."""
+        widths = []
+        for scheme in ("light", "dark"):
+            if scheme == "dark":
+                self.tab(names[0])
+                self.web.get_by_label("dark page").click()
+            for one in names:
+                self.tab(one)
+                time.sleep(0.5)
+                self.picture(f"{name}_{one.lower()}_{self.SIZE_PX[0]}_{scheme}")
+                widths.append(tuple(self.web.evaluate("[document.documentElement.scrollWidth, innerWidth]")))
+        return widths
 
     def picture(self, name):
         keep_picture(self.web, f"viewer_{name}")

@@ -13,11 +13,7 @@ class QuietCapturePage(QuietPage):
     """A page of a capture that no browser shows."""
 
     def make_page(self, viewer):
-        """Make the page once the visitor's camera is known, as the server does."""
-        state = self.client.camera._state
-        state.update_timestamp, state.image_width, state.image_height, state.fov = 1.0, 900, 700, 0.35
-        state.wxyz, state.position, state.look_at = np.array([1.0, 0, 0, 0]), np.zeros(3), np.array([0, 0, 1.0])
-        state.up_direction, state.near, state.far = np.array([0, -1.0, 0]), 1.0, 1e4
+        """Return the page of a capture."""
         return CapturePage(self.client, viewer._capture)
 
     def settle(self):

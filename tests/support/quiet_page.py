@@ -3,6 +3,7 @@
 import asyncio
 import time
 
+import numpy as np
 import viser
 from viser.infra._infra import AsyncMessageBuffer, WebsockClientConnection, _ClientHandleState
 
@@ -26,6 +27,12 @@ class QuietPage:
         self.downloads = {}
         self.client.add_notification = lambda title, body, **_: self.notices.append((title, body))
         self.client.send_file_download = lambda name, content, **_: self.downloads.update({name: content})
+
+        # A page is made once the visitor's camera is known.
+        state = self.client.camera._state
+        state.update_timestamp, state.image_width, state.image_height, state.fov = 1.0, 900, 700, 0.35
+        state.wxyz, state.position, state.look_at = np.array([1.0, 0, 0, 0]), np.zeros(3), np.array([0, 0, 1.0])
+        state.up_direction, state.near, state.far = np.array([0, -1.0, 0]), 1.0, 1e4
 
         def make():
             began = time.perf_counter()
@@ -52,6 +59,16 @@ class QuietPage:
             handle._impl.value = value
             event = viser.GuiEvent(client=self.client, client_id=self.client.client_id, target=handle)
             for callback in handle._impl.update_cb:
+                await callback(event)
+
+        asyncio.run_coroutine_threadsafe(run(), self.loop).result(60)
+
+    def trigger(self, command):
+        """Do what a key does, and what the palette of commands does."""
+
+        async def run():
+            event = viser.CommandEvent(client=self.client, client_id=self.client.client_id, target=command)
+            for callback in command._impl.trigger_cb:
                 await callback(event)
 
         asyncio.run_coroutine_threadsafe(run(), self.loop).result(60)

@@ -30,6 +30,37 @@ def close_to(session, d):
     return np.allclose(session.d, d, atol=1e-3)
 
 
+class Desktop(Tab):
+    """A page on a screen."""
+
+    SIZE_PX = (1440, 900)
+
+
+class Phone(Tab):
+    """A page on a phone."""
+
+    SIZE_PX = (390, 844)
+
+
+@pytest.mark.parametrize("kind", [Desktop, Phone])
+def test_no_tab_scrolls_sideways_and_the_page_is_named_after_the_actor(chromium, viewer, kind):
+    tab = kind(chromium, viewer)
+    until(lambda: tab.web.title() == "someone - jawusd")
+    widths = tab.keep_every_tab("rig", ("Pose", "Animate", "Files"))
+    assert set(widths) == {(kind.SIZE_PX[0], kind.SIZE_PX[0])}
+    tab.said("inside the bound")
+    if kind is Phone:
+        panel = tab.web.locator(".mantine-Paper-root", has=tab.web.locator(".jawusd-page")).last
+        box, height = tab.resting_place(panel), kind.SIZE_PX[1]
+        assert box["width"] == kind.SIZE_PX[0] and box["y"] >= 0.49 * height
+        incisor = tab.pixel(rest_places(tab.session.rig)[INCISOR])
+        assert 0 < incisor[0] < kind.SIZE_PX[0] and 0 < incisor[1] < box["y"]
+        tab.web.get_by_text("someone", exact=True).click()  # the head of the panel folds it
+        until(lambda: tab.resting_place(panel)["height"] < 80)
+    tab.web.close()
+    assert tab.complaints == [] and tab.elsewhere == []
+
+
 def test_sliders_pose_the_jaw_and_their_ends_follow(tab):
     tab.type_slider(0, 20)
     until(lambda: close_to(tab.session, [20, 0, 0]))
@@ -106,6 +137,10 @@ def test_a_pinned_condyle_stays_and_undo_takes_the_drag_back(tab):
     free = landmark_places(tab.session.rig, tab.session.d)
     tab.web.keyboard.press("Control+z")
     until(lambda: close_to(tab.session, [15, 0, 0]))
+    tab.web.keyboard.press("Control+Shift+z")
+    until(lambda: not close_to(tab.session, [15, 0, 0]))
+    tab.web.keyboard.press("Control+z")
+    until(lambda: close_to(tab.session, [15, 0, 0]))
     tab.web.get_by_label("condyle right").click()
     until(lambda: tab.session.work.pins)
     time.sleep(0.5)
@@ -124,7 +159,7 @@ def test_every_view_is_drawn_in_light_and_dark(tab):
     camera, rest = tab.page.client.camera, rest_places(tab.session.rig)
     for name in PRESETS:
         tab.press(name)
-        target, eye = preset_view(rest, name)
+        target, eye = preset_view(rest, name, camera.image_width / camera.image_height)
         until(lambda eye=eye: np.allclose(camera.position, eye, atol=0.1))
         until(lambda target=target: np.allclose(camera.look_at, target, atol=0.1))
         assert (tab.page.scene.grips[0].opacity is None) == (not name.startswith("condyle"))

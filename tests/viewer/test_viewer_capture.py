@@ -2,6 +2,7 @@
 
 import asyncio
 import shutil
+import threading
 import time
 import tomllib
 from dataclasses import replace
@@ -166,12 +167,82 @@ def test_all_cameras_stand_side_by_side(page):
     assert page.page.layout.size_px == capture.sizes_px["cam1"]
 
 
+def test_cameras_are_shown_as_they_are_decoded(viewed):
+    wall, shown = viewed.wall, []
+    held = threading.Event()
+    backdrops = wall.__self__.wall._backdrops
+    late = backdrops["cam1"]
+
+    class Late:
+        """A camera whose picture comes last."""
+
+        is_footage = True
+
+        def picture(self, frame):
+            held.wait(60)
+            return late.picture(frame)
+
+    def seen(image):
+        shown.append(image)
+        held.set()
+
+    backdrops["cam1"] = Late()
+    try:
+        whole = wall(FIRST, None, "footage", seen)
+    finally:
+        backdrops["cam1"] = late
+    first, same = np.array_split(shown[0], 3, axis=1), np.array_split(whole, 3, axis=1)
+    assert [np.array_equal(a[40:], b[40:]) for a, b in zip(first, same, strict=True)] == [True, False, True]
+    np.testing.assert_array_equal(whole, viewed.wall(FIRST, None, "footage"))
+
+
+def test_a_picture_that_takes_long_is_said_to_be_loading(viewed):
+    held = threading.Event()
+
+    def late(*given):
+        held.wait(60)
+        return viewed.picture(*given)
+
+    viewer = CaptureViewer(replace(viewed, picture=late), "127.0.0.1", 0)
+    opened = QuietCapturePage(viewer)
+    words = opened.page.footage._words
+    until(lambda: "loading" in words.content)
+    held.set()
+    opened.settle()
+    assert "loading" not in words.content
+    viewer.stop()
+
+
+def test_widgets_that_do_not_apply_are_off(page):
+    picks, labels, footage = page.page.picks, page.page.labels, page.page.footage
+
+    def off():
+        widgets = {"picking": picks.picking, "sides": picks.sides, "pick": picks.chosen, "edit": picks.edit}
+        widgets |= {"go": picks.go, "write": picks.write, "paint": labels.kinds, "radius": labels.radius}
+        return {name for name, widget in widgets.items() if widget.disabled or not widget.visible}
+
+    brush = {"paint", "radius"}
+    page.press(picks.picking, False)
+    assert off() == {"sides", *brush}
+    page.press(picks.picking, True)
+    assert off() == brush
+    page.press(footage.views, "all cameras")
+    assert off() == {"picking", "sides", *brush}
+    page.press(footage.views, "cam0")
+    page.press(picks.edit, "pick")
+    page.press(picks.edit, "all")
+    assert off() == {"pick", "edit", "go", "write", *brush}
+    page.press(labels.painting, True)
+    assert off() == {"pick", "edit", "go", "write"} and labels.undo.disabled
+
+
 def test_playing_leaves_out_pictures_instead_of_falling_behind(viewed):
     drawn = []
 
-    def slowly(frame, poses, look):
+    def slowly(frame, poses, look, partly):
         time.sleep(0.25)  # six frames
         drawn.append(frame)
+        assert partly is None or not opened.page.footage.player.playing
         return viewed.wall(frame, poses, look)
 
     viewer = CaptureViewer(replace(viewed, wall=slowly), "127.0.0.1", 0)

@@ -102,6 +102,33 @@ def clickable(mesh, vertex, pose, eye):
     return 0.6 * world[vertex] + 0.4 * middles[face]
 
 
+class Phone(CaptureTab):
+    """A page on a phone."""
+
+    SIZE_PX = (390, 844)
+
+
+class Desktop(CaptureTab):
+    """A page on a screen."""
+
+    SIZE_PX = (1440, 900)
+
+
+@pytest.mark.parametrize("kind", [Desktop, Phone])
+def test_no_tab_scrolls_sideways_and_the_page_is_named_after_the_capture(chromium, viewer, kind):
+    tab = kind(chromium, viewer)
+    tab.settle()
+    assert tab.web.title() == f"{tab.page._capture.name} - jawusd"
+    if kind is Phone:
+        panel = tab.resting_place(tab.web.locator(".mantine-Paper-root", has=tab.web.locator(".jawusd-page")).last)
+        for mesh, pose in zip(tab.page._capture.scans.values(), tab.page.poses.values(), strict=True):
+            assert all(tab.pixel(place)[1] < panel["y"] for place in transform_points(pose, mesh.vertices[::500]))
+    widths = tab.keep_every_tab("capture", ("Footage", "Picks", "Scans"))
+    assert set(widths) == {(kind.SIZE_PX[0], kind.SIZE_PX[0])}
+    tab.web.close()
+    assert tab.complaints == []
+
+
 def test_frames_are_stepped_and_the_cameras_stand_in_space(tab):
     tab.press("+1")
     until(lambda: tab.page.footage.frame == FIRST + 1 and not tab.page.busy)

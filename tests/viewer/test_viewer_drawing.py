@@ -13,7 +13,7 @@ from jawusd.geometry import LANDMARKS
 from jawusd.viewer.decimate import for_view, is_solid
 from jawusd.viewer.motion import Clip
 from jawusd.viewer.plots import bound_plot, curve_plot, posselt_plot, posselt_point, with_playhead
-from jawusd.viewer.pose_panel import reading_html, slider_ends
+from jawusd.viewer.pose_panel import reading_html, slider_ends, verdict_html
 from jawusd.viewer.readouts import border_path, habitual_path, landmark_places, read_out, rest_places
 
 RIG = example_rig()
@@ -26,9 +26,9 @@ def test_the_numbers_of_a_pose_are_displacements_in_anatomical_axes():
     moved = [A @ ((T - rest) @ [*RIG.landmarks[LANDMARKS.index(name)], 1])[:3] for name in
              ("incisor", "condyle_left", "condyle_right")]  # fmt: skip
     found = read_out(RIG, d)
-    np.testing.assert_allclose([found.lateral_mm, -found.opening_mm, found.protrusion_mm], moved[0], atol=1e-9)
+    np.testing.assert_allclose(found.incisor_mm, moved[0], atol=1e-9)
     np.testing.assert_allclose([found.condyle_left_mm, found.condyle_right_mm], moved[1:], atol=1e-9)
-    assert found.inside and found.margin_mm == float(RIG.margin(d)) and found.opening_mm > 10
+    assert found.inside and found.margin_mm == float(RIG.margin(d)) and found.incisor_mm[1] < -10
     codes = RIG.captured_d
     nearest = np.linalg.norm(codes - d, axis=1).min() if len(codes) else np.inf
     assert found.captured_mm == pytest.approx(nearest)
@@ -82,7 +82,7 @@ def test_posselt_figures_hold_the_border_and_mark_the_incisal_point():
         ElementTree.fromstring(plot.definition())
         found = read_out(RIG, [10.0, 1.0, 0.0])
         x, y = posselt_point(landmark_places(RIG, [10.0, 1.0, 0.0]), rest, axis)
-        assert (x, y) == pytest.approx((found.lateral_mm if column == 0 else found.protrusion_mm, -found.opening_mm))
+        assert (x, y) == pytest.approx((found.incisor_mm[column], found.incisor_mm[1]))
         assert plot.low[0] < x < plot.high[0] and plot.low[1] < y < plot.high[1]
 
 
@@ -115,7 +115,20 @@ def test_the_reading_says_in_words_and_colour_when_a_pose_is_outside():
     limits = np.array([[0.0, 40.0], [-2, 2], [-1, 1]])
     good = reading_html(read_out(RIG, [5.0, 0, 0]), (5.0, 0, 0), limits)
     bad = reading_html(read_out(RIG, [5.0, 30.0, 0]), (5.0, 30.0, 0), limits)
-    assert "OUTSIDE" not in good and "OUTSIDE" in bad and "<b style" in bad and "<b style" not in good
+    assert "<b style" in bad and "<b style" not in good
+    inside, outside = (verdict_html(read_out(RIG, [5.0, side, 0])) for side in (0.0, 30.0))
+    assert "OUTSIDE" not in inside and "OUTSIDE" in outside and "margin -" in outside
+
+
+def test_measures_are_explained_where_the_pointer_rests():
+    reading = reading_html(read_out(RIG, [5.0, 0, 0]), (5.0, 0, 0), np.array([[0.0, 40.0], [-2, 2], [-1, 1]]))
+    rows = {row.find("td").text: row.get("title") for row in ElementTree.fromstring(reading).iter("tr")}
+    assert "take" in rows["nearest captured"] and "forward" in rows["incisor moved"] and all(rows.values())
+    assert "forward" not in rows and 'title="How far' in verdict_html(read_out(RIG, [5.0, 0, 0]))
+
+
+def test_no_value_is_minus_zero():
+    limits = np.array([[0.0, 40.0], [-2, 2], [-1, 1]])
     assert "-0.00" not in reading_html(read_out(RIG, [0.0, 0, 0]), (0.0, 0, 0), limits)
 
 

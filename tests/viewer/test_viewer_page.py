@@ -10,7 +10,8 @@ from viser import UploadedFile
 from jawusd.formats.keys import load_keys
 from jawusd.formats.poses import read_parameters
 from jawusd.rig.motion_read import read_poses_of_stage
-from jawusd.viewer.readouts import landmark_places
+from jawusd.viewer.readouts import CONDYLES, INCISOR, landmark_places, rest_places
+from jawusd.viewer.scene import PRESETS, preset_view
 
 
 @pytest.fixture
@@ -38,15 +39,54 @@ def test_sliders_take_their_ends_from_the_rig(quiet):
     np.testing.assert_allclose(ends, session.rig.ranges(20.0), atol=0.01)
     assert pose.sliders[0].value == 20.0 and session.d[0] == 20.0
     quiet.enter(pose.sliders[1], 100.0)
-    assert pose.sliders[1].value == pytest.approx(session.d[1], abs=0.006) and "OUTSIDE" not in pose.reading.content
+    assert pose.sliders[1].value == pytest.approx(session.d[1], abs=0.006)
+    assert "OUTSIDE" not in quiet.page.verdict.content
     quiet.enter(pose.keep_valid, False)
     quiet.enter(pose.sliders[1], 9.0)
-    assert "OUTSIDE" in pose.reading.content and pose.sliders[1].max > 9.0
+    assert "OUTSIDE" in quiet.page.verdict.content and pose.sliders[1].max > 9.0
     quiet.enter(button(quiet, "history"), "undo")
-    assert "OUTSIDE" not in pose.reading.content
+    assert "OUTSIDE" not in quiet.page.verdict.content
     quiet.enter(button(quiet, "history"), "close jaw")
     np.testing.assert_allclose(session.d, 0, atol=0.01)
     assert quiet.notices == []
+
+
+def test_the_verdict_stands_above_the_tabs_and_sliders_name_their_unit(quiet):
+    page = quiet.page
+    inside = {one._impl.parent_container_id for one in (page.pose.sliders[0], page.motion.play, page.files.load)}
+    assert page.verdict._impl.parent_container_id == "root" and len(inside - {"root"}) == 3
+    assert all(slider.label.endswith("[mm]") for slider in page.pose.sliders)
+    assert not any("forward" in slider.label for slider in page.pose.sliders)  # of the incisor, which is read out
+
+
+def test_what_was_undone_is_done_again_by_its_key(quiet):
+    session = quiet.page.session
+    quiet.enter(quiet.page.pose.sliders[0], 12.0)
+    keys = {
+        (command._impl.props.hotkey, command._impl.props.modifier): command
+        for command in quiet.client.gui._command_handle_from_uuid.values()
+    }
+    for modifier, opening in (("cmd/ctrl", 0.0), ("cmd/ctrl+shift", 12.0)):
+        quiet.trigger(keys["Z", modifier])
+        assert session.d[0] == pytest.approx(opening, abs=0.01)
+
+
+@pytest.mark.parametrize("aspect", [2.0, 0.46])
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_view_shows_the_joints_and_the_incisor_beside_the_panel_of_a_phone(name, aspect, viewer):
+    rest = rest_places(viewer._actor.rig)
+    target, eye = preset_view(rest, name, aspect)
+    up, back = np.array([0.0, 1.0, 0.0]), (eye - target) / np.linalg.norm(eye - target)
+    right = np.cross(up, back) / np.linalg.norm(np.cross(up, back))
+    close = {"condyle left": [CONDYLES[0]], "condyle right": [CONDYLES[1]]}
+    seen = rest[close.get(name, [INCISOR, *CONDYLES])]
+    p = (seen - eye) @ np.stack([right, np.cross(back, right), -back], axis=1)
+    across, upwards = (p[:, k] / p[:, 2] / np.tan(0.3) for k in (0, 1))
+    assert (np.abs(across) < aspect).all() and (np.abs(upwards) < 1).all()
+    if aspect < 1:
+        assert (upwards > 0).all()  # the lower half is the panel's
+    if name == "top":
+        assert upwards[0] < upwards[1]  # front teeth below, joints above
 
 
 def test_the_mandible_on_the_page_stands_where_the_rig_says(quiet):
