@@ -88,8 +88,8 @@ def bound_not_reached(gaps: tuple[Array, Array], shares: tuple[float, float]) ->
         if share > _MOST_GAPS:
             low, high = places[:, 0].min(), places[:, 0].max()
             found.append(
-                f"{100 * share:.0f} % of the bound of {name} lies more than {FAR_MM[0]:g} mm of opening or {far:g} mm "
-                f"of {name} from every captured pose: record slow circling at {low:.0f} to {high:.0f} mm of opening."
+                f"{100 * share:.0f} % of the bound of opening and {name} has no captured pose within {FAR_MM[0]:g} and "
+                f"{far:g} mm: record slow circling at {low:.0f} to {high:.0f} mm of opening."
             )
     return found
 

@@ -165,7 +165,7 @@ def test_gaps_are_inside_the_bound_and_far_from_every_pose(found):
     for index, gaps in enumerate(coverage.gaps):
         scaled = (gaps[:, None] - coverage.d[None, :, [0, index + 1]]) / [3.0, 2.0]
         assert not len(gaps) or np.linalg.norm(scaled, axis=-1).min() > 1
-        named = any(f"of the bound of {PARAMETERS[index + 1]}" in sentence for sentence in coverage.sentences)
+        named = any(f"bound of opening and {PARAMETERS[index + 1]}" in sentence for sentence in coverage.sentences)
         width = np.nan_to_num(np.diff(coverage.slices[index], axis=1)[:, 0])
         area = np.trapezoid(width, coverage.slices_d1)
         assert named == (0.25 * len(gaps) / area > 0.02)  # gaps lie on a grid of 0.5 mm

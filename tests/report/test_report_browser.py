@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import trimesh
 from browser import headless_chromium, keep_picture
-from report_data import experiments, report_data
+from report_data import experiments, report_data, solve_data
 
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.report import Origin, ReplayPart
 from jawusd.report.document import write_document
+from jawusd.report.solve_page import write_solve_page
 
 PATIENCE_MS = 120_000
 
@@ -85,13 +86,28 @@ def test_no_width_scrolls_the_page_sideways(chromium, tmp_path, scheme, width):
     page = context.new_page()
     page.goto((tmp_path / "report.html").as_uri())
     wide = page.evaluate("[document.documentElement.scrollWidth, innerWidth]")
+    cells = page.locator("#verdicts td").evaluate_all("all => all.map(e => e.getBoundingClientRect().right)")
     links = page.locator("nav a").evaluate_all("all => all.map(e => e.getBoundingClientRect().right)")
     letters = page.locator("#tracking svg text").first.evaluate("e => e.getBoundingClientRect().height")
     keep_picture(page, f"report_{width}_{scheme}", full_page=True)
     context.close()
     assert wide[0] <= wide[1] == width
     assert len(links) > 5 and max(links) <= width
+    assert len(cells) > 20 and max(cells) <= width  # verdicts are read without scrolling
     assert letters > 8  # drawings are legible, and scrolled by themselves
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1440, 390])
+def test_no_width_scrolls_the_page_of_a_performance_sideways(chromium, tmp_path, scheme, width):
+    write_solve_page(tmp_path / "take.html", solve_data())
+    context = chromium.new_context(color_scheme=scheme, viewport={"width": width, "height": 844})
+    page = context.new_page()
+    page.goto((tmp_path / "take.html").as_uri())
+    wide = page.evaluate("[document.documentElement.scrollWidth, innerWidth]")
+    keep_picture(page, f"solve_{width}_{scheme}", full_page=True)
+    context.close()
+    assert wide[0] <= wide[1] == width
 
 
 def luminance(color):
