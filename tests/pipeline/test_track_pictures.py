@@ -103,6 +103,16 @@ def test_without_picks_the_teeth_are_searched(offsets, truth):
     assert tracks.meta["start"]["by"] == "search" and off_mm(tracks, truth).mean() < 0.3
 
 
+def test_mirrored_scans_are_named(offsets):
+    hand = np.array([-1.0, 1.0, 1.0])
+    meshes = {
+        name: replace(mesh, vertices=hand * mesh.vertices, faces=mesh.faces[:, ::-1])
+        for name, mesh in load_meshes(load_capture(EXAMPLE)).items()
+    }
+    found = track_videos(unmasked((48, 52), bootstrap=None), offsets, meshes, 1, no_progress).meta["findings"]
+    assert "scans_mirrored" in {one["kind"] for one in found}
+
+
 def test_picks_beside_the_teeth_are_refused(offsets):
     capture = load_capture(EXAMPLE)
     picks = capture.bootstrap

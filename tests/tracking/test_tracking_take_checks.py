@@ -24,6 +24,7 @@ def _kinds(tracks):
 
 def test_a_good_take_is_not_doubted(capture):
     timely = {"camera_late", "frame_dropped", "camera_moved", "focal_length", "scan_size", "lens_distortion"}
+    timely |= {"scans_mirrored"}
     assert not timely & {kind for kind, _ in _kinds(track(capture))}
 
 
@@ -62,6 +63,14 @@ def test_scans_of_a_wrong_size_are_named(capture):
     tracks = track_capture(capture, CAMERAS, OFFSETS, *larger, LANDMARKS)
     assert "scan_size" in {kind for kind, _ in _kinds(tracks)}
     assert np.isfinite(tracks.T_upper_lower).all()
+
+
+def test_mirrored_scans_are_named(capture):
+    hand = np.array([-1.0, 1.0, 1.0])
+    mirrored = [replace(mesh, vertices=hand * mesh.vertices, faces=mesh.faces[:, ::-1]) for mesh in MESHES]
+    unpicked = capture.model_copy(update={"bootstrap": None})
+    tracks = track_capture(unpicked, CAMERAS, OFFSETS, *mirrored, LANDMARKS)
+    assert ("scans_mirrored", None) in _kinds(tracks) and np.isfinite(tracks.T_upper_lower).all()
 
 
 def lens_kinds(bend):

@@ -132,6 +132,13 @@ def thinned(scan: Scan, crown_faces: int) -> Scan:
     return replace(thin, probes=scan.probes, centre=scan.centre, radius_mm=scan.radius_mm)
 
 
+def mirrored(scan: Scan, point: Array, normal: Array) -> Scan:
+    """Return the mirror image of an arch; the mirror passes through a point [mm] across a unit normal, both (3,)."""
+    vertices = scan.vertices - 2.0 * np.outer((scan.vertices - point) @ normal, normal)
+    crown, gum = (np.ascontiguousarray(faces[:, ::-1]) for faces in (scan.crown_faces, scan.gum_faces))
+    return _with_tables(scan.name, vertices, crown, gum, scan.painted)
+
+
 def _with_tables(
     name: str,
     vertices: Array,

@@ -17,7 +17,7 @@ from jawusd.tracking.contour.quality import matched_px
 from jawusd.tracking.contour.scan import ARCHES, Scan
 from jawusd.tracking.contour.views import View
 from jawusd.tracking.region.learned import CORRELATION_PX
-from jawusd.tracking.region.take_checks import camera_findings, size_findings
+from jawusd.tracking.region.take_checks import camera_findings, scan_findings
 from jawusd.tracking.region.tracker import RegionPose
 from jawusd.tracking.sequence.closed_bite import observe_bite
 from jawusd.tracking.sequence.extrinsics import Extrinsics
@@ -79,7 +79,7 @@ def tracks_of(
     names = tuple(camera.name for camera in take.cameras)
     findings = [
         *camera_findings(names, [solution for _, _, solution in solved]),
-        *size_findings(names, take.scans, looks, config),
+        *scan_findings(names, take.scans, take.axes[0], looks, config),
         *time_findings(names, records, nuisances, extrinsics, config),
     ]
     notes: TracksMeta = {

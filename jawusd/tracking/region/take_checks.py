@@ -1,4 +1,4 @@
-"""What colours tell of the cameras and scans of a take: knocked cameras, wrong focal lengths, scans of another size."""
+"""What colours tell of cameras and scans: knocked cameras, wrong focal lengths, scans mirrored or of another size."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from jawusd.tracking.contour.scan import Scan
 from jawusd.tracking.contour.views import View
 from jawusd.tracking.initialization.magnification import measure_magnification
 from jawusd.tracking.region.learned import CORRELATION_PX
+from jawusd.tracking.sequence.mirror_check import mirror_findings
 from jawusd.tracking.sequence.take_checks import OF_COLOURS, lens_findings
 
 # Share of a camera's contour that fits over that of the camera with most, below which it sees the teeth elsewhere. It
@@ -53,12 +54,17 @@ def camera_findings(names: Sequence[str], solutions: Iterable[Solution]) -> list
     ]
 
 
-def size_findings(
-    names: Sequence[str], scans: Sequence[Scan], looks: Iterable[tuple[Array, Sequence[View]]], config: TrackingConfig
+def scan_findings(
+    names: Sequence[str],
+    scans: Sequence[Scan],
+    left: Array,
+    looks: Iterable[tuple[Array, Sequence[View]]],
+    config: TrackingConfig,
 ) -> list[Finding]:
-    """Return what some frames tell of the scans' size and of focal lengths; see `lens_findings`.
+    """Return what some frames tell of the scans and of focal lengths; see `lens_findings` and `mirror_findings`.
 
     Args:
+        left: unit vector in scan coordinates, shape (3,).
         looks: T_world_upper and T_world_lower (2, 4, 4) of a frame, and its views, one per camera.
     """
 
@@ -67,5 +73,6 @@ def size_findings(
 
     instants = [(poses, views, shown(views)) for poses, views in looks]
     thin = [scan.thin or scan for scan in scans]
+    hands = mirror_findings(thin, left, instants, config)
     found = measure_magnification(thin, instants, replace(config, correlation_px=CORRELATION_PX))
-    return [] if found is None else lens_findings(names, found, OF_COLOURS)
+    return hands if found is None else hands + lens_findings(names, found, OF_COLOURS)

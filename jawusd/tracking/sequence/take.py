@@ -28,6 +28,7 @@ from jawusd.tracking.sequence.delays import bridge, delay_motions
 from jawusd.tracking.sequence.extrinsics import Extrinsics
 from jawusd.tracking.sequence.frame_tracker import FrameTracker
 from jawusd.tracking.sequence.history import History, MotionPredictor
+from jawusd.tracking.sequence.mirror_check import mirror_findings
 from jawusd.tracking.sequence.nuisance import Nuisances, TakeEquations
 from jawusd.tracking.sequence.rest_frames import RestFrames, rest_frames
 from jawusd.tracking.sequence.results import assemble, outline_variance
@@ -39,7 +40,8 @@ Progress = Callable[[int, int], None]
 # gaps would cost the square of its length.
 _NEARBY_FRAMES = 4000
 _SETTLED_REST = 6  # frames with the teeth together among those on which nuisances are settled
-_SHOWN_AS_MOTION = ("focal_length", "scan_size", "lens_distortion")  # a moved camera would only hide these
+# A moved camera would only hide these.
+_SHOWN_AS_MOTION = ("focal_length", "scan_size", "lens_distortion", "scans_mirrored")
 _CHECKED_FRAMES = 8  # whose contours are searched widely for wrong lenses and sizes: half a second
 
 
@@ -89,16 +91,16 @@ def track_capture(
             frames = rest_frames(take.records, named, up, point, scans[1].probes)
             corrects = capture.scans.registration == "take"
             rest = RestFrames(frames, named is not None, point, scans[1].centre, corrects)
-            lenses = take.lenses()
-            wrong_size = any(finding.kind in _SHOWN_AS_MOTION for finding in lenses)
-            nuisances, extrinsics = take.refine(rest, may_move=not wrong_size)
+            given = take.scans_and_lenses(start.T_anatomical_scan[0, :3])
+            wrong = any(finding.kind in _SHOWN_AS_MOTION for finding in given)
+            nuisances, extrinsics = take.refine(rest, may_move=not wrong)
             records = take.records if capture.frames else _trimmed(take.records)
             names = tuple(camera.name for camera in masks.cameras)
             findings = [
                 *start.findings,
                 *masks.findings(),
                 *use_of_cameras(names, records),
-                *lenses,
+                *given,
                 *motion_findings(names, extrinsics),
                 *time_findings(names, take.records, nuisances, extrinsics, config),
             ]
@@ -205,8 +207,12 @@ class _Take:
         self._realign(found, extrinsics)
         return found
 
-    def lenses(self) -> list[Finding]:
-        """Return what the take, before anything is corrected, tells of focal lengths, lenses and the scans' size."""
+    def scans_and_lenses(self, left: Array) -> list[Finding]:
+        """Return what the take, before anything is corrected, tells of focal lengths, lenses and the scans.
+
+        Args:
+            left: unit vector in scan coordinates, shape (3,).
+        """
         whole = whole_frames(self.records)
         if not whole:
             return []
@@ -215,8 +221,9 @@ class _Take:
             views = self._masks.at(whole[k])
             instants.append((self.records[whole[k]].solution.poses, views, present_masks(views)))
         scans = [scan.thin or scan for scan in self._solver.scans]
+        hands = mirror_findings(scans, left, instants, self._config)
         found = measure_magnification(scans, instants, self._config)
-        return [] if found is None else lens_findings([camera.name for camera in self._masks.cameras], found)
+        return hands if found is None else hands + lens_findings([camera.name for camera in self._masks.cameras], found)
 
     def _equations(self, extrinsics: Extrinsics, rest: RestFrames) -> TakeEquations:
         variance = outline_variance(self.records, self._config)
