@@ -152,23 +152,46 @@ class Capture(Strict):
         )
         object.__setattr__(self, "cameras", told)  # the capture itself cannot be changed otherwise
         names = [camera.name for camera in self.cameras]
-        if len(set(names)) != len(names):
-            raise ValueError(f"camera names must differ, found {', '.join(names)}")
+        listed = ", ".join(names)
+        twice = [name for name in names if names.count(name) > 1]
+        if twice:
+            raise ValueError(
+                f'[[camera]] name = "{twice[0]}" is given {len(twice)} times, camera names must differ '
+                f"(found {listed}). Call each camera by a name of its own"
+            )
         if self.frames is not None and self.frames[0] >= self.frames[1]:
-            raise ValueError(f"frames = {list(self.frames)} is empty; the second number is one past the last frame")
+            raise ValueError(
+                f"frames = {list(self.frames)} is empty, the second number must be larger: it is one past the last "
+                "frame. Write it as frames = [30, 270]"
+            )
         if self.boards is not None and len(self.boards.videos) != len(names):
-            raise ValueError(f"[boards] names {len(self.boards.videos)} videos for {len(names)} cameras")
-        mentioned = {self.sync.reference} if self.sync.reference else set()
-        mentioned |= set(self.sync.offsets or {})
-        for pick in (*self.bootstrap.upper, *self.bootstrap.lower) if self.bootstrap else ():
-            mentioned |= {view.camera for view in pick.views}
-        unknown = sorted(mentioned - set(names))
-        if unknown:
-            raise ValueError(f"names camera {unknown[0]}, known are {', '.join(names)}")
-        if self.sync.offsets is not None and set(names) - set(self.sync.offsets):
-            missing = sorted(set(names) - set(self.sync.offsets))
-            raise ValueError(f"[sync] offsets has no entry for {missing[0]}; the reference camera's is 0")
+            raise ValueError(
+                f"[boards] videos names {len(self.boards.videos)} clips, needed are {len(names)}, one for each of "
+                f"{listed}. Name them in the order of the cameras"
+            )
+        self._check_names_of_cameras(names)
         return self
+
+    def _check_names_of_cameras(self, names: list[str]) -> None:
+        listed = ", ".join(names)
+        mentioned = {"[sync] reference": [self.sync.reference] if self.sync.reference else []}
+        mentioned["[sync] offsets"] = list(self.sync.offsets or {})
+        if self.bootstrap is not None:
+            for row in ("upper", "lower"):
+                picks = getattr(self.bootstrap, row)
+                mentioned[f"[[bootstrap.{row}]] camera"] = [view.camera for pick in picks for view in pick.views]
+        for key, found in mentioned.items():
+            unknown = [name for name in found if name not in names]
+            if unknown:
+                raise ValueError(
+                    f'{key} names camera "{unknown[0]}", allowed are {listed}. Write the name as its [[camera]] has it'
+                )
+        missing = [name for name in names if self.sync.offsets is not None and name not in self.sync.offsets]
+        if missing:
+            raise ValueError(
+                f"[sync] offsets has no entry for {missing[0]}, needed are {listed}. "
+                f"Write it as {missing[0]} = 0, in frames; the reference camera's is 0"
+            )
 
     @property
     def reference(self) -> str:
@@ -252,7 +275,9 @@ def read_capture(
         return None, [error]
     units = data.pop("units", "mm")
     if units != "mm":
-        return None, [UnitsError(f'units are "{units}", allowed is "mm".', path=path)]
+        return None, [
+            UnitsError(f'units are "{units}", allowed is "mm".', path=path, hint='Scale to mm, and write units = "mm".')
+        ]
     folder = path.resolve().parent
     data["folder"] = folder
     try:

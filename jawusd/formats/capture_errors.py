@@ -121,7 +121,7 @@ def _wrong_value(
     values: dict[str, object] = context if isinstance(context, dict) else {}
     while location and isinstance(location[-1], int) and kind == "missing":
         location, kind, values = location[:-1], "too_few", {}
-    if not location or isinstance(location[-1], int):
+    if not location or isinstance(location[-1], int) or (kind == "value_error" and _model_at(location, model)):
         name, said = "", place(location, data)
     else:
         name = str(location[-1])
@@ -139,7 +139,7 @@ def _wrong_value(
     words = _WORDS.get(kind)
     text = words.format(**{"actual_length": "too many", **values}) if words else _needed(kind, str(problem["msg"]))
     unit = f" ({key.unit})" if key.unit and (" number " in text or kind.startswith(("greater", "less"))) else ""
-    shows_form = words is None or kind in ("missing", "too_few", "string_pattern_mismatch")
+    shows_form = kind not in ("too_long", "too_short", "string_too_short")
     hint = f"Write it as {name} = {key.example}." if key.example and shows_form else None
     return f"{said or 'the file'}{_found(kind, given)} {text}{unit}.".replace("'", '"'), hint
 

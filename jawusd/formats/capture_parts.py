@@ -72,18 +72,24 @@ class Masks(Strict):
             return data
         rest = {key: value for key, value in data.items() if key != "labels"}
         if rest.keys() & {"upper", "lower"}:
-            raise ValueError("give either labels, or upper and lower")
+            raise ValueError("has labels beside upper or lower, allowed is one kind. Take out the other")
         return rest | {"upper": data["labels"], "lower": data["labels"]}
 
     @model_validator(mode="after")
     def _values_tell_the_arches(self) -> Masks:
         values = (self.upper_value, self.lower_value)
         if self.upper == self.lower and None in values:
-            raise ValueError("one file for both rows needs upper_value and lower_value, their gray values")
+            raise ValueError(
+                "upper and lower are one file, which needs upper_value and lower_value, the gray values of the rows. "
+                "Write them as upper_value = 1 and lower_value = 2"
+            )
         if self.upper != self.lower and values != (None, None):
-            raise ValueError("upper_value and lower_value are for labels, one file for both rows")
+            raise ValueError("upper_value and lower_value are for labels, one file for both rows. Take them out")
         if self.upper_value is not None and self.upper_value == self.lower_value:
-            raise ValueError(f"upper_value and lower_value are both {self.upper_value}")
+            raise ValueError(
+                f"upper_value and lower_value are both {self.upper_value}, they must differ. "
+                "Write each row's own gray value"
+            )
         return self
 
     @property
@@ -153,7 +159,7 @@ class CameraSource(Strict):
     @model_validator(mode="after")
     def _has_source(self) -> CameraSource:
         if self.video is None and self.masks is None:
-            raise ValueError("needs a video or masks")
+            raise ValueError('has neither video nor masks, one is needed. Write it as video = "left.mp4"')
         return self
 
     @property
@@ -197,7 +203,14 @@ class Boards(Strict):
     @model_validator(mode="after")
     def _describes_markers(self) -> Boards:
         if self.pattern == "charuco" and (self.dictionary is None or self.marker_mm is None):
-            raise ValueError('a "charuco" board needs dictionary (as "DICT_5X5_100") and marker_mm')
+            lacking = [key for key in ("dictionary", "marker_mm") if getattr(self, key) is None]
+            raise ValueError(
+                f'pattern = "charuco" needs {" and ".join(lacking)} too. '
+                'Write dictionary = "DICT_5X5_100", or whichever is printed, and marker_mm = 6.0, the side of a marker'
+            )
         if self.marker_mm is not None and self.marker_mm >= self.square_mm:
-            raise ValueError(f"marker_mm = {self.marker_mm:g} must be smaller than square_mm = {self.square_mm:g}")
+            raise ValueError(
+                f"marker_mm = {self.marker_mm:g} must be smaller than square_mm = {self.square_mm:g}. "
+                "Measure both on the printed board"
+            )
         return self

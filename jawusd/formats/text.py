@@ -43,7 +43,8 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, object]:
     try:
         return tomllib.loads(read_text(path, _MOST_TOML_BYTES))
     except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise FormatError(f"is not valid TOML: {error}.", path=path) from error
+        hint = 'Text stands in quotes, as name = "anna", and tables in brackets, as [scans].'
+        raise FormatError(f"is not valid TOML: {error}.", path=path, hint=hint) from error
 
 
 def parse_json(text: str, path: Path) -> object:

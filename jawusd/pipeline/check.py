@@ -113,6 +113,9 @@ def check_capture(
             progress("check", done, len(_CHECKS))
             findings += _run(check, parts)
     progress("check", len(_CHECKS), len(_CHECKS))
+    if loaded is None:  # one note in place of one for each check
+        findings = [finding for finding in findings if finding.kind != "not_checked"]
+        findings.append(Finding("not_checked", "note", "nothing else was checked, as the capture cannot be read"))
     order = {"error": 0, "warning": 1, "note": 2}
     return sorted(_told_once(findings), key=lambda finding: order[finding.severity])
 

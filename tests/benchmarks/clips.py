@@ -5,7 +5,9 @@
 CAPTURE has videos and picks on its first frame. Each kind is made from the decoded pictures of its videos: numbered
 pictures, ProRes 422 HQ of 10 bits, a phone's clip (H.264, variable rate, stored turned by 90 degrees). Masks are made
 from the footage, so that every pixel counts. "away" is the largest distance of lower teeth vertices, against the upper
-ones, from where the videos as they are put them.
+ones, from where the videos as they are put them. What of it is the codec's, and not the way the clip is read, is told
+by `prores_pixels` and `phone_pixels`, the decoded pictures of those clips stored without loss, and by `noise`, the
+pictures with normal noise of one level of 255.
 """
 
 from __future__ import annotations
@@ -56,6 +58,14 @@ def write_phone(path: Path, images: np.ndarray, fps: float) -> Path:
     return path
 
 
+def written(kind: str, place: Path, images: np.ndarray, fps: float) -> Path:
+    """Write a ProRes or a phone's clip."""
+    place.mkdir(parents=True, exist_ok=True)
+    if kind == "prores":
+        return write_prores(place / "clip.mov", images, Fraction(fps).limit_denominator(1001))
+    return write_phone(place / "clip.mp4", images, fps)
+
+
 def restored(capture: Capture, offsets: dict[str, int], kind: str, folder: Path, first: int, count: int) -> tuple:
     """Return the capture with clips of another kind, and their offsets; frames count from the first."""
     cameras, shifted = [], {}
@@ -67,12 +77,17 @@ def restored(capture: Capture, offsets: dict[str, int], kind: str, folder: Path,
         images = np.stack([frame.image for frame in video.frames(start, stop, colour="rgb", threads=1)])
         place = folder / camera.name
         place.mkdir(parents=True)
-        if kind in KINDS:
+        if kind.endswith("_pixels"):
+            stored = written(kind.removesuffix("_pixels"), folder / "stored" / camera.name, images, capture.fps)
+            images = np.stack([frame.image for frame in Video(stored).frames(colour="rgb", threads=1)])
+            path = write_sequence(place, images, "png8", first=1000 + start)
+        elif kind == "noise":
+            noisy = np.rint(images + np.random.default_rng(1).normal(size=images.shape))
+            path = write_sequence(place, noisy.clip(0, 255).astype(np.uint8), "png8", first=1000 + start)
+        elif kind in KINDS:
             path = write_sequence(place, images, kind, first=1000 + start)
-        elif kind == "prores":
-            path = write_prores(place / "clip.mov", images, Fraction(capture.fps).limit_denominator(1001))
         else:
-            path = write_phone(place / "clip.mp4", images, capture.fps)
+            path = written(kind, place, images, capture.fps)
         cameras.append(camera.model_copy(update={"video": path, "masks": None}))
         shifted[camera.name] = offsets[camera.name] + start
     zero = shifted[capture.reference]

@@ -1,0 +1,140 @@
+"""Forty mistakes of a beginner: each is one message that names file, key, what was found, what is allowed, what to do.
+
+What a mistake has not, as a misspelt folder has no key, is left out of its row.
+"""
+
+import numpy as np
+import pytest
+from capture_texts import HEAD, TABLES
+from typer.testing import CliRunner
+
+from jawusd.cli.main import app
+from jawusd.errors import JawusdError
+from jawusd.imaging.video_writer import VideoWriter
+
+BOARDS = '[boards]\ncols = 9\nrows = 6\nsquare_mm = 8.0\nvideos = ["left.mp4", "right.mp4"]\n'
+TEXT = HEAD + TABLES + BOARDS
+VIEWS = '[{ camera = "left", x = 1, y = 2 }, { camera = "%s", x = 1, y = 2 }]'
+PICK = f"[bootstrap]\nframe = 1\n[[bootstrap.upper]]\nvertex = 3\nviews = {VIEWS}\n[boards]"
+CAMERA = (
+    'size = [64, 48]\nmatrix = [[100, 0, 32], [0, 100, 24], [0, 0, 1]]\ndistortions = []\nrotation = [0, 0, 0]\n'
+    "translation = [0, 0, 400]\n"
+)
+CAMERAS = f'[cam_0]\nname = "left"\n{CAMERA}[cam_1]\nname = "right"\n{CAMERA}'
+
+# What is wrong in words; what is written instead of what in capture.toml; key; found; allowed; what to do.
+IN_THE_FILE = [
+    ("a misspelt key", "video = ", "vidoe = ", '[[camera]] 1 ("left")', '"vidoe"', "allowed are name", '"video"'),
+    ("a misspelt table", "[scans]", "[scan]", "", '"scan"', "fps, frames, calibration", 'mean "scans"'),
+    ("capitals", "fps", "FPS", "", '"FPS"', "allowed are format", 'mean "fps"'),
+    ("a key of another table", "cols", "square_mm = 2\ncols", "", "overwrite a value", "", ""),
+    ("a key below the tables", "cols", "fps = 24.0\ncols", "[boards]", '"fps"', "pattern, cols", "top of the file"),
+    ("masks that are one word", "video = ", "mask = ", '("left")', '"mask"', "video, masks", 'mean "masks"'),
+    ("no rate", "fps = 24.0\n", "", "fps", "is missing", "", "fps = 23.976"),
+    ("a rate with its unit", "fps = 24.0", 'fps = "24 fps"', "fps", '"24 fps"', "a number", "fps = 23.976"),
+    ("a rate below 0", "fps = 24.0", "fps = -24.0", "fps", "-24.0", "more than 0 (frames per second)", "fps = 23.976"),
+    ("frames that end first", "name", "frames = [9, 3]\nname", "frames", "[9, 3]", "must be larger", "[30, 270]"),
+    ("one frame", "name", "frames = [9]\nname", "frames", "too few", "", "frames = [30, 270]"),
+    ("frames in words", "name", 'frames = "all"\nname', "frames", '"all"', "a list in brackets", "[30, 270]"),
+    ("a name with a slash", 'name = "x"', 'name = "x/y"', "name", '"x/y"', "not allowed", 'name = "anna"'),
+    ("a name twice", 'name = "right"', 'name = "left"', "[[camera]] name", "left, left", "must differ", "of its own"),
+    ("no lower row", 'lower_teeth = "l.ply"', "", "lower_teeth", "is missing", "", 'lower_teeth = "scans/lower.ply"'),
+    ("a scan that is not there", '"u.ply"', '"u.stl"', "[scans] upper_teeth", '"u.stl"', "does not exist", "u.ply?"),
+    ("a clip that is not there", '= "left.mp4"', '= "Left.MP4"', "video", '"Left.MP4"', "does not exist", "left.mp4?"),
+    ("a path out of the folder", '"u.ply"', '"../u.ply"', "upper_teeth", '"../u.ply"', "out of the", "--allow-outside"),
+    ("a device for a clip", 'video = "left.mp4"', "video = 3", "video", "= 3", "a path in quotes", '"left.mp4"'),
+    ("a camera without footage", 'video = "left.mp4"', "", "[[camera]] 1", "neither", "one is needed", 'video = "left'),
+    ("masks of one row", 'video = "left.mp4"', 'masks.upper = "a"', "masks lower", "is missing", "", "lower = "),
+    ("a square with its unit", "= 8.0", '= "8 mm"', "[boards] square_mm", '"8 mm"', "a number", "square_mm = 8.0"),
+    ("a square in another unit", "= 8.0", "= 800.0", "[boards] square_mm", "800.0", "200 or less (mm)", "= 8.0"),
+    ("a square that nobody measured", "square_mm = 8.0\n", "", "[boards] square_mm", "missing", "", "square_mm = 8.0"),
+    ("corners called columns", "cols = 9", "columns = 9", "[boards]", '"columns"', "pattern, cols", 'mean "cols"'),
+    ("half a corner", "cols = 9", "cols = 9.5", "[boards] cols", "9.5", "a whole number", "cols = 9"),
+    ("a board without its markers", "cols", 'pattern = "charuco"\ncols', "[boards]", '"charuco"', "needs", "DICT_5X5"),
+    ("a board of no kind", "cols", 'pattern = "dots"\ncols', "[boards] pattern", '"dots"', 'must be "chess', "or"),
+    ("a board clip too few", ', "right.mp4"]', "]", "[boards] videos", "1 clips", "needed are 2", "in the order"),
+    ("a way to align that is none", "[boards]", '[sync]\nmethod = "clap"\n[boards]', "method", '"clap"', '"flash"', ""),
+    ("a camera that is none", "[boards]", '[sync]\nreference = "mid"\n[boards]', "reference", '"mid"', "left", "Write"),
+    ("an offset too few", "[boards]", "[sync]\noffsets = { left = 0 }\n[boards]", "offsets", "right", "needed", "= 0"),
+    ("a pick before the take", "[boards]", "[bootstrap]\nframe = -1\n[boards]", "frame", "-1", "0 or more", "Write it"),
+    ("a pick of no camera", "[boards]", PICK % "mid", "[[bootstrap.upper]] camera", '"mid"', "left, ", "Write"),
+    ("a newer file", "capture/1", "capture/9", "format", "capture/9", "up to", "Update jawusd"),
+    ("centimetres", "fps", 'units = "cm"\nfps', "units", '"cm"', 'allowed is "mm"', "Scale to mm"),
+    ("text without quotes", 'name = "x"', "name = x", "", "line 2", "TOML", "in quotes"),
+]
+# The same of what is typed: words; file; found; allowed; what to do.
+TYPED = [
+    ("a folder without capture", ["check", "empty"], "empty", "no such file", "", "jawusd init"),
+    ("a clip for a capture", ["check", "left.mp4"], "left.mp4", '".mp4" is no capture', "a folder with", "jawusd init"),
+    ("an output with files", ["build", ".", "-o", "full"], "full", "not empty", "", "Name a new folder"),
+    ("an output that is a file", ["build", ".", "-o", "u.ply"], "u.ply", "is a file", "needs a folder", ""),
+    ("a capture for a rig", ["info", "."], ".", "without actor.usda", "", "jawusd build"),
+    ("two people in one folder", ["init", "two"], "", "anna_upper.stl, bob_upper.stl", "one person", "name one"),
+    ("a lens alone", ["cameras", "lens.nk", "-o", "a.toml"], "lens.nk", "no Camera node", "", "Export Project"),
+    ("a project of a tracker", ["cameras", "shot.3de", "-o", "a.toml"], "shot.3de", "project", "not read", "Nuke"),
+    ("cameras to what is not written", ["cameras", "cal.toml", "-o", "a.fbx"], "a.fbx", '".fbx"', "", "Name a .toml"),
+    ("cameras of other names", ["check", "others"], "cal.toml", "left", "names east, west", ""),
+]
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    import trimesh
+
+    folder = tmp_path_factory.mktemp("forty")
+    for name in ("left", "right"):
+        with VideoWriter(folder / f"{name}.mp4", (64, 48), 24.0) as writer:
+            for k in range(8):
+                writer.write(np.full((48, 64), 25 * k, np.uint8))
+    for name in ("u", "l"):
+        trimesh.creation.box((60, 10, 50)).subdivide().subdivide().export(folder / f"{name}.ply")
+    for inner in ("empty", "full", "two", "others"):
+        (folder / inner).mkdir()
+    (folder / "full" / "diary.txt").touch()
+    for name in ("anna_upper.stl", "bob_upper.stl", "anna_lower.stl", "bob_lower.stl"):
+        (folder / "two" / name).touch()
+    for name in ("u.ply", "l.ply", "left.mp4", "right.mp4"):
+        (folder / "others" / name).write_bytes((folder / name).read_bytes())
+    text = f'{HEAD}calibration = "cal.toml"\n{TABLES}'
+    (folder / "capture.toml").write_text(text)
+    (folder / "others" / "capture.toml").write_text(text)
+    (folder / "cal.toml").write_text(CAMERAS)
+    (folder / "others" / "cal.toml").write_text(CAMERAS.replace("left", "east").replace("right", "west"))
+    (folder / "lens.nk").write_text("LD_3DE_Classic_LD_Model {\n name lens1\n}\n")
+    (folder / "shot.3de").write_text("project")
+    return folder
+
+
+def told(words):
+    """Return what the program says of a mistake, on one line."""
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code != 0
+    assert done.exception is None or isinstance(done.exception, JawusdError | SystemExit), done.exception
+    said = str(done.exception) if isinstance(done.exception, JawusdError) else done.output
+    return " ".join(said.split())
+
+
+@pytest.mark.parametrize("row", IN_THE_FILE, ids=[row[0] for row in IN_THE_FILE])
+def test_a_mistake_in_the_file(place, tmp_path, row):
+    _, old, new, *parts = row
+    assert old in TEXT
+    for name in ("u.ply", "l.ply", "left.mp4", "right.mp4"):
+        (tmp_path / name).write_bytes((place / name).read_bytes())
+    path = tmp_path / "capture.toml"
+    path.write_text(TEXT.replace(old, new, 1))
+    said = CliRunner().invoke(app, ["check", str(path)]).stdout
+    errors = [line for line in said.splitlines() if line.startswith("error: ")]
+    assert sum(all(part in line for part in ("capture.toml", *parts)) for line in errors) == 1, errors
+    assert sum("capture.toml" in line for line in errors) == 1, errors
+
+
+@pytest.mark.parametrize("row", TYPED, ids=[row[0] for row in TYPED])
+def test_a_mistake_at_the_shell(place, monkeypatch, row):
+    _, words, *parts = row
+    monkeypatch.chdir(place)
+    said = told(words)
+    assert all(part in said for part in parts), said
+
+
+def test_they_are_forty():
+    assert len(IN_THE_FILE) + len(TYPED) >= 40
