@@ -173,17 +173,20 @@ def frames(parts: Parts) -> Iterator[Finding]:
 
     if count is None:
         return
-    if stop > count:
-        message = f"frames end at {stop - 1}, but camera {capture.reference} has frames 0 to {count - 1}"
-        yield Finding("frames_missing", "error", message, stop, count, path=parts.description, hint="Correct frames.")
+    offsets = parts.offsets() or {}
+    known = {name: _frame_count(parts, name) for name in offsets}
+    # the reference camera may end, or lack masks, before others do
+    end = max([count, *(own + offsets[name] for name, own in known.items() if own is not None)])
+    if stop > end:
+        message = f"frames end at {stop - 1}, but no camera has any after {end - 1}"
+        yield Finding("frames_missing", "error", message, stop, end, path=parts.description, hint="Correct frames.")
     if capture.bootstrap is not None and not first <= capture.bootstrap.frame < stop:
         yield out_of("bootstrap_frame", "bootstrap.frame", capture.bootstrap.frame, "error")
     rest = capture.motion.rest_frame
     if rest is not None and not first <= rest < stop:
-        yield out_of("rest_frame", "motion.rest_frame", rest, "error" if rest >= count else "warning")
-    offsets = parts.offsets() or {}
+        yield out_of("rest_frame", "motion.rest_frame", rest, "error" if rest >= end else "warning")
     for name, offset in offsets.items():
-        own = _frame_count(parts, name)
+        own = known[name]
         if own is not None and (first - offset >= own or stop - offset <= 0):
             message = f"none of its {own} frames lies within the frames of the take, by its offset of {offset:+d}"
             yield Finding("offset_wrong", "error", message, offset, camera=name, path=parts.description)

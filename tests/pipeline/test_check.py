@@ -199,6 +199,13 @@ def test_each_fault_is_found_by_its_cause(capture, plants):
         assert any(words in f.line() for f in matching), plant
 
 
+def test_the_reference_camera_may_lack_the_last_masks(capture):
+    described(capture, 'video = "video/cam0.mp4"\n', "")
+    for arch in ("upper", "lower"):
+        mask_video(capture, f"cam0/{arch}.mkv", 255, count=319)
+    assert "frames_missing" not in {f.kind for f in found(capture)}  # frame 319 is the last one
+
+
 def test_masks_numbered_for_another_camera_are_exchanged():
     offsets = {"cam0": 0, "cam1": 4, "cam2": -3}
     right = {name: ((10 - offset, 29 - offset), None) for name, offset in offsets.items()}
