@@ -229,7 +229,9 @@ def _board(
     if not seen:
         out.missing.append("[boards] cols and rows: no chessboard was found in the board clips")
     elif board.pattern == "charuco":
-        out.missing.append("[boards] cols, rows and marker_mm of the ChArUco board")
+        out.missing.append(
+            "[boards] cols and rows, one less than the ChArUco board has squares, and marker_mm, the side of a marker"
+        )
     if seen:
         size = f"{board.cols} x {board.rows} inner corners" if board.cols else f"markers of {board.dictionary}"
         out.found.append(f"board: {board.pattern}, {size}")

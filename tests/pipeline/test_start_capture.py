@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from boards import board, chessboard, photograph, poses, studio
+from boards import board, charuco, chessboard, photograph, poses, studio
 from typer.testing import CliRunner
 
 from jawusd.cli.main import app
@@ -50,6 +50,21 @@ def test_a_bare_folder_becomes_a_capture_but_for_the_squares(folder):
     write_start(start)
     _, problems = read_capture(folder)
     assert [problem.message for problem in problems] == ["[boards] square_mm is missing."]
+
+
+def test_a_charuco_board_is_told_by_its_markers_and_the_rest_asked_for(folder):
+    about = board("charuco", cols=7, rows=5, square_mm=9, dictionary="DICT_5X5_50", marker_mm=6.5)
+    texture, to_texture = charuco(about)
+    for name, camera in zip(("left", "right"), studio(lens=(0.0, 0.0))):
+        with VideoWriter(folder / f"board_{name}.mp4", (640, 480), 24.0, quality_crf=8) as writer:
+            for T in poses(6, np.random.default_rng(0), tilt=0.3):
+                writer.write(photograph(camera, T, texture, to_texture))
+    start = start_capture(folder, 9.0, None, quiet)
+    (line,) = start.missing
+    assert "cols and rows, one less than the ChArUco board has squares" in line and "marker_mm" in line
+    write_start(start)
+    text = (folder / "capture.toml").read_text()
+    assert 'dictionary = "DICT_5X5_50"' in text and "FILL IN: cols" in text
 
 
 def test_with_the_squares_it_can_be_read(folder):
