@@ -180,7 +180,7 @@ HEAD = (
     [
         ('labels = "l.mkv"', "needs upper_value and lower_value"),
         ('labels = "l.mkv", upper_value = 1, lower_value = 1', "are both 1"),
-        ('labels = "l.mkv", upper = "u.mkv", upper_value = 1, lower_value = 2', "labels beside upper or lower, allowed is one kind"),
+        ('labels = "l.mkv", upper = "u.mkv", upper_value = 1, lower_value = 2', "labels beside upper or lower"),
         ('upper = "u.mkv", lower = "l.mkv", upper_value = 1', "are for labels, one file for both rows"),
         ('upper = "l.mkv", lower = "l.mkv"', "one file, which needs upper_value and lower_value"),
         ('labels = "l.mkv", upper_value = 0, lower_value = 2', "must be 1 or more"),
