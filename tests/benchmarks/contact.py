@@ -10,8 +10,8 @@ What is said of depth is beyond the depth of the closed bite by the same oracle 
 
     bake        seconds of processor time to measure contact; error: of the clearances, as the rig states it
     grows       bytes that the layer with the tables grows by [MB]
-    valid       random poses inside the bound: share deeper than 0.2 mm, and the deepest; near: the same of a quarter
-                as many poses with less than 3 mm of opening, and before: of the bound without contact
+    valid       random poses inside the bound: share deeper than 0.2 mm, and the deepest; near: the same of poses with
+                less than 3 mm of opening, and before: of the bound without contact
     gap         at d1 = 0, over d2 and d3: median and 95th percentile of what the teeth are apart
     captured    share of captured poses inside the bound or within the rig's tolerance of it, and of those judged valid
     through     poses driven 1 mm and more through the closed teeth (less where scans overlap so far in the closed bite
@@ -86,7 +86,7 @@ class Surface:
         self.near = np.zeros(cells.max(axis=0) + 5, dtype=bool)
         self.near[tuple(cells.T)] = True
         self.near = binary_dilation(self.near, np.ones((3, 3, 3)), iterations=int(np.ceil(NEAR_MM)))
-        self.moving = self.points[rng.random(len(self.points)) < 0.05]
+        self.moving = self.points[rng.random(len(self.points)) < 0.08]
 
     def depth(self, points: np.ndarray, floor: float) -> float:
         """Return how deep the deepest of points (n, 3) lies [mm]; `floor` if none is deeper."""
@@ -183,18 +183,18 @@ def measure(case: Case, count: int) -> str:
     oracle = Oracle(case.subject.meshes["upper_teeth"], case.subject.meshes["lower_teeth"], rig.T_rest)
     print(f"  oracle ready after {time.process_time():.0f} s", file=sys.stderr)
     inside = oracle.beyond(rig.pose(sample_valid(rig, count, 1)))
-    near = oracle.beyond(rig.pose(low_openings(rig, count // 4, rng)))
-    closed = low_openings(rig, 150, rng)
+    near = oracle.beyond(rig.pose(low_openings(rig, count, rng)))
+    closed = low_openings(rig, 300, rng)
     closed[:, 0] = 0.0
     gap = oracle.gap(rig.pose(closed[rig.margin(closed) >= 0]))
     captured = rig.validate(noisy)
     kept = (captured.margin_mm >= rig.limits.margin_mm).mean()
-    through = low_openings(rig, 300, rng) - [3.0, 0.0, 0.0] * rng.uniform(0.3, 1.0, (300, 1))
+    through = low_openings(rig, 600, rng) - [3.0, 0.0, 0.0] * rng.uniform(0.3, 1.0, (600, 1))
     T = rig.pose(through)
     deep = min(THROUGH_MM, NEAR_MM - oracle.closed - 0.1)
     T = T[oracle.beyond(T, deep - 0.1) > deep]
     refused = (~rig.validate(T).valid).mean() if len(T) else np.nan
-    before = oracle.beyond(old.pose(low_openings(old, count // 20, rng)))
+    before = oracle.beyond(old.pose(low_openings(old, count // 4, rng)))
     grows = (layer_size(rig) - layer_size(old)) / 2**20
     return (
         f"{case.name:<28}{oracle.closed:6.2f}{bake_s:7.1f}{rig.contact.error_mm:7.3f}{grows:7.2f}"

@@ -6,12 +6,9 @@ Each is one message, without a traceback, that names what was given and what to 
 import subprocess
 import sys
 
-import numpy as np
 import pytest
-from capture_texts import HEAD, TABLES
+from capture_texts import HEAD, TABLES, write_media
 from package_copy import ROOT
-
-from jawusd.imaging.video_writer import VideoWriter
 
 CAPTURE = f'{HEAD}calibration = "cal.toml"\n{TABLES}'
 
@@ -19,15 +16,8 @@ CAPTURE = f'{HEAD}calibration = "cal.toml"\n{TABLES}'
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
     """Return a folder with a capture, clips, a rig's folder that is none, and files of other kinds."""
-    import trimesh
-
     folder = tmp_path_factory.mktemp("newcomer")
-    for name in ("left", "right"):
-        with VideoWriter(folder / f"{name}.mp4", (64, 48), 24.0) as writer:
-            for k in range(8):
-                writer.write(np.full((48, 64), 25 * k, np.uint8))
-    for name in ("u", "l"):
-        trimesh.creation.box((60, 10, 50)).subdivide().subdivide().export(folder / f"{name}.ply")
+    write_media(folder)
     (folder / "capture.toml").write_text(CAPTURE)
     (folder / "cal.toml").write_text("[cam_0]\n")
     (folder / "empty").mkdir()

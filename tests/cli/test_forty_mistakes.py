@@ -3,14 +3,12 @@
 What a mistake has not, as a misspelt folder has no key, is left out of its row.
 """
 
-import numpy as np
 import pytest
-from capture_texts import HEAD, TABLES
+from capture_texts import HEAD, TABLES, write_media
 from typer.testing import CliRunner
 
 from jawusd.cli.main import app
 from jawusd.errors import JawusdError
-from jawusd.imaging.video_writer import VideoWriter
 
 BOARDS = '[boards]\ncols = 9\nrows = 6\nsquare_mm = 8.0\nvideos = ["left.mp4", "right.mp4"]\n'
 TEXT = HEAD + TABLES + BOARDS
@@ -79,15 +77,8 @@ TYPED = [
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
-    import trimesh
-
     folder = tmp_path_factory.mktemp("forty")
-    for name in ("left", "right"):
-        with VideoWriter(folder / f"{name}.mp4", (64, 48), 24.0) as writer:
-            for k in range(8):
-                writer.write(np.full((48, 64), 25 * k, np.uint8))
-    for name in ("u", "l"):
-        trimesh.creation.box((60, 10, 50)).subdivide().subdivide().export(folder / f"{name}.ply")
+    write_media(folder)
     for inner in ("empty", "full", "two", "others"):
         (folder / inner).mkdir()
     (folder / "full" / "diary.txt").touch()

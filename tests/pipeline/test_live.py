@@ -162,7 +162,9 @@ def test_the_command_follows_the_example(rig):
         receiver.bind(("127.0.0.1", 0))
         receiver.settimeout(5)
         to = f"127.0.0.1:{receiver.getsockname()[1]}"
-        command = [sys.executable, "-m", "jawusd", "live", str(rig), str(EXAMPLE), "--osc", to]
+        command = [sys.executable, "-m", "jawusd", "live", str(rig), str(EXAMPLE)]
+        subprocess.run(command, capture_output=True, timeout=300, check=True)  # compiles, where nothing did before
+        command += ["--osc", to]
         done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
         heard = OscPacket(receiver.recv(4096)).messages
     assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
@@ -180,7 +182,7 @@ def test_the_command_follows_the_example(rig):
             tip = jaw.landmarks[0]
             wanted = transform_point(relative[frames.index(number)], tip)
             errors.append(np.linalg.norm(transform_point(jaw.pose(line["d"]), tip) - wanted))
-    assert errors and np.median(errors) < 0.6  # how many are solved depends on how many come in time
+    assert len(errors) > 0.3 * len(lines) and np.median(errors) < 0.6
 
 
 def test_teeth_are_found_again_after_frames_left_out(rig):

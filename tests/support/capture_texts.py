@@ -1,4 +1,8 @@
-"""The least of a capture.toml, for tests that spoil it."""
+"""The least of a capture.toml, and of the files it names, for tests that spoil it."""
+
+import numpy as np
+
+from jawusd.imaging.video_writer import VideoWriter
 
 HEAD = """format = "jawusd-capture/1"
 name = "x"
@@ -14,3 +18,15 @@ video = "left.mp4"
 name = "right"
 video = "right.mp4"
 """
+
+
+def write_media(folder):
+    """Write the clips and scans that TABLES names."""
+    import trimesh
+
+    for name in ("left", "right"):
+        with VideoWriter(folder / f"{name}.mp4", (64, 48), 24.0) as writer:
+            for k in range(8):
+                writer.write(np.full((48, 64), 25 * k, np.uint8))
+    for name in ("u", "l"):
+        trimesh.creation.box((60, 10, 50)).subdivide().subdivide().export(folder / f"{name}.ply")
