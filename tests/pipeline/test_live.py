@@ -163,7 +163,8 @@ def test_the_command_follows_the_example(rig):
         receiver.settimeout(5)
         to = f"127.0.0.1:{receiver.getsockname()[1]}"
         command = [sys.executable, "-m", "jawusd", "live", str(rig), str(EXAMPLE)]
-        subprocess.run(command, capture_output=True, timeout=300, check=True)  # compiles, where nothing did before
+        warm = [*command, "--seconds", "1"]  # compiles, where nothing did before
+        subprocess.run(warm, capture_output=True, timeout=300, check=True)
         command += ["--osc", to]
         done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
         heard = OscPacket(receiver.recv(4096)).messages
