@@ -1,17 +1,29 @@
 """What several folders of tests share."""
 
 import json
+import os
+import shutil
 
 import pytest
 from filelock import FileLock
 from package_copy import ROOT
+
+FAST = {"evaluator", "formats", "geometry", "library"}  # folders of tests that need neither footage nor USD
+
+
+def pytest_collection_modifyitems(items):
+    """Mark the tests of the small folders as fast."""
+    for item in items:
+        if item.path.parent.name in FAST and item.get_closest_marker("slow") is None:
+            item.add_marker("fast")
 
 
 @pytest.fixture(scope="session")
 def example_build(tmp_path_factory, worker_id):
     """Build examples/capture once per run, in the first process that needs it.
 
-    Returns the folder, which nobody may change, and the summary.
+    Returns the folder, which nobody may change, and the summary. JAWUSD_EXAMPLE_BUILD may name a folder in which the
+    same version has built it: what is there is taken over.
     """
     from jawusd.pipeline.build import BuildOptions, build
 
@@ -20,5 +32,9 @@ def example_build(tmp_path_factory, worker_id):
     out, said = shared / "example" / "actor", shared / "example.json"
     with FileLock(shared / "example.lock"):
         if not said.exists():
-            said.write_text(json.dumps(build(ROOT / "examples" / "capture", out, BuildOptions(), lambda *told: None)))
+            built = os.environ.get("JAWUSD_EXAMPLE_BUILD")
+            if built:
+                shutil.copytree(built, out)
+            options = BuildOptions(resume=bool(built))
+            said.write_text(json.dumps(build(ROOT / "examples" / "capture", out, options, lambda *told: None)))
     return out, json.loads(said.read_text())

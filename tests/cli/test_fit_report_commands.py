@@ -109,6 +109,7 @@ def test_each_mistake_is_one_clear_error(given, tmp_path, arguments, code, words
     assert not (tmp_path / "m.npz").exists()
 
 
+@pytest.mark.slow
 def test_report_draws_and_prints_the_experiments(given, tmp_path):
     out = tmp_path / "figures"
     command = ["report", given / "poses.csv", "--experiments", "--landmarks", given / "landmarks.json", "-o", out]

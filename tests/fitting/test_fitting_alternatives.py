@@ -157,6 +157,7 @@ def published(data):
     return few, fits
 
 
+@pytest.mark.slow
 def test_paper_model_counts_the_constant_once(published):
     _, fits = published
     found = fits[True].network_sum
@@ -171,6 +172,7 @@ def test_paper_model_counts_the_constant_once(published):
         np.testing.assert_allclose(single.value(alone), single.parts[0].value(single.net, alone[:, 0])[0], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_grouping_by_incisal_motion_beats_the_fixed_groups(published):
     few, fits = published
     assert fits[True].notes["groups"] == [[0], [1, 2], [3, 4]]
@@ -179,6 +181,7 @@ def test_grouping_by_incisal_motion_beats_the_fixed_groups(published):
     assert fits[False].notes["train_errors_as_published"]["mandible"]["mean"] < literal
 
 
+@pytest.mark.slow
 def test_paper_model_rests_at_the_closed_bite(published):
     _, fits = published
     for fitted in fits.values():

@@ -259,6 +259,7 @@ def test_shown_parameters_of_a_full_take(take, anatomy):
     assert shown.all() and sentences == []
 
 
+@pytest.mark.slow
 def test_full_take_lacks_nothing_and_poor_takes_are_told_what_to_record(person):
     full = fit(person, record(person, 1200, 1, "hidden").T_noisy)  # with wandering through the whole envelope
     assert [w for w in full.meta["warnings"] if w["code"] == "take_lacks"] == []

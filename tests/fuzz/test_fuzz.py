@@ -34,6 +34,7 @@ def worker(tmp_path_factory):
     worker.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reader", READERS)
 def test_damaged_files_are_read_or_refused(worker, reader):
     seeds = [*ONCE_BROKEN.get(reader, ()), *range(PER_READER)]

@@ -161,6 +161,7 @@ def unpicked(capture, tmp_path, **boards):
     return opened.model_copy(update={"bootstrap": None, "boards": changed}), tmp_path / "calibration.toml"
 
 
+@pytest.mark.slow
 def test_without_picks_masks_tell_the_size_of_the_squares(capture, corners_found_once, tmp_path, monkeypatch):
     monkeypatch.setattr("jawusd.capture.calibrate.find_boards", lambda *arguments: corners_found_once)
     report = calibrate_boards(*unpicked(capture, tmp_path), lambda *told: None)

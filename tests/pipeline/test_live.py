@@ -156,6 +156,7 @@ def test_lines_say_what_the_frame_holds():
     }
 
 
+@pytest.mark.slow
 def test_the_command_follows_the_example(rig):
     """However slow the machine is, what is said to be solved is near the truth."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:

@@ -74,6 +74,7 @@ def shoot(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
 def test_a_killed_worker_and_a_bad_capture_leave_the_rest_as_serial_builds_make_it(shoot):
     process = started(shoot, "--workers", "2", "--json")

@@ -86,6 +86,7 @@ def test_shots_without_masks_are_solved_from_their_videos(rig, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["take.csv"]
 
 
+@pytest.mark.slow
 def test_teeth_are_found_in_the_pictures_of_one_camera_without_picks(rig):
     """Depth is what one camera tells least; the standard deviation has to say so."""
     found = solve(rig, bare(0, 24, ["cam0"], picks=False))
@@ -155,6 +156,7 @@ def test_one_of_several_rigs_is_solved(rig, shot, tmp_path):
     assert (np.ptp(read_poses_of_stage(tmp_path / "take.usda", "/Shot/a")[1], axis=0) == 0).all()
 
 
+@pytest.mark.slow
 def test_one_camera_will_do(rig, shot):
     capture = open_capture(shot)
     alone = capture.model_copy(update={"cameras": capture.cameras[:1], "bootstrap": None})

@@ -65,7 +65,10 @@ KINDS = {
 }
 
 
-@pytest.mark.parametrize("kind", KINDS)
+USUAL = ("zero_one", "sixteen", "inverted", "palette")  # one of each way to be read; the others are slow
+
+
+@pytest.mark.parametrize("kind", [k if k in USUAL else pytest.param(k, marks=pytest.mark.slow) for k in KINDS])
 def test_every_kind_of_mask_tracks_like_black_and_white(drawn, expected, tmp_path, kind):
     tracks = track(make_capture(rewritten(drawn, tmp_path, KINDS[kind]), COUNT))
     assert np.array_equal(tracks.T_upper_lower, expected.T_upper_lower)

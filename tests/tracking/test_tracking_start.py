@@ -152,6 +152,7 @@ def test_exchanged_rows_of_one_camera_are_named(pictures, short_search, picked):
         _start(_capture(pictures, cameras=_rows_exchanged(pictures, ["cam2"]), **change))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("picked", [True, False])
 def test_exchanged_rows_of_all_cameras_are_named(pictures, short_search, picked):
     change = {} if picked else {"bootstrap": None}
