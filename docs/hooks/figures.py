@@ -1,0 +1,211 @@
+"""The drawings of the documentation, as SVG in the text of a page: `python docs/hooks/figures.py FOLDER` writes files."""
+
+import math
+import sys
+from pathlib import Path
+
+
+def svg(width, height, label, parts):
+    """Return an SVG of the given size; the label is what screen readers say."""
+    head = f'<svg class="drawing" viewBox="0 0 {width} {height}" role="img" aria-label="{label}">'
+    return head + "".join(parts) + "</svg>"
+
+
+def text(x, y, words, anchor="middle", kind=""):
+    """Return words at a place."""
+    return f'<text x="{x:g}" y="{y:g}" text-anchor="{anchor}" class="{kind}">{words}</text>'
+
+
+def path(points, kind="line", closed=False):
+    """Return a line through points."""
+    d = "M" + " L".join(f"{x:.1f} {y:.1f}" for x, y in points) + (" Z" if closed else "")
+    return f'<path d="{d}" class="{kind}"/>'
+
+
+def circle(x, y, radius, kind="soft"):
+    """Return a circle."""
+    return f'<circle cx="{x:g}" cy="{y:g}" r="{radius:g}" class="{kind}"/>'
+
+
+def box(x, y, width, height, kind="soft"):
+    """Return a rectangle."""
+    return f'<rect x="{x:g}" y="{y:g}" width="{width:g}" height="{height:g}" rx="4" class="{kind}"/>'
+
+
+def arrow(start, end, kind="line"):
+    """Return a line with a head at its end."""
+    (x0, y0), (x1, y1) = start, end
+    angle = math.atan2(y1 - y0, x1 - x0)
+    wings = [(x1 - 10 * math.cos(angle + s), y1 - 10 * math.sin(angle + s)) for s in (0.45, -0.45)]
+    return path([start, end], kind) + path([wings[0], end, wings[1]], kind)
+
+
+def camera(x, y, angle_deg, name):
+    """Return a camera seen from above that looks along an angle."""
+    a = math.radians(angle_deg)
+    corners = [(-26, -11), (0, -11), (0, -5), (12, -9), (12, 9), (0, 5), (0, 11), (-26, 11)]
+    turned = [(x + u * math.cos(a) - v * math.sin(a), y + u * math.sin(a) + v * math.cos(a)) for u, v in corners]
+    return path(turned, "soft", closed=True) + text(x - 44 * math.cos(a), y - 44 * math.sin(a) + 5, name)
+
+
+def cameras():
+    """Draw where cameras and lights stand, seen from above."""
+    mouth, far = (340.0, 120.0), 190.0
+    parts = [circle(340, 62, 58), text(340, 60, "head"), path([(334, 119), (340, 130), (346, 119)])]
+    for angle, name in ((-38.0, "right"), (0.0, "front"), (37.0, "left")):
+        a = math.radians(90.0 - angle)
+        x, y = mouth[0] + far * math.cos(a), mouth[1] + far * math.sin(a)
+        parts += [path([mouth, (x, y)], "thin"), camera(x, y, math.degrees(a) + 180.0, name)]
+    for x in (95.0, 585.0):
+        parts += [box(x - 34, 150, 68, 20), text(x, 196, "soft light")]
+    arc = [(mouth[0] + 95 * math.cos(t), mouth[1] + 95 * math.sin(t)) for t in (math.radians(d) for d in range(53, 91))]
+    parts += [path(arc, "one"), text(404, 234, "30 to 45&#176;", "start", "small")]
+    parts += [text(330, 268, "0.2 to 0.5 m", "end", "small")]
+    return svg(680, 380, "Three cameras around the mouth, seen from above, with soft lights at both sides", parts)
+
+
+def exercises():
+    """Draw the exercises of a take over time: opening, laterotrusion and protrusion."""
+    plan = [
+        ("teeth together", 2, (0, 0, 0)),
+        ("open wide, slowly", 5, (1, 0, 0)),
+        ("to the left and right", 5, (0, 1, 0)),
+        ("forward", 4, (0, 0, 1)),
+        ("half open: left, right, forward", 6, (0.45, 1, 0.7)),
+        ("around the limits", 5, (0.9, 0.8, 0.3)),
+        ("chew and speak", 5, (0.3, 0.25, 0.1)),
+        ("teeth together", 2, (0, 0, 0)),
+    ]
+    scale, left, curves, parts, at = 16.5, 90.0, ([], [], []), [], 0.0
+    for row, (name, seconds, sizes) in enumerate(plan):
+        x = left + at * scale
+        parts += [path([(x, 20), (x, 262)], "thin"), text(x + seconds * scale / 2, 16, str(row + 1))]
+        for k in range(41):
+            t = k / 40
+            turns = 3 if "chew" in name else 1
+            swing = 0.5 - 0.5 * math.cos(2 * math.pi * turns * t)
+            sides = math.sin(2 * math.pi * turns * t)
+            held = min(1.0, 5 * t, 5 * (1 - t)) if "half" in name or "limits" in name else swing
+            values = (sizes[0] * held, sizes[1] * sides, sizes[2] * (sides if "half" in name else swing))
+            for curve, value in zip(curves, values):
+                curve.append((x + t * seconds * scale, value))
+        at += seconds
+    for curve, kind, base, name in zip(curves, ("one", "two", "three"), (90, 160, 250), ("opening", "side", "forward")):
+        high = 55 if base != 160 else 34
+        parts += [path([(x, base - high * v) for x, v in curve], kind), text(left - 12, base, name, "end")]
+    for row, (name, seconds, _) in enumerate(plan):
+        column, line = divmod(row, 4)
+        parts.append(text(100 + 300 * column, 292 + 20 * line, f"{row + 1}  {name}, {seconds} s", "start", "small"))
+    return svg(680, 362, "Exercises of a take over time: opening, laterotrusion and protrusion", parts)
+
+
+def crown(x, top, width, height, up):
+    """Return the outline of a crown; `up` points from the edge to the gum."""
+    s = -1 if up else 1
+    return [
+        (x, top), (x + 0.12 * width, top - s * 0.15 * height), (x + 0.1 * width, top - s * height),
+        (x + 0.9 * width, top - s * height), (x + 0.88 * width, top - s * 0.15 * height), (x + width, top),
+    ]  # fmt: skip
+
+
+def masks():
+    """Draw what masks of both rows hold: crowns, from the gum line to the free edges, behind the lips or not."""
+    parts = []
+    for side, label in ((0, "the picture"), (350, "its two masks")):
+        for row in range(2):
+            edge = 118 if row == 0 else 150
+            for k in range(6):
+                x, width, height = side + 52 + 37 * k, 36, 52 - 3 * abs(k - 2.5)
+                height = height if row == 0 else 0.75 * height
+                gum_line = edge - height if row == 0 else edge + height
+                if not side:
+                    parts.append(box(x, gum_line - 22 if row == 0 else gum_line, width, 22, "gum"))
+                kind = "soft" if not side else "area"
+                parts.append(path(crown(x, gum_line, width, height, up=row == 0), kind, closed=True))
+        parts.append(text(side + 163, 250, label))
+    parts += [text(338, 66, "gum line", "middle", "small"), text(338, 138, "free edges", "middle", "small")]
+    parts += [arrow((308, 68), (276, 72)), arrow((372, 68), (400, 72)), arrow((300, 134), (276, 122))]
+    parts += [text(513, 40, "upper", "middle", "small"), text(513, 222, "lower", "middle", "small")]
+    return svg(680, 264, "Crowns in the picture, and the masks of the upper and the lower row", parts)
+
+
+def board():
+    """Draw where the calibration board is held: at the place of the teeth, near and far, tilted."""
+    parts = [path([(70, 60), (300, 150)], "thin"), path([(70, 240), (300, 150)], "thin"), camera(70, 60, 21, "")]
+    parts += [camera(70, 240, -21, ""), camera(60, 150, 0, ""), path([(60, 150), (300, 150)], "thin")]
+    for x, y, tilt in ((260, 150, 0), (300, 138, 22), (340, 158, -22), (380, 150, 8)):
+        a = math.radians(90 + tilt)
+        parts.append(path([(x - 46 * math.cos(a), y - 46 * math.sin(a)), (x + 46 * math.cos(a), y + 46 * math.sin(a))]))
+    parts += [text(320, 232, "the board, where the teeth will be:"), text(320, 252, "near, far, tilted every way")]
+    for i in range(7):
+        for j in range(5):
+            if (i + j) % 2 == 0:
+                parts.append(box(470 + 24 * i, 80 + 24 * j, 24, 24, "line").replace('class="line"', 'class="square"'))
+    parts += [box(460, 70, 188, 140, "line"), text(554, 236, "chessboard: inner corners count"), ]  # fmt: skip
+    parts += [text(554, 256, "cols = 6, rows = 4", "middle", "small")]
+    return svg(680, 290, "The calibration board is shown to all cameras where the teeth will be", parts)
+
+
+def parameters():
+    """Draw the three parameters at the lower incisal point, seen from the side and from the front."""
+    skull = [(60, 60), (120, 52), (190, 60), (250, 76), (262, 104)]
+    closed = [(66, 76), (74, 130), (110, 166), (180, 176), (252, 160), (262, 112)]
+    open_ = [(66 + 10, 80), (70, 136), (96, 186), (160, 216), (236, 222), (254, 176)]
+    parts = [path(skull), path(closed, "thin"), path(open_), circle(66, 74, 10), circle(76, 80, 10, "line")]
+    parts += [text(40, 52, "condyle", "middle", "small"), arrow((262, 112), (254, 172), "one")]
+    parts += [text(276, 148, "d1 opening", "start"), arrow((262, 112), (316, 112), "three")]
+    parts += [text(322, 117, "d3 protrusion", "start"), circle(262, 112, 4, "fill1")]
+    parts += [text(262, 94, "lower incisal point", "start", "small"), text(170, 262, "from the side")]
+    front = 560
+    parts += [path([(front - 80, 76), (front - 60, 96), (front + 60, 96), (front + 80, 76)])]
+    parts += [path([(front - 84, 86), (front - 66, 170), (front, 196), (front + 66, 170), (front + 84, 86)])]
+    parts += [path([(front - 56, 112), (front + 56, 112)]), circle(front, 112, 4, "fill2")]
+    parts += [arrow((front, 112), (front + 56, 130), "two"), text(front + 2, 152, "d2, to the subject's left")]
+    parts += [text(front, 262, "from the front")]
+    return svg(680, 280, "Opening d1 and protrusion d3 from the side, laterotrusion d2 from the front", parts)
+
+
+def stages():
+    """Draw the stages of a build and what each hands on."""
+    names = (
+        ("sync", "offsets of cameras"), ("track", "poses of both rows"), ("fit", "model and bound"),
+        ("aid", "hard frames again"), ("bake", "OpenUSD rig"),
+    )  # fmt: skip
+    parts = []
+    for k, (name, what) in enumerate(names):
+        x = 16 + 133 * k
+        parts += [box(x, 40, 112, 46), text(x + 56, 68, name), text(x + 56, 108, what, "middle", "small")]
+        if k:
+            parts.append(arrow((x - 20, 63), (x - 2, 63)))
+    parts += [path([(471, 40), (471, 20), (205, 20), (205, 36)], "thin"), text(338, 14, "", "middle", "small")]
+    return svg(680, 126, "The stages of a build: sync, track, fit, aid, bake", parts)
+
+
+def bound():
+    """Draw a section of the bound, with margins inside and outside."""
+    points = []
+    for k in range(72):
+        a = 2 * math.pi * k / 72
+        r = 1 + 0.12 * math.cos(2 * a) - 0.14 * math.sin(a)
+        points.append((230 + 130 * r * math.cos(a), 145 + 88 * r * math.sin(a)))
+    parts = [path(points, "area", closed=True), path([(60, 165), (430, 165)], "thin"), path([(230, 20), (230, 270)], "thin")]
+    parts += [text(430, 182, "d2", "end"), text(240, 32, "d3", "start")]
+    parts += [circle(280, 120, 5, "fill3"), text(292, 116, "inside: margin +2.1 mm", "start", "small")]
+    parts += [circle(430, 72, 5, "fill2"), text(444, 70, "outside: margin -2.9 mm", "start", "small")]
+    parts += [arrow((430, 72), (362, 104), "two"), text(444, 90, "brought to the nearest valid d", "start", "small")]
+    parts += [text(230, 292, "section of the bound at one opening d1")]
+    return svg(680, 304, "A section of the bound in d2 and d3, with one point inside and one outside", parts)
+
+
+FIGURES = {
+    "cameras": cameras, "exercises": exercises, "masks": masks, "board": board, "parameters": parameters,
+    "stages": stages, "bound": bound,
+}  # fmt: skip
+
+if __name__ == "__main__":
+    folder = Path(sys.argv[1])
+    folder.mkdir(parents=True, exist_ok=True)
+    style = (Path(__file__).parents[1] / "style.css").read_text().replace("var(--md-default-fg-color)", "#222")
+    for name, draw in FIGURES.items():
+        drawn = draw().replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1)
+        (folder / f"{name}.svg").write_text(drawn.replace(">", f"><style>{style}</style>", 1))

@@ -1,0 +1,51 @@
+"""The page of all commands, from what each says with --help."""
+
+import html
+
+import typer
+
+from jawusd.cli.main import app
+from jawusd.cli.summaries import EXIT_CODES, SUMMARIES
+
+INTRODUCTION = """# Commands
+
+Made from the program: the same text as `jawusd COMMAND --help`. `python -m jawusd` is the same program. Results go to
+stdout, progress to stderr; `--json` prints what a program can read. Nothing is overwritten without `--force` (or
+`--resume` and `--fresh`, where a command goes on with earlier work). Vectors are written `--d 20 2 1` or `--d 20,2,1`.
+Options of `jawusd` itself stand before the command: `jawusd --log build.log build ...`.
+
+"""
+
+
+def page():
+    """Return the page as Markdown."""
+    program = typer.main.get_command(app)
+    parts = [INTRODUCTION, "| command | what it does |\n|---|---|\n"]
+    parts += [f"| [`{name}`](#jawusd-{name}) | {escaped(SUMMARIES[name])} |\n" for name in program.commands]
+    parts.append(f"\n{escaped(EXIT_CODES)} [Errors and exit codes](errors.md) names them one by one.\n\n")
+    parts.append(section("jawusd", program, "jawusd"))
+    parts += [section(f"jawusd {name}", command, f"jawusd-{name}") for name, command in program.commands.items()]
+    return "".join(parts)
+
+
+def section(title, command, anchor):
+    """Return the part of one command: usage, help, and every argument and option."""
+    context = typer.Context(command, info_name=title)
+    usage = " ".join(command.collect_usage_pieces(context))
+    lines = [f"## {title} {{ #{anchor} }}\n\n```text\n{title} {usage}\n```\n\n"]
+    if command.help:
+        lines.append(escaped(command.help.replace("\f", "")) + "\n\n")
+    for parameter in command.get_params(context):
+        record = parameter.get_help_record(context)
+        if record is not None:
+            names, meaning = record
+            lines.append(f"`{names}`\n:   {escaped(meaning) or 'As its name says.'}\n\n")
+    return "".join(lines)
+
+
+def escaped(text):
+    """Return text that Markdown shows as it is."""
+    text = html.escape(text, quote=False)
+    for sign in "\\`*_[]{}#|":
+        text = text.replace(sign, "\\" + sign)
+    return text

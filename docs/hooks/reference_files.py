@@ -1,0 +1,80 @@
+"""The page of file formats: the modules of jawusd.formats that read or write one, and the files of a rig's folder."""
+
+from jawusd.rig import layout
+
+#: Title and module of every file, in groups.
+FILES = {
+    "What goes in": {
+        "Capture: capture.toml": "jawusd.formats.capture",
+        "List of captures": "jawusd.formats.capture_list",
+        "Cameras of any program": "jawusd.formats.camera_files",
+        "Cameras: TOML of aniposelib, Pose2Sim and Caliscope": "jawusd.formats.calibration",
+        "Cameras: Metashape XML and RealityScan XMP": "jawusd.formats.camera_xml",
+        "Cameras: RealityScan CSV and OpenCV YAML": "jawusd.formats.camera_tables",
+        "Cameras: 3DEqualizer": "jawusd.formats.camera_3de",
+        "Lenses: 3DEqualizer": "jawusd.formats.lens_3de",
+        "Labels of crown and gum: SCAN.labels.npz": "jawusd.formats.scan_labels",
+        "Landmarks: landmarks.json": "jawusd.formats.landmarks",
+        "Poses and parameters: CSV and JSON": "jawusd.formats.poses",
+        "Keys: keys.json": "jawusd.formats.keys",
+        "ARKit face captures: CSV": "jawusd.formats.arkit",
+    },
+    "What comes out": {
+        "Tracks: tracks.npz": "jawusd.formats.tracks",
+        "Solved jaw in tracks.npz": "jawusd.formats.solved",
+        "Model: model.npz": "jawusd.formats.model",
+        "Solved performance: CSV": "jawusd.formats.performance",
+        "ARKit mapping: JSON": "jawusd.formats.arkit_mapping",
+        "Joint table: CSV": "jawusd.formats.joint_table",
+        "Photographs: photos.json": "jawusd.formats.photographs",
+        "Cameras for other programs": "jawusd.formats.camera_write",
+        "glTF for the web: .glb": "jawusd.formats.gltf",
+        "Library: library.json": "jawusd.library.index",
+        "State of a build: build.json": "jawusd.pipeline.state",
+        "Masks made by segment: segment.json": "jawusd.pipeline.segment_record",
+        "Paper's experiments": "jawusd.formats.experiments",
+    },
+    "What they share": {
+        "Meshes": "jawusd.formats.mesh",
+        "Findings": "jawusd.formats.finding",
+        "Time code": "jawusd.formats.timecode",
+        "Numbered pictures": "jawusd.formats.numbered",
+        "Folders that stages may name": "jawusd.formats.allowed_folders",
+    },
+}
+
+FOLDER = f"""# Files
+
+Every file that jawusd reads or writes: a dataclass, a reader and a writer each, made from their docstrings. Readers
+check version, units, shapes and finite numbers, and name the field that is wrong. Writers write beside the target and
+rename: nobody meets half a file. Files of a newer version are refused, of an older one upgraded. There are no pickles.
+
+## The folder of a rig
+
+| file | holds |
+|---|---|
+| `{layout.ACTOR_FILE}` | the rig's interface: default prim `{layout.ACTOR}`, [attributes](usd.md) `jaw:*`; names all others |
+| `{layout.RIG_FILE}` | the arrays of the exact model and the sampled table |
+| `{layout.GEO_FILE}` | meshes: `{layout.SKULL}` and `{layout.MANDIBLE}`, which moves |
+| `{layout.PROXY_FILE}` | the same with about a tenth of the faces: variant set `{layout.DETAIL}` |
+| `{layout.ONNX_FILE}`, `{layout.ENCODE_FILE}` | the decoder (d to pose, twist, margin) and the encoder (pose to d), float32 |
+| `anim_capture.usdc` | the captured motion as plain transforms; variant set `{layout.MOTION}` |
+| `{layout.SKEL_FILE}` | the same as a UsdSkel skeleton, whose keys can be edited |
+| `{layout.PACKAGE_FILE}` | one file for viewers, without ONNX |
+| `cameras.usda` | the calibrated cameras |
+| `tracks.npz`, `first_pass.npz` | [poses of both arches][jawusd.formats.tracks], final and of the first pass |
+| `model.npz` | the [fitted model][jawusd.formats.model], all that `jawusd.evaluator.load` needs |
+| `report.html` | how good the build is, on one page without other files |
+| `build.json` | which stages are done, from which files, with which versions |
+
+"""
+
+
+def page():
+    """Return the page as Markdown."""
+    parts = [FOLDER]
+    for group, files in FILES.items():
+        parts.append(f"## {group}\n\n")
+        for title, module in files.items():
+            parts.append(f'::: {module}\n    options:\n      heading: "{title}"\n      heading_level: 3\n\n')
+    return "".join(parts)

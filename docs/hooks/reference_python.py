@@ -1,0 +1,65 @@
+"""The pages of the Python API: one directive of mkdocstrings per package or module."""
+
+PAGES = {
+    "evaluator": (
+        "Numpy and nothing else: `import jawusd.evaluator` loads no other package. `python -m jawusd.evaluator` "
+        "does the same on the command line.",
+        ["jawusd.evaluator", "jawusd.fast"],
+    ),
+    "solvers": ("The rig in PyTorch, for solvers that follow gradients.", ["jawusd.solvers"]),
+    "rig": (
+        "Reading, checking and animating rigs in OpenUSD.",
+        ["jawusd.rig", "jawusd.rig.rebake", "jawusd.rig.publish", "jawusd.rig.glb", "jawusd.rig.cameras"],
+    ),
+    "library": (
+        "A folder of actors, and motion of one person for another.",
+        ["jawusd.library.transport", "jawusd.library.personal", "jawusd.library.timing"],
+    ),
+    "pipeline": (
+        "The stages wired together: what the commands call. Heavy packages are loaded by the functions that need them.",
+        [
+            f"jawusd.pipeline.{name}"
+            for name in (
+                "build track fit bake check calibrate segment scans photographs solve live report "
+                "library many joint_table camera_convert start_capture doctor prepare"
+            ).split()
+        ],
+    ),
+    "fitting": (
+        "The jaw model from poses, and poses from pictures.",
+        ["jawusd.fitting", "jawusd.tracking", "jawusd.tracking.photographs"],
+    ),
+    "geometry": ("Rotations, rigid motions, cameras and the anatomical frame.", ["jawusd.geometry"]),
+    "plugins": (
+        "Files that `python -m jawusd.plugins` copies out of the package, to run inside other programs.",
+        ["jawusd.plugins.jawusd_reader", "jawusd.plugins.jawusd_recipes", "jawusd.plugins.extension"],
+    ),
+}
+
+TOP = """# jawusd
+
+::: jawusd
+    options:
+      show_root_heading: false
+      show_root_toc_entry: false
+      members: [load]
+
+| name | |
+|---|---|
+| [`jawusd.load`][jawusd.load] | read a rig |
+| [`jawusd.JawRig`][jawusd.evaluator.JawRig] | the rig: pose, encode, margin, validate, ik |
+| [`jawusd.build`][jawusd.pipeline.build.build] | from a capture to a rig in one call |
+| [`jawusd.track`][jawusd.pipeline.track.track] | track both rows of teeth |
+| [`jawusd.JawusdError`][jawusd.errors.JawusdError] | what every error of jawusd is |
+| `jawusd.__version__` | the version, as text |
+"""
+
+
+def pages():
+    """Return the pages by their place."""
+    found = {"reference/python/jawusd.md": TOP}
+    for name, (sentence, modules) in PAGES.items():
+        title = "jawusd.fitting and jawusd.tracking" if name == "fitting" else f"jawusd.{name}"
+        directives = "\n".join(f"::: {module}\n" for module in modules)
+        found[f"reference/python/{name}.md"] = f"# {title}\n\n{sentence}\n\n{directives}"
+    return found
