@@ -59,8 +59,8 @@ def cameras():
     for x in (95.0, 585.0):
         parts += [box(x - 34, 150, 68, 20), text(x, 196, "soft light")]
     arc = [(mouth[0] + 95 * math.cos(t), mouth[1] + 95 * math.sin(t)) for t in (math.radians(d) for d in range(53, 91))]
-    parts += [path(arc, "one"), text(404, 234, "30 to 45&#176;", "start", "small")]
-    parts += [text(330, 268, "0.2 to 0.5 m", "end", "small")]
+    parts += [path(arc, "one"), text(404, 234, "about 40&#176;", "start", "small")]
+    parts += [text(330, 268, "about 0.2 m", "end", "small")]
     return svg(680, 380, "Three cameras around the mouth, seen from above, with soft lights at both sides", parts)
 
 

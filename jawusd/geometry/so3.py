@@ -60,7 +60,7 @@ def so3_exp(w: ArrayLike) -> Array:
 
 
 def so3_log(R: ArrayLike) -> Array:
-    """Map rotation matrices (..., 3, 3) to rotation vectors (..., 3) of angle in [0, pi] [rad]."""
+    """Map rotation matrices (..., 3, 3) to rotation vectors [rad] (..., 3), of angles in [0, pi]."""
     q = wxyz_from_matrix(R)
     norm = np.linalg.norm(q[..., 1:], axis=-1)
     angle = 2 * np.arctan2(norm, q[..., 0])
