@@ -30,11 +30,11 @@ def number(pattern, text):
     return float(re.search(pattern, text)[1])
 
 
-def test_examples_are_numbered_without_gaps_and_described_in_the_readme():
+def test_examples_are_numbered_without_gaps_and_described_in_the_documentation():
     names = sorted(path.name for path in EXAMPLES.glob("*.py"))
     assert [name[:3] for name in names] == [f"{k:02d}_" for k in range(1, len(names) + 1)]
-    readme = (ROOT / "README.md").read_text()
-    assert [name for name in names if name not in readme] == []
+    index = (ROOT / "docs" / "index.md").read_text()
+    assert [name for name in names if name not in index] == []
 
 
 def test_01_build(example_build, tmp_path):
