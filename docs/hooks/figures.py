@@ -1,4 +1,4 @@
-"""The drawings of the documentation, as SVG in the text of a page: `python docs/hooks/figures.py FOLDER` writes files."""
+"""The drawings of the documentation, as SVG in the text of a page. As files: python docs/hooks/figures.py FOLDER."""
 
 import math
 import sys
@@ -9,6 +9,15 @@ def svg(width, height, label, parts):
     """Return an SVG of the given size; the label is what screen readers say."""
     head = f'<svg class="drawing" viewBox="0 0 {width} {height}" role="img" aria-label="{label}">'
     return head + "".join(parts) + "</svg>"
+
+
+def smooth(points, kind="line"):
+    """Return a curve that begins and ends at the outer points and rounds the corners at all others."""
+    middles = [((a + c) / 2, (b + d) / 2) for (a, b), (c, d) in zip(points, points[1:])]
+    d = f"M{points[0][0]:g} {points[0][1]:g} L{middles[0][0]:g} {middles[0][1]:g}"
+    for (x, y), (u, v) in zip(points[1:-1], middles[1:]):
+        d += f" Q{x:g} {y:g} {u:g} {v:g}"
+    return f'<path d="{d} L{points[-1][0]:g} {points[-1][1]:g}" class="{kind}"/>'
 
 
 def text(x, y, words, anchor="middle", kind=""):
@@ -27,9 +36,9 @@ def circle(x, y, radius, kind="soft"):
     return f'<circle cx="{x:g}" cy="{y:g}" r="{radius:g}" class="{kind}"/>'
 
 
-def box(x, y, width, height, kind="soft"):
+def box(x, y, width, height, kind="soft", corner=4):
     """Return a rectangle."""
-    return f'<rect x="{x:g}" y="{y:g}" width="{width:g}" height="{height:g}" rx="4" class="{kind}"/>'
+    return f'<rect x="{x:g}" y="{y:g}" width="{width:g}" height="{height:g}" rx="{corner}" class="{kind}"/>'
 
 
 def arrow(start, end, kind="line"):
@@ -68,7 +77,7 @@ def exercises():
     """Draw the exercises of a take over time: opening, laterotrusion and protrusion."""
     plan = [
         ("teeth together", 2, (0, 0, 0)),
-        ("open wide, slowly", 5, (1, 0, 0)),
+        ("open wide, slowly, three times", 9, (1, 0, 0)),
         ("to the left and right", 5, (0, 1, 0)),
         ("forward", 4, (0, 0, 1)),
         ("half open: left, right, forward", 6, (0.45, 1, 0.7)),
@@ -76,17 +85,17 @@ def exercises():
         ("chew and speak", 5, (0.3, 0.25, 0.1)),
         ("teeth together", 2, (0, 0, 0)),
     ]
-    scale, left, curves, parts, at = 16.5, 90.0, ([], [], []), [], 0.0
+    scale, left, curves, parts, at = 14.7, 90.0, ([], [], []), [], 0.0
     for row, (name, seconds, sizes) in enumerate(plan):
         x = left + at * scale
         parts += [path([(x, 20), (x, 262)], "thin"), text(x + seconds * scale / 2, 16, str(row + 1))]
         for k in range(41):
             t = k / 40
-            turns = 3 if "chew" in name else 1
+            turns = 3 if "chew" in name or "three" in name else 1
             swing = 0.5 - 0.5 * math.cos(2 * math.pi * turns * t)
             sides = math.sin(2 * math.pi * turns * t)
             held = min(1.0, 5 * t, 5 * (1 - t)) if "half" in name or "limits" in name else swing
-            values = (sizes[0] * held, sizes[1] * sides, sizes[2] * (sides if "half" in name else swing))
+            values = (sizes[0] * held, sizes[1] * sides, sizes[2] * (held * abs(sides) if "half" in name else swing))
             for curve, value in zip(curves, values):
                 curve.append((x + t * seconds * scale, value))
         at += seconds
@@ -103,9 +112,10 @@ def crown(x, top, width, height, up):
     """Return the outline of a crown; `up` points from the edge to the gum."""
     s = -1 if up else 1
     return [
-        (x, top), (x + 0.12 * width, top - s * 0.15 * height), (x + 0.1 * width, top - s * height),
-        (x + 0.9 * width, top - s * height), (x + 0.88 * width, top - s * 0.15 * height), (x + width, top),
+        (x + 0.15 * width, top), (x, top - s * 0.6 * height), (x + 0.06 * width, top - s * height),
+        (x + 0.94 * width, top - s * height), (x + width, top - s * 0.6 * height), (x + 0.85 * width, top),
     ]  # fmt: skip
+
 
 
 def masks():
@@ -140,28 +150,42 @@ def board():
     for i in range(7):
         for j in range(5):
             if (i + j) % 2 == 0:
-                parts.append(box(470 + 24 * i, 80 + 24 * j, 24, 24, "line").replace('class="line"', 'class="square"'))
+                parts.append(box(470 + 24 * i, 80 + 24 * j, 24, 24, "square", 0))
     parts += [box(460, 70, 188, 140, "line"), text(554, 236, "chessboard: inner corners count"), ]  # fmt: skip
     parts += [text(554, 256, "cols = 6, rows = 4", "middle", "small")]
     return svg(680, 290, "The calibration board is shown to all cameras where the teeth will be", parts)
 
 
+def turn(x, y, degrees):
+    """Return a point turned about the condyle, which slides forward and down as the mouth opens."""
+    a = math.radians(degrees)
+    u, v = x - 64, y - 66
+    return 64 + u * math.cos(a) - v * math.sin(a) + 9, 66 + u * math.sin(a) + v * math.cos(a) + 6
+
+
+def teeth(x, y, count, lower):
+    """Return crowns in a row, as outlines."""
+    return [path(crown(x + 18 * k, y + (30 if lower else 0), 17, 28, not lower), "soft", True) for k in range(count)]
+
+
 def parameters():
     """Draw the three parameters at the lower incisal point, seen from the side and from the front."""
-    skull = [(60, 60), (120, 52), (190, 60), (250, 76), (262, 104)]
-    closed = [(66, 76), (74, 130), (110, 166), (180, 176), (252, 160), (262, 112)]
-    open_ = [(66 + 10, 80), (70, 136), (96, 186), (160, 216), (236, 222), (254, 176)]
-    parts = [path(skull), path(closed, "thin"), path(open_), circle(66, 74, 10), circle(76, 80, 10, "line")]
-    parts += [text(40, 52, "condyle", "middle", "small"), arrow((262, 112), (254, 172), "one")]
-    parts += [text(276, 148, "d1 opening", "start"), arrow((262, 112), (316, 112), "three")]
-    parts += [text(322, 117, "d3 protrusion", "start"), circle(262, 112, 4, "fill1")]
-    parts += [text(262, 94, "lower incisal point", "start", "small"), text(170, 262, "from the side")]
+    skull = [(30, 58), (52, 46), (80, 58), (96, 50), (150, 62), (230, 70), (262, 74)]
+    parts = [smooth(skull), *teeth(176, 72, 5, False)]
+    jaw = [(66, 66), (58, 84), (72, 120), (84, 156), (120, 166), (200, 164), (262, 160), (270, 136), (262, 112)]
+    turned = [turn(x, y, 14.0) for x, y in jaw]
+    parts += [smooth(jaw, "thin"), smooth(turned), circle(64, 66, 9, "thin"), circle(*turn(64, 66, 14.0), 9)]
+    start, end = (266, 104), turn(266, 104, 14.0)
+    parts += [text(50, 34, "condyle"), arrow(start, end, "one"), circle(*start, 4, "fill1")]
+    parts += [text(end[0] + 16, end[1] - 14, "d1 opening", "start"), arrow(start, (326, 104), "three")]
+    parts += [text(334, 109, "d3 protrusion", "start"), text(278, 88, "lower incisal point", "start", "small")]
+    parts.append(text(170, 262, "from the side"))
     front = 560
-    parts += [path([(front - 80, 76), (front - 60, 96), (front + 60, 96), (front + 80, 76)])]
-    parts += [path([(front - 84, 86), (front - 66, 170), (front, 196), (front + 66, 170), (front + 84, 86)])]
-    parts += [path([(front - 56, 112), (front + 56, 112)]), circle(front, 112, 4, "fill2")]
-    parts += [arrow((front, 112), (front + 56, 130), "two"), text(front + 2, 152, "d2, to the subject's left")]
-    parts += [text(front, 262, "from the front")]
+    parts += [*teeth(front - 54, 66, 6, False), *teeth(front - 54, 122, 6, True), circle(front, 112, 4, "fill2")]
+    parts.append(smooth([(front - 88, 76), (front - 80, 140), (front - 50, 184), (front, 196), (front + 50, 184),
+                         (front + 80, 140), (front + 88, 76)]))  # fmt: skip
+    parts += [arrow((front, 112), (front + 62, 112), "two"), text(front, 222, "d2, to the subject's left")]
+    parts.append(text(front, 262, "from the front"))
     return svg(680, 280, "Opening d1 and protrusion d3 from the side, laterotrusion d2 from the front", parts)
 
 
@@ -188,9 +212,10 @@ def bound():
         a = 2 * math.pi * k / 72
         r = 1 + 0.12 * math.cos(2 * a) - 0.14 * math.sin(a)
         points.append((230 + 130 * r * math.cos(a), 145 + 88 * r * math.sin(a)))
-    parts = [path(points, "area", closed=True), path([(60, 165), (430, 165)], "thin"), path([(230, 20), (230, 270)], "thin")]
+    parts = [path(points, "area", closed=True)]
+    parts += [path([(60, 165), (430, 165)], "thin"), path([(230, 20), (230, 270)], "thin")]
     parts += [text(430, 182, "d2", "end"), text(240, 32, "d3", "start")]
-    parts += [circle(280, 120, 5, "fill3"), text(292, 116, "inside: margin +2.1 mm", "start", "small")]
+    parts += [circle(280, 120, 5, "fill3"), text(240, 146, "inside: margin +2.1 mm", "start", "small")]
     parts += [circle(430, 72, 5, "fill2"), text(444, 70, "outside: margin -2.9 mm", "start", "small")]
     parts += [arrow((430, 72), (362, 104), "two"), text(444, 90, "brought to the nearest valid d", "start", "small")]
     parts += [text(230, 292, "section of the bound at one opening d1")]

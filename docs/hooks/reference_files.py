@@ -53,11 +53,11 @@ rename: nobody meets half a file. Files of a newer version are refused, of an ol
 
 | file | holds |
 |---|---|
-| `{layout.ACTOR_FILE}` | the rig's interface: default prim `{layout.ACTOR}`, [attributes](usd.md) `jaw:*`; names all others |
+| `{layout.ACTOR_FILE}` | the interface: default prim `{layout.ACTOR}`, [attributes](usd.md) `jaw:*`; names the others |
 | `{layout.RIG_FILE}` | the arrays of the exact model and the sampled table |
 | `{layout.GEO_FILE}` | meshes: `{layout.SKULL}` and `{layout.MANDIBLE}`, which moves |
 | `{layout.PROXY_FILE}` | the same with about a tenth of the faces: variant set `{layout.DETAIL}` |
-| `{layout.ONNX_FILE}`, `{layout.ENCODE_FILE}` | the decoder (d to pose, twist, margin) and the encoder (pose to d), float32 |
+| `{layout.ONNX_FILE}`, `{layout.ENCODE_FILE}` | decoder (d to pose, twist, margin) and encoder (pose to d), float32 |
 | `anim_capture.usdc` | the captured motion as plain transforms; variant set `{layout.MOTION}` |
 | `{layout.SKEL_FILE}` | the same as a UsdSkel skeleton, whose keys can be edited |
 | `{layout.PACKAGE_FILE}` | one file for viewers, without ONNX |
@@ -76,5 +76,6 @@ def page():
     for group, files in FILES.items():
         parts.append(f"## {group}\n\n")
         for title, module in files.items():
-            parts.append(f'::: {module}\n    options:\n      heading: "{title}"\n      heading_level: 3\n\n')
+            options = [f'heading: "{title}"', f'toc_label: "{title}"', "heading_level: 3"]
+            parts.append("\n      ".join([f"::: {module}\n    options:", *options]) + "\n\n")
     return "".join(parts)

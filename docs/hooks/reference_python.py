@@ -1,5 +1,10 @@
 """The pages of the Python API: one directive of mkdocstrings per package or module."""
 
+STAGES = (
+    "build", "track", "fit", "bake", "check", "calibrate", "segment", "scans", "photographs", "solve", "live", "report",
+    "library", "many", "joint_table", "camera_convert", "start_capture", "doctor", "prepare",
+)  # fmt: skip
+
 PAGES = {
     "evaluator": (
         "Numpy and nothing else: `import jawusd.evaluator` loads no other package. `python -m jawusd.evaluator` "
@@ -17,13 +22,7 @@ PAGES = {
     ),
     "pipeline": (
         "The stages wired together: what the commands call. Heavy packages are loaded by the functions that need them.",
-        [
-            f"jawusd.pipeline.{name}"
-            for name in (
-                "build track fit bake check calibrate segment scans photographs solve live report "
-                "library many joint_table camera_convert start_capture doctor prepare"
-            ).split()
-        ],
+        [f"jawusd.pipeline.{name}" for name in STAGES],
     ),
     "fitting": (
         "The jaw model from poses, and poses from pictures.",

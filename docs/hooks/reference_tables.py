@@ -4,19 +4,19 @@ import re
 from pathlib import Path
 
 from pxr import Sdf
+from reference_commands import escaped
 
 import jawusd.errors
 from jawusd.cli.summaries import EXIT_CODES
 from jawusd.evaluator import schema as arrays
 from jawusd.formats.capture import capture_keys
-from reference_commands import escaped
 
 SCHEMA = Path(__file__).resolve().parents[2] / "schemas" / "schema.usda"
 
 CAPTURE = """# capture.toml
 
-Made from the models that read the file: the same as `jawusd init --reference` prints. Paths are relative to the file and
-stay below its folder, unless `--allow-outside` is given. [From masks](../guides/masks.md) and
+Made from the models that read the file: what `jawusd init --reference` prints too. Paths are relative to the file
+and stay below its folder, unless `--allow-outside` is given. [From masks](../guides/masks.md) and
 [From footage alone](../guides/footage.md) say which of the keys a capture needs; `jawusd init FOLDER` writes a file
 with comments from what lies in a folder, and `jawusd check FOLDER` says what is wrong with it.
 

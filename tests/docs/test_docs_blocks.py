@@ -105,7 +105,7 @@ def test_python_blocks_run(desk, monkeypatch):
     for block in of("python"):
         if not block.parsed:
             code = compile("\n" * block.line + block.text, str(ROOT / block.page), "exec")
-            exec(code, names.setdefault(block.page, {}))  # noqa: S102
+            exec(code, names.setdefault(block.page, {}))
 
 
 COPIED = ("jawusd_reader", "jawusd_recipes")
