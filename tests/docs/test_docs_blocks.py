@@ -82,7 +82,8 @@ def test_console_blocks_print_what_they_say(desk, example_build):
     printed = {BUILD: built}  # built once for all tests; later pages repeat what an earlier one did
     for block in of("console"):
         for command, expected in steps(block):
-            command = command.replace("out/actor.usda", "out")
+            # A rig's folder and its file are the same to these commands: what was run is not run again.
+            command = re.sub(r"^(jawusd (?:info|pose|animate|validate)) out/actor\.usda", r"\1 out", command)
             if command not in printed:
                 done = subprocess.run(
                     ["sh", "-c", command], cwd=folder, env=env, capture_output=True, text=True, timeout=120, check=False
