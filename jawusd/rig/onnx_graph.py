@@ -118,24 +118,28 @@ class Graph:
 
     def clip(self, x: Value, low: float, high: float) -> Value:
         """Return x limited to [low, high]."""
-        return self.op("Min", self.op("Max", x, low), high)
+        return self.op("Clip", x, low, high)
 
     def angle_coefficients(self, squared: Value) -> Triple[Value]:
         """Return a, b and c of `jawusd.geometry.rodrigues` at a squared angle [rad^2]."""
-        small, far = self._near_and_far(squared)
+        small, far, series = self._near_and_far(squared)
         angle = self.sqrt(far)
         quotients = angle_quotients(far, angle, self.op("Sin", angle), self.op("Sin", 0.5 * angle))
-        series = self.polynomials([*long_angle_series(), _INVERSE_SERIES], squared)
         return triple([self.op("Where", small, x, y) for x, y in zip(series, quotients)])
 
     def inverse_coefficient(self, squared: Value, a: Value, b: Value) -> Value:
         """Return e of the inverse left Jacobian ``I - W / 2 + e W W``: ``(1 - a / (2 b)) / x`` (Barfoot 2017, 7.77)."""
-        small, far = self._near_and_far(squared)
-        series = self.polynomials([*long_angle_series(), _INVERSE_SERIES], squared)
+        small, far, series = self._near_and_far(squared)
         return self.op("Where", small, series[3], (1.0 - a / (2.0 * b)) / far)
 
-    def _near_and_far(self, squared: Value) -> tuple[Value, Value]:
-        return self.op("Less", squared, _SERIES_BELOW_RAD2), self.op("Max", squared, _SERIES_BELOW_RAD2)
+    def _near_and_far(self, squared: Value) -> tuple[Value, Value, list[Value]]:
+        """Return where a squared angle is small, itself for the closed forms, and the series, which must not overflow.
+
+        What overflows is no longer left out where it is multiplied with 0.
+        """
+        near = self.op("Min", squared, _SERIES_BELOW_RAD2)
+        series = self.polynomials([*long_angle_series(), _INVERSE_SERIES], near)
+        return self.op("Less", squared, _SERIES_BELOW_RAD2), self.op("Max", squared, _SERIES_BELOW_RAD2), series
 
     def polynomials(self, coefficients: Sequence[Sequence[float]], x: Value) -> list[Value]:
         """Return several polynomials of x: its powers times one matrix, a third of the operators of Horner's scheme."""
@@ -167,10 +171,12 @@ class Graph:
         return triple(self.parts(factors[0] @ weights, 3))
 
     def lookup(self, x: Value, knots: Array, tables: Sequence[Array]) -> list[tuple[Value]]:
-        """Return, of each table, the rows (n, k) whose index is the number of knots (m, 1) at or below x."""
-        passed = self.op("Cast", self.op("GreaterOrEqual", x, self.constant(knots.T)), to=TensorProto.INT64)
-        interval = self.op("ReduceSum", passed, self.constant([1], np.int64), keepdims=0)
-        return [(self.op("Gather", self.constant(table), interval, axis=0),) for table in tables]
+        """Return, of each table, the rows (n, k) whose index is the number of knots (m, 1) at or below x.
+
+        The first row and, for each knot passed, what the next one has more: affine, where looking up is not.
+        """
+        passed = self.op("Cast", self.op("GreaterOrEqual", x, self.constant(knots.T)), to=self.elem_type)
+        return [(passed @ np.diff(table, axis=0) + self.constant(table[:1]),) for table in tables]
 
     def split(self, row: Sequence[Value], width: int) -> list[Value]:
         """Return the columns (n, 1) of a wide number (n, width)."""

@@ -21,6 +21,7 @@ from jawusd.rig.arrays import model_hash
 from jawusd.rig.onnx_encode import add_encoder
 from jawusd.rig.onnx_graph import FloatType, Graph, Value
 from jawusd.rig.onnx_model import add_margin, add_twist, decode_motion, images
+from jawusd.rig.onnx_packing import packed
 
 FORMAT = "jawusd-onnx/1"
 OPSET = 17
@@ -54,13 +55,12 @@ def decode_model(rig: JawRig, dtype: FloatType = np.float32) -> onnx.ModelProto:
     d = Value(g, "d")
     motion = decode_motion(g, rig, d)
     add_twist(g, rig, motion, "twist")
-    upper = images(g, rig, motion, np.eye(4))  # the columns of the pose, without its bottom row
-    columns = g.reshape(upper, [-1, 4, 3])
-    zero = g.op("Slice", columns, *(g.constant([x], np.int64) for x in (0, 1, 2))) * 0.0  # as long as the batch
-    bottom = zero + g.constant([[[0.0], [0.0], [0.0], [1.0]]])
-    g.op("Transpose", g.concat([columns, bottom], axis=2), perm=[0, 2, 1], name="pose")
+    columns = images(g, rig, motion, np.eye(4))  # of the pose, one after another, without its bottom row
+    flat = columns @ np.eye(16).reshape(4, 4, 16)[:3].swapaxes(0, 1).reshape(12, 16) + g.constant([np.eye(16)[15]])
+    g.op("Reshape", flat, g.constant([-1, 4, 4], np.int64), name="pose")
     g.op("Squeeze", add_margin(g, rig, d), g.constant([1], np.int64), name="margin")
     outputs: Shapes = {"pose": ["N", 4, 4], "twist": ["N", 6], "margin": ["N"]}
+    g = packed(g, {"d": 3}, list(outputs))
     return _model(g, rig, "jaw_decode", decode_model.__doc__, {"d": ["N", 3]}, outputs)
 
 
