@@ -121,6 +121,9 @@ def test_sliders_bound_handle_export_nodes_and_two_actors(tmp_path, archive, act
     np.testing.assert_array_equal(times, frames)
     np.testing.assert_allclose(exported, d, atol=1e-5)
     assert fps == FPS
+    assert "there is no such file" in found["gone"] and not (tmp_path / "groundless.usdc").exists()
+    assert found["overridden"]["override"]
+    assert distance_mm([found["overridden"]["pose"]], rig, kept[:1]) < EXACT_MM
 
 
 def check_two_actors(rig, two, inside):

@@ -67,8 +67,12 @@ def actors() -> list[bpy.types.Object]:
 
 
 def mandible_of(actor: bpy.types.Object) -> bpy.types.Object:
-    """Return the object that an actor moves."""
-    return next(found for found in bpy.data.objects if found.get(_ACTOR) == actor)
+    """Return the object that an actor moves.
+
+    Library overrides of reopened files point to the actor in the library: there the hierarchy tells.
+    """
+    below = [found for found in actor.children_recursive if _ACTOR in found]
+    return below[0] if below else next(found for found in bpy.data.objects if found.get(_ACTOR) == actor)
 
 
 def meshes_of(mandible: bpy.types.Object) -> list[bpy.types.Object]:
@@ -100,8 +104,12 @@ def parameters(actor: bpy.types.Object) -> tuple[float, float, float]:
 
 def shown(actor: bpy.types.Object, d: tuple[float, float, float]) -> tuple[float, float, float]:
     """Return the parameters [mm] that the mandible takes: d, brought inside the bound where the actor keeps valid."""
-    rig = rig_of(actor)
-    if not actor.get(KEEP) or rig.is_inside(d):
+    return _kept(rig_of(actor), d) if actor.get(KEEP) else d
+
+
+def _kept(rig: carried.JawRig, d: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Return parameters [mm] brought inside the bound."""
+    if rig.is_inside(d):
         return d
     d1, d2, d3 = rig.keep_inside([0.0], [d]).d[0].tolist()
     return d1, d2, d3
@@ -215,7 +223,8 @@ def _channel(mandible: bpy.types.Object, d1: float, d2: float, d3: float, keep: 
     key = (actor[_STORE], d1, d2, d3, bool(keep))
     if key not in _poses:
         _poses.clear()  # the seven channels of one pose follow one another
-        T = rig_of(actor).pose(shown(actor, (d1, d2, d3)) if keep else (d1, d2, d3))
+        rig = rig_of(actor)
+        T = rig.pose(_kept(rig, (d1, d2, d3)) if keep else (d1, d2, d3))
         turn = _QUATERNION_LENGTH * carried.wxyz_from_matrix(T[:3, :3])
         _poses[key] = (*(T[:3, 3] + _AWAY_MM).tolist(), *turn.tolist())
     return _poses[key][channel]

@@ -53,6 +53,48 @@ def two_actors(package, take, poses):
     return found
 
 
+def without_rig_file(package, folder):
+    """Export after the rig's file has gone; return what Blender says."""
+    actor = bpy.data.objects["Actor"]
+    source, actor[package.jaw.SOURCE] = actor[package.jaw.SOURCE], os.path.join(folder, "gone", "actor.usda")
+    try:
+        return list(bpy.ops.jawusd.export(actor="Actor", filepath=os.path.join(folder, "groundless.usdc")))
+    except RuntimeError as error:  # an operator that reports an error
+        return str(error)
+    finally:
+        actor[package.jaw.SOURCE] = source
+
+
+def overridden(package, folder, take, d):
+    """Link an actor from another file and override it; return its mandible posed by d, kept valid, after reopening."""
+    bpy.ops.wm.read_homefile(use_empty=True)
+    bpy.ops.wm.usd_import(filepath=take)
+    actor, made = package.jaw.actors()[0], bpy.data.collections.new("Rig")
+    actor.animation_data_clear()
+    bpy.context.scene.collection.children.link(made)
+    for found in (actor, *actor.children_recursive):
+        made.objects.link(found)
+    library, shot = os.path.join(folder, "library.blend"), os.path.join(folder, "shot.blend")
+    bpy.ops.wm.save_as_mainfile(filepath=library)
+    bpy.ops.wm.read_homefile(use_empty=True)
+    with bpy.data.libraries.load(library, link=True) as (_, linked):
+        linked.collections = ["Rig"]
+    linked.collections[0].override_hierarchy_create(bpy.context.scene, bpy.context.view_layer)
+    for reopened in (False, True):
+        if reopened:
+            bpy.ops.wm.save_as_mainfile(filepath=shot)
+            bpy.ops.wm.open_mainfile(filepath=shot)
+        actor = next(found for found in package.jaw.actors() if found.override_library)
+        actor[package.jaw.KEEP] = True
+        for name, value in zip(NAMES, d):
+            actor[name] = value
+        actor.update_tag()
+        bpy.context.view_layer.update()
+    mandible = package.jaw.mandible_of(actor)
+    shown = mandible.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    return {"override": mandible.override_library is not None, "pose": [list(row) for row in shown.matrix_local]}
+
+
 def by_bones(package, take):
     """Import a take that bones move into an empty scene; return its actors and the vertices of the mandible."""
     bpy.ops.wm.read_homefile(use_empty=True)
@@ -114,6 +156,7 @@ def main(archive, folder, take, poses, bones):
     actor, scene, result = bpy.data.objects["Actor"], bpy.context.scene, {}
     result["keys"] = sum(len(curve.keyframe_points) for curve in package.jaw.curves(actor))
     bpy.ops.jawusd.export(actor="Actor", filepath=os.path.join(folder, "exported.usdc"))
+    result["gone"] = without_rig_file(package, folder)
     actor.animation_data.action = None
     result["poses"] = [posed(d) for d in poses["inside"]]
     result["limits"] = limits()
@@ -138,6 +181,7 @@ def main(archive, folder, take, poses, bones):
     result["nodes"] = with_nodes(poses["inside"][0])
     bpy.ops.preferences.addon_enable(module="bl_ext.test_repository.jawusd_blender")
     result["bones"] = by_bones(package, bones)
+    result["overridden"] = overridden(package, folder, take, poses["outside"][0])
     print("RESULT " + json.dumps(result))
 
 
