@@ -248,7 +248,7 @@ def _validate_rig(path: Path, as_json: bool) -> None:
         result,
         as_json,
         lambda: [
-            *(f"{finding.severity}: {finding.rule}: {finding.message}" for finding in findings),
+            *(f"{finding.severity}: {finding.rule}: {finding.path}: {finding.message}" for finding in findings),
             f"{path}: {len(errors)} errors, {len(findings) - len(errors)} other findings",
         ],
     )

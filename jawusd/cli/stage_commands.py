@@ -121,7 +121,7 @@ def rebake(
     found = read_stage_motion(loaded, rig, stage, prim, mandible, skull, origin.value if origin else None)
     motion, changes = kept_inside(loaded, AuthoredMotion(found.frames, found.d, found.fps))
     known = np.isfinite(motion.d).all(axis=1)
-    if found.fitted and prim is not None:
+    if found.fitted and prim is not None and stage.suffix.lower() not in USD_SUFFIXES:  # else it is the stage's
         write_over(out, rig, loaded, motion.frames, motion.d, found.fps, prim)
     elif found.fitted:
         write_animation(out, rig, motion.frames, motion.d, found.fps, rig=loaded)
@@ -163,7 +163,7 @@ def publish(
     emit({"files": files}, as_json, lambda: files)
 
 
-_ORIGINS = {"d": "keys of d", "mandible": "mandible's transforms"}
+_ORIGINS = {"d": "values of d", "mandible": "mandible's transforms"}
 
 
 def read_stage_motion(
@@ -201,9 +201,9 @@ def read_stage_motion(
             except JawusdError as error:
                 error.path = str(stage)
                 raise
-    if mandible is None and skull is None and carries_rig(stage):
+    if mandible is None and skull is None and carries_rig(stage, prim):
         return motion_of_stage(stage, loaded, prim, origin)
-    return _fitted(loaded, rig, stage, mandible, skull, None)
+    return _fitted(loaded, rig, stage, mandible or prim, skull or prim, None)
 
 
 def holds_stage(path: Path) -> bool:

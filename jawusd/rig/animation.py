@@ -27,13 +27,15 @@ from jawusd.rig.read import load_rig
 from jawusd.rig.skel import offer_skeleton
 from jawusd.rig.table import landmark_distance
 
-# Between two baked samples, at these shares of the interval, no landmark may be farther from the model than this.
-_BETWEEN_MM = 0.02
+#: Between two baked samples, at the shares of the interval that follow, no landmark is farther [mm] from the model.
+BETWEEN_MM = 0.02
 _SHARES = (0.25, 0.5, 0.75)
 _MAX_HALVINGS = 5
 _USD_LERP_BELOW = 1e-5
 # Every whole frame is baked: an hour at 60 per second fits.
 _MOST_FRAMES, _FARTHEST_FRAME = 220_000, 1e9
+#: Key, in the custom data of sampled parameters, of the hash of the model that they are meant for.
+MADE_FOR = "modelHash"
 #: Key of the lost frames in an animation layer's `customLayerData`.
 LOST = "lostFrames"
 #: The same of frames that were not seen.
@@ -66,12 +68,14 @@ def write_animation(
             they make it a variant, see `offer_skeleton`.
 
     Raises:
-        RigError: Frames do not increase, nothing to animate, or the frame rate is not positive.
+        RigError: No such actor, frames that do not increase, nothing to animate, or a frame rate that is not positive.
         FormatError: `actor` is not a rig.
         OutputError: The file cannot be written.
         ValueError: Shapes of frames and d that do not match.
     """
     out, actor = Path(out), Path(actor)
+    if not actor.is_file():
+        raise RigError("there is no such file, which the layer would stand on.", path=actor)
     rig = load_rig(actor) if rig is None else rig
     frames, d = np.asarray(frames, dtype=np.float64), np.asarray(d, dtype=np.float64)
     if frames.ndim != 1 or d.shape != (len(frames), 3):
@@ -123,7 +127,7 @@ def bake_times(rig: JawRig, frames: Array, d: Array, span: Array) -> tuple[Array
         for share in _SHARES:
             exact = rig.pose(_at(start + share * step, frames, d))
             errors.append(landmark_distance(rig, exact, _shown(poses[:-1], poses[1:], share)))
-        coarse = np.max(errors, axis=0) > _BETWEEN_MM
+        coarse = np.max(errors, axis=0) > BETWEEN_MM
         if not coarse.any():
             break
         middles = (start + 0.5 * step)[coarse]
@@ -149,6 +153,7 @@ def author_motion(
         attribute = Sdf.AttributeSpec(
             actor, parameter, Sdf.ValueTypeNames.Double, Sdf.VariabilityVarying, declaresCustom=True
         )
+        attribute.customData = {MADE_FOR: rig.model_hash}
         _set_samples(layer, attribute, frames, d[:, i].tolist())
     times, poses = bake_times(rig, frames, d, span)
     mandible = Sdf.CreatePrimInLayer(layer, paths[1])

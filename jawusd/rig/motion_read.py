@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pxr import Usd, UsdGeom
 
 from jawusd.errors import FormatError
-from jawusd.geometry.arrays import Array
+from jawusd.geometry.arrays import Array, Mask
 from jawusd.geometry.se3 import rigidity_defect
 from jawusd.rig.animation import LOST
 from jawusd.rig.bones import bones_of
@@ -43,7 +44,7 @@ def read_poses_of_stage(path: str | os.PathLike[str], prim_path: str | None = No
 
 
 def poses_at(mandible: Usd.Prim, actor: Usd.Prim, times: ArrayLike, path: object) -> Array:
-    """Return T_skull_mandible (F, 4, 4) [mm] of a mandible in its actor at times (F,), by transforms or by bones.
+    """Return T_skull_mandible (F, 4, 4) [mm] of a mandible of an actor at times (F,), by transforms or by bones.
 
     Raises:
         FormatError: The motion is not rigid.
@@ -53,7 +54,8 @@ def poses_at(mandible: Usd.Prim, actor: Usd.Prim, times: ArrayLike, path: object
     if bones is not None:
         poses = bones.poses(actor, [Usd.TimeCode(time) for time in times.tolist()], path)
     else:
-        poses = np.array([_placed(mandible, actor, time) for time in times.tolist()])
+        skull = skull_of(actor)
+        poses = np.array([_placed(mandible, skull, actor, time) for time in times.tolist()])
     defect = rigidity_defect(poses)
     if not defect.max() <= _RIGID:
         worst = int(np.argmax(np.where(np.isfinite(defect), defect, np.inf)))
@@ -65,8 +67,12 @@ def poses_at(mandible: Usd.Prim, actor: Usd.Prim, times: ArrayLike, path: object
     return poses
 
 
-def _placed(mandible: Usd.Prim, actor: Usd.Prim, time: float) -> Array:
-    moved, _ = UsdGeom.XformCache(Usd.TimeCode(time)).ComputeRelativeTransform(mandible, actor)
+def _placed(mandible: Usd.Prim, skull: Usd.Prim | None, actor: Usd.Prim, time: float) -> Array:
+    cache = UsdGeom.XformCache(Usd.TimeCode(time))
+    moved, _ = cache.ComputeRelativeTransform(mandible, actor)
+    if skull is not None:
+        placed, _ = cache.ComputeRelativeTransform(skull, actor)
+        moved *= placed.GetInverse()
     return np.array(moved).T  # USD multiplies rows from the left
 
 
@@ -114,6 +120,18 @@ def key_times(attribute: Usd.Attribute) -> list[float]:
     return np.union1d(knots, np.arange(first, last + 1)).tolist()
 
 
+def times_between(attributes: Iterable[Usd.Attribute]) -> tuple[Array, Mask]:
+    """Return the times at which one of several attributes has samples, and the whole frames between them.
+
+    Returns:
+        Times, increasing, shape (n,), and which of them have samples, shape (n,).
+    """
+    keys = np.unique(np.concatenate([np.zeros(0), *(key_times(attribute) for attribute in attributes)]))
+    first, last = np.ceil(keys.min(initial=np.inf)), np.floor(keys.max(initial=-np.inf))
+    times = np.union1d(keys, np.arange(first, last + 1)) if 0 <= last - first < _MOST_FRAMES else keys
+    return times, np.isin(times, keys)
+
+
 def mandible_of(stage: Usd.Stage, actor: Usd.Prim, path: object) -> Usd.Prim:
     """Return the prim that a rig moves.
 
@@ -126,6 +144,13 @@ def mandible_of(stage: Usd.Stage, actor: Usd.Prim, path: object) -> Usd.Prim:
     if not prim or not prim.IsA(UsdGeom.Xformable):
         raise FormatError(f"{actor.GetPath()} has no mandible that could move.", path=str(path))
     return prim
+
+
+def skull_of(actor: Usd.Prim) -> Usd.Prim | None:
+    """Return the prim of a rig's skull; None where it names none."""
+    targets = actor.GetRelationship("jaw:skull").GetTargets() if actor.HasRelationship("jaw:skull") else []
+    prim = actor.GetStage().GetPrimAtPath(targets[0]) if targets else None
+    return prim if prim and prim.IsA(UsdGeom.Xformable) else None
 
 
 def frames_of_stage(stage: Usd.Stage, path: object) -> NDArray[np.int64]:

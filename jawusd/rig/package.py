@@ -47,10 +47,12 @@ def write_package(out: str | os.PathLike[str], source: str | os.PathLike[str]) -
 
 
 def _flattened(stage: Usd.Stage, source: str | os.PathLike[str]) -> Sdf.Layer:
-    rigs = [prim.GetPath() for prim in stage.TraverseAll() if has_jaw_api(prim)]
+    layer = stage.Flatten(addSourceFileComment=False)
+    # in the layer, not in the stage: what instances share, it holds once and elsewhere
+    flat = Usd.Stage.Open(layer)
+    rigs = [prim.GetPath() for prim in flat.TraverseAll() if has_jaw_api(prim)]
     if not rigs:
         raise RigError("holds no jaw rig.", path=source)
-    layer = stage.Flatten(addSourceFileComment=False)
     layer.customLayerData = {key: value for key, value in layer.customLayerData.items() if key != CHECKSUMS}
     for path in rigs:
         actor = layer.GetPrimAtPath(path)

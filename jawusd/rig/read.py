@@ -19,7 +19,7 @@ from jawusd.rig.arrays import read_arrays, read_value
 from jawusd.rig.asset_paths import file_of
 from jawusd.rig.child_process import remember, try_in_child
 from jawusd.rig.layout import ONNX_ATTRIBUTES, PARAMETERS
-from jawusd.rig.schema import has_jaw_api
+from jawusd.rig.schema import has_jaw_api, rig_prims
 from jawusd.rig.table import DecoderTable
 from jawusd.rig.untrusted import open_checked, raises_format_error
 from jawusd.rig.versions import upgrade_rig
@@ -75,7 +75,7 @@ def find_rig_prim(stage: Usd.Stage, where: object, prim_path: str | None = None)
         if not prim or not has_jaw_api(prim):
             raise FormatError(f"{prim_path} carries no jaw rig.", path=str(where))
         return prim
-    prims = [prim for prim in stage.Traverse() if has_jaw_api(prim)]
+    prims = rig_prims(stage)
     if not prims:
         raise FormatError("holds no jaw rig (no prim with JawRigAPI).", path=str(where))
     if len(prims) > 1:

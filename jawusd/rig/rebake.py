@@ -15,6 +15,7 @@ from jawusd.evaluator import JawRig
 from jawusd.geometry.arrays import Array
 from jawusd.rig import _gf
 from jawusd.rig.animation import CARRIED, author_motion
+from jawusd.rig.baked import BAKED_MM, looked_at, skull_moved_mm
 from jawusd.rig.bones import bones_of
 from jawusd.rig.layers import new_layer, relative_path, write_layer
 from jawusd.rig.layout import MOTION, PARAMETERS, SKELETON, TRANSFORMS
@@ -25,9 +26,8 @@ from jawusd.rig.motion_read import (
     poses_at,
     read_parameters_of_stage,
 )
-from jawusd.rig.read import find_rig_prim, open_stage
-from jawusd.rig.rules import BAKED_MM
-from jawusd.rig.schema import has_jaw_api
+from jawusd.rig.read import find_rig_prim, open_stage, rig_of
+from jawusd.rig.schema import rig_prims
 from jawusd.rig.table import landmark_distance
 from jawusd.rig.untrusted import raises_format_error
 
@@ -72,20 +72,16 @@ def departure(path: str | os.PathLike[str], rig: JawRig, prim_path: str | None =
     """
     stage = open_stage(path)
     actor = _actor(stage, path, rig, prim_path)
-    sampled = read_parameters_of_stage(path, str(actor.GetPath()))
-    if sampled is None:
-        return None
-    known = np.isfinite(sampled[1]).all(axis=1)
-    times, d = sampled[0][known], sampled[1][known]
     mandible = mandible_of(stage, actor, path)
-    # bones have keys where d has: in between each is interpolated in its own way
-    if bones_of(mandible) is None and stage.HasAuthoredTimeCodeRange():
-        shown = frames_of_stage(stage, path)
-        wanted = [np.interp(shown, times, column) for column in d.T]
-        times, d = np.concatenate([times, shown]), np.concatenate([d, np.stack(wanted, axis=1)])
-    T = poses_at(mandible, actor, times, path)
-    away = landmark_distance(rig, T, rig.pose(d))
-    return Departure(int((away > BAKED_MM).sum()), len(away), float(away.max(initial=0.0)))
+    moving, parameters = _moving(mandible), [actor.GetAttribute(name) for name in PARAMETERS]
+    sampled = read_parameters_of_stage(path, str(actor.GetPath()))
+    if not all(parameters) or (sampled is None and _rank(stage, parameters) >= _rank(stage, moving)):
+        return None
+    times, allowed_mm = looked_at(actor, moving, bones_of(mandible) is not None)
+    times = times if len(times) else np.zeros(1)
+    d = np.array([[attribute.Get(time) for attribute in parameters] for time in times.tolist()], dtype=np.float64)
+    away = landmark_distance(rig, poses_at(mandible, actor, times, path), rig.pose(d))
+    return Departure(int((~(away <= allowed_mm)).sum()), len(away), float(away.max()))
 
 
 @raises_format_error(0)
@@ -110,8 +106,7 @@ def motion_of_stage(
         origin = _origin(stage, actor, mandible, away, path)
     sampled = read_parameters_of_stage(path, str(actor.GetPath()))
     if origin == "d":
-        if sampled is None:
-            raise FormatError("has no keys of d.", path=str(path))
+        sampled = _held(stage, actor, path) if sampled is None else sampled
         return StageMotion(*sampled, origin, np.zeros(len(sampled[0])))
     frames = frames_of_stage(stage, path)
     d, residual_mm = rig.encode(poses_at(mandible, actor, frames, path))
@@ -123,14 +118,10 @@ def _origin(stage: Usd.Stage, actor: Usd.Prim, mandible: Usd.Prim, away: Departu
         return "mandible"
     if not away.frames:
         return "d"
-    bones = bones_of(mandible)
-    ops = bones.keyed() if bones else [op.GetAttr() for op in UsdGeom.Xformable(mandible).GetOrderedXformOps()]
-    if not any(key_times(op) for op in ops):
+    moving = _moving(mandible)
+    if not any(key_times(attribute) for attribute in moving):
         return "d"
-    ranks = [
-        min((_rank(stage, attribute) for attribute in attributes), default=np.inf)
-        for attributes in ([actor.GetAttribute(name) for name in PARAMETERS], ops)
-    ]
+    ranks = [_rank(stage, attributes) for attributes in ([actor.GetAttribute(name) for name in PARAMETERS], moving)]
     if ranks[0] == ranks[1]:
         raise RigError(
             f"d and the mandible disagree by up to {away.largest_mm:.2f} mm, and both have keys in one layer.",
@@ -141,20 +132,40 @@ def _origin(stage: Usd.Stage, actor: Usd.Prim, mandible: Usd.Prim, away: Departu
 
 
 def _actor(stage: Usd.Stage, path: object, rig: JawRig, prim_path: str | None) -> Usd.Prim:
-    """Return the prim that carries a rig; of several the only one made from the same model."""
-    if prim_path is None:
-        prims = [prim for prim in stage.Traverse() if has_jaw_api(prim)]
-        alike = [prim for prim in prims if prim.GetAttribute("jaw:modelHash").Get() == rig.model_hash]
-        if len(prims) > 1 and len(alike) == 1:
-            return alike[0]
-    return find_rig_prim(stage, path, prim_path)
+    """Return the prim that carries a rig, of several the only one made from the same model; refuse another person's."""
+    alike = [p for p in rig_prims(stage) if p.GetAttribute("jaw:modelHash").Get() == rig.model_hash]
+    found = alike[0] if prim_path is None and len(alike) == 1 else find_rig_prim(stage, path, prim_path)
+    own, other = (str(meta.get("actor") or "") for meta in (rig.meta, rig_of(found, path).meta))
+    if own and other and own != other:
+        raise FormatError(
+            f'{found.GetPath()} is the rig of "{other}", the rig given is of "{own}": another person\'s d and bound.',
+            path=str(path),
+            hint="Name the rig of that person, or carry the motion over with `jawusd retarget`.",
+        )
+    return found
 
 
-def _rank(stage: Usd.Stage, attribute: Usd.Attribute) -> float:
-    """Return how many layers of a stage are stronger than the strongest opinion of an attribute."""
-    stack = attribute.GetPropertyStack()
+def _held(stage: Usd.Stage, actor: Usd.Prim, path: object) -> tuple[Array, Array, float]:
+    """Return a d without keys as a motion that stays there: first and last frame, d twice [mm], frames per second."""
+    frames = frames_of_stage(stage, path)[[0, -1]]
+    d = np.array([actor.GetAttribute(name).Get() for name in PARAMETERS], dtype=np.float64)
+    if not np.isfinite(d).all():
+        raise FormatError("its d is not finite.", path=str(path))
+    times = np.unique(frames).astype(np.float64)
+    return times, np.tile(d, (len(times), 1)), float(stage.GetTimeCodesPerSecond())
+
+
+def _moving(mandible: Usd.Prim) -> list[Usd.Attribute]:
+    """Return the attributes that move a mandible: of its joints or its own ops."""
+    bones = bones_of(mandible)
+    return bones.keyed() if bones else [op.GetAttr() for op in UsdGeom.Xformable(mandible).GetOrderedXformOps()]
+
+
+def _rank(stage: Usd.Stage, attributes: list[Usd.Attribute]) -> float:
+    """Return how many layers of a stage are stronger than the strongest opinion of several attributes."""
     layers = stage.GetLayerStack(includeSessionLayers=False)
-    return float(layers.index(stack[0].layer)) if stack and stack[0].layer in layers else np.inf
+    strongest = [stack[0].layer for stack in (attribute.GetPropertyStack() for attribute in attributes) if stack]
+    return min((float(layers.index(layer)) for layer in strongest if layer in layers), default=np.inf)
 
 
 def write_over(
@@ -224,6 +235,12 @@ def write_rebaked(
     stage = open_stage(shot)
     actor = _actor(stage, shot, rig, prim_path)
     mandible = mandible_of(stage, actor, shot)
+    if not (away_mm := skull_moved_mm(actor, rig)) <= BAKED_MM:
+        raise RigError(
+            f"{actor.GetPath()} has its skull moved by {away_mm:.2f} mm: a mandible baked in it would be off as much.",
+            path=str(shot),
+            hint="Move the actor instead of its skull, or give it the motion: jawusd encode, then jawusd animate.",
+        )
     layer = new_layer(float(stage.GetTimeCodesPerSecond()))
     layer.pseudoRoot.SetInfo(UsdGeom.Tokens.metersPerUnit, UsdGeom.GetStageMetersPerUnit(stage))
     layer.pseudoRoot.SetInfo(UsdGeom.Tokens.upAxis, UsdGeom.GetStageUpAxis(stage))

@@ -14,9 +14,11 @@ from jawusd.evaluator import JawRig
 from jawusd.evaluator.verdicts import OUTSIDE, place
 from jawusd.geometry.arrays import Array
 from jawusd.rig import _gf
+from jawusd.rig.animation import MADE_FOR
+from jawusd.rig.baked import BAKED_MM, looked_at, skull_moved_mm, time_codes
 from jawusd.rig.bones import bones_of
 from jawusd.rig.layout import ONNX_ATTRIBUTES, PARAMETERS, SIDECAR_HASH
-from jawusd.rig.motion_read import key_times
+from jawusd.rig.motion_read import times_between
 from jawusd.rig.read import read_table, rig_of
 from jawusd.rig.sampling import sample_valid
 from jawusd.rig.table import landmark_distance
@@ -24,8 +26,6 @@ from jawusd.rig.untrusted import FAULTS, fault_message
 
 _TABLE_SLACK_MM = 0.01  # the table states its error over more parameters than are tried here
 _ONNX_MM = 0.01
-#: Largest distance [mm] of a baked pose from that of d.
-BAKED_MM = 0.01
 _OPS = [("xformOp:translate", "double3"), ("xformOp:orient", "quatd")]
 _PROBES = 500
 _ONNX_PROBES = 100
@@ -52,11 +52,18 @@ Rule = Callable[[Usd.Prim], Iterator[Finding]]
 
 
 def check_model(prim: Usd.Prim) -> Iterator[Finding]:
-    """Check that version, units and model arrays can be read: complete, of the right shapes, finite."""
+    """Check that version, units and model arrays can be read, and are those of the motion on top of them."""
     try:
-        rig_of(prim, _where(prim))
+        rig = rig_of(prim, _where(prim))
     except JawusdError as error:
         yield _finding("error", "Model", prim, error.message)
+        return
+    made_for = prim.GetAttribute(PARAMETERS[0]).GetCustomDataByKey(MADE_FOR)
+    if made_for is not None and made_for != rig.model_hash:
+        message = f"the model is not the one that its motion was made with ({PARAMETERS[0]} names another). "
+        message += "Either files of several actors were mixed: `jawusd publish` them first. "
+        message += "Or the rig was built anew since: `jawusd rebake` the motion."
+        yield _finding("error", "Model", prim, message)
 
 
 def check_table(prim: Usd.Prim) -> Iterator[Finding]:
@@ -109,7 +116,7 @@ def check_bounds(prim: Usd.Prim) -> Iterator[Finding]:
     rig = _rig(prim)
     if rig is None:
         return
-    times = _times(prim, [prim.GetAttribute(name) for name in PARAMETERS])
+    times = time_codes(times_between(prim.GetAttribute(name) for name in PARAMETERS)[0])
     d = _parameters(prim, times)
     margin = rig.margin(d)
     worst = int(np.argmin(np.where(np.isfinite(margin), margin, -np.inf)))
@@ -145,29 +152,19 @@ def check_mandible(prim: Usd.Prim) -> Iterator[Finding]:
     if rig is None:
         return
     moving = bones.keyed() if bones else [op.GetAttr() for op in ops]
-    # at the keys of d, too: where only d is keyed, the jaw stays still
-    times = _times(prim, [*moving, *(prim.GetAttribute(name) for name in PARAMETERS)])
+    at, allowed_mm = looked_at(prim, moving, bones is not None)
+    times = time_codes(at)
     try:
         baked = bones.poses(prim, times, _where(prim)) if bones else _transforms(moving, times)
-        away_mm = _skull_moved(prim, rig, times)
+        away_mm = skull_moved_mm(prim, rig)
     except FormatError as error:
         yield _finding("error", "Mandible", mandible.GetPrim(), error.message)
         return
     still = not any(attribute.GetNumTimeSamples() for attribute in moving)
-    yield from _check_baked(rig, mandible.GetPrim(), times, baked, _parameters(prim, times), still)
+    yield from _check_baked(rig, mandible.GetPrim(), times, baked, _parameters(prim, times), allowed_mm, still)
     if not away_mm <= BAKED_MM:
-        yield _finding("error", "Mandible", prim, f"bones move the skull by {away_mm:.3f} mm ({BAKED_MM} allowed).")
-
-
-def _skull_moved(prim: Usd.Prim, rig: JawRig, times: list[Usd.TimeCode]) -> float:
-    """Return how far bones move the skull in the actor [mm]."""
-    targets = prim.GetRelationship("jaw:skull").GetTargets() if prim.HasRelationship("jaw:skull") else []
-    skull = prim.GetStage().GetPrimAtPath(targets[0]) if targets else None
-    bones = bones_of(skull) if skull else None
-    if bones is None:
-        return 0.0
-    poses = bones.poses(prim, times, _where(prim))
-    return float(landmark_distance(rig, poses, np.broadcast_to(np.eye(4), poses.shape)).max())
+        message = f"the skull is moved in the actor by {away_mm:.3f} mm ({BAKED_MM} allowed): move the actor instead."
+        yield _finding("error", "Mandible", prim, message)
 
 
 def _transforms(ops: list[Usd.Attribute], times: list[Usd.TimeCode]) -> Array:
@@ -176,14 +173,22 @@ def _transforms(ops: list[Usd.Attribute], times: list[Usd.TimeCode]) -> Array:
 
 
 def _check_baked(
-    rig: JawRig, mandible: Usd.Prim, times: list[Usd.TimeCode], baked: Array, d: Array, still: bool
+    rig: JawRig,
+    mandible: Usd.Prim,
+    times: list[Usd.TimeCode],
+    baked: Array,
+    d: Array,
+    allowed_mm: Array,
+    still: bool,
 ) -> Iterator[Finding]:
     error_mm = landmark_distance(rig, baked, rig.pose(d))
-    worst = int(np.argmax(np.where(np.isfinite(error_mm), error_mm, np.inf)))
-    if not error_mm[worst] <= BAKED_MM:
-        message = f"the baked pose at {times[worst]} is {error_mm[worst]:.3f} mm from that of d ({BAKED_MM} allowed)."
-        if still:
-            message += " Only d is keyed, the mandible is not: bake it with `jawusd rebake`."
+    over_mm = error_mm - allowed_mm
+    worst = int(np.argmax(np.where(np.isfinite(over_mm), over_mm, np.inf)))
+    if not over_mm[worst] <= 0:
+        message = f"the baked pose at {times[worst]} is {error_mm[worst]:.3f} mm from that of d "
+        message += f"({allowed_mm[worst]:.2f} allowed)."
+        message += " Only d is keyed, the mandible is not:" if still else " Bring both together:"
+        message += " bake it with `jawusd rebake`." if still else " `jawusd rebake`."
         yield _finding("error", "Mandible", mandible, message)
 
 
@@ -226,12 +231,6 @@ def _rig(prim: Usd.Prim) -> JawRig | None:
         return rig_of(prim, _where(prim))
     except JawusdError:
         return None
-
-
-def _times(prim: Usd.Prim, attributes: list[Usd.Attribute]) -> list[Usd.TimeCode]:
-    """Return every time at which one of the attributes has a sample; without any, the default time."""
-    samples = sorted({time for attribute in attributes for time in key_times(attribute)})
-    return [Usd.TimeCode(time) for time in samples] or [Usd.TimeCode.Default()]
 
 
 def _at(attribute: Usd.Attribute, time: Usd.TimeCode) -> Gf.Vec3d | Gf.Quatd:

@@ -40,3 +40,8 @@ def has_jaw_api(prim: Usd.Prim) -> bool:
     """Return whether a prim carries JawRigAPI, whether or not this process knows the schema."""
     applied = prim.GetMetadata("apiSchemas")
     return applied is not None and SCHEMA_NAME in applied.GetAddedOrExplicitItems()
+
+
+def rig_prims(stage: Usd.Stage) -> list[Usd.Prim]:
+    """Return the prims of a stage that carry JawRigAPI, those inside instances too."""
+    return [prim for prim in stage.Traverse(Usd.TraverseInstanceProxies()) if has_jaw_api(prim)]

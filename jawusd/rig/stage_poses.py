@@ -23,8 +23,8 @@ from jawusd.geometry.se3 import se3_inverse, transform_points
 from jawusd.rig.geo import read_geometry
 from jawusd.rig.layout import ACTOR
 from jawusd.rig.motion_read import frames_of_stage
-from jawusd.rig.read import open_stage
-from jawusd.rig.schema import has_jaw_api
+from jawusd.rig.read import find_rig_prim, open_stage
+from jawusd.rig.schema import rig_prims
 from jawusd.rig.untrusted import raises_format_error
 
 _POINTS = 2000  # of a mesh, evenly spread over its vertices, are fitted
@@ -52,16 +52,23 @@ class StagePoses(NamedTuple):
     meshes: tuple[str, str]
 
 
-def carries_rig(path: str | os.PathLike[str]) -> bool:
+def carries_rig(path: str | os.PathLike[str], prim_path: str | None = None) -> bool:
     """Tell whether a stage holds a rig whose mandible moves by transforms or its bones: nothing has to be fitted.
+
+    Args:
+        path: Any stage.
+        prim_path: Which rig, where it has several.
 
     Raises:
         RigError: Not a stage.
+        FormatError: The named prim carries no rig, though others do.
     """
     stage = open_stage(path)
-    meshes = [UsdGeom.Mesh(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh)]
-    deforming = any(mesh.GetPointsAttr().ValueMightBeTimeVarying() for mesh in meshes)
-    return not deforming and any(has_jaw_api(prim) for prim in stage.Traverse())
+    rigs = rig_prims(stage)
+    if rigs and prim_path is not None:
+        rigs = [find_rig_prim(stage, path, prim_path)]
+    meshes = [UsdGeom.Mesh(prim) for rig in rigs for prim in _meshes(rig)]
+    return bool(rigs) and not any(mesh.GetPointsAttr().ValueMightBeTimeVarying() for mesh in meshes)
 
 
 @raises_format_error(0)
@@ -144,18 +151,23 @@ def _find(stage: Usd.Stage, rest: dict[str, Mesh], names: tuple[str, ...], below
     """Return the mesh of the stage that has the vertices of one of those named; teeth before bone."""
     if below is not None and not (Sdf.Path.IsValidPathString(below) and stage.GetPrimAtPath(below)):
         raise FormatError(f"has no prim {below}.", path=str(path))
-    start = stage.GetPrimAtPath(below) if below is not None else stage.GetPseudoRoot()
-    meshes = [p for p in Usd.PrimRange(start, Usd.TraverseInstanceProxies()) if p.IsA(UsdGeom.Mesh)]
+    meshes = _meshes(stage.GetPrimAtPath(below) if below is not None else stage.GetPseudoRoot())
     found = {str(prim.GetPath()): _used_points(prim) for prim in meshes}
-    wanted = {name: rest[name] for name in names if name in rest}
+    wanted, doubtful = {name: rest[name] for name in names if name in rest}, []
     for name, mesh in wanted.items():
         alike = [prim for prim in meshes if len(found[str(prim.GetPath())].all) == len(mesh.vertices)]
         alike = alike or [prim for prim in meshes if found[str(prim.GetPath())].different == _different(mesh)]
         # both rows may have as many vertices: then the name has to tell
-        named = [prim for prim in alike if _plain(name) in _plain(str(prim.GetPath()))]
-        if named or len(alike) == 1:
-            prim = (named or alike)[0]
-            return _Place(prim, mesh.vertices, *_correspondence(mesh, found[str(prim.GetPath())]))
+        named = [prim for prim in alike if _plain(name) in _plain(str(prim.GetPath()))] or alike
+        if len(named) == 1:
+            return _Place(named[0], mesh.vertices, *_correspondence(mesh, found[str(named[0].GetPath())]))
+        doubtful = doubtful or [str(prim.GetPath()) for prim in named]
+    if doubtful:
+        raise FormatError(
+            f"has several meshes with the vertices of the rig's {next(iter(wanted))}: {', '.join(doubtful)}.",
+            path=str(path),
+            hint="Say whose jaw is meant: name prims of one actor with --skull and --mandible.",
+        )
     sizes = " or ".join(f"{len(mesh.vertices)} ({name})" for name, mesh in wanted.items())
     where = f" below {below}" if below is not None else ""
     raise FormatError(
@@ -171,6 +183,10 @@ class _Points(NamedTuple):
     all: Array
     used: NDArray[np.int64]
     different: int
+
+
+def _meshes(below: Usd.Prim) -> list[Usd.Prim]:
+    return [prim for prim in Usd.PrimRange(below, Usd.TraverseInstanceProxies()) if prim.IsA(UsdGeom.Mesh)]
 
 
 def _used_points(prim: Usd.Prim) -> _Points:

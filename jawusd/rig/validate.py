@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 
-from pxr import Usd
+from pxr import Sdf, Usd
 
 from jawusd.rig.read import open_stage
 from jawusd.rig.rules import RULES, Finding, Rule
-from jawusd.rig.schema import has_jaw_api
+from jawusd.rig.schema import rig_prims
 
 try:
     from pxr import UsdValidation
@@ -56,8 +56,11 @@ def validate_stage(path: str | os.PathLike[str]) -> list[Finding]:
 
 
 def _rig_prims(stage: Usd.Stage) -> list[Usd.Prim]:
-    # by metadata, not by schema type: the schema may be unknown to this process
-    return [prim for prim in stage.Traverse() if has_jaw_api(prim)]
+    """Return the prims that carry a rig; of instances that share one, the first."""
+    first: dict[Sdf.Path, Usd.Prim] = {}
+    for prim in rig_prims(stage):
+        first.setdefault(prim.GetPrimInPrototype().GetPath() if prim.IsInstanceProxy() else prim.GetPath(), prim)
+    return list(first.values())
 
 
 def _stage_validator(rule: Rule) -> Callable[[Usd.Stage, object], list[UsdValidation.ValidationError]]:

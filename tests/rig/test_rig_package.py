@@ -9,6 +9,7 @@ from pxr import Sdf, Usd, UsdGeom
 
 from jawusd.errors import RigError
 from jawusd.rig import load_rig
+from jawusd.rig.motion_read import read_poses_of_stage
 from jawusd.rig.package import write_package
 
 
@@ -81,3 +82,28 @@ def test_no_transform_of_a_shot_is_whole(anchored_folder, tmp_path):
         for time in (0.0, 1.0):
             assert tuple(attribute.Get(time)) != value
             np.testing.assert_allclose(attribute.Get(time), value, atol=1e-6)
+
+
+def test_actors_inside_instances_are_packed(anchored_folder, tmp_path):
+    """What instances share lies elsewhere in a flat layer: its ONNX files stay outside all the same."""
+    for name, source, below in (("unit", "anim_capture.usdc", "Person"), ("shot", "unit.usda", "Unit")):
+        stage = Usd.Stage.CreateNew(str(anchored_folder / f"{name}.usda"))
+        UsdGeom.SetStageUpAxis(stage, "Y")
+        UsdGeom.SetStageMetersPerUnit(stage, 0.001)
+        stage.SetTimeCodesPerSecond(24)
+        stage.SetStartTimeCode(30)
+        stage.SetEndTimeCode(69)
+        stage.SetDefaultPrim(stage.DefinePrim("/Shot", "Xform"))
+        for number in range(1 if name == "unit" else 2):
+            prim = stage.DefinePrim(f"/Shot/{below}{number}", "Xform")
+            prim.GetReferences().AddReference(f"./{source}")
+            prim.SetInstanceable(name == "shot")
+        stage.Save()
+    package = write_package(tmp_path / "shot.usdz", anchored_folder / "shot.usda")
+    assert zipfile.ZipFile(package).namelist() == ["shot.usdc"]
+    assert_valid_usd(package)
+    frames, d = example_motion()
+    for number in range(2):
+        found, T = read_poses_of_stage(package, f"/Shot/Unit{number}/Person0")
+        np.testing.assert_array_equal(found, frames)
+        np.testing.assert_allclose(T, example_rig().pose(d), atol=1e-6)

@@ -4,13 +4,16 @@ import json
 
 import numpy as np
 import pytest
-from example_rig import assert_valid_usd, example_motion, example_rig
+from example_rig import assert_valid_usd, example_meshes, example_motion, example_rig
 from pxr import Gf, Sdf, Ts, Usd, UsdGeom
+from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from jawusd.cli.main import app
 from jawusd.errors import FormatError, RigError
+from jawusd.evaluator import JawRig
 from jawusd.rig import write_animation
+from jawusd.rig.bake import bake_rig
 from jawusd.rig.motion_read import read_parameters_of_stage, read_poses_of_stage
 from jawusd.rig.rebake import departure, motion_of_stage
 
@@ -56,6 +59,11 @@ def key_splines(prim):
             knot.SetNextInterpolation(Ts.InterpLinear)
             spline.SetKnot(knot)
         prim.GetAttribute(f"jaw:d{i + 1}").SetSpline(spline)
+
+
+def hold_d(prim):
+    for i in range(3):
+        prim.GetAttribute(f"jaw:d{i + 1}").Set(KEYS[13][i])
 
 
 def keyed(frames):
@@ -155,3 +163,126 @@ def test_an_instance_is_made_editable(folder, kind):
     run("rebake", folder / "actor.usda", path, "-o", folder / "baked.usdc")
     frames, T = read_poses_of_stage(folder / "baked.usdc")
     np.testing.assert_allclose(T, example_rig(kind).pose(keyed(frames)), atol=1e-6)
+
+
+@pytest.mark.parametrize("source", ["actor.usda", "anim_capture.usdc"])
+def test_a_d_that_is_held_is_found_and_baked(anchored_folder, source):
+    """One value in the shot, no keys: over a still jaw, and over a captured motion, it is what the animator wants."""
+    folder = anchored_folder
+    path = shot(folder, hold_d, source=source)
+    run("validate", path, code=1)
+    judged = json.loads(run("validate", folder / "actor.usda", path, "--json", code=1))
+    assert judged["unbaked"]["largest_mm"] > 10
+    found = json.loads(run("rebake", folder / "actor.usda", path, "-o", folder / "baked.usdc", "--json"))
+    assert found["from"] == "d"
+    run("validate", folder / "baked.usdc")
+    run("validate", folder / "actor.usda", folder / "baked.usdc")
+    _, T = read_poses_of_stage(folder / "baked.usdc")
+    np.testing.assert_allclose(T, np.tile(example_rig().pose(KEYS[13]), (25, 1, 1)), atol=1e-6)
+
+
+def test_a_mandible_that_departs_from_d_between_keys_is_found(anchored_folder):
+    """Equal at both keys, but a straight way between them, which no jaw goes."""
+    folder = anchored_folder
+    rig = example_rig()
+
+    def key_both(prim):
+        mandible = prim.GetStage().GetPrimAtPath(f"{prim.GetPath()}/geo/Mandible")
+        for time in (1, 13):
+            for i in range(3):
+                prim.GetAttribute(f"jaw:d{i + 1}").Set(KEYS[time][i], time)
+            T = rig.pose(KEYS[time])
+            x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
+            mandible.GetAttribute("xformOp:translate").Set(Gf.Vec3d(*T[:3, 3]), time)
+            mandible.GetAttribute("xformOp:orient").Set(Gf.Quatd(w, x, y, z), time)
+
+    path = shot(folder, key_both)
+    assert "(0.03 allowed)" in run("validate", path, code=1)
+    assert departure(path, rig).largest_mm > 0.3
+    run("validate", folder / "actor.usda", path, code=1)
+
+
+@pytest.mark.parametrize(("fps", "offset"), [(24, Sdf.LayerOffset(-11.3, 1.37)), (60, Sdf.LayerOffset())])
+def test_a_take_at_another_pace_is_as_valid_as_before(anchored_folder, fps, offset):
+    folder = anchored_folder
+
+    def retime(prim):
+        prim.GetStage().SetTimeCodesPerSecond(fps)
+        prim.GetStage().SetEndTimeCode(110)
+        prim.GetReferences().SetReferences([Sdf.Reference("./anim_capture.usdc", layerOffset=offset)])
+
+    path = shot(folder, retime)
+    run("validate", path)
+    run("validate", folder / "actor.usda", path)
+    run("rebake", folder / "actor.usda", path, "-o", folder / "baked.usdc")
+    run("validate", folder / "baked.usdc")
+
+
+def test_a_moved_skull_is_found_and_taken_out_of_poses(anchored_folder):
+    folder = anchored_folder
+
+    def lower(prim):
+        skull = prim.GetStage().GetPrimAtPath(f"{prim.GetPath()}/geo/Skull")
+        UsdGeom.Xformable(skull).AddTranslateOp().Set(Gf.Vec3d(0, -2, 0))
+
+    path = shot(folder, lower, source="anim_capture.usdc")
+    assert "the skull is moved in the actor by 2.000 mm" in run("validate", path, code=1)
+    frames, T = read_poses_of_stage(path)
+    taken, d = example_motion()
+    expected = example_rig().pose(d[np.clip(frames - taken[0], 0, None)])
+    expected[:, 1, 3] += 2
+    np.testing.assert_allclose(T, expected, atol=1e-6)
+    done = CliRunner().invoke(app, ["rebake", str(folder / "actor.usda"), str(path), "--from", "d"])
+    assert "skull moved by 2.00 mm" in str(done.exception)
+
+
+def test_the_rig_of_another_person_is_refused(anchored_folder):
+    folder = anchored_folder
+    rig = example_rig()
+    path = shot(folder, key_d)
+    other = JawRig(rig.arrays, {**rig.meta, "actor": "Ben"})
+    with pytest.raises(FormatError, match='is the rig of "example", the rig given is of "Ben"'):
+        motion_of_stage(path, other)
+    with pytest.raises(FormatError, match="another person's d"):
+        departure(path, other)
+    bake_rig(folder / "ben", other, example_meshes(), name="Ben", fps=24, table_size=17)
+    for command in (["validate"], ["encode"], ["animate"], ["rebake"]):
+        done = CliRunner().invoke(app, [*command, str(folder / "ben" / "actor.usda"), str(path)])
+        assert done.exit_code > 0 and "retarget" in done.exception.hint
+
+
+def test_a_motion_made_for_another_model_is_found(anchored_folder):
+    """As where a packager has put one actor's files in the place of another's: even where the jaw keeps still."""
+    folder = anchored_folder
+    rig = example_rig()
+    other = JawRig({**rig.arrays, "landmarks": rig.landmarks + 0.01}, rig.meta)
+    write_animation(folder / "anim.usdc", folder / "actor.usda", [1, 2], np.zeros((2, 3)), 24, rig=other)
+    assert "made with (jaw:d1 names another)" in run("validate", folder / "anim.usdc", code=1)
+    run("rebake", folder / "actor.usda", folder / "anim.usdc", "-o", folder / "baked.usdc")
+    run("validate", folder / "baked.usdc")
+
+
+def test_an_actor_inside_an_instance_is_found(anchored_folder):
+    """A unit of scenery that holds the actor, itself an instance, three times: judged once."""
+    folder = anchored_folder
+    unit = shot(folder, key_d, name="unit.usda")
+
+    def instanced(prim):
+        prim.SetInstanceable(True)
+
+    path = shot(folder, instanced, actors=("Unit1", "Unit2", "Unit3"), source="unit.usda")
+    assert "Only d is keyed" in run("validate", unit, code=1)
+    assert run("validate", path, code=1).count("Only d is keyed") == 1
+    run("info", path, "--prim", "/Shot/Unit2/Person")
+    run(
+        "rebake",
+        folder / "actor.usda",
+        path,
+        "-o",
+        folder / "baked.usdc",
+        "--prim",
+        "/Shot/Unit2/Person",
+    )
+    for name, moves in (("Unit1", False), ("Unit2", True)):
+        _, T = read_poses_of_stage(folder / "baked.usdc", f"/Shot/{name}/Person")
+        assert (np.ptp(T[:, :3, 3], axis=0).max() > 1) == moves

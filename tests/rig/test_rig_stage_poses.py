@@ -153,3 +153,52 @@ def test_a_stage_without_range_is_refused(folder, kind):
     layer.Save()
     with pytest.raises(FormatError, match="no start and end"):
         fit_poses_of_stage(path, folder / "actor.usda")
+
+
+def two_actors(path, rig):
+    """Write two copies of an actor side by side, the second moving half as far."""
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageUpAxis(stage, "Z")
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    stage.SetTimeCodesPerSecond(FPS)
+    stage.SetStartTimeCode(float(FRAMES[0]))
+    stage.SetEndTimeCode(float(FRAMES[-1]))
+    for name, share in (("Anna", 1.0), ("Ben", 0.5)):
+        one = exported(path.with_name(f"{name}.usda"), rig.pose(share * D))
+        stage.DefinePrim(f"/Shot/{name}", "Xform").GetReferences().AddReference(f"./{one.name}", "/World")
+    stage.Save()
+    return path
+
+
+def test_of_two_copies_of_an_actor_one_has_to_be_named(anchored_folder):
+    rig, actor = example_rig(), anchored_folder / "actor.usda"
+    path = two_actors(anchored_folder / "shot.usda", rig)
+    with pytest.raises(FormatError, match="several meshes .*: /Shot/Anna/UpperTeethMesh, /Shot/Ben/UpperTeethMesh"):
+        fit_poses_of_stage(path, actor)
+    for name, share in (("Anna", 1.0), ("Ben", 0.5)):
+        out = anchored_folder / f"{name}.csv"
+        run("encode", actor, path, "-o", out, "--prim", f"/Shot/{name}")
+        np.testing.assert_allclose(np.loadtxt(out, delimiter=",", skiprows=1)[:, 1:4], share * D, atol=1e-3)
+        run("rebake", actor, path, "-o", anchored_folder / f"{name}.usdc", "--prim", f"/Shot/{name}")
+        _, d, _ = read_parameters_of_stage(anchored_folder / f"{name}.usdc")
+        np.testing.assert_allclose(d, share * D, atol=1e-3)
+
+
+def test_a_point_cache_of_something_else_changes_no_rig(anchored_folder):
+    """As a cached face: of two actors of one person, each named, the transforms count."""
+    stage = Usd.Stage.CreateNew(str(anchored_folder / "shot.usda"))
+    frames, d = example_motion()
+    stage.SetStartTimeCode(float(frames[0]))
+    stage.SetEndTimeCode(float(frames[-1]))
+    stage.SetTimeCodesPerSecond(FPS)
+    for name, source in (("Anna", "anim_capture.usdc"), ("Ben", "actor.usda")):
+        stage.DefinePrim(f"/Shot/{name}", "Xform").GetReferences().AddReference(f"./{source}")
+    points = UsdGeom.Mesh.Define(stage, "/Shot/Face").CreatePointsAttr()
+    for frame in frames.tolist():
+        points.Set(Vt.Vec3fArray([(0, 0, frame), (1, 0, 0), (0, 1, 0)]), frame)
+    stage.Save()
+    actor, path = anchored_folder / "actor.usda", anchored_folder / "shot.usda"
+    for name, expected in (("Anna", d), ("Ben", 0 * d)):
+        out = anchored_folder / f"{name}.csv"
+        run("encode", actor, path, "-o", out, "--prim", f"/Shot/{name}")
+        np.testing.assert_allclose(np.loadtxt(out, delimiter=",", skiprows=1)[:, 1:4], expected, atol=1e-5)
