@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from jawusd.formats.mesh import GUM, TOOTH, Mesh, crown_face_mask
 from jawusd.geometry.arrays import Array
+from jawusd.imaging.mesh_cleaning import manifold
 
 
 def decimated(vertices: Array, faces: NDArray[np.int32], count: int) -> tuple[Array, NDArray[np.int32]]:
@@ -43,6 +44,11 @@ def proxy_of(mesh: Mesh, count: int) -> Mesh:
     (crowns, first, tooth), (gums, second, gum) = parts
     faces = np.concatenate([first, second + np.int32(len(crowns))])
     return Mesh(np.concatenate([crowns, gums]), faces, labels=np.concatenate([tooth, gum]))
+
+
+def bone_proxy_of(mesh: Mesh, count: int) -> Mesh:
+    """Return a bone of about `count` faces as a manifold: where it is porous, collapsed edges pinch it."""
+    return manifold(proxy_of(mesh, count))
 
 
 def _border_edges(faces: NDArray[np.int32]) -> int:

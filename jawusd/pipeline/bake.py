@@ -56,7 +56,7 @@ def bake_subject(
         RigError, OutputError: the rig cannot be written.
     """
     from jawusd.fitting.speeds import with_speeds
-    from jawusd.imaging.decimation import proxy_of
+    from jawusd.imaging.decimation import bone_proxy_of, proxy_of
     from jawusd.imaging.mesh_cleaning import manifold
     from jawusd.rig.bake import bake_rig
 
@@ -78,7 +78,11 @@ def bake_subject(
         frames=model.frames if moving else None,
         d=model.d if moving else None,
         table_size=table_size,
-        proxies={key: proxy_of(mesh, _PROXY_FACES) for key, mesh in meshes.items() if len(mesh.faces) > _PROXY_FACES},
+        proxies={
+            key: (bone_proxy_of if key in BONES else proxy_of)(mesh, _PROXY_FACES)
+            for key, mesh in meshes.items()
+            if len(mesh.faces) > _PROXY_FACES
+        },
     )
     progress("bake", 1, 1)
     return files

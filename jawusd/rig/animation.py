@@ -21,7 +21,7 @@ from jawusd.geometry.quaternion import wxyz_from_matrix
 from jawusd.geometry.se3 import make_transform
 from jawusd.geometry.so3 import so3_exp
 from jawusd.rig import _gf
-from jawusd.rig.layers import new_layer, relative_path, stage_of, without_warning, write_layer
+from jawusd.rig.layers import new_layer, relative_path, stage_of, write_layer
 from jawusd.rig.layout import ACTOR, MANDIBLE, PARAMETERS
 from jawusd.rig.read import load_rig
 from jawusd.rig.skel import offer_skeleton
@@ -243,8 +243,7 @@ def write_splines(
     # A stage still open on the nameless layer would look for the animation beside it, and complain.
     del stage, actor
     layer.subLayerPaths.append(relative_path(Path(animation), out))
-    with without_warning("inner looping is deprecated"):  # what OpenUSD 26.11 says of every spline that it writes
-        return write_layer(layer, out)
+    return write_layer(layer, out)
 
 
 def _spline(frames: Array, values: Array, slopes: Array, curved: Mask) -> Ts.Spline:

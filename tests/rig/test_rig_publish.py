@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from jawusd.cli.main import app
 from jawusd.errors import RigError
-from jawusd.rig import load_rig
+from jawusd.rig import load_rig, write_splines
 from jawusd.rig.bake import bake_rig
 from jawusd.rig.motion_read import read_poses_of_stage
 from jawusd.rig.publish import publish_rig
@@ -67,3 +67,14 @@ def test_what_cannot_be_published(published, anchored_folder, tmp_path):
         publish_rig(anchored_folder, anchored_folder, "hero")
     with pytest.raises(RigError, match="no such file"):
         publish_rig(published / "hero", tmp_path / "out")
+
+
+def test_splines_are_published_without_a_warning_of_openusd(anchored_folder, tmp_path, capfd):
+    keys = np.array([[0.0, 0, 0], [9, 1, 0], [3, 0, 0]])
+    curved = np.ones(2, dtype=bool)
+    arguments = (anchored_folder / "splines.usda", anchored_folder / "anim_capture.usdc", [30, 40, 50], keys, FPS)
+    write_splines(*arguments, 0 * keys, curved)
+    publish_rig(anchored_folder, tmp_path / "lib", "hero")
+    assert capfd.readouterr().err == ""
+    stage = Usd.Stage.Open(str(tmp_path / "lib" / "hero_splines.usda"))
+    assert stage.GetPrimAtPath("/Actor").GetAttribute("jaw:d1").GetSpline().Eval(40) == 9
