@@ -22,7 +22,7 @@ from jawusd.geometry.se3 import make_transform
 from jawusd.geometry.so3 import so3_exp
 from jawusd.rig import _gf
 from jawusd.rig.layers import new_layer, relative_path, stage_of, write_layer
-from jawusd.rig.layout import ACTOR, MANDIBLE, PARAMETERS
+from jawusd.rig.layout import ACTOR, MADE_FOR, MANDIBLE, PARAMETERS
 from jawusd.rig.read import load_rig
 from jawusd.rig.skel import offer_skeleton
 from jawusd.rig.table import landmark_distance
@@ -34,8 +34,6 @@ _MAX_HALVINGS = 5
 _USD_LERP_BELOW = 1e-5
 # Every whole frame is baked: an hour at 60 per second fits.
 _MOST_FRAMES, _FARTHEST_FRAME = 220_000, 1e9
-#: Key, in the custom data of sampled parameters, of the hash of the model that they are meant for.
-MADE_FOR = "modelHash"
 #: Key of the lost frames in an animation layer's `customLayerData`.
 LOST = "lostFrames"
 #: The same of frames that were not seen.

@@ -15,4 +15,5 @@ MOTION, TRANSFORMS, SKELETON = "motion", "transforms", "skeleton"  # the one of 
 
 PARAMETERS = ("jaw:d1", "jaw:d2", "jaw:d3")
 ONNX_ATTRIBUTES = ("jaw:onnx", "jaw:onnx:encode")
+MADE_FOR = "modelHash"  # key of the custom data of sampled parameters: the model that they are meant for
 SIDECAR_HASH = "sha256"  # key of the custom data of these attributes

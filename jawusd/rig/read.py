@@ -18,7 +18,7 @@ from jawusd.inputs import check_path
 from jawusd.rig.arrays import read_arrays, read_value
 from jawusd.rig.asset_paths import file_of
 from jawusd.rig.child_process import remember, try_in_child
-from jawusd.rig.layout import ONNX_ATTRIBUTES, PARAMETERS
+from jawusd.rig.layout import MADE_FOR, ONNX_ATTRIBUTES, PARAMETERS
 from jawusd.rig.schema import has_jaw_api, rig_prims
 from jawusd.rig.table import DecoderTable
 from jawusd.rig.untrusted import open_checked, raises_format_error
@@ -89,7 +89,8 @@ def rig_of(prim: Usd.Prim, where: object) -> JawRig:
     """Build the evaluator from a rig prim.
 
     Raises:
-        FormatError: A header that is not JSON or names another kind of model; else as `load_rig`.
+        FormatError: A header that is not JSON or names another kind of model, or a package whose rig has not its own
+            model; else as `load_rig`.
     """
     upgrade_rig(prim, where)
     check_units(prim, where)
@@ -104,9 +105,25 @@ def rig_of(prim: Usd.Prim, where: object) -> JawRig:
     if meta.get("kind") != kind:
         raise FormatError(f"jaw:model:kind is {kind!r}, jaw:meta says {meta.get('kind')!r}.", path=str(where))
     try:
-        return JawRig(arrays, meta)
+        rig = JawRig(arrays, meta)
     except EvaluatorError as error:
         raise FormatError(error.message, path=str(where)) from error
+    # thresholds of a folder may have been edited; nobody edits packages, but packagers mix up equal names in them
+    packed = prim.GetStage().GetRootLayer().identifier.endswith(".usdz")
+    if packed and not set(named_models(prim)) <= {None, rig.model_hash}:
+        raise FormatError(
+            f"{prim.GetPath()} has not its own model (jaw:modelHash): files of several actors were mixed in packing.",
+            path=str(where),
+            hint="Pack shots with `jawusd publish SHOT -o shot.usdz`, or publish the actors under names of their own.",
+        )
+    return rig
+
+
+def named_models(prim: Usd.Prim) -> tuple[object, object]:
+    """Return the hashes of the models that a rig prim names: its own, and the one its motion is for; None for none."""
+    own = prim.GetAttribute("jaw:modelHash").Get() if prim.HasAttribute("jaw:modelHash") else None
+    keyed = prim.HasAttribute(PARAMETERS[0])
+    return own, prim.GetAttribute(PARAMETERS[0]).GetCustomDataByKey(MADE_FOR) if keyed else None
 
 
 def check_units(prim: Usd.Prim, where: object) -> None:

@@ -14,12 +14,11 @@ from jawusd.evaluator import JawRig
 from jawusd.evaluator.verdicts import OUTSIDE, place
 from jawusd.geometry.arrays import Array
 from jawusd.rig import _gf
-from jawusd.rig.animation import MADE_FOR
 from jawusd.rig.baked import BAKED_MM, looked_at, skull_moved_mm, time_codes
 from jawusd.rig.bones import bones_of
 from jawusd.rig.layout import ONNX_ATTRIBUTES, PARAMETERS, SIDECAR_HASH
 from jawusd.rig.motion_read import times_between
-from jawusd.rig.read import read_table, rig_of
+from jawusd.rig.read import named_models, read_table, rig_of
 from jawusd.rig.sampling import sample_valid
 from jawusd.rig.table import landmark_distance
 from jawusd.rig.untrusted import FAULTS, fault_message
@@ -58,8 +57,12 @@ def check_model(prim: Usd.Prim) -> Iterator[Finding]:
     except JawusdError as error:
         yield _finding("error", "Model", prim, error.message)
         return
-    made_for = prim.GetAttribute(PARAMETERS[0]).GetCustomDataByKey(MADE_FOR)
-    if made_for is not None and made_for != rig.model_hash:
+    own, made_for = named_models(prim)
+    if own not in (None, rig.model_hash):
+        message = "the model is not the one it was baked from (jaw:modelHash): files of several actors were mixed, "
+        message += "or values were changed by hand. `jawusd publish` gives actors names of their own."
+        yield _finding("error", "Model", prim, message)
+    if made_for not in (None, rig.model_hash):
         message = f"the model is not the one that its motion was made with ({PARAMETERS[0]} names another). "
         message += "Either files of several actors were mixed: `jawusd publish` them first. "
         message += "Or the rig was built anew since: `jawusd rebake` the motion."

@@ -7,11 +7,12 @@ from pxr import Sdf, Usd, UsdUtils
 from typer.testing import CliRunner
 
 from jawusd.cli.main import app
-from jawusd.errors import RigError
+from jawusd.errors import FormatError, RigError
 from jawusd.rig import load_rig, write_splines
 from jawusd.rig.bake import bake_rig
 from jawusd.rig.motion_read import read_poses_of_stage
 from jawusd.rig.publish import publish_rig
+from jawusd.rig.validate import validate_stage
 
 KINDS = {"hero": "anchored", "villain": "additive"}
 
@@ -78,3 +79,28 @@ def test_splines_are_published_without_a_warning_of_openusd(anchored_folder, tmp
     assert capfd.readouterr().err == ""
     stage = Usd.Stage.Open(str(tmp_path / "lib" / "hero_splines.usda"))
     assert stage.GetPrimAtPath("/Actor").GetAttribute("jaw:d1").GetSpline().Eval(40) == 9
+
+
+@pytest.mark.parametrize("file", ["actor.usda", "anim_capture.usdc"])
+def test_actors_mixed_up_by_a_packager_are_refused(tmp_path, file):
+    """Built folders, not published: OpenUSD's packager flattens their names, and two actors share one's files."""
+    stage = Usd.Stage.CreateNew(str(tmp_path / "shot.usda"))
+    stage.SetDefaultPrim(stage.DefinePrim("/Shot", "Xform"))
+    frames, d = example_motion(8)
+    for name, kind in KINDS.items():
+        options = {"name": name, "fps": FPS, "frames": frames, "d": d, "table_size": 17}
+        bake_rig(tmp_path.parent / f"built_{file[:4]}" / name, example_rig(kind), example_meshes(), **options)
+        reference = f"../built_{file[:4]}/{name}/{file}"
+        stage.DefinePrim(f"/Shot/{name}", "Xform").GetReferences().AddReference(reference)
+    stage.Save()
+    package = tmp_path / "shot.usdz"
+    assert UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(tmp_path / "shot.usda")), str(package))
+    refused = 0
+    for name, kind in KINDS.items():
+        try:
+            assert load_rig(package, f"/Shot/{name}").kind == kind
+        except FormatError as error:
+            refused += "mixed in packing" in str(error)
+    assert refused == 1
+    found = [finding.message for finding in validate_stage(package) if finding.rule == "Model"]
+    assert any("mixed" in message for message in found)
