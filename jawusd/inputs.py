@@ -8,6 +8,8 @@ from pathlib import Path
 
 from jawusd.errors import FormatError, JawusdError
 
+_LFS = b"version https://git-lfs"
+
 
 def check_input(path: str | os.PathLike[str], error: type[JawusdError] = FormatError) -> None:
     """Check that something to read is a file. What is missing is left to its reader, which says so.
@@ -26,6 +28,17 @@ def check_input(path: str | os.PathLike[str], error: type[JawusdError] = FormatE
         return
     if wrong:
         raise error("is not a file.", path=path)
+
+
+def why_unreadable(path: str | os.PathLike[str]) -> tuple[str, str] | None:
+    """Return why a file of any kind cannot be read, and what to do; None if neither length nor beginning says it."""
+    with open(path, "rb") as file:
+        beginning = file.read(len(_LFS))
+    if not beginning:
+        return "the file is empty.", "Copy it again."
+    if beginning == _LFS:
+        return "is a pointer of Git LFS, not the file itself.", "Fetch it: git lfs pull."
+    return None
 
 
 def check_path(path: str | os.PathLike[str], error: type[JawusdError]) -> None:

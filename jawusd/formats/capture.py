@@ -13,7 +13,7 @@ from jawusd.errors import FormatError, JawusdError, UnitsError
 from jawusd.formats.capture_errors import problems_of
 from jawusd.formats.capture_keys import Key, KeyEntry, entries
 from jawusd.formats.capture_parts import Boards, CameraSource, Scans, Strict
-from jawusd.formats.capture_paths import resolve_paths
+from jawusd.formats.capture_paths import resolve_paths, similar_names
 from jawusd.formats.text import read_toml
 from jawusd.geometry import rigidity_defect
 from jawusd.npz import check_format
@@ -209,9 +209,13 @@ def _refuse_other_files(path: Path) -> None:
         FormatError: it is missing, or is no text.
     """
     if not path.exists():
-        hint = None
+        hint = f"There is no folder {path.parent} either."
+        if not path.is_absolute():
+            hint = f"Paths begin in the folder you are in, {Path.cwd()}."
         if path.parent.is_dir():
             hint = f"`jawusd init {path.parent}` writes one from the footage and scans in that folder."
+            if close := similar_names(path):
+                hint = f"Did you mean {close}? Else {hint}"
         raise FormatError("there is no such file.", path=path, hint=hint)
     if path.is_file() and path.suffix.lower() != ".toml":
         with open(path, "rb") as file:

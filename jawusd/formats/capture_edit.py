@@ -28,7 +28,7 @@ def write_bootstrap(path: str | os.PathLike[str], picks: Bootstrap, expected: Bo
     path = Path(path).resolve()  # a link stays a link
     check_input(path)
     try:
-        text = path.read_bytes().decode("utf-8")
+        text = path.read_bytes().decode("utf-8-sig")
         found = tomllib.loads(text).get(_TABLE)
         there = None if found is None else Bootstrap.model_validate(found)
     except OSError as error:

@@ -23,7 +23,7 @@ _WORDS = {
     "less_than": "must be less than {lt:g}",
     "less_than_equal": "must be {le:g} or less",
     "literal_error": "must be {expected}",
-    "string_pattern_mismatch": "has letters that are not allowed, or none",
+    "string_pattern_mismatch": "has letters that are not allowed, or none; allowed are {signs}",
     "string_too_short": "is empty",
     "too_short": "has {actual_length} entries, {min_length} or more are needed",
     "too_long": "has {actual_length} entries, at most {max_length} are allowed",
@@ -137,6 +137,8 @@ def _wrong_value(
     if below is not None and not key.meaning and kind == "missing":
         return f"[[{name}]] is missing." if many else f"[{name}] is missing.", "See `jawusd init --reference`."
     words = _WORDS.get(kind)
+    if "pattern" in values:
+        values = {**values, "signs": _signs(str(values["pattern"]))}
     text = words.format(**{"actual_length": "too many", **values}) if words else _needed(kind, str(problem["msg"]))
     unit = f" ({key.unit})" if key.unit and (" number " in text or kind.startswith(("greater", "less"))) else ""
     shows_form = kind not in ("too_long", "too_short", "string_too_short")
@@ -144,10 +146,19 @@ def _wrong_value(
     return f"{said or 'the file'}{_found(kind, given)} {text}{unit}.".replace("'", '"'), hint
 
 
+def _signs(pattern: str) -> str:
+    """Return what a pattern of one class of signs allows, in words; another pattern as it is."""
+    inside = re.fullmatch(r"\^\[(.+)\]\+\$", pattern)
+    if inside is None:
+        return f"{pattern.strip('^$')}"
+    signs = [sign.removeprefix("\\") for sign in re.findall(r"\w-\w|\\?.", inside[1])]
+    return " ".join("blanks" if sign == " " else sign for sign in signs)
+
+
 def _found(kind: str, given: object) -> str:
     if kind in ("missing", "too_few", "too_short", "too_long") or isinstance(given, dict | list | tuple):
         return "" if kind in _WORDS else ":"
-    shown = json.dumps(given) if isinstance(given, str | bool | int | float) else str(given)
+    shown = json.dumps(given, ensure_ascii=False) if isinstance(given, str | bool | int | float) else str(given)
     return f" = {shown:.80}" if kind in _WORDS else f" = {shown:.80}:"
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TypeVar
@@ -12,11 +13,15 @@ from pydantic import BaseModel
 
 from jawusd.errors import CaptureError, JawusdError
 from jawusd.formats.capture_errors import Location, place
+from jawusd.formats.file_kinds import wrong_kind
 from jawusd.formats.numbered import is_pattern
 
 M = TypeVar("M", bound=BaseModel)
 _MOVE = "Move the file inside, or allow it with --allow-outside."
 _SHOWN = 3  # names like a missing one
+_DRIVE = re.compile(r"[A-Za-z]:[\\/]")  # how paths of Windows begin
+_NO_NAME = re.compile(r"[\x00-\x1f]")  # what a backslash and a letter make in TOML: \t of videos\take.mp4
+_RELATIVE = "Write it from the folder of the capture on, with slashes, as video/left.mp4."
 
 
 def resolve_paths(
@@ -35,11 +40,13 @@ def resolve_paths(
     """
     folder = source.resolve().parent
     problems: list[JawusdError] = []
+    named: dict[tuple[str, Path], Location] = {}
 
     def absolute(value: Path, location: Location) -> Path:
         full = Path(os.path.normpath(folder / value))
         try:
-            problem = _problem(value, full, folder, allow_outside)
+            problem = _problem(value, full, folder, allow_outside) or _misnamed(location, full)
+            problem = problem or _named_twice(location, full, named, data)
         except (OSError, ValueError, RuntimeError) as error:  # too long, a null byte, links in a circle
             problem = f"is no path that can be followed ({error!s:.100}).", None
         if problem is not None:
@@ -76,6 +83,8 @@ def _where(location: Location, data: Mapping[str, object]) -> str:
 
 def _problem(value: Path, full: Path, folder: Path, allow_outside: bool) -> tuple[str, str | None] | None:
     """Return what is wrong with a path and what to do, None if nothing is."""
+    if os.name != "nt" and _DRIVE.match(str(value)):
+        return "is a path of Windows, which leads nowhere here.", _RELATIVE
     # Resolve links as well: a link may lead out of the folder though its name does not.
     anchor = full.parent if is_pattern(full) else full
     inside, exists = anchor.resolve().is_relative_to(folder), anchor.exists()
@@ -85,8 +94,29 @@ def _problem(value: Path, full: Path, folder: Path, allow_outside: bool) -> tupl
         return f"is not safe: the link {link} leads out of the folder of the capture.", _MOVE
     if exists:
         return None
+    if "\\" in str(value) or _NO_NAME.search(str(value)):
+        return "does not exist; a backslash separates no folders.", _RELATIVE
     kind = "folder" if is_pattern(full) else "file"
     return f"does not exist: there is no {kind} {anchor}.", _similar(anchor)
+
+
+def _misnamed(location: Location, full: Path) -> tuple[str, str | None] | None:
+    """Return what is wrong with the kind of a file, and what to do."""
+    key = next((str(part) for part in reversed(location) if isinstance(part, str)), "")
+    kind = wrong_kind(key, full)
+    return None if kind is None else (kind, f"Name another file for {key}.")
+
+
+def _named_twice(
+    location: Location, full: Path, named: dict[tuple[str, Path], Location], data: Mapping[str, object]
+) -> tuple[str, str | None] | None:
+    """Return what is wrong with a scan, clip or mask that another key names too; note it for those that follow."""
+    group = next((str(part) for part in location if part in ("scans", "masks", "video", "videos")), "")
+    other = named.setdefault((group, full), location)
+    # One file may hold the labels of both rows of a camera.
+    if not group or other == location or (group == "masks" and other[:2] == location[:2]):
+        return None
+    return f"is named before, by {_where(other, data)}; each needs its own file.", "Name the right file here or there."
 
 
 def _link_out(place: Path, folder: Path) -> str | None:
@@ -100,12 +130,16 @@ def _link_out(place: Path, folder: Path) -> str | None:
 
 def _similar(path: Path) -> str:
     """Return advice that names what there is of nearly that name."""
-    parent = path.parent
-    if not parent.is_dir():
-        return f"There is no folder {parent} either."
-    names = sorted(entry.name for entry in parent.iterdir() if not entry.name.startswith("."))
+    if not path.parent.is_dir():
+        return f"There is no folder {path.parent} either."
+    found = similar_names(path)
+    return f"Did you mean {found}?" if found else "Check the path in the file."
+
+
+def similar_names(path: Path) -> str:
+    """Return what there is of nearly the name of a path, in its folder: "left.mp4 or left.mov", "" if nothing is."""
+    names = sorted(entry.name for entry in path.parent.iterdir() if not entry.name.startswith("."))
     lower = {name.lower(): name for name in names}
     close = [lower[found] for found in difflib.get_close_matches(path.name.lower(), lower, n=_SHOWN)]
     stems = [name for name in names if Path(name).stem == path.stem and name not in close]
-    found = [*stems, *close][:_SHOWN]
-    return f"Did you mean {' or '.join(found)}?" if found else "Check the path in the file."
+    return " or ".join([*stems, *close][:_SHOWN])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import tomllib
 from pathlib import Path
 
@@ -11,6 +12,9 @@ from jawusd.errors import FormatError
 from jawusd.inputs import check_input
 
 _MOST_TOML_BYTES = 4 << 20
+_SHOWN = 80  # characters of a line
+_WIDE = (b"\xff\xfe", b"\xfe\xff")  # byte order marks of UTF-16
+_AS_UTF8 = "Save it as UTF-8: editors ask for the encoding under Save As."
 
 
 def read_text(path: Path, most_bytes: int, encoding: str = "utf-8") -> str:
@@ -28,23 +32,48 @@ def read_text(path: Path, most_bytes: int, encoding: str = "utf-8") -> str:
     except FileNotFoundError as error:
         raise FormatError("there is no such file.", path=path) from error
     except UnicodeDecodeError as error:
-        raise FormatError(f"is not UTF-8 text ({error}).", path=path) from error
+        raise _not_utf8(path, error) from error
     except OSError as error:
         raise FormatError(f"cannot be read: {error.strerror}.", path=path) from error
 
 
+def _not_utf8(path: Path, error: UnicodeDecodeError) -> FormatError:
+    if error.object[:2] in _WIDE:
+        return FormatError("is UTF-16 text, allowed is UTF-8.", path=path, hint=_AS_UTF8)
+    line, byte = error.object[: error.start].count(b"\n") + 1, error.object[error.start]
+    return FormatError(
+        f"is not UTF-8 text: line {line} holds the byte 0x{byte:02x}, as an accented letter in another encoding.",
+        path=path,
+        hint=_AS_UTF8,
+    )
+
+
 def read_toml(path: str | os.PathLike[str]) -> dict[str, object]:
-    """Return the tables and values of a TOML file.
+    """Return the tables and values of a TOML file, with a byte order mark or without.
 
     Raises:
         FormatError: missing, too large, not UTF-8 or not TOML.
     """
     path = Path(path)
+    text = read_text(path, _MOST_TOML_BYTES, "utf-8-sig")
     try:
-        return tomllib.loads(read_text(path, _MOST_TOML_BYTES))
+        return tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError) as error:
-        hint = 'Text stands in quotes, as name = "anna", and tables in brackets, as [scans].'
-        raise FormatError(f"is not valid TOML: {error}.", path=path, hint=hint) from error
+        said, hint = _not_toml(text, str(error))
+        raise FormatError(f"is not valid TOML: {said}.", path=path, hint=hint) from error
+
+
+def _not_toml(text: str, said: str) -> tuple[str, str]:
+    """Return what is wrong with the line that an error of tomllib names, and what to do."""
+    place = re.search(r" \(at line (\d+), column \d+\)$", said)
+    line = text.splitlines()[int(place[1]) - 1].strip() if place else ""
+    if place:
+        said = f"line {place[1]}, {line[:_SHOWN]}: {said[: place.start()]}"
+    if "\\" in line:
+        return said, 'Write paths with slashes, as "video/left.mp4", on Windows too.'
+    if re.search("[\u2018-\u201f\u00ab\u00bb]", line):
+        return said, 'Write straight quotes, as name = "anna"; word processors make others of them.'
+    return said, 'Text stands in quotes, as name = "anna", and tables in brackets, as [scans].'
 
 
 def parse_json(text: str, path: Path) -> object:

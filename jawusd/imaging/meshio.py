@@ -13,14 +13,15 @@ import trimesh
 from numpy.typing import NDArray
 
 from jawusd.errors import CaptureError, explain_missing_packages
+from jawusd.formats.file_kinds import MESHES
 from jawusd.formats.mesh import Mesh, tooth_labels
 from jawusd.geometry.arrays import Array
-from jawusd.inputs import check_input
+from jawusd.inputs import check_input, why_unreadable
 
 # People who read scans with this module label them next; scripts outside the package import both from here.
 __all__ = ["Winding", "load_mesh", "tooth_labels", "winding"]
 
-_KINDS = (".ply", ".stl", ".obj", ".dcm")
+_NO_FACES = "Export the surface, not a point cloud, under a name that says its format."
 # Diagonal of the bounding box [mm]: smallest, typical, largest. A full arch has about 80, a mandible 165, a skull 290.
 _DIAGONAL_MM = {"scan": (20.0, 80.0, 150.0), "bone": (50.0, 200.0, 500.0)}
 _NO_COLOUR = 128  # gray, where a texture says nothing
@@ -41,8 +42,8 @@ def load_mesh(path: str | os.PathLike[str], kind: Literal["scan", "bone"] = "sca
     """
     path = Path(path)
     check_input(path, CaptureError)
-    if path.suffix.lower() not in _KINDS:
-        raise CaptureError(f"meshes are read from {', '.join(_KINDS)} files.", path=path, hint="Convert the mesh.")
+    if path.suffix.lower() not in MESHES:
+        raise CaptureError(f"meshes are read from {', '.join(MESHES)} files.", path=path, hint="Convert the mesh.")
     if path.suffix.lower() == ".dcm":
         return _checked(path, *_read_dcm(path), kind)
     try:
@@ -51,9 +52,10 @@ def load_mesh(path: str | os.PathLike[str], kind: Literal["scan", "bone"] = "sca
     except FileNotFoundError as error:
         raise CaptureError("no such mesh.", path=path, hint="Check the path in capture.toml.") from error
     except Exception as error:  # trimesh reports damaged files by whatever its parsers stumble over
-        raise CaptureError(f"the mesh cannot be read ({error}).", path=path, hint="Export it again.") from error
+        said, hint = why_unreadable(path) or (f"the mesh cannot be read ({error}).", "Export it again.")
+        raise CaptureError(said, path=path, hint=hint) from error
     if not isinstance(loaded, trimesh.Trimesh) or len(loaded.faces) == 0:
-        raise CaptureError("the file holds no triangles.", path=path, hint="Export the surface, not a point cloud.")
+        raise CaptureError("the file holds no triangles.", path=path, hint=_NO_FACES)
     if np.shape(loaded.vertices)[1:] != (3,) or np.shape(loaded.faces)[1:] != (3,):
         raise CaptureError("its vertices do not have three coordinates each.", path=path, hint="Export it again.")
     return _checked(path, np.asarray(loaded.vertices), np.asarray(loaded.faces), _vertex_colors(loaded), kind, uv)

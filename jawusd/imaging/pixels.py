@@ -9,6 +9,7 @@ from typing import Literal, TypeAlias
 import av
 import cv2
 import numpy as np
+from av.video.reformatter import Interpolation
 from numpy.typing import NDArray
 
 from jawusd.imaging.display import to_display
@@ -20,6 +21,9 @@ Slices: TypeAlias = "tuple[slice[int, int, int], slice[int, int, int]]"
 # ITU-R BT.709 / BT.601 video range: 16 is black, 235 is white.
 _STRETCH = np.clip(np.round((np.arange(256) - 16.0) * 255 / 219), 0, 255).astype(np.uint8)
 _BYTE_BITS = 8
+# ffmpeg's quick way to RGB is dark by 1.3 of 255 levels and repeats colours over blocks of pixels; this way rounds, and
+# interpolates colours.
+TO_RGB = Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
 _FULL_RANGE = 2  # AVCOL_RANGE_JPEG
 _PLANAR_VIDEO_RANGE = ("yuv420p", "yuv422p", "yuv444p", "nv12", "nv21")
 _PLANAR_FULL_RANGE = ("gray", "yuvj420p", "yuvj422p", "yuvj444p")
@@ -42,10 +46,22 @@ def converted(frame: av.VideoFrame, colour: Colour, rotation_deg: int, window: S
     pixels: NDArray[np.uint8]
     if colour == "rgb" and max(part.bits for part in frame.format.components) > _BYTE_BITS:
         # The way from 10 bits to 8 loses up to two levels in ffmpeg; rounding from 16 bits does not.
-        pixels = to_display(frame.to_ndarray(format="rgb48le"), 65535, None, None)
+        pixels = to_display(*deep_rgb(frame), None, None)
     else:
-        pixels = np.asarray(frame.to_ndarray(format="rgb24" if colour == "rgb" else "rgba"), np.uint8)
+        shape = "rgb24" if colour == "rgb" else "rgba"
+        pixels = np.asarray(frame.to_ndarray(format=shape, interpolation=TO_RGB), np.uint8)
     return np.ascontiguousarray(np.rot90(pixels, rotation_deg // 90)[window])
+
+
+def deep_rgb(frame: av.VideoFrame) -> tuple[NDArray[np.uint16], int]:
+    """Return a decoded picture as RGB of two bytes (h, w, 3), not turned, and the value of white in it."""
+    stored = np.asarray(frame.to_ndarray(format="rgb48le", interpolation=TO_RGB), np.uint16)
+    if frame.format.is_rgb:
+        return stored, 65535
+    bits = max(part.bits for part in frame.format.components)
+    full = frame.color_range == _FULL_RANGE or len(frame.format.components) == 1
+    # ffmpeg shifts: whites end in zeros.
+    return stored, ((1 << bits) - 1) << (16 - bits) if full else 255 << 8
 
 
 def _gray(frame: av.VideoFrame, rotation_deg: int, window: Slices) -> NDArray[np.uint8]:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from jawusd.errors import CaptureError
 from jawusd.imaging.containers import PICTURES, open_container
 from jawusd.imaging.display import Stored
+from jawusd.imaging.pixels import TO_RGB
 from jawusd.inputs import check_input
 
 _HINT = "Export the pictures again, as PNG, TIFF, EXR, DPX or JPEG."
@@ -63,12 +64,12 @@ def _pixels(frame: av.VideoFrame) -> tuple[Stored, int]:
     if "f16" in name or "f32" in name:
         return _fractions(frame), 1
     if bits <= 8:
-        return frame.to_ndarray(format="gray" if name == "gray" else "rgb24"), 255
+        return frame.to_ndarray(format="gray" if name == "gray" else "rgb24", interpolation=TO_RGB), 255
     if name.startswith("gray"):
         return _gray(frame, bits), (1 << bits) - 1
     if frame.format.is_rgb:
         return frame.to_ndarray(format="rgb48le"), 65535
-    return frame.to_ndarray(format="rgb24"), 255
+    return frame.to_ndarray(format="rgb24", interpolation=TO_RGB), 255
 
 
 def _gray(frame: av.VideoFrame, bits: int) -> NDArray[np.uint16]:

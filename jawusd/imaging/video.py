@@ -20,10 +20,12 @@ from jawusd.imaging.clip import Clip, VideoFrame
 from jawusd.imaging.containers import open_container
 from jawusd.imaging.display import to_display
 from jawusd.imaging.pictures import MOST_PX
-from jawusd.imaging.pixels import Colour, Slices, coloured, converted
+from jawusd.imaging.pixels import Colour, Slices, coloured, converted, deep_rgb
 from jawusd.imaging.timeline import Timeline
+from jawusd.inputs import why_unreadable
 
 _REENCODE = "Re-encode it, for example: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp4."
+_CUT_OFF = "Copy it again from the camera; a recording that was cut off has to be repaired first."
 # WebM keeps transparency in a second stream, which only these decoders read; announced in the file's meta data.
 _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
 
@@ -103,18 +105,16 @@ class Video(Clip):
     def _image(self, frame: av.VideoFrame, colour: Colour, window: Slices) -> NDArray[np.uint8]:
         if self._space is None:
             return converted(frame, colour, self.rotation_deg, window)
-        stored = np.rot90(frame.to_ndarray(format="rgb48le"), self.rotation_deg // 90)[window]
-        return coloured(to_display(stored, 65535, self._space, self._config), colour)
+        stored, white = deep_rgb(frame)
+        turned = np.rot90(stored, self.rotation_deg // 90)[window]
+        return coloured(to_display(turned, white, self._space, self._config), colour)
 
     def _open(self) -> av.container.InputContainer:
         try:
             container = open_container(self.path)
         except (av.FFmpegError, OSError) as error:
-            raise CaptureError(
-                f"the video cannot be opened ({error.strerror}).",
-                path=self.path,
-                hint="Copy it again from the camera; a recording that was cut off has to be repaired first.",
-            ) from error
+            said, hint = why_unreadable(self.path) or (f"the video cannot be opened ({error.strerror}).", _CUT_OFF)
+            raise CaptureError(said, path=self.path, hint=hint) from error
         if not container.streams.video:
             container.close()
             raise CaptureError("the file holds no video stream.", path=self.path, hint="Check capture.toml.")

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+import numpy as np
+
 from jawusd.errors import OutputError
 from jawusd.formats.calibration import save_calibration
 from jawusd.formats.camera_files import lacks_sizes, load_cameras_file
@@ -12,6 +14,7 @@ from jawusd.formats.camera_write import save_colmap
 from jawusd.geometry import Camera
 
 Size = tuple[int, int]
+_LEAST_APART_MM = 10.0  # the same as in `capture.camera_checks`, which refuses such a capture
 USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz", ".abc")
 
 
@@ -82,8 +85,12 @@ def camera_lines(cameras: list[Camera], files: list[Path]) -> list[str]:
     """Return cameras as text."""
     lines = []
     for camera in cameras:
-        where = ", ".join(f"{value:.1f}" for value in camera.centre_world())
+        where = ", ".join(f"{value:.1f}" for value in np.round(camera.centre_world(), 1) + 0.0)  # not -0.0
         lens = f"{camera.distortion.size} coefficients" if camera.distortion.size else "no distortion"
         width, height = camera.size_px
         lines.append(f"{camera.name}: {width} x {height} px, f {camera.K[0, 0]:.1f} px, {lens}, at {where} mm")
+    places = np.array([camera.centre_world() for camera in cameras])
+    apart = float(np.linalg.norm(np.ptp(places, axis=0)))
+    if len(cameras) > 1 and apart < _LEAST_APART_MM:
+        lines.append(f"note: all cameras lie within {apart:.3g} mm; if the source is in metres, give --unit-mm 1000")
     return [*lines, *map(str, files)]

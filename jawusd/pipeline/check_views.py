@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import filecmp
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
+from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 
@@ -30,11 +33,23 @@ def clips(parts: Parts) -> Iterator[Finding]:
         try:
             video = open_clip(camera.clip)
         except JawusdError as error:
-            yield found_error("clip", error)
+            yield replace(found_error("clip", error), camera=camera.name)
             continue
         yield from decoded_findings(video, camera.name)
         parts.videos[camera.name] = video
+    yield from _copies({name: video.path for name, video in parts.videos.items()})
     yield from rate_findings(parts.videos, parts.given.fps, parts.description)
+
+
+def _copies(clips: Mapping[str, Path]) -> Iterator[Finding]:
+    """Find clips that are copies of one file: of two cameras no clips are alike to the byte."""
+    for one, other in combinations(clips, 2):
+        paths = clips[one], clips[other]
+        if not all(path.is_file() for path in paths) or not filecmp.cmp(*paths, shallow=False):
+            continue
+        message = f"its clip {paths[1].name} is a copy of {paths[0].name}, the clip of camera {one}"
+        hint = "Copy the clip of this camera again."
+        yield Finding("clips_alike", "error", message, path=str(paths[1]), camera=other, hint=hint)
 
 
 def calibration(parts: Parts) -> Iterator[Finding]:
@@ -86,7 +101,7 @@ def boards(parts: Parts) -> Iterator[Finding]:
         try:
             video = open_clip(path)
         except JawusdError as error:
-            yield found_error("board_clip", error)
+            yield replace(found_error("board_clip", error), camera=camera.name)
             continue
         yield from decoded_findings(video, camera.name)
         own = parts.videos.get(camera.name)

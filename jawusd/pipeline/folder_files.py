@@ -10,11 +10,9 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 
 from jawusd.formats.capture_template import CameraSketch
+from jawusd.formats.file_kinds import MESHES, PICTURES, VIDEOS
 from jawusd.formats.numbered import groups
 
-CLIPS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".m4v", ".mxf", ".mts", ".mpg", ".y4m")
-PICTURES = (".png", ".tif", ".tiff", ".exr", ".dpx", ".jpg", ".jpeg")
-SCANS = (".ply", ".stl", ".obj", ".dcm")
 _CALIBRATIONS = (".toml", ".json", ".xml", ".csv", ".yaml", ".yml", ".txt", ".usda", ".usdc", ".usd", ".nk")
 _FEWEST_PICTURES = 5  # fewer numbered pictures are no sequence
 _DEPTH = 4
@@ -57,7 +55,7 @@ def find_files(folder: Path) -> FoundFiles:
     out = FoundFiles()
     for path in sorted(_files(folder)):
         suffix, said = path.suffix.lower(), set(words(path))
-        if suffix in CLIPS or "%" in path.name:
+        if suffix in VIDEOS or "%" in path.name:
             row = _row(path)
             if row and (said & _MASK or "%" in path.name):
                 out.masks[path] = row
@@ -67,7 +65,7 @@ def find_files(folder: Path) -> FoundFiles:
                 out.boards.append(path)
             else:
                 out.clips.append(path)
-        elif suffix in SCANS:
+        elif suffix in MESHES:
             out.scans[_part(path)].append(path)
         elif suffix in _CALIBRATIONS and path.name not in ("capture.toml", "build.json"):
             out.calibrations.append(path)

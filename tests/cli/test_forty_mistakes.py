@@ -1,4 +1,4 @@
-"""Forty mistakes of a beginner: each is one message that names file, key, what was found, what is allowed, what to do.
+"""Forty mistakes of a beginner and more: each is one message with file, key, what was found, is allowed, and is to do.
 
 What a mistake has not, as a misspelt folder has no key, is left out of its row.
 """
@@ -59,10 +59,37 @@ IN_THE_FILE = [
     ("a newer file", "capture/1", "capture/9", "format", "capture/9", "up to", "Update jawusd"),
     ("centimetres", "fps", 'units = "cm"\nfps', "units", '"cm"', 'allowed is "mm"', "Scale to mm"),
     ("text without quotes", 'name = "x"', "name = x", "", "line 2", "TOML", "in quotes"),
+    ("a video for a scan", '"u.ply"', '"left.mp4"', "[scans] upper_teeth", '"left.mp4"', "a mesh is needed", "Name"),
+    ("a scan for a clip", '= "left.mp4"', '= "u.ply"', '1 ("left") video', '"u.ply"', "a video or numbered", "Name"),
+    ("a clip to calibrate", "[scans]", 'calibration = "left.mp4"\n[scans]', "calibration", '"left', "[boards]", "Name"),
+    ("one clip for two", '= "right.mp4"', '= "left.mp4"', '2 ("right") video', '"left', "own file", '1 ("left") video'),
+    ("one scan for both rows", '"l.ply"', '"u.ply"', "[scans] lower_teeth", '"u.ply"', "own file", "upper_teeth"),
+    ("backslashes", '= "left.mp4"', '= "clips\\left.mp4"', "line 9", "clips\\left.mp4", "TOML", '"video/left.mp4"'),
+    ("backslashes as text", '= "left.mp4"', "= 'clips\\left.mp4'", "video", "clips\\left", "separates", "video/left"),
+    ("a backslash and t", '= "left.mp4"', '= "clips\\take.mp4"', "video", "clips\take.mp4", "separates", "video/left"),
+    ("a drive", '= "left.mp4"', '= "C:/anna/left.mp4"', "video", "C:/anna", "Windows", "from the folder of"),
+    ("curly quotes", '"u.ply"', "\u201cu.ply\u201d", "line 5", "\u201cu.ply\u201d", "TOML", "straight quotes"),
+    ("an accent", 'name = "x"', 'name = "J\u00f6rg"', "name", '"J\u00f6rg"', "A-Z a-z 0-9 _ - . blanks", '"anna"'),
+]
+LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n"
+# How the file is stored: words; encoding; what is allowed; what to do.
+STORED = [
+    ("UTF-16", "utf-16", "is UTF-16 text, allowed is UTF-8", "Save it as UTF-8"),
+    ("an accent of Windows", "cp1252", "line 2 holds the byte 0xf6", "Save it as UTF-8"),
+]
+# Files that are there and hold something else: words; name; bytes; found; what to do.
+CONTENTS = [
+    ("an empty scan", "u.ply", b"", "the file is empty", "Copy it again"),
+    ("an empty clip", "left.mp4", b"", "the file is empty", "Copy it again"),
+    ("a scan that git has not fetched", "l.ply", LFS, "Git LFS", "git lfs pull"),
+    ("a clip that git has not fetched", "left.mp4", LFS, "Git LFS", "pull"),
+    ("text under the name of a scan", "u.ply", b"dear diary", "cannot be read", "Export it again"),
 ]
 # The same of what is typed: words; file; found; allowed; what to do.
 TYPED = [
     ("a folder without capture", ["check", "empty"], "empty", "no such file", "", "jawusd init"),
+    ("a folder's name misspelt", ["check", "emty"], "emty", "no such file", "Did you mean empty?", "jawusd init"),
+    ("a path from another folder", ["check", "shots/anna"], "shots/anna", "no such file", "the folder you are in", ""),
     ("a clip for a capture", ["check", "left.mp4"], "left.mp4", '".mp4" is no capture', "a folder with", "jawusd init"),
     ("an output with files", ["build", ".", "-o", "full"], "full", "not empty", "", "Name a new folder"),
     ("an output that is a file", ["build", ".", "-o", "u.ply"], "u.ply", "is a file", "needs a folder", ""),
@@ -109,14 +136,47 @@ def told(words):
 def test_a_mistake_in_the_file(place, tmp_path, row):
     _, old, new, *parts = row
     assert old in TEXT
-    for name in ("u.ply", "l.ply", "left.mp4", "right.mp4"):
-        (tmp_path / name).write_bytes((place / name).read_bytes())
-    path = tmp_path / "capture.toml"
-    path.write_text(TEXT.replace(old, new, 1))
-    said = CliRunner().invoke(app, ["check", str(path)]).stdout
-    errors = [line for line in said.splitlines() if line.startswith("error: ")]
+    errors = check_of(tmp_path, place, TEXT.replace(old, new, 1))
     assert sum(all(part in line for part in ("capture.toml", *parts)) for line in errors) == 1, errors
     assert sum("capture.toml" in line for line in errors) == 1, errors
+
+
+def check_of(folder, place, text=TEXT, encoding="utf-8"):
+    """Return the errors of a capture, one a line; files that the folder has already stay."""
+    for name in ("u.ply", "l.ply", "left.mp4", "right.mp4"):
+        if not (folder / name).exists():
+            (folder / name).write_bytes((place / name).read_bytes())
+    (folder / "capture.toml").write_bytes(text.encode(encoding))
+    said = CliRunner().invoke(app, ["check", str(folder)]).stdout
+    return [line for line in said.splitlines() if line.startswith("error: ")]
+
+
+@pytest.mark.parametrize("row", STORED, ids=[row[0] for row in STORED])
+def test_a_mistake_in_how_the_file_is_stored(place, tmp_path, row):
+    _, encoding, *parts = row
+    (line,) = check_of(tmp_path, place, TEXT.replace('name = "x"', 'name = "J\u00f6rg"'), encoding)
+    assert all(part in line for part in ("capture.toml", *parts)), line
+
+
+def test_marks_and_line_ends_of_windows_are_no_mistake(place, tmp_path):
+    plain = check_of(tmp_path, place)
+    assert check_of(tmp_path, place, TEXT.replace("\n", "\r\n"), "utf-8-sig") == plain
+    assert not any("capture.toml" in line for line in plain)
+
+
+@pytest.mark.parametrize("row", CONTENTS, ids=[row[0] for row in CONTENTS])
+def test_a_mistake_in_a_file(place, tmp_path, row):
+    _, name, data, *parts = row
+    (tmp_path / name).write_bytes(data)
+    errors = check_of(tmp_path, place)
+    assert sum(all(part in line for part in (name, *parts)) for line in errors) == 1, errors
+
+
+def test_a_copy_of_a_clip(place, tmp_path):
+    (tmp_path / "right.mp4").write_bytes((place / "left.mp4").read_bytes())
+    errors = check_of(tmp_path, place)
+    parts = ("right.mp4", "camera right", "is a copy of left.mp4, the clip of camera left", "Copy the clip")
+    assert sum(all(part in line for part in parts) for line in errors) == 1, errors
 
 
 @pytest.mark.parametrize("row", TYPED, ids=[row[0] for row in TYPED])
@@ -128,4 +188,4 @@ def test_a_mistake_at_the_shell(place, monkeypatch, row):
 
 
 def test_they_are_forty():
-    assert len(IN_THE_FILE) + len(TYPED) >= 40
+    assert len(IN_THE_FILE) + len(TYPED) + len(STORED) + len(CONTENTS) >= 40

@@ -344,10 +344,14 @@ def test_the_command(tmp_path):
     for out in ("model", "b.toml", "b.usda"):
         done = CliRunner().invoke(app, ["cameras", str(tmp_path / "a.toml"), "-o", str(tmp_path / out)])
         assert done.exit_code == 0 and "left: 1920 x 1080 px, f 2050.0 px, 5 coefficients" in done.stdout
+        assert "note:" not in done.stdout
     same(load_cameras_file(tmp_path / "b.toml"), example())
     for name, (R, centre) in POSES.items():
         (tmp_path / "xmp").mkdir(exist_ok=True)
         (tmp_path / "xmp" / f"{name}.xmp").write_text(xmp(R, centre))
+    metres = ["cameras", str(tmp_path / "xmp"), "-o", str(tmp_path / "m"), "--size", "1920x1080"]
+    close = CliRunner().invoke(app, metres)
+    assert "all cameras lie within 0.918 mm; if the source is in metres, give --unit-mm 1000" in close.stdout
     words = ["cameras", str(tmp_path / "xmp"), "-o", str(tmp_path / "c.toml"), "--unit-mm", "1000"]
     assert isinstance(CliRunner().invoke(app, words).exception, JawusdError)
     assert CliRunner().invoke(app, [*words, "--size", "1920x1080"]).exit_code == 0

@@ -112,7 +112,8 @@ def test_a_video_is_no_capture(tmp_path):
     assert "no capture" in read_capture(tmp_path / "take.mp4")[1][0].message
     assert f"jawusd init {tmp_path}" in str(read_capture(tmp_path / "take.mp4")[1][0])
     assert f"jawusd init {tmp_path}" in str(read_capture(tmp_path)[1][0])
-    assert read_capture(tmp_path / "none" / "capture.toml")[1][0].hint is None
+    away = tmp_path / "none"
+    assert read_capture(away / "capture.toml")[1][0].hint == f"There is no folder {away} either."
 
 
 def test_every_key_is_in_the_reference_with_what_it_means(tmp_path):

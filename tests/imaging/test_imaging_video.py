@@ -219,3 +219,27 @@ def test_damaged_pictures_name_the_frame(tmp_path: Path, length: int) -> None:
     path.write_bytes(data)
     with pytest.raises(CaptureError, match=r"damaged\.mp4: frame \d+ of 60 \(at 1\.\d+ s\) cannot be decoded"):
         list(Video(path).frames())
+
+
+@pytest.mark.parametrize(("pixels", "bits"), [("yuv420p", 8), ("yuv422p10le", 10)])
+def test_colours_are_those_of_the_standard(tmp_path, pixels, bits):
+    """Even pictures, stored without loss, against the formula of ITU-R BT.601, video range."""
+    rng = np.random.default_rng(4)
+    path, scale = tmp_path / "even.mkv", 1 << (bits - 8)
+    wanted = rng.integers(30, 220, (24, 3)).astype(float)  # not at the ends: there some are cut off
+    luma = wanted @ [0.299, 0.587, 0.114]
+    blue, red = (wanted[:, 2] - luma) / 1.772, (wanted[:, 0] - luma) / 1.402
+    stored = np.rint(scale * np.column_stack([16 + 219 / 255 * luma, 128 + 224 / 255 * blue, 128 + 224 / 255 * red]))
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("ffv1", rate=24)
+        stream.width, stream.height, stream.pix_fmt = *SIZE, pixels
+        for values in stored:
+            frame = av.VideoFrame(*SIZE, pixels)
+            for plane, value in zip(frame.planes, values, strict=True):
+                kind = np.dtype("<u2" if bits > 8 else "u1")
+                plane.update(np.full(plane.buffer_size // kind.itemsize, value, kind))
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    found = np.array([frame.image.reshape(-1, 3).mean(0) for frame in Video(path).frames(colour="rgb")])
+    assert np.abs(found - wanted).max() < 1.6  # 8 bits of the colours are 1.1 levels apart
+    assert np.abs((found - wanted).mean(0)).max() < 0.35

@@ -24,9 +24,9 @@ def write_media(folder):
     """Write the clips and scans that TABLES names."""
     import trimesh
 
-    for name in ("left", "right"):
+    for first, name in enumerate(("left", "right")):
         with VideoWriter(folder / f"{name}.mp4", (64, 48), 24.0) as writer:
             for k in range(8):
-                writer.write(np.full((48, 64), 25 * k, np.uint8))
+                writer.write(np.full((48, 64), 25 * k + first, np.uint8))
     for name in ("u", "l"):
         trimesh.creation.box((60, 10, 50)).subdivide().subdivide().export(folder / f"{name}.ply")

@@ -80,6 +80,17 @@ def test_arches_exchanged_in_one_camera_or_in_all_are_told():
     assert finding.kind == "masks_arches_exchanged" and "in every camera" in finding.message
 
 
+def test_exchanged_scans_are_told():
+    turned = replace(GIVEN, vertices=GIVEN.vertices[::-1], crowns=GIVEN.crowns[::-1])
+    assert only(turned) == ("scans_exchanged", "error")
+    # Picks whose vertices the other scan does not have are not tried on it.
+    wrong = {**TABLE, "cam0": TABLE["cam1"], "cam1": TABLE["cam0"]}
+    last = max(pick.vertex for pick in GIVEN.picks[1])
+    assert max(pick.vertex for pick in GIVEN.picks[0]) > last
+    short = replace(GIVEN, cameras=wrong, vertices=(VERTICES[0], VERTICES[1][: last + 1]))
+    assert only(short) == ("calibrations_exchanged", "error")
+
+
 def test_exchanged_masks_of_cameras_are_told():
     seen = pixels()
     (finding,) = found(GIVEN, {**seen, "cam0": seen["cam1"], "cam1": seen["cam0"]})

@@ -186,6 +186,7 @@ def _mistakes(given: Setting) -> Iterator[Mistake]:
         "Export them again without mirroring; one axis may have been negated.",
         _with_scans(given, np.array([-1.0, 1.0, 1.0])),
     )
+    yield from _exchanged_scans(given)
     yield from _exchanges(given)
     size, _ = picked_size(given.picks, given.vertices, given.cameras)
     if abs(size - 1.0) > _SIZE_SHARE:
@@ -198,6 +199,18 @@ def _mistakes(given: Setting) -> Iterator[Mistake]:
             True,
         )
     yield from _wrong_lenses(given)
+
+
+def _exchanged_scans(given: Setting) -> Iterator[Mistake]:
+    """Yield the exchange of the two scans, if the picks' vertices are there then."""
+    vertices = given.vertices[::-1]
+    if all(pick.vertex < len(own) for own, picks in zip(vertices, given.picks, strict=True) for pick in picks):
+        yield Mistake(
+            "scans_exchanged",
+            "upper_teeth and lower_teeth in [scans] are exchanged",
+            "Exchange the names of these files.",
+            replace(given, vertices=vertices, crowns=given.crowns[::-1]),
+        )
 
 
 def _exchanges(given: Setting) -> Iterator[Mistake]:
