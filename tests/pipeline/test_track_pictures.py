@@ -145,4 +145,15 @@ def test_frames_that_tell_little_make_footage_doubtful(tracked, lost, unsure, wo
     sigma[:unsure] = 1.2
     sigma[11 : 11 - lost : -1] = np.nan
     found = footage_doubts(replace(tracked[1], sigma_mm=sigma))
-    assert found == [] if words is None else words in found[0].message and f"{lost + unsure} of 12" in found[0].message
+    if words is None:
+        assert found == []
+        return
+    frames = tracked[1].frames
+    assert words in found[0].message and f"{lost + unsure} of 12" in found[0].message
+    assert f"write frames = [{frames[unsure]}, {frames[11 - lost] + 1}]" in found[0].hint
+
+
+def test_footage_doubtful_all_over_has_no_part_to_keep(tracked):
+    sigma = np.full((12, 5), 0.3)
+    sigma[6] = np.nan
+    assert "frames =" not in footage_doubts(replace(tracked[1], sigma_mm=sigma))[0].hint

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from jawusd.formats.finding import Finding
 from jawusd.formats.tracks import Tracks
@@ -24,6 +25,7 @@ _STRAINED = 2.0
 # that three of them were spoilt to, all 6 with frames a millimetre off are called so, or refused at their start, and so
 # are 10 without: those of flickering light, blur, and a resolution of 1.4 px/mm.
 _UNKNOWN_MM, _FEW, _MANY = 1.0, 0.03, 0.2
+_MOST = 0.6  # of the frames, that are good and adjoin, are a take without its beginning and end
 _USUAL, _LEAST = 0.9, 0.25  # quantile of the take with which a strained frame is compared, and its least value
 
 
@@ -54,6 +56,16 @@ def widen_strained(tracks: Tracks, landmarks: Array, axes: Array) -> Tracks:
     )
 
 
+def _longest_run(good: NDArray[np.bool_]) -> tuple[int, int]:
+    """Return the longest run of frames, first and one past the last."""
+    ends = np.flatnonzero(np.diff(np.concatenate([[0], good.astype(np.int8), [0]])))
+    runs = ends.reshape(-1, 2)
+    if len(runs) == 0:
+        return 0, 0
+    first, last = runs[np.argmax(np.ptp(runs, axis=1))].tolist()
+    return first, last
+
+
 def footage_doubts(tracks: Tracks) -> list[Finding]:
     """Return a warning if the jaw is lost, or not known to a millimetre, in too many frames that colours alone showed.
 
@@ -71,5 +83,9 @@ def footage_doubts(tracks: Tracks) -> list[Finding]:
     )
     worst = int(np.argmax(np.where(np.isfinite(sigma_mm), sigma_mm, np.inf)))
     hint = "Look at the overlay, light the mouth better, or draw masks (`jawusd segment`)."
+    first, last = _longest_run(~bad)
+    if last - first >= _MOST * len(bad):
+        kept = f"[{tracks.frames[first]}, {tracks.frames[last - 1] + 1}]"
+        hint = f"If the others are dark, as in light flashes, write frames = {kept} in capture.toml. {hint}"
     value, limit = round(100 * share, 1), 100 * _FEW
     return [Finding("footage_doubtful", "warning", message, value, limit, frame=int(tracks.frames[worst]), hint=hint)]
