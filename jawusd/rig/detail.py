@@ -38,7 +38,17 @@ def proxy_layer(
     stage = stage_of(layer)
     for name, proxy in proxies.items():
         hide_look(UsdGeom.Mesh(stage.GetPrimAtPath(MESH_PATHS[name])), proxy, meshes[name])
-    return layer
+    return _with_ordered_fields(layer)
+
+
+def _with_ordered_fields(layer: Sdf.Layer) -> Sdf.Layer:
+    """Return a layer read from the text of another.
+
+    CopySpec adds fields in the order of their addresses in memory: a binary layer would differ from run to run.
+    """
+    ordered = Sdf.Layer.CreateAnonymous(".usda")
+    ordered.ImportFromString(layer.ExportToString())
+    return ordered
 
 
 def _define_beside(layer: Sdf.Layer, proxies: Iterable[str]) -> None:
