@@ -8,6 +8,9 @@ import pytest
 from filelock import FileLock
 from package_copy import ROOT
 
+# Before OpenUSD is loaded, and for the programs that tests start: in one thread, as `jawusd` runs it.
+os.environ |= {"PXR_WORK_THREAD_LIMIT": "1", "TF_ENV_SETTING_ALERTS_ENABLED": "0"}
+
 FAST = {"evaluator", "formats", "geometry", "library"}  # folders of tests that need neither footage nor USD
 
 

@@ -2,48 +2,31 @@
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
-import faulthandler
 import gc
 import os
 import selectors
 import signal
-import subprocess
 import sys
 import threading
 import time
 import warnings
 from collections.abc import Iterable
-from enum import Enum
 from pathlib import Path
 
-from pxr import Sdf, Usd, Work
+from pxr import Work
 
 from jawusd.errors import RigError
-from jawusd.formats.allowed_folders import SETTING, allowed_folders, is_allowed
-from jawusd.rig.untrusted import open_checked
-
-#: Limits of a child: processor time [s], address space beyond what it starts with [bytes], and waiting [s], for disks
-#: that are slow. Rigs of scans take .02 s, stages of a million prims some five.
-MOST_CPU_S, MOST_MEMORY, MOST_WAIT_S = 10, 4 << 30, 60
+from jawusd.formats.allowed_folders import SETTING, is_allowed
+from jawusd.rig import child_limits
+from jawusd.rig.child_limits import End, end_of_death, leave_all, read_whole
+from jawusd.rig.reader_process import ReaderProcess
 
 _MOST_SLEEP_S = 3  # of a copy of this process: then a new one decides
-_TRIES = 200  # to find all other threads asleep, a millisecond apart
-_FULL, _IS_STARTED = 3, 4  # exit codes of a child that needs more memory, and of a new process that did its work
-_NEW_NETWORK = 0x40000000 | 0x10000000  # CLONE_NEWNET | CLONE_NEWUSER of linux/sched.h
+_TRIES = 20  # to find all other threads asleep, a millisecond apart
+_EXIT_CODES = {End.WHOLE: 0, End.LARGE: 3}
 _TRUST = f"If you trust it, allow its folder with --allow or the setting {SETTING}: then it is read without limits."
 
-
-class _End(Enum):
-    """How a child ended, as messages say it."""
-
-    WHOLE = "is whole"
-    SLOW = f"takes OpenUSD more than {MOST_CPU_S} s to read"
-    LARGE = f"needs more than {MOST_MEMORY >> 30} GB to be read"
-    CRASHED = "ends OpenUSD when it is read"
-
-
+_reader = ReaderProcess()
 _known: dict[Path, dict[Path, tuple[int, ...]]] = {}
 
 
@@ -57,10 +40,10 @@ def try_in_child(path: Path) -> None:
     """
     if is_allowed(path) or _is_known(path):
         return
-    end = _forked(path) if _can_fork() else None
-    if end in (None, _End.CRASHED):
-        end = _started(path) or end
-    if end not in (None, _End.WHOLE):  # None: no child can be had
+    end = _forked(path) if not _reader.runs() and _can_fork() else None
+    if end in (None, End.CRASHED):
+        end = _reader.read(path) or end
+    if end not in (None, End.WHOLE):  # None: no child can be had
         raise RigError(f"{end.value}: it is damaged, or was made to.", path=path, hint=_TRUST)
 
 
@@ -109,7 +92,7 @@ def _state_and_time(process: str) -> tuple[str, int]:
     return fields[0], int(fields[11]) + int(fields[12])
 
 
-def _forked(path: Path) -> _End | None:
+def _forked(path: Path) -> End | None:
     """Read in a copy of this process, some 5 ms; return None where it waits, maybe for what another thread held."""
     reading, writing = os.pipe()
     with warnings.catch_warnings():
@@ -118,7 +101,9 @@ def _forked(path: Path) -> _End | None:
     if child == 0:
         try:
             Work.SetConcurrencyLimit(1)  # the threads of the parent are not here
-            os._exit(_read(path))
+            gc.disable()  # it would copy what is shared with the parent
+            leave_all()
+            os._exit(_EXIT_CODES[read_whole(path)])
         finally:  # nothing else of the parent's runs here
             os._exit(1)
     os.close(writing)
@@ -130,7 +115,9 @@ def _forked(path: Path) -> _End | None:
         if not ended:
             os.kill(child, signal.SIGKILL)
         status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    return _end(status, whole=0) if ended else None
+    if not ended:
+        return None
+    return next((end for end, code in _EXIT_CODES.items() if code == status), end_of_death(status))
 
 
 def _ends(child: int, reading: int) -> bool:
@@ -138,7 +125,7 @@ def _ends(child: int, reading: int) -> bool:
     slept_s, worked = 0, 0
     with selectors.DefaultSelector() as selector:
         selector.register(reading, selectors.EVENT_READ)
-        for _ in range(MOST_WAIT_S):
+        for _ in range(child_limits.MOST_WAIT_S):
             if selector.select(1.0):
                 return True
             state, ticks = _state_and_time(str(child))
@@ -147,79 +134,3 @@ def _ends(child: int, reading: int) -> bool:
             if slept_s > _MOST_SLEEP_S:
                 return False
     return False
-
-
-def _started(path: Path) -> _End | None:
-    """Read in a new Python, some 0.4 s; return None where there is no program to start."""
-    if (
-        not Path(sys.executable or "").stem.lower().startswith(("python", "mayapy", "hython"))
-    ):  # a program that Python is part of
-        return None
-    program = "import sys; from jawusd.rig.child_process import main; sys.exit(main(sys.argv[1]))"
-    folders = os.pathsep.join(map(str, allowed_folders()))
-    environment = {**os.environ, SETTING: folders, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    try:
-        done = subprocess.run(
-            [sys.executable, "-P", "-c", program, str(path.absolute())],
-            stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-            env=environment, timeout=MOST_WAIT_S, check=False,
-        )  # fmt: skip
-    except subprocess.TimeoutExpired:
-        return _End.SLOW
-    except OSError:
-        return None
-    return None if done.returncode == 1 else _end(done.returncode, whole=_IS_STARTED)
-
-
-def _end(status: int, whole: int) -> _End:
-    if status == whole:
-        return _End.WHOLE
-    if status == _FULL:
-        return _End.LARGE
-    return _End.SLOW if -status == getattr(signal, "SIGXCPU", None) else _End.CRASHED
-
-
-def main(path: str) -> int:
-    """Read a stage in this process, which ends thereafter; return its exit code."""
-    return _read(Path(path)) or _IS_STARTED
-
-
-def _read(path: Path) -> int:
-    gc.disable()  # it would copy what is shared with the parent
-    faulthandler.disable()
-    nothing = os.open(os.devnull, os.O_RDWR)
-    for stream in (0, 1, 2):  # the parent prints what there is to say
-        os.dup2(nothing, stream)
-    _limit()
-    try:
-        _read_all(open_checked(path))
-    except MemoryError:
-        return _FULL
-    except Exception:  # the parent comes to the same, and says so
-        return 0
-    return 0
-
-
-def _limit() -> None:
-    """Limit memory and time of this process; let it write no files, and leave the network where users may."""
-    try:
-        import resource
-    except ImportError:  # on Windows, where waiting has a limit and nothing else
-        return
-    limits = [(resource.RLIMIT_CPU, MOST_CPU_S), (resource.RLIMIT_CORE, 0), (resource.RLIMIT_FSIZE, 0)]
-    with contextlib.suppress(OSError):
-        pages = int(Path("/proc/self/statm").read_text().split()[0])
-        limits.append((resource.RLIMIT_AS, pages * resource.getpagesize() + MOST_MEMORY))
-    for kind, most in limits:
-        hard = resource.getrlimit(kind)[1]
-        resource.setrlimit(kind, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))
-    if sys.platform == "linux":
-        ctypes.CDLL(None).unshare(_NEW_NETWORK)
-
-
-def _read_all(stage: Usd.Stage) -> None:
-    """Read all values of a stage's layers, which binary layers do when asked, and visit all prims, of instances too."""
-    for layer in stage.GetUsedLayers():
-        Sdf.Layer.CreateAnonymous(".usda").TransferContent(layer)
-    for _ in Usd.PrimRange.Stage(stage, Usd.TraverseInstanceProxies()):
-        pass

@@ -2,16 +2,20 @@
 
 import os
 import signal
+import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 
 import pytest
 
 from jawusd.errors import RigError
 from jawusd.formats.allowed_folders import SETTING
-from jawusd.rig import child_process, load_rig
+from jawusd.rig import child_limits, child_process, load_rig
+from jawusd.rig.child_limits import End
 from jawusd.rig.read import open_stage
+from jawusd.rig.reader_process import ReaderProcess
 
 HEADER = "#usda 1.0\n"
 
@@ -22,13 +26,22 @@ def doubling(levels):
     return HEADER + 'def "L0" {}\n' + "".join(twice % (i + 1, i, i) for i in range(levels))
 
 
+@pytest.fixture(autouse=True)
+def reader(monkeypatch):
+    """Return the second Python of this test alone, which is not started yet."""
+    own = ReaderProcess()
+    monkeypatch.setattr(child_process, "_reader", own)
+    yield own
+    own.close()
+
+
 @pytest.fixture
-def children(monkeypatch):
+def children(reader, monkeypatch):
     """Return the paths that children were asked to read."""
     asked = []
-    for name in ("_forked", "_started"):
-        real = getattr(child_process, name)
-        monkeypatch.setattr(child_process, name, lambda path, real=real: asked.append(path) or real(path))
+    for where, name in ((child_process, "_forked"), (reader, "read")):
+        real = getattr(where, name)
+        monkeypatch.setattr(where, name, lambda path, real=real: asked.append(path) or real(path))
     return asked
 
 
@@ -36,6 +49,12 @@ def children(monkeypatch):
 def forks(monkeypatch):
     """Let copies be made at any time: on a busy machine, threads may take long to fall asleep."""
     monkeypatch.setattr(child_process, "_can_fork", lambda: sys.platform == "linux")
+
+
+@pytest.fixture
+def no_reader(reader, monkeypatch):
+    """Let no second Python be had."""
+    monkeypatch.setattr(reader, "read", lambda path: None)
 
 
 @pytest.fixture
@@ -61,29 +80,27 @@ def in_thread(function):
 
 
 def test_stages_that_take_for_ever_are_one_message(bomb, forks, monkeypatch):
-    monkeypatch.setattr(child_process, "MOST_CPU_S", 1)
+    monkeypatch.setattr(child_limits, "MOST_CPU_S", 1)
     with pytest.raises(RigError, match="takes OpenUSD more than"):
         open_stage(bomb)
 
 
-def test_stages_that_take_all_memory_are_one_message(bomb, forks, monkeypatch):
-    monkeypatch.setattr(child_process, "MOST_MEMORY", 150 << 20)
-    monkeypatch.setattr(child_process, "_started", lambda path: None)
+def test_stages_that_take_all_memory_are_one_message(bomb, forks, no_reader, monkeypatch):
+    monkeypatch.setattr(child_limits, "MOST_MEMORY", 150 << 20)
     with pytest.raises(RigError, match="GB to be read|ends OpenUSD"):
         open_stage(bomb)
 
 
 @pytest.mark.parametrize("way", [signal.SIGSEGV, signal.SIGABRT])
-def test_crashes_are_one_message(way, anchored_folder, forks, monkeypatch):
-    monkeypatch.setattr(child_process, "open_checked", lambda path: os.kill(os.getpid(), way))
-    monkeypatch.setattr(child_process, "_started", lambda path: None)
+def test_crashes_are_one_message(way, anchored_folder, forks, no_reader, monkeypatch):
+    monkeypatch.setattr(child_limits, "open_checked", lambda path: os.kill(os.getpid(), way))
     with pytest.raises(RigError, match="ends OpenUSD"):
         open_stage(anchored_folder / "actor.usda")
 
 
 def test_a_crash_of_a_copy_is_asked_again_of_a_new_process(anchored_folder, forks, monkeypatch, children):
     """The copy may have crashed for the state of this process; the file is whole."""
-    monkeypatch.setattr(child_process, "open_checked", lambda path: os.kill(os.getpid(), signal.SIGSEGV))
+    monkeypatch.setattr(child_limits, "open_checked", lambda path: os.kill(os.getpid(), signal.SIGSEGV))
     assert open_stage(anchored_folder / "actor.usda")
     assert len(children) == 2
 
@@ -91,7 +108,7 @@ def test_a_crash_of_a_copy_is_asked_again_of_a_new_process(anchored_folder, fork
 @pytest.mark.skipif(sys.platform != "linux", reason="forks are for Linux")
 def test_a_copy_that_waits_for_ever_is_left_soon(anchored_folder, forks, monkeypatch, children):
     """As one does that was made while another thread held a lock of OpenUSD."""
-    monkeypatch.setattr(child_process, "open_checked", lambda path: time.sleep(1000))
+    monkeypatch.setattr(child_limits, "open_checked", lambda path: time.sleep(1000))
     monkeypatch.setattr(child_process, "_MOST_SLEEP_S", 1)
     assert open_stage(anchored_folder / "actor.usda")
     assert len(children) == 2
@@ -113,15 +130,73 @@ def test_no_copy_is_made_while_another_thread_works(monkeypatch):
         assert child_process._can_fork() is allowed
 
 
-def test_programs_of_several_threads_start_a_new_process(anchored_folder, bomb, children, monkeypatch):
+def test_programs_of_several_threads_start_a_second_python(anchored_folder, bomb, children, monkeypatch):
     def opened():
         load_rig(anchored_folder / "actor.usda")
         open_stage(bomb)
 
-    monkeypatch.setattr(child_process, "MOST_WAIT_S", 4)
+    monkeypatch.setattr(child_limits, "MOST_WAIT_S", 4)
     monkeypatch.setattr(child_process, "_forked", lambda path: pytest.fail("this process has several threads"))
     (error,) = in_thread(opened)
     assert "takes OpenUSD more than" in str(error) and len(children) == 2
+
+
+def test_a_second_python_reads_one_stage_after_the_other(anchored_folder, reader):
+    actor = anchored_folder / "actor.usda"
+    assert reader.read(actor) is End.WHOLE
+    first = reader._process
+    assert reader.read(actor) is End.WHOLE and reader._process is first
+    first.kill()  # as a stage that it had read before may have left it
+    assert reader.read(actor) is End.WHOLE and reader._process is not first
+    reader._owner += 1  # as in a fork of this process, which would read answers to other questions
+    assert not reader.runs()
+    reader._owner -= 1
+
+
+def test_a_stage_that_ends_the_second_python_is_one_message(bomb, reader, monkeypatch):
+    def end():
+        while not reader._has_read:
+            time.sleep(0.01)
+        os.kill(reader._process.pid, signal.SIGSEGV)
+
+    monkeypatch.setattr(child_process, "_can_fork", lambda: False)
+    other = threading.Thread(target=end)
+    other.start()
+    with pytest.raises(RigError, match="ends OpenUSD"):
+        open_stage(bomb)
+    other.join()
+    assert not reader.runs()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of Linux")
+def test_a_second_python_writes_no_files_and_has_no_network(anchored_folder, reader):
+    import resource
+
+    assert reader.read(anchored_folder / "actor.usda") is End.WHOLE
+    process = reader._process.pid
+    for kind in (resource.RLIMIT_FSIZE, resource.RLIMIT_CORE):
+        assert resource.prlimit(process, kind)[0] == 0
+    assert resource.prlimit(process, resource.RLIMIT_CPU)[0] < 60
+    alone = subprocess.run(["unshare", "--user", "--net", "true"], capture_output=True, check=False)
+    if alone.returncode == 0:  # the system lets users do so
+        assert os.readlink(f"/proc/{process}/ns/net") != os.readlink("/proc/self/ns/net")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_a_second_python_ends_with_the_program(anchored_folder):
+    program = (
+        "import os, sys, pathlib; from jawusd.rig.reader_process import ReaderProcess; reader = ReaderProcess(); "
+        "reader.read(pathlib.Path(sys.argv[1])); print(reader._process.pid, flush=True); os._exit(9)"
+    )
+    line = [sys.executable, "-c", program, str(anchored_folder / "actor.usda")]
+    found = subprocess.run(line, capture_output=True, text=True, check=False)
+    assert found.returncode == 9
+    place = Path(f"/proc/{int(found.stdout)}/stat")
+    for _ in range(1000):
+        if not place.exists() or ") Z" in place.read_text():
+            return
+        time.sleep(0.01)
+    pytest.fail("it still runs")
 
 
 def test_a_rig_costs_a_child_once(anchored_folder, forks, children):
@@ -145,13 +220,14 @@ def test_new_processes_know_the_folders_that_were_allowed(anchored_folder, tmp_p
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "elsewhere" / "more.usda").write_text(doubling(28))
     (anchored_folder / "shot.usda").write_text(f"{HEADER}( subLayers = [@../elsewhere/more.usda@] )\n")
-    monkeypatch.setattr(child_process, "MOST_WAIT_S", 4)
+    monkeypatch.setattr(child_limits, "MOST_WAIT_S", 4)
     monkeypatch.setenv(SETTING, str(tmp_path / "elsewhere"))
     assert "takes OpenUSD" in str(in_thread(lambda: open_stage(anchored_folder / "shot.usda"))[0])
 
 
-def test_programs_that_python_is_part_of_read_without_a_child(anchored_folder, monkeypatch):
-    monkeypatch.setattr(sys, "executable", "/opt/maya/bin/maya.bin")
+@pytest.mark.parametrize("program", ["/opt/maya/bin/maya.bin", "/nowhere/python3", None])
+def test_programs_that_python_is_part_of_read_without_a_child(program, anchored_folder, monkeypatch):
+    monkeypatch.setattr(sys, "executable", program)
     assert in_thread(lambda: load_rig(anchored_folder / "actor.usda")) == []
 
 
@@ -160,6 +236,6 @@ def test_a_child_writes_no_files_and_leaves_no_core(anchored_folder, forks, tmp_
     def write(path):
         (tmp_path / "written").write_text("x")
 
-    monkeypatch.setattr(child_process, "open_checked", write)
+    monkeypatch.setattr(child_limits, "open_checked", write)
     child_process.try_in_child(anchored_folder / "actor.usda")
     assert not (tmp_path / "written").exists() or (tmp_path / "written").stat().st_size == 0
