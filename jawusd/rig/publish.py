@@ -10,7 +10,9 @@ from pathlib import Path
 from pxr import Sdf, UsdUtils
 
 from jawusd.errors import RigError
+from jawusd.formats.allowed_folders import is_allowed
 from jawusd.formats.atomic import atomic_path
+from jawusd.inputs import check_input
 from jawusd.rig.checksums import record_checksums
 from jawusd.rig.layers import write_layer
 from jawusd.rig.layout import ACTOR_FILE, ENCODE_FILE, GEO_FILE, ONNX_FILE, PACKAGE_FILE, PROXY_FILE, RIG_FILE
@@ -54,10 +56,23 @@ def publish_rig(folder: str | os.PathLike[str], out: str | os.PathLike[str], pre
     found = [path.name for path in sorted(folder.iterdir()) if path.suffix in (*_LAYERS, *_COPIED)]
     ordered = [*(name for name in _FIRST if name in found), *(name for name in found if name not in _FIRST)]
     names = {name: _named(prefix, name) for name in ordered}
+    for name in names:
+        _check_own(folder / name)
     out.mkdir(parents=True, exist_ok=True)
     written = [_copy(folder / name, out / new, names) for name, new in names.items()]
     shown = names.get(_CAPTURED, names[ACTOR_FILE])
     return [*written, write_package(out / _named(prefix, PACKAGE_FILE), out / shown)]
+
+
+def _check_own(path: Path) -> None:
+    """Check that a file that is copied is one, and that no link brings it from elsewhere.
+
+    Raises:
+        RigError: It is not.
+    """
+    check_input(path, RigError)
+    if not is_allowed(path) and not path.resolve().is_relative_to(path.parent.resolve()):
+        raise RigError("links to a file outside its own folder.", path=path, hint="Put a copy in its place.")
 
 
 def _named(prefix: str, name: str) -> str:

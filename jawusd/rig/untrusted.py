@@ -87,9 +87,9 @@ def open_checked(path: Path) -> Usd.Stage:
 def check_reach(path: Path) -> list[Sdf.Layer]:
     """Check, before a layer or package is composed, that a rig's layers name only files in their own folder or below.
 
-    Layers that only use a rig (animation, shots) may name it outside their folder, and nothing else. Files that a rig's
-    layers name must lie in the rig's folder, with links resolved. Any may lie in folders that were allowed, see
-    `formats.allowed_folders`.
+    Layers that only use a rig (animation, shots) may name it outside their folder, and nothing else, in values neither:
+    what values name is read (ONNX) and packed (pictures). Files that a rig's layers name must lie in the rig's folder,
+    with links resolved. Any may lie in folders that were allowed, see `formats.allowed_folders`.
 
     Returns:
         The layers, which stay loaded as long as they are referenced.
@@ -154,9 +154,10 @@ def _layers_named(layer: Sdf.Layer, home: Path | None) -> list[_Named]:
     for asset in asset_paths(layer):
         target = layer.ComputeAbsolutePath(asset)
         file = file_of(target)
-        if home is not None:
+        is_part = asset in composed or is_layer(asset)
+        if home is not None or not is_part:
             _check_inside(layer, asset, file, folder)
-        if asset in composed or is_layer(asset):
+        if is_part:
             inside = is_allowed(file) or file.resolve().is_relative_to(folder)
             named.append((target, None if is_allowed(file) else home, None if inside else layer.identifier))
     return named

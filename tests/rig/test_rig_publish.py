@@ -1,5 +1,7 @@
 """Rigs under names of their own: nothing refers to the old names, and actors packed together keep their data."""
 
+import os
+
 import numpy as np
 import pytest
 from example_rig import FPS, assert_valid_usd, example_meshes, example_motion, example_rig
@@ -104,3 +106,19 @@ def test_actors_mixed_up_by_a_packager_are_refused(tmp_path, file):
     assert refused == 1
     found = [finding.message for finding in validate_stage(package) if finding.rule == "Model"]
     assert any("mixed" in message for message in found)
+
+
+@pytest.mark.parametrize("name", ["more.onnx", "more.usda"])
+def test_links_to_files_elsewhere_are_not_copied(name, anchored_folder, tmp_path):
+    (tmp_path / "letter").write_text("#usda 1.0\n")
+    (anchored_folder / name).symlink_to(tmp_path / "letter")
+    with pytest.raises(RigError, match="outside its own folder"):
+        publish_rig(anchored_folder, tmp_path / "out", "hero")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="named pipes of POSIX")
+def test_pipes_are_not_copied(anchored_folder, tmp_path):
+    os.mkfifo(anchored_folder / "more.onnx")
+    with pytest.raises(RigError, match="not a file"):
+        publish_rig(anchored_folder, tmp_path / "out", "hero")

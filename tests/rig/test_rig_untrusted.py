@@ -7,6 +7,7 @@ from jawusd.errors import RigError
 from jawusd.formats.allowed_folders import SETTING
 from jawusd.rig import describe
 from jawusd.rig.asset_paths import file_of
+from jawusd.rig.package import write_package
 from jawusd.rig.read import open_stage
 
 OUTSIDE = '#usda 1.0\nover "Actor" {\n    string jaw:actor = "evil"\n    double jaw:d1 = 7\n}\n'
@@ -42,10 +43,14 @@ def named_by(how, elsewhere):
             f'asset[] assetPaths = [@./rig.usdc@]\nasset manifestAssetPath = @{elsewhere}/evil.usda@\n'
             f'string primPath = "/Actor"\n{times}'
         ),
+        "picture": f'#usda 1.0\nover "Actor" {{\n    asset inputs:file = @{elsewhere}/letter.png@\n}}\n',
+        "graph": f'#usda 1.0\nover "Actor" {{\n    asset jaw:onnx = @{elsewhere}/letter.onnx@\n}}\n',
+        "sound in a list": f'#usda 1.0\nover "Actor" {{\n    asset[] sounds = [@./a.wav@, @{elsewhere}/b.wav@]\n}}\n',
     }[how]  # fmt: skip
 
 
-WAYS = ["format arguments", "dotted arguments", "expression", "clip template", "clips", "clip manifest"]
+WAYS = ["format arguments", "dotted arguments", "expression", "clip template", "clips", "clip manifest", "picture",
+        "graph", "sound in a list"]  # fmt: skip
 
 
 @pytest.mark.parametrize("how", WAYS)
@@ -64,6 +69,19 @@ def test_a_rig_reads_nothing_elsewhere(how, anchored_folder, elsewhere):
     layer.Export(str(anchored_folder / "actor.usda"))
     with pytest.raises(RigError, match="outside its own folder"):
         describe(anchored_folder / "actor.usda")
+
+
+def test_shots_pack_no_files_from_elsewhere(anchored_folder, elsewhere, tmp_path):
+    """A package that is passed on would hold them."""
+    (elsewhere / "letter.png").write_text("between us")
+    for name in (f"{elsewhere}/letter.png", "./link.png"):
+        text = f'( defaultPrim = "Actor" )\ndef "Actor" ( references = @actor.usda@ ) {{\n    asset a = @{name}@\n}}\n'
+        (anchored_folder / "shot.usda").write_text(f"#usda 1.0\n{text}")
+        (anchored_folder / "link.png").unlink(missing_ok=True)
+        (anchored_folder / "link.png").symlink_to(elsewhere / "letter.png")
+        with pytest.raises(RigError, match="outside its own folder"):
+            write_package(tmp_path / "shot.usdz", anchored_folder / "shot.usda")
+    assert not (tmp_path / "shot.usdz").exists()
 
 
 def test_clips_that_link_elsewhere_are_not_read(anchored_folder, elsewhere):
