@@ -6,6 +6,8 @@ import os
 
 import av
 
+from jawusd.imaging.pictures import MOST_PX
+
 #: Formats of one file. FFmpeg also follows playlists (HLS, DASH, concat, SDP), which name other files and addresses.
 FORMATS = (
     "mov,mp4,m4a,3gp,3g2,mj2", "matroska,webm", "avi", "mpegts", "mpeg", "mpegvideo", "mxf", "flv", "ogg", "asf", "nut",
@@ -21,12 +23,19 @@ PICTURES = (
 )  # fmt: skip
 
 
-def open_container(path: str | os.PathLike[str], formats: tuple[str, ...] = FORMATS) -> av.container.InputContainer:
-    """Open a video or sound file, or one of other formats.
+def open_container(
+    path: str | os.PathLike[str], formats: tuple[str, ...] = FORMATS, most_px: int = MOST_PX
+) -> av.container.InputContainer:
+    """Open a video or sound file, or one of other formats. Decoders refuse pictures of more than so many pixels.
 
     Raises:
         av.FFmpegError: it is none, or one that names other files.
         OSError: it cannot be read.
     """
+    limit = {"max_pixels": str(most_px)}
     options = {"format_whitelist": ",".join(formats), "protocol_whitelist": "file"}
-    return av.open(os.fspath(path), metadata_errors="replace", options=options)
+    container = av.open(os.fspath(path), metadata_errors="replace", options=options | limit)  # it decodes some, too
+    for stream in container.streams.video:
+        if stream.codec_context is not None:  # of codecs that are not known
+            stream.codec_context.options = limit
+    return container

@@ -22,6 +22,8 @@ from jawusd.inputs import check_input
 
 _HINT = "Export the pictures again, as PNG, TIFF, EXR, DPX or JPEG."
 _MOST_HEADER_BYTES = 1 << 16
+#: Most pixels of a picture, those of 8K: a few bytes can declare one that fills the memory, at up to 28 bytes a pixel.
+MOST_STORED_PX = 36_000_000
 _EXR, _DPX = b"\x76\x2f\x31\x01", (b"SDPX", b"XPDS")
 _DPX_LOG = (1, 3)  # transfer characteristics of printing density and of logarithm, SMPTE ST 268-1 table 5A
 
@@ -52,11 +54,14 @@ def read_stored(path: Path) -> StoredPicture:
     """
     check_input(path, CaptureError)
     try:
-        with open_container(path, PICTURES) as container:
+        with open_container(path, PICTURES, MOST_STORED_PX) as container:
             frame = next(container.decode(video=0))
             return StoredPicture(*_pixels(frame))
+    except MemoryError as error:
+        raise CaptureError("the picture needs more memory than there is.", path=path, hint=_HINT) from error
     except (av.FFmpegError, OSError, StopIteration, IndexError, ValueError) as error:
-        raise CaptureError(f"the picture cannot be read ({error!s:.100}).", path=path, hint=_HINT) from error
+        what = f"the picture cannot be read, it is damaged or has more than {MOST_STORED_PX} px ({error!s:.100})."
+        raise CaptureError(what, path=path, hint=_HINT) from error
 
 
 def _pixels(frame: av.VideoFrame) -> tuple[Stored, int]:
@@ -81,15 +86,13 @@ def _fractions(frame: av.VideoFrame) -> NDArray[np.float16] | NDArray[np.float32
     """Return planes of fractions as they are stored, in the order red, green, blue."""
     kind = np.dtype(np.float16 if "f16" in frame.format.name else np.float32)
     kind = kind.newbyteorder(">" if frame.format.name.endswith("be") else "<")
-    planes = []
-    for plane in frame.planes:
+    count = len(frame.planes)
+    pixels = np.empty((frame.height, frame.width, min(count, 3)), kind.newbyteorder("="))
+    order = (0,) if count == 1 else (1, 2, 0)  # ffmpeg's planar order is green, blue, red
+    for plane, channel in zip(frame.planes, order):  # a fourth is alpha
         rows = np.frombuffer(memoryview(plane), np.uint8).reshape(-1, plane.line_size)
-        row = np.ascontiguousarray(rows[: frame.height, : frame.width * kind.itemsize])
-        planes.append(row.view(kind).astype(kind.newbyteorder("=")))
-    if len(planes) == 1:
-        return planes[0]
-    green, blue, red = planes[:3]  # ffmpeg's planar order
-    return np.stack([red, green, blue], axis=-1)
+        pixels[..., channel] = np.ascontiguousarray(rows[: frame.height, : frame.width * kind.itemsize]).view(kind)
+    return pixels[..., 0] if count == 1 else pixels
 
 
 def read_header(path: Path) -> PictureHeader:

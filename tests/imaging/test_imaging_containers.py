@@ -9,7 +9,7 @@ import pytest
 from package_copy import ROOT
 
 from jawusd.errors import CaptureError
-from jawusd.imaging import pictures, video
+from jawusd.imaging import pictures, stored_picture, video
 from jawusd.imaging.audio import read_sound
 from jawusd.imaging.pictures import MOST_PX, read_gray
 from jawusd.imaging.video import Video
@@ -64,6 +64,23 @@ def test_huge_pictures_are_none(suffix, tmp_path, monkeypatch):
     assert read_gray(path).shape == (80, 60)
     monkeypatch.setattr(pictures, "MOST_PX", 80 * 60 - 1)
     assert read_gray(path) is None
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".jpg", ".dpx", ".exr"])
+def test_huge_frames_of_sequences_are_refused_before_they_are_decoded(suffix, tmp_path, monkeypatch):
+    """177 bytes of PNG took 1.3 GB before."""
+    kind = {".exr": "gbrpf32le", ".dpx": "rgb48be", ".tif": "rgb48le", ".jpg": "yuvj420p"}.get(suffix, "rgb48be")
+    path = tmp_path / f"a{suffix}"
+    with av.open(str(path), "w", "image2", options={"update": "1"}) as out:
+        codec = {".jpg": "mjpeg", ".tif": "tiff"}.get(suffix, suffix[1:])
+        stream = out.add_stream(codec, 24, options={})
+        stream.width, stream.height, stream.pix_fmt = 64, 80, kind
+        frame = av.VideoFrame.from_ndarray(np.zeros((80, 64, 3), np.uint8), "rgb24").reformat(format=kind)
+        out.mux([*stream.encode(frame), *stream.encode(None)])
+    assert stored_picture.read_stored(path).pixels.shape == (80, 64, 3)
+    monkeypatch.setattr(stored_picture, "MOST_STORED_PX", 64 * 80 - 1)
+    with pytest.raises(CaptureError, match="more than 5119 px"):
+        stored_picture.read_stored(path)
 
 
 def test_a_header_that_announces_more_than_memory_is_none(tmp_path):
