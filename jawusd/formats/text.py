@@ -15,6 +15,10 @@ _MOST_TOML_BYTES = 4 << 20
 _SHOWN = 80  # characters of a line
 _WIDE = (b"\xff\xfe", b"\xfe\xff")  # byte order marks of UTF-16
 _AS_UTF8 = "Save it as UTF-8: editors ask for the encoding under Save As."
+# Tables within tables that one key may name: tomllib takes time by their square, hours for a file of 200 kB.
+_MOST_DOTS = 64
+_NAME = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
+_LONG_KEY = re.compile(rf"(?<![\w-])(?:{_NAME}[ \t]*+\.[ \t]*+){{{_MOST_DOTS}}}", re.ASCII)
 
 
 def read_text(path: Path, most_bytes: int, encoding: str = "utf-8") -> str:
@@ -56,9 +60,11 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, object]:
     """
     path = Path(path)
     text = read_text(path, _MOST_TOML_BYTES, "utf-8-sig")
+    if _LONG_KEY.search(text):
+        raise FormatError(f"has a key of more than {_MOST_DOTS} names with dots between.", path=path)
     try:
         return tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # also of numbers of more than 4300 digits
         said, hint = _not_toml(text, str(error))
         raise FormatError(f"is not valid TOML: {said}.", path=path, hint=hint) from error
 
@@ -66,7 +72,7 @@ def read_toml(path: str | os.PathLike[str]) -> dict[str, object]:
 def _not_toml(text: str, said: str) -> tuple[str, str]:
     """Return what is wrong with the line that an error of tomllib names, and what to do."""
     place = re.search(r" \(at line (\d+), column \d+\)$", said)
-    line = text.splitlines()[int(place[1]) - 1].strip() if place else ""
+    line = text.split("\n")[int(place[1]) - 1].strip() if place else ""
     if place:
         said = f"line {place[1]}, {line[:_SHOWN]}: {said[: place.start()]}"
     if "\\" in line:

@@ -101,6 +101,7 @@ def read_header(path: Path) -> PictureHeader:
     Raises:
         CaptureError: it cannot be read.
     """
+    check_input(path, CaptureError)
     try:
         with open(path, "rb") as file:
             head = file.read(_MOST_HEADER_BYTES)

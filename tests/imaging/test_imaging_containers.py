@@ -1,5 +1,6 @@
 """Videos that name other files, or pictures larger than memory, are refused before anything else is opened."""
 
+import os
 import shutil
 
 import av
@@ -81,6 +82,13 @@ def test_huge_frames_of_sequences_are_refused_before_they_are_decoded(suffix, tm
     monkeypatch.setattr(stored_picture, "MOST_STORED_PX", 64 * 80 - 1)
     with pytest.raises(CaptureError, match="more than 5119 px"):
         stored_picture.read_stored(path)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="named pipes of POSIX")
+def test_headers_of_pipes_are_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "0001.exr")
+    with pytest.raises(CaptureError, match="is not a file"):
+        stored_picture.read_header(tmp_path / "0001.exr")
 
 
 def test_a_header_that_announces_more_than_memory_is_none(tmp_path):
