@@ -24,6 +24,7 @@ from jawusd.cli.options import (
     Method,
     Outside,
     RestOption,
+    RigidOption,
     UnitOption,
     UpperOption,
     subject_given,
@@ -154,7 +155,10 @@ def _check_backend(solver: Solver, backend: Backend) -> None:
 def fit(
     poses: Annotated[
         Path,
-        typer.Argument(help="tracks.npz, a CSV of poses, or HDF5 of jaw-tracking-system.", show_default=False),
+        typer.Argument(
+            help="tracks.npz, a CSV of poses, HDF5 of jaw-tracking-system, or with --rigid a table of markers.",
+            show_default=False,
+        ),
     ],
     capture: CaptureOption = None,
     upper_teeth: UpperOption = None,
@@ -166,6 +170,7 @@ def fit(
     invert: InvertOption = False,
     rest_frame: RestOption = None,
     group: GroupOption = None,
+    rigid: RigidOption = None,
     out: Annotated[Path, typer.Option("-o", "--out", help="File of the model.")] = Path("model.npz"),
     model: Annotated[Method, typer.Option(help="Form of the jaw model.")] = Method.anchored,
     force: Force = False,
@@ -178,7 +183,7 @@ def fit(
     from jawusd.pipeline.prepare import naming_file
 
     refuse_existing(out, force)
-    motion = read_motion(poses, trajectory_options(columns, length_unit, invert, rest_frame, group))
+    motion = read_motion(poses, trajectory_options(columns, length_unit, invert, rest_frame, group, rigid))
     subject = subject_given(poses.stem, capture, upper_teeth, lower_teeth, mandible, landmarks, allow_outside)
     with progress() as report, naming_file(poses):
         fitted = fit_subject(subject, motion, model.value, report)

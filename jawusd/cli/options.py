@@ -135,19 +135,46 @@ RestOption = Annotated[
     typer.Option(help="A frame with the teeth in occlusion: poses are taken relative to it.", show_default=False),
 ]
 GroupOption = Annotated[str | None, typer.Option(help="Trajectory of an HDF5 file.", show_default=False)]
+RigidOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="PLATE=MARKERS",
+        help="The file holds markers; which of them are fixed to jaw=... and, unless it stands still, head=...: their "
+        "numbers, as jaw=5,6,7,8 (with --rest-frame), or a marker description, as jaw=jaw.rig. Tables of numbers "
+        "alone and ArtiSynth probes are read, marker%d.txt as one. May be repeated.",
+        show_default=False,
+    ),
+]
 
 
 def trajectory_options(
-    columns: str | None, length_unit: LengthUnit, invert: bool, rest_frame: int | None, group: str | None
+    columns: str | None,
+    length_unit: LengthUnit,
+    invert: bool,
+    rest_frame: int | None,
+    group: str | None,
+    rigid: list[str] | None,
 ) -> TrajectoryOptions:
-    """Return the options of a file of poses.
+    """Return the options of a file of poses or markers.
 
     Raises:
-        typer.BadParameter: a column map that cannot be read.
+        typer.BadParameter: a column map or plates that cannot be read.
     """
     from jawusd.pipeline.fit import TrajectoryOptions
 
-    return TrajectoryOptions(_column_map(columns), length_unit.value, invert, rest_frame, group)
+    return TrajectoryOptions(_column_map(columns), length_unit.value, invert, rest_frame, group, _plates(rigid))
+
+
+def _plates(told: list[str] | None) -> dict[str, str]:
+    found: dict[str, str] = {}
+    for text in told or ():
+        name, sign, markers = (piece.strip() for piece in text.partition("="))
+        if not sign or not markers or name not in ("head", "jaw"):
+            raise typer.BadParameter(f'"{text}" is not of the form jaw=MARKERS or head=MARKERS.', param_hint="--rigid")
+        if name in found:
+            raise typer.BadParameter(f'"{name}" is named twice.', param_hint="--rigid")
+        found[name] = markers
+    return found
 
 
 def _column_map(text: str | None) -> dict[str, str]:

@@ -21,6 +21,7 @@ from jawusd.cli.options import (
     Outside,
     Prim,
     RestOption,
+    RigidOption,
     UnitOption,
     UpperOption,
     subject_given,
@@ -63,13 +64,14 @@ def report(
     invert: InvertOption = False,
     rest_frame: RestOption = None,
     group: GroupOption = None,
+    rigid: RigidOption = None,
     starts: Annotated[int, typer.Option(min=1, max=64, help="Random starts of the paper's networks.")] = 2,
     force: Annotated[bool, typer.Option("--force", help="Overwrite existing figures, or the page of a solve.")] = False,
     allow_outside: Outside = False,
     as_json: Json = False,
 ) -> None:
     """Write the report of a finished build again, or of a solve; or repeat the paper's experiments on a take."""
-    options = trajectory_options(columns, length_unit, invert, rest_frame, group)
+    options = trajectory_options(columns, length_unit, invert, rest_frame, group, rigid)
     if not experiments:
         _report_found(source, capture, out, force, allow_outside, as_json)
         return

@@ -17,7 +17,7 @@ from jawusd.geometry.anatomy import (
 )
 from jawusd.geometry.camera import Camera
 from jawusd.geometry.quaternion import matrix_from_wxyz, wxyz_from_matrix
-from jawusd.geometry.rigid import rigid_fit, triangulate
+from jawusd.geometry.rigid import rigid_fit, rigid_fits, triangulate
 from jawusd.geometry.se3 import (
     make_transform,
     orthonormalise,
@@ -59,6 +59,7 @@ __all__ = [
     "random_rotation",
     "relative_pose",
     "rigid_fit",
+    "rigid_fits",
     "rigidity_defect",
     "se3_adjoint",
     "se3_exp",

@@ -1,4 +1,4 @@
-"""Rigid alignment of point sets and triangulation of image points."""
+"""Rigid alignment of point sets, of which some may be missing, and triangulation of image points."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jawusd.geometry.arrays import Array
-from jawusd.geometry.se3 import make_transform
+from jawusd.geometry.se3 import make_transform, transform_points
+
+_FLATTEST = 1e-6  # of points in a line: their second extent over the first
 
 
 def rigid_fit(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = None) -> Array:
@@ -34,6 +36,41 @@ def rigid_fit(source: ArrayLike, target: ArrayLike, weights: ArrayLike | None = 
     sign[..., 0, 2] = np.sign(np.linalg.det(U @ Vt))
     R = np.swapaxes((U * sign) @ Vt, -1, -2)
     return make_transform(R, q0 - R @ p0)
+
+
+def rigid_fits(source: ArrayLike, targets: ArrayLike) -> tuple[Array, Array]:
+    """Return the rigid motions of a set of points whose copies are partly missing, each by `rigid_fit`.
+
+    Args:
+        source: points [mm], shape (N, 3).
+        targets: the points after each motion [mm], shape (F, N, 3), NaN where one is missing.
+
+    Returns:
+        T (F, 4, 4), NaN where fewer than three points are there or those that are lie on one line, and the root mean
+        square distance (F,) [mm] of the points that are there, NaN likewise.
+
+    Raises:
+        ValueError: wrong shapes.
+    """
+    P, Q = np.asarray(source, dtype=np.float64), np.asarray(targets, dtype=np.float64)
+    if P.ndim != 2 or P.shape[1] != 3 or Q.ndim != 3 or Q.shape[1:] != P.shape:
+        raise ValueError(f"need source (N, 3) and targets (F, N, 3), got {P.shape} and {Q.shape}")
+    T, rms = np.full((len(Q), 4, 4), np.nan), np.full(len(Q), np.nan)
+    there = np.isfinite(Q).all(axis=-1)
+    for seen in np.unique(there, axis=0):
+        if seen.sum() < 3 or _on_a_line(P[seen]):
+            continue
+        rows = np.flatnonzero((there == seen).all(axis=1))
+        found = Q[rows][:, seen]
+        T[rows] = rigid_fit(P[seen], found)
+        off = transform_points(T[rows], P[seen]) - found
+        rms[rows] = np.sqrt((off**2).sum(axis=-1).mean(axis=-1))
+    return T, rms
+
+
+def _on_a_line(points: Array) -> bool:
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(spread[1] < _FLATTEST * spread[0] or spread[0] == 0)
 
 
 def triangulate(projections: ArrayLike, pixels: ArrayLike) -> Array:

@@ -1,4 +1,4 @@
-"""Fit a jaw model to tracks, or to poses of other programs, which are brought to T_skull_mandible in mm first.
+"""Fit a jaw model to tracks, or to poses and markers of other programs, brought to T_skull_mandible in mm first.
 
 Poses of jaw-tracking-system (PyPI `jaw-tracking-system`, Mueller et al.), an optical marker system, come as HDF5.
 Layout, as its `store_transformations` writes it (version 1.1): one group per trajectory, by default
@@ -28,6 +28,7 @@ from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.geometry import make_transform, matrix_from_wxyz, rigidity_defect, se3_inverse
 from jawusd.geometry.arrays import Array
 from jawusd.pipeline.contact import ContactSummary, contact_words, joint_words, with_contact
+from jawusd.pipeline.markers import marker_poses
 from jawusd.pipeline.prepare import Subject, registered_subject
 from jawusd.pipeline.state import Progress, no_progress
 
@@ -60,6 +61,8 @@ class TrajectoryOptions:
     # anywhere on the mandible; None: the poses are identity in occlusion
     rest_frame: int | None = None
     group: str | None = None  # the trajectory of an HDF5 file; None: its raw one
+    # the plates of a table of markers, see `pipeline.markers.marker_poses`; empty: the file holds poses
+    rigid: Mapping[str, str] = field(default_factory=dict)
 
 
 class FitSummary(TypedDict, total=False):
@@ -151,14 +154,19 @@ def read_motion(path: str | os.PathLike[str], options: TrajectoryOptions | None 
 
 
 def read_trajectory(path: str | os.PathLike[str], options: TrajectoryOptions) -> Poses:
-    """Read poses from a CSV or JSON table, or from HDF5 (.h5, .hdf5) of jaw-tracking-system.
+    """Read poses from a CSV or JSON table, a table of markers, or HDF5 (.h5, .hdf5) of jaw-tracking-system.
 
     Raises:
         FormatError: not such a file; an option that does not suit it; the rest frame is missing or has no pose.
         MissingDependencyError: HDF5 without h5py.
     """
     path = Path(path)
-    if path.suffix.lower() in HDF5_SUFFIXES:
+    if options.rigid:
+        if options.columns or options.group:
+            raise FormatError("columns and groups are for poses; a table of markers has plates.", path=path)
+        T = marker_poses(path, options.rigid, options.rest_frame, LENGTH_UNITS_MM[options.length_unit])
+        frames = np.arange(len(T))
+    elif path.suffix.lower() in HDF5_SUFFIXES:
         if options.rest_frame is None:
             raise FormatError(
                 "its poses are those of landmarks on the mandible, not of a scan.",

@@ -62,6 +62,11 @@ def given(person, poses, tmp_path_factory):
         "T_anatomical_skull": make_transform(np.eye(3), -person.landmarks[0]).tolist(),
     }
     (folder / "landmarks.json").write_text(json.dumps(data))
+    plate = person.landmarks[:4]
+    moved = np.einsum("fij,nj->fni", poses[:, :3, :3], plate) + poses[:, None, :3, 3]
+    np.savetxt(folder / "markers.asc", moved.reshape(FRAMES, -1), fmt="%.12e")
+    rows = [f"{number} {x!r} {y!r} {z!r} 1" for number, (x, y, z) in enumerate(plate.tolist(), start=1)]
+    (folder / "jaw.rig").write_text("\n".join(["4 ;Number of markers", "Marker X Y Z Views", *rows]))
     return folder
 
 
@@ -73,9 +78,19 @@ def test_the_same_poses_give_the_same_model_however_they_are_written(given, tmp_
     run("fit", given / "foreign.csv", *whose, "--columns", columns, "--length-unit", "m", "-o", tmp_path / "b.npz")
     run("fit", given / "jaw.h5", *whose, "--rest-frame", 0, "-o", tmp_path / "c.npz")
     ours, foreign, hdf5 = (load_model(tmp_path / f"{name}.npz") for name in "abc")
+    plate = f"jaw={given / 'jaw.rig'}"
+    run("fit", given / "markers.asc", *whose, "--rigid", plate, "-o", tmp_path / "d.npz")
+    np.testing.assert_allclose(load_model(tmp_path / "d.npz").d, ours.d, atol=0.05)
     # A fit of few poses at five landmarks magnifies the last digits of the poses; HDF5 has one pose more, the first.
     np.testing.assert_allclose(foreign.d, ours.d, atol=0.05)
     assert np.median(np.abs(hdf5.d[1:] - ours.d)) < 0.05
+
+
+def test_plates_that_cannot_be_read_are_refused(given):
+    whose = ("--landmarks", given / "landmarks.json")
+    assert "jaw=MARKERS" in run("fit", given / "markers.asc", *whose, "--rigid", "tongue=1,2,3", code=2)
+    twice = ("--rigid", "jaw=1,2,3", "--rigid", "jaw=1,2,4")
+    assert "named twice" in run("fit", given / "markers.asc", *whose, *twice, code=2)
 
 
 def test_scans_take_the_place_of_a_capture(given, tmp_path, poses):
