@@ -16,8 +16,8 @@ from jawusd.geometry.arrays import Array
 PLATES = ("head", "jaw")
 
 # Root mean square distance of a plate's markers from their places on it, beyond which a frame has no pose: a marker
-# jumped or was taken for another. Of 6,400 plates of recorded speech and clench the largest is 0.18 mm; by chance it is passed in
-# 1 of 10 million frames where four markers have 0.3 mm of noise per axis (chi squared of six degrees of freedom).
+# jumped or was taken for another. Of 6,400 plates of recorded speech and clench the largest is 0.18 mm; chance passes
+# it once in 10 million where four markers have 0.3 mm of noise per axis (chi squared of six degrees of freedom).
 _FARTHEST_MM = 1.0
 
 
