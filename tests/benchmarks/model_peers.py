@@ -108,12 +108,12 @@ def gp_incisor(data: TrainingData) -> Peer:
     return Peer(rebuild, len(data) * 6)
 
 
-def autoencoder(points: Array) -> tuple[Rebuild, int]:
-    """A plain autoencoder 6-8-3-8-6 with tanh units, trained by L-BFGS; the better of two starts."""
+def autoencoder(points: Array, codes: int = CODES, starts: int = AE_STARTS) -> tuple[Rebuild, int]:
+    """A plain autoencoder 6-8-codes-8-6 with tanh units, trained by L-BFGS; the best of some starts."""
     torch.set_num_threads(1)
     centre, scale = points.mean(0), points.std(0).max()
     x = torch.from_numpy((points - centre) / scale)
-    nets = [_trained(x, seed) for seed in range(AE_STARTS)]
+    nets = [_trained(x, codes, seed) for seed in range(starts)]
     net = min(nets, key=lambda found: ((found(x) - x) ** 2).mean().item())
 
     def rebuild(new: Array) -> Array:
@@ -123,10 +123,10 @@ def autoencoder(points: Array) -> tuple[Rebuild, int]:
     return rebuild, sum(weight.numel() for weight in net.parameters())
 
 
-def _trained(x: torch.Tensor, seed: int) -> torch.nn.Module:
+def _trained(x: torch.Tensor, codes: int, seed: int) -> torch.nn.Module:
     torch.manual_seed(seed)
     width = x.shape[1]
-    layers = [(width, AE_HIDDEN), (AE_HIDDEN, CODES), (CODES, AE_HIDDEN), (AE_HIDDEN, width)]
+    layers = [(width, AE_HIDDEN), (AE_HIDDEN, codes), (codes, AE_HIDDEN), (AE_HIDDEN, width)]
     a, b, c, d = (torch.nn.Linear(*sizes, dtype=torch.float64) for sizes in layers)
     net = torch.nn.Sequential(a, torch.nn.Tanh(), b, c, torch.nn.Tanh(), d)
     weights = list(net.parameters())

@@ -1,0 +1,165 @@
+"""Photographs of real teeth: crowns of two patients aligned with drawn outlines, and automatic masks against them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from report import table, title
+from scipy import ndimage
+from sources import PATIENTS
+
+from jawusd.geometry import Camera, so3_log, transform_point
+from jawusd.imaging.meshio import load_mesh
+from jawusd.imaging.overlay import save_png
+from jawusd.imaging.pictures import read_gray, read_picture
+from jawusd.pipeline.photographs import drawn_over, read_drawing
+from jawusd.segmentation.colours import ColourModel
+from jawusd.segmentation.config import SegmentationConfig
+from jawusd.segmentation.crowns import ScanSurface, expect_crowns
+from jawusd.segmentation.learn import cut_picture
+from jawusd.segmentation.picture import Window
+from jawusd.segmentation.rows import tooth_rows
+from jawusd.tracking.photographs import PhotoAlignment, align_photographs
+from jawusd.tracking.photographs.align import _lower_incisor, _refined
+from jawusd.tracking.photographs.contact import Contact
+from jawusd.tracking.photographs.solve import Bite
+
+Array = np.ndarray
+COLOUR = 1  # cv2.IMREAD_COLOR
+VIEWS = {"front": 4, "left": 2, "right": 3}  # with the teeth together, and their numbers in the names of the files
+ROWS = ("Upper", "Lower")
+LARGEST_TOOTH = 0.05  # share of a picture: closed lines around more enclose no tooth
+PALETTE = np.array([[60, 220, 60], [60, 160, 255]])
+
+
+def run(data: Path, out: Path) -> None:
+    """Print the tables of both patients and write pictures."""
+    title("Photographs of patients", f"`{PATIENTS.repository}` seg/valid and demo/ref_mesh", PATIENTS.licence)
+    folder = PATIENTS.found(data)
+    aligned = [align(folder, patient) for patient in (0, 1)]
+    print("Outlines [px at 1440 px width]; T_upper_lower by a photograph alone and by the two others [mm]:\n")
+    header = ("patient", "photograph", "focal", "rms", "median", "without gum lines", "alone to all", "others to all")
+    table(header, (row for patient, found in enumerate(aligned) for row in outline_rows(patient, found)))
+    print("Automatic masks against the areas of the drawn outlines, intersection over union:\n")
+    table(
+        ("patient", "photograph", "upper", "lower", "both", "both, without scans", "outlines closed"),
+        (row for patient, found in enumerate(aligned) for row in mask_rows(folder, patient, found, out)),
+    )
+
+
+def align(folder: Path, patient: int) -> PhotoAlignment:
+    """Align a patient's crowns with the lines drawn in three photographs, focal lengths unknown."""
+    lines = [read_drawing(labels(folder, patient, view), view) for view in VIEWS]
+    return align_photographs(lines, meshes(folder, patient), lambda stage, done, total: None)
+
+
+def meshes(folder: Path, patient: int) -> list:
+    """Return the crowns of both rows, each in a frame of its own."""
+    place = folder / "demo" / "ref_mesh" / str(patient)
+    return [load_mesh(place / f"Ref_{row}_Mesh_Tag={patient}.obj") for row in ROWS]
+
+
+def labels(folder: Path, patient: int, view: str) -> Array:
+    """Return the drawn lines of a photograph, gray, 0 where there is none."""
+    return read_gray(folder / "seg" / "valid" / "label" / f"{patient}-{VIEWS[view]}.png")
+
+
+def outline_rows(patient: int, found: PhotoAlignment) -> list[list[str]]:
+    """Return the rows of a patient: how outlines fit, and how photographs agree on the bite at the lower incisor."""
+    joint, point = found.bite, _lower_incisor(found.rows)
+    contact = Contact([crowns.scan for crowns in found.rows.fine])
+
+    def bite(numbers: list[int]) -> Array:
+        photos = tuple(joint.photos[k] for k in numbers)
+        start = Bite(photos, joint.T_upper_lower, joint.gum_mm)
+        return _refined(start, [photo.drawing for photo in photos], found.rows, contact).T_upper_lower
+
+    def apart(T: Array) -> str:
+        off = np.linalg.norm(transform_point(T, point) - transform_point(joint.T_upper_lower, point))
+        turn = np.degrees(np.linalg.norm(so3_log(T[:3, :3] @ joint.T_upper_lower[:3, :3].T)))
+        return f"{off:.2f} ({turn:.1f} degrees)"
+
+    rows = []
+    for k, photo in enumerate(found.result.photos):
+        figures = (photo.outline_rms_px, photo.outline_median_px, photo.free_rms_px)
+        others = [j for j in range(len(VIEWS)) if j != k]
+        told = [f"{value:.2f}" for value in figures]
+        rows.append([str(patient), photo.name, f"{photo.focal_px:.0f}", *told, apart(bite([k])), apart(bite(others))])
+    return rows
+
+
+def mask_rows(folder: Path, patient: int, found: PhotoAlignment, out: Path) -> list[list[str]]:
+    """Return the rows of a patient: masks by the aligned crowns and colours, and by the picture alone."""
+    scans = tuple(ScanSurface.of(mesh) for mesh in meshes(folder, patient))
+    return [mask_row(folder, patient, found, k, scans, out) for k in range(len(VIEWS))]
+
+
+def mask_row(folder: Path, patient: int, found: PhotoAlignment, number: int, scans: tuple, out: Path) -> list[str]:
+    """Return the row of a photograph, and write its masks over it."""
+    told, photo = found.result.photos[number], found.bite.photos[number]
+    picture = read_picture(folder / "seg" / "valid" / "image" / f"{patient}-{VIEWS[told.name]}.png", COLOUR)
+    picture, drawn = picture[..., ::-1], labels(folder, patient, told.name)
+    if told.mirrored:
+        picture, drawn = picture[:, ::-1], drawn[:, ::-1]
+    picture = np.ascontiguousarray(picture)
+    size = (picture.shape[1], picture.shape[0])
+    k1 = [photo.pose.opencv_k1(size), 0.0, 0.0, 0.0]
+    lens = Camera(told.name, size, photo.pose.camera_matrix(size), np.array(k1), photo.pose.T_cam_upper)
+    poses = np.stack([np.eye(4), found.bite.T_upper_lower])
+    expected = expect_crowns(scans, poses, lens)
+    px_per_mm = photo.pose.focal_px / float((photo.pose.T_cam_upper @ [*scans[0].vertices.mean(axis=0), 1.0])[2])
+    masks = automatic(picture, lens, expected, px_per_mm)
+    areas, closed = drawn_areas(drawn, expected.labels)
+    rows = tooth_rows(picture)
+    bare = overlap(rows.masks.any(axis=0), areas.any(axis=0)) if rows is not None else "no rows found"
+    both = overlap(masks.any(axis=0), areas.any(axis=0))
+    save_overlay(out / f"patient_{patient}_{told.name}", picture, masks, areas, found, number)
+    single = [overlap(mask, area) for mask, area in zip(masks, areas, strict=True)]
+    return [str(patient), told.name, *single, both, bare, str(closed)]
+
+
+def automatic(picture: Array, lens: Camera, expected, px_per_mm: float) -> Array:
+    """Return the masks of both rows (2, h, w) that the colours under and around the aligned crowns tell."""
+    config = SegmentationConfig()
+    colours = ColourModel(config.memory_frames)
+    inside = expected.inside_px.max(axis=0) / px_per_mm
+    around = inside < -config.outer_mm
+    colours.learn(picture, inside > config.inner_mm, around & (inside > -config.outer_mm - config.margin_mm))
+    window = Window(lens, picture, (0, 0))
+    shares, _ = cut_picture(window, expected, colours, config, px_per_mm, config.reach_mm[-1], None)
+    return shares > 0.5
+
+
+def drawn_areas(lines: Array, expected: Array) -> tuple[Array, int]:
+    """Return the areas of both rows (2, h, w) that closed lines enclose, by the crowns seen there, and their number."""
+    thick = ndimage.binary_dilation(lines > 0)
+    parts, count = ndimage.label(~thick)
+    sizes = ndimage.sum_labels(np.ones_like(parts), parts, np.arange(1, count + 1))
+    areas, closed = np.zeros((2, *lines.shape), dtype=bool), 0
+    for part in 1 + np.flatnonzero(sizes < LARGEST_TOOTH * lines.size):
+        here = parts == part
+        seen = [np.count_nonzero(expected[here] == row) for row in (1, 2)]
+        if max(seen) * 2 > np.count_nonzero(here):
+            areas[int(np.argmax(seen))] |= here
+            closed += 1
+    return np.stack([ndimage.binary_closing(area, iterations=4) for area in areas]), closed
+
+
+def overlap(one: Array, other: Array) -> str:
+    """Return the intersection over union of two masks, as it is printed."""
+    return f"{np.count_nonzero(one & other) / max(1, np.count_nonzero(one | other)):.3f}"
+
+
+def save_overlay(path: Path, picture: Array, masks: Array, areas: Array, found: PhotoAlignment, number: int) -> None:
+    """Write the outlines of crowns over the photograph, and masks (tinted) with the borders of drawn areas (red)."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    upright = picture[:, ::-1] if found.result.photos[number].mirrored else picture
+    save_png(path.with_name(path.name + "_crowns.png"), drawn_over(np.ascontiguousarray(upright), found, number))
+    tinted = picture.astype(np.float64)
+    for mask, colour in zip(masks, PALETTE, strict=True):
+        tinted[mask] = 0.6 * tinted[mask] + 0.4 * colour
+    for area in areas:
+        border = area & ~ndimage.binary_erosion(area, iterations=2)
+        tinted[border] = (255, 40, 40)
+    save_png(path.with_name(path.name + "_masks.png"), tinted.astype(np.uint8))
