@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -37,10 +38,16 @@ def run(data: Path, out: Path) -> None:
     """Print the tables of both patients and write pictures."""
     title("Photographs of patients", f"`{PATIENTS.repository}` seg/valid and demo/ref_mesh", PATIENTS.licence)
     folder = PATIENTS.found(data)
-    aligned = [align(folder, patient) for patient in (0, 1)]
+    aligned: list[PhotoAlignment] = []
+
+    def outlines() -> Iterator[list[str]]:
+        for patient in (0, 1):
+            aligned.append(align(folder, patient))
+            yield from outline_rows(patient, aligned[patient])
+
     print("Outlines [px at 1440 px width]; T_upper_lower by a photograph alone and by the two others [mm]:\n")
     header = ("patient", "photograph", "focal", "rms", "median", "without gum lines", "alone to all", "others to all")
-    table(header, (row for patient, found in enumerate(aligned) for row in outline_rows(patient, found)))
+    table(header, outlines())
     print("Automatic masks against the areas of the drawn outlines, intersection over union:\n")
     table(
         ("patient", "photograph", "upper", "lower", "both", "both, without scans", "outlines closed"),

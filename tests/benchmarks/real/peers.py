@@ -12,9 +12,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 from report import table, title
-from tracking import cut
 
-from jawusd.formats.capture import Capture, load_capture
+from jawusd.formats.capture import Bootstrap, Capture, Pick, PickView, load_capture
 from jawusd.formats.mesh import Mesh, crown_face_mask, tooth_labels
 from jawusd.geometry import Camera, make_transform, rigid_fits, se3_inverse, transform_points
 from jawusd.pipeline.prepare import load_cameras, load_meshes, subject_of_capture
@@ -25,7 +24,8 @@ from jawusd.tracking.paper.take import track_capture_paper
 Array = np.ndarray
 ROWS = ("upper", "lower")
 OFF_MM = 2.0  # incisal error from which a pose is of no use
-PICKS, PICK_PX = 8, 1.5  # points per row that a person picks in every picture, and how far off along each axis
+# Points per row that a person picks in every picture, how far off along each axis, and the fewest that will do.
+PICKS, PICK_PX, FEWEST_PICKS = 8, 1.5, 6
 # Markers at the four corners of a plate this far before the teeth, and the noise of their places: 0.18 mm rms, as the
 # optical jaw-tracking-system reports of its cameras.
 PLATE_MM, BEFORE_MM, MARKER_MM = (50.0, 76.0), 60.0, 0.18
@@ -72,14 +72,35 @@ def scene_of(path: Path, frames: int) -> Scene:
     scans = (meshes["upper_teeth"], meshes["lower_teeth"])
     start = min(len(truth["frames"]) // 3, len(truth["frames"]) - frames)
     window = slice(start, start + frames)
+    poses = (truth["T_world_upper"][window], truth["T_world_lower"][window])
+    first = int(truth["frames"][start])
+    picks = {name: exact_picks(scan, T[0], cameras) for name, scan, T in zip(ROWS, scans, poses, strict=True)}
+    given = {"frames": (first, first + frames), "bootstrap": Bootstrap(frame=first, **picks)}
     return Scene(
-        cut(capture, cameras, list(scans), truth, start, frames),
+        capture.model_copy(update=given),
         cameras,
         dict(zip(truth["camera_names"].tolist(), truth["offsets"].tolist(), strict=True)),
         scans,
         subject_of_capture(capture, meshes).landmarks,
-        (truth["T_world_upper"][window], truth["T_world_lower"][window]),
+        poses,
     )
+
+
+def exact_picks(scan: Mesh, pose: Array, cameras: list[Camera]) -> tuple[Pick, ...]:
+    """Return points of a row where they truly are, in the pictures of all cameras that they lie in."""
+    picks = []
+    for vertex in spread_vertices(scan):
+        pixels = {camera.name: inside(camera, transform_points(pose, scan.vertices[[vertex]])) for camera in cameras}
+        views = [PickView(camera=name, x=seen[0, 0], y=seen[0, 1]) for name, seen in pixels.items() if len(seen)]
+        if len(views) > 1:
+            picks.append(Pick(vertex=int(vertex), views=tuple(views)))
+    return tuple(picks)
+
+
+def inside(camera: Camera, points_world: Array) -> Array:
+    """Return where points (N, 3) are seen that lie in a camera's picture [px], shape (M, 2)."""
+    pixels = camera.project(points_world)
+    return pixels[((pixels > 0) & (pixels < np.array(camera.size_px) - 1)).all(axis=1)]
 
 
 def methods(m3t: Path | None) -> dict[str, Callable[[Scene], Array]]:
@@ -129,28 +150,33 @@ def picked_points(scene: Scene) -> Array:
     rng, camera = np.random.default_rng(0), scene.cameras[0]
     poses = []
     for scan, truth in zip(scene.scans, scene.poses, strict=True):
-        points = spread_points(scan)
+        points = scan.vertices[spread_vertices(scan)]
         seen = [camera.project(transform_points(T, points)) + rng.normal(0, PICK_PX, (PICKS, 2)) for T in truth]
         poses.append(np.stack([posed(points, pixels, camera) for pixels in seen]))
     return se3_inverse(poses[0]) @ poses[1]
 
 
 def posed(points: Array, pixels: Array, camera: Camera) -> Array:
-    """Return T_cam_row by OpenCV's SQPNP and its refinement by Levenberg-Marquardt."""
-    lens = (camera.K, camera.distortion)
+    """Return T_cam_row by OpenCV's SQPNP and its refinement by Levenberg-Marquardt; NaN where too few points show."""
+    lens, shown = (camera.K, camera.distortion), ((pixels > 0) & (pixels < camera.size_px)).all(axis=1)
+    if shown.sum() < FEWEST_PICKS:
+        return np.full((4, 4), np.nan)
+    points, pixels = points[shown], pixels[shown]
     _, turn, shift = cv2.solvePnP(points, pixels, *lens, flags=cv2.SOLVEPNP_SQPNP)
     turn, shift = cv2.solvePnPRefineLM(points, pixels, *lens, turn, shift)
     return make_transform(cv2.Rodrigues(turn)[0], shift.ravel())
 
 
-def spread_points(scan: Mesh) -> Array:
-    """Return points of the front half of a row that lie as far apart as they can, (PICKS, 3)."""
-    crown = scan.vertices[tooth_labels(scan) > 0]
-    crown = crown[crown[:, 2] > np.median(crown[:, 2])]
-    chosen = [crown[crown[:, 2].argmax()]]
+def spread_vertices(scan: Mesh) -> Array:
+    """Return vertices of the front half of a row that lie as far apart as they can, (PICKS,)."""
+    crown = np.flatnonzero(tooth_labels(scan) > 0)
+    depth = scan.vertices[crown, 2]
+    crown = crown[depth > np.median(depth)]
+    chosen = [crown[scan.vertices[crown, 2].argmax()]]
     while len(chosen) < PICKS:
-        chosen.append(crown[np.min([np.linalg.norm(crown - one, axis=1) for one in chosen], axis=0).argmax()])
-    return np.stack(chosen)
+        apart = np.linalg.norm(scan.vertices[crown, None] - scan.vertices[chosen], axis=-1).min(axis=1)
+        chosen.append(crown[apart.argmax()])
+    return np.array(chosen)
 
 
 def markers(scene: Scene) -> Array:
