@@ -11,27 +11,15 @@ from typing import Annotated
 
 import typer
 
-from jawusd.cli import (
-    animate_command,
-    build_commands,
-    capture_commands,
-    face_commands,
-    library_commands,
-    live_commands,
-    photo_commands,
-    report_commands,
-    rig_commands,
-    solve_commands,
-    stage_commands,
-    start_commands,
-)
-from jawusd.cli.command import CONTEXT, Command
+from jawusd.cli.command import CONTEXT
+from jawusd.cli.commands import Commands
 from jawusd.cli.log import logged
-from jawusd.cli.summaries import EXIT_CODES, SUMMARIES
+from jawusd.cli.summaries import EXIT_CODES
 from jawusd.errors import JawusdError, OutputError, explain_missing_packages
 
 app = typer.Typer(
     name="jawusd",
+    cls=Commands,
     help="Capture in, jaw rig out: person-specific jaw kinematics from video as an OpenUSD rig.",
     epilog=EXIT_CODES,
     context_settings=CONTEXT,
@@ -40,42 +28,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-for _command in (
-    start_commands.init,
-    start_commands.doctor,
-    start_commands.cameras,
-    build_commands.build,
-    build_commands.track,
-    build_commands.fit,
-    build_commands.bake,
-    build_commands.demo,
-    build_commands.build_many,
-    capture_commands.check,
-    capture_commands.calibrate,
-    capture_commands.sync,
-    capture_commands.segment,
-    capture_commands.scans,
-    photo_commands.photos,
-    rig_commands.info,
-    rig_commands.pose,
-    stage_commands.encode,
-    rig_commands.validate,
-    rig_commands.ik,
-    animate_command.animate,
-    face_commands.arkit_fit,
-    face_commands.arkit_table,
-    stage_commands.rebake,
-    stage_commands.publish,
-    solve_commands.solve,
-    live_commands.live,
-    library_commands.retarget,
-    library_commands.library,
-    capture_commands.plates,
-    report_commands.report,
-    report_commands.view,
-):
-    _name = _command.__name__.replace("_", "-")
-    app.command(_name, cls=Command, context_settings=CONTEXT, short_help=SUMMARIES[_name])(_command)
 
 
 @app.callback(invoke_without_command=True)

@@ -1,7 +1,9 @@
-"""What each command does in a few words, as `jawusd --help` lists it on 80 columns."""
+"""What each command does in a few words, as `jawusd --help` lists it on 80 columns, in that order."""
 
 SUMMARIES = {
     "init": "Begin a capture: look at a folder, write its capture.toml.",
+    "doctor": "Say what is installed and what works here.",
+    "cameras": "Carry calibrated cameras between programs.",
     "build": "Turn a capture into a rig.",
     "track": "Track both rows of teeth through the masks.",
     "fit": "Fit a jaw model to tracked or given poses.",
@@ -31,8 +33,6 @@ SUMMARIES = {
     "plates": "Write the footage without lens distortion.",
     "report": "Write the report of a build or a solve again.",
     "view": "See a rig or a capture in the browser.",
-    "cameras": "Carry calibrated cameras between programs.",
-    "doctor": "Say what is installed and what works here.",
 }
 
 EXIT_CODES = (

@@ -1,17 +1,22 @@
 """The rig as OpenUSD: authoring, reading, validation, animation, ONNX sidecar.
 
-`jawusd.rig.bake` and `jawusd.rig.onnx_sidecar` need the package onnx (`jawusd[build]`); nothing else here does.
+What its names need is loaded when they are first used. `jawusd.rig.bake` and
+`jawusd.rig.onnx_sidecar` need the package onnx (`jawusd[build]`); nothing else here does.
 """
 
-from jawusd.formats.allowed_folders import allow_folders
-from jawusd.rig.animation import write_animation, write_splines
-from jawusd.rig.nvidia import find_nvidia_validator, nvidia_findings
-from jawusd.rig.read import describe, load_rig
-from jawusd.rig.schema import register_schema, schema_is_live
-from jawusd.rig.validate import Finding, register_validators, validate_stage
+from __future__ import annotations
 
-# At import: OpenUSD ignores schemas registered after a process has used its first stage.
-register_schema()
+import importlib
+from typing import TYPE_CHECKING
+
+from jawusd.rig.schema import register_schema, schema_is_live
+
+if TYPE_CHECKING:
+    from jawusd.formats.allowed_folders import allow_folders
+    from jawusd.rig.animation import write_animation, write_splines
+    from jawusd.rig.nvidia import find_nvidia_validator, nvidia_findings
+    from jawusd.rig.read import describe, load_rig
+    from jawusd.rig.validate import Finding, register_validators, validate_stage
 
 __all__ = [
     "Finding",
@@ -27,3 +32,29 @@ __all__ = [
     "write_animation",
     "write_splines",
 ]
+
+_MODULES = {
+    "Finding": "jawusd.rig.validate",
+    "allow_folders": "jawusd.formats.allowed_folders",
+    "describe": "jawusd.rig.read",
+    "find_nvidia_validator": "jawusd.rig.nvidia",
+    "load_rig": "jawusd.rig.read",
+    "nvidia_findings": "jawusd.rig.nvidia",
+    "register_validators": "jawusd.rig.validate",
+    "validate_stage": "jawusd.rig.validate",
+    "write_animation": "jawusd.rig.animation",
+    "write_splines": "jawusd.rig.animation",
+}
+
+# At import: OpenUSD ignores schemas registered after a process has used its first stage.
+register_schema()
+
+
+def __getattr__(name: str) -> object:
+    if name not in _MODULES:
+        raise AttributeError(f"module 'jawusd.rig' has no attribute {name!r}")
+    return getattr(importlib.import_module(_MODULES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return __all__
