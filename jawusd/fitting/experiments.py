@@ -14,7 +14,7 @@ from jawusd.fitting.coverage import FAR_MM, bound_not_reached, missing_movements
 from jawusd.fitting.data import Source, SubjectAnatomy, TrainingData, select
 from jawusd.fitting.fit import FittingConfig, Progress, fit_form
 from jawusd.fitting.form import FittedForm
-from jawusd.fitting.nlpca import Nlpca, train_nlpca
+from jawusd.fitting.nlpca import Nlpca
 from jawusd.fitting.paper import COMPONENTS, PaperFit
 from jawusd.fitting.synthesis import Bounds, captured_reference, distance_to_nearest
 from jawusd.formats.experiments import Coverage, Distances, Experiments
@@ -147,6 +147,8 @@ def _networks(
     data: TrainingData, config: FittingConfig, paper: FittedForm | None, notify: Callable[[int], None]
 ) -> list[Nlpca]:
     """Return networks of 1..5 components; the last is that of the paper's model, if there is one."""
+    from jawusd.fitting.nlpca_training import train_nlpca  # imports torch
+
     points = se3_log(data.motion) @ data.metric.twist_root()
     nets = []
     for count in range(1, COMPONENTS + 1):

@@ -158,7 +158,7 @@ def fit_form(
         return fit_additive(data, shown, config.trim_mad)
     if config.method == "pca":
         return fit_pca(data, shown)
-    from jawusd.fitting.paper import fit_paper  # imports torch, which takes two seconds
+    from jawusd.fitting.paper import fit_paper
 
     return fit_paper(data, shown, config.literal, config.starts, config.seed, nets)
 

@@ -43,8 +43,8 @@ class MandibleMetric:
     def largest(self, M: Array, target: Array) -> Array:
         """Return the largest displacement of any point between motions (N, 4, 4) [mm], shape (N,)."""
         difference = M - target
-        moved = self.extremes @ np.swapaxes(difference[:, :3, :3], 1, 2) + difference[:, None, :3, 3]
-        return np.sqrt((moved**2).sum(-1).max(-1))
+        x, y, z = np.moveaxis(difference[:, :3, :3] @ self.extremes.T + difference[:, :3, 3:], 1, 0)
+        return np.sqrt((x * x + y * y + z * z).max(-1))
 
     def nearest(self, model: JawModelForm, target: Array) -> tuple[Array, Array]:
         """Return the parameters (N, 3) [mm] and motions (N, 4, 4) of a model nearest to motions (N, 4, 4)."""

@@ -25,7 +25,7 @@ from jawusd.fitting.curves import MEASURED, Curve, in_millimetres
 from jawusd.fitting.data import TrainingData
 from jawusd.fitting.error_table import pose_errors, summarise
 from jawusd.fitting.form import FittedForm
-from jawusd.fitting.nlpca import Nlpca, train_nlpca
+from jawusd.fitting.nlpca import Nlpca
 from jawusd.geometry import se3_exp, se3_log
 from jawusd.geometry.arrays import Array, Mask
 
@@ -118,6 +118,8 @@ def fit_paper(
     Raises:
         FittingError: a parameter is not in the data, or no component moves the incisal point that way.
     """
+    from jawusd.fitting.nlpca_training import train_nlpca  # imports torch, which takes two seconds
+
     if not shown.all():
         raise FittingError(
             "the paper's model needs opening, lateral and protrusive movements in the data.",
@@ -151,6 +153,8 @@ def _network_sum(data: TrainingData, points: Array, root: Array, literal: bool, 
 
 
 def _part(net: Nlpca, components: Array, group: tuple[int, ...], seed: int, stages: int) -> _Part:
+    from jawusd.fitting.nlpca_training import train_nlpca
+
     if len(group) == 1:
         return _Part(group, None)
     return _Part(group, train_nlpca(net.decode(_only(components, group)), 1, seed, centre=True, stages=stages))

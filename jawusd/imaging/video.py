@@ -59,7 +59,7 @@ class Video(Clip):
             stream = container.streams.video[0]
             announced = stream.frames
             self._time_base = float(stream.time_base or 1)
-            self._pts, self._seek_dts, stored = self._packet_table(container, stream)
+            self._pts, self._seek_dts, self._key_before, stored = self._packet_table(container, stream)
             self.fps = float(stream.average_rate or 0)
             stored_aspect = stream.sample_aspect_ratio
             self.timecode = _timecode(container, stream)
@@ -74,7 +74,7 @@ class Video(Clip):
                 path=path,
                 hint="Copy it again from the camera, or cut it to the part that is whole.",
             )
-        self.keys = np.unique(self._seek_dts, return_index=True)[1]
+        self.keys = np.unique(self._key_before)
         self.start_s = float(self._pts[0] * self._time_base)
         self.times_s = (self._pts - self._pts[0]) * self._time_base
         self.timeline = Timeline(self.times_s, self.fps)
@@ -133,8 +133,11 @@ class Video(Clip):
 
     def _packet_table(
         self, container: av.container.InputContainer, stream: av.VideoStream
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], int]:
-        """Return per picture its time stamp and where to seek for it, and how many pictures the file stores."""
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.intp], int]:
+        """Return per picture its time stamp, the time its key frame is decoded at and that frame's number.
+
+        Last comes how many pictures the file stores.
+        """
         pts, dts, key, stored = [], [], [], 0
         try:
             for packet in container.demux(stream):
@@ -152,10 +155,9 @@ class Video(Clip):
             pass
         order = np.argsort(pts, kind="stable")
         times = np.array(pts, np.int64)[order]
-        # Seeking by the decoding time of the last key frame shown no later than the picture: it decodes before it.
         is_key = np.array(key, bool)[order]
         latest = np.maximum.accumulate(np.where(is_key, np.arange(len(order)), 0)) if len(order) else order
-        return times, np.array(dts, np.int64)[order][latest], stored
+        return times, np.array(dts, np.int64)[order][latest], latest, stored
 
     def _decode(self, first: int, last: int, threads: int, alpha: bool = False) -> Iterator[tuple[int, av.VideoFrame]]:
         """Yield (index, decoded frame) for every index of [first, last), or raise naming the one that is missing."""
@@ -164,9 +166,9 @@ class Video(Clip):
             stream = container.streams.video[0]
             stream.thread_type = "AUTO"
             stream.codec_context.thread_count = threads
-            if first > 0:
-                container.seek(int(self._seek_dts[first]), stream=stream, backward=True)
             try:
+                if first > 0:
+                    self._seek(container, stream, first)
                 for frame in self._decoded(container, stream, alpha):
                     if wanted == last:
                         return
@@ -180,6 +182,19 @@ class Video(Clip):
                 raise self._undecodable(wanted) from error
         if wanted < last:
             raise self._undecodable(wanted)
+
+    def _seek(self, container: av.container.InputContainer, stream: av.VideoStream, index: int) -> None:
+        """Go to the last key frame shown no later than a picture, or before it.
+
+        Containers seek by the time a key frame is shown or by that of its decoding; where the first leads past the
+        picture, the second does not. MP4 seeks by the first, and by the second would begin one key frame earlier.
+        """
+        for time in (self._pts[self._key_before[index]], self._seek_dts[index]):
+            container.seek(int(time), stream=stream, backward=True)
+            reached = next(container.demux(stream))
+            container.seek(int(time), stream=stream, backward=True)
+            if reached.is_keyframe and reached.pts is not None and reached.pts <= self._pts[index]:
+                return
 
     def _decoded(
         self, container: av.container.InputContainer, stream: av.VideoStream, alpha: bool

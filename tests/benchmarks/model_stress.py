@@ -27,7 +27,7 @@ from jawusd.fitting import FittingConfig, fit_model  # noqa: E402
 from jawusd.fitting.anchored import fit_anchored  # noqa: E402
 from jawusd.fitting.data import SubjectAnatomy, TrainingData, select_poses, select_tracks  # noqa: E402
 from jawusd.fitting.form import FittedForm  # noqa: E402
-from jawusd.fitting.nlpca import train_nlpca  # noqa: E402
+from jawusd.fitting.nlpca_training import train_nlpca  # noqa: E402
 from jawusd.fitting.paper import fit_paper  # noqa: E402
 from jawusd.formats.capture import load_capture  # noqa: E402
 from jawusd.formats.tracks import load_tracks  # noqa: E402

@@ -12,7 +12,7 @@ from jawusd.fitting import FittingConfig, fit_model
 from jawusd.fitting.curves import in_millimetres
 from jawusd.fitting.data import SubjectAnatomy, select_poses
 from jawusd.fitting.metric import MandibleMetric
-from jawusd.fitting.nlpca import train_nlpca
+from jawusd.fitting.nlpca_training import train_nlpca
 from jawusd.fitting.paper import fit_paper
 from jawusd.fitting.pca import fit_pca
 from jawusd.geometry import make_transform, mandible_metric, se3_exp, se3_log

@@ -12,7 +12,7 @@ from jawusd.fitting.condyle_paths import condyle_paths, path_distances, principa
 from jawusd.fitting.coverage import PARAMETERS
 from jawusd.fitting.data import SubjectAnatomy, select_poses
 from jawusd.fitting.experiments import MODELS, run_experiments
-from jawusd.fitting.nlpca import train_nlpca
+from jawusd.fitting.nlpca_training import train_nlpca
 from jawusd.fitting.synthesis import BOX, POLYGONS, POSES, SLICES, Bounds, captured_reference, distance_to_nearest
 from jawusd.formats.experiments import TABLE_COLUMNS, CondylePath, save_table
 from jawusd.formats.mesh import Mesh

@@ -1,5 +1,6 @@
 """Video reading and writing against OpenCV's sequential decoder and broken files."""
 
+from collections.abc import Iterator
 from fractions import Fraction
 from pathlib import Path
 
@@ -82,6 +83,23 @@ def test_every_seek_lands_on_its_frame(variable: tuple[Path, list[int]]) -> None
         frames = list(video.frames(first, min(first + 3, 60)))
         assert [f.index for f in frames] == list(range(first, min(first + 3, 60)))
         assert all(np.array_equal(f.image, expected[f.index]) for f in frames)
+
+
+def test_a_seek_decodes_from_the_key_frame_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_b_frames(tmp_path / "even.mp4", list(range(0, 2400, 40)), sc_threshold="0")
+    video, decoded, read = Video(tmp_path / "even.mp4"), [], Video._decoded
+
+    def counted(*arguments: object) -> Iterator[av.VideoFrame]:
+        for frame in read(*arguments):
+            decoded.append(frame.pts)
+            yield frame
+
+    monkeypatch.setattr(Video, "_decoded", counted)
+    assert video.keys.tolist() == [0, 12, 24, 36, 48]
+    for first in range(video.count):
+        decoded.clear()
+        next(video.frames(first))
+        assert len(decoded) == first % 12 + 1
 
 
 def test_dense_key_frames_do_not_confuse_seeking(tmp_path: Path) -> None:
