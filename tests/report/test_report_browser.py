@@ -5,16 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
-from browser import headless_chromium, keep_picture
+from browser import headless_chromium, keep_picture, open_page
 from report_data import experiments, report_data, solve_data
 
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.report import Origin, ReplayPart
 from jawusd.report.document import write_document
 from jawusd.report.solve_page import write_solve_page
-
-PATIENCE_MS = 120_000
-
 
 chromium = pytest.fixture(headless_chromium, scope="module")
 
@@ -24,16 +21,14 @@ def opened(request, chromium, tmp_path):
     """Open the report of an example; what went wrong and what was asked for is checked afterwards."""
     data, path = report_data(lost=(20, 21)), tmp_path / "report.html"
     write_document(path, data)
-    context = chromium.new_context(color_scheme=request.param, viewport={"width": 1200, "height": 900})
-    context.set_default_timeout(PATIENCE_MS)
-    page, trouble, requests = context.new_page(), [], []
+    page, trouble, requests = open_page(chromium, 1200, 900, color_scheme=request.param), [], []
     page.on("console", lambda message: trouble.append(message.text) if message.type == "error" else None)
     page.on("pageerror", lambda error: trouble.append(str(error)))
     page.on("request", lambda request: requests.append(request.url))
     page.goto(path.as_uri())
     yield page, data, request.param
     keep_picture(page, f"report_{request.param}", full_page=True)
-    context.close()
+    page.context.close()
     assert trouble == []
     assert [url for url in requests if not url.startswith("data:")] == [path.as_uri()]
 
@@ -66,11 +61,11 @@ def ball(name, kind, radius, place=(0.0, 0.0, 0.0)):
 def test_bone_that_nearly_coincides_with_teeth_stays_behind_them(chromium, tmp_path, bone_mm, seen):
     parts = (ball("mandible", "bone", bone_mm), ball("lower_teeth", "tooth", 10.0))
     write_document(tmp_path / "report.html", report_data(parts=parts))
-    page = chromium.new_page(viewport={"width": 1200, "height": 900})
+    page = open_page(chromium, 1200, 900)
     page.goto((tmp_path / "report.html").as_uri())
     drawn = picture(page)
     red, green, blue = drawn[drawn.shape[0] // 2, drawn.shape[1] // 2]
-    page.close()
+    page.context.close()
     colour = {"tooth": 0.90 / 0.95, "bone": 0.72 / 0.84}[seen]  # as replay.js paints them
     assert blue / red == pytest.approx(colour, abs=0.02)
 
@@ -82,15 +77,14 @@ def test_no_width_scrolls_the_page_sideways(chromium, tmp_path, scheme, width):
     data = report_data(experiments=experiments(sentences=("Record slow circling with the mouth half open. " * 6,)))
     data = replace(data, actor=long, origin=Origin("today", f"jawusd build {long}", {"jawusd": "1"}), left_out=(long,))
     write_document(tmp_path / "report.html", data)
-    context = chromium.new_context(color_scheme=scheme, viewport={"width": width, "height": 844})
-    page = context.new_page()
+    page = open_page(chromium, width, 844, color_scheme=scheme)
     page.goto((tmp_path / "report.html").as_uri())
     wide = page.evaluate("[document.documentElement.scrollWidth, innerWidth]")
     cells = page.locator("#verdicts td").evaluate_all("all => all.map(e => e.getBoundingClientRect().right)")
     links = page.locator("nav a").evaluate_all("all => all.map(e => e.getBoundingClientRect().right)")
     letters = page.locator("#tracking svg text").first.evaluate("e => e.getBoundingClientRect().height")
     keep_picture(page, f"report_{width}_{scheme}", full_page=True)
-    context.close()
+    page.context.close()
     assert wide[0] <= wide[1] == width
     assert len(links) > 5 and max(links) <= width
     assert len(cells) > 20 and max(cells) <= width  # verdicts are read without scrolling
@@ -101,12 +95,11 @@ def test_no_width_scrolls_the_page_sideways(chromium, tmp_path, scheme, width):
 @pytest.mark.parametrize("width", [1440, 390])
 def test_no_width_scrolls_the_page_of_a_performance_sideways(chromium, tmp_path, scheme, width):
     write_solve_page(tmp_path / "take.html", solve_data())
-    context = chromium.new_context(color_scheme=scheme, viewport={"width": width, "height": 844})
-    page = context.new_page()
+    page = open_page(chromium, width, 844, color_scheme=scheme)
     page.goto((tmp_path / "take.html").as_uri())
     wide = page.evaluate("[document.documentElement.scrollWidth, innerWidth]")
     keep_picture(page, f"solve_{width}_{scheme}", full_page=True)
-    context.close()
+    page.context.close()
     assert wide[0] <= wide[1] == width
 
 

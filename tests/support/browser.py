@@ -11,6 +11,7 @@ import pytest
 
 _NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 # Software GL, so that machines without a graphics card show the pages too.
+PATIENCE_MS = 120_000  # for one step of a page: software GL on a machine that does other work, too
 _ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 
@@ -18,6 +19,13 @@ def keep_picture(page, name: str, **how: bool) -> None:
     """Save a screenshot in the folder that SCREENSHOTS names, as continuous integration does; else do nothing."""
     if "SCREENSHOTS" in os.environ:
         page.screenshot(path=Path(os.environ["SCREENSHOTS"]) / f"{name}.png", **how)
+
+
+def open_page(chromium, width: int, height: int, **context: object):
+    """Return an empty page of a size in px, in a context of its own, that waits for a slow machine."""
+    opened = chromium.new_context(viewport={"width": width, "height": height}, **context)
+    opened.set_default_timeout(PATIENCE_MS)
+    return opened.new_page()
 
 
 def headless_chromium() -> Iterator:
