@@ -171,7 +171,7 @@ def test_labels_that_mean_nothing_are_refused(tmp_path):
 
 HEAD = (
     'format = "jawusd-capture/1"\nname = "x"\nunits = "mm"\nfps = 24.0\n[scans]\nupper_teeth = "s.ply"\n'
-    'lower_teeth = "s.ply"\n[[camera]]\nname = "a"\n'
+    'lower_teeth = "t.ply"\n[[camera]]\nname = "a"\n'
 )
 
 
@@ -187,7 +187,7 @@ HEAD = (
     ],
 )
 def test_a_capture_says_what_labels_mean(tmp_path, keys, message):
-    for name in ("s.ply", "l.mkv", "u.mkv"):
+    for name in ("s.ply", "t.ply", "l.mkv", "u.mkv"):
         (tmp_path / name).touch()
     path = tmp_path / "capture.toml"
     path.write_text(HEAD + 'masks = { labels = "l.mkv", upper_value = 1, lower_value = 2 }\n')
