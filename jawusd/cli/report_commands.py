@@ -86,10 +86,9 @@ def report(
         refuse_existing(path, force)
     poses = stage.fitted_poses(source) if source.is_dir() else source
     motion = read_motion(poses, options)
-    if source.is_dir() and not any((capture, upper_teeth, lower_teeth, mandible, landmarks)):
-        subject = subject_of_build(source)
-    else:
-        subject = subject_given(source.stem, capture, upper_teeth, lower_teeth, mandible, landmarks, allow_outside)
+    given = (capture, upper_teeth, lower_teeth, mandible, landmarks)
+    built = source.is_dir() and not any(given)
+    subject = subject_of_build(source) if built else subject_given(source.stem, *given, allow_outside)
     with progress() as tell, naming_file(poses):
         found = stage.do_experiments(subject, motion, starts, tell)
         files = stage.draw_experiments(found, folder)

@@ -7,7 +7,7 @@ import pytest
 import shapely
 import trimesh
 
-from jawusd.fitting import FittingConfig, experiments, paper
+from jawusd.fitting import FittingConfig, nlpca_training
 from jawusd.fitting.condyle_paths import condyle_paths, path_distances, principal_opening, sagittal_section
 from jawusd.fitting.coverage import PARAMETERS
 from jawusd.fitting.data import SubjectAnatomy, select_poses
@@ -49,8 +49,7 @@ def data(poses, anatomy):
 def quick():
     """Train the networks for a tenth of their time."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in (paper, experiments):
-            patch.setattr(module, "train_nlpca", lambda *a, **k: train_nlpca(*a, **(k | {"stages": 2})))
+        patch.setattr(nlpca_training, "train_nlpca", lambda *a, **k: train_nlpca(*a, **(k | {"stages": 2})))
         yield
 
 

@@ -12,7 +12,8 @@ REPOSITORIES = ("paulgribble/optotrak", "aaltolab/artisynth-chewing-env", "Nosen
 
 def run(*arguments):
     """Run the benchmark; return its exit code, output and complaint."""
-    done = subprocess.run([sys.executable, SCRIPT, *arguments], capture_output=True, text=True, timeout=120, check=False)
+    command = [sys.executable, SCRIPT, *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     return done.returncode, done.stdout, done.stderr
 
 
