@@ -153,7 +153,8 @@ def _find(stage: Usd.Stage, rest: dict[str, Mesh], names: tuple[str, ...], below
         raise FormatError(f"has no prim {below}.", path=str(path))
     meshes = _meshes(stage.GetPrimAtPath(below) if below is not None else stage.GetPseudoRoot())
     found = {str(prim.GetPath()): _used_points(prim) for prim in meshes}
-    wanted, doubtful = {name: rest[name] for name in names if name in rest}, []
+    wanted = {name: rest[name] for name in names if name in rest}
+    doubtful: list[str] = []
     for name, mesh in wanted.items():
         alike = [prim for prim in meshes if len(found[str(prim.GetPath())].all) == len(mesh.vertices)]
         alike = alike or [prim for prim in meshes if found[str(prim.GetPath())].different == _different(mesh)]
