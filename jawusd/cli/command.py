@@ -17,7 +17,7 @@ INTERRUPTED = 130
 CONTEXT = {"help_option_names": ["-h", "--help"]}
 
 _WORDS = "jawusd.words"  # key of the words of a command in its context
-_VECTOR = re.compile(r"[-+]?[\d.eE+-]+(,[-+]?[\d.eE+-]+){2}")
+_VECTOR = re.compile(r" *[-+]?[\d.eE+-]+((, *| +)[-+]?[\d.eE+-]+){2} *")
 _VECTORS = ("--d", "--point", "--target", "--start")
 
 # What is kept of each command's work, and how to go on; all other commands write whole files at their end only.
@@ -60,14 +60,14 @@ def command_line(ctx: typer.Context) -> str:
 
 
 def with_vectors_split(args: list[str]) -> list[str]:
-    """Return arguments with a,b,c after the options of vectors as three words."""
+    """Return arguments with a,b,c or "a b c" after the options of vectors as three words."""
     out: list[str] = []
     for word in args:
         option, sign, value = word.partition("=")
         if sign and option in _VECTORS and _VECTOR.fullmatch(value):
-            out += [option, *value.split(",")]
+            out += [option, *value.replace(",", " ").split()]
         elif out and out[-1] in _VECTORS and _VECTOR.fullmatch(word):
-            out += word.split(",")
+            out += word.replace(",", " ").split()
         else:
             out.append(word)
     return out

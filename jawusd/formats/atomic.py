@@ -17,6 +17,8 @@ from jawusd.errors import OutputError
 
 # Prefix of every unfinished file and folder, by which what a killed run leaves behind is recognised and deleted.
 _UNFINISHED = ".jawusd-tmp-"
+#: What to do where a file or folder cannot be written.
+ELSEWHERE = "Name a place where you may write."
 
 
 @contextlib.contextmanager
@@ -34,7 +36,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
         handle, name = tempfile.mkstemp(dir=target.parent, prefix=f"{_UNFINISHED}{target.stem}-", suffix=target.suffix)
         os.close(handle)
     except OSError as error:
-        raise OutputError(f"cannot write here: {error.strerror}.", path=target) from error
+        raise OutputError(f"cannot write here: {error.strerror}.", path=target, hint=ELSEWHERE) from error
     temporary = Path(name)
     try:
         yield temporary
@@ -63,7 +65,7 @@ def scratch_folder(beside: str | os.PathLike[str]) -> Iterator[Path]:
         target.parent.mkdir(parents=True, exist_ok=True)
         folder = Path(tempfile.mkdtemp(dir=target.parent, prefix=_UNFINISHED))
     except OSError as error:
-        raise OutputError(f"cannot write here: {error.strerror}.", path=target) from error
+        raise OutputError(f"cannot write here: {error.strerror}.", path=target, hint=ELSEWHERE) from error
     try:
         yield folder
     finally:

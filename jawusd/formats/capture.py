@@ -214,7 +214,9 @@ def _refuse_other_files(path: Path) -> None:
             hint = f"Paths begin in the folder you are in, {Path.cwd()}."
         if path.parent.is_dir():
             hint = f"`jawusd init {path.parent}` writes one from the footage and scans in that folder."
-            if close := similar_names(path):
+            if (path.parent / "actor.usda").exists():
+                hint = "That folder holds a rig; name the capture that it was built from."
+            elif close := similar_names(path):
                 hint = f"Did you mean {close}? Else {hint}"
         raise FormatError("there is no such file.", path=path, hint=hint)
     if path.is_file() and path.suffix.lower() != ".toml":

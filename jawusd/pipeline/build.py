@@ -160,7 +160,7 @@ def check_folder(folder: Path, options: BuildOptions) -> None:
         OutputError: it is a file, or holds other files, or a build that is neither to be continued nor deleted.
     """
     if folder.is_file():
-        raise OutputError("is a file; the rig needs a folder.", path=folder)
+        raise OutputError("is a file; the rig needs a folder.", path=folder, hint="Name a new folder.")
     if not folder.is_dir() or options.resume or options.fresh:
         return
     if (folder / BUILD_FILE).exists():

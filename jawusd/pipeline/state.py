@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Generic, TypeVar
 
 from jawusd.errors import FormatError, OutputError
-from jawusd.formats.atomic import clear_unfinished, write_text_atomic
+from jawusd.formats.atomic import ELSEWHERE, clear_unfinished, write_text_atomic
 from jawusd.inputs import check_input, check_path
 from jawusd.npz import check_format
 
@@ -140,7 +140,7 @@ def make_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise OutputError(f"cannot write here: {error.strerror}.", path=path) from error
+        raise OutputError(f"cannot write here: {error.strerror}.", path=path, hint=ELSEWHERE) from error
 
 
 @contextlib.contextmanager
@@ -156,7 +156,7 @@ def locked(folder: Path) -> Iterator[None]:
     try:
         handle = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT, 0o644)
     except OSError as error:
-        raise OutputError(f"cannot write here: {error.strerror}.", path=folder) from error
+        raise OutputError(f"cannot write here: {error.strerror}.", path=folder, hint=ELSEWHERE) from error
     try:
         if not _try_lock(handle):
             raise OutputError(

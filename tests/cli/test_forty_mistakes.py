@@ -92,7 +92,9 @@ TYPED = [
     ("a path from another folder", ["check", "shots/anna"], "shots/anna", "no such file", "the folder you are in", ""),
     ("a clip for a capture", ["check", "left.mp4"], "left.mp4", '".mp4" is no capture', "a folder with", "jawusd init"),
     ("an output with files", ["build", ".", "-o", "full"], "full", "not empty", "", "Name a new folder"),
-    ("an output that is a file", ["build", ".", "-o", "u.ply"], "u.ply", "is a file", "needs a folder", ""),
+    ("an output that is a file", ["build", ".", "-o", "u.ply"], "u.ply", "is a file", "needs a folder", "Name a new"),
+    ("an output out of reach", ["build", ".", "-o", "/dev/null/out"], "out", "cannot write here", "", "Name a"),
+    ("a rig for a capture", ["check", "rig"], "rig", "no such file", "", "That folder holds a rig; name the capture"),
     ("a capture for a rig", ["info", "."], ".", "without actor.usda", "", "jawusd build"),
     ("two people in one folder", ["init", "two"], "", "anna_upper.stl, bob_upper.stl", "one person", "name one"),
     ("a lens alone", ["cameras", "lens.nk", "-o", "a.toml"], "lens.nk", "no Camera node", "", "Export Project"),
@@ -106,8 +108,9 @@ TYPED = [
 def place(tmp_path_factory):
     folder = tmp_path_factory.mktemp("forty")
     write_media(folder)
-    for inner in ("empty", "full", "two", "others"):
+    for inner in ("empty", "full", "two", "others", "rig"):
         (folder / inner).mkdir()
+    (folder / "rig" / "actor.usda").touch()
     (folder / "full" / "diary.txt").touch()
     for name in ("anna_upper.stl", "bob_upper.stl", "anna_lower.stl", "bob_lower.stl"):
         (folder / "two" / name).touch()
