@@ -105,7 +105,7 @@ def _contact_drop(form: AnchoredModel, teeth: Teeth, d2: Array, d3: Array, captu
 
     def touches(rows: Indices, down: Array) -> Mask:
         R, t, _ = form.chart_derivative(np.stack([side[rows], -down, ahead[rows]], axis=1))
-        return teeth.pair.depth(make_transform(R, t)) > teeth.closed_mm
+        return teeth.pair.is_deeper(make_transform(R, t), teeth.closed_mm)
 
     found = np.full(len(side), np.nan)
     left = np.flatnonzero(wanted)

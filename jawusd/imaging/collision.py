@@ -10,7 +10,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.geometry.arrays import Array
+from jawusd.geometry.arrays import Array, Mask
 from jawusd.geometry.se3 import se3_inverse
 from jawusd.imaging.solid import DistanceGrid, distance_grid, outer_faces
 
@@ -65,14 +65,22 @@ class Pair:
         The largest distance of a point of one surface inside the other solid to that solid's surface; negative, down to
         -`FARTHEST_MM`, where they are apart.
         """
+        return self._deepest(T_upper_lower, -FARTHEST_MM, np.inf)
+
+    def is_deeper(self, T_upper_lower: Array, limit_mm: float) -> Mask:
+        """Return where `depth` is more than a limit, shape (n,), without measuring by how much."""
+        return self._deepest(T_upper_lower, max(limit_mm, -FARTHEST_MM), limit_mm) > limit_mm
+
+    def _deepest(self, T_upper_lower: Array, least: float, enough: float) -> Array:
+        """Return the depths where these are more than the least [mm], shape (n,); past `enough`, any such value."""
         there = np.ascontiguousarray(T_upper_lower)
         back = np.ascontiguousarray(se3_inverse(there))
-        found = np.full(len(there), -FARTHEST_MM)
+        found = np.full(len(there), least)
 
         def deepen(first: int) -> None:
             part = slice(first, first + size)
-            _deepen(found[part], there[part], *_flat(self.upper.grid, self.lower.samples))
-            _deepen(found[part], back[part], *_flat(self.lower.grid, self.upper.samples))
+            _deepen(found[part], there[part], enough, *_flat(self.upper.grid, self.lower.samples))
+            _deepen(found[part], back[part], enough, *_flat(self.lower.grid, self.upper.samples))
 
         size = max(1, -(-len(found) // _PARTS))
         with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -196,17 +204,21 @@ def _away(M, point, values, origin, per_mm):  # type: ignore[no-untyped-def]  # 
 
 
 @numba.njit(nogil=True, cache=True)
-def _deepen(depth, T, values, origin, per_mm, points, start, balls, group_start, groups):  # type: ignore[no-untyped-def]  # compiled
-    """Raise each depth to that of the deepest of the points under T[i]."""
+def _deepen(depth, T, enough, values, origin, per_mm, points, start, balls, group_start, groups):  # type: ignore[no-untyped-def]  # compiled
+    """Raise each depth to that of the deepest of the points under T[i], or to any that is more than enough."""
     last = 0
     for i in range(len(T)):
         best, M = depth[i], T[i]
         # the group that was deepest in the pose before comes first: it leaves most others behind
         for turn in range(len(groups) + 1):
+            if best > enough:
+                break
             g = last if turn == 0 else turn - 1
             if groups[g, 3] - _away(M, groups[g], values, origin, per_mm) <= best:
                 continue
             for c in range(group_start[g], group_start[g + 1]):
+                if best > enough:
+                    break
                 if balls[c, 3] - _away(M, balls[c], values, origin, per_mm) <= best:
                     continue
                 for p in range(start[c], start[c + 1]):

@@ -36,6 +36,15 @@ def test_depth_of_two_balls_is_their_overlap():
     np.testing.assert_allclose(depth, 2 * RADIUS - apart, atol=0.06)
 
 
+@pytest.mark.parametrize("limit_mm", [-2.0, -0.4, 0.0, 0.7])
+def test_what_is_deeper_than_a_limit_is_told_without_its_depth(limit_mm):
+    pair = Pair(whole(ball(), 1.0), whole(ball(), -1.0))
+    poses = np.array([shifted(v) for v in np.random.default_rng(1).normal(0.0, 7.0, (60, 3))])
+    deeper = pair.depth(poses) > limit_mm
+    assert (pair.is_deeper(poses, limit_mm) == deeper).all() and deeper.any()
+    assert deeper.all() == (limit_mm < -FARTHEST_MM)
+
+
 def test_surfaces_far_apart_are_as_far_as_can_be_told():
     pair = Pair(whole(ball(), 1.0), whole(ball(), -1.0))
     assert pair.depth(shifted([0.0, -40.0, 0.0])[None]) == -FARTHEST_MM
