@@ -252,12 +252,24 @@ def _gum_distance_px(labels: NDArray[np.uint8], u: float, v: float, reach_px: fl
     """Return how far the nearest pixel lies that shows gum [px]; the reach if none is nearer."""
     i = pixel_of(u)
     j = pixel_of(v)
+    height, width = labels.shape
     n = int(reach_px)
     best = reach_px * reach_px
-    for y in range(max(0, j - n), min(labels.shape[0], j + n + 1)):
-        for x in range(max(0, i - n), min(labels.shape[1], i + n + 1)):
-            if labels[y, x] == GUM:
-                best = min(best, float((x - i) ** 2 + (y - j) ** 2))
+    for dy in range(n + 1):  # from the pixel outwards, until nothing nearer can follow
+        if dy * dy >= best:
+            break
+        for y in (j - dy, j + dy):
+            if y < 0 or y >= height:
+                continue
+            for dx in range(n + 1):
+                square = float(dx * dx + dy * dy)
+                if square >= best:
+                    break
+                if (0 <= i - dx < width and labels[y, i - dx] == GUM) or (
+                    0 <= i + dx < width and labels[y, i + dx] == GUM
+                ):
+                    best = square
+                    break
     return np.sqrt(best)
 
 
