@@ -38,7 +38,8 @@ def linked(html, terms, glossary):
     if not terms:
         return html
     left = dict(terms)
-    pattern = re.compile(r"\b(" + "|".join(sorted(map(re.escape, terms), key=len, reverse=True)) + r")\b", re.I)
+    words = "|".join(sorted(map(re.escape, terms), key=len, reverse=True))
+    pattern = re.compile(rf"(?<![\w:/.])({words})(?![\w/]|[:.]\w)", re.I)  # not in names as jaw:model:kind
     closed, out = 0, []
 
     def link(found):

@@ -66,7 +66,7 @@ def usd_page():
     layer = Sdf.Layer.OpenAsAnonymous(str(SCHEMA))
     prim = layer.GetPrimAtPath("/JawRigAPI")
     named = array_names()
-    lines = [USD, " ".join(prim.GetInfo("documentation").split()), "\n\n"]
+    lines = [USD, escaped(" ".join(prim.GetInfo("documentation").split())), "\n\n"]
     group = None
     for attribute in prim.properties:
         name = attribute.name

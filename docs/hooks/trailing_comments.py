@@ -2,6 +2,8 @@
 
 import griffe
 
+NOTHING = "\N{NO-BREAK SPACE}"  # a field whose name and type say all
+
 
 class TrailingComments(griffe.Extension):
     """Give attributes without a docstring the comment that ends their line, or the lines `#: ...` above it."""
@@ -19,4 +21,16 @@ class TrailingComments(griffe.Extension):
         text = " ".join(words).strip()
         if text and not text.startswith(("noqa", "type:")):
             text = text[:1].upper() + text[1:].rstrip(".") + "."
-            attr.docstring = griffe.Docstring(text, lineno=attr.lineno, parent=attr)
+        elif listed_by_fields(attr):
+            text = NOTHING
+        else:
+            return
+        attr.docstring = griffe.Docstring(text, lineno=attr.lineno, parent=attr)
+
+
+def listed_by_fields(attr):
+    """Tell whether an attribute is a field of a class whose docstring does not list its fields: all are shown then."""
+    parent = attr.parent
+    if not isinstance(parent, griffe.Class) or attr.annotation is None or parent.docstring is None:
+        return False
+    return "Attributes:" not in parent.docstring.value

@@ -11,6 +11,7 @@ from html.parser import HTMLParser
 from urllib.parse import unquote, urlsplit
 
 import pytest
+from browser import headless_chromium, keep_picture
 from doc_blocks import COMMANDS
 from package_copy import ROOT
 
@@ -196,3 +197,23 @@ def test_pages_link_to_the_glossary(site):
     people = [path for folder in ("start", "guides", "explanation") for path in (site / folder).glob("*.html")]
     assert len(people) > 20
     assert [path.name for path in people if linked not in path.read_text()] == []
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    yield from headless_chromium()
+
+
+def test_no_page_is_wider_than_a_phone(site, chromium):
+    context = chromium.new_context(viewport={"width": 390, "height": 844}, color_scheme="dark", offline=True)
+    page, wide = context.new_page(), []
+    for path in sorted(site.rglob("*.html")):
+        page.goto(path.as_uri(), wait_until="load")
+        if page.evaluate("document.documentElement.scrollWidth") > 390:
+            wide.append(path.name)
+    assert wide == []
+    page.goto((site / "start/film.html").as_uri())
+    keep_picture(page, "docs_film_390_dark", full_page=True)
+    page.set_content("<table style='width: 800px'><tr><td>x</td></tr></table>")
+    assert page.evaluate("document.documentElement.scrollWidth") > 390
+    context.close()
