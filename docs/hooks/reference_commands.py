@@ -30,7 +30,7 @@ def page():
 
 def section(title, command, anchor):
     """Return the part of one command: usage, help, and every argument and option."""
-    context = typer.Context(command, info_name=title)
+    context = typer.Context(command, info_name=title, **command.context_settings)  # -h beside --help
     usage = " ".join(command.collect_usage_pieces(context))
     lines = [f"## {title} {{ #{anchor} }}\n\n```text\n{title} {usage}\n```\n\n"]
     if command.help:
