@@ -21,10 +21,10 @@ def page():
     """Return the page as Markdown."""
     program = typer.main.get_command(app)
     parts = [INTRODUCTION, "| command | what it does |\n|---|---|\n"]
-    parts += [f"| [`{name}`](#jawusd-{name}) | {escaped(SUMMARIES[name])} |\n" for name in program.commands]
+    parts += [f"| [`{name}`](#jawusd-{name}) | {escaped(SUMMARIES[name])} |\n" for name in SUMMARIES]
     parts.append(f"\n{escaped(EXIT_CODES)} [Errors and exit codes](errors.md) names them one by one.\n\n")
     parts.append(section("jawusd", program, "jawusd"))
-    parts += [section(f"jawusd {name}", command, f"jawusd-{name}") for name, command in program.commands.items()]
+    parts += [section(f"jawusd {name}", program.commands[name], f"jawusd-{name}") for name in SUMMARIES]
     return "".join(parts)
 
 
