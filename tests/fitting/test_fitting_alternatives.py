@@ -201,6 +201,7 @@ def test_paper_model_says_what_the_data_must_show(data):
         fit_paper(data, np.array([True, False, True]), False, 1, 0)
 
 
+@pytest.mark.slow
 def test_twists_of_the_published_reconstruction_are_near_the_data(published):
     few, fits = published
     again = fits[False].reconstruct_as_published(few.motion)
