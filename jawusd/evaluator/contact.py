@@ -128,10 +128,11 @@ class ContactField:
 
     def collides(self, d: Array, limit_mm: float) -> Mask:
         """Tell at which d (n, 3) [mm] there is less clearance than ``limit_mm``; False for NaN."""
-        least = limit_mm - self.error_mm
-        if len(d) == 1:  # the call that must be quick
-            return np.array([self._single(*d[0].tolist()) < least])
-        return self.clearance(d).clearance_mm < least
+        return self.clearance(d).clearance_mm < limit_mm - self.error_mm
+
+    def collides_at(self, d: Array, limit_mm: float) -> bool:
+        """Tell the same of one d (1, 3) [mm], in floats: the call that must be quick."""
+        return self._single(*d[0].tolist()) < limit_mm - self.error_mm
 
     def _single(self, d1: float, d2: float, d3: float) -> float:
         """Return the clearance [mm] at one d [mm], in floats; NaN for NaN."""
@@ -215,6 +216,8 @@ class TouchingTeeth:
         if self.contact is None:
             return verdicts
         limit_mm = self.contact.limit_mm if measured else -AUTHORED_MM
+        if len(verdicts.d) == 1 and not self.contact.collides_at(verdicts.d, limit_mm):
+            return verdicts
         return verdicts.with_collisions(self.contact.collides(verdicts.d, limit_mm))
 
 

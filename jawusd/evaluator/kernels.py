@@ -16,7 +16,7 @@ from jawusd.evaluator.distances import distance_residual, landmark_vectors
 from jawusd.evaluator.encoding import Encoder
 from jawusd.evaluator.frames import RigFrames
 from jawusd.evaluator.models import JawModelForm
-from jawusd.evaluator.nearest import nearest_in_valley
+from jawusd.evaluator.nearest import least_in_valley, nearest_in_valley
 from jawusd.evaluator.solver import Residual, minimise
 from jawusd.evaluator.verdicts import RIGID_TOLERANCE, Limits, Verdicts, judge
 from jawusd.geometry.arrays import Array, Indices
@@ -178,6 +178,11 @@ class NumpyKernels:
 
     def solve_ik(self, vectors: Array, targets: Array, start: Array) -> tuple[Array, Array]:
         """Return the d (n, 3) [mm] inside that carry vectors nearest to targets, and the squared distances (n,)."""
+        if len(start) == 1:
+            residual = distance_residual(self._model.decode_derivative, vectors, targets)
+            found = least_in_valley(self._bound, residual, start[0])[None]
+            r, _ = residual(found, np.arange(1))
+            return found, np.einsum("nm,nm->n", r, r)
         return self._bottom(distance_residual(self._model.decode_derivative, vectors, targets), start)
 
     def _bottom(self, residual: Residual, start: Array) -> tuple[Array, Array]:

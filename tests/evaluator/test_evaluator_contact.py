@@ -57,6 +57,7 @@ def test_one_pose_is_judged_as_many_are():
     limits = np.nan_to_num(together, nan=0.0) + field.error_mm + np.where(np.arange(len(d)) % 2, 1e-6, -1e-6)
     for row, value, limit in zip(d, together, limits):
         assert field.collides(row[None], limit).tolist() == [bool(value < limit - field.error_mm)]
+        assert field.collides_at(row[None], limit) == bool(value < limit - field.error_mm)
 
 
 def test_colliding_poses_are_refused():
