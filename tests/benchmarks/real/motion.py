@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from models import FREE, MODELS, errors_or_reason
+from models import FOLDS, FREE, MODELS, components, errors_or_reason
 from report import bars, curves, table, title
 from sources import CHEWING, OPTOTRAK
 
@@ -164,9 +164,22 @@ def noise_floor(take: Take, clench: Take) -> None:
     floor = np.sqrt((left**2).sum(axis=1).mean())
     print(f"Noise of the clench in the three directions that PCA leaves out: {floor:.3f} mm.")
     placed = transform_points(take.T, take.points).reshape(len(take.T), -1)
-    values = np.linalg.svd(placed - placed.mean(axis=0), compute_uv=False)
-    told = ", ".join(f"{np.sqrt((values[k:] ** 2).sum() / len(placed) / len(take.points)):.3f}" for k in (1, 2, 3))
-    print(f"PCA of the marker coordinates themselves leaves {told} mm with 1, 2, 3 components, seen frames.\n")
+    fold = np.arange(len(placed)) * FOLDS // len(placed)
+    held_out = [(fold != k, fold == k) for k in range(FOLDS)]
+    for name, parts in {"seen": [(fold >= 0, fold >= 0)], "unseen": held_out}.items():
+        told = ", ".join(f"{pca_of_markers(placed, parts, count) / np.sqrt(len(take.points)):.3f}" for count in FREE)
+        print(f"PCA of the marker coordinates themselves leaves {told} mm with 1, 2, 3 components, {name} frames.")
+    print()
+
+
+def pca_of_markers(placed: Array, parts: list[tuple[Array, Array]], count: int) -> float:
+    """Return the rms length of what components leave of rows (N, 3 M), fitted to some rows and tried on others."""
+    squares = 0.0
+    for seen, tried in parts:
+        mean, axes = components(placed[seen], count)
+        off = placed[tried] - mean
+        squares += float((off**2).sum() - ((off @ axes.T) ** 2).sum())
+    return float(np.sqrt(squares / len(placed)))
 
 
 def models(data: Path, out: Path) -> None:
