@@ -29,7 +29,7 @@ def main() -> None:
     parser.add_argument("--list", action="store_true", help="say which repositories to clone, and under which licence")
     parser.add_argument("--data", type=Path, help="folder of the clones")
     parser.add_argument("--captures", type=Path, nargs="*", default=[], help="captures with truth, for the peers")
-    parser.add_argument("--m3t", type=Path, help="the program built from m3t_poses.cpp, for the peers")
+    parser.add_argument("--m3t", type=Path, help="a program that runs M3T as README.md says, for the peers")
     parser.add_argument("--frames", type=int, default=24, help="of each capture, for the peers")
     parser.add_argument("--only", nargs="*", choices=SECTIONS, default=SECTIONS)
     parser.add_argument("--out", type=Path, default=Path("real_out"), help="folder of plots and pictures")

@@ -60,7 +60,7 @@ def run(captures: list[Path], frames: int, m3t: Path | None) -> None:
         header = ("method", "incisor mean", "largest", "condyles mean", "no pose", "off", "CPU s per frame")
         table(header, (row(name, scene, method) for name, method in methods(m3t).items()))
     if m3t is None:
-        print("M3T was not run: build m3t_poses.cpp as README.md says, and name the program with --m3t.")
+        print("M3T was not run: name a program that README.md describes with --m3t.")
 
 
 def scene_of(path: Path, frames: int) -> Scene:
@@ -208,7 +208,7 @@ def m3t_tracks(scene: Scene, program: Path) -> Array:
 
 
 def m3t_job(scene: Scene, folder: Path) -> str:
-    """Write pictures without distortion and bodies of the crowns; return the text that m3t_poses reads."""
+    """Write pictures without distortion and bodies of the crowns; return the text that the program reads."""
     lines = [str(folder), str(len(scene.poses[0])), str(len(scene.cameras))]
     for camera in scene.cameras:
         pictures = folder / camera.name
