@@ -121,11 +121,14 @@ def check_capture(
 
 
 def _run(check: _Check, parts: Parts) -> list[Finding]:
-    lacking = [name for name in check.needs if not getattr(parts, name)]
-    if lacking == ["samples"] and parts.capture is not None and not any(c.masks for c in parts.capture.cameras):
+    lacking, capture = [name for name in check.needs if not getattr(parts, name)], parts.capture
+    if "samples" in lacking and capture is not None and not any(c.masks for c in capture.cameras):
         return []  # there are no masks to look at
     if lacking:
-        return [Finding("not_checked", "note", f"{check.what}: not checked, because what it needs cannot be read")]
+        boards = capture is not None and capture.calibration is None and capture.boards is not None
+        later = boards and lacking == ["cameras"]
+        why = "the cameras are calibrated from the boards first" if later else "what it needs cannot be read"
+        return [Finding("not_checked", "note", f"{check.what}: not checked, because {why}")]
     found: list[Finding] = []
     try:
         found.extend(check.run(parts))

@@ -304,3 +304,10 @@ def test_nothing_is_said_of_masks_that_a_capture_does_not_have():
     capture = load_capture(EXAMPLE)
     cameras = tuple(camera.model_copy(update={"masks": None}) for camera in capture.cameras)
     assert check_capture(capture.model_copy(update={"cameras": cameras})) == []
+
+
+def test_what_boards_will_tell_is_said_to_come_later(capture):
+    described(capture, 'calibration = "calibration.toml"\n', "")
+    (capture / "calibration.toml").unlink()
+    said = [finding.message for finding in found(capture) if finding.kind == "not_checked"]
+    assert said and all("the cameras are calibrated from the boards first" in message for message in said)
