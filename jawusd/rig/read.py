@@ -22,7 +22,7 @@ from jawusd.rig.layout import MADE_FOR, ONNX_ATTRIBUTES, PARAMETERS
 from jawusd.rig.schema import has_jaw_api, rig_prims
 from jawusd.rig.table import DecoderTable
 from jawusd.rig.untrusted import open_checked, raises_format_error
-from jawusd.rig.versions import upgrade_rig
+from jawusd.rig.versions import upgrade_rig, was_upgraded
 
 PathArg = str | os.PathLike[str]
 
@@ -120,7 +120,12 @@ def rig_of(prim: Usd.Prim, where: object) -> JawRig:
 
 
 def named_models(prim: Usd.Prim) -> tuple[object, object]:
-    """Return the hashes of the models that a rig prim names: its own, and the one its motion is for; None for none."""
+    """Return the hashes of the models that a rig prim names: its own, and the one its motion is for; None for none.
+
+    None, too, for a rig of an older format, whose upgraded arrays have another hash.
+    """
+    if was_upgraded(prim):
+        return None, None
     own = prim.GetAttribute("jaw:modelHash").Get() if prim.HasAttribute("jaw:modelHash") else None
     keyed = prim.HasAttribute(PARAMETERS[0])
     return own, prim.GetAttribute(PARAMETERS[0]).GetCustomDataByKey(MADE_FOR) if keyed else None

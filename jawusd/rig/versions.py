@@ -57,3 +57,9 @@ def upgrade_rig(prim: Usd.Prim, where: object) -> None:
         for step in range(version, FORMAT_VERSION):
             STEPS[step](prim)
             prim.GetAttribute("jaw:formatVersion").Set(step + 1)
+
+
+def was_upgraded(prim: Usd.Prim) -> bool:
+    """Return whether `upgrade_rig` changed a rig prim: hashes in its files are those of its values before."""
+    path = prim.GetPath().AppendProperty("jaw:formatVersion")
+    return prim.GetStage().GetSessionLayer().GetAttributeAtPath(path) is not None

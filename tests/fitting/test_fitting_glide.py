@@ -56,6 +56,9 @@ class FlatTeeth:
         moved = (T @ np.append(self._incisor, 1.0))[:, :3] - self._incisor
         return self.closed_mm + moved[:, 1] + 0.4 * moved[:, 2]
 
+    def is_deeper(self, T, limit_mm):
+        return self.depth(T) > limit_mm
+
 
 def test_d1_counts_from_contact_and_poses_stay():
     rig = example_rig()
