@@ -78,8 +78,9 @@ def _samples(
 ) -> tuple[Array, int]:
     """Return what `contour_samples` does, of the tables of a scan."""
     px_per_mm = _px_per_mm(matrix, centre)
-    silhouette = _silhouette(vertices, faces, planes, edges, eye, matrix, step_px, labels, inverse_depth, tolerance_mm)
-    _tell_gum(silhouette, labels, px_per_mm, _in_picture(matrix, towards_gum))
+    candidates = _silhouette(vertices, faces, planes, edges, eye, matrix, step_px, labels.shape)
+    facing = _in_picture(matrix, towards_gum)
+    silhouette = _visible(candidates, labels, inverse_depth, tolerance_mm, px_per_mm, facing)
     line = _gingival_margin(margin, margin_directions, matrix, labels, inverse_depth, tolerance_mm)
     return np.concatenate((silhouette, line)), len(silhouette)
 
@@ -122,15 +123,9 @@ def _silhouette(
     eye: Array,
     matrix: Array,
     step_px: float,
-    labels: NDArray[np.uint8],
-    inverse_depth: NDArray[np.float32],
-    tolerance_mm: float,
+    shape: tuple[int, int],
 ) -> Array:
-    """Sample the edges between faces turned to and away from the eye, and all borders, where they are seen.
-
-    There the edge's own surface is visible on the inner side, with no crown on the outer.
-    """
-    height, width = labels.shape
+    """Sample the edges between faces turned to and away from the eye, and all borders, inside the region."""
     front = np.empty(len(faces), np.bool_)
     for f in range(len(faces)):
         front[f] = planes[f, 0] * eye[0] + planes[f, 1] * eye[1] + planes[f, 2] * eye[2] > planes[f, 3]
@@ -146,64 +141,41 @@ def _silhouette(
         uj, vj, wj = _pixel(matrix, vertices[j, 0], vertices[j, 1], vertices[j, 2])
         if wi <= 0 or wj <= 0:
             continue
-        if max(ui, uj) < 0 or max(vi, vj) < 0 or min(ui, uj) >= width or min(vi, vj) >= height:
+        if max(ui, uj) < 0 or max(vi, vj) < 0 or min(ui, uj) >= shape[1] or min(vi, vj) >= shape[0]:
             continue
         length = np.sqrt((uj - ui) ** 2 + (vj - vi) ** 2)
         if length < 1e-6:
             continue
-        nx, ny = (vj - vi) / length, (ui - uj) / length
+        nx = (vj - vi) / length
+        ny = (ui - uj) / length
+        k = faces[f, 0]
+        if k in (i, j):
+            k = faces[f, 1]
+        if k in (i, j):
+            k = faces[f, 2]
+        uk, vk, wk = _pixel(matrix, vertices[k, 0], vertices[k, 1], vertices[k, 2])
+        if nx * (uk - ui) + ny * (vk - vi) > 0:  # outward is away from the face's third corner
+            nx = -nx
+            ny = -ny
         pieces = max(1, int(np.ceil(length / step_px)))
-        out = _with_room(out, n, pieces)
-        k = -1
+        if n + pieces > len(out):
+            grown = np.empty((2 * len(out) + pieces, COLUMNS))
+            grown[:n] = out[:n]
+            out = grown
         for q in range(pieces):
             t = (q + 0.5) / pieces
-            x = vertices[i, 0] + t * (vertices[j, 0] - vertices[i, 0])
-            y = vertices[i, 1] + t * (vertices[j, 1] - vertices[i, 1])
-            z = vertices[i, 2] + t * (vertices[j, 2] - vertices[i, 2])
-            u, v, w = _pixel(matrix, x, y, z)
-            a, b, c, d = pixel_of(u + nx), pixel_of(v + ny), pixel_of(u - nx), pixel_of(v - ny)
-            if min(a, c) < 0 or min(b, d) < 0 or max(a, c) >= width or max(b, d) >= height:
-                continue
-            if (labels[b, a] == CROWN) == (labels[d, c] == CROWN):
-                continue  # as at nearly all edges, which other crowns hide: no need to know which way is outward
-            if k < 0:
-                k = _third_corner(faces, f, i, j)
-                uk, vk, _ = _pixel(matrix, vertices[k, 0], vertices[k, 1], vertices[k, 2])
-                if nx * (uk - ui) + ny * (vk - vi) > 0:  # outward is away from the face's third corner
-                    nx, ny = -nx, -ny
-                    a, b, c, d = c, d, a, b
-            if labels[b, a] == CROWN or _nearer(inverse_depth[d, c], 1.0 / w, tolerance_mm):
-                continue
             sample = out[n]
-            sample[X], sample[Y], sample[Z], sample[U], sample[V] = x, y, z, u, v
+            for a in range(3):
+                sample[a] = vertices[i, a] + t * (vertices[j, a] - vertices[i, a])
+            sample[U], sample[V], w = _pixel(matrix, sample[X], sample[Y], sample[Z])
             sample[NX], sample[NY] = nx, ny
-            sample[LENGTH], sample[INVERSE_DEPTH] = length / pieces, 1.0 / w
+            sample[LENGTH] = length / pieces
+            sample[INVERSE_DEPTH] = 1.0 / w
             # Where the crown ends, it runs into gum, or was cut off with it.
             sample[GUM_SHARE] = 1.0 if g < 0 else 0.0
             sample[GUM_SLOPE] = _border_slope(vertices, i, j, k, sample, matrix, w) if g < 0 else 0.0
             n += 1
     return out[:n]
-
-
-@numba.njit(nogil=True, cache=True)
-def _with_room(samples: Array, used: int, more: int) -> Array:
-    """Return a table of samples, the used ones kept, with room for so many more."""
-    if used + more <= len(samples):
-        return samples
-    grown = np.empty((2 * len(samples) + more, COLUMNS))
-    grown[:used] = samples[:used]
-    return grown
-
-
-@numba.njit(nogil=True, cache=True, inline="always")
-def _third_corner(faces: Faces, f: int, i: int, j: int) -> int:
-    """Return the corner of a face that is neither i nor j."""
-    k = faces[f, 0]
-    if k in (i, j):
-        k = faces[f, 1]
-    if k in (i, j):
-        k = faces[f, 2]
-    return k
 
 
 @numba.njit(nogil=True, cache=True)
@@ -233,16 +205,40 @@ def pixel_of(coordinate: float) -> int:
 
 
 @numba.njit(nogil=True, cache=True)
-def _tell_gum(samples: Array, labels: NDArray[np.uint8], px_per_mm: float, facing_gum: Array) -> None:
-    """Write which share of each silhouette sample is gum line, and which a free edge."""
-    for sample in samples:
-        if sample[GUM_SHARE] == 0.0:
+def _visible(
+    samples: Array,
+    labels: NDArray[np.uint8],
+    inverse_depth: NDArray[np.float32],
+    tolerance_mm: float,
+    px_per_mm: float,
+    facing_gum: Array,
+) -> Array:
+    """Keep samples whose own surface is visible on the inner side, with no crown on the outer; tell edge from gum."""
+    out = np.empty_like(samples)
+    height, width = labels.shape
+    n = 0
+    for s in range(len(samples)):
+        sample = samples[s]
+        i = pixel_of(sample[U] - sample[NX])
+        j = pixel_of(sample[V] - sample[NY])
+        a = pixel_of(sample[U] + sample[NX])
+        b = pixel_of(sample[V] + sample[NY])
+        if min(i, a) < 0 or min(j, b) < 0 or max(i, a) >= width or max(j, b) >= height:
+            continue
+        if labels[b, a] == CROWN or labels[j, i] != CROWN:
+            continue
+        if _nearer(inverse_depth[j, i], sample[INVERSE_DEPTH], tolerance_mm):
+            continue
+        out[n] = sample
+        if out[n, GUM_SHARE] == 0.0:
             distance_mm = _gum_distance_px(labels, sample[U], sample[V], _GUM_FAR_MM * px_per_mm) / px_per_mm
             share = (_GUM_FAR_MM - distance_mm) / (_GUM_FAR_MM - _GUM_NEAR_MM)
             cosine = sample[NX] * facing_gum[0] + sample[NY] * facing_gum[1]
             share = max(share, (cosine - _LEAST_FACING) / (_FULL_FACING - _LEAST_FACING))
-            sample[GUM_SHARE] = min(max(share, 0.0), 1.0)
-        sample[EDGE_SHARE] = 1.0 - sample[GUM_SHARE]
+            out[n, GUM_SHARE] = min(max(share, 0.0), 1.0)
+        out[n, EDGE_SHARE] = 1.0 - out[n, GUM_SHARE]
+        n += 1
+    return out[:n]
 
 
 @numba.njit(nogil=True, cache=True, inline="always")
