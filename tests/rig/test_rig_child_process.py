@@ -106,12 +106,19 @@ def test_a_crash_of_a_copy_is_asked_again_of_a_new_process(anchored_folder, fork
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="forks are for Linux")
-def test_a_copy_that_waits_for_ever_is_left_soon(anchored_folder, forks, monkeypatch, children):
+def test_a_copy_that_waits_for_ever_is_left_soon(monkeypatch):
     """As one does that was made while another thread held a lock of OpenUSD."""
-    monkeypatch.setattr(child_limits, "open_checked", lambda path: time.sleep(1000))
     monkeypatch.setattr(child_process, "_MOST_SLEEP_S", 1)
-    assert open_stage(anchored_folder / "actor.usda")
-    assert len(children) == 2
+    reading, writing = os.pipe()
+    child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(1000)"], pass_fds=(writing,))
+    os.close(writing)
+    try:
+        assert not child_process._ends(child.pid, reading)
+        assert child.poll() is None
+    finally:
+        child.kill()
+        child.wait()
+        os.close(reading)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="forks are for Linux")
