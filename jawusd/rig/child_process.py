@@ -40,9 +40,12 @@ def try_in_child(path: Path) -> None:
     """
     if is_allowed(path) or _is_known(path):
         return
-    end = _forked(path) if not _reader.runs() and _can_fork() else None
+    copied = not _reader.runs() and _can_fork()
+    end = _forked(path) if copied else None
     if end in (None, End.CRASHED):
         end = _reader.read(path) or end
+    if end is None and not copied and _can_fork():  # the second Python has ended, and no new one can be started
+        end = _forked(path)
     if end not in (None, End.WHOLE):  # None: no child can be had
         raise RigError(f"{end.value}: it is damaged, or was made to.", path=path, hint=_TRUST)
 
@@ -121,14 +124,18 @@ def _forked(path: Path) -> End | None:
 
 
 def _ends(child: int, reading: int) -> bool:
-    """Wait for a child to close its end of a pipe; return False where it has slept too long, or worked too long."""
+    """Wait for a child to close its end of a pipe; return False where it has slept too long, or worked too long.
+
+    Its main thread does all its work; a thread of the task scheduler may run in circles for workers that were not
+    copied.
+    """
     slept_s, worked = 0, 0
     with selectors.DefaultSelector() as selector:
         selector.register(reading, selectors.EVENT_READ)
         for _ in range(child_limits.MOST_WAIT_S):
             if selector.select(1.0):
                 return True
-            state, ticks = _state_and_time(str(child))
+            state, ticks = _state_and_time(f"{child}/task/{child}")
             slept_s = slept_s + 1 if state == "S" and ticks == worked else 0
             worked = ticks
             if slept_s > _MOST_SLEEP_S:

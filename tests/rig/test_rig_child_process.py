@@ -46,8 +46,9 @@ def children(reader, monkeypatch):
 
 
 @pytest.fixture
-def forks(monkeypatch):
+def forks(anchored_folder, reader, monkeypatch):
     """Let copies be made at any time: on a busy machine, threads may take long to fall asleep."""
+    reader.close()  # which baking has started, if this test is the first to bake
     monkeypatch.setattr(child_process, "_can_fork", lambda: sys.platform == "linux")
 
 
@@ -106,19 +107,20 @@ def test_a_crash_of_a_copy_is_asked_again_of_a_new_process(anchored_folder, fork
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="forks are for Linux")
-def test_a_copy_that_waits_for_ever_is_left_soon(monkeypatch):
+def test_a_crash_is_one_message_where_the_second_python_is_gone(anchored_folder, forks, no_reader, reader, monkeypatch):
+    monkeypatch.setattr(reader, "runs", lambda: True)
+    monkeypatch.setattr(child_limits, "open_checked", lambda path: os.kill(os.getpid(), signal.SIGSEGV))
+    with pytest.raises(RigError, match="ends OpenUSD"):
+        open_stage(anchored_folder / "actor.usda")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="forks are for Linux")
+def test_a_copy_that_waits_for_ever_is_left_soon(anchored_folder, forks, monkeypatch, children):
     """As one does that was made while another thread held a lock of OpenUSD."""
     monkeypatch.setattr(child_process, "_MOST_SLEEP_S", 1)
-    reading, writing = os.pipe()
-    child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(1000)"], pass_fds=(writing,))
-    os.close(writing)
-    try:
-        assert not child_process._ends(child.pid, reading)
-        assert child.poll() is None
-    finally:
-        child.kill()
-        child.wait()
-        os.close(reading)
+    monkeypatch.setattr(child_limits, "open_checked", lambda path: time.sleep(1000))
+    assert open_stage(anchored_folder / "actor.usda")
+    assert len(children) == 2
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="forks are for Linux")
