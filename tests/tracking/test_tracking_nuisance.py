@@ -8,6 +8,7 @@ import pytest
 from bumpy_teeth import jaw_poses
 from small_take import CAMERAS, LANDMARKS, MESHES, OFFSETS, errors_mm, make_capture, track, write_masks
 
+from jawusd.formats.mesh import Mesh, crown_face_mask
 from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, load_tracks, save_tracks
 from jawusd.geometry import Camera, rigidity_defect, se3_exp, se3_inverse, se3_log
 from jawusd.tracking import TrackingConfig, track_capture
@@ -16,7 +17,7 @@ from jawusd.tracking.contour.frame_record import FrameRecord
 from jawusd.tracking.sequence.delays import bridge, delay_motions, interpolation_errors
 from jawusd.tracking.sequence.extrinsics import Extrinsics, corrected_cameras
 from jawusd.tracking.sequence.frame_tracker import FrameTracker
-from jawusd.tracking.sequence.nuisance import Nuisances, corrected_pose
+from jawusd.tracking.sequence.nuisance import DRAWN, Nuisances, corrected_pose
 
 FRAMES = 16
 WITHOUT = TrackingConfig(refine_rounds=0)
@@ -57,6 +58,20 @@ def test_nothing_is_found_where_nothing_is(tmp_path):
     tracks = track(make_capture(write_masks(tmp_path / "clean", FRAMES), FRAMES))
     assert np.abs(list(tracks.meta["delays_frames"].values())).max() < 0.03
     assert np.abs(list(tracks.meta["outline_bias_px"].values())).max() < 0.1
+
+
+def test_scans_without_gum_tell_less_of_how_masks_were_drawn(tmp_path, monkeypatch):
+    """The same take, with all that is measured on it, leaves more unknown of both arches."""
+    capture = make_capture(write_masks(tmp_path / "crowns", 6), 6)
+    crowns = [Mesh(m.vertices, m.faces[crown_face_mask(m)], m.colors) for m in MESHES]
+
+    def sigma_px():
+        found = track_capture(capture, CAMERAS, OFFSETS, *crowns, LANDMARKS)
+        return np.array(list(found.meta["outline_bias_sigma_px"].values()))
+
+    unknown = sigma_px()
+    monkeypatch.setattr("jawusd.tracking.sequence.take.DRAWN_BESIDE_CROWNS", DRAWN)
+    assert (unknown > 1.05 * sigma_px()).all()
 
 
 def _nuisances(**values):

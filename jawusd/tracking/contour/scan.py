@@ -29,6 +29,7 @@ _PROBES = 300  # enough for a mean over the crowns to one per cent
 # Crown faces above which most steps use a thinned scan, and how many that one keeps: thinning from 20,000 to 5,000
 # costs 0.002 mm at 1 px of mask noise, and time goes with the faces.
 _DENSE_FACES, _THIN_FACES = 60_000, 20_000
+_GUM_SHARE = 0.02  # gum faces for each crown face below which they are remains of what was cut away
 _FEWEST_CROWN_FACES = 100  # fewer cannot show a contour in several directions
 
 
@@ -53,6 +54,11 @@ class Scan:
     painted: bool
     # the same arch with fewer faces, for all but the last steps; None where this one is thin enough
     thin: Scan | None = None
+
+    @property
+    def shows_gum(self) -> bool:
+        """Tell whether gum lies around the crowns."""
+        return len(self.gum_faces) > _GUM_SHARE * len(self.crown_faces)
 
     def crown_vertices(self, limit: int | None = None) -> Array:
         """Return the vertices of the crowns [mm], shape (N, 3), at most about `limit` of them."""

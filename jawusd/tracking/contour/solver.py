@@ -27,7 +27,6 @@ from jawusd.tracking.contour.samples import HABITS, LENGTH, contour_samples
 from jawusd.tracking.contour.scan import ARCHES, Scan
 from jawusd.tracking.contour.views import Drawn, View, present_masks
 
-_GUM_SHARE = 0.02  # gum faces for each crown face below which they are remains of what was cut away
 _DENSE_STEPS = 2  # with all faces of a dense scan, after the thinned one has settled
 
 # samples, how many of them are silhouette, their distances to the mask edge, visible contour length [px]
@@ -221,7 +220,7 @@ class ContourSolver:
 
 def _towards_gum(scans: Sequence[Scan]) -> list[Array | None]:
     """Return for each arch where its gum must be, a unit vector in scan coordinates; None if the scan shows it."""
-    shown = [len(scan.gum_faces) > _GUM_SHARE * len(scan.crown_faces) for scan in scans]
+    shown = [scan.shows_gum for scan in scans]
     if all(shown):
         return [None, None]
     up = bite_normal(scans[0].crown_vertices(), scans[1].crown_vertices())

@@ -29,7 +29,7 @@ from jawusd.tracking.sequence.extrinsics import Extrinsics
 from jawusd.tracking.sequence.frame_tracker import FrameTracker
 from jawusd.tracking.sequence.history import History, MotionPredictor
 from jawusd.tracking.sequence.mirror_check import mirror_findings
-from jawusd.tracking.sequence.nuisance import Nuisances, TakeEquations
+from jawusd.tracking.sequence.nuisance import DRAWN, DRAWN_BESIDE_CROWNS, Nuisances, TakeEquations
 from jawusd.tracking.sequence.rest_frames import RestFrames, rest_frames
 from jawusd.tracking.sequence.results import assemble, outline_variance
 from jawusd.tracking.sequence.take_checks import lens_findings, motion_findings, time_findings
@@ -135,6 +135,7 @@ class _Take:
         self._first, self._stop = first, stop
         self._progress = progress or (lambda done, total: None)
         self._probes = probe_points(solver.scans)
+        self._hand = DRAWN if all(scan.shows_gum for scan in solver.scans) else DRAWN_BESIDE_CROWNS
         self.records: dict[int, FrameRecord] = {}
 
     def begin(self, frame: int, poses: Array) -> None:
@@ -227,7 +228,7 @@ class _Take:
 
     def _equations(self, extrinsics: Extrinsics, rest: RestFrames) -> TakeEquations:
         variance = outline_variance(self.records, self._config)
-        equations = TakeEquations(self.records, variance, extrinsics)
+        equations = TakeEquations(self.records, variance, extrinsics, hand=self._hand)
         observe_bite(equations, self.records, rest, extrinsics, variance)
         return equations
 
@@ -256,7 +257,7 @@ class _Take:
                 views = _corrected_views(views, self.records, frame, found, extrinsics)
                 solution = self._solver.solve(start, views, c.gates_from(0.0), used)
                 records[frame] = replace(records[frame], solution=solution)
-            equations = TakeEquations(records, variance, extrinsics, sample)
+            equations = TakeEquations(records, variance, extrinsics, sample, self._hand)
             observe_bite(equations, records, sampled_rest, extrinsics, variance)
             more = equations.solve(c, cameras_moved)
             found = found.plus(more)
