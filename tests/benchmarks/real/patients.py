@@ -30,7 +30,9 @@ Array = np.ndarray
 COLOUR = 1  # cv2.IMREAD_COLOR
 VIEWS = {"front": 4, "left": 2, "right": 3}  # with the teeth together, and their numbers in the names of the files
 ROWS = ("Upper", "Lower")
+LINE = 64  # gray from which a pixel belongs to a line; its blur reaches three times as far
 LARGEST_TOOTH = 0.05  # share of a picture: closed lines around more enclose no tooth
+BESIDE_PX = 20  # masks are judged as far as this beyond the areas
 PALETTE = np.array([[60, 220, 60], [60, 160, 255]])
 
 
@@ -118,8 +120,11 @@ def mask_row(folder: Path, patient: int, found: PhotoAlignment, number: int, sca
     px_per_mm = photo.pose.focal_px / float((photo.pose.T_cam_upper @ [*scans[0].vertices.mean(axis=0), 1.0])[2])
     masks = automatic(picture, lens, expected, px_per_mm)
     areas, closed = drawn_areas(drawn, expected.labels)
+    # what lies beside the closed outlines belongs to teeth whose lines are open: nobody says where they end
+    judged = ndimage.distance_transform_edt(~areas.any(axis=0)) < BESIDE_PX
     rows = tooth_rows(picture)
-    bare = overlap(rows.masks.any(axis=0), areas.any(axis=0)) if rows is not None else "no rows found"
+    bare = overlap(rows.masks.any(axis=0) & judged, areas.any(axis=0)) if rows is not None else "no rows found"
+    masks &= judged
     both = overlap(masks.any(axis=0), areas.any(axis=0))
     save_overlay(out / f"patient_{patient}_{told.name}", picture, masks, areas, found, number)
     single = [overlap(mask, area) for mask, area in zip(masks, areas, strict=True)]
@@ -139,18 +144,19 @@ def automatic(picture: Array, lens: Camera, expected, px_per_mm: float) -> Array
 
 
 def drawn_areas(lines: Array, expected: Array) -> tuple[Array, int]:
-    """Return the areas of both rows (2, h, w) that closed lines enclose, by the crowns seen there, and their number."""
-    thick = ndimage.binary_dilation(lines > 0)
-    parts, count = ndimage.label(~thick)
+    """Return the areas (2, h, w) in closed lines, to their middle, by the row of the crowns there, and their number."""
+    drawn = lines > LINE
+    half_px = ndimage.distance_transform_edt(drawn)[drawn].max()
+    parts, count = ndimage.label(~ndimage.binary_dilation(drawn))
     sizes = ndimage.sum_labels(np.ones_like(parts), parts, np.arange(1, count + 1))
     areas, closed = np.zeros((2, *lines.shape), dtype=bool), 0
     for part in 1 + np.flatnonzero(sizes < LARGEST_TOOTH * lines.size):
         here = parts == part
         seen = [np.count_nonzero(expected[here] == row) for row in (1, 2)]
         if max(seen) * 2 > np.count_nonzero(here):
-            areas[int(np.argmax(seen))] |= here
+            areas[int(np.argmax(seen))] |= ndimage.binary_dilation(here, iterations=1 + int(half_px))
             closed += 1
-    return np.stack([ndimage.binary_closing(area, iterations=4) for area in areas]), closed
+    return areas, closed
 
 
 def overlap(one: Array, other: Array) -> str:
