@@ -75,11 +75,12 @@ def digests(out):
 
 
 def records(out):
-    """Return what build.json says of every stage, but for times and the report's own hash."""
+    """Return what build.json says of every stage, but for times, command lines and the report's own hash."""
     kept = {}
     for name, record in stages(out).items():
         outputs = {file: found for file, found in record["outputs"].items() if file != REPORT}
-        kept[name] = {"inputs": record["inputs"], "outputs": outputs, "result": record["result"]}
+        result = {key: value for key, value in record["result"].items() if key != "origin"}
+        kept[name] = {"inputs": record["inputs"], "outputs": outputs, "result": result}
     return kept
 
 
