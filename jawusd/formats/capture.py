@@ -19,6 +19,7 @@ from jawusd.geometry import rigidity_defect
 from jawusd.npz import check_format
 
 FAMILY, VERSION = "jawusd-capture", 1
+_MOST_PICKS = 200  # on a row of teeth; the triples of them, of which some are tried, grow with the third power
 
 
 class Sync(Strict):
@@ -74,8 +75,8 @@ class Bootstrap(Strict):
     """Give the picks that start the tracking, on one frame of the reference camera."""
 
     frame: Annotated[int, Field(ge=0), Key("Frame of the reference camera in which the points are picked.", "120")]
-    upper: tuple[Pick, ...] = ()
-    lower: tuple[Pick, ...] = ()
+    upper: Annotated[tuple[Pick, ...], Field(max_length=_MOST_PICKS)] = ()
+    lower: Annotated[tuple[Pick, ...], Field(max_length=_MOST_PICKS)] = ()
 
 
 class MotionSection(Strict):

@@ -22,7 +22,7 @@ from jawusd.imaging.display import to_display
 from jawusd.imaging.pictures import MOST_PX
 from jawusd.imaging.pixels import Colour, Slices, coloured, converted, deep_rgb
 from jawusd.imaging.timeline import Timeline
-from jawusd.inputs import why_unreadable
+from jawusd.inputs import check_input, why_unreadable
 
 _REENCODE = "Re-encode it, for example: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp4."
 _CUT_OFF = "Copy it again from the camera; a recording that was cut off has to be repaired first."
@@ -51,6 +51,7 @@ class Video(Clip):
         self.path = Path(path)
         self._space = None if colour_space == "display" else colour_space
         self._config = colour_config
+        check_input(self.path, CaptureError)
         if not self.path.is_file():
             raise CaptureError("no such video.", path=path, hint="Check the path in capture.toml.")
         if self.path.stat().st_size == 0:

@@ -19,6 +19,10 @@ if TYPE_CHECKING:
 
 # Frames looked at for rows that are apart: every so-many-th, in parts of the take; starts tried in a part.
 _EVERY, _PART, _TRIED = 8, 240, 4
+# Starts tried in all. One takes some ten seconds of processor time; where six parts of a take in which rows seem apart
+# have none that fits, scans, cameras or what was taken for teeth are wrong, and the other parts are like them. Work is
+# counted, not time: what is found does not depend on the machine.
+_MOST_TRIED = 24
 #: How much rows of teeth may be bridged to count as apart: of 64 pictures of eight mouths, those below were all parted
 #: rightly.
 MOST_BRIDGED = 0.1
@@ -74,12 +78,14 @@ class PictureSearch(Generic[T]):
         """Return the first start that fits clearly, or the best one of a part of the take.
 
         Raises:
-            TrackingError: none fits.
+            TrackingError: none of those tried fits.
             CaptureError: a picture cannot be decoded.
         """
         best: Begin[T] | None = None
         tried: list[int] = []
+        seen = 0
         for part in (frames[k : k + _PART] for k in range(0, len(frames), _PART)):
+            seen += len(part)
             looks = sorted(self._looks(part, progress), key=lambda look: look.bridged)
             for look in looks[:_TRIED]:
                 tried.append(look.frame)
@@ -90,11 +96,10 @@ class PictureSearch(Generic[T]):
                     return best
             if best is not None and best.fit >= LEAST_FIT:
                 return best
-        fit = (
-            "" if best is None else f"; at best {best.fit:.0%} of the contour in sight fits, {LEAST_FIT:.0%} is needed"
-        )
+            if len(tried) >= _MOST_TRIED:
+                break
         raise TrackingError(
-            f"the teeth were not found on {len(tried)} frames that show both rows apart{fit}",
+            _tried(tried, best, frames[seen:]),
             hint="Check that scans, or rig, are of this person; let the footage show both rows of teeth apart and "
             "upright for a moment, pick teeth in two cameras ([bootstrap]), or draw masks.",
         )
@@ -119,6 +124,18 @@ class PictureSearch(Generic[T]):
             masked = masked_cameras(self.capture, look.rows, numbers, Path(folder))
             near = self.near(masked, look.frame)
         return None if near is None else Begin(look.frame, *self.judged(look.frame, near), "search")
+
+
+def _tried(tried: Sequence[int], best: Begin[T] | None, left: range) -> str:
+    """Return on which frames starts were tried, what came of it, and which frames are left."""
+    found = f"the teeth were not found on {len(tried)} frames that show both rows apart"
+    if tried:
+        found += f" ({', '.join(map(str, sorted(tried)))})"
+    if best is not None:
+        found += f"; at best {best.fit:.0%} of the contour in sight fits, {LEAST_FIT:.0%} is needed"
+    if left:
+        found += f"; frames {left[0]} to {left[-1]} were not searched, as {_MOST_TRIED} are tried at most"
+    return found
 
 
 def masked_cameras(

@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+import threading
 
 import cv2
 import numpy as np
@@ -197,6 +198,23 @@ def test_each_fault_is_found_by_its_cause(capture, plants):
         matching = [f for f in got if f.kind == kind]
         assert matching and all(f.severity == severity for f in matching), plant
         assert any(words in f.line() for f in matching), plant
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="named pipes of POSIX")
+@pytest.mark.parametrize(
+    "names", [("video/cam1.mp4", "masks/cam2/upper.mkv", "scans/upper_teeth.ply"), ("calibration.toml",)]
+)
+def test_pipes_that_nobody_writes_to_are_named_and_not_waited_for(capture, names):
+    for name in names:
+        (capture / name).unlink()
+        os.mkfifo(capture / name)
+    got = []
+    thread = threading.Thread(target=lambda: got.extend(found(capture)), daemon=True)
+    thread.start()
+    thread.join(60)
+    lines = [f.line() for f in got if f.severity == "error"]
+    for name in names:
+        assert any(name in line and "is not a file" in line for line in lines), (name, lines)
 
 
 def test_the_reference_camera_may_lack_the_last_masks(capture):

@@ -21,7 +21,7 @@ from jawusd.tracking.contour.scan import prepare_scan
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import MaskViews, View, working_size
 from jawusd.tracking.initialization.reacquire import shift_to_masks
-from jawusd.tracking.sequence.history import MotionPredictor
+from jawusd.tracking.sequence.history import MotionPredictor, SearchAllowance
 
 CONFIG = TrackingConfig()
 SCANS = tuple(prepare_scan(m, n) for m, n in zip(MESHES, ("upper", "lower")))
@@ -163,6 +163,17 @@ def test_searches_become_rarer_while_lost():
         due.append(motion.search_is_due())
         motion.update(motion.predict(), UPPER, BOTH)
     assert due[:5] == [True, True, True, False, True] and sum(due) < 10
+
+
+def test_searches_in_vain_use_up_what_a_take_allows():
+    searches = SearchAllowance(64)
+    for frame in range(searches.most):
+        assert searches.allows(frame)
+        searches.note(frame, found=False)
+    assert searches.most == 20 and not searches.allows(20) and not searches.allows(19)
+    assert searches.left_out == {20}  # on the other one it ran
+    searches.note(20, found=True)
+    assert searches.allows(21) and searches.fruitless == 20
 
 
 def test_searches_stay_due_while_there_is_nothing_to_see():

@@ -2,11 +2,14 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from small_take import CAMERAS, MESHES, OFFSETS, make_capture, write_masks
 
 from jawusd.errors import TrackingError
+from jawusd.tracking.initialization import scale_search
 from jawusd.tracking.initialization.scale_search import seen_size
+from jawusd.tracking.initialization.start_search import Found, StartSearch
 
 COUNT = 3
 
@@ -39,3 +42,19 @@ def test_masks_of_something_else_tell_no_size(capture, monkeypatch):
         seen_size(capture, CAMERAS, OFFSETS, turned)
     with pytest.raises(TrackingError, match="has masks of both rows"):
         seen_size(make_capture(capture.folder, COUNT, frames=(400, 402)), CAMERAS, OFFSETS, MESHES)
+
+
+def test_a_climb_without_an_end_counts_as_no_fit(capture, monkeypatch):
+    """Let every size fit better than the one before: the climb ends after so many sizes and is not believed."""
+    sizes = []
+
+    def better(self, frame, size, poses, size_of_poses):
+        sizes.append(size)
+        return float(len(sizes)), 0.9, poses
+
+    monkeypatch.setattr(scale_search._Sizes, "_fitted", better)
+    monkeypatch.setattr(scale_search, "_MOST_SIZES", 20)
+    monkeypatch.setattr(StartSearch, "at", lambda *_: Found(np.stack([np.eye(4)] * 2), 1.0, np.ones(2)))
+    with pytest.raises(TrackingError, match=r"at no size from 0\.5 to 2"):
+        seen_size(capture, CAMERAS, OFFSETS, MESHES)
+    assert 2 * 5 * 20 < len(sizes) <= 2 * 5 * 21  # frames, starts, and the first size of each climb

@@ -6,12 +6,27 @@ import shutil
 import cv2
 import numpy as np
 import pytest
-from small_take import CAMERAS, LANDMARKS, MESHES, ROWS, START, errors_mm, make_capture, png, source, track, write_masks
+from small_take import (
+    CAMERAS,
+    FIRST,
+    LANDMARKS,
+    MESHES,
+    ROWS,
+    START,
+    errors_mm,
+    make_capture,
+    png,
+    source,
+    track,
+    write_masks,
+)
 
 from jawusd.errors import TrackingError
 from jawusd.formats.tracks import LOST, load_tracks, save_tracks
 from jawusd.pipeline.track import track_lines, track_summary
 from jawusd.tracking import track_capture
+from jawusd.tracking.sequence import history
+from jawusd.tracking.sequence.frame_tracker import FrameTracker
 
 FRAMES = 10
 
@@ -108,6 +123,26 @@ def test_hidden_teeth_are_lost_and_found_again(take):
     assert np.isfinite(tracks.T_world_upper).all() and np.isnan(tracks.sigma_mm[5:7]).all()
     assert (tracks.status[7:] != 0).all()
     assert np.nanmax(errors_mm(tracks)) < 0.1
+
+
+def test_masks_exchanged_now_and_then_are_not_searched_for_ever(take, monkeypatch):
+    """Exchange the rows' masks on three frames apart from one another, each of which would be searched both ways."""
+    for k in (5, 7, 9):
+        for camera in CAMERAS:
+            upper, lower = (png(take, camera.name, row, k) for row in ROWS)
+            upper.rename(take / "other.png")
+            lower.rename(upper)
+            (take / "other.png").rename(lower)
+    calls = []
+    search = FrameTracker._search_many_starts
+    monkeypatch.setattr(FrameTracker, "_search_many_starts", lambda *given: calls.append(1) or search(*given))
+    monkeypatch.setattr(history, "_FRUITLESS", 1)
+    tracks = track(_capture(take))
+    (finding,) = [found for found in tracks.meta["findings"] if found["kind"] == "searches_left_out"]
+    assert len(calls) == 1 and "1 times in vain" in finding["message"] and finding["frame"] in FIRST + np.array([7, 9])
+    lost = (tracks.status == LOST).any(1)
+    assert lost[[5, 7, 9]].all() and not lost[[0, 1, 2, 3, 4, 6, 8]].any()
+    assert np.nanmax(errors_mm(tracks)[~lost]) < 0.1
 
 
 def test_every_lost_frame_of_a_spoiled_stretch_names_its_reason(take, tmp_path):

@@ -54,7 +54,7 @@ def test_a_scan_that_fits_nowhere_while_the_other_does_is_named(fits, named):
 
 
 class _Searches:
-    """Answer searches with a fit per search, every one of which takes a minute of a clock."""
+    """Answer searches with a fit per search."""
 
     def __init__(self, fits=()):
         self.fits, self.count = dict(fits), 0
@@ -68,9 +68,6 @@ class _Searches:
             raise TrackingError("nothing found")
         return Found(np.stack([np.eye(4)] * 2), 1000.0, np.full(2, self.fits[self.count]))
 
-    def clock(self):
-        return 60.0 * self.count
-
 
 def _refused(searches, monkeypatch):
     monkeypatch.setattr(start_causes, "aligned", lambda search, footage, poses, frame: poses)
@@ -79,19 +76,19 @@ def _refused(searches, monkeypatch):
         for name in ("cam0", "cam1", "cam2")
     ]
     footage = Footage(sources, TABLE, OFFSETS, (0, 10))
-    return start_causes.refuse_by_cause(searches, footage, 3, set(), searches.clock)
+    return start_causes.refuse_by_cause(searches, footage, 3, set())
 
 
 def test_the_search_for_a_mistake_ends_and_says_what_was_tried(monkeypatch):
     searches = _Searches()
+    monkeypatch.setattr(start_causes, "MOST_PICTURES", 20)
     words = _refused(searches, monkeypatch)
-    assert searches.count == 6  # those begun within 300 s
-    assert "any of 6 mistakes" in words and "14 more were not tried, as 300 s had passed" in words
+    assert searches.count == 6  # of three cameras each
+    assert "any of 6 mistakes" in words and "14 more were not tried: no more than 20 pictures are searched" in words
 
 
-def test_quick_searches_try_every_mistake(monkeypatch):
+def test_every_mistake_of_three_cameras_is_tried(monkeypatch):
     searches = _Searches()
-    monkeypatch.setattr(searches, "clock", lambda: 0.0)
     assert _refused(searches, monkeypatch) == (
         "Undoing any of 20 mistakes in masks, scans and calibration does not help."
     )
@@ -99,6 +96,7 @@ def test_quick_searches_try_every_mistake(monkeypatch):
 
 
 def test_of_mistakes_that_are_not_all_tried_only_one_beyond_doubt_counts(monkeypatch):
+    monkeypatch.setattr(start_causes, "MOST_PICTURES", 20)
     assert "not tried" in _refused(_Searches({5: 0.2}), monkeypatch)
     with pytest.raises(TrackingError, match="found only with that undone"):
         _refused(_Searches({5: 0.5}), monkeypatch)

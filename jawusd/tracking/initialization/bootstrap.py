@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, islice
+from math import comb
 
 import numpy as np
 
@@ -63,8 +64,8 @@ def pose_from_picks(
     places = np.stack([triangulate(s.matrices, s.pixels) for s in sightings])
     points = np.stack([s.point for s in sightings])
     best, best_cost = None, np.inf
-    triples = list(combinations(range(len(picks)), _FEWEST))
-    for triple in triples[:: max(1, len(triples) // _MOST_TRIPLES)]:
+    step = max(1, comb(len(picks), _FEWEST) // _MOST_TRIPLES)
+    for triple in islice(combinations(range(len(picks)), _FEWEST), 0, None, step):
         k = list(triple)
         try:
             pose = rigid_fit(points[k], places[k])

@@ -30,6 +30,8 @@ _STARTS = (1.0, 1 / 1.15, 1.15, 1 / 1.32, 1.32)
 _STEPS = (0.03, 0.01, 0.005)
 _SMALLEST, _LARGEST = 0.5, 2.0
 _SURVEYED, _FRAMES_TRIED = 24, 2
+# Sizes aligned in a climb: from one end to the other in the widest steps, and the others. Uneven masks may have hills.
+_MOST_SIZES = 64
 _CLEAR_FIT = 0.3  # as for the start of a take: wrong poses stay below 0.1 in one of the arches
 
 
@@ -94,13 +96,18 @@ class _Sizes:
         return Footage(sources, cameras, self._offsets, self._capture.frames)
 
     def climb(self, frame: int, size: float, poses: Array) -> tuple[float, float]:
-        """Return the size at which the fit is best, going uphill from given poses, and the fit of the worse arch."""
+        """Return the size at which the fit is best, going uphill from given poses, and the fit of the worse arch.
+
+        The fit counts as none at all if there is no end to it after `_MOST_SIZES`.
+        """
         objective, fit, poses = self._fitted(frame, size, poses, size)
+        left = _MOST_SIZES
         beside = {}
         for step in _STEPS:
             beside = {0: objective}
             for direction in (1, -1):
-                while True:
+                while left > 0:
+                    left -= 1
                     there = size * (1 + step) ** direction
                     if not _SMALLEST <= there <= _LARGEST:
                         break
@@ -110,6 +117,8 @@ class _Sizes:
                         break
                     beside = {-direction: objective}
                     size, (objective, fit, poses) = there, other
+        if left == 0:
+            return size, -np.inf
         if {1, -1} <= beside.keys():  # the top of a parabola through the last three
             bend = beside[1] - 2 * objective + beside[-1]
             size *= (1 + _STEPS[-1]) ** (0.5 * (beside[-1] - beside[1]) / bend if bend < 0 else 0.0)

@@ -21,7 +21,13 @@ from jawusd.tracking.initialization.bootstrap import picked_sigma_mm, pose_from_
 from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.initialization.mixups import all_arches_exchanged, likely_mixup
 from jawusd.tracking.initialization.scan_checks import check_occlusion
-from jawusd.tracking.initialization.start_causes import CLEAR_FIT, aligned, refuse_by_cause, refuse_lone_arch
+from jawusd.tracking.initialization.start_causes import (
+    CLEAR_FIT,
+    MOST_PICTURES,
+    aligned,
+    refuse_by_cause,
+    refuse_lone_arch,
+)
 from jawusd.tracking.initialization.start_search import Found, StartSearch
 
 _SURVEYED = 24  # frames surveyed: two seconds of reading, and every exercise of a usual take is met
@@ -137,7 +143,7 @@ def _elsewhere(
     other = _near_on_another_frame(search, footage, start)
     if other is None:
         try:
-            other = search_start(search, footage)
+            other = search_start(search, footage, explain=False)
         except TrackingError:
             return start
     message = f"{reason}; the teeth were found on frame {other.frame}"
@@ -170,16 +176,22 @@ def _fits(search: StartSearch, footage: Footage, start: Start) -> bool:
     return True
 
 
-def search_start(search: StartSearch, footage: Footage) -> Start:
+def search_start(search: StartSearch, footage: Footage, explain: bool = True) -> Start:
     """Find a frame on which both arches can be aligned, and their poses there.
 
     The first frame that fits beyond doubt is taken, or else the one that fits best.
+
+    Args:
+        search: of the scans.
+        footage: gives the masks.
+        explain: whether to search for the mistake where no frame fits, which takes several times as long.
 
     Raises:
         TrackingError: no frame of those tried could be aligned; the message says what happened on each, or which
             exchange of masks would let it succeed.
     """
-    frames = footage.survey(None, _SURVEYED).promising(_FRAMES_TRIED).tolist()
+    most = max(1, min(_FRAMES_TRIED, MOST_PICTURES // len(footage.sources)))
+    frames = footage.survey(None, _SURVEYED).promising(most).tolist()
     failed: dict[int, str] = {}
     accused: set[str] = set()
     best: tuple[int, Found] | None = None
@@ -206,7 +218,7 @@ def search_start(search: StartSearch, footage: Footage) -> Start:
         if found.fit >= CLEAR_FIT:
             break
     if best is None:
-        tried = refuse_by_cause(search, footage, frames[0], accused)
+        tried = refuse_by_cause(search, footage, frames[0], accused) if explain else ""
         refuse_lone_arch(fits)
         raise TrackingError(
             f"there are no [bootstrap] picks, and searching the teeth failed on all {len(frames)} frames tried. "

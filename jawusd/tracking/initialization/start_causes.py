@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -22,8 +21,11 @@ from jawusd.tracking.initialization.start_search import StartSearch
 CLEAR_FIT = 0.3
 _EXPLAINS = 0.1  # least fit with a mistake undone, which wrong poses do not reach
 _MOST_CAMERAS = 4  # whose exchanges are tried; every one costs a search
-# Time after which no further search for the mistake begins [s]; the time of a search grows with the number of cameras.
-_MOST_SECONDS = 300.0
+#: Pictures searched after which no further search begins [-], on the frames of a start and again for the mistake; each
+#: takes two to three seconds of processor time. All mistakes of up to four cameras are tried, and without exchanges, of
+#: eight.
+#: Work is counted, not time: what is said does not depend on the machine.
+MOST_PICTURES = 120
 # Sizes of the scans that are tried, each of which finds teeth that are 5 % off it.
 _SIZES = (0.95, 1.05, 0.86, 1.16, 0.77, 1.28)
 
@@ -49,18 +51,13 @@ def aligned(search: StartSearch, footage: Footage, poses: Array, frame: int) -> 
         return first_record(solver, solver.config, poses, masks.at(frame), frame).solution.poses
 
 
-def refuse_by_cause(
-    search: StartSearch,
-    footage: Footage,
-    frame: int,
-    accused: set[str],
-    clock: Callable[[], float] = time.monotonic,
-) -> str:
+def refuse_by_cause(search: StartSearch, footage: Footage, frame: int, accused: set[str]) -> str:
     """Refuse a capture for the mistake with which undone the search succeeds on a frame.
 
     Mistakes whose hints are among the `accused` are tried first. What is wrong with one camera alone, or with the size
-    of the scans, is looked for last, since leaving out what contradicts makes many poses fit. No search begins once the
-    time is up; what was found in a group of mistakes that are not all tried counts if it fits beyond doubt.
+    of the scans, is looked for last, since leaving out what contradicts makes many poses fit. No search begins that
+    would look at more than `MOST_PICTURES`; what was found in a group of mistakes that are not all tried counts if it
+    fits beyond doubt.
 
     Returns:
         What was tried, as a sentence, if there is no such mistake among it.
@@ -70,11 +67,12 @@ def refuse_by_cause(
     """
     exchanges = sorted(_exchanges(search, footage), key=lambda cause: cause.hint not in accused)
     groups = ([*_mirrored(search, footage)], exchanges, [*_sizes(search, footage)], [*_cameras(search, footage)])
-    count, tried, end = sum(map(len, groups)), 0, clock() + _MOST_SECONDS
+    count, tried, pictures = sum(map(len, groups)), 0, 0
     for causes in groups:
         explained: list[tuple[float, _Cause]] = []
         for cause in causes:
-            if clock() > end:
+            pictures += len(cause.footage.sources)
+            if pictures > MOST_PICTURES:
                 break
             explained.append((_fit(cause, frame), cause))
         tried += len(explained)
@@ -86,7 +84,7 @@ def refuse_by_cause(
     sentence = f"Undoing any of {tried} mistakes in masks, scans and calibration does not help"
     if tried == count:
         return f"{sentence}."
-    return f"{sentence}; {count - tried} more were not tried, as {_MOST_SECONDS:.0f} s had passed."
+    return f"{sentence}; {count - tried} more were not tried: no more than {MOST_PICTURES} pictures are searched."
 
 
 def refuse_lone_arch(fits: Mapping[int, Array]) -> None:

@@ -66,6 +66,7 @@ class FrameTracker:
         self._solver = solver
         self._config = config
         self.history = history
+        self.searched = False  # from many starts, at the last instant
 
     def track(
         self,
@@ -84,6 +85,7 @@ class FrameTracker:
         """
         gates = self._config.gates_from(reach_px)
         instant = _Instant(starts, views, pose_history or ())
+        self.searched = False
         trial = first = self._begin(starts[0], views, gates)
         for failing, attempt in (
             (self._suspect, self._try_other_starts),
@@ -217,6 +219,7 @@ class FrameTracker:
     def _search_many_starts(self, trial: _Trial, suspect: Mask, instant: _Instant) -> _Trial:
         """Try many starts around the prediction and earlier poses, the most promising ones to the end."""
         c, views = self._config, instant.views
+        self.searched = True
         for r in np.flatnonzero(suspect).tolist():
             only = np.arange(2) == r
             bases = [self._onto_masks(p[r], r, views, trial.use) for p in (instant.starts[0], *instant.pose_history)]

@@ -15,6 +15,8 @@ from jawusd.tracking.contour.scan import ARCHES
 
 _KEPT_POSES = 16  # earlier poses kept: enough to cover the exercises of a jaw at 2 mm
 _APART_MM = 2.0  # poses nearer than this have the same basin
+# Searches from many starts that may find nothing in a take, and frames of it that allow one more.
+_FRUITLESS, _FRAMES_PER_FRUITLESS = 16, 16
 _RECENT = 8  # frames over which prediction errors are remembered: a third of a chewing stroke at 24 fps
 
 
@@ -103,6 +105,39 @@ class MotionPredictor:
         """Return earlier poses as starts for the next frame: the jaw relative to where the head is now."""
         head = self.predict()[0]
         return [np.stack([p[0], head @ se3_inverse(p[0]) @ p[1]]) for p in self._seen]
+
+
+class SearchAllowance:
+    """Say whether a take is worth another search from many starts.
+
+    One takes as long as tracking ten to fifty frames. Masks that show something else now and then would have it run in
+    vain on each such frame, forwards and backwards. Work is counted, not time, so the result does not depend on the
+    machine.
+    """
+
+    def __init__(self, frames: int) -> None:
+        """Allow for the searches of a take of so many frames."""
+        self.most = self._left = _FRUITLESS + frames // _FRAMES_PER_FRUITLESS
+        self.fruitless = 0
+        self._searched: set[int] = set()
+        self._refused: set[int] = set()
+
+    @property
+    def left_out(self) -> set[int]:
+        """The frames on which a search was due and never ran."""
+        return self._refused - self._searched
+
+    def allows(self, frame: int) -> bool:
+        """Tell whether to search on a frame where that is due."""
+        if self._left <= 0:
+            self._refused.add(frame)
+        return self._left > 0
+
+    def note(self, frame: int, found: bool) -> None:
+        """Take a search on a frame into account: what finds teeth earns another one."""
+        self._searched.add(frame)
+        self._left = min(self.most, self._left + 1) if found else self._left - 1
+        self.fruitless += not found
 
 
 class _Partial(NamedTuple):

@@ -27,12 +27,12 @@ from jawusd.tracking.sequence.closed_bite import observe_bite
 from jawusd.tracking.sequence.delays import bridge, delay_motions
 from jawusd.tracking.sequence.extrinsics import Extrinsics
 from jawusd.tracking.sequence.frame_tracker import FrameTracker
-from jawusd.tracking.sequence.history import History, MotionPredictor
+from jawusd.tracking.sequence.history import History, MotionPredictor, SearchAllowance
 from jawusd.tracking.sequence.mirror_check import mirror_findings
 from jawusd.tracking.sequence.nuisance import DRAWN, DRAWN_BESIDE_CROWNS, Nuisances, TakeEquations
 from jawusd.tracking.sequence.rest_frames import RestFrames, rest_frames
 from jawusd.tracking.sequence.results import assemble, outline_variance
-from jawusd.tracking.sequence.take_checks import lens_findings, motion_findings, time_findings
+from jawusd.tracking.sequence.take_checks import lens_findings, motion_findings, search_findings, time_findings
 
 Progress = Callable[[int, int], None]
 
@@ -103,6 +103,7 @@ def track_capture(
                 *given,
                 *motion_findings(names, extrinsics),
                 *time_findings(names, take.records, nuisances, extrinsics, config),
+                *search_findings(take.searches, take.records),
             ]
     notes: TracksMeta = {
         "start": start.notes,
@@ -137,6 +138,7 @@ class _Take:
         self._probes = probe_points(solver.scans)
         self._hand = DRAWN if all(scan.shows_gum for scan in solver.scans) else DRAWN_BESIDE_CROWNS
         self.records: dict[int, FrameRecord] = {}
+        self.searches = SearchAllowance(stop - first)
 
     def begin(self, frame: int, poses: Array) -> None:
         """Align the bootstrap frame from the pick poses."""
@@ -149,7 +151,7 @@ class _Take:
             return
         tracker, motion = self._from(frames.start - frames.step)
         for frame, views in self._masks.walk(frames.start, frames.stop, frames.step):
-            record = self._one(tracker, motion, views)
+            record = self._one(tracker, motion, frame, views)
             self.records[frame] = record
             self._progress(len(self.records), self._stop - self._first)
 
@@ -160,7 +162,7 @@ class _Take:
                 continue
             tracker, motion = self._from(stop)
             for frame, views in self._masks.walk(stop - 1, first - 1, -1):
-                record = self._one(tracker, motion, views)
+                record = self._one(tracker, motion, frame, views)
                 lost, was_lost = record.status == LOST, self.records[frame].status == LOST
                 if (lost <= was_lost).all() and (lost != was_lost).any():
                     status = np.where(was_lost & ~lost, RECOVERED, record.status).astype(np.int8)
@@ -289,10 +291,12 @@ class _Take:
             motion.remember(self.records[near].solution.poses, self.records[near].status != LOST)
         return FrameTracker(self._solver, self._config, history), motion
 
-    def _one(self, tracker: FrameTracker, motion: MotionPredictor, views: Sequence[View]) -> FrameRecord:
+    def _one(self, tracker: FrameTracker, motion: MotionPredictor, frame: int, views: Sequence[View]) -> FrameRecord:
         reach = self._config.gate_per_miss * motion.miss_mm() * self._config.working_px_per_mm
-        pose_history = motion.pose_history() if motion.search_is_due() else None
-        record = tracker.track(motion.starts(), views, pose_history, reach)
+        may_search = motion.search_is_due() and self.searches.allows(frame)
+        record = tracker.track(motion.starts(), views, motion.pose_history() if may_search else None, reach)
+        if tracker.searched:
+            self.searches.note(frame, bool((record.status != LOST).all()))
         motion.update(record.solution.poses, np.asarray(record.status != LOST), np.asarray(record.used.any(1)))
         tracker.history.add(record)
         return record

@@ -14,11 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from jawusd.formats.finding import Finding
+from jawusd.formats.tracks import LOST
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.frame_record import FrameRecord, whole_frames
 from jawusd.tracking.initialization.magnification import Magnification
 from jawusd.tracking.sequence.delay_steps import delay_steps
 from jawusd.tracking.sequence.extrinsics import Extrinsics
+from jawusd.tracking.sequence.history import SearchAllowance
 from jawusd.tracking.sequence.nuisance import Nuisances
 from jawusd.tracking.sequence.results import outline_variance
 
@@ -230,3 +232,26 @@ def motion_findings(names: Sequence[str], extrinsics: Extrinsics) -> list[Findin
                 )
             )
     return out
+
+
+def search_findings(searches: SearchAllowance, records: Mapping[int, FrameRecord]) -> list[Finding]:
+    """Return a warning if teeth were no longer searched on frames that stay lost, as too many searches were in vain.
+
+    Kind: "searches_left_out" [frames].
+    """
+    lost = [f for f in sorted(searches.left_out) if ((records[f].status == LOST) & records[f].used.any(1)).any()]
+    if not lost:
+        return []
+    return [
+        Finding(
+            "searches_left_out",
+            "warning",
+            f"the teeth were lost and searched from many starts {searches.fruitless} times in vain, as often as a take "
+            f"of this length allows ({searches.most} times more than with success); on {len(lost)} frames from this "
+            "one on they stay lost without another search.",
+            value=len(lost),
+            limit=searches.most,
+            frame=lost[0],
+            hint="Look at the masks of the lost frames: rows or cameras may be exchanged there.",
+        )
+    ]
