@@ -166,7 +166,7 @@ def test_searches_become_rarer_while_lost():
 
 
 def test_searches_in_vain_use_up_what_a_take_allows():
-    searches = SearchAllowance(64)
+    searches = SearchAllowance(384)
     for frame in range(searches.most):
         assert searches.allows(frame)
         searches.note(frame, found=False)
