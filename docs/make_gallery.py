@@ -1,0 +1,233 @@
+"""Make the pictures of docs/gallery.md: python docs/make_gallery.py [out] [--only NAME ...] [-o FOLDER]
+
+`out` is the folder of `jawusd build examples/capture -o out`. A picture whose program is not installed is named and left
+as it was: `viewer` wants Chromium and playwright, `blender` the environment blender45 of
+`tests/interop/make_environments.py` in the folder that JAWUSD_INTEROP names. `face_solver` takes minutes.
+"""
+
+import argparse
+import contextlib
+import io
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from PIL import Image, ImageDraw, ImageFont
+
+import jawusd
+from jawusd.evaluator import JawRig
+from jawusd.formats.capture import load_capture
+from jawusd.formats.contact import DEEP, TOUCHING
+from jawusd.formats.tracks import load_tracks
+from jawusd.geometry import transform_point
+from jawusd.imaging.overlay import placed_scans
+from jawusd.imaging.video_writer import VideoWriter
+from jawusd.pipeline.calibrate import sync_cameras
+from jawusd.pipeline.media import tracked_scans
+from jawusd.pipeline.overlay import open_wall
+from jawusd.pipeline.prepare import subject_of_build
+from jawusd.pipeline.report import do_experiments
+from jawusd.pipeline.state import no_progress
+from jawusd.pipeline.view import ContactView, open_viewer
+from jawusd.report.figures import condyle_figure
+from jawusd.report.style import BLUE, VERMILION, figure_bytes
+
+ROOT = Path(__file__).resolve().parents[1]
+CAPTURE = ROOT / "examples" / "capture"
+FIRST, FRAMES, STEP = 128, 120, 2  # of the clips: opens wide and moves to the side; every second frame, in real time
+TILE_PX = (320, 240)
+PATIENCE_MS = 120_000  # for the page of the viewer, drawn without a graphics card
+
+
+class NotInstalledError(Exception):
+    """Say what a picture needs that is not here."""
+
+
+def save_webp(path: Path, image: Image.Image, width_px: int) -> Path:
+    """Save a picture, reduced to a width; return the file."""
+    size = width_px, round(image.height * width_px / image.width)
+    image.convert("RGB").resize(size, Image.Resampling.LANCZOS).save(path, quality=84, method=6)
+    return path
+
+
+def drawn(figure: Figure) -> Image.Image:
+    """Return a figure as a picture."""
+    return Image.open(io.BytesIO(figure_bytes(figure, "png", 200)))
+
+
+def overlay(out: Path, folder: Path) -> Path:
+    """Draw the tracked scans over the footage, all cameras side by side."""
+    capture, tracks = load_capture(CAPTURE), load_tracks(out / "tracks.npz")
+    offsets, scans = sync_cameras(capture, no_progress)["offsets"], tracked_scans(capture, tracks)
+    wall = open_wall(capture, offsets, tracks, scans, TILE_PX)
+    path, (width, height) = folder / "overlay.mp4", (side // 2 * 2 for side in wall.size_px)
+    with contextlib.closing(wall), VideoWriter(path, (width, height), capture.fps / STEP, quality_crf=27) as video:
+        for row in range(FIRST, FIRST + FRAMES, STEP):
+            picture = wall.draw(int(tracks.frames[row]), placed_scans(tracks, row, scans), fill=0.15)
+            video.write(picture[:height, :width])
+    return path
+
+
+def border(rig: JawRig, openings: int = 60, ways: int = 72) -> np.ndarray:
+    """Return parameters on the bound [mm], shape (openings, ways, 3): at every opening as far as each way goes."""
+    d1, angle = np.linspace(*rig.d_range[0], openings), np.linspace(0, 2 * np.pi, ways)
+    start = np.zeros((openings, ways, 3))
+    start[..., 0] = d1[:, None]
+    way = np.zeros_like(start)
+    way[..., 1:] = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    near, far = np.zeros((openings, ways, 1)), np.full((openings, ways, 1), 40.0)
+    for _ in range(30):
+        middle = (near + far) / 2
+        inside = rig.is_inside(start + middle * way)[..., None]
+        near, far = np.where(inside, middle, near), np.where(inside, far, middle)
+    return start + near * way
+
+
+def incisal_point(rig: JawRig, d: np.ndarray) -> np.ndarray:
+    """Return where the lower incisal point is, from the closed bite to the left, up and forward [mm]."""
+    A = rig.T_anatomical_skull
+    return transform_point(A @ rig.pose(d), rig.landmarks[0]) - transform_point(A @ rig.T_rest, rig.landmarks[0])
+
+
+def envelope(out: Path, folder: Path) -> Path:
+    """Draw everywhere that the lower incisal point can go, with the captured motion inside."""
+    rig = jawusd.load(out / "actor.usda")
+    surface, captured = incisal_point(rig, border(rig)), incisal_point(rig, rig.captured_d)
+    figure = Figure(figsize=(8.6, 4.4), layout="constrained")
+    solid = figure.add_subplot(1, 3, 1, projection="3d")
+    x, y, z = np.moveaxis(surface, -1, 0)
+    solid.plot_surface(z, x, y, color=BLUE, alpha=0.25, linewidth=0, rcount=60, ccount=72)
+    solid.plot(*captured[:, [2, 0, 1]].T, color=VERMILION, lw=0.8)
+    solid.set_box_aspect([np.ptp(z), np.ptp(x), np.ptp(y)])
+    solid.view_init(elev=16, azim=-28)
+    solid.set(xlabel="forward", ylabel="left", zlabel="up", title="the envelope of motion [mm]")
+    solid.locator_params(nbins=4)
+    for place, (across, label, title) in enumerate(
+        [(2, "forward [mm]", "from the side"), (0, "to the subject's left [mm]", "from the front")], start=2
+    ):
+        plane = figure.add_subplot(1, 3, place)
+        a, b = surface[..., across], surface[..., 1]
+        plane.pcolormesh(a, b, np.ones_like(a), shading="gouraud", cmap="Blues", vmin=0, vmax=3, rasterized=True)
+        plane.plot(captured[:, across], captured[:, 1], color=VERMILION, lw=0.8)
+        plane.set(xlabel=label, ylabel="up [mm]", title=title, aspect="equal")
+        plane.spines[["top", "right"]].set_visible(False)
+    return save_webp(folder / "envelope.webp", drawn(figure), 1200)
+
+
+def contacts(out: Path, folder: Path) -> Path:
+    """Draw where teeth touch in the closed bite and in a glide to the left, as articulating paper marks them."""
+    actor = out / "actor.usda"
+    rig = jawusd.load(actor)
+    view, left = ContactView(actor, rig, "/Actor"), 0.6 * float(rig.ranges(0.0).d2_max)
+    poses = {"closed bite": (0.0, 0.0, 0.0), f"gliding {left:.1f} mm to the left": (0.0, left, 0.0)}
+    pictures = [Image.fromarray(view.draw(np.array(d))) for d in poses.values()]
+    font, gap, line = ImageFont.load_default(22), 40, 44
+    width, height = pictures[0].size
+    sheet = Image.new("RGB", (2 * width + gap, height + 2 * line), "white")
+    pen = ImageDraw.Draw(sheet)
+    for k, (words, picture) in enumerate(zip(poses, pictures, strict=True)):
+        sheet.paste(picture, (k * (width + gap), line))
+        pen.text((k * (width + gap) + width / 2, 8), words, fill="black", font=font, anchor="ma")
+    at = 12
+    for mark in (*TOUCHING, DEEP):
+        pen.rectangle((at, height + line + 12, at + 20, height + line + 32), fill=mark.color)
+        pen.text((at + 28, height + line + 22), mark.meaning, fill="black", font=font, anchor="lm")
+        at += 60 + round(font.getlength(mark.meaning))
+    return save_webp(folder / "contacts.webp", sheet, min(sheet.width, 1500))
+
+
+def condyles(out: Path, folder: Path) -> Path:
+    """Draw the path of the left condyle under the skull, after Fig. 5 of the paper."""
+    found = do_experiments(subject_of_build(out), load_tracks(out / "tracks.npz"), 1, no_progress, quick=True)
+    return save_webp(folder / "condyles.webp", drawn(condyle_figure(found)), 1100)
+
+
+def viewer(out: Path, folder: Path) -> Path:
+    """Photograph the page of `jawusd view` in Chromium, a pose with the teeth apart."""
+    names = ("chromium", "chromium-browser", "google-chrome", "chrome")
+    program = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, names)), None)
+    try:
+        from playwright.sync_api import sync_playwright
+    except ModuleNotFoundError:
+        raise NotInstalledError("playwright: pip install playwright") from None
+    if program is None:
+        raise NotInstalledError("Chromium: install it, or name it in CHROMIUM")
+    served = open_viewer(out, "127.0.0.1", 0)
+    arguments = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    with contextlib.ExitStack() as stack:
+        stack.callback(served.stop)
+        playwright = stack.enter_context(sync_playwright())
+        page = playwright.chromium.launch(executable_path=program, args=arguments).new_page(
+            viewport={"width": 1440, "height": 900}
+        )
+        page.set_default_timeout(PATIENCE_MS)
+        page.goto(served.url)
+        page.wait_for_selector("text=nearest captured")
+        page.locator(".mantine-Notification-closeButton").first.click()  # "Software WebGL" lies over the jaw
+        for index, value in enumerate((18.0, 3.0, 1.0)):
+            box = page.locator("input.mantine-NumberInput-input:visible").nth(index)
+            box.fill(str(value))
+            box.press("Enter")
+        page.wait_for_timeout(4000)  # the last frame is drawn
+        picture = page.screenshot()
+    return save_webp(folder / "viewer.webp", Image.open(io.BytesIO(picture)), 1200)
+
+
+def face_solver(out: Path, folder: Path) -> Path:
+    """Compare a jaw rig as prior with the usual ones: examples/03_face_solver.py, on a synthetic person."""
+    with tempfile.TemporaryDirectory() as plots:
+        plot = Path(plots) / "face_solver.png"
+        script = ROOT / "examples" / "03_face_solver.py"
+        subprocess.run([sys.executable, script, "-o", plot], check=True, stdout=subprocess.DEVNULL)
+        return save_webp(folder / "face_solver.webp", Image.open(plot), 990)
+
+
+def blender(out: Path, folder: Path, frames: int = FRAMES) -> Path:
+    """Render the captured motion in Blender, imported as it is."""
+    python = Path(os.environ.get("JAWUSD_INTEROP", "")) / "blender45" / "bin" / "python"
+    if "JAWUSD_INTEROP" not in os.environ or not python.exists():
+        raise NotInstalledError("Blender: python tests/interop/make_environments.py FOLDER; set JAWUSD_INTEROP=FOLDER")
+    path = folder / "blender.mp4"
+    with tempfile.TemporaryDirectory() as pictures:
+        script = Path(__file__).with_name("gallery_blender.py")
+        command = [python, script, out / "anim_capture.usdc", pictures, FIRST, frames, STEP]
+        subprocess.run(list(map(str, command)), check=True, stdout=subprocess.DEVNULL)
+        images = [np.array(Image.open(file).convert("RGB")) for file in sorted(Path(pictures).glob("*.png"))]
+    fps = load_capture(CAPTURE).fps / STEP
+    with VideoWriter(path, images[0].shape[1::-1], fps, quality_crf=25) as video:
+        for image in images:
+            video.write(image)
+    return path
+
+
+PICTURES = {
+    made.__name__: made for made in (overlay, envelope, contacts, condyles, viewer, face_solver, blender)
+}
+
+
+def main() -> int:
+    """Make the pictures that were asked for; return 1 if a program was missing."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", nargs="?", type=Path, default=Path("out"))
+    parser.add_argument("--only", nargs="+", choices=PICTURES, default=list(PICTURES))
+    parser.add_argument("-o", "--folder", type=Path, default=Path(__file__).parent / "gallery")
+    options = parser.parse_args()
+    options.folder.mkdir(parents=True, exist_ok=True)
+    missing = 0
+    for name in options.only:
+        try:
+            path = PICTURES[name](options.out, options.folder)
+            print(f"{path}: {path.stat().st_size / 1024:.0f} kB", flush=True)
+        except NotInstalledError as needed:
+            missing += 1
+            print(f"{name}: not made, needs {needed}", flush=True)
+    return 1 if missing else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,99 @@
+"""The pictures of the gallery: made by its program from the example, all shown on its page, and small."""
+
+import importlib.util
+import os
+import re
+
+import av
+import numpy as np
+import pytest
+from foreign import environment
+from package_copy import ROOT
+from PIL import Image
+
+import jawusd
+from jawusd.formats.contact import TOUCHING
+
+FOLDER = ROOT / "docs" / "gallery"
+MOST_BYTES = 2_000_000
+
+
+@pytest.fixture(scope="module")
+def gallery():
+    spec = importlib.util.spec_from_file_location("make_gallery", ROOT / "docs" / "make_gallery.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def pixels(path):
+    """Return a picture as RGB floats (h, w, 3)."""
+    return np.asarray(Image.open(path).convert("RGB"), dtype=float)
+
+
+def near(picture, color, within=24.0):
+    """Return the share of pixels of a colour, those that packing has changed a little included."""
+    return float((np.abs(picture - np.array(color)).max(axis=-1) < within).mean())
+
+
+def test_the_page_shows_every_picture_and_each_has_its_function(gallery):
+    shown = re.findall(r"gallery/(\w+)\.(?:webp|mp4)", (ROOT / "docs" / "gallery.md").read_text())
+    stored = sorted(path.stem for path in FOLDER.iterdir())
+    assert sorted(shown) == stored == sorted(gallery.PICTURES)
+    assert sum(path.stat().st_size for path in FOLDER.iterdir()) < MOST_BYTES
+
+
+def test_the_border_is_where_the_bound_ends(example_build, gallery):
+    rig = jawusd.load(example_build[0] / "actor.usda")
+    edge = gallery.border(rig, openings=9, ways=12)
+    assert np.abs(rig.margin(edge[1:-1])).max() < 0.05
+    moved = gallery.incisal_point(rig, np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 0.0], [5.0, 2.0, 0.0]]))
+    assert np.abs(moved[0]).max() < 1e-9
+    assert moved[1, 1] < -8 and moved[2, 0] > 1
+
+
+def test_contacts_are_marked_where_teeth_meet_and_nowhere_else(example_build, gallery, tmp_path):
+    picture = pixels(gallery.contacts(example_build[0], tmp_path))
+    arches = picture[: int(0.85 * len(picture))]  # above the legend
+    closed, gliding = np.split(arches, [arches.shape[1] // 2], axis=1)
+    yellow = TOUCHING[-1].color
+    assert near(closed, yellow) > 3 * near(gliding, yellow) > 0
+
+
+def test_envelope_is_drawn_as_a_surface_with_the_captured_line(example_build, gallery, tmp_path):
+    picture = pixels(gallery.envelope(example_build[0], tmp_path))
+    assert picture.shape[1] == 1200
+    assert near(picture, (255, 255, 255)) > 0.4
+    assert near(picture, (213, 94, 0), 60) > 0.002  # vermilion
+
+
+@pytest.mark.slow
+def test_condyles_overlay_and_viewer(example_build, gallery, tmp_path):
+    assert pixels(gallery.condyles(example_build[0], tmp_path)).std() > 20
+    with av.open(str(gallery.overlay(example_build[0], tmp_path))) as video:
+        frames = [frame.to_ndarray(format="rgb24").astype(float) for frame in video.decode(video=0)]
+    assert len(frames) == gallery.FRAMES // gallery.STEP
+    assert all(near(frame, (0, 200, 255), 60) > 0.001 for frame in frames)  # outlines of the lower teeth
+    try:
+        picture = pixels(gallery.viewer(example_build[0], tmp_path))
+    except gallery.NotInstalledError as needed:
+        pytest.skip(str(needed))
+    assert near(picture, (236, 229, 212), 40) > 0.005  # enamel
+
+
+@pytest.mark.slow
+def test_blender_moves_the_jaw(example_build, gallery, tmp_path):
+    environment("blender45")
+    path = gallery.blender(example_build[0], tmp_path, frames=2 * gallery.STEP)
+    with av.open(str(path)) as video:
+        frames = [frame.to_ndarray(format="rgb24").astype(float) for frame in video.decode(video=0)]
+    assert len(frames) == 2
+    assert np.abs(frames[0] - frames[1]).max() > 40
+
+
+def test_what_is_missing_is_named(example_build, gallery, tmp_path, monkeypatch, capsys):
+    monkeypatch.delenv("JAWUSD_INTEROP", raising=False)
+    monkeypatch.setattr("sys.argv", ["make_gallery.py", str(example_build[0]), "--only", "blender", "-o", str(tmp_path)])
+    assert gallery.main() == 1
+    assert "blender: not made, needs Blender: python tests/interop/make_environments.py" in capsys.readouterr().out
+    assert os.listdir(tmp_path) == []
