@@ -27,7 +27,8 @@ def surfaces():
 
 def corners():
     """Return the middle and the size of all meshes in the present frame."""
-    points = [thing.matrix_world @ Vector(corner) for thing in bpy.data.objects if thing.type == "MESH" for corner in thing.bound_box]
+    meshes = [thing for thing in bpy.data.objects if thing.type == "MESH"]
+    points = [mesh.matrix_world @ Vector(corner) for mesh in meshes for corner in mesh.bound_box]
     low, high = (Vector(map(pick, zip(*points))) for pick in (min, max))
     return (low + high) / 2, (high - low).length
 

@@ -1,7 +1,7 @@
 """Make the pictures of docs/gallery.md: python docs/make_gallery.py [out] [--only NAME ...] [-o FOLDER]
 
-`out` is the folder of `jawusd build examples/capture -o out`. A picture whose program is not installed is named and left
-as it was: `viewer` wants Chromium and playwright, `blender` the environment blender45 of
+`out` is the folder of `jawusd build examples/capture -o out`. A picture whose program is not installed is named and
+left as it was: `viewer` wants Chromium and playwright, `blender` the environment blender45 of
 `tests/interop/make_environments.py` in the folder that JAWUSD_INTEROP names. `face_solver` takes minutes.
 """
 
@@ -205,9 +205,7 @@ def blender(out: Path, folder: Path, frames: int = FRAMES) -> Path:
     return path
 
 
-PICTURES = {
-    made.__name__: made for made in (overlay, envelope, contacts, condyles, viewer, face_solver, blender)
-}
+PICTURES = {made.__name__: made for made in (overlay, envelope, contacts, condyles, viewer, face_solver, blender)}
 
 
 def main() -> int:

@@ -1,4 +1,4 @@
-"""Where OpenUSD finds the codeless schema JawRigAPI, told before it is loaded: it looks only once."""
+"""Where OpenUSD finds the codeless schema JawRigAPI, set before it is loaded: it looks only once."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ FILES = {
         "Labels of crown and gum: SCAN.labels.npz": "jawusd.formats.scan_labels",
         "Landmarks: landmarks.json": "jawusd.formats.landmarks",
         "Poses and parameters: CSV and JSON": "jawusd.formats.poses",
-        "Marker positions: tables, probes and plates": "jawusd.formats.markers",
+        "Marker positions: tables, probes and rigid bodies": "jawusd.formats.markers",
         "Keys: keys.json": "jawusd.formats.keys",
         "ARKit face captures: CSV": "jawusd.formats.arkit",
     },

@@ -138,7 +138,7 @@ GroupOption = Annotated[str | None, typer.Option(help="Trajectory of an HDF5 fil
 RigidOption = Annotated[
     list[str] | None,
     typer.Option(
-        metavar="PLATE=MARKERS",
+        metavar="BODY=MARKERS",
         help="The file holds markers; which of them are fixed to jaw=... and, unless it stands still, head=...: their "
         "numbers, as jaw=5,6,7,8 (with --rest-frame), or a marker description, as jaw=jaw.rig. Tables of numbers "
         "alone and ArtiSynth probes are read, marker%d.txt as one. May be repeated.",
@@ -158,16 +158,16 @@ def trajectory_options(
     """Return the options of a file of poses or markers.
 
     Raises:
-        typer.BadParameter: a column map or plates that cannot be read.
+        typer.BadParameter: a column map or rigid bodies that cannot be read.
     """
     from jawusd.pipeline.fit import TrajectoryOptions
 
-    return TrajectoryOptions(_column_map(columns), length_unit.value, invert, rest_frame, group, _plates(rigid))
+    return TrajectoryOptions(_column_map(columns), length_unit.value, invert, rest_frame, group, _rigid_bodies(rigid))
 
 
-def _plates(told: list[str] | None) -> dict[str, str]:
+def _rigid_bodies(given: list[str] | None) -> dict[str, str]:
     found: dict[str, str] = {}
-    for text in told or ():
+    for text in given or ():
         name, sign, markers = (piece.strip() for piece in text.partition("="))
         if not sign or not markers or name not in ("head", "jaw"):
             raise typer.BadParameter(f'"{text}" is not of the form jaw=MARKERS or head=MARKERS.', param_hint="--rigid")

@@ -107,7 +107,7 @@ def _info_lines(found: Description) -> list[str]:
 
 def pose(
     rig: RigArg,
-    d: Annotated[Triple, typer.Option("--d", help="Opening, lateral (+ left), protrusion (+ forward) [mm].")],
+    d: Annotated[Triple, typer.Option("--d", help="Opening, laterotrusion (+ left), protrusion (+ forward) [mm].")],
     prim: Prim = None,
     allow: Allow = None,
     as_json: Json = False,

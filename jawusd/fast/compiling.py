@@ -12,7 +12,7 @@ import numba
 F = TypeVar("F")
 
 _in_memory = partial(numba.njit, nogil=True, error_model="numpy")
-_kept: list[bool] = []  # whether code is kept, once a function has told
+_kept: list[bool] = []  # whether code is kept, known once a function was compiled
 
 
 def compiled(signature: str) -> Callable[[F], F]:

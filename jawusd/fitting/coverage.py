@@ -22,7 +22,7 @@ _SECTORS, _SECTOR_REACH, _FEWEST_SECTORS = 8, 0.25, 6
 FAR_MM = np.array([3.0, 2.0, 2.0])
 # Share of the bound in gaps that is worth recording. Of 14 synthetic persons' takes of 1,200 frames that wander through
 # the whole envelope at most 0.5 % lie in gaps, without half open frames at least 20 %; of takes of 833 frames of
-# exercises, of which none is told to record more, 0.4 to 10.8 %.
+# exercises, none of which gets this advice, 0.4 to 10.8 %.
 _MOST_GAPS = 0.15
 
 # Ranges (1 to 99 %) below which a parameter is noise or habit, not an exercise [mm]

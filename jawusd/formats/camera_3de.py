@@ -39,7 +39,7 @@ def load_3de(path: Path, sizes: Mapping[str, Size]) -> list[Camera]:
 
     Raises:
         CalibrationError: no camera, a camera that moves or zooms, a size that is not known, a distortion model that is
-            not read, or a lens that cannot be told or cannot be written with OpenCV's coefficients.
+            not read, or a lens that cannot be identified or cannot be written with OpenCV's coefficients.
         FormatError: a file cannot be read.
     """
     scripts = [path] if path.is_file() else sorted(path.glob("*.nk"))

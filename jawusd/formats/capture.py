@@ -147,11 +147,11 @@ class Capture(Strict):
     @model_validator(mode="after")
     def _consistent(self) -> Capture:
         own = {"fps": self.fps, "colour_config": self.colour_config}
-        told = tuple(
+        cameras = tuple(
             camera.model_copy(update={key: value for key, value in own.items() if getattr(camera, key) is None})
             for camera in self.cameras
         )
-        object.__setattr__(self, "cameras", told)  # the capture itself cannot be changed otherwise
+        object.__setattr__(self, "cameras", cameras)  # the capture itself cannot be changed otherwise
         names = [camera.name for camera in self.cameras]
         listed = ", ".join(names)
         twice = [name for name in names if names.count(name) > 1]

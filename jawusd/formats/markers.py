@@ -1,4 +1,4 @@
-"""Tables of marker positions, as optical systems write them, and the plates that markers are fixed to.
+"""Tables of marker positions, as optical systems write them, and the rigid bodies that carry the markers.
 
 Tables, one row of x, y, z of every marker per frame, frames numbered from 0:
 
@@ -7,8 +7,8 @@ Tables, one row of x, y, z of every marker per frame, frames numbered from 0:
 * a probe of ArtiSynth (Modelling Guide, "Numeric probes", text format): `start stop scale`, then `interpolation size
   step`, then the rows. A marker per file is common: a pattern of numbered files is read as one table.
 
-Plates: a marker description file of Northern Digital (`.rig`), which names its markers by their numbers in the table,
-or these numbers alone.
+Rigid bodies: a marker description file of Northern Digital (`.rig`), which names its markers by their numbers in the
+table, or these numbers alone.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ _RIG_COUNT = "number of markers"
 
 
 @dataclass(frozen=True)
-class Plate:
-    """Hold what is known of a plate: its markers' numbers, counted from 1, and their positions on it.
+class RigidBody:
+    """Hold what is known of a rigid body: its markers' numbers, counted from 1, and their positions on it.
 
     Attributes:
         markers: numbers in the table.
-        points: positions in the plate's frame, shape (N, 3), in the unit of its file; None where only the numbers are
-            known.
+        points: positions in the body's own frame, shape (N, 3), in the unit of its file; None where only the numbers
+            are known.
     """
 
     markers: tuple[int, ...]
@@ -61,8 +61,8 @@ def read_markers(path: str | os.PathLike[str]) -> Array:
     tables = {file: _read_table(file) for file in numbered_files(path).values()}
     counts = {file.name: len(table) for file, table in tables.items()}
     if len(set(counts.values())) > 1:
-        told = ", ".join(f"{name} has {count}" for name, count in counts.items())
-        raise FormatError(f"the tables have different numbers of frames: {told}.", path=path)
+        lengths = ", ".join(f"{name} has {count}" for name, count in counts.items())
+        raise FormatError(f"the tables have different numbers of frames: {lengths}.", path=path)
     return np.concatenate(list(tables.values()), axis=1)
 
 
@@ -105,20 +105,20 @@ def _probe_size(rows: list[list[str]], path: Path) -> int:
         ) from error
 
 
-def read_plate(told: str | os.PathLike[str]) -> Plate:
-    """Read a plate: a marker description file (.rig), or the numbers of its markers (`5,6,7,8`).
+def read_body(description: str | os.PathLike[str]) -> RigidBody:
+    """Read a rigid body: a marker description file (.rig), or the numbers of its markers (`5,6,7,8`).
 
     Raises:
         FormatError: neither of them, fewer than three markers, or a marker named twice.
     """
-    text = os.fspath(told)
+    text = os.fspath(description)
     numbers = [piece.strip() for piece in text.split(",")]
     if all(piece.isascii() and piece.isdigit() for piece in numbers):
-        return _checked(Plate(tuple(int(piece) for piece in numbers), None), text)
-    return _checked(_read_rig(Path(told)), text)
+        return _checked(RigidBody(tuple(int(piece) for piece in numbers), None), text)
+    return _checked(_read_rig(Path(description)), text)
 
 
-def _read_rig(path: Path) -> Plate:
+def _read_rig(path: Path) -> RigidBody:
     """Read Northern Digital's marker description: a count, then `number x y z views` per marker."""
     lines = read_text(path, _MAX_BYTES, "latin-1").splitlines()
     counts = [line.partition(";")[0].strip() for line in lines if _RIG_COUNT in line.lower()]
@@ -126,7 +126,7 @@ def _read_rig(path: Path) -> Plate:
         raise FormatError(
             f'is not a marker description: no line tells the "{_RIG_COUNT}".',
             path=path,
-            hint="Name a .rig file, or the numbers of the plate's markers, as 5,6,7,8.",
+            hint="Name a .rig file, or the numbers of the rigid body's markers, as 5,6,7,8.",
         )
     header = next((k for k, line in enumerate(lines) if line.split()[:4] == ["Marker", "X", "Y", "Z"]), len(lines))
     rows = [line.split() for line in lines[header + 1 :] if line.strip()]
@@ -139,13 +139,13 @@ def _read_rig(path: Path) -> Plate:
         raise FormatError(f"says that it has {counts[0]} markers and lists {len(markers)}.", path=path)
     if not np.isfinite(points).all():
         raise FormatError("holds a position that is not a finite number.", path=path)
-    return Plate(markers, points)
+    return RigidBody(markers, points)
 
 
-def _checked(plate: Plate, where: str) -> Plate:
-    numbers = ", ".join(map(str, plate.markers))
-    if len(set(plate.markers)) != len(plate.markers) or min(plate.markers, default=1) < 1:
+def _checked(body: RigidBody, where: str) -> RigidBody:
+    numbers = ", ".join(map(str, body.markers))
+    if len(set(body.markers)) != len(body.markers) or min(body.markers, default=1) < 1:
         raise FormatError(f"markers {numbers}: each must be named once, counted from 1.", path=where)
-    if len(plate.markers) < 3:
+    if len(body.markers) < 3:
         raise FormatError(f"names the markers {numbers or 'none'}; three or more are needed.", path=where)
-    return plate
+    return body

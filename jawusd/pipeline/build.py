@@ -338,9 +338,9 @@ def build_lines(summary: BuildSummary) -> list[str]:
     """Return the summary of a build as text."""
     offsets = ", ".join(f"{name} {offset:+d}" for name, offset in summary["sync"]["offsets"].items())
     # What the tracks say of the scans is said with them.
-    told = [Finding.from_json(found).line() for found in summary["track"].get("findings", [])]
+    known = [Finding.from_json(found).line() for found in summary["track"].get("findings", [])]
     lines = [Finding.from_json(found).line() for found in summary.get("findings", [])]
-    lines = [line for line in lines if line not in told]
+    lines = [line for line in lines if line not in known]
     if summary["calibrate"]:
         lines += [
             "the capture names no calibration: made one from its boards",

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from jawusd.imaging.contact import Teeth
 
 _QUALITY = 88  # of the pictures, JPEG
-_FARTHEST_MM = 1.5  # distances that are told, see `imaging.collision`
+_FARTHEST_MM = 1.5  # distances that are measured, see `imaging.collision`
 
 
 class ContactSummary(TypedDict, total=False):

@@ -61,7 +61,7 @@ class TrajectoryOptions:
     # anywhere on the mandible; None: the poses are identity in occlusion
     rest_frame: int | None = None
     group: str | None = None  # the trajectory of an HDF5 file; None: its raw one
-    # the plates of a table of markers, see `pipeline.markers.marker_poses`; empty: the file holds poses
+    # the rigid bodies of a table of markers, see `pipeline.markers.marker_poses`; empty: the file holds poses
     rigid: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -163,7 +163,7 @@ def read_trajectory(path: str | os.PathLike[str], options: TrajectoryOptions) ->
     path = Path(path)
     if options.rigid:
         if options.columns or options.group:
-            raise FormatError("columns and groups are for poses; a table of markers has plates.", path=path)
+            raise FormatError("columns and groups are for poses; a table of markers has rigid bodies.", path=path)
         T = marker_poses(path, options.rigid, options.rest_frame, LENGTH_UNITS_MM[options.length_unit])
         frames = np.arange(len(T))
     elif path.suffix.lower() in HDF5_SUFFIXES:

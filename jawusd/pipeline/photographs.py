@@ -94,11 +94,11 @@ def read_drawing(picture: NDArray[np.uint8], name: str) -> Drawing:
 
 def drawn_over(picture: NDArray[np.uint8], found: PhotoAlignment, number: int) -> NDArray[np.uint8]:
     """Return an RGB picture (h, w, 3) with the aligned crowns' outlines, upper green and lower blue."""
-    photo, told = found.bite.photos[number], found.result.photos[number]
+    photo, solved = found.bite.photos[number], found.result.photos[number]
     seen = seen_outlines(found.rows.fine, photo, found.bite)
     out = picture.copy()
     column, row = np.round(seen.pixels).astype(int).T
-    if told.mirrored:
+    if solved.mirrored:
         column = picture.shape[1] - 1 - column
     for right, down in ((0, 0), (1, 0), (0, 1), (1, 1)):
         x, y = column + right, row + down

@@ -230,7 +230,7 @@ def _drawn(meta: TracksFacts, camera: str) -> str:
 
 
 def _bite(data: ReportData) -> str:
-    """Return what the take tells of the gum line as drawn and of the closed bite."""
+    """Return what the take shows about the gum line as drawn and about the closed bite."""
     meta, said = tracks_facts(data), []
     if "gum_line_mm" in meta:
         upper, lower = meta["gum_line_mm"]

@@ -16,7 +16,7 @@ from scipy import ndimage
 from jawusd.geometry.arrays import Array, Mask
 
 _WIDTH_PX = 480  # of the picture that is worked on
-# Teeth are told by brightness less redness, CIELAB L* - 2.5 a*. Levels of it that are tried, as percentiles of the
+# Teeth are found by brightness less redness, CIELAB L* - 2.5 a*. Levels of it that are tried, as percentiles of the
 # picture, and the percentile of the picture that counts as white.
 _REDNESS, _LEVELS, _BRIGHTEST = 2.5, (40, 55, 65, 72, 78, 83, 87, 90, 92, 94, 96), 99.5
 # Of what surrounds teeth, so much must be redder by a difference of a*, or darker by a factor.

@@ -62,7 +62,7 @@ def bound_plot(rig: JawRig, axis: int) -> Plot:
     rings = np.split(corners, np.cumsum(rig.arrays[f"polygon_{name}_counts"])[:-1].astype(int))
     border = border_path(rig, axis)[:, [0, axis]]
     captured = _thinned(captured_d(rig)[:, [0, axis]])
-    title = ("", "lateral d2 over opening d1", "protrusion d3 over opening d1")[axis]
+    title = ("", "laterotrusion d2 over opening d1", "protrusion d3 over opening d1")[axis]
     plot = framed(f"jaw-{name}", np.vstack([corners, border, captured]), title, "opening d1 [mm]", "mm")
     parts = [_dots(plot, captured), *(_ring(plot, ring, GREY, "4 3") for ring in rings), _ring(plot, border, BLUE)]
     return drawn(plot, parts)
@@ -72,7 +72,7 @@ def posselt_plot(rig: JawRig, axis: int) -> Plot:
     """Draw Posselt's figure, the border movements of the lower incisal point.
 
     Args:
-        axis: 1 frontal (x is lateral, d3 = 0), 2 sagittal (x is forward, d2 = 0).
+        axis: 1 frontal (x is to the left, d3 = 0), 2 sagittal (x is forward, d2 = 0).
     """
     origin = rest_places(rig)[INCISOR]
     columns = [0, 1] if axis == 1 else [2, 1]

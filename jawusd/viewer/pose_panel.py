@@ -16,7 +16,7 @@ from jawusd.viewer.session import Session
 from jawusd.viewer.widgets import Choice, add_dark_checkbox, assign, guarded, small_text
 
 STEP_MM = 0.01
-LABELS = ("d1 opening [mm]", "d2 lateral [mm]", "d3 protrusion [mm]")
+LABELS = ("d1 opening [mm]", "d2 laterotrusion [mm]", "d3 protrusion [mm]")
 _HINTS = (
     "Opening [mm] along this person's own path.",
     "Laterotrusion [mm] at the incisal point, + to the subject's left.",
@@ -153,7 +153,7 @@ def reading_html(readout: Readout, d: tuple[float, float, float], limits: Array)
     """Return the numbers of a pose as HTML."""
     captured = f"{readout.captured_mm:.2f} mm" if math.isfinite(readout.captured_mm) else "nothing captured"
     rows = [
-        ("incisor moved", _moved(readout.incisor_mm), _MOVED_HELP),
+        ("incisal point moved", _moved(readout.incisor_mm), _MOVED_HELP),
         ("left condyle moved", _moved(readout.condyle_left_mm), _MOVED_HELP),
         ("right condyle moved", _moved(readout.condyle_right_mm), _MOVED_HELP),
         ("nearest captured", captured, _CAPTURED_HELP),

@@ -11,7 +11,7 @@ from jawusd.formats.tracks import LOST, Tracks
 from jawusd.geometry.arrays import Array
 from jawusd.viewer.plots import CURVE_COLORS, Plot, drawn, framed, path_through, place, with_playhead
 
-_NAMES = ("d1 opening", "d2 lateral", "d3 protrusion")
+_NAMES = ("d1 opening", "d2 laterotrusion", "d3 protrusion")
 _BAND = 2.0  # sigmas: 95 % of normal errors
 _MOST_SAMPLES = 400
 _STRIP_PX = 6

@@ -78,15 +78,15 @@ def test_the_same_poses_give_the_same_model_however_they_are_written(given, tmp_
     run("fit", given / "foreign.csv", *whose, "--columns", columns, "--length-unit", "m", "-o", tmp_path / "b.npz")
     run("fit", given / "jaw.h5", *whose, "--rest-frame", 0, "-o", tmp_path / "c.npz")
     ours, foreign, hdf5 = (load_model(tmp_path / f"{name}.npz") for name in "abc")
-    plate = f"jaw={given / 'jaw.rig'}"
-    run("fit", given / "markers.asc", *whose, "--rigid", plate, "-o", tmp_path / "d.npz")
+    body = f"jaw={given / 'jaw.rig'}"
+    run("fit", given / "markers.asc", *whose, "--rigid", body, "-o", tmp_path / "d.npz")
     np.testing.assert_allclose(load_model(tmp_path / "d.npz").d, ours.d, atol=0.05)
     # A fit of few poses at five landmarks magnifies the last digits of the poses; HDF5 has one pose more, the first.
     np.testing.assert_allclose(foreign.d, ours.d, atol=0.05)
     assert np.median(np.abs(hdf5.d[1:] - ours.d)) < 0.05
 
 
-def test_plates_that_cannot_be_read_are_refused(given):
+def test_rigid_bodies_that_cannot_be_read_are_refused(given):
     whose = ("--landmarks", given / "landmarks.json")
     assert "jaw=MARKERS" in run("fit", given / "markers.asc", *whose, "--rigid", "tongue=1,2,3", code=2)
     twice = ("--rigid", "jaw=1,2,3", "--rigid", "jaw=1,2,4")

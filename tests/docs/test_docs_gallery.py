@@ -93,7 +93,8 @@ def test_blender_moves_the_jaw(example_build, gallery, tmp_path):
 
 def test_what_is_missing_is_named(example_build, gallery, tmp_path, monkeypatch, capsys):
     monkeypatch.delenv("JAWUSD_INTEROP", raising=False)
-    monkeypatch.setattr("sys.argv", ["make_gallery.py", str(example_build[0]), "--only", "blender", "-o", str(tmp_path)])
+    command = ["make_gallery.py", str(example_build[0]), "--only", "blender", "-o", str(tmp_path)]
+    monkeypatch.setattr("sys.argv", command)
     assert gallery.main() == 1
     assert "blender: not made, needs Blender: python tests/interop/make_environments.py" in capsys.readouterr().out
     assert os.listdir(tmp_path) == []

@@ -1,10 +1,10 @@
-"""Tables of markers and plates: made-up samples of each format, and each mistake."""
+"""Tables of markers and rigid bodies: made-up samples of each format, and each mistake."""
 
 import numpy as np
 import pytest
 
 from jawusd.errors import FormatError
-from jawusd.formats.markers import read_markers, read_plate
+from jawusd.formats.markers import read_body, read_markers
 
 # as opto2ascii writes: a marker out of sight is a huge number
 NDI = """1.000000e+02 2.000000e+02 -2.500000e+03 1.500000e+02 2.000000e+02 -2.500000e+03
@@ -42,11 +42,11 @@ def test_a_probe_of_artisynth_and_one_in_a_file_per_marker(tmp_path):
 
 def test_a_marker_description_and_numbers(tmp_path):
     (tmp_path / "jaw.rig").write_text(RIG)
-    plate = read_plate(tmp_path / "jaw.rig")
-    assert plate.markers == (5, 6, 8)
-    np.testing.assert_array_equal(plate.points, [[-69.5, -15.75, 99.9], [-20.25, -23.5, 109.25], [-66.5, 23.75, 105.0]])
-    plate = read_plate("5, 6,8")
-    assert plate.markers == (5, 6, 8) and plate.points is None
+    body = read_body(tmp_path / "jaw.rig")
+    assert body.markers == (5, 6, 8)
+    np.testing.assert_array_equal(body.points, [[-69.5, -15.75, 99.9], [-20.25, -23.5, 109.25], [-66.5, 23.75, 105.0]])
+    body = read_body("5, 6,8")
+    assert body.markers == (5, 6, 8) and body.points is None
 
 
 @pytest.mark.parametrize(
@@ -61,7 +61,7 @@ def test_a_marker_description_and_numbers(tmp_path):
         ("0 8 1\nLinear 6 0.02\n1 2 3\n", "line 3 has 3 numbers, 6 are expected"),
     ],
 )
-def test_each_mistake_of_a_table_is_told(tmp_path, text, words):
+def test_each_mistake_of_a_table_is_named(tmp_path, text, words):
     (tmp_path / "markers.txt").write_text(text)
     with pytest.raises(FormatError, match=words):
         read_markers(tmp_path / "markers.txt")
@@ -84,15 +84,15 @@ def test_tables_of_different_lengths_are_told(tmp_path):
         ("8                 -66.5", "6                 -66.5", "each must be named once"),
     ],
 )
-def test_each_mistake_of_a_description_is_told(tmp_path, old, new, words):
+def test_each_mistake_of_a_description_is_named(tmp_path, old, new, words):
     (tmp_path / "jaw.rig").write_text(RIG.replace(old, new))
     with pytest.raises(FormatError, match=words):
-        read_plate(tmp_path / "jaw.rig")
+        read_body(tmp_path / "jaw.rig")
 
 
 @pytest.mark.parametrize(
-    ("told", "words"), [("1,2", "three or more"), ("0,1,2", "counted from 1"), ("head.rig", "no such")]
+    ("description", "words"), [("1,2", "three or more"), ("0,1,2", "counted from 1"), ("head.rig", "no such")]
 )
-def test_each_mistake_of_numbers_is_told(told, words):
+def test_each_mistake_of_numbers_is_named(description, words):
     with pytest.raises(FormatError, match=words):
-        read_plate(told)
+        read_body(description)

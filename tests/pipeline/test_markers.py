@@ -44,34 +44,34 @@ def write(folder, markers):
     return folder / "speech.asc"
 
 
-def write_plate(path, first, points):
+def write_body(path, first, points):
     rows = [f"{first + k} {x} {y} {z} 1" for k, (x, y, z) in enumerate(points)]
     path.write_text("\n".join(["4 ;Number of markers", "Marker X Y Z Views", *rows]))
     return str(path)
 
 
 @pytest.fixture
-def plates(tmp_path):
-    return {"head": write_plate(tmp_path / "head.rig", 1, HEAD), "jaw": write_plate(tmp_path / "jaw.rig", 5, JAW)}
+def bodies(tmp_path):
+    return {"head": write_body(tmp_path / "head.rig", 1, HEAD), "jaw": write_body(tmp_path / "jaw.rig", 5, JAW)}
 
 
-def test_poses_of_described_plates(tmp_path, markers, plates, jaw):
-    np.testing.assert_allclose(marker_poses(write(tmp_path, markers), plates), jaw, atol=1e-5)
+def test_poses_of_described_bodies(tmp_path, markers, bodies, jaw):
+    np.testing.assert_allclose(marker_poses(write(tmp_path, markers), bodies), jaw, atol=1e-5)
 
 
-def test_one_missing_marker_of_four_costs_nothing_two_cost_the_frame(tmp_path, markers, plates, jaw):
+def test_one_missing_marker_of_four_costs_nothing_two_cost_the_frame(tmp_path, markers, bodies, jaw):
     markers[3, 6] = -3.697314e28
     markers[5, 0] = np.nan
     markers[7, [4, 7]] = -3.697314e28
-    T = marker_poses(write(tmp_path, markers), plates)
+    T = marker_poses(write(tmp_path, markers), bodies)
     kept = np.delete(np.arange(COUNT), 7)
     np.testing.assert_allclose(T[kept], jaw[kept], atol=1e-5)
     assert np.isnan(T[7]).all()
 
 
-def test_a_marker_that_jumps_costs_the_frame(tmp_path, markers, plates, jaw):
+def test_a_marker_that_jumps_costs_the_frame(tmp_path, markers, bodies, jaw):
     markers[4, 5] += [0, 6, 0]
-    T = marker_poses(write(tmp_path, markers), plates)
+    T = marker_poses(write(tmp_path, markers), bodies)
     assert np.isnan(T[4]).all()
     np.testing.assert_allclose(np.delete(T, 4, 0), np.delete(jaw, 4, 0), atol=1e-5)
 
@@ -102,22 +102,22 @@ def test_fit_reads_markers_in_centimetres_relative_to_a_rest_frame(tmp_path, mar
     [
         ({"head": "1,2,3"}, 0, "jaw is needed"),
         ({"jaw": "5,6,7", "tongue": "1,2,3"}, 0, "jaw is needed"),
-        ({"jaw": "7,8,9"}, 0, "has 8 markers; the plate of the jaw names marker 9"),
+        ({"jaw": "7,8,9"}, 0, "has 8 markers; the rigid body of the jaw names marker 9"),
         ({"jaw": "5,6,7"}, None, "--rest-frame"),
         ({"jaw": "5,6,7"}, 12, "has no frame 12; it has 0 to 11"),
         ({"jaw": "5,6,7"}, 2, "frame 2 does not show all markers of the jaw"),
     ],
 )
-def test_each_mistake_of_plates_is_told(tmp_path, markers, rigid, rest, words):
+def test_each_mistake_of_rigid_bodies_is_named(tmp_path, markers, rigid, rest, words):
     markers[2, 5] = np.nan
     with pytest.raises(FormatError, match=words):
         marker_poses(write(tmp_path, markers), rigid, rest)
 
 
-def test_a_plate_whose_markers_are_exchanged_is_refused(tmp_path, markers, plates):
+def test_a_body_whose_markers_are_exchanged_is_refused(tmp_path, markers, bodies):
     markers[:, [4, 5]] = markers[:, [5, 4]]
     with pytest.raises(FormatError, match=r"markers 5, 6, 7, 8 lie .* mm from their places"):
-        marker_poses(write(tmp_path, markers), plates)
+        marker_poses(write(tmp_path, markers), bodies)
 
 
 def test_markers_on_a_line_give_no_pose(tmp_path):

@@ -60,7 +60,7 @@ def check_occlusion(scans: Sequence[Scan], T_anatomical_scan: ArrayLike | None) 
 def occlusion_findings(scans: Sequence[Scan], T_anatomical_scan: ArrayLike | None) -> tuple[Array, list[Finding]]:
     """Return T_anatomical_scan (4, 4), given or derived, and everything wrong or doubtful about two scans in one frame.
 
-    Only what cannot be a bite is an error; then nothing else is told, since it follows from that.
+    Only what cannot be a bite is an error; then nothing else is reported, since it follows from that.
     """
     given = T_anatomical_scan is not None
     derived = anatomical_frame(*(scan.crown_vertices(6000) for scan in scans))

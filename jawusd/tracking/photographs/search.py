@@ -63,7 +63,7 @@ class UsualBite:
 def usual_bites(scans: Sequence[Scan]) -> list[UsualBite]:
     """Return each way in which two rows may stand over one another.
 
-    Each row's plane and forward direction follow from its shape. Which side of a row is up is told by its gum, if it
+    Each row's plane and forward direction follow from its shape. Which side of a row is up follows from its gum, if it
     has one; else both are returned.
     """
     frames = [[_row_frame(scan, r, side) for side in _sides(scan, r)] for r, scan in enumerate(scans)]

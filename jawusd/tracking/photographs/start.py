@@ -91,7 +91,7 @@ def _misfit(aligner: Aligner, bite: Bite) -> float:
 
 
 def find_next(drawing: Drawing, rows: Rows, T_upper_lower: Array, contact: Contact) -> Found:
-    """Return the best start of a photograph of a bite that another photograph has told, roughly."""
+    """Return the best start of a photograph of a bite that another photograph has given, roughly."""
     found = _aligned_candidates(drawing, rows, T_upper_lower, _CANDIDATES)
     aligner = Aligner(rows.thin, rows.usual.T_upper_lower, contact)
     ends = []

@@ -34,7 +34,7 @@ _ODD = np.array([False, True, False, False, False, True, True, False, False, Fal
 _SPREAD_MM, _PRODUCTS, _CONSTANT_MM = (0.4, 1.5, 1.5), 0.5, 1.0
 # Distance of found condyles from a jaw's own polynomials, standard deviation to the side, up and forwards [mm].
 _OFF_MM = (0.3, 0.8, 0.5)
-_NEWS = 0.1  # share of a frame that neighbouring frames have not told yet
+_NEWS = 0.1  # share of a frame that neighbouring frames do not already give
 _BACK = 0.25, 0.005  # way back of an incisal point that goes down, per mm and per mm^2: a mean of the same joints
 _DOUBT = 4.0  # squared distance per coordinate from which frames teach less: they may be wrong [-]
 

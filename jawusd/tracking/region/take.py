@@ -56,10 +56,10 @@ class TakeFacts:
 def tracks_of(
     followed: Mapping[int, RegionPose], take: TakeFacts, looks: Sequence[tuple[Array, Sequence[View]]] = ()
 ) -> Tracks:
-    """Return the tracks of frames; delays between cameras and where borders lie are told from all of them.
+    """Return the tracks of frames; delays between cameras and where borders lie are estimated from all of them.
 
     Args:
-        looks: poses and views of some of the frames, which sizes and focal lengths are told from.
+        looks: poses and views of some of the frames, which sizes and focal lengths are estimated from.
 
     Raises:
         TrackingError: the registration of the scans is to be corrected, and the mouth was not closed.

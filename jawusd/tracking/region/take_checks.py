@@ -1,4 +1,4 @@
-"""What colours tell of cameras and scans: knocked cameras, wrong focal lengths, scans mirrored or of another size."""
+"""What colours show of cameras and scans: knocked cameras, wrong focal lengths, scans mirrored or of another size."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def scan_findings(
     looks: Iterable[tuple[Array, Sequence[View]]],
     config: TrackingConfig,
 ) -> list[Finding]:
-    """Return what some frames tell of the scans and of focal lengths; see `lens_findings` and `mirror_findings`.
+    """Return what some frames show about the scans and of focal lengths; see `lens_findings` and `mirror_findings`.
 
     Args:
         left: unit vector in scan coordinates, shape (3,).

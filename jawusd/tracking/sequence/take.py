@@ -211,7 +211,7 @@ class _Take:
         return found
 
     def scans_and_lenses(self, left: Array) -> list[Finding]:
-        """Return what the take, before anything is corrected, tells of focal lengths, lenses and the scans.
+        """Return what the take, before anything is corrected, shows about focal lengths, lenses and the scans.
 
         Args:
             left: unit vector in scan coordinates, shape (3,).

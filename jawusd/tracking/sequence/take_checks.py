@@ -65,7 +65,7 @@ _STEP_FRAMES = 0.5
 
 
 def lens_findings(names: Sequence[str], found: Magnification, limits: LensLimits = OF_MASKS) -> list[Finding]:
-    """Return what the magnification of the cameras tells of scans, focal lengths, lenses and masks.
+    """Return what the magnification of the cameras shows about scans, focal lengths, lenses and masks.
 
     Kinds: "scan_size" [%], "focal_length" [%], "lens_distortion" [%], "side_teeth" [%], "masks_wide" [px].
     """

@@ -13,7 +13,7 @@ from sources import CHEWING, OPTOTRAK
 
 from jawusd.fitting.coverage import missing_movements, shown_parameters
 from jawusd.fitting.data import SubjectAnatomy, TrainingData, select_poses
-from jawusd.formats.markers import read_markers, read_plate
+from jawusd.formats.markers import read_body, read_markers
 from jawusd.geometry import (
     make_transform,
     rigid_fits,
@@ -52,7 +52,7 @@ def speech(data: Path) -> tuple[Take, Take]:
     """Return the take of speech and the clench, measured at the four markers of the jaw."""
     folder = OPTOTRAK.found(data) / "plgrigid"
     plates = {name: str(folder / f"{name}.rig") for name in ("head", "jaw")}
-    points = read_plate(plates["jaw"]).points
+    points = read_body(plates["jaw"]).points
     anatomy = SubjectAnatomy.of(T_ANATOMICAL_HEAD, SPEECH_LANDMARKS, points, None)
     spoken, clenched = (marker_poses(folder / f"{name}.asc", plates) for name in ("dms1", "cln1"))
     taken = select_poses(np.arange(len(spoken)), spoken, anatomy).data
