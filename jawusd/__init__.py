@@ -7,6 +7,7 @@ where the schema `JawRigAPI` is (`jawusd info --schema`).
 from __future__ import annotations
 
 import importlib
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from jawusd.plugin_path import announce_schema
@@ -47,7 +48,7 @@ def load(path: str | PathLike[str], *, prim: str | None = None, fast: bool = Fal
     """Load a rig for posing, validation and inverse kinematics.
 
     Args:
-        path: `actor.usda` (or any layer or package that carries the rig), or a `model.npz`.
+        path: Folder of a rig, its `actor.usda` (or any layer or package that carries the rig), or a `model.npz`.
         prim: Path of the rig's prim, where a stage holds several.
         fast: Compile the most used functions with numba: the same results to 1e-10, several times faster. Needs
             `pip install 'jawusd[fast]'`; the first use after an installation compiles for about a minute.
@@ -63,8 +64,9 @@ def load(path: str | PathLike[str], *, prim: str | None = None, fast: bool = Fal
         rig = evaluator.load(path)
     else:
         from jawusd.rig import load_rig
+        from jawusd.rig.layout import actor_in_folder
 
-        rig = load_rig(path, prim)
+        rig = load_rig(actor_in_folder(Path(path)), prim)
     if not fast:
         return rig
     from jawusd.fast import accelerate

@@ -59,22 +59,9 @@ Prim = Annotated[str | None, typer.Option("--prim", help="Which rig, where a sta
 
 
 def _actor_in_folder(rig: Path | None) -> Path | None:
-    """Return the actor of a rig's folder, other paths as they are.
+    from jawusd.rig.layout import actor_in_folder
 
-    Raises:
-        RigError: a folder without one.
-    """
-    from jawusd.errors import RigError
-
-    if rig is None or not rig.is_dir():
-        return rig
-    actor = rig / "actor.usda"
-    if not actor.exists():
-        hint = "Name the folder of a build (jawusd build ... -o FOLDER), or a file of it."
-        if (rig / "capture.toml").exists():
-            hint = f"It is a capture; build a rig from it with: jawusd build {rig} -o out"
-        raise RigError("is a folder without actor.usda.", path=rig, hint=hint)
-    return actor
+    return None if rig is None else actor_in_folder(rig)
 
 
 RigArg = Annotated[

@@ -35,7 +35,7 @@ def set_value(name, value):
     return change
 
 
-def test_what_is_baked_is_read_back_exactly(folder, kind):
+def test_what_is_baked_is_read_back_exactly(folder, kind, tmp_path_factory):
     expected = example_rig(kind)
     for name in ("actor.usda", "anim_capture.usdc"):
         rig = load_rig(folder / name)
@@ -46,6 +46,9 @@ def test_what_is_baked_is_read_back_exactly(folder, kind):
         assert model_hash(rig) == model_hash(expected)
     d = example_motion()[1]
     np.testing.assert_array_equal(jawusd.load(folder / "actor.usda").pose(d), expected.pose(d))
+    np.testing.assert_array_equal(jawusd.load(folder).pose(d), expected.pose(d))
+    with pytest.raises(RigError, match="is a folder without actor.usda"):
+        jawusd.load(tmp_path_factory.mktemp("empty"))
 
 
 def test_what_not_every_rig_has_is_read_back_exactly(kind, tmp_path):
