@@ -4,6 +4,7 @@ Usage: python gallery_blender.py out/anim_capture.usdc FOLDER FIRST FRAMES STEP
 """
 
 import math
+import os
 import sys
 
 import bpy
@@ -70,3 +71,5 @@ def main(stage, folder, first, frames, step):
 
 if __name__ == "__main__":
     main(*sys.argv[1:3], *map(int, sys.argv[3:6]))
+    sys.stdout.flush()
+    os._exit(0)  # the module hangs at a normal exit in some versions

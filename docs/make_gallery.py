@@ -126,19 +126,19 @@ def contacts(out: Path, folder: Path) -> Path:
     view, left = ContactView(actor, rig, "/Actor"), 0.6 * float(rig.ranges(0.0).d2_max)
     poses = {"closed bite": (0.0, 0.0, 0.0), f"gliding {left:.1f} mm to the left": (0.0, left, 0.0)}
     pictures = [Image.fromarray(view.draw(np.array(d))) for d in poses.values()]
-    font, gap, line = ImageFont.load_default(22), 40, 44
+    font, line = ImageFont.load_default(20), 44
     width, height = pictures[0].size
-    sheet = Image.new("RGB", (2 * width + gap, height + 2 * line), "white")
+    sheet = Image.new("RGB", (width, 2 * (height + line) + line), "white")
     pen = ImageDraw.Draw(sheet)
     for k, (words, picture) in enumerate(zip(poses, pictures, strict=True)):
-        sheet.paste(picture, (k * (width + gap), line))
-        pen.text((k * (width + gap) + width / 2, 8), words, fill="black", font=font, anchor="ma")
-    at = 12
+        sheet.paste(picture, (0, k * (height + line) + line))
+        pen.text((width / 2, k * (height + line) + 12), words, fill="black", font=font, anchor="ma")
+    at, below = 12, sheet.height - line + 12
     for mark in (*TOUCHING, DEEP):
-        pen.rectangle((at, height + line + 12, at + 20, height + line + 32), fill=mark.color)
-        pen.text((at + 28, height + line + 22), mark.meaning, fill="black", font=font, anchor="lm")
-        at += 60 + round(font.getlength(mark.meaning))
-    return save_webp(folder / "contacts.webp", sheet, min(sheet.width, 1500))
+        pen.rectangle((at, below, at + 20, below + 20), fill=mark.color)
+        pen.text((at + 26, below + 10), mark.meaning, fill="black", font=font, anchor="lm")
+        at += 48 + round(font.getlength(mark.meaning))
+    return save_webp(folder / "contacts.webp", sheet, sheet.width)
 
 
 def condyles(out: Path, folder: Path) -> Path:
