@@ -16,11 +16,11 @@ from jawusd.viewer.session import Session
 from jawusd.viewer.widgets import Choice, add_dark_checkbox, assign, guarded, small_text
 
 STEP_MM = 0.01
-LABELS = ("d1 opening [mm]", "d2 laterotrusion [mm]", "d3 protrusion [mm]")
+NAMES = ("opening", "laterotrusion", "protrusion")
 _HINTS = (
-    "Opening [mm] along this person's own path.",
-    "Laterotrusion [mm] at the incisal point, + to the subject's left.",
-    "Protrusion [mm] relative to this person's path of opening, which itself leads back: + before it, - behind it.",
+    "Opening d1 [mm] along this person's own path.",
+    "Laterotrusion d2 [mm] at the incisal point, + to the subject's left.",
+    "Protrusion d3 [mm] relative to this person's path of opening, which itself leads back: + before it, - behind it.",
 )
 _DRAG_HELP = small_text(
     "Drag the jaw itself, too: what you hold follows the pointer as far as this person can move it.", "opacity:.7"
@@ -44,7 +44,7 @@ class PosePanel:
         """Make the widgets in the present container; call `changed` after every change."""
         self._client, self._session, self._scene, self._changed = client, session, scene, changed
         gui = client.gui
-        self.sliders = [self._add_slider(index, label) for index, label in enumerate(LABELS)]
+        self.sliders = [self._add_slider(index, label) for index, label in enumerate(f"{name} [mm]" for name in NAMES)]
         self.keep_valid = gui.add_checkbox("keep valid", True, hint="Stop sliders at the bound of this person.")
         self.keep_valid.on_update(guarded(client, self._keep))
         gui.add_html(_DRAG_HELP)
@@ -157,7 +157,7 @@ def reading_html(readout: Readout, d: tuple[float, float, float], limits: Array)
         ("left condyle moved", _moved(readout.condyle_left_mm), _MOVED_HELP),
         ("right condyle moved", _moved(readout.condyle_right_mm), _MOVED_HELP),
         ("nearest captured", captured, _CAPTURED_HELP),
-        *((f"valid d{i + 1}", _span(d[i], *limits[i]), _VALID_HELP) for i in range(3)),
+        *((f"valid {name}", _span(d[i], *limits[i]), _VALID_HELP) for i, name in enumerate(NAMES)),
     ]
     style = "opacity:.7;padding-right:8px;white-space:nowrap"
     cells = "".join(

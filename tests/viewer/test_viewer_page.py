@@ -55,7 +55,7 @@ def test_the_verdict_stands_above_the_tabs_and_sliders_name_their_unit(quiet):
     page = quiet.page
     inside = {one._impl.parent_container_id for one in (page.pose.sliders[0], page.motion.play, page.files.load)}
     assert page.verdict._impl.parent_container_id == "root" and len(inside - {"root"}) == 3
-    assert all(slider.label.endswith("[mm]") for slider in page.pose.sliders)
+    assert all(slider.label.endswith(" [mm]") for slider in page.pose.sliders)
     assert not any("forward" in slider.label for slider in page.pose.sliders)  # of the incisor, which is read out
 
 
