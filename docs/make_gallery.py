@@ -116,6 +116,7 @@ def envelope(out: Path, folder: Path) -> Path:
         plane.plot(captured[:, across], captured[:, 1], color=VERMILION, lw=0.8)
         plane.set(xlabel=label, ylabel="up [mm]", title=title, aspect="equal")
         plane.spines[["top", "right"]].set_visible(False)
+    figure.get_layout_engine().set(h_pad=0.12, w_pad=0.08)
     return save_webp(folder / "envelope.webp", drawn(figure), 1200)
 
 

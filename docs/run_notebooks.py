@@ -1,7 +1,7 @@
 """Run the notebooks of docs/notebooks and store what they print: python docs/run_notebooks.py [NAME ...]
 
-They read the rig in `out/` of the repository (`jawusd build examples/capture -o out`) and write nothing there: each runs
-in a folder of its own that stands as deep.
+They read the rig in `out/` of the repository (`jawusd build examples/capture -o out`) and write nothing there: each
+runs in a folder of its own that stands as deep.
 """
 
 import argparse

@@ -117,7 +117,6 @@ def crown(x, top, width, height, up):
     ]  # fmt: skip
 
 
-
 def masks():
     """Draw what masks of both rows hold: crowns, from the gum line to the free edges, behind the lips or not."""
     parts = []

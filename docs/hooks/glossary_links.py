@@ -39,7 +39,9 @@ def linked(html, terms, glossary):
         return html
     left = dict(terms)
     words = "|".join(sorted(map(re.escape, terms), key=len, reverse=True))
-    pattern = re.compile(rf"(?<![\w:/.])({words})(?![\w/]|[:.]\w)", re.I)  # not in names as jaw:model:kind
+    pattern = re.compile(
+        rf"(?<!Cramer-Rao )(?<![\w:/.])({words})(?![\w/]|[:.]\w)", re.I
+    )  # not in names as jaw:model:kind, nor in others' terms
     closed, out = 0, []
 
     def link(found):
