@@ -39,9 +39,8 @@ def linked(html, terms, glossary):
         return html
     left = dict(terms)
     words = "|".join(sorted(map(re.escape, terms), key=len, reverse=True))
-    pattern = re.compile(
-        rf"(?<!Cramer-Rao )(?<![\w:/.])({words})(?![\w/]|[:.]\w)", re.I
-    )  # not in names as jaw:model:kind, nor in others' terms
+    # Neither in names, as jaw:model:kind, nor in terms of others.
+    pattern = re.compile(rf"(?<!Cramer-Rao )(?<![\w:/.])({words})(?![\w/]|[:.]\w)", re.I)
     closed, out = 0, []
 
     def link(found):

@@ -1,10 +1,10 @@
 """Long runs: python tests/benchmarks/long_runs.py [--frames 1000 20000] [--captures 50] [--sessions 300].
 
-    frames      peak memory of tracking a take of so many frames: the example's masks, played to and fro
-    captures    `build-many` of short captures that is killed five times and meets a full disk once (no file may grow
-                beyond some size), then resumed to the end: every folder is compared with that of a serial build
-    at once     two builds started together in one folder: one is told so, the other ends as a serial build
-    sessions    memory of a viewer after so many pages were opened, used and closed
+frames      peak memory of tracking a take of so many frames: the example's masks, played to and fro
+captures    `build-many` of short captures that is killed five times and meets a full disk once (no file may grow
+            beyond some size), then resumed to the end: every folder is compared with that of a serial build
+at once     two builds started together in one folder: one is told so, the other ends as a serial build
+sessions    memory of a viewer after so many pages were opened, used and closed
 """
 
 from __future__ import annotations

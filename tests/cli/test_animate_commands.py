@@ -133,9 +133,7 @@ def test_keys_outside_come_inside_and_keep_their_tangents(actor, tmp_path):
     keys = [{"frame": 1, "d": [2, 0, 0]}, {"frame": 13, "d": far}, {"frame": 25, "d": [2, 0, 0]}]
     (tmp_path / "keys.json").write_text(json.dumps({"fps": 24, "interpolation": "smooth", "keys": keys}))
     splines, out = tmp_path / "splines.usda", tmp_path / "anim.usdc"
-    summary = json.loads(
-        run("animate", actor, tmp_path / "keys.json", "-o", out, "--splines", splines, "--json")
-    )
+    summary = json.loads(run("animate", actor, tmp_path / "keys.json", "-o", out, "--splines", splines, "--json"))
     assert summary["clamped"] >= 1
     stage = Usd.Stage.Open(str(splines))
     knots = stage.GetPrimAtPath("/Actor").GetAttribute("jaw:d1").GetSpline().GetKnots()

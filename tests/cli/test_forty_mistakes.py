@@ -15,7 +15,7 @@ TEXT = HEAD + TABLES + BOARDS
 VIEWS = '[{ camera = "left", x = 1, y = 2 }, { camera = "%s", x = 1, y = 2 }]'
 PICK = f"[bootstrap]\nframe = 1\n[[bootstrap.upper]]\nvertex = 3\nviews = {VIEWS}\n[boards]"
 CAMERA = (
-    'size = [64, 48]\nmatrix = [[100, 0, 32], [0, 100, 24], [0, 0, 1]]\ndistortions = []\nrotation = [0, 0, 0]\n'
+    "size = [64, 48]\nmatrix = [[100, 0, 32], [0, 100, 24], [0, 0, 1]]\ndistortions = []\nrotation = [0, 0, 0]\n"
     "translation = [0, 0, 400]\n"
 )
 CAMERAS = f'[cam_0]\nname = "left"\n{CAMERA}[cam_1]\nname = "right"\n{CAMERA}'

@@ -235,7 +235,6 @@ def test_solved_takes_in_viewer_and_report():
         assert f"bound: {words_of_measured(margin[row])}, margin {margin[row]:.2f} mm" in text
         assert ("does not allow" in text) == (margin[row] < -TOLERANCE_MM)
 
-
     bar = StatusBar(tracks, FPS, 1600)
     said = [" ".join(text for text, *_ in bar._said(row)) for row in range(count)]
     assert all(f"bound: {words_of_measured(m)}, margin" in text for m, text in zip(margin, said))

@@ -199,6 +199,12 @@ def test_pages_link_to_the_glossary(site):
     assert [path.name for path in people if linked not in path.read_text()] == []
 
 
+def test_terms_of_others_are_not_linked(site):
+    text = (site / "benchmarks.html").read_text()
+    assert "Cramer-Rao bound" in text
+    assert ">model</a>" in text
+
+
 @pytest.fixture(scope="module")
 def chromium():
     yield from headless_chromium()

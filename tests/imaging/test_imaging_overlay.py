@@ -115,9 +115,7 @@ def test_tracking_sheet_shows_rows_of_frames_and_columns_of_cameras(tmp_path: Pa
         for k in range(3):
             out.write(np.full((120, 160, 3), 80 + 40 * k, np.uint8))
     behind = {"cam": Backdrop(CameraSource(name="cam", video=path), 10)}
-    sheet = overlay.tracking_sheet(
-        tracks(4), [10, 11, 13], [CAMERA], behind, patch(12), patch(12), tile_px=(96, 64)
-    )
+    sheet = overlay.tracking_sheet(tracks(4), [10, 11, 13], [CAMERA], behind, patch(12), patch(12), tile_px=(96, 64))
     assert sheet.shape == (3 * (64 + 22), 96, 3)
     first, second, third = np.split(sheet, 3)
 

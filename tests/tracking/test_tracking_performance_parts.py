@@ -97,9 +97,7 @@ def inside_by(bias_px, jaw, frames, habits):
             habit_weight=np.tile(free.T @ free, (2, 1, 1, 1)),
             habit_distance=(moved @ free)[:, None],
         )
-        fit = SimpleNamespace(
-            pose=pose, solution=SimpleNamespace(outline=outline), found=np.ones(2, bool), growth=None
-        )
+        fit = SimpleNamespace(pose=pose, solution=SimpleNamespace(outline=outline), found=np.ones(2, bool), growth=None)
         system.add_frame(k, *unknowns.frame(fit, np.full(2, 1.0 / 10.0)))
     system.add_shared(*unknowns.prior(none))
     return unknowns.moved([pose] * frames, none, *system.solve())[1].habits[:, 0]
