@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from jawusd.errors import CaptureError
 from jawusd.geometry.arrays import Array
-from jawusd.imaging.pixels import Colour, Slices
+from jawusd.imaging.pixels import Colour, ColourPicture, Slices
 from jawusd.imaging.timeline import Timeline
 
 
@@ -86,12 +86,7 @@ class Clip(ABC):
             ValueError: the region is empty or outside the picture.
         """
         last = self.count if last is None else last
-        if not 0 <= first <= last <= self.count:
-            raise CaptureError(
-                f"frames {first} to {last - 1} asked for, the video holds frames 0 to {self.count - 1}.",
-                path=self.path,
-                hint="Correct `frames` in capture.toml, or copy the video again if it should be longer.",
-            )
+        self._check_range(first, last)
         width, height = self.size_px
         x0, y0, x1, y1 = region or (0, 0, width, height)
         if not (0 <= x0 < x1 <= width and 0 <= y0 < y1 <= height):
@@ -109,6 +104,22 @@ class Clip(ABC):
         decoded = self.frames(known[0], known[-1] + 1, colour=colour) if known else iter(())
         for number in wanted:
             yield None if number is None else next(frame.image for frame in decoded if frame.index == number)
+
+    def colour_pictures(self, wanted: Sequence[int | None]) -> Iterator[ColourPicture | None]:
+        """Yield as `pictures` does, in RGB; pictures of videos are converted by the parts that are asked for.
+
+        Raises:
+            CaptureError: a picture lies outside the file or cannot be decoded.
+        """
+        yield from self.pictures(wanted, colour="rgb")
+
+    def _check_range(self, first: int, last: int) -> None:
+        if not 0 <= first <= last <= self.count:
+            raise CaptureError(
+                f"frames {first} to {last - 1} asked for, the video holds frames 0 to {self.count - 1}.",
+                path=self.path,
+                hint="Correct `frames` in capture.toml, or copy the video again if it should be longer.",
+            )
 
     @abstractmethod
     def _converted(self, first: int, last: int, colour: Colour, window: Slices, threads: int) -> Iterator[VideoFrame]:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import re
+from fractions import Fraction
 from functools import lru_cache
 from typing import Literal, TypeAlias
 
 import av
+import av.filter
 import cv2
 import numpy as np
 from av.video.reformatter import Interpolation
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from jawusd.imaging.display import to_display
 
@@ -24,6 +26,9 @@ _BYTE_BITS = 8
 # ffmpeg's quick way to RGB is dark by 1.3 of 255 levels and repeats colours over blocks of pixels; this way rounds, and
 # interpolates colours.
 TO_RGB = Interpolation.BILINEAR | Interpolation.ACCURATE_RND | Interpolation.FULL_CHR_H_INT
+_AROUND_PX = 8  # kept around a part of a picture: colours are interpolated
+_STEP_PX = 32  # of its sides
+_ANY_TIME = Fraction(1, 1000)  # filters ask for a unit of time
 _FULL_RANGE = 2  # AVCOL_RANGE_JPEG
 _PLANAR_VIDEO_RANGE = ("yuv420p", "yuv422p", "yuv444p", "nv12", "nv21")
 _PLANAR_FULL_RANGE = ("gray", "yuvj420p", "yuvj422p", "yuvj444p")
@@ -39,18 +44,92 @@ def _deep_table(bits: int, high: bool, full: bool) -> NDArray[np.uint8]:
     return np.asarray(np.clip(np.rint((luma - low) * 255 / span), 0, 255), np.uint8)
 
 
+class DecodedPicture:
+    """A decoded picture of which parts are turned into RGB as they are asked for, as parts of an array are.
+
+    Attributes:
+        shape: that of the array: height, width, 3.
+    """
+
+    def __init__(self, frame: av.VideoFrame, rotation_deg: int) -> None:
+        """Take what the decoder gives, and the turn that the file asks for."""
+        self._frame, self._rotation_deg = frame, rotation_deg
+        turned = rotation_deg in (90, 270)
+        self.shape = (frame.width, frame.height, 3) if turned else (frame.height, frame.width, 3)
+
+    def __getitem__(self, window: Slices) -> NDArray[np.uint8]:
+        """Return the RGB pixels of some rows and columns, (h, w, 3)."""
+        return converted(self._frame, "rgb", self._rotation_deg, window)
+
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[np.uint8]:
+        """Return the whole picture."""
+        whole = (slice(0, self.shape[0], 1), slice(0, self.shape[1], 1))
+        return np.asarray(self[whole], dtype)
+
+
+#: A picture in RGB, (h, w, 3) uint8, as a whole or by parts.
+ColourPicture: TypeAlias = "NDArray[np.uint8] | DecodedPicture"
+
+
 def converted(frame: av.VideoFrame, colour: Colour, rotation_deg: int, window: Slices) -> NDArray[np.uint8]:
     """Return a window (h, w), (h, w, 3) or (h, w, 4) of a decoded picture after its turn."""
     if colour == "gray":
         return _gray(frame, rotation_deg, window)
+    part, inside = _around(frame, _stored_window(frame, rotation_deg, window))
     pixels: NDArray[np.uint8]
-    if colour == "rgb" and max(part.bits for part in frame.format.components) > _BYTE_BITS:
+    if colour == "rgb" and max(one.bits for one in frame.format.components) > _BYTE_BITS:
         # The way from 10 bits to 8 loses up to two levels in ffmpeg; rounding from 16 bits does not.
-        pixels = to_display(*deep_rgb(frame), None, None)
+        pixels = to_display(*deep_rgb(part), None, None)
+    elif colour == "rgb" and not part.format.is_rgb:
+        # ffmpeg writes three planes twice as fast as pixels, with the same values.
+        green, blue, red = (_plane(p) for p in part.reformat(format="gbrp", interpolation=TO_RGB).planes)
+        pixels = np.asarray(cv2.merge([red, green, blue]), np.uint8)
     else:
         shape = "rgb24" if colour == "rgb" else "rgba"
-        pixels = np.asarray(frame.to_ndarray(format=shape, interpolation=TO_RGB), np.uint8)
-    return np.ascontiguousarray(np.rot90(pixels, rotation_deg // 90)[window])
+        pixels = np.asarray(part.to_ndarray(format=shape, interpolation=TO_RGB), np.uint8)
+    return np.ascontiguousarray(np.rot90(pixels[inside], rotation_deg // 90))
+
+
+def _plane(plane: av.video.plane.VideoPlane) -> NDArray[np.uint8]:
+    """Return a plane of bytes, (h, w), without a copy."""
+    return np.frombuffer(memoryview(plane), np.uint8).reshape(-1, plane.line_size)[: plane.height, : plane.width]
+
+
+def _stored_window(frame: av.VideoFrame, rotation_deg: int, window: Slices) -> Slices:
+    """Return the rows and columns of a stored picture that its turn takes to a window."""
+    turns = rotation_deg // 90
+    height, width = (frame.width, frame.height) if turns % 2 else (frame.height, frame.width)
+    rows, columns = (slice(*part.indices(side)[:2]) for part, side in zip(window, (height, width), strict=True))
+    for _ in range(turns):
+        rows, columns = columns, slice(height - rows.stop, height - rows.start)
+        height, width = width, height
+    return rows, columns
+
+
+def _widened(part: slice[int, int, int], limit: int) -> tuple[int, int]:
+    """Return where a part of a side begins and ends with what is kept around it, in steps that ffmpeg is quick with."""
+    start = max(0, part.start - _AROUND_PX) // _STEP_PX * _STEP_PX
+    return start, min(limit, start + -(-(part.stop + _AROUND_PX - start) // _STEP_PX) * _STEP_PX)
+
+
+def _around(frame: av.VideoFrame, window: Slices) -> tuple[av.VideoFrame, Slices]:
+    """Return what surrounds a window of a stored picture, and the window in it; the whole if that is not much more."""
+    rows, columns = window
+    (top, bottom), (left, right) = (_widened(*sides) for sides in zip(window, (frame.height, frame.width)))
+    height, width = bottom - top, right - left
+    if height * width > 0.5 * frame.height * frame.width:
+        return frame, window
+    # ffmpeg's own filter keeps what the decoder says of colours and of where they are sampled.
+    graph = av.filter.Graph()
+    source = graph.add_buffer(width=frame.width, height=frame.height, format=frame.format, time_base=_ANY_TIME)
+    crop = graph.add("crop", f"{width}:{height}:{left}:{top}:exact=1")
+    sink = graph.add("buffersink")
+    source.link_to(crop)
+    crop.link_to(sink)
+    graph.configure()
+    graph.vpush(frame)
+    inside = slice(rows.start - top, rows.stop - top), slice(columns.start - left, columns.stop - left)
+    return graph.vpull(), inside
 
 
 def deep_rgb(frame: av.VideoFrame) -> tuple[NDArray[np.uint16], int]:
@@ -76,9 +155,7 @@ def _gray(frame: av.VideoFrame, rotation_deg: int, window: Slices) -> NDArray[np
     full = name in _PLANAR_FULL_RANGE or (name in _PLANAR_VIDEO_RANGE and frame.color_range == _FULL_RANGE)
     if not full and name not in _PLANAR_VIDEO_RANGE:
         frame = frame.reformat(format="gray")
-    plane = frame.planes[0]
-    stored = np.frombuffer(memoryview(plane), np.uint8).reshape(-1, plane.line_size)[: frame.height, : frame.width]
-    image = np.rot90(stored, rotation_deg // 90)[window]
+    image = np.rot90(_plane(frame.planes[0]), rotation_deg // 90)[window]
     if name in _PLANAR_VIDEO_RANGE and not full:
         return np.asarray(cv2.LUT(np.ascontiguousarray(image), _STRETCH), np.uint8)
     return image

@@ -8,7 +8,7 @@ decoded picture is placed by its time stamp, so that B-frames, edit lists and va
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import av
@@ -20,7 +20,7 @@ from jawusd.imaging.clip import Clip, VideoFrame
 from jawusd.imaging.containers import open_container
 from jawusd.imaging.display import to_display
 from jawusd.imaging.pictures import MOST_PX
-from jawusd.imaging.pixels import Colour, Slices, coloured, converted, deep_rgb
+from jawusd.imaging.pixels import Colour, ColourPicture, DecodedPicture, Slices, coloured, converted, deep_rgb
 from jawusd.imaging.timeline import Timeline
 from jawusd.inputs import check_input, why_unreadable
 
@@ -96,6 +96,22 @@ class Video(Clip):
         self.has_alpha = self._alpha_decoder is not None or any(part.is_alpha for part in stored_as.components)
         self.is_rgb = stored_as.is_rgb or stored_as.has_palette
         self.is_gray = not self.is_rgb and len(stored_as.components) == 1
+
+    def colour_pictures(self, wanted: Sequence[int | None]) -> Iterator[ColourPicture | None]:
+        """Yield as `Clip.colour_pictures`."""
+        if self._space is not None:
+            yield from super().colour_pictures(wanted)
+            return
+        known = [number for number in wanted if number is not None]
+        if known:
+            self._check_range(known[0], known[-1] + 1)
+        decoded = self._decode(known[0], known[-1] + 1, threads=0) if known else iter(())
+        for number in wanted:
+            if number is None:
+                yield None
+            else:
+                frame = next(frame for index, frame in decoded if index == number)
+                yield DecodedPicture(frame, self.rotation_deg)
 
     def _converted(self, first: int, last: int, colour: Colour, window: Slices, threads: int) -> Iterator[VideoFrame]:
         for index, frame in self._decode(first, last, threads, alpha=colour == "rgba"):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from jawusd.geometry.arrays import Mask
 from jawusd.geometry.camera import Camera
-from jawusd.imaging.pixels import Slices
+from jawusd.imaging.pixels import ColourPicture, DecodedPicture, Slices
 
 _NODE_PX = 16  # spacing of the map samples that locate a region
 
@@ -25,6 +25,21 @@ def remap(image: NDArray[_Pixel], positions: NDArray[np.float32]) -> NDArray[_Pi
     # cv2's stub requires a second map, which a map of two channels does not need.
     found = cv2.remap(image, positions, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)  # type: ignore[call-overload]
     return np.asarray(found, image.dtype)
+
+
+def _needed(picture: DecodedPicture, positions: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return a picture of which only what lies within the sides of positions (h, w, 2) [px] is converted.
+
+    The rest is not set: memory that nobody touches costs nothing.
+    """
+    sides = np.concatenate([positions[0], positions[-1], positions[:, 0], positions[:, -1]])
+    limit = np.array(picture.shape[1::-1])
+    low = np.clip(np.floor(sides.min(0)), 0, limit - 1).astype(int)
+    high = np.clip(np.floor(sides.max(0)) + 2, low + 1, limit).astype(int)
+    out = np.empty(picture.shape, np.uint8)
+    box = (slice(low[1], high[1]), slice(low[0], high[0]))
+    out[box] = picture[box]
+    return out
 
 
 class WorkingView:
@@ -97,7 +112,7 @@ class WorkingView:
             raise ValueError(f"light must be of {self.source.size_px} px and stay so, got {image.shape}")
         return remap(image, self._map)
 
-    def part(self, image: NDArray[np.uint8], window: Slices) -> NDArray[np.uint8]:
+    def part(self, image: ColourPicture, window: Slices) -> NDArray[np.uint8]:
         """Return the part of `picture` at rows and columns whose start and stop lie inside it.
 
         Raises:
@@ -106,14 +121,15 @@ class WorkingView:
         self._check(image)
         return self._averaged(image, window)
 
-    def _check(self, image: NDArray[np.uint8]) -> None:
-        if image.shape[1::-1] != self.source.size_px or image.dtype != np.uint8:
-            raise ValueError(f"picture must be uint8 of {self.source.size_px} px, got {image.dtype} {image.shape}")
+    def _check(self, image: ColourPicture) -> None:
+        if image.shape[1::-1] != self.source.size_px or (isinstance(image, np.ndarray) and image.dtype != np.uint8):
+            kind = getattr(image, "dtype", "")
+            raise ValueError(f"picture must be uint8 of {self.source.size_px} px, got {kind} {image.shape}")
 
-    def _averaged(self, image: NDArray[np.uint8], window: Slices) -> NDArray[np.uint8]:
+    def _averaged(self, image: ColourPicture, window: Slices) -> NDArray[np.uint8]:
         n, (rows, cols) = self._samples, window
         part = self._map[rows.start * n : rows.stop * n, cols.start * n : cols.stop * n]
-        fine = remap(image, part)
+        fine = remap(image if isinstance(image, np.ndarray) else _needed(image, part), part)
         if n == 1:
             return fine
         size = (cols.stop - cols.start, rows.stop - rows.start)

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 import jawusd
 from jawusd.errors import CaptureError, explain_missing_packages
 from jawusd.evaluator import JawRig
@@ -261,7 +263,7 @@ class _Follower:
         """Search the teeth in pictures, if they show the rows apart."""
         from jawusd.segmentation.rows import tooth_rows
 
-        rows = {name: tooth_rows(image) for name, image in pictures.items() if image is not None}
+        rows = {name: tooth_rows(np.asarray(image)) for name, image in pictures.items() if image is not None}
         apart = {name: row for name, row in rows.items() if row is not None and row.bridged <= MOST_BRIDGED}
         if len(apart) < min(2, len(self._cameras)):
             return

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Generic, TypeVar
 
+import numpy as np
+
 from jawusd.errors import TrackingError
 from jawusd.formats.capture import CameraSource, Capture
 from jawusd.pipeline.segment_record import with_masks
@@ -110,7 +112,7 @@ class PictureSearch(Generic[T]):
 
         out, chosen = [], part[::_EVERY]
         for done, (frame, pictures) in enumerate(self.footage.walk(chosen), start=1):
-            rows = {name: tooth_rows(image) for name, image in pictures.items() if image is not None}
+            rows = {name: tooth_rows(np.asarray(image)) for name, image in pictures.items() if image is not None}
             apart = {name: row for name, row in rows.items() if row is not None and row.bridged <= MOST_BRIDGED}
             if len(apart) >= min(2, self.cameras):
                 out.append(_Look(frame, apart))

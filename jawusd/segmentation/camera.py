@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera, transform_points
 from jawusd.geometry.arrays import Array, Mask
+from jawusd.imaging.pixels import ColourPicture
 from jawusd.segmentation.arches import Seeds, learn_colours
 from jawusd.segmentation.colours import ColourModel
 from jawusd.segmentation.config import SegmentationConfig
@@ -79,7 +80,7 @@ class CameraSegmenter:
 
     def segment(
         self,
-        image: NDArray[np.uint8],
+        image: ColourPicture,
         poses: Array,
         turn: int,
         keys: Sequence[Key | None] = (None, None),
@@ -119,7 +120,7 @@ class CameraSegmenter:
     def _around(self, poses: Array) -> Array:
         return np.concatenate([transform_points(poses[r], self._points[r]) for r in _ARCHES])
 
-    def study(self, image: NDArray[np.uint8], poses: Array, keys: Sequence[Key | None]) -> Example | None:
+    def study(self, image: ColourPicture, poses: Array, keys: Sequence[Key | None]) -> Example | None:
         """Learn the colours of a picture for which a person drew, and return it as an example.
 
         The poses are aligned ones. None if the masks are not finished, or the teeth out of sight.

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TypeAlias
 
 from jawusd.imaging.clip import Clip
+from jawusd.imaging.pixels import ColourPicture
 
-_CHUNK = 16  # instants held at once when going backwards: 100 MB per full HD camera
+_CHUNK = 16  # instants held at once when going backwards: 50 MB per full HD camera
 
-Pictures = dict[str, NDArray[np.uint8] | None]
+Pictures: TypeAlias = "dict[str, ColourPicture | None]"
 _Frames = range  # inside the class below, `range` is its method
 
 
@@ -57,6 +56,6 @@ class ColourFootage:
 
     def _forwards(self, frames: _Frames) -> Iterator[tuple[int, Pictures]]:
         wanted = {name: [self.own(name, frame) for frame in frames] for name in self._videos}
-        readers = {name: self._videos[name].pictures(own, colour="rgb") for name, own in wanted.items()}
+        readers = {name: self._videos[name].colour_pictures(own) for name, own in wanted.items()}
         for frame in frames:
             yield frame, {name: next(reader) for name, reader in readers.items()}

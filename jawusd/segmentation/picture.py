@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from jawusd.geometry import Camera
 from jawusd.geometry.arrays import Array, Mask
+from jawusd.imaging.pixels import ColourPicture
 from jawusd.imaging.working_view import WorkingView, remap
 
 _NODE_PX = 8  # spacing of undistorted positions; the lens is smooth in between
@@ -37,7 +38,7 @@ class PictureFrame:
         self._working = WorkingView(source, (width, height))
         self._back = _positions(source, self._working.camera)
 
-    def window(self, image: NDArray[np.uint8], points_world: Array, margin_mm: float) -> Window | None:
+    def window(self, image: ColourPicture, points_world: Array, margin_mm: float) -> Window | None:
         """Return what surrounds world points (N, 3) [mm] in a recorded RGB picture (H, W, 3); None if out of sight."""
         camera = self._working.camera
         seen = camera.project_pinhole(points_world[camera.depth(points_world) > 0])

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from jawusd.errors import CaptureError
+from jawusd.imaging.pixels import TO_RGB
 from jawusd.imaging.video import Video
 from jawusd.imaging.video_writer import VideoWriter
 
@@ -134,6 +135,35 @@ def test_rotation_is_honoured_as_opencv_does(tmp_path: Path, rotation: int) -> N
         assert np.abs(frame.image.astype(int) - image).mean() < 1.5
     assert np.array_equal(next(video.frames(3, region=(5, 9, 40, 50))).image, found[3].image[9:50, 5:40])
     assert next(video.frames(colour="rgb")).image.shape[:2] == expected[0].shape
+
+
+@pytest.mark.parametrize("rotation", [0, 90, 180, -90])
+@pytest.mark.parametrize("pixels", ["yuv420p", "yuv444p", "yuv420p10le", "gray", "bgr0"])
+def test_parts_of_colour_pictures_are_those_of_the_whole(tmp_path: Path, rotation: int, pixels: str) -> None:
+    """Against ffmpeg's own conversion of the whole picture."""
+    path, size = tmp_path / "film.mkv", (320, 240)
+    noise = np.random.default_rng(1).integers(0, 256, (size[1] // 4, size[0] // 4, 3), np.uint8)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("ffv1", rate=24)
+        stream.width, stream.height, stream.pix_fmt = *size, pixels
+        if rotation:
+            stream.set_display_rotation(rotation)
+        frame = av.VideoFrame.from_ndarray(cv2.resize(noise, size, interpolation=cv2.INTER_CUBIC), format="rgb24")
+        container.mux(stream.encode(frame.reformat(format=pixels)))
+        container.mux(stream.encode(None))
+    video = Video(path)
+    whole = next(video.frames(colour="rgb")).image
+    if "10" not in pixels:
+        with av.open(str(path)) as container:
+            shown = next(container.decode(video=0)).to_ndarray(format="rgb24", interpolation=TO_RGB)
+        assert np.array_equal(whole, np.rot90(shown, video.rotation_deg // 90))
+    for rows, columns in ((slice(11, 60), slice(41, 93)), (slice(0, 30), slice(140, 240))):
+        (picture,) = video.colour_pictures([0])
+        assert picture is not None and picture.shape == whole.shape
+        apart = np.abs(picture[rows, columns].astype(int) - whole[rows, columns])
+        assert apart.shape == whole[rows, columns].shape
+        assert apart.max(initial=0) <= 3 and (apart > 0).mean() < 0.02  # ffmpeg rounds by where in a row a pixel lies
+    assert np.array_equal(np.asarray(next(video.colour_pictures([0]))), whole)
 
 
 def test_lossless_gray_round_trip(tmp_path: Path) -> None:

@@ -77,5 +77,5 @@ def test_footage_is_taken_at_its_time(take):
                 if own in DROPPED.get(camera.name, ()):
                     assert image is None and footage.own(camera.name, frame) is None
                 else:
-                    assert image.mean() == pytest.approx(40 + 5 * own, abs=1.5)
+                    assert np.asarray(image).mean() == pytest.approx(40 + 5 * own, abs=1.5)
                     assert footage.own(camera.name, frame) == own_frames(camera.name).index(own)
