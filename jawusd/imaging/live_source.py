@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 import threading
-import time
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.errors import CaptureError
+from jawusd.imaging import live_clock
 from jawusd.imaging.pixels import converted
 from jawusd.imaging.video import Video
 
@@ -58,7 +58,7 @@ class LiveSource:
         self._open.wait()
 
     def play(self, begin_s: float) -> None:
-        """Give out pictures; those of a file as if the recordings began at a time of `time.monotonic`."""
+        """Give out pictures; those of a file as if the recordings began at a time of `live_clock.now_s`."""
         self._begin_s = begin_s
         self._playing.set()
 
@@ -119,7 +119,7 @@ class LiveSource:
             self._open.set()
             self._playing.wait()
             due = self._begin_s - self._early_s + frame.time_s
-            if self._stopped.wait(max(0.0, due - time.monotonic())):
+            if live_clock.wait_until(due, self._stopped):
                 return
             yield LivePicture(due, frame.image)
 
@@ -132,7 +132,7 @@ class LiveSource:
                 whole = (slice(0, None), slice(0, None))
                 for frame in container.decode(video=0):
                     self._open.set()
-                    yield LivePicture(time.monotonic(), converted(frame, "rgb", 0, whole))
+                    yield LivePicture(live_clock.now_s(), converted(frame, "rgb", 0, whole))
         except (av.FFmpegError, OSError, IndexError) as error:
             raise CaptureError(
                 f"cannot be read ({error}).",

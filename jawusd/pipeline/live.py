@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import tempfile
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import ExitStack
@@ -20,6 +19,7 @@ from jawusd.evaluator import JawRig
 from jawusd.formats.capture import Capture
 from jawusd.formats.performance import SolveState
 from jawusd.geometry.arrays import Array
+from jawusd.imaging import live_clock
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.cuts import Cutter
 from jawusd.pipeline.picture_search import LEAST_FIT, MOST_BRIDGED, masked_cameras
@@ -203,7 +203,7 @@ class _Follower:
             source.open(start * self._period_s)
         for source in self._sources.values():
             source.wait_open()
-        begin = time.monotonic() - start * self._period_s
+        begin = live_clock.now_s() - start * self._period_s
         for source in self._sources.values():
             source.play(begin)
         last, blind_since = begin + (start - 0.5) * self._period_s, 0.0
@@ -230,7 +230,7 @@ class _Follower:
             margin_mm=float(verdict.margin_mm[0]),
             verdict=verdict.words()[0],
             state=str(SolveState.SOLVED if fit.found.all() else SolveState.CARRIED),
-            latency_ms=1e3 * (time.monotonic() - at),
+            latency_ms=1e3 * (live_clock.now_s() - at),
             dropped=dropped,
         )
 

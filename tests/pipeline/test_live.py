@@ -4,6 +4,7 @@ import json
 import socket
 import subprocess
 import sys
+import threading
 import time
 
 import av
@@ -16,6 +17,7 @@ import jawusd
 from jawusd.errors import CaptureError, FormatError, OutputError
 from jawusd.formats.performance import SolveState
 from jawusd.geometry import transform_point
+from jawusd.imaging import live_clock
 from jawusd.imaging.live_source import LiveSource
 from jawusd.pipeline.cuts import Cutter
 from jawusd.pipeline.live import LiveFrame, live, next_instant
@@ -26,7 +28,7 @@ from jawusd.pipeline.solve_pictures import PreparedTeeth
 from jawusd.segmentation.footage import ColourFootage
 from jawusd.tracking.region.live import LiveTake
 
-EXAMPLE = ROOT / "examples" / "capture"
+EXAMPLE, FPS = ROOT / "examples" / "capture", 24.0
 
 
 @pytest.fixture(scope="module")
@@ -156,17 +158,55 @@ def test_lines_say_what_the_frame_holds():
     }
 
 
+@pytest.fixture
+def patient_film(monkeypatch):
+    """Let films go on only when the follower waits for a picture, so that no machine is too slow for them."""
+    moved, wait = threading.Condition(), LiveSource.wait
+    shown = [0.0]
+
+    def wait_until(time_s, stopped):
+        with moved:
+            moved.wait_for(lambda: stopped.is_set() or time_s <= shown[0] + 1e-6)
+        return stopped.is_set()
+
+    def asked(source, after_s, timeout_s):
+        with moved:
+            shown[0] = max(shown[0], after_s + 0.5 / FPS)
+            moved.notify_all()
+        return wait(source, after_s, timeout_s)
+
+    monkeypatch.setattr(live_clock, "now_s", lambda: shown[0])
+    monkeypatch.setattr(live_clock, "wait_until", wait_until)
+    monkeypatch.setattr(LiveSource, "wait", asked)
+    yield
+    shown[0] = np.inf
+    with moved:
+        moved.notify_all()
+
+
 @pytest.mark.slow
-def test_the_command_follows_the_example(rig):
-    """However slow the machine is, what is said to be solved is near the truth."""
+def test_the_example_is_followed_at_every_frame(rig, patient_film):
+    told = list(live(rig, EXAMPLE, seconds=59.5 / FPS))
+    assert len(told) == 60 and all(found.dropped == 0 for found in told)
+    np.testing.assert_allclose(np.diff([found.time_s for found in told]), 1 / FPS, atol=1e-3)
+    jaw, errors = jawusd.load(rig), []
+    tip = jaw.landmarks[0]
+    with np.load(EXAMPLE / "truth" / "truth.npz") as truth:
+        relative = dict(zip(truth["frames"].tolist(), truth["T_upper_lower"], strict=True))
+    for found in told:
+        if found.state == "solved":
+            wanted = transform_point(relative[round(found.time_s * FPS)], tip)
+            errors.append(np.linalg.norm(transform_point(jaw.pose(found.d), tip) - wanted))
+    assert len(errors) >= 54 and np.median(errors) < 0.3 and max(errors) < 1.0
+
+
+@pytest.mark.slow
+def test_the_command_tells_lines_and_osc(rig):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
         receiver.bind(("127.0.0.1", 0))
         receiver.settimeout(5)
-        to = f"127.0.0.1:{receiver.getsockname()[1]}"
-        command = [sys.executable, "-m", "jawusd", "live", str(rig), str(EXAMPLE)]
-        warm = [*command, "--seconds", "1"]  # compiles, where nothing did before
-        subprocess.run(warm, capture_output=True, timeout=300, check=True)
-        command += ["--osc", to]
+        command = [sys.executable, "-m", "jawusd", "live", str(rig), str(EXAMPLE), "--seconds", "2"]
+        command += ["--osc", f"127.0.0.1:{receiver.getsockname()[1]}"]
         done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
         heard = OscPacket(receiver.recv(4096)).messages
     assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
@@ -174,19 +214,6 @@ def test_the_command_follows_the_example(rig):
     assert lines and {timed.message.address for timed in heard} >= {"/jaw/d", "/jaw/state"}
     first = next(timed.message.params for timed in heard if timed.message.address == "/jaw/d")
     np.testing.assert_allclose(first, lines[0]["d"], atol=1e-3)
-    jaw = jawusd.load(rig)
-    with np.load(EXAMPLE / "truth" / "truth.npz") as truth:
-        frames, relative = truth["frames"].tolist(), truth["T_upper_lower"]
-    capture_fps, errors = 24.0, []
-    for line in lines:
-        number = round(line["time_s"] * capture_fps)
-        if line["state"] == "solved" and number in frames:
-            tip = jaw.landmarks[0]
-            wanted = transform_point(relative[frames.index(number)], tip)
-            errors.append(np.linalg.norm(transform_point(jaw.pose(line["d"]), tip) - wanted))
-    assert not errors or np.median(errors) < 0.6
-    # a machine that has time for a few instants only leaves gaps in which the jaw is lost: then they are not counted
-    assert len(errors) > 0.3 * len(lines) or len(lines) < 60
 
 
 def test_teeth_are_found_again_after_frames_left_out(rig):
