@@ -50,6 +50,8 @@ class TrackingConfig:
     overlap_tolerance_mm: float = 0.4
     # Update below which iterations stop [mm at the crowns]: a tenth of the accuracy that can be reached.
     converged_mm: float = 0.004
+    # Update from which on the gates in between are left out [mm at the crowns]: they are for steps that go farther.
+    settled_mm: float = 0.0
     # Motion after which a scan is drawn again for hidden parts [px]: hidden parts are judged to one pixel.
     redraw_px: float = 1.0
     # Plausible distance of an arch from its prediction [mm]: a weak pull, for motions that masks leave free.
@@ -125,6 +127,13 @@ class TrackingConfig:
     settle_frames: int = 40
     settle_rounds: int = 6
     settled_share: float = 0.2
+
+    def gates_after(self, gates_px: tuple[float, ...], moved_mm: float) -> tuple[float, ...]:
+        """Return the gates to go on with after a step of so many mm with the first of them."""
+        rest = gates_px[1:]
+        if rest and gates_px[0] == rest[-1]:
+            return () if moved_mm < self.converged_mm else rest
+        return rest[-1:] if moved_mm < self.settled_mm else rest
 
     def gates_from(self, reach_px: float) -> tuple[float, ...]:
         """Return the gates to go through when the start is off by about reach_px, and no less than the usual."""

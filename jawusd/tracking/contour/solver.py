@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jawusd.geometry import bite_normal, orthonormalise, transform_point, transform_points
+from jawusd.geometry import bite_normal, orthonormalise, transform_point
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.config import Mapper, TrackingConfig
 from jawusd.tracking.contour.correspondences import accumulate, scatter_of_tiles, search_edges
@@ -27,6 +27,7 @@ from jawusd.tracking.contour.samples import HABITS, LENGTH, contour_samples
 from jawusd.tracking.contour.scan import ARCHES, Scan
 from jawusd.tracking.contour.views import Drawn, View, present_masks
 
+_CORNERS = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, 0, -1]])  # of a ball, that show its motion
 _DENSE_STEPS = 2  # with all faces of a dense scan, after the thinned one has settled
 
 # samples, how many of them are silhouette, their distances to the mask edge, visible contour length [px]
@@ -101,10 +102,10 @@ class ContourSolver:
         rendering = rendering or Rendering(self, views)
         pull = StartTerm(start, self._start_strength)
         all_terms: tuple[ResidualTerm, ...] = (SilhouetteTerm(), GingivalMarginTerm(), pull, *terms)
-        iterations = 0
-        for gate in gates_px:
+        iterations, left = 0, tuple(gates_px)
+        while left:
             iterations += 1
-            state = self.linearise(poses, views, use, gate, rendering)
+            state = self.linearise(poses, views, use, left[0], rendering)
             equations = NormalEquations(outline_weight)
             for term in all_terms:
                 term.accumulate(state, equations)
@@ -112,8 +113,7 @@ class ContourSolver:
             for r in ARCHES:
                 # Without orthonormalisation, rounding errors grow as predictions multiply poses frame after frame.
                 poses[r] = orthonormalise(motion_about(state.centres[r], step[r]) @ poses[r])
-            if gate == gates_px[-1] and self._motion_mm(step) < self.config.converged_mm:
-                break
+            left = self.config.gates_after(left, self._motion_mm(step))
         gate = gates_px[-1] if gates_px else self.config.final_gate_px[1]
         state = self.linearise(poses, views, use, gate, rendering, final=True)
         return replace(state, iterations=iterations)
@@ -252,8 +252,8 @@ class Rendering:
         if last is None:
             return True
         scan, matrix = self._solver.scans[r], self._views[c].matrix
-        corners = scan.centre + scan.radius_mm * np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, 0, -1]])
-        change = _pixels(matrix, transform_points(pose, corners)) - _pixels(matrix, transform_points(last, corners))
+        corners = scan.centre + scan.radius_mm * _CORNERS
+        change = _pixels(matrix @ pose, corners) - _pixels(matrix @ last, corners)
         return float(np.abs(change).max()) > self._solver.config.redraw_px
 
     def _draw(self, r: int, c: int, pose: Array) -> None:

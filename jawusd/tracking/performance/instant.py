@@ -64,17 +64,16 @@ class InstantSolver:
             rendering: of these views, if there is one.
         """
         rendering = rendering or Rendering(self.solver, views)
-        pose = start
-        for gate in gates_px:
-            state = self.linearise(pose, views, use, rendering, gate)
+        pose, left = start, tuple(gates_px)
+        while left:
+            state = self.linearise(pose, views, use, rendering, left[0])
             matrix, right = self.equations(pose, state, outline_weight)
             away = self.coordinates.step(expected.pose, pose)
             step = np.asarray(
                 np.linalg.solve(matrix + np.diag(expected.precision), right - expected.precision * away), np.float64
             )
             pose = self.coordinates.moved(pose, step)
-            if gate == gates_px[-1] and self._motion_mm(step) < self.config.converged_mm:
-                break
+            left = self.config.gates_after(left, self._motion_mm(step))
         state = self.linearise(pose, views, use, rendering, self.config.final_gate_px[1], final=True)
         return Aligned(pose, state)
 

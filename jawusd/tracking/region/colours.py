@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter1d
 
 from jawusd.geometry.arrays import Array, Mask
 
@@ -17,6 +18,9 @@ _BITS = 4  # per channel: finer bins stay empty
 BINS = 1 << (3 * _BITS)
 
 _BLUR = 0.7  # of histograms [bins]
+_REACH = 2  # of the blur [bins]
+# Share of a colour that the blur takes to each other one along an axis; what would leave the cube stays at its side.
+_SPREAD = gaussian_filter1d(np.eye(1 << _BITS), _BLUR, axis=0, mode="nearest", radius=_REACH)
 _LOCAL = 0.5  # share of a patch's own histogram
 _MOST = 3.0  # bound of the log ratios: no colour is certain
 _LIPS = 0.2  # share of skin and lips in what may lie outside of teeth anywhere
@@ -74,15 +78,9 @@ class CameraColours:
             rates: weight of new tooth and of new outside colours, 0 .. 1.
         """
         # Free edges and gum line of a patch are the same teeth.
-        both = tooth.reshape(2, PATCHES, KINDS, BINS).sum(2, keepdims=True)
-        tooth = np.broadcast_to(both, (2, PATCHES, KINDS, BINS)).reshape(2, TABLES, BINS)
-        for known, new, rate in ((self._local_tooth, tooth, rates[0]), (self._local_outside, outside, rates[1])):
-            total = new.sum(-1, keepdims=True)
-            fresh = _smooth(new / np.maximum(total, 1.0))
-            first = known.sum(-1, keepdims=True) == 0
-            share = np.where(first, 1.0, rate) * np.minimum(1.0, total / _ENOUGH)
-            known *= 1 - share
-            known += share * fresh
+        both = tooth.reshape(2, PATCHES, KINDS, BINS).sum(2)
+        _blend(self._local_tooth.reshape(-1, KINDS, BINS), both.reshape(-1, BINS), rates[0])
+        _blend(self._local_outside.reshape(-1, 1, BINS), outside.reshape(-1, BINS), rates[1])
         self._tooth = _blended(self._tooth, tooth.sum((0, 1)), rates[0])
         self._outside = _blended(self._outside, outside.sum((0, 1)), rates[1])
         self.ratio = self._ratio()
@@ -98,16 +96,45 @@ class CameraColours:
         return np.clip(np.log((tooth + _EMPTY) / (outside + _EMPTY)), -_MOST, _MOST).astype(np.float32)
 
 
+@numba.njit(nogil=True, cache=True)
+def _blend(known: Array, counts: Array, rate: float) -> None:
+    """Blend new counts (T, B), blurred, into histograms (T, K, B), all K alike, as much as there are counts."""
+    blurred = np.empty(BINS)
+    for t in range(len(known)):
+        total = counts[t].sum()
+        if total == 0.0:
+            continue
+        _blur(counts[t], blurred)
+        share = (rate if known[t].any() else 1.0) * min(1.0, total / _ENOUGH)
+        for k in range(known.shape[1]):
+            for b in range(BINS):
+                known[t, k, b] = (1 - share) * known[t, k, b] + share / total * blurred[b]
+
+
+@numba.njit(nogil=True, cache=True)
+def _blur(histogram: Array, out: Array) -> None:
+    """Blur a histogram (B,), most of which is empty, over neighbouring colours."""
+    out[:] = 0.0
+    side, reach = len(_SPREAD), _REACH
+    for b in range(len(histogram)):
+        if histogram[b] == 0.0:
+            continue
+        red, green, blue = b // (side * side), b // side % side, b % side
+        for i in range(max(red - reach, 0), min(red + reach + 1, side)):
+            for j in range(max(green - reach, 0), min(green + reach + 1, side)):
+                part = histogram[b] * _SPREAD[i, red] * _SPREAD[j, green]
+                for k in range(max(blue - reach, 0), min(blue + reach + 1, side)):
+                    out[(i * side + j) * side + k] += part * _SPREAD[k, blue]
+
+
 def _blended(known: Array, counts: Array, rate: float) -> Array:
     """Return a histogram (BINS,) with new counts blended in, if they are enough."""
     total = counts.sum()
     return known if total < 2 * _ENOUGH else (1 - rate) * known + rate * _smooth(counts / total)
 
 
-def _smooth(histograms: Array) -> Array:
-    """Blur histograms (..., BINS) over neighbouring colours."""
-    side = 1 << _BITS
-    cube = histograms.reshape(-1, side, side, side)
-    return np.asarray(gaussian_filter(cube, (0, _BLUR, _BLUR, _BLUR), mode="nearest", truncate=3)).reshape(
-        histograms.shape
-    )
+def _smooth(histogram: Array) -> Array:
+    """Blur a histogram (BINS,) over neighbouring colours."""
+    out = np.empty(BINS)
+    _blur(histogram, out)
+    return out

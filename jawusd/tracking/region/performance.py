@@ -31,7 +31,9 @@ from jawusd.tracking.region.rig_tracker import RigTracker
 Cuts = Callable[[Sequence[Camera], Array, range], Iterator[Cut]]
 Progress = Callable[[int, int], None]
 
-_FACES, _SAMPLE_STEP_PX, _REDRAW_PX = 20_000, 2.0, 2.0
+# Faces of the crowns until the last step, and there; distance of contour samples, motion that redraws scans [px], and
+# the step after which the gates in between are left out [mm].
+_ROUGH_FACES, _FACES, _SAMPLE_STEP_PX, _REDRAW_PX, _SETTLED_MM = 6_000, 20_000, 2.0, 2.0, 0.08
 # Frames that tell a fixed head and unknown focal lengths before all are solved, and how often focal lengths are.
 _FIRST_FRAMES, _FOCAL_ROUNDS = 120, 3
 # How borders of colours err over a take, and over which length alike [px] apart from that: teeth darken towards their
@@ -82,10 +84,19 @@ class PictureTake:
             shot: pictures and frames.
             config: the tracker's numbers.
         """
-        self._scans, self._axes, self._jaw, self._shot = [thinned(scan, _FACES) for scan in scans], axes, jaw, shot
+        self._axes, self._jaw, self._shot = axes, jaw, shot
+        self._scans = [thinned(scan, _FACES) for scan in scans]
         self.coordinates = Coordinates(jaw, self._scans)
-        config = replace(config or TrackingConfig(), sample_step_px=_SAMPLE_STEP_PX, redraw_px=_REDRAW_PX)
-        self._instants = InstantSolver(ContourSolver(self._scans, config), self.coordinates)
+        config = replace(
+            config or TrackingConfig(),
+            sample_step_px=_SAMPLE_STEP_PX,
+            redraw_px=_REDRAW_PX,
+            settled_mm=_SETTLED_MM,
+        )
+        self._instants, self._rough = (
+            InstantSolver(ContourSolver([thinned(scan, faces) for scan in scans], config), self.coordinates)
+            for faces in (_FACES, _ROUGH_FACES)
+        )
 
     def begun(self, frame: int, near: Pose) -> tuple[Pose, float]:
         """Return the pose on a frame near a guess, and how much of the contour in sight fits it, 0 .. 1.
@@ -141,7 +152,8 @@ class PictureTake:
 
     def _tracker(self, cameras: Sequence[Camera], head: float) -> RigTracker:
         colours = LearnedColours(self._scans, cameras, self._axes)
-        return RigTracker(self._instants, colours, head=head, free_focal=self._shot.free_focal)
+        free_focal = self._shot.free_focal
+        return RigTracker(self._rough, colours, head=head, free_focal=free_focal, whole=self._instants)
 
     def _first_cut(self, cameras: Sequence[Camera], frame: int, near: Pose) -> Cut:
         return next(iter(self._shot.cuts(cameras, self._centre(near), range(frame, frame + 1))))

@@ -29,6 +29,7 @@ from jawusd.tracking.region.starts import head_shifts, likeliest
 # Variance of the borders of colours times the length over which they err alike [px^3]: as for both arches alone.
 _BORDER_PX3 = 0.7**2 * CORRELATION_PX
 _FIRST_GATES_PX = (12.0, 8.0, 6.0, 4.0, 3.0, 2.5, 2.0)
+_LAST_GATES_PX = (2.0,)
 _TRIAL_GATES_PX = (8.0, 6.0)  # of the many poses that a search tries
 _STEADY_FRAMES = 1.5  # since the last step, up to which its motion tells where the teeth are
 _FIRST_ROUNDS = 3  # picks are a few tenths of a millimetre off; each round takes most of the rest
@@ -56,6 +57,7 @@ class RigTracker:
         head: float = 1.0,
         free_focal: bool = False,
         pace: Pace = THOROUGH,
+        whole: InstantSolver | None = None,
     ) -> None:
         """Take what aligns instants and where the colours are kept; `begin` comes first.
 
@@ -63,7 +65,9 @@ class RigTracker:
             head: how far the head moves, see `Prediction`.
             free_focal: tell how outlines grow with focal lengths.
             pace: how much work an instant is worth.
+            whole: aligns with more faces of the scans in the last step, if that is wanted.
         """
+        self._whole = whole
         self._instants, self._coordinates, self._colours = instants, instants.coordinates, colours
         self._head, self._free_focal, self._pace = head, free_focal, pace
         self._jaws = spread_out(instants.coordinates.jaw, _JAWS)
@@ -80,14 +84,15 @@ class RigTracker:
         sigma = MOST_UNSURE * np.r_[[min(1.0, self._head)] * 6, [1.0] * 3]
         for _ in range(_FIRST_ROUNDS):
             arches = self._coordinates.arches(pose)
-            look = _Look(self._instants, self._colours, cut(arches), arches)
-            found = look.align(pose, Expected(pose, sigma**-2.0), _FIRST_GATES_PX)
+            look = _Look(self._instants, self._colours, cut(arches), arches, self._whole)
+            rough = look.align(pose, Expected(pose, sigma**-2.0), _FIRST_GATES_PX)
+            found = look.polished(rough, Expected(pose, sigma**-2.0))
             pose = found.pose
             look.learn(pose, FIRST_RATES)
         self.expected = Expected(pose, sigma**-2.0)
         fit = look.fit(found, np.ones(2, bool), self._free_focal)
         self._motion = Prediction(self._coordinates, pose, fit.found, head=self._head)
-        self._first = _share(found.solution)
+        self._first = _share(rough.solution)
         self._usual.append(self._first)
         return fit
 
@@ -105,8 +110,8 @@ class RigTracker:
         if not look.use.any():
             self._motion.take(expected.pose, np.zeros(2, bool))
             return FrameFit(expected.pose, None, look.use, look.use, np.full(look.use.shape, np.nan))
-        found, look = self._best(expected, look, cut, frames)
-        share = _share(found.solution)
+        rough, look = self._best(expected, look, cut, frames)
+        share, found = _share(rough.solution), look.polished(rough, expected)
         unsure = (self._motion.blind > 0) | (frames > _UNSURE_FRAMES)
         least = np.where(unsure, _AGAIN, _LOST) * self._usual_share()
         trusted = (share >= least) & (matched_px(found.solution) >= self._least_px)
@@ -127,7 +132,7 @@ class RigTracker:
     def _look(self, cut: Cut, around: Array) -> _Look:
         """Return the pictures around both arches at poses (2, 4, 4)."""
         before = self._coordinates.arches(self._motion.last)
-        return _Look(self._instants, self._colours, cut(around), before)
+        return _Look(self._instants, self._colours, cut(around), before, self._whole)
 
     def _wide_look(self, found: Aligned, cut: Cut) -> _Look:
         """Return the pictures around all that the jaw reaches from a pose of the head."""
@@ -202,10 +207,16 @@ class _Look:
     """Hold the pictures of one instant, drawn into by all attempts."""
 
     def __init__(
-        self, instants: InstantSolver, colours: LearnedColours, pictures: Sequence[Picture | None], before: Array
+        self,
+        instants: InstantSolver,
+        colours: LearnedColours,
+        pictures: Sequence[Picture | None],
+        before: Array,
+        whole: InstantSolver | None,
     ) -> None:
-        self._instants, self._colours, self._pictures = instants, colours, pictures
+        self._instants, self._colours, self._pictures, self._whole = instants, colours, pictures, whole
         self.views = colours.views(pictures, before)
+        self._counting = colours.counting(self.views)
         self._rendering = Rendering(instants.solver, self.views)
         self.use = present_masks(self.views)
 
@@ -214,16 +225,25 @@ class _Look:
         weight = np.full(2, 1.0 / _BORDER_PX3)
         return self._instants.align(start, self.views, self.use, gates_px, expected, weight, self._rendering)
 
+    def polished(self, found: Aligned, expected: Expected) -> Aligned:
+        """Return the alignment with all faces there are; hidden parts are as before."""
+        if self._whole is None:
+            return found
+        weight = np.full(2, 1.0 / _BORDER_PX3)
+        views = self._counting
+        return self._whole.align(found.pose, views, self.use, _LAST_GATES_PX, expected, weight, self._rendering)
+
     def upper_crowns(self, pose: Pose) -> list[Mask]:
         """Return the pixels of each view that show upper crowns at a pose."""
         self._instants.linearise(pose, self.views, self.use, self._rendering, self._instants.config.final_gate_px[1])
         return [labels[0] == CROWN for labels in self._rendering.labels]
 
     def learn(self, pose: Pose, rates: tuple[float, float]) -> None:
-        """Take up the colours beside the borders found at a pose."""
-        counting, gate = self._colours.counting(self.views), self._instants.config.final_gate_px[1]
-        self._instants.linearise(pose, counting, self.use, self._rendering, gate)
-        self._colours.learn(counting, self._pictures, self._instants.coordinates.arches(pose), rates)
+        """Take up the colours beside the borders found at a pose, once."""
+        if self._whole is None:
+            gate = self._instants.config.final_gate_px[1]
+            self._instants.linearise(pose, self._counting, self.use, self._rendering, gate)
+        self._colours.learn(self._counting, self._pictures, self._instants.coordinates.arches(pose), rates)
 
     def fit(self, found: Aligned, trusted: Mask, free_focal: bool) -> FrameFit:
         """Return what is known of the frame, with the arches that are trusted, shape (2,)."""
@@ -232,8 +252,8 @@ class _Look:
         if not free_focal or not trusted.any():
             return FrameFit(found.pose, found.solution, use, use, unknown)
         matched: list[Matched] = []
-        gate = self._instants.config.final_gate_px[1]
-        solution = self._instants.linearise(found.pose, self.views, use, self._rendering, gate, True, matched)
+        gate, instants = self._instants.config.final_gate_px[1], self._whole or self._instants
+        solution = instants.linearise(found.pose, self.views, use, self._rendering, gate, True, matched)
         growth = growth_of(matched, solution.poses, solution.centres, self.views)
         return FrameFit(found.pose, solution, use, use, unknown, growth)
 
