@@ -24,7 +24,7 @@ from jawusd.tracking.region.pace import BRIEF
 from jawusd.tracking.region.picture import Cut
 from jawusd.tracking.region.rig_tracker import RigTracker
 
-_FACES, _SAMPLE_STEP_PX, _REDRAW_PX = 3_000, 3.0, 4.0
+_FACES, _SAMPLE_STEP_PX, _REDRAW_PX, _SETTLED_MM = 3_000, 3.0, 4.0, 0.2
 _WIDER = 1.5  # true over computed standard deviation, as where all frames are solved together
 
 
@@ -54,7 +54,9 @@ class LiveTake:
         self._scans, self._axes, self._cameras = [thinned(scan, _FACES) for scan in scans], axes, cameras
         self._head = STEADY if fixed_head else 1.0
         self.coordinates = Coordinates(jaw, self._scans)
-        config = replace(TrackingConfig(), sample_step_px=_SAMPLE_STEP_PX, redraw_px=_REDRAW_PX)
+        config = replace(
+            TrackingConfig(), sample_step_px=_SAMPLE_STEP_PX, redraw_px=_REDRAW_PX, settled_mm=_SETTLED_MM
+        )
         self._instants = InstantSolver(ContourSolver(self._scans, config, executor), self.coordinates)
         self._tracker: RigTracker | None = None
 

@@ -216,7 +216,6 @@ class _Look:
     ) -> None:
         self._instants, self._colours, self._pictures, self._whole = instants, colours, pictures, whole
         self.views = colours.views(pictures, before)
-        self._counting = colours.counting(self.views)
         self._rendering = Rendering(instants.solver, self.views)
         self.use = present_masks(self.views)
 
@@ -230,7 +229,7 @@ class _Look:
         if self._whole is None:
             return found
         weight = np.full(2, 1.0 / _BORDER_PX3)
-        views = self._counting
+        self._counting = views = self._colours.counting(self.views)
         return self._whole.align(found.pose, views, self.use, _LAST_GATES_PX, expected, weight, self._rendering)
 
     def upper_crowns(self, pose: Pose) -> list[Mask]:
@@ -241,7 +240,7 @@ class _Look:
     def learn(self, pose: Pose, rates: tuple[float, float]) -> None:
         """Take up the colours beside the borders found at a pose, once."""
         if self._whole is None:
-            gate = self._instants.config.final_gate_px[1]
+            self._counting, gate = self._colours.counting(self.views), self._instants.config.final_gate_px[1]
             self._instants.linearise(pose, self._counting, self.use, self._rendering, gate)
         self._colours.learn(self._counting, self._pictures, self._instants.coordinates.arches(pose), rates)
 
