@@ -54,9 +54,7 @@ class LiveTake:
         self._scans, self._axes, self._cameras = [thinned(scan, _FACES) for scan in scans], axes, cameras
         self._head = STEADY if fixed_head else 1.0
         self.coordinates = Coordinates(jaw, self._scans)
-        config = replace(
-            TrackingConfig(), sample_step_px=_SAMPLE_STEP_PX, redraw_px=_REDRAW_PX, settled_mm=_SETTLED_MM
-        )
+        config = replace(TrackingConfig(), sample_step_px=_SAMPLE_STEP_PX, redraw_px=_REDRAW_PX, settled_mm=_SETTLED_MM)
         self._instants = InstantSolver(ContourSolver(self._scans, config, executor), self.coordinates)
         self._tracker: RigTracker | None = None
 
