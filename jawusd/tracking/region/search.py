@@ -24,10 +24,9 @@ from jawusd.tracking.region.starts import head_shifts, likeliest, starts_everywh
 from jawusd.tracking.sequence.history import MotionPredictor
 
 # Gates of an alignment from the prediction, from farther, of the brief trial of a start, and with all faces at last;
-# distance of contour samples, motion that redraws scans [px], step after which gates in between are left out [mm].
+# distance of contour samples, motion that redraws scans [px].
 _NEAR_GATES_PX, _FAR_GATES_PX = (6.0, 4.0, 3.0, 2.5, 2.0), (12.0, 8.0, 6.0, 4.0, 3.0, 2.5, 2.0)
 _TRIAL_GATES_PX, _LAST_GATES_PX, _SAMPLE_STEP_PX, _REDRAW_PX = (8.0, 6.0), (2.0,), 2.0, 2.0
-_SETTLED_MM = 0.08
 _FACES = 6_000  # of the crowns until the last steps: with no more at all, incisal points were 0.02 mm worse
 # Variance of borders times the length over which they err alike, against which expected condyles are weighed [px^3]:
 # where the jaw is well seen, and in doubtful frames. With the greater one everywhere, the incisal points of two takes
@@ -64,7 +63,6 @@ class PoseSearch:
             config or TrackingConfig(),
             sample_step_px=_SAMPLE_STEP_PX,
             redraw_px=_REDRAW_PX,
-            settled_mm=_SETTLED_MM,
         )
         self.solver = ContourSolver([replace(scan, thin=None) for scan in scans], self.config, executor)
         self._thin = ContourSolver([thinned(scan, _FACES) for scan in scans], self.config, executor)
