@@ -46,11 +46,11 @@ class Commands(TyperGroup):
         super().__init__(**settings)  # type: ignore[arg-type]
         self.commands = _Loaded()  # type: ignore[assignment]
 
-    def list_commands(self, ctx: typer.Context) -> list[str]:  # type: ignore[override]
+    def list_commands(self, ctx: object) -> list[str]:
         """Return the names in the order of `jawusd --help`."""
         return list(SUMMARIES)
 
-    def format_commands(self, ctx: typer.Context, formatter: _Formatter) -> None:  # type: ignore[override]
+    def format_commands(self, ctx: object, formatter: _Formatter) -> None:
         """Write the list of commands with what each does."""
         with formatter.section("Commands"):
             formatter.write_dl([(name, SUMMARIES[name]) for name in SUMMARIES])

@@ -159,13 +159,17 @@ def _balls(points: Array, start: NDArray[np.int64]) -> Array:
     return np.column_stack([centres, np.maximum.reduceat(away, start[:-1])])
 
 
-def _flat(grid: DistanceGrid, samples: Samples) -> tuple[object, ...]:
+# what compiled functions take of a grid and of the samples of the other arch
+_Flat = tuple[NDArray[np.float32], Array, float, Array, NDArray[np.int64], Array, NDArray[np.int64], Array]
+
+
+def _flat(grid: DistanceGrid, samples: Samples) -> _Flat:
     parts = (samples.points, samples.start, samples.balls, samples.group_start, samples.groups)
     return (grid.values, grid.origin, 1.0 / grid.step_mm, *parts)
 
 
 @numba.njit(nogil=True, cache=True)
-def _look_up(values, origin, per_mm, x, y, z):  # type: ignore[no-untyped-def]  # compiled
+def _look_up(values: NDArray[np.float32], origin: Array, per_mm: float, x: float, y: float, z: float) -> float:
     """Return the distance at a point, linear between values; outside the grid at least FARTHEST_MM."""
     fx, fy, fz = (x - origin[0]) * per_mm, (y - origin[1]) * per_mm, (z - origin[2]) * per_mm
     nx, ny, nz = values.shape
@@ -184,13 +188,13 @@ def _look_up(values, origin, per_mm, x, y, z):  # type: ignore[no-untyped-def]  
 
 
 @numba.njit(nogil=True, cache=True)
-def _look_up_all(found, points, values, origin, per_mm):  # type: ignore[no-untyped-def]  # compiled
+def _look_up_all(found: Array, points: Array, values: NDArray[np.float32], origin: Array, per_mm: float) -> None:
     for i in range(len(points)):
         found[i] = _look_up(values, origin, per_mm, points[i, 0], points[i, 1], points[i, 2])
 
 
 @numba.njit(nogil=True, cache=True)
-def _away(M, point, values, origin, per_mm):  # type: ignore[no-untyped-def]  # compiled
+def _away(M: Array, point: Array, values: NDArray[np.float32], origin: Array, per_mm: float) -> float:
     """Return the distance at the image of a point under M."""
     x, y, z = point[0], point[1], point[2]
     return _look_up(
@@ -204,7 +208,19 @@ def _away(M, point, values, origin, per_mm):  # type: ignore[no-untyped-def]  # 
 
 
 @numba.njit(nogil=True, cache=True)
-def _deepen(depth, T, enough, values, origin, per_mm, points, start, balls, group_start, groups):  # type: ignore[no-untyped-def]  # compiled
+def _deepen(
+    depth: Array,
+    T: Array,
+    enough: float,
+    values: NDArray[np.float32],
+    origin: Array,
+    per_mm: float,
+    points: Array,
+    start: NDArray[np.int64],
+    balls: Array,
+    group_start: NDArray[np.int64],
+    groups: Array,
+) -> None:
     """Raise each depth to that of the deepest of the points under T[i], or to any that is more than enough."""
     last = 0
     for i in range(len(T)):

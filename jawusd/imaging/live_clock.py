@@ -1,4 +1,4 @@
-"""The clock that pictures which come by themselves are told by: that of the machine, unless a test drives another."""
+"""The clock of live pictures: that of the machine, unless a test puts another in its place."""
 
 from __future__ import annotations
 

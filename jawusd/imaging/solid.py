@@ -83,9 +83,9 @@ def distance_grid(corners: Array, outer: Mask, box: Array, step_mm: float, up: f
         step_mm: between values.
         up: see `outer_faces`.
     """
-    shape = tuple(int(n) for n in np.ceil((box[1] - box[0]) / step_mm) + 1)
+    nx, ny, nz = (int(n) for n in np.ceil((box[1] - box[0]) / step_mm) + 1)
     kept = np.ascontiguousarray(corners[outer])
-    nearest = _nearest_faces(kept, box[0], step_mm, shape, _BAND_CELLS)
+    nearest = _nearest_faces(kept, box[0], step_mm, (nx, ny, nz), _BAND_CELLS)
     where = distance_transform_edt(nearest < 0, return_distances=False, return_indices=True)
     nearest = _nearer_faces(kept, nearest[tuple(where)], box[0], step_mm)
     values = _distances(kept, nearest, box[0], step_mm)
@@ -131,7 +131,14 @@ def _crossing(corners: Array, f: int, x: float, z: float) -> tuple[int, float]:
 
 
 @numba.njit(nogil=True, cache=True)
-def _crossings(points, corners, low, shape, start, faces):  # type: ignore[no-untyped-def]  # compiled
+def _crossings(
+    points: Array,
+    corners: Array,
+    low: Array,
+    shape: tuple[int, int],
+    start: NDArray[np.int64],
+    faces: NDArray[np.int64],
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the winding count below each point, and the kind of the lowest crossing below it."""
     count = np.zeros(len(points), np.int64)
     first = np.zeros(len(points), np.int64)
@@ -153,7 +160,17 @@ def _crossings(points, corners, low, shape, start, faces):  # type: ignore[no-un
 
 
 @numba.njit(nogil=True, cache=True)
-def _set_signs(values, corners, origin, step, up, low, shape, start, faces):  # type: ignore[no-untyped-def]  # compiled
+def _set_signs(
+    values: NDArray[np.float32],
+    corners: Array,
+    origin: Array,
+    step: float,
+    up: float,
+    low: Array,
+    shape: tuple[int, int],
+    start: NDArray[np.int64],
+    faces: NDArray[np.int64],
+) -> None:
     heights, kinds = np.empty(_MOST_CROSSINGS), np.empty(_MOST_CROSSINGS, np.int64)
     nx, ny, nz = values.shape
     for i in range(nx):
@@ -208,7 +225,9 @@ def _squared_distance(corners: Array, f: int, x: float, y: float, z: float) -> f
 
 
 @numba.njit(nogil=True, cache=True)
-def _nearest_faces(corners, origin, step, shape, band):  # type: ignore[no-untyped-def]  # compiled
+def _nearest_faces(
+    corners: Array, origin: Array, step: float, shape: tuple[int, int, int], band: float
+) -> NDArray[np.int32]:
     """Return the number of the nearest triangle at the values near triangles, shape (nx, ny, nz); -1 elsewhere."""
     nearest = np.full(shape, -1, np.int32)
     # beyond the band, a triangle whose box reaches a value is not always the nearest one
@@ -231,7 +250,7 @@ def _nearest_faces(corners, origin, step, shape, band):  # type: ignore[no-untyp
 
 
 @numba.njit(nogil=True, cache=True)
-def _nearer_faces(corners, nearest, origin, step):  # type: ignore[no-untyped-def]  # compiled
+def _nearer_faces(corners: Array, nearest: NDArray[np.int32], origin: Array, step: float) -> NDArray[np.int32]:
     """Return, at every value, the nearest of its own triangle and those of its six neighbours."""
     found = nearest.copy()
     nx, ny, nz = nearest.shape
@@ -256,7 +275,7 @@ def _nearer_faces(corners, nearest, origin, step):  # type: ignore[no-untyped-de
 
 
 @numba.njit(nogil=True, cache=True)
-def _distances(corners, nearest, origin, step):  # type: ignore[no-untyped-def]  # compiled
+def _distances(corners: Array, nearest: NDArray[np.int32], origin: Array, step: float) -> NDArray[np.float32]:
     values = np.empty(nearest.shape, np.float32)
     nx, ny, nz = nearest.shape
     for i in range(nx):

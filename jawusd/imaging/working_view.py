@@ -30,13 +30,13 @@ def remap(image: NDArray[_Pixel], positions: NDArray[np.float32]) -> NDArray[_Pi
 def _needed(picture: DecodedPicture, positions: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Return a picture of which only what lies within the sides of positions (h, w, 2) [px] is converted.
 
-    The rest is not set: memory that nobody touches costs nothing.
+    The rest is black; memory that nobody touches costs nothing.
     """
     sides = np.concatenate([positions[0], positions[-1], positions[:, 0], positions[:, -1]])
     limit = np.array(picture.shape[1::-1])
     low = np.clip(np.floor(sides.min(0)), 0, limit - 1).astype(int)
     high = np.clip(np.floor(sides.max(0)) + 2, low + 1, limit).astype(int)
-    out = np.empty(picture.shape, np.uint8)
+    out = np.zeros(picture.shape, np.uint8)
     box = (slice(low[1], high[1]), slice(low[0], high[0]))
     out[box] = picture[box]
     return out

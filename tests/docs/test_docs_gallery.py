@@ -1,6 +1,5 @@
 """The pictures of the gallery: made by its program from the example, all shown on its page, and small."""
 
-import importlib.util
 import os
 import re
 
@@ -8,6 +7,7 @@ import av
 import numpy as np
 import pytest
 from foreign import environment
+from load_script import load_script
 from package_copy import ROOT
 from PIL import Image
 
@@ -20,10 +20,7 @@ MOST_BYTES = 2_000_000
 
 @pytest.fixture(scope="module")
 def gallery():
-    spec = importlib.util.spec_from_file_location("make_gallery", ROOT / "docs" / "make_gallery.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_script(ROOT / "docs" / "make_gallery.py")
 
 
 def pixels(path):

@@ -1,10 +1,10 @@
 """The notebooks run from top to bottom on the rig of the example, and print what is stored in them."""
 
-import importlib.util
 import json
 
 import pytest
 from doc_blocks import missing
+from load_script import load_script
 from package_copy import ROOT
 
 nbformat = pytest.importorskip("nbformat", reason="nbclient is not installed")
@@ -16,10 +16,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*:DeprecationWarning:jupyter_cl
 
 @pytest.fixture(scope="module")
 def program():
-    spec = importlib.util.spec_from_file_location("run_notebooks", ROOT / "docs" / "run_notebooks.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load_script(ROOT / "docs" / "run_notebooks.py")
 
 
 def marked(path):

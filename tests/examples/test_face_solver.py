@@ -1,18 +1,15 @@
 """The face-solver example runs; its full comparison takes minutes."""
 
-import importlib.util
 import sys
 
 import pytest
+from load_script import load_script
 from package_copy import ROOT
 
 
 @pytest.fixture
 def example(monkeypatch):
-    spec = importlib.util.spec_from_file_location("face_solver", ROOT / "examples" / "03_face_solver.py")
-    module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "face_solver", module)
-    spec.loader.exec_module(module)
+    module = load_script(ROOT / "examples" / "03_face_solver.py")
     monkeypatch.setattr(module, "STEP", 70)
     monkeypatch.setattr(module, "WEIGHTS", (0.1,))
     return module

@@ -10,67 +10,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from browser_tab import until
-from package_copy import ROOT
 from quiet_capture_page import QuietCapturePage
-from short_example import write_short
-from typer.testing import CliRunner
+from viewed_example import FIRST, STOP, copy_example, quiet, truth, write_true_tracks
 from viser._messages import FileTransferStartUpload
 
-from jawusd.cli.main import app
-from jawusd.errors import CaptureError, FormatError
 from jawusd.formats.capture import load_capture
 from jawusd.formats.performance import STATE_COLOURS, SolveState
 from jawusd.formats.solved import SolvedJaw
-from jawusd.formats.tracks import LOST, PARTIAL, TRACKED, LostReason, Tracks, load_tracks, save_tracks
+from jawusd.formats.tracks import load_tracks, save_tracks
 from jawusd.geometry import transform_point, transform_points
 from jawusd.pipeline.view_capture import viewed_capture
 from jawusd.viewer.server import CaptureViewer
 
-EXAMPLE = ROOT / "examples" / "capture"
-FIRST, STOP = 20, 50
-
-
-def quiet(stage, done, total):
-    """Swallow progress."""
-
-
-def truth():
-    with np.load(EXAMPLE / "truth" / "truth.npz") as archive:
-        return {name: archive[name] for name in archive.files}
-
-
-def write_true_tracks(path, cameras=("cam0", "cam1", "cam2")):
-    """Write tracks of the example's first frames that are the truth, one frame lost."""
-    known = truth()
-    rows = slice(*np.searchsorted(known["frames"], (FIRST, STOP)))
-    count = STOP - FIRST
-    poses = {name: known[name][rows].copy() for name in ("T_world_upper", "T_world_lower", "T_upper_lower")}
-    poses["T_world_lower"][7] = poses["T_upper_lower"][7] = np.nan
-    status = np.full((count, 2), TRACKED, np.int8)
-    status[7, 1], status[3] = LOST, PARTIAL
-    reason, value, limit = np.zeros((count, 2), np.uint8), np.full((count, 2), np.nan), np.full((count, 2), np.nan)
-    reason[7, 1], value[7, 1], limit[7, 1] = LostReason.LOW_SCORE, 0.31, 0.6
-    covariance = np.zeros((count, 6, 6))
-    save_tracks(path, Tracks(
-        frames=known["frames"][rows], **poses, **{f"raw_{name}": value for name, value in poses.items()}, status=status,
-        prior_aided=np.arange(count) == 3, coverage_error=np.full((count, 2, 3), 0.004),
-        masks_used=np.ones((count, 2, 3), bool), covariance_upper=covariance, covariance_lower=covariance,
-        covariance_relative=covariance, sigma_mm=np.zeros((count, 5)), residual_px=np.zeros((count, 2)),
-        matched_px=np.zeros((count, 2)), camera_names=cameras, lost_reason=reason, lost_value=value, lost_limit=limit,
-    ))  # fmt: skip
-    return path
-
 
 @pytest.fixture(scope="module")
 def copy(tmp_path_factory):
-    """Return a copy of the example that says its offsets, so that nothing has to be found."""
-    folder = shutil.copytree(EXAMPLE, tmp_path_factory.mktemp("viewed") / "capture")
-    known = truth()
-    offsets = ", ".join(f"{n} = {k}" for n, k in zip(known["camera_names"], known["offsets"], strict=True))
-    path = folder / "capture.toml"
-    text = path.read_text().replace('method = "flash"', f'method = "offsets"\noffsets = {{ {offsets} }}')
-    path.write_text(text)
-    return folder
+    return copy_example(tmp_path_factory.mktemp("viewed") / "capture")
 
 
 @pytest.fixture(scope="module")
@@ -359,43 +314,3 @@ def test_a_page_with_old_picks_does_not_overwrite_new_ones(viewed, copy, tmp_pat
     assert "changed by somebody else" in other.notices.pop()[1]
     assert len(tomllib.loads((folder / "capture.toml").read_text())["bootstrap"]["upper"]) == 3
     viewer.stop()
-
-
-def test_a_capture_without_calibration_still_shows_its_footage(copy, tmp_path):
-    folder = shutil.copytree(copy, tmp_path / "capture")
-    path = folder / "capture.toml"
-    path.write_text(path.read_text().replace('calibration = "calibration.toml"\n', ""))
-    seen = viewed_capture(folder, None, quiet)
-    assert seen.cameras == {} and seen.tracks is None and seen.frames == (20, 319)
-    viewer = CaptureViewer(seen, "127.0.0.1", 0)
-    opened = QuietCapturePage(viewer)
-    opened.settle()
-    assert "3-D" not in opened.page.footage.views.options and opened.notices == []
-    viewer.stop()
-
-
-def test_bad_captures_and_foreign_tracks_are_clear_errors(copy, tmp_path):
-    with pytest.raises(FormatError, match="no such file"):
-        viewed_capture(tmp_path / "capture.toml", None, quiet)
-    tracks = write_true_tracks(tmp_path / "tracks.npz", ("cam0", "cam1", "left"))
-    with pytest.raises(FormatError, match="of the cameras cam0, cam1, left; the capture has cam0, cam1, cam2"):
-        viewed_capture(copy, tracks, quiet)
-    folder = shutil.copytree(copy, tmp_path / "capture")
-    path = folder / "capture.toml"
-    text = path.read_text()
-    path.write_text(text.replace('video = "video/cam0.mp4"', 'video = "calibration.toml"'))
-    with pytest.raises(CaptureError):
-        viewed_capture(path, None, quiet)
-    result = CliRunner().invoke(app, ["view", str(tmp_path), "--tracks", str(tracks)])
-    assert result.exit_code == 2 and "--tracks belongs to a capture" in result.output
-
-
-def test_a_capture_of_masks_alone_is_shown(tmp_path):
-    shown = viewed_capture(write_short(tmp_path, 12), None, quiet)
-    assert shown.frames == (20, 31) and list(shown.sizes_px) == ["cam0", "cam1", "cam2"]
-    picture = shown.picture("cam0", 22, None, "outlines")
-    y, x = np.nonzero(picture[..., 0] > 100)
-    x0, y0, x1, y1 = shown.teeth_region("cam0", 22)
-    assert x.min() < x0 + 2 and x.max() > x1 - 2 and y.min() < y0 + 2 and y.max() > y1 - 2
-    assert (picture == picture[..., :1]).all()
-    assert shown.wall(22, None, "outlines").shape == (shown.wall_px[1], shown.wall_px[0], 3)
