@@ -1,8 +1,8 @@
-"""A whole take: the first frame, forwards, backwards, then backwards into every gap, and a refinement of it all."""
+"""A whole take: the first frame, passes over its frames, and a refinement of it all."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -16,29 +16,22 @@ from jawusd.geometry import Camera
 from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.frame_record import FrameRecord, whole_frames
-from jawusd.tracking.contour.scan import prepare_scan, probe_points, teeth_centre
+from jawusd.tracking.contour.scan import prepare_scan, teeth_centre
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import MaskViews, View, present_masks
-from jawusd.tracking.initialization.first_frame import first_record
 from jawusd.tracking.initialization.magnification import measure_magnification
 from jawusd.tracking.initialization.start import find_start
 from jawusd.tracking.sequence.camera_use import use_of_cameras
 from jawusd.tracking.sequence.closed_bite import observe_bite
 from jawusd.tracking.sequence.delays import bridge, delay_motions
 from jawusd.tracking.sequence.extrinsics import Extrinsics
-from jawusd.tracking.sequence.frame_tracker import FrameTracker
-from jawusd.tracking.sequence.history import History, MotionPredictor, SearchAllowance
 from jawusd.tracking.sequence.mirror_check import mirror_findings
-from jawusd.tracking.sequence.nuisance import DRAWN, DRAWN_BESIDE_CROWNS, Nuisances, TakeEquations
+from jawusd.tracking.sequence.nuisance import DRAWN, DRAWN_BESIDE_CROWNS, Hand, Nuisances, TakeEquations
+from jawusd.tracking.sequence.passes import Passes, Progress
 from jawusd.tracking.sequence.rest_frames import RestFrames, rest_frames
 from jawusd.tracking.sequence.results import assemble, outline_variance
 from jawusd.tracking.sequence.take_checks import lens_findings, motion_findings, search_findings, time_findings
 
-Progress = Callable[[int, int], None]
-
-# Most frames around a restart whose poses and quality the tracker takes over: without a limit, a long take with many
-# gaps would cost the square of its length.
-_NEARBY_FRAMES = 4000
 _SETTLED_REST = 6  # frames with the teeth together among those on which nuisances are settled
 # A moved camera would only hide these.
 _SHOWN_AS_MOTION = ("focal_length", "scan_size", "lens_distortion", "scans_mirrored")
@@ -85,6 +78,7 @@ def track_capture(
             take.begin(start.frame, start.poses)
             take.run(range(start.frame + 1, stop))
             take.run(range(start.frame - 1, first - 1, -1))
+            take.track_back_to(start.frame)
             take.close_gaps()
             point = np.mean([scan.centre for scan in scans], axis=0)
             named, up = capture.motion.rest_frame, start.T_anatomical_scan[1, :3]
@@ -120,53 +114,8 @@ def _trimmed(records: dict[int, FrameRecord]) -> dict[int, FrameRecord]:
     return {f: record for f, record in records.items() if min(masked) <= f <= max(masked)}
 
 
-class _Take:
-    """Run the tracker over the frames of a take and keep one record per frame."""
-
-    def __init__(
-        self,
-        solver: ContourSolver,
-        config: TrackingConfig,
-        masks: MaskViews,
-        first: int,
-        stop: int,
-        progress: Progress | None,
-    ) -> None:
-        self._solver, self._config, self._masks = solver, config, masks
-        self._first, self._stop = first, stop
-        self._progress = progress or (lambda done, total: None)
-        self._probes = probe_points(solver.scans)
-        self._hand = DRAWN if all(scan.shows_gum for scan in solver.scans) else DRAWN_BESIDE_CROWNS
-        self.records: dict[int, FrameRecord] = {}
-        self.searches = SearchAllowance(stop - first)
-
-    def begin(self, frame: int, poses: Array) -> None:
-        """Align the bootstrap frame from the pick poses."""
-        self.records[frame] = first_record(self._solver, self._config, poses, self._masks.at(frame), frame, True)
-        self._progress(1, self._stop - self._first)
-
-    def run(self, frames: range) -> None:
-        """Track away from the frame next to the first one given."""
-        if not len(frames):
-            return
-        tracker, motion = self._from(frames.start - frames.step)
-        for frame, views in self._masks.walk(frames.start, frames.stop, frames.step):
-            record = self._one(tracker, motion, frame, views)
-            self.records[frame] = record
-            self._progress(len(self.records), self._stop - self._first)
-
-    def close_gaps(self) -> None:
-        """Track backwards into every gap from the frame after it, and keep frames that lose fewer arches."""
-        for first, stop in _gaps(self.records):
-            if stop not in self.records:
-                continue
-            tracker, motion = self._from(stop)
-            for frame, views in self._masks.walk(stop - 1, first - 1, -1):
-                record = self._one(tracker, motion, frame, views)
-                lost, was_lost = record.status == LOST, self.records[frame].status == LOST
-                if (lost <= was_lost).all() and (lost != was_lost).any():
-                    status = np.where(was_lost & ~lost, RECOVERED, record.status).astype(np.int8)
-                    self.records[frame] = replace(record, status=status)
+class _Take(Passes):
+    """Track a take, estimate what is wrong with cameras and masks in all of it, and align its frames again."""
 
     def refine(self, rest: RestFrames, may_move: bool) -> tuple[Nuisances, Extrinsics]:
         """Estimate delays, habits and camera poses; where they matter, align all frames again with them corrected.
@@ -230,9 +179,12 @@ class _Take:
 
     def _equations(self, extrinsics: Extrinsics, rest: RestFrames) -> TakeEquations:
         variance = outline_variance(self.records, self._config)
-        equations = TakeEquations(self.records, variance, extrinsics, hand=self._hand)
+        equations = TakeEquations(self.records, variance, extrinsics, hand=self._hand())
         observe_bite(equations, self.records, rest, extrinsics, variance)
         return equations
+
+    def _hand(self) -> Hand:
+        return DRAWN if all(scan.shows_gum for scan in self._solver.scans) else DRAWN_BESIDE_CROWNS
 
     def _middle(self) -> Array:
         """Return a point amid the teeth, world coordinates [mm], shape (3,)."""
@@ -259,7 +211,7 @@ class _Take:
                 views = _corrected_views(views, self.records, frame, found, extrinsics)
                 solution = self._solver.solve(start, views, c.gates_from(0.0), used)
                 records[frame] = replace(records[frame], solution=solution)
-            equations = TakeEquations(records, variance, extrinsics, sample, self._hand)
+            equations = TakeEquations(records, variance, extrinsics, sample, self._hand())
             observe_bite(equations, records, sampled_rest, extrinsics, variance)
             more = equations.solve(c, cameras_moved)
             found = found.plus(more)
@@ -270,7 +222,7 @@ class _Take:
     def _realign(self, nuisances: Nuisances, extrinsics: Extrinsics) -> None:
         """Align every frame again from its poses, with all nuisances of the take corrected."""
         before = dict(self.records)
-        tracker, _ = self._from(self._first)
+        tracker, _ = self.beside(self._first)
         for frame, views in self._masks.walk(self._first, self._stop):
             views = _corrected_views(views, before, frame, nuisances, extrinsics)
             record = tracker.track(_starts_again(before, frame), views, None)
@@ -279,27 +231,6 @@ class _Take:
             status = np.where(found & doubted, RECOVERED, record.status).astype(np.int8)
             self.records[frame] = replace(record, status=status)
             tracker.history.add(record)
-
-    def _from(self, frame: int) -> tuple[FrameTracker, MotionPredictor]:
-        """Return a tracker and a predictor that start from the frames around a tracked one."""
-        history = History(self._config.history_frames, self._config.score_frames)
-        known = sorted(self.records, key=lambda f: -abs(f - frame))[-_NEARBY_FRAMES:]
-        for near in known[-self._config.history_frames :]:
-            history.add(self.records[near])
-        motion = MotionPredictor(self.records[frame].solution.poses, self._probes)
-        for near in known[::10]:
-            motion.remember(self.records[near].solution.poses, self.records[near].status != LOST)
-        return FrameTracker(self._solver, self._config, history), motion
-
-    def _one(self, tracker: FrameTracker, motion: MotionPredictor, frame: int, views: Sequence[View]) -> FrameRecord:
-        reach = self._config.gate_per_miss * motion.miss_mm() * self._config.working_px_per_mm
-        may_search = motion.search_is_due() and self.searches.allows(frame)
-        record = tracker.track(motion.starts(), views, motion.pose_history() if may_search else None, reach)
-        if tracker.searched:
-            self.searches.note(frame, bool((record.status != LOST).all()))
-        motion.update(record.solution.poses, np.asarray(record.status != LOST), np.asarray(record.used.any(1)))
-        tracker.history.add(record)
-        return record
 
 
 def _corrected_views(
@@ -325,15 +256,3 @@ def _starts_again(records: Mapping[int, FrameRecord], frame: int) -> list[Array]
         if across is not None:
             even[arch] = across[0]
     return [even, own] if len(lost) else [own]
-
-
-def _gaps(records: Mapping[int, FrameRecord]) -> Iterable[tuple[int, int]]:
-    """Yield runs of frames in which an arch is lost, as first frame and one past the last."""
-    lost = [frame for frame in sorted(records) if (records[frame].status == LOST).any()]
-    runs: list[list[int]] = []
-    for frame in lost:
-        if runs and runs[-1][1] == frame:
-            runs[-1][1] = frame + 1
-        else:
-            runs.append([frame, frame + 1])
-    return [(a, b) for a, b in runs]

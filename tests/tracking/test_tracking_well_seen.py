@@ -1,0 +1,78 @@
+"""First frames that were aligned wrongly are found by tracking back to them from frames that show the teeth well."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_take import FIRST, START, errors_mm, make_capture, track, write_masks
+
+from jawusd.formats.tracks import LOST
+from jawusd.tracking.contour.frame_record import FrameRecord
+from jawusd.tracking.sequence.passes import Passes
+from jawusd.tracking.sequence.well_seen import nearest_well_seen
+
+FRAMES = 10
+OFF_MM = 2.5  # farther than the gates, so that a contour near by is taken for the teeth's
+WRONG = range(FIRST + START - 1, FIRST + START + 2)
+
+
+@pytest.fixture(scope="module")
+def records(tmp_path_factory):
+    """Return the records of a take whose frames are all right, and its capture."""
+    capture = make_capture(write_masks(tmp_path_factory.mktemp("take"), FRAMES), FRAMES)
+    kept = {}
+
+    def keep(self, start):
+        kept.update(self.records)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Passes, "track_back_to", keep)
+        track(capture)
+    return kept, capture
+
+
+def lost(record: FrameRecord) -> FrameRecord:
+    """Return the record of a frame whose lower teeth are lost."""
+    return replace(record, status=np.array([record.status[0], LOST], np.int8))
+
+
+def test_the_nearest_frame_that_is_tracked_is_well_seen(records):
+    known, _ = records
+    start = FIRST + START
+    assert nearest_well_seen(known, start) == start
+    hidden = {frame: lost(record) if frame in WRONG else record for frame, record in known.items()}
+    assert nearest_well_seen(hidden, start) in (WRONG.start - 1, WRONG.stop)
+    assert nearest_well_seen({frame: lost(record) for frame, record in known.items()}, start) is None
+
+
+def test_wrong_first_frames_are_tracked_again_from_the_others(records, monkeypatch):
+    known, capture = records
+    track_back_to = Passes.track_back_to
+    seen = {}
+
+    def plant(self, start):
+        down = np.eye(4)
+        down[1, 3] = -OFF_MM
+        for frame in WRONG:
+            record, views = self.records[frame], self._masks.at(frame)
+            poses = record.solution.poses.copy()
+            poses[1] = down @ poses[1]
+            solution = self._solver.solve(poses, views, (0.1,), record.used)
+            self.records[frame] = replace(record, solution=solution)
+        seen["before"] = centres(self.records)
+        track_back_to(self, start)
+        seen["after"] = centres(self.records)
+
+    monkeypatch.setattr(Passes, "track_back_to", plant)
+    tracks = track(capture)
+    right = centres(known)
+    off_mm = {when: np.linalg.norm(found - right, axis=2).max() for when, found in seen.items()}
+    assert off_mm["before"] > 2.0, "the planted frames are wrong"
+    assert off_mm["after"] < 0.1
+    assert (tracks.status != LOST).all()
+    assert errors_mm(tracks).max() < 0.2
+
+
+def centres(records):
+    """Return the centres of both arches in all frames [mm], shape (n, 2, 3)."""
+    return np.array([records[frame].solution.centres for frame in sorted(records)])
