@@ -74,8 +74,10 @@ class CaptureTab(Tab):
     def view(self, name):
         """Look at a camera, or at all of them."""
         self.tab("Footage")
-        self.press(name)
-        until(lambda: self.page.footage.view == name)
+        self.settle()
+        wanted = self.page._wanted
+        self.press(name)  # also of the view shown, which moves the eye back
+        until(lambda: self.page._wanted > wanted and self.page.footage.view == name)
         self.settle()
         self.tab("Picks")
 
