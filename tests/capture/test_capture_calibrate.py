@@ -50,6 +50,7 @@ def test_distances_survive_whatever_order_the_corners_come_in(tmp_path, cols, ro
     assert any("disagree with the rest and were left out" in note for note in report.notes)
 
 
+@pytest.mark.slow
 def test_the_expected_error_is_what_repeated_calibrations_show(tmp_path):
     boards, errors, expected = board(), [], []
     for seed in range(6):
@@ -116,6 +117,7 @@ def picked(rng, noise_px=1.0):
     return scans, {"frame": 0, **picks}
 
 
+@pytest.mark.slow
 def test_a_wrong_square_size_is_told_by_the_teeth(tmp_path):
     rng = np.random.default_rng(4)
     scans, picks = picked(rng)
@@ -132,6 +134,7 @@ def test_a_wrong_square_size_is_told_by_the_teeth(tmp_path):
     assert unsure.scale.ratio is None and "scatter too much" in unsure.scale.reason
 
 
+@pytest.mark.slow
 def test_advice_names_what_was_done_badly(tmp_path):
     rng, boards = np.random.default_rng(5), board()
     capture = capture_of(CAMERAS, boards, tmp_path)

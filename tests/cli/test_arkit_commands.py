@@ -48,6 +48,7 @@ def test_animate_says_how_far_arkit_weights_were_clamped(actor, tmp_path):
     assert "30 frames lay outside" in run("animate", actor, "--arkit", csv, "-o", out, "--force")
 
 
+@pytest.mark.slow
 def test_arkit_fit_learns_the_actors_own_mapping(actor, tmp_path):
     """Weights that mean d by gains of this actor, 0.5 s apart; `animate --mapping` gives d back."""
     rig, phase = jawusd.load(actor), 2 * np.pi * np.arange(720) / 24

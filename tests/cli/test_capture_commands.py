@@ -109,6 +109,7 @@ def capture(tmp_path):
     return tmp_path, cameras
 
 
+@pytest.mark.slow
 def test_calibrate_writes_cameras_and_report(capture, tmp_path):
     folder, truth = capture
     result = run("calibrate", folder, "-o", tmp_path / "out.toml", "--report", tmp_path / "report.json", "--json")

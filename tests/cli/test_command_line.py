@@ -98,6 +98,7 @@ def test_a_log_holds_what_was_printed_and_where_an_error_arose(tmp_path):
     assert refused.returncode == errors.OutputError.exit_code and "the log cannot be written" in refused.stderr
 
 
+@pytest.mark.slow
 def test_ctrl_c_says_what_is_kept_and_how_to_go_on(tmp_path):
     capture = write_short(tmp_path / "capture", 40)
     words = [sys.executable, "-m", "jawusd", "build", str(capture), "-o", str(tmp_path / "out"), "--jobs", "1"]

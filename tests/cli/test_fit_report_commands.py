@@ -93,6 +93,7 @@ def test_rigid_bodies_that_cannot_be_read_are_refused(given):
     assert "named twice" in run("fit", given / "markers.asc", *whose, *twice, code=2)
 
 
+@pytest.mark.slow
 def test_scans_take_the_place_of_a_capture(given, tmp_path, poses):
     scans = ["--upper-teeth", SCANS / "upper_teeth.ply", "--lower-teeth", SCANS / "lower_teeth.ply"]
     scans += ["--mandible", SCANS / "mandible.ply"]
@@ -138,6 +139,7 @@ def test_report_draws_and_prints_the_experiments(given, tmp_path):
     assert "--force" in run(*command, code=10)
 
 
+@pytest.mark.slow
 def test_report_says_what_it_needs(given, tmp_path):
     assert "--experiments" in run("report", given / "poses.csv", code=2)
     assert "-o" in run("report", given / "poses.csv", "--experiments", code=2)

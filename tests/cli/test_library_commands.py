@@ -259,6 +259,7 @@ def test_landmarks_and_a_library_make_a_rig(people, tmp_path):
 SCANS = ROOT / "examples" / "capture" / "scans"
 
 
+@pytest.mark.slow
 def test_somebody_without_a_capture_gets_a_rig_on_loose_scans(people, tmp_path):
     files = {name: SCANS / f"{name}.ply" for name in ("upper_teeth", "lower_teeth", "mandible")}
     named = dict(zip(LANDMARKS, subject_of_scans(files, "me").landmarks.tolist(), strict=True))

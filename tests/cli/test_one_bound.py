@@ -251,6 +251,7 @@ def test_report_of_a_build():
     assert check.found == f"{100 * (MARGIN >= -TOLERANCE_MM).mean():.1f} %"
 
 
+@pytest.mark.slow
 def test_usd_rule(actor, tmp_path):
     write_animation(tmp_path / "anim.usda", actor, np.arange(COUNT), D, FPS)
     stage = Usd.Stage.Open(str(tmp_path / "anim.usda"))
@@ -258,6 +259,7 @@ def test_usd_rule(actor, tmp_path):
     assert finding.message.startswith(f"{(~INSIDE).sum()} of {COUNT} samples are outside")
 
 
+@pytest.mark.slow
 def test_plain_reader_and_add_on(actor, tmp_path, monkeypatch):
     """As shipped: the packed reader, and the panel of the Blender add-on with the evaluator it carries."""
     extension.copy_scripts(tmp_path / "scripts")

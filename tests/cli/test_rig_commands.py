@@ -67,6 +67,7 @@ def test_info_names_actor_ranges_and_meshes(actor):
     assert "someone" in text and "animation: 40 samples" in text
 
 
+@pytest.mark.slow
 def test_info_says_how_a_frame_was_tracked(tmp_path):
     tracks = make_tracks(4)
     tracks.status[1, 1], tracks.lost_reason[1, 1] = TrackStatus.LOST, LostReason.LOW_SCORE

@@ -112,6 +112,7 @@ def packed(shot):
     return shot.with_name("sh010.usdz")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("made", [lambda shot: shot, overridden, packed], ids=["shot", "overridden", "packed"])
 def test_every_command_takes_the_right_actor(shot, tmp_path, made):
     stage = made(shot)

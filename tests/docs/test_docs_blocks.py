@@ -76,6 +76,7 @@ def desk(example_build, tmp_path_factory):
     return folder, {**os.environ, "PATH": path, "PYTHONPATH": str(ROOT)}
 
 
+@pytest.mark.slow
 def test_console_blocks_print_what_they_say(desk, example_build):
     folder, env = desk
     built = "\n".join(build_lines(example_build[1])).replace(str(example_build[1]["folder"]), "out")

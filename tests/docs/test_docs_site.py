@@ -210,6 +210,7 @@ def chromium():
     yield from headless_chromium()
 
 
+@pytest.mark.slow
 def test_no_page_is_wider_than_a_phone(site, chromium):
     context = chromium.new_context(viewport={"width": 390, "height": 844}, color_scheme="dark", offline=True)
     page, wide = context.new_page(), []

@@ -67,6 +67,7 @@ def test_random_keys(rig, method, spread):
     assert np.mean([found.overshoot_mm > 0.05 for found in sets]) < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rig", [RIG, hollow_rig()], ids=["example", "hollow"])
 def test_one_pose_is_brought_where_it_would_stay(rig):
     """As a motion that stands still there, inside, and in small steps for small steps."""

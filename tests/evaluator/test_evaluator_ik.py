@@ -48,6 +48,7 @@ def test_never_worse_than_the_papers_search_and_always_valid(rig, handles):
     np.testing.assert_allclose(distance_mm, np.sqrt((left**2).sum(-1).mean(-1)), atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", sorted(RIGS))
 def test_a_far_throw_finds_the_better_side_of_a_ripple(kind, monkeypatch):
     """A bound that ripples with opening is full of valleys; the search from the start alone ends in wrong ones."""

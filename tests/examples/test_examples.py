@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 
+import pytest
 from foreign import environment
 from package_copy import ROOT
 from pxr import Usd
@@ -82,6 +83,7 @@ def test_05_blender(example_build, tmp_path):
     assert (tmp_path / "jaw.blend").stat().st_size > 100_000
 
 
+@pytest.mark.slow
 def test_06_import_csv(tmp_path):
     text = run(tmp_path, "06_import_csv.py")
     assert "300 poses" in text
@@ -89,6 +91,7 @@ def test_06_import_csv(tmp_path):
     assert jawusd.load(tmp_path / "rig_mocap" / "actor.usda").arrays["d_range"][0, 1] > 40
 
 
+@pytest.mark.slow
 def test_07_library_and_retarget(example_build, tmp_path):
     actor = example_build[0] / "actor.usda"
     text = run(tmp_path, "07_library_and_retarget.py", actor)

@@ -11,6 +11,7 @@ import sys
 import time
 
 import numpy as np
+import pytest
 from faults import digests, records, stages, unfinished
 from package_copy import ROOT
 
@@ -75,6 +76,7 @@ def test_killed_builds_end_as_one_that_was_left_alone(tmp_path):
     assert digests(out) == exact and records(out) == records(alone) and unfinished(out) == []
 
 
+@pytest.mark.slow
 def test_what_a_killed_build_left_is_cleared_and_nothing_else(tmp_path):
     out = tmp_path / "out"
     (out / "masks").mkdir(parents=True)
@@ -85,6 +87,7 @@ def test_what_a_killed_build_left_is_cleared_and_nothing_else(tmp_path):
     assert unfinished(out) == [] and (out / ".mine").exists() and (out / "masks" / ".jawusd-mine").exists()
 
 
+@pytest.mark.slow
 def test_a_record_that_was_changed_is_refused(tmp_path):
     out = tmp_path / "out"
     assert end(start(out)) == 0

@@ -114,6 +114,7 @@ def test_curve_goes_on_where_the_incisal_point_turns_back():
     np.testing.assert_allclose(moved.knots[early], moved.values[early, 5] - moved.values[0, 5], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_network_finds_a_curve_and_depends_only_on_its_seed():
     rng = np.random.default_rng(2)
     t = np.linspace(-1, 1, 200)
@@ -127,6 +128,7 @@ def test_network_finds_a_curve_and_depends_only_on_its_seed():
     assert not np.array_equal(network.layers[0], other.layers[0])
 
 
+@pytest.mark.slow
 def test_network_components_come_in_order_of_what_they_explain():
     rng = np.random.default_rng(3)
     codes = rng.normal(size=(300, 3)) * [5, 3, 2]

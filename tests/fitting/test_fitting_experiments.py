@@ -132,6 +132,7 @@ def test_paths_are_measured_against_the_captured_condyles():
     assert len(down_from.values_mm) == len(up_from.values_mm) == 100
 
 
+@pytest.mark.slow
 def test_every_model_and_component_count_is_in_the_table(found):
     table = found.table()
     assert all(tuple(row) == TABLE_COLUMNS for row in table)
@@ -198,6 +199,7 @@ def test_opening_alone_leaves_the_papers_model_out_and_says_so(quick, person, an
     assert any("laterotrusion" in sentence for sentence in found.coverage.sentences)
 
 
+@pytest.mark.slow
 def test_gross_outliers_are_counted_but_do_not_spoil_the_rest(quick, poses, anatomy):
     rng = np.random.default_rng(5)
     struck = rng.choice(FRAMES, 6, replace=False)
@@ -212,6 +214,7 @@ def test_gross_outliers_are_counted_but_do_not_spoil_the_rest(quick, poses, anat
     assert max(path.opening_mm.max() for path in found.condyle_paths if path.model == "anchored") < 60
 
 
+@pytest.mark.slow
 def test_frames_a_prior_helped_with_are_never_used(quick, poses, anatomy):
     nan = np.full((FRAMES, 4, 4), np.nan)
     aided = np.zeros(FRAMES, dtype=bool)

@@ -139,6 +139,7 @@ def test_single_sliders_stay_anatomical(person, rig):
         assert person.is_valid(rig.pose(d)).all()
 
 
+@pytest.mark.slow
 def test_fit_is_deterministic(person, take, model):
     again = fit(person, take, FittingConfig())
     assert again.meta == model.meta

@@ -63,6 +63,7 @@ def test_pure_opening_and_few_poses_are_left_alone(person, anatomy, poses):
     assert not gross_outliers(select(knocked(poses[::10], 3, 0.5, 40.0)[0], anatomy).data).any()
 
 
+@pytest.mark.slow
 def test_bounds_do_not_reach_out_to_failures(person, poses):
     bad, rows = knocked(poses, 12, 0.5, 40.0)
     ranges = []

@@ -53,12 +53,14 @@ def test_clearance_is_what_is_left_under_the_skull():
     assert joints.clearances(lifted(-30.0)) == pytest.approx(1.5)
 
 
+@pytest.mark.slow
 def test_what_the_closed_bite_overlaps_is_allowed():
     joints = find_joints(skull(-0.6), mandible(), LANDMARKS, np.eye(4), np.eye(4))
     assert joints.closed_mm == pytest.approx(0.6, abs=0.04)
     np.testing.assert_allclose(joints.clearances(lifted(0.0, 0.5, -0.5)), [0.0, -0.5, 0.5], atol=0.04)
 
 
+@pytest.mark.slow
 def test_one_side_is_enough_and_frames_do_not_matter():
     tilt = np.eye(4)
     tilt[:2, :2] = [[np.cos(0.02), -np.sin(0.02)], [np.sin(0.02), np.cos(0.02)]]  # left side up: 1 mm at 50 mm
@@ -88,6 +90,7 @@ def test_bones_that_show_no_joint_are_told(bones, words):
         find_joints(*bones(), LANDMARKS, np.eye(4), np.eye(4))
 
 
+@pytest.mark.slow
 def test_condyles_of_a_synthetic_person_slide_along_their_sockets():
     person = Person(1)
     anatomy = build_anatomy(person)

@@ -47,6 +47,7 @@ def distance_mm(matrices, rig, d):
     return np.linalg.norm(moved(np.array(matrices), points) - moved(rig.pose(d), points), axis=-1).max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("blender", BLENDERS)
 def test_takes_play_as_the_evaluator_says(tmp_path, archive, actor, blender):
     """Imported at 59.94 per second, and keyed, in any order of frames, and after saving on any frame."""
@@ -73,6 +74,7 @@ def test_takes_play_as_the_evaluator_says(tmp_path, archive, actor, blender):
     assert found["scene"] == [pytest.approx(60000 / 1001, rel=1e-6), "MILLIMETERS"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("blender", BLENDERS)
 def test_sliders_bound_handle_export_nodes_and_two_actors(tmp_path, archive, actor, blender):
     rig, folder = actor

@@ -14,6 +14,7 @@ from jawusd.rig.sampling import sample_valid
 MESHES = {"MandibleMesh": "mandible", "LowerTeethMesh": "lower_teeth"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("blender", ["blender45", "blender50"])
 @pytest.mark.parametrize("kind", ["anchored", "additive", "touching"])
 @pytest.mark.parametrize("file", ["anim_capture.usdc", "actor.usdz"])

@@ -132,6 +132,7 @@ def test_a_second_build_needs_a_word_and_resume_reuses_everything(built):
     assert again["reused"] == ["check", "sync", "track", "fit", "aid", "bake", "report"]
 
 
+@pytest.mark.slow
 def test_resume_redoes_only_what_depends_on_a_change(built, tmp_path):
     out = tmp_path / "copy"
     shutil.copytree(built[0], out)
@@ -268,6 +269,7 @@ def test_an_output_folder_with_other_files_is_left_alone(tmp_path):
     assert os.listdir(tmp_path) == ["mine.txt"]
 
 
+@pytest.mark.slow
 def test_the_program_reports_a_broken_capture_without_a_traceback(capture, tmp_path):
     calibration_without_rotation(capture)
     command = [sys.executable, "-m", "jawusd", "build", str(capture), "-o", str(tmp_path / "out")]

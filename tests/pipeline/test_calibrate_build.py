@@ -82,6 +82,7 @@ def test_lengths_in_the_mouth_are_those_of_the_true_cameras(calibrated):
     assert np.abs(error).mean() < 0.03
 
 
+@pytest.mark.slow
 def test_a_resumed_build_keeps_the_calibration_until_the_boards_change(capture, calibrated, tmp_path):
     out = tmp_path / "actor"
     shutil.copytree(calibrated[0], out)
@@ -97,6 +98,7 @@ def test_a_resumed_build_keeps_the_calibration_until_the_boards_change(capture, 
         build(changed, out, BuildOptions(resume=True), stop_at("calibrate", []))
 
 
+@pytest.mark.slow
 def test_a_fresh_build_deletes_the_masks_an_earlier_one_made(capture, tmp_path):
     made = tmp_path / "actor" / "masks" / "cam0" / "upper" / "000031.png"
     made.parent.mkdir(parents=True)
@@ -171,6 +173,7 @@ def test_without_picks_masks_tell_the_size_of_the_squares(capture, corners_found
         calibrate_boards(*unpicked(capture, tmp_path, square_mm=9.0), lambda *told: None)
 
 
+@pytest.mark.slow
 def test_without_picks_and_masks_the_size_is_said_to_be_unknown(capture, corners_found_once, tmp_path, monkeypatch):
     monkeypatch.setattr("jawusd.capture.calibrate.find_boards", lambda *arguments: corners_found_once)
     opened, out = unpicked(capture, tmp_path, square_mm=9.0)

@@ -176,6 +176,7 @@ SAID = {
 
 
 # Together those that do not hide one another: every check of a capture takes seconds.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "plants",
     [
@@ -217,6 +218,7 @@ def test_pipes_that_nobody_writes_to_are_named_and_not_waited_for(capture, names
         assert any(name in line and "is not a file" in line for line in lines), (name, lines)
 
 
+@pytest.mark.slow
 def test_the_reference_camera_may_lack_the_last_masks(capture):
     described(capture, 'video = "video/cam0.mp4"\n', "")
     for arch in ("upper", "lower"):
@@ -263,6 +265,7 @@ def test_every_wrong_key_is_listed(capture):
     assert any("fsp" in line for line in lines) and any("colums" in line for line in lines)
 
 
+@pytest.mark.slow
 def test_missing_packages_are_named(monkeypatch):
     monkeypatch.setattr(checks, "find_spec", lambda name: None if name in ("torch", "jinja2") else True)
     lines = [f.line() for f in found(EXAMPLE)]
@@ -281,6 +284,7 @@ def test_a_check_that_stumbles_is_a_finding_and_the_others_go_on(capture, monkey
     assert {"check_failed", "rest_frame", "not_checked"} <= {f.kind for f in got}
 
 
+@pytest.mark.slow
 def test_build_refuses_with_all_errors_before_any_work(capture, tmp_path):
     scan_in_metres(capture)
     pick_frame_outside(capture)
@@ -289,6 +293,7 @@ def test_build_refuses_with_all_errors_before_any_work(capture, tmp_path):
     assert not (tmp_path / "out" / "build.json").exists()
 
 
+@pytest.mark.slow
 def test_the_program_prints_findings_and_leaves_with_5(capture):
     scan_in_metres(capture)
     command = [sys.executable, "-m", "jawusd", "check", str(capture)]

@@ -216,6 +216,7 @@ def test_the_command_tells_lines_and_osc(rig):
     np.testing.assert_allclose(first, lines[0]["d"], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_teeth_are_found_again_after_frames_left_out(rig):
     """A quarter of a second is missing time and again; poses that are said to be found are never far off."""
     capture = open_capture(EXAMPLE)

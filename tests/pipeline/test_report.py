@@ -69,6 +69,7 @@ def test_a_report_written_again_tells_of_the_build_as_it_was_made(built):
     assert BuildState(built).stages["report"].result["origin"] == made
 
 
+@pytest.mark.slow
 def test_a_placeholder_is_not_shown_as_a_mandible(built):
     report_build(built, None, quiet)
     assert "placeholder is no anatomy" not in (built / "report.html").read_text()
@@ -78,6 +79,7 @@ def test_a_placeholder_is_not_shown_as_a_mandible(built):
     assert "the rig&#39;s placeholder is no anatomy" in (built / "report.html").read_text()
 
 
+@pytest.mark.slow
 def test_the_experiments_of_a_build_go_into_its_report(built):
     """With the paper's networks, which a build leaves out."""
     tracks = load_tracks(built / "tracks.npz")

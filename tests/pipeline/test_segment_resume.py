@@ -51,6 +51,7 @@ def contents(folder):
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("torn", [False, True])
 def test_work_taken_up_gives_the_masks_of_work_never_stopped(take, undisturbed, tmp_path, torn):
     whole, entries, done = undisturbed
@@ -66,6 +67,7 @@ def test_work_taken_up_gives_the_masks_of_work_never_stopped(take, undisturbed, 
     assert contents(tmp_path) == contents(whole)
 
 
+@pytest.mark.slow
 def test_finished_masks_teach_and_are_written_as_they_were_drawn(take, undisturbed, tmp_path):
     capture, offsets = take
     own = capture.frames[0] + 2 - offsets["cam0"]

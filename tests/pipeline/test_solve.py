@@ -58,6 +58,7 @@ def test_the_command_writes_a_table_and_a_summary(rig, shot, tmp_path):
     assert "--force" in run("solve", rig, shot, "-o", tmp_path / "take.csv", code=10)
 
 
+@pytest.mark.slow
 def test_tracks_and_animation_hold_the_same_jaw(rig, shot, tmp_path):
     jaw = jawusd.load(rig)
     found = solve(rig, shot, tmp_path / "take.npz")
@@ -79,6 +80,7 @@ def bare(first, last, cameras=None, picks=True):
     return capture.model_copy(update=update)
 
 
+@pytest.mark.slow
 def test_shots_without_masks_are_solved_from_their_videos(rig, tmp_path):
     found = solve(rig, bare(-2, 4), tmp_path / "take.csv")
     assert (found.state == SolveState.SOLVED).all() and found.notes["start"]["by"] == "picks"
@@ -96,6 +98,7 @@ def test_teeth_are_found_in_the_pictures_of_one_camera_without_picks(rig):
     assert errors.mean() < 1.0 and errors.max() < 4 * found.sigma_d.max()
 
 
+@pytest.mark.slow
 def test_unknown_focal_lengths_are_found_in_pictures(rig, monkeypatch):
     """The calibration says 6 per cent too much."""
     shot = bare(-2, 10)
@@ -110,12 +113,14 @@ def test_unknown_focal_lengths_are_found_in_pictures(rig, monkeypatch):
     assert tip_errors_mm(jawusd.load(rig), found.frames, found.d).mean() < 0.6
 
 
+@pytest.mark.slow
 def test_a_worn_camera_has_one_head(rig):
     """The example's head hardly moves in half a second, as before a worn camera."""
     found = solve(rig, bare(0, 12), fixed_head=True)
     np.testing.assert_allclose(found.T_world_upper, np.broadcast_to(found.T_world_upper[0], (12, 4, 4)), atol=1e-4)
 
 
+@pytest.mark.slow
 def test_pictures_that_do_not_show_this_person_are_refused(rig):
     """The picked pixels of both arches are exchanged: nothing fits there."""
     shot = bare(-1, 2)
@@ -128,6 +133,7 @@ def test_pictures_that_do_not_show_this_person_are_refused(rig):
         solve(rig, shot.model_copy(update={"bootstrap": moved}))
 
 
+@pytest.mark.slow
 def test_frames_that_were_not_seen_are_named(rig, shot, tmp_path):
     capture = open_capture(shot)
     found = solve(rig, capture, None)
@@ -139,6 +145,7 @@ def test_frames_that_were_not_seen_are_named(rig, shot, tmp_path):
     assert solve_summary(found)["carried"] == [(frame, frame)]
 
 
+@pytest.mark.slow
 def test_one_of_several_rigs_is_solved(rig, shot, tmp_path):
     stage = tmp_path / "two.usda"
     references = "".join(f'    def "{name}" (references = @{rig}@) {{}}\n' for name in "ab")
@@ -179,6 +186,7 @@ def test_a_shot_without_masks_and_videos_is_refused(rig, shot, tmp_path):
         solve(rig, capture.model_copy(update={"cameras": none}), tmp_path / "take.csv")
 
 
+@pytest.mark.slow
 def test_a_performance_is_drawn_and_reported(rig, shot, tmp_path):
     """Cameras of the shot have masks alone: these are drawn over."""
     summary = json.loads(

@@ -52,6 +52,7 @@ def test_a_bare_folder_becomes_a_capture_but_for_the_squares(folder):
     assert [problem.message for problem in problems] == ["[boards] square_mm is missing."]
 
 
+@pytest.mark.slow
 def test_a_charuco_board_is_told_by_its_markers_and_the_rest_asked_for(folder):
     about = board("charuco", cols=7, rows=5, square_mm=9, dictionary="DICT_5X5_50", marker_mm=6.5)
     texture, to_texture = charuco(about)
@@ -67,6 +68,7 @@ def test_a_charuco_board_is_told_by_its_markers_and_the_rest_asked_for(folder):
     assert 'dictionary = "DICT_5X5_50"' in text and "FILL IN: cols" in text
 
 
+@pytest.mark.slow
 def test_with_the_squares_it_can_be_read(folder):
     start = start_capture(folder, 8.0, None, quiet)
     assert start.missing == [] and start.notes == []
@@ -92,12 +94,14 @@ def test_what_is_missing_is_said(tmp_path):
     assert text.count("# FILL IN:") == 3 and 'video = "front.mp4"' in text
 
 
+@pytest.mark.slow
 def test_scans_of_two_people_are_not_guessed(folder):
     (folder / "bob_upper.stl").touch()
     start = start_capture(folder, 8.0, None, quiet)
     assert len(start.missing) == 1 and "bob_upper.stl, upper.stl may all be it" in start.missing[0]
 
 
+@pytest.mark.slow
 def test_a_calibration_gives_the_cameras_their_names(folder):
     from jawusd.formats.calibration import save_calibration
 
@@ -112,6 +116,7 @@ def test_a_calibration_gives_the_cameras_their_names(folder):
     assert len(start.missing) == 1 and "the calibration has A, B" in start.missing[0]
 
 
+@pytest.mark.slow
 def test_the_command_refuses_to_overwrite_and_says_what_is_missing_by_its_exit_code(folder):
     run = CliRunner()
     assert run.invoke(app, ["init", str(folder), "--square-mm", "8"]).exit_code == 0

@@ -100,6 +100,7 @@ def test_a_registration_taken_from_the_take_moves_lower_scan_and_teeth_but_no_co
     assert registered_subject(subject, {}) is subject
 
 
+@pytest.mark.slow
 def test_the_rig_holds_the_lower_scan_where_the_take_shows_it(tmp_path):
     usd = pytest.importorskip("pxr.Usd")
     subject = subject_of_scans(SCANS, "someone")

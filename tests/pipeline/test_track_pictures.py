@@ -73,6 +73,7 @@ def turned(camera):
     return replace(camera, T_cam_world=se3_exp(np.deg2rad([0.6, 0.4, 0, 0, 0, 0])) @ camera.T_cam_world)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("spoil", "size", "kind", "camera"),
     [
@@ -97,12 +98,14 @@ def test_wrong_cameras_and_scans_are_named(offsets, monkeypatch, spoil, size, ki
     assert (kind, camera) in {(one["kind"], one.get("camera")) for one in found}
 
 
+@pytest.mark.slow
 def test_without_picks_the_teeth_are_searched(offsets, truth):
     capture = unmasked((48, 52), bootstrap=None)
     tracks = first_pass(capture, offsets, 1, no_progress)
     assert tracks.meta["start"]["by"] == "search" and off_mm(tracks, truth).mean() < 0.3
 
 
+@pytest.mark.slow
 def test_mirrored_scans_are_named(offsets):
     hand = np.array([-1.0, 1.0, 1.0])
     meshes = {

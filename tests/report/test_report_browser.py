@@ -127,6 +127,7 @@ def test_the_replay_shows_the_frame_that_is_asked_for(opened):
     assert part(page, "frame").inner_text().startswith(f"frame {data.overlays[0].frame},")
 
 
+@pytest.mark.slow
 def test_it_plays_turns_and_is_readable(opened):
     page, _, scheme = opened
     before = part(page, "frame").inner_text()

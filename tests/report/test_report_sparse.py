@@ -57,6 +57,7 @@ def test_error_tables_of_nothing_show_dashes():
     assert text.count('<td class="number">\u2013</td>') == 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["reconstruction", "synthesis"])
 def test_experiments_that_found_no_poses(name):
     found = experiments()

@@ -115,6 +115,7 @@ def test_table_in_the_file_agrees_with_the_model(folder, kind):
     assert prim.GetAttribute("jaw:decoder:errorSamples").Get() > 10_000
 
 
+@pytest.mark.slow
 def test_finer_tables_are_better(kind):
     rig = example_rig(kind)
     errors = [build_table(rig, mandible_vertices(), size).max_error_mm for size in SIZES]
@@ -239,6 +240,7 @@ def test_rig_without_skull_and_mandible_meshes(tmp_path, kind):
             assert_valid_usd(path)
 
 
+@pytest.mark.slow
 def test_baking_again_replaces_what_an_open_stage_shows(tmp_path):
     rig, meshes = example_rig(), example_meshes()
     bake_rig(tmp_path, rig, meshes, name="first", fps=FPS)
@@ -249,6 +251,7 @@ def test_baking_again_replaces_what_an_open_stage_shows(tmp_path):
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
 
 
+@pytest.mark.slow
 def test_baking_twice_gives_the_same_bytes(tmp_path):
     frames, d = example_motion()
     for name in ("a", "b"):

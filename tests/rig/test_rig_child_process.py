@@ -86,6 +86,7 @@ def test_stages_that_take_for_ever_are_one_message(bomb, forks, monkeypatch):
         open_stage(bomb)
 
 
+@pytest.mark.slow
 def test_stages_that_take_all_memory_are_one_message(bomb, forks, no_reader, monkeypatch):
     monkeypatch.setattr(child_limits, "MOST_MEMORY", 150 << 20)
     with pytest.raises(RigError, match="GB to be read|ends OpenUSD"):
@@ -139,6 +140,7 @@ def test_no_copy_is_made_while_another_thread_works(monkeypatch):
         assert child_process._can_fork() is allowed
 
 
+@pytest.mark.slow
 def test_programs_of_several_threads_start_a_second_python(anchored_folder, bomb, children, monkeypatch):
     def opened():
         load_rig(anchored_folder / "actor.usda")
@@ -224,6 +226,7 @@ def test_allowed_folders_are_read_without_a_child(anchored_folder, children, mon
     assert children == []
 
 
+@pytest.mark.slow
 def test_new_processes_know_the_folders_that_were_allowed(anchored_folder, tmp_path, monkeypatch):
     """What the child refuses, it does not read."""
     (tmp_path / "elsewhere").mkdir()

@@ -113,6 +113,7 @@ def test_jawusd_reads_the_skeleton(anchored_folder, tmp_path, path):
     np.testing.assert_allclose(found.d, D, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_edited_bones_are_read_and_baked_to_transforms(anchored_folder, tmp_path):
     rig, wanted = example_rig(), np.array([6.0, -1.0, 0.5])
 

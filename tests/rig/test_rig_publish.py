@@ -45,6 +45,7 @@ def test_every_file_has_its_own_name_and_is_valid(published):
             assert load_rig(published / name / file).kind == KINDS[name]
 
 
+@pytest.mark.slow
 def test_actors_packed_together_keep_their_data(published, tmp_path):
     stage = Usd.Stage.CreateNew(str(tmp_path / "shot.usda"))
     frames, d = example_motion(8)

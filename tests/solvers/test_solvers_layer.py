@@ -76,6 +76,7 @@ def test_gradcheck_of_poses_and_margins(pair):
     assert torch.autograd.gradgradcheck(layer.margin, d[:3].detach().requires_grad_(), eps=1e-6, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_gradcheck_of_encoding_and_loss_far_off_the_model(pair):
     """Poses several millimetres off the model, where leaving out second derivatives would show."""
     rig, layer = pair

@@ -79,6 +79,7 @@ def test_nested_batches_under_vmap(pair):
     torch.testing.assert_close(torch.func.vmap(torch.func.vmap(layer.loss))(T), layer.loss(T))
 
 
+@pytest.mark.slow
 def test_project_is_the_evaluators(pair):
     """As near as the plain rig finds, never outside; the same point, but where two are as near."""
     rig, layer = pair
@@ -162,6 +163,7 @@ def test_another_type_of_number_is_one_clear_error(pair, name):
     torch.testing.assert_close(found.double(), call(layer, name)(arguments(rig, name)), rtol=1e-3, atol=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["forward", "margin", "penalty", "unconstrained"])
 def test_compiles_as_one_graph_for_any_batch(pair, name):
     rig, layer = pair
@@ -176,6 +178,7 @@ def test_compiles_as_one_graph_for_any_batch(pair, name):
         torch.testing.assert_close(slope, expected, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "atol"), [("forward", 1e-12), ("inside", 1e-9), ("project", 0.05), ("loss", 1e-6)])
 def test_exports_with_a_dynamic_batch(name, atol):
     """Searches make a fixed number of steps in a captured graph: enough for poses and parameters a jaw comes near."""
@@ -187,6 +190,7 @@ def test_exports_with_a_dynamic_batch(name, atol):
         torch.testing.assert_close(program.module()(x), call(layer, name)(x), rtol=0, atol=atol)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")  # inside torch's exporter
 @pytest.mark.parametrize("name", ["forward", "margin"])
 def test_onnx_export_with_a_dynamic_batch(pair, name, tmp_path):

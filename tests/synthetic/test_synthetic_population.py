@@ -81,6 +81,7 @@ def test_the_population_varies_in_everything() -> None:
     assert any(p.upper.brackets for p in persons) and any((p.upper.overlap_mm < -0.5).any() for p in persons)
 
 
+@pytest.mark.slow
 def test_teeth_touch_in_occlusion_and_do_not_run_into_one_another(bites: list[Bite]) -> None:
     for seed, bite in zip(SEEDS, bites, strict=True):
         upper, lower = _solid(bite.upper), _solid(bite.lower)

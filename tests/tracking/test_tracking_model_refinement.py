@@ -154,6 +154,7 @@ def worst_mm(poses, truth):
     return max(vertex_error_mm(small_take.MESHES[1], poses[k], truth[k, 1]) for k in HIDDEN)
 
 
+@pytest.mark.slow
 def test_hidden_teeth_are_found_with_the_model(take, jaw, truth):
     first = take[1]
     assert hard_frames(first)[list(HIDDEN)].all() and not hard_frames(first)[:6].any()

@@ -47,6 +47,7 @@ def test_taking_delays_out_improves_the_poses(late):
     assert better.max() < 0.06
 
 
+@pytest.mark.slow
 def test_masks_drawn_too_wide_are_noticed_and_made_up_for(tmp_path):
     capture = make_capture(write_masks(tmp_path / "wide", 8, grown_px=1.0), 8)
     tracks, without = track(capture), track(capture, config=WITHOUT)
@@ -54,6 +55,7 @@ def test_masks_drawn_too_wide_are_noticed_and_made_up_for(tmp_path):
     assert errors_mm(tracks, raw=True).mean() < 0.7 * errors_mm(without, raw=True).mean()
 
 
+@pytest.mark.slow
 def test_nothing_is_found_where_nothing_is(tmp_path):
     tracks = track(make_capture(write_masks(tmp_path / "clean", FRAMES), FRAMES))
     assert np.abs(list(tracks.meta["delays_frames"].values())).max() < 0.03
@@ -132,6 +134,7 @@ def takes(tmp_path_factory):
     return track(capture), _track_knocked(capture), _track_knocked(capture, config=WITHOUT)
 
 
+@pytest.mark.slow
 def test_knocked_cameras_are_put_right(takes):
     good, corrected, without = takes
     assert corrected.meta["extrinsics"]["corrected"] and not without.meta["extrinsics"]["corrected"]
@@ -274,6 +277,7 @@ def test_long_gaps_and_ends_are_not_bridged():
     assert delay_motions(_records(6, lost=(0, 1))[0], 0, np.array([0.0, 0.3]))[1, 1].tolist() == np.eye(4).tolist()
 
 
+@pytest.mark.slow
 def test_frames_lost_to_a_late_camera_are_found_once_it_is_known(tmp_path):
     """Call a row lost without reason, as a late camera may: aligned again with the delay taken out it comes back."""
     capture = make_capture(write_masks(tmp_path / "late", FRAMES, delays=(0.0, 0.3, -0.2)), FRAMES)

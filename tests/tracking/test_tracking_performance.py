@@ -163,6 +163,7 @@ def test_a_worn_camera_sees_one_head(jaw, scans, truth, tmp_path):
     assert np.linalg.norm(head, axis=-1).max() < 0.5 and np.isfinite(found.covariance).all()
 
 
+@pytest.mark.slow
 def test_one_camera_finds_where_to_begin(jaw, scans, truth, folder):
     camera = small_take.CAMERAS[0]
     source = small_take.source(folder, camera.name)

@@ -110,6 +110,7 @@ def aligned(mouth, rows, contact, names, seed=0, last=6):
     return bite, aligner
 
 
+@pytest.mark.slow
 def test_three_photographs_tell_the_bite_and_the_focal_length(mouth, rows):
     rows, contact = rows
     bite, aligner = aligned(mouth, rows, contact, VIEWS)
@@ -119,6 +120,7 @@ def test_three_photographs_tell_the_bite_and_the_focal_length(mouth, rows):
     assert aligner.misfit(bite, 0.5).max() < 0.2
 
 
+@pytest.mark.slow
 def test_one_photograph_tells_the_bite_across_its_line_of_sight(mouth, rows):
     rows, contact = rows
     bite, _ = aligned(mouth, rows, contact, ["left"], seed=2, last=20)
@@ -138,6 +140,7 @@ def quiet(stage, done, total):
     pass
 
 
+@pytest.mark.slow
 def test_photographs_are_aligned_from_nothing_one_over_a_mirror(mouth, small_search):
     drawings = [
         read_lines(mouth.draw(VIEWS["front"]), "front"),
@@ -152,6 +155,7 @@ def test_photographs_are_aligned_from_nothing_one_over_a_mirror(mouth, small_sea
         assert photo.misfit < 0.15 and photo.alone_off_mm < 0.5
 
 
+@pytest.mark.slow
 def test_crowns_of_somebody_else_are_named(mouth, small_search):
     found = align.align_photographs(
         [read_lines(mouth.draw(VIEWS["front"]), "front")], Mouth(10).with_gum(), quiet

@@ -184,6 +184,7 @@ class Covered(ColourFootage):
                 yield frame, skin if instead is None else pictures
 
 
+@pytest.mark.slow
 def test_teeth_are_found_again_when_lips_open_over_an_open_jaw():
     capture = load_capture(ROOT / "examples" / "capture" / "capture.toml")
     with np.load(capture.folder / "truth" / "truth.npz") as truth:

@@ -30,11 +30,13 @@ def farther_apart(factor):
     return cameras
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [1.0, 0.9, 1.2])
 def test_the_size_is_that_of_the_world(capture, factor):
     assert seen_size(capture, farther_apart(factor), OFFSETS, MESHES) == pytest.approx(factor, rel=0.01)
 
 
+@pytest.mark.slow
 def test_masks_of_something_else_tell_no_size(capture, monkeypatch):
     monkeypatch.setattr("jawusd.tracking.initialization.scale_search._STARTS", (1.0,))
     turned = [replace(m, vertices=m.vertices * [0.6, 1.0, 1.3]) for m in MESHES]

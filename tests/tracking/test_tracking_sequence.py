@@ -145,6 +145,7 @@ def test_masks_exchanged_now_and_then_are_not_searched_for_ever(take, monkeypatc
     assert np.nanmax(errors_mm(tracks)[~lost]) < 0.1
 
 
+@pytest.mark.slow
 def test_every_lost_frame_of_a_spoiled_stretch_names_its_reason(take, tmp_path):
     for camera in CAMERAS:
         path = png(take, camera.name, "lower", 5)
@@ -180,6 +181,7 @@ def test_exchanged_masks_are_named(pictures):
         track(capture)
 
 
+@pytest.mark.slow
 def test_picks_far_from_the_masks_are_named_and_made_up_for(pictures):
     tracks = track(_capture(pictures, away_mm=12.0))
     assert "picks_off" in {found["kind"] for found in tracks.meta["findings"]}
@@ -191,6 +193,7 @@ def test_bootstrap_frame_must_lie_in_the_range(pictures):
         track(_capture(pictures, frames=(10, 15)))
 
 
+@pytest.mark.slow
 def test_a_picked_frame_without_two_masks_of_each_row_gives_way_to_another(take):
     for camera in CAMERAS[1:]:
         png(take, camera.name, "upper", START).unlink()

@@ -138,6 +138,7 @@ def test_no_frame_with_masks_of_both_rows_is_refused(tmp_path):
         _start(capture)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("picked", [True, False])
 def test_exchanged_cameras_are_named(pictures, short_search, picked):
     change = {} if picked else {"bootstrap": None}
@@ -208,6 +209,7 @@ def test_picks_that_fit_outlive_a_search_that_does_not(pictures, monkeypatch, fa
     assert max(_error_mm(start, r) for r in (0, 1)) < 1.0
 
 
+@pytest.mark.slow
 def test_reversed_faces_do_not_matter(pictures):
     turned = [Mesh(m.vertices, m.faces[:, ::-1], m.colors) for m in MESHES]
     capture = _capture(pictures)

@@ -28,6 +28,7 @@ def test_a_good_take_is_not_doubted(capture):
     assert not timely & {kind for kind, _ in _kinds(track(capture))}
 
 
+@pytest.mark.slow
 def test_a_camera_a_frame_late_is_named_and_made_up_for(tmp_path):
     late = make_capture(write_masks(tmp_path / "late", FRAMES, delays=(0.0, 1.0, 0.0)), FRAMES)
     tracks = track(late)
@@ -37,6 +38,7 @@ def test_a_camera_a_frame_late_is_named_and_made_up_for(tmp_path):
     assert errors_mm(tracks, raw=True)[1:-1].mean() < 0.06
 
 
+@pytest.mark.slow
 def test_a_frame_dropped_in_mid_take_is_named(tmp_path):
     folder = write_masks(tmp_path / "take", FRAMES + 1)
     for row in ("upper", "lower"):
@@ -48,6 +50,7 @@ def test_a_frame_dropped_in_mid_take_is_named(tmp_path):
     assert dropped["camera"] == "cam1" and abs(dropped["frame"] - (5 + 8)) <= 2
 
 
+@pytest.mark.slow
 def test_a_wrong_focal_length_is_named(capture):
     K = CAMERAS[2].K.copy()
     K[0, 0], K[1, 1] = 1.05 * K[0, 0], 1.05 * K[1, 1]
@@ -58,6 +61,7 @@ def test_a_wrong_focal_length_is_named(capture):
     assert value == pytest.approx(-100 * 0.05 / 1.05, abs=1.0)  # seen smaller than expected
 
 
+@pytest.mark.slow
 def test_scans_of_a_wrong_size_are_named(capture):
     larger = [replace(mesh, vertices=1.03 * mesh.vertices) for mesh in MESHES]
     tracks = track_capture(capture, CAMERAS, OFFSETS, *larger, LANDMARKS)
@@ -65,6 +69,7 @@ def test_scans_of_a_wrong_size_are_named(capture):
     assert np.isfinite(tracks.T_upper_lower).all()
 
 
+@pytest.mark.slow
 def test_mirrored_scans_are_named(capture):
     hand = np.array([-1.0, 1.0, 1.0])
     mirrored = [replace(mesh, vertices=hand * mesh.vertices, faces=mesh.faces[:, ::-1]) for mesh in MESHES]

@@ -308,6 +308,7 @@ def test_a_bad_file_is_a_message_and_the_page_lives_on(tab, tmp_path):
     np.testing.assert_allclose(d[:, 0], 1 + 0.8 * frames)
 
 
+@pytest.mark.slow
 def test_two_pages_do_not_mix(chromium, viewer, tab):
     other = Tab(chromium, viewer)
     tab.type_slider(0, 18)

@@ -181,6 +181,7 @@ def test_two_pages_do_not_mix(chromium, viewer, tab):
     assert other.complaints == []
 
 
+@pytest.mark.slow
 def test_picks_made_in_the_page_build_a_rig(tab, folder, tmp_path):
     capture, page = tab.page._capture, tab.page
     original = load_capture(EXAMPLE).bootstrap
@@ -223,6 +224,7 @@ def test_picks_made_in_the_page_build_a_rig(tab, folder, tmp_path):
     assert tracks.tracked().all() and tracks.meta["start"]["picks_left_out"] == {"lower": [], "upper": []}
 
 
+@pytest.mark.slow
 def test_tracked_poses_are_drawn_and_the_plot_is_a_timeline(chromium, example_build):
     viewer = open_capture_viewer(EXAMPLE, example_build[0], "127.0.0.1", 0, quiet)
     tab = CaptureTab(chromium, viewer)

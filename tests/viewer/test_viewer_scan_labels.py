@@ -54,6 +54,7 @@ def test_strokes_are_taken_back_in_order() -> None:
     assert brush.undo() == "upper" and not brush.labels["upper"].any() and not before.any()
 
 
+@pytest.mark.slow
 def test_painted_labels_are_saved_and_used(tmp_path) -> None:
     folder = shutil.copytree(ROOT / "examples" / "capture", tmp_path / "capture")
     viewed = viewed_capture(folder, None, no_progress)
