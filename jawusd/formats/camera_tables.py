@@ -78,7 +78,7 @@ def load_realityscan_csv(path: Path, sizes: Mapping[str, Size]) -> list[Camera]:
             found = {key: float(value) for key, value in values.items() if key != "name"}
         except ValueError as error:
             raise CalibrationError(f"line {number} holds what is no number ({error}).", path=path) from error
-        if len(row) < len(_NEEDED) or not np.isfinite(list(found.values())).all():
+        if not values.keys() >= set(_NEEDED) or not np.isfinite(list(found.values())).all():
             raise CalibrationError(f"line {number} has too few values, or one that is not finite.", path=path)
         name = Path(values["name"].strip().replace("\\", "/")).stem
         size = known_size(path, name, sizes)

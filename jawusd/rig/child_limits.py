@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import faulthandler
 import math
@@ -54,12 +53,32 @@ def leave_all() -> None:
         ctypes.CDLL(None).unshare(_NEW_NETWORK)
 
 
-def read_whole(path: Path) -> End:
+def memory_of_child() -> int:
+    """Return the address space that a child may use beyond what it has before [bytes]: `MOST_MEMORY`, or less.
+
+    Where this process has a limit, it is half of what is left: this process opens what the child has read, and
+    allocates more as it uses it; OpenUSD ends a process that cannot have what it asks for.
+    """
+    try:
+        import resource
+    except ImportError:
+        return MOST_MEMORY
+    limit, used = resource.getrlimit(resource.RLIMIT_AS)[0], _used_memory()
+    if limit == resource.RLIM_INFINITY or used is None:
+        return MOST_MEMORY
+    return min(MOST_MEMORY, max(limit - used, 0) // 2)
+
+
+def read_whole(path: Path, memory: int) -> End:
     """Read a stage in this process, with limits of memory and processor time that end it.
 
     What the rules of `open_checked` refuse counts as whole: the parent comes to the same, and says so.
+
+    Args:
+        path: of the stage.
+        memory: address space beyond what this process has, from `memory_of_child` of the process that asks [bytes].
     """
-    _limit()
+    _limit(memory)
     try:
         stage = open_checked(path)
         for layer in stage.GetUsedLayers():  # binary layers read values when asked
@@ -73,16 +92,24 @@ def read_whole(path: Path) -> End:
     return End.WHOLE
 
 
-def _limit() -> None:
-    """Limit memory and processor time of this process, beyond what it has used so far."""
+def _limit(memory: int) -> None:
+    """Limit memory [bytes] and processor time of this process, beyond what it has used so far."""
     try:
         import resource
     except ImportError:
         return
     limits = [(resource.RLIMIT_CPU, math.ceil(time.process_time()) + MOST_CPU_S)]
-    with contextlib.suppress(OSError):
-        pages = int(Path("/proc/self/statm").read_text().split()[0])
-        limits.append((resource.RLIMIT_AS, pages * resource.getpagesize() + MOST_MEMORY))
+    if (used := _used_memory()) is not None:
+        limits.append((resource.RLIMIT_AS, used + memory))
     for kind, most in limits:
         hard = resource.getrlimit(kind)[1]
         resource.setrlimit(kind, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))
+
+
+def _used_memory() -> int | None:
+    """Return the address space of this process [bytes]; None where no /proc says it."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+    except OSError:
+        return None
+    return pages * os.sysconf("SC_PAGE_SIZE")

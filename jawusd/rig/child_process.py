@@ -18,13 +18,14 @@ from pxr import Work
 from jawusd.errors import RigError
 from jawusd.formats.allowed_folders import SETTING, is_allowed
 from jawusd.rig import child_limits
-from jawusd.rig.child_limits import End, end_of_death, leave_all, read_whole
+from jawusd.rig.child_limits import End, end_of_death, leave_all, memory_of_child, read_whole
 from jawusd.rig.reader_process import ReaderProcess
 
 _MOST_SLEEP_S = 3  # of a copy of this process: then a new one decides
 _TRIES = 20  # to find all other threads asleep, a millisecond apart
 _EXIT_CODES = {End.WHOLE: 0, End.LARGE: 3}
 _TRUST = f"If you trust it, allow its folder with --allow or the setting {SETTING}: then it is read without limits."
+_MORE_MEMORY = "Give the process more address space (ulimit -v)."
 
 _reader = ReaderProcess()
 _known: dict[Path, dict[Path, tuple[int, ...]]] = {}
@@ -40,12 +41,16 @@ def try_in_child(path: Path) -> None:
     """
     if is_allowed(path) or _is_known(path):
         return
+    memory = memory_of_child()
     copied = not _reader.runs() and _can_fork()
-    end = _forked(path) if copied else None
+    end = _forked(path, memory) if copied else None
     if end in (None, End.CRASHED):
-        end = _reader.read(path) or end
+        end = _reader.read(path, memory) or end
     if end is None and not copied and _can_fork():  # the second Python has ended, and no new one can be started
-        end = _forked(path)
+        end = _forked(path, memory)
+    if end in (End.LARGE, End.CRASHED) and memory < child_limits.MOST_MEMORY:
+        found = f"cannot be read with {memory >> 20} MB, half of the memory that this process may still use."
+        raise RigError(found, path=path, hint=_MORE_MEMORY)
     if end not in (None, End.WHOLE):  # None: no child can be had
         raise RigError(f"{end.value}: it is damaged, or was made to.", path=path, hint=_TRUST)
 
@@ -95,7 +100,7 @@ def _state_and_time(process: str) -> tuple[str, int]:
     return fields[0], int(fields[11]) + int(fields[12])
 
 
-def _forked(path: Path) -> End | None:
+def _forked(path: Path, memory: int) -> End | None:
     """Read in a copy of this process, some 5 ms; return None where it waits, maybe for what another thread held."""
     reading, writing = os.pipe()
     with warnings.catch_warnings():
@@ -106,7 +111,7 @@ def _forked(path: Path) -> End | None:
             Work.SetConcurrencyLimit(1)  # the threads of the parent are not here
             gc.disable()  # it would copy what is shared with the parent
             leave_all()
-            os._exit(_EXIT_CODES[read_whole(path)])
+            os._exit(_EXIT_CODES[read_whole(path, memory)])
         finally:  # nothing else of the parent's runs here
             os._exit(1)
     os.close(writing)

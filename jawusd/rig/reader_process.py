@@ -35,13 +35,13 @@ class ReaderProcess:
         """Tell whether it was started, by this process: not by one that this is a fork of."""
         return self._process is not None and self._owner == os.getpid()
 
-    def read(self, path: Path) -> End | None:
-        """Read a stage there; return None where no program can be started."""
+    def read(self, path: Path, memory: int) -> End | None:
+        """Read a stage there with so much memory [bytes]; return None where no program can be started."""
         with self._lock:
             used = self.runs() and self._has_read
-            end = self._ask(path)
+            end = self._ask(path, memory)
             if end is End.CRASHED and used:  # maybe for what it had read before
-                end = self._ask(path)
+                end = self._ask(path, memory)
         return end
 
     def close(self) -> None:
@@ -50,14 +50,15 @@ class ReaderProcess:
             _end(self._process)
         self._process = None
 
-    def _ask(self, path: Path) -> End | None:
+    def _ask(self, path: Path, memory: int) -> End | None:
         """Return what the process answers, or how it ended without an answer; None if there is none."""
         if not self.runs():
             self._process = self._started()
         process = self._process
         if process is None:
             return None
-        request = {"path": str(path.absolute()), "allowed": [str(folder) for folder in allowed_folders()]}
+        allowed = [str(folder) for folder in allowed_folders()]
+        request = {"path": str(path.absolute()), "memory": memory, "allowed": allowed}
         self._has_read = True
         answer, in_time = _answer(process, child_limits.MOST_WAIT_S, json.dumps(request))
         if answer in (End.WHOLE.name, End.SLOW.name):
@@ -133,4 +134,4 @@ def main() -> None:
     for line in requests:
         request = json.loads(line)
         allow_folders(request["allowed"])
-        answers.write(child_limits.read_whole(Path(request["path"])).name + "\n")
+        answers.write(child_limits.read_whole(Path(request["path"]), request["memory"]).name + "\n")

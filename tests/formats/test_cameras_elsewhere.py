@@ -190,6 +190,10 @@ def test_realityscan_csv(tmp_path):
     path.write_text("\n".join(lines).replace("38.0", "wide"))
     with pytest.raises(CalibrationError, match="line 2 holds what is no number"):
         load_cameras_file(path, 1000.0, sizes)
+    front, short = ",".join("abcdefgh"), ",".join(lines[2].split(",")[:7])
+    path.write_text(f"{front},{lines[1].lstrip('#')}\n{'1,' * 8}{short}\n")
+    with pytest.raises(CalibrationError, match="too few values"):
+        load_cameras_file(path, 1000.0, sizes)
 
 
 K = np.array([[2050.0, 0, 970.0], [0, 2060.0, 531.0], [0, 0, 1]])

@@ -2,6 +2,8 @@
 
 import json
 import pickle
+import struct
+import zipfile
 from dataclasses import replace
 
 import numpy as np
@@ -137,6 +139,15 @@ def test_rubbish_is_one_clear_error(tmp_path, content):
     path = tmp_path / "t.npz"
     path.write_bytes(content)
     with pytest.raises(FormatError, match="t.npz"):
+        load_tracks(path)
+
+
+@pytest.mark.parametrize("header", ["{'descr': '<f8'", "if a:\n    b\n  c", "{'descr': '<f8', 'shape': 'x'}"])
+def test_damaged_headers_of_arrays_are_one_clear_error(tmp_path, header):
+    path = tmp_path / "t.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("frames.npy", b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header.encode())
+    with pytest.raises(FormatError, match="t.npz.*not a readable npz"):
         load_tracks(path)
 
 

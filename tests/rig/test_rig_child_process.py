@@ -41,7 +41,7 @@ def children(reader, monkeypatch):
     asked = []
     for where, name in ((child_process, "_forked"), (reader, "read")):
         real = getattr(where, name)
-        monkeypatch.setattr(where, name, lambda path, real=real: asked.append(path) or real(path))
+        monkeypatch.setattr(where, name, lambda path, memory, real=real: asked.append(path) or real(path, memory))
     return asked
 
 
@@ -55,7 +55,7 @@ def forks(anchored_folder, reader, monkeypatch):
 @pytest.fixture
 def no_reader(reader, monkeypatch):
     """Let no second Python be had."""
-    monkeypatch.setattr(reader, "read", lambda path: None)
+    monkeypatch.setattr(reader, "read", lambda path, memory: None)
 
 
 @pytest.fixture
@@ -147,18 +147,18 @@ def test_programs_of_several_threads_start_a_second_python(anchored_folder, bomb
         open_stage(bomb)
 
     monkeypatch.setattr(child_limits, "MOST_WAIT_S", 4)
-    monkeypatch.setattr(child_process, "_forked", lambda path: pytest.fail("this process has several threads"))
+    monkeypatch.setattr(child_process, "_forked", lambda path, memory: pytest.fail("this process has several threads"))
     (error,) = in_thread(opened)
     assert "takes OpenUSD more than" in str(error) and len(children) == 2
 
 
 def test_a_second_python_reads_one_stage_after_the_other(anchored_folder, reader):
     actor = anchored_folder / "actor.usda"
-    assert reader.read(actor) is End.WHOLE
+    assert reader.read(actor, child_limits.MOST_MEMORY) is End.WHOLE
     first = reader._process
-    assert reader.read(actor) is End.WHOLE and reader._process is first
+    assert reader.read(actor, child_limits.MOST_MEMORY) is End.WHOLE and reader._process is first
     first.kill()  # as a stage that it had read before may have left it
-    assert reader.read(actor) is End.WHOLE and reader._process is not first
+    assert reader.read(actor, child_limits.MOST_MEMORY) is End.WHOLE and reader._process is not first
     reader._owner += 1  # as in a fork of this process, which would read answers to other questions
     assert not reader.runs()
     reader._owner -= 1
@@ -183,7 +183,7 @@ def test_a_stage_that_ends_the_second_python_is_one_message(bomb, reader, monkey
 def test_a_second_python_writes_no_files_and_has_no_network(anchored_folder, reader):
     import resource
 
-    assert reader.read(anchored_folder / "actor.usda") is End.WHOLE
+    assert reader.read(anchored_folder / "actor.usda", child_limits.MOST_MEMORY) is End.WHOLE
     process = reader._process.pid
     for kind in (resource.RLIMIT_FSIZE, resource.RLIMIT_CORE):
         assert resource.prlimit(process, kind)[0] == 0
@@ -197,7 +197,7 @@ def test_a_second_python_writes_no_files_and_has_no_network(anchored_folder, rea
 def test_a_second_python_ends_with_the_program(anchored_folder):
     program = (
         "import os, sys, pathlib; from jawusd.rig.reader_process import ReaderProcess; reader = ReaderProcess(); "
-        "reader.read(pathlib.Path(sys.argv[1])); print(reader._process.pid, flush=True); os._exit(9)"
+        "reader.read(pathlib.Path(sys.argv[1]), 1 << 30); print(reader._process.pid, flush=True); os._exit(9)"
     )
     line = [sys.executable, "-c", program, str(anchored_folder / "actor.usda")]
     found = subprocess.run(line, capture_output=True, text=True, check=False)
@@ -208,6 +208,24 @@ def test_a_second_python_ends_with_the_program(anchored_folder):
             return
         time.sleep(0.01)
     pytest.fail("it still runs")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of Linux")
+def test_a_stage_too_large_for_what_this_process_has_left_is_one_message(tmp_path):
+    """A second Python that was started before may use more than the program that asks it, which would be ended."""
+    program = (
+        "import resource, sys; from jawusd.errors import RigError; from jawusd.rig import child_limits, child_process\n"
+        "from jawusd.rig.read import open_stage\n"
+        "child_process._reader._process = child_process._reader._started(); open_stage(sys.argv[1])\n"
+        "most = child_limits._used_memory() + (8 << 20); resource.setrlimit(resource.RLIMIT_CORE, (0, 0))\n"
+        "resource.setrlimit(resource.RLIMIT_AS, (most, most)); open_stage(sys.argv[1])\n"
+        "try: open_stage(sys.argv[2])\nexcept RigError as error: print(error)"
+    )
+    for levels in (1, 13):
+        (tmp_path / f"{levels}.usda").write_text(doubling(levels))
+    line = [sys.executable, "-c", program, str(tmp_path / "1.usda"), str(tmp_path / "13.usda")]
+    found = subprocess.run(line, capture_output=True, text=True, check=False)
+    assert found.returncode == 0 and "13.usda: cannot be read with " in found.stdout
 
 
 def test_a_rig_costs_a_child_once(anchored_folder, forks, children):
