@@ -190,8 +190,8 @@ def test_realityscan_csv(tmp_path):
     path.write_text("\n".join(lines).replace("38.0", "wide"))
     with pytest.raises(CalibrationError, match="line 2 holds what is no number"):
         load_cameras_file(path, 1000.0, sizes)
-    front, short = ",".join("abcdefgh"), ",".join(lines[2].split(",")[:7])
-    path.write_text(f"{front},{lines[1].lstrip('#')}\n{'1,' * 8}{short}\n")
+    short = ",".join(lines[2].split(",")[:7])
+    path.write_text(f"{'note,' * 8}{lines[1].lstrip('#')}\n{'1,' * 8}{short}\n")
     with pytest.raises(CalibrationError, match="too few values"):
         load_cameras_file(path, 1000.0, sizes)
 
