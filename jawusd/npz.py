@@ -27,8 +27,8 @@ JsonObject = dict[str, object]
 # Ten times what 20,000 frames take; guards against archives that unpack to fill the memory.
 _MAX_ARRAY_BYTES = 512 << 20
 # What zipfile and numpy raise for damaged members, beside OSError: their decoders' own errors, missing methods and
-# passwords (RuntimeError), headers that declare more than there is (MemoryError) or nest too deeply; headers that are no
-# Python literal numpy takes apart with Python's tokenizer, which raises errors of its own.
+# passwords (RuntimeError), headers that declare more than there is (MemoryError) or nest too deeply; headers that are
+# no Python literal numpy takes apart with Python's tokenizer, which raises errors of its own.
 _DAMAGED = (
     ValueError, EOFError, LookupError, TypeError, AttributeError, RuntimeError, MemoryError, OverflowError,
     zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, tokenize.TokenError, SyntaxError,
