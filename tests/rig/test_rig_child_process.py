@@ -224,7 +224,7 @@ def test_a_stage_too_large_for_what_this_process_has_left_is_one_message(tmp_pat
     for levels in (1, 13):
         (tmp_path / f"{levels}.usda").write_text(doubling(levels))
     line = [sys.executable, "-c", program, str(tmp_path / "1.usda"), str(tmp_path / "13.usda")]
-    found = subprocess.run(line, capture_output=True, text=True, check=False)
+    found = subprocess.run(line, capture_output=True, text=True, check=False, timeout=60)
     assert found.returncode == 0 and "13.usda: cannot be read with " in found.stdout
 
 
