@@ -94,7 +94,8 @@ def looped_take(folder: Path, count: int) -> Path:
 def many(folder: Path, count: int, kills: int, seed: int) -> bool:
     """Disturb a run over many captures, finish it, and compare each folder with a serial build."""
     take, rng = write_short(folder / "take", SHORT_FRAMES), np.random.default_rng(seed)
-    serial, out = folder / "serial", folder / "out"
+    # as deep as the others: build.json tells the way to the take
+    serial, out = folder / "alone" / "serial", folder / "out"
     start = time.perf_counter()
     code, said = finish(start_build(take, serial))
     if code:

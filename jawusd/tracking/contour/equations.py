@@ -8,7 +8,6 @@ kind of measurement is a new class with `accumulate`, handed to `ContourSolver.s
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -82,9 +81,9 @@ class Solution:
     visible_px: Array  # contour length that could have been matched, per arch and view [px], shape (2, C)
     iterations: int  # how many linearised steps were taken
 
-    @cached_property
+    @property
     def outline(self) -> OutlineSums:
-        """The sums over all matched contour samples."""
+        """The sums over all matched contour samples; not kept, as every frame of a take keeps its solution."""
         return self.silhouette.plus(self.gingival_margin)
 
 

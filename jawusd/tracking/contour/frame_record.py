@@ -40,7 +40,7 @@ class FrameRecord:
 
 def whole_frames(records: Mapping[int, FrameRecord]) -> list[int]:
     """Return the frames in which both arches are tracked, in order."""
-    return [frame for frame, record in sorted(records.items()) if (record.status != LOST).all()]
+    return [frame for frame in sorted(records) if (records[frame].status != LOST).all()]
 
 
 @dataclass(frozen=True, eq=False)

@@ -40,14 +40,19 @@ def delay_steps(
     if len(frames) < 2 * _LEAST_FRAMES:
         return []
     cameras = len(extrinsics.twists)
-    parts = [TakeEquations(records, variance_px3, extrinsics, [frame]).normal_equations() for frame in frames]
-    S, right = (np.sum([part[k] for part in parts], axis=0) for k in (0, 1))
+    S, right = TakeEquations(records, variance_px3, extrinsics, []).normal_equations()
+    columns, delays = [], []  # of the delays, per frame
+    for frame in frames:
+        own_S, own_right = TakeEquations(records, variance_px3, extrinsics, [frame]).normal_equations()
+        S, right = S + own_S, right + own_right
+        columns.append(own_S[:, :cameras].copy())
+        delays.append(own_right[:cameras].copy())
     prior = np.linalg.pinv(TakeEquations(records, variance_px3, extrinsics, []).prior_covariance())
     fixed = len(right) - 6 * cameras  # camera motions are taken as known
     keep = np.arange(1, fixed)
     A = np.linalg.inv((S + prior)[np.ix_(keep, keep)])
-    after_S = np.cumsum([part[0][:, :cameras] for part in parts[::-1]], axis=0)[::-1]
-    after_r = np.cumsum([part[1][:cameras] for part in parts[::-1]], axis=0)[::-1]
+    after_S = np.cumsum(columns[::-1], axis=0)[::-1]
+    after_r = np.cumsum(delays[::-1], axis=0)[::-1]
     out = []
     for c in range(cameras):
         best = DelayStep(0.0, 1.0, frames[0])

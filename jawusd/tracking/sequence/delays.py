@@ -82,7 +82,8 @@ def _is_tracked(records: Mapping[int, FrameRecord], frame: int, arch: int) -> bo
     return frame in records and bool(records[frame].status[arch] != LOST)
 
 
-_BRIDGE_FRAMES = 6  # a quarter of a second at 24 fps: jaws turn round in less than two of these
+#: Frames on either side that are looked at: a quarter of a second at 24 fps, jaws turn round in less than two of these.
+BRIDGE_FRAMES = 6
 
 
 def bridge(records: Mapping[int, FrameRecord], frame: int, arch: int) -> tuple[Array, Array] | None:
@@ -90,7 +91,7 @@ def bridge(records: Mapping[int, FrameRecord], frame: int, arch: int) -> tuple[A
 
     None without tracked frames close by on both sides.
     """
-    reach = range(1, _BRIDGE_FRAMES + 1)
+    reach = range(1, BRIDGE_FRAMES + 1)
     before = next((frame - k for k in reach if _is_tracked(records, frame - k, arch)), None)
     after = next((frame + k for k in reach if _is_tracked(records, frame + k, arch)), None)
     if before is None or after is None:

@@ -18,6 +18,7 @@ from jawusd.tracking.contour.views import MaskViews, View
 from jawusd.tracking.initialization.first_frame import first_record
 from jawusd.tracking.sequence.frame_tracker import FrameTracker
 from jawusd.tracking.sequence.history import History, MotionPredictor, SearchAllowance
+from jawusd.tracking.sequence.packed_records import PackedRecords
 from jawusd.tracking.sequence.well_seen import nearest_well_seen
 
 Progress = Callable[[int, int], None]
@@ -44,7 +45,7 @@ class Passes:
         self._first, self._stop = first, stop
         self._progress = progress or (lambda done, total: None)
         self._probes = probe_points(solver.scans)
-        self.records: dict[int, FrameRecord] = {}
+        self.records = PackedRecords()
         self.searches = SearchAllowance(stop - first)
 
     def begin(self, frame: int, poses: Array) -> None:
@@ -71,7 +72,7 @@ class Passes:
         if seen is None or seen == start:
             return
         step = 1 if seen < start else -1
-        judged = {frame: record for frame, record in self.records.items() if (frame - seen) * step <= 0}
+        judged = self.records.kept(frame for frame in self.records if (frame - seen) * step <= 0)
         tracker, motion = self.beside(seen, judged)
         for frame, views in self._masks.walk(seen + step, self._stop if step > 0 else self._first - 1, step):
             before = self.records[frame]

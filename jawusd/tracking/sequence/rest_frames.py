@@ -7,10 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jawusd.formats.tracks import LOST
 from jawusd.geometry import relative_pose
 from jawusd.geometry.arrays import Array
-from jawusd.tracking.contour.frame_record import FrameRecord
+from jawusd.tracking.contour.frame_record import FrameRecord, whole_frames
 
 # Teeth held together rest: slower than this against one another [mm/frame at the teeth], and no farther from the
 # closest frame [mm].
@@ -46,11 +45,7 @@ def rest_frames(
         up: from the lower to the upper teeth, unit vector in scan axes, shape (3,).
         point, probes: amid the teeth, shape (3,), and spread over the lower ones, shape (N, 3), scan coordinates [mm].
     """
-    relative = {
-        frame: relative_pose(*record.solution.poses)
-        for frame, record in sorted(records.items())
-        if (record.status != LOST).all()
-    }
+    relative = {frame: relative_pose(*records[frame].solution.poses) for frame in whole_frames(records)}
     if named is None:
         closed = {f: float((T[:3, :3] @ point + T[:3, 3] - point) @ up) for f, T in relative.items()}
         ranked = sorted(closed, key=lambda f: -closed[f])

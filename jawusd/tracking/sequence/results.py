@@ -6,10 +6,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict
 
 import numpy as np
+from numpy.typing import NDArray
 
 from jawusd.formats.tracks import LOST, Tracks, TracksMeta
 from jawusd.geometry import relative_pose, se3_adjoint
-from jawusd.geometry.arrays import Array
+from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.equations import Solution, translation
 from jawusd.tracking.contour.frame_record import FrameRecord
@@ -56,12 +57,10 @@ def assemble(
         TrackingError: the registration of the scans is to be corrected, and the mouth was not closed.
     """
     frames = np.array(sorted(records), np.int64)
-    ordered = [records[f] for f in frames]
-    status = np.stack([record.status for record in ordered])
+    figures = zip(*(_figures(records[f]) for f in frames.tolist()), strict=True)
+    status, losses, centres, coverage, used, residual, matched = (np.stack(column) for column in figures)
     raw, covariance, covariance_relative, bite = _measured(records, nuisances, extrinsics, config, rest)
-    losses = np.array([record.losses for record in ordered], np.float64)  # reason, value, limit
     known = status != LOST
-    centres = np.stack([record.solution.centres for record in ordered])
     middle = np.median(centres[known.all(1)] if known.all(1).any() else centres, axis=(0, 1))
     final = np.stack([smooth_poses(frames, raw[:, r], covariance[:, r], middle) for r in ARCHES], axis=1)
     raw_relative, relative = _relative(raw), _relative(final)
@@ -89,20 +88,27 @@ def assemble(
         raw_T_upper_lower=raw_relative,
         status=status,
         prior_aided=np.zeros(len(frames), bool),
-        coverage_error=np.stack([record.coverage for record in ordered]),
-        masks_used=np.stack([record.used for record in ordered]),
+        coverage_error=coverage,
+        masks_used=used,
         covariance_upper=covariance[:, 0],
         covariance_lower=covariance[:, 1],
         covariance_relative=covariance_relative,
         sigma_mm=landmark_sigmas(raw_relative, covariance_relative, landmarks),
-        residual_px=np.stack([residual_px(record.solution) for record in ordered]),
-        matched_px=np.stack([matched_px(record.solution) for record in ordered]),
+        residual_px=residual,
+        matched_px=matched,
         camera_names=camera_names,
         meta=meta,
         lost_reason=losses[..., 0].astype(np.uint8),
         lost_value=losses[..., 1],
         lost_limit=losses[..., 2],
     )
+
+
+def _figures(record: FrameRecord) -> tuple[Array | Mask | NDArray[np.int8], ...]:
+    """Return what the tracks say of a frame besides poses; the second are reason, value and limit of each loss."""
+    solution, losses = record.solution, np.array(record.losses, np.float64)
+    quality = (residual_px(solution), matched_px(solution))
+    return (record.status, losses, solution.centres, record.coverage, record.used, *quality)
 
 
 def _measured(

@@ -23,10 +23,11 @@ from jawusd.tracking.initialization.magnification import measure_magnification
 from jawusd.tracking.initialization.start import find_start
 from jawusd.tracking.sequence.camera_use import use_of_cameras
 from jawusd.tracking.sequence.closed_bite import observe_bite
-from jawusd.tracking.sequence.delays import bridge, delay_motions
+from jawusd.tracking.sequence.delays import BRIDGE_FRAMES, bridge, delay_motions
 from jawusd.tracking.sequence.extrinsics import Extrinsics
 from jawusd.tracking.sequence.mirror_check import mirror_findings
 from jawusd.tracking.sequence.nuisance import DRAWN, DRAWN_BESIDE_CROWNS, Hand, Nuisances, TakeEquations
+from jawusd.tracking.sequence.packed_records import PackedRecords
 from jawusd.tracking.sequence.passes import Passes, Progress
 from jawusd.tracking.sequence.rest_frames import RestFrames, rest_frames
 from jawusd.tracking.sequence.results import assemble, outline_variance
@@ -108,10 +109,10 @@ def track_capture(
     return assemble(records, names, points, nuisances, extrinsics, config, rest, notes)
 
 
-def _trimmed(records: dict[int, FrameRecord]) -> dict[int, FrameRecord]:
+def _trimmed(records: PackedRecords) -> PackedRecords:
     """Drop frames without any mask before the first and after the last frame that has one."""
     masked = [frame for frame, record in records.items() if np.isfinite(record.coverage).any()]
-    return {f: record for f, record in records.items() if min(masked) <= f <= max(masked)}
+    return records.kept(frame for frame in records if min(masked) <= frame <= max(masked))
 
 
 class _Take(Passes):
@@ -194,7 +195,7 @@ class _Take(Passes):
         self, found: Nuisances, extrinsics: Extrinsics, rest: RestFrames, cameras_moved: bool
     ) -> tuple[Nuisances, Extrinsics]:
         """Align some frames repeatedly until the nuisances converge: matches follow them only step by step."""
-        c, records = self._config, dict(self.records)
+        c, records = self._config, self.records.kept(self.records)
         whole = whole_frames(records)
         if not whole:
             return found, extrinsics
@@ -221,7 +222,7 @@ class _Take(Passes):
 
     def _realign(self, nuisances: Nuisances, extrinsics: Extrinsics) -> None:
         """Align every frame again from its poses, with all nuisances of the take corrected."""
-        before = dict(self.records)
+        before = self.records.kept(self.records)
         tracker, _ = self.beside(self._first)
         for frame, views in self._masks.walk(self._first, self._stop):
             views = _corrected_views(views, before, frame, nuisances, extrinsics)
@@ -231,6 +232,7 @@ class _Take(Passes):
             status = np.where(found & doubted, RECOVERED, record.status).astype(np.int8)
             self.records[frame] = replace(record, status=status)
             tracker.history.add(record)
+            before.pop(frame - BRIDGE_FRAMES, None)  # of a long take, not every frame is held twice
 
 
 def _corrected_views(

@@ -1,0 +1,98 @@
+"""The records of a take, packed: in a third of the memory that tens of thousands of them take as objects."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, MutableMapping
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jawusd.formats.tracks import LostReason
+from jawusd.geometry.arrays import Array
+from jawusd.tracking.contour.equations import OutlineSums, Solution
+from jawusd.tracking.contour.frame_record import FrameRecord, Loss
+
+_KEPT_FRAMES = 32
+# Of the sums per arch and view, those that are symmetric 6 x 6 matrices come first.
+_SUM_SHAPES = tuple(table.shape[2:] for table in OutlineSums.zeros(1))
+_LOWER = np.tril_indices(6)
+_MIRROR = np.empty((6, 6), np.int64)  # of a whole matrix, where its entries lie in the lower half
+_MIRROR[_LOWER] = _MIRROR[_LOWER[::-1]] = np.arange(len(_LOWER[0]))
+
+
+class PackedRecords(MutableMapping[int, FrameRecord]):
+    """Map frames to their records; each is packed when it is set and unpacked when it is looked up.
+
+    Poses and figures keep double precision. Sums over samples have single precision: they are sums of thousands of
+    distances known to a hundredth of a pixel.
+    """
+
+    def __init__(self) -> None:
+        self._packed: dict[int, tuple[Array, NDArray[np.float32]]] = {}
+        self._unpacked: dict[int, FrameRecord] = {}  # those looked up last: mostly frames beside one another
+
+    def __getitem__(self, frame: int) -> FrameRecord:
+        if frame not in self._unpacked:
+            found = _unpacked(*self._packed[frame])
+            if len(self._unpacked) >= _KEPT_FRAMES:
+                del self._unpacked[next(iter(self._unpacked))]
+            self._unpacked[frame] = found
+        return self._unpacked[frame]
+
+    def __setitem__(self, frame: int, record: FrameRecord) -> None:
+        self._packed[frame] = _packed(record)
+        self._unpacked.pop(frame, None)
+
+    def __delitem__(self, frame: int) -> None:
+        del self._packed[frame]
+        self._unpacked.pop(frame, None)
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._packed)
+
+    def __len__(self) -> int:
+        return len(self._packed)
+
+    def kept(self, frames: Iterable[int]) -> PackedRecords:
+        """Return the same records of some frames."""
+        out = PackedRecords()
+        out._packed = {frame: self._packed[frame] for frame in frames}
+        return out
+
+
+def _packed(record: FrameRecord) -> tuple[Array, NDArray[np.float32]]:
+    solution, losses = record.solution, record.losses
+    figures = (
+        solution.poses, solution.centres, solution.visible_px, record.status, record.used, record.coverage,
+        [(float(loss.reason), loss.value, loss.limit) for loss in losses], [solution.iterations],
+    )  # fmt: skip
+    sums = []
+    for outline in (solution.silhouette, solution.gingival_margin):
+        sums += [outline.precision[..., _LOWER[0], _LOWER[1]], *outline[1:]]
+    sums += [matrix[:, _LOWER[0], _LOWER[1]] for matrix in (solution.scatters, solution.gum_scatters)]
+    return _joined(figures), _joined(sums).astype(np.float32)
+
+
+def _unpacked(figures: Array, sums: NDArray[np.float32]) -> FrameRecord:
+    views = (len(figures) - 32 - 6 - 2 - 6 - 1) // 6
+    poses, centres, visible, status, used, coverage, losses, iterations = _split(
+        figures, ((2, 4, 4), (2, 3), (2, views), (2,), (2, views), (2, views), (2, 3), (1,))
+    )
+    half = (21,)
+    shapes = [(2, views, *shape) for shape in (half, *_SUM_SHAPES[1:])]
+    parts = _split(sums.astype(np.float64), (*shapes, *shapes, (2, 21), (2, 21)))
+    count = len(shapes)
+    silhouette, margin = (OutlineSums(parts[k][..., _MIRROR], *parts[k + 1 : k + count]) for k in (0, count))
+    scatters, gum_scatters = (part[:, _MIRROR] for part in parts[-2:])
+    solution = Solution(poses, silhouette, margin, centres, scatters, gum_scatters, visible, int(iterations[0]))
+    first, second = (Loss(LostReason(int(reason)), float(value), float(limit)) for reason, value, limit in losses)
+    return FrameRecord(solution, status.astype(np.int8), used.astype(bool), coverage, (first, second))
+
+
+def _joined(arrays: Iterable[ArrayLike]) -> Array:
+    return np.concatenate([np.asarray(array, np.float64).ravel() for array in arrays])
+
+
+def _split(flat: Array, shapes: tuple[tuple[int, ...], ...]) -> list[Array]:
+    ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
+    return [part.reshape(shape) for part, shape in zip(np.split(flat, ends[:-1]), shapes, strict=True)]

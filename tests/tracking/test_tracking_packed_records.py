@@ -1,0 +1,64 @@
+"""Packed records hold what was put in."""
+
+import numpy as np
+import pytest
+from small_take import make_capture, track, write_masks
+
+from jawusd.formats.tracks import LostReason
+from jawusd.tracking.contour.frame_record import NO_LOSS, FrameRecord, Loss
+from jawusd.tracking.sequence import passes
+from jawusd.tracking.sequence.packed_records import PackedRecords
+
+FRAMES = 4
+
+
+@pytest.fixture(scope="module")
+def records(tmp_path_factory):
+    """Return the records of a take as the tracker made them, before they were packed."""
+    made = {}
+
+    class Kept(PackedRecords):
+        def __setitem__(self, frame, record):
+            made[frame] = record
+            super().__setitem__(frame, record)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(passes, "PackedRecords", Kept)
+        track(make_capture(write_masks(tmp_path_factory.mktemp("take"), FRAMES), FRAMES))
+    return made
+
+
+def test_what_is_looked_up_is_what_was_set(records):
+    packed = PackedRecords()
+    packed.update(records)
+    assert list(packed) == list(records) and len(packed) == FRAMES
+    for frame, record in records.items():
+        found = packed[frame]
+        for name in ("status", "used", "coverage"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(record, name))
+            assert getattr(found, name).dtype == getattr(record, name).dtype
+        np.testing.assert_array_equal(np.array(found.losses, float), np.array(record.losses, float))
+        own, kept = record.solution, found.solution
+        assert kept.iterations == own.iterations
+        for name in ("poses", "centres", "visible_px"):
+            np.testing.assert_array_equal(getattr(kept, name), getattr(own, name))
+        for name in ("scatters", "gum_scatters"):
+            np.testing.assert_allclose(getattr(kept, name), getattr(own, name), rtol=1e-6, atol=1e-30)
+        for name in ("silhouette", "gingival_margin"):
+            for one, other in zip(getattr(kept, name), getattr(own, name), strict=True):
+                assert one.shape == other.shape
+                np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-30)
+
+
+def test_a_record_that_is_set_again_takes_the_place_of_the_one_looked_up(records):
+    packed = PackedRecords()
+    packed.update(records)
+    first, second = sorted(packed)[:2]
+    assert packed[first].losses[1].reason == LostReason.NONE
+    old = records[first]
+    lost = (NO_LOSS, Loss(LostReason.LOW_SCORE, 0.3, 0.6))
+    packed[first] = FrameRecord(old.solution, old.status, old.used, old.coverage, lost)
+    assert packed[first].losses[1] == lost[1]
+    del packed[first]
+    assert first not in packed and second in packed
+    assert list(packed.kept([second])) == [second]
