@@ -172,3 +172,24 @@ def test_casts_are_named_where_their_reader_is_missing(part, tmp_path, monkeypat
     (tmp_path / "cast.dcm").write_bytes(b"zip")
     row = part("scanner").row("cast", tmp_path / "cast.dcm", tmp_path)
     assert row[0] == "cast" and "jawusd[dcm]" in row[1] and row[2:] == ["-"] * 5
+
+
+def test_the_jaws_angle_and_lips_follow_landmarks_and_scale_is_fitted(part):
+    face = part("face")
+    openings = np.array([0.0, 0.1, 0.2, 0.35])
+    points = np.zeros((4, 468, 3))
+    points[:, 234], points[:, 454] = (-70, 0, 0), (70, 0, 0)
+    points[:, 1] = (0, 0, -90)
+    points[:, 152] = 90 * np.stack([0 * openings, np.sin(1 + openings), -np.cos(1 + openings)], axis=1)
+    points[:, 14, 1] = 140 * openings
+    np.testing.assert_allclose(face.jaw_angle(points), 1 + openings)
+    np.testing.assert_allclose(face.lips_apart(points), openings, atol=1e-12)
+    assert face.off_line(face.jaw_angle(points), 5 + 80 * openings) < 1e-9
+    assert face.off_line(face.jaw_angle(points), np.array([0.0, 10, 0, 10])) > 3
+
+
+def test_sections_say_what_they_lack(part, capsys):
+    part("face").run([], None)
+    assert "name the Python of an environment with mediapipe" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match="--captures"):
+        part("peers").run([], 8, None)
