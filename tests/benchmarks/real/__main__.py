@@ -20,7 +20,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # the other ben
 
 from sources import SOURCES, listing  # noqa: E402
 
-SECTIONS = ("markers", "models", "patients", "scanner", "peers")
+SECTIONS = ("markers", "models", "patients", "scanner", "peers", "face")
 
 
 def main() -> None:
@@ -30,6 +30,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, help="folder of the clones")
     parser.add_argument("--captures", type=Path, nargs="*", default=[], help="captures with truth, for the peers")
     parser.add_argument("--m3t", type=Path, help="a program that runs M3T as README.md says, for the peers")
+    parser.add_argument("--mediapipe", type=Path, help="Python of an environment with mediapipe 0.10.21, for the face")
     parser.add_argument("--frames", type=int, default=24, help="of each capture, for the peers")
     parser.add_argument("--only", nargs="*", choices=SECTIONS, default=SECTIONS)
     parser.add_argument("--out", type=Path, default=Path("real_out"), help="folder of plots and pictures")
@@ -59,6 +60,10 @@ def run(section: str, given: argparse.Namespace) -> None:
         import scanner
 
         scanner.run(given.data, given.out)
+    elif section == "face":
+        import face
+
+        face.run(given.captures, given.mediapipe)
     else:
         import peers
 

@@ -7,6 +7,7 @@ motion, where the code is not told by the motion itself (PCA, Gaussian process, 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import model_peers
 import numpy as np
@@ -27,19 +28,29 @@ Fitted = Callable[[Array, int], Array]  # of motions (N, 4, 4) and the number of
 Model = Callable[[TrainingData], Fitted]
 
 FREE = {1: ((0,),), 2: ((0, 1), (0, 2)), 3: ((0, 1, 2),)}  # parameters left free, d1 to d3; the better pair is taken
-# Poses that are learned from: a Gaussian process takes the cube of their number, networks minutes.
-MOST_GP, MOST_NET = 300, 400
+# Poses that are learned from: a Gaussian process takes the cube of their number; networks learn for seconds a part.
+MOST_GP, MOST_NET = 300, 200
+MOST_CHOICE = 300  # poses that decide which parameters are left free
 NETS: dict[bytes, dict[int, Nlpca]] = {}  # of the paper, by the poses they learned from: both forms share them
 STEPS, NUDGE = 8, 1e-4  # of Gauss-Newton, and of its differences [mm]
 FOLDS = 5
 
 
-def hold_out(data: TrainingData, model: Model) -> Array:
+@dataclass(frozen=True)
+class Entry:
+    """Hold a model, and from how many poses of a take it learns at most."""
+
+    model: Model
+    most: int | None = None
+
+
+def hold_out(data: TrainingData, entry: Entry) -> Array:
     """Return the rms errors [mm] of every pose with 1, 2, 3 parameters (3, N), contiguous fifths left out in turn."""
     fold = np.arange(len(data)) * FOLDS // len(data)
     errors = np.empty((3, len(data)))
     for k in range(FOLDS):
-        unseen, fitted = data.motion[fold == k], model(data.select(fold != k))
+        seen = data.select(fold != k)
+        unseen, fitted = data.motion[fold == k], entry.model(seen if entry.most is None else thinned(seen, entry.most))
         for parameters in FREE:
             errors[parameters - 1, fold == k] = data.metric.rms(fitted(unseen, parameters), unseen)
     return errors
@@ -73,21 +84,20 @@ def nearest(
     return decode(d)
 
 
-def ours(method: str, most: int | None = None, **config: object) -> Model:
+def ours(method: str, **config: object) -> Model:
     """Return a model of jawusd; with fewer parameters the others stay 0."""
 
     def fit(data: TrainingData) -> Fitted:
         shown = np.ones(3, dtype=bool) if method == "paper" else shown_parameters(data)[0]
-        learned = data if most is None else thinned(data, most)
-        nets = NETS.setdefault(learned.motion.tobytes(), {}) if method == "paper" else None
-        form = fit_form(learned, shown, FittingConfig(method=method, starts=1, **config), nets)
+        nets = NETS.setdefault(data.motion.tobytes(), {}) if method == "paper" else None
+        form = fit_form(data, shown, FittingConfig(method=method, starts=1, **config), nets)
 
         def rebuilt(M: Array, free: tuple[int, ...]) -> Array:
             d, T = data.metric.nearest(form.model, M)
             start = d * np.isin(range(3), free)
             return T if len(free) == 3 else nearest(form.model.motion, data.metric, M, start, free)
 
-        few = thinned(data, MOST_GP).motion
+        few = thinned(data, MOST_CHOICE).motion
 
         def error(free: tuple[int, ...]) -> float:
             return float((data.metric.rms(rebuilt(few, free), few) ** 2).mean())
@@ -97,12 +107,12 @@ def ours(method: str, most: int | None = None, **config: object) -> Model:
     return fit
 
 
-def on_twists(fit: Callable[[Array, int], Rebuild], most: int | None = None) -> Model:
+def on_twists(fit: Callable[[Array, int], Rebuild]) -> Model:
     """Return a model of twists in metric coordinates (N, 6), whose distances are rms displacements of the jaw."""
 
     def of_motions(data: TrainingData) -> Fitted:
         root = data.metric.twist_root()
-        points = se3_log((data if most is None else thinned(data, most)).motion) @ root
+        points = se3_log(data.motion) @ root
 
         def rebuilt(M: Array, parameters: int) -> Array:
             return se3_exp(np.linalg.solve(root.T, fit(points, parameters)(se3_log(M) @ root).T).T)
@@ -183,22 +193,22 @@ def linear_blends(data: TrainingData) -> Fitted:
     return rebuild
 
 
-MODELS: dict[str, Model] = {
-    "anchored (jawusd)": ours("anchored"),
-    "additive (jawusd)": ours("additive"),
-    "PCA of twists": on_twists(pca),
-    "PCA codes + GP": on_twists(gp_decoder, MOST_GP),
-    "autoencoder 6-8-k-8-6": on_twists(autoencoder, MOST_NET),
-    "hinge alone (FLAME's jaw)": hinge,
-    "linear blends (RigLogic's form)": linear_blends,
-    "paper (Yang et al. 2019)": ours("paper", MOST_NET),
-    "paper, literal": ours("paper", MOST_NET, literal=True),
+MODELS: dict[str, Entry] = {
+    "anchored (jawusd)": Entry(ours("anchored")),
+    "additive (jawusd)": Entry(ours("additive")),
+    "paper (Yang et al. 2019)": Entry(ours("paper"), MOST_NET),
+    "paper, literal": Entry(ours("paper", literal=True), MOST_NET),
+    "PCA of twists": Entry(on_twists(pca)),
+    "PCA codes + GP": Entry(on_twists(gp_decoder), MOST_GP),
+    "autoencoder 6-8-k-8-6": Entry(on_twists(autoencoder), MOST_NET),
+    "hinge alone (FLAME's jaw)": Entry(hinge),
+    "linear blends (RigLogic's form)": Entry(linear_blends),
 }
 
 
-def errors_or_reason(data: TrainingData, model: Model) -> Array | str:
+def errors_or_reason(data: TrainingData, entry: Entry) -> Array | str:
     """Return the hold-out errors (3, N) [mm] of a model, or why it cannot be fitted."""
     try:
-        return hold_out(data, model)
+        return hold_out(data, entry)
     except FittingError as error:
         return error.message

@@ -127,6 +127,7 @@ def poses_against_the_maker(data: Path, out: Path) -> None:
     )
     curves(out / "clench.png", {"jaw markers from their mean place": np.sqrt((still**2).mean(axis=1))}, "mm")
     lacking(spoken.data)
+    incisor_path(data)
 
 
 def rms(values: Array) -> str:
@@ -152,6 +153,17 @@ def lacking(data: TrainingData) -> None:
     for sentence in [*sentences, *missing_movements(np.stack([-u[:, 1], u[:, 0], u[:, 2]], axis=1), shown)]:
         print(f"- {sentence}")
     print()
+
+
+def incisor_path(data: Path) -> None:
+    """Print how the points of `JMA_position.txt`, beside the chewing take, move: not as points of a jaw do."""
+    points = read_markers(CHEWING.found(data) / "XML_Processing" / "JMA_position.txt")
+    T, _ = rigid_fits(points[0], points)
+    moved = np.linalg.norm(points - points[0], axis=-1).max()
+    turned = np.degrees(np.linalg.norm(so3_log(T[:, :3, :3]), axis=1)).max()
+    print(f"`{CHEWING.repository}` JMA_position.txt: {len(points)} frames of {points.shape[1]} points are read;")
+    print(f"they move by {moved:.0f} mm and turn by {turned:.1f} degrees at most. No jaw opens so far without")
+    print("turning: these are points carried along a path, no poses, and no model is fitted to them.\n")
 
 
 def noise_floor(take: Take, clench: Take) -> None:
@@ -192,11 +204,12 @@ def models(data: Path, out: Path) -> None:
     spoken, clench = speech(data)
     noise_floor(spoken, clench)
     takes = {"speech": spoken, "chewing": chewing(data), "synthetic": synthetic()}
-    print("rms at the measured points [mm] of contiguous fifths of the take that were left out, by parameters:\n")
+    print("rms at the measured points [mm] of contiguous fifths of the take that were left out, by parameters;")
+    print("poses: from how many of the others, evenly spread, a model learns.\n")
     drawn: dict[str, dict[str, float]] = {}
     reasons: list[str] = []
     table(
-        ("model", *(f"{name} {k}" for name in takes for k in FREE), "seconds"),
+        ("model", "poses", *(f"{name} {k}" for name in takes for k in FREE), "seconds"),
         (model_row(name, takes, drawn, reasons) for name in MODELS),
     )
     for reason in dict.fromkeys(reasons):
@@ -206,7 +219,8 @@ def models(data: Path, out: Path) -> None:
 
 def model_row(name: str, takes: dict[str, Take], drawn: dict[str, dict[str, float]], reasons: list[str]) -> list[str]:
     """Return a row of the table of models; adds to the plot of speech and to why models cannot be fitted."""
-    begun, cells = time.process_time(), [name]
+    most = MODELS[name].most
+    begun, cells = time.process_time(), [name, "all" if most is None else str(most)]
     for take_name, take in takes.items():
         found = errors_or_reason(take.data, MODELS[name])
         if isinstance(found, str):

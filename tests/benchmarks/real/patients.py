@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,8 @@ from report import table, title
 from scipy import ndimage
 from sources import PATIENTS
 
-from jawusd.geometry import Camera, so3_log, transform_point
+from jawusd.formats.mesh import Mesh
+from jawusd.geometry import Camera, so3_log, transform_point, transform_points
 from jawusd.imaging.meshio import load_mesh
 from jawusd.imaging.overlay import save_png
 from jawusd.imaging.pictures import read_gray, read_picture
@@ -21,6 +23,8 @@ from jawusd.segmentation.crowns import ScanSurface, expect_crowns
 from jawusd.segmentation.learn import cut_picture
 from jawusd.segmentation.picture import Window
 from jawusd.segmentation.rows import tooth_rows
+from jawusd.tracking.contour.scan import prepare_scan
+from jawusd.tracking.initialization.occlusion import measure_occlusion
 from jawusd.tracking.photographs import PhotoAlignment, align_photographs
 from jawusd.tracking.photographs.align import _lower_incisor, _refined
 from jawusd.tracking.photographs.contact import Contact
@@ -50,6 +54,11 @@ def run(data: Path, out: Path) -> None:
     print("Outlines [px at 1440 px width]; T_upper_lower by a photograph alone and by the two others [mm]:\n")
     header = ("patient", "photograph", "focal", "rms", "median", "without gum lines", "alone to all", "others to all")
     table(header, outlines())
+    print("Crowns in occlusion as the photographs close them; gaps are negative where crowns overlap:\n")
+    table(
+        ("patient", "gap left [mm]", "gap right [mm]", "overlap [mm]", "opposed, share", "overjet [mm]"),
+        (occlusion_row(folder, patient, found) for patient, found in enumerate(aligned)),
+    )
     print("Automatic masks against the areas of the drawn outlines, intersection over union:\n")
     table(
         ("patient", "photograph", "upper", "lower", "both", "both, without scans", "outlines closed"),
@@ -63,7 +72,17 @@ def align(folder: Path, patient: int) -> PhotoAlignment:
     return align_photographs(lines, meshes(folder, patient), lambda stage, done, total: None)
 
 
-def meshes(folder: Path, patient: int) -> list:
+def occlusion_row(folder: Path, patient: int, found: PhotoAlignment) -> list[str]:
+    """Return the row of a patient: how the crowns meet in the bite that all photographs share."""
+    upper, lower = meshes(folder, patient)
+    lower = replace(lower, vertices=transform_points(found.bite.T_upper_lower, lower.vertices))
+    scans = [prepare_scan(mesh, row.lower()) for mesh, row in zip((upper, lower), ROWS, strict=True)]
+    met = measure_occlusion(scans, found.rows.usual.T_anatomical_upper)
+    figures = (*met.side_gaps_mm, met.depth_mm, met.opposite, -met.lower_ahead_mm)
+    return [str(patient), *(f"{figure:.2f}" for figure in figures)]
+
+
+def meshes(folder: Path, patient: int) -> list[Mesh]:
     """Return the crowns of both rows, each in a frame of its own."""
     place = folder / "demo" / "ref_mesh" / str(patient)
     return [load_mesh(place / f"Ref_{row}_Mesh_Tag={patient}.obj") for row in ROWS]

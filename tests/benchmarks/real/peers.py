@@ -67,8 +67,7 @@ def scene_of(path: Path, frames: int) -> Scene:
     """Return the window of a capture that begins after a third of it."""
     capture = load_capture(path)
     cameras, meshes = load_cameras(capture), load_meshes(capture)
-    with np.load(capture.folder / "truth" / "truth.npz", allow_pickle=False) as archive:
-        truth = {name: archive[name] for name in archive.files}
+    truth = load_truth(capture)
     scans = (meshes["upper_teeth"], meshes["lower_teeth"])
     start = min(len(truth["frames"]) // 3, len(truth["frames"]) - frames)
     window = slice(start, start + frames)
@@ -84,6 +83,12 @@ def scene_of(path: Path, frames: int) -> Scene:
         subject_of_capture(capture, meshes).landmarks,
         poses,
     )
+
+
+def load_truth(capture: Capture) -> dict[str, Array]:
+    """Return the arrays of a capture's truth."""
+    with np.load(capture.folder / "truth" / "truth.npz", allow_pickle=False) as archive:
+        return {name: archive[name] for name in archive.files}
 
 
 def exact_picks(scan: Mesh, pose: Array, cameras: list[Camera]) -> tuple[Pick, ...]:
@@ -242,7 +247,7 @@ def obj_of_crowns(scan: Mesh) -> str:
 
 def write_pictures(scene: Scene, camera: Camera, folder: Path) -> None:
     """Write the window of a camera's video as 0.png, 1.png, ..., the first picture twice, without distortion."""
-    video = next(one.video for one in scene.capture.cameras if one.name == camera.name)
+    video = camera_video(scene.capture, camera)
     reader = cv2.VideoCapture(str(video))
     first = scene.frames()[0] - scene.offsets[camera.name]
     for number in range(first + len(scene.frames())):
@@ -254,3 +259,8 @@ def write_pictures(scene: Scene, camera: Camera, folder: Path) -> None:
         straight = cv2.undistort(picture, camera.K, camera.distortion)
         for name in (0, 1) if number == first else (number - first + 1,):
             cv2.imwrite(str(folder / f"{name}.png"), straight)
+
+
+def camera_video(capture: Capture, camera: Camera) -> Path:
+    """Return the video of a camera."""
+    return next(one.video for one in capture.cameras if one.name == camera.name)
