@@ -91,10 +91,10 @@ def test_sigma_of_the_crowns_follows_the_information(noisy_fits):
     solution, _ = noisy_fits[0]
     sigma = crown_sigma_mm(SCANS[0], solution, 0, CONFIG)
     assert 0.005 < sigma < 0.1
-    for sums in solution.outline:
+    for sums in (*solution.silhouette, *solution.gingival_margin):
         sums[0, 1:] = 0  # one view left: depth is nearly free
     assert crown_sigma_mm(SCANS[0], solution, 0, CONFIG) > 3 * sigma
-    for sums in solution.outline:
+    for sums in (*solution.silhouette, *solution.gingival_margin):
         sums[0] = 0
     assert np.isinf(crown_sigma_mm(SCANS[0], solution, 0, CONFIG))
     assert np.isinf(np.diag(twist_covariance(solution, 0, 0.4, 10.0))).all()
