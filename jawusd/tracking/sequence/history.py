@@ -16,8 +16,8 @@ from jawusd.tracking.contour.scan import ARCHES
 _KEPT_POSES = 16  # earlier poses kept: enough to cover the exercises of a jaw at 2 mm
 _APART_MM = 2.0  # poses nearer than this have the same basin
 # Searches from many starts that may find nothing in a take, and frames of it that allow one more: at five seconds each
-# at most, all of them together take no longer than tracking. 300 frames of one valid take and 80 of another, while lips
-# close over the teeth, needed none.
+# at most, all of them together take no longer than tracking. Of 40 valid persons of the population (seeds 8100, 9300)
+# none needed more, nor did 300 frames of one take and 80 of another while lips close over the teeth.
 _FRUITLESS, _FRAMES_PER_FRUITLESS = 8, 32
 _RECENT = 8  # frames over which prediction errors are remembered: a third of a chewing stroke at 24 fps
 
