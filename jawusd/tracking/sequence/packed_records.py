@@ -13,7 +13,7 @@ from jawusd.tracking.contour.equations import OutlineSums, Solution
 from jawusd.tracking.contour.frame_record import FrameRecord, Loss
 
 _KEPT_FRAMES = 32
-# Of the sums per arch and view, those that are symmetric 6 x 6 matrices come first.
+# Of a sum per arch and view; the first is a symmetric 6 x 6 matrix.
 _SUM_SHAPES = tuple(table.shape[2:] for table in OutlineSums.zeros(1))
 _LOWER = np.tril_indices(6)
 _MIRROR = np.empty((6, 6), np.int64)  # of a whole matrix, where its entries lie in the lower half
@@ -74,13 +74,14 @@ def _packed(record: FrameRecord) -> tuple[Array, NDArray[np.float32]]:
 
 
 def _unpacked(figures: Array, sums: NDArray[np.float32]) -> FrameRecord:
-    views = (len(figures) - 32 - 6 - 2 - 6 - 1) // 6
+    # Besides poses, centres, status, losses and iterations there are three figures per arch and view.
+    views = (len(figures) - 2 * 16 - 2 * 3 - 2 - 2 * 3 - 1) // (2 * 3)
     poses, centres, visible, status, used, coverage, losses, iterations = _split(
         figures, ((2, 4, 4), (2, 3), (2, views), (2,), (2, views), (2, views), (2, 3), (1,))
     )
-    half = (21,)
+    half = (len(_LOWER[0]),)
     shapes = [(2, views, *shape) for shape in (half, *_SUM_SHAPES[1:])]
-    parts = _split(sums.astype(np.float64), (*shapes, *shapes, (2, 21), (2, 21)))
+    parts = _split(sums.astype(np.float64), (*shapes, *shapes, (2, *half), (2, *half)))
     count = len(shapes)
     silhouette, margin = (OutlineSums(parts[k][..., _MIRROR], *parts[k + 1 : k + count]) for k in (0, count))
     scatters, gum_scatters = (part[:, _MIRROR] for part in parts[-2:])
