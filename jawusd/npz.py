@@ -26,10 +26,10 @@ JsonObject = dict[str, object]
 
 # Ten times what 20,000 frames take; guards against archives that unpack to fill the memory.
 _MAX_ARRAY_BYTES = 512 << 20
-# What zipfile and numpy raise for damaged members, beside OSError: their decoders' own errors, missing methods and
+#: What zipfile and numpy raise for damaged members, beside OSError: their decoders' own errors, missing methods and
 # passwords (RuntimeError), headers that declare more than there is (MemoryError) or nest too deeply; headers that are
 # no Python literal numpy takes apart with Python's tokenizer, which raises errors of its own.
-_DAMAGED = (
+DAMAGED = (
     ValueError, EOFError, LookupError, TypeError, AttributeError, RuntimeError, MemoryError, OverflowError,
     zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, tokenize.TokenError, SyntaxError,
 )  # fmt: skip
@@ -62,7 +62,7 @@ def read_npz(path: str | os.PathLike[str], family: str, version: int) -> tuple[N
                     raise FormatError(f'"{name}" is no array.', path=path)
     except FileNotFoundError as error:
         raise FormatError("there is no such file.", path=path) from error
-    except (OSError, *_DAMAGED) as error:
+    except (OSError, *DAMAGED) as error:
         raise FormatError(f"is not a readable npz file ({error!s:.200}).", path=path) from error
     if "meta" not in arrays:
         raise FormatError(f'has no "meta"; a {family} file carries its format and units there.', path=path)

@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jawusd.formats.atomic import write_bytes_atomic
+from jawusd.geometry.arrays import Array
+from jawusd.npz import DAMAGED
 from jawusd.segmentation.colours import ColourModel
 
 # Alternating: a run may be killed between saving the colours of a frame and recording it.
@@ -43,13 +45,21 @@ class ColourStates:
         """
         for frame in (done, done - step):
             path = self._folder / _FILES[frame % 2]
-            if not path.exists():
+            kept = _stored(path)
+            if kept is None or (int(kept["frame"]), int(kept["step"])) != (frame, step):
                 continue
-            with np.load(path, allow_pickle=False) as kept:
-                if (int(kept["frame"]), int(kept["step"])) == (frame, step):
-                    for name, model in self._colours.items():
-                        model.take_up(kept[f"seen {name}"], kept[f"counts {name}"])
-                    return frame
+            for name, model in self._colours.items():
+                model.take_up(np.asarray(kept[f"seen {name}"], np.int64), kept[f"counts {name}"])
+            return frame
+        return None
+
+
+def _stored(path: Path) -> dict[str, Array] | None:
+    """Return the arrays of a file; None where there is none, or it is damaged: the frames are then done again."""
+    try:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except (OSError, *DAMAGED):
         return None
 
 

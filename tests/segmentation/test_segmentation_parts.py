@@ -17,7 +17,7 @@ from jawusd.segmentation.cut import cut_three_ways
 from jawusd.segmentation.files import KeyMasks, mask_path, write_mask
 from jawusd.segmentation.learn import Example, learn_numbers
 from jawusd.segmentation.picture import PictureFrame, Window
-from jawusd.segmentation.state import ColourStates
+from jawusd.segmentation.state import ColourStates, state_files
 
 
 def exact_two_way_cut(cost, edge):
@@ -262,6 +262,17 @@ def test_colours_go_on_where_they_stopped(tmp_path):
     assert states.take_up(7, 1) == 6  # frame 7 is on record, its colours are not
     assert states.take_up(5, 1) == 5
     assert np.array_equal(fresh.log_odds(rgb), model.log_odds(rgb))
+
+
+def test_damaged_colours_are_done_again(tmp_path):
+    model = taught(painted(np.random.default_rng(7), (90, 120), (170, 104, 96)), expect_disks()[1].any(0))
+    states = ColourStates(tmp_path, {"cam0": model})
+    for frame in (5, 6):
+        states.keep(frame, 1)
+    assert states.take_up(6, 1) == 6
+    for path in state_files(tmp_path):  # only that of frame 6, then both
+        path.write_bytes(path.read_bytes()[:-40])
+        assert states.take_up(6, 1) == (5 if path == state_files(tmp_path)[0] else None)
 
 
 def test_a_folder_without_key_masks_is_refused(tmp_path):
