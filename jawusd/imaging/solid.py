@@ -9,6 +9,7 @@ alike. Faces that lie inside other parts, as where neighbouring teeth overlap, a
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -39,8 +40,7 @@ class DistanceGrid:
     values: NDArray[np.float32]
 
 
-@dataclass(frozen=True, eq=False)
-class _Columns:
+class _Columns(NamedTuple):
     """The triangles over every square of the (x, z) plane: numbers of those over square i are list[start[i]:end[i]]."""
 
     low: Array
@@ -65,7 +65,7 @@ def outer_faces(corners: Array, up: float) -> tuple[Mask, float]:
     normals = np.cross(flipped[:, 1] - flipped[:, 0], flipped[:, 2] - flipped[:, 0])
     length = np.linalg.norm(normals, axis=1)
     before = flipped.mean(axis=1) + _OFF_FACE_MM * normals / np.maximum(length, 1e-12)[:, None]
-    count, first = _crossings(before + _JITTER_MM, flipped, columns.low, columns.shape, columns.start, columns.faces)
+    count, first = _crossings(before + _JITTER_MM, flipped, columns)
     met = first[first != 0]
     entering = float((met > 0).mean()) if len(met) else 0.0
     return (count <= 0) & (length > 0), entering
@@ -91,7 +91,7 @@ def distance_grid(corners: Array, outer: Mask, box: Array, step_mm: float, up: f
     values = _distances(kept, nearest, box[0], step_mm)
     flipped = _upwards(corners, up)
     columns = _columns_of(flipped)
-    _set_signs(values, flipped, box[0], step_mm, up, columns.low, columns.shape, columns.start, columns.faces)
+    _set_signs(values, flipped, box[0], step_mm, up, columns)
     return DistanceGrid(np.array(box[0]), step_mm, values)
 
 
@@ -131,15 +131,9 @@ def _crossing(corners: Array, f: int, x: float, z: float) -> tuple[int, float]:
 
 
 @numba.njit(nogil=True, cache=True)
-def _crossings(
-    points: Array,
-    corners: Array,
-    low: Array,
-    shape: tuple[int, int],
-    start: NDArray[np.int64],
-    faces: NDArray[np.int64],
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _crossings(points: Array, corners: Array, columns: _Columns) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the winding count below each point, and the kind of the lowest crossing below it."""
+    low, shape, start, faces = columns
     count = np.zeros(len(points), np.int64)
     first = np.zeros(len(points), np.int64)
     for p in range(len(points)):
@@ -161,16 +155,9 @@ def _crossings(
 
 @numba.njit(nogil=True, cache=True)
 def _set_signs(
-    values: NDArray[np.float32],
-    corners: Array,
-    origin: Array,
-    step: float,
-    up: float,
-    low: Array,
-    shape: tuple[int, int],
-    start: NDArray[np.int64],
-    faces: NDArray[np.int64],
+    values: NDArray[np.float32], corners: Array, origin: Array, step: float, up: float, columns: _Columns
 ) -> None:
+    low, shape, start, faces = columns
     heights, kinds = np.empty(_MOST_CROSSINGS), np.empty(_MOST_CROSSINGS, np.int64)
     nx, ny, nz = values.shape
     for i in range(nx):

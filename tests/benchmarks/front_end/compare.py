@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import shutil
-import sys
 import tempfile
 import time
 from dataclasses import dataclass, replace
@@ -32,6 +31,7 @@ from jawusd.tracking.region.view import RegionView
 MOST = 3.0  # bound of log ratios, that of learned colours
 LEVELS = 16  # of the network's log ratio: with the 4096 colours, what 16 bits hold
 STRIDE = 8  # sizes the network takes are multiples of it
+PLAIN = LearnedColours.views
 
 
 class Network:
@@ -64,7 +64,7 @@ class RatedView(RegionView):
 
 
 def rated(view: RegionView, network: Network, colours_too: bool) -> RatedView:
-    """Return a view with the network's ratios, or the mean of them and of the colours'."""
+    """Return a view with the network's ratios, or their sum with the colours', bounded alike."""
     found = network.log_ratio(view.rgb)
     level = np.rint((found + MOST) / (2 * MOST) * (LEVELS - 1)).astype(np.uint16)
     values = np.linspace(-MOST, MOST, LEVELS, dtype=np.float32)
@@ -88,9 +88,6 @@ def exchange(network: Network | None, colours_too: bool) -> None:
         ]
 
     LearnedColours.views = views
-
-
-PLAIN = LearnedColours.views
 
 
 def without_masks(source: Path, folder: Path) -> Path:
@@ -146,4 +143,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

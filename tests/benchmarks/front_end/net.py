@@ -111,6 +111,5 @@ def write(net: Net, path: Path) -> None:
     torch.onnx.export(net, (example,), str(path), dynamic_axes=sizes, dynamo=False, **names)
 
 
-
 if __name__ == "__main__":
     main()
