@@ -9,15 +9,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from cramer_rao import MEAN_W
+from population_bound import cramer_rao, crown_sigmas, efficient
 
 from jawusd.errors import JawusdError
 from jawusd.formats.capture import load_capture
 from jawusd.formats.tracks import TRACKED, Tracks
 from jawusd.geometry import (
-    Camera,
-    mandible_metric,
-    se3_adjoint,
     se3_inverse,
     se3_log,
     transform_point,
@@ -25,20 +22,12 @@ from jawusd.geometry import (
 )
 from jawusd.pipeline.prepare import load_cameras, load_meshes, subject_of_capture
 from jawusd.pipeline.track import track
-from jawusd.synthetic.annotator import REFERENCE_HEIGHT
-from jawusd.tracking import TrackingConfig
-from jawusd.tracking.contour.equations import translation
-from jawusd.tracking.contour.frame_record import FrameRecord
-from jawusd.tracking.contour.quality import twist_covariance
-from jawusd.tracking.contour.scan import Scan, prepare_scan
-from jawusd.tracking.contour.solver import ContourSolver
-from jawusd.tracking.contour.views import MaskViews
-from jawusd.tracking.sequence.extrinsics import Extrinsics
-from jawusd.tracking.sequence.nuisance import TakeEquations, pose_response
+from jawusd.tracking.contour.scan import prepare_scan
 
 ROWS = ("upper", "lower")
 AXES = ("left", "up", "front")
 GROSS_MM = 0.5
+STEADY_MM = 0.02
 
 
 @dataclass
@@ -135,7 +124,7 @@ def compare(outcome: Outcome, folder: Path, tracks: Tracks, truth: dict[str, np.
     scans = [prepare_scan(meshes[f"{row}_teeth"], row) for row in ROWS]
     exact = np.stack([truth[f"T_world_{row}"][rows] for row in ROWS], axis=1)
     found = np.stack([getattr(tracks, f"T_world_{row}")[good] for row in ROWS], axis=1)
-    known, bound = cramer_rao(folder, scans, exact, truth, rows, cameras)
+    bounds = cramer_rao(folder, scans, exact, truth, rows, cameras)
     usual = np.ones(len(rows), bool)
     for r, row in enumerate(ROWS):
         gap = transform_points(found[:, r], scans[r].probes) - transform_points(exact[:, r], scans[r].probes)
@@ -143,16 +132,16 @@ def compare(outcome: Outcome, folder: Path, tracks: Tracks, truth: dict[str, np.
         of_frame = np.sqrt((distance**2).mean(1))
         figures[f"vertices {row}"] = float(distance.mean())
         wrong = of_frame > GROSS_MM
-        sigma = _crown_sigmas(exact[:, r], scans[r], getattr(tracks, f"covariance_{row}")[good])
+        sigma = crown_sigmas(exact[:, r], scans[r], getattr(tracks, f"covariance_{row}")[good])
         flagged = (tracks.status[good, r] != TRACKED) | (sigma > GROSS_MM / 2)
         figures[f"gross {row}"] = float(wrong.mean())
         usual &= ~wrong
         figures[f"silent {row}"] = float((wrong & ~flagged).mean())
-        least = _crown_sigmas(exact[:, r], scans[r], bound[:, r])
+        least = crown_sigmas(exact[:, r], scans[r], bounds.unknown[:, r])
         figures[f"bound {row}"] = float(np.median(least))
         figures[f"ratio {row}"] = float(np.median(of_frame) / np.median(least))
         figures[f"ratio known {row}"] = float(
-            np.median(of_frame) / np.median(_crown_sigmas(exact[:, r], scans[r], known[:, r]))
+            np.median(of_frame) / np.median(crown_sigmas(exact[:, r], scans[r], bounds.known[:, r]))
         )
         inwards = np.swapaxes(exact[:, r, :3, :3], 1, 2)
         vectors[f"shift {row}"] = (to_bite @ np.median(np.einsum("fij,fj->fi", inwards, gap.mean(1)), axis=0)).tolist()
@@ -168,6 +157,7 @@ def compare(outcome: Outcome, folder: Path, tracks: Tracks, truth: dict[str, np.
     twist = se3_log(relative @ se3_inverse(measured))
     figures["nees relative"] = _nees(twist[usual], tracks.covariance_relative[good][usual])
     figures["sigma incisor"] = float(np.nanmedian(tracks.sigma_mm[good, 0]))
+    vectors |= efficient(bounds, scans, exact, landmarks[0], to_bite, STEADY_MM)
     for name in ("ratio", "ratio known"):
         figures[name] = max(figures[f"{name} {row}"] for row in ROWS)
     for name in ("gross", "silent"):
@@ -175,58 +165,6 @@ def compare(outcome: Outcome, folder: Path, tracks: Tracks, truth: dict[str, np.
     gum = tracks.meta.get("gum_line_mm")
     if gum is not None:
         vectors["gum error"] = (np.asarray(gum, float).ravel()[:2] - truth["gum_mm"]).tolist()
-
-
-def cramer_rao(
-    folder: Path, scans: list, exact: np.ndarray, truth: dict, rows: np.ndarray, cameras: list
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least covariances of both arches' twists by the annotator's wobble, two of shape (F, 2, 6, 6).
-
-    The first if the annotator's habits are known, the second if they must be told from the take by the spread that
-    hands have (the bound of van Trees 1968 for parameters with a prior).
-    """
-    capture, config = load_capture(folder), TrackingConfig()
-    offsets = dict(zip(truth["camera_names"].tolist(), truth["offsets"].tolist(), strict=True))
-    centre = np.mean([transform_point(exact[0, r], scans[r].centre) for r in (0, 1)], axis=0)
-    table = {camera.name: camera for camera in cameras}
-    solver, noise = ContourSolver(scans, config), _noise(truth, cameras[0], centre, config)
-    status, used = np.full(2, TRACKED, np.int8), np.ones((2, len(cameras)), bool)
-    records = {}
-    with MaskViews(capture.cameras, table, offsets, centre, config.working_px_per_mm) as masks:
-        for pose, row in zip(exact, rows):
-            frame = int(truth["frames"][row])
-            solution = solver.solve(pose, masks.at(frame), ())
-            records[frame] = FrameRecord(solution, status, used, np.zeros((2, len(cameras))))
-        extrinsics = Extrinsics.calibrated(masks.cameras, centre)
-    # The weights of the robust estimate are left out of the information.
-    habits = TakeEquations(records, np.full(2, noise * MEAN_W), extrinsics).solve(config, False).covariance
-    known, unknown = np.empty((2, len(rows), 2, 6, 6))
-    for k, (frame, record) in enumerate(records.items()):
-        for r in (0, 1):
-            known[k, r] = MEAN_W * twist_covariance(record.solution, r, 1.0, noise)
-            to_world = se3_adjoint(translation(record.solution.centres[r]))
-            response = to_world @ pose_response(records, frame, r, extrinsics)
-            unknown[k, r] = known[k, r] + response @ habits @ response.T
-    return known, unknown
-
-
-def _noise(truth: dict, first: Camera, centre: np.ndarray, config: TrackingConfig) -> float:
-    """Return variance times correlation length of the annotator's wobble at the working size [px^3]."""
-    scale = max(first.size_px[1] / REFERENCE_HEIGHT, 0.45)
-    full = float(first.K[0, 0] / first.depth(centre[None])[0])  # px per mm
-    working = min(full, config.working_px_per_mm)
-    wobble_px = float(truth["wobble_px"]) * scale / full * working
-    together_px = float(truth["cell_px"]) * scale / full * working
-    # rounding to whole pixels of the recorded picture, independent from pixel to pixel
-    return wobble_px**2 * together_px + (working / full) ** 3 / 12.0
-
-
-def _crown_sigmas(poses: np.ndarray, scan: Scan, covariances: np.ndarray) -> np.ndarray:
-    """Return the rms standard deviation of crown vertices [mm], shape (F,), by covariances of left twists."""
-    squares = [
-        np.trace(mandible_metric(transform_points(T, scan.probes)) @ C) for T, C in zip(poses, covariances, strict=True)
-    ]
-    return np.sqrt(np.array(squares))
 
 
 def _nees(twist: np.ndarray, covariance: np.ndarray) -> float:

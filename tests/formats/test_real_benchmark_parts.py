@@ -1,6 +1,7 @@
 """Parts of the benchmark on data of others, on made-up samples of each of its formats and on motions known exactly."""
 
 import importlib
+import re
 import sys
 from pathlib import Path
 
@@ -70,9 +71,9 @@ def recorded(tmp_path):
 
 
 def figures(told, quantity):
-    """Return the numbers of a row of a printed table."""
+    """Return the numbers of a row of a printed table, whose last columns are its data, licence and command."""
     row = next(line for line in told.splitlines() if quantity in line)
-    return [float(cell) for cell in row.split("|")[2:-1]]
+    return [float(cell) for cell in row.split("|")[2:-4]]
 
 
 def test_markers_agree_with_the_makers_poses(part, recorded, capsys):
@@ -81,6 +82,8 @@ def test_markers_agree_with_the_makers_poses(part, recorded, capsys):
     told = capsys.readouterr().out
     assert max(figures(told, "from the maker's poses") + figures(told, "from the maker's, speech")) < 1e-3
     assert max(figures(told, "noise of jaw markers")) < 1e-3
+    rows = [line for line in told.splitlines() if line.startswith("| ")]
+    assert all(re.search(r"paulgribble/optotrak.*none given.*--only markers` \|$", row) for row in rows[1:])
     assert "5 frames of 3 points are read;\nthey move by 50 mm and turn by 0.0 degrees" in told
     assert (recorded / "out" / "clench.png").stat().st_size > 0
 

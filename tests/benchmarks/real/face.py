@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from peers import ROWS, camera_video, load_truth
-from report import table, title
+from report import Origin, table, title
 
 from jawusd.formats.capture import Capture, load_capture
 from jawusd.geometry import Camera, se3_inverse, transform_point, transform_points
@@ -17,19 +17,20 @@ from jawusd.pipeline.prepare import load_cameras, load_meshes, subject_of_captur
 Array = np.ndarray
 SAMPLES = 40  # frames spread over the take
 FEWEST = 10  # faces that a line is fitted to
+ORIGIN = Origin("frames of one camera spread over each capture, simulated by jawusd", "ours", "face")
 NOSE, CHIN, EARS, LIPS = 1, 152, (234, 454), (13, 14)  # numbers of landmarks; of the lips the inner edges
 
 
 def run(captures: list[Path], python: Path | None) -> None:
     """Print a row per capture."""
-    title("Opening by MediaPipe", "frames of one camera spread over each capture, simulated by jawusd", "ours")
+    title("Opening by MediaPipe", ORIGIN)
     if python is None:
         print("MediaPipe was not run: name the Python of an environment with mediapipe 0.10.21 with --mediapipe.")
         return
     print("Distance of the lower incisal point from its place in the bite [mm] by the line through all measurements")
     print("that fits the truth best: MediaPipe's own figures have no scale.\n")
     header = ("capture", "camera", "frames", "no face", "truth, spread", "jaw angle, rms off", "lips, rms off")
-    table(header, (row(path, python) for path in captures))
+    table(header, (row(path, python) for path in captures), ORIGIN)
 
 
 def row(path: Path, python: Path) -> list[str]:

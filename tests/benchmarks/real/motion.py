@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from models import FOLDS, FREE, MODELS, components, errors_or_reason
-from report import bars, curves, table, title
+from report import Origin, bars, curves, table, title
 from sources import CHEWING, OPTOTRAK
 
 from jawusd.fitting.coverage import missing_movements, shown_parameters
@@ -37,6 +37,12 @@ SPEECH_LANDMARKS = np.array([[-37.0, 0, 78], [-37, -25, 45], [-37, 25, 45], [0, 
 HALF_WIDTH, FORWARD, DOWN = 50.0, 80.0, 40.0  # of usual jaws: condyles apart, incisors before and below them [mm]
 USUAL = np.array([[0, -DOWN, FORWARD], [25, -DOWN, 45], [-25, -DOWN, 45], [HALF_WIDTH, 0, 0], [-HALF_WIDTH, 0, 0]])
 SYNTHETIC_FRAMES, SYNTHETIC_SEED = 600, 1
+OF_MARKERS = Origin(f"`{OPTOTRAK.repository}` plgrigid", OPTOTRAK.licence, "markers")
+OF_MODELS = Origin(
+    f"`{OPTOTRAK.repository}` (speech), `{CHEWING.repository}` (chewing), a synthetic person of jawusd",
+    f"{OPTOTRAK.licence}; {CHEWING.licence}; ours",
+    "models",
+)
 
 
 @dataclass(frozen=True)
@@ -106,7 +112,7 @@ def synthetic() -> Take:
 
 def poses_against_the_maker(data: Path, out: Path) -> None:
     """Print noise in the clench, distance to the maker's poses, what speech lacks, and what PCA of markers leaves."""
-    title("Markers to poses", f"`{OPTOTRAK.repository}` plgrigid", OPTOTRAK.licence)
+    title("Markers to poses", OF_MARKERS)
     spoken, clenched = speech(data)
     maker = maker_poses(OPTOTRAK.found(data) / "plgrigid" / "rig1.asc")
     apart = se3_inverse(maker) @ spoken.T
@@ -124,6 +130,7 @@ def poses_against_the_maker(data: Path, out: Path) -> None:
             ("jaw markers from the maker's poses, speech [mm]", rms(off), f"{off.max():.4f}"),
             ("turn from the maker's, speech [degrees]", rms(angle), f"{angle.max():.4f}"),
         ],
+        OF_MARKERS,
     )
     curves(out / "clench.png", {"jaw markers from their mean place": np.sqrt((still**2).mean(axis=1))}, "mm")
     lacking(spoken.data)
@@ -196,11 +203,7 @@ def pca_of_markers(placed: Array, parts: list[tuple[Array, Array]], count: int) 
 
 def models(data: Path, out: Path) -> None:
     """Print the hold-out errors of every model with 1, 2, 3 parameters on speech, chewing and a synthetic person."""
-    title(
-        "Models of jaw motion",
-        f"`{OPTOTRAK.repository}` (speech), `{CHEWING.repository}` (chewing), a synthetic person of jawusd",
-        f"{OPTOTRAK.licence}; {CHEWING.licence}; ours",
-    )
+    title("Models of jaw motion", OF_MODELS)
     spoken, clench = speech(data)
     noise_floor(spoken, clench)
     takes = {"speech": spoken, "chewing": chewing(data), "synthetic": synthetic()}
@@ -211,6 +214,7 @@ def models(data: Path, out: Path) -> None:
     table(
         ("model", "poses", *(f"{name} {k}" for name in takes for k in FREE), "seconds"),
         (model_row(name, takes, drawn, reasons) for name in MODELS),
+        OF_MODELS,
     )
     for reason in dict.fromkeys(reasons):
         print(f"- {reason}")

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from report import table, title
+from report import Origin, table, title
 from scipy import ndimage
 from sources import PATIENTS
 
@@ -37,12 +37,13 @@ ROWS = ("Upper", "Lower")
 LINE = 64  # gray from which a pixel belongs to a line; its blur reaches three times as far
 LARGEST_TOOTH = 0.05  # share of a picture: closed lines around more enclose no tooth
 BESIDE_PX = 20  # masks are judged as far as this beyond the areas
+ORIGIN = Origin(f"`{PATIENTS.repository}` seg/valid and demo/ref_mesh", PATIENTS.licence, "patients")
 PALETTE = np.array([[60, 220, 60], [60, 160, 255]])
 
 
 def run(data: Path, out: Path) -> None:
     """Print the tables of both patients and write pictures."""
-    title("Photographs of patients", f"`{PATIENTS.repository}` seg/valid and demo/ref_mesh", PATIENTS.licence)
+    title("Photographs of patients", ORIGIN)
     folder = PATIENTS.found(data)
     aligned: list[PhotoAlignment] = []
 
@@ -53,16 +54,18 @@ def run(data: Path, out: Path) -> None:
 
     print("Outlines [px at 1440 px width]; T_upper_lower by a photograph alone and by the two others [mm]:\n")
     header = ("patient", "photograph", "focal", "rms", "median", "without gum lines", "alone to all", "others to all")
-    table(header, outlines())
+    table(header, outlines(), ORIGIN)
     print("Crowns in occlusion as the photographs close them; gaps are negative where crowns overlap:\n")
     table(
         ("patient", "gap left [mm]", "gap right [mm]", "overlap [mm]", "opposed, share", "overjet [mm]"),
         (occlusion_row(folder, patient, found) for patient, found in enumerate(aligned)),
+        ORIGIN,
     )
     print("Automatic masks against the areas of the drawn outlines, intersection over union:\n")
     table(
         ("patient", "photograph", "upper", "lower", "both", "both, without scans", "outlines closed"),
         (row for patient, found in enumerate(aligned) for row in mask_rows(folder, patient, found, out)),
+        ORIGIN,
     )
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from report import table, title
+from report import Origin, table, title
 
 from jawusd.formats.capture import Bootstrap, Capture, Pick, PickView, load_capture
 from jawusd.formats.mesh import Mesh, crown_face_mask, tooth_labels
@@ -55,10 +55,11 @@ def run(captures: list[Path], frames: int, m3t: Path | None) -> None:
     for path in captures:
         scene = scene_of(path, frames)
         first, last = scene.capture.frames
-        title(f"Peers on {scene.capture.name}", f"frames {first} to {last - 1}, simulated by jawusd", "ours")
+        origin = Origin(f"{scene.capture.name}, frames {first} to {last - 1}, simulated by jawusd", "ours", "peers")
+        title(f"Peers on {scene.capture.name}", origin)
         print(f"Errors of T_upper_lower [mm]; frames without a pose; frames more than {OFF_MM:g} mm off.\n")
         header = ("method", "incisor mean", "largest", "condyles mean", "no pose", "off", "CPU s per frame")
-        table(header, (row(name, scene, method) for name, method in methods(m3t).items()))
+        table(header, (row(name, scene, method) for name, method in methods(m3t).items()), origin)
     if m3t is None:
         print("M3T was not run: name a program that README.md describes with --m3t.")
 

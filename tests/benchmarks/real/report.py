@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib
@@ -12,17 +13,28 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 
-def title(text: str, data: str, licence: str) -> None:
-    """Print the heading of a section with what data it is on."""
-    print(f"\n## {text}\n\nData: {data}; licence: {licence}.\n", flush=True)
+@dataclass(frozen=True)
+class Origin:
+    """Say what data the rows of tables are on, under which licence, and the section of the command that prints them."""
+
+    data: str
+    licence: str
+    section: str
 
 
-def table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Print a Markdown table, a row as soon as it is there."""
+def title(text: str, origin: Origin) -> None:
+    """Print the heading of a section."""
+    print(f"\n## {text}\n\nData: {origin.data}; licence: {origin.licence}.\n", flush=True)
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[object]], origin: Origin) -> None:
+    """Print a Markdown table, a row as soon as it is there, each with its origin."""
+    names = (origin.data, origin.licence, f"`--only {origin.section}`")
+    header = (*header, "data", "licence", "command")
     print("| " + " | ".join(header) + " |")
     print("|" + "---|" * len(header), flush=True)
     for row in rows:
-        print("| " + " | ".join(map(str, row)) + " |", flush=True)
+        print("| " + " | ".join(map(str, (*row, *names))) + " |", flush=True)
     print(flush=True)
 
 

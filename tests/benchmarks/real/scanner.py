@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import patients
-from report import saved, table, title
+from report import Origin, saved, table, title
 from sources import PATIENTS, SCANNER
 
 from jawusd.errors import MissingDependencyError
@@ -15,18 +15,19 @@ from jawusd.formats.mesh import GUM, Mesh
 from jawusd.imaging.meshio import load_mesh
 from jawusd.imaging.scan_labels import label_scan
 
+ORIGIN = Origin(
+    f"`{SCANNER.repository}` TestData, `{PATIENTS.repository}` demo/ref_mesh",
+    f"{SCANNER.licence}; {PATIENTS.licence}",
+    "scanner",
+)
 CASTS = ("real-world/scan_012.dcm", "real-world/scan_039.dcm", "real-world/scan_040.dcm", "Scan-01/Scan.dcm")
 
 
 def run(data: Path, out: Path) -> None:
     """Print what is read and labelled, with pictures."""
-    title(
-        "Files of real scanners",
-        f"`{SCANNER.repository}` TestData, `{PATIENTS.repository}` demo/ref_mesh",
-        f"{SCANNER.licence}; {PATIENTS.licence}",
-    )
+    title("Files of real scanners", ORIGIN)
     header = ("file", "vertices", "faces", "extent [mm]", "crown, share", "weak border, share", "seconds")
-    table(header, (row(name, path, out) for name, path in files(data).items()))
+    table(header, (row(name, path, out) for name, path in files(data).items()), ORIGIN)
 
 
 def files(data: Path) -> dict[str, Path]:
