@@ -10,7 +10,7 @@ from jawusd.errors import TrackingError
 from jawusd.formats.capture import Bootstrap
 from jawusd.geometry import transform_point, transform_points
 from jawusd.tracking.contour.scan import prepare_scan
-from jawusd.tracking.initialization.pick_cameras import shifted, zoomed
+from jawusd.tracking.initialization.pick_cameras import fitted_camera, shifted, zoomed
 from jawusd.tracking.initialization.pick_causes import Setting
 from jawusd.tracking.initialization.pick_checks import pick_findings
 
@@ -151,3 +151,10 @@ def test_contradictions_without_a_single_cause_are_refused_as_such():
     turned = tuple([p.model_copy(update={"vertex": q.vertex}) for p, q in zip(own, own[::-1])] for own in GIVEN.picks)
     with pytest.raises(TrackingError, match="contradict one another"):
         found(replace(GIVEN, picks=turned))
+
+
+def test_no_focal_length_is_fitted_to_picks_without_sense():
+    """Of scans in inches, five times the focal length would come nearer; of worse ones, one that overflows."""
+    inches = tuple(vertices / 25.4 for vertices in VERTICES)
+    camera = fitted_camera(GIVEN.picks, inches, TABLE, "cam0", True)
+    assert camera.K[0, 0] <= 2 * TABLE["cam0"].K[0, 0] * (1 + 1e-9)

@@ -14,6 +14,7 @@ from jawusd.geometry.arrays import Array
 
 # What may be wrong, standard deviations: shift over the picture's width, relative focal length; and of a click [mm].
 _SHIFT, _FOCAL, _CLICK_MM = 0.05, 0.1, 0.3
+_MOST_ZOOM = np.log(2.0)  # logarithm of a focal length over the given one: what clicks without sense ask for overflows
 _STEP = np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0])  # of the poses, about what they are off [rad, mm]
 
 
@@ -48,7 +49,9 @@ def fitted_camera(
     width = float(given.size_px[0])
 
     def changed(x: Array) -> Camera:
-        return zoomed(given, float(np.exp(x[0] * _FOCAL))) if zooms else shifted(given, x[:2] * _SHIFT * width)
+        if not zooms:
+            return shifted(given, x[:2] * _SHIFT * width)
+        return zoomed(given, float(np.exp(np.clip(x[0] * _FOCAL, -_MOST_ZOOM, _MOST_ZOOM))))
 
     placed = [_placed(own, points, cameras) for own, points in zip(picks, vertices, strict=True)]
     starts = [start for start in placed if start is not None]
