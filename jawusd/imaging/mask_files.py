@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
 
@@ -53,16 +53,17 @@ class PngMasks:
         """
         self._pattern, self._size_px, self._labels, self._is_other = pattern, size_px, labels, is_other
         self.odd: dict[int, str] = {}
-        self._files = numbered_files(pattern) if "%" not in pattern.name else self._found(pattern)
-        self.count = max(self._files) + 1
+        # Names, not paths: hours of several cameras are a hundred thousand files.
+        self._names = self._found(pattern) if "%" in pattern.name else _names(numbered_files(pattern))
+        self.count = max(self._names) + 1
 
     @property
     def numbers(self) -> set[int]:
         """Return the numbers of the files."""
-        return set(self._files)
+        return set(self._names)
 
     @staticmethod
-    def _found(pattern: Path) -> dict[int, Path]:
+    def _found(pattern: Path) -> dict[int, str]:
         number = _NUMBER.search(pattern.name)
         if number is None or pattern.name.count("%") != 1:
             raise CaptureError(
@@ -76,12 +77,12 @@ class PngMasks:
         before, after = (re.escape(part) for part in (pattern.name[: number.start()], pattern.name[number.end() :]))
         name = re.compile(f"{before}({digits}){after}")
         found = (name.fullmatch(entry.name) for entry in os.scandir(pattern.parent))
-        files = {int(match[1]): pattern.parent / match[0] for match in found if match}
-        if not files:
+        names = {int(match[1]): match[0] for match in found if match}
+        if not names:
             raise CaptureError(
                 "no file of the folder has such a name.", path=pattern, hint="Correct `masks` in capture.toml."
             )
-        return files
+        return names
 
     @cached_property
     def levels(self) -> SourceLevels:
@@ -90,7 +91,7 @@ class PngMasks:
         Raises:
             CaptureError: the pictures have another size or are no masks.
         """
-        found = png_levels([self._files[k] for k in sorted(self._files)], self._is_other)
+        found = png_levels([self._path(k) for k in sorted(self._names)], self._is_other)
         if self._size_px is not None:
             for path, size in found.sizes_px:
                 _check_size(path, size, self._size_px)
@@ -103,10 +104,11 @@ class PngMasks:
             CaptureError: a file cannot be decoded or has another size, or the pictures are no masks.
         """
         for number in range(first, self.count):
-            path = self._files.get(number)
-            if path is None:
+            if number not in self._names:
                 yield None
-            elif self._labels is not None:
+                continue
+            path = self._path(number)
+            if self._labels is not None:
                 image = self._load(path)
                 image = image if image.ndim == 2 else read_palette_numbers(path, image)
                 yield _labelled(image, self._labels, path, "")
@@ -126,8 +128,11 @@ class PngMasks:
 
     def first_size_px(self) -> tuple[int, int]:
         """Return the (width, height) of the first file."""
-        height, width = self._load(self._files[min(self._files)]).shape[:2]
+        height, width = self._load(self._path(min(self._names))).shape[:2]
         return width, height
+
+    def _path(self, number: int) -> Path:
+        return self._pattern.parent / self._names[number]
 
     def _load(self, path: Path) -> RawImage:
         image = load_png(path)
@@ -181,6 +186,10 @@ class VideoMasks:
             if odd:
                 self.odd[frame.index] = f"picture {frame.index} {odd}"
             yield mask
+
+
+def _names(files: Mapping[int, Path]) -> dict[int, str]:
+    return {number: path.name for number, path in files.items()}
 
 
 def _check_size(path: Path, found: tuple[int, int], allowed: tuple[int, int]) -> None:

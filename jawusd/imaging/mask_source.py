@@ -44,8 +44,11 @@ def png_levels(files: Sequence[Path], is_other: Callable[[RawImage], bool] | Non
     chosen = _spread(len(files), _SAMPLED)
     sample = [files[k] for k in chosen]
     versions = tuple((stat.st_mtime_ns, stat.st_size) for stat in (path.stat() for path in sample))
-    others = _Others(path for k, path in enumerate(files) if k not in chosen)
-    return _png_levels_of_version(tuple(sample), versions, others, is_other)
+    others = _Others([path for k, path in enumerate(files) if k not in chosen])
+    try:
+        return _png_levels_of_version(tuple(sample), versions, others, is_other)
+    finally:
+        others.files = []  # the cache keeps this object, and takes have tens of thousands of files
 
 
 def video_levels(path: Path) -> tuple[SourceLevels, Colour]:
@@ -57,14 +60,17 @@ def video_levels(path: Path) -> tuple[SourceLevels, Colour]:
     return _video_levels_of_version(path, path.stat().st_mtime_ns)
 
 
-class _Others(tuple[Path, ...]):
-    """Hold files; all such are equal, so that a cache does not compare them."""
+class _Others:
+    """Hold files besides a sample; as many others are equal, so that a cache does not compare them."""
+
+    def __init__(self, files: list[Path]) -> None:
+        self.files, self._count = files, len(files)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Others) and len(self) == len(other)
+        return isinstance(other, _Others) and self._count == other._count
 
     def __hash__(self) -> int:
-        return len(self)
+        return self._count
 
 
 def _spread(count: int, most: int) -> list[int]:
@@ -97,7 +103,7 @@ def _png_levels_of_version(
                     sizes.setdefault((image.shape[1], image.shape[0]), path)
                     yield read_palette_numbers(path, image) if as_numbers else image
 
-        more = partial(pictures, others, palette_numbers, read, sizes)
+        more = partial(pictures, others.files, palette_numbers, read, sizes)
         try:
             found = find_levels(pictures(sample, palette_numbers, read, sizes), False, more)
         except NotMasks as error:

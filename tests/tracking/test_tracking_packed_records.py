@@ -6,7 +6,7 @@ from small_take import make_capture, track, write_masks
 
 from jawusd.formats.tracks import LostReason
 from jawusd.tracking.contour.frame_record import NO_LOSS, FrameRecord, Loss
-from jawusd.tracking.sequence import passes
+from jawusd.tracking.sequence import packed_records, passes
 from jawusd.tracking.sequence.packed_records import PackedRecords
 
 FRAMES = 4
@@ -62,3 +62,17 @@ def test_a_record_that_is_set_again_takes_the_place_of_the_one_looked_up(records
     del packed[first]
     assert first not in packed and second in packed
     assert list(packed.kept([second])) == [second]
+
+
+def test_long_takes_are_kept_in_a_file_and_read_back_alike(records, monkeypatch):
+    monkeypatch.setattr(packed_records, "_IN_MEMORY", 1000)
+    packed = PackedRecords()
+    for frame in range(40 * FRAMES):
+        packed[frame] = records[sorted(records)[frame % FRAMES]]
+    copy = packed.kept(packed)
+    packed[0] = records[sorted(records)[1]]
+    for frame in (0, 1, 40 * FRAMES - 1):
+        found, own = copy[frame].solution, records[sorted(records)[frame % FRAMES]].solution
+        np.testing.assert_array_equal(found.poses, own.poses)
+    np.testing.assert_array_equal(packed[0].solution.poses, packed[1].solution.poses)
+    assert packed[0] is not packed[1]

@@ -41,18 +41,19 @@ def delay_steps(
         return []
     cameras = len(extrinsics.twists)
     S, right = TakeEquations(records, variance_px3, extrinsics, []).normal_equations()
-    columns, delays = [], []  # of the delays, per frame
-    for frame in frames:
+    # Of the delays, per frame, then summed up in place from each frame on: of long takes, tens of megabytes.
+    after_S = np.empty((len(frames), len(right), cameras))
+    after_r = np.empty((len(frames), cameras))
+    for k, frame in enumerate(frames):
         own_S, own_right = TakeEquations(records, variance_px3, extrinsics, [frame]).normal_equations()
         S, right = S + own_S, right + own_right
-        columns.append(own_S[:, :cameras].copy())
-        delays.append(own_right[:cameras].copy())
+        after_S[k], after_r[k] = own_S[:, :cameras], own_right[:cameras]
+    for table in (after_S, after_r):
+        np.cumsum(table[::-1], axis=0, out=table[::-1])
     prior = np.linalg.pinv(TakeEquations(records, variance_px3, extrinsics, []).prior_covariance())
     fixed = len(right) - 6 * cameras  # camera motions are taken as known
     keep = np.arange(1, fixed)
     A = np.linalg.inv((S + prior)[np.ix_(keep, keep)])
-    after_S = np.cumsum(columns[::-1], axis=0)[::-1]
-    after_r = np.cumsum(delays[::-1], axis=0)[::-1]
     out = []
     for c in range(cameras):
         best = DelayStep(0.0, 1.0, frames[0])

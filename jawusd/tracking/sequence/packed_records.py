@@ -1,7 +1,9 @@
-"""The records of a take, packed: in a third of the memory that tens of thousands of them take as objects."""
+"""The records of a take, packed into a file without a name: tens of thousands of them take no memory."""
 
 from __future__ import annotations
 
+import tempfile
+import weakref
 from collections.abc import Iterable, Iterator, MutableMapping
 
 import numpy as np
@@ -13,6 +15,7 @@ from jawusd.tracking.contour.equations import OutlineSums, Solution
 from jawusd.tracking.contour.frame_record import FrameRecord, Loss
 
 _KEPT_FRAMES = 32
+_IN_MEMORY = 16 << 20  # bytes before there is a file: takes of a minute or two need none
 # Of a sum per arch and view; the first is a symmetric 6 x 6 matrix.
 _SUM_SHAPES = tuple(table.shape[2:] for table in OutlineSums.zeros(1))
 _LOWER = np.tril_indices(6)
@@ -24,40 +27,68 @@ class PackedRecords(MutableMapping[int, FrameRecord]):
     """Map frames to their records; each is packed when it is set and unpacked when it is looked up.
 
     Poses and figures keep double precision. Sums over samples have single precision: they are sums of thousands of
-    distances known to a hundredth of a pixel.
+    distances known to a hundredth of a pixel. For one thread.
     """
 
     def __init__(self) -> None:
-        self._packed: dict[int, tuple[Array, NDArray[np.float32]]] = {}
+        self._store = _Store()
+        self._places: dict[int, int] = {}
         self._unpacked: dict[int, FrameRecord] = {}  # those looked up last: mostly frames beside one another
 
     def __getitem__(self, frame: int) -> FrameRecord:
         if frame not in self._unpacked:
-            found = _unpacked(*self._packed[frame])
+            found = _unpacked(*self._store.read(self._places[frame]))
             if len(self._unpacked) >= _KEPT_FRAMES:
                 del self._unpacked[next(iter(self._unpacked))]
             self._unpacked[frame] = found
         return self._unpacked[frame]
 
     def __setitem__(self, frame: int, record: FrameRecord) -> None:
-        self._packed[frame] = _packed(record)
+        self._places[frame] = self._store.add(*_packed(record))
         self._unpacked.pop(frame, None)
 
     def __delitem__(self, frame: int) -> None:
-        del self._packed[frame]
+        del self._places[frame]
         self._unpacked.pop(frame, None)
 
     def __iter__(self) -> Iterator[int]:
-        return iter(self._packed)
+        return iter(self._places)
 
     def __len__(self) -> int:
-        return len(self._packed)
+        return len(self._places)
 
     def kept(self, frames: Iterable[int]) -> PackedRecords:
         """Return the same records of some frames."""
         out = PackedRecords()
-        out._packed = {frame: self._packed[frame] for frame in frames}
+        out._store = self._store
+        out._places = {frame: self._places[frame] for frame in frames}
         return out
+
+
+class _Store:
+    """Keep packed records one behind the other; what is replaced stays, for copies of the mapping may hold it."""
+
+    def __init__(self) -> None:
+        self._file = tempfile.SpooledTemporaryFile(_IN_MEMORY)  # noqa: SIM115  # open as long as this object is used
+        self._end = 0
+        weakref.finalize(self, self._file.close)
+
+    def add(self, figures: Array, sums: NDArray[np.float32]) -> int:
+        """Write a record; return its place."""
+        place = self._end
+        self._file.seek(place)
+        for part in (np.array([len(figures), len(sums)], np.int64), figures, sums):
+            self._end += self._file.write(part.tobytes())
+        return place
+
+    def read(self, place: int) -> tuple[Array, NDArray[np.float32]]:
+        """Return the record at a place."""
+        self._file.seek(place)
+        figures, sums = np.frombuffer(self._file.read(16), np.int64).tolist()
+        return (
+            np.frombuffer(self._file.read(8 * figures), np.float64),
+            np.frombuffer(self._file.read(4 * sums), np.float32),
+        )
 
 
 def _packed(record: FrameRecord) -> tuple[Array, NDArray[np.float32]]:
