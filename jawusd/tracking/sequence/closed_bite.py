@@ -20,7 +20,7 @@ from jawusd.errors import TrackingError
 from jawusd.formats.finding import Finding, Severity
 from jawusd.formats.tracks import LOST, Registration
 from jawusd.geometry import relative_pose, se3_adjoint, se3_exp, se3_inverse, se3_log
-from jawusd.geometry.arrays import Array, Mask
+from jawusd.geometry.arrays import Array
 from jawusd.tracking.contour.equations import translation
 from jawusd.tracking.contour.frame_record import FrameRecord
 from jawusd.tracking.contour.scan import ARCHES
@@ -40,6 +40,7 @@ STEADY = 0.3
 _FEWEST_FRAMES = 2
 # Neighbouring frames have nearly the same outline error: each adds this much to the evidence of one, up to a limit [-].
 _NEW_PER_FRAME, _MOST_FRAMES = 0.25, 3.0
+_USUAL_FRAMES = 2000  # that show the usual error of a take, evenly spread: more add memory alone
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,13 +149,15 @@ def closed_bite(
     relative = relative_pose(poses[used, 0], poses[used, 1])
     found = se3_log(back @ relative @ there).mean(0)
 
-    def local(covariance: Array, chosen: Mask) -> Array:
-        A = se3_adjoint(back @ se3_inverse(poses[chosen].reshape(-1, 4, 4))).reshape(-1, 2, 6, 6)
-        return np.asarray(A @ covariance[chosen] @ np.swapaxes(A, -1, -2), np.float64)
+    def local(covariance: Array, at: Array) -> Array:
+        A = se3_adjoint(back @ se3_inverse(at.reshape(-1, 4, 4))).reshape(-1, 2, 6, 6)
+        return np.asarray(A @ covariance @ np.swapaxes(A, -1, -2), np.float64)
 
-    upper, lower = (_positive(part) for part in np.median(local(steady_part(outline, habits), known), axis=0))
+    usual = np.flatnonzero(known)[:: max(1, int(known.sum()) // _USUAL_FRAMES)]
+    steady = local(steady_part(outline[usual], habits[usual]), poses[usual])
+    upper, lower = (_positive(part) for part in np.median(steady, axis=0))
     independent = min(1.0 + _NEW_PER_FRAME * (count - 1), _MOST_FRAMES)
-    noise = (1.0 - STEADY) / independent * local(outline, used).mean(0).sum(0)
+    noise = (1.0 - STEADY) / independent * local(outline[used], poses[used]).mean(0).sum(0)
     both = upper + lower
     prior = _registration_spread(found, both + noise)
     gain = np.linalg.inv(both + noise + prior)

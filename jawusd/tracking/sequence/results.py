@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,9 +58,9 @@ def assemble(
         TrackingError: the registration of the scans is to be corrected, and the mouth was not closed.
     """
     frames = np.array(sorted(records), np.int64)
-    figures = zip(*(_figures(records[f]) for f in frames.tolist()), strict=True)
-    status, losses, centres, coverage, used, residual, matched = (np.stack(column) for column in figures)
-    raw, covariance, covariance_relative, bite = _measured(records, nuisances, extrinsics, config, rest)
+    raw, status, losses, centres, coverage, used, residual, matched = _columns(records, frames)
+    raw[status == LOST] = np.nan
+    raw, covariance, covariance_relative, bite = _measured(raw, records, nuisances, extrinsics, config, rest)
     known = status != LOST
     middle = np.median(centres[known.all(1)] if known.all(1).any() else centres, axis=(0, 1))
     final = np.stack([smooth_poses(frames, raw[:, r], covariance[:, r], middle) for r in ARCHES], axis=1)
@@ -86,10 +87,10 @@ def assemble(
         raw_T_world_upper=raw[:, 0],
         raw_T_world_lower=raw[:, 1],
         raw_T_upper_lower=raw_relative,
-        status=status,
+        status=status.astype(np.int8),
         prior_aided=np.zeros(len(frames), bool),
         coverage_error=coverage,
-        masks_used=used,
+        masks_used=used.astype(bool),
         covariance_upper=covariance[:, 0],
         covariance_lower=covariance[:, 1],
         covariance_relative=covariance_relative,
@@ -104,34 +105,48 @@ def assemble(
     )
 
 
+def _columns(records: Mapping[int, FrameRecord], frames: NDArray[np.int64]) -> list[Array]:
+    """Return what the tracks say of frames, an array per figure: poses as aligned first, see `_figures`."""
+    rows = (_figures(records[frame]) for frame in frames.tolist())
+    first = next(rows)
+    columns = [np.empty((len(frames), *value.shape)) for value in first]
+    for k, row in enumerate(chain([first], rows)):  # frame by frame: of long takes, a list would hold all records
+        for column, value in zip(columns, row, strict=True):
+            column[k] = value
+    return columns
+
+
 def _figures(record: FrameRecord) -> tuple[Array | Mask | NDArray[np.int8], ...]:
-    """Return what the tracks say of a frame besides poses; the second are reason, value and limit of each loss."""
+    """Return what the tracks say of a frame; the third are reason, value and limit of each loss."""
     solution, losses = record.solution, np.array(record.losses, np.float64)
     quality = (residual_px(solution), matched_px(solution))
-    return (record.status, losses, solution.centres, record.coverage, record.used, *quality)
+    return (solution.poses, record.status, losses, solution.centres, record.coverage, record.used, *quality)
 
 
 def _measured(
+    raw: Array,
     records: Mapping[int, FrameRecord],
     nuisances: Nuisances,
     extrinsics: Extrinsics,
     config: TrackingConfig,
     rest: RestFrames,
 ) -> tuple[Array, Array, Array, ClosedBite | None]:
-    """Return the poses (F, 2, 4, 4), their covariances (F, 2, 6, 6), that of the relative pose (F, 6, 6), the bite."""
+    """Return the poses (F, 2, 4, 4), their covariances (F, 2, 6, 6), that of the relative pose (F, 6, 6), the bite.
+
+    `raw` are the poses as aligned, NaN where lost.
+    """
     frames = np.array(sorted(records), np.int64)
-    raw = np.stack([records[f].solution.poses for f in frames])
-    raw[np.stack([records[f].status for f in frames]) == LOST] = np.nan
     outline, habits = _covariances(records, take_correlation_px(records, config), nuisances, extrinsics)
-    covariance = outline + habits
-    relative = _relative_covariance(raw, covariance)
     bite = closed_bite(frames, raw, outline, habits, rest)
+    covariance, steady = outline + habits, steady_part(outline, habits)
+    del outline, habits  # of long takes, as large as all tracks
+    relative = _relative_covariance(raw, covariance)
     if bite is None:
         return raw, covariance, relative, None
-    steady = steady_part(outline, habits)
-    still = np.tile(np.eye(4), (len(frames), 1, 1))
+    still = np.broadcast_to(np.eye(4), (len(frames), 4, 4))
     relative = bite.reduce(relative, _relative_covariance(raw, steady), still, 2)
-    covariance = np.stack([bite.reduce(covariance[:, r], steady[:, r], raw[:, r], r) for r in ARCHES], axis=1)
+    for r in ARCHES:
+        covariance[:, r] = bite.reduce(covariance[:, r], steady[:, r], raw[:, r], r)
     return bite.correct(raw, rest.apply), covariance, relative, bite
 
 

@@ -75,4 +75,4 @@ def _corrections(poses: Array, covariance: Array) -> Array:
                 bands[17 - 6 * (b - a), columns] += ca * cb * weight.ravel()
         arches = np.arange(6 * a, 6 * (a + len(bend)))
         right[arches] -= ca * (weight * bend).ravel()
-    return solveh_banded(bands, right).reshape(count, 6)
+    return solveh_banded(bands, right, overwrite_ab=True, overwrite_b=True).reshape(count, 6)
