@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -24,10 +25,11 @@ from jawusd.tracking.contour.equations import (
     motion_about,
 )
 from jawusd.tracking.contour.samples import HABITS, LENGTH, contour_samples
-from jawusd.tracking.contour.scan import ARCHES, Scan
+from jawusd.tracking.contour.scan import ARCHES, Scan, thinned
 from jawusd.tracking.contour.views import Drawn, View, present_masks
 
 _CORNERS = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, 0, -1]])  # of a ball, that show its motion
+_ROUGH_FACES = 6_000  # of a crown row in trials: a third of the usual scan's, an eighth of a fine one's
 _DENSE_STEPS = 2  # with all faces of a dense scan, after the thinned one has settled
 
 # samples, how many of them are silhouette, their distances to the mask edge, visible contour length [px]
@@ -56,6 +58,13 @@ class ContourSolver:
         self._towards_gum = _towards_gum(self.scans)
         thin = [scan.thin or scan for scan in self.scans]
         self._thin = ContourSolver(thin, config, executor) if any(scan.thin for scan in self.scans) else None
+        self._executor = executor
+
+    @cached_property
+    def rough(self) -> ContourSolver:
+        """Return a solver of scans with few faces, for trials of which most are given up."""
+        scans = [thinned(replace(scan.thin or scan, thin=None), _ROUGH_FACES) for scan in self.scans]
+        return ContourSolver(scans, self.config, self._executor)
 
     def solve(
         self,

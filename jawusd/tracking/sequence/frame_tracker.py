@@ -122,9 +122,17 @@ class FrameTracker:
         status[[loss.reason != LostReason.NONE for loss in losses]] = LOST
         return FrameRecord(trial.solution, status, trial.use, trial.coverage, losses)
 
-    def _try(self, start: Array, views: Sequence[View], gates: Sequence[float], use: Mask) -> _Trial:
-        solution = self._solver.solve(start, views, gates, use)
-        return _Trial(solution, *uncovered_px(self._solver.scans, solution.poses, views), use)
+    def _try(
+        self,
+        start: Array,
+        views: Sequence[View],
+        gates: Sequence[float],
+        use: Mask,
+        solver: ContourSolver | None = None,
+    ) -> _Trial:
+        solver = solver or self._solver
+        solution = solver.solve(start, views, gates, use)
+        return _Trial(solution, *uncovered_px(solver.scans, solution.poses, views), use)
 
     def _suspect(self, trial: _Trial) -> Mask:
         """Tell which arches look worse than in recent frames, shape (2,)."""
@@ -226,7 +234,7 @@ class FrameTracker:
             ranked = []
             for pose in [*_around(bases[0], self._solver.scans[r].centre, c.search_rings), *bases[1:]]:
                 poses = np.where(only[:, None, None], pose, trial.solution.poses)
-                brief = self._try(poses, views, c.trial_gates_px, trial.use)
+                brief = self._try(poses, views, c.trial_gates_px, trial.use, self._solver.rough)
                 ranked.append((brief.objective(c.uncovered_price)[r].sum(), poses))
             ranked.sort(key=lambda entry: -entry[0])
             for _, poses in ranked[: c.search_finalists]:
