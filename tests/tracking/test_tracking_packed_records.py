@@ -1,9 +1,12 @@
 """Packed records hold what was put in."""
 
+import errno
+
 import numpy as np
 import pytest
 from small_take import make_capture, track, write_masks
 
+from jawusd.errors import OutputError
 from jawusd.formats.tracks import LostReason
 from jawusd.tracking.contour.frame_record import NO_LOSS, FrameRecord, Loss
 from jawusd.tracking.sequence import packed_records, passes
@@ -76,3 +79,14 @@ def test_long_takes_are_kept_in_a_file_and_read_back_alike(records, monkeypatch)
         np.testing.assert_array_equal(found.poses, own.poses)
     np.testing.assert_array_equal(packed[0].solution.poses, packed[1].solution.poses)
     assert packed[0] is not packed[1]
+
+
+def test_a_full_folder_is_one_message(records, monkeypatch):
+    def full(data):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    packed = PackedRecords()
+    monkeypatch.setattr(packed._store._file, "write", full, raising=False)
+    with pytest.raises(OutputError, match="while it is tracked: No space left") as caught:
+        packed.update(records)
+    assert "TMPDIR" in caught.value.hint

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator, MutableMapping
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jawusd.errors import OutputError
 from jawusd.formats.tracks import LostReason
 from jawusd.geometry.arrays import Array
 from jawusd.tracking.contour.equations import OutlineSums, Solution
@@ -74,11 +75,22 @@ class _Store:
         weakref.finalize(self, self._file.close)
 
     def add(self, figures: Array, sums: NDArray[np.float32]) -> int:
-        """Write a record; return its place."""
+        """Write a record; return its place.
+
+        Raises:
+            OutputError: the folder for such files is full.
+        """
         place = self._end
-        self._file.seek(place)
-        for part in (np.array([len(figures), len(sums)], np.int64), figures, sums):
-            self._end += self._file.write(part.tobytes())
+        try:
+            self._file.seek(place)
+            for part in (np.array([len(figures), len(sums)], np.int64), figures, sums):
+                self._end += self._file.write(part.tobytes())
+        except OSError as error:
+            raise OutputError(
+                f"a long take cannot be kept there while it is tracked: {error.strerror}.",
+                path=tempfile.gettempdir(),
+                hint="Make room, or name another folder in TMPDIR.",
+            ) from error
         return place
 
     def read(self, place: int) -> tuple[Array, NDArray[np.float32]]:
