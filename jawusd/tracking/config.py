@@ -52,9 +52,8 @@ class TrackingConfig:
     converged_mm: float = 0.004
     # Update from which on the gates in between are left out [mm at the crowns]: they are for steps that go farther.
     settled_mm: float = 0.0
-    # Motion after which a scan is drawn again for hidden parts [px]: points are looked up where they were drawn, and
-    # only what the arches hide of one another is late. From 1 to 3 px, errors are the same (.031 and .036 mm).
-    redraw_px: float = 2.0
+    # Motion after which a scan is drawn again for hidden parts [px]: hidden parts are judged to one pixel.
+    redraw_px: float = 1.0
     # Plausible distance of an arch from its prediction [mm]: a weak pull, for motions that masks leave free.
     prediction_mm: float = 0.5
     # Outline variance times correlation length behind that pull [px^3]: 0.4 px over 18 px, typical masks by hand.

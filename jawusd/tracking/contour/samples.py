@@ -35,7 +35,6 @@ def contour_samples(
     step_px: float,
     depth_tolerance_mm: float,
     towards_gum: Array | None = None,
-    drawn: Array | None = None,
 ) -> tuple[Array, int]:
     """Return the contour points at which the picture changes from crown to anything else, shape (n, COLUMNS).
 
@@ -51,14 +50,11 @@ def contour_samples(
             hidden behind it.
         towards_gum: unit vector in scan coordinates, shape (3,), for scans that end at the gum without showing it:
             outlines that face this way are gum line.
-        drawn: the projection with which the pictures were drawn, if it is not quite `matrix`, shape (3, 4): what a
-            point shows and hides is then looked up where it was.
     """
     gum = np.zeros(3) if towards_gum is None else towards_gum
-    drawn_with = matrix if drawn is None else drawn
     tables = (scan.vertices, scan.crown_faces, scan.planes, scan.edges, scan.gingival_margin, scan.margin_directions)
     samples, count = _samples(
-        *tables, scan.centre, eye, matrix, drawn_with, labels, inverse_depth, step_px, depth_tolerance_mm, gum
+        *tables, scan.centre, eye, matrix, labels, inverse_depth, step_px, depth_tolerance_mm, gum
     )
     return samples, count
 
@@ -74,7 +70,6 @@ def _samples(
     centre: Array,
     eye: Array,
     matrix: Array,
-    drawn: Array,
     labels: NDArray[np.uint8],
     inverse_depth: NDArray[np.float32],
     step_px: float,
@@ -85,8 +80,8 @@ def _samples(
     px_per_mm = _px_per_mm(matrix, centre)
     candidates = _silhouette(vertices, faces, planes, edges, eye, matrix, step_px, labels.shape)
     facing = _in_picture(matrix, towards_gum)
-    silhouette = _visible(candidates, drawn, labels, inverse_depth, tolerance_mm, px_per_mm, facing)
-    line = _gingival_margin(margin, margin_directions, matrix, drawn, labels, inverse_depth, tolerance_mm)
+    silhouette = _visible(candidates, labels, inverse_depth, tolerance_mm, px_per_mm, facing)
+    line = _gingival_margin(margin, margin_directions, matrix, labels, inverse_depth, tolerance_mm)
     return np.concatenate((silhouette, line)), len(silhouette)
 
 
@@ -212,7 +207,6 @@ def pixel_of(coordinate: float) -> int:
 @numba.njit(nogil=True, cache=True)
 def _visible(
     samples: Array,
-    drawn: Array,
     labels: NDArray[np.uint8],
     inverse_depth: NDArray[np.float32],
     tolerance_mm: float,
@@ -225,20 +219,19 @@ def _visible(
     n = 0
     for s in range(len(samples)):
         sample = samples[s]
-        u, v, w = _pixel(drawn, sample[X], sample[Y], sample[Z])
-        i = pixel_of(u - sample[NX])
-        j = pixel_of(v - sample[NY])
-        a = pixel_of(u + sample[NX])
-        b = pixel_of(v + sample[NY])
+        i = pixel_of(sample[U] - sample[NX])
+        j = pixel_of(sample[V] - sample[NY])
+        a = pixel_of(sample[U] + sample[NX])
+        b = pixel_of(sample[V] + sample[NY])
         if min(i, a) < 0 or min(j, b) < 0 or max(i, a) >= width or max(j, b) >= height:
             continue
         if labels[b, a] == CROWN or labels[j, i] != CROWN:
             continue
-        if _nearer(inverse_depth[j, i], 1.0 / w, tolerance_mm):
+        if _nearer(inverse_depth[j, i], sample[INVERSE_DEPTH], tolerance_mm):
             continue
         out[n] = sample
         if out[n, GUM_SHARE] == 0.0:
-            distance_mm = _gum_distance_px(labels, u, v, _GUM_FAR_MM * px_per_mm) / px_per_mm
+            distance_mm = _gum_distance_px(labels, sample[U], sample[V], _GUM_FAR_MM * px_per_mm) / px_per_mm
             share = (_GUM_FAR_MM - distance_mm) / (_GUM_FAR_MM - _GUM_NEAR_MM)
             cosine = sample[NX] * facing_gum[0] + sample[NY] * facing_gum[1]
             share = max(share, (cosine - _LEAST_FACING) / (_FULL_FACING - _LEAST_FACING))
@@ -285,7 +278,6 @@ def _gingival_margin(
     segments: Array,
     directions: Array,
     matrix: Array,
-    drawn: Array,
     labels: NDArray[np.uint8],
     inverse_depth: NDArray[np.float32],
     tolerance_mm: float,
@@ -299,7 +291,7 @@ def _gingival_margin(
         p = segments[s, 0]
         q = segments[s, 1]
         x, y, z = 0.5 * (p[0] + q[0]), 0.5 * (p[1] + q[1]), 0.5 * (p[2] + q[2])
-        u, v, w = _pixel(drawn, x, y, z)
+        u, v, w = _pixel(matrix, x, y, z)
         if w <= 0 or u < 3 or v < 3 or u > width - 4 or v > height - 4:
             continue
         up, vp, wp = _pixel(matrix, p[0], p[1], p[2])
@@ -320,7 +312,6 @@ def _gingival_margin(
             continue
         if _nearer(inverse_depth[pixel_of(v + ny), pixel_of(u + nx)], 1.0 / w, tolerance_mm):
             continue
-        u, v, w = _pixel(matrix, x, y, z)
         out[n, X], out[n, Y], out[n, Z], out[n, U], out[n, V] = x, y, z, u, v
         out[n, NX], out[n, NY], out[n, LENGTH], out[n, INVERSE_DEPTH] = nx / reach, ny / reach, length, 1.0 / w
         out[n, EDGE_SHARE], out[n, GUM_SHARE] = 0.0, 1.0

@@ -196,8 +196,7 @@ class ContourSolver:
         pictures = (rendering.labels[c][r], depths[r])
         limits = (config.sample_step_px, config.depth_tolerance_mm)
         gum = self._towards_gum[r]
-        matrix, drawn_with = view.matrix @ pose, rendering.matrix(r, c)
-        samples, silhouettes = contour_samples(scan, matrix, eye, *pictures, *limits, gum, drawn_with)
+        samples, silhouettes = contour_samples(scan, view.matrix @ pose, eye, *pictures, *limits, gum)
         visible = float(samples[:, LENGTH].sum())
         search_limits = (reach, config.overlap_tolerance_mm, config.normal_cosine)
         if view.edges is None:
@@ -256,11 +255,6 @@ class Rendering:
 
         tasks = [(r, c) for r in ARCHES for c in range(len(self._views)) if self._moved(r, c, poses[r])]
         list(self._solver.map(draw, tasks))
-
-    def matrix(self, r: int, c: int) -> Array:
-        """Return the projection with which a scan was last drawn, scan coordinates [mm] to px, shape (3, 4)."""
-        view = self._views[c]
-        return view.matrix @ view.T_delay[r] @ self._drawn[r, c]
 
     def _moved(self, r: int, c: int, pose: Array) -> bool:
         last = self._drawn.get((r, c))
