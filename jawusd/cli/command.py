@@ -37,12 +37,12 @@ class Command(TyperCommand):
 
     # typer hands its public Context to both methods; the base class in its private copy of click declares that one's.
 
-    def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]
+    def parse_args(self, ctx: typer.Context, args: list[str]) -> list[str]:  # type: ignore[override]  # click has its own Context
         """Take vectors as `--d 20,2,1` too, and keep the words for `command_line`."""
         ctx.meta[_WORDS] = list(args)
         return super().parse_args(ctx, with_vectors_split(args))
 
-    def invoke(self, ctx: typer.Context) -> object:  # type: ignore[override]
+    def invoke(self, ctx: typer.Context) -> object:  # type: ignore[override]  # as above
         """Run, and say on Ctrl+C what is kept."""
         try:
             return super().invoke(ctx)

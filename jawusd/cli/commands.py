@@ -43,8 +43,8 @@ class Commands(TyperGroup):
     # typer hands its public Context; the base class in its private copy of click declares that one's.
 
     def __init__(self, **settings: object) -> None:
-        super().__init__(**settings)  # type: ignore[arg-type]
-        self.commands = _Loaded()  # type: ignore[assignment]
+        super().__init__(**settings)  # type: ignore[arg-type]  # typer passes them on as they are
+        self.commands = _Loaded()  # type: ignore[assignment]  # a mapping that loads what is asked for
 
     def list_commands(self, ctx: object) -> list[str]:
         """Return the names in the order of `jawusd --help`."""

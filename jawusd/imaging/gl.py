@@ -87,7 +87,7 @@ def open_context() -> moderngl.Context:
     """
     try:
         # moderngl annotates each setting as if it were all of them.
-        context = moderngl.create_standalone_context(backend="egl", require=430)  # type: ignore[arg-type]
+        context = moderngl.create_standalone_context(backend="egl", require=430)  # type: ignore[arg-type]  # a name
     except Exception as error:  # moderngl raises bare exceptions with the loader's text
         raise MissingDependencyError(
             f"drawing on the GPU needs OpenGL 4.3 through EGL, which did not start ({error}).",

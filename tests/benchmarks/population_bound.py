@@ -94,7 +94,7 @@ def efficient(
         points = transform_points(exact[:, r], scans[r].probes)
         inwards = to_bite @ np.swapaxes(exact[:, r, :3, :3], 1, 2)
         out[f"efficient shift {row}"] = _within(inwards @ _moved(twists[:, r], points.mean(1)), steady_mm)
-        metric = np.stack([mandible_metric(of_frame) for of_frame in points])
+        metric = np.stack([mandible_metric(own) for own in points])
         of_frame = np.sqrt(np.einsum("fid,fij,fjd->fd", twists[:, r], metric, twists[:, r]))
         least = np.median(crown_sigmas(exact[:, r], scans[r], bounds.unknown[:, r]))
         ratios.append(np.median(of_frame, axis=0) / least)

@@ -72,6 +72,7 @@ def test_long_takes_are_kept_in_a_file_and_read_back_alike(records, monkeypatch)
     packed = PackedRecords()
     for frame in range(40 * FRAMES):
         packed[frame] = records[sorted(records)[frame % FRAMES]]
+    assert packed._store._file._rolled  # there is a file
     copy = packed.kept(packed)
     packed[0] = records[sorted(records)[1]]
     for frame in (0, 1, 40 * FRAMES - 1):
@@ -86,7 +87,7 @@ def test_a_full_folder_is_one_message(records, monkeypatch):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     packed = PackedRecords()
-    monkeypatch.setattr(packed._store._file, "write", full, raising=False)
+    monkeypatch.setattr(packed._store._file, "write", full)
     with pytest.raises(OutputError, match="while it is tracked: No space left") as caught:
         packed.update(records)
     assert "TMPDIR" in caught.value.hint

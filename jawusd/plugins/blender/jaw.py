@@ -119,7 +119,7 @@ def _text_of(rig: carried.JawRig) -> str:
     """Return a rig as text that a scene can store."""
     packed = io.BytesIO()
     # Blender's numpy has no argument `allow_pickle`, which the types expect
-    np.savez(packed, **{**rig.arrays, "meta": np.array(json.dumps(rig.meta))})  # type: ignore[arg-type]
+    np.savez(packed, **{**rig.arrays, "meta": np.array(json.dumps(rig.meta))})  # type: ignore[arg-type]  # flags are named
     return base64.b64encode(zlib.compress(packed.getvalue())).decode()
 
 

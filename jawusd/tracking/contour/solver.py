@@ -29,7 +29,7 @@ from jawusd.tracking.contour.scan import ARCHES, Scan, thinned
 from jawusd.tracking.contour.views import Drawn, View, present_masks
 
 _CORNERS = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, 0, -1]])  # of a ball, that show its motion
-_ROUGH_FACES = 6_000  # of a crown row in trials: a third of the usual scan's, an eighth of a fine one's
+_ROUGH_FACES = 6_000  # of a crown row in trials: a third of a thinned scan's
 _DENSE_STEPS = 2  # with all faces of a dense scan, after the thinned one has settled
 
 # samples, how many of them are silhouette, their distances to the mask edge, visible contour length [px]

@@ -40,7 +40,7 @@ STEADY = 0.3
 _FEWEST_FRAMES = 2
 # Neighbouring frames have nearly the same outline error: each adds this much to the evidence of one, up to a limit [-].
 _NEW_PER_FRAME, _MOST_FRAMES = 0.25, 3.0
-_USUAL_FRAMES = 2000  # that show the usual error of a take, evenly spread: more add memory alone
+_USUAL_FRAMES = 2000  # at least, evenly spread, that show the usual error of a long take: more add memory alone
 
 
 @dataclass(frozen=True, eq=False)

@@ -125,7 +125,7 @@ def outline_rows(patient: int, found: PhotoAlignment) -> list[list[str]]:
 def moved_singly_rms_px(found: PhotoAlignment, number: int) -> float:
     """Return the rms of outlines [px at 1440 px width] if every tooth could move in the picture by itself.
 
-    No alignment of whole rows leaves less but by chance: what remains is between the drawn lines and the crowns.
+    An alignment of whole rows has less freedom: what remains here is between the drawn lines and the crowns.
     """
     photo = found.bite.photos[number]
     to_usual = _AT_WIDTH_PX / photo.drawing.size_px[0]
