@@ -23,20 +23,20 @@ def blurred(values: NDArray[np.float32], sigma_px: float) -> NDArray[np.float32]
     return np.asarray(cv2.GaussianBlur(values, (0, 0), sigma_px), np.float32)
 
 
-def closed(mask: Mask, width_px: int) -> Mask:
+def closed(mask: Mask, width_px: float) -> Mask:
     """Return a mask with gaps up to a width filled (morphological closing by a disc)."""
-    return np.asarray(cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, _disc(width_px)) > 0)
+    return _less(~_less(~mask, 0.5 * width_px), 0.5 * width_px)
 
 
-def opened(mask: Mask, width_px: int) -> Mask:
+def opened(mask: Mask, width_px: float) -> Mask:
     """Return a mask without parts narrower than a width (morphological opening by a disc)."""
-    return np.asarray(cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, _disc(width_px)) > 0)
+    return ~_less(~_less(mask, 0.5 * width_px), 0.5 * width_px)
 
 
-def _disc(width_px: int) -> NDArray[np.uint8]:
-    """Return a disc of an odd width, so that outlines are not moved to one side."""
-    width = 2 * (max(width_px, 1) // 2) + 1
-    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (width, width)), np.uint8)
+def _less(mask: Mask, radius_px: float) -> Mask:
+    """Return a mask without what lies within a radius of its outline; the picture's border is none."""
+    inside = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5)
+    return np.asarray(inside - 0.5 > radius_px)
 
 
 def smooth_field(nodes: Array, cell_px: float, size_px: tuple[int, int]) -> NDArray[np.float32]:
@@ -44,6 +44,11 @@ def smooth_field(nodes: Array, cell_px: float, size_px: tuple[int, int]) -> NDAr
     height, width = int(np.ceil(nodes.shape[0] * cell_px)), int(np.ceil(nodes.shape[1] * cell_px))
     field = cv2.resize(nodes.astype(np.float32), (width, height), interpolation=cv2.INTER_CUBIC)
     return np.ascontiguousarray(field[: size_px[1], : size_px[0]], np.float32)
+
+
+def enlarged(field: NDArray[np.float32], times: int) -> NDArray[np.float32]:
+    """Return a smooth picture (h, w) with so many times more pixels along either side."""
+    return np.asarray(cv2.resize(field, None, fx=times, fy=times, interpolation=cv2.INTER_LINEAR), np.float32)
 
 
 def write_mask(path: str, mask: NDArray[np.uint8]) -> None:

@@ -8,9 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.geometry.arrays import Array, Mask
-from jawusd.imaging.redraw import blurred, closed, opened, outside_px, smooth_field
+from jawusd.imaging.redraw import blurred, closed, enlarged, opened, outside_px, smooth_field
 
 REFERENCE_HEIGHT = 1080.0
+#: How many times finer than the mask's pixels a hand is drawn, an odd number: otherwise offsets of less than half a
+#: pixel would do nothing, and larger ones move straight edges by a whole pixel but oblique ones by less.
+FINER = 3
 _KEEP = 0.6  # of the wobble that changes, from frame to frame
 _LEAST_SCALE = 0.45  # hands do not get finer without end as pictures get smaller
 _NEAR_GUM_MM, _AWAY_FROM_GUM_MM = 0.8, 1.5
@@ -69,10 +72,11 @@ class Hand:
         self, annotator: Annotator, arch: int, camera: int, size_px: tuple[int, int], rng: np.random.Generator
     ) -> None:
         """Start drawing masks of a width and height."""
-        self._who, self._arch, self._camera, self._size, self._rng = annotator, arch, camera, size_px, rng
-        self._scale = max(size_px[1] / REFERENCE_HEIGHT, _LEAST_SCALE)
+        self._who, self._arch, self._camera, self._rng = annotator, arch, camera, rng
+        self._size = size_px
+        self._scale = FINER * max(size_px[1] / REFERENCE_HEIGHT, _LEAST_SCALE)
         self._cell = annotator.cell_px * self._scale
-        rows, columns = (int(np.ceil(s / self._cell)) + 2 for s in size_px[::-1])
+        rows, columns = (int(np.ceil(FINER * s / self._cell)) + 2 for s in size_px[::-1])
         self._constant = rng.normal(size=(2, rows, columns))
         self._varying = rng.normal(size=(2, rows, columns))
 
@@ -82,10 +86,11 @@ class Hand:
         """Return the mask (h, w) as this person draws it, None if they forget it.
 
         Args:
-            tooth: 1..14 where a tooth of the arch is seen, 0 elsewhere: part of the picture, shape (rows, columns).
+            tooth: 1..14 where a tooth of the arch is seen, 0 elsewhere: part of a picture that is `FINER` times finer
+                than the mask, shape (rows, columns).
             gum: where gum of the arch is seen, same shape.
-            window: first column and row of that part.
-            px_per_mm: at the teeth.
+            window: first column and row of that part, which are multiples of `FINER`.
+            px_per_mm: of that picture at the teeth.
         """
         who, rng = self._who, self._rng
         self._varying = _KEEP * self._varying + np.sqrt(1.0 - _KEEP**2) * rng.normal(size=self._varying.shape)
@@ -95,8 +100,10 @@ class Hand:
         part = self._outline(tooth, gum, window, px_per_mm)
         if wrong:
             part = _spoilt(part, rng)
+        part = part[FINER // 2 :: FINER, FINER // 2 :: FINER]  # centres of the mask's pixels
         mask = np.zeros(self._size[::-1], np.uint8)
-        mask[window[1] : window[1] + part.shape[0], window[0] : window[0] + part.shape[1]] = np.where(part, 255, 0)
+        row, column = window[1] // FINER, window[0] // FINER
+        mask[row : row + part.shape[0], column : column + part.shape[1]] = np.where(part, 255, 0)
         return mask
 
     def _outline(self, tooth: NDArray[np.uint8], gum: Mask, window: tuple[int, int], px_per_mm: float) -> Mask:
@@ -106,11 +113,11 @@ class Hand:
         if not mask.any():
             return mask
         if who.papilla > 0:
-            between = closed(mask, 2 * round(0.9 * px_per_mm) + 1) & gum
+            between = closed(mask, 1.8 * px_per_mm) & gum
             mask = mask | (between & (taste < 2.0 * who.papilla - 1.0))
-        mask = opened(mask, max(2, round(who.sliver_px * scale)))
+        mask = opened(mask, who.sliver_px * scale)
         mask = blurred(mask.astype(np.float32), 1.5 * scale) > 0.5
-        near = np.ones(mask.shape, np.float32) * 0.0
+        near = np.zeros(mask.shape, np.float32)
         if gum.any():
             to_gum_mm = np.maximum(outside_px(gum), 0.0) / px_per_mm
             near = np.clip((_AWAY_FROM_GUM_MM - to_gum_mm) / (_AWAY_FROM_GUM_MM - _NEAR_GUM_MM), 0.0, 1.0)
@@ -126,11 +133,12 @@ class Hand:
         """Return wobble and taste, of about unit variance, over the window."""
         share = self._who.constant_share
         nodes = np.sqrt(share) * self._constant + np.sqrt(1.0 - share) * self._varying
+        column, row, rows, columns = (k // FINER for k in (*window, *shape))
         out = []
         for layer in nodes:
-            field = smooth_field(layer, self._cell, self._size)
+            field = smooth_field(layer, self._cell / FINER, self._size)[row : row + rows, column : column + columns]
             # Cubic interpolation between independent nodes lowers the variance to about 0.55.
-            out.append(1.35 * field[window[1] : window[1] + shape[0], window[0] : window[0] + shape[1]])
+            out.append(enlarged(1.35 * field, FINER))
         return out[0], out[1]
 
     def _by_tooth(self, tooth: NDArray[np.uint8], scale: float) -> NDArray[np.float32]:

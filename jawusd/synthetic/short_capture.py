@@ -21,7 +21,7 @@ from jawusd.geometry import Camera, make_transform, se3_inverse, so3_exp, transf
 from jawusd.geometry.arrays import Array
 from jawusd.imaging.raster import draw_depth_labels
 from jawusd.imaging.redraw import write_mask
-from jawusd.synthetic.annotator import Annotator, Hand, draw_annotator
+from jawusd.synthetic.annotator import FINER, Annotator, Hand, draw_annotator
 from jawusd.synthetic.bite import Bite, build_bite
 from jawusd.synthetic.dental_arch import DentalArch
 from jawusd.synthetic.dentition import without_gum
@@ -135,9 +135,14 @@ def write_short_capture(folder: str | os.PathLike[str], config: ShortConfig) -> 
     return capture
 
 
-def labelled(capture: ShortCapture, camera: int, t: float) -> Drawn:
-    """Draw who is seen where at a time: labels (rows, columns), first column and row of the part, inverse depth."""
-    view, T_skull = capture.cameras[camera], capture.motion.head(t)
+def labelled(capture: ShortCapture, camera: int, t: float, finer: int = 1) -> Drawn:
+    """Draw who is seen where at a time: labels (rows, columns), first column and row of the part, inverse depth.
+
+    The picture has so many times more pixels across than the camera's; the part begins and ends with a whole one of
+    these.
+    """
+    given, T_skull = capture.cameras[camera], capture.motion.head(t)
+    view = given.scaled((finer * given.size_px[0], finer * given.size_px[1]))
     T_jaw = capture.motion.jaw(t)
     parts = [
         (transform_points(T_skull, capture.bite.upper.mesh.vertices), capture.labels[0]),
@@ -149,9 +154,9 @@ def labelled(capture: ShortCapture, camera: int, t: float) -> Drawn:
         projected = np.column_stack([view.project(points), view.depth(points)])
         drawn.append((np.ascontiguousarray(projected, np.float32), surfaces))
     crowns = [pixels[arch.tooth != 0, :2] for (pixels, _), arch in zip(drawn, capture.arches)]
-    size, teeth = np.array(view.size_px), np.concatenate(crowns)
-    low = np.clip(np.floor(teeth.min(0)) - _PAD_PX, 0, size - 8).astype(int)
-    high = np.clip(np.ceil(teeth.max(0)) + _PAD_PX, low + 8, size).astype(int)
+    size, teeth = np.array(given.size_px), np.concatenate(crowns) / finer
+    low = finer * np.clip(np.floor(teeth.min(0)) - _PAD_PX, 0, size - 8).astype(int)
+    high = finer * np.clip(np.ceil(teeth.max(0)) + _PAD_PX, low // finer + 8, size).astype(int)
     shape = (int(high[1] - low[1]), int(high[0] - low[0]))
     labels, depth = np.zeros(shape, np.uint8), np.zeros(shape, np.float32)
     for pixels, surfaces in drawn:
@@ -197,9 +202,9 @@ def _write_masks(folder: Path, capture: ShortCapture) -> None:
             (folder / "masks" / camera.name / jaw).mkdir(parents=True, exist_ok=True)
         for k in range(config.frames):
             t = k + float(capture.delays[c])
-            labels, window, _ = labelled(capture, c, t)
+            labels, window, _ = labelled(capture, c, t, FINER)
             centre = transform_points(capture.motion.head(t), np.array([[0.0, -4.0, -10.0]]))
-            px_per_mm = float(camera.K[0, 0] / camera.depth(centre)[0])
+            px_per_mm = float(FINER * camera.K[0, 0] / camera.depth(centre)[0])
             own = FIRST_FRAME + k - capture.offsets[c]
             for row, jaw in enumerate(JAWS):
                 first = TEETH_FROM[row]

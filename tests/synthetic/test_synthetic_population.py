@@ -12,7 +12,7 @@ from jawusd.formats.calibration import load_calibration
 from jawusd.formats.capture import load_capture
 from jawusd.formats.mesh import tooth_labels
 from jawusd.imaging.meshio import load_mesh
-from jawusd.synthetic.annotator import Hand, draw_annotator
+from jawusd.synthetic.annotator import FINER, Hand, draw_annotator
 from jawusd.synthetic.bite import Bite, build_bite
 from jawusd.synthetic.population import draw_traits
 from jawusd.synthetic.scanner import FORMATS, Scanner, encoded, scanned
@@ -170,7 +170,7 @@ def test_continuous_scans_are_one_surface() -> None:
     assert on_line.sum() > 14 * 30  # crown and gum share the vertices of the cervical line
 
 
-@pytest.mark.parametrize(("gum_mm", "edge_px"), [(-0.12, 0.0), (0.1, 0.8)])
+@pytest.mark.parametrize(("gum_mm", "edge_px"), [(-0.12, 0.0), (0.1, 0.8), (0.0, 0.35), (0.0, -0.35)])
 def test_annotators_draw_gum_and_edges_where_they_see_them(gum_mm: float, edge_px: float) -> None:
     from dataclasses import replace
 
@@ -178,11 +178,18 @@ def test_annotators_draw_gum_and_edges_where_they_see_them(gum_mm: float, edge_p
         draw_annotator(0, 1), gum_mm=np.array([gum_mm, gum_mm]), gum_tooth_mm=np.zeros((2, 14)), edge_px=edge_px,
         camera_px=np.zeros(1), wobble_px=0.0, papilla=0.0, sliver_px=2.0, missing=0.0, gross=0.0,
     )  # fmt: skip
-    tooth = np.zeros((300, 400), np.uint8)
-    tooth[100:200, 100:300] = 1
-    gum = np.zeros((300, 400), bool)
-    gum[60:100, 100:300] = True
-    mask = Hand(who, 0, 0, (1920, 1080), np.random.default_rng(0)).draw(tooth, gum, (0, 0), 10.0)[:300, :400]
-    column = np.flatnonzero(mask[:, 200])
-    assert column[0] == pytest.approx(100 - 10 * gum_mm, abs=1.0)
-    assert column[-1] == pytest.approx(199 + edge_px, abs=1.0)
+    first, last = [], []
+    for part in range(FINER):  # of a pixel: on average over all places of an edge, a third of a pixel counts too
+        tooth = np.zeros((FINER * 300, FINER * 400), np.uint8)
+        tooth[FINER * 100 + part : FINER * 200 + part, FINER * 100 : FINER * 300] = 1
+        gum = np.zeros(tooth.shape, bool)
+        gum[FINER * 60 : FINER * 100 + part, FINER * 100 : FINER * 300] = True
+        hand = Hand(who, 0, 0, (1920, 1080), np.random.default_rng(0))
+        column = np.flatnonzero(hand.draw(tooth, gum, (0, 0), FINER * 10.0)[:300, 200])
+        first.append(column[0])
+        last.append(column[-1])
+    middle = (FINER - 1) / (2 * FINER)  # of the parts
+    assert np.mean(first) == pytest.approx(100 + middle - 10 * gum_mm, abs=0.35)
+    assert np.mean(last) == pytest.approx(199 + middle + edge_px, abs=0.35)
+    if gum_mm == 0.0:
+        assert np.sign(np.mean(last) - 199 - middle) == np.sign(edge_px)

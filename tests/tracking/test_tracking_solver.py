@@ -48,16 +48,17 @@ def _views(k, meshes=MESHES, **noise):
     ]
 
 
-def _samples(r, pose, camera):
+def _samples(r, pose, camera, scan=None):
+    scan = scan or SCANS[r]
     labels = np.zeros(camera.size_px[::-1], np.uint8)
     depth = np.zeros(camera.size_px[::-1], np.float32)
-    points = np.empty((len(SCANS[r].vertices), 3), np.float32)
-    project(SCANS[r].vertices_single, (camera.projection_matrix() @ pose).astype(np.float32), points)
-    draw_depth_labels(points, SCANS[r].crown_faces, 0, 0, False, depth, labels, CROWN)
-    draw_depth_labels(points, SCANS[r].gum_faces, 0, 0, False, depth, labels, GUM)
+    points = np.empty((len(scan.vertices), 3), np.float32)
+    project(scan.vertices_single, (camera.projection_matrix() @ pose).astype(np.float32), points)
+    draw_depth_labels(points, scan.crown_faces, 0, 0, False, depth, labels, CROWN)
+    draw_depth_labels(points, scan.gum_faces, 0, 0, False, depth, labels, GUM)
     eye = transform_point(se3_inverse(pose), camera.centre_world())
     matrix = camera.projection_matrix() @ pose
-    return contour_samples(SCANS[r], matrix, eye, labels, depth, 3.0, 1.5)[0], labels
+    return contour_samples(scan, matrix, eye, labels, depth, 3.0, 1.5)[0], labels
 
 
 def test_samples_lie_on_the_outline_of_the_rendered_crowns():
@@ -76,6 +77,25 @@ def test_samples_lie_on_the_outline_of_the_rendered_crowns():
     assert (labels[outside[:, 1], outside[:, 0]] != CROWN).mean() > 0.97
     # Part of it is the crown-gum line.
     assert (labels[outside[:, 1], outside[:, 0]] == GUM).mean() > 0.1
+
+
+def test_samples_of_a_rough_scan_do_not_lie_inside_of_its_outline():
+    rng, mesh, off, length = np.random.default_rng(5), MESHES[0], [], []
+    rough = replace(mesh, vertices=mesh.vertices + 0.04 * rng.normal(size=mesh.vertices.shape))
+    scan = prepare_scan(rough, "upper")
+    for camera in CAMERAS:
+        for k in (0, 4):
+            samples, _ = _samples(0, POSES[k, 0], camera, scan)
+            samples = samples[samples[:, EDGE_SHARE] == 1.0]
+            mask = render_masks((rough, MESHES[1]), POSES[k], camera, fine=9)[0]
+            out = np.empty(len(samples))
+            search_edges(samples, mask, np.zeros_like(mask), np.zeros(mask.shape, np.float32), 2.0, 0.4, 0.7, out)
+            off.append(out)
+            length.append(samples[:, LENGTH])
+    off, length = np.concatenate(off), np.concatenate(length)
+    found = np.isfinite(off)
+    assert found.sum() > 1000
+    assert abs(np.average(off[found], weights=length[found])) < 0.02  # 0.06 with all that is within a pixel of it
 
 
 def test_edge_search_on_soft_straight_edges():

@@ -24,7 +24,7 @@ from jawusd.tracking.sequence.extrinsics import Extrinsics
 from jawusd.tracking.sequence.nuisance import Hand, TakeEquations, corrected_pose
 from jawusd.tracking.sequence.rest_frames import RestFrames, rest_frames
 from jawusd.tracking.sequence.results import assemble, outline_variance
-from jawusd.tracking.sequence.take_checks import time_findings
+from jawusd.tracking.sequence.time_checks import time_findings
 
 #: How borders of colours lie beside the teeth's edges: up to half a pixel inside, as teeth darken towards them; where
 #: the gum line is found was learned on the way.

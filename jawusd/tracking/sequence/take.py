@@ -25,13 +25,15 @@ from jawusd.tracking.sequence.camera_use import use_of_cameras
 from jawusd.tracking.sequence.closed_bite import observe_bite
 from jawusd.tracking.sequence.delays import BRIDGE_FRAMES, bridge, delay_motions
 from jawusd.tracking.sequence.extrinsics import Extrinsics
+from jawusd.tracking.sequence.frame_shifts import frame_shifts
 from jawusd.tracking.sequence.mirror_check import mirror_findings
 from jawusd.tracking.sequence.nuisance import DRAWN, DRAWN_BESIDE_CROWNS, Hand, Nuisances, TakeEquations
 from jawusd.tracking.sequence.packed_records import PackedRecords
 from jawusd.tracking.sequence.passes import Passes, Progress
 from jawusd.tracking.sequence.rest_frames import RestFrames, rest_frames
 from jawusd.tracking.sequence.results import assemble, outline_variance
-from jawusd.tracking.sequence.take_checks import lens_findings, motion_findings, search_findings, time_findings
+from jawusd.tracking.sequence.take_checks import lens_findings, motion_findings, search_findings
+from jawusd.tracking.sequence.time_checks import time_findings
 
 _SETTLED_REST = 6  # frames with the teeth together among those on which nuisances are settled
 # A moved camera would only hide these.
@@ -86,6 +88,7 @@ def track_capture(
             frames = rest_frames(take.records, named, up, point, scans[1].probes)
             corrects = capture.scans.registration == "take"
             rest = RestFrames(frames, named is not None, point, scans[1].centre, corrects)
+            shifts = frame_shifts(take.records, masks, solver)
             given = take.scans_and_lenses(start.T_anatomical_scan[0, :3])
             wrong = any(finding.kind in _SHOWN_AS_MOTION for finding in given)
             nuisances, extrinsics = take.refine(rest, may_move=not wrong)
@@ -97,7 +100,7 @@ def track_capture(
                 *use_of_cameras(names, records),
                 *given,
                 *motion_findings(names, extrinsics),
-                *time_findings(names, take.records, nuisances, extrinsics, config),
+                *time_findings(names, take.records, nuisances, extrinsics, config, shifts),
                 *search_findings(take.searches, take.records),
             ]
     notes: TracksMeta = {

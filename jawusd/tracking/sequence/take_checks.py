@@ -1,4 +1,4 @@
-"""What a tracked take says of calibration, synchronisation and masks: lenses, scan sizes, late cameras, lost frames.
+"""What a tracked take says of calibration and masks: lenses, scan sizes, moved cameras, searches given up.
 
 False alarms: none of 17 valid synthetic persons carried any of these findings (`tests/benchmarks/population.py
 --persons 8 --seed 1` and `--persons 9 --seed 9`), which bounds the rate of all kinds together to 16 % (95 %); those of
@@ -15,14 +15,10 @@ import numpy as np
 
 from jawusd.formats.finding import Finding
 from jawusd.formats.tracks import LOST
-from jawusd.tracking.config import TrackingConfig
-from jawusd.tracking.contour.frame_record import FrameRecord, whole_frames
+from jawusd.tracking.contour.frame_record import FrameRecord
 from jawusd.tracking.initialization.magnification import Magnification
-from jawusd.tracking.sequence.delay_steps import delay_steps
 from jawusd.tracking.sequence.extrinsics import Extrinsics
 from jawusd.tracking.sequence.history import SearchAllowance
-from jawusd.tracking.sequence.nuisance import Nuisances
-from jawusd.tracking.sequence.results import outline_variance
 
 
 @dataclass(frozen=True)
@@ -58,10 +54,6 @@ _MOST_BEND = 0.015
 _TURN_DEG, _MOVE_MM = 0.25, 0.7
 _TELLING_CAMERAS = 3  # of two that differ, either may be wrong
 _CLEARLY = 4.0  # standard deviations
-_LATE_FRAMES = 0.7  # cameras that run freely are up to half a frame apart
-# Step of a delay in mid take [frames]. The one valid take of a drawn person that was looked at (30 frames) showed 0.02;
-# a rate of false alarms is not known. Steps are missed where the jaw is so fast that the late masks are left out.
-_STEP_FRAMES = 0.5
 
 
 def lens_findings(names: Sequence[str], found: Magnification, limits: LensLimits = OF_MASKS) -> list[Finding]:
@@ -157,56 +149,6 @@ def _wide(name: str, c: int, found: Magnification, limits: LensLimits) -> list[F
             hint="Draw them again, or leave this camera out.",
         )
     ]
-
-
-def time_findings(
-    names: Sequence[str],
-    records: Mapping[int, FrameRecord],
-    nuisances: Nuisances,
-    extrinsics: Extrinsics,
-    config: TrackingConfig,
-) -> list[Finding]:
-    """Return cameras that are a frame late or early, from the start or from some frame on.
-
-    Kinds: "camera_late" [frames], "frame_dropped" [frames].
-    """
-    out = []
-    for k, name in enumerate(names):
-        late, sigma = float(nuisances.delays[k]), float(nuisances.sigma_delays[k])
-        if abs(late) > max(_LATE_FRAMES, _CLEARLY * sigma):
-            out.append(
-                Finding(
-                    "camera_late",
-                    "warning",
-                    f"its pictures are {abs(late):.1f} frames {'later' if late > 0 else 'earlier'} than its offset "
-                    f"says; below {_LATE_FRAMES} frames is usual.",
-                    value=round(late, 2),
-                    limit=_LATE_FRAMES,
-                    camera=name,
-                    hint=f"Check its offset in [sync]: {round(late):+d} frames would fit better.",
-                )
-            )
-    steps = delay_steps(records, outline_variance(records, config), extrinsics, whole_frames(records))
-    # Poses follow the camera in part, so that the others seem to step the other way: the clearest step is its own.
-    clearest = max(range(len(steps)), key=lambda c: abs(steps[c].step) / steps[c].sigma, default=None)
-    if clearest is None:
-        return out
-    name, found = names[clearest], steps[clearest]
-    if abs(found.step) > max(_STEP_FRAMES, _CLEARLY * found.sigma):
-        out.append(
-            Finding(
-                "frame_dropped",
-                "warning",
-                f"its delay changes by {found.step:+.1f} frames near here: a frame was dropped or doubled; below "
-                f"{_STEP_FRAMES} frames is usual.",
-                value=round(found.step, 2),
-                limit=_STEP_FRAMES,
-                camera=name,
-                frame=found.frame,
-                hint="Export the clip again at a constant frame rate, or cut the take there.",
-            )
-        )
-    return out
 
 
 def motion_findings(names: Sequence[str], extrinsics: Extrinsics) -> list[Finding]:
