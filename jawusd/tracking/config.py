@@ -53,7 +53,7 @@ class TrackingConfig:
     # Update from which on the gates in between are left out [mm at the crowns]: they are for steps that go farther.
     settled_mm: float = 0.0
     # Motion after which a scan is drawn again for hidden parts [px]: hidden parts are judged to one pixel.
-    redraw_px: float = 1.0
+    redraw_px: float = 2.0
     # Plausible distance of an arch from its prediction [mm]: a weak pull, for motions that masks leave free.
     prediction_mm: float = 0.5
     # Outline variance times correlation length behind that pull [px^3]: 0.4 px over 18 px, typical masks by hand.

@@ -251,7 +251,8 @@ def scatter_of_tiles(
         sample = samples[s]
         weight = (1.0 - (d / gate_px) ** 2) ** 2 * sample[LENGTH]
         _slope(sample, pose, matrix, centre, jacobian)
-        tile = int(sample[V]) // tile_px * across + int(sample[U]) // tile_px
+        row, column = min(max(int(sample[V]), 0), shape[0] - 1), min(max(int(sample[U]), 0), shape[1] - 1)
+        tile = row // tile_px * across + column // tile_px
         for k in range(6):
             sums[tile, k] += weight * d * jacobian[k]
             gum[tile, k] += weight * sample[GUM_SHARE] * jacobian[k]

@@ -9,6 +9,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from jawusd.geometry import bite_normal, orthonormalise, transform_point
 from jawusd.geometry.arrays import Array, Mask
@@ -24,11 +25,11 @@ from jawusd.tracking.contour.equations import (
     StartTerm,
     motion_about,
 )
+from jawusd.tracking.contour.rendering import Rendering
 from jawusd.tracking.contour.samples import HABITS, LENGTH, contour_samples
 from jawusd.tracking.contour.scan import ARCHES, Scan, thinned
 from jawusd.tracking.contour.views import Drawn, View, present_masks
 
-_CORNERS = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, 0, -1]])  # of a ball, that show its motion
 _ROUGH_FACES = 6_000  # of a crown row in trials: a third of a thinned scan's
 _DENSE_STEPS = 2  # with all faces of a dense scan, after the thinned one has settled
 
@@ -57,7 +58,8 @@ class ContourSolver:
         self._start_strength = config.typical_noise_px3 / config.prediction_mm**2 * arms
         self._towards_gum = _towards_gum(self.scans)
         thin = [scan.thin or scan for scan in self.scans]
-        self._thin = ContourSolver(thin, config, executor) if any(scan.thin for scan in self.scans) else None
+        #: The same of scans with fewer faces; None where all have few.
+        self.thin = ContourSolver(thin, config, executor) if any(scan.thin for scan in self.scans) else None
         self._executor = executor
 
     @cached_property
@@ -88,9 +90,9 @@ class ContourSolver:
             rendering: of these views by this solver, to share with other looks at them.
         """
         use = present_masks(views) if use is None else use
-        if self._thin is None or not gates_px:
+        if self.thin is None or not gates_px:
             return self._descend(poses, poses, views, gates_px, use, terms, outline_weight, rendering)
-        rough = self._thin.solve(poses, views, gates_px, use, terms, outline_weight)
+        rough = self.thin.solve(poses, views, gates_px, use, terms, outline_weight)
         gates = tuple(gates_px[-1:]) * _DENSE_STEPS
         last = self._descend(poses, rough.poses, views, gates, use, terms, outline_weight, rendering)
         return replace(last, iterations=rough.iterations + last.iterations)
@@ -182,21 +184,9 @@ class ContourSolver:
                 gum_scatters[r] += gum
         return Solution(poses.copy(), silhouette, margin, centres, scatters, gum_scatters, visible, 0)
 
-    def _match(
-        self,
-        pose: Array,
-        view: View,
-        r: int,
-        rendering: Rendering,
-        c: int,
-        reach: float,
-    ) -> _Match:
-        config, scan, depths = self.config, self.scans[r], rendering.depths[c]
-        eye = pose[:3, :3].T @ (view.eye - pose[:3, 3])
-        pictures = (rendering.labels[c][r], depths[r])
-        limits = (config.sample_step_px, config.depth_tolerance_mm)
-        gum = self._towards_gum[r]
-        samples, silhouettes = contour_samples(scan, view.matrix @ pose, eye, *pictures, *limits, gum)
+    def _match(self, pose: Array, view: View, r: int, rendering: Rendering, c: int, reach: float) -> _Match:
+        config, depths = self.config, rendering.depths[c]
+        samples, silhouettes = rendering.contour(self, r, c, pose)
         visible = float(samples[:, LENGTH].sum())
         search_limits = (reach, config.overlap_tolerance_mm, config.normal_cosine)
         if view.edges is None:
@@ -210,6 +200,15 @@ class ContourSolver:
             weights[hidden] = 0.0
             samples[:, LENGTH] *= weights
         return samples, silhouettes, distances - samples[:, HABITS] @ view.habits[r], visible
+
+    def contour(
+        self, r: int, pose: Array, view: View, labels: NDArray[np.uint8], depth: NDArray[np.float32]
+    ) -> tuple[Array, int]:
+        """Return the contour of an arch in pictures drawn at its pose (4, 4) in a view; see `contour_samples`."""
+        eye = pose[:3, :3].T @ (view.eye - pose[:3, 3])
+        limits = (self.config.sample_step_px, self.config.depth_tolerance_mm)
+        matrix = view.matrix @ pose
+        return contour_samples(self.scans[r], matrix, eye, labels, depth, *limits, self._towards_gum[r])
 
     def _final_gate(self, distances: list[Array], gate: float) -> float:
         """Return the Tukey gate that suits the spread of the residuals (median absolute deviation)."""
@@ -234,45 +233,3 @@ def _towards_gum(scans: Sequence[Scan]) -> list[Array | None]:
         return [None, None]
     up = bite_normal(scans[0].crown_vertices(), scans[1].crown_vertices())
     return [None if gum else way * up for gum, way in zip(shown, (1.0, -1.0), strict=True)]
-
-
-class Rendering:
-    """Keep pictures of both scans in every view of one instant, drawn again only after they have moved."""
-
-    def __init__(self, solver: ContourSolver, views: Sequence[View]) -> None:
-        self._solver = solver
-        self._views = views
-        self._drawn: dict[tuple[int, int], Array] = {}
-        shapes = [view.masks.shape for view in views]
-        self.labels = [np.zeros(shape, np.uint8) for shape in shapes]
-        self.depths = [np.zeros(shape, np.float32) for shape in shapes]
-
-    def update(self, poses: Array) -> None:
-        """Draw the scans whose projection has moved by more than the allowed pixels."""
-
-        def draw(task: tuple[int, int]) -> None:
-            self._draw(*task, poses[task[0]])
-
-        tasks = [(r, c) for r in ARCHES for c in range(len(self._views)) if self._moved(r, c, poses[r])]
-        list(self._solver.map(draw, tasks))
-
-    def _moved(self, r: int, c: int, pose: Array) -> bool:
-        last = self._drawn.get((r, c))
-        if last is None:
-            return True
-        scan, matrix = self._solver.scans[r], self._views[c].matrix
-        corners = scan.centre + scan.radius_mm * _CORNERS
-        change = _pixels(matrix @ pose, corners) - _pixels(matrix @ last, corners)
-        return float(np.abs(change).max()) > self._solver.config.redraw_px
-
-    def _draw(self, r: int, c: int, pose: Array) -> None:
-        view, labels, depth = self._views[c], self.labels[c][r], self.depths[c][r]
-        labels[:] = 0
-        depth[:] = 0
-        self._solver.scans[r].draw(view.matrix @ view.T_delay[r] @ pose, depth, labels)
-        self._drawn[r, c] = pose.copy()
-
-
-def _pixels(matrix: Array, points: Array) -> Array:
-    h = points @ matrix[:, :3].T + matrix[:, 3]
-    return h[:, :2] / h[:, 2:]

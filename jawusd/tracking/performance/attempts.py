@@ -11,8 +11,8 @@ import numpy as np
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.quality import matched_px, residual_px, score_px
+from jawusd.tracking.contour.rendering import Rendering
 from jawusd.tracking.contour.scan import ARCHES, CROWN
-from jawusd.tracking.contour.solver import Rendering
 from jawusd.tracking.contour.views import View, present_masks
 from jawusd.tracking.performance.coordinates import Pose
 from jawusd.tracking.performance.focal import Growth

@@ -9,8 +9,9 @@ import numpy as np
 
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.contour.equations import Solution
+from jawusd.tracking.contour.rendering import Rendering
 from jawusd.tracking.contour.scan import ARCHES, thinned
-from jawusd.tracking.contour.solver import ContourSolver, Matched, Rendering
+from jawusd.tracking.contour.solver import ContourSolver, Matched
 from jawusd.tracking.contour.views import View
 from jawusd.tracking.performance.coordinates import HEAD, JAW, LOCAL, Coordinates, Pose
 

@@ -10,8 +10,9 @@ import numpy as np
 from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.quality import correlation_px, residual_px
+from jawusd.tracking.contour.rendering import Rendering
 from jawusd.tracking.contour.scan import ARCHES
-from jawusd.tracking.contour.solver import Matched, Rendering
+from jawusd.tracking.contour.solver import Matched
 from jawusd.tracking.performance.attempts import MOST_UNSURE, Attempts, FrameFit, usual_residual_px
 from jawusd.tracking.performance.coordinates import HEAD, JAW, LOCAL, Coordinates
 from jawusd.tracking.performance.focal import growth_of

@@ -12,8 +12,9 @@ import numpy as np
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.quality import matched_px, score_px
+from jawusd.tracking.contour.rendering import Rendering
 from jawusd.tracking.contour.scan import CROWN
-from jawusd.tracking.contour.solver import Matched, Rendering
+from jawusd.tracking.contour.solver import Matched
 from jawusd.tracking.contour.views import present_masks
 from jawusd.tracking.performance.attempts import MOST_UNSURE, FrameFit
 from jawusd.tracking.performance.coordinates import JAW, Pose

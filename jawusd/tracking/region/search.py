@@ -14,8 +14,9 @@ from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.quality import score_px
+from jawusd.tracking.contour.rendering import Rendering
 from jawusd.tracking.contour.scan import Scan, thinned
-from jawusd.tracking.contour.solver import ContourSolver, Rendering
+from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import View
 from jawusd.tracking.region.bite import BiteTerm
 from jawusd.tracking.region.condyles import CondyleMotion, CondyleTerm

@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 from jawusd.geometry.arrays import Array
 from jawusd.tracking.contour.frame_record import FrameRecord
 from jawusd.tracking.contour.quality import score_px, uncovered_px
+from jawusd.tracking.contour.rendering import Rendering
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import MaskViews, View, present_masks
 
 SHIFTS = (-1, 0, 1)  # frames
-_LOOKED_AT = 24  # frames of a take
+_LOOKED_AT = 18  # frames of a take: a tenth of a second each
 _FEWEST = 3  # frames that tell, on either side of a step: two masks in a row may be wrong
 # By how much a shift must fit better than others to tell, as a share of the visible contour, and how much of it counts.
 _LEAST_LEAD, _MOST_LEAD = 0.1, 0.5
@@ -93,6 +94,9 @@ def _agree(leads: Array) -> bool:
 def frame_shifts(records: Mapping[int, FrameRecord], masks: MaskViews, solver: ContourSolver) -> FrameShifts:
     """Compare the masks of some frames, those in which the jaw is fastest, with those before and after.
 
+    Where all cameras show the right instant at both ends of the take, what lies between is not looked at: one step
+    there would have to be followed by its opposite.
+
     Args:
         records: of all frames of the take.
         masks: of the take.
@@ -100,29 +104,36 @@ def frame_shifts(records: Mapping[int, FrameRecord], masks: MaskViews, solver: C
     """
     frames = _fast_frames(records)
     fit = np.full((len(frames), len(masks.cameras), len(SHIFTS)), np.nan)
-    for k, frame in enumerate(frames):
-        around = [masks.at(frame + shift) for shift in SHIFTS]
-        for c in range(len(masks.cameras)):
-            fit[k, c] = _fit(records[frame], around, c, solver)
+    ends = [k for k in range(len(frames)) if min(k, len(frames) - 1 - k) < _FEWEST]
+    between = [k for k in range(len(frames)) if k not in ends]
+    for part in (ends, between):
+        for k in part:
+            fit[k] = _fits(records[frames[k]], [masks.at(frames[k] + shift) for shift in SHIFTS], solver.thin or solver)
+        own = np.stack([_leads(fit[ends, c]) for c in range(len(masks.cameras))])[..., SHIFTS.index(0)]
+        if (own > _LEAST_LEAD).all():
+            break
     return FrameShifts(np.array(frames, int), fit)
 
 
-def _fit(record: FrameRecord, around: Sequence[Sequence[View]], c: int, solver: ContourSolver) -> Array:
-    """Return the fit of a camera's masks of every shift, at poses that the other cameras alone give, shape (3,)."""
-    config = solver.config
-    own = [views[c] for views in around]
-    shown = np.logical_and.reduce([view.present for view in own])  # (2,)
-    use = present_masks(around[1])
-    use[:, c] = False
-    shown &= use.any(1)
-    if not shown.any():
-        return np.full(len(SHIFTS), np.nan)
-    poses = solver.solve(record.solution.poses, around[1], config.gates_from(0.0), use).poses
-    seen = np.repeat(shown[:, None], len(SHIFTS), axis=1)
-    judged = solver.solve(poses, own, (), seen)
-    uncovered, _ = uncovered_px(solver.scans, poses, own)
-    fits = np.where(seen, score_px(judged) - config.uncovered_price * uncovered, 0.0).sum(0)
-    return fits / max(float(judged.visible_px[seen].sum()) / len(SHIFTS), 1.0)
+def _fits(record: FrameRecord, around: Sequence[Sequence[View]], solver: ContourSolver) -> Array:
+    """Return the fit of all cameras' masks of every shift, at poses that the other cameras alone give, shape (C, 3)."""
+    config, poses, views = solver.config, record.solution.poses, around[SHIFTS.index(0)]
+    rendering = Rendering(solver, views)
+    out = np.full((len(views), len(SHIFTS)), np.nan)
+    for c in range(len(views)):
+        own = [now[c] for now in around]
+        use = present_masks(views)
+        use[:, c] = False
+        shown = np.logical_and.reduce([view.present for view in own]) & use.any(1)  # (2,)
+        if not shown.any():
+            continue
+        apart = solver.solve(poses, views, config.gates_from(0.0), use, rendering=rendering).poses
+        seen = np.repeat(shown[:, None], len(SHIFTS), axis=1)
+        judged = solver.solve(apart, own, (), seen)
+        uncovered, _ = uncovered_px(solver.scans, apart, own)
+        fits = np.where(seen, score_px(judged) - config.uncovered_price * uncovered, 0.0).sum(0)
+        out[c] = fits / max(float(judged.visible_px[seen].sum()) / len(SHIFTS), 1.0)
+    return out
 
 
 def _fast_frames(records: Mapping[int, FrameRecord]) -> list[int]:
