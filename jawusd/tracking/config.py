@@ -52,7 +52,7 @@ class TrackingConfig:
     converged_mm: float = 0.004
     # Update from which on the gates in between are left out [mm at the crowns]: they are for steps that go farther.
     settled_mm: float = 0.0
-    # Motion after which a scan is drawn again for hidden parts [px]: hidden parts are judged to one pixel.
+    # Motion after which a scan is drawn and its contour sampled again [px]: hidden parts are judged to so much.
     redraw_px: float = 2.0
     # Plausible distance of an arch from its prediction [mm]: a weak pull, for motions that masks leave free.
     prediction_mm: float = 0.5

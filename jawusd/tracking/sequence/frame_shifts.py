@@ -6,17 +6,18 @@ where the jaw is fast: masks of the wrong instant are then left out, or draw the
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.geometry.arrays import Array
+from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.contour.frame_record import FrameRecord
-from jawusd.tracking.contour.quality import score_px, uncovered_px
+from jawusd.tracking.contour.quality import score_px
 from jawusd.tracking.contour.rendering import Rendering
+from jawusd.tracking.contour.scan import CROWN
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import MaskViews, View, present_masks
 
@@ -28,11 +29,17 @@ _LEAST_LEAD, _MOST_LEAD = 0.1, 0.5
 
 
 class Shift(NamedTuple):
-    """Name a camera that shows a later instant than it should by so many frames, from a frame of the take on."""
+    """Name a camera that shows a later instant than it should by so many frames.
+
+    Attributes:
+        camera: its number.
+        frames: by how many; negative for an earlier instant.
+        frame: of the take, from which on; None if it does all over the take.
+    """
 
     camera: int
     frames: int
-    frame: int
+    frame: int | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,37 +55,28 @@ class FrameShifts:
     frames: NDArray[np.int_]
     fit: Array
 
-    def step(self) -> Shift | None:
-        """Return where a camera changes from one shift to another: the clearest one, None without any."""
-        found = [step for c in range(self.fit.shape[1]) if (step := self._step_of(c)) is not None]
-        return max(found)[1] if found else None
+    def clearest(self) -> Shift | None:
+        """Return the camera that shows another instant most clearly, None if all show the right one.
 
-    def late(self) -> Shift | None:
-        """Return the camera that shows another instant all over the take, the clearest one; None without any."""
-        found = []
-        for c in range(self.fit.shape[1]):
-            leads = _leads(self.fit[:, c])
-            told = leads[np.isfinite(leads).all(1)]
-            for k in (0, 2):
-                if _agree(told[:, k]):
-                    found.append((float(np.median(told[:, k])), Shift(c, -SHIFTS[k], int(self.frames[0]))))
-        return max(found)[1] if found else None
+        One camera's shift draws the poses that others are compared with, so that these seem to shift as well.
+        """
+        found = [shift for c in range(self.fit.shape[1]) for shift in self._shifts_of(c)]
+        return max(found, key=lambda entry: entry[0])[1] if found else None
 
-    def _step_of(self, c: int) -> tuple[float, Shift] | None:
-        """Return a camera's clearest step after its evidence."""
+    def _shifts_of(self, c: int) -> Iterator[tuple[float, Shift]]:
+        """Yield what a camera's masks may show, each after its evidence."""
         leads = _leads(self.fit[:, c])
         rows = np.flatnonzero(np.isfinite(leads).all(1))
         told = np.clip(leads[rows], -_MOST_LEAD, _MOST_LEAD)
-        best: tuple[float, Shift] | None = None
+        for k, shift in enumerate(SHIFTS):
+            if shift != 0 and _agree(told[:, k]):
+                yield float(told[:, k].sum()), Shift(c, -shift, None)
         for k in range(_FEWEST, len(rows) - _FEWEST + 1):
             before, after = told[:k], told[k:]
             a, b = int(np.median(before, axis=0).argmax()), int(np.median(after, axis=0).argmax())
-            if a == b or not (_agree(before[:, a]) and _agree(after[:, b])):
-                continue
-            evidence = float(before[:, a].sum() + after[:, b].sum())
-            if best is None or evidence > best[0]:
-                best = evidence, Shift(c, SHIFTS[a] - SHIFTS[b], int(self.frames[rows[k]]))
-        return best
+            if a != b and _agree(before[:, a]) and _agree(after[:, b]):
+                evidence = float(before[:, a].sum() + after[:, b].sum())
+                yield evidence, Shift(c, SHIFTS[a] - SHIFTS[b], int(self.frames[rows[k]]))
 
 
 def _leads(fit: Array) -> Array:
@@ -120,19 +118,40 @@ def _fits(record: FrameRecord, around: Sequence[Sequence[View]], solver: Contour
     config, poses, views = solver.config, record.solution.poses, around[SHIFTS.index(0)]
     rendering = Rendering(solver, views)
     out = np.full((len(views), len(SHIFTS)), np.nan)
-    for c in range(len(views)):
-        own = [now[c] for now in around]
+    for c, view in enumerate(views):
         use = present_masks(views)
         use[:, c] = False
-        shown = np.logical_and.reduce([view.present for view in own]) & use.any(1)  # (2,)
-        if not shown.any():
-            continue
-        apart = solver.solve(poses, views, config.gates_from(0.0), use, rendering=rendering).poses
-        seen = np.repeat(shown[:, None], len(SHIFTS), axis=1)
-        judged = solver.solve(apart, own, (), seen)
-        uncovered, _ = uncovered_px(solver.scans, apart, own)
-        fits = np.where(seen, score_px(judged) - config.uncovered_price * uncovered, 0.0).sum(0)
-        out[c] = fits / max(float(judged.visible_px[seen].sum()) / len(SHIFTS), 1.0)
+        shown = np.logical_and.reduce([now[c].present for now in around]) & use.any(1)  # (2,)
+        if shown.any():
+            apart = solver.solve(poses, views, config.gates_from(0.0), use, rendering=rendering).poses
+            masks = [_in_window(view, now[c]) for now in around]
+            out[c] = _judged(apart, view, masks, shown, solver)
+    return out
+
+
+def _judged(poses: Array, view: View, masks: Sequence[NDArray[np.uint8]], shown: Mask, solver: ContourSolver) -> Array:
+    """Return how well each of several pairs of masks (2, h, w) of a view fits poses, shape (n,) [-]."""
+    rendering, out = Rendering(solver, [view]), np.empty(len(masks))
+    for k, pair in enumerate(masks):
+        found = solver.solve(poses, [replace(view, masks=pair)], (), shown[:, None], rendering=rendering)
+        uncovered = ((pair > 127) & (rendering.labels[0] != CROWN)).sum((1, 2))
+        fits = score_px(found)[:, 0] - solver.config.uncovered_price * uncovered
+        out[k] = fits[shown].sum() / max(float(found.visible_px[shown].sum()), 1.0)
+    return out
+
+
+def _in_window(view: View, other: View) -> NDArray[np.uint8]:
+    """Return the masks of another instant of the same camera in the window of a view, shape (2, h, w)."""
+    # Windows differ by whole pixels: cutting off x columns takes x times row 2 of the matrix from row 0.
+    axis = view.matrix[2]
+    moved = np.rint((other.matrix[:2] - view.matrix[:2]) @ axis / (axis @ axis)).astype(int)
+    out = np.zeros_like(view.masks)
+    into, start = [], []
+    for shift, size, whole in zip(-moved[::-1], other.masks.shape[1:], out.shape[1:], strict=True):
+        first, last = max(int(shift), 0), min(int(shift) + size, whole)
+        into.append(slice(first, max(first, last)))
+        start.append(slice(first - int(shift), max(first, last) - int(shift)))
+    out[:, into[0], into[1]] = other.masks[:, start[0], start[1]]
     return out
 
 

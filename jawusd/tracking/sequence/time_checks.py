@@ -41,13 +41,12 @@ def time_findings(
     late = {k: float(nuisances.delays[k]) for k in range(len(names)) if _is_late(nuisances, k)}
     if shifts is None:
         return [*_late(names, late), *_step_of_delay(names, records, extrinsics, config)]
-    step = shifts.step()
-    if step is not None:
-        return [*_late(names, late), _dropped(names[step.camera], step.frames, step.frame)]
-    whole = shifts.late()
-    if whole is not None and not late:
-        late = {whole.camera: float(whole.frames)}
-    return _late(names, late)
+    shift = shifts.clearest()
+    if shift is None:
+        return _late(names, late)
+    if shift.frame is None:
+        return _late(names, late or {shift.camera: float(shift.frames)})
+    return [*_late(names, late), _dropped(names[shift.camera], shift.frames, shift.frame)]
 
 
 def _is_late(nuisances: Nuisances, camera: int) -> bool:
