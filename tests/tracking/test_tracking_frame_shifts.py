@@ -48,6 +48,13 @@ def test_a_camera_late_from_the_start_makes_no_step():
     assert _shifts((0,) * 12, (0,) * 12).clearest() is None
 
 
+def test_masks_that_fit_at_no_instant_are_no_shift():
+    shifts = _shifts((0,) * 12, (0,) * 7 + (-1,) * 5)
+    shifts.fit[:] -= 0.7  # a wrong lens, say
+    assert shifts.clearest() is None
+    assert shifts.is_timely(0)
+
+
 def test_a_jaw_at_rest_tells_nothing():
     still = FrameShifts(FRAMES, np.random.default_rng(0).normal(0.4, 0.01, (12, 3, 3)))
     assert still.clearest() is None

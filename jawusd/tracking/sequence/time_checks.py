@@ -41,6 +41,7 @@ def time_findings(
     late = {k: float(nuisances.delays[k]) for k in range(len(names)) if _is_late(nuisances, k)}
     if shifts is None:
         return [*_late(names, late), *_step_of_delay(names, records, extrinsics, config)]
+    late = {camera: frames for camera, frames in late.items() if not shifts.is_timely(camera)}
     shift = shifts.clearest()
     if shift is None:
         return _late(names, late)
