@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import io
 import json
 import os
+import selectors
 import subprocess
 import sys
 import threading
 from pathlib import Path
+from typing import IO, cast
 
 from jawusd.formats.allowed_folders import SETTING, allow_folders, allowed_folders
 from jawusd.rig import child_limits
@@ -97,25 +100,32 @@ def _folders() -> list[str]:
 
 def _answer(process: subprocess.Popen[str], most_s: float, request: str | None = None) -> tuple[str, bool]:
     """Return the next line a process writes, "" if it ends before, and whether it did so in time: else it is killed."""
-    timed_out = threading.Event()
-
-    def end() -> None:
-        timed_out.set()
+    if process.stdin is None or process.stdout is None:
+        return "", True
+    if request is not None:
+        with contextlib.suppress(OSError):  # it has ended
+            process.stdin.write(request + "\n")
+            process.stdin.flush()
+    in_time = _writes(process.stdout, most_s)
+    if not in_time:
         process.kill()
+    return process.stdout.readline().strip(), in_time
 
-    timer = threading.Timer(most_s, end)
-    timer.daemon = True
-    timer.start()
-    try:
-        if request is not None and process.stdin is not None:
-            with contextlib.suppress(OSError):  # it has ended
-                process.stdin.write(request + "\n")
-                process.stdin.flush()
-        answer = process.stdout.readline().strip() if process.stdout is not None else ""
-    finally:
-        timer.cancel()
-        timer.join()
-    return answer, not timed_out.is_set()
+
+def _writes(pipe: IO[str], most_s: float) -> bool:
+    """Wait until a pipe, from which lines were read whole, has something to read or ends; tell whether it did in time.
+
+    Without a thread where that can be had: a program that is short of memory cannot start one.
+    """
+    if sys.platform != "win32":
+        with selectors.DefaultSelector() as selector:
+            selector.register(pipe, selectors.EVENT_READ)
+            return bool(selector.select(most_s))
+    buffer = cast(io.TextIOWrapper, pipe).buffer
+    waiting = threading.Thread(target=cast(io.BufferedReader, buffer).peek, args=(1,), daemon=True)
+    waiting.start()
+    waiting.join(most_s)
+    return not waiting.is_alive()
 
 
 def _end(process: subprocess.Popen[str]) -> None:

@@ -173,11 +173,10 @@ def _in_window(view: View, other: View) -> NDArray[np.uint8]:
 
 def _fast_frames(records: Mapping[int, FrameRecord]) -> list[int]:
     """Return frames all over the take, of every part the one in which the lower arch moves most between neighbours."""
-    inner = [frame for frame in sorted(records) if frame - 1 in records and frame + 1 in records]
+    centres = {frame: records[frame].solution.centres[1] for frame in sorted(records)}
+    inner = [frame for frame in centres if frame - 1 in centres and frame + 1 in centres]
     if not inner:
         return []
-    moved = [
-        float(np.linalg.norm(records[f + 1].solution.centres[1] - records[f - 1].solution.centres[1])) for f in inner
-    ]
+    moved = [float(np.linalg.norm(centres[frame + 1] - centres[frame - 1])) for frame in inner]
     parts = np.array_split(np.arange(len(inner)), min(_LOOKED_AT, len(inner)))
     return [inner[max(part, key=lambda i: moved[i])] for part in parts]

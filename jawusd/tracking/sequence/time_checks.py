@@ -15,8 +15,8 @@ from jawusd.tracking.sequence.results import outline_variance
 
 _CLEARLY = 4.0  # standard deviations
 _LATE_FRAMES = 0.7  # cameras that run freely are up to half a frame apart
-# Step of a delay in mid take [frames]. The one valid take of a drawn person that was looked at (30 frames) showed 0.02;
-# a rate of false alarms is not known. Steps are missed where the jaw is so fast that the late masks are left out.
+# Step of a delay in mid take of footage without masks [frames]. The one valid take of a drawn person that was looked at
+# (30 frames) showed 0.02; a rate of false alarms is not known. Steps are missed where the jaw is fast.
 _STEP_FRAMES = 0.5
 
 
