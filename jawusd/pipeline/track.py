@@ -217,9 +217,9 @@ def model_pass(
 
 def tracking_config(capture: Capture) -> TrackingConfig:
     """Return the tracker's numbers for the masks of a capture."""
-    from jawusd.tracking.config import FOR_AUTO_MASKS, TrackingConfig
+    from jawusd.tracking.config import FOR_AUTO_MASKS, FOR_TAKES
 
-    return TrackingConfig() if auto_masks_folder(capture) is None else FOR_AUTO_MASKS
+    return FOR_TAKES if auto_masks_folder(capture) is None else FOR_AUTO_MASKS
 
 
 def track_summary(tracks: Tracks) -> TrackSummary:

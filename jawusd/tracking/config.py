@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, TypeVar
 
 _Item = TypeVar("_Item")
@@ -53,7 +53,7 @@ class TrackingConfig:
     # Update from which on the gates in between are left out [mm at the crowns]: they are for steps that go farther.
     settled_mm: float = 0.0
     # Motion after which a scan is drawn and its contour sampled again [px]: hidden parts are judged to so much.
-    redraw_px: float = 2.0
+    redraw_px: float = 1.0
     # Plausible distance of an arch from its prediction [mm]: a weak pull, for motions that masks leave free.
     prediction_mm: float = 0.5
     # Outline variance times correlation length behind that pull [px^3]: 0.4 px over 18 px, typical masks by hand.
@@ -140,8 +140,12 @@ class TrackingConfig:
         return tuple(g for g in self.wide_gates_px if g <= max(reach_px, self.first_gate_px))
 
 
+#: For takes of several cameras. Scans are drawn half as often, with the same errors; a search in a single camera, which
+#: has less contour to go by, ended elsewhere (`tests/pipeline/test_solve.py`).
+FOR_TAKES = TrackingConfig(redraw_px=2.0)
+
 #: For masks that jawusd made. They vary more from frame to frame than drawn ones: outlines get rougher as lips close,
 #: and what looks lost by the rules for drawn masks is not. A pose given up needlessly is a frame without a jaw. Their
 #: errors last along whole teeth and many frames: with the factor of drawn masks, NEES of the relative pose was 6 on a
 #: rasterised and 13 on a path-traced take, with this one 0.9 and 1.8.
-FOR_AUTO_MASKS = TrackingConfig(suspect_residual=3.0, suspect_score=0.25, tile_factor=20.0)
+FOR_AUTO_MASKS = replace(FOR_TAKES, suspect_residual=3.0, suspect_score=0.25, tile_factor=20.0)

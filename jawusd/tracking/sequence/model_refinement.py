@@ -14,7 +14,7 @@ from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, Tracks
 from jawusd.geometry import Camera, relative_pose, se3_adjoint, se3_exp, se3_inverse, se3_log, transform_point
 from jawusd.geometry.arrays import Array, Mask
-from jawusd.tracking.config import TrackingConfig
+from jawusd.tracking.config import FOR_TAKES, TrackingConfig
 from jawusd.tracking.contour.equations import Solution
 from jawusd.tracking.contour.quality import (
     coverage_error,
@@ -70,7 +70,7 @@ def refine_tracks(
     Raises:
         CaptureError: a mask cannot be read.
     """
-    config = config or TrackingConfig()
+    config = config or FOR_TAKES
     hard = np.flatnonzero(hard_frames(tracks))
     measured = np.asarray(np.isfinite(tracks.raw_T_upper_lower).all((1, 2)))
     good = measured & ~hard_frames(tracks)

@@ -14,7 +14,7 @@ from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import LOST, RECOVERED, TRACKED, Tracks, TracksMeta
 from jawusd.geometry import Camera
 from jawusd.geometry.arrays import Array
-from jawusd.tracking.config import TrackingConfig
+from jawusd.tracking.config import FOR_TAKES, TrackingConfig
 from jawusd.tracking.contour.frame_record import FrameRecord, whole_frames
 from jawusd.tracking.contour.scan import prepare_scan, teeth_centre
 from jawusd.tracking.contour.solver import ContourSolver
@@ -68,7 +68,7 @@ def track_capture(
         TrackingError: one camera only, masks or scans mixed up, or no frame on which the teeth can be aligned.
         CaptureError: a mask cannot be read.
     """
-    config = config or TrackingConfig()
+    config = config or FOR_TAKES
     table = {camera.name: camera for camera in cameras}
     scans = (prepare_scan(upper, "upper"), prepare_scan(lower, "lower"))
     with ThreadPoolExecutor(threads) as pool:
