@@ -52,7 +52,8 @@ def pick_ends(
     for vertex in good[np.array(spread_out(world[good], _PICKS))].tolist():
         views = []
         for c in np.flatnonzero(visible[vertex])[:2]:
-            x, y = cameras[c].project(world[vertex]) + rng.normal(0.0, _PICK_NOISE_PX, 2)
+            clicked = cameras[c].project(world[vertex]) + rng.normal(0.0, _PICK_NOISE_PX, 2)
+            x, y = np.clip(clicked, 0.0, np.array(cameras[c].size_px) - 1.0)
             views.append((cameras[c].name, float(x), float(y)))
         out.append((int(vertex), views))
     return out
