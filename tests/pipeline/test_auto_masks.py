@@ -12,7 +12,7 @@ from jawusd.pipeline.follow import _follow_back, _jumps
 from jawusd.pipeline.segment_guide import GUIDE, save_guide, take_up_guide
 from jawusd.pipeline.segment_record import SUMMARY, auto_masks_folder, with_masks
 from jawusd.pipeline.track import tracking_config
-from jawusd.tracking import TrackingConfig
+from jawusd.tracking.config import FOR_TAKES
 from jawusd.tracking.region.tracker import RegionPose
 
 LANDMARKS = np.array([[0, 0, 0], [20, 0, -25], [-20, 0, -25], [50, 40, -80], [-50, 40, -80]], float)
@@ -33,9 +33,9 @@ def test_only_masks_beside_a_summary_of_segmentation_are_made(tmp_path):
 def test_drawn_masks_are_judged_by_the_usual_numbers(tmp_path):
     given = load_capture(ROOT / "examples" / "capture" / "capture.toml")
     (tmp_path / SUMMARY).write_text("{}")
-    assert tracking_config(given) == TrackingConfig()
+    assert tracking_config(given) == FOR_TAKES
     made = tracking_config(with_masks(given, tmp_path))
-    assert made.suspect_residual > TrackingConfig().suspect_residual
+    assert made.suspect_residual > FOR_TAKES.suspect_residual
 
 
 def _take(frames, relative):
