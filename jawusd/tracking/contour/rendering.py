@@ -22,7 +22,7 @@ class Rendering:
     """Keep pictures and contours of both scans in every view of one instant, made again only after they have moved.
 
     Until then the points of a contour move with the scan. That its outline runs through other points then, as it turns,
-    is of second order: hundredths of a pixel at most.
+    is of second order.
     """
 
     def __init__(self, solver: ContourSolver, views: Sequence[View]) -> None:
