@@ -69,14 +69,14 @@ class _Searches:
         return Found(np.stack([np.eye(4)] * 2), 1000.0, np.full(2, self.fits[self.count]))
 
 
-def _refused(searches, monkeypatch):
+def _refused(searches, monkeypatch, fits=None):
     monkeypatch.setattr(start_causes, "aligned", lambda search, footage, poses, frame: poses)
     sources = [
         CameraSource(name=name, masks=Masks(upper=f"{name}/upper/%06d.png", lower=f"{name}/lower/%06d.png"))
         for name in ("cam0", "cam1", "cam2")
     ]
     footage = Footage(sources, TABLE, OFFSETS, (0, 10))
-    return start_causes.refuse_by_cause(searches, footage, 3, set())
+    return start_causes.refuse_by_cause(searches, footage, [3, 6, 8], fits or {}, set())
 
 
 def test_the_search_for_a_mistake_ends_and_says_what_was_tried(monkeypatch):
@@ -90,8 +90,21 @@ def test_the_search_for_a_mistake_ends_and_says_what_was_tried(monkeypatch):
 def test_every_mistake_of_three_cameras_is_tried(monkeypatch):
     searches = _Searches()
     assert _refused(searches, monkeypatch) == (
-        "Undoing any of 20 mistakes in masks, scans and calibration does not help."
+        "Undoing any of 20 mistakes in masks, scans and calibration does not help on frames 3, 6."
     )
+    assert searches.count == 40  # of 57 pictures each time
+
+
+def test_a_mistake_that_one_frame_does_not_show_is_looked_for_on_another(monkeypatch):
+    with pytest.raises(TrackingError, match="found only with that undone") as refused:
+        _refused(_Searches({25: 0.2}), monkeypatch)
+    assert refused.value.frame == 6
+
+
+def test_a_scan_that_fits_nowhere_is_named_before_mistakes_are_looked_for_on_other_frames(monkeypatch):
+    searches = _Searches({25: 0.2})
+    with pytest.raises(TrackingError, match="the lower scan does not fit its own masks"):
+        _refused(searches, monkeypatch, {3: np.array([0.5, 0.02])})
     assert searches.count == 20
 
 

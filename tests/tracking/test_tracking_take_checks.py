@@ -1,6 +1,7 @@
 """Faults of calibration and synchronisation that only a tracked take shows."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from small_take import CAMERAS, LANDMARKS, MESHES, OFFSETS, errors_mm, make_capt
 
 from jawusd.tracking import track_capture
 from jawusd.tracking.initialization.magnification import Magnification
-from jawusd.tracking.sequence.take_checks import lens_findings
+from jawusd.tracking.sequence.take_checks import lens_findings, misfit_findings
 
 FRAMES = 16
 
@@ -90,3 +91,29 @@ def test_only_what_a_lens_can_do_is_put_down_to_it():
     assert lens_kinds(0.005) == lens_kinds(-0.005) == [("lens_distortion", "cam0")]
     assert lens_kinds(-0.03) == lens_kinds(0.03) == [("side_teeth", "cam0")]
     assert lens_kinds(-0.001) == []
+
+
+def _fits(share, rough_px, frames=5):
+    """Return records of frames in which both arches fit such shares of their contour [-] with such residuals [px]."""
+    share, rough = np.array(share)[:, None] * np.ones(3), np.array(rough_px)[:, None] * np.ones(3)
+    outline = SimpleNamespace(score_px=500 * share, weight=np.full((2, 3), 100.0), square=100 * 0.828 * rough**2)
+    solution = SimpleNamespace(outline=outline, visible_px=np.full((2, 3), 500.0))
+    return {k: SimpleNamespace(solution=solution, status=np.ones(2, np.int8)) for k in range(frames)}
+
+
+@pytest.mark.parametrize(
+    ("share", "rough_px", "named"),
+    [
+        ((0.72, 0.09), (0.58, 1.23), "lower"),  # the lower scan of somebody else
+        ((0.09, 0.72), (1.23, 0.58), "upper"),
+        ((0.55, 0.30), (0.57, 0.56), None),  # lips over the lower teeth
+        ((0.72, 0.09), (0.58, 0.60), None),  # hardly to be seen
+        ((0.48, 0.56), (0.29, 0.47), None),
+    ],
+)
+def test_a_scan_that_fits_hardly_anything_is_named(share, rough_px, named):
+    found = misfit_findings(_fits(share, rough_px))
+    assert [(f.kind, f.message.split(" scan")[0]) for f in found] == (
+        [] if named is None else [("scan_misfit", f"the {named}")]
+    )
+    assert not misfit_findings(_fits(share, rough_px, 2))

@@ -26,7 +26,6 @@ from jawusd.tracking.initialization.start_causes import (
     MOST_PICTURES,
     aligned,
     refuse_by_cause,
-    refuse_lone_arch,
 )
 from jawusd.tracking.initialization.start_search import Found, StartSearch
 
@@ -218,8 +217,7 @@ def search_start(search: StartSearch, footage: Footage, explain: bool = True) ->
         if found.fit >= CLEAR_FIT:
             break
     if best is None:
-        tried = refuse_by_cause(search, footage, frames[0], accused) if explain else ""
-        refuse_lone_arch(fits)
+        tried = refuse_by_cause(search, footage, frames, fits, accused) if explain else ""
         raise TrackingError(
             f"there are no [bootstrap] picks, and searching the teeth failed on all {len(frames)} frames tried. "
             + " ".join([*(f"Frame {frame}: {message}." for frame, message in failed.items()), tried]),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -51,13 +51,22 @@ def aligned(search: StartSearch, footage: Footage, poses: Array, frame: int) -> 
         return first_record(solver, solver.config, poses, masks.at(frame), frame).solution.poses
 
 
-def refuse_by_cause(search: StartSearch, footage: Footage, frame: int, accused: set[str]) -> str:
-    """Refuse a capture for the mistake with which undone the search succeeds on a frame.
+def refuse_by_cause(
+    search: StartSearch, footage: Footage, frames: Sequence[int], fits: Mapping[int, Array], accused: set[str]
+) -> str:
+    """Refuse a capture for the mistake with which undone the search succeeds on one of some frames.
 
     Mistakes whose hints are among the `accused` are tried first. What is wrong with one camera alone, or with the size
     of the scans, is looked for last, since leaving out what contradicts makes many poses fit. No search begins that
     would look at more than `MOST_PICTURES`; what was found in a group of mistakes that are not all tried counts if it
-    fits beyond doubt.
+    fits beyond doubt. A scan that fits none of its masks is the next suspect; then other frames are tried, as far as
+    all mistakes can be: the right one is missed on some, as teeth are with nothing wrong.
+
+    Args:
+        search, footage: that failed.
+        frames: tried in this order.
+        fits: what the search found, by frame: `arch_fit` of both arches [-], shape (2,).
+        accused: hints of mistakes.
 
     Returns:
         What was tried, as a sentence, if there is no such mistake among it.
@@ -67,7 +76,23 @@ def refuse_by_cause(search: StartSearch, footage: Footage, frame: int, accused: 
     """
     exchanges = sorted(_exchanges(search, footage), key=lambda cause: cause.hint not in accused)
     groups = ([*_mirrored(search, footage)], exchanges, [*_sizes(search, footage)], [*_cameras(search, footage)])
-    count, tried, pictures = sum(map(len, groups)), 0, 0
+    count = sum(map(len, groups))
+    pictures = sum(len(cause.footage.sources) for group in groups for cause in group)
+    frames = frames[: max(1, MOST_PICTURES // pictures)]
+    tried = _refuse_on(frames[0], groups)
+    refuse_lone_arch(fits)
+    for frame in frames[1:]:
+        _refuse_on(frame, groups)
+    where = f"frame{'s' if len(frames) > 1 else ''} {', '.join(map(str, frames))}"
+    sentence = f"Undoing any of {tried} mistakes in masks, scans and calibration does not help on {where}"
+    if tried == count:
+        return f"{sentence}."
+    return f"{sentence}; {count - tried} more were not tried: no more than {MOST_PICTURES} pictures are searched."
+
+
+def _refuse_on(frame: int, groups: Sequence[Sequence[_Cause]]) -> int:
+    """Refuse a capture for the mistake with which undone the search succeeds on a frame; return how many were tried."""
+    tried, pictures = 0, 0
     for causes in groups:
         explained: list[tuple[float, _Cause]] = []
         for cause in causes:
@@ -81,10 +106,7 @@ def refuse_by_cause(search: StartSearch, footage: Footage, frame: int, accused: 
         if best is not None and fit >= least:
             message = f"{best.message}: the teeth are found only with that undone"
             raise TrackingError(message, frame=frame, hint=best.hint)
-    sentence = f"Undoing any of {tried} mistakes in masks, scans and calibration does not help"
-    if tried == count:
-        return f"{sentence}."
-    return f"{sentence}; {count - tried} more were not tried: no more than {MOST_PICTURES} pictures are searched."
+    return tried
 
 
 def refuse_lone_arch(fits: Mapping[int, Array]) -> None:

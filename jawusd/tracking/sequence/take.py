@@ -32,7 +32,7 @@ from jawusd.tracking.sequence.packed_records import PackedRecords
 from jawusd.tracking.sequence.passes import Passes, Progress
 from jawusd.tracking.sequence.rest_frames import RestFrames, rest_frames
 from jawusd.tracking.sequence.results import assemble, outline_variance
-from jawusd.tracking.sequence.take_checks import lens_findings, motion_findings, search_findings
+from jawusd.tracking.sequence.take_checks import lens_findings, misfit_findings, motion_findings, search_findings
 from jawusd.tracking.sequence.time_checks import time_findings
 
 _SETTLED_REST = 6  # frames with the teeth together among those on which nuisances are settled
@@ -101,6 +101,7 @@ def track_capture(
                 *given,
                 *motion_findings(names, extrinsics),
                 *time_findings(names, take.records, nuisances, extrinsics, config, shifts),
+                *misfit_findings(take.records),
                 *search_findings(take.searches, take.records),
             ]
     notes: TracksMeta = {

@@ -15,7 +15,9 @@ import numpy as np
 
 from jawusd.formats.finding import Finding
 from jawusd.formats.tracks import LOST
-from jawusd.tracking.contour.frame_record import FrameRecord
+from jawusd.tracking.contour.frame_record import FrameRecord, whole_frames
+from jawusd.tracking.contour.quality import residual_px, score_px
+from jawusd.tracking.contour.scan import ARCH_NAMES
 from jawusd.tracking.initialization.magnification import Magnification
 from jawusd.tracking.sequence.extrinsics import Extrinsics
 from jawusd.tracking.sequence.history import SearchAllowance
@@ -53,6 +55,9 @@ _MOST_BEND = 0.015
 # Motion of a camera since its calibration, which the take corrects.
 _TURN_DEG, _MOVE_MM = 0.25, 0.7
 _TELLING_CAMERAS = 3  # of two that differ, either may be wrong
+# Share of its visible contour that a scan fits, over that of the other scan, and standard deviation of what is matched,
+# over that of the other: both together tell the scan of somebody else.
+_FITS_LESS, _FITS_ROUGHER, _TELLING_FRAMES = 0.35, 1.5, 3
 _CLEARLY = 4.0  # standard deviations
 
 
@@ -171,6 +176,36 @@ def motion_findings(names: Sequence[str], extrinsics: Extrinsics) -> list[Findin
                     limit=_TURN_DEG,
                     camera=name,
                     hint="It was knocked: calibrate again to be sure.",
+                )
+            )
+    return out
+
+
+def misfit_findings(records: Mapping[int, FrameRecord]) -> list[Finding]:
+    """Return a warning for a scan that fits hardly anything of the masks it was tracked through.
+
+    Kind: "scan_misfit" [% of the visible contour].
+    """
+    whole = [records[frame].solution for frame in whole_frames(records)]
+    if len(whole) < _TELLING_FRAMES:
+        return []
+    shares = [score_px(s).sum(1) / np.maximum(s.visible_px.sum(1), 1.0) for s in whole]
+    share, rough = np.median(shares, axis=0), np.nanmedian([residual_px(s) for s in whole], axis=0)
+    out = []
+    for r, other in ((0, 1), (1, 0)):
+        if share[r] < _FITS_LESS * share[other] and rough[r] > _FITS_ROUGHER * rough[other]:
+            name = ARCH_NAMES[r]
+            out.append(
+                Finding(
+                    "scan_misfit",
+                    "warning",
+                    f"the {name} scan hardly fits its own masks: {share[r]:.0%} of its visible contour, within "
+                    f"{rough[r]:.1f} px; the {ARCH_NAMES[other]} one fits {share[other]:.0%}, within "
+                    f"{rough[other]:.1f} px. Its poses are not to be trusted.",
+                    value=round(100 * float(share[r]), 1),
+                    limit=round(100 * _FITS_LESS * float(share[other]), 1),
+                    hint=f"Check that the {name} scan is this person's, of this time, and that its masks show the "
+                    f"{name} teeth.",
                 )
             )
     return out
