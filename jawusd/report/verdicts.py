@@ -25,7 +25,9 @@ MARKS = {GOOD: "\u2714", LOOK: "!", BAD: "\u2716", OPEN: "?"}
 _PAPER_COVERAGE_PERCENT, _PAPER_MEAN_MM, _PAPER_WORST_MM = 0.754, 1.73, 7.22
 _UNKNOWN = "not known"
 _EXERCISES = "full opening, slides to both sides and protrusion, closed and half open"
-_UNUSED = {"camera_without_masks", "masks_black", "camera_not_used", "camera_rarely_used"}  # findings of tracks
+# Findings of tracks.
+_UNUSED = {"camera_without_masks", "masks_black", "camera_not_used", "camera_rarely_used"}
+_WRONG_SCANS = {"scan_misfit", "scans_mirrored"}
 _LACKING = {"take_lacks", "not_shown"}  # warnings of the fit about movements that are missing or too small
 _MISTAKES = {"scan_units", "pose_units", "front_back_flip", "left_right_flip", "upside_down", "swapped_jaws"}
 _SENTENCES = {
@@ -175,6 +177,12 @@ def _track(tracks: Tracks) -> Verdict:
     unused = [f"{one.camera}: {one.message}" for one in found if one.kind in _UNUSED]
     if unused:
         checks.append(Check("cameras that are not used", " ".join(unused), "none", LOOK))
+    wrong = [one.message for one in found if one.kind in _WRONG_SCANS]
+    if wrong:
+        checks.append(Check("scans", " ".join(wrong), "they fit the masks", BAD))
+    others = [one.line() for one in found if one.severity == "warning" and one.kind not in _UNUSED | _WRONG_SCANS]
+    if others:
+        checks.append(Check("warnings", " ".join(others), "none", LOOK))
     return _verdict("track", checks)
 
 

@@ -96,6 +96,23 @@ def test_a_camera_that_is_not_used_asks_for_a_look():
     assert track.checks[-1].found == "left: used in 0 of 60 frames."
 
 
+@pytest.mark.parametrize(
+    ("kind", "severity", "grade"),
+    [
+        ("scan_misfit", "warning", BAD),
+        ("scans_mirrored", "warning", BAD),
+        ("frame_dropped", "warning", LOOK),
+        ("registration_unknown", "note", GOOD),
+    ],
+)
+def test_what_tracking_warns_of_counts(kind, severity, grade):
+    data = report_data()
+    data.tracks.meta["findings"] = [Finding(kind, severity, "something is wrong.").as_json()]
+    assert grades(data)["track"] == grade
+    track = next(verdict for verdict in judge(data) if verdict.stage == "track")
+    assert ("something is wrong." in track.checks[-1].found) == (grade != GOOD)
+
+
 @pytest.mark.parametrize("code", ["take_lacks", "not_shown"])
 def test_missing_movements_and_unproven_times_ask_for_a_look(code):
     data = report_data(sync={"offsets": {}, "method": "taken as simultaneous"}, experiments=None)
