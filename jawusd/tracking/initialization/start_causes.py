@@ -138,6 +138,8 @@ def _fit(cause: _Cause, frame: int) -> float:
     """Return how well the teeth fit with a mistake undone [-]; zero if they are not found."""
     try:
         found = cause.search.at(cause.footage, frame)
+        if found.fit < _EXPLAINS:
+            return 0.0
         aligned(cause.search, cause.footage, found.poses, frame)
     except (TrackingError, CaptureError):
         return 0.0
