@@ -127,6 +127,18 @@ def test_masks_of_something_else_are_refused_with_what_was_tried(tmp_path, short
         _start(_capture(folder, bootstrap=None))
 
 
+def test_where_teeth_are_not_found_it_is_said_what_is_doubtful_about_the_scans(pictures, monkeypatch):
+    def fail(*arguments):
+        raise TrackingError("the teeth are not found", frame=7, hint="Give picks.")
+
+    monkeypatch.setattr(take_start, "search_start", fail)
+    with pytest.raises(TrackingError, match=r"Give picks\. warning: the crowns of the scans run 1\.\d mm into"):
+        _start(_capture(pictures, bootstrap=None))
+    lower = Mesh(MESHES[1].vertices - [0.0, 2.5, 0.0], MESHES[1].faces, MESHES[1].colors)
+    with pytest.raises(TrackingError, match=r"Give picks\.$"):
+        _start(_capture(pictures, bootstrap=None), (MESHES[0], lower))
+
+
 def test_no_frame_with_masks_of_both_rows_is_refused(tmp_path):
     folder = write_masks(tmp_path / "take", FRAMES)
     for path in folder.glob("cam[12]/lower/*.png"):

@@ -72,11 +72,23 @@ def find_start(
     footage = Footage(masked_sources(capture.cameras, cameras, offsets), cameras, offsets, capture.frames)
     T_anatomical_scan, findings = check_occlusion(solver.scans, capture.anatomy.T_anatomical_skull)
     search = StartSearch(meshes, solver, T_anatomical_scan, map_)
-    if capture.bootstrap is not None:
-        start = _picked(capture.bootstrap, capture.frames, footage, meshes, search)
-    else:
-        start = search_start(search, footage)
+    try:
+        if capture.bootstrap is not None:
+            start = _picked(capture.bootstrap, capture.frames, footage, meshes, search)
+        else:
+            start = search_start(search, footage)
+    except TrackingError as error:
+        raise _with_doubts(error, findings) from error
     return replace(start, findings=(*start.findings, *findings), T_anatomical_scan=T_anatomical_scan)
+
+
+def _with_doubts(error: TrackingError, findings: Sequence[Finding]) -> TrackingError:
+    """Return an error that also says what is doubtful about the scans, which may be its cause."""
+    if not findings:
+        return error
+    doubts = " ".join(finding.line() for finding in findings)
+    hint = f"{error.hint} {doubts}" if error.hint else doubts
+    return TrackingError(error.message, path=error.path, camera=error.camera, frame=error.frame, hint=hint)
 
 
 def _picked(
