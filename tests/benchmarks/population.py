@@ -184,13 +184,13 @@ def row(group: list[Outcome]) -> str:
 
 def verdict(outcome: Outcome, cause: str, before: set[str]) -> str:
     """Return what was said of a planted fault: found, wrong cause or missed."""
-    # A kind that the same person's valid capture carries too says nothing of the fault.
+    if outcome.refused:
+        return "found" if re.search(cause, outcome.refused, re.IGNORECASE) and not outcome.crashed else "wrong cause"
     new = [(kind, severity, line) for kind, severity, line in outcome.findings if kind not in before]
-    said = [outcome.refused, *(f"{kind} {line}" for kind, _, line in new)]
-    if any(re.search(cause, one, re.IGNORECASE) for one in said) and not outcome.crashed:
+    # A kind that the same person's valid capture carries too says nothing of the fault.
+    if any(re.search(cause, f"{kind} {line}", re.IGNORECASE) for kind, _, line in new):
         return "found"
-    warned = outcome.refused or any(severity in ("warning", "error") for _, severity, _ in new)
-    return "wrong cause" if warned else "missed"
+    return "wrong cause" if any(severity in ("warning", "error") for _, severity, _ in new) else "missed"
 
 
 def report_faults(outcomes: list[Outcome], before: dict[int, set[str]]) -> None:

@@ -21,12 +21,7 @@ from jawusd.tracking.initialization.bootstrap import picked_sigma_mm, pose_from_
 from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.initialization.mixups import all_arches_exchanged, likely_mixup
 from jawusd.tracking.initialization.scan_checks import check_occlusion
-from jawusd.tracking.initialization.start_causes import (
-    CLEAR_FIT,
-    MOST_PICTURES,
-    aligned,
-    refuse_by_cause,
-)
+from jawusd.tracking.initialization.start_causes import CLEAR_FIT, MOST_PICTURES, aligned, refuse_by_cause
 from jawusd.tracking.initialization.start_search import Found, StartSearch
 
 _SURVEYED = 24  # frames surveyed: two seconds of reading, and every exercise of a usual take is met

@@ -56,9 +56,9 @@ _MOST_BEND = 0.015
 _TURN_DEG, _MOVE_MM = 0.25, 0.7
 _TELLING_CAMERAS = 3  # of two that differ, either may be wrong
 # Share of its visible contour that a scan fits, over that of the other scan, and standard deviation of what is matched,
-# over that of the other: both together tell the scan of somebody else (0.12 and 2.1 on the one take of 8 with one that
-# was tracked at all). None of 30 valid persons came near (`population.py --persons 30 --seed 9500`), which bounds the
-# rate of false alarms to 10 % (95 %); of ten looked at the nearest had 0.55 and 1.0.
+# over that of the other: both together tell the scan of somebody else. Chosen on the one take with one that was tracked
+# at all (0.12 and 2.1; `population.py --faults`, person 9502) and nine valid persons, of whom the nearest had 0.55 and
+# 1.0. None of 21 other valid persons (9500-9529) was named, which bounds the rate of false alarms to 14 % (95 %).
 _FITS_LESS, _FITS_ROUGHER, _TELLING_FRAMES = 0.35, 1.5, 3
 _CLEARLY = 4.0  # standard deviations
 
