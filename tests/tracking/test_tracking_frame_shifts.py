@@ -55,6 +55,14 @@ def test_masks_that_fit_at_no_instant_are_no_shift():
     assert shifts.is_timely(0)
 
 
+@pytest.mark.parametrize(("better", "found"), [(0.0, False), (0.25, True)])
+def test_a_step_that_lost_the_jaw_is_found_where_its_camera_fits_better_than_the_others(better, found):
+    shifts = _shifts((0,) * 12, (0,) * 7 + (-1,) * 5, (0,) * 12)
+    shifts.fit[7:] -= 0.8
+    shifts.fit[7:, 1, SHIFTS.index(-1)] += better
+    assert (shifts.clearest() == (1, 1, 47)) == found
+
+
 def test_a_jaw_at_rest_tells_nothing():
     still = FrameShifts(FRAMES, np.random.default_rng(0).normal(0.4, 0.01, (12, 3, 3)))
     assert still.clearest() is None

@@ -52,6 +52,22 @@ def test_good_prediction_is_tracked(tracker):
     assert max(_errors(record)) < 0.05
 
 
+def test_a_mask_that_stays_uncovered_from_the_first_frame_on_is_left_out(tracker):
+    """A knocked camera: its masks, never covered, are no worse than usual, and alone would lose every frame."""
+    views = _views(1)
+    masks = views[0].masks.copy()
+    for row in masks:
+        row[:, : row.shape[1] // 12] = 255
+    views[0] = replace(views[0], masks=masks)
+    first = tracker.track([POSES[0]], _views(0), [])
+    coverage = np.where(np.arange(3) == 0, 0.3, first.coverage)
+    tracker.history = History(CONFIG.history_frames, CONFIG.score_frames)
+    tracker.history.add(replace(first, coverage=coverage))
+    record = tracker.track([POSES[0]], views, [])
+    assert record.status.tolist() == [PARTIAL, PARTIAL] and record.used.tolist() == [[False, True, True]] * 2
+    assert (record.coverage[:, 0] > CONFIG.lost_coverage).all() and max(_errors(record)) < 0.1
+
+
 def test_jaw_far_from_its_prediction_is_found(tracker):
     away = POSES[1].copy()
     away[1] = make_transform(np.eye(3), [1.0, 9.0, 1.0]) @ away[1] @ se3_exp([-0.08, 0, 0, 0, 0, 0])

@@ -32,8 +32,8 @@ from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.scan import prepare_scan
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import masked_sources
+from jawusd.tracking.initialization import searched_start, start_search
 from jawusd.tracking.initialization import start as take_start
-from jawusd.tracking.initialization import start_search
 from jawusd.tracking.initialization.first_frame import first_record
 from jawusd.tracking.initialization.footage import Footage, MaskSurvey, survey_masks
 from jawusd.tracking.initialization.mixups import possible_mixups
@@ -58,7 +58,7 @@ def short_search(monkeypatch):
     """Search few orientations, on one frame."""
     turns = np.radians([-18.0, 0.0, 18.0])
     monkeypatch.setattr(start_search, "_GRID", Grid(turns, turns, turns, (10.0, 8.0, 12.0)))
-    monkeypatch.setattr(take_start, "_FRAMES_TRIED", 1)
+    monkeypatch.setattr(searched_start, "FRAMES_TRIED", 1)
     monkeypatch.setattr(start_search, "_FINALISTS", 2)
 
 
@@ -116,7 +116,7 @@ def test_two_cameras_are_enough(pictures, short_search):
 
 
 def test_masks_of_something_else_are_refused_with_what_was_tried(tmp_path, short_search, monkeypatch):
-    monkeypatch.setattr(take_start, "refuse_by_cause", lambda *arguments: "No mistake explains it.")
+    monkeypatch.setattr(searched_start, "refuse_by_cause", lambda *arguments: "No mistake explains it.")
     folder = write_masks(tmp_path / "take", FRAMES)
     for k, path in enumerate(sorted(folder.rglob("*.png"))):
         picture = np.zeros_like(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
@@ -215,7 +215,7 @@ def test_picks_that_fit_outlive_a_search_that_does_not(pictures, monkeypatch, fa
 
     monkeypatch.setattr(take_start, "_SURE_MM", 0.0)
     monkeypatch.setattr(take_start, "search_around", search)
-    monkeypatch.setattr(take_start, "_around_without_a_camera", lambda *_: None)
+    monkeypatch.setattr(take_start, "around_without_a_camera", lambda *_: None)
     start = _start(_capture(pictures))
     assert start.notes["by"] == "picks" and not [f for f in start.findings if f.kind == "picks_off"]
     assert max(_error_mm(start, r) for r in (0, 1)) < 1.0
@@ -280,11 +280,24 @@ def _misplaced(poses, turn_rad=0.5):
 class _FoundBefore:
     """Answer searches with fits and poses that were made up."""
 
-    def __init__(self, fits, misplaced=()):
+    def __init__(self, fits, misplaced=(), mirrored_fit=None):
         self.solver = ContourSolver(SCANS, TrackingConfig())
         self.fits, self.misplaced, self.asked = list(fits), misplaced, []
+        self.mirrored_fit = mirrored_fit
+
+    def mirrored(self):
+        other = _FoundBefore([] if self.mirrored_fit is None else [self.mirrored_fit])
+        other.sources = self.sources
+        return other
+
+    def scaled(self, factor):
+        other = _FoundBefore([])
+        other.sources = self.sources
+        return other
 
     def at(self, footage, frame):
+        if len(self.asked) == len(self.fits):
+            raise TrackingError("nothing found")
         if list(footage.sources) != list(self.sources):
             raise TrackingError("nothing found after exchanging masks")
         poses = jaw_poses(FRAMES)[frame - FIRST]
@@ -298,7 +311,7 @@ class _FoundBefore:
 def _searched(folder, search):
     footage = _footage(folder)
     search.sources = footage.sources
-    return take_start.search_start(search, footage)
+    return searched_start.search_start(search, footage)
 
 
 def test_first_frame_that_fits_beyond_doubt_is_taken(pictures):
@@ -310,6 +323,16 @@ def test_without_one_the_frame_that_fits_best_is_taken(pictures):
     search = _FoundBefore([0.1, 0.15, 0.25, 0.2, 0.1])
     start = _searched(pictures, search)
     assert start.frame == search.asked[2] and len(search.asked) == 5 and start.notes["fit"] == 0.25
+
+
+@pytest.mark.parametrize(("fit", "mirrored_fit", "refused"), [(0.2, 0.5, True), (0.2, 0.25, False), (0.4, 0.5, False)])
+def test_a_start_in_doubt_is_refused_if_a_mistake_undone_leaves_none(pictures, fit, mirrored_fit, refused):
+    search = _FoundBefore([fit] * 5, mirrored_fit=mirrored_fit)
+    if refused:
+        with pytest.raises(TrackingError, match="mirrored: left and right are exchanged"):
+            _searched(pictures, search)
+    else:
+        assert _searched(pictures, search).notes["fit"] == fit
 
 
 def test_wrong_minimum_that_covers_the_masks_is_refused(pictures):
@@ -342,7 +365,7 @@ def test_poor_poses_accuse_no_masks(pictures, monkeypatch):
     def accuse(footage, solver, poses, frame):
         return possible_mixups(footage.sources)[0] if frame == search.asked[0] else None
 
-    monkeypatch.setattr(take_start, "likely_mixup", accuse)
+    monkeypatch.setattr(searched_start, "likely_mixup", accuse)
     search = _FoundBefore([0.1, 0.5])
     assert _searched(pictures, search).frame == search.asked[1]
     search = _FoundBefore([0.5])
@@ -355,7 +378,7 @@ def test_picks_far_off_are_helped_by_a_search_everywhere(pictures, short_search)
     search = StartSearch(MESHES, ContourSolver(SCANS, TrackingConfig()), np.eye(4))
     off = make_transform(np.eye(3), [14.0, 0, -14.0]) @ truth
     assert search.near(footage, FIRST + START, off).fit < 0.1
-    found = take_start.search_around(search, footage, FIRST + START, off)
+    found = searched_start.search_around(search, footage, FIRST + START, off)
     assert max(vertex_error_mm(MESHES[r], found.poses[r], truth[r]) for r in (0, 1)) < 0.1 and found.fit > 0.3
 
 

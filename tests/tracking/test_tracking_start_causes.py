@@ -62,6 +62,9 @@ class _Searches:
     def mirrored(self):
         return self
 
+    def scaled(self, factor):
+        return self
+
     def at(self, footage, frame):
         self.count += 1
         if self.count not in self.fits:
@@ -69,14 +72,14 @@ class _Searches:
         return Found(np.stack([np.eye(4)] * 2), 1000.0, np.full(2, self.fits[self.count]))
 
 
-def _refused(searches, monkeypatch, fits=None):
+def _refused(searches, monkeypatch, fits=None, accused=(), beyond_doubt=False):
     monkeypatch.setattr(start_causes, "aligned", lambda search, footage, poses, frame: poses)
     sources = [
         CameraSource(name=name, masks=Masks(upper=f"{name}/upper/%06d.png", lower=f"{name}/lower/%06d.png"))
         for name in ("cam0", "cam1", "cam2")
     ]
     footage = Footage(sources, TABLE, OFFSETS, (0, 10))
-    return start_causes.refuse_by_cause(searches, footage, [3, 6, 8], fits or {}, set())
+    return start_causes.refuse_by_cause(searches, footage, [3, 6, 8], fits or {}, set(accused), beyond_doubt)
 
 
 def test_the_search_for_a_mistake_ends_and_says_what_was_tried(monkeypatch):
@@ -113,3 +116,16 @@ def test_of_mistakes_that_are_not_all_tried_only_one_beyond_doubt_counts(monkeyp
     assert "not tried" in _refused(_Searches({5: 0.2}), monkeypatch)
     with pytest.raises(TrackingError, match="found only with that undone"):
         _refused(_Searches({5: 0.5}), monkeypatch)
+
+
+def test_sizes_are_tried_first_where_the_scans_are_of_no_usual_size(monkeypatch):
+    with pytest.raises(TrackingError, match="the scans are about 5% too small"):
+        _refused(_Searches({1: 0.2}), monkeypatch, accused=[start_causes.SIZE_HINT])
+    with pytest.raises(TrackingError, match="the scans are mirrored"):
+        _refused(_Searches({1: 0.2}), monkeypatch)
+
+
+def test_only_a_fit_beyond_doubt_counts_where_one_is_asked_for(monkeypatch):
+    assert "does not help" in _refused(_Searches({1: 0.2}), monkeypatch, beyond_doubt=True)
+    with pytest.raises(TrackingError, match="the scans are mirrored"):
+        _refused(_Searches({1: 0.4}), monkeypatch, beyond_doubt=True)

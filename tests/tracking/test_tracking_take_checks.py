@@ -9,7 +9,7 @@ from small_take import CAMERAS, LANDMARKS, MESHES, OFFSETS, errors_mm, make_capt
 
 from jawusd.tracking import track_capture
 from jawusd.tracking.initialization.magnification import Magnification
-from jawusd.tracking.sequence.take_checks import lens_findings, misfit_findings
+from jawusd.tracking.sequence.take_checks import OF_COLOURS, OF_MASKS, lens_findings, misfit_findings
 
 FRAMES = 16
 
@@ -82,8 +82,33 @@ def test_mirrored_scans_are_named(capture):
 def lens_kinds(bend):
     """Return what is found where the first of three cameras shows side teeth so much larger."""
     bends, none, small = np.array([bend, 0.0, 0.0]), np.zeros(3), np.full(3, 1e-4)
-    found = Magnification(none, small, bends, small, np.zeros((3, 2)), np.full((3, 2), 0.1), 0.5)
-    return [(f.kind, f.camera) for f in lens_findings(["cam0", "cam1", "cam2"], found)]
+    return _lens_kinds(Magnification(none, small, bends, small, *_masks_and_motion(none), 0.5))
+
+
+def _masks_and_motion(clear):
+    """Return the fields of masks drawn rightly, and of cameras that seem to have moved so clearly, shape (3,)."""
+    return np.zeros((3, 2)), np.full((3, 2), 0.1), np.full(3, 0.005), np.full(3, 2.0), np.array(clear, float)
+
+
+def _lens_kinds(found, limits=OF_MASKS):
+    return [(f.kind, f.camera) for f in lens_findings(["cam0", "cam1", "cam2"], found, limits)]
+
+
+@pytest.mark.parametrize(
+    ("clear", "named"),
+    [
+        ((4.6, 13.8, 4.9), "cam1"),  # knocked by half a degree and 2 mm
+        ((10.0, 9.8, 19.0), "cam2"),
+        ((9.4, 9.6, 10.6), None),  # the masks of the last one are drawn 6 px too wide
+        ((2.6, 4.8, 4.5), None),
+    ],
+)
+def test_a_knocked_camera_is_named_and_its_lens_is_not(clear, named):
+    small, bend = np.full(3, 1e-4), np.array([0.0, 0.007, 0.0])  # pictures of another place seem to be bent
+    found = Magnification(np.zeros(3), small, bend, small, *_masks_and_motion(clear), 0.5)
+    bent = [] if named == "cam1" else [("lens_distortion", "cam1")]
+    assert sorted(_lens_kinds(found)) == sorted(bent + ([("camera_moved", named)] if named else []))
+    assert _lens_kinds(found, OF_COLOURS) == []
 
 
 def test_only_what_a_lens_can_do_is_put_down_to_it():

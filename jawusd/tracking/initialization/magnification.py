@@ -41,6 +41,8 @@ class Magnification:
         scale, sigma_scale: relative, shape (C,): 0.05 where pictures are 5 % larger than expected.
         bend, sigma_bend: change of it from the optical axis to a radius of 25 mm at the teeth, shape (C,).
         bias_px, sigma_bias_px: how far masks reach beyond the teeth at the working size, per arch, shape (C, 2).
+        turn_rad, move_mm: how far each camera turned and moved against the mean of all, shape (C,).
+        motion_clear: length of that motion in standard deviations (Mahalanobis), shape (C,).
         spread_px: rms distance that remains.
     """
 
@@ -50,6 +52,9 @@ class Magnification:
     sigma_bend: Array
     bias_px: Array
     sigma_bias_px: Array
+    turn_rad: Array
+    move_mm: Array
+    motion_clear: Array
     spread_px: float
 
     @property
@@ -193,9 +198,22 @@ def _solved(blocks: Sequence[_Rows], cameras: int, config: TrackingConfig) -> Ma
         spread = max(_spread(np.concatenate(left)), _LEAST_SPREAD_PX)
     sigma = np.sqrt(np.diag(covariance)).reshape(cameras, _UNKNOWNS)
     found = theta.reshape(cameras, _UNKNOWNS)
-    return Magnification(
-        found[:, 0], sigma[:, 0], found[:, 1], sigma[:, 1], found[:, 8:], np.minimum(sigma[:, 8:], 1.0), spread
-    )
+    bias_sigma = np.minimum(sigma[:, 8:], 1.0)
+    motion = _motion(theta, covariance, cameras)
+    return Magnification(found[:, 0], sigma[:, 0], found[:, 1], sigma[:, 1], found[:, 8:], bias_sigma, *motion, spread)
+
+
+def _motion(theta: Array, covariance: Array, cameras: int) -> tuple[Array, Array, Array]:
+    """Return turn [rad] and motion [mm] of each camera against the mean of all, and their clearness, shapes (C,)."""
+    against_mean = np.eye(cameras) - 1.0 / cameras
+    pick = np.zeros((6, _UNKNOWNS))
+    pick[:, 2:8] = np.eye(6)
+    twists, clear = np.zeros((cameras, 6)), np.zeros(cameras)
+    for c in range(cameras):
+        rows = np.kron(against_mean[c], pick)
+        twists[c] = rows @ theta
+        clear[c] = np.sqrt(twists[c] @ np.linalg.pinv(rows @ covariance @ rows.T) @ twists[c])
+    return np.linalg.norm(twists[:, :3], axis=1), np.linalg.norm(twists[:, 3:], axis=1), clear
 
 
 def magnified(view: View, scale: float) -> View:

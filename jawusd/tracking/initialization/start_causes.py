@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 from jawusd.errors import CaptureError, TrackingError
-from jawusd.geometry import Camera
 from jawusd.geometry.arrays import Array
 from jawusd.tracking.contour.scan import ARCH_NAMES, teeth_centre
 from jawusd.tracking.initialization.first_frame import first_record
@@ -28,6 +27,8 @@ _MOST_CAMERAS = 4  # whose exchanges are tried; every one costs a search
 MOST_PICTURES = 120
 # Sizes of the scans that are tried, each of which finds teeth that are 5 % off it.
 _SIZES = (0.95, 1.05, 0.86, 1.16, 0.77, 1.28)
+#: Hint of scans of a wrong size, by which they are accused.
+SIZE_HINT = "Check the scans' unit and scaling, and the square size of the calibration board."
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,21 +53,28 @@ def aligned(search: StartSearch, footage: Footage, poses: Array, frame: int) -> 
 
 
 def refuse_by_cause(
-    search: StartSearch, footage: Footage, frames: Sequence[int], fits: Mapping[int, Array], accused: set[str]
+    search: StartSearch,
+    footage: Footage,
+    frames: Sequence[int],
+    fits: Mapping[int, Array],
+    accused: set[str],
+    beyond_doubt: bool = False,
 ) -> str:
     """Refuse a capture for the mistake with which undone the search succeeds on one of some frames.
 
-    Mistakes whose hints are among the `accused` are tried first. What is wrong with one camera alone, or with the size
-    of the scans, is looked for last, since leaving out what contradicts makes many poses fit. No search begins that
-    would look at more than `MOST_PICTURES`; what was found in a group of mistakes that are not all tried counts if it
-    fits beyond doubt. A scan that fits none of its masks is the next suspect; then other frames are tried, as far as
-    all mistakes can be: the right one is missed on some, as teeth are with nothing wrong.
+    Exchanges whose hints are among the `accused` are tried before others, and sizes before everything. What is wrong
+    with one camera alone, or else with the size of the scans, is looked for last, since leaving out what contradicts
+    makes many poses fit. No search begins that would look at more than `MOST_PICTURES`; what was found in a group of
+    mistakes that are not all tried counts if it fits beyond doubt. A scan that fits none of its masks is the next
+    suspect; then other frames are tried, as far as all mistakes can be: the right one is missed on some, as teeth are
+    with nothing wrong.
 
     Args:
         search, footage: that failed.
         frames: tried in this order.
         fits: what the search found, by frame: `arch_fit` of both arches [-], shape (2,).
         accused: hints of mistakes.
+        beyond_doubt: whether only a fit beyond doubt counts.
 
     Returns:
         What was tried, as a sentence, if there is no such mistake among it.
@@ -75,14 +83,18 @@ def refuse_by_cause(
         TrackingError: names the mistake.
     """
     exchanges = sorted(_exchanges(search, footage), key=lambda cause: cause.hint not in accused)
-    groups = ([*_mirrored(search, footage)], exchanges, [*_sizes(search, footage)], [*_cameras(search, footage)])
+    sizes = [*_sizes(search, footage)]
+    groups = [[*_mirrored(search, footage)], exchanges, sizes, [*_cameras(search, footage)]]
+    if SIZE_HINT in accused:
+        groups.remove(sizes)
+        groups.insert(0, sizes)
     count = sum(map(len, groups))
     pictures = sum(len(cause.footage.sources) for group in groups for cause in group)
     frames = frames[: max(1, MOST_PICTURES // pictures)]
-    tried = _refuse_on(frames[0], groups)
+    tried = _refuse_on(frames[0], groups, beyond_doubt)
     refuse_lone_arch(fits)
     for frame in frames[1:]:
-        _refuse_on(frame, groups)
+        _refuse_on(frame, groups, beyond_doubt)
     where = f"frame{'s' if len(frames) > 1 else ''} {', '.join(map(str, frames))}"
     sentence = f"Undoing any of {tried} mistakes in masks, scans and calibration does not help on {where}"
     if tried == count:
@@ -90,7 +102,7 @@ def refuse_by_cause(
     return f"{sentence}; {count - tried} more were not tried: no more than {MOST_PICTURES} pictures are searched."
 
 
-def _refuse_on(frame: int, groups: Sequence[Sequence[_Cause]]) -> int:
+def _refuse_on(frame: int, groups: Sequence[Sequence[_Cause]], beyond_doubt: bool) -> int:
     """Refuse a capture for the mistake with which undone the search succeeds on a frame; return how many were tried."""
     tried, pictures = 0, 0
     for causes in groups:
@@ -101,7 +113,7 @@ def _refuse_on(frame: int, groups: Sequence[Sequence[_Cause]]) -> int:
                 break
             explained.append((_fit(cause, frame), cause))
         tried += len(explained)
-        least = _EXPLAINS if len(explained) == len(causes) else CLEAR_FIT
+        least = CLEAR_FIT if beyond_doubt or len(explained) < len(causes) else _EXPLAINS
         fit, best = max(explained, key=lambda one: one[0], default=(0.0, None))
         if best is not None and fit >= least:
             message = f"{best.message}: the teeth are found only with that undone"
@@ -174,17 +186,10 @@ def _sizes(search: StartSearch, footage: Footage) -> Iterator[_Cause]:
         yield _Cause(
             f"the scans are about {abs(size - 1.0):.0%} too {'large' if size > 1.0 else 'small'}: their scale is "
             "wrong, or the calibration's lengths",
-            "Check the scans' unit and scaling, and the square size of the calibration board.",
-            search,
-            replace(footage, cameras={name: _farther(camera, size) for name, camera in footage.cameras.items()}),
+            SIZE_HINT,
+            search.scaled(1.0 / size),
+            footage,
         )
-
-
-def _farther(camera: Camera, factor: float) -> Camera:
-    """Return a camera in a world whose lengths are so many times as long."""
-    T = camera.T_cam_world.copy()
-    T[:3, 3] *= factor
-    return replace(camera, T_cam_world=T)
 
 
 def _cameras(search: StartSearch, footage: Footage) -> Iterator[_Cause]:

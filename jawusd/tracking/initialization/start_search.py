@@ -88,9 +88,20 @@ class StartSearch:
     def mirrored(self) -> StartSearch:
         """Return the search of the same scans mirrored, left and right exchanged."""
         meshes = [mirrored_scan(mesh, self._T_anatomical_scan) for mesh in self._meshes]
+        return self._of(meshes, self._T_anatomical_scan)
+
+    def scaled(self, factor: float) -> StartSearch:
+        """Return the search of the same scans with all lengths multiplied by a factor [-]."""
+        meshes = [replace(mesh, vertices=factor * mesh.vertices) for mesh in self._meshes]
+        T = self._T_anatomical_scan.copy()
+        T[:3, 3] *= factor
+        return self._of(meshes, T)
+
+    def _of(self, meshes: Sequence[Mesh], T_anatomical_scan: Array) -> StartSearch:
+        """Return the search of other scans."""
         scans = [prepare_scan(mesh, name) for mesh, name in zip(meshes, ARCH_NAMES, strict=True)]
         solver = ContourSolver((scans[0], scans[1]), self._config)
-        return StartSearch(meshes, solver, self._T_anatomical_scan, self._map)
+        return StartSearch(meshes, solver, T_anatomical_scan, self._map)
 
     def at(self, footage: Footage, frame: int) -> Found:
         """Return the best poses on a frame.

@@ -164,7 +164,8 @@ class FrameTracker:
     def _spoiled(self, trial: _Trial, fewest: int) -> Mask:
         """Tell which masks the scan neither covers nor fits while it does at least so many others, shape (2, C)."""
         dead = trial.use & (score_px(trial.solution) < self._config.dead_score * self.history.usual_score())
-        wrong = self._badly_covered(trial) | dead
+        uncovered = trial.use & (trial.coverage > self._config.lost_coverage)  # alone it would lose the arch
+        wrong = self._badly_covered(trial) | uncovered | dead
         for r in ARCHES:
             if (trial.use[r] & ~wrong[r]).sum() < fewest:
                 wrong[r] = False  # it is the pose that is wrong, not so many masks

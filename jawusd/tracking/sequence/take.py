@@ -94,12 +94,14 @@ def track_capture(
             nuisances, extrinsics = take.refine(rest, may_move=not wrong)
             records = take.records if capture.frames else _trimmed(take.records)
             names = tuple(camera.name for camera in masks.cameras)
+            moved = motion_findings(names, extrinsics)
+            corrected = {(finding.kind, finding.camera) for finding in moved}
             findings = [
                 *start.findings,
                 *masks.findings(),
                 *use_of_cameras(names, records),
-                *given,
-                *motion_findings(names, extrinsics),
+                *(finding for finding in given if (finding.kind, finding.camera) not in corrected),
+                *moved,
                 *time_findings(names, take.records, nuisances, extrinsics, config, shifts),
                 *misfit_findings(take.records),
                 *search_findings(take.searches, take.records),
