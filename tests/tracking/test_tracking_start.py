@@ -325,7 +325,9 @@ def test_without_one_the_frame_that_fits_best_is_taken(pictures):
     assert start.frame == search.asked[2] and len(search.asked) == 5 and start.notes["fit"] == 0.25
 
 
-@pytest.mark.parametrize(("fit", "mirrored_fit", "refused"), [(0.2, 0.5, True), (0.2, 0.25, False), (0.4, 0.5, False)])
+@pytest.mark.parametrize(
+    ("fit", "mirrored_fit", "refused"), [(0.07, 0.5, True), (0.07, 0.25, False), (0.2, 0.5, False)]
+)
 def test_a_start_in_doubt_is_refused_if_a_mistake_undone_leaves_none(pictures, fit, mirrored_fit, refused):
     search = _FoundBefore([fit] * 5, mirrored_fit=mirrored_fit)
     if refused:

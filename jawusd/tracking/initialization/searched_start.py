@@ -13,7 +13,7 @@ from jawusd.formats.finding import Finding
 from jawusd.geometry.arrays import Array
 from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.initialization.mixups import all_arches_exchanged, likely_mixup
-from jawusd.tracking.initialization.start_causes import CLEAR_FIT, MOST_PICTURES, aligned, refuse_by_cause
+from jawusd.tracking.initialization.start_causes import CLEAR_FIT, EXPLAINS, MOST_PICTURES, aligned, refuse_by_cause
 from jawusd.tracking.initialization.start_search import Found, StartSearch
 
 #: Frames surveyed: two seconds of reading, and every exercise of a usual take is met.
@@ -36,8 +36,8 @@ class Start:
 def search_start(search: StartSearch, footage: Footage, doubts: Collection[str] = (), explain: bool = True) -> Start:
     """Find a frame on which both arches can be aligned, and their poses there.
 
-    The first frame that fits beyond doubt is taken, or else the one that fits best. Where neither arch fits beyond
-    doubt there, but both do with a mistake undone, that mistake is refused.
+    The first frame that fits beyond doubt is taken, or else the one that fits best. Where neither arch fits there as
+    right poses do, but both fit beyond doubt with a mistake undone, that mistake is refused.
 
     Args:
         search: of the scans.
@@ -85,7 +85,7 @@ def search_start(search: StartSearch, footage: Footage, doubts: Collection[str] 
             "masks, the calibration and the time offsets.",
         )
     frame, found = best
-    if explain and found.fits.max() < CLEAR_FIT:
+    if explain and found.fits.max() < EXPLAINS:
         refuse_by_cause(search, footage, [frame], {}, accused, beyond_doubt=True)
     _check_upright(search, footage, frame, found)
     notes = {"by": "search", "frame": frame, "worth_px": found.objective_px, "fit": found.fit}

@@ -18,7 +18,8 @@ from jawusd.tracking.initialization.start_search import StartSearch
 # exceed 0.35 where much of the teeth shows, and 0.1 with lips nearly closed or cameras 0.1 degrees off.
 # (Scans of other persons: 0.35 to 0.77 in the arch that is right, below 0.05 in the other one, on seven persons.)
 CLEAR_FIT = 0.3
-_EXPLAINS = 0.1  # least fit with a mistake undone, which wrong poses do not reach
+#: Least fit with a mistake undone, which wrong poses do not reach [-].
+EXPLAINS = 0.1
 _MOST_CAMERAS = 4  # whose exchanges are tried; every one costs a search
 #: Pictures searched after which no further search begins [-], on the frames of a start and again for the mistake; each
 #: takes two to three seconds of processor time. All mistakes of up to four cameras are tried, and without exchanges, of
@@ -113,7 +114,7 @@ def _refuse_on(frame: int, groups: Sequence[Sequence[_Cause]], beyond_doubt: boo
                 break
             explained.append((_fit(cause, frame), cause))
         tried += len(explained)
-        least = CLEAR_FIT if beyond_doubt or len(explained) < len(causes) else _EXPLAINS
+        least = CLEAR_FIT if beyond_doubt or len(explained) < len(causes) else EXPLAINS
         fit, best = max(explained, key=lambda one: one[0], default=(0.0, None))
         if best is not None and fit >= least:
             message = f"{best.message}: the teeth are found only with that undone"
@@ -132,7 +133,7 @@ def refuse_lone_arch(fits: Mapping[int, Array]) -> None:
     """
     clear = {frame: fit for frame, fit in fits.items() if fit.max() >= CLEAR_FIT}
     arches = {int(fit.argmax()) for fit in clear.values()}
-    if len(arches) != 1 or any(fit.min() >= _EXPLAINS for fit in clear.values()):
+    if len(arches) != 1 or any(fit.min() >= EXPLAINS for fit in clear.values()):
         return
     good = arches.pop()
     frame = max(clear, key=lambda f: float(clear[f][good]))
@@ -140,7 +141,7 @@ def refuse_lone_arch(fits: Mapping[int, Array]) -> None:
     name, other = ARCH_NAMES[1 - good], ARCH_NAMES[good]
     raise TrackingError(
         f"the {name} scan does not fit its own masks on any frame where the {other} one does: {fit[1 - good]:.2f} of "
-        f"its contour against {fit[good]:.2f}, less what stays uncovered; at least {_EXPLAINS:g} is needed",
+        f"its contour against {fit[good]:.2f}, less what stays uncovered; at least {EXPLAINS:g} is needed",
         frame=frame,
         hint=f"Check that the {name} scan is this person's, of this time, and that its masks show the {name} teeth.",
     )
@@ -150,7 +151,7 @@ def _fit(cause: _Cause, frame: int) -> float:
     """Return how well the teeth fit with a mistake undone [-]; zero if they are not found."""
     try:
         found = cause.search.at(cause.footage, frame)
-        if found.fit < _EXPLAINS:
+        if found.fit < EXPLAINS:
             return 0.0
         aligned(cause.search, cause.footage, found.poses, frame)
     except (TrackingError, CaptureError):
