@@ -1,15 +1,16 @@
 """First frames that were aligned wrongly are found by tracking back to them from frames that show the teeth well."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from small_take import FIRST, START, errors_mm, make_capture, track, write_masks
 
-from jawusd.formats.tracks import LOST
+from jawusd.formats.tracks import LOST, TRACKED, LostReason
 from jawusd.tracking.contour.frame_record import FrameRecord
 from jawusd.tracking.sequence.passes import Passes
-from jawusd.tracking.sequence.well_seen import nearest_well_seen
+from jawusd.tracking.sequence.well_seen import give_up_poorly_seen, nearest_well_seen
 
 FRAMES = 10
 OFF_MM = 2.5  # farther than the gates, so that a contour near by is taken for the teeth's
@@ -76,3 +77,31 @@ def test_wrong_first_frames_are_tracked_again_from_the_others(records, monkeypat
 def centres(records):
     """Return the centres of both arches in all frames [mm], shape (n, 2, 3)."""
     return np.array([records[frame].solution.centres for frame in sorted(records)])
+
+
+def seen(share, rough_px):
+    """Return the record of a frame in which such a share of the lower contour fits [-], so roughly [px]."""
+    share, rough = (np.array([usual, lower])[:, None] * np.ones(3) for usual, lower in ((0.6, share), (0.6, rough_px)))
+    outline = SimpleNamespace(score_px=500 * share, weight=np.full((2, 3), 100.0), square=100 * 0.828 * rough**2)
+    solution = SimpleNamespace(outline=outline, visible_px=np.full((2, 3), 500.0))
+    return FrameRecord(solution, np.full(2, TRACKED, np.int8), np.ones((2, 3), bool), np.zeros((2, 3)))
+
+
+@pytest.mark.parametrize(
+    ("share", "rough_px", "given_up"),
+    [(0.12, 1.1, True), (0.12, 0.7, False), (0.5, 1.1, False), (0.5, 0.6, False)],
+)
+def test_an_arch_that_fits_far_less_and_far_more_roughly_than_usual_is_given_up(share, rough_px, given_up):
+    known = {frame: seen(0.5, 0.6) for frame in range(10)} | {4: seen(share, rough_px)}
+    give_up_poorly_seen(known)
+    lost = {frame: (record.status == LOST).tolist() for frame, record in known.items()}
+    assert lost == {frame: [False, given_up and frame == 4] for frame in range(10)}
+    if given_up:
+        assert [loss.reason for loss in known[4].losses] == [LostReason.NONE, LostReason.LOW_SCORE]
+        assert known[4].losses[1].value == pytest.approx(share / 0.5)
+
+
+def test_a_few_frames_do_not_tell_what_is_usual():
+    known = {frame: seen(0.5, 0.6) for frame in range(4)} | {4: seen(0.12, 1.1)}
+    give_up_poorly_seen(known)
+    assert (known[4].status == TRACKED).all()

@@ -34,6 +34,7 @@ from jawusd.tracking.sequence.rest_frames import RestFrames, rest_frames
 from jawusd.tracking.sequence.results import assemble, outline_variance
 from jawusd.tracking.sequence.take_checks import lens_findings, misfit_findings, motion_findings, search_findings
 from jawusd.tracking.sequence.time_checks import time_findings
+from jawusd.tracking.sequence.well_seen import give_up_poorly_seen
 
 _SETTLED_REST = 6  # frames with the teeth together among those on which nuisances are settled
 # A moved camera would only hide these.
@@ -92,6 +93,7 @@ def track_capture(
             given = take.scans_and_lenses(start.T_anatomical_scan[0, :3])
             wrong = any(finding.kind in _SHOWN_AS_MOTION for finding in given)
             nuisances, extrinsics = take.refine(rest, may_move=not wrong)
+            give_up_poorly_seen(take.records)
             records = take.records if capture.frames else _trimmed(take.records)
             names = tuple(camera.name for camera in masks.cameras)
             moved = motion_findings(names, extrinsics)
