@@ -18,8 +18,8 @@ _LEAST_SCORE, _MOST_RESIDUAL = 0.8, 1.2
 # Of the medians of the take, per arch: with a smaller share of the visible contour and a larger residual at once, the
 # edges of lips were taken for the teeth's. Chosen on 15 persons with lips in the way (9600-9614 and 9503-9521 of
 # `tests/benchmarks/population.py`, 360 arches in frames): it names the three that were 0.6 to 0.9 mm off at a promised
-# 0.15 (0.3 of the median share, 1.8 times the residual), and no other. None of 216 of nine
-# persons besides was named, at most 1.4 % (95 %), nor of 833 frames of a long take (1.43 times the residual at most).
+# 0.15 (0.3 of the median share, 1.8 times the residual), and no other. Of nine persons besides, none of 216 was named,
+# at most 1.4 % (95 %), nor any of 833 frames of a long take (at most 1.43 times the residual).
 _POOR_SHARE, _POOR_RESIDUAL, _TELLING_FRAMES = 0.5, 1.6, 6
 
 
