@@ -60,7 +60,7 @@ def test_a_mask_that_stays_uncovered_from_the_first_frame_on_is_left_out(tracker
         row[:, : row.shape[1] // 12] = 255
     views[0] = replace(views[0], masks=masks)
     first = tracker.track([POSES[0]], _views(0), [])
-    coverage = np.where(np.arange(3) == 0, 0.3, first.coverage)
+    coverage = np.where(np.arange(3) == 0, 0.9, first.coverage)
     tracker.history = History(CONFIG.history_frames, CONFIG.score_frames)
     tracker.history.add(replace(first, coverage=coverage))
     record = tracker.track([POSES[0]], views, [])

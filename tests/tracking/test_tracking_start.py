@@ -1,6 +1,5 @@
 """Starts without picks, from poor picks, and from footage or scans that were mixed up."""
 
-import re
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -25,7 +24,7 @@ from small_take import (
 
 from jawusd.errors import TrackingError
 from jawusd.formats.mesh import Mesh
-from jawusd.geometry import make_transform, random_rotation, se3_exp, se3_inverse, transform_point, transform_points
+from jawusd.geometry import make_transform, random_rotation, se3_inverse, transform_point, transform_points
 from jawusd.imaging.raster import draw_silhouette, project, unpack_bits, words_for
 from jawusd.tracking import track_capture
 from jawusd.tracking.config import TrackingConfig
@@ -34,9 +33,7 @@ from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import masked_sources
 from jawusd.tracking.initialization import searched_start, start_search
 from jawusd.tracking.initialization import start as take_start
-from jawusd.tracking.initialization.first_frame import first_record
 from jawusd.tracking.initialization.footage import Footage, MaskSurvey, survey_masks
-from jawusd.tracking.initialization.mixups import possible_mixups
 from jawusd.tracking.initialization.pose_search import Grid, Screen, _template, coarse_scan
 from jawusd.tracking.initialization.scan_checks import check_occlusion
 from jawusd.tracking.initialization.start import find_start
@@ -267,112 +264,6 @@ def test_all_shifts_at_once_agree_with_drawing_each(pictures):
 def _footage(folder):
     capture = _capture(folder)
     return Footage(masked_sources(capture.cameras, TABLE, OFFSETS), TABLE, OFFSETS, capture.frames)
-
-
-def _misplaced(poses, turn_rad=0.5):
-    """Return the poses with the upper row turned into a wrong minimum, which from 0.35 rad covers most of its masks."""
-    middle = make_transform(np.eye(3), [0, 0, -11])
-    out = poses.copy()
-    out[0] = poses[0] @ middle @ se3_exp([0, turn_rad, 0, 0, 0, 0]) @ se3_inverse(middle)
-    return out
-
-
-class _FoundBefore:
-    """Answer searches with fits and poses that were made up."""
-
-    def __init__(self, fits, misplaced=(), mirrored_fit=None):
-        self.solver = ContourSolver(SCANS, TrackingConfig())
-        self.fits, self.misplaced, self.asked = list(fits), misplaced, []
-        self.mirrored_fit = mirrored_fit
-
-    def mirrored(self):
-        other = _FoundBefore([] if self.mirrored_fit is None else [self.mirrored_fit])
-        other.sources = self.sources
-        return other
-
-    def scaled(self, factor):
-        other = _FoundBefore([])
-        other.sources = self.sources
-        return other
-
-    def at(self, footage, frame):
-        if len(self.asked) == len(self.fits):
-            raise TrackingError("nothing found")
-        if list(footage.sources) != list(self.sources):
-            raise TrackingError("nothing found after exchanging masks")
-        poses = jaw_poses(FRAMES)[frame - FIRST]
-        if len(self.asked) in self.misplaced:
-            poses = _misplaced(poses)
-        fit = self.fits[len(self.asked)]
-        self.asked.append(frame)
-        return Found(poses, 1000.0 * fit, np.full(2, fit))
-
-
-def _searched(folder, search):
-    footage = _footage(folder)
-    search.sources = footage.sources
-    return searched_start.search_start(search, footage)
-
-
-def test_first_frame_that_fits_beyond_doubt_is_taken(pictures):
-    search = _FoundBefore([0.1, 0.5, 0.9])
-    assert _searched(pictures, search).frame == search.asked[1] and len(search.asked) == 2
-
-
-def test_without_one_the_frame_that_fits_best_is_taken(pictures):
-    search = _FoundBefore([0.1, 0.15, 0.25, 0.2, 0.1])
-    start = _searched(pictures, search)
-    assert start.frame == search.asked[2] and len(search.asked) == 5 and start.notes["fit"] == 0.25
-
-
-@pytest.mark.parametrize(
-    ("fit", "mirrored_fit", "refused"), [(0.07, 0.5, True), (0.07, 0.25, False), (0.2, 0.5, False)]
-)
-def test_a_start_in_doubt_is_refused_if_a_mistake_undone_leaves_none(pictures, fit, mirrored_fit, refused):
-    search = _FoundBefore([fit] * 5, mirrored_fit=mirrored_fit)
-    if refused:
-        with pytest.raises(TrackingError, match="mirrored: left and right are exchanged"):
-            _searched(pictures, search)
-    else:
-        assert _searched(pictures, search).notes["fit"] == fit
-
-
-def test_wrong_minimum_that_covers_the_masks_is_refused(pictures):
-    solver, poses = ContourSolver(SCANS, TrackingConfig()), jaw_poses(FRAMES)[0]
-    with _footage(pictures).views(poses[0, :3, 3], 7.2) as masks:
-        assert first_record(solver, solver.config, poses, masks.at(FIRST), FIRST).solution.poses.shape == (2, 4, 4)
-        with pytest.raises(TrackingError, match="upper teeth do not fit their masks") as refusal:
-            first_record(solver, solver.config, _misplaced(poses), masks.at(FIRST), FIRST)
-    share, fit = re.findall(r"(-?[\d.]+)%? (?:of the visible|\(at least 0.03)", str(refusal.value))
-    assert float(share) > 15 and float(fit) < 0  # the first alone would not tell
-
-
-def test_wrong_minimum_is_left_without_the_mask_that_it_does_not_cover(pictures):
-    solver, poses = ContourSolver(SCANS, TrackingConfig()), jaw_poses(FRAMES)[0]
-    with _footage(pictures).views(poses[0, :3, 3], 7.2) as masks:
-        record = first_record(solver, solver.config, _misplaced(poses, 0.35), masks.at(FIRST), FIRST)
-    assert record.used.all()
-    for r in (0, 1):
-        assert vertex_error_mm(MESHES[r], record.solution.poses[r], poses[r]) < 0.05
-
-
-def test_frame_with_wrong_poses_is_passed_over(pictures):
-    search = _FoundBefore([0.2] * 5, misplaced=(0, 1))
-    start = _searched(pictures, search)
-    assert start.frame == search.asked[2]
-    assert list(start.notes["failed"]) == [str(f) for f in search.asked[:2]]
-
-
-def test_poor_poses_accuse_no_masks(pictures, monkeypatch):
-    def accuse(footage, solver, poses, frame):
-        return possible_mixups(footage.sources)[0] if frame == search.asked[0] else None
-
-    monkeypatch.setattr(searched_start, "likely_mixup", accuse)
-    search = _FoundBefore([0.1, 0.5])
-    assert _searched(pictures, search).frame == search.asked[1]
-    search = _FoundBefore([0.5])
-    with pytest.raises(TrackingError, match="exchanged in camera cam0"):
-        _searched(pictures, search)
 
 
 def test_picks_far_off_are_helped_by_a_search_everywhere(pictures, short_search):

@@ -28,7 +28,7 @@ _MOST_CAMERAS = 4  # whose exchanges are tried; every one costs a search
 MOST_PICTURES = 120
 # Sizes of the scans that are tried, each of which finds teeth that are 5 % off it.
 _SIZES = (0.95, 1.05, 0.86, 1.16, 0.77, 1.28)
-#: Hint of scans of a wrong size, by which they are accused.
+#: Hint for scans of a wrong size; where it is among the `accused`, sizes are tried first.
 SIZE_HINT = "Check the scans' unit and scaling, and the square size of the calibration board."
 
 
@@ -85,10 +85,8 @@ def refuse_by_cause(
     """
     exchanges = sorted(_exchanges(search, footage), key=lambda cause: cause.hint not in accused)
     sizes = [*_sizes(search, footage)]
-    groups = [[*_mirrored(search, footage)], exchanges, sizes, [*_cameras(search, footage)]]
-    if SIZE_HINT in accused:
-        groups.remove(sizes)
-        groups.insert(0, sizes)
+    hands, cameras = [*_mirrored(search, footage)], [*_cameras(search, footage)]
+    groups = (sizes, hands, exchanges, cameras) if SIZE_HINT in accused else (hands, exchanges, sizes, cameras)
     count = sum(map(len, groups))
     pictures = sum(len(cause.footage.sources) for group in groups for cause in group)
     frames = frames[: max(1, MOST_PICTURES // pictures)]

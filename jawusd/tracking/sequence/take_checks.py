@@ -125,17 +125,18 @@ def _knocked(found: Magnification, limits: LensLimits) -> int | None:
 
 def _moved(name: str, turn_rad: float, move_mm: float, clear: float) -> Finding:
     """Say that a camera stands elsewhere than its calibration says, too far off for its masks to be followed."""
-    turn = float(np.rad2deg(turn_rad))
-    return Finding(
-        "camera_moved",
-        "warning",
-        f"against the other cameras it seems to have turned by {turn:.2f} degrees and moved by {move_mm:.1f} mm since "
-        f"its calibration, {clear:.0f} times their uncertainty; up to {OF_MASKS.knock:g} times is usual.",
-        value=round(turn, 3),
-        limit=_TURN_DEG,
-        camera=name,
-        hint="It was knocked, or is calibrated wrongly: calibrate it again, or leave it out.",
+    turn_deg = float(np.rad2deg(turn_rad))
+    return _camera_moved(
+        name,
+        turn_deg,
+        f"against the other cameras it seems to have turned by {turn_deg:.2f} degrees and moved by {move_mm:.1f} mm "
+        f"since its calibration, {clear:.0f} times their uncertainty; up to {OF_MASKS.knock:g} times is usual.",
+        "It was knocked, or is calibrated wrongly: calibrate it again, or leave it out.",
     )
+
+
+def _camera_moved(name: str, turn_deg: float, message: str, hint: str) -> Finding:
+    return Finding("camera_moved", "warning", message, round(turn_deg, 3), _TURN_DEG, camera=name, hint=hint)
 
 
 def _bent(name: str, bend: float, limits: LensLimits) -> Finding:
@@ -202,18 +203,11 @@ def motion_findings(names: Sequence[str], extrinsics: Extrinsics) -> list[Findin
         turn, move = float(np.rad2deg(np.linalg.norm(twist[:3]))), float(np.linalg.norm(twist[3:]))
         clear = (np.abs(twist) > _CLEARLY * sigma).any()
         if clear and (turn > _TURN_DEG or move > _MOVE_MM):
-            out.append(
-                Finding(
-                    "camera_moved",
-                    "warning",
-                    f"as the take shows it, it sees the teeth turned by {turn:.2f} degrees and moved by {move:.1f} mm "
-                    f"against its calibration (usual are {_TURN_DEG:g} degrees and {_MOVE_MM:g} mm); corrected.",
-                    value=round(turn, 3),
-                    limit=_TURN_DEG,
-                    camera=name,
-                    hint="It was knocked: calibrate again to be sure.",
-                )
+            message = (
+                f"as the take shows it, it sees the teeth turned by {turn:.2f} degrees and moved by {move:.1f} mm "
+                f"against its calibration (usual are {_TURN_DEG:g} degrees and {_MOVE_MM:g} mm); corrected."
             )
+            out.append(_camera_moved(name, turn, message, "It was knocked: calibrate again to be sure."))
     return out
 
 
