@@ -38,6 +38,7 @@ from jawusd.tracking.initialization.pose_search import Grid, Screen, _template, 
 from jawusd.tracking.initialization.scan_checks import check_occlusion
 from jawusd.tracking.initialization.start import find_start
 from jawusd.tracking.initialization.start_search import Found, StartSearch
+from jawusd.tracking.sequence.passes import Passes
 
 FRAMES = 5
 TABLE = {camera.name: camera for camera in CAMERAS}
@@ -134,6 +135,15 @@ def test_where_teeth_are_not_found_it_is_said_what_is_doubtful_about_the_scans(p
     lower = Mesh(MESHES[1].vertices - [0.0, 2.5, 0.0], MESHES[1].faces, MESHES[1].colors)
     with pytest.raises(TrackingError, match=r"Give picks\.$"):
         _start(_capture(pictures, bootstrap=None), (MESHES[0], lower))
+
+
+def test_where_picked_teeth_do_not_fit_it_is_said_what_is_doubtful_about_the_scans(pictures, monkeypatch):
+    def fail(*arguments):
+        raise TrackingError("the teeth do not fit", frame=7, hint="Check the picks.")
+
+    monkeypatch.setattr(Passes, "begin", fail)
+    with pytest.raises(TrackingError, match=r"Check the picks\. warning: the crowns of the scans run 1\.\d mm into"):
+        track_capture(_capture(pictures), CAMERAS, OFFSETS, *MESHES, LANDMARKS)
 
 
 def test_no_frame_with_masks_of_both_rows_is_refused(tmp_path):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -62,24 +62,31 @@ def find_start(
     footage = Footage(masked_sources(capture.cameras, cameras, offsets), cameras, offsets, capture.frames)
     T_anatomical_scan, findings = check_occlusion(solver.scans, capture.anatomy.T_anatomical_skull)
     search = StartSearch(meshes, solver, T_anatomical_scan, map_)
-    try:
+    with quoting(findings):
         if capture.bootstrap is not None:
             start = _picked(capture.bootstrap, capture.frames, footage, meshes, search)
         else:
             doubts = {SIZE_HINT} if any(finding.kind == "scan_size" for finding in findings) else set()
             start = search_start(search, footage, doubts)
-    except TrackingError as error:
-        raise _with_doubts(error, findings) from error
     return replace(start, findings=(*start.findings, *findings), T_anatomical_scan=T_anatomical_scan)
 
 
-def _with_doubts(error: TrackingError, findings: Sequence[Finding]) -> TrackingError:
-    """Return an error that also says what is doubtful about the scans, which may be its cause."""
-    if not findings:
-        return error
-    doubts = " ".join(finding.line() for finding in findings)
-    hint = f"{error.hint} {doubts}" if error.hint else doubts
-    return TrackingError(error.message, path=error.path, camera=error.camera, frame=error.frame, hint=hint)
+@contextlib.contextmanager
+def quoting(findings: Sequence[Finding]) -> Iterator[None]:
+    """Add findings to the hint of a TrackingError that is raised inside: they may be its cause.
+
+    Raises:
+        TrackingError: as raised inside, with the findings.
+    """
+    try:
+        yield
+    except TrackingError as error:
+        if not findings:
+            raise
+        hint = " ".join([*([error.hint] if error.hint else []), *(finding.line() for finding in findings)])
+        raise TrackingError(
+            error.message, path=error.path, camera=error.camera, frame=error.frame, hint=hint
+        ) from error
 
 
 def _picked(

@@ -20,7 +20,7 @@ from jawusd.tracking.contour.scan import prepare_scan, teeth_centre
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import MaskViews, View, present_masks
 from jawusd.tracking.initialization.magnification import measure_magnification
-from jawusd.tracking.initialization.start import find_start
+from jawusd.tracking.initialization.start import find_start, quoting
 from jawusd.tracking.sequence.camera_use import use_of_cameras
 from jawusd.tracking.sequence.closed_bite import observe_bite
 from jawusd.tracking.sequence.delays import BRIDGE_FRAMES, bridge, delay_motions
@@ -79,7 +79,8 @@ def track_capture(
         with MaskViews(capture.cameras, table, offsets, centre, config.working_px_per_mm) as masks:
             first, stop = capture.frames or masks.frames
             take = _Take(solver, config, masks, first, stop, progress)
-            take.begin(start.frame, start.poses)
+            with quoting(start.findings):
+                take.begin(start.frame, start.poses)
             take.run(range(start.frame + 1, stop))
             take.run(range(start.frame - 1, first - 1, -1))
             take.track_back_to(start.frame)
