@@ -48,6 +48,23 @@ class Passes:
         self.records = PackedRecords()
         self.searches = SearchAllowance(stop - first)
 
+    def track_from(self, frame: int, poses: Array) -> None:
+        """Track all frames, both ways from the one whose poses are given, then back to it and into the gaps.
+
+        Args:
+            frame: reference frame number.
+            poses: T_world_scan of both arches there, near enough to be aligned, shape (2, 4, 4).
+
+        Raises:
+            TrackingError: the teeth do not fit the masks of that frame.
+            CaptureError: a mask cannot be read.
+        """
+        self.begin(frame, poses)
+        self.run(range(frame + 1, self._stop))
+        self.run(range(frame - 1, self._first - 1, -1))
+        self.track_back_to(frame)
+        self.close_gaps()
+
     def begin(self, frame: int, poses: Array) -> None:
         """Align the bootstrap frame from the pick poses."""
         self.records[frame] = first_record(self._solver, self._config, poses, self._masks.at(frame), frame, True)

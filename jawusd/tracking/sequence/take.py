@@ -80,11 +80,7 @@ def track_capture(
             first, stop = capture.frames or masks.frames
             take = _Take(solver, config, masks, first, stop, progress)
             with quoting(start.findings):
-                take.begin(start.frame, start.poses)
-            take.run(range(start.frame + 1, stop))
-            take.run(range(start.frame - 1, first - 1, -1))
-            take.track_back_to(start.frame)
-            take.close_gaps()
+                take.track_from(start.frame, start.poses)
             point = np.mean([scan.centre for scan in scans], axis=0)
             named, up = capture.motion.rest_frame, start.T_anatomical_scan[1, :3]
             frames = rest_frames(take.records, named, up, point, scans[1].probes)
