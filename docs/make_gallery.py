@@ -30,9 +30,9 @@ from jawusd.imaging.video_writer import VideoWriter
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.media import tracked_scans
 from jawusd.pipeline.overlay import open_wall
-from jawusd.pipeline.prepare import subject_of_build
 from jawusd.pipeline.report import do_experiments
 from jawusd.pipeline.state import no_progress
+from jawusd.pipeline.subject import subject_of_build
 from jawusd.pipeline.view import ContactView, open_viewer
 from jawusd.report.figures import condyle_figure
 from jawusd.report.style import BLUE, VERMILION, figure_bytes

@@ -18,7 +18,7 @@ from jawusd.formats.capture import load_capture
 from jawusd.geometry import make_transform, so3_exp, transform_points, wxyz_from_matrix
 from jawusd.pipeline.bake import bake_subject
 from jawusd.pipeline.fit import TrajectoryOptions, fit_subject, read_motion
-from jawusd.pipeline.prepare import subject_of_capture
+from jawusd.pipeline.subject import subject_of_capture
 
 CAPTURE = Path(__file__).parent / "capture"
 COLUMNS = {"frame": "Frame", "tx": "X", "ty": "Y", "tz": "Z", "qw": "W", "qx": "I", "qy": "J", "qz": "K"}

@@ -156,6 +156,17 @@ class ClusterError(JawusdError):
 
 
 @contextlib.contextmanager
+def naming_file(path: str | PathLike[str]) -> Iterator[None]:
+    """Name a file in the errors of stages that know only its content."""
+    try:
+        yield
+    except JawusdError as error:
+        if error.path is None:
+            error.path = str(path)
+        raise
+
+
+@contextlib.contextmanager
 def explain_missing_packages(extra: str | None = None) -> Iterator[None]:
     """Say which extra to install when a package is missing; use it in a `with` statement or as a decorator.
 

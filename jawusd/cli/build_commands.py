@@ -31,6 +31,7 @@ from jawusd.cli.options import (
     trajectory_options,
 )
 from jawusd.cli.output import emit, progress, refuse_existing
+from jawusd.errors import naming_file
 
 
 class Solver(StrEnum):
@@ -121,8 +122,8 @@ def track(
     """Track both rows of teeth through the masks, or the videos alone."""
     from jawusd.formats.model import load_model
     from jawusd.pipeline import track as stage
+    from jawusd.pipeline.capture_inputs import open_capture
     from jawusd.pipeline.overlay import overlay_files
-    from jawusd.pipeline.prepare import open_capture
 
     _check_backend(solver, backend)
     refuse_existing(out, force)
@@ -180,7 +181,6 @@ def fit(
     """Fit a three-parameter jaw model to tracked or given poses."""
     from jawusd.formats.model import save_model
     from jawusd.pipeline.fit import fit_lines, fit_subject, fit_summary, read_motion
-    from jawusd.pipeline.prepare import naming_file
 
     refuse_existing(out, force)
     motion = read_motion(poses, trajectory_options(columns, length_unit, invert, rest_frame, group, rigid))

@@ -45,7 +45,7 @@ def calibrate(
     """Calibrate the cameras from clips of a chessboard or ChArUco board, and say how far the result can be trusted."""
     from jawusd.formats.atomic import write_text_atomic
     from jawusd.pipeline.calibrate import calibrate_boards, calibration_lines
-    from jawusd.pipeline.prepare import open_capture
+    from jawusd.pipeline.capture_inputs import open_capture
 
     for path in (out, report_file):
         if path is not None:
@@ -88,7 +88,7 @@ def sync(
         write_light_curves,
         write_sync_plot,
     )
-    from jawusd.pipeline.prepare import open_capture
+    from jawusd.pipeline.capture_inputs import open_capture
 
     if plot is not None and plot.suffix.lower() not in PLOT_SUFFIXES:
         raise typer.BadParameter(f"--plot {plot} must end in {' or '.join(PLOT_SUFFIXES)}.")
@@ -159,7 +159,7 @@ def segment(
 ) -> None:
     """Make masks of both rows of teeth from the videos, starting from the picks, or from a search without them."""
     from jawusd.pipeline.calibrate import sync_cameras
-    from jawusd.pipeline.prepare import open_capture
+    from jawusd.pipeline.capture_inputs import open_capture
     from jawusd.pipeline.segment import SegmentOptions, segment_teeth
     from jawusd.pipeline.segment_record import RECORD, segment_lines, write_summary
 
@@ -225,8 +225,8 @@ def plates(
     """Write the footage without lens distortion where the rig's cameras.usda says, numbered by its time codes."""
     from jawusd.formats.tracks import load_tracks
     from jawusd.pipeline.calibrate import sync_cameras
+    from jawusd.pipeline.capture_inputs import open_capture
     from jawusd.pipeline.media import write_plates
-    from jawusd.pipeline.prepare import open_capture
 
     refuse_existing(rig / "plates", force)
     frames = load_tracks(rig / "tracks.npz").frames

@@ -11,7 +11,7 @@ import typer
 if TYPE_CHECKING:
     from jawusd.evaluator import JawRig
     from jawusd.pipeline.fit import TrajectoryOptions
-    from jawusd.pipeline.prepare import Subject
+    from jawusd.pipeline.subject import Subject
 
 
 class Method(StrEnum):
@@ -202,7 +202,8 @@ def subject_given(
         typer.BadParameter: none or several of them.
         JawusdError: what the files raise.
     """
-    from jawusd.pipeline.prepare import open_capture, subject_of_capture, subject_of_landmarks, subject_of_scans
+    from jawusd.pipeline.capture_inputs import open_capture
+    from jawusd.pipeline.subject import subject_of_capture, subject_of_landmarks, subject_of_scans
 
     files = {"upper_teeth": upper_teeth, "lower_teeth": lower_teeth, "mandible": mandible}
     scans = {key: path for key, path in files.items() if path is not None}

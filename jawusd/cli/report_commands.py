@@ -28,6 +28,7 @@ from jawusd.cli.options import (
     trajectory_options,
 )
 from jawusd.cli.output import emit, progress, refuse_existing
+from jawusd.errors import naming_file
 
 if TYPE_CHECKING:
     from jawusd.formats.experiments import Experiments
@@ -79,7 +80,7 @@ def report(
         raise typer.BadParameter("name the folder of the figures with -o.", param_hint="--out")
     from jawusd.pipeline import report as stage
     from jawusd.pipeline.fit import read_motion
-    from jawusd.pipeline.prepare import naming_file, subject_of_build
+    from jawusd.pipeline.subject import subject_of_build
 
     folder = out or source / "experiments"
     for path in stage.experiment_files(folder):

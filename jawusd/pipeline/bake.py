@@ -12,9 +12,11 @@ from jawusd.formats.capture import Capture
 from jawusd.formats.model import JawModel
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import LANDMARKS
+from jawusd.pipeline.cameras import load_cameras, tracked_cameras
 from jawusd.pipeline.contact import with_contact
-from jawusd.pipeline.prepare import BONES, Subject, load_cameras, registered_subject, tracked_cameras
+from jawusd.pipeline.meshes import BONES
 from jawusd.pipeline.state import Progress, no_progress
+from jawusd.pipeline.subject import Subject, registered_subject
 
 DEFAULT_FPS = 24.0
 _PROXY_FACES = 1500  # of a mesh; those along its borders come on top, see `proxy_of`

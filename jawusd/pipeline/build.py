@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NotRequired, TypedDict, TypeVar, cast
 
 from jawusd import __version__
-from jawusd.errors import OutputError, explain_missing_packages
+from jawusd.errors import OutputError, explain_missing_packages, naming_file
 from jawusd.formats.capture import Capture
 from jawusd.formats.finding import Finding
 from jawusd.formats.model import load_model, save_model
@@ -23,10 +23,11 @@ from jawusd.pipeline.calibrate import (
     calibration_lines,
     sync_cameras,
 )
+from jawusd.pipeline.cameras import rescaled_cameras
+from jawusd.pipeline.capture_inputs import input_hashes, open_capture
 from jawusd.pipeline.check import check_capture, refuse_errors
 from jawusd.pipeline.fit import FitSummary, fit_lines, fit_subject, fit_summary
 from jawusd.pipeline.origin import origin_now
-from jawusd.pipeline.prepare import input_hashes, naming_file, open_capture, rescaled_cameras, subject_of_capture
 from jawusd.pipeline.report import BuildFacts, missing_packages, place_of, write_build_report
 from jawusd.pipeline.scans import all_labelled, store_labels, with_stored_labels
 from jawusd.pipeline.segment_record import delete_masks
@@ -43,6 +44,7 @@ from jawusd.pipeline.state import (
     locked,
     no_progress,
 )
+from jawusd.pipeline.subject import subject_of_capture
 from jawusd.pipeline.track import TrackSummary, first_pass, model_pass, track_lines, track_summary
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NotRequired, TypedDict, cast
 
-from jawusd.errors import SyncError, TrackingError, explain_missing_packages
+from jawusd.errors import SyncError, TrackingError, explain_missing_packages, naming_file
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.calibration import save_calibration
 from jawusd.formats.capture import Capture
@@ -16,7 +16,7 @@ from jawusd.formats.clip_source import ClipSource
 from jawusd.formats.light_curve import LightCurve
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera
-from jawusd.pipeline.prepare import load_meshes, naming_file
+from jawusd.pipeline.meshes import load_meshes
 from jawusd.pipeline.state import Progress
 
 if TYPE_CHECKING:

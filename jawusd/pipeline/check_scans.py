@@ -10,8 +10,9 @@ from jawusd.errors import JawusdError
 from jawusd.formats.finding import Finding
 from jawusd.geometry import LANDMARKS
 from jawusd.pipeline.check_parts import Parts, found_error
-from jawusd.pipeline.prepare import BONES, MESHES, subject_of_capture
+from jawusd.pipeline.meshes import BONES, MESHES
 from jawusd.pipeline.scan_labels import TEETH, label_teeth
+from jawusd.pipeline.subject import subject_of_capture
 
 # Teeth lie on their bone: the nearest point of the bone to the middle of the crowns is closer than this [mm].
 _TEETH_TO_BONE_MM = 20.0

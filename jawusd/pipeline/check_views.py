@@ -15,8 +15,8 @@ from jawusd.errors import CaptureError, JawusdError
 from jawusd.formats.finding import Finding, Severity
 from jawusd.geometry import Camera
 from jawusd.geometry.arrays import Array
+from jawusd.pipeline.cameras import load_cameras, rescaled_cameras
 from jawusd.pipeline.check_parts import Parts, found_error
-from jawusd.pipeline.prepare import load_cameras, rescaled_cameras
 
 _INSTANTS = 5  # at which the views are compared
 _CROWN_POINTS = 6000

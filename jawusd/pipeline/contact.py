@@ -14,9 +14,10 @@ from jawusd.evaluator.contact import AUTHORED_MM, NEAR_MM, ContactField
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.model import JawModel
 from jawusd.formats.report import ContactPicture
-from jawusd.pipeline.prepare import BONES, Subject
+from jawusd.pipeline.meshes import BONES
 from jawusd.pipeline.scan_labels import TEETH
 from jawusd.pipeline.state import Progress, no_progress
+from jawusd.pipeline.subject import Subject
 
 if TYPE_CHECKING:
     from jawusd.imaging.contact import Teeth

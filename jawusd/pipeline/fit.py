@@ -29,8 +29,8 @@ from jawusd.geometry import make_transform, matrix_from_wxyz, rigidity_defect, s
 from jawusd.geometry.arrays import Array
 from jawusd.pipeline.contact import ContactSummary, contact_words, joint_words, with_contact
 from jawusd.pipeline.markers import marker_poses
-from jawusd.pipeline.prepare import Subject, registered_subject
 from jawusd.pipeline.state import Progress, no_progress
+from jawusd.pipeline.subject import Subject, registered_subject
 
 if TYPE_CHECKING:
     import h5py

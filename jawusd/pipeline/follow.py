@@ -11,8 +11,8 @@ import numpy as np
 from jawusd.geometry import Camera, relative_pose, transform_points
 from jawusd.geometry.arrays import Array
 from jawusd.pipeline.cuts import Cutter
-from jawusd.pipeline.prepare import Subject
 from jawusd.pipeline.state import Progress
+from jawusd.pipeline.subject import Subject
 
 if TYPE_CHECKING:
     from jawusd.segmentation.footage import ColourFootage

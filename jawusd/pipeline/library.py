@@ -21,8 +21,8 @@ from jawusd.library.index import MODEL_FILE, Entry, Library, load_donors, scan_l
 from jawusd.library.personal import PersonalMotion, leave_one_out, personal_motion
 from jawusd.library.timing import follow
 from jawusd.pipeline.fit import fit_summary
-from jawusd.pipeline.prepare import Subject, subject_of_landmarks
 from jawusd.pipeline.state import Progress
+from jawusd.pipeline.subject import Subject, subject_of_landmarks
 
 # Smallest step of a motion carried over, as a share of the source's step scaled by the ratio of the ranges.
 _SLOWEST = 0.1

@@ -14,22 +14,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 import jawusd
-from jawusd.errors import CaptureError, explain_missing_packages
+from jawusd.errors import CaptureError, explain_missing_packages, naming_file
 from jawusd.evaluator import JawRig
 from jawusd.formats.capture import Capture
 from jawusd.formats.performance import SolveState
 from jawusd.geometry.arrays import Array
 from jawusd.imaging import live_clock
 from jawusd.pipeline.calibrate import sync_cameras
+from jawusd.pipeline.cameras import load_cameras
+from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.cuts import Cutter
+from jawusd.pipeline.meshes import load_labelled, registered_meshes
 from jawusd.pipeline.picture_search import LEAST_FIT, MOST_BRIDGED, masked_cameras
-from jawusd.pipeline.prepare import (
-    load_cameras,
-    load_labelled,
-    naming_file,
-    open_capture,
-    registered_meshes,
-)
 from jawusd.pipeline.solve_pictures import PreparedTeeth, VideoOptions, VideoShot
 from jawusd.pipeline.state import no_progress
 

@@ -17,7 +17,8 @@ from jawusd.formats.model import JawModel
 from jawusd.formats.report import Overlay, ReplayPart
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import Camera, transform_points
-from jawusd.pipeline.prepare import load_cameras, load_meshes, registered_meshes, tracked_cameras
+from jawusd.pipeline.cameras import load_cameras, tracked_cameras
+from jawusd.pipeline.meshes import load_meshes, registered_meshes
 from jawusd.pipeline.state import Progress, make_folder
 
 if TYPE_CHECKING:

@@ -15,8 +15,8 @@ from jawusd.formats.capture import Capture
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import Camera
+from jawusd.pipeline.cameras import load_cameras, tracked_cameras
 from jawusd.pipeline.media import check_same_cameras, open_backdrops, open_footage, tracked_scans
-from jawusd.pipeline.prepare import load_cameras, tracked_cameras
 from jawusd.pipeline.state import Progress, make_folder
 
 if TYPE_CHECKING:

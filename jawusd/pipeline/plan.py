@@ -12,7 +12,7 @@ from typing import TypeVar, cast
 from jawusd.errors import explain_missing_packages
 from jawusd.formats.capture import Capture
 from jawusd.pipeline.build import BuildOptions, StagedBuild, check_folder
-from jawusd.pipeline.prepare import open_capture
+from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.scans import all_labelled
 from jawusd.pipeline.state import BuildState, StageRecord, no_progress
 

@@ -16,11 +16,12 @@ from jawusd.formats.finding import Finding
 from jawusd.formats.model import load_model
 from jawusd.formats.report import CameraFacts, Origin, Overlay, ReportData, RigFacts
 from jawusd.formats.tracks import Tracks, load_tracks
+from jawusd.pipeline.cameras import load_cameras
+from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.contact import contact_pictures
 from jawusd.pipeline.fit import Poses, fit_summary
 from jawusd.pipeline.media import draw_worst_frames, replay_parts
 from jawusd.pipeline.origin import recorded_origin
-from jawusd.pipeline.prepare import Subject, load_cameras, open_capture, subject_of_build
 from jawusd.pipeline.scans import with_stored_labels
 from jawusd.pipeline.state import (
     BUILD_FILE,
@@ -33,6 +34,7 @@ from jawusd.pipeline.state import (
     locked,
     no_progress,
 )
+from jawusd.pipeline.subject import Subject, subject_of_build
 
 if TYPE_CHECKING:
     from jawusd.report.verdicts import BuildVerdict

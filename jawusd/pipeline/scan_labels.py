@@ -46,7 +46,7 @@ def label_teeth(
     """Return the teeth scans among meshes with their labels, by arch.
 
     Args:
-        meshes: by the names of `prepare.MESHES`.
+        meshes: by the names of `meshes.MESHES`.
         files: where they were read.
         folder: of the labels; None: beside the scans.
         ignore_files: as if there were no files of labels.

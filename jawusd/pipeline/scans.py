@@ -15,7 +15,8 @@ from jawusd.formats.capture import Capture, Scans
 from jawusd.formats.mesh import Mesh, painted_labels, tooth_labels
 from jawusd.formats.scan_labels import ScanLabels, labels_path, save_scan_labels
 from jawusd.geometry import anatomical_frame
-from jawusd.pipeline.prepare import labelled_teeth, open_capture, read_files
+from jawusd.pipeline.capture_inputs import open_capture
+from jawusd.pipeline.meshes import labelled_teeth, read_files
 from jawusd.pipeline.scan_labels import TEETH, LabelledScan
 from jawusd.pipeline.state import Progress, no_progress
 
@@ -83,7 +84,7 @@ def label_scans(
 
 
 def all_labelled(capture: Capture) -> bool:
-    """Tell whether paint or files say of both teeth scans what is crown; raises as `prepare.load_meshes`."""
+    """Tell whether paint or files say of both teeth scans what is crown; raises as `meshes.load_meshes`."""
     scans = capture.scans
     files = {name: getattr(scans, name) for name in TEETH.values()}
     open_ones = {name: path for name, path in files.items() if not labels_path(path, scans.labels).is_file()}

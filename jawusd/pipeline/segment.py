@@ -17,10 +17,11 @@ from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.capture import Capture
 from jawusd.formats.tracks import LOST
 from jawusd.geometry.arrays import Array
+from jawusd.pipeline.capture_inputs import input_hashes
 from jawusd.pipeline.follow import Follower
 from jawusd.pipeline.media import open_footage
+from jawusd.pipeline.meshes import load_meshes
 from jawusd.pipeline.picture_search import outside
-from jawusd.pipeline.prepare import input_hashes, load_meshes, subject_of_capture
 from jawusd.pipeline.segment_guide import known_guide, save_guide
 from jawusd.pipeline.segment_record import (
     LEARNED,
@@ -29,6 +30,7 @@ from jawusd.pipeline.segment_record import (
     Journal,
 )
 from jawusd.pipeline.state import Progress, hash_files, hash_value
+from jawusd.pipeline.subject import subject_of_capture
 from jawusd.pipeline.track_pictures import searched_start
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from jawusd.formats.tracks import Tracks
 from jawusd.geometry import relative_pose, se3_inverse, transform_points
 from jawusd.geometry.arrays import Array
 from jawusd.npz import TWIST_ORDER, UNITS, read_npz, take
-from jawusd.pipeline.prepare import registration_of
+from jawusd.pipeline.meshes import registration_of
 from jawusd.pipeline.segment_record import auto_masks_folder
 
 if TYPE_CHECKING:

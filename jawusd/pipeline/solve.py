@@ -10,7 +10,7 @@ from typing import NotRequired, TypedDict, cast
 import numpy as np
 
 import jawusd
-from jawusd.errors import OutputError, RigError, explain_missing_packages
+from jawusd.errors import OutputError, RigError, explain_missing_packages, naming_file
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.verdicts import is_inside
 from jawusd.formats.capture import Capture
@@ -18,8 +18,10 @@ from jawusd.formats.finding import Finding
 from jawusd.formats.performance import Performance, SolveState, write_performance
 from jawusd.formats.tracks import save_tracks
 from jawusd.pipeline.calibrate import sync_cameras
+from jawusd.pipeline.cameras import load_cameras
+from jawusd.pipeline.capture_inputs import open_capture
+from jawusd.pipeline.meshes import load_labelled, registered_meshes
 from jawusd.pipeline.overlay import VIDEO, write_overlay
-from jawusd.pipeline.prepare import load_cameras, load_labelled, naming_file, open_capture, registered_meshes
 from jawusd.pipeline.segment_guide import take_up_guide
 from jawusd.pipeline.solve_pictures import VideoOptions, solve_videos
 from jawusd.pipeline.solve_report import check_page, solve_limits, write_solve_report

@@ -17,8 +17,8 @@ from jawusd.geometry.arrays import Array
 from jawusd.pipeline.cuts import Cutter
 from jawusd.pipeline.media import open_videos
 from jawusd.pipeline.picture_search import LEAST_FIT, Begin, PictureSearch, outside, unseen_picks
-from jawusd.pipeline.prepare import subject_of_capture
 from jawusd.pipeline.state import Progress
+from jawusd.pipeline.subject import subject_of_capture
 
 if TYPE_CHECKING:
     from jawusd.tracking.config import Mapper

@@ -9,16 +9,17 @@ from pathlib import Path
 
 import numpy as np
 
-from jawusd.errors import FormatError, OutputError, explain_missing_packages
+from jawusd.errors import FormatError, OutputError, explain_missing_packages, naming_file
 from jawusd.formats.capture import Capture
 from jawusd.formats.coverage import worst_frames
 from jawusd.formats.performance import SolveState
 from jawusd.formats.report import Overlay, SolveReportData
 from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.pipeline.calibrate import sync_cameras
+from jawusd.pipeline.cameras import load_cameras, tracked_cameras
+from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.media import check_same_cameras, draw_frames, open_backdrops, tracked_scans
 from jawusd.pipeline.origin import package_versions
-from jawusd.pipeline.prepare import load_cameras, naming_file, open_capture, tracked_cameras
 from jawusd.pipeline.report import attempt, camera_facts
 from jawusd.pipeline.state import Progress, make_folder
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NotRequired, TypedDict
 
 import numpy as np
 
-from jawusd.errors import TrackingError, explain_missing_packages
+from jawusd.errors import TrackingError, explain_missing_packages, naming_file
 from jawusd.evaluator import JawRig
 from jawusd.formats.capture import Capture
 from jawusd.formats.coverage import used_coverage
@@ -19,21 +19,14 @@ from jawusd.formats.model import JawModel
 from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, LostReason, Registration, Tracks, TrackStatus, save_tracks
 from jawusd.geometry import LANDMARKS
 from jawusd.pipeline.calibrate import sync_cameras
+from jawusd.pipeline.cameras import Size, load_cameras, rescaled_cameras
+from jawusd.pipeline.capture_inputs import open_capture
+from jawusd.pipeline.meshes import load_labelled, load_meshes, registered_meshes
 from jawusd.pipeline.overlay import write_overlay
-from jawusd.pipeline.prepare import (
-    Size,
-    load_cameras,
-    load_labelled,
-    load_meshes,
-    naming_file,
-    open_capture,
-    registered_meshes,
-    rescaled_cameras,
-    subject_of_capture,
-)
 from jawusd.pipeline.segment_guide import take_up_guide
 from jawusd.pipeline.segment_record import auto_masks_folder
 from jawusd.pipeline.state import Progress, no_progress
+from jawusd.pipeline.subject import subject_of_capture
 from jawusd.pipeline.track_pictures import track_videos
 
 if TYPE_CHECKING:

@@ -14,8 +14,8 @@ from jawusd.geometry.arrays import Array
 from jawusd.pipeline.follow import Follower
 from jawusd.pipeline.media import open_footage
 from jawusd.pipeline.picture_search import Begin, PictureSearch, outside, unseen_picks
-from jawusd.pipeline.prepare import subject_of_capture
 from jawusd.pipeline.state import Progress
+from jawusd.pipeline.subject import subject_of_capture
 
 if TYPE_CHECKING:
     from jawusd.segmentation.footage import ColourFootage

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import explain_missing_packages
+from jawusd.errors import explain_missing_packages, naming_file
 from jawusd.formats.capture import Bootstrap, Capture
 from jawusd.formats.capture_edit import write_bootstrap
 from jawusd.formats.mesh import Mesh, crown_face_mask, tooth_labels
@@ -20,19 +20,14 @@ from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.geometry import Camera
 from jawusd.geometry.arrays import Array
 from jawusd.pipeline.calibrate import sync_cameras
+from jawusd.pipeline.cameras import load_cameras, tracked_cameras
+from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.media import check_same_cameras, open_backdrops
-from jawusd.pipeline.prepare import (
-    load_cameras,
-    load_meshes,
-    naming_file,
-    open_capture,
-    registered_meshes,
-    subject_of_capture,
-    tracked_cameras,
-)
+from jawusd.pipeline.meshes import load_meshes, registered_meshes
 from jawusd.pipeline.report import as_built, is_build, recorded_offsets
 from jawusd.pipeline.scans import save_reviewed
 from jawusd.pipeline.state import BuildState, Progress
+from jawusd.pipeline.subject import subject_of_capture
 
 if TYPE_CHECKING:
     from jawusd.imaging.backdrop import Backdrop

@@ -9,7 +9,7 @@ import pytest
 from package_copy import ROOT
 
 MODULES = sorted((ROOT / "jawusd").rglob("*.py"))
-MAX_MODULE_LINES = 400
+MAX_MODULE_LINES = 385
 MAX_FUNCTION_LINES = 60
 
 
@@ -29,7 +29,7 @@ def test_modules_and_functions_are_short():
     assert [fault for path in MODULES for fault in oversized(path.read_text(), path.relative_to(ROOT))] == []
 
 
-@pytest.mark.parametrize("source", ["x = 1\n" * 401, 'def f():\n    """F."""\n' + "    x = 1\n" * 61])
+@pytest.mark.parametrize("source", ["x = 1\n" * 386, 'def f():\n    """F."""\n' + "    x = 1\n" * 61])
 def test_what_is_too_long_is_found(source):
     assert oversized(source, "m.py")
 

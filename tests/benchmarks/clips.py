@@ -30,7 +30,7 @@ from jawusd.formats.capture import Capture, load_capture
 from jawusd.geometry import relative_pose, transform_points
 from jawusd.imaging.video import Video
 from jawusd.pipeline.calibrate import sync_cameras
-from jawusd.pipeline.prepare import load_meshes
+from jawusd.pipeline.meshes import load_meshes
 from jawusd.pipeline.segment import SegmentOptions, segment_teeth
 
 _AFTER = 2  # pictures after the last frame, so that clips end behind it

@@ -38,7 +38,8 @@ from jawusd.formats.mesh import Mesh
 from jawusd.geometry import se3_exp, se3_inverse, transform_points
 from jawusd.pipeline.contact import with_contact
 from jawusd.pipeline.fit import fit_subject
-from jawusd.pipeline.prepare import Subject, _measured, load_meshes, subject_of_capture
+from jawusd.pipeline.meshes import load_meshes
+from jawusd.pipeline.subject import Subject, _measured, subject_of_capture
 from jawusd.rig.author import decoder_layer
 from jawusd.rig.sampling import sample_valid
 from jawusd.rig.table import DecoderTable

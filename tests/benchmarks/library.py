@@ -32,7 +32,7 @@ from jawusd.geometry import landmark_frame, make_transform, rigid_fit, transform
 from jawusd.library.personal import Learned, leave_one_out, personal_motion  # noqa: E402
 from jawusd.library.transport import Donor, landmark_distance_mm  # noqa: E402
 from jawusd.pipeline.library import fit_personal, retarget  # noqa: E402
-from jawusd.pipeline.prepare import Subject  # noqa: E402
+from jawusd.pipeline.subject import Subject  # noqa: E402
 from jawusd.synthetic.exercises import record  # noqa: E402
 from jawusd.synthetic.person import Person  # noqa: E402
 

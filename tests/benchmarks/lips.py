@@ -31,10 +31,11 @@ from jawusd.formats.tracks import LOST, TRACKED, load_tracks
 from jawusd.geometry import LANDMARKS, relative_pose, se3_inverse, se3_log, transform_point
 from jawusd.pipeline.calibrate import sync_cameras
 from jawusd.pipeline.media import open_footage
-from jawusd.pipeline.prepare import load_meshes, subject_of_capture
+from jawusd.pipeline.meshes import load_meshes
 from jawusd.pipeline.segment import SegmentOptions, segment_teeth
 from jawusd.pipeline.segment_guide import GUIDE, followed_teeth, save_guide
 from jawusd.pipeline.segment_record import RECORD, with_masks, write_summary
+from jawusd.pipeline.subject import subject_of_capture
 from jawusd.pipeline.track import track
 from jawusd.segmentation.footage import ColourFootage
 from jawusd.tracking.contour.quality import landmark_sigmas, relative_covariance

@@ -32,7 +32,8 @@ from jawusd.fitting.paper import fit_paper  # noqa: E402
 from jawusd.formats.capture import load_capture  # noqa: E402
 from jawusd.formats.tracks import load_tracks  # noqa: E402
 from jawusd.geometry import LANDMARKS, make_transform, se3_exp, se3_log, so3_exp, transform_point  # noqa: E402
-from jawusd.pipeline.prepare import load_meshes, subject_of_capture  # noqa: E402
+from jawusd.pipeline.meshes import load_meshes  # noqa: E402
+from jawusd.pipeline.subject import subject_of_capture  # noqa: E402
 from jawusd.synthetic.exercises import record  # noqa: E402
 
 ALL_SHOWN = np.ones(3, dtype=bool)

@@ -20,7 +20,9 @@ from jawusd.geometry import (
     transform_point,
     transform_points,
 )
-from jawusd.pipeline.prepare import load_cameras, load_meshes, subject_of_capture
+from jawusd.pipeline.cameras import load_cameras
+from jawusd.pipeline.meshes import load_meshes
+from jawusd.pipeline.subject import subject_of_capture
 from jawusd.pipeline.track import track
 from jawusd.tracking.contour.scan import prepare_scan
 

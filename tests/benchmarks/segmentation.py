@@ -20,9 +20,10 @@ from jawusd.geometry import LANDMARKS, se3_inverse, transform_point
 from jawusd.imaging.masks import MaskReader
 from jawusd.imaging.video import Video
 from jawusd.pipeline.calibrate import sync_cameras
-from jawusd.pipeline.prepare import load_meshes, subject_of_capture
+from jawusd.pipeline.meshes import load_meshes
 from jawusd.pipeline.segment import SegmentOptions, segment_teeth
 from jawusd.pipeline.segment_record import with_masks, write_summary
+from jawusd.pipeline.subject import subject_of_capture
 from jawusd.pipeline.track import first_pass
 
 

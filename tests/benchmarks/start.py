@@ -24,7 +24,8 @@ from jawusd.formats.capture import Bootstrap, load_capture
 from jawusd.geometry import transform_point, transform_points
 from jawusd.imaging.raster import draw_depth_labels, project
 from jawusd.pipeline.calibrate import sync_cameras
-from jawusd.pipeline.prepare import load_cameras, load_meshes
+from jawusd.pipeline.cameras import load_cameras
+from jawusd.pipeline.meshes import load_meshes
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.scan import prepare_scan
 from jawusd.tracking.contour.solver import ContourSolver

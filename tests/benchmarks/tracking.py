@@ -91,7 +91,9 @@ def run_setup(path: Path, setup: Setup, windows: int, length: int) -> dict:
     from jawusd.formats.capture import load_capture
     from jawusd.formats.mesh import tooth_labels
     from jawusd.geometry import transform_points
-    from jawusd.pipeline.prepare import load_cameras, load_meshes, subject_of_capture
+    from jawusd.pipeline.cameras import load_cameras
+    from jawusd.pipeline.meshes import load_meshes
+    from jawusd.pipeline.subject import subject_of_capture
     from jawusd.tracking import track_capture
     from jawusd.tracking.contour.solver import ContourSolver
     from jawusd.tracking.paper import take as paper_take

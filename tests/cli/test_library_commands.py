@@ -17,7 +17,7 @@ from jawusd.errors import FittingError, FormatError, OutputError, RigError
 from jawusd.formats.model import load_model
 from jawusd.formats.poses import write_parameters
 from jawusd.geometry import LANDMARKS
-from jawusd.pipeline.prepare import subject_of_scans
+from jawusd.pipeline.subject import subject_of_scans
 from jawusd.rig import write_animation
 from jawusd.rig.bake import bake_rig
 from jawusd.rig.layout import PARAMETERS

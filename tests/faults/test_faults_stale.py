@@ -8,7 +8,7 @@ from package_copy import ROOT
 
 from jawusd.pipeline import build
 from jawusd.pipeline.build import BuildOptions
-from jawusd.pipeline.prepare import input_files, open_capture
+from jawusd.pipeline.capture_inputs import input_files, open_capture
 
 EXAMPLE = ROOT / "examples" / "capture"
 FROM_TRACK = ["track", "fit", "aid", "bake", "report"]

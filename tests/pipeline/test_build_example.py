@@ -20,7 +20,8 @@ from jawusd.formats.calibration import load_calibration
 from jawusd.formats.tracks import load_tracks
 from jawusd.geometry import transform_points
 from jawusd.pipeline.build import BuildOptions, build
-from jawusd.pipeline.prepare import load_cameras, open_capture, rescaled_cameras
+from jawusd.pipeline.cameras import load_cameras, rescaled_cameras
+from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.rig.validate import validate_stage
 
 EXAMPLE = ROOT / "examples" / "capture"

@@ -16,7 +16,8 @@ from jawusd.formats.calibration import load_calibration
 from jawusd.geometry import triangulate
 from jawusd.pipeline.build import BuildOptions, build, build_lines
 from jawusd.pipeline.calibrate import calibrate_boards, calibration_lines
-from jawusd.pipeline.prepare import input_files, load_cameras, open_capture
+from jawusd.pipeline.cameras import load_cameras
+from jawusd.pipeline.capture_inputs import input_files, open_capture
 
 EXAMPLE = ROOT / "examples" / "capture"
 

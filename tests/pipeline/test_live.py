@@ -19,11 +19,13 @@ from jawusd.formats.performance import SolveState
 from jawusd.geometry import transform_point
 from jawusd.imaging import live_clock
 from jawusd.imaging.live_source import LiveSource
+from jawusd.pipeline.cameras import load_cameras
+from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.cuts import Cutter
 from jawusd.pipeline.live import LiveFrame, live, next_instant
 from jawusd.pipeline.media import open_videos
+from jawusd.pipeline.meshes import load_labelled, registered_meshes
 from jawusd.pipeline.osc import OscSender
-from jawusd.pipeline.prepare import load_cameras, load_labelled, open_capture, registered_meshes
 from jawusd.pipeline.solve_pictures import PreparedTeeth
 from jawusd.segmentation.footage import ColourFootage
 from jawusd.tracking.region.live import LiveTake

@@ -16,8 +16,8 @@ from jawusd.formats.solved import SolvedJaw
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import Camera, make_transform, relative_pose
 from jawusd.imaging.video_writer import VideoWriter
+from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.overlay import TILE_PX, overlay_files, write_overlay
-from jawusd.pipeline.prepare import open_capture
 
 SIZE = (240, 180)
 K = np.array([[300.0, 0, 120], [0, 300, 90], [0, 0, 1]])

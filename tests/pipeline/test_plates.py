@@ -11,8 +11,8 @@ import pytest
 from jawusd.formats.calibration import save_calibration
 from jawusd.geometry import Camera, make_transform
 from jawusd.imaging.video_writer import VideoWriter
+from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.media import write_plates
-from jawusd.pipeline.prepare import open_capture
 from jawusd.rig.cameras import PLATE
 
 SIZE = (320, 240)

@@ -16,7 +16,8 @@ from jawusd.formats.capture import load_capture
 from jawusd.formats.mesh import BASE, GUM, TOOTH, Mesh, crown_face_mask, tooth_labels
 from jawusd.formats.scan_labels import ScanLabels, labels_path, load_scan_labels, save_scan_labels
 from jawusd.imaging.meshio import load_mesh
-from jawusd.pipeline.prepare import input_hashes, load_labelled, load_meshes
+from jawusd.pipeline.capture_inputs import input_hashes
+from jawusd.pipeline.meshes import load_labelled, load_meshes
 from jawusd.pipeline.scan_labels import label_teeth
 from jawusd.pipeline.scans import all_labelled, label_scans, save_reviewed, store_labels, with_stored_labels
 

@@ -18,7 +18,8 @@ from jawusd.formats.poses import read_parameters
 from jawusd.formats.tracks import load_tracks
 from jawusd.geometry import transform_point
 from jawusd.imaging.video import Video
-from jawusd.pipeline.prepare import load_cameras, open_capture
+from jawusd.pipeline.cameras import load_cameras
+from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.solve import check_output, solve, solve_summary, write_solved
 from jawusd.rig.motion_read import read_poses_of_stage
 

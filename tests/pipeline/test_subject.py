@@ -13,8 +13,8 @@ from jawusd.errors import CaptureError, FormatError, RigError
 from jawusd.formats.model import JawModel, save_model
 from jawusd.geometry import LANDMARKS, landmark_frame
 from jawusd.pipeline.bake import bake_subject
-from jawusd.pipeline.prepare import (
-    open_capture,
+from jawusd.pipeline.capture_inputs import open_capture
+from jawusd.pipeline.subject import (
     registered_subject,
     subject_of_build,
     subject_of_capture,

@@ -12,7 +12,7 @@ from jawusd.formats.tracks import LOST
 from jawusd.geometry import se3_exp, transform_points
 from jawusd.pipeline import track_pictures
 from jawusd.pipeline.media import open_footage
-from jawusd.pipeline.prepare import load_meshes
+from jawusd.pipeline.meshes import load_meshes
 from jawusd.pipeline.state import no_progress
 from jawusd.pipeline.track import first_pass, track_lines, track_summary
 from jawusd.pipeline.track_pictures import track_videos

@@ -117,7 +117,7 @@ def read_foreign(place, path):
 
 
 def read_landmarks(place, path):
-    from jawusd.pipeline.prepare import subject_of_landmarks
+    from jawusd.pipeline.subject import subject_of_landmarks
 
     subject_of_landmarks(path, "x")
 

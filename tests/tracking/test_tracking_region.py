@@ -11,8 +11,9 @@ from jawusd.formats.capture import load_capture
 from jawusd.geometry import relative_pose
 from jawusd.pipeline.follow import Follower
 from jawusd.pipeline.media import open_footage
-from jawusd.pipeline.prepare import load_meshes, subject_of_capture
+from jawusd.pipeline.meshes import load_meshes
 from jawusd.pipeline.segment_guide import known_guide, save_guide
+from jawusd.pipeline.subject import subject_of_capture
 from jawusd.segmentation.footage import ColourFootage
 from jawusd.tracking.contour.samples import COLUMNS, INVERSE_DEPTH, LENGTH, NX, NY, U, V
 from jawusd.tracking.contour.scan import CROWN, prepare_scan
