@@ -16,6 +16,7 @@ from report_data import experiments, report_data
 from jawusd.formats.finding import Finding
 from jawusd.formats.report import Origin, Overlay, RigFacts
 from jawusd.formats.tracks import LostReason
+from jawusd.report import document as report_document
 from jawusd.report.document import _frame_lists, document, worded
 from jawusd.report.replay import replay_data
 
@@ -58,7 +59,13 @@ def page():
     return document(report_data(lost=(20, 21), experiments=experiments(sentences=("Record protrusion.",))))
 
 
-def test_reasons_of_losses_are_listed_with_their_frames():
+@pytest.fixture
+def words_alone(monkeypatch):
+    """Leave the figures out, which take most of the time of a page."""
+    monkeypatch.setattr(report_document, "inline_svg", lambda *arguments: "")
+
+
+def test_reasons_of_losses_are_listed_with_their_frames(words_alone):
     data = report_data(lost=(20, 21))
     data.tracks.lost_reason[20:22, 1] = LostReason.LOW_SCORE
     listed = {reason: (count, frames) for reason, count, frames in _frame_lists(data)}
@@ -141,7 +148,7 @@ def test_text_from_files_stays_text():
     assert HOSTILE in "".join(shown.text)
 
 
-def test_when_how_and_with_what_a_build_was_made_is_told():
+def test_when_how_and_with_what_a_build_was_made_is_told(words_alone):
     text = " ".join(Page(document(report_data())).text)
     for words in ("Capture someone", "built 2031-02-03 04:05:06 UTC with jawusd 1.2.3", "jawusd build 'some where' -o"):
         assert words in text
@@ -149,7 +156,7 @@ def test_when_how_and_with_what_a_build_was_made_is_told():
     assert "built at a time that is not recorded" in text and "Versions: not recorded" in text
 
 
-def test_commands_are_set_as_code_and_no_backtick_is_seen():
+def test_commands_are_set_as_code_and_no_backtick_is_seen(words_alone):
     said = "Run `jawusd check <it>` first."
     data = report_data(rig=RigFacts(0.02, ("error: see `jawusd validate`",)), inferred=(said,), left_out=(said,))
     data.model.meta["warnings"] = [{"code": "rotation_range", "message": said}]
@@ -174,7 +181,7 @@ def test_a_long_take_stays_small():
     assert len(text) < 4e6
 
 
-def test_how_masks_were_drawn_and_the_closed_bite_are_told():
+def test_how_masks_were_drawn_and_the_closed_bite_are_told(words_alone):
     data = report_data()
     registration = {
         "frames": [46, 50],
