@@ -111,6 +111,21 @@ def test_a_knocked_camera_is_named_and_its_lens_is_not(clear, named):
     assert _lens_kinds(found, OF_COLOURS) == []
 
 
+@pytest.mark.parametrize(
+    ("bias_px", "bend", "kinds"),
+    [
+        ([[-0.13, -0.09], [1.88, 1.84], [-0.07, -0.20]], 0.0, ["masks_wide"]),  # by 6 px of 1080 lines
+        ([[0.33, 0.35], [3.85, 2.01], [0.53, 0.23]], -0.015, ["masks_wide"]),  # by 6 px of 540 lines: no lens is wrong
+        ([[0.0, 0.1], [0.22, 0.32], [0.0, 0.1]], 0.0, []),  # the most of 49 valid persons
+        ([[0.0, 0.0], [1.9, -1.9], [0.0, 0.0]], 0.0, []),  # one arch wider, one narrower: the camera is off
+    ],
+)
+def test_masks_drawn_wider_in_one_camera_are_named(bias_px, bend, kinds):
+    none, small, masks = np.zeros(3), np.full(3, 1e-4), _masks_and_motion(np.zeros(3))
+    found = Magnification(none, small, np.array([0.0, bend, 0.0]), small, np.array(bias_px), *masks[1:], 0.5)
+    assert _lens_kinds(found) == [(kind, "cam1") for kind in kinds]
+
+
 def test_only_what_a_lens_can_do_is_put_down_to_it():
     """Masks that end in the shadow of the cheeks make side teeth smaller than any lens does."""
     assert lens_kinds(0.005) == lens_kinds(-0.005) == [("lens_distortion", "cam0")]
