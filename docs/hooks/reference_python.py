@@ -2,7 +2,8 @@
 
 STAGES = (
     "build", "track", "fit", "bake", "check", "calibrate", "segment", "scans", "photographs", "solve", "live", "report",
-    "library", "many", "joint_table", "camera_convert", "start_capture", "doctor", "prepare",
+    "library", "many", "joint_table", "camera_convert", "start_capture", "doctor", "cameras", "meshes",
+    "subject", "capture_inputs",
 )  # fmt: skip
 
 PAGES = {
