@@ -53,7 +53,7 @@ class Wrapped(torch.nn.Module):
         return call(self.layer, self.name)(x)
 
 
-@pytest.mark.filterwarnings("ignore:.*torch.jit.script.*:DeprecationWarning")  # in torch's own forward mode
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script.*")  # in torch's own forward mode
 @pytest.mark.parametrize("name", EVERY)
 def test_vmap_and_jacrev_agree_with_batches_and_with_differences(pair, name):
     rig, layer = pair
