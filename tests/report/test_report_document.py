@@ -156,7 +156,7 @@ def test_when_how_and_with_what_a_build_was_made_is_told(words_alone):
     assert "built at a time that is not recorded" in text and "Versions: not recorded" in text
 
 
-def test_commands_are_set_as_code_and_no_backtick_is_seen(words_alone):
+def test_commands_are_set_as_code_and_no_backtick_is_seen():
     said = "Run `jawusd check <it>` first."
     data = report_data(rig=RigFacts(0.02, ("error: see `jawusd validate`",)), inferred=(said,), left_out=(said,))
     data.model.meta["warnings"] = [{"code": "rotation_range", "message": said}]

@@ -53,7 +53,9 @@ class Wrapped(torch.nn.Module):
         return call(self.layer, self.name)(x)
 
 
-@pytest.mark.filterwarnings("ignore:.*torch.jit.script.*")  # in torch's own forward mode
+# Both in torch's own forward mode: the first until 2.13, the second from 2.14 on.
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script.*:DeprecationWarning")
+@pytest.mark.filterwarnings("ignore:.*torch.jit.script.*:FutureWarning")
 @pytest.mark.parametrize("name", EVERY)
 def test_vmap_and_jacrev_agree_with_batches_and_with_differences(pair, name):
     rig, layer = pair
