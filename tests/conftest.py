@@ -15,10 +15,15 @@ FAST = {"evaluator", "formats", "geometry", "library"}  # folders of tests that 
 
 
 def pytest_collection_modifyitems(items):
-    """Mark the tests of the small folders as fast."""
+    """Mark the tests of the small folders as fast, and begin with files that have slow tests.
+
+    Processes take whole files: a long one that begins last leaves the others idle.
+    """
     for item in items:
         if item.path.parent.name in FAST and item.get_closest_marker("slow") is None:
             item.add_marker("fast")
+    long = {item.path for item in items if item.get_closest_marker("slow") is not None}
+    items.sort(key=lambda item: item.path not in long)
 
 
 @pytest.fixture(scope="session")

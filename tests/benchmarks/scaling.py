@@ -1,11 +1,14 @@
-"""What a capture costs as it grows: python tests/benchmarks/scaling.py build|track FOLDER [FRAMES ...]
+"""What a capture costs as it grows: python tests/benchmarks/scaling.py build|track|many FOLDER [FRAMES ...]
 
 `build` loops the frames of examples/capture back and forth (masks alone, at half size) to takes of the given numbers of
 frames (100, 1000 and 5000 by default) and builds each. It prints, for every stage, processor time (user and system) per
 frame, its ratio to the shortest take's, and peak memory, then the size of what was written.
 
-`track` tracks a made-up mouth: with 2 to 8 cameras, with pictures up to 3840 x 2400, and takes of the given numbers of
-frames (10, 100, 1000 by default).
+`track` tracks a made-up mouth: with 2 to 12 cameras, with pictures from 480 to 4800 lines, with scans of 9,000 to 600,000
+triangles, and takes of the given numbers of frames (10, 100, 1000 by default).
+
+`many` builds twenty takes of the example's first frames, whose number may be given (30 by default), once with one worker
+and once with two, and compares the time of two with half of that of one.
 
 Every run is a process of its own with one thread. FOLDER gets the takes, their pictures linked, and the builds. Linux
 only: memory is the high-water mark that the kernel keeps.
@@ -27,16 +30,21 @@ for variable in VARIABLES:
 
 import cv2  # noqa: E402
 import numpy as np  # noqa: E402
+import trimesh  # noqa: E402
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 from bumpy_teeth import jaw_poses, make_cameras, render_masks  # noqa: E402
 from short_example import write_short  # noqa: E402
 
+from jawusd.formats.mesh import Mesh  # noqa: E402
+
 ROWS = ("upper", "lower")
 FIRST = 20  # first frame of the looped example
 UNIQUE = 40  # different frames of the made-up mouth
-CAMERAS = (2, 3, 4, 6, 8)
-SIZES = (0.5, 1.0, 3.0, 6.0)  # of 640 x 400
+CAMERAS = (2, 3, 4, 6, 8, 12)
+SIZES = (0.5, 1.2, 2.7, 5.4, 12.0)  # of 640 x 400; 12 is 8K
+FINER = (0, 1, 2, 3)  # how often each triangle is cut in four
+MANY = 20  # captures
 
 
 def back_and_forth(count: int, length: int) -> np.ndarray:
@@ -106,11 +114,13 @@ def cost_of_build(capture: str, out: str) -> dict:
     return {"seconds": seconds, "peaks": peaks, "sizes": sizes, "tracked": summary["track"]["tracked"]}
 
 
-def cost_of_track(folder: str, cameras: int, size: float, frames: int) -> dict:
+def cost_of_track(folder: str, cameras: int, size: float, frames: int, finer: int) -> dict:
     """Track the made-up mouth here and return processor seconds and peak memory [MB]."""
     import small_take
 
     from jawusd.tracking import track_capture
+
+    small_take.MESHES = tuple(_finer(mesh, finer) for mesh in small_take.MESHES)
 
     own = make_cameras(tuple(np.linspace(-40, 40, cameras)))
     small_take.CAMERAS = [camera.scaled(tuple(int(size * s) for s in camera.size_px)) for camera in own]
@@ -123,7 +133,18 @@ def cost_of_track(folder: str, cameras: int, size: float, frames: int) -> dict:
     clock = time.process_time()
     tracks = track_capture(*arguments, threads=1)
     spent = time.process_time() - clock
-    return {"seconds": spent, "peak": _peak_mb(), "before": before, "tracked": int(tracks.tracked().sum())}
+    faces = sum(len(mesh.faces) for mesh in small_take.MESHES)
+    tracked = int(tracks.tracked().sum())
+    return {"seconds": spent, "peak": _peak_mb(), "before": before, "tracked": tracked, "faces": faces}
+
+
+def _finer(mesh: Mesh, times: int) -> Mesh:
+    """Return the same surface with every triangle cut in four so many times."""
+    for _ in range(times):
+        paint = {"color": np.asarray(mesh.colors, np.float64)}
+        vertices, faces, paint = trimesh.remesh.subdivide(mesh.vertices, mesh.faces, vertex_attributes=paint)
+        mesh = Mesh(vertices, faces.astype(np.int32), np.rint(paint["color"]).astype(np.uint8))
+    return mesh
 
 
 def _peak_mb() -> float:
@@ -181,18 +202,37 @@ def report_build(root: Path, counts: list[int]) -> None:
 
 def report_track(root: Path, counts: list[int]) -> None:
     """Track takes of many shapes and print the table."""
-    heads = ("cameras", 7), ("frames", 7), ("picture", 12), ("s", 9), ("ms/frame", 9), ("per view", 9), ("peak MB", 8)
+    heads = ("cameras", 7), ("frames", 7), ("picture", 12), ("triangles", 9), ("s", 9), ("ms/frame", 9)
+    heads = *heads, ("per view", 9), ("peak MB", 8)
     print(" ".join(f"{name:>{width}}" for name, width in heads), "tracked")
-    shapes = [(c, 60, 1.0) for c in CAMERAS] + [(3, 60, s) for s in SIZES] + [(3, n, 0.5) for n in counts]
-    for cameras, frames, size in shapes:
+    shapes = [(c, 60, 1.2, 0) for c in CAMERAS] + [(3, 60, s, 0) for s in SIZES]
+    shapes += [(3, 60, 1.2, finer) for finer in FINER] + [(3, n, 0.5, 0) for n in counts]
+    for cameras, frames, size, finer in shapes:
         folder = root / f"mouth_{cameras}_{frames}_{size:g}"
         if not folder.exists():
             write_mouth(folder, cameras, size, frames)
-        cost = in_a_process("track", folder, cameras, size, frames)
+        cost = in_a_process("track", folder, cameras, size, frames, finer)
         each = 1e3 * cost["seconds"] / frames
         picture = f"{int(640 * size)} x {int(400 * size)}"
-        row = f"{cameras:>7} {frames:>7} {picture:>12} {cost['seconds']:>9.2f} {each:>9.2f} {each / cameras:>9.2f}"
+        shape = f"{cameras:>7} {frames:>7} {picture:>12} {cost['faces']:>9}"
+        row = f"{shape} {cost['seconds']:>9.2f} {each:>9.2f} {each / cameras:>9.2f}"
         print(f"{row} {cost['peak']:>8.0f} {cost['tracked']:>7}", flush=True)
+
+
+def report_many(root: Path, counts: list[int]) -> None:
+    """Build twenty takes with one and with two workers and print how near two come to half the time of one."""
+    takes = [write_short(root / f"take_{k}", counts[0]) for k in range(MANY)]
+    (root / "list.txt").write_text("".join(f"{take.name}/capture.toml\n" for take in takes))
+    seconds = {}
+    for workers in (1, 2):
+        out = root / f"built_by_{workers}"
+        command = [sys.executable, "-m", "jawusd", "build-many", str(root / "list.txt"), "-o", str(out)]
+        clock = time.perf_counter()
+        subprocess.run([*command, "--workers", str(workers)], check=True, stdout=subprocess.DEVNULL)
+        seconds[workers] = time.perf_counter() - clock
+    ratio = 2 * seconds[2] / seconds[1]
+    print(f"{MANY} takes of {counts[0]} frames: {seconds[1]:.1f} s by one worker, {seconds[2]:.1f} s by two, ", end="")
+    print(f"{ratio:.2f} of ideal")
 
 
 def main(arguments: list[str]) -> None:
@@ -202,11 +242,15 @@ def main(arguments: list[str]) -> None:
         if kind == "build":
             print(json.dumps(cost_of_build(*rest)))
         else:
-            folder, cameras, size, frames = rest
-            print(json.dumps(cost_of_track(folder, int(cameras), float(size), int(frames))))
+            folder, cameras, size, frames, finer = rest
+            print(json.dumps(cost_of_track(folder, int(cameras), float(size), int(frames), int(finer))))
         return
     kind, folder, *counts = arguments
-    reports = {"build": (report_build, [100, 1000, 5000]), "track": (report_track, [10, 100, 1000])}
+    reports = {
+        "build": (report_build, [100, 1000, 5000]),
+        "track": (report_track, [10, 100, 1000]),
+        "many": (report_many, [30]),
+    }
     report, usual = reports[kind]
     report(Path(folder), [int(count) for count in counts] or usual)
 

@@ -70,6 +70,7 @@ def given(person, poses, tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_the_same_poses_give_the_same_model_however_they_are_written(given, tmp_path):
     whose = ("--landmarks", given / "landmarks.json")
     columns = "frame=Frame,tx=X,ty=Y,tz=Z,qw=W,qx=I,qy=J,qz=K"

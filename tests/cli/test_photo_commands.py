@@ -36,6 +36,7 @@ def files(mouth, tmp_path):
     return [tmp_path / "front.png", tmp_path / "left.png", *scans, "-o", tmp_path / "out"]
 
 
+@pytest.mark.slow
 def test_photos_writes_the_bite_and_pictures(mouth, files, tmp_path, monkeypatch):
     search_little(monkeypatch)
     told = json.loads(run("photos", *files, "--json").stdout)

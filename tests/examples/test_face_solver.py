@@ -15,6 +15,7 @@ def example(monkeypatch):
     return module
 
 
+@pytest.mark.slow
 def test_a_rig_beats_the_pull_to_the_closed_mouth(example, monkeypatch, tmp_path, capsys):
     picture = tmp_path / "errors.png"
     monkeypatch.setattr(sys, "argv", ["face_solver.py", "-o", str(picture)])

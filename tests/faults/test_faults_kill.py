@@ -55,6 +55,7 @@ def end(process):
     return process.returncode
 
 
+@pytest.mark.slow
 def test_killed_builds_end_as_one_that_was_left_alone(tmp_path):
     alone = tmp_path / "alone"
     begun = time.perf_counter()

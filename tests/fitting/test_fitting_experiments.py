@@ -147,6 +147,7 @@ def test_every_model_and_component_count_is_in_the_table(found):
     assert mean["anchored"] < mean["additive"] < mean["pca"] < mean["NLPCA 1"]
 
 
+@pytest.mark.slow
 def test_rows_repeat_the_distances(found):
     one = found.of("reconstruction")[0]
     row = one.row()
@@ -154,12 +155,14 @@ def test_rows_repeat_the_distances(found):
     assert row["mean_mm"] == pytest.approx(sum(one.values_mm) / FRAMES)
 
 
+@pytest.mark.slow
 def test_the_table_is_written_as_csv(found, tmp_path):
     save_table(tmp_path / "t.csv", found.table())
     lines = (tmp_path / "t.csv").read_text().splitlines()
     assert lines[0] == ",".join(TABLE_COLUMNS) and len(lines) == len(found.table()) + 1
 
 
+@pytest.mark.slow
 def test_gaps_are_inside_the_bound_and_far_from_every_pose(found):
     coverage = found.coverage
     for index, gaps in enumerate(coverage.gaps):

@@ -45,6 +45,7 @@ def lifted(*heights):
     return T
 
 
+@pytest.mark.slow
 def test_clearance_is_what_is_left_under_the_skull():
     joints = find_joints(skull(), mandible(), LANDMARKS, np.eye(4), np.eye(4))
     np.testing.assert_allclose(joints.closed, -GAP, atol=0.03)

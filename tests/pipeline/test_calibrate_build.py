@@ -57,6 +57,7 @@ def calibrated(capture, tmp_path_factory):
     return out, told
 
 
+@pytest.mark.slow
 def test_the_build_calibrates_from_the_boards(calibrated):
     out, told = calibrated
     assert ("calibrate", 72, 72) in told
@@ -70,6 +71,7 @@ def test_the_build_calibrates_from_the_boards(calibrated):
     assert "24 views" in lines and "the teeth confirm" in lines and "advice: camera cam0 uses 24 views" in lines
 
 
+@pytest.mark.slow
 def test_lengths_in_the_mouth_are_those_of_the_true_cameras(calibrated):
     out, _ = calibrated
     found, truth = load_calibration(out / "calibration.toml"), load_calibration(EXAMPLE / "calibration.toml")
@@ -110,6 +112,7 @@ def test_a_fresh_build_deletes_the_masks_an_earlier_one_made(capture, tmp_path):
     assert not (tmp_path / "actor" / "masks").exists()
 
 
+@pytest.mark.slow
 def test_the_summary_of_a_build_says_what_was_made(calibrated):
     out, _ = calibrated
     record = json.loads((out / "build.json").read_text())["stages"]

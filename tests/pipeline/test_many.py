@@ -92,6 +92,7 @@ def test_a_killed_worker_and_a_bad_capture_leave_the_rest_as_serial_builds_make_
         assert results(shoot / "out" / name) == serial
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
 def test_an_interrupt_leaves_no_process_and_no_half_file(shoot, tmp_path):
     (tmp_path / "list.txt").write_text(f"{shoot / 'take'}\n")

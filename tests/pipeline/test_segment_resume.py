@@ -95,6 +95,7 @@ def test_finished_masks_teach_and_are_written_as_they_were_drawn(take, undisturb
     assert wider > before
 
 
+@pytest.mark.slow
 def test_doubtful_masks_are_shown_over_their_pictures(take, undisturbed, tmp_path):
     capture, offsets = take
     own = capture.frames[0] + 1 - offsets["cam0"]

@@ -51,6 +51,7 @@ def run(*arguments, code=0):
     return result.stdout if code == 0 else result.stderr
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_table_and_a_summary(rig, shot, tmp_path):
     summary = json.loads(run("solve", rig, shot, "-o", tmp_path / "take.csv", "--json"))
     assert summary["frames"] == summary["solved"] == COUNT and not summary["carried"] and not summary["lost"]

@@ -171,6 +171,7 @@ def test_commands_are_set_as_code_and_no_backtick_is_seen():
     assert worded("one ` alone") == "one ` alone"
 
 
+@pytest.mark.slow
 def test_a_long_take_stays_small():
     data = report_data(count=20000)
     many = np.random.default_rng(0).uniform([0, -9, -1], [40, 9, 7], (20000, 3))

@@ -60,6 +60,7 @@ def _edge(mesh: trimesh.Trimesh, up: float) -> np.ndarray:
     return np.median(ends, axis=0)
 
 
+@pytest.mark.slow
 def test_bites_cover_the_human_range(bites: list[Bite]) -> None:
     edges = np.array([[_edge(_solid(b.upper), -1.0), _edge(_solid(b.lower), 1.0)] for b in bites])
     overbite, overjet = edges[:, 1, 1] - edges[:, 0, 1], edges[:, 0, 2] - edges[:, 1, 2]
@@ -144,6 +145,7 @@ def test_same_seed_same_capture(tmp_path: Path, capture: Path) -> None:
         assert (tmp_path / file).read_bytes() == (capture / file).read_bytes(), file
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("format_", FORMATS)
 def test_every_format_reads_back(format_: str, bites: list[Bite], tmp_path: Path) -> None:
     paint = "none" if format_.startswith("stl") else "painted"

@@ -170,6 +170,7 @@ def test_hidden_teeth_are_found_with_the_model(take, jaw, truth):
     assert error[list(HIDDEN)].max() < 0.4
 
 
+@pytest.mark.slow
 def test_lost_frames_come_back_marked_and_raw_poses_stay(take, jaw, truth):
     first = take[1]
     gone = list(HIDDEN)
@@ -198,6 +199,7 @@ def test_lost_frames_come_back_marked_and_raw_poses_stay(take, jaw, truth):
     np.testing.assert_array_equal(aided.raw_T_upper_lower[kept], first.raw_T_upper_lower[kept])
 
 
+@pytest.mark.slow
 def test_a_model_of_another_jaw_helps_nobody(take, jaw, truth):
     """Its poses do not fit the masks or the model, so the first pass stays."""
     arrays = {**jaw.arrays, "residual_limit_mm": np.array(1e-6)}
@@ -205,6 +207,7 @@ def test_a_model_of_another_jaw_helps_nobody(take, jaw, truth):
     assert not aided.prior_aided.any()
 
 
+@pytest.mark.slow
 def test_without_hard_frames_nothing_is_done(take, jaw):
     first = take[1]
     easy = replace(first, status=np.ones_like(first.status), sigma_mm=np.full_like(first.sigma_mm, 0.1))

@@ -31,6 +31,7 @@ def late(tmp_path_factory):
     return track(capture), track(capture, config=WITHOUT)
 
 
+@pytest.mark.slow
 def test_delays_are_found_to_a_fiftieth_of_a_frame(late):
     tracks, _ = late
     delays = list(tracks.meta["delays_frames"].values())
@@ -39,6 +40,7 @@ def test_delays_are_found_to_a_fiftieth_of_a_frame(late):
     assert all(0 < s < 0.02 for s in list(tracks.meta["delays_sigma_frames"].values())[1:])
 
 
+@pytest.mark.slow
 def test_taking_delays_out_improves_the_poses(late):
     tracks, without = late
     inner = slice(1, -1)  # at the ends nothing tells the velocity
@@ -62,6 +64,7 @@ def test_nothing_is_found_where_nothing_is(tmp_path):
     assert np.abs(list(tracks.meta["outline_bias_px"].values())).max() < 0.1
 
 
+@pytest.mark.slow
 def test_scans_without_gum_tell_less_of_how_masks_were_drawn(tmp_path, monkeypatch):
     """The same take, with all that is measured on it, leaves more unknown of both arches."""
     capture = make_capture(write_masks(tmp_path / "crowns", 6), 6)
@@ -145,6 +148,7 @@ def test_knocked_cameras_are_put_right(takes):
     assert np.abs(list(corrected.meta["outline_bias_px"].values())).max() < 0.15
 
 
+@pytest.mark.slow
 def test_corrected_cameras_see_the_teeth_where_the_true_ones_do(takes):
     good, corrected, _ = takes
     then = corrected_cameras(KNOCKED, corrected.meta)
@@ -164,6 +168,7 @@ def test_corrected_cameras_see_the_teeth_where_the_true_ones_do(takes):
     assert misses(KNOCKED) > 4 * misses(then)
 
 
+@pytest.mark.slow
 def test_corrections_fit_their_uncertainty(takes):
     """Compare with the knocks themselves, but for the motion of the world that brings the two sets closest."""
     report = takes[1].meta["extrinsics"]
@@ -180,6 +185,7 @@ def test_corrections_fit_their_uncertainty(takes):
     assert np.abs(undone / sigma).max() > 10  # the test has something to find
 
 
+@pytest.mark.slow
 def test_corrections_cancel_and_survive_the_file(takes, tmp_path):
     save_tracks(tmp_path / "tracks.npz", takes[1])
     meta = load_tracks(tmp_path / "tracks.npz").meta
@@ -187,6 +193,7 @@ def test_corrections_cancel_and_survive_the_file(takes, tmp_path):
     assert max(rigidity_defect(c.T_cam_world) for c in corrected_cameras(KNOCKED, meta)) < 1e-9
 
 
+@pytest.mark.slow
 def test_true_cameras_are_left_alone(takes):
     report = takes[0].meta["extrinsics"]
     assert not report["corrected"] and not np.any(list(report["moves_mm"].values()))

@@ -125,6 +125,7 @@ def test_hidden_teeth_are_lost_and_found_again(take):
     assert np.nanmax(errors_mm(tracks)) < 0.1
 
 
+@pytest.mark.slow
 def test_masks_exchanged_now_and_then_are_not_searched_for_ever(take, monkeypatch):
     """Exchange the rows' masks on three frames apart from one another, each of which would be searched both ways."""
     for k in (5, 7, 9):

@@ -88,6 +88,7 @@ def _rows_exchanged(folder, names):
     return [{"name": c.name, "masks": masks(c.name)} for c in CAMERAS]
 
 
+@pytest.mark.slow
 def test_take_without_picks_is_tracked(pictures):
     tracks = track(_capture(pictures, bootstrap=None))
     assert (tracks.status == 1).all() and errors_mm(tracks).max() < 0.1

@@ -55,6 +55,7 @@ def capture(folder, with_clips):
     return make_capture(folder, COUNT, cameras=cameras)
 
 
+@pytest.mark.slow
 def test_masks_are_taken_at_their_time(take):
     tracks = track(capture(take, with_clips=True))
     assert tracks.tracked().all() and errors_mm(tracks, raw=True).max() < 0.25
