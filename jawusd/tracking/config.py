@@ -52,8 +52,11 @@ class TrackingConfig:
     converged_mm: float = 0.004
     # Update from which on the gates in between are left out [mm at the crowns]: they are for steps that go farther.
     settled_mm: float = 0.0
-    # Motion after which a scan is drawn and its contour sampled again [px]: hidden parts are judged to so much.
+    # Motion after which pictures and contour of a scan are made again [px]: hidden parts are judged to so much.
     redraw_px: float = 1.0
+    # Motion of near against far parts of a scan in a picture from which on it is drawn anew [px]; until then, pictures
+    # of it are warped. 2 to 8 px leave the errors of 200 frames as they are (0.038 and 0.045 mm), 4 px halve drawing.
+    parallax_px: float = 4.0
     # Plausible distance of an arch from its prediction [mm]: a weak pull, for motions that masks leave free.
     prediction_mm: float = 0.5
     # Outline variance times correlation length behind that pull [px^3]: 0.4 px over 18 px, typical masks by hand.
@@ -140,8 +143,8 @@ class TrackingConfig:
         return tuple(g for g in self.wide_gates_px if g <= max(reach_px, self.first_gate_px))
 
 
-#: For takes of several cameras. Scans are drawn half as often, with the same errors; a search in a single camera, which
-#: has less contour to go by, ended elsewhere (`tests/pipeline/test_solve.py`).
+#: For takes of several cameras. Pictures are made half as often, with the same errors; a search in a single camera,
+#: which has less contour to go by, ended elsewhere (`tests/pipeline/test_solve.py`).
 FOR_TAKES = TrackingConfig(redraw_px=2.0)
 
 #: For masks that jawusd made. They vary more from frame to frame than drawn ones: outlines get rougher as lips close,

@@ -4,11 +4,11 @@
 frames (100, 1000 and 5000 by default) and builds each. It prints, for every stage, processor time (user and system) per
 frame, its ratio to the shortest take's, and peak memory, then the size of what was written.
 
-`track` tracks a made-up mouth: with 2 to 12 cameras, with pictures from 480 to 4800 lines, with scans of 9,000 to 600,000
-triangles, and takes of the given numbers of frames (10, 100, 1000 by default).
+`track` tracks a made-up mouth: with 2 to 12 cameras, with pictures from 480 to 4800 lines, with scans of 9,000 to
+600,000 triangles, and takes of the given numbers of frames (10, 100, 1000 by default).
 
-`many` builds twenty takes of the example's first frames, whose number may be given (30 by default), once with one worker
-and once with two, and compares the time of two with half of that of one.
+`many` builds twenty takes of the example's first frames, whose number may be given (30 by default), once with one
+worker and once with two, and compares the time of two with half of that of one.
 
 Every run is a process of its own with one thread. FOLDER gets the takes, their pictures linked, and the builds. Linux
 only: memory is the high-water mark that the kernel keeps.

@@ -1,4 +1,4 @@
-"""Pictures and contours of both scans at one instant, kept as long as they have hardly moved."""
+"""Pictures and contours of both scans at one instant, made again only after they have moved."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jawusd.geometry.arrays import Array
-from jawusd.tracking.contour.samples import U, V, Z
+from jawusd.tracking.contour.drawing import Drawing
 from jawusd.tracking.contour.scan import ARCHES
 from jawusd.tracking.contour.views import View
 
@@ -28,23 +28,23 @@ class Rendering:
     def __init__(self, solver: ContourSolver, views: Sequence[View]) -> None:
         self._solver = solver
         self._views = views
-        self._drawn: dict[tuple[int, int], Array] = {}
-        self._contours: dict[tuple[ContourSolver, int, int], tuple[Array, Array, int]] = {}
+        self._shown: dict[tuple[int, int], tuple[Array, Drawing, float]] = {}
         shapes = [view.masks.shape for view in views]
         self.labels = [np.zeros(shape, np.uint8) for shape in shapes]
         self.depths = [np.zeros(shape, np.float32) for shape in shapes]
 
     def update(self, poses: Array) -> None:
-        """Draw the scans whose projection has moved by more than the allowed pixels."""
+        """Show the scans anew whose projection has moved by more than the allowed pixels."""
 
-        def draw(task: tuple[int, int]) -> None:
-            self._draw(*task, poses[task[0]])
+        def show(task: tuple[int, int]) -> None:
+            self._show(*task, poses[task[0]])
 
+        self._solver.drawings.forget_old()
         tasks = [(r, c) for r in ARCHES for c in range(len(self._views)) if self._moved(r, c, poses[r])]
-        list(self._solver.map(draw, tasks))
+        list(self._solver.map(show, tasks))
 
     def contour(self, solver: ContourSolver, r: int, c: int, pose: Array) -> tuple[Array, int]:
-        """Return the contour of a solver's scan in a view, moved to a pose near the one the view was drawn at.
+        """Return the contour of a solver's scan in a view, moved to a pose near the one the view shows it in.
 
         Args:
             solver: whose scan it is; its pictures may be another solver's, of the same scans.
@@ -54,30 +54,25 @@ class Rendering:
         Returns:
             As `contour_samples`; a copy.
         """
-        view, drawn = self._views[c], self._drawn[r, c]
-        kept = self._contours.get((solver, r, c))
-        if kept is None or kept[0] is not drawn:
-            found = solver.contour(r, view.T_delay[r] @ drawn, view, self.labels[c][r], self.depths[c][r])
-            kept = self._contours[solver, r, c] = (drawn, *found)
-        samples = kept[1].copy()
-        samples[:, [U, V]] = _pixels(view.matrix @ pose, samples[:, : Z + 1])
-        return samples, kept[2]
+        _, drawing, turned_rad = self._shown[r, c]
+        view = self._views[c]
+        return drawing.contour(solver, r, view.matrix @ pose, view.masks.shape[1:], turned_rad)
 
     def _moved(self, r: int, c: int, pose: Array) -> bool:
-        last = self._drawn.get((r, c))
-        if last is None:
+        shown = self._shown.get((r, c))
+        if shown is None:
             return True
         scan, matrix = self._solver.scans[r], self._views[c].matrix
         corners = scan.centre + scan.radius_mm * _CORNERS
-        change = _pixels(matrix @ pose, corners) - _pixels(matrix @ last, corners)
+        change = _pixels(matrix @ pose, corners) - _pixels(matrix @ shown[0], corners)
         return float(np.abs(change).max()) > self._solver.config.redraw_px
 
-    def _draw(self, r: int, c: int, pose: Array) -> None:
+    def _show(self, r: int, c: int, pose: Array) -> None:
         view, labels, depth = self._views[c], self.labels[c][r], self.depths[c][r]
-        labels[:] = 0
-        depth[:] = 0
-        self._solver.scans[r].draw(view.matrix @ view.T_delay[r] @ pose, depth, labels)
-        self._drawn[r, c] = pose.copy()
+        T_world_scan = view.T_delay[r] @ pose
+        matrix = view.matrix @ T_world_scan
+        drawing = self._solver.drawings.of(r, view.eye, T_world_scan, matrix, labels.shape)
+        self._shown[r, c] = (pose.copy(), drawing, drawing.show(matrix, labels, depth))
 
 
 def _pixels(matrix: Array, points: Array) -> Array:

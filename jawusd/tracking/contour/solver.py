@@ -15,6 +15,7 @@ from jawusd.geometry import bite_normal, orthonormalise, transform_point
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.config import Mapper, TrackingConfig
 from jawusd.tracking.contour.correspondences import accumulate, scatter_of_tiles, search_edges
+from jawusd.tracking.contour.drawing import Drawings
 from jawusd.tracking.contour.equations import (
     GingivalMarginTerm,
     NormalEquations,
@@ -61,6 +62,8 @@ class ContourSolver:
         #: The same of scans with fewer faces; None where all have few.
         self.thin = ContourSolver(thin, config, executor) if any(scan.thin for scan in self.scans) else None
         self._executor = executor
+        #: What was drawn last; its pictures serve as long as they show nearly the same.
+        self.drawings = Drawings(self.scans, config.parallax_px)
 
     @cached_property
     def rough(self) -> ContourSolver:
@@ -202,12 +205,10 @@ class ContourSolver:
         return samples, silhouettes, distances - samples[:, HABITS] @ view.habits[r], visible
 
     def contour(
-        self, r: int, pose: Array, view: View, labels: NDArray[np.uint8], depth: NDArray[np.float32]
+        self, r: int, matrix: Array, eye: Array, labels: NDArray[np.uint8], depth: NDArray[np.float32]
     ) -> tuple[Array, int]:
-        """Return the contour of an arch in pictures drawn at its pose (4, 4) in a view; see `contour_samples`."""
-        eye = pose[:3, :3].T @ (view.eye - pose[:3, 3])
+        """Return the contour of an arch in pictures that `matrix` (3, 4) projects it to; see `contour_samples`."""
         limits = (self.config.sample_step_px, self.config.depth_tolerance_mm)
-        matrix = view.matrix @ pose
         return contour_samples(self.scans[r], matrix, eye, labels, depth, *limits, self._towards_gum[r])
 
     def _final_gate(self, distances: list[Array], gate: float) -> float:
