@@ -13,10 +13,9 @@ import numpy as np
 from jawusd.errors import CaptureError
 from jawusd.formats.numbered import numbered_files
 from jawusd.imaging.mask_levels import MaskImage, RawImage
-from jawusd.imaging.mask_source import SourceLevels, load_png, png_levels, video_levels
+from jawusd.imaging.mask_source import SourceLevels, load_png, mask_video, png_levels, video_levels
 from jawusd.imaging.pictures import read_palette_numbers
 from jawusd.imaging.pixels import Colour
-from jawusd.imaging.video import Video
 
 #: Gray values of the wanted arch and of the other one in label images; all else must be 0.
 LabelValues = tuple[int, int]
@@ -156,7 +155,7 @@ class VideoMasks:
         Raises:
             CaptureError: the video is missing or damaged, or has another size.
         """
-        self._video, self._labels = Video(path), labels
+        self._video, self._labels = mask_video(path), labels
         self.odd: dict[int, str] = {}
         _check_size(path, self._video.size_px, size_px)
         self.count, self.timeline = self._video.count, self._video.timeline

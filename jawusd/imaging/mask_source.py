@@ -60,6 +60,24 @@ def video_levels(path: Path) -> tuple[SourceLevels, Colour]:
     return _video_levels_of_version(path, path.stat().st_mtime_ns)
 
 
+def mask_video(path: Path) -> Video:
+    """Return a video of masks; its table of frames is read once, though a take opens it a dozen times.
+
+    Raises:
+        CaptureError: as `Video`.
+    """
+    if not path.is_file():
+        return Video(path)  # which says so
+    found = path.stat()
+    return _video_of_version(path, found.st_mtime_ns, found.st_size)
+
+
+@lru_cache(maxsize=64)
+def _video_of_version(path: Path, changed_ns: int, size: int) -> Video:
+    """Open a video; time of its last change and size identify its version."""
+    return Video(path)
+
+
 class _Others:
     """Hold files besides a sample; as many others are equal, so that a cache does not compare them."""
 
@@ -119,7 +137,7 @@ def _png_levels_of_version(
 @lru_cache(maxsize=256)
 def _video_levels_of_version(path: Path, changed_ns: int) -> tuple[SourceLevels, Colour]:
     """Find the levels of a video and what to decode; the time of its last change identifies its version."""
-    video = Video(path)
+    video = mask_video(path)
     colour: Colour = "gray" if video.is_gray else "rgba" if video.has_alpha else "rgb"
     # Pictures that decode by themselves are cheap; few of them may be empty, as the first often is.
     sample = [int(video.keys[k]) for k in _spread(len(video.keys), _SAMPLED)]

@@ -117,6 +117,19 @@ class MaskReader:
         """Return which pictures read so far contradict the others, and how; they count as not segmented."""
         return [self._source.odd[number] for number in sorted(self._source.odd)]
 
+    def read_some(self, first: int, stop: int) -> list[MaskImage | None]:
+        """Return the masks of frames in a row, [first, stop), as `read` would, without decoding more than these.
+
+        Raises:
+            CaptureError: a picture cannot be decoded, has the wrong size, or is no mask.
+        """
+        inside = range(max(first, 0), min(stop, self.count))
+        if not inside:
+            return [None] * (stop - first)
+        with contextlib.closing(self._results(inside.start)) as results:
+            found = [next(results) for _ in inside]
+        return [None] * (inside.start - first) + found + [None] * (stop - inside.stop)
+
     def close(self) -> None:
         """Stop decoding ahead; the reader can still be used."""
         if self._ahead is not None:
@@ -262,6 +275,10 @@ class _Ahead:
 
     def stop(self) -> None:
         self._stopping.set()
+        # The thread may wait for room, and puts one item at most from now on.
+        with contextlib.suppress(queue.Empty):
+            while True:
+                self._queue.get_nowait()
         self._thread.join()
 
     def _run(self, items: Generator[MaskImage | None]) -> None:
@@ -275,7 +292,5 @@ class _Ahead:
             self._put(None, error)
 
     def _put(self, item: MaskImage | None, error: Exception | None) -> None:
-        while not self._stopping.is_set():
-            with contextlib.suppress(queue.Full):
-                self._queue.put((item, error), timeout=0.05)
-                return
+        if not self._stopping.is_set():
+            self._queue.put((item, error))

@@ -87,6 +87,47 @@ def test_decoding_runs_ahead_but_not_away(video: Path) -> None:
     assert "jawusd-masks" not in {thread.name for thread in threading.enumerate()}
 
 
+@pytest.mark.parametrize("kind", ["pattern", "video"])
+def test_frames_in_a_row_are_those_read_one_by_one(kind: str, request: pytest.FixtureRequest) -> None:
+    prepared: list[int] = []
+
+    def prepare(image: np.ndarray) -> np.ndarray:
+        prepared.append(int(image.sum()))
+        return image
+
+    with MaskReader(request.getfixturevalue(kind), SIZE, prepare=prepare) as reader:
+        for first, stop in ((0, 3), (2, 8), (-2, 2), (COUNT - 2, COUNT + 3), (-3, -1), (COUNT, COUNT + 2), (4, 4)):
+            some = reader.read_some(first, stop)
+            decoded = len(prepared)
+            each = [reader.read(k) for k in range(first, stop)]
+            assert [a is None for a in some] == [b is None for b in each]
+            assert all(np.array_equal(a, b) for a, b in zip(some, each, strict=True) if a is not None)
+            assert decoded == sum(mask is not None for mask in some), "only what was asked for"
+            reader.close()
+            prepared.clear()
+
+
+def test_closing_ends_a_thread_that_waits_for_room(video: Path) -> None:
+    with MaskReader(video, SIZE) as reader:
+        for first in range(0, 8, 2):
+            reader.read(first)
+            reader.read(first + 1)
+            waiting = reader._ahead._thread
+            time.sleep(0.05)  # until the thread waits for room
+            assert waiting.is_alive()
+            reader.close()
+            assert not waiting.is_alive()
+            check(reader, first + 1, BLACK)
+
+
+def test_a_video_that_was_made_anew_is_read_anew(video: Path) -> None:
+    assert MaskReader(video, SIZE).count == COUNT
+    with VideoWriter(video, SIZE, 24, lossless=True) as out:
+        for k in range(COUNT + 5):
+            out.write(mask(k % COUNT))
+    assert MaskReader(video, SIZE).count == COUNT + 5
+
+
 def test_errors_come_with_their_frame_when_read_ahead(pattern: Path) -> None:
     bad = pattern.parent / "000008.png"
     bad.write_bytes(bad.read_bytes()[:40])

@@ -1,6 +1,7 @@
 """Single instants: escalation, and the reason why an arch is lost."""
 
 import re
+from collections import deque
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from jawusd.tracking.contour.scan import prepare_scan
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import View
 from jawusd.tracking.sequence.frame_tracker import FrameTracker
-from jawusd.tracking.sequence.history import History
+from jawusd.tracking.sequence.history import History, _median
 
 CONFIG = TrackingConfig()
 MESHES = (arch(True), arch(False))
@@ -158,3 +159,17 @@ def test_one_mask_is_too_few_for_an_arch(tracker):
     assert record.status.tolist() == [TRACKED, LOST]
     assert record.losses[1] == (LostReason.FEW_MASKS, 1, 2) and record.losses[0].reason == LostReason.NONE
     assert str(LostReason.FEW_MASKS) == "few masks" and str(LOST) == "lost"
+
+
+def test_medians_of_what_is_known_are_those_of_numpy():
+    rng = np.random.default_rng(5)
+    for count in (1, 2, 7, 24):
+        for missing in (0.0, 0.3, 0.9, 1.0):
+            values = rng.normal(size=(count, 2, 3))
+            values[rng.random(values.shape) < missing] = np.nan
+            otherwise = rng.normal(size=(2, 3))
+            expected = otherwise.copy()
+            known = np.isfinite(values).any(0)
+            expected[known] = np.nanmedian(values[:, known], axis=0)
+            assert (_median(deque(values), otherwise) == expected).all()
+    assert _median(deque(), 4.0) == 4.0

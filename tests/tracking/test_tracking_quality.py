@@ -207,6 +207,17 @@ def test_walking_backwards_gives_the_same_views(tmp_path):
             assert (a.masks == b.masks).all() and (a.matrix == b.matrix).all()
 
 
+def test_views_around_an_instant_are_those_of_each(tmp_path):
+    capture = make_capture(write_masks(tmp_path / "take", 5), 5)
+    table = {c.name: c for c in CAMERAS}
+    with MaskViews(capture.cameras, table, OFFSETS, np.array([0, 0, 0.0]), 5.0) as masks:
+        for frame in (FIRST, FIRST + 2, FIRST + 5):  # the last one shows none
+            for k, views in enumerate(masks.around(frame, 1)):
+                for a, b in zip(views, masks.at(frame - 1 + k), strict=True):
+                    assert (a.masks == b.masks).all() and (a.matrix == b.matrix).all()
+                    assert (a.present == b.present).all()
+
+
 def test_views_keep_the_geometry_of_the_camera(tmp_path):
     capture = make_capture(write_masks(tmp_path / "take", 4), 4)
     table = {c.name: c for c in CAMERAS}

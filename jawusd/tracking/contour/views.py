@@ -140,6 +140,21 @@ class MaskViews:
             for working, offset, pair in zip(self._working, self._offsets, self._readers, strict=True)
         ]
 
+    def around(self, frame: int, reach: int) -> list[list[View]]:
+        """Return the views of the instants up to `reach` frames before and after one, in order.
+
+        Masks are decoded once, in the order of their files: each jump to another frame opens these anew.
+
+        Raises:
+            CaptureError: a mask cannot be decoded.
+        """
+        first, stop = frame - reach, frame + reach + 1
+        cameras = []
+        for working, offset, pair in zip(self._working, self._offsets, self._readers, strict=True):
+            masks = zip(*(reader.read_some(first - offset, stop - offset) for reader in pair), strict=True)
+            cameras.append([_view(working, both) for both in masks])
+        return [list(views) for views in zip(*cameras, strict=True)]
+
     def walk(self, first: int, stop: int, step: int = 1) -> Iterator[tuple[int, list[View]]]:
         """Yield instants of a range with their views; with step -1 backwards, though masks are read forwards."""
         if step > 0:

@@ -134,7 +134,7 @@ def frame_shifts(records: Mapping[int, FrameRecord], masks: MaskViews, solver: C
     between = [k for k in range(len(frames)) if k not in ends]
     for part in (ends, between):
         for k in part:
-            fit[k] = _fits(records[frames[k]], [masks.at(frames[k] + shift) for shift in SHIFTS], solver.thin or solver)
+            fit[k] = _fits(records[frames[k]], masks.around(frames[k], SHIFTS[-1]), solver.thin or solver)
         own = np.stack([_leads(fit[ends, c]) for c in range(len(masks.cameras))])[..., SHIFTS.index(0)]
         if (own > _LEAST_LEAD).all():
             break

@@ -193,8 +193,11 @@ class History:
 
 
 def _median(values: deque[Array], otherwise: float | Array) -> Array:
-    stack = np.array(values)
+    """Return the medians of what is known, by sorting: of so few values `np.nanmedian` takes ten times as long."""
+    if not values:
+        return np.asarray(otherwise, np.float64)
+    stack = np.sort(np.array(values), axis=0)  # NaN behind all others
     known = np.isfinite(stack).any(0)
-    out = np.array(np.broadcast_to(otherwise, stack.shape[1:]), np.float64)
-    out[known] = np.nanmedian(stack[:, known], axis=0)
-    return out
+    count = (~np.isnan(stack)).sum(0)
+    low, high = (np.take_along_axis(stack, at[None], axis=0)[0] for at in (np.maximum(count - 1, 0) // 2, count // 2))
+    return np.asarray(np.where(known, 0.5 * (low + high), otherwise), np.float64)

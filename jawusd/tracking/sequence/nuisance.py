@@ -113,6 +113,14 @@ class _Layout:
         self.cameras, self._hand = cameras, hand
         self.twists = cameras + 9 + 4 * cameras
         self.size = self.twists + 6 * cameras
+        self._habits = np.zeros((2, cameras, 3, self.size))
+        for arch, camera in np.ndindex(2, cameras):
+            of_arch = cameras + 3 + 3 * arch
+            of_view = cameras + 9 + 2 * (2 * camera + arch)
+            out = self._habits[arch, camera]
+            out[0, [cameras, of_arch, of_view]] = 1.0
+            out[1, [cameras, cameras + 1, of_arch + 1, of_view + 1]] = 1.0
+            out[2, [cameras + 2, of_arch + 2]] = 1.0
 
     def twist(self, camera: int) -> slice[int, int, None]:
         """Return where a camera's twist stands."""
@@ -120,14 +128,7 @@ class _Layout:
 
     def habits(self, arch: int, camera: int) -> Array:
         """Return how the habits of an arch in a camera follow from the unknowns, shape (3, size)."""
-        out = np.zeros((3, self.size))
-        hand = self.cameras
-        of_arch = hand + 3 + 3 * arch
-        of_view = hand + 9 + 2 * (2 * camera + arch)
-        out[0, [hand, of_arch, of_view]] = 1.0
-        out[1, [hand, hand + 1, of_arch + 1, of_view + 1]] = 1.0
-        out[2, [hand + 2, of_arch + 2]] = 1.0
-        return out
+        return np.asarray(self._habits[arch, camera])
 
     def prior_sigma(self) -> Array:
         """Return the prior standard deviations of delays and habits, shape (twists,)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 import weakref
 from collections.abc import Iterable, Iterator, MutableMapping
@@ -51,6 +52,9 @@ class PackedRecords(MutableMapping[int, FrameRecord]):
     def __delitem__(self, frame: int) -> None:
         del self._places[frame]
         self._unpacked.pop(frame, None)
+
+    def __contains__(self, frame: object) -> bool:
+        return frame in self._places  # by default, the record would be unpacked
 
     def __iter__(self) -> Iterator[int]:
         return iter(self._places)
@@ -138,5 +142,8 @@ def _joined(arrays: Iterable[ArrayLike]) -> Array:
 
 
 def _split(flat: Array, shapes: tuple[tuple[int, ...], ...]) -> list[Array]:
-    ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
-    return [part.reshape(shape) for part, shape in zip(np.split(flat, ends[:-1]), shapes, strict=True)]
+    parts, end = [], 0
+    for shape in shapes:
+        start, end = end, end + math.prod(shape)
+        parts.append(flat[start:end].reshape(shape))
+    return parts

@@ -60,14 +60,15 @@ def assemble(
     frames = np.array(sorted(records), np.int64)
     raw, status, losses, centres, coverage, used, residual, matched = _columns(records, frames)
     raw[status == LOST] = np.nan
-    raw, covariance, covariance_relative, bite = _measured(raw, records, nuisances, extrinsics, config, rest)
+    correlation = take_correlation_px(records, config)
+    raw, covariance, covariance_relative, bite = _measured(raw, records, nuisances, extrinsics, correlation, rest)
     known = status != LOST
     middle = np.median(centres[known.all(1)] if known.all(1).any() else centres, axis=(0, 1))
     final = np.stack([smooth_poses(frames, raw[:, r], covariance[:, r], middle) for r in ARCHES], axis=1)
     raw_relative, relative = _relative(raw), _relative(final)
     meta: TracksMeta = {
         "tracking": asdict(config),
-        "correlation_px": take_correlation_px(records, config),
+        "correlation_px": correlation,
         "delays_frames": dict(zip(camera_names, nuisances.delays.tolist(), strict=True)),
         "delays_sigma_frames": dict(zip(camera_names, nuisances.sigma_delays.tolist(), strict=True)),
         **_habits_report(nuisances, camera_names),
@@ -128,15 +129,16 @@ def _measured(
     records: Mapping[int, FrameRecord],
     nuisances: Nuisances,
     extrinsics: Extrinsics,
-    config: TrackingConfig,
+    correlation: float,
     rest: RestFrames,
 ) -> tuple[Array, Array, Array, ClosedBite | None]:
     """Return the poses (F, 2, 4, 4), their covariances (F, 2, 6, 6), that of the relative pose (F, 6, 6), the bite.
 
-    `raw` are the poses as aligned, NaN where lost.
+    `raw` are the poses as aligned, NaN where lost, `correlation` the length over which outline errors move together
+    [px].
     """
     frames = np.array(sorted(records), np.int64)
-    outline, habits = _covariances(records, take_correlation_px(records, config), nuisances, extrinsics)
+    outline, habits = _covariances(records, correlation, nuisances, extrinsics)
     bite = closed_bite(frames, raw, outline, habits, rest)
     covariance, steady = outline + habits, steady_part(outline, habits)
     del outline, habits  # of long takes, as large as all tracks
@@ -182,8 +184,9 @@ def outline_variance(records: Mapping[int, FrameRecord], config: TrackingConfig)
     """Return the variance times correlation length of the outline errors per arch [px^3], shape (2,)."""
     residual = _of_tracked(records, residual_px)
     typical = np.full(2, config.typical_noise_px3)
+    correlation = take_correlation_px(records, config)
     for r in np.flatnonzero(np.isfinite(residual).any(0)):
-        typical[r] = np.nanmedian(residual[:, r]) ** 2 * take_correlation_px(records, config)
+        typical[r] = np.nanmedian(residual[:, r]) ** 2 * correlation
     return typical
 
 

@@ -130,8 +130,10 @@ class _Take(Passes):
         """
         c = self._config
         extrinsics = Extrinsics.calibrated(self._masks.cameras, self._middle())
-        known = self._late_cameras(extrinsics, rest)
         equations = self._equations(extrinsics, rest)
+        known = self._late_cameras(equations, extrinsics, rest)
+        if known is not None:
+            equations = self._equations(extrinsics, rest)
         found = equations.solve(c, True)
         cameras_moved = may_move and found.cameras_moved(c) and c.refine_rounds > 0
         if not cameras_moved:
@@ -152,13 +154,13 @@ class _Take(Passes):
             pending = late or (rounds < c.refine_rounds and residual.matters(c))
         return found, extrinsics
 
-    def _late_cameras(self, extrinsics: Extrinsics, rest: RestFrames) -> Nuisances | None:
+    def _late_cameras(self, equations: TakeEquations, extrinsics: Extrinsics, rest: RestFrames) -> Nuisances | None:
         """Correct delays near a frame before anything else; None without any.
 
         So late a camera also looks moved, and its masks look wrong where the jaw is fast.
         """
         c = self._config
-        found = self._equations(extrinsics, rest).solve(c, False)
+        found = equations.solve(c, False)
         if np.abs(found.delays).max() < c.late_frames or not c.refine_rounds:
             return None
         found, _ = self._settle(found, extrinsics, rest, False)
