@@ -48,11 +48,10 @@ def shown_at(pose):
 
 def moved(sideways_mm=0.0, roll_rad=0.0, turn_rad=0.0):
     """Return POSE moved across the picture, rolled about the line of sight and turned about the vertical."""
-    line = CAMERA.T_cam_world[:3, :3][2]
-    about = POSE @ make_transform(np.eye(3), SCANS[0].centre)
-    step = make_transform(se3_exp(np.r_[roll_rad * line + turn_rad * CAMERA.T_cam_world[:3, :3][1], 0, 0, 0])[:3, :3], np.zeros(3))
-    place = about[:3, 3]
-    back, forth = make_transform(np.eye(3), -place), make_transform(np.eye(3), place + sideways_mm * CAMERA.T_cam_world[:3, :3][0])
+    across, down, line = CAMERA.T_cam_world[:3, :3]
+    place = transform_point(POSE, SCANS[0].centre)
+    step = se3_exp(np.r_[roll_rad * line + turn_rad * down, 0, 0, 0])
+    back, forth = make_transform(np.eye(3), -place), make_transform(np.eye(3), place + sideways_mm * across)
     return forth @ step @ back @ POSE
 
 

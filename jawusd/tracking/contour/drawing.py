@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-import cv2
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.geometry.arrays import Array
+from jawusd.imaging.warp import warp_nearest
 from jawusd.tracking.contour.samples import COLUMNS, INVERSE_DEPTH, NX, NY, U, V, X, Y, Z
 from jawusd.tracking.contour.scan import Scan
 
@@ -74,7 +74,9 @@ class Drawing:
 
     def to_drawn(self, matrix: Array) -> Array:
         """Return the affine map from pixels at another pose to those of the drawing, shape (2, 3)."""
-        return np.asarray(cv2.invertAffineTransform((self._least_squares @ _pixels(matrix, self._probes)).T))
+        *linear, shift = self._least_squares @ _pixels(matrix, self._probes)
+        back = np.linalg.inv(np.transpose(linear))
+        return np.column_stack([back, -back @ shift])
 
     def show(self, matrix: Array, labels: NDArray[np.uint8], inverse_depth: NDArray[np.float32]) -> float:
         """Write the pictures at a pose that the drawing shows; return by how much the scan has turned in them [rad].
@@ -88,9 +90,8 @@ class Drawing:
             labels[:], inverse_depth[:] = self._labels[window], self._inverse_depth[window]
             return 0.0
         to_drawn = self.to_drawn(matrix)
-        size, flags = labels.shape[::-1], cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
-        cv2.warpAffine(self._labels, to_drawn, size, labels, flags)
-        cv2.warpAffine(self._inverse_depth, to_drawn, size, inverse_depth, flags)
+        warp_nearest(self._labels, to_drawn, labels)
+        warp_nearest(self._inverse_depth, to_drawn, inverse_depth)
         centre = np.append(self._scan.centre, 1.0)
         inverse_depth *= np.float32((self._matrix[2] @ centre) / (matrix[2] @ centre))
         return float(np.arctan2(to_drawn[0, 1] - to_drawn[1, 0], to_drawn[0, 0] + to_drawn[1, 1]))
