@@ -127,9 +127,21 @@ def names_without(text):
     return [n.attr for n in used if n.value.id in alias and not hasattr(alias[n.value.id], n.attr)]
 
 
-@pytest.mark.parametrize("block", [block for block in of("python") if block.parsed], ids=str)
+PARSED = [block for block in of("python") if block.parsed]
+IN_PROGRAMS = [block for block in PARSED if "jawusd_reader" in block.text]
+
+
+@pytest.mark.parametrize("block", [block for block in PARSED if block not in IN_PROGRAMS], ids=str)
+def test_blocks_for_clusters_run_commands_that_there_are(block):
+    lists = [node.elts for node in ast.walk(ast.parse(block.text)) if isinstance(node, ast.List)]
+    words = [[getattr(element, "value", "PLACE") for element in elements] for elements in lists]
+    commands = [" ".join(map(str, line)) for line in words if line[:1] == ["jawusd"]]
+    assert commands and [fault for fault in map(unknown, commands) if fault] == []
+    assert unknown(commands[0].replace("build-many", "build-all"))
+
+
+@pytest.mark.parametrize("block", IN_PROGRAMS, ids=str)
 def test_blocks_for_other_programs_use_what_there_is(block, monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT / "jawusd" / "plugins"))
-    assert "jawusd_reader" in block.text
     assert names_without(block.text) == []
     assert names_without(block.text + "\nrecipes.maya_bakes(rig)\n") == ["maya_bakes"]

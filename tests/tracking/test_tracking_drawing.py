@@ -119,7 +119,7 @@ def test_drawings_of_cameras_long_gone_are_forgotten():
     drawings = Drawings(SCANS, PARALLAX_PX)
     for k in range(70):
         camera = CAMERA.centre_world() + [1e-3 * k, 0, 0]
-        drawings.of(0, camera, POSE, seen(POSE)[0], (8, 8))
+        drawings.of(0, 0, camera, POSE, seen(POSE)[0], (8, 8))
     assert len(drawings._kept) == 70
     drawings.forget_old()
     assert not drawings._kept

@@ -124,19 +124,24 @@ class Drawings:
     def __init__(self, scans: Sequence[Scan], parallax_px: float) -> None:
         """Keep nothing yet; `parallax_px` as `Drawing.shows` takes it."""
         self._scans, self._parallax_px = scans, parallax_px
-        self._kept: dict[tuple[int, bytes], Drawing] = {}
+        self._kept: dict[tuple[int, int, bytes], Drawing] = {}
 
-    def of(self, arch: int, camera: Array, T_world_scan: Array, matrix: Array, shape: tuple[int, int]) -> Drawing:
+    def of(
+        self, arch: int, view: int, camera: Array, T_world_scan: Array, matrix: Array, shape: tuple[int, int]
+    ) -> Drawing:
         """Return a drawing that shows an arch in a pose.
 
+        Safe to call from several threads for different arches or views.
+
         Args:
+            view: number of the view, of those of its instant.
             camera: camera centre in the world [mm], shape (3,).
             T_world_scan: the pose, shape (4, 4).
             matrix: projection from scan coordinates [mm] to homogeneous px of the window, shape (3, 4).
             shape: of the window (h, w).
         """
         eye = T_world_scan[:3, :3].T @ (camera - T_world_scan[:3, 3])
-        key = (arch, camera.tobytes())
+        key = (arch, view, camera.tobytes())
         kept = self._kept.get(key)
         if kept is None or not kept.shows(matrix, eye, shape, self._parallax_px):
             kept = self._kept[key] = Drawing(self._scans[arch], matrix, eye, shape)

@@ -71,7 +71,7 @@ class Rendering:
         view, labels, depth = self._views[c], self.labels[c][r], self.depths[c][r]
         T_world_scan = view.T_delay[r] @ pose
         matrix = view.matrix @ T_world_scan
-        drawing = self._solver.drawings.of(r, view.eye, T_world_scan, matrix, labels.shape)
+        drawing = self._solver.drawings.of(r, c, view.eye, T_world_scan, matrix, labels.shape)
         self._shown[r, c] = (pose.copy(), drawing, drawing.show(matrix, labels, depth))
 
 
