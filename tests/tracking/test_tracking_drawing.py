@@ -46,13 +46,13 @@ def shown_at(pose):
     return labels, depth, turned
 
 
-def moved(sideways_mm=0.0, roll_rad=0.0, turn_rad=0.0):
-    """Return POSE moved across the picture, rolled about the line of sight and turned about the vertical."""
+def moved(sideways_mm=0.0, roll_rad=0.0, turn_rad=0.0, away_mm=0.0):
+    """Return POSE moved across the picture and away, rolled about the line of sight, turned about the vertical."""
     across, down, line = CAMERA.T_cam_world[:3, :3]
     place = transform_point(POSE, SCANS[0].centre)
     step = se3_exp(np.r_[roll_rad * line + turn_rad * down, 0, 0, 0])
-    back, forth = make_transform(np.eye(3), -place), make_transform(np.eye(3), place + sideways_mm * across)
-    return forth @ step @ back @ POSE
+    there = place + sideways_mm * across + away_mm * line
+    return make_transform(np.eye(3), there) @ step @ make_transform(np.eye(3), -place) @ POSE
 
 
 def test_at_its_own_pose_a_drawing_is_shown_as_drawn():
@@ -64,7 +64,13 @@ def test_at_its_own_pose_a_drawing_is_shown_as_drawn():
 
 
 @pytest.mark.parametrize(
-    "pose", [moved(sideways_mm=4.0), moved(roll_rad=0.1), moved(sideways_mm=-3.0, roll_rad=-0.05, turn_rad=0.01)]
+    "pose",
+    [
+        moved(sideways_mm=4.0),
+        moved(roll_rad=0.1),
+        moved(sideways_mm=4.0, away_mm=3.0),
+        moved(sideways_mm=-3.0, roll_rad=-0.05, turn_rad=0.01),
+    ],
 )
 def test_a_warped_drawing_is_as_one_drawn_there(pose):
     labels, depth, turned = shown_at(pose)
@@ -95,11 +101,17 @@ def test_what_another_look_shows_is_drawn_anew():
 
     assert shows(POSE) and shows(moved(sideways_mm=1.0, roll_rad=0.02))
     assert not shows(moved(turn_rad=0.1))  # other sides are seen
-    nearer = moved()
-    nearer[:3, 3] -= 0.1 * (nearer[:3, 3] - CAMERA.centre_world())
-    assert not shows(nearer)
+    assert shows(moved(away_mm=-3.0)) and not shows(moved(away_mm=-20.0))
     assert not shows(moved(sideways_mm=60.0))  # parts of the window were not drawn
     assert not shows(POSE, (SHAPE[0] + 100, SHAPE[1]))
+
+
+def test_contours_end_at_the_window():
+    drawing, solver = Drawing(SCANS[0], *seen(POSE), SHAPE), ContourSolver(SCANS, TrackingConfig())
+    whole, _ = drawing.contour(solver, 0, seen(POSE)[0], SHAPE, 0.0)
+    middle = int(np.median(whole[:, U]))
+    part, count = drawing.contour(solver, 0, seen(POSE)[0], (SHAPE[0], middle), 0.0)
+    assert 0 < count < len(part) < len(whole) and part[:, U].max() < middle - 1
 
 
 def test_pictures_of_one_instant_serve_the_next():
