@@ -150,7 +150,11 @@ class Drawings:
     def forget_old(self) -> None:
         """Let go of all if there are too many."""
         if len(self._kept) > _MOST_KEPT:
-            self._kept.clear()
+            self.forget()
+
+    def forget(self) -> None:
+        """Let go of all."""
+        self._kept.clear()
 
 
 @numba.njit(nogil=True, cache=True)

@@ -71,6 +71,13 @@ class ContourSolver:
         scans = [thinned(replace(scan.thin or scan, thin=None), _ROUGH_FACES) for scan in self.scans]
         return ContourSolver(scans, self.config, self._executor)
 
+    def forget_drawings(self) -> None:
+        """Draw all scans anew the next time: poses then depend on nothing that was aligned before."""
+        self.drawings.forget()
+        for solver in (self.thin, self.__dict__.get("rough")):  # asking for it would make it
+            if solver is not None:
+                solver.forget_drawings()
+
     def solve(
         self,
         poses: Array,

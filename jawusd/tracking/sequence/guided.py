@@ -110,6 +110,7 @@ class GuidedTracker:
             history.add_summary(before)
         tracker = FrameTracker(self._solver, self._config, history)
         for frame in frames:
+            self._solver.forget_drawings()  # work that is taken up here gives what work never stopped gives
             start = guide[frame]
             record = tracker.track([start], self._see(frame, start, 0), None)
             for turn in range(1, self._rounds):
@@ -122,6 +123,7 @@ class GuidedTracker:
 
     def judge(self, frame: int, poses: Array, status: NDArray[np.int8]) -> FrameRecord:
         """Return the record of a frame whose poses, shape (2, 4, 4), and status, shape (2,), are known already."""
+        self._solver.forget_drawings()
         views = self._see(frame, poses, self._rounds - 1)
         use = present_masks(views)
         solution = self._solver.solve(poses, views, (), use)
