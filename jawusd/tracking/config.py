@@ -55,8 +55,9 @@ class TrackingConfig:
     # Motion after which pictures and contour of a scan are made again [px]: hidden parts are judged to so much.
     redraw_px: float = 1.0
     # Motion of near against far parts of a scan in a picture from which on it is drawn anew [px]; until then, pictures
-    # of it are warped. 2 to 8 px leave the errors of 200 frames as they are (0.038 and 0.045 mm), 4 px halve drawing.
-    parallax_px: float = 4.0
+    # of it are warped. Up to 8 px leave the errors of 200 frames as they are (0.038 and 0.045 mm), but at 4 px knocked
+    # cameras were corrected 7 sigma off (`tests/tracking/test_tracking_nuisance.py`), at 2 px as at 0, by 1 at most.
+    parallax_px: float = 2.0
     # Plausible distance of an arch from its prediction [mm]: a weak pull, for motions that masks leave free.
     prediction_mm: float = 0.5
     # Outline variance times correlation length behind that pull [px^3]: 0.4 px over 18 px, typical masks by hand.
