@@ -46,7 +46,7 @@ class Drawing:
         scan.draw(self._matrix, self._inverse_depth, self._labels)
         self._contours: dict[ContourSolver, _Kept] = {}
         self._probes = scan.probes[:: max(1, len(scan.probes) // 24)]
-        drawn_at = np.column_stack([_pixels(self._matrix, self._probes), np.ones(len(self._probes))])
+        drawn_at = np.column_stack([projected(self._matrix, self._probes), np.ones(len(self._probes))])
         self._least_squares = np.linalg.pinv(drawn_at)  # of affine maps from here, shape (3, n)
 
     def shows(self, matrix: Array, eye: Array, shape: tuple[int, int], parallax_px: float) -> bool:
@@ -74,7 +74,7 @@ class Drawing:
 
     def to_drawn(self, matrix: Array) -> Array:
         """Return the affine map from pixels at another pose to those of the drawing, shape (2, 3)."""
-        *linear, shift = self._least_squares @ _pixels(matrix, self._probes)
+        *linear, shift = self._least_squares @ projected(matrix, self._probes)
         back = np.linalg.inv(np.transpose(linear))
         return np.column_stack([back, -back @ shift])
 
@@ -195,6 +195,7 @@ def _px_per_mm(matrix: Array, point: Array) -> float:
     return float(np.linalg.norm(across) / (matrix[2, :3] @ point + matrix[2, 3]))
 
 
-def _pixels(matrix: Array, points: Array) -> Array:
+def projected(matrix: Array, points: Array) -> Array:
+    """Return where a projection (3, 4) shows points (n, 3) [px], shape (n, 2)."""
     h = points @ matrix[:, :3].T + matrix[:, 3]
     return np.asarray(h[:, :2] / h[:, 2:])

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jawusd.geometry.arrays import Array
-from jawusd.tracking.contour.drawing import Drawing
+from jawusd.tracking.contour.drawing import Drawing, projected
 from jawusd.tracking.contour.scan import ARCHES
 from jawusd.tracking.contour.views import View
 
@@ -64,7 +64,7 @@ class Rendering:
             return True
         scan, matrix = self._solver.scans[r], self._views[c].matrix
         corners = scan.centre + scan.radius_mm * _CORNERS
-        change = _pixels(matrix @ pose, corners) - _pixels(matrix @ shown[0], corners)
+        change = projected(matrix @ pose, corners) - projected(matrix @ shown[0], corners)
         return float(np.abs(change).max()) > self._solver.config.redraw_px
 
     def _show(self, r: int, c: int, pose: Array) -> None:
@@ -73,8 +73,3 @@ class Rendering:
         matrix = view.matrix @ T_world_scan
         drawing = self._solver.drawings.of(r, c, view.eye, T_world_scan, matrix, labels.shape)
         self._shown[r, c] = (pose.copy(), drawing, drawing.show(matrix, labels, depth))
-
-
-def _pixels(matrix: Array, points: Array) -> Array:
-    h = points @ matrix[:, :3].T + matrix[:, 3]
-    return h[:, :2] / h[:, 2:]
