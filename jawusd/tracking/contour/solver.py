@@ -71,6 +71,13 @@ class ContourSolver:
         scans = [thinned(replace(scan.thin or scan, thin=None), _ROUGH_FACES) for scan in self.scans]
         return ContourSolver(scans, self.config, self._executor)
 
+    def exact(self) -> ContourSolver:
+        """Return a solver of the same scans that draws them at every pose.
+
+        Searches need it: they rank poses by what they leave uncovered, in small pictures, and in any order.
+        """
+        return ContourSolver(self.scans, replace(self.config, parallax_px=0.0), self._executor)
+
     def forget_drawings(self) -> None:
         """Draw all scans anew the next time: poses then depend on nothing that was aligned before."""
         self.drawings.forget()

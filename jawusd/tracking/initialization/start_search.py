@@ -78,11 +78,12 @@ class StartSearch:
             T_anatomical_scan: scan frame to (left, up, front) axes, shape (4, 4).
             map_: runs parts of the search.
         """
-        self.solver, self._config, self._map = solver, solver.config, map_
+        self.solver, self._map = solver.exact(), map_
+        self._config = self.solver.config
         self._meshes, self._T_anatomical_scan = meshes, T_anatomical_scan
         self._coarse = tuple(coarse_scan(m, n) for m, n in zip(meshes, ARCH_NAMES, strict=True))
         self._hinges = [hinge_at_front(s.crown_vertices(), T_anatomical_scan) for s in self._coarse]
-        self._coarse_solver = ContourSolver(self._coarse, solver.config)
+        self._coarse_solver = ContourSolver(self._coarse, self._config)
         self._jaws = _opened(self._coarse[1].crown_vertices(), T_anatomical_scan)
 
     def mirrored(self) -> StartSearch:

@@ -77,6 +77,7 @@ class SingleStart:
             T_anatomical_scan: scan frame to (left, up, front) axes, shape (4, 4).
             map_: runs orientations.
         """
+        solver = solver.exact()
         self._jaw, self._map, self._config = jaw, map_, solver.config
         self._coarse = tuple(coarse_scan(mesh, name) for mesh, name in zip(meshes, ARCH_NAMES, strict=True))
         self._hinge = hinge_at_front(self._coarse[0].crown_vertices(), T_anatomical_scan)
