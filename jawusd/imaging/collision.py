@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -19,28 +20,25 @@ FARTHEST_MM = 1.5
 
 _STEP_MM = 0.25
 _SAMPLE_MM = 0.5  # samples of a face lie no farther apart
-_CLUSTER_MM = 1.2
+_BOXES_MM = (4.8, 2.4, 1.2, 0.6)  # edges, each in the one before
 _PARTS = 16  # of many poses, for threads
-_GROUP_CELLS = 4  # clusters are grouped by so many cells per axis
 
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Points of a surface in clusters, so that clusters that are far away are passed over at once.
+    """Points of a surface in a tree of boxes, so that those far away are passed over at once.
 
     Attributes:
-        points: in order of their clusters [mm], shape (P, 3).
-        start: first point of every cluster, and the number of points at the end, shape (C + 1,).
-        balls: centres of the clusters and distances of their farthest points [mm], shape (C, 4).
-        group_start: first cluster of every group, and the number of clusters at the end, shape (G + 1,).
-        groups: centres and radii of the groups [mm], shape (G, 4).
+        points: in order of the smallest boxes [mm], shape (P, 3).
+        balls: centres of what boxes hold and distances of its farthest points [mm], shape (B, 4); every box is followed
+            by those within it.
+        nodes: of every box, its first and last point, where it holds no smaller boxes, else 0 and 0; and the next box
+            that is not within it, shape (B, 3).
     """
 
     points: Array
-    start: NDArray[np.int64]
     balls: Array
-    group_start: NDArray[np.int64]
-    groups: Array
+    nodes: NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,11 +74,13 @@ class Pair:
         there = np.ascontiguousarray(T_upper_lower)
         back = np.ascontiguousarray(se3_inverse(there))
         found = np.full(len(there), least)
+        met = (self.upper.grid, self.lower.samples), (self.lower.grid, self.upper.samples)
+        sides = [(_field(grid), own.points, own.balls, own.nodes) for grid, own in met]
 
         def deepen(first: int) -> None:
             part = slice(first, first + size)
-            _deepen(found[part], there[part], enough, *_flat(self.upper.grid, self.lower.samples))
-            _deepen(found[part], back[part], enough, *_flat(self.lower.grid, self.upper.samples))
+            _deepen(found[part], there[part], enough, *sides[0])
+            _deepen(found[part], back[part], enough, *sides[1])
 
         size = max(1, -(-len(found) // _PARTS))
         with ThreadPoolExecutor(os.cpu_count()) as pool:
@@ -91,7 +91,7 @@ class Pair:
 def distances(grid: DistanceGrid, points: Array) -> Array:
     """Return the signed distances at points (n, 3) [mm], shape (n,); outside the grid at least `FARTHEST_MM`."""
     found = np.empty(len(points))
-    _look_up_all(found, np.ascontiguousarray(points), grid.values, grid.origin, 1.0 / grid.step_mm)
+    _look_up_all(found, np.ascontiguousarray(points), _field(grid))
     return found
 
 
@@ -116,7 +116,7 @@ def solid(corners: Array, up: float, box: Array) -> Solid:
     outer, entering = outer_faces(corners, up)
     grid = distance_grid(corners, outer, box, _STEP_MM, up)
     near = ((corners <= box[1]) & (corners >= box[0])).all(axis=2).any(axis=1)
-    return Solid(grid, clustered(surface_points(corners[outer & near], _SAMPLE_MM)), entering)
+    return Solid(grid, in_boxes(surface_points(corners[outer & near], _SAMPLE_MM)), entering)
 
 
 def surface_points(corners: Array, apart_mm: float) -> Array:
@@ -131,15 +131,19 @@ def surface_points(corners: Array, apart_mm: float) -> Array:
     return np.unique(np.round(np.concatenate(found), 6), axis=0)
 
 
-def clustered(points: Array) -> Samples:
-    """Return points (P, 3) [mm] in clusters, and these in groups."""
-    cell = np.floor(points / _CLUSTER_MM).astype(np.int64)
-    group = cell // _GROUP_CELLS
-    order = np.lexsort((*cell.T, *group.T))
-    points, keys = np.ascontiguousarray(points[order]), np.concatenate([group, cell], axis=1)[order]
-    starts = [_firsts(keys), _firsts(keys[:, :3])]
-    balls, groups = (_balls(points, start) for start in starts)
-    return Samples(points, starts[0], balls, np.searchsorted(starts[0], starts[1]), groups)
+def in_boxes(points: Array) -> Samples:
+    """Return points (P, 3) [mm] in a tree of boxes."""
+    cells = [np.floor(points / edge).astype(np.int64) for edge in _BOXES_MM]
+    order = np.lexsort([column for cell in reversed(cells) for column in cell.T])
+    points = np.ascontiguousarray(points[order])
+    starts = [_firsts(np.concatenate(cells[: size + 1], axis=1)[order]) for size in range(len(cells))]
+    balls = np.concatenate([_balls(points, start) for start in starts])
+    first, end = (np.concatenate([start[part] for start in starts]) for part in (slice(-1), slice(1, None)))
+    size = np.repeat(np.arange(len(starts)), [len(start) - 1 for start in starts])
+    order = np.lexsort([size, first])
+    first, end, smallest = first[order], end[order], size[order] == len(starts) - 1
+    nodes = np.column_stack([first * smallest, end * smallest, np.searchsorted(first, end)])
+    return Samples(points, np.ascontiguousarray(balls[order]), nodes)
 
 
 def _firsts(keys: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -159,48 +163,59 @@ def _balls(points: Array, start: NDArray[np.int64]) -> Array:
     return np.column_stack([centres, np.maximum.reduceat(away, start[:-1])])
 
 
-# what compiled functions take of a grid and of the samples of the other arch
-_Flat = tuple[NDArray[np.float32], Array, float, Array, NDArray[np.int64], Array, NDArray[np.int64], Array]
+class _Field(NamedTuple):
+    """A distance grid as compiled functions take it: its values in a row, how many along each axis, origin, 1/step."""
+
+    values: NDArray[np.float32]
+    nx: int
+    ny: int
+    nz: int
+    x: float
+    y: float
+    z: float
+    per_mm: float
 
 
-def _flat(grid: DistanceGrid, samples: Samples) -> _Flat:
-    parts = (samples.points, samples.start, samples.balls, samples.group_start, samples.groups)
-    return (grid.values, grid.origin, 1.0 / grid.step_mm, *parts)
+def _field(grid: DistanceGrid) -> _Field:
+    (nx, ny, nz), (x, y, z) = grid.values.shape, grid.origin.tolist()
+    return _Field(grid.values.ravel(), nx, ny, nz, x, y, z, 1.0 / grid.step_mm)
 
 
-@numba.njit(nogil=True, cache=True)
-def _look_up(values: NDArray[np.float32], origin: Array, per_mm: float, x: float, y: float, z: float) -> float:
+@numba.njit(nogil=True, cache=True, inline="always")
+def _look_up(field: _Field, x: float, y: float, z: float) -> float:
     """Return the distance at a point, linear between values; outside the grid at least FARTHEST_MM."""
-    fx, fy, fz = (x - origin[0]) * per_mm, (y - origin[1]) * per_mm, (z - origin[2]) * per_mm
-    nx, ny, nz = values.shape
+    fx, fy, fz = (x - field.x) * field.per_mm, (y - field.y) * field.per_mm, (z - field.z) * field.per_mm
+    nx, ny, nz = field.nx, field.ny, field.nz
     if not (0 <= fx < nx - 1 and 0 <= fy < ny - 1 and 0 <= fz < nz - 1):
         outside = max(-fx, fx - nx + 1, -fy, fy - ny + 1, -fz, fz - nz + 1, 0.0)
-        return FARTHEST_MM + outside / per_mm
+        return FARTHEST_MM + outside / field.per_mm
     i, j, k = int(fx), int(fy), int(fz)
     a, b, c = fx - i, fy - j, fz - k
-    low = (values[i, j, k] * (1 - c) + values[i, j, k + 1] * c) * (1 - b) + (
-        values[i, j + 1, k] * (1 - c) + values[i, j + 1, k + 1] * c
+    values = field.values
+    # unsigned: others are taken for numbers from the end if negative, which costs a third of the time
+    one, row, layer = np.uint64(1), np.uint64(nz), np.uint64(ny * nz)
+    at = np.uint64((i * ny + j) * nz + k)
+    low = (values[at] * (1 - c) + values[at + one] * c) * (1 - b) + (
+        values[at + row] * (1 - c) + values[at + row + one] * c
     ) * b
-    high = (values[i + 1, j, k] * (1 - c) + values[i + 1, j, k + 1] * c) * (1 - b) + (
-        values[i + 1, j + 1, k] * (1 - c) + values[i + 1, j + 1, k + 1] * c
+    at += layer
+    high = (values[at] * (1 - c) + values[at + one] * c) * (1 - b) + (
+        values[at + row] * (1 - c) + values[at + row + one] * c
     ) * b
     return low * (1 - a) + high * a
 
 
 @numba.njit(nogil=True, cache=True)
-def _look_up_all(found: Array, points: Array, values: NDArray[np.float32], origin: Array, per_mm: float) -> None:
+def _look_up_all(found: Array, points: Array, field: _Field) -> None:
     for i in range(len(points)):
-        found[i] = _look_up(values, origin, per_mm, points[i, 0], points[i, 1], points[i, 2])
+        found[i] = _look_up(field, points[i, 0], points[i, 1], points[i, 2])
 
 
-@numba.njit(nogil=True, cache=True)
-def _away(M: Array, point: Array, values: NDArray[np.float32], origin: Array, per_mm: float) -> float:
+@numba.njit(nogil=True, cache=True, inline="always")
+def _away(field: _Field, M: Array, x: float, y: float, z: float) -> float:
     """Return the distance at the image of a point under M."""
-    x, y, z = point[0], point[1], point[2]
     return _look_up(
-        values,
-        origin,
-        per_mm,
+        field,
         M[0, 0] * x + M[0, 1] * y + M[0, 2] * z + M[0, 3],
         M[1, 0] * x + M[1, 1] * y + M[1, 2] * z + M[1, 3],
         M[2, 0] * x + M[2, 1] * y + M[2, 2] * z + M[2, 3],
@@ -208,37 +223,30 @@ def _away(M: Array, point: Array, values: NDArray[np.float32], origin: Array, pe
 
 
 @numba.njit(nogil=True, cache=True)
+def _deepest_of(field: _Field, M: Array, points: Array, first: int, end: int, best: float) -> float:
+    """Return how deep the deepest of some points is under M, or `best` if none is deeper."""
+    for p in range(first, end):
+        best = max(best, -_away(field, M, points[p, 0], points[p, 1], points[p, 2]))
+    return best
+
+
+@numba.njit(nogil=True, cache=True)
 def _deepen(
-    depth: Array,
-    T: Array,
-    enough: float,
-    values: NDArray[np.float32],
-    origin: Array,
-    per_mm: float,
-    points: Array,
-    start: NDArray[np.int64],
-    balls: Array,
-    group_start: NDArray[np.int64],
-    groups: Array,
+    depth: Array, T: Array, enough: float, field: _Field, points: Array, balls: Array, nodes: NDArray[np.int64]
 ) -> None:
     """Raise each depth to that of the deepest of the points under T[i], or to any that is more than enough."""
     last = 0
-    for i in range(len(T)):
-        best, M = depth[i], T[i]
-        # the group that was deepest in the pose before comes first: it leaves most others behind
-        for turn in range(len(groups) + 1):
-            if best > enough:
-                break
-            g = last if turn == 0 else turn - 1
-            if groups[g, 3] - _away(M, groups[g], values, origin, per_mm) <= best:
+    for i in range(len(T) if len(nodes) else 0):
+        M = T[i]
+        # what was deepest in the pose before comes first: it leaves most others behind
+        best = _deepest_of(field, M, points, nodes[last, 0], nodes[last, 1], depth[i])
+        n = 0
+        while n < len(nodes) and best <= enough:
+            if balls[n, 3] - _away(field, M, balls[n, 0], balls[n, 1], balls[n, 2]) <= best:
+                n = nodes[n, 2]
                 continue
-            for c in range(group_start[g], group_start[g + 1]):
-                if best > enough:
-                    break
-                if balls[c, 3] - _away(M, balls[c], values, origin, per_mm) <= best:
-                    continue
-                for p in range(start[c], start[c + 1]):
-                    away = _away(M, points[p], values, origin, per_mm)
-                    if -away > best:
-                        best, last = -away, g
+            deeper = _deepest_of(field, M, points, nodes[n, 0], nodes[n, 1], best)
+            if deeper > best:
+                best, last = deeper, n
+            n += 1
         depth[i] = best

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from jawusd.imaging.collision import FARTHEST_MM, Pair, solid, tips_box
+from jawusd.geometry import se3_inverse, so3_exp, transform_points
+from jawusd.imaging.collision import FARTHEST_MM, Pair, distances, solid, tips_box
 from jawusd.imaging.solid import outer_faces
 
 RADIUS = 6.0
@@ -34,6 +35,25 @@ def test_depth_of_two_balls_is_their_overlap():
     apart = rng.uniform(2 * RADIUS - 3.0, 2 * RADIUS + 1.0, 60)
     depth = pair.depth(np.array([shifted(a * n) for a, n in zip(apart, directions)]))
     np.testing.assert_allclose(depth, 2 * RADIUS - apart, atol=0.06)
+
+
+def test_no_point_is_passed_over():
+    """Against all points of both surfaces, of rough balls, one pose after the other as unlike as can be."""
+    rng = np.random.default_rng(4)
+    rough = [ball() * (1.0 + 0.04 * np.sin(5.0 * ball() + phase)) for phase in (0.0, 2.0)]
+    pair = Pair(whole(rough[0], 1.0), whole(rough[1], -1.0))
+    poses = np.array([shifted(v) for v in rng.normal(0.0, 6.0, (40, 3))])
+    poses[:, :3, :3] = [so3_exp(w) for w in rng.normal(0.0, 1.0, (40, 3))]
+    every = [
+        max(
+            -distances(pair.upper.grid, transform_points(T, pair.lower.samples.points)).min(),
+            -distances(pair.lower.grid, transform_points(se3_inverse(T), pair.upper.samples.points)).min(),
+            -FARTHEST_MM,
+        )
+        for T in poses
+    ]
+    np.testing.assert_allclose(pair.depth(poses), every, atol=1e-12)
+    assert np.ptp(every) > 5.0
 
 
 @pytest.mark.parametrize("limit_mm", [-2.0, -0.4, 0.0, 0.7])
