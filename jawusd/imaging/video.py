@@ -186,7 +186,7 @@ class Video(Clip):
             try:
                 if first > 0:
                     self._seek(container, stream, first)
-                for frame in self._decoded(container, stream, alpha):
+                for frame in self._decoded(container, stream, alpha, int(self._pts[first])):
                     if wanted == last:
                         return
                     if frame.pts is None or frame.pts < self._pts[wanted]:
@@ -214,10 +214,14 @@ class Video(Clip):
                 return
 
     def _decoded(
-        self, container: av.container.InputContainer, stream: av.VideoStream, alpha: bool
+        self, container: av.container.InputContainer, stream: av.VideoStream, alpha: bool, first: int
     ) -> Iterator[av.VideoFrame]:
+        """Yield what is decoded from here on; pictures before a time stamp only if others are made from them."""
         if not (alpha and self._alpha_decoder):
-            yield from container.decode(stream)
+            for packet in container.demux(stream):
+                early = packet.pts is not None and packet.pts < first
+                stream.codec_context.skip_frame = "NONREF" if early else "DEFAULT"
+                yield from packet.decode()
             return
         decoder = av.CodecContext.create(self._alpha_decoder, "r")
         for packet in container.demux(stream):
