@@ -12,8 +12,14 @@ from package_copy import ROOT
 EXAMPLE = ROOT / "examples" / "capture"
 
 
-def write_short(folder: Path, frames: int) -> Path:
-    """Write a capture of the example's first frames, its files linked, and return its folder."""
+def write_short(folder: Path, frames: int, without: tuple[str, ...] = ()) -> Path:
+    """Write a capture of the example's first frames, its files linked, and return its folder.
+
+    Args:
+        folder: where to.
+        frames: how many; a model needs 15.
+        without: scans left out, such as "skull".
+    """
     for name in ("scans", "masks"):
         for source in sorted((EXAMPLE / name).rglob("*")):
             target = folder / source.relative_to(EXAMPLE)
@@ -24,6 +30,8 @@ def write_short(folder: Path, frames: int) -> Path:
     text = (EXAMPLE / "capture.toml").read_text()
     text = re.sub(r"frames = \[20, \d+\]", f"frames = [20, {20 + frames}]", text)
     text = re.sub(r'(?m)^video = .*\n|^\[boards\]\n(?:\w+ = .*\n)+|^method = "flash"\n', "", text)
+    for name in without:
+        text = re.sub(rf'(?m)^{name} = "scans/.*\n', "", text)
     with np.load(EXAMPLE / "truth" / "truth.npz") as truth:
         offsets = zip(truth["camera_names"].tolist(), truth["offsets"].tolist(), strict=True)
         given = ", ".join(f"{name} = {offset}" for name, offset in offsets)
