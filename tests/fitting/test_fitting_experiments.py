@@ -7,13 +7,13 @@ import pytest
 import shapely
 import trimesh
 
-from jawusd.fitting import FittingConfig, nlpca_training
+from jawusd.fitting import FittingConfig, nlpca_training, synthesis
 from jawusd.fitting.condyle_paths import condyle_paths, path_distances, principal_opening, sagittal_section
 from jawusd.fitting.coverage import PARAMETERS
 from jawusd.fitting.data import SubjectAnatomy, select_poses
 from jawusd.fitting.experiments import MODELS, run_experiments
 from jawusd.fitting.nlpca_training import train_nlpca
-from jawusd.fitting.synthesis import BOX, POLYGONS, POSES, SLICES, Bounds, captured_reference, distance_to_nearest
+from jawusd.fitting.synthesis import BOX, POLYGONS, SLICES, Bounds, captured_reference, distance_to_nearest
 from jawusd.formats.experiments import TABLE_COLUMNS, CondylePath, save_table
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import TRACKED, Tracks
@@ -47,8 +47,10 @@ def data(poses, anatomy):
 
 @pytest.fixture(scope="module")
 def quick():
-    """Train the networks for a tenth of their time."""
+    """Train the networks for a tenth of their time, and draw a fifth of the random poses."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(synthesis, "POSES", 200)
+        patch.setattr(synthesis, "_BATCH", 800)
         patch.setattr(nlpca_training, "train_nlpca", lambda *a, **k: train_nlpca(*a, **(k | {"stages": 2})))
         yield
 
@@ -83,7 +85,8 @@ def test_random_parameters_fill_each_bound_and_nothing_else():
     d = rng.uniform([0, -8, -1], [40, 8, 6], (600, 3)) * np.linspace(0.2, 1, 600)[:, None]
     bounds = Bounds.of(d, 0.23)
     drawn = bounds.draw(np.random.default_rng(1))
-    assert {name: len(values) for name, values in drawn.items()} == {BOX: POSES, POLYGONS: POSES, SLICES: POSES}
+    assert tuple(drawn) == (BOX, POLYGONS, SLICES)
+    assert {len(values) for values in drawn.values()} == {synthesis.POSES}
     assert (drawn[BOX] >= d.min(0)).all() and (drawn[BOX] <= d.max(0)).all()
     for axis, rings in zip((1, 2), bounds.rings, strict=True):
         shape = shapely.union_all([shapely.Polygon(ring) for ring in rings]).buffer(1e-9)
@@ -218,7 +221,7 @@ def test_gross_outliers_are_counted_but_do_not_spoil_the_rest(quick, poses, anat
 
 
 @pytest.mark.slow
-def test_frames_a_prior_helped_with_are_never_used(quick, poses, anatomy):
+def test_frames_a_prior_helped_with_are_never_used(poses, anatomy):
     nan = np.full((FRAMES, 4, 4), np.nan)
     aided = np.zeros(FRAMES, dtype=bool)
     aided[100:120] = True
@@ -226,7 +229,7 @@ def test_frames_a_prior_helped_with_are_never_used(quick, poses, anatomy):
     wrong[aided] = wrong[aided] @ se3_exp([0, 0.3, 0, 0, 0, 30.0])
     fields = {name: nan for name in ("T_world_upper", "T_world_lower", "raw_T_world_upper", "raw_T_world_lower")}
     tracks = _tracks(wrong, aided, fields)
-    found = run_experiments(tracks, anatomy, config=FittingConfig(starts=1))
+    found = run_experiments(tracks, anatomy, quick=True)
     assert found.frames == FRAMES - 20
     assert max(found.of("reconstruction")[-2].values_mm) < 5
 
