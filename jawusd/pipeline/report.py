@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -80,18 +81,22 @@ def write_build_report(
     left_out: list[str] = []
     tracks, model = load_tracks(folder / "tracks.npz"), load_model(folder / "model.npz")
     subject = subject_of_build(folder)
-    if experiments is None:
-        experiments = attempt(
-            "experiments",
-            left_out,
-            lambda: do_experiments(subject, load_tracks(fitted_poses(folder)), 1, no_progress, quick=True),
-        )
-        left_out.append(_NETWORKS)
-    if describe(folder / "actor.usda")["placeholders"]:
-        left_out.append("the mandible in 3-D: no mesh of it was given, and the rig's placeholder is no anatomy.")
-    progress("report", 1, 4)
-    overlays = attempt("pictures of the footage", left_out, lambda: _overlays(facts, tracks)) or ()
-    contacts = attempt("contacts of the teeth", left_out, lambda: contact_pictures(model, subject)) or ()
+    with ThreadPoolExecutor(1) as pool:  # decodes and draws without Python's lock
+        unseen: list[str] = []
+        drawing = pool.submit(attempt, "pictures of the footage", unseen, lambda: _overlays(facts, tracks))
+        if experiments is None:
+            experiments = attempt(
+                "experiments",
+                left_out,
+                lambda: do_experiments(subject, load_tracks(fitted_poses(folder)), 1, no_progress, quick=True),
+            )
+            left_out.append(_NETWORKS)
+        if describe(folder / "actor.usda")["placeholders"]:
+            left_out.append("the mandible in 3-D: no mesh of it was given, and the rig's placeholder is no anatomy.")
+        progress("report", 1, 4)
+        contacts = attempt("contacts of the teeth", left_out, lambda: contact_pictures(model, subject)) or ()
+        overlays = drawing.result() or ()
+    left_out += unseen
     progress("report", 2, 4)
     data = ReportData(
         actor=subject.name,
