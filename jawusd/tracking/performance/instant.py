@@ -38,7 +38,7 @@ class Aligned:
 
 
 class InstantSolver:
-    """Gauss-Newton in head pose and jaw parameters; keeps no state between instants."""
+    """Gauss-Newton in head pose and jaw parameters; of instants before, only drawings are kept."""
 
     def __init__(self, solver: ContourSolver, coordinates: Coordinates) -> None:
         self.solver, self.coordinates = solver, coordinates
