@@ -27,7 +27,7 @@ class Reached(Exception):
 
 
 def stop_at(stage_name, told):
-    """Return a progress function that ends the build when a stage begins."""
+    """Return a progress function that ends the build when a stage tells of itself."""
 
     def progress(stage, done, total):
         told.append((stage, done, total))
@@ -35,6 +35,11 @@ def stop_at(stage_name, told):
             raise Reached
 
     return progress
+
+
+def track_is_reached(*arguments):
+    """Stand in for `first_pass`, which searches the teeth before it tells of itself."""
+    raise Reached
 
 
 @pytest.fixture(scope="module")
@@ -50,16 +55,27 @@ def capture(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def calibrated(capture, tmp_path_factory):
+    """The folder of a build that ended before its tracking, what it told, and the corners it found on the boards.
+
+    The size of the squares does not change these.
+    """
     out = tmp_path_factory.mktemp("build") / "actor"
-    told = []
-    with pytest.raises(Reached):
-        build(capture, out, BuildOptions(), stop_at("track", told))
-    return out, told
+    told, corners = [], []
+
+    def kept(*arguments):
+        corners.append(find_boards(*arguments))
+        return corners[-1]
+
+    with pytest.MonkeyPatch.context() as patched, pytest.raises(Reached):
+        patched.setattr("jawusd.capture.calibrate.find_boards", kept)
+        patched.setattr("jawusd.pipeline.build.first_pass", track_is_reached)
+        build(capture, out, BuildOptions(), stop_at(None, told))
+    return out, told, *corners
 
 
 @pytest.mark.slow
 def test_the_build_calibrates_from_the_boards(calibrated):
-    out, told = calibrated
+    out, told, _ = calibrated
     assert ("calibrate", 72, 72) in told
     record = json.loads((out / "build.json").read_text())["stages"]
     assert set(record) == {"check", "calibrate", "sync"}
@@ -73,7 +89,7 @@ def test_the_build_calibrates_from_the_boards(calibrated):
 
 @pytest.mark.slow
 def test_lengths_in_the_mouth_are_those_of_the_true_cameras(calibrated):
-    out, _ = calibrated
+    out, *_ = calibrated
     found, truth = load_calibration(out / "calibration.toml"), load_calibration(EXAMPLE / "calibration.toml")
     with np.load(EXAMPLE / "truth" / "truth.npz", allow_pickle=False) as archive:
         centre = archive["T_world_upper"][0][:3, 3]
@@ -86,12 +102,13 @@ def test_lengths_in_the_mouth_are_those_of_the_true_cameras(calibrated):
 
 
 @pytest.mark.slow
-def test_a_resumed_build_keeps_the_calibration_until_the_boards_change(capture, calibrated, tmp_path):
+def test_a_resumed_build_keeps_the_calibration_until_the_boards_change(capture, calibrated, tmp_path, monkeypatch):
+    monkeypatch.setattr("jawusd.pipeline.build.first_pass", track_is_reached)
     out = tmp_path / "actor"
     shutil.copytree(calibrated[0], out)
     told = []
     with pytest.raises(Reached):
-        build(capture, out, BuildOptions(resume=True), stop_at("track", told))
+        build(capture, out, BuildOptions(resume=True), stop_at(None, told))
     assert [entry for entry in told if entry[0] == "calibrate"] == [("calibrate", 1, 1)]
     changed = tmp_path / "changed"
     shutil.copytree(capture, changed)
@@ -108,13 +125,13 @@ def test_a_fresh_build_deletes_the_masks_an_earlier_one_made(capture, tmp_path):
     made.touch()
     (tmp_path / "actor" / "masks" / "segment.jsonl").write_text("{}\n")
     with pytest.raises(Reached):
-        build(capture, tmp_path / "actor", BuildOptions(fresh=True), stop_at("calibrate", []))
+        build(capture, tmp_path / "actor", BuildOptions(fresh=True), stop_at("check", []))
     assert not (tmp_path / "actor" / "masks").exists()
 
 
 @pytest.mark.slow
 def test_the_summary_of_a_build_says_what_was_made(calibrated):
-    out, _ = calibrated
+    out, *_ = calibrated
     record = json.loads((out / "build.json").read_text())["stages"]
     summary = {
         "calibrate": record["calibrate"]["result"], "sync": record["sync"]["result"], "fit": {}, "reused": [],
@@ -153,33 +170,32 @@ def test_a_calibration_of_colmap_is_read_where_the_capture_names_it(capture, tmp
     assert [path.name for path in input_files(opened, ["calibration"])["calibration"]] == ["cameras.txt", "images.txt"]
 
 
-@pytest.fixture(scope="module")
-def corners_found_once(capture):
-    """The corners on the boards, which no size of the squares changes."""
+def unpicked(capture, tmp_path, offsets=None, **boards):
+    """Return the capture without picks, its cameras aligned by given offsets, its boards described otherwise."""
     opened = open_capture(capture)
-    return find_boards(tuple(camera.name for camera in opened.cameras), opened.boards, lambda done, total: None)
-
-
-def unpicked(capture, tmp_path, **boards):
-    """Return the capture without picks, its boards described otherwise."""
-    opened = open_capture(capture)
-    changed = opened.boards.model_copy(update=boards)
-    return opened.model_copy(update={"bootstrap": None, "boards": changed}), tmp_path / "calibration.toml"
+    update = {
+        "bootstrap": None,
+        "boards": opened.boards.model_copy(update=boards),
+        "sync": opened.sync.model_copy(update={"offsets": offsets}),
+    }
+    return opened.model_copy(update=update), tmp_path / "calibration.toml"
 
 
 @pytest.mark.slow
-def test_without_picks_masks_tell_the_size_of_the_squares(capture, corners_found_once, tmp_path, monkeypatch):
-    monkeypatch.setattr("jawusd.capture.calibrate.find_boards", lambda *arguments: corners_found_once)
-    report = calibrate_boards(*unpicked(capture, tmp_path), lambda *told: None)
+def test_without_picks_masks_tell_the_size_of_the_squares(capture, calibrated, tmp_path, monkeypatch):
+    out, _, corners = calibrated
+    monkeypatch.setattr("jawusd.capture.calibrate.find_boards", lambda *arguments: corners)
+    offsets = json.loads((out / "build.json").read_text())["stages"]["sync"]["result"]["offsets"]
+    report = calibrate_boards(*unpicked(capture, tmp_path, offsets), lambda *told: None)
     assert report["scale"]["ratio"] == pytest.approx(1.0, abs=0.01)
     assert any("the teeth confirm the board's size" in line for line in calibration_lines(report))
     with pytest.raises(CalibrationError, match=r"squares of 9 mm would have to be (7\.9|8\.0)\d mm"):
-        calibrate_boards(*unpicked(capture, tmp_path, square_mm=9.0), lambda *told: None)
+        calibrate_boards(*unpicked(capture, tmp_path, offsets, square_mm=9.0), lambda *told: None)
 
 
 @pytest.mark.slow
-def test_without_picks_and_masks_the_size_is_said_to_be_unknown(capture, corners_found_once, tmp_path, monkeypatch):
-    monkeypatch.setattr("jawusd.capture.calibrate.find_boards", lambda *arguments: corners_found_once)
+def test_without_picks_and_masks_the_size_is_said_to_be_unknown(capture, calibrated, tmp_path, monkeypatch):
+    monkeypatch.setattr("jawusd.capture.calibrate.find_boards", lambda *arguments: calibrated[2])
     opened, out = unpicked(capture, tmp_path, square_mm=9.0)
     bare = tuple(camera.model_copy(update={"masks": None}) for camera in opened.cameras)
     report = calibrate_boards(opened.model_copy(update={"cameras": bare}), out, lambda *told: None)
