@@ -17,8 +17,9 @@ from jawusd.imaging.solid import DistanceGrid, distance_grid, outer_faces
 
 #: Surfaces farther apart than this count as this far apart [mm].
 FARTHEST_MM = 1.5
+#: Between the distances to a surface as curved as teeth are.
+STEP_MM = 0.25
 
-_STEP_MM = 0.25
 _SAMPLE_MM = 0.5  # samples of a face lie no farther apart
 _BOXES_MM = (4.8, 2.4, 1.2, 0.6)  # edges, each in the one before
 _PARTS = 16  # of many poses, for threads
@@ -105,16 +106,17 @@ def tips_box(corners: Array, up: float, height_mm: float) -> Array:
     return box
 
 
-def solid(corners: Array, up: float, box: Array) -> Solid:
+def solid(corners: Array, up: float, box: Array, step_mm: float = STEP_MM) -> Solid:
     """Build a solid from triangles.
 
     Args:
         corners: triangles counter-clockwise seen from outside [mm], shape (F, 3, 3), y vertical.
         up: see `outer_faces`.
         box: where the solid matters, rows low and high [mm], shape (2, 3).
+        step_mm: between its distances, which are linear in between.
     """
     outer, entering = outer_faces(corners, up)
-    grid = distance_grid(corners, outer, box, _STEP_MM, up)
+    grid = distance_grid(corners, outer, box, step_mm, up)
     near = ((corners <= box[1]) & (corners >= box[0])).all(axis=2).any(axis=1)
     return Solid(grid, in_boxes(surface_points(corners[outer & near], _SAMPLE_MM)), entering)
 

@@ -13,7 +13,7 @@ from jawusd.evaluator.contact import AUTHORED_MM, NEAR_MM, UNIT_MM, ContactField
 from jawusd.formats.mesh import BASE, Mesh
 from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import se3_inverse, transform_points
-from jawusd.imaging.collision import FARTHEST_MM, Pair, Solid, solid, tips_box
+from jawusd.imaging.collision import FARTHEST_MM, STEP_MM, Pair, Solid, solid, tips_box
 
 _CROWN_MM = 14.0  # from the tips of the teeth to where gums begin, at most
 _LEAST_WOUND = 0.6  # share of lines that enter a scan where they first meet it; 0.93 and more for scans wound alike
@@ -99,15 +99,15 @@ def _solid(name: str, mesh: Mesh, T: Array, up: float) -> Solid:
     return wound_solid(f"{name} scan", corners, up, tips_box(corners, up, _CROWN_MM))
 
 
-def wound_solid(name: str, corners: Array, up: float, box: Array) -> Solid:
+def wound_solid(name: str, corners: Array, up: float, box: Array, step_mm: float = STEP_MM) -> Solid:
     """Return the solid of triangles wound either way, see `jawusd.imaging.collision.solid`.
 
     Raises:
         NoContact: They are not wound alike; naming the mesh.
     """
-    found = solid(corners, up, box)
+    found = solid(corners, up, box, step_mm)
     if found.entering < 0.5:  # wound the other way round
-        found = solid(np.ascontiguousarray(corners[:, ::-1]), up, box)
+        found = solid(np.ascontiguousarray(corners[:, ::-1]), up, box, step_mm)
     if found.entering < _LEAST_WOUND:
         raise NoContact(f"the triangles of the {name} are not wound alike")
     return found
