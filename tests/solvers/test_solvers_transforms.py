@@ -20,6 +20,11 @@ LAYERS = {kind: JawLayer(rig) for kind, rig in RIGS.items()}
 EVERY = ("forward", "margin", "penalty", "project", "inside", "unconstrained", "encode", "loss")
 
 
+def cases(*names):
+    """Every rig with `forward`; one for what only the bound decides, which is the same in all of them."""
+    return [(kind, name) for name in names for kind in (sorted(RIGS) if name == "forward" else ["anchored"])]
+
+
 @pytest.fixture(params=sorted(RIGS))
 def pair(request):
     return RIGS[request.param], LAYERS[request.param]
@@ -165,10 +170,20 @@ def test_another_type_of_number_is_one_clear_error(pair, name):
     torch.testing.assert_close(found.double(), call(layer, name)(arguments(rig, name)), rtol=1e-3, atol=0.05)
 
 
+@pytest.mark.parametrize("part", ["bound", "interior"])
+def test_the_bound_is_the_same_in_all_rigs(part):
+    """Which is why it is compiled and exported for one of them."""
+    first = getattr(LAYERS["anchored"], part).state_dict()
+    for layer in LAYERS.values():
+        assert type(getattr(layer, part)) is type(getattr(LAYERS["anchored"], part))
+        state = getattr(layer, part).state_dict()
+        assert list(state) == list(first) and all(torch.equal(state[key], first[key]) for key in first)
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["forward", "margin", "penalty", "unconstrained"])
-def test_compiles_as_one_graph_for_any_batch(pair, name):
-    rig, layer = pair
+@pytest.mark.parametrize(("kind", "name"), cases("forward", "margin", "penalty", "unconstrained"))
+def test_compiles_as_one_graph_for_any_batch(kind, name):
+    rig, layer = RIGS[kind], LAYERS[kind]
     torch._dynamo.reset()
     compiled = torch.compile(call(layer, name), fullgraph=True, dynamic=True, backend="aot_eager")
     for count in (6, 9):
@@ -187,18 +202,19 @@ def test_exports_with_a_dynamic_batch(name, atol):
     rig, layer = RIGS["anchored"], LAYERS["anchored"]
     x = arguments(rig, name)
     program = torch.export.export(Wrapped(layer, name), (x,), dynamic_shapes=({0: torch.export.Dim("n")},))
+    captured = program.module()
     for count in (3, 40):
         x = arguments(rig, name, count, seed=count)
-        torch.testing.assert_close(program.module()(x), call(layer, name)(x), rtol=0, atol=atol)
+        torch.testing.assert_close(captured(x), call(layer, name)(x), rtol=0, atol=atol)
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")  # inside torch's exporter
-@pytest.mark.parametrize("name", ["forward", "margin"])
-def test_onnx_export_with_a_dynamic_batch(pair, name, tmp_path):
+@pytest.mark.parametrize(("kind", "name"), cases("forward", "margin"))
+def test_onnx_export_with_a_dynamic_batch(kind, name, tmp_path):
     pytest.importorskip("onnxscript")
     onnxruntime = pytest.importorskip("onnxruntime")
-    rig, layer = pair
+    rig, layer = RIGS[kind], LAYERS[kind]
     path = tmp_path / "layer.onnx"
     batch = ({0: torch.export.Dim("n")},)
     torch.onnx.export(Wrapped(layer, name).eval(), (arguments(rig, name),), path, dynamic_shapes=batch, verbose=False)
