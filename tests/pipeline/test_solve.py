@@ -37,6 +37,13 @@ def rig(example_build):
     return example_build[0] / "actor.usda"
 
 
+@pytest.fixture(scope="module")
+def solved(rig, shot, tmp_path_factory):
+    """The performance of the shot, which nobody may change, and the tracks written with it."""
+    path = tmp_path_factory.mktemp("solved") / "take.npz"
+    return solve(rig, shot, path), path
+
+
 def tip_errors_mm(rig, frames, d):
     with np.load(EXAMPLE / "truth" / "truth.npz") as truth:
         relative = truth["T_upper_lower"][np.searchsorted(truth["frames"], frames)]
@@ -61,13 +68,12 @@ def test_the_command_writes_a_table_and_a_summary(rig, shot, tmp_path):
 
 
 @pytest.mark.slow
-def test_tracks_and_animation_hold_the_same_jaw(rig, shot, tmp_path):
-    jaw = jawusd.load(rig)
-    found = solve(rig, shot, tmp_path / "take.npz")
-    tracks = load_tracks(tmp_path / "take.npz")
+def test_tracks_and_animation_hold_the_same_jaw(rig, shot, solved, tmp_path):
+    jaw, (found, path) = jawusd.load(rig), solved
+    tracks = load_tracks(path)
     np.testing.assert_allclose(tracks.T_upper_lower, jaw.pose(found.d), atol=1e-9)
     assert solve_summary(found)["sigma_mm"]["d1"] < 0.1
-    solve(rig, shot, tmp_path / "take.usdc")
+    write_solved(tmp_path / "take.usdc", found, jaw, rig, open_capture(shot).fps)
     frames, poses = read_poses_of_stage(tmp_path / "take.usdc")
     shown = poses[np.isin(frames, found.frames)]
     np.testing.assert_allclose(shown, jaw.pose(found.d), atol=1e-3)
@@ -136,11 +142,10 @@ def test_pictures_that_do_not_show_this_person_are_refused(rig):
 
 
 @pytest.mark.slow
-def test_frames_that_were_not_seen_are_named(rig, shot, tmp_path):
-    capture = open_capture(shot)
-    found = solve(rig, capture, None)
+def test_frames_that_were_not_seen_are_named(rig, shot, solved, tmp_path):
+    found = replace(solved[0], state=solved[0].state.copy())
     found.state[3] = SolveState.CARRIED
-    write_solved(tmp_path / "take.usda", found, jawusd.load(rig), rig, capture.fps)
+    write_solved(tmp_path / "take.usda", found, jawusd.load(rig), rig, open_capture(shot).fps)
     layer = Sdf.Layer.FindOrOpen(str(tmp_path / "take.usda"))
     frame = int(found.frames[3])
     assert list(layer.customLayerData["carriedFrames"]) == [frame]
@@ -148,7 +153,7 @@ def test_frames_that_were_not_seen_are_named(rig, shot, tmp_path):
 
 
 @pytest.mark.slow
-def test_one_of_several_rigs_is_solved(rig, shot, tmp_path):
+def test_one_of_several_rigs_is_solved(rig, shot, solved, tmp_path):
     stage = tmp_path / "two.usda"
     references = "".join(f'    def "{name}" (references = @{rig}@) {{}}\n' for name in "ab")
     header = "defaultPrim = 'Shot'; metersPerUnit = 0.001; upAxis = 'Y'; timeCodesPerSecond = 12; startTimeCode = 0"
@@ -156,7 +161,7 @@ def test_one_of_several_rigs_is_solved(rig, shot, tmp_path):
     stage.write_text(text)
     assert "--prim" in run("solve", stage, shot, "-o", tmp_path / "take.usda", code=3)
     run("solve", stage, shot, "--prim", "/Shot/b", "-o", tmp_path / "take.usda")
-    found = solve(rig, shot)
+    found, _ = solved
     at = found.frames * 12 / open_capture(shot).fps  # the stage runs at 12 a second
     times, T = read_poses_of_stage(tmp_path / "take.usda", "/Shot/b")
     shown = (times >= at[0]) & (times <= at[-1])
