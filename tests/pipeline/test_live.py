@@ -188,8 +188,8 @@ def patient_film(monkeypatch):
 
 @pytest.mark.slow
 def test_the_example_is_followed_at_every_frame(rig, patient_film):
-    told = list(live(rig, EXAMPLE, seconds=59.5 / FPS))
-    assert len(told) == 60 and all(found.dropped == 0 for found in told)
+    told = list(live(rig, EXAMPLE, seconds=39.5 / FPS))
+    assert len(told) == 40 and all(found.dropped == 0 for found in told)
     np.testing.assert_allclose(np.diff([found.time_s for found in told]), 1 / FPS, atol=1e-3)
     jaw, errors = jawusd.load(rig), []
     tip = jaw.landmarks[0]
@@ -199,7 +199,7 @@ def test_the_example_is_followed_at_every_frame(rig, patient_film):
         if found.state == "solved":
             wanted = transform_point(relative[round(found.time_s * FPS)], tip)
             errors.append(np.linalg.norm(transform_point(jaw.pose(found.d), tip) - wanted))
-    assert len(errors) >= 54 and np.median(errors) < 0.3 and max(errors) < 1.0
+    assert len(errors) >= 36 and np.median(errors) < 0.3 and max(errors) < 1.0
 
 
 @pytest.mark.slow
