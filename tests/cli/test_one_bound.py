@@ -287,14 +287,14 @@ def test_plain_reader_and_add_on(actor, tmp_path, monkeypatch):
     drawn.layout = _Layout(labels)
     render = types.SimpleNamespace(fps=FPS, fps_base=1.0)
     context = types.SimpleNamespace(scene=types.SimpleNamespace(render=render))
-    said = []
-    for d in D.tolist():
+    said, some = [], slice(None, None, 5)  # both of those all over and of those near; the panel draws slowly
+    for d in D[some].tolist():
         labels.clear()
         shown.update(dict(zip(("d1", "d2", "d3"), d)))
         drawn.draw(context)
         (place,) = [label for label in labels if "the bound" in label]
         said.append(place.startswith("inside"))
-    assert disagreements(said) == 0
+    np.testing.assert_array_equal(said, INSIDE[some])
 
 
 class _Layout:

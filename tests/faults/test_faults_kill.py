@@ -5,6 +5,7 @@ The stages only write what a seed gives, so that kills hit the writing; tests/be
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -55,12 +56,18 @@ def end(process):
     return process.returncode
 
 
-@pytest.mark.slow
-def test_killed_builds_end_as_one_that_was_left_alone(tmp_path):
-    alone = tmp_path / "alone"
+@pytest.fixture(scope="module")
+def left_alone(tmp_path_factory):
+    """A finished build, and how long it took."""
+    folder = tmp_path_factory.mktemp("left") / "alone"
     begun = time.perf_counter()
-    assert end(start(alone)) == 0
-    whole_s = time.perf_counter() - begun
+    assert end(start(folder)) == 0
+    return folder, time.perf_counter() - begun
+
+
+@pytest.mark.slow
+def test_killed_builds_end_as_one_that_was_left_alone(left_alone, tmp_path):
+    alone, whole_s = left_alone
     exact, rng, killed = digests(alone), np.random.default_rng(0), 0
     assert len(exact) == 72
     out = tmp_path / "killed"
@@ -89,9 +96,8 @@ def test_what_a_killed_build_left_is_cleared_and_nothing_else(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_record_that_was_changed_is_refused(tmp_path):
-    out = tmp_path / "out"
-    assert end(start(out)) == 0
+def test_a_record_that_was_changed_is_refused(left_alone, tmp_path):
+    out = shutil.copytree(left_alone[0], tmp_path / "out")
     path = out / "build.json"
     data = json.loads(path.read_text())
     data["stages"]["sync"]["result"]["offsets"]["cam1"] = 3

@@ -45,9 +45,13 @@ def lifted(*heights):
     return T
 
 
+@pytest.fixture(scope="module")
+def joints():
+    return find_joints(skull(), mandible(), LANDMARKS, np.eye(4), np.eye(4))
+
+
 @pytest.mark.slow
-def test_clearance_is_what_is_left_under_the_skull():
-    joints = find_joints(skull(), mandible(), LANDMARKS, np.eye(4), np.eye(4))
+def test_clearance_is_what_is_left_under_the_skull(joints):
     np.testing.assert_allclose(joints.closed, -GAP, atol=0.03)
     heights = np.array([-0.5, 0.0, 0.3, 0.7, 1.2])
     np.testing.assert_allclose(joints.clearances(lifted(*heights)), GAP - heights, atol=0.04)
@@ -62,11 +66,10 @@ def test_what_the_closed_bite_overlaps_is_allowed():
 
 
 @pytest.mark.slow
-def test_one_side_is_enough_and_frames_do_not_matter():
+def test_one_side_is_enough_and_frames_do_not_matter(joints):
     tilt = np.eye(4)
     tilt[:2, :2] = [[np.cos(0.02), -np.sin(0.02)], [np.sin(0.02), np.cos(0.02)]]  # left side up: 1 mm at 50 mm
     tilt[1, 3] = 38.0 * (1 - np.cos(0.02))
-    joints = find_joints(skull(), mandible(), LANDMARKS, np.eye(4), np.eye(4))
     expected = GAP - (tilt @ [*LANDMARKS[3], 1.0])[1] + 38.0
     np.testing.assert_allclose(joints.clearances(tilt[None]), expected, atol=0.04)
     A = np.array([[0.0, 0, 1, 20], [0, 1, 0, -5], [-1, 0, 0, 7], [0, 0, 0, 1]])  # skull to anatomical axes
