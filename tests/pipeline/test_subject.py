@@ -102,11 +102,12 @@ def test_a_registration_taken_from_the_take_moves_lower_scan_and_teeth_but_no_co
 
 @pytest.mark.slow
 def test_the_rig_holds_the_lower_scan_where_the_take_shows_it(tmp_path):
+    """One model is baked as fitted without scans, the other as one that says how teeth meet."""
     usd = pytest.importorskip("pxr.Usd")
     subject = subject_of_scans(SCANS, "someone")
     model = JawModel(example_arrays(), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0), np.zeros(0, bool))
     places = []
-    for name, meta in (("given", {}), ("taken", _moved(True))):
+    for name, meta in (("given", {}), ("taken", {**_moved(True), "contact": {"missing": "not measured"}})):
         model.meta.clear()
         model.meta.update({**example_meta(), **meta})
         bake_subject(subject, model, tmp_path / name, fps=FPS, table_size=17)
