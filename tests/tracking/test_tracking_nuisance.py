@@ -24,11 +24,15 @@ WITHOUT = TrackingConfig(refine_rounds=0)
 
 
 @pytest.fixture(scope="module")
-def late(tmp_path_factory):
+def late_capture(tmp_path_factory):
     """Two cameras that run 0.3 frames late and 0.2 early."""
     folder = write_masks(tmp_path_factory.mktemp("late"), FRAMES, delays=(0.0, 0.3, -0.2))
-    capture = make_capture(folder, FRAMES)
-    return track(capture), track(capture, config=WITHOUT)
+    return make_capture(folder, FRAMES)
+
+
+@pytest.fixture(scope="module")
+def late(late_capture):
+    return track(late_capture), track(late_capture, config=WITHOUT)
 
 
 @pytest.mark.slow
@@ -58,8 +62,8 @@ def test_masks_drawn_too_wide_are_noticed_and_made_up_for(tmp_path):
 
 
 @pytest.mark.slow
-def test_nothing_is_found_where_nothing_is(tmp_path):
-    tracks = track(make_capture(write_masks(tmp_path / "clean", FRAMES), FRAMES))
+def test_nothing_is_found_where_nothing_is(takes):
+    tracks, *_ = takes
     assert np.abs(list(tracks.meta["delays_frames"].values())).max() < 0.03
     assert np.abs(list(tracks.meta["outline_bias_px"].values())).max() < 0.1
 
@@ -285,9 +289,8 @@ def test_long_gaps_and_ends_are_not_bridged():
 
 
 @pytest.mark.slow
-def test_frames_lost_to_a_late_camera_are_found_once_it_is_known(tmp_path):
+def test_frames_lost_to_a_late_camera_are_found_once_it_is_known(late_capture):
     """Call a row lost without reason, as a late camera may: aligned again with the delay taken out it comes back."""
-    capture = make_capture(write_masks(tmp_path / "late", FRAMES, delays=(0.0, 0.3, -0.2)), FRAMES)
     original = FrameTracker.track
 
     def distrustful(self, starts, views, pose_history, reach_px=0.0):
@@ -299,7 +302,7 @@ def test_frames_lost_to_a_late_camera_are_found_once_it_is_known(tmp_path):
     AT = jaw_poses(11)[10]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(FrameTracker, "track", distrustful)
-        tracks = track(capture)
+        tracks = track(late_capture)
     assert tracks.status[10].tolist() == [TRACKED, RECOVERED]
     assert errors_mm(tracks, raw=True)[10].max() < 0.1
 
