@@ -139,6 +139,17 @@ class TrackingConfig:
             return () if moved_mm < self.converged_mm else rest
         return rest[-1:] if moved_mm < self.settled_mm else rest
 
+    def with_gates_scaled(self, factor: float) -> TrackingConfig:
+        """Return the numbers for pictures with so many times the pixels per mm, as far as they say what matches."""
+        return replace(
+            self,
+            wide_gates_px=tuple(factor * gate for gate in self.wide_gates_px),
+            trial_gates_px=tuple(factor * gate for gate in self.trial_gates_px),
+            final_gate_px=(factor * self.final_gate_px[0], factor * self.final_gate_px[1]),
+            score_gate_px=factor * self.score_gate_px,
+            pull_above_px=factor * self.pull_above_px,
+        )
+
     def gates_from(self, reach_px: float) -> tuple[float, ...]:
         """Return the gates to go through when the start is off by about reach_px, and no less than the usual."""
         return tuple(g for g in self.wide_gates_px if g <= max(reach_px, self.first_gate_px))

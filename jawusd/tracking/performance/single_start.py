@@ -51,6 +51,8 @@ _DISTINCT_MM = 3.0  # mean distance of the teeth between heads that are kept
 # Fit of the arch that fits worse beyond which there is no doubt, and below which there is no start [-]: as with more
 # cameras, see `start_causes.CLEAR_FIT`.
 _CLEAR_FIT, _LEAST_FIT = 0.3, 0.1
+# How far candidates may lie from the pose they are aligned to, standard deviations [rad, mm, mm].
+_NEARBY = MOST_UNSURE / 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +84,10 @@ class SingleStart:
         self._coarse = tuple(coarse_scan(mesh, name) for mesh, name in zip(meshes, ARCH_NAMES, strict=True))
         self._hinge = hinge_at_front(self._coarse[0].crown_vertices(), T_anatomical_scan)
         weight = np.full(2, 1.0 / solver.config.typical_noise_px3)
-        rough = ContourSolver(self._coarse, solver.config)
+        # With gates of the same pixels, three times as wide in mm, teeth half hidden by lips shrank to what is seen of
+        # them: from the true pose, they ended 30 mm farther away.
+        small = self._config.with_gates_scaled(_PX_PER_MM / self._config.working_px_per_mm)
+        rough = ContourSolver(self._coarse, small)
         self._rough = Attempts(InstantSolver(rough, Coordinates(jaw, self._coarse)), weight)
         self._fine = Attempts(InstantSolver(solver, Coordinates(jaw, solver.scans)), weight)
         self._jaws = spread_out(jaw, _JAWS)
@@ -124,7 +129,7 @@ class SingleStart:
         with footage.views(places[usual].mean(0), _PX_PER_MM) as masks:
             views = masks.at(frame)
         instant = self._rough.instant(views)
-        ends = [self._after(pose, instant, self._config.wide_gates_px) for pose in self._searched(views, places)]
+        ends = [self._after(pose, instant, self._rough.config.wide_gates_px) for pose in self._searched(views, places)]
         ends = sorted(ends, key=_worth)[:_WINNERS]
         best: tuple[float, FrameFit] | None = None
         px_per_mm = self._config.working_px_per_mm
@@ -153,7 +158,7 @@ class SingleStart:
             (pair for some in self._map(partial(self._with_jaws, views), heads) for pair in some), key=_worth
         )
         instant = self._rough.instant(views)
-        few = self._config.trial_gates_px
+        few = self._rough.config.trial_gates_px
         tried = [(self._after(pose, instant, few)[0], pose) for _, pose in pairs[:_TRIED]]
         return [pose for _, pose in sorted(tried, key=_worth)[:_FINALISTS]]
 
@@ -190,7 +195,7 @@ class SingleStart:
 
     def _after(self, pose: Pose, instant: Instant, gates: Sequence[float]) -> tuple[float, Pose]:
         """Return how well both arches fit after some steps [px], and where they are then."""
-        expected = Expected(pose, MOST_UNSURE**-2.0)
+        expected = Expected(pose, _NEARBY**-2.0)
         trial = self._rough.attempt(pose, expected, instant, instant.present, gates)
         arches = self._rough.instants.coordinates.arches(trial.pose)
         outside = sum(self._outside_price(r, arches[r], instant.views[0]) for r in ARCHES)
