@@ -121,7 +121,6 @@ def cost_of_track(folder: str, cameras: int, size: float, frames: int, finer: in
     from jawusd.tracking import track_capture
 
     small_take.MESHES = tuple(_finer(mesh, finer) for mesh in small_take.MESHES)
-
     own = make_cameras(tuple(np.linspace(-40, 40, cameras)))
     small_take.CAMERAS = [camera.scaled(tuple(int(size * s) for s in camera.size_px)) for camera in own]
     small_take.OFFSETS = {camera.name: 0 for camera in own}
