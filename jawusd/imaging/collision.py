@@ -33,8 +33,8 @@ class Samples:
         points: in order of the smallest boxes [mm], shape (P, 3).
         balls: centres of what boxes hold and distances of its farthest points [mm], shape (B, 4); every box is followed
             by those within it.
-        nodes: of every box, its first and last point, where it holds no smaller boxes, else 0 and 0; and the next box
-            that is not within it, shape (B, 3).
+        nodes: of every box that holds no smaller ones, its first point and the one after its last, of others 0 and 0; and
+            the next box that is not within it, shape (B, 3).
     """
 
     points: Array
@@ -194,7 +194,7 @@ def _look_up(field: _Field, x: float, y: float, z: float) -> float:
     i, j, k = int(fx), int(fy), int(fz)
     a, b, c = fx - i, fy - j, fz - k
     values = field.values
-    # unsigned: others are taken for numbers from the end if negative, which costs a third of the time
+    # unsigned: of signed numbers it is looked at every time whether they count from the end
     one, row, layer = np.uint64(1), np.uint64(nz), np.uint64(ny * nz)
     at = np.uint64((i * ny + j) * nz + k)
     low = (values[at] * (1 - c) + values[at + one] * c) * (1 - b) + (
