@@ -33,8 +33,8 @@ class Samples:
         points: in order of the smallest boxes [mm], shape (P, 3).
         balls: centres of what boxes hold and distances of its farthest points [mm], shape (B, 4); every box is followed
             by those within it.
-        nodes: of every box that holds no smaller ones, its first point and the one after its last, of others 0 and 0; and
-            the next box that is not within it, shape (B, 3).
+        nodes: of every box that holds no smaller ones, its first point and the one after its last, of others 0 and 0;
+            and the next box that is not within it, shape (B, 3).
     """
 
     points: Array
