@@ -1,6 +1,7 @@
 """Borders of teeth found in colours, against pictures whose borders are known by construction."""
 
 import weakref
+from types import SimpleNamespace
 from typing import ClassVar
 
 import numpy as np
@@ -19,6 +20,7 @@ from jawusd.tracking.contour.samples import COLUMNS, INVERSE_DEPTH, LENGTH, NX, 
 from jawusd.tracking.contour.scan import CROWN, prepare_scan
 from jawusd.tracking.region.colours import BINS, PATCHES, TABLES, Areas, CameraColours, colour_bins
 from jawusd.tracking.region.edges import search_borders, search_creases, sharpen
+from jawusd.tracking.region.performance import follow_back
 from jawusd.tracking.sequence.guided import GuidedTracker
 
 TOOTH, LIP = np.array([215.0, 205.0, 185.0]), np.array([150.0, 75.0, 80.0])
@@ -183,6 +185,23 @@ class Covered(ColourFootage):
             for _, pictures in super().walk(range(instead or frame, (instead or frame) + 1)):
                 skin = {name: np.full_like(image, (190, 130, 110)) for name, image in pictures.items()}
                 yield frame, skin if instead is None else pictures
+
+
+@pytest.mark.parametrize("step", [1, -1])
+def test_what_searches_found_late_is_followed_back(step):
+    """Lost from the 3rd frame on, in sight again from the 5th, found at the 8th; lost to the end from the 9th on."""
+    way = range(30, 30 + 10 * step, step)
+    fits = {at: SimpleNamespace(found=np.array([True, k < 3 or k == 8]), by="first") for k, at in enumerate(way)}
+    asked = []
+
+    def back(frame, before):
+        asked.append((frame, list(before)))
+        return (SimpleNamespace(found=np.array([True, at in way[5:8]]), by="back") for at in before)
+
+    follow_back(fits, way, back)
+    assert asked == [(way[8], list(way[7:2:-1]))]
+    assert [fits[at].by for at in way] == ["first"] * 5 + ["back"] * 3 + ["first"] * 2
+    assert [bool(fits[at].found.all()) for at in way] == [True] * 3 + [False] * 2 + [True] * 4 + [False]
 
 
 @pytest.mark.slow

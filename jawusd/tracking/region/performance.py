@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise, takewhile
 
 import numpy as np
 
@@ -173,7 +175,16 @@ class PictureTake:
             for frame, cut in zip(way, self._shot.cuts(cameras, self._centre(pose), way), strict=True):
                 fits[frame] = one.step(cut)
                 progress(len(fits), len(frames))
+            follow_back(fits, way, partial(self._turned, cameras, one, fits))
         return [fits[frame] for frame in frames]
+
+    def _turned(
+        self, cameras: Sequence[Camera], one: RigTracker, fits: dict[int, FrameFit], frame: int, before: range
+    ) -> Iterator[FrameFit]:
+        """Yield the fits of frames, followed from one against the way of a tracker."""
+        turned = one.other_way(fits[frame])
+        for cut in self._shot.cuts(cameras, self._centre(fits[frame].pose), before):
+            yield turned.step(cut)
 
     def _smoothed(self, frames: range, fits: Sequence[FrameFit]) -> Smoothed:
         """Return all frames refined together."""
@@ -198,6 +209,25 @@ class PictureTake:
         away = np.median([self.coordinates.head_steps(first, fit.pose.head) for fit in seen], axis=0)
         head = self.coordinates.turned(first, away)
         return [replace(fit, pose=replace(fit.pose, head=head)) for fit in fits]
+
+
+def follow_back(fits: dict[int, FrameFit], way: range, back: Callable[[int, range], Iterator[FrameFit]]) -> None:
+    """Replace fits that were not found by what is followed into them, against the way, from where they were found.
+
+    Teeth may be in sight for some frames before a search finds them.
+
+    Args:
+        fits: by frame; replaced up to the first one that is not found from there either.
+        way: frames in the order in which they were followed.
+        back: yields the fits of frames in their order, followed from a frame that comes before them in it.
+    """
+    for last, frame in pairwise(way):
+        if fits[last].found.all() or not fits[frame].found.all():
+            continue
+        before = range(last, way.start - way.step, -way.step)
+        lost = list(takewhile(lambda at: not fits[at].found.all(), before))
+        again = takewhile(lambda fit: fit.found.all(), back(frame, before[: len(lost)]))
+        fits.update(zip(lost, again, strict=False))
 
 
 def _zoomed(camera: Camera, factor: float) -> Camera:
