@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from jawusd.geometry.arrays import Array
+from jawusd.geometry.rodrigues import N
 
 
 def wxyz_from_matrix(R: ArrayLike) -> Array:
@@ -17,20 +21,33 @@ def wxyz_from_matrix(R: ArrayLike) -> Array:
     R = np.asarray(R, dtype=np.float64)
     if R.shape[-2:] != (3, 3):
         raise ValueError(f"rotation matrices must have shape (..., 3, 3), got {R.shape}")
-    diagonal = np.stack([R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]], axis=-1)
-    trace = diagonal.sum(-1)
-    # 4 q q^T from the entries of R: every row is a multiple of q; the row with the largest diagonal keeps all digits.
-    outer = np.empty((*R.shape[:-2], 4, 4))
-    outer[..., 0, 0] = 1 + trace
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        outer[..., i + 1, i + 1] = 1 - trace + 2 * diagonal[..., i]
-        outer[..., 0, i + 1] = outer[..., i + 1, 0] = R[..., k, j] - R[..., j, k]
-        outer[..., j + 1, k + 1] = outer[..., k + 1, j + 1] = R[..., k, j] + R[..., j, k]
+    if R.ndim == 2:
+        one = _multiples(R.tolist())
+        row = max(range(4), key=lambda i: one[i][i])
+        found = np.array(one[row]) / math.hypot(*one[row])
+        return -found if found[0] < 0 else found
+    outer: Array = np.moveaxis(np.array(_multiples(np.moveaxis(R, (-2, -1), (0, 1)))), (0, 1), (-2, -1))
     best = np.argmax(np.einsum("...ii->...i", outer), axis=-1)
     q = np.take_along_axis(outer, best[..., None, None], axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     return np.where(q[..., :1] < 0, -q, q)
+
+
+def _multiples(R: Sequence[Sequence[N]] | Array) -> list[list[N]]:
+    """Return 4 q q^T from rows of entries, floats or arrays: every row is a multiple of q.
+
+    The row with the largest diagonal keeps all digits.
+    """
+    a, b, c = R[0][0], R[1][1], R[2][2]
+    x, y, z = R[2][1] - R[1][2], R[0][2] - R[2][0], R[1][0] - R[0][1]
+    xy, xz, yz = R[1][0] + R[0][1], R[0][2] + R[2][0], R[2][1] + R[1][2]
+    trace = a + b + c
+    return [
+        [1 + trace, x, y, z],
+        [x, 1 - trace + 2 * a, xy, xz],
+        [y, xy, 1 - trace + 2 * b, yz],
+        [z, xz, yz, 1 - trace + 2 * c],
+    ]
 
 
 def continuous_wxyz(R: ArrayLike) -> Array:

@@ -19,7 +19,7 @@ _COUPLING_SERIES_RAD = 0.3
 def make_transform(R: ArrayLike, t: ArrayLike) -> Array:
     """Assemble transforms (..., 4, 4) from rotation matrices (..., 3, 3) and translations (..., 3) [mm]."""
     R, t = np.asarray(R, dtype=np.float64), np.asarray(t, dtype=np.float64)
-    shape = np.broadcast_shapes(R.shape[:-2], t.shape[:-1])
+    shape = () if R.ndim == 2 and t.ndim == 1 else np.broadcast_shapes(R.shape[:-2], t.shape[:-1])
     T = np.zeros((*shape, 4, 4))
     T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = R, t, 1.0
     return T

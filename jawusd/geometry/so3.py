@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jawusd.geometry import rodrigues
 from jawusd.geometry.arrays import Array
 from jawusd.geometry.quaternion import matrix_from_wxyz, wxyz_from_matrix
 from jawusd.geometry.rodrigues import SMALL_SQUARED_ANGLE, angle_quotients, angle_series, turning
@@ -34,6 +35,9 @@ def vee(W: ArrayLike) -> Array:
 
 def angle_coefficients(squared: Array) -> tuple[Array, Array, Array]:
     """Return a, b and c of `jawusd.geometry.rodrigues` at squared angles [rad^2] of any shape."""
+    if np.ndim(squared) == 0 and squared < np.inf:  # one rotation, in floats: numpy takes most of its time for calls
+        a, b, c = map(np.asarray, rodrigues.angle_coefficients(float(squared)))
+        return a, b, c
     small = squared < SMALL_SQUARED_ANGLE
     safe = np.where(small, 1.0, squared)
     angle = np.sqrt(safe)
@@ -42,8 +46,11 @@ def angle_coefficients(squared: Array) -> tuple[Array, Array, Array]:
     return a, b, c
 
 
-def _series(w: Array, first: Array | float, second: Array) -> Array:
+def _series(w: Array, first: Array | float, second: Array | float) -> Array:
     """Return ``I + first W + second W W``, W = hat(w), shape (..., 3, 3)."""
+    if w.ndim == 1:
+        p, q, r = w.tolist()
+        return np.array(turning((p, q, r), float(first), float(second))) + np.eye(3)
     x, y, z = np.moveaxis(w, -1, 0)
     out = np.empty((*w.shape[:-1], 3, 3))
     for i, row in enumerate(turning((x, y, z), first, second)):

@@ -136,6 +136,7 @@ def test_quaternions_agree_with_scipy():
     wxyz = g.wxyz_from_matrix(R)
     expected = Rotation.from_matrix(R).as_quat(canonical=True)[:, [3, 0, 1, 2]]
     np.testing.assert_allclose(wxyz, expected, atol=1e-14)
+    np.testing.assert_allclose([g.wxyz_from_matrix(one) for one in R], expected, atol=1e-14)
     np.testing.assert_allclose(g.matrix_from_wxyz(-3 * wxyz), R, atol=1e-14)
 
 

@@ -258,7 +258,7 @@ def test_all_shifts_at_once_agree_with_drawing_each(pictures):
         view = masks.at(FIRST + 2)[1]
     scan = coarse_scan(Mesh(MESHES[1].vertices, MESHES[1].faces), "lower")  # without gum silhouettes say all
     shifts = np.random.default_rng(0).uniform(-8, 8, (12, 3))
-    found = Screen(view, 1, 2.0, shifts, centre).objective(scan, pose)
+    found = Screen(view, 1, 2.0, shifts, centre).objectives(scan, pose[None])[0]
     template = np.pad(_template(view.masks[1], view.masks[0], 2.0), 60)
     h = view.matrix @ np.append(centre, 1)
     slope = (view.matrix[:2, :3] - (h[:2] / h[2])[:, None] * view.matrix[2, :3]) / h[2]

@@ -44,11 +44,11 @@ class Grid:
     step_mm: float = 1.5
 
     def turns(self) -> Iterator[Array]:
-        """Yield the rotations to be tried, shape (3, 3)."""
+        """Yield the rotations to be tried, those that differ in their roll together, shape (N, 3, 3)."""
+        rolls = so3_exp(self.roll_rad[:, None] * [0.0, 0.0, 1.0])
         for yaw in self.yaw_rad:
             for pitch in self.pitch_rad:
-                for roll in self.roll_rad:
-                    yield so3_exp([0, yaw, 0]) @ so3_exp([pitch, 0, 0]) @ so3_exp([0, 0, roll])
+                yield so3_exp([0, yaw, 0]) @ so3_exp([pitch, 0, 0]) @ rolls
 
     def shifts(self) -> Array:
         """Return the translations to be tried along left, up and front [mm], shape (N, 3)."""
@@ -93,14 +93,21 @@ class Screen:
         self._full = tuple(fft.next_fast_len(n, real=True) for n in picture.shape)
         self._template = fft.rfft2(picture, self._full)
         self._matrix = np.array([[1, 0, right - x[0]], [0, 1, down - y[0]], [0, 0, 1.0]]) @ view.matrix
-        self._columns, self._rows = (pixels % self._full[::-1]).T
+        columns, rows = (pixels % self._full[::-1]).T
+        self._places = rows * self._full[1] + columns
 
-    def objective(self, scan: Scan, pose: Array) -> NDArray[np.float32]:
-        """Return the objective of a pose under all shifts [px], shape (N,)."""
-        depth, labels = np.zeros(self._shape, np.float32), np.zeros(self._shape, np.uint8)
-        scan.draw(self._matrix @ pose, depth, labels)
-        drawn = fft.rfft2((labels == CROWN).astype(np.float32), self._full)
-        return fft.irfft2(np.conj(drawn) * self._template, self._full)[self._rows, self._columns]
+    def objectives(self, scan: Scan, poses: Array) -> NDArray[np.float32]:
+        """Return the objectives of poses (P, 4, 4) under all shifts [px], shape (P, N)."""
+        drawn = np.zeros((len(poses), *self._full), np.float32)
+        for pose, picture in zip(poses, drawn, strict=True):
+            depth, labels = np.zeros(self._shape, np.float32), np.zeros(self._shape, np.uint8)
+            scan.draw(self._matrix @ pose, depth, labels)
+            picture[: self._shape[0], : self._shape[1]] = labels == CROWN
+        product = fft.rfft2(drawn, overwrite_x=True)
+        np.conj(product, out=product)
+        product *= self._template
+        found = fft.irfft2(product, self._full, overwrite_x=True)
+        return found.reshape(len(poses), -1)[:, self._places]
 
 
 def search_arch(
@@ -128,13 +135,15 @@ def search_arch(
     shifts = grid.shifts() @ base[:3, :3].T
     screens = [Screen(view, arch, px_per_mm, shifts, base[:3, 3]) for view in views if view.present[arch]]
 
-    def best_translation(turn: Array) -> Candidate:
-        pose = base @ make_transform(turn, np.zeros(3)) @ hinge
-        objective = np.sum([screen.objective(scan, pose) for screen in screens], axis=0)
-        best = int(objective.argmax())
-        return Candidate(float(objective[best]), make_transform(np.eye(3), shifts[best]) @ pose)
+    def best_translations(turns: Array) -> list[Candidate]:
+        poses = base @ make_transform(turns, np.zeros(3)) @ hinge
+        objectives = np.sum([screen.objectives(scan, poses) for screen in screens], axis=0)
+        best = objectives.argmax(axis=1)
+        poses[:, :3, 3] += shifts[best]
+        return [Candidate(float(row[k]), pose) for row, k, pose in zip(objectives, best, poses, strict=True)]
 
-    return sorted(map_(best_translation, grid.turns()), key=lambda c: -c.objective)
+    found = [candidate for some in map_(best_translations, grid.turns()) for candidate in some]
+    return sorted(found, key=lambda c: -c.objective)
 
 
 def _template(mask: NDArray[np.uint8], other: NDArray[np.uint8], px_per_mm: float) -> Array:

@@ -182,11 +182,9 @@ class SingleStart:
         """Return the two most promising jaws with a head, with the objective of both arches."""
         place = transform_point(head.pose, self._coarse[1].centre)
         screen = Screen(views[0], 1, _PX_PER_MM, _SHIFTS @ head.pose[:3, :3].T, place)
-        worth = []
-        for d in self._jaws:
-            pose = head.pose @ self._jaw.pose(d)
-            price = self._outside_price(1, pose, views[0])
-            worth.append(float(screen.objective(self._coarse[1], pose).max()) - price)
+        poses = head.pose @ self._jaw.pose(self._jaws)
+        prices = np.array([self._outside_price(1, pose, views[0]) for pose in poses])
+        worth = screen.objectives(self._coarse[1], poses).max(axis=1) - prices
         return [(head.objective + worth[k], Pose(head.pose, self._jaws[k])) for k in np.argsort(worth)[::-1][:2]]
 
     def _outside_price(self, arch: int, pose: Array, view: View) -> float:
