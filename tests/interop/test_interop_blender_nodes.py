@@ -1,6 +1,7 @@
 """The Blender file without add-on: Geometry Nodes pose the mandible with all scripts switched off."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -14,14 +15,22 @@ from jawusd.rig.sampling import sample_valid
 MESHES = {"MandibleMesh": "mandible", "LowerTeethMesh": "lower_teeth"}
 
 
+@pytest.fixture(scope="module", params=["anchored", "additive", "touching"])
+def actor(request, tmp_path_factory):
+    """Return a rig and its folder."""
+    rig, (frames, d) = touching_rig() if request.param == "touching" else example_rig(request.param), example_motion()
+    folder = tmp_path_factory.mktemp(request.param)
+    bake_rig(folder, rig, example_meshes(), name="x", fps=FPS, frames=frames, d=d, table_size=17)
+    return rig, folder
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("blender", ["blender45", "blender50"])
-@pytest.mark.parametrize("kind", ["anchored", "additive", "touching"])
 @pytest.mark.parametrize("file", ["anim_capture.usdc", "actor.usdz"])
-def test_nodes_pose_the_mandible_without_scripts(tmp_path, blender, kind, file):
-    rig, meshes = touching_rig() if kind == "touching" else example_rig(kind), example_meshes()
-    frames, d = example_motion()
-    bake_rig(tmp_path / "actor", rig, meshes, name="x", fps=FPS, frames=frames, d=d, table_size=17)
+def test_nodes_pose_the_mandible_without_scripts(tmp_path, blender, actor, file):
+    rig, folder = actor
+    meshes, (frames, d) = example_meshes(), example_motion()
+    shutil.copytree(folder, tmp_path / "actor")
     # also at rest, and beyond the ends of the model's curves
     poses = np.concatenate([np.zeros((1, 3)), sample_valid(rig, 50, seed=6), [[-2, 3, 1], [70, 0, 0], [5, -14, -5]]])
     (tmp_path / "poses.json").write_text(json.dumps(poses.tolist()))

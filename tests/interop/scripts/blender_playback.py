@@ -3,13 +3,12 @@
 Usage: python blender_playback.py ZIP FOLDER TAKE.usd KEYS.json FRAME,FRAME,...
 KEYS is a list of takes, each [[frame, d1, d2, d3], ...]; every one but the imported motion is keyed on the sliders.
 Each take is played forward, backward, and again after the file was saved on each of FRAMES and reopened. Prints
-{"takes": [{"FRAME": [matrix forward, backward, ...reopened]}], "d": [{"FRAME": [d1, d2, d3]}], "ms": per frame}.
+{"takes": [{"FRAME": [matrix forward, backward, ...reopened]}], "d": [{"FRAME": [d1, d2, d3]}]}.
 """
 
 import json
 import os
 import sys
-import time
 
 import bpy
 
@@ -28,16 +27,11 @@ def matrix(name="Mandible"):
 
 def played(frames, found, values=None):
     """Show frames in turn; note the mandible and, if asked, the sliders."""
-    scene, start = bpy.context.scene, time.perf_counter()
     for frame in frames:
-        scene.frame_set(frame)
-    spent = time.perf_counter() - start
-    for frame in frames:
-        scene.frame_set(frame)
+        bpy.context.scene.frame_set(frame)
         found.setdefault(str(frame), []).append(matrix())
         if values is not None:
             values[str(frame)] = [bpy.data.objects["Actor"][name] for name in NAMES]
-    return 1e3 * spent / len(frames)
 
 
 def key(keys):
@@ -55,7 +49,7 @@ def main(archive, folder, take, takes, saved_on):
     """Play all takes and print what was shown."""
     bpy.ops.wm.read_homefile(use_empty=True)
     package = install(archive, folder)
-    result = {"takes": [], "d": [], "ms": []}
+    result = {"takes": [], "d": []}
     with open(takes) as opened:
         takes = [None, *json.load(opened)]
     for keys in takes:
@@ -65,7 +59,7 @@ def main(archive, folder, take, takes, saved_on):
             key(keys)
         scene = bpy.context.scene
         frames, found, values = list(range(scene.frame_start, scene.frame_end + 1)), {}, {}
-        result["ms"].append(played(frames, found, values))
+        played(frames, found, values)
         played(frames[::-1], found)
         for frame in saved_on:
             scene = bpy.context.scene
