@@ -135,10 +135,10 @@ def _landmarks_mm(tracks, truth):
 
 
 @pytest.fixture(scope="module")
-def takes(tmp_path_factory):
+def takes(clean_take):
     """The same masks with the true cameras, with knocked ones, and with these taken as they are."""
-    capture = make_capture(write_masks(tmp_path_factory.mktemp("knocked"), FRAMES), FRAMES)
-    return track(capture), _track_knocked(capture), _track_knocked(capture, config=WITHOUT)
+    capture, good = clean_take
+    return good, _track_knocked(capture), _track_knocked(capture, config=WITHOUT)
 
 
 @pytest.mark.slow
