@@ -24,7 +24,7 @@ from small_take import (
 
 from jawusd.errors import TrackingError
 from jawusd.formats.mesh import Mesh
-from jawusd.geometry import make_transform, random_rotation, se3_inverse, transform_point, transform_points
+from jawusd.geometry import make_transform, random_rotation, se3_exp, se3_inverse, transform_point, transform_points
 from jawusd.imaging.raster import draw_silhouette, project, unpack_bits, words_for
 from jawusd.tracking import track_capture
 from jawusd.tracking.config import TrackingConfig
@@ -34,7 +34,14 @@ from jawusd.tracking.contour.views import masked_sources
 from jawusd.tracking.initialization import searched_start, start_search
 from jawusd.tracking.initialization import start as take_start
 from jawusd.tracking.initialization.footage import Footage, MaskSurvey, survey_masks
-from jawusd.tracking.initialization.pose_search import Grid, Screen, _template, coarse_scan
+from jawusd.tracking.initialization.pose_search import (
+    Grid,
+    Screen,
+    _template,
+    coarse_scan,
+    hinge_at_front,
+    search_arch,
+)
 from jawusd.tracking.initialization.scan_checks import check_occlusion
 from jawusd.tracking.initialization.start import find_start
 from jawusd.tracking.initialization.start_search import Found, StartSearch
@@ -270,6 +277,22 @@ def test_all_shifts_at_once_agree_with_drawing_each(pictures):
         bits = np.zeros((template.shape[0], words_for(template.shape[1])), np.uint64)
         draw_silhouette(points, scan.crown_faces, 0, 0, template.shape[1], False, bits)
         assert worth == pytest.approx(template[unpack_bits(bits, template.shape[1])].sum(), rel=0.02, abs=3.0)
+
+
+def test_the_best_of_turns_and_shifts_undoes_what_was_done_to_the_guess(pictures):
+    capture = _capture(pictures)
+    footage = Footage(masked_sources(capture.cameras, TABLE, OFFSETS), TABLE, OFFSETS, capture.frames)
+    pose, scan = jaw_poses(3)[2, 1], coarse_scan(MESHES[1], "lower")
+    with footage.views(transform_point(pose, scan.centre), 2.0) as masks:
+        views = masks.at(FIRST + 2)
+    hinge = hinge_at_front(scan.crown_vertices(), np.eye(4))
+    turned = pose @ np.linalg.inv(hinge) @ se3_exp([0, 0, 0.3, 0, 0, 0])
+    guess = make_transform(turned[:3, :3], turned[:3, 3] - turned[:3, :3] @ [4.5, -3.0, 6.0])
+    none = np.zeros(1)
+    found = search_arch(scan, 1, views, 2.0, guess, hinge, Grid(none, none, np.array([0.3, 0, -0.3]), (6.0, 6.0, 9.0)))
+    assert [len(found), found[0].objective] == [3, max(one.objective for one in found)]
+    off = transform_points(found[0].pose, scan.probes) - transform_points(pose, scan.probes)
+    assert np.linalg.norm(off, axis=1).max() < 1.5  # mm, the step
 
 
 def _footage(folder):
