@@ -72,12 +72,13 @@ def _teeth(toothlike: Array, redness: Array) -> tuple[Mask, float] | None:
     best: tuple[float, float, float, Mask] | None = None
     for level in np.percentile(toothlike, _LEVELS).tolist():
         above = ndimage.binary_opening(toothlike > level, np.ones((2, 2)))
-        groups, count = ndimage.label(ndimage.binary_closing(above, iterations=_CLOSE_PX))
+        groups, count = ndimage.label(_closed(above))
         areas = np.bincount(groups.ravel(), minlength=count + 1)
         fair = (areas > _LEAST_AREA * groups.size) & (areas < _MOST_AREA * groups.size)
         fair[[0, *_at_border(groups)]] = False
+        boxes = ndimage.find_objects(groups)
         for number in np.flatnonzero(fair).tolist():
-            inside, outside = _standing_out(groups, number, above, toothlike, redness)
+            inside, outside = _standing_out(groups, number, boxes[number - 1], above, toothlike, redness)
             worth = (inside - outside) ** 2 * np.sqrt(areas[number])
             if worth > (0.0 if best is None else best[0]):
                 best = worth, inside, outside, groups == number
@@ -88,17 +89,29 @@ def _teeth(toothlike: Array, redness: Array) -> tuple[Mask, float] | None:
     parts, count = ndimage.label(toothlike > level)
     like = ndimage.median(toothlike, parts, np.arange(count + 1)) > outside + _AS_BRIGHT * (inside - outside)
     own = np.bincount(parts.ravel(), group.ravel(), count + 1) > 0.5 * np.bincount(parts.ravel())
+    boxes = ndimage.find_objects(parts)
+
+    def stands_out(number: int) -> float:
+        inside, outside = _standing_out(parts, number, boxes[number - 1], parts > 0, toothlike, redness)
+        return inside - outside
+
     kept = [
         number
         for number in _parts_near(parts, group)
-        if like[number] and (own[number] or _stands_out(parts, number, toothlike, redness) > _LIKE * (inside - outside))
+        if like[number] and (own[number] or stands_out(number) > _LIKE * (inside - outside))
     ]
     return (np.isin(parts, kept), level) if kept else None
 
 
-def _stands_out(parts: NDArray[np.int32], number: int, toothlike: Array, redness: Array) -> float:
-    inside, outside = _standing_out(parts, number, parts > 0, toothlike, redness)
-    return inside - outside
+def _distance(away: Mask) -> NDArray[np.float32]:
+    """Return how far it is from every pixel to the nearest one that is not `away`, along rows and columns [px]."""
+    return np.asarray(cv2.distanceTransform(away.astype(np.uint8), cv2.DIST_L1, 3), np.float32)
+
+
+def _closed(mask: Mask) -> Mask:
+    """Return a mask with small gaps closed; beyond the picture nothing is."""
+    grown = np.pad(_distance(~mask) <= _CLOSE_PX, 1)
+    return (_distance(grown) > _CLOSE_PX)[1:-1, 1:-1]
 
 
 def _at_border(groups: NDArray[np.int32]) -> list[int]:
@@ -106,14 +119,18 @@ def _at_border(groups: NDArray[np.int32]) -> list[int]:
 
 
 def _standing_out(
-    groups: NDArray[np.int32], number: int, above: Mask, toothlike: Array, redness: Array
+    groups: NDArray[np.int32], number: int, box: tuple[slice, slice], above: Mask, toothlike: Array, redness: Array
 ) -> tuple[float, float]:
     """Return how much a group looks like teeth, and the ring around it; nothing if that is neither redder nor dark."""
-    (top, left), (bottom, right) = ((f(np.nonzero(groups == number), axis=1)) for f in (np.min, np.max))
-    around = np.s_[max(top - _FAR_PX, 0) : bottom + _FAR_PX + 1, max(left - _FAR_PX, 0) : right + _FAR_PX + 1]
+    rows, columns = box
+    around = (
+        slice(max(rows.start - _FAR_PX, 0), rows.stop + _FAR_PX),
+        slice(max(columns.start - _FAR_PX, 0), columns.stop + _FAR_PX),
+    )
     group = groups[around] == number
     own = group & above[around]
-    ring = ndimage.binary_dilation(group, iterations=_FAR_PX) & ~ndimage.binary_dilation(group, iterations=_NEAR_PX)
+    away = _distance(~group)
+    ring = (away <= _FAR_PX) & (away > _NEAR_PX)
     if not own.any() or not ring.any():
         return 0.0, 0.0
     inside = float(np.median(toothlike[around][own]))
@@ -141,7 +158,7 @@ def _split(teeth: Mask, bright: Array) -> tuple[NDArray[np.bool_], float] | None
     rows, columns = np.nonzero(teeth)
     first, last, top, bottom = columns.min(), columns.max(), rows.min(), rows.max()
     lines = top + _lines(int(last - first + 1), int(bottom - top + 1))  # (N, width)
-    lines = np.clip(lines, 1, len(teeth) - 2)
+    np.clip(lines, 1, len(teeth) - 2, out=lines)
     across = np.arange(first, last + 1)
     taken = teeth[:, across].any(0)
     upper = np.cumsum(teeth[:, across], axis=0)
@@ -150,7 +167,8 @@ def _split(teeth: Mask, bright: Array) -> tuple[NDArray[np.bool_], float] | None
     if not len(fair):
         return None
     lines = lines[fair]
-    bridged = np.mean([bright[lines + k, across] for k in _LINE_PX], axis=0)[:, taken].mean(1)
+    near = np.mean([np.roll(bright, -k, axis=0) for k in _LINE_PX], axis=0)  # of the rows around each pixel
+    bridged = near[lines[:, taken], across[taken]].mean(1)
     best = int(bridged.argmin())
     below = np.zeros(teeth.shape, bool)
     below[:, across] = np.arange(len(teeth))[:, None] > lines[best]
