@@ -19,6 +19,7 @@ _TIMES, _FEW_MARKERS = 2, 4  # pictures that must agree on another board; fewest
 _FEWEST_CORNERS = 8  # of a ChArUco board; fewer do not fix its pose
 # The corner is refined in a window of this share of a cell: larger ones reach blur and lens, smaller ones only noise.
 _WINDOW_SHARE, _WINDOW_PX = 0.12, (3, 12)
+_LARGE_PX = 1000  # width from which pictures are first searched at half their size: a quarter of the time
 _FLAGS = cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_LARGER
 
 
@@ -71,11 +72,23 @@ def corners_and_width(search: Search, image: NDArray[np.uint8], boards: Boards) 
 
 
 def _chessboard(boards: Boards) -> Search:
-    def search(image: NDArray[np.uint8]) -> Array | None:
+    def look(image: NDArray[np.uint8]) -> Array | None:
         ok, corners, meta = cv2.findChessboardCornersSBWithMeta(image, (boards.cols, boards.rows), flags=_FLAGS)
         if not ok or meta.shape != (boards.rows, boards.cols):
             return None
-        return _refined(image, corners.reshape(-1, 2).astype(np.float64), boards)
+        return corners.reshape(-1, 2).astype(np.float64)
+
+    def search(image: NDArray[np.uint8]) -> Array | None:
+        height, width = image.shape
+        corners = None
+        if width >= _LARGE_PX:
+            half = cv2.resize(image, (width // 2, height // 2), interpolation=cv2.INTER_AREA)
+            corners = look(np.asarray(half, np.uint8))
+        if corners is not None:
+            corners = (corners + 0.5) * [width / (width // 2), height / (height // 2)] - 0.5
+        else:
+            corners = look(image)
+        return None if corners is None else _refined(image, corners, boards)
 
     return search
 
