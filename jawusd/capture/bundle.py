@@ -92,8 +92,8 @@ class _Problem:
         self.corners_px, self.points_mm = corners_px[:, self.views], points_mm
         self.cameras = len(corners_px)
         self.seen = np.isfinite(self.corners_px[..., 0])
-        # The first residual of each camera's view.
-        self.blocks = [(c, v) for c in range(self.cameras) for v in range(len(self.views)) if self.seen[c, v].any()]
+        # Per camera the view and the corner of each point it saw.
+        self.points = [np.nonzero(seen) for seen in self.seen]
 
     def pack(self, start: FirstGuess) -> Array:
         """Return all unknowns of a start: lenses, poses of cameras 1.., poses of boards."""
@@ -142,26 +142,27 @@ class _Problem:
 
     def residuals(self, x: Array) -> Array:
         """Return projected minus seen pixels, shape (R,)."""
-        return np.concatenate([self._block(x, c, v, False)[0] for c, v in self.blocks])
+        turns = so3_exp(self.split(x)[1][:, :3])
+        return np.concatenate([self._camera(x, turns, c)[0] for c in range(self.cameras)])
 
     def spread(self, x: Array) -> Array:
         """Return the residuals as (C, V, N, 2), NaN where not seen."""
         out = np.full(self.corners_px.shape, np.nan)
-        for c, v in self.blocks:
-            out[c, v, self.seen[c, v]] = self._block(x, c, v, False)[0].reshape(-1, 2)
+        out[self.seen] = self.residuals(x).reshape(-1, 2)
         return out
 
     def jacobian(self, x: Array) -> csr_matrix:
         """Return d residual / d unknown, sparse, shape (R, U)."""
+        boards = self.split(x)[1]
+        turns, slopes = so3_exp(boards[:, :3]), so3_left_jacobian(boards[:, :3])
         data, rows, columns, row = [], [], [], 0
-        for c, v in self.blocks:
-            residual, parts = self._block(x, c, v, True)
-            for column, part in parts:
-                r, k = np.indices(part.shape)
+        for c in range(self.cameras):
+            parts = self._parts(x, turns, slopes, c)
+            for first, part in parts:
                 data.append(part.ravel())
-                rows.append((row + r).ravel())
-                columns.append((column + k).ravel())
-            row += len(residual)
+                rows.append(np.repeat(np.arange(row, row + len(part)), _POSE))
+                columns.append((np.broadcast_to(first, len(part))[:, None] + np.arange(_POSE)).ravel())
+            row += len(parts[0][1])
         entries = (np.concatenate(data), (np.concatenate(rows), np.concatenate(columns)))
         return csr_matrix(entries, shape=(row, len(x)))
 
@@ -175,34 +176,50 @@ class _Problem:
         own = len(self.split(x)[0])
         return sigma**2 * inverse[:own, :own]
 
-    def _block(self, x: Array, c: int, v: int, derive: bool) -> tuple[Array, list[tuple[int, Array]]]:
-        """Return residuals (2n,) of one view by one camera and its Jacobian parts with their first column."""
+    def _camera(self, x: Array, turns: Array, c: int) -> tuple[Array, Array, Array, Array]:
+        """Return what one camera sees at the boards' rotations (V, 3, 3): its n points in order of the views.
+
+        Returns:
+            residuals (2n,), OpenCV's derivative of the pixels (2n, ...), points turned as the board is and points
+            turned as the camera is (n, 3).
+        """
         cameras, boards = self.split(x)
-        lens, column = cameras[c * _LENS : (c + 1) * _LENS], self.cameras * _LENS + (c - 1) * _POSE
-        pose = cameras[column : column + _POSE] if c else np.zeros(_POSE)
+        lens, pose = cameras[c * _LENS : (c + 1) * _LENS], self._pose(x, c)
         K = np.array([[lens[0], 0, lens[2]], [0, lens[1], lens[3]], [0, 0, 1.0]])
-        points = self.points_mm[self.seen[c, v]]
-        turned = points @ so3_exp(boards[v, :3]).T
-        world = turned + boards[v, 3:]
-        R = so3_exp(pose[:3])
-        carried = world @ R.T
+        views, corners = self.points[c]
+        turned = (turns[views] @ self.points_mm[corners][..., None])[..., 0]
+        carried = (turned + boards[views, 3:]) @ so3_exp(pose[:3]).T
         terms = np.array([*lens[4:], 0.0, 0.0])
         found, derived = cv2.projectPoints(carried + pose[3:], np.zeros(3), np.zeros(3), K, terms)
-        pixels, J = np.asarray(found, np.float64), np.asarray(derived, np.float64)
-        residual = (pixels.reshape(-1, 2) - self.corners_px[c, v, self.seen[c, v]]).ravel()
-        if not derive:
-            return residual, []
+        seen = self.corners_px[c, views, corners]
+        residual = np.asarray(found, np.float64).reshape(-1, 2) - seen
+        return residual.ravel(), np.asarray(derived, np.float64), turned, carried
+
+    def _parts(self, x: Array, turns: Array, slopes: Array, c: int) -> list[tuple[Array | int, Array]]:
+        """Return the parts of one camera's Jacobian, shape (2n, 6), with their first column, an int or per row.
+
+        Args:
+            turns, slopes: the boards' rotations and their left Jacobians, shape (V, 3, 3).
+        """
+        pose, views = self._pose(x, c), self.points[c][0]
+        _, J, turned, carried = self._camera(x, turns, c)
         # Columns of OpenCV: rotation 0-2, translation 3-5, f 6-7, c 8-9, distortion from 10.
         by_point = J[:, 3:6].reshape(-1, 2, 3)
-        parts = [(c * _LENS, J[:, 6:12])]
+        parts: list[tuple[Array | int, Array]] = [(c * _LENS, J[:, 6:12])]
         if c:
             by_turn = by_point @ (-hat(carried)) @ so3_left_jacobian(pose[:3])
-            parts.append((column, np.concatenate([by_turn, by_point], axis=-1).reshape(-1, _POSE)))
-        by_world = by_point @ R
-        by_turn = by_world @ (-hat(turned)) @ so3_left_jacobian(boards[v, :3])
+            own = np.concatenate([by_turn, by_point], axis=-1).reshape(-1, _POSE)
+            parts.append((self.cameras * _LENS + (c - 1) * _POSE, own))
+        by_world = by_point @ so3_exp(pose[:3])
+        by_turn = by_world @ (-hat(turned)) @ slopes[views]
         board = np.concatenate([by_turn, by_world], axis=-1).reshape(-1, _POSE)
-        parts.append((len(cameras) + v * _POSE, board))
-        return residual, parts
+        parts.append((np.repeat(len(self.split(x)[0]) + views * _POSE, 2), board))
+        return parts
+
+    def _pose(self, x: Array, c: int) -> Array:
+        """Return the pose of a camera; the first one is the world."""
+        column = self.cameras * _LENS + (c - 1) * _POSE
+        return x[column : column + _POSE] if c else np.zeros(_POSE)
 
 
 def _huber(residual: Array, scale_px: float) -> float:
