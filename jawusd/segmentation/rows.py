@@ -119,7 +119,12 @@ def _at_border(groups: NDArray[np.int32]) -> list[int]:
 
 
 def _standing_out(
-    groups: NDArray[np.int32], number: int, box: tuple[slice, slice], above: Mask, toothlike: Array, redness: Array
+    groups: NDArray[np.int32],
+    number: int,
+    box: tuple[slice[int, int, None], slice[int, int, None]],
+    above: Mask,
+    toothlike: Array,
+    redness: Array,
 ) -> tuple[float, float]:
     """Return how much a group looks like teeth, and the ring around it; nothing if that is neither redder nor dark."""
     rows, columns = box
