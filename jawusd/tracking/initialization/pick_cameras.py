@@ -65,9 +65,10 @@ def fitted_camera(
         out = [x[:2]]
         for k, (start, seen) in enumerate(zip(starts, sights, strict=True)):
             T = se3_exp(x[2 + 6 * k : 8 + 6 * k] * _STEP)
-            for camera_name, (points, pixels, middle) in seen.items():
-                camera = table[camera_name]
-                placed = transform_points(start, middle + transform_points(T, points - middle))
+            about, middle, views = seen
+            everything = transform_points(start, middle + transform_points(T, about))
+            for camera_name, which, pixels in views:
+                camera, placed = table[camera_name], everything[which]
                 mm_per_px = camera.depth(placed) / float(camera.K[0, 0])
                 out.append(((camera.project(placed) - pixels) * mm_per_px[:, None] / _CLICK_MM).ravel())
         return np.concatenate(out)
@@ -76,17 +77,21 @@ def fitted_camera(
     return changed(found.x)
 
 
-def _sights(picks: Sequence[Pick], vertices: Array) -> dict[str, tuple[Array, Array, Array]]:
-    """Return the picked points of a scan (N, 3), their pixels (N, 2) and the middle of all picks (3,), by camera."""
-    middle = np.mean([vertices[pick.vertex] for pick in picks], axis=0)
-    seen: dict[str, list[tuple[Array, list[float]]]] = {}
-    for pick in picks:
+def _sights(picks: Sequence[Pick], vertices: Array) -> tuple[Array, Array, list[tuple[str, list[int], Array]]]:
+    """Return what is picked of a scan.
+
+    Returns:
+        the picked points about their middle (P, 3), the middle (3,), and by camera which points it saw, at which
+        pixels (N, 2).
+    """
+    points = np.stack([vertices[pick.vertex] for pick in picks])
+    middle = points.mean(axis=0)
+    seen: dict[str, list[tuple[int, list[float]]]] = {}
+    for k, pick in enumerate(picks):
         for view in pick.views:
-            seen.setdefault(view.camera, []).append((vertices[pick.vertex], [view.x, view.y]))
-    return {
-        name: (np.stack([point for point, _ in own]), np.array([pixel for _, pixel in own]), middle)
-        for name, own in seen.items()
-    }
+            seen.setdefault(view.camera, []).append((k, [view.x, view.y]))
+    views = [(name, [k for k, _ in own], np.array([pixel for _, pixel in own])) for name, own in seen.items()]
+    return points - middle, middle, views
 
 
 def _placed(picks: Sequence[Pick], vertices: Array, cameras: Mapping[str, Camera]) -> Array | None:
