@@ -40,17 +40,10 @@ def heed_interrupts():
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-NO_FIGURES = 'raise ModuleNotFoundError("no report: nothing here reads it", name="matplotlib")\n'
-
-
 def started(folder, *arguments):
-    """Start the program on the list of a folder, in a process group of its own as in a terminal, without reports."""
-    (folder / "without").mkdir()
-    (folder / "without" / "matplotlib.py").write_text(NO_FIGURES)
-    path = os.pathsep.join(filter(None, (str(folder / "without"), os.environ.get("PYTHONPATH"))))
+    """Start the program on the list of a folder, in a process group of its own as in a terminal."""
     command = [sys.executable, "-m", "jawusd", "build-many", str(folder / "list.txt"), "-o", str(folder / "out")]
     how = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
-    how["env"] = {**os.environ, "PYTHONPATH": path}
     return subprocess.Popen([*command, *arguments], **how, preexec_fn=heed_interrupts)
 
 
