@@ -19,8 +19,11 @@ from jawusd.tracking.contour.scan import prepare_scan, teeth_centre
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import MaskViews, masked_sources
 from jawusd.tracking.initialization.footage import Footage
+from jawusd.tracking.performance.attempts import FrameFit
 from jawusd.tracking.performance.coordinates import LOCAL, Coordinates, Pose
+from jawusd.tracking.performance.instant import InstantSolver
 from jawusd.tracking.performance.single_start import SingleStart
+from jawusd.tracking.performance.smoother import Smoother
 from jawusd.tracking.performance.take import Shot, solve_performance
 
 COUNT = 26
@@ -126,6 +129,22 @@ def test_a_performance_is_found_and_carried_through_closed_lips(jaw, scans, trut
         transform_points(found.T_world_upper, crown) - transform_points(truth[1], crown), axis=-1
     ).mean(1)
     assert head[seen()].max() < 2.5 * seen_mm
+
+
+@pytest.mark.parametrize("cameras", [1, 3])
+def test_the_bound_pulls_a_jaw_inside_but_makes_it_no_surer(jaw, scans, truth, cameras):
+    """Nothing is seen of a jaw some millimetres to the side of its bound."""
+    instants = InstantSolver(ContourSolver(scans, TrackingConfig()), Coordinates(jaw, scans))
+    none = np.zeros((2, cameras), bool)
+
+    def smoothed(d):
+        fits = [FrameFit(Pose(truth[1][0], d), None, none, none, np.full(none.shape, np.nan))] * 5
+        return Smoother(instants, None, range(5), 25.0, cameras).run(fits)
+
+    away = truth[0][0] + [0.0, 12.0, 0.0]
+    inside, beyond = smoothed(truth[0][0]), smoothed(away)
+    assert jaw.margin(away) < -1 < -0.1 < jaw.margin(beyond.fits[0].pose.d) < 0
+    np.testing.assert_allclose(beyond.covariance[:, 6:, 6:], inside.covariance[:, 6:, 6:], rtol=1e-6)
 
 
 def test_a_start_elsewhere_is_refused(jaw, scans, truth, folder):

@@ -18,9 +18,12 @@ from jawusd.pipeline.subject import subject_of_capture
 from jawusd.segmentation.footage import ColourFootage
 from jawusd.tracking.contour.samples import COLUMNS, INVERSE_DEPTH, LENGTH, NX, NY, U, V
 from jawusd.tracking.contour.scan import CROWN, prepare_scan
+from jawusd.tracking.region import rig_tracker
 from jawusd.tracking.region.colours import BINS, PATCHES, TABLES, Areas, CameraColours, colour_bins
 from jawusd.tracking.region.edges import search_borders, search_creases, sharpen
+from jawusd.tracking.region.pace import THOROUGH
 from jawusd.tracking.region.performance import follow_back
+from jawusd.tracking.region.rig_tracker import RigTracker
 from jawusd.tracking.sequence.guided import GuidedTracker
 
 TOOTH, LIP = np.array([215.0, 205.0, 185.0]), np.array([150.0, 75.0, 80.0])
@@ -202,6 +205,21 @@ def test_what_searches_found_late_is_followed_back(step):
     assert asked == [(way[8], list(way[7:2:-1]))]
     assert [fits[at].by for at in way] == ["first"] * 5 + ["back"] * 3 + ["first"] * 2
     assert [bool(fits[at].found.all()) for at in way] == [True] * 3 + [False] * 2 + [True] * 4 + [False]
+
+
+@pytest.mark.parametrize(("fits", "kept"), [([0.3, 0.12], "near"), ([0.3, 0.2], "far"), ([0.12, 0.3], "near")])
+def test_what_a_search_finds_is_kept_only_if_enough_of_it_fits(monkeypatch, fits, kept):
+    """A closed mouth fits hardly anywhere; the pose that fits best of all then lies anywhere."""
+    monkeypatch.setattr(rig_tracker, "_share", np.asarray)
+    near, far = SimpleNamespace(pose="near", solution=[0.3, 0.05]), SimpleNamespace(pose="far", solution=fits)
+    look = SimpleNamespace(align=lambda *_: near)
+    tracker = RigTracker.__new__(RigTracker)
+    tracker._pace, tracker._failed, tracker._head = THOROUGH, 0, 0.1
+    tracker._motion, tracker._usual_share = SimpleNamespace(last=None), lambda: np.array([0.4, 0.4])
+    monkeypatch.setattr(rig_tracker, "_better", lambda one, other: one)
+    tracker._wide_look, tracker._searched = (lambda *_: look), (lambda *_: far)
+    found, _ = tracker._best(SimpleNamespace(pose=None), look, None, 1.0, np.array([0.15, 0.15]))
+    assert found.pose == kept
 
 
 @pytest.mark.slow

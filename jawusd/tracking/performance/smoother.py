@@ -25,9 +25,9 @@ from jawusd.tracking.performance.unknowns import DRAWN, HabitPrior, TakeState, U
 # How often outlines are matched anew; a third time changes less than a hundredth of a millimetre.
 _ROUNDS = 2
 _FOCAL_ROUNDS = 6  # with unknown focal lengths, which move the head by centimetres along the line of sight
-# True over computed variance of a frame's unknowns [-]: outline errors last for some frames, and the rig is not quite
-# the person; neither is in the equations.
-_WIDER = 1.5**2
+#: True over computed variance of a frame's unknowns [-]: outline errors last for some frames, and the rig is not quite
+#: the person; neither is in the equations.
+WIDER = 1.5**2
 # How far smoothed poses of frames that were missed may be off, standard deviations [rad, mm, mm].
 _NEARBY = np.r_[[0.05] * 3, [3.0] * 3, [3.0] * 3]
 
@@ -57,6 +57,7 @@ class Smoother:
         free_focal: bool = False,
         length_px: float | None = None,
         habits: HabitPrior = DRAWN,
+        wider: float = WIDER,
     ) -> None:
         """Take what aligns instants, the pictures, the frames in order, and how many cameras there are.
 
@@ -64,7 +65,9 @@ class Smoother:
             views: None for fits whose outlines are matched where they are; with a fixed head these have the same one.
             length_px: over which outlines err alike, where residuals do not show it.
             habits: what is known of how far outlines reach over the teeth.
+            wider: true over computed variance of a frame's unknowns.
         """
+        self._wider = wider
         self._cameras, self._rounds, self._length_px = cameras, _FOCAL_ROUNDS if free_focal else _ROUNDS, length_px
         if views is None:
             self._rounds = 0
@@ -105,9 +108,11 @@ class Smoother:
                 done(round_ * len(fits) + k + 1, total)
             weight = 1.0 / outline_variance(fits, config, self._length_px)
         sigma = np.zeros(self._cameras)
-        covariance, shared = self._covariance(system)
+        # The bound says on which side of it the jaw is, not where: with it, the median NEES of twelve solves by one camera
+        # was twice as large.
+        covariance, shared = self._covariance(self._system(fits, state, weight, motion, bounded=False))
         if self._unknowns.free_focal:
-            sigma = np.sqrt(_WIDER * np.diag(shared)[self._unknowns.focal])
+            sigma = np.sqrt(self._wider * np.diag(shared)[self._unknowns.focal])
         return Smoothed(fits, covariance, state, sigma)
 
     def _with_one_head(self, fits: list[FrameFit]) -> list[FrameFit]:
@@ -121,8 +126,10 @@ class Smoother:
             for fit, frame in zip(fits, self._frames, strict=True)
         ]
 
-    def _system(self, fits: Sequence[FrameFit], state: TakeState, weight: Array, motion: Motion) -> TakeSystem:
-        """Return the equations of the take about where it stands."""
+    def _system(
+        self, fits: Sequence[FrameFit], state: TakeState, weight: Array, motion: Motion, *, bounded: bool = True
+    ) -> TakeSystem:
+        """Return the equations of the take about where it stands, with or without the bound of the rig."""
         unknowns = self._unknowns
         system = TakeSystem(len(fits), unknowns.local, unknowns.shared)
         weak = np.zeros(unknowns.local + unknowns.shared)
@@ -130,7 +137,7 @@ class Smoother:
         if unknowns.head is not None:
             weak[unknowns.head] = MOST_UNSURE[HEAD] ** -2.0
         for k, fit in enumerate(fits):
-            precision, right = unknowns.frame(fit, weight)
+            precision, right = unknowns.frame(fit, weight, bounded=bounded)
             # Steps of what nothing measures stay finite.
             system.add_frame(k, precision + np.diag(1e-3 * weak), right)
         system.add_shared(*unknowns.prior(state))
@@ -177,14 +184,14 @@ class Smoother:
         wide = np.sqrt(unknowns.redundancy)
         shared = found.shared * np.outer(wide, wide)
         if not unknowns.fixed_head:
-            own = _WIDER * found.own + found.response @ shared @ np.swapaxes(found.response, 1, 2)
+            own = self._wider * found.own + found.response @ shared @ np.swapaxes(found.response, 1, 2)
             return np.asarray(own, np.float64), found.shared
         # The head is one of the unknowns of the take.
         response = np.zeros((system.frames, LOCAL, unknowns.shared))
         response[:, HEAD, :6] = np.eye(6)
         response[:, JAW] = found.response
-        out = response @ (_WIDER * shared) @ np.swapaxes(response, 1, 2)
-        out[:, JAW, JAW] += _WIDER * found.own
+        out = response @ (self._wider * shared) @ np.swapaxes(response, 1, 2)
+        out[:, JAW, JAW] += self._wider * found.own
         return np.asarray(out, np.float64), found.shared
 
 

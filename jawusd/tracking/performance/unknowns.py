@@ -98,16 +98,18 @@ class Unknowns:
         off[self.focal] = state.log_focal if self.free_focal else ()
         return precision, -precision * off
 
-    def frame(self, fit: FrameFit, weight: Array) -> tuple[Array, Array]:
+    def frame(self, fit: FrameFit, weight: Array, *, bounded: bool = True) -> tuple[Array, Array]:
         """Return precision and right side of a frame by its outlines and the bound, shapes (L + G, L + G) and (L + G,).
 
         Args:
             fit: the frame, matched where it is.
             weight: 1 / (outline variance times correlation length) of both arches [1/px^3], shape (2,).
+            bounded: with the bound of the rig.
         """
         pose, solution, found, size = fit.pose, fit.solution, fit.found, LOCAL + 2 * _HABITS + self.free_focal
         matrix, right = np.zeros((size, size)), np.zeros(size)
-        matrix[:LOCAL, :LOCAL], right[:LOCAL] = bound_equations(self._coordinates, pose.d)
+        if bounded:
+            matrix[:LOCAL, :LOCAL], right[:LOCAL] = bound_equations(self._coordinates, pose.d)
         for r, slope in zip(ARCHES, self._coordinates.slopes(pose), strict=True):
             if solution is None or not found[r]:
                 continue

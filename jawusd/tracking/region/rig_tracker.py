@@ -111,10 +111,10 @@ class RigTracker:
         if not look.use.any():
             self._motion.take(expected.pose, np.zeros(2, bool))
             return FrameFit(expected.pose, None, look.use, look.use, np.full(look.use.shape, np.nan))
-        rough, look = self._best(expected, look, cut, frames)
-        share, found = _share(rough.solution), look.polished(rough, expected)
         unsure = (self._motion.blind > 0) | (frames > _UNSURE_FRAMES)
         least = np.where(unsure, _AGAIN, _LOST) * self._usual_share()
+        rough, look = self._best(expected, look, cut, frames, least)
+        share, found = _share(rough.solution), look.polished(rough, expected)
         trusted = (share >= least) & (matched_px(found.solution) >= self._least_px)
         if not trusted.any():
             found = replace(found, pose=expected.pose)
@@ -139,8 +139,11 @@ class RigTracker:
         """Return the pictures around all that the jaw reaches from a pose of the head."""
         return self._look(cut, np.stack([found.pose.head, found.pose.head @ self._widest]))
 
-    def _best(self, expected: Expected, look: _Look, cut: Cut, frames: float) -> tuple[Aligned, _Look]:
-        """Align from the prediction, and from other starts where that may have failed; then in more of the pictures."""
+    def _best(self, expected: Expected, look: _Look, cut: Cut, frames: float, least: Array) -> tuple[Aligned, _Look]:
+        """Align from the prediction, and from other starts where that may have failed; then in more of the pictures.
+
+        What is found far away is kept only if at least so much of the contour in sight fits there, shape (2,).
+        """
         pace, usual = self._pace, self._usual_share()
         in_turn, far = pace.in_turn and self._failed > pace.searches, frames > _STEADY_FRAMES
         gates = pace.far_px if far and not in_turn else pace.gates_px
@@ -163,7 +166,8 @@ class RigTracker:
         found = look.align(found.pose, expected, gates)
         if self._head == 1.0 and _share(found.solution)[0] < _SEARCHED * usual[0]:
             found = self._with_head_searched(found, expected, look)
-        return self._searched(found, expected, look), look
+        far_away = self._searched(found, expected, look)
+        return far_away if (_share(far_away.solution) >= least).all() else found, look
 
     def _best_in_turn(self, found: Aligned, expected: Expected, look: _Look, cut: Cut) -> tuple[Aligned, _Look]:
         """Search the jaw in one frame and the head in a later one: teeth out of sight hold up no pictures."""
