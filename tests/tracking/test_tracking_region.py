@@ -1,6 +1,7 @@
 """Borders of teeth found in colours, against pictures whose borders are known by construction."""
 
 import weakref
+from collections import deque
 from types import SimpleNamespace
 from typing import ClassVar
 
@@ -205,6 +206,18 @@ def test_what_searches_found_late_is_followed_back(step):
     assert asked == [(way[8], list(way[7:2:-1]))]
     assert [fits[at].by for at in way] == ["first"] * 5 + ["back"] * 3 + ["first"] * 2
     assert [bool(fits[at].found.all()) for at in way] == [True] * 3 + [False] * 2 + [True] * 4 + [False]
+
+
+def test_a_jaw_that_is_lost_slowly_does_not_get_usual():
+    """A wrong pose that fits ever less was followed for six frames, up to 8 mm off."""
+    tracker = RigTracker.__new__(RigTracker)
+    tracker._usual, tracker._first = deque([np.array([0.5, 0.4])] * 3, maxlen=15), np.array([0.5, 0.3])
+    for share in np.linspace(0.2, 0.14, 30):
+        tracker._remember(np.array([0.5, share]))
+    np.testing.assert_allclose(tracker._usual_share(), [0.5, 0.4])
+    for share in np.linspace(0.4, 0.3, 30):
+        tracker._remember(np.array([0.5, share]))
+    assert tracker._usual_share()[1] < 0.35
 
 
 @pytest.mark.parametrize(("fits", "kept"), [([0.3, 0.12], "near"), ([0.3, 0.2], "far"), ([0.12, 0.3], "near")])

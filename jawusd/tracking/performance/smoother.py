@@ -108,8 +108,8 @@ class Smoother:
                 done(round_ * len(fits) + k + 1, total)
             weight = 1.0 / outline_variance(fits, config, self._length_px)
         sigma = np.zeros(self._cameras)
-        # The bound says on which side of it the jaw is, not where: with it, the median NEES of twelve solves by one camera
-        # was twice as large.
+        # The bound says on which side of it the jaw is, not where: with it, the median NEES of twelve solves by one
+        # camera was twice as large.
         covariance, shared = self._covariance(self._system(fits, state, weight, motion, bounded=False))
         if self._unknowns.free_focal:
             sigma = np.sqrt(self._wider * np.diag(shared)[self._unknowns.focal])

@@ -44,8 +44,8 @@ _FIRST_FRAMES, _FOCAL_ROUNDS = 120, 3
 # NEES of d of 0.44 to 2.4, median 0.91; with the habits of drawn masks 0.08 to 0.15 mm, and 0.12 on actor_a.
 _BORDERS, _CORRELATION_PX = HabitPrior((0.4, 0.08, 0.02), 5.0), 80.0
 # Variance of a single camera's poses over that of several cameras that tell as much [-]: borders that light or blur
-# moved have no other view against them. NEES of d over twelve solves of four persons by one camera, median: 2.1 without;
-# 0.2 to 11 with it, since a frame in a wrong minimum says nothing of it.
+# moved have no other view against them. NEES of d over twelve solves of four persons by one camera, median: 2.1 without
+# it, 1.0 with it, and 0.2 to 11, since a frame in a wrong minimum says nothing of it.
 _ALONE = 2.0
 
 

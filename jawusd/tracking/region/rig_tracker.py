@@ -123,9 +123,14 @@ class RigTracker:
             self._failed = 0
             if self._frame % self._pace.learn_every == 0:
                 look.learn(found.pose, RATES)
-            self._usual.append(share)
+            self._remember(share)
         self._motion.take(found.pose, trusted)
         return look.fit(found, trusted, self._free_focal)
+
+    def _remember(self, share: Array) -> None:
+        """Take the shares of contour that fit (2,) as an example of what is usual, but those that are doubtful."""
+        usual = self._usual_share()
+        self._usual.append(np.where(share >= _SEARCHED * usual, share, usual))
 
     def _usual_share(self) -> Array:
         return np.maximum(np.median(self._usual, axis=0), _LEAST_USUAL * self._first)
