@@ -66,6 +66,26 @@ def test_chessboard_corners_in_video_are_those_projected(tmp_path):
             assert miss < 0.25
 
 
+@pytest.mark.parametrize("scale", [1.5, 0.3])
+def test_large_pictures_are_searched_at_half_their_size_unless_a_board_is_too_small_there(tmp_path, scale):
+    """The smaller board has squares of 7 px, of which half is too little."""
+    wide, images = (960, 1280), []
+    for camera in pictures(board()):
+        images.append([])
+        for picture in camera:
+            drawn = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+            images[-1].append(np.full(wide, np.median(picture), np.uint8))
+            images[-1][-1][: len(drawn), : drawn.shape[1]] = drawn
+    found = find_boards(NAMES, board(videos=write_pictures(tmp_path, images)), quiet)
+    grid, missed = corner_grid(board()), []
+    for c, camera in enumerate(CAMERAS):
+        for v, number in enumerate(found.numbers.tolist()):
+            T = POSES[number // 3]
+            exact = (opencv_pixels(camera, grid @ T[:3, :3].T + T[:3, 3]) + 0.5) * scale - 0.5
+            missed.append(min(np.abs(found.corners_px[c, v] - order).max() for order in (exact, exact[::-1])))
+    assert np.isfinite(missed).sum() >= 6 and np.nanmax(missed) < 0.25 * max(scale, 1.0)
+
+
 def test_charuco_in_numbered_pictures_keeps_the_numbers_of_its_corners(tmp_path):
     about = {"pattern": "charuco", "dictionary": "DICT_4X4_50", "marker_mm": 6.5, "cols": 7, "rows": 5, "square_mm": 9}
     boards = board(**about)
