@@ -19,7 +19,7 @@ from jawusd.pipeline.subject import subject_of_capture
 from jawusd.segmentation.footage import ColourFootage
 from jawusd.tracking.contour.samples import COLUMNS, INVERSE_DEPTH, LENGTH, NX, NY, U, V
 from jawusd.tracking.contour.scan import CROWN, prepare_scan
-from jawusd.tracking.region import rig_tracker
+from jawusd.tracking.region import performance, rig_tracker
 from jawusd.tracking.region.colours import BINS, PATCHES, TABLES, Areas, CameraColours, colour_bins
 from jawusd.tracking.region.edges import search_borders, search_creases, sharpen
 from jawusd.tracking.region.pace import THOROUGH
@@ -191,21 +191,35 @@ class Covered(ColourFootage):
                 yield frame, skin if instead is None else pictures
 
 
+def fit_of(by, found, px, doubtful=False):
+    return SimpleNamespace(by=by, found=np.array([True, found]), solution=np.array([px]), doubtful=doubtful)
+
+
 @pytest.mark.parametrize("step", [1, -1])
-def test_what_searches_found_late_is_followed_back(step):
+def test_teeth_are_followed_back_from_where_they_were_found(monkeypatch, step):
     """Lost from the 3rd frame on, in sight again from the 5th, found at the 8th; lost to the end from the 9th on."""
+    monkeypatch.setattr(performance, "score_px", np.asarray)
     way = range(30, 30 + 10 * step, step)
-    fits = {at: SimpleNamespace(found=np.array([True, k < 3 or k == 8]), by="first") for k, at in enumerate(way)}
-    asked = []
+    fits = {at: fit_of("first", k < 3 or k == 8, 9.0) for k, at in enumerate(way)}
+    asked, looked = [], []
 
     def back(frame, before):
         asked.append((frame, list(before)))
-        return (SimpleNamespace(found=np.array([True, at in way[5:8]]), by="back") for at in before)
+        for at in before:
+            looked.append(at)
+            yield fit_of("back", at in way[5:8], 5.0)
 
     follow_back(fits, way, back)
-    assert asked == [(way[8], list(way[7:2:-1]))]
+    assert asked == [(way[8], list(way[7::-1]))] and looked == list(way[7:3:-1])
     assert [fits[at].by for at in way] == ["first"] * 5 + ["back"] * 3 + ["first"] * 2
-    assert [bool(fits[at].found.all()) for at in way] == [True] * 3 + [False] * 2 + [True] * 4 + [False]
+
+
+def test_a_wrong_pose_is_replaced_up_to_where_the_right_one_fits_no_better(monkeypatch):
+    """From frame 2 on wrong, but doubtful only in 3, where it fits better all the same, and 5; right from 6 on."""
+    monkeypatch.setattr(performance, "score_px", np.asarray)
+    fits = {k: fit_of("first", True, 7.0 if k == 3 else 5.0, k in (3, 5)) for k in range(8)}
+    follow_back(fits, range(8), lambda frame, before: (fit_of("back", True, 6.0 if at > 1 else 5.0) for at in before))
+    assert [fits[k].by for k in range(8)] == ["first", "first", "back", "first", "back", "back", "first", "first"]
 
 
 def test_a_jaw_that_is_lost_slowly_does_not_get_usual():

@@ -36,6 +36,7 @@ class FrameFit:
         present: the masks there are, shape (2, C).
         uncovered: share of every mask the scan leaves uncovered, NaN without one, shape (2, C).
         growth: how the outlines grow with focal lengths, where these are unknown.
+        doubtful: less of the contour fits than usual, so that another pose may be right.
     """
 
     pose: Pose
@@ -44,6 +45,7 @@ class FrameFit:
     present: Mask
     uncovered: Array
     growth: Growth | None = None
+    doubtful: bool = False
 
     @property
     def found(self) -> Mask:

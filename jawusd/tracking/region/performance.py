@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise, takewhile
+from itertools import pairwise
 
 import numpy as np
 
@@ -217,22 +217,37 @@ class PictureTake:
 
 
 def follow_back(fits: dict[int, FrameFit], way: range, back: Callable[[int, range], Iterator[FrameFit]]) -> None:
-    """Replace fits that were not found by what is followed into them, against the way, from where they were found.
+    """Follow the teeth against the way into frames in which they were not found, or doubtful; keep what fits better.
 
-    Teeth may be in sight for some frames before a search finds them.
+    Teeth may be in sight for some frames before a search finds them, and a wrong pose is often left for the right one
+    only frames later.
 
     Args:
-        fits: by frame; replaced up to the first one that is not found from there either.
+        fits: by frame; looked at again are those before one that is less doubtful than the last, until the teeth are
+            lost on the way back, or one without doubt fits no worse than what is followed into it.
         way: frames in the order in which they were followed.
         back: yields the fits of frames in their order, followed from a frame that comes before them in it.
     """
     for last, frame in pairwise(way):
-        if fits[last].found.all() or not fits[frame].found.all():
+        if _trust(fits[frame]) <= _trust(fits[last]):
             continue
         before = range(last, way.start - way.step, -way.step)
-        lost = list(takewhile(lambda at: not fits[at].found.all(), before))
-        again = takewhile(lambda fit: fit.found.all(), back(frame, before[: len(lost)]))
-        fits.update(zip(lost, again, strict=False))
+        for at, fit in zip(before, back(frame, before), strict=False):
+            better = _worth(fit) > _worth(fits[at])
+            if not fit.found.all() or (_trust(fits[at]) == 2 and not better):
+                break
+            if better:
+                fits[at] = fit
+
+
+def _trust(fit: FrameFit) -> int:
+    """Return 0 for teeth that were not found, 1 for doubtful ones, 2 for others."""
+    return int(fit.found.all()) * (1 if fit.doubtful else 2)
+
+
+def _worth(fit: FrameFit) -> tuple[int, float]:
+    """Return what ranks fits of a frame: arches found, contour that fits [px]."""
+    return int(fit.found.sum()), 0.0 if fit.solution is None else float(score_px(fit.solution).sum())
 
 
 def _zoomed(camera: Camera, factor: float) -> Camera:

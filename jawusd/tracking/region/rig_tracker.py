@@ -112,7 +112,8 @@ class RigTracker:
             self._motion.take(expected.pose, np.zeros(2, bool))
             return FrameFit(expected.pose, None, look.use, look.use, np.full(look.use.shape, np.nan))
         unsure = (self._motion.blind > 0) | (frames > _UNSURE_FRAMES)
-        least = np.where(unsure, _AGAIN, _LOST) * self._usual_share()
+        usual = self._usual_share()
+        least = np.where(unsure, _AGAIN, _LOST) * usual
         rough, look = self._best(expected, look, cut, frames, least)
         share, found = _share(rough.solution), look.polished(rough, expected)
         trusted = (share >= least) & (matched_px(found.solution) >= self._least_px)
@@ -125,7 +126,8 @@ class RigTracker:
                 look.learn(found.pose, RATES)
             self._remember(share)
         self._motion.take(found.pose, trusted)
-        return look.fit(found, trusted, self._free_focal)
+        fit = look.fit(found, trusted, self._free_focal)
+        return replace(fit, doubtful=bool((share < _DOUBTED * usual).any()))
 
     def _remember(self, share: Array) -> None:
         """Take the shares of contour that fit (2,) as an example of what is usual, but those that are doubtful."""
