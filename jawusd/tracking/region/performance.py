@@ -47,6 +47,7 @@ _BORDERS, _CORRELATION_PX = HabitPrior((0.4, 0.08, 0.02), 5.0), 80.0
 # moved have no other view against them. NEES of d over twelve solves of four persons by one camera, median: 2.1 without
 # it, 1.0 with it, and 0.2 to 11, since a frame in a wrong minimum says nothing of it.
 _ALONE = 2.0
+_CLEARLY = 1.05  # contour that fits over that of another pose from which on it is the better one without doubt
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,7 +225,7 @@ def follow_back(fits: dict[int, FrameFit], way: range, back: Callable[[int, rang
 
     Args:
         fits: by frame; looked at again are those before one that is less doubtful than the last, until the teeth are
-            lost on the way back, or one without doubt fits no worse than what is followed into it.
+            lost on the way back, or what is followed into one without doubt does not fit clearly better.
         way: frames in the order in which they were followed.
         back: yields the fits of frames in their order, followed from a frame that comes before them in it.
     """
@@ -233,11 +234,10 @@ def follow_back(fits: dict[int, FrameFit], way: range, back: Callable[[int, rang
             continue
         before = range(last, way.start - way.step, -way.step)
         for at, fit in zip(before, back(frame, before), strict=False):
-            better = _worth(fit) > _worth(fits[at])
-            if not fit.found.all() or (_trust(fits[at]) == 2 and not better):
+            old = fits[at]
+            if not fit.found.all() or (_trust(old) == 2 and _fitting_px(fit) < _CLEARLY * _fitting_px(old)):
                 break
-            if better:
-                fits[at] = fit
+            fits[at] = max(old, fit, key=lambda one: (one.found.sum(), _fitting_px(one)))
 
 
 def _trust(fit: FrameFit) -> int:
@@ -245,9 +245,8 @@ def _trust(fit: FrameFit) -> int:
     return int(fit.found.all()) * (1 if fit.doubtful else 2)
 
 
-def _worth(fit: FrameFit) -> tuple[int, float]:
-    """Return what ranks fits of a frame: arches found, contour that fits [px]."""
-    return int(fit.found.sum()), 0.0 if fit.solution is None else float(score_px(fit.solution).sum())
+def _fitting_px(fit: FrameFit) -> float:
+    return 0.0 if fit.solution is None else float(score_px(fit.solution).sum())
 
 
 def _zoomed(camera: Camera, factor: float) -> Camera:
