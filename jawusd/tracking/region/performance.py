@@ -47,7 +47,9 @@ _BORDERS, _CORRELATION_PX = HabitPrior((0.4, 0.08, 0.02), 5.0), 80.0
 # moved have no other view against them. NEES of d over twelve solves of four persons by one camera, median: 2.1 without
 # it, 1.0 with it, and 0.2 to 11, since a frame in a wrong minimum says nothing of it.
 _ALONE = 2.0
-_CLEARLY = 1.05  # contour that fits over that of another pose from which on it is the better one without doubt
+# Contour that fits over that of a pose without doubt, from which on another pose takes its place. Chosen on one camera
+# of the example, not on a population; with 1, slightly better poses could lead back through a whole take.
+_CLEARLY = 1.05
 
 
 @dataclass(frozen=True, eq=False)
