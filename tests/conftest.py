@@ -10,6 +10,9 @@ from package_copy import ROOT
 
 # Before OpenUSD is loaded, and for the programs that tests start: in one thread, as `jawusd` runs it.
 os.environ |= {"PXR_WORK_THREAD_LIMIT": "1", "TF_ENV_SETTING_ALERTS_ENABLED": "0"}
+# Before numpy and torch are loaded: the processes that share the tests use all cores already, and threads of linear
+# algebra that wait for one another cost a third of the time.
+os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
 FAST = {"evaluator", "formats", "geometry", "library"}  # folders of tests that need neither footage nor USD
 

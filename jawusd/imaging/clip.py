@@ -94,24 +94,31 @@ class Clip(ABC):
         window = (slice(y0, y1), slice(x0, x1))
         return self._converted(first, last, colour, window, threads)
 
-    def pictures(self, wanted: Sequence[int | None], *, colour: Colour = "gray") -> Iterator[NDArray[np.uint8] | None]:
+    def pictures(
+        self, wanted: Sequence[int | None], *, colour: Colour = "gray", threads: int = 0
+    ) -> Iterator[NDArray[np.uint8] | None]:
         """Yield a picture for each of increasing numbers, None for None, decoding what lies between only once.
+
+        Args:
+            wanted: numbers of pictures, rising, and None, for which nothing comes.
+            colour: what the pictures come as.
+            threads: decoder threads; 0 lets the codec choose.
 
         Raises:
             CaptureError: a picture lies outside the file or cannot be decoded.
         """
         known = [number for number in wanted if number is not None]
-        decoded = self.frames(known[0], known[-1] + 1, colour=colour) if known else iter(())
+        decoded = self.frames(known[0], known[-1] + 1, colour=colour, threads=threads) if known else iter(())
         for number in wanted:
             yield None if number is None else next(frame.image for frame in decoded if frame.index == number)
 
-    def colour_pictures(self, wanted: Sequence[int | None]) -> Iterator[ColourPicture | None]:
+    def colour_pictures(self, wanted: Sequence[int | None], *, threads: int = 0) -> Iterator[ColourPicture | None]:
         """Yield as `pictures` does, in RGB; pictures of videos are converted by the parts that are asked for.
 
         Raises:
             CaptureError: a picture lies outside the file or cannot be decoded.
         """
-        yield from self.pictures(wanted, colour="rgb")
+        yield from self.pictures(wanted, colour="rgb", threads=threads)
 
     def _check_range(self, first: int, last: int) -> None:
         if not 0 <= first <= last <= self.count:

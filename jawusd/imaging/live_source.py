@@ -11,11 +11,10 @@ from pathlib import Path
 
 import av
 import numpy as np
-from numpy.typing import NDArray
 
 from jawusd.errors import CaptureError
 from jawusd.imaging import live_clock
-from jawusd.imaging.pixels import converted
+from jawusd.imaging.pixels import ColourPicture, DecodedPicture
 from jawusd.imaging.video import Video
 
 _KEPT = 8  # last pictures: more than those of an instant that waits for its turn
@@ -25,10 +24,13 @@ _DEVICES = {"linux": ("/dev/", "v4l2"), "darwin": ("avfoundation:", "avfoundatio
 
 @dataclass(frozen=True, eq=False)
 class LivePicture:
-    """Hold a picture: its time on the clock all sources share [s], and its pixels, RGB uint8 (H, W, 3)."""
+    """Hold a picture: its time on the clock all sources share [s], and its pixels, RGB uint8 (H, W, 3).
+
+    What nobody looks at is not turned into RGB.
+    """
 
     time_s: float
-    rgb: NDArray[np.uint8]
+    rgb: ColourPicture
 
 
 class LiveSource:
@@ -115,13 +117,14 @@ class LiveSource:
         """Yield the pictures of a file at the times they were taken."""
         video = Video(self.where)
         first = int(np.searchsorted(video.times_s, from_s + self._early_s))
-        for frame in video.frames(min(first, video.count), colour="rgb", threads=1):
+        numbers = range(first, video.count)
+        for time_s, picture in zip(video.times_s[first:], video.colour_pictures(numbers, threads=1), strict=True):
             self._open.set()
             self._playing.wait()
-            due = self._begin_s - self._early_s + frame.time_s
-            if live_clock.wait_until(due, self._stopped):
+            due = self._begin_s - self._early_s + float(time_s)
+            if picture is None or live_clock.wait_until(due, self._stopped):
                 return
-            yield LivePicture(due, frame.image)
+            yield LivePicture(due, picture)
 
     def _stream(self) -> Iterator[LivePicture]:
         start, name = _DEVICES.get(sys.platform, ("", ""))
@@ -129,10 +132,9 @@ class LiveSource:
         address = self.where.removeprefix(start) if device and start.endswith(":") else self.where
         try:
             with av.open(address, format=name if device else None) as container:
-                whole = (slice(0, None), slice(0, None))
                 for frame in container.decode(video=0):
                     self._open.set()
-                    yield LivePicture(live_clock.now_s(), converted(frame, "rgb", 0, whole))
+                    yield LivePicture(live_clock.now_s(), DecodedPicture(frame, 0))
         except (av.FFmpegError, OSError, IndexError) as error:
             raise CaptureError(
                 f"cannot be read ({error}).",

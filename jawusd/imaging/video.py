@@ -97,15 +97,15 @@ class Video(Clip):
         self.is_rgb = stored_as.is_rgb or stored_as.has_palette
         self.is_gray = not self.is_rgb and len(stored_as.components) == 1
 
-    def colour_pictures(self, wanted: Sequence[int | None]) -> Iterator[ColourPicture | None]:
+    def colour_pictures(self, wanted: Sequence[int | None], *, threads: int = 0) -> Iterator[ColourPicture | None]:
         """Yield as `Clip.colour_pictures`."""
         if self._space is not None:
-            yield from super().colour_pictures(wanted)
+            yield from super().colour_pictures(wanted, threads=threads)
             return
         known = [number for number in wanted if number is not None]
         if known:
             self._check_range(known[0], known[-1] + 1)
-        decoded = self._decode(known[0], known[-1] + 1, threads=0) if known else iter(())
+        decoded = self._decode(known[0], known[-1] + 1, threads=threads) if known else iter(())
         for number in wanted:
             if number is None:
                 yield None

@@ -11,8 +11,11 @@ from jawusd.geometry import Camera, transform_points
 from jawusd.geometry.arrays import Array
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
     from jawusd.segmentation.footage import ColourFootage, Pictures
     from jawusd.segmentation.picture import PictureFrame
+    from jawusd.tracking.config import Mapper
     from jawusd.tracking.contour.scan import Scan
     from jawusd.tracking.region.picture import Cut, Picture
 
@@ -22,19 +25,23 @@ _WORKING_PX_PER_MM, _MARGIN_MM = 7.2, 6.0  # resolution at the teeth, and what i
 class Cutter:
     """Cut what surrounds the teeth out of the pictures of all cameras."""
 
-    def __init__(self, cameras: Mapping[str, Camera], scans: Sequence[Scan], centre: Array) -> None:
+    def __init__(
+        self, cameras: Mapping[str, Camera], scans: Sequence[Scan], centre: Array, executor: Executor | None = None
+    ) -> None:
         """Choose the working size.
 
         Args:
             cameras: calibrated, by name.
             scans: upper and lower.
             centre: where the teeth are about, in the world [mm], shape (3,).
+            executor: threads that prepare the pictures of all cameras side by side.
         """
         from jawusd.segmentation.picture import PictureFrame
 
         self._frames: dict[str, PictureFrame] = {
             name: PictureFrame(camera, centre, _WORKING_PX_PER_MM) for name, camera in cameras.items()
         }
+        self._map: Mapper = executor.map if executor else map
         self._probes = [scan.probes for scan in scans]
 
     def cut(self, pictures: Pictures) -> Cut:
@@ -42,7 +49,7 @@ class Cutter:
 
         def cut(poses: Array) -> list[Picture | None]:
             around = np.concatenate([transform_points(T, own) for T, own in zip(poses, self._probes, strict=True)])
-            return [self._one(name, pictures, around) for name in self._frames]
+            return list(self._map(lambda name: self._one(name, pictures, around), self._frames))
 
         return cut
 

@@ -69,7 +69,7 @@ class Follower:
         from jawusd.tracking.contour.scan import teeth_centre
         from jawusd.tracking.region.tracker import RegionTracker
 
-        cutter = Cutter(self.cameras, self._scans, teeth_centre(self._scans, poses))
+        cutter = Cutter(self.cameras, self._scans, teeth_centre(self._scans, poses), self._pool)
         axes = self._subject.T_anatomical_skull[:3, :3]
         landmarks, cameras = self._subject.landmarks, list(self.cameras.values())
         tracker = RegionTracker(self._scans, cameras, landmarks, axes, executor=self._pool)

@@ -177,6 +177,7 @@ class _Follower:
         with naming_file(capture.folder / "capture.toml"):
             self._cameras = {camera.name: camera for camera in load_cameras(capture) if camera.name in where}
             meshes = registered_meshes(load_labelled(capture)[0], jaw.meta)
+        self._pool = pool
         self._teeth = PreparedTeeth(self._capture, meshes, jaw, pool.map)
         cameras = tuple(self._cameras.values())
         scans, axes = self._teeth.scans, self._teeth.axes
@@ -251,7 +252,7 @@ class _Follower:
         from jawusd.tracking.contour.scan import teeth_centre
 
         centre = teeth_centre(self._teeth.scans, self._take.coordinates.arches(near))
-        cutter = Cutter(self._cameras, self._teeth.scans, centre)
+        cutter = Cutter(self._cameras, self._teeth.scans, centre, self._pool)
         if self._take.begin(cutter.cut(pictures), near) >= LEAST_FIT:
             self._cutter = cutter
 

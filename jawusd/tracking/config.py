@@ -52,6 +52,8 @@ class TrackingConfig:
     converged_mm: float = 0.004
     # Update from which on the gates in between are left out [mm at the crowns]: they are for steps that go farther.
     settled_mm: float = 0.0
+    # Last update up to which the residuals before it serve for those after it [mm at the crowns]; 0 looks again.
+    judged_mm: float = 0.0
     # Motion after which pictures and contour of a scan are made again [px]: hidden parts are judged to so much.
     redraw_px: float = 1.0
     # Motion of near against far parts of a scan in a picture from which on it is drawn anew [px]; until then, pictures

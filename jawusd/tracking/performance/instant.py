@@ -65,7 +65,7 @@ class InstantSolver:
             rendering: of these views, if there is one.
         """
         rendering = rendering or Rendering(self.solver, views)
-        pose, left = start, tuple(gates_px)
+        pose, left, moved_mm = start, tuple(gates_px), np.inf
         while left:
             state = self.linearise(pose, views, use, rendering, left[0])
             matrix, right = self.equations(pose, state, outline_weight)
@@ -73,9 +73,10 @@ class InstantSolver:
             step = np.asarray(
                 np.linalg.solve(matrix + np.diag(expected.precision), right - expected.precision * away), np.float64
             )
-            pose = self.coordinates.moved(pose, step)
-            left = self.config.gates_after(left, self._motion_mm(step))
-        state = self.linearise(pose, views, use, rendering, self.config.final_gate_px[1], final=True)
+            pose, moved_mm = self.coordinates.moved(pose, step), self._motion_mm(step)
+            left = self.config.gates_after(left, moved_mm)
+        if moved_mm > self.config.judged_mm:
+            state = self.linearise(pose, views, use, rendering, self.config.final_gate_px[1], final=True)
         return Aligned(pose, state)
 
     def linearise(

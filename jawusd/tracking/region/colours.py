@@ -31,8 +31,19 @@ _ROUNDS = 3  # of sorting lips out of what lies under crowns
 
 def colour_bins(rgb: NDArray[np.uint8]) -> NDArray[np.uint16]:
     """Return the colour bin of every pixel of a picture (h, w, 3), shape (h, w)."""
-    coarse = rgb.astype(np.uint16) >> (8 - _BITS)
-    return np.asarray((coarse[..., 0] << (2 * _BITS)) | (coarse[..., 1] << _BITS) | coarse[..., 2], np.uint16)
+    out = np.empty(rgb.shape[:2], np.uint16)
+    _write_bins(rgb, out)
+    return out
+
+
+@numba.njit(nogil=True, cache=True)
+def _write_bins(rgb: NDArray[np.uint8], out: NDArray[np.uint16]) -> None:
+    for j in range(rgb.shape[0]):
+        for i in range(rgb.shape[1]):
+            bin_ = 0
+            for c in range(3):
+                bin_ = (bin_ << _BITS) | (rgb[j, i, c] >> (8 - _BITS))
+            out[j, i] = bin_
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,13 +98,34 @@ class CameraColours:
 
     def _ratio(self) -> NDArray[np.float32]:
         """Return the log ratio of tooth over anything else by arch, table and bin, shape (2, TABLES, BINS)."""
-        tooth, outside = np.zeros((2, TABLES, BINS)), np.zeros((2, TABLES, BINS))
-        base = np.tile(np.stack([self._outside, 0.5 * (self._gum + self._outside)]), (PATCHES, 1))
-        for out, local, whole in ((tooth, self._local_tooth, self._tooth), (outside, self._local_outside, base)):
-            share = _LOCAL * (local.sum(-1, keepdims=True) > 0)
-            out[:] = share * local + (1 - share) * whole
-        outside = (1 - _LIPS) * outside + _LIPS * self._lips
-        return np.clip(np.log((tooth + _EMPTY) / (outside + _EMPTY)), -_MOST, _MOST).astype(np.float32)
+        out = np.empty((2 * TABLES, BINS), np.float32)
+        beside = np.stack([self._outside, 0.5 * (self._gum + self._outside)])  # by kind
+        inside, outside = self._local_tooth.reshape(-1, BINS), self._local_outside.reshape(-1, BINS)
+        _write_ratios(inside, outside, self._tooth, beside, self._lips, out)
+        return out.reshape(2, TABLES, BINS)
+
+
+@numba.njit(nogil=True, cache=True)
+def _write_ratios(
+    local_tooth: Array, local_outside: Array, tooth: Array, outside: Array, lips: Array, out: NDArray[np.float32]
+) -> None:
+    """Write the log ratios of tables (T, B) with histograms of their own, of all teeth, beside both kinds, and of lips.
+
+    Args:
+        local_tooth, local_outside: of the tables, empty where nothing was learned, shape (T, B).
+        tooth: of all teeth, shape (B,).
+        outside: of what lies beside borders of each kind, shape (KINDS, B).
+        lips: of skin and lips, shape (B,).
+        out: receives, shape (T, B).
+    """
+    for t in range(len(out)):
+        inner = _LOCAL if local_tooth[t].any() else 0.0
+        outer = _LOCAL if local_outside[t].any() else 0.0
+        for b in range(BINS):
+            p = inner * local_tooth[t, b] + (1 - inner) * tooth[b]
+            q = outer * local_outside[t, b] + (1 - outer) * outside[t % KINDS, b]
+            q = (1 - _LIPS) * q + _LIPS * lips[b]
+            out[t, b] = min(max(np.log((p + _EMPTY) / (q + _EMPTY)), -_MOST), _MOST)
 
 
 @numba.njit(nogil=True, cache=True)

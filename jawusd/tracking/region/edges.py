@@ -34,16 +34,23 @@ def _label(labels: NDArray[np.uint8], x: float, y: float) -> int:
 
 
 @numba.njit(nogil=True, cache=True, inline="always")
+def _within(bins: NDArray[np.uint16], x: float, y: float) -> bool:
+    """Tell whether there are four pixels around a place to interpolate between."""
+    return x >= 0 and y >= 0 and x < bins.shape[1] - 1 and y < bins.shape[0] - 1
+
+
+@numba.njit(nogil=True, cache=True, inline="always")
 def _ratio_at(bins: NDArray[np.uint16], table: NDArray[np.float32], x: float, y: float) -> float:
     """Interpolate the log ratio of a table bilinearly; 0, which says nothing, outside of the picture."""
-    if x < 0 or y < 0 or x >= bins.shape[1] - 1 or y >= bins.shape[0] - 1:
+    if not _within(bins, x, y):
         return 0.0
-    i = int(x)
-    j = int(y)
-    a = x - i
-    b = y - j
-    return (table[bins[j, i]] * (1 - a) + table[bins[j, i + 1]] * a) * (1 - b) + (
-        table[bins[j + 1, i]] * (1 - a) + table[bins[j + 1, i + 1]] * a
+    i = np.uint32(x)
+    j = np.uint32(y)
+    one = np.uint32(1)
+    a = x - np.floor(x)
+    b = y - np.floor(y)
+    return (table[bins[j, i]] * (1 - a) + table[bins[j, np.uint32(i + one)]] * a) * (1 - b) + (
+        table[bins[np.uint32(j + one), i]] * (1 - a) + table[bins[np.uint32(j + one), np.uint32(i + one)]] * a
     ) * b
 
 
@@ -118,7 +125,7 @@ def _hidden(sample: Array, other_inverse_depth: NDArray[np.float32], tolerance_m
     return other_inverse_depth[j, i] * (1 - tolerance_mm * own) > own
 
 
-@numba.njit(nogil=True, cache=True)
+@numba.njit(nogil=True, cache=True, inline="always")
 def _read_line(
     r: Array,
     n: int,
@@ -131,20 +138,22 @@ def _read_line(
 ) -> None:
     """Read the log ratios along a normal; 0 past the own crown inwards, and past any crown outwards."""
     x, y, nx, ny = sample[U], sample[V], sample[NX], sample[NY]
-    blocked = False
+    r[:] = 0.0
     for i in range(n, 2 * n + 1):
         t = (i - n) * step
         px, py = x + t * nx, y + t * ny
-        if t > 1.0 and (_label(own_labels, px, py) == CROWN or _label(other_labels, px, py) == CROWN):
-            blocked = True
-        r[i] = 0.0 if blocked else _ratio_at(bins, table, px, py)
-    blocked = False
+        if not _within(bins, px, py):
+            break
+        row, column = np.uint32(py + 0.5), np.uint32(px + 0.5)
+        if t > 1.0 and (own_labels[row, column] == CROWN or other_labels[row, column] == CROWN):
+            break
+        r[i] = _ratio_at(bins, table, px, py)
     for i in range(n - 1, -1, -1):
         t = (i - n) * step
         px, py = x + t * nx, y + t * ny
-        if t < -1.0 and _label(own_labels, px, py) != CROWN:
-            blocked = True
-        r[i] = 0.0 if blocked else _ratio_at(bins, table, px, py)
+        if not _within(bins, px, py) or (t < -1.0 and own_labels[np.uint32(py + 0.5), np.uint32(px + 0.5)] != CROWN):
+            break
+        r[i] = _ratio_at(bins, table, px, py)
 
 
 @numba.njit(nogil=True, cache=True, inline="always")
@@ -177,16 +186,22 @@ def _zero_crossing(r: Array, n: int, step: float, k: int) -> float:
 
 
 @numba.njit(nogil=True, cache=True, inline="always")
-def _channel(rgb: NDArray[np.uint8], x: float, y: float, c: int) -> float:
+def _colour(rgb: NDArray[np.uint8], x: float, y: float) -> tuple[float, float, float]:
+    """Interpolate a colour bilinearly; beyond the picture it is that of its rim."""
     x = min(max(x, 0.0), rgb.shape[1] - 1.001)
     y = min(max(y, 0.0), rgb.shape[0] - 1.001)
     i = int(x)
     j = int(y)
     a = x - i
     b = y - j
-    return (rgb[j, i, c] * (1 - a) + rgb[j, i + 1, c] * a) * (1 - b) + (
-        rgb[j + 1, i, c] * (1 - a) + rgb[j + 1, i + 1, c] * a
-    ) * b
+    return (
+        (rgb[j, i, 0] * (1 - a) + rgb[j, i + 1, 0] * a) * (1 - b)
+        + (rgb[j + 1, i, 0] * (1 - a) + rgb[j + 1, i + 1, 0] * a) * b,
+        (rgb[j, i, 1] * (1 - a) + rgb[j, i + 1, 1] * a) * (1 - b)
+        + (rgb[j + 1, i, 1] * (1 - a) + rgb[j + 1, i + 1, 1] * a) * b,
+        (rgb[j, i, 2] * (1 - a) + rgb[j, i + 1, 2] * a) * (1 - b)
+        + (rgb[j + 1, i, 2] * (1 - a) + rgb[j + 1, i + 1, 2] * a) * b,
+    )
 
 
 @numba.njit(nogil=True, cache=True)
@@ -221,9 +236,13 @@ def sharpen(
         outer[:] = 0.0
         for q in range(3):
             t = 1.75 + q + wide
+            within, beyond = (
+                _colour(rgb, u + (d - t) * nx, v + (d - t) * ny),
+                _colour(rgb, u + (d + t) * nx, v + (d + t) * ny),
+            )
             for c in range(3):
-                inner[c] += _channel(rgb, u + (d - t) * nx, v + (d - t) * ny, c) / 3
-                outer[c] += _channel(rgb, u + (d + t) * nx, v + (d + t) * ny, c) / 3
+                inner[c] += within[c] / 3
+                outer[c] += beyond[c] / 3
         if ((inner - outer) ** 2).sum() < contrast * contrast:
             continue
         # Pictures of moving edges are ramps of light, not of its code: their middle is the steepest place of what is
@@ -237,9 +256,10 @@ def sharpen(
         steps = int(2 * (reach_px + wide))
         for q in range(2 * (steps + arm) + 1):
             t = d + 0.5 * (q - steps - arm)
+            colour = _colour(rgb, u + t * nx, v + t * ny)
             p = 0.0
             for c in range(3):
-                value = _channel(rgb, u + t * nx, v + t * ny, c) / 255
+                value = colour[c] / 255
                 p += ((value if power == 1.0 else value**power) - outer[c]) * (inner[c] - outer[c])
             line[q] = p / norm
         place = _steepest(line, steps, arm)
@@ -343,7 +363,8 @@ def _sharpest(line: Array, at: int, steps: int) -> float:
 
 @numba.njit(nogil=True, cache=True, inline="always")
 def _light(rgb: NDArray[np.uint8], x: float, y: float) -> float:
-    return (_channel(rgb, x, y, 0) + _channel(rgb, x, y, 1) + _channel(rgb, x, y, 2)) / 3
+    red, green, blue = _colour(rgb, x, y)
+    return (red + green + blue) / 3
 
 
 @numba.njit(nogil=True, cache=True)

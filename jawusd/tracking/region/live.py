@@ -24,7 +24,9 @@ from jawusd.tracking.region.pace import BRIEF
 from jawusd.tracking.region.picture import Cut
 from jawusd.tracking.region.rig_tracker import RigTracker
 
-_FACES, _SAMPLE_STEP_PX, _REDRAW_PX, _SETTLED_MM = 3_000, 3.0, 4.0, 0.2
+_FACES = 3_000
+# What is done less often than in recorded pictures: half a pixel less or more is not worth a picture that is left out.
+_SETTINGS = replace(TrackingConfig(), sample_step_px=3.0, redraw_px=4.0, parallax_px=6.0, settled_mm=0.4, judged_mm=0.3)
 _WIDER = 1.5  # true over computed standard deviation, as where all frames are solved together
 
 
@@ -54,8 +56,7 @@ class LiveTake:
         self._scans, self._axes, self._cameras = [thinned(scan, _FACES) for scan in scans], axes, cameras
         self._head = STEADY if fixed_head else 1.0
         self.coordinates = Coordinates(jaw, self._scans)
-        config = replace(TrackingConfig(), sample_step_px=_SAMPLE_STEP_PX, redraw_px=_REDRAW_PX, settled_mm=_SETTLED_MM)
-        self._instants = InstantSolver(ContourSolver(self._scans, config, executor), self.coordinates)
+        self._instants = InstantSolver(ContourSolver(self._scans, _SETTINGS, executor), self.coordinates)
         self._tracker: RigTracker | None = None
 
     def begin(self, cut: Cut, near: Pose) -> float:

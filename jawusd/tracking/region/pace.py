@@ -13,10 +13,11 @@ class Pace:
 
     Attributes:
         gates_px: residual gate of every step from the prediction.
-        far_px: the same after frames that were left out.
+        next_px: the same after a frame that was left out.
+        far_px: the same after more of them.
         wide_px: from other starts, and at the end of a search; None takes the gates of the prediction again.
         doubted, searched: shares of the usual contour that fits, below which other starts are tried, and poses
-            searched, while no frames were left out.
+            searched, while hardly any frames were left out.
         jaws, finalists, heads: poses of the jaw and of the head that a search tries, and jaws followed to the end.
         search_every: failed frames per search.
         searches: failed frames after which teeth count as out of sight.
@@ -26,6 +27,7 @@ class Pace:
     """
 
     gates_px: _Gates
+    next_px: _Gates
     far_px: _Gates
     wide_px: _Gates | None
     doubted: float
@@ -43,6 +45,7 @@ class Pace:
 #: For recorded pictures.
 THOROUGH = Pace(
     gates_px=(6.0, 4.0, 3.0, 2.5, 2.0),
+    next_px=(6.0, 4.0, 3.0, 2.5, 2.0),
     far_px=(6.0, 4.0, 3.0, 2.5, 2.0),
     wide_px=(12.0, 8.0, 6.0, 4.0, 3.0, 2.5, 2.0),
     doubted=0.8,
@@ -59,6 +62,7 @@ THOROUGH = Pace(
 #: For pictures that wait for nobody. Searches cost what passes meanwhile, so they begin later.
 BRIEF = Pace(
     gates_px=(8.0, 3.0, 2.0),
+    next_px=(16.0, 6.0, 2.5, 2.0),
     far_px=(24.0, 14.0, 8.0, 4.0, 2.0),
     wide_px=None,
     doubted=0.6,

@@ -32,7 +32,8 @@ _BORDER_PX3 = 0.7**2 * CORRELATION_PX
 _FIRST_GATES_PX = (12.0, 8.0, 6.0, 4.0, 3.0, 2.5, 2.0)
 _LAST_GATES_PX = (2.0,)
 _TRIAL_GATES_PX = (8.0, 6.0)  # of the many poses that a search tries
-_STEADY_FRAMES = 1.5  # since the last step, up to which its motion tells where the teeth are
+# Since the last step, up to which none was left out, and up to which its motion tells where the teeth are.
+_NEXT_FRAMES, _STEADY_FRAMES = 1.5, 2.5
 _FIRST_ROUNDS = 3  # picks are a few tenths of a millimetre off; each round takes most of the rest
 # Share of the usual contour that fits, below which a pose is doubted, others are searched, an arch is given up,
 # and one that was lost is not trusted again. The pace may doubt and search later while no frames are left out.
@@ -153,7 +154,7 @@ class RigTracker:
         """
         pace, usual = self._pace, self._usual_share()
         in_turn, far = pace.in_turn and self._failed > pace.searches, frames > _STEADY_FRAMES
-        gates = pace.far_px if far and not in_turn else pace.gates_px
+        gates = pace.gates_px if frames <= _NEXT_FRAMES else pace.far_px if far and not in_turn else pace.next_px
         # After frames that were left out no motion vouches for a pose that fits only half.
         doubted, searched = (_DOUBTED, _SEARCHED) if far else (pace.doubted, pace.searched)
         found = look.align(expected.pose, expected, gates)
