@@ -223,8 +223,9 @@ def test_the_command_tells_lines_and_osc(rig, tmp_path):
 
 
 @pytest.mark.slow
-def test_teeth_are_found_again_after_frames_left_out(rig):
-    """A quarter of a second is missing time and again; poses that are said to be found are never far off."""
+@pytest.mark.parametrize(("stride", "least"), [(2, 11), (6, 7)])
+def test_teeth_are_found_again_after_frames_left_out(rig, stride, least):
+    """Up to a quarter of a second is missing time and again; poses that are said to be found are never far off."""
     capture = open_capture(EXAMPLE)
     jaw = jawusd.load(rig)
     cameras = {camera.name: camera for camera in load_cameras(capture)}
@@ -235,7 +236,7 @@ def test_teeth_are_found_again_after_frames_left_out(rig):
         offsets = dict(zip(truth["camera_names"].tolist(), truth["offsets"].tolist(), strict=True))
         upper = dict(zip(truth["frames"].tolist(), truth["T_world_upper"], strict=True))
         relative = dict(zip(truth["frames"].tolist(), truth["T_upper_lower"], strict=True))
-    frames = range(capture.bootstrap.frame, capture.bootstrap.frame + 72, 6)
+    frames = range(capture.bootstrap.frame, capture.bootstrap.frame + 12 * stride, stride)
     start = take.coordinates.pose_of(np.stack([upper[frames[0]], upper[frames[0]] @ relative[frames[0]]]))
     cutter = Cutter(cameras, teeth.scans, upper[frames[0]][:3, 3])
     found, errors = 0, []
@@ -243,11 +244,11 @@ def test_teeth_are_found_again_after_frames_left_out(rig):
         if frame == frames[0]:
             assert take.begin(cutter.cut(pictures), start) > 0.15
             continue
-        fit = take.step(cutter.cut(pictures), 6.0)
+        fit = take.step(cutter.cut(pictures), float(stride))
         if fit.found.all():
             found += 1
             tip = jaw.landmarks[0]
             wanted = transform_point(relative[frame], tip)
             errors.append(np.linalg.norm(transform_point(jaw.pose(fit.pose.d), tip) - wanted))
             assert (take.sigma_d(fit) > 0).all() and take.sigma_d(fit).max() < 2.0
-    assert found >= 7 and max(errors) < 1.0 and np.median(errors) < 0.25
+    assert found >= least and max(errors) < 1.0 and np.median(errors) < 0.25

@@ -21,7 +21,7 @@ from jawusd.tracking.contour.views import MaskViews, masked_sources
 from jawusd.tracking.initialization.footage import Footage
 from jawusd.tracking.performance.attempts import FrameFit
 from jawusd.tracking.performance.coordinates import LOCAL, Coordinates, Pose
-from jawusd.tracking.performance.instant import InstantSolver
+from jawusd.tracking.performance.instant import Expected, InstantSolver
 from jawusd.tracking.performance.single_start import SingleStart
 from jawusd.tracking.performance.smoother import Smoother
 from jawusd.tracking.performance.take import Shot, solve_performance
@@ -145,6 +145,18 @@ def test_the_bound_pulls_a_jaw_inside_but_makes_it_no_surer(jaw, scans, truth, c
     inside, beyond = smoothed(truth[0][0]), smoothed(away)
     assert jaw.margin(away) < -1 < -0.1 < jaw.margin(beyond.fits[0].pose.d) < 0
     np.testing.assert_allclose(beyond.covariance[:, 6:, 6:], inside.covariance[:, 6:, 6:], rtol=1e-6)
+
+
+@pytest.mark.parametrize(("judged_mm", "step_mm", "again"), [(0.0, 0.2, True), (0.3, 0.2, False), (0.3, 0.4, True)])
+def test_residuals_are_looked_at_again_after_long_steps(jaw, scans, truth, monkeypatch, judged_mm, step_mm, again):
+    solver = ContourSolver(scans, replace(TrackingConfig(), judged_mm=judged_mm))
+    instants, finals = InstantSolver(solver, Coordinates(jaw, scans)), []
+    monkeypatch.setattr(instants, "linearise", lambda *_, final=False: finals.append(final))
+    monkeypatch.setattr(instants, "equations", lambda *_: (np.eye(9), np.r_[np.zeros(8), step_mm]))
+    start = Pose(truth[1][0], truth[0][0])
+    found = instants.align(start, [], np.ones((2, 0), bool), (2.0,), Expected(start, np.zeros(9)), np.ones(2))
+    assert finals == [False, True][: 1 + again]
+    np.testing.assert_allclose(found.pose.d - start.d, [0, 0, step_mm], atol=1e-9)
 
 
 def test_a_start_elsewhere_is_refused(jaw, scans, truth, folder):

@@ -44,6 +44,11 @@ def prepared(teeth):
     return [prepare_scan(mesh, arch) for mesh, arch in zip(teeth, ("upper", "lower"), strict=True)]
 
 
+def test_colours_share_a_bin_if_their_upper_four_bits_agree():
+    picture = np.array([[[0, 0, 0], [15, 15, 15], [255, 255, 255], [16, 0, 0], [0, 16, 0], [0, 0, 16]]], np.uint8)
+    assert colour_bins(picture).tolist() == [[0, 0, BINS - 1, 256, 16, 1]]
+
+
 def samples_at(radius):
     angles = np.linspace(0, 2 * np.pi, 90, endpoint=False)
     out = np.zeros((len(angles), COLUMNS))
