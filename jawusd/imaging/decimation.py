@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from jawusd.formats.mesh import GUM, TOOTH, Mesh, crown_face_mask
 from jawusd.geometry.arrays import Array
+from jawusd.geometry.welding import welded
 from jawusd.imaging.mesh_cleaning import manifold
 
 
@@ -52,8 +53,9 @@ def bone_proxy_of(mesh: Mesh, count: int) -> Mesh:
 
 
 def _border_edges(faces: NDArray[np.int32]) -> int:
-    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    return int((np.unique(edges, axis=0, return_counts=True)[1] == 1).sum())
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1).astype(np.int64)
+    numbers = edges[:, 0] * (edges.max(initial=0) + 1) + edges[:, 1]
+    return int((np.unique(numbers, return_counts=True)[1] == 1).sum())
 
 
 def decimated_scan(
@@ -68,6 +70,6 @@ def decimated_scan(
     points = np.concatenate([p for p, _ in parts])
     crowns, gum = parts[0][1], parts[1][1] + len(parts[0][0])
     # The border exists on both sides; merged, it is the crown-gum line again.
-    unique, index = np.unique(points, axis=0, return_inverse=True)
-    index = index.reshape(-1).astype(np.int32)
-    return np.ascontiguousarray(unique), np.ascontiguousarray(index[crowns]), np.ascontiguousarray(index[gum])
+    places, index = welded(points)
+    index = index.astype(np.int32)
+    return places, np.ascontiguousarray(index[crowns]), np.ascontiguousarray(index[gum])

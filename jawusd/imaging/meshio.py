@@ -16,6 +16,7 @@ from jawusd.errors import CaptureError, explain_missing_packages
 from jawusd.formats.file_kinds import MESHES
 from jawusd.formats.mesh import Mesh, tooth_labels
 from jawusd.geometry.arrays import Array
+from jawusd.geometry.welding import welded
 from jawusd.inputs import check_input, why_unreadable
 
 # People who read scans with this module label them next; scripts outside the package import both from here.
@@ -193,12 +194,12 @@ def winding(mesh: Mesh) -> Winding:
     "Efficient feature extraction for 2D/3D objects in mesh representation", ICIP 2001). Vertices at the same place
     count as one.
     """
-    unique, inverse = np.unique(mesh.vertices, axis=0, return_inverse=True)
-    faces = inverse.reshape(-1)[mesh.faces]
+    places, index = welded(mesh.vertices)
+    faces = index[mesh.faces]
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    there = edges[:, 0] * len(unique) + edges[:, 1]
-    back = edges[:, 1] * len(unique) + edges[:, 0]
-    closed = len(np.unique(there)) == len(there) and bool(np.isin(there, back).all())
+    there = np.sort(edges[:, 0] * len(places) + edges[:, 1])
+    back = np.sort(edges[:, 1] * len(places) + edges[:, 0])
+    closed = bool((there[1:] != there[:-1]).all() and (there == back).all())
     a, b, c = np.moveaxis(mesh.vertices[mesh.faces] - mesh.vertices.mean(axis=0), 1, 0)
     volume = float(np.einsum("fi,fi->", a, np.cross(b, c)) / 6)
     return Winding(closed, volume > 0, volume)

@@ -14,6 +14,7 @@ from jawusd.errors import TrackingError
 from jawusd.formats.mesh import Mesh, crown_face_mask, tooth_labels
 from jawusd.geometry import transform_point
 from jawusd.geometry.arrays import Array
+from jawusd.geometry.welding import welded
 from jawusd.imaging.decimation import decimated_scan
 from jawusd.imaging.raster import draw_depth_labels, draw_silhouette, project, words_for
 from jawusd.tracking.contour.gingival_margin import crown_gum_segments
@@ -177,8 +178,8 @@ def _with_tables(
 
 def _weld(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
     """Merge vertices at the same place: triangle soups would otherwise consist of borders only."""
-    unique, inverse = np.unique(vertices, axis=0, return_inverse=True)
-    return np.ascontiguousarray(unique), np.ascontiguousarray(inverse.reshape(-1)[faces], np.int32)
+    places, index = welded(vertices)
+    return places, np.ascontiguousarray(index[faces], np.int32)
 
 
 def _wound_outwards(vertices: Array, faces: Faces) -> Faces:
