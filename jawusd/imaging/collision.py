@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.geometry.se3 import se3_inverse
+from jawusd.geometry.welding import welded
 from jawusd.imaging.solid import DistanceGrid, distance_grid, outer_faces
 
 #: Surfaces farther apart than this count as this far apart [mm].
@@ -130,7 +131,7 @@ def surface_points(corners: Array, apart_mm: float) -> Array:
         i, j = np.meshgrid(np.arange(n + 1), np.arange(n + 1), indexing="ij")
         weights = np.stack([n - i - j, i, j], axis=-1)[i + j <= n] / n
         found.append(np.einsum("pk,fkc->fpc", weights, corners[parts == n]).reshape(-1, 3))
-    return np.unique(np.round(np.concatenate(found), 6), axis=0)
+    return welded(np.round(np.concatenate(found), 6))[0]
 
 
 def in_boxes(points: Array) -> Samples:

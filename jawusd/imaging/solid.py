@@ -87,8 +87,7 @@ def distance_grid(corners: Array, outer: Mask, box: Array, step_mm: float, up: f
     kept = np.ascontiguousarray(corners[outer])
     nearest = _nearest_faces(kept, box[0], step_mm, (nx, ny, nz), _BAND_CELLS)
     where = distance_transform_edt(nearest < 0, return_distances=False, return_indices=True)
-    nearest = _nearer_faces(kept, nearest[tuple(where)], box[0], step_mm)
-    values = _distances(kept, nearest, box[0], step_mm)
+    values = _distances(kept, nearest[tuple(where)], box[0], step_mm)
     flipped = _upwards(corners, up)
     columns = _columns_of(flipped)
     _set_signs(values, flipped, box[0], step_mm, up, columns)
@@ -237,39 +236,25 @@ def _nearest_faces(
 
 
 @numba.njit(nogil=True, cache=True)
-def _nearer_faces(corners: Array, nearest: NDArray[np.int32], origin: Array, step: float) -> NDArray[np.int32]:
-    """Return, at every value, the nearest of its own triangle and those of its six neighbours."""
-    found = nearest.copy()
-    nx, ny, nz = nearest.shape
-    for i in range(nx):
-        for j in range(ny):
-            for k in range(nz):
-                x, y, z = origin[0] + i * step, origin[1] + j * step, origin[2] + k * step
-                best = -1.0
-                for di, dj, dk in ((-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1)):
-                    a, b, c = i + di, j + dj, k + dk
-                    if a < 0 or b < 0 or c < 0 or a >= nx or b >= ny or c >= nz:
-                        continue
-                    other = nearest[a, b, c]
-                    if other == nearest[i, j, k] or other == found[i, j, k]:
-                        continue
-                    if best < 0:
-                        best = _squared_distance(corners, nearest[i, j, k], x, y, z)
-                    squared = _squared_distance(corners, other, x, y, z)
-                    if squared < best:
-                        best, found[i, j, k] = squared, other
-    return found
-
-
-@numba.njit(nogil=True, cache=True)
 def _distances(corners: Array, nearest: NDArray[np.int32], origin: Array, step: float) -> NDArray[np.float32]:
+    """Return, at every value, the distance to the nearest of its own triangle and those of its six neighbours."""
     values = np.empty(nearest.shape, np.float32)
     nx, ny, nz = nearest.shape
     for i in range(nx):
         for j in range(ny):
             for k in range(nz):
-                squared = _squared_distance(
-                    corners, nearest[i, j, k], origin[0] + i * step, origin[1] + j * step, origin[2] + k * step
-                )
-                values[i, j, k] = np.sqrt(squared)
+                x, y, z = origin[0] + i * step, origin[1] + j * step, origin[2] + k * step
+                own = found = nearest[i, j, k]
+                best = _squared_distance(corners, own, x, y, z)
+                for di, dj, dk in ((-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1)):
+                    a, b, c = i + di, j + dj, k + dk
+                    if a < 0 or b < 0 or c < 0 or a >= nx or b >= ny or c >= nz:
+                        continue
+                    other = nearest[a, b, c]
+                    if other == own or other == found:
+                        continue
+                    squared = _squared_distance(corners, other, x, y, z)
+                    if squared < best:
+                        best, found = squared, other
+                values[i, j, k] = np.sqrt(best)
     return values
