@@ -131,7 +131,7 @@ def surface_points(corners: Array, apart_mm: float) -> Array:
         i, j = np.meshgrid(np.arange(n + 1), np.arange(n + 1), indexing="ij")
         weights = np.stack([n - i - j, i, j], axis=-1)[i + j <= n] / n
         found.append(np.einsum("pk,fkc->fpc", weights, corners[parts == n]).reshape(-1, 3))
-    return welded(np.round(np.concatenate(found), 6))[0]
+    return welded(np.asarray(np.round(np.concatenate(found), 6), np.float64))[0]
 
 
 def in_boxes(points: Array) -> Samples:

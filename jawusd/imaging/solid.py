@@ -251,7 +251,7 @@ def _distances(corners: Array, nearest: NDArray[np.int32], origin: Array, step: 
                     if a < 0 or b < 0 or c < 0 or a >= nx or b >= ny or c >= nz:
                         continue
                     other = nearest[a, b, c]
-                    if other == own or other == found:
+                    if other in (own, found):
                         continue
                     squared = _squared_distance(corners, other, x, y, z)
                     if squared < best:

@@ -21,7 +21,8 @@ from jawusd.tracking.contour.samples import COLUMNS, INVERSE_DEPTH, LENGTH, NX, 
 from jawusd.tracking.contour.scan import CROWN, prepare_scan
 from jawusd.tracking.region import performance, rig_tracker
 from jawusd.tracking.region.colours import BINS, PATCHES, TABLES, Areas, CameraColours, colour_bins
-from jawusd.tracking.region.edges import search_borders, search_creases, sharpen
+from jawusd.tracking.region.creases import search_creases
+from jawusd.tracking.region.edges import search_borders, sharpen
 from jawusd.tracking.region.pace import THOROUGH
 from jawusd.tracking.region.performance import follow_back
 from jawusd.tracking.region.rig_tracker import RigTracker

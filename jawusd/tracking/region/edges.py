@@ -20,17 +20,6 @@ _MOST_STEPS = 10  # to either side of a sample
 _LEAST_CLEAR = 0.15  # share of the clear log ratio below which an edge is none
 _LEAST_BLUR_PX, _MOST_BLUR_PX, _GAMMA = 1.0, 10.0, 2.2  # of motion taken into account; of the pictures' code
 _SMOOTH_PX = 1.0  # half the width over which slopes are measured
-# Farthest that creases are looked for, and their edges from the darkest place; half steps to measure a slope over.
-_CREASE_PX, _BESIDE_PX, _CREASE_ARM = 6.0, 3.0, 3
-
-
-@numba.njit(nogil=True, cache=True, inline="always")
-def _label(labels: NDArray[np.uint8], x: float, y: float) -> int:
-    i = pixel_of(x)
-    j = pixel_of(y)
-    if i < 0 or j < 0 or j >= labels.shape[0] or i >= labels.shape[1]:
-        return 0
-    return labels[j, i]
 
 
 @numba.njit(nogil=True, cache=True, inline="always")
@@ -186,7 +175,7 @@ def _zero_crossing(r: Array, n: int, step: float, k: int) -> float:
 
 
 @numba.njit(nogil=True, cache=True, inline="always")
-def _colour(rgb: NDArray[np.uint8], x: float, y: float) -> tuple[float, float, float]:
+def colour_at(rgb: NDArray[np.uint8], x: float, y: float) -> tuple[float, float, float]:
     """Interpolate a colour bilinearly; beyond the picture it is that of its rim."""
     x = min(max(x, 0.0), rgb.shape[1] - 1.001)
     y = min(max(y, 0.0), rgb.shape[0] - 1.001)
@@ -237,8 +226,8 @@ def sharpen(
         for q in range(3):
             t = 1.75 + q + wide
             within, beyond = (
-                _colour(rgb, u + (d - t) * nx, v + (d - t) * ny),
-                _colour(rgb, u + (d + t) * nx, v + (d + t) * ny),
+                colour_at(rgb, u + (d - t) * nx, v + (d - t) * ny),
+                colour_at(rgb, u + (d + t) * nx, v + (d + t) * ny),
             )
             for c in range(3):
                 inner[c] += within[c] / 3
@@ -256,7 +245,7 @@ def sharpen(
         steps = int(2 * (reach_px + wide))
         for q in range(2 * (steps + arm) + 1):
             t = d + 0.5 * (q - steps - arm)
-            colour = _colour(rgb, u + t * nx, v + t * ny)
+            colour = colour_at(rgb, u + t * nx, v + t * ny)
             p = 0.0
             for c in range(3):
                 value = colour[c] / 255
@@ -290,81 +279,6 @@ def _steepest(line: Array, steps: int, arm: int) -> float:
             place = k - 1 - steps + (0.5 * (before - after) / bend if bend < 0 else 0.0)
         before, slope = slope, after
     return place
-
-
-@numba.njit(nogil=True, cache=True)
-def search_creases(
-    samples: Array,
-    rgb: NDArray[np.uint8],
-    own_labels: NDArray[np.uint8],
-    other_labels: NDArray[np.uint8],
-    reach_px: float,
-    contrast: float,
-    weight: float,
-    out: Array,
-    clearness: Array,
-) -> None:
-    """Find edges of crowns right before those of the other arch: where light changes most at the dark line between.
-
-    Either crown may be the darker one towards the line, but shading fades, and an edge is as sharp as the lens.
-
-    Args:
-        contrast: least difference between the brighter tooth and the line [8-bit steps].
-        weight: of such an edge [-].
-        The others are those of `search_borders`; only samples without a border are looked at.
-    """
-    reach = min(reach_px, _CREASE_PX)
-    n = 2 * int(reach + _BESIDE_PX) + _CREASE_ARM
-    line = np.empty(2 * n + 1)
-    for s in range(len(samples)):
-        sample = samples[s]
-        if clearness[s] != 0.0:  # found, or hidden
-            continue
-        u, v, nx, ny = sample[U], sample[V], sample[NX], sample[NY]
-        beyond_x, beyond_y = u + 3 * nx, v + 3 * ny
-        if _label(other_labels, beyond_x, beyond_y) != CROWN or _label(own_labels, beyond_x, beyond_y) == CROWN:
-            continue
-        for k in range(2 * n + 1):
-            t = 0.5 * (k - n)
-            line[k] = _light(rgb, u + t * nx, v + t * ny)
-        low, at = np.inf, n
-        for k in range(n - int(2 * reach), n + int(2 * reach) + 1):
-            p = line[k] + 0.25 * abs(k - n)  # of two lines the nearer one
-            if p < low:
-                low, at = p, k
-        least = line[at]
-        before, behind = line[max(at - 8, 0)], line[min(at + 8, 2 * n)]
-        if max(before, behind) - least < contrast or min(before, behind) - least < 0.4 * contrast:
-            continue
-        place = _sharpest(line, at, int(2 * _BESIDE_PX))
-        if not np.isnan(place) and abs(place - n) <= 2 * reach:
-            out[s] = 0.5 * (place - n)
-            clearness[s] = weight
-
-
-@numba.njit(nogil=True, cache=True, inline="always")
-def _sharpest(line: Array, at: int, steps: int) -> float:
-    """Return the index near another one at which a line changes most steeply, up or down; NaN at an end."""
-    best, place = 0.0, np.nan
-    before, slope = np.nan, np.nan
-    first = max(at - steps, _CREASE_ARM)
-    for k in range(first, min(at + steps, len(line) - 1 - _CREASE_ARM) + 1):
-        after = 0.0
-        for i in range(1, _CREASE_ARM + 1):
-            after += (line[k + i] - line[k - i]) * min(i, _CREASE_ARM + 1 - i)
-        after = abs(after)
-        if k > first + 1 and slope > best and slope >= before and slope >= after:
-            best = slope
-            bend = before - 2 * slope + after
-            place = k - 1 + (0.5 * (before - after) / bend if bend < 0 else 0.0)
-        before, slope = slope, after
-    return place
-
-
-@numba.njit(nogil=True, cache=True, inline="always")
-def _light(rgb: NDArray[np.uint8], x: float, y: float) -> float:
-    red, green, blue = _colour(rgb, x, y)
-    return (red + green + blue) / 3
 
 
 @numba.njit(nogil=True, cache=True)

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from jawusd.geometry.arrays import Array
 from jawusd.tracking.contour.views import Drawn
 from jawusd.tracking.region.colours import BINS, KINDS, TABLES
-from jawusd.tracking.region.edges import count_colours, search_borders, search_creases, sharpen
+from jawusd.tracking.region.creases import search_creases
+from jawusd.tracking.region.edges import count_colours, search_borders, sharpen
 from jawusd.tracking.region.places import choose_tables, measure_blur
 
 _SHUTTER = 0.5  # share of a frame's time that it is exposed: unknown, usual for film
