@@ -61,6 +61,9 @@ def main() -> None:
     if "PXR_WORK_THREAD_LIMIT" not in os.environ:
         # Before OpenUSD is loaded: rigs are small, and where it has no threads it can be tried in a fork at any moment.
         os.environ |= {"PXR_WORK_THREAD_LIMIT": "1", "TF_ENV_SETTING_ALERTS_ENABLED": "0"}
+    # Before numpy is loaded: sums that several threads share differ in their last bits, from which fits end micrometres
+    # apart on other machines. The matrices are so small that more threads save nothing.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         with explain_missing_packages():
             app()

@@ -167,3 +167,14 @@ def test_the_doctor_looks_at_what_a_build_needs():
     assert found["codecs"]["h264"] and found["codecs"]["prores"] and {"build", "view"} <= set(found["extras"])
     assert done.exit_code == (1 if found["problems"] else 0)
     assert "OpenGL:" in run("doctor").stdout
+
+
+def test_linear_algebra_has_one_thread_unless_told_otherwise():
+    """With two, a fit ended 5 micrometres elsewhere; it counts only before numpy is loaded."""
+    shown = "print(os.environ['OPENBLAS_NUM_THREADS'], 'numpy' in sys.modules)"
+    code = f"import os, sys, jawusd.cli.main as m\nm.app = lambda: {shown}\nm.main()"
+    rest = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    for given, expected in (({}, "1 False"), ({"OPENBLAS_NUM_THREADS": "2"}, "2 False")):
+        command = [sys.executable, "-c", code]
+        done = subprocess.run(command, env=rest | given, capture_output=True, text=True, check=True)
+        assert done.stdout.strip() == expected
