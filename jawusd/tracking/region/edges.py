@@ -33,6 +33,7 @@ def _ratio_at(bins: NDArray[np.uint16], table: NDArray[np.float32], x: float, y:
     """Interpolate the log ratio of a table bilinearly; 0, which says nothing, outside of the picture."""
     if not _within(bins, x, y):
         return 0.0
+    # Unsigned: compiled look-ups then do not ask whether an index counts from the end.
     i = np.uint32(x)
     j = np.uint32(y)
     one = np.uint32(1)

@@ -25,7 +25,8 @@ from jawusd.tracking.region.picture import Cut
 from jawusd.tracking.region.rig_tracker import RigTracker
 
 _FACES = 3_000
-# What is done less often than in recorded pictures: half a pixel less or more is not worth a picture that is left out.
+# Coarser than for recorded pictures, where pictures that are left out cost more: on 100 frames of one take the incisal
+# point was 0.182 mm off with these, 0.178 with parallax of 2 px, 0.2 mm for settled steps and a last look at all poses.
 _SETTINGS = replace(TrackingConfig(), sample_step_px=3.0, redraw_px=4.0, parallax_px=6.0, settled_mm=0.4, judged_mm=0.3)
 _WIDER = 1.5  # true over computed standard deviation, as where all frames are solved together
 

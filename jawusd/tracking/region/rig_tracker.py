@@ -154,7 +154,7 @@ class RigTracker:
         """
         pace, usual = self._pace, self._usual_share()
         in_turn, far = pace.in_turn and self._failed > pace.searches, frames > _STEADY_FRAMES
-        gates = pace.gates_px if frames <= _NEXT_FRAMES else pace.far_px if far and not in_turn else pace.next_px
+        gates = pace.gates_px if in_turn or frames <= _NEXT_FRAMES else pace.far_px if far else pace.next_px
         # After frames that were left out no motion vouches for a pose that fits only half.
         doubted, searched = (_DOUBTED, _SEARCHED) if far else (pace.doubted, pace.searched)
         found = look.align(expected.pose, expected, gates)
