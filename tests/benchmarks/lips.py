@@ -2,8 +2,9 @@
 
     python tests/benchmarks/lips.py --persons 10 --out FOLDER
 
-Takes of a hundred frames in which the lips close three times are rendered, followed by colours alone, segmented and
-tracked; what lies in FOLDER already is kept. Prints per closing and in all, for both:
+Takes of a hundred frames in which the lips close three times are rendered and tracked by their colours, as `jawusd
+track` does without masks, and with --masks also through masks that `jawusd segment` makes; what lies in FOLDER already
+is kept. Prints per take and in all:
 
     again       frames from the first one in which the teeth are in sight again to the first one found within 0.5 mm;
                 in sight are both rows where two cameras see a sixth of their crowns. A row that is lost is not found
@@ -27,19 +28,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "support"))
 from lips_take import write_lips_capture
 
 from jawusd.formats.capture import load_capture
-from jawusd.formats.tracks import LOST, TRACKED, load_tracks
-from jawusd.geometry import LANDMARKS, relative_pose, se3_inverse, se3_log, transform_point
+from jawusd.formats.tracks import TRACKED, load_tracks, save_tracks
+from jawusd.geometry import LANDMARKS, se3_inverse, se3_log, transform_point
 from jawusd.pipeline.calibrate import sync_cameras
-from jawusd.pipeline.media import open_footage
-from jawusd.pipeline.meshes import load_meshes
 from jawusd.pipeline.segment import SegmentOptions, segment_teeth
-from jawusd.pipeline.segment_guide import GUIDE, followed_teeth, save_guide
 from jawusd.pipeline.segment_record import RECORD, with_masks, write_summary
-from jawusd.pipeline.subject import subject_of_capture
 from jawusd.pipeline.track import track
-from jawusd.segmentation.footage import ColourFootage
-from jawusd.tracking.contour.quality import landmark_sigmas, relative_covariance
-from jawusd.tracking.sequence.guided import GuidedTracker
+from jawusd.tracking.contour.quality import landmark_sigmas
 
 FOUND_MM, GROSS_MM, SOON = 0.5, 1.0, 5
 IN_SIGHT, CAMERAS = 1 / 6, 2
@@ -121,30 +116,12 @@ def quiet(stage, done, total):
     """Say nothing of progress."""
 
 
-def follow(capture, offsets, folder):
-    """Follow the teeth by colours alone and keep the poses where `segment` would."""
-    cameras, videos = open_footage(capture)
-    meshes = load_meshes(capture)
-    teeth, start = (meshes["upper_teeth"], meshes["lower_teeth"]), capture.bootstrap.frame
-    picked = GuidedTracker(*teeth, None, 1).picked(capture.bootstrap, cameras)
-    subject = subject_of_capture(capture, meshes)
-    footage = ColourFootage(videos, offsets)
-    save_guide(
-        folder,
-        "",
-        followed_teeth(footage, cameras, teeth, subject, range(*capture.frames), (start, picked), quiet, None),
-    )
-
-
-def by_colours(folder):
-    """Return frames, relative poses, covariances and status of what was followed by colours."""
-    with np.load(folder / GUIDE) as guide:
-        found, poses, spread = guide["found"], guide["poses"], guide["covariance"]
-        both = found.all(1) & np.isfinite(spread).all((1, 2, 3))
-        relative, covariance = np.full((len(both), 4, 4), np.nan), np.full((len(both), 6, 6), np.nan)
-        relative[both] = relative_pose(poses[both, 0], poses[both, 1])
-        covariance[both] = relative_covariance(poses[both, 0], spread[both, 0], spread[both, 1])
-        return guide["frames"], relative, covariance, np.where(found, TRACKED, LOST)
+def masks_tracked(capture, folder):
+    """Return the tracks of a capture by masks that `segment` makes."""
+    offsets, masks = sync_cameras(capture, quiet)["offsets"], folder / "masks"
+    entries = segment_teeth(capture, offsets, masks, SegmentOptions(None, (masks / RECORD).exists(), 1), quiet)
+    write_summary(capture, entries, masks)
+    return track(with_masks(capture, masks), jobs=1)
 
 
 def main():
@@ -155,31 +132,27 @@ def main():
     parser.add_argument("--frames", type=int, default=100)
     parser.add_argument("--size", type=int, nargs=2, default=(640, 360), help="of the pictures [px]")
     parser.add_argument("--out", type=Path, help="folder of the captures; what is finished there is kept")
-    parser.add_argument("--colours-only", action="store_true", help="leave out masks and tracking")
+    parser.add_argument("--masks", action="store_true", help="also make masks, and track through them")
     options = parser.parse_args()
     out = options.out or Path(tempfile.mkdtemp())
-    totals = {"colours": Figures(), "tracked": Figures()}
+    ways = {"colours": lambda capture, folder: track(capture, jobs=1)}
+    if options.masks:
+        ways["masks"] = masks_tracked
+    totals = {name: Figures() for name in ways}
     for seed in range(options.seed, options.seed + options.persons):
         folder = out / f"person_{seed}"
         if not (folder / "capture.toml").exists():
             write_lips_capture(folder, seed, options.frames, tuple(options.size))
         capture = load_capture(folder / "capture.toml")
-        offsets = sync_cameras(capture, quiet)["offsets"]
         with np.load(folder / "truth" / "truth.npz") as archive:
             truth = {name: archive[name] for name in archive.files}
-        masks, tracks = folder / "masks", folder / "tracks.npz"
-        if not options.colours_only and not tracks.exists():
-            entries = segment_teeth(capture, offsets, masks, SegmentOptions(None, (masks / RECORD).exists(), 1), quiet)
-            write_summary(capture, entries, masks)
-            track(with_masks(capture, masks), tracks, jobs=1)
-        elif not (masks / GUIDE).exists():
-            masks.mkdir(exist_ok=True)
-            follow(capture, offsets, masks)
-        print(seed, "colours", totals["colours"].add(truth, *by_colours(masks)), flush=True)
-        if tracks.exists():
-            made = load_tracks(tracks)
+        for name, way in ways.items():
+            path = folder / f"{name}.npz"
+            if not path.exists():
+                save_tracks(path, way(capture, folder))
+            made = load_tracks(path)
             shown = (made.frames, made.T_upper_lower, made.covariance_relative, made.status)
-            print(seed, "tracked", totals["tracked"].add(truth, *shown), flush=True)
+            print(seed, name, totals[name].add(truth, *shown), flush=True)
     for name, figures in totals.items():
         if figures.frames:
             print(name, figures.line())
