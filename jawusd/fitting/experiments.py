@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from jawusd.errors import FittingError
+from jawusd.fitting.blas import one_blas_thread
 from jawusd.fitting.condyle_paths import condyle_paths, parameter_paths, path_distances, sagittal_section
 from jawusd.fitting.coverage import FAR_MM, bound_not_reached, missing_movements, shown_parameters
 from jawusd.fitting.data import Source, SubjectAnatomy, TrainingData, select
@@ -52,6 +53,7 @@ class _Fitted:
     notes: tuple[str, ...]
 
 
+@one_blas_thread
 def run_experiments(
     source: Source,
     anatomy: SubjectAnatomy,

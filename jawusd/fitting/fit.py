@@ -15,6 +15,7 @@ from jawusd.evaluator import JawRig
 from jawusd.fitting.additive import fit_additive
 from jawusd.fitting.anatomy_gate import AnatomyWarning, check_anatomy
 from jawusd.fitting.anchored import fit_anchored
+from jawusd.fitting.blas import one_blas_thread
 from jawusd.fitting.bounds import alpha_shapes, fit_slice_hull, valid_box
 from jawusd.fitting.coverage import PARAMETERS, missing_movements, shown_parameters
 from jawusd.fitting.data import Selection, Source, SubjectAnatomy, TrainingData, select
@@ -66,6 +67,7 @@ class FittingConfig:
             raise ValueError(f"starts must be at least 1, got {self.starts}")
 
 
+@one_blas_thread
 def fit_model(
     source: Source,
     *,

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from jawusd.errors import FittingError
 from jawusd.evaluator import JawRig
@@ -203,6 +204,19 @@ def test_model_survives_the_file(tmp_path, model):
     loaded = load_model(tmp_path / "model.npz")
     np.testing.assert_array_equal(loaded.d, model.d)
     JawRig(loaded.arrays, loaded.meta)
+
+
+def test_a_fit_does_not_depend_on_the_threads_of_linear_algebra(person, take):
+    """With two threads it ended 5 micrometres elsewhere; the number that the process has is left as it was."""
+    T = take[:400]
+    with threadpool_limits(limits=1, user_api="blas"):
+        alone = fit(person, T)
+    with threadpool_limits(limits=2, user_api="blas"):
+        shared = fit(person, T)
+        threads = {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+    assert threads == {2}
+    for name, values in alone.arrays.items():
+        np.testing.assert_array_equal(shared.arrays[name], values, name)
 
 
 def test_progress_runs_from_zero_to_all(person, take):
