@@ -17,8 +17,9 @@ from jawusd.pipeline.meshes import load_meshes
 from jawusd.pipeline.segment_guide import known_guide, save_guide
 from jawusd.pipeline.subject import subject_of_capture
 from jawusd.segmentation.footage import ColourFootage
-from jawusd.tracking.contour.samples import COLUMNS, INVERSE_DEPTH, LENGTH, NX, NY, U, V
+from jawusd.tracking.contour.samples import COLUMNS, INVERSE_DEPTH, LENGTH, NX, NY, U, V, X, Y
 from jawusd.tracking.contour.scan import CROWN, prepare_scan
+from jawusd.tracking.contour.views import Drawn
 from jawusd.tracking.region import performance, rig_tracker
 from jawusd.tracking.region.colours import BINS, PATCHES, TABLES, Areas, CameraColours, colour_bins
 from jawusd.tracking.region.creases import search_creases
@@ -26,6 +27,7 @@ from jawusd.tracking.region.edges import search_borders, sharpen
 from jawusd.tracking.region.pace import THOROUGH
 from jawusd.tracking.region.performance import follow_back
 from jawusd.tracking.region.rig_tracker import RigTracker
+from jawusd.tracking.region.view import Counts, RegionView
 from jawusd.tracking.sequence.guided import GuidedTracker
 
 TOOTH, LIP = np.array([215.0, 205.0, 185.0]), np.array([150.0, 75.0, 80.0])
@@ -85,6 +87,32 @@ def test_borders_are_found_from_either_side(off):
     assert np.abs(distances[found] + off).mean() < 0.6
     sharpen(samples, picture, 20.0, 2.0, np.zeros(len(samples)), distances, weights)
     assert np.abs(distances[found] + off).mean() < 0.12
+
+
+def weights_after(motion_px, counts):
+    """Return the weights of a disc's borders that moves to the right from frame to frame, and their normals."""
+    picture, share = disc()
+    samples = samples_at(RADIUS)
+    samples[:, X], samples[:, Y] = samples[:, U], samples[:, V]
+    areas = Areas(share > 0.99, share < 0.01, np.zeros_like(share, bool), np.zeros_like(share, bool))
+    bins = colour_bins(picture)
+    before = np.tile([[1.0, 0, 0, -motion_px], [0, 1, 0, 0], [0, 0, 0, 1]], (2, 1, 1))
+    ratio, patches = CameraColours(bins, areas).ratio, np.zeros((2, PATCHES, 2))
+    view = RegionView(picture, bins, ratio, patches, np.eye(3), before, counts)
+    drawn = Drawn((share > 0.5).astype(np.uint8) * CROWN, np.zeros((SIZE, SIZE), np.uint8), np.zeros((SIZE, SIZE)))
+    return view.search(samples, len(samples), 0, drawn, LIMITS)[1], samples[:, [NX, NY]]
+
+
+def test_borders_that_move_count_less_in_the_last_look():
+    rest, normals = weights_after(0.0, Counts.zeros())
+    fast, _ = weights_after(40.0, Counts.zeros())
+    found = rest > 0.3
+    along, across = found & (np.abs(normals[:, 0]) > 0.9), found & (np.abs(normals[:, 0]) < 0.05)
+    assert along.sum() > 10 and across.sum() > 1
+    assert (fast[along] < 0.3 * rest[along]).all()
+    np.testing.assert_allclose(fast[across], rest[across], rtol=0.02)
+    earlier, _ = weights_after(40.0, None)  # which tells whether teeth are lost
+    assert (earlier[along] > 0.9 * rest[along]).all()
 
 
 def test_what_the_other_arch_hides_says_nothing():
