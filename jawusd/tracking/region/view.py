@@ -16,8 +16,8 @@ from jawusd.tracking.region.places import choose_tables, measure_blur
 
 _SHUTTER = 0.5  # share of a frame's time that it is exposed: unknown, usual for film
 # Motion during the exposure at which a border counts half in the last look [px]: what is measured of a ramp of light is
-# the less sure the longer it is, in variance as the square. Chosen on two path-traced mouths, with a look at two others;
-# NEES of the four 0.74, 0.35, 0.77, 0.31, without it 1.54, 0.44, 1.04, 0.40. Looks before the last one tell by the share
+# the less sure the longer it is, in variance as the square. Chosen on two path-traced mouths, two others were seen;
+# NEES of all four 0.74, 0.35, 0.77, 0.31, without it 1.54, 0.44, 1.04, 0.40. Looks before the last tell by the share
 # of the contour that fits whether teeth are lost, which fast ones are not.
 _BLURRED_PX = 10.0
 _LEARNED_PX = (2, 7)  # distances from borders between which colours are learned
