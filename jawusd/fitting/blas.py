@@ -1,4 +1,4 @@
-"""One thread of linear algebra for fits: what several share of a sum decides its last digits, and a fit micrometres."""
+"""Fit in one thread of linear algebra: sums that several share differ in their last digits, and fits by micrometres."""
 
 from __future__ import annotations
 

@@ -99,7 +99,8 @@ def weights_after(motion_px, counts):
     before = np.tile([[1.0, 0, 0, -motion_px], [0, 1, 0, 0], [0, 0, 0, 1]], (2, 1, 1))
     ratio, patches = CameraColours(bins, areas).ratio, np.zeros((2, PATCHES, 2))
     view = RegionView(picture, bins, ratio, patches, np.eye(3), before, counts)
-    drawn = Drawn((share > 0.5).astype(np.uint8) * CROWN, np.zeros((SIZE, SIZE), np.uint8), np.zeros((SIZE, SIZE)))
+    other, depth = np.zeros((SIZE, SIZE), np.uint8), np.zeros((SIZE, SIZE), np.float32)
+    drawn = Drawn((share > 0.5).astype(np.uint8) * CROWN, other, depth)
     return view.search(samples, len(samples), 0, drawn, LIMITS)[1], samples[:, [NX, NY]]
 
 
