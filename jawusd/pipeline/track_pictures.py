@@ -45,7 +45,7 @@ def track_videos(
     from jawusd.segmentation.footage import ColourFootage
     from jawusd.tracking.contour.scan import prepare_scan
     from jawusd.tracking.region.picture_start import RowStart
-    from jawusd.tracking.region.strained import footage_doubts, widen_strained
+    from jawusd.tracking.region.strained import footage_doubts
     from jawusd.tracking.region.take import TakeFacts, tracks_of
 
     cameras, videos = open_footage(capture)
@@ -80,7 +80,6 @@ def track_videos(
     )
     tracks = tracks_of(followed, facts, follower.looks)
     tracks.meta["start"] = {"by": begin.by, "frame": begin.frame, "fit": begin.fit}
-    tracks = widen_strained(tracks, subject.landmarks, facts.axes)
     findings = [finding.as_json() for finding in (*rows.findings, *footage_doubts(tracks))]
     tracks.meta["findings"] = [*tracks.meta.get("findings", []), *findings]
     return tracks

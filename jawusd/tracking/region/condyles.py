@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jawusd.geometry import hat, relative_pose, rigid_fit, transform_point
+from jawusd.geometry import hat, relative_pose, rigid_fit, se3_adjoint, se3_inverse, transform_point
 from jawusd.geometry.arrays import Array
-from jawusd.tracking.contour.equations import NormalEquations, Solution
+from jawusd.tracking.contour.equations import NormalEquations, Solution, translation
 from jawusd.tracking.contour.quality import landmark_sigmas
 
 _UNIT_MM = (5.0, 20.0, 5.0)  # motion of the incisal point to the left, up and forwards that is a unit
@@ -64,15 +64,14 @@ class CondyleMotion:
         self._precision = first[:, :, None] * np.eye(usual.shape[1])  # of the coefficients, shape (6, K, K)
         self._sums = first * usual  # precision times mean, shape (6, K)
 
-    def learn(self, poses: Array, covariance: Array) -> None:
-        """Take up a frame: T_world_upper and T_world_lower (2, 4, 4), and the covariance of the left twist between."""
-        relative = relative_pose(poses[0], poses[1])
+    def learn(self, relative: Array, covariance: Array) -> None:
+        """Take up a frame: T_upper_lower (4, 4), and the covariance (6, 6) of its left twist about the skull origin."""
         incisor, condyles = self._shifts(relative)
         features = _features(incisor)[0]
         known = self._off + np.repeat(landmark_sigmas(relative, covariance, self._points[1:]) ** 2, 3)
         if not np.isfinite(known).all():
             return
-        strange = _DOUBT / (_DOUBT + self.strain(poses) / len(known))
+        strange = _DOUBT / (_DOUBT + self.strain(relative) / len(known))
         weight = _NEWS * strange / known
         self._precision += weight[:, None, None] * np.outer(features, features)
         self._sums += (weight * condyles)[:, None] * features
@@ -87,9 +86,12 @@ class CondyleMotion:
         open_questions = np.linalg.solve(self._precision, np.broadcast_to(features, means.shape)[..., None])[..., 0]
         return means @ features, means @ slopes, self._off + open_questions @ features
 
-    def strain(self, poses: Array) -> float:
-        """Return the squared distance of the condyles from where they are expected, in standard deviations."""
-        incisor, condyles = self._shifts(relative_pose(poses[0], poses[1]))
+    def strain(self, relative: Array) -> float:
+        """Return the squared distance of the condyles from where they are expected, in standard deviations.
+
+        `relative` is T_upper_lower (4, 4).
+        """
+        incisor, condyles = self._shifts(relative)
         mean, _, variance = self.expected(incisor)
         return float((np.square(condyles - mean) / variance).sum())
 
@@ -105,15 +107,13 @@ class CondyleMotion:
         moved = (transform_point(relative, self._points) - self._points) @ self.axes.T
         return moved[0], moved[1:].ravel()
 
-    def residual(self, state: Solution) -> tuple[Array, Array, Array]:
-        """Return condyles less what is expected (6,), slopes by both arches' twists (6, 12), and variances (6,)."""
-        relative = relative_pose(state.poses[0], state.poses[1])
-        turn = self.axes @ state.poses[0, :3, :3].T
-        slopes = []
-        for point in self._points:
-            at = transform_point(state.poses[1], point)
-            moves = [np.hstack([-turn @ hat(at - centre), turn]) for centre in state.centres]
-            slopes.append(np.hstack([-moves[0], moves[1]]))
+    def residual(self, relative: Array) -> tuple[Array, Array, Array]:
+        """Return condyles less what is expected [mm], their slopes, and variances [mm^2]; shapes (6,), (6, 6), (6,).
+
+        `relative` is T_upper_lower (4, 4); the slopes are by its left twist about the skull origin.
+        """
+        points = transform_point(relative, self._points)
+        slopes = [self.axes @ np.hstack([-hat(point), np.eye(3)]) for point in points]
         incisor, condyles = self._shifts(relative)
         mean, along, variance = self.expected(incisor)
         return condyles - mean, np.concatenate(slopes[1:]) - along @ slopes[0], variance
@@ -128,7 +128,10 @@ class CondyleTerm:
 
     def accumulate(self, state: Solution, equations: NormalEquations) -> None:
         """Add the squared distances at the state's poses, in units of the outline sums."""
-        residual, slope, variance = self.motion.residual(state)
+        residual, slope, variance = self.motion.residual(relative_pose(state.poses[0], state.poses[1]))
+        to_skull = se3_adjoint(se3_inverse(state.poses[0]))
+        upper, lower = (slope @ to_skull @ se3_adjoint(translation(centre)) for centre in state.centres)
+        slope = np.hstack([-upper, lower])
         weights = self.noise_px3 * float(equations.outline_weight.mean()) / variance
         equations.add_joint(slope.T @ (weights[:, None] * slope), -slope.T @ (weights * residual))
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jawusd.geometry import se3_inverse
+from jawusd.geometry import relative_pose, se3_inverse
 from jawusd.geometry.arrays import Array
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.equations import Solution
@@ -142,7 +142,7 @@ class PoseSearch:
 
     def worth_px(self, solution: Solution) -> float:
         """Return how much contour fits, less what it costs to have the condyles where they are not expected [px]."""
-        return float(score_px(solution).sum()) - _STRAIN_PX * self.condyles.strain(solution.poses)
+        return float(score_px(solution).sum()) - _STRAIN_PX * self.condyles.strain(relative_pose(*solution.poses))
 
     def _better(self, one: Solution, other: Solution) -> Solution:
         """Return the likelier one."""

@@ -29,30 +29,42 @@ _MOST = 0.6  # of the frames, that are good and adjoin, are a take without its b
 _USUAL, _LEAST = 0.9, 0.25  # quantile of the take with which a strained frame is compared, and its least value
 
 
+def strain_factors(motion: CondyleMotion, relative: Array, covariance: Array) -> Array:
+    """Teach a motion all frames; return by how much covariances are to be wider, 1 where nothing is strained (F,).
+
+    Their strain over the usual one (Birge 1932).
+
+    Args:
+        motion: one that was taught nothing yet.
+        relative: T_upper_lower, shape (F, 4, 4).
+        covariance: of their left twists about the skull origin, shape (F, 6, 6).
+    """
+    for pose, spread in zip(relative, covariance, strict=True):
+        motion.learn(pose, spread)
+    strain = np.array([motion.strain(pose) / 6 for pose in relative])
+    usual = max(float(np.quantile(strain, _USUAL)), _LEAST)
+    return np.where(strain > _STRAINED, np.maximum(strain / usual, 1.0), 1.0)
+
+
 def widen_strained(tracks: Tracks, landmarks: Array, axes: Array) -> Tracks:
-    """Return tracks whose strained frames have a covariance wider by their strain over the usual one (Birge 1932).
+    """Return tracks whose strained frames have a wider covariance; see `strain_factors`.
 
     Args:
         landmarks, axes: as in `CondyleMotion`.
     """
-    poses = np.stack([tracks.raw_T_world_upper, tracks.raw_T_world_lower], axis=1)
-    known = np.asarray(np.isfinite(poses).all((1, 2, 3)) & np.isfinite(tracks.covariance_relative).all((1, 2)))
+    relative, between = tracks.raw_T_upper_lower, tracks.covariance_relative
+    known = np.asarray(np.isfinite(relative).all((1, 2)) & np.isfinite(between).all((1, 2)))
     if not known.any():
         return tracks
-    motion = CondyleMotion(landmarks, axes)
-    for k in np.flatnonzero(known).tolist():
-        motion.learn(poses[k], tracks.covariance_relative[k])
-    strain = np.zeros(len(known))
-    strain[known] = [motion.strain(pair) / 6 for pair in poses[known]]
-    usual = max(float(np.quantile(strain[known], _USUAL)), _LEAST)
-    wider = np.where(strain > _STRAINED, np.maximum(strain / usual, 1.0), 1.0)[:, None, None]
-    between = wider * tracks.covariance_relative
+    wider = np.ones((len(known), 1, 1))
+    wider[known, 0, 0] = strain_factors(CondyleMotion(landmarks, axes), relative[known], between[known])
+    between = wider * between
     return replace(
         tracks,
         covariance_upper=wider * tracks.covariance_upper,
         covariance_lower=wider * tracks.covariance_lower,
         covariance_relative=between,
-        sigma_mm=landmark_sigmas(tracks.raw_T_upper_lower, between, landmarks),
+        sigma_mm=landmark_sigmas(relative, between, landmarks),
     )
 
 

@@ -16,6 +16,7 @@ from jawusd.tracking.contour.frame_record import NO_LOSS, FrameRecord, Loss
 from jawusd.tracking.contour.quality import matched_px
 from jawusd.tracking.contour.scan import ARCHES, Scan
 from jawusd.tracking.contour.views import View
+from jawusd.tracking.region.condyle_fusion import CondyleFusion
 from jawusd.tracking.region.learned import CORRELATION_PX
 from jawusd.tracking.region.take_checks import camera_findings, scan_findings
 from jawusd.tracking.region.tracker import RegionPose
@@ -88,7 +89,8 @@ def tracks_of(
     }
     moved = {f: np.stack([corrected_pose(records, f, arch, nuisances) for arch in ARCHES]) for f in records}
     records = {f: replace(r, solution=replace(r.solution, poses=moved[f])) for f, r in records.items()}
-    return assemble(records, names, take.landmarks, nuisances, extrinsics, config, rest, notes)
+    fuse = CondyleFusion(take.landmarks, take.axes)
+    return assemble(records, names, take.landmarks, nuisances, extrinsics, config, rest, notes, fuse)
 
 
 def _record(found: RegionPose, solution: Solution, config: TrackingConfig) -> FrameRecord:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from jawusd.geometry import Camera
+from jawusd.geometry import Camera, relative_pose
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.config import TrackingConfig
 from jawusd.tracking.contour.equations import Solution
@@ -185,7 +185,7 @@ class _Way:
         covariance = np.where(found[:, None, None], _covariance(solution), np.nan)
         if found.all():
             instant.learn(poses, RATES)
-            self._search.condyles.learn(poses, relative_covariance(poses[0], *covariance))
+            self._search.condyles.learn(relative_pose(*poses), relative_covariance(poses[0], *covariance))
             self._usual.append(share)
         self._motion.update(poses, found, np.full(2, seen))
         self._poses, self._found = poses, found

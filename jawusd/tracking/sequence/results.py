@@ -37,6 +37,11 @@ from jawusd.tracking.sequence.nuisance import Nuisances, interpolation_covarianc
 from jawusd.tracking.sequence.rest_frames import RestFrames
 from jawusd.tracking.sequence.smoothing import smooth_poses
 
+#: What else is known of poses, told once all are measured: takes poses (F, 2, 4, 4), NaN where lost, the covariances of
+#: their left twists about the world origin (F, 2, 6, 6), and that of T_upper_lower about the skull origin (F, 6, 6);
+#: returns likelier ones.
+Fusion = Callable[[Array, Array, Array], tuple[Array, Array, Array]]
+
 
 def assemble(
     records: Mapping[int, FrameRecord],
@@ -47,8 +52,9 @@ def assemble(
     config: TrackingConfig,
     rest: RestFrames,
     notes: TracksMeta,
+    fuse: Fusion | None = None,
 ) -> Tracks:
-    """Return the tracks of a take: raw poses as aligned, final poses smoothed over time.
+    """Return the tracks of a take: raw poses as aligned, and fused if asked for; final poses smoothed over time.
 
     The covariances are those of the raw poses: outline errors change slowly, so smoothing reduces them little.
 
@@ -62,6 +68,8 @@ def assemble(
     raw[status == LOST] = np.nan
     correlation = take_correlation_px(records, config)
     raw, covariance, covariance_relative, bite = _measured(raw, records, nuisances, extrinsics, correlation, rest)
+    if fuse is not None:
+        raw, covariance, covariance_relative = fuse(raw, covariance, covariance_relative)
     known = status != LOST
     middle = np.median(centres[known.all(1)] if known.all(1).any() else centres, axis=(0, 1))
     final = np.stack([smooth_poses(frames, raw[:, r], covariance[:, r], middle) for r in ARCHES], axis=1)
@@ -75,11 +83,7 @@ def assemble(
         "extrinsics": extrinsics.report(camera_names),
         **notes,
     }
-    findings = meta.get("findings", [])
-    if bite is None:
-        meta["findings"] = [*findings, registration_unknown(rest).as_json()]
-    else:
-        meta |= _bite_report(bite, rest, findings)
+    meta |= _bite_report(bite, rest, meta.get("findings", []))
     return Tracks(
         frames=frames,
         T_world_upper=final[:, 0],
@@ -152,8 +156,10 @@ def _measured(
     return bite.correct(raw, rest.apply), covariance, relative, bite
 
 
-def _bite_report(bite: ClosedBite, rest: RestFrames, findings: list[dict[str, str | float | int]]) -> TracksMeta:
+def _bite_report(bite: ClosedBite | None, rest: RestFrames, findings: list[dict[str, str | float | int]]) -> TracksMeta:
     """Return what the closed bite tells, for the meta data; the findings are added to those given."""
+    if bite is None:
+        return {"findings": [*findings, registration_unknown(rest).as_json()]}
     registration = bite.report(rest)
     check_registration(registration)
     return {
