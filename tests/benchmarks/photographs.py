@@ -6,7 +6,9 @@ else are taken, whose misfit should be large. --out writes the outlines over the
 green (upper) and blue (lower).
 
     rms, median   distance of every drawn point from the nearest outline of like direction [px at 1440 px]
-    free          rms of those that do not run along the gum
+    free          rms of those that do not run along the gum, by the crowns
+    between       rms of those with teeth on both sides, by the drawing alone
+    outside       rms of the others: lines drawn along gum and cheek
     misfit        of the row that fits worse, see `AlignedPhoto`
     hand          misfit of the other handedness over that of this one, at the start
     alone, pair   the bite from one photograph alone, and from the others without it: how far they place the lower
@@ -20,6 +22,8 @@ import time
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt, label
 
 from jawusd.geometry import transform_point
 from jawusd.imaging.meshio import load_mesh
@@ -27,12 +31,13 @@ from jawusd.imaging.overlay import save_png
 from jawusd.imaging.pictures import read_gray, read_picture
 from jawusd.pipeline.photographs import drawn_over, read_drawing
 from jawusd.tracking.photographs import align_photographs
-from jawusd.tracking.photographs.align import _lower_incisor, _refined
+from jawusd.tracking.photographs.align import _line_distances, _lower_incisor, _refined, _rms
 from jawusd.tracking.photographs.contact import Contact
 from jawusd.tracking.photographs.solve import Bite
 
 COLOUR = 1  # cv2.IMREAD_COLOR
 VIEWS = ("front", "left", "right")
+LINE, BESIDE_PX = 0.25, 7.0  # share of a line's brightness where it ends, and how far from there its middle is at most
 
 
 def main() -> None:
@@ -43,7 +48,8 @@ def main() -> None:
     arguments.add_argument("--out", type=Path)
     given = arguments.parse_args()
     begun = time.process_time()
-    drawings = [read_drawing(read_gray(given.folder / f"outlines_{view}.png"), view) for view in VIEWS]
+    pictures = [read_gray(given.folder / f"outlines_{view}.png") for view in VIEWS]
+    drawings = [read_drawing(picture, view) for picture, view in zip(pictures, VIEWS, strict=True)]
     meshes = [load_mesh((given.crowns or given.folder) / f"{row}_crowns.ply") for row in ("upper", "lower")]
     found = align_photographs(drawings, meshes, lambda stage, done, total: None)
     joint, point = found.bite, _lower_incisor(found.rows)
@@ -56,14 +62,17 @@ def main() -> None:
         return transform_point(bite.T_upper_lower, point)
 
     everywhere = transform_point(joint.T_upper_lower, point)
-    print(f"{'':6} mirrored  focal    rms  median   free  misfit  hand   alone   pair  alone to pair")
+    print(f"{'':6} mirrored  focal    rms  median   free  between  outside  misfit  hand   alone   pair  alone to pair")
     for k, photo in enumerate(found.result.photos):
         alone, pair = incisor([k]), incisor([j for j in range(len(VIEWS)) if j != k])
+        distance = _line_distances(joint.photos[k], joint, found.rows)[0]
+        beside = outside(pictures[k], drawings[k].pixels)
         off = [np.linalg.norm(difference) for difference in (alone - everywhere, pair - everywhere, alone - pair)]
         print(
             f"{photo.name:6} {'yes' if photo.mirrored else 'no':>8}  {photo.focal_px:5.0f}  {photo.outline_rms_px:5.2f}"
-            f"  {photo.outline_median_px:6.2f}  {photo.free_rms_px:5.2f}  {photo.misfit:6.3f}  {photo.other_hand:4.2f}"
-            f"  {off[0]:6.2f} {off[1]:6.2f}  {off[2]:13.2f}"
+            f"  {photo.outline_median_px:6.2f}  {photo.free_rms_px:5.2f}"
+            f"  {_rms(distance[~beside]):7.2f}  {_rms(distance[beside]):7.2f}  {photo.misfit:6.3f}"
+            f"  {photo.other_hand:4.2f}  {off[0]:6.2f} {off[1]:6.2f}  {off[2]:13.2f}"
         )
         if given.out is not None:
             overlay(given, found, k)
@@ -71,6 +80,15 @@ def main() -> None:
     for finding in found.result.findings:
         print(finding.line())
     print(f"{time.process_time() - begun:.0f} s of processor time")
+
+
+def outside(picture: NDArray[np.uint8], pixels: np.ndarray) -> NDArray[np.bool_]:
+    """Return which points of lines (N, 2) [px] border on what no line encloses, shape (N,)."""
+    areas, _ = label(picture < LINE * picture.max())
+    edge = np.unique(np.concatenate([areas[0], areas[-1], areas[:, 0], areas[:, -1]]))
+    away = distance_transform_edt(~np.isin(areas, edge[edge > 0]))
+    column, row = np.round(pixels).astype(int).T
+    return away[row, column] < BESIDE_PX * picture.shape[1] / 1440.0
 
 
 def overlay(given: argparse.Namespace, found, number: int) -> None:
