@@ -117,7 +117,8 @@ def solid(corners: Array, up: float, box: Array, step_mm: float = STEP_MM) -> So
         step_mm: between its distances, which are linear in between.
     """
     outer, entering = outer_faces(corners, up)
-    grid = distance_grid(corners, outer, box, step_mm, up)
+    # Linear between values, distances are exact up to the farthest if values are across a diagonal beyond.
+    grid = distance_grid(corners, outer, box, step_mm, up, FARTHEST_MM + 3.0**0.5 * step_mm)
     near = ((corners <= box[1]) & (corners >= box[0])).all(axis=2).any(axis=1)
     return Solid(grid, in_boxes(surface_points(corners[outer & near], _SAMPLE_MM)), entering)
 

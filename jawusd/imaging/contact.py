@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -78,8 +79,8 @@ def find_teeth(upper: Mesh, lower: Mesh, T_anatomical_skull: Array, T_rest: Arra
         NoContact: A scan is too coarse or wound at random, or there is no closed bite.
     """
     placed = (("upper", upper, T_anatomical_skull, 1.0), ("lower", lower, T_anatomical_skull @ T_rest, -1.0))
-    solids = [_solid(name, mesh, T, up) for name, mesh, T, up in placed]
-    pair = Pair(*solids)
+    with ThreadPoolExecutor(len(placed)) as pool:  # most of the work is done without Python's lock
+        pair = Pair(*pool.map(lambda row: _solid(*row), placed))
     closed = float(pair.depth(np.eye(4)[None])[0])
     if closed < -_WIDEST_GAP_MM:
         raise NoContact(f"the closed bite leaves more than {_WIDEST_GAP_MM:g} mm between the rows of teeth")

@@ -15,7 +15,7 @@ from jawusd.formats.mesh import Mesh
 from jawusd.geometry.anatomy import LANDMARKS
 from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import se3_inverse, transform_points
-from jawusd.imaging.collision import Pair
+from jawusd.imaging.collision import FARTHEST_MM, Pair
 from jawusd.imaging.contact import NoContact, wound_solid
 
 #: Between sampled clearances.
@@ -80,6 +80,8 @@ def find_joints(skull: Mesh, mandible: Mesh, landmarks: Array, T_anatomical_skul
     heads = transform_points(closed_bite, landmarks[_CONDYLES])
     left, right = (_joint(above, below, head) for head in heads)
     closed = np.array([float(pair.depth(np.eye(4)[None])[0]) for pair in (left, right)])
+    for pair, depth in zip((left, right), closed):
+        _check_near(pair, depth)
     if closed.max() > _DEEPEST_MM:
         raise NoContact(
             f"in the closed bite a condyle runs {closed.max():.1f} mm into the skull (at most {_DEEPEST_MM:g} mm)"
@@ -93,11 +95,16 @@ def _joint(above: Array, below: Array, head: Array) -> Pair:
     _check_fine("mandible", below, condyle)
     _check_fine("skull", above, fossa)
     upper = wound_solid("skull", above, 1.0, fossa, _GRID_MM)
-    pair = Pair(upper, wound_solid("mandible", below, -1.0, condyle, _GRID_MM))
+    return Pair(upper, wound_solid("mandible", below, -1.0, condyle, _GRID_MM))
+
+
+def _check_near(pair: Pair, depth_mm: float) -> None:
+    """Raise NoContact where a condyle, so deep in the skull, is far from it."""
+    if depth_mm > -FARTHEST_MM:
+        return
     gap, _ = cKDTree(pair.upper.samples.points).query(pair.lower.samples.points)
     if gap.min() > _WIDEST_MM:
         raise NoContact(f"a condyle is {gap.min():.1f} mm from the skull (at most {_WIDEST_MM:g} mm is a joint)")
-    return pair
 
 
 def _check_fine(name: str, corners: Array, box: Array) -> None:

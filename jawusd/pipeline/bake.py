@@ -13,7 +13,7 @@ from jawusd.formats.model import JawModel
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import LANDMARKS
 from jawusd.pipeline.cameras import load_cameras, tracked_cameras
-from jawusd.pipeline.contact import with_contact
+from jawusd.pipeline.contact import meeting_surfaces, with_contact
 from jawusd.pipeline.meshes import BONES
 from jawusd.pipeline.state import Progress, no_progress
 from jawusd.pipeline.subject import Subject, registered_subject
@@ -66,7 +66,8 @@ def bake_subject(
     # Bones come from segmented scans with all their faults; teeth scans stay as they are, vertex for vertex.
     meshes = {key: manifold(mesh) if key in BONES else mesh for key, mesh in subject.meshes.items()}
     if "contact" not in model.meta:  # fitted without the scans
-        model = with_contact(model, subject, progress, regauge=False)
+        placed = (model.arrays[name] for name in ("T_anatomical_skull", "landmarks", "T_rest"))
+        model = with_contact(model, meeting_surfaces(subject.meshes, *placed), progress, regauge=False)
     if "velocity_covariance" not in model.arrays and subject.fps is not None:
         model = with_speeds(model, subject.fps)
     moving = len(model.frames) > 0

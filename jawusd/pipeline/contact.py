@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
@@ -14,6 +14,7 @@ from jawusd.evaluator.contact import AUTHORED_MM, NEAR_MM, ContactField
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.model import JawModel
 from jawusd.formats.report import ContactPicture
+from jawusd.geometry.arrays import Array
 from jawusd.pipeline.meshes import BONES
 from jawusd.pipeline.scan_labels import TEETH
 from jawusd.pipeline.state import Progress, no_progress
@@ -21,9 +22,18 @@ from jawusd.pipeline.subject import Subject
 
 if TYPE_CHECKING:
     from jawusd.imaging.contact import Teeth
+    from jawusd.imaging.joints import Joints
 
 _QUALITY = 88  # of the pictures, JPEG
 _FARTHEST_MM = 1.5  # distances that are measured, see `imaging.collision`
+
+
+@dataclass(frozen=True, eq=False)
+class MeetingSurfaces:
+    """Hold teeth and joints as solids, or why there are none."""
+
+    teeth: Teeth | str
+    joints: Joints | str
 
 
 class ContactSummary(TypedDict, total=False):
@@ -111,56 +121,71 @@ def teeth_of(rig: JawRig, meshes: Mapping[str, Mesh]) -> Teeth:
         raise RigError(f"does not show how the teeth meet: {reason}.") from reason
 
 
+def meeting_surfaces(
+    meshes: Mapping[str, Mesh], T_anatomical_skull: Array, landmarks: Array, T_rest: Array
+) -> MeetingSurfaces:
+    """Return teeth and joints among meshes as solids, or why there are none; what else is given is as in `Subject`.
+
+    Args:
+        meshes: Scans and bones, registered as the poses are.
+    """
+    from jawusd.imaging.contact import NoContact, find_teeth
+    from jawusd.imaging.joints import find_joints
+
+    teeth: Teeth | str = "there are no scans of both rows of teeth"
+    joints: Joints | str = "there are no meshes of both skull and mandible"
+    if all(name in meshes for name in TEETH.values()):
+        try:
+            teeth = find_teeth(meshes[TEETH["upper"]], meshes[TEETH["lower"]], T_anatomical_skull, T_rest)
+        except NoContact as reason:
+            teeth = str(reason)
+    if all(name in meshes for name in BONES):
+        try:
+            joints = find_joints(meshes["skull"], meshes["mandible"], landmarks, T_anatomical_skull, T_rest)
+        except NoContact as reason:
+            joints = str(reason)
+    return MeetingSurfaces(teeth, joints)
+
+
 def with_contact(
-    model: JawModel, subject: Subject, progress: Progress = no_progress, *, regauge: bool = True
+    model: JawModel, surfaces: MeetingSurfaces, progress: Progress = no_progress, *, regauge: bool = True
 ) -> JawModel:
     """Return a model with the clearances of teeth and condyles.
 
     ``meta["contact"]`` and ``meta["joints"]`` say how deep these run in, or why there are none.
 
     Args:
-        subject: The person, scans registered as the model's poses are.
+        surfaces: Those of the person, see `meeting_surfaces`.
         regauge: Count d1 from where the teeth touch, and end the bound there.
     """
-    return _with_joints(_with_teeth(model, subject, progress, regauge), subject)
+    model = _with_joints(_with_teeth(model, surfaces.teeth, progress, regauge), surfaces.joints)
+    progress("contact", 3, 3)
+    return model
 
 
-def _with_teeth(model: JawModel, subject: Subject, progress: Progress, regauge: bool) -> JawModel:
+def _with_teeth(model: JawModel, teeth: Teeth | str, progress: Progress, regauge: bool) -> JawModel:
     from jawusd.fitting.glide import follow_teeth
-    from jawusd.imaging.contact import NoContact, find_teeth, sample_field
+    from jawusd.imaging.contact import sample_field
 
-    if not all(name in subject.meshes for name in TEETH.values()):
-        return _known(model, "contact", {"missing": "there are no scans of both rows of teeth"})
+    if isinstance(teeth, str):
+        return _known(model, "contact", {"missing": teeth})
     progress("contact", 0, 3)
-    upper, lower = (subject.meshes[TEETH[row]] for row in ("upper", "lower"))
-    try:
-        teeth = find_teeth(upper, lower, model.arrays["T_anatomical_skull"], model.arrays["T_rest"])
-        progress("contact", 1, 3)
-        if regauge:
-            model = follow_teeth(model, teeth)
-        progress("contact", 2, 3)
-        field = sample_field(teeth, JawRig(model.arrays, model.meta))
-    except NoContact as reason:
-        return _known(model, "contact", {"missing": str(reason)})
-    finally:
-        progress("contact", 3, 3)
+    if regauge:
+        model = follow_teeth(model, teeth)
+    progress("contact", 1, 3)
+    field = sample_field(teeth, JawRig(model.arrays, model.meta))
+    progress("contact", 2, 3)
     return replace(_known(model, "contact", _summary(field)), arrays={**model.arrays, **field.arrays("teeth")})
 
 
-def _with_joints(model: JawModel, subject: Subject) -> JawModel:
-    from jawusd.imaging.contact import NoContact, sample_field
-    from jawusd.imaging.joints import STEP_MM, find_joints
+def _with_joints(model: JawModel, joints: Joints | str) -> JawModel:
+    from jawusd.imaging.contact import sample_field
+    from jawusd.imaging.joints import STEP_MM
 
-    if not all(name in subject.meshes for name in BONES):
-        return _known(model, "joints", {"missing": "there are no meshes of both skull and mandible"})
-    skull, mandible = (subject.meshes[name] for name in ("skull", "mandible"))
-    arrays = model.arrays
-    try:
-        joints = find_joints(skull, mandible, arrays["landmarks"], arrays["T_anatomical_skull"], arrays["T_rest"])
-    except NoContact as reason:
-        return _known(model, "joints", {"missing": str(reason)})
-    field = sample_field(joints, JawRig(arrays, model.meta), STEP_MM, np.inf)
-    return replace(_known(model, "joints", _summary(field)), arrays={**arrays, **field.arrays("condyles")})
+    if isinstance(joints, str):
+        return _known(model, "joints", {"missing": joints})
+    field = sample_field(joints, JawRig(model.arrays, model.meta), STEP_MM, np.inf)
+    return replace(_known(model, "joints", _summary(field)), arrays={**model.arrays, **field.arrays("condyles")})
 
 
 def _known(model: JawModel, name: str, found: ContactSummary) -> JawModel:

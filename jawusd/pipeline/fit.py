@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -27,7 +28,7 @@ from jawusd.formats.poses import read_poses
 from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.geometry import make_transform, matrix_from_wxyz, rigidity_defect, se3_inverse
 from jawusd.geometry.arrays import Array
-from jawusd.pipeline.contact import ContactSummary, contact_words, joint_words, with_contact
+from jawusd.pipeline.contact import ContactSummary, contact_words, joint_words, meeting_surfaces, with_contact
 from jawusd.pipeline.markers import marker_poses
 from jawusd.pipeline.state import Progress, no_progress
 from jawusd.pipeline.subject import Subject, registered_subject
@@ -97,20 +98,23 @@ def fit_subject(
     registration = motion.meta.get("registration") if isinstance(motion, Tracks) else None
     if registration is not None:
         subject = registered_subject(subject, {"registration": registration})
-    model = fit_model(
-        motion,
-        T_anatomical_skull=subject.T_anatomical_skull,
-        landmarks=subject.landmarks,
-        mandible_vertices=subject.measured_points(),
-        T_rest=subject.T_rest,
-        config=FittingConfig(method=cast("Method", method)),  # which checks the name
-        actor=subject.name,
-        progress=partial(progress, "fit"),
-    )
-    model.meta["inferred"] = list(subject.inferred)
-    if registration is not None:
-        model.meta["registration"] = registration
-    model = with_contact(model, subject, progress)
+    placed = subject.T_anatomical_skull, subject.landmarks, subject.T_rest
+    with ThreadPoolExecutor(1) as pool:  # solids take no model, and little of Python's lock, which a fit holds
+        surfaces = pool.submit(meeting_surfaces, subject.meshes, *placed)
+        model = fit_model(
+            motion,
+            T_anatomical_skull=subject.T_anatomical_skull,
+            landmarks=subject.landmarks,
+            mandible_vertices=subject.measured_points(),
+            T_rest=subject.T_rest,
+            config=FittingConfig(method=cast("Method", method)),  # which checks the name
+            actor=subject.name,
+            progress=partial(progress, "fit"),
+        )
+        model.meta["inferred"] = list(subject.inferred)
+        if registration is not None:
+            model.meta["registration"] = registration
+        model = with_contact(model, surfaces.result(), progress)
     if subject.fps is None:
         return model
     model.meta["fps"] = subject.fps

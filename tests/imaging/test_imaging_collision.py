@@ -5,10 +5,11 @@ import pytest
 import trimesh
 
 from jawusd.geometry import se3_inverse, so3_exp, transform_points
-from jawusd.imaging.collision import FARTHEST_MM, Pair, distances, solid, tips_box
-from jawusd.imaging.solid import outer_faces
+from jawusd.imaging.collision import FARTHEST_MM, STEP_MM, Pair, distances, solid, tips_box
+from jawusd.imaging.solid import distance_grid, outer_faces
 
 RADIUS = 6.0
+DIAGONAL_MM = 3.0**0.5 * STEP_MM  # of a cell: values are linear between its corners
 
 
 def ball(centre=(0.0, 0.0, 0.0), radius=RADIUS):
@@ -78,9 +79,25 @@ def test_a_scan_open_above_has_an_inside():
     grid = found.grid
     points = grid.origin + grid.step_mm * np.stack(np.indices(grid.values.shape), axis=-1)
     exact = np.linalg.norm(points, axis=-1) - RADIUS
-    for away_mm, error_mm in ((0.5, 0.01), (2.5, 0.08)):  # farther away the nearest face is that of a cell nearby
-        low = (points[..., 1] < 0.0) & (np.abs(exact) < away_mm)
+    below = points[..., 1] < 0.0
+    for inside_mm, outside_mm, error_mm in ((0.5, 0.5, 0.01), (2.5, FARTHEST_MM + DIAGONAL_MM, 0.08)):
+        low = below & (exact > -inside_mm) & (exact < outside_mm)  # deep, the nearest face is that of a cell nearby
         np.testing.assert_allclose(grid.values[low], exact[low], atol=error_mm)
+    far = below & (exact > FARTHEST_MM + DIAGONAL_MM)
+    assert (grid.values[far] > FARTHEST_MM + DIAGONAL_MM - 0.01).all() and (grid.values[far] < exact[far] + 0.08).all()
+
+
+def test_a_surface_that_goes_on_beyond_the_grid_is_not_passed_over():
+    """A wall just outside, nearer than any value within the band of its part inside."""
+    corners = ball(radius=20.0) * [1.0, 0.05, 1.0]  # a lens 2 mm thick
+    box = np.array([[-4.0, 1.9, -4.0], [4.0, 12.0, 4.0]])  # above it: it touches the box in its middle alone
+    outer, _ = outer_faces(corners, -1.0)
+    grid = distance_grid(corners, outer, box, STEP_MM, -1.0, 1.0)
+    points = grid.origin + grid.step_mm * np.stack(np.indices(grid.values.shape), axis=-1)
+    shape = trimesh.Trimesh(**trimesh.triangles.to_kwargs(corners))
+    some = points.reshape(-1, 3)[::37]
+    exact = trimesh.proximity.closest_point_naive(shape, some)[1]
+    assert (grid.values.ravel()[::37] < exact + 0.1).all()
 
 
 def test_distances_deep_inside_a_rough_solid_are_those_to_its_nearest_face():

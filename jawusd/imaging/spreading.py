@@ -1,0 +1,97 @@
+"""Give every cell of a grid the number that its nearest numbered cell has, and how far that one is.
+
+The feature transform of Maurer et al. (2003), IEEE TPAMI 25:265, one axis after the other; in integers and in place, so
+that it takes a fraction of the time and memory of scipy's, which keeps three coordinates of every cell.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+
+@numba.njit(nogil=True, cache=True)
+def spread(numbers: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Give cells below 0 the numbers of the nearest others, in place; of several as near, of the first in order.
+
+    Args:
+        numbers: of the cells, shape (nx, ny, nz).
+
+    Returns:
+        The squared distances to the cells whose numbers were taken [cells^2], shape (nx, ny, nz); where there are no
+        numbers at all, more than any distance in the grid.
+    """
+    nx, ny, nz = numbers.shape
+    away = np.empty((nx, ny, nz), np.int32)
+    _along_first(numbers, away)
+    longest = max(ny, nz)
+    before, squared, site = np.empty(longest, np.int32), np.empty(longest, np.int64), np.empty(longest, np.int64)
+    for i in range(nx):
+        for k in range(nz):
+            _along_line(numbers[i, :, k], away[i, :, k], before, squared, site)
+        for j in range(ny):
+            _along_line(numbers[i, j], away[i, j], before, squared, site)
+    return away
+
+
+@numba.njit(nogil=True, cache=True)
+def _along_first(numbers: NDArray[np.int32], away: NDArray[np.int32]) -> None:
+    """Spread numbers along the first axis, and set the squared distances."""
+    nx, ny, nz = numbers.shape
+    none = nx + ny + nz
+    for i in range(nx):
+        for j in range(ny):
+            for k in range(nz):
+                away[i, j, k] = 0 if numbers[i, j, k] >= 0 else none
+                if i > 0 and numbers[i, j, k] < 0 and numbers[i - 1, j, k] >= 0:
+                    numbers[i, j, k], away[i, j, k] = numbers[i - 1, j, k], away[i - 1, j, k] + 1
+    for i in range(nx - 1, -1, -1):
+        for j in range(ny):
+            for k in range(nz):
+                if i < nx - 1 and numbers[i + 1, j, k] >= 0 and away[i + 1, j, k] + 1 < away[i, j, k]:
+                    numbers[i, j, k], away[i, j, k] = numbers[i + 1, j, k], away[i + 1, j, k] + 1
+    for i in range(nx):
+        for j in range(ny):
+            for k in range(nz):
+                away[i, j, k] *= away[i, j, k]
+
+
+@numba.njit(nogil=True, cache=True)
+def _along_line(
+    numbers: NDArray[np.int32],
+    away: NDArray[np.int32],
+    before: NDArray[np.int32],
+    squared: NDArray[np.int64],
+    site: NDArray[np.int64],
+) -> None:
+    """Spread numbers along a line of cells whose squared distances across it are known.
+
+    Args:
+        numbers, away: of the line's cells, shape (n,).
+        before, squared, site: room for at least as many values.
+    """
+    last = -1
+    for y in range(len(numbers)):
+        before[y], squared[y] = numbers[y], away[y]
+        if numbers[y] < 0:
+            continue
+        while last >= 1:  # is no cell nearest to the site before this one?
+            a, b = site[last] - site[last - 1], y - site[last]
+            u, v, w = squared[site[last - 1]], squared[site[last]], squared[y]
+            if (a + b) * v - b * u - a * w - a * b * (a + b) <= 0:
+                break
+            last -= 1
+        last += 1
+        site[last] = y
+    if last < 0:
+        return
+    at = 0
+    for y in range(len(numbers)):
+        best = squared[site[at]] + (site[at] - y) ** 2
+        while at < last:
+            following = squared[site[at + 1]] + (site[at + 1] - y) ** 2
+            if best <= following:
+                break
+            at, best = at + 1, following
+        numbers[y], away[y] = before[site[at]], best
