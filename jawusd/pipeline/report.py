@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar, cast
@@ -14,7 +14,7 @@ from jawusd.errors import FormatError, JawusdError, MissingDependencyError, expl
 from jawusd.formats.capture import Capture
 from jawusd.formats.experiments import Experiments, save_table
 from jawusd.formats.finding import Finding
-from jawusd.formats.model import load_model
+from jawusd.formats.model import JawModel, load_model
 from jawusd.formats.report import CameraFacts, Origin, Overlay, ReportData, RigFacts
 from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.pipeline.cameras import load_cameras
@@ -74,31 +74,46 @@ def write_build_report(
         FormatError, RigError: a file of the build is damaged.
         OutputError: the file cannot be written.
     """
-    from jawusd.report.document import write_document  # before the work: it may not be installed
-    from jawusd.rig.read import describe
+    from jawusd.report.document import draw_figures, write_document  # before the work: it may not be installed
 
     progress("report", 0, 4)
-    left_out: list[str] = []
     tracks, model = load_tracks(folder / "tracks.npz"), load_model(folder / "model.npz")
     subject = subject_of_build(folder)
-    with ThreadPoolExecutor(1) as pool:  # decodes and draws without Python's lock
-        unseen: list[str] = []
-        drawing = pool.submit(attempt, "pictures of the footage", unseen, lambda: _overlays(facts, tracks))
-        if experiments is None:
-            experiments = attempt(
-                "experiments",
-                left_out,
-                lambda: do_experiments(subject, load_tracks(fitted_poses(folder)), 1, no_progress, quick=True),
-            )
-            left_out.append(_NETWORKS)
-        if describe(folder / "actor.usda")["placeholders"]:
-            left_out.append("the mandible in 3-D: no mesh of it was given, and the rig's placeholder is no anatomy.")
+    unmet, unseen = list[str](), list[str]()
+    # Pictures are decoded, drawn and measured without Python's lock, beside what needs it.
+    with ThreadPoolExecutor(1) as pool:
+        drawn = pool.submit(attempt, "pictures of the footage", unseen, lambda: _overlays(facts, tracks))
+        met = pool.submit(attempt, "contacts of the teeth", unmet, lambda: contact_pictures(model, subject))
+        data = _without_pictures(folder, facts, tracks, model, subject, experiments)
         progress("report", 1, 4)
-        contacts = attempt("contacts of the teeth", left_out, lambda: contact_pictures(model, subject)) or ()
-        overlays = drawing.result() or ()
-    left_out += unseen
-    progress("report", 2, 4)
-    data = ReportData(
+        figures = draw_figures(data)
+        progress("report", 2, 4)
+        overlays, contacts = drawn.result() or (), met.result() or ()
+    left_out = tuple(dict.fromkeys((*data.left_out, *unmet, *unseen)))
+    progress("report", 3, 4)
+    data = replace(data, overlays=overlays, contacts=contacts, left_out=left_out)
+    verdict = write_document(folder / REPORT_FILE, data, figures)
+    progress("report", 4, 4)
+    return folder / REPORT_FILE, verdict
+
+
+def _without_pictures(
+    folder: Path, facts: BuildFacts, tracks: Tracks, model: JawModel, subject: Subject, experiments: Experiments | None
+) -> ReportData:
+    """Return what the report of a build shows, but for the pictures of footage and teeth."""
+    from jawusd.rig.read import describe
+
+    left_out: list[str] = []
+    if experiments is None:
+        experiments = attempt(
+            "experiments",
+            left_out,
+            lambda: do_experiments(subject, load_tracks(fitted_poses(folder)), 1, no_progress, quick=True),
+        )
+        left_out.append(_NETWORKS)
+    if describe(folder / "actor.usda")["placeholders"]:
+        left_out.append("the mandible in 3-D: no mesh of it was given, and the rig's placeholder is no anatomy.")
+    return ReportData(
         actor=subject.name,
         tracks=tracks,
         model=model,
@@ -110,16 +125,11 @@ def write_build_report(
         origin=facts.origin,
         rig=_rig_facts(folder),
         experiments=experiments,
-        overlays=overlays,
+        overlays=(),
         parts=attempt("3-D replay", left_out, lambda: replay_parts(folder, model)) or (),
-        left_out=tuple(dict.fromkeys(left_out)),
+        left_out=tuple(left_out),
         findings=_check_findings(facts.stages),
-        contacts=contacts,
     )
-    progress("report", 3, 4)
-    verdict = write_document(folder / REPORT_FILE, data)
-    progress("report", 4, 4)
-    return folder / REPORT_FILE, verdict
 
 
 def report_build(

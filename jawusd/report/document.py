@@ -6,6 +6,7 @@ import base64
 import math
 import os
 import re
+from collections.abc import Mapping
 from importlib import resources
 
 import jinja2
@@ -36,18 +37,23 @@ _LISTED = 60  # frames named one by one
 _PLACES = ("mandible", "incisor", "molar_left", "molar_right", "condyle_left", "condyle_right")
 
 
-def write_document(path: str | os.PathLike[str], data: ReportData) -> BuildVerdict:
+def write_document(
+    path: str | os.PathLike[str], data: ReportData, figures: Mapping[str, Markup] | None = None
+) -> BuildVerdict:
     """Write the report to an HTML file; return what it says in short.
+
+    Args:
+        figures: what `draw_figures` returned, if they are drawn already.
 
     Raises:
         OutputError: the file cannot be written.
     """
-    write_text_atomic(path, document(data))
+    write_text_atomic(path, document(data, figures))
     return in_short(judge(data))
 
 
-def document(data: ReportData) -> str:
-    """Return the report as HTML; all content of files is escaped."""
+def document(data: ReportData, figures: Mapping[str, Markup] | None = None) -> str:
+    """Return the report as HTML, see `write_document`; all content of files is escaped."""
     verdicts = judge(data)
     return (
         page_environment()
@@ -61,7 +67,7 @@ def document(data: ReportData) -> str:
             style=own_file("report.css"),
             script=own_file("replay.js"),
             replay=replay_data(data),
-            figures=_figures(data),
+            figures=draw_figures(data) if figures is None else figures,
             pictures=[(one, base64.b64encode(one.jpeg).decode("ascii")) for one in data.overlays],
             contacts=[(one, base64.b64encode(one.jpeg).decode("ascii")) for one in data.contacts],
             paper=(DEEP, *TOUCHING),
@@ -106,7 +112,8 @@ def own_file(name: str) -> Markup:
     return Markup(resources.files("jawusd.report").joinpath("page", name).read_text(encoding="utf-8"))
 
 
-def _figures(data: ReportData) -> dict[str, Markup]:
+def draw_figures(data: ReportData) -> dict[str, Markup]:
+    """Return the plots of a report by the names that its page has for them; pictures are not looked at."""
     drawn = {
         "tracking": inline_svg(tracking_figure(data.tracks), "tracking", "How every frame was tracked."),
         "model": inline_svg(model_figure(data.model), "model", "Parameters, model error and margin of every frame."),
