@@ -89,10 +89,10 @@ def run_experiments(
     swept = {name: fitted.forms[name].model for name in ("paper", DEFAULT) if name in fitted.forms}
     widest = float(np.quantile(kept[:, 0], _OPENING_QUANTILE))
     paths = condyle_paths(data, swept, widest, bones.get("mandible"), anatomy)
-    bounds = {name: Bounds.of(d[fitted.forms[name].kept], config.alpha) for name, d in fitted.d.items()}
+    drawn = (DEFAULT,) if quick else tuple(fitted.d)
+    bounds = {name: Bounds.of(fitted.d[name][fitted.forms[name].kept], config.alpha) for name in drawn}
     distances = path_distances(paths, captured, d)
-    drawn = {name: bounds[name] for name in bounds if name == DEFAULT or not quick}
-    distances += _reconstruction(data, fitted, nets) + _synthesis(data, fitted, drawn, config)
+    distances += _reconstruction(data, fitted, nets) + _synthesis(data, fitted, bounds, config)
     compared = {name: fitted.forms[name].model for name in (LINEAR, DEFAULT) if name in fitted.forms}
     notify(steps, steps)
     skull = np.empty((0, 2, 2))

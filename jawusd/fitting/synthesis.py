@@ -68,9 +68,10 @@ def distance_to_nearest(metric: MandibleMetric, motion: Array, captured: Array) 
     tree = cKDTree(places)
     guess = tree.query(at)[1]
     best = metric.largest(motion, captured[guess])
-    for row, near in enumerate(tree.query_ball_point(at, best)):
-        if near:
-            best[row] = min(best[row], metric.largest(motion[row], captured[near]).min())
+    for row, found in enumerate(tree.query_ball_point(at, best)):
+        near = captured[found]
+        near = near[metric.largest_at_least(motion[row], near) <= best[row]]
+        best[row] = metric.largest(motion[row], near).min(initial=best[row])
     return best
 
 

@@ -36,11 +36,13 @@ def distances(a, b, points):
 def test_metric_equals_distances_of_all_points(points):
     rng = np.random.default_rng(1)
     metric = MandibleMetric.of_points(points)
-    a, b = motions(rng, 9), motions(rng, 9)
+    a, b = motions(rng, 70), motions(rng, 70)
     distance = np.stack([distances(s, t, points) for s, t in zip(a, b, strict=True)])
     np.testing.assert_allclose(metric.rms(a, b), np.sqrt((distance**2).mean(1)), rtol=1e-10)
     np.testing.assert_allclose(metric.largest(a, b), distance.max(1), rtol=1e-10)
     assert len(metric.extremes) < len(points)
+    least = metric.largest_at_least(a, b)
+    assert (least <= distance.max(1) + 1e-9).all() and (least > 0).all()
 
 
 def test_metric_works_on_points_in_one_plane(points):
