@@ -27,6 +27,7 @@ from jawusd.pipeline.cameras import rescaled_cameras
 from jawusd.pipeline.capture_inputs import input_hashes, open_capture
 from jawusd.pipeline.check import check_capture, refuse_errors
 from jawusd.pipeline.fit import FitSummary, fit_lines, fit_subject, fit_summary
+from jawusd.pipeline.memory import give_back_memory
 from jawusd.pipeline.origin import origin_now
 from jawusd.pipeline.report import BuildFacts, missing_packages, place_of, write_build_report
 from jawusd.pipeline.scans import all_labelled, store_labels, with_stored_labels
@@ -251,6 +252,7 @@ class StagedBuild:
             return cast("StageRecord[R]", record)
         start = time.perf_counter()
         outputs, result = work()
+        give_back_memory()
         return self.state.finish(name, inputs, outputs, time.perf_counter() - start, result)
 
     def _checked(self, videos: dict[str, str]) -> StageRecord[CheckResult]:
