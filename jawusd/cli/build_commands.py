@@ -73,7 +73,9 @@ def build(
 ) -> None:
     """Turn a capture into a rig: calibrate if need be, sync, track, fit, track hard frames again, bake."""
     from jawusd.pipeline import build as stages
+    from jawusd.pipeline.memory import map_large_arrays
 
+    map_large_arrays()
     _check_backend(solver, backend)
     options = stages.BuildOptions(
         model.value,

@@ -116,6 +116,7 @@ def _report_found(
     source: Path, capture: Path | None, out: Path | None, force: bool, allow_outside: bool, as_json: bool
 ) -> None:
     """Write the report of what a solve or a build left behind."""
+    from jawusd.pipeline.memory import map_large_arrays
     from jawusd.pipeline.report import report_build
     from jawusd.pipeline.solve_report import check_page, report_solve
 
@@ -126,6 +127,7 @@ def _report_found(
         with progress() as tell:
             path = report_solve(source, capture, page, tell, allow_outside=allow_outside)
     elif source.is_dir():
+        map_large_arrays()
         with progress() as tell:
             path = report_build(source, capture, tell, allow_outside=allow_outside)
     else:

@@ -27,7 +27,7 @@ from jawusd.pipeline.cameras import rescaled_cameras
 from jawusd.pipeline.capture_inputs import input_hashes, open_capture
 from jawusd.pipeline.check import check_capture, refuse_errors
 from jawusd.pipeline.fit import FitSummary, fit_lines, fit_subject, fit_summary
-from jawusd.pipeline.memory import give_back_memory, map_large_arrays
+from jawusd.pipeline.memory import give_back_memory
 from jawusd.pipeline.origin import origin_now
 from jawusd.pipeline.report import BuildFacts, missing_packages, place_of, write_build_report
 from jawusd.pipeline.scans import all_labelled, store_labels, with_stored_labels
@@ -148,7 +148,6 @@ def build(
     capture = open_capture(capture, allow_outside=options.allow_outside)
     folder = Path(out)
     check_folder(folder, options)
-    map_large_arrays()
     with locked(folder):
         state = BuildState(folder)
         if options.fresh:

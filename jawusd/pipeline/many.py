@@ -38,6 +38,7 @@ from jawusd.errors import ClusterError, JawusdError
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.capture_list import ListedCapture
 from jawusd.pipeline.build import BuildOptions, FitSummary, build, check_folder
+from jawusd.pipeline.memory import map_large_arrays
 from jawusd.pipeline.state import Progress, make_folder
 
 SUMMARY_JSON, SUMMARY_CSV = "builds.json", "builds.csv"
@@ -203,6 +204,7 @@ def _outcome(future: Future[Outcome], item: ListedCapture) -> Outcome:
 def _build_one(run: str, item: ListedCapture, folder: str, options: BuildOptions) -> Outcome:
     """Build one capture; runs on a worker."""
     outcome = Outcome(item.name, str(item.path), FAILED)
+    map_large_arrays()
     try:
         summary = build(item.path, folder, options, _progress(run, item.name))
     except _CalledOffError:

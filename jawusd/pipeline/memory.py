@@ -12,7 +12,8 @@ _LARGE_BYTES = 8_000_000  # smaller ones cost time to map: from 1 MB on, a tenth
 def map_large_arrays() -> None:
     """Let arrays of more than 8 MB go back to the system as soon as they are freed, from here on, with glibc.
 
-    It does so at first, but stops for arrays as large as the largest that was freed.
+    It does so at first, but stops for arrays as large as the largest that was freed. This holds for the whole process,
+    so that it is for programs and workers alone.
     """
     if sys.platform == "linux":
         option = getattr(ctypes.CDLL(None), "mallopt", None)

@@ -22,7 +22,6 @@ from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.contact import contact_pictures
 from jawusd.pipeline.fit import Poses, fit_summary
 from jawusd.pipeline.media import draw_worst_frames, replay_parts
-from jawusd.pipeline.memory import map_large_arrays
 from jawusd.pipeline.origin import recorded_origin
 from jawusd.pipeline.scans import with_stored_labels
 from jawusd.pipeline.state import (
@@ -77,7 +76,6 @@ def write_build_report(
     """
     from jawusd.report.document import draw_figures, write_document  # before the work: it may not be installed
 
-    map_large_arrays()
     progress("report", 0, 4)
     tracks, model = load_tracks(folder / "tracks.npz"), load_model(folder / "model.npz")
     subject = subject_of_build(folder)
