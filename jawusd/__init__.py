@@ -63,10 +63,14 @@ def load(path: str | PathLike[str], *, prim: str | None = None, fast: bool = Fal
 
         rig = evaluator.load(path)
     else:
-        from jawusd.rig import load_rig
+        from jawusd.rig.child_process import begin_in_child
         from jawusd.rig.layout import actor_in_folder
 
-        rig = load_rig(actor_in_folder(Path(path)), prim)
+        actor = actor_in_folder(Path(path))
+        begin_in_child(actor)  # which works while the rest is imported
+        from jawusd.rig import load_rig
+
+        rig = load_rig(actor, prim)
     if not fast:
         return rig
     from jawusd.fast import accelerate

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import gc
 import os
 import selectors
@@ -11,6 +12,7 @@ import threading
 import time
 import warnings
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 from pxr import Work
@@ -29,6 +31,21 @@ _MORE_MEMORY = "Give the process more address space (ulimit -v)."
 
 _reader = ReaderProcess()
 _known: dict[Path, dict[Path, tuple[int, ...]]] = {}
+_begun: dict[Path, _Copy] = {}
+
+
+def begin_in_child(path: Path) -> None:
+    """Let a copy of this process begin what `try_in_child` will wait for, while this one imports what it needs next.
+
+    Does nothing where it would have to be a new Python, where there is no such file, and where memory is limited: how
+    much the copy may use shows when this process has all it needs.
+    """
+    if not path.is_file() or is_allowed(path) or _is_known(path) or _reader.runs():
+        return
+    memory = memory_of_child()
+    if memory == child_limits.MOST_MEMORY and _can_fork():
+        _drop(_begun.pop(path.absolute(), None))
+        _begun[path.absolute()] = _copied(path, memory)
 
 
 def try_in_child(path: Path) -> None:
@@ -39,15 +56,17 @@ def try_in_child(path: Path) -> None:
     Raises:
         RigError: The child crashed, or needed more time or memory than it may have.
     """
+    begun = _begun.pop(path.absolute(), None)
     if is_allowed(path) or _is_known(path):
+        _drop(begun)
         return
     memory = memory_of_child()
-    copied = not _reader.runs() and _can_fork()
-    end = _forked(path, memory) if copied else None
+    copied = begun is not None or (not _reader.runs() and _can_fork())
+    end = _end_of(begun or _copied(path, memory)) if copied else None
     if end in (None, End.CRASHED):
         end = _reader.read(path, memory) or end
     if end is None and not copied and _can_fork():  # the second Python has ended, and no new one can be started
-        end = _forked(path, memory)
+        end = _end_of(_copied(path, memory))
     if end in (End.LARGE, End.CRASHED) and memory < child_limits.MOST_MEMORY:
         found = f"cannot be read with {memory >> 20} MB, half of the memory that this process may still use."
         raise RigError(found, path=path, hint=_MORE_MEMORY)
@@ -100,8 +119,23 @@ def _state_and_time(process: str) -> tuple[str, int]:
     return fields[0], int(fields[11]) + int(fields[12])
 
 
-def _forked(path: Path, memory: int) -> End | None:
-    """Read in a copy of this process, some 5 ms; return None where it waits, maybe for what another thread held."""
+@dataclass(frozen=True)
+class _Copy:
+    """A copy of this process that reads a stage.
+
+    Attributes:
+        child: Its process number.
+        pipe: What ends when it has read.
+        owner: The process that may wait for it.
+    """
+
+    child: int
+    pipe: int
+    owner: int
+
+
+def _copied(path: Path, memory: int) -> _Copy:
+    """Begin to read in a copy of this process, some 5 ms."""
     reading, writing = os.pipe()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # of Python 3.12, for the idle threads of OpenUSD
@@ -115,17 +149,38 @@ def _forked(path: Path, memory: int) -> End | None:
         finally:  # nothing else of the parent's runs here
             os._exit(1)
     os.close(writing)
+    return _Copy(child, reading, os.getpid())
+
+
+def _end_of(copy: _Copy) -> End | None:
+    """Return how a copy ends; None where it waits, maybe for what another thread held."""
     ended = False
     try:
-        ended = _ends(child, reading)
+        ended = _ends(copy.child, copy.pipe)
     finally:
-        os.close(reading)
-        if not ended:
-            os.kill(child, signal.SIGKILL)
-        status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        status = _closed(copy, kill=not ended)
     if not ended:
         return None
     return next((end for end, code in _EXIT_CODES.items() if code == status), end_of_death(status))
+
+
+def _closed(copy: _Copy, kill: bool) -> int:
+    """Wait for the end of a copy and return its exit code."""
+    os.close(copy.pipe)
+    if kill:
+        os.kill(copy.child, signal.SIGKILL)
+    return os.waitstatus_to_exitcode(os.waitpid(copy.child, 0)[1])
+
+
+def _drop(copy: _Copy | None) -> None:
+    if copy is not None and copy.owner == os.getpid():  # not in a fork of this process
+        _closed(copy, kill=True)
+
+
+@atexit.register
+def _drop_all() -> None:
+    while _begun:
+        _drop(_begun.popitem()[1])
 
 
 def _ends(child: int, reading: int) -> bool:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import numpy as np
 from pxr import Sdf, Tf, Usd
 
 #: Brackets within brackets, and elements of a path, that are read. Stages of studios have some twenty; OpenUSD ends the
@@ -67,6 +66,8 @@ def _is_deep(data: bytes) -> bool:
 
 def _levels(text: bytes) -> int:
     """Return how many brackets are open at most, at any place of a text."""
+    import numpy as np  # few texts come here; the copy of a process that reads them first is made before it is loaded
+
     steps = np.frombuffer(text.translate(_STEPS, _OTHERS), np.int8)
     level = deepest = 0
     for first in range(0, len(steps), _CHUNK):

@@ -1,5 +1,6 @@
 """What OpenUSD ends or hangs on ends a child process; whole rigs cost a child once."""
 
+import json
 import os
 import signal
 import subprocess
@@ -39,7 +40,7 @@ def reader(monkeypatch):
 def children(reader, monkeypatch):
     """Return the paths that children were asked to read."""
     asked = []
-    for where, name in ((child_process, "_forked"), (reader, "read")):
+    for where, name in ((child_process, "_copied"), (reader, "read")):
         real = getattr(where, name)
         monkeypatch.setattr(where, name, lambda path, memory, real=real: asked.append(path) or real(path, memory))
     return asked
@@ -150,7 +151,7 @@ def test_programs_of_several_threads_start_a_second_python(anchored_folder, bomb
         open_stage(bomb)
 
     monkeypatch.setattr(child_limits, "MOST_WAIT_S", 4)
-    monkeypatch.setattr(child_process, "_forked", lambda path, memory: pytest.fail("this process has several threads"))
+    monkeypatch.setattr(child_process, "_copied", lambda path, memory: pytest.fail("this process has several threads"))
     (error,) = in_thread(opened)
     assert "takes OpenUSD more than" in str(error) and len(children) == 2
 
@@ -239,6 +240,43 @@ def test_a_rig_costs_a_child_once(anchored_folder, forks, children):
     os.utime(anchored_folder / "geo.usdc", ns=(1, 1))
     load_rig(actor)
     assert children == [actor, actor]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="forks are for Linux")
+def test_a_child_that_was_begun_is_the_one_that_is_waited_for(anchored_folder, bomb, forks, children, monkeypatch):
+    actor = anchored_folder / "actor.usda"
+    child_process.begin_in_child(actor)
+    load_rig(actor)
+    child_process.begin_in_child(actor)  # which is known by now
+    assert children == [actor]
+    monkeypatch.setattr(child_limits, "MOST_CPU_S", 1)
+    child_process.begin_in_child(bomb)
+    with pytest.raises(RigError, match="takes OpenUSD more than"):
+        open_stage(bomb)
+    assert children[:2] == [actor, bomb] and not child_process._begun
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="forks are for Linux")
+def test_no_child_is_begun_with_limited_memory_or_in_allowed_folders(anchored_folder, forks, children, monkeypatch):
+    actor = anchored_folder / "actor.usda"
+    with monkeypatch.context() as limited:
+        limited.setattr(child_process, "memory_of_child", lambda: child_limits.MOST_MEMORY - 1)
+        child_process.begin_in_child(actor)
+    monkeypatch.setenv(SETTING, str(anchored_folder))
+    child_process.begin_in_child(actor)
+    assert children == []
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="forks are for Linux")
+def test_children_that_nobody_waited_for_end_with_the_program(bomb):
+    program = (
+        "import sys, pathlib; from jawusd.rig import child_process; child_process._can_fork = lambda: True\n"
+        "child_process.begin_in_child(pathlib.Path(sys.argv[1])); "
+        "print([copy.child for copy in child_process._begun.values()])"
+    )
+    found = subprocess.run([sys.executable, "-c", program, str(bomb)], capture_output=True, text=True, check=True)
+    (child,) = json.loads(found.stdout)
+    assert not Path(f"/proc/{child}").exists()
 
 
 def test_allowed_folders_are_read_without_a_child(anchored_folder, children, monkeypatch):
