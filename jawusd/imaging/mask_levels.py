@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from jawusd.imaging.pixels import Slices
+
 MaskImage = NDArray[np.uint8]
 RawImage = NDArray[np.uint8] | NDArray[np.uint16]  # as files store it
 
@@ -54,7 +56,8 @@ class MaskLevels:
     def coverage(self, image: RawImage) -> tuple[MaskImage | None, str]:
         """Return the mask of a picture, 0 .. 255, half of it the outline; None without teeth, and why if that is odd.
 
-        The reason, to follow the name of the picture, is empty for a mask and for an empty picture.
+        The reason, to follow the name of the picture, is empty for a mask and for an empty picture. The mask may be the
+        picture itself.
         """
         if (image.dtype == np.uint16) != self.deep:
             return None, f"has {8 * image.dtype.itemsize} bits per channel, unlike the others"
@@ -63,17 +66,51 @@ class MaskLevels:
         if low == high:
             empty = self.plane == "alpha" or abs(low - self.teeth) > abs(low - self.background)
             return None, "" if empty else f"is {low:g} all over, which means teeth everywhere"
-        mask = np.asarray(cv2.LUT(plane, self._table) if plane.dtype == np.uint8 else self._table[plane], np.uint8)
-        inside = cv2.countNonZero(cv2.inRange(mask, 128, 255))
+        box = self._around_teeth(plane)  # mostly a tenth of the picture; all else is not looked at again
+        part = self._shares(plane[box])
+        inside = cv2.countNonZero(cv2.inRange(part, 128, 255))
         if inside == 0:
             brightest = low if self.inverted else high
-            faint = int(mask.max()) <= 255 * _FAINT
+            faint = int(part.max()) <= 255 * _FAINT
             return None, "" if faint else f"reaches only {brightest:g}, teeth are {self.teeth:g} in the others"
-        if (gray := cv2.countNonZero(cv2.inRange(mask, 26, 229)) / mask.size) > MOST_GRAY:
+        if (gray := cv2.countNonZero(cv2.inRange(part, 26, 229)) / plane.size) > MOST_GRAY:
             return None, f"is no mask: {gray:.0%} of it are neither teeth nor background"
+        mask = part if part.shape == plane.shape else self._placed(part, box, plane)
         if inside > mask.size / 2 and border_share(mask, 127.5) > 0.5:
             return None, f"has {inside / mask.size:.0%} teeth, up to the border: as if inverted, unlike the others"
         return mask, ""
+
+    def _around_teeth(self, plane: RawImage) -> Slices:
+        """Return the rows and columns of a channel outside of which all is background; at least one pixel."""
+
+        def seen(part: RawImage, axis: int) -> list[int]:
+            most = part.min(axis) if self.inverted else part.max(axis)
+            return np.flatnonzero(self._table[most]).tolist()
+
+        rows = seen(plane, 1)
+        if not rows:
+            return slice(0, 1, 1), slice(0, 1, 1)
+        band = slice(rows[0], rows[-1] + 1, 1)
+        columns = seen(plane[band], 0)
+        return band, slice(columns[0], columns[-1] + 1, 1)
+
+    def _shares(self, part: RawImage) -> MaskImage:
+        """Return the share of teeth in pixels of a channel, 0 .. 255."""
+        if part.dtype != np.uint8:
+            return self._table[part]
+        return cast(MaskImage, part if self._as_stored else cv2.LUT(part, self._table))
+
+    def _placed(self, part: MaskImage, box: Slices, plane: RawImage) -> MaskImage:
+        if self._as_stored:
+            return cast(MaskImage, plane)
+        mask = np.zeros(plane.shape, np.uint8)
+        mask[box] = part
+        return mask
+
+    @cached_property
+    def _as_stored(self) -> bool:
+        """Whether 8 bit pixels are shares as they are."""
+        return not self.deep and bool((self._table == np.arange(256)).all())
 
     @cached_property
     def _table(self) -> NDArray[np.uint8]:

@@ -71,9 +71,9 @@ class WorkingView:
             source.K, distortion, None, source.scaled(fine_size).K, fine_size, cv2.CV_32FC2
         )
         self._map = np.asarray(maps[0], np.float32)
-        self._nodes = np.ascontiguousarray(self._map[::_NODE_PX, ::_NODE_PX])
+        self._nodes = np.ascontiguousarray(np.moveaxis(self._map[::_NODE_PX, ::_NODE_PX], 2, 0))
         # No node of a region lies farther from its neighbour than this [px of the recorded picture].
-        steps = [np.abs(np.diff(self._nodes, axis=axis)).max(initial=_NODE_PX) for axis in (0, 1)]
+        steps = [np.abs(np.diff(self._nodes, axis=axis)).max(initial=_NODE_PX) for axis in (1, 2)]
         self._reach_px = float(max(steps)) + 1
 
     def mask(self, mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -141,11 +141,11 @@ class WorkingView:
         if rows.size == 0:
             return None
         cols = np.flatnonzero(mask[rows[0] : rows[-1] + 1].max(axis=0))
-        low = np.array([cols[0], rows[0]], np.float32) - self._reach_px
-        high = np.array([cols[-1], rows[-1]], np.float32) + self._reach_px
+        reach, (x, y) = np.float32(self._reach_px), self._nodes
         # Within the reach of the box there is at least one node beyond each of its sides; the ring of cells around
         # those nodes therefore holds the box.
-        inside: Mask = np.all((self._nodes >= low) & (self._nodes <= high), axis=2)
+        across: Mask = (x >= cols[0] - reach) & (x <= cols[-1] + reach)
+        inside: Mask = across & (y >= rows[0] - reach) & (y <= rows[-1] + reach)
         spans = []
         for hits, limit in zip((inside.any(axis=1), inside.any(axis=0)), self.camera.size_px[::-1]):
             where = np.flatnonzero(hits)

@@ -10,7 +10,7 @@ from PIL import Image, ImageDraw
 
 from jawusd.errors import CaptureError
 from jawusd.formats.capture_parts import CameraSource, Masks
-from jawusd.imaging.mask_levels import MOST_SOFT
+from jawusd.imaging.mask_levels import MOST_SOFT, MaskLevels
 from jawusd.imaging.mask_survey import survey_masks
 from jawusd.imaging.masks import MaskReader, open_masks
 
@@ -195,3 +195,21 @@ def test_the_range_that_a_video_announces_is_not_trusted(tmp_path, tagged):
         container.mux(stream.encode(None))
     found = MaskReader(path, SIZE).read(4)
     assert np.array_equal(found, teeth(4))
+
+
+@pytest.mark.parametrize("deep", [False, True])
+@pytest.mark.parametrize("lossy", [False, True])
+@pytest.mark.parametrize(("background", "white"), [(0, 255), (0, 90), (30, 220), (255, 0), (200, 60)])
+def test_masks_are_the_values_of_all_pixels_though_few_are_looked_at(background, white, lossy, deep):
+    scale = 257 if deep else 1
+    levels = MaskLevels("brightest", background * scale, white * scale, deep, lossy)
+    soft = cv2.GaussianBlur(teeth(0), (0, 0), 1.5) / 255.0
+    picture = np.round(scale * (background + (white - background) * soft)).astype(np.uint16 if deep else np.uint8)
+    stored = picture.copy()
+    mask, odd = levels.coverage(picture)
+    share = np.clip((stored.astype(np.float64) / scale - background) / (white - background), 0, 1)
+    if lossy:
+        share = np.where(share < 0.06, 0, np.where(share > 0.94, 1, share))
+    assert odd == "" and mask.shape == picture.shape
+    np.testing.assert_allclose(mask, 255 * share, atol=0.5 + 1e-9)
+    assert (picture == stored).all()

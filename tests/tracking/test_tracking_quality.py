@@ -6,8 +6,11 @@ from bumpy_teeth import arch, jaw_poses, make_cameras, render_masks
 from small_take import CAMERAS, FIRST, MESHES, OFFSETS, make_capture, write_masks
 
 from jawusd.errors import TrackingError
+from jawusd.formats.tracks import TRACKED
 from jawusd.geometry import make_transform, relative_pose, se3_exp, se3_inverse, se3_log, transform_points
 from jawusd.tracking.config import TrackingConfig
+from jawusd.tracking.contour.equations import motion_about, translation, twist_between
+from jawusd.tracking.contour.frame_record import FrameSummary
 from jawusd.tracking.contour.quality import (
     correlation_px,
     crown_sigma_mm,
@@ -21,7 +24,7 @@ from jawusd.tracking.contour.scan import prepare_scan
 from jawusd.tracking.contour.solver import ContourSolver
 from jawusd.tracking.contour.views import MaskViews, View, working_size
 from jawusd.tracking.initialization.reacquire import shift_to_masks
-from jawusd.tracking.sequence.history import MotionPredictor, SearchAllowance
+from jawusd.tracking.sequence.history import History, MotionPredictor, SearchAllowance
 
 CONFIG = TrackingConfig()
 SCANS = tuple(prepare_scan(m, n) for m, n in zip(MESHES, ("upper", "lower")))
@@ -119,6 +122,26 @@ BOTH, UPPER = np.array([True, True]), np.array([True, False])
 
 def _motion(poses):
     return MotionPredictor(poses, np.zeros((2, 3, 3)) + np.eye(3) * 10)
+
+
+def test_motions_about_a_point_are_motions_there_carried_to_it():
+    rng = np.random.default_rng(3)
+    centre, start = np.array([40.0, -25.0, 310.0]), jaw_poses(3)[2][1]
+    for twist in rng.normal(size=(20, 6)) * ([0.3] * 3 + [5.0] * 3):
+        there = translation(centre) @ se3_exp(twist) @ translation(-centre)
+        np.testing.assert_allclose(motion_about(centre, twist), there, atol=1e-12)
+        np.testing.assert_allclose(twist_between(start, there @ start, centre), twist, atol=1e-10)
+
+
+def test_what_is_usual_follows_every_frame():
+    history, medians = History(5, 3), []
+    for k in (4.0, 8.0, 6.0, 10.0):
+        view, arch = np.full((2, 3), k), np.full(2, k)
+        status, used = np.full(2, TRACKED, np.int8), np.ones((2, 3), bool)
+        history.add_summary(FrameSummary(np.tile(np.eye(4), (2, 1, 1)), status, used, view, view, arch))
+        usual = (history.usual_score(), history.usual_residual(), history.usual_coverage())
+        medians.append([float(x.ravel()[0]) for x in usual])
+    assert medians == [[4, 4, 4], [6, 6, 6], [6, 6, 6], [8, 7, 7]]
 
 
 def test_prediction_goes_on_and_starts_offer_to_stop():

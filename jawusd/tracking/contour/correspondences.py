@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.geometry.arrays import Array
+from jawusd.tracking.contour.equations import OutlineSums
 from jawusd.tracking.contour.samples import (
     COLUMNS,
     EDGE_SHARE,
@@ -214,6 +215,40 @@ def accumulate(
         sum_weight += weight
         sum_square += weight * d * d
     return sum_weight, sum_square, matched_px, score_px
+
+
+@numba.njit(nogil=True, cache=True)
+def accumulate_outline(
+    r: int,
+    c: int,
+    samples: Array,
+    silhouettes: int,
+    distances: Array,
+    limits: tuple[float, float, float],
+    where: tuple[Array, Array, Array],
+    silhouette: OutlineSums,
+    margin: OutlineSums,
+) -> None:
+    """Write the sums of one arch in one view, of the silhouette and of the gingival margin behind it.
+
+    Args:
+        r, c: arch and view: the places in the sums, which are zero there.
+        samples, distances: as for `accumulate`.
+        silhouettes: how many of the samples are silhouette.
+        limits: gate, score gate and pull, as for `accumulate`.
+        where: pose, matrix and centre, as for `accumulate`.
+        silhouette, margin: receive.
+    """
+    for k in range(2):
+        sums = silhouette if k == 0 else margin
+        first, stop = (0, silhouettes) if k == 0 else (silhouettes, len(samples))
+        weight, square, matched_px, score_px = accumulate(
+            samples[first:stop], distances[first:stop], limits[0], limits[1], limits[2], where[0], where[1], where[2],
+            sums.precision[r, c], sums.gradient[r, c], sums.habit_slope[r, c], sums.habit_distance[r, c],
+            sums.habit_weight[r, c],
+        )  # fmt: skip
+        sums.weight[r, c], sums.square[r, c] = weight, square
+        sums.matched_px[r, c], sums.score_px[r, c] = matched_px, score_px
 
 
 @numba.njit(nogil=True, cache=True)

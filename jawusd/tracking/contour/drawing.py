@@ -44,6 +44,7 @@ class Drawing:
         size = (shape[0] + 2 * _AROUND_PX, shape[1] + 2 * _AROUND_PX)
         self._labels, self._inverse_depth = np.zeros(size, np.uint8), np.zeros(size, np.float32)
         scan.draw(self._matrix, self._inverse_depth, self._labels)
+        self._px_per_mm = _px_per_mm(self._matrix, scan.centre)
         self._contours: dict[ContourSolver, _Kept] = {}
         self._probes = scan.probes[:: max(1, len(scan.probes) // 24)]
         drawn_at = np.column_stack([projected(self._matrix, self._probes), np.ones(len(self._probes))])
@@ -59,11 +60,12 @@ class Drawing:
         centre, radius_mm = self._scan.centre, self._scan.radius_mm
         before, now = self._eye - centre, eye - centre
         far = np.linalg.norm(before), np.linalg.norm(now)
-        zoom = _px_per_mm(matrix, centre) / _px_per_mm(self._matrix, centre)
+        px_per_mm = _px_per_mm(matrix, centre)
+        zoom = px_per_mm / self._px_per_mm
         if max(zoom, 1.0 / zoom) > _LARGEST_ZOOM:
             return False
         turned_rad = np.linalg.norm(before / far[0] - now / far[1])
-        if turned_rad * radius_mm * _px_per_mm(matrix, centre) > parallax_px:
+        if turned_rad * radius_mm * px_per_mm > parallax_px:
             return False
         to_drawn = self.to_drawn(matrix)
         height, width = shape

@@ -23,12 +23,16 @@ def translation(t: Array) -> Array:
 
 def motion_about(centre: Array, twist: Array) -> Array:
     """Return the motion of a twist, shape (..., 6), about a world point (3,), shape (..., 4, 4)."""
-    return translation(centre) @ se3_exp(twist) @ translation(-centre)
+    motion = se3_exp(twist)
+    motion[..., :3, 3] += centre - motion[..., :3, :3] @ centre
+    return motion
 
 
 def twist_between(start: Array, end: Array, centre: Array) -> Array:
     """Return the twist about a world point (3,) that takes one pose (4, 4) to another, shape (6,)."""
-    return se3_log(translation(-centre) @ end @ se3_inverse(start) @ translation(centre))
+    motion = end @ se3_inverse(start)
+    motion[:3, 3] += motion[:3, :3] @ centre - centre
+    return se3_log(motion)
 
 
 class OutlineSums(NamedTuple):

@@ -10,7 +10,7 @@ import numpy as np
 from jawusd.geometry import hat, mandible_metric, se3_adjoint, se3_inverse, transform_points
 from jawusd.geometry.arrays import Array
 from jawusd.imaging.raster import count_and_not, count_bits, pack_bits
-from jawusd.tracking.config import TrackingConfig
+from jawusd.tracking.config import Mapper, TrackingConfig
 from jawusd.tracking.contour.equations import NormalEquations, ResidualTerm, Solution, translation
 from jawusd.tracking.contour.scan import ARCHES, Scan
 from jawusd.tracking.contour.views import View
@@ -23,41 +23,52 @@ _TUKEY_VARIANCE = 0.828
 
 def score_px(solution: Solution) -> Array:
     """Return the contour length that fits its mask edges, closeness counted, per arch and view [px], shape (2, C)."""
-    return solution.outline.score_px
+    return solution.silhouette.score_px + solution.gingival_margin.score_px
 
 
 def matched_px(solution: Solution) -> Array:
     """Return the matched contour length per arch [px], shape (2,)."""
-    return solution.outline.matched_px.sum(1)
+    return np.asarray((solution.silhouette.matched_px + solution.gingival_margin.matched_px).sum(1))
 
 
 def residual_px(solution: Solution) -> Array:
     """Return the standard deviation of the matched residuals per arch [px], shape (2,); NaN without a match."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.sqrt(solution.outline.square.sum(1) / solution.outline.weight.sum(1) / _TUKEY_VARIANCE)
+        weight, square = _weight_and_square(solution)
+        return np.sqrt(square.sum(1) / weight.sum(1) / _TUKEY_VARIANCE)
 
 
 def view_residual_px(solution: Solution) -> Array:
     """Return the standard deviation of the matched residuals per arch and view [px], shape (2, C); NaN without any."""
-    weight, square = solution.outline.weight, solution.outline.square
+    weight, square = _weight_and_square(solution)
     out = np.full(weight.shape, np.nan)
     np.divide(square, weight * _TUKEY_VARIANCE, out=out, where=weight > 0)
     return np.sqrt(out)
 
 
-def uncovered_px(scans: Sequence[Scan], poses: Array, views: Sequence[View]) -> tuple[Array, Array]:
+def _weight_and_square(solution: Solution) -> tuple[Array, Array]:
+    """Return these two of the sums over all matched samples: adding up all of them takes several times as long."""
+    edge, gum = solution.silhouette, solution.gingival_margin
+    return edge.weight + gum.weight, edge.square + gum.square
+
+
+def uncovered_px(
+    scans: Sequence[Scan], poses: Array, views: Sequence[View], in_threads: Mapper = map
+) -> tuple[Array, Array]:
     """Return E_SP of paper eq. 8, the mask pixels that the projected crowns leave uncovered, and all mask pixels.
 
     Both are counts per arch and view, shape (2, C).
     """
     uncovered, total = np.zeros((2, len(views))), np.zeros((2, len(views)))
-    for r, scan in enumerate(scans):
-        for c, view in enumerate(views):
-            if not view.present[r]:
-                continue
-            mask = pack_bits(view.masks[r] > 127)
-            crowns = scan.silhouette(view.matrix @ view.T_delay[r] @ poses[r], view.masks.shape[1:])
-            uncovered[r, c], total[r, c] = count_and_not(mask, crowns), count_bits(mask)
+
+    def count(task: tuple[int, int]) -> None:
+        r, c = task
+        view = views[c]
+        mask = pack_bits(view.masks[r] > 127)
+        crowns = scans[r].silhouette(view.matrix @ view.T_delay[r] @ poses[r], view.masks.shape[1:])
+        uncovered[r, c], total[r, c] = count_and_not(mask, crowns), count_bits(mask)
+
+    list(in_threads(count, [(r, c) for r in range(len(scans)) for c in range(len(views)) if views[c].present[r]]))
     return uncovered, total
 
 

@@ -28,6 +28,7 @@ class Rendering:
     def __init__(self, solver: ContourSolver, views: Sequence[View]) -> None:
         self._solver = solver
         self._views = views
+        self._corners = [scan.centre + scan.radius_mm * _CORNERS for scan in solver.scans]
         self._shown: dict[tuple[int, int], tuple[Array, Drawing, float]] = {}
         shapes = [view.masks.shape for view in views]
         self.labels = [np.zeros(shape, np.uint8) for shape in shapes]
@@ -62,14 +63,14 @@ class Rendering:
         shown = self._shown.get((r, c))
         if shown is None:
             return True
-        scan, matrix = self._solver.scans[r], self._views[c].matrix
-        corners = scan.centre + scan.radius_mm * _CORNERS
-        change = projected(matrix @ pose, corners) - projected(matrix @ shown[0], corners)
-        return float(np.abs(change).max()) > self._solver.config.redraw_px
+        matrix = self._views[c].matrix
+        moved_px = np.abs(projected(matrix @ pose, self._corners[r]) - shown[0]).max()
+        return bool(moved_px > self._solver.config.redraw_px)
 
     def _show(self, r: int, c: int, pose: Array) -> None:
         view, labels, depth = self._views[c], self.labels[c][r], self.depths[c][r]
         T_world_scan = view.T_delay[r] @ pose
         matrix = view.matrix @ T_world_scan
         drawing = self._solver.drawings.of(r, c, view.eye, T_world_scan, matrix, labels.shape)
-        self._shown[r, c] = (pose.copy(), drawing, drawing.show(matrix, labels, depth))
+        at = projected(view.matrix @ pose, self._corners[r])
+        self._shown[r, c] = (at, drawing, drawing.show(matrix, labels, depth))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from jawusd.geometry import bite_normal, orthonormalise, transform_point
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.tracking.config import Mapper, TrackingConfig
-from jawusd.tracking.contour.correspondences import accumulate, scatter_of_tiles, search_edges
+from jawusd.tracking.contour.correspondences import accumulate_outline, scatter_of_tiles, search_edges
 from jawusd.tracking.contour.drawing import Drawings
 from jawusd.tracking.contour.equations import (
     GingivalMarginTerm,
@@ -139,9 +139,10 @@ class ContourSolver:
                 term.accumulate(state, equations)
             step = equations.solve()
             for r in ARCHES:
-                # Without orthonormalisation, rounding errors grow as predictions multiply poses frame after frame.
-                poses[r] = orthonormalise(motion_about(state.centres[r], step[r]) @ poses[r])
+                poses[r] = motion_about(state.centres[r], step[r]) @ poses[r]
             left = self.config.gates_after(left, self._motion_mm(step))
+        if iterations:  # else rounding errors would grow, as predictions multiply poses frame after frame
+            poses = orthonormalise(poses)
         gate = gates_px[-1] if gates_px else self.config.final_gate_px[1]
         state = self.linearise(poses, views, use, gate, rendering, final=True)
         return replace(state, iterations=iterations)
@@ -169,13 +170,15 @@ class ContourSolver:
         config = self.config
         rendering.update(poses)
         tasks = [(r, c) for r in ARCHES for c in range(len(views)) if use[r, c]]
+        moved = {(r, c): views[c].T_delay[r] @ poses[r] for r, c in tasks}
 
         def match(task: tuple[int, int]) -> _Match:
             r, c = task
-            pose = views[c].T_delay[r] @ poses[r]
-            return self._match(pose, views[c], r, rendering, c, gate + 1.0)
+            return self._match(moved[task], views[c], r, rendering, c, gate + 1.0)
 
-        matches = dict(zip(tasks, self.map(match, tasks), strict=True))
+        # Masks are looked up in less time than a thread takes to begin; colours are not.
+        mapper = map if all(view.edges is None for view in views) else self.map
+        matches = dict(zip(tasks, mapper(match, tasks), strict=True))
         centres = np.stack([transform_point(poses[r], self.scans[r].centre) for r in ARCHES])
         silhouette, margin = OutlineSums.zeros(len(views)), OutlineSums.zeros(len(views))
         scatters, gum_scatters, visible = np.zeros((2, 6, 6)), np.zeros((2, 6, 6)), np.zeros((2, len(views)))
@@ -187,13 +190,9 @@ class ContourSolver:
             samples, count, distances, visible[r, c] = matches[r, c]
             if matched is not None:
                 matched.append(Matched(r, c, samples, distances, used[r]))
-            where = (views[c].T_delay[r] @ poses[r], views[c].matrix, centres[r])
-            for outline, part in ((silhouette, slice(None, count)), (margin, slice(count, None))):
-                tables = tuple(table[r, c] for table in outline[:5])
-                gates = (used[r], config.score_gate_px, pull)
-                sums = accumulate(samples[part], distances[part], *gates, *where, *tables)
-                for table, value in zip(outline[5:], sums, strict=True):
-                    table[r, c] = value
+            where = (moved[r, c], views[c].matrix, centres[r])
+            limits = (used[r], config.score_gate_px, pull)
+            accumulate_outline(r, c, samples, count, distances, limits, where, silhouette, margin)
             if final:
                 shape = views[c].masks.shape[1:]
                 own, gum = scatter_of_tiles(samples, distances, used[r], *where, shape, config.tile_px)
@@ -229,10 +228,12 @@ class ContourSolver:
         """Return the Tukey gate that suits the spread of the residuals (median absolute deviation)."""
         d = np.concatenate(distances) if distances else np.empty(0)
         d = np.abs(d[np.isfinite(d)])
-        d = d[d < gate]
+        d = np.sort(d[d < gate])
         if len(d) < 20:
             return gate
-        return float(np.clip(self.config.gate_sigmas * 1.4826 * np.median(d), *self.config.final_gate_px))
+        median = 0.5 * float(d[(len(d) - 1) // 2] + d[len(d) // 2])  # np.median takes several times as long
+        low, high = self.config.final_gate_px
+        return min(max(self.config.gate_sigmas * 1.4826 * median, low), high)
 
     def _motion_mm(self, step: Array) -> float:
         """Return the largest motion of a crown vertex under twists about the centres [mm]."""

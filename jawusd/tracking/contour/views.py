@@ -233,14 +233,18 @@ def _view(working: WorkingView, masks: Sequence[NDArray[np.uint8] | None]) -> Vi
     """Cut both masks of a camera down to their surroundings."""
     camera = working.camera
     # Masks that reach the half level nowhere have no outline: too small to show at the working size.
-    masks = [m if m is not None and m.max() > 127 else None for m in masks]
+    highest = [None if m is None else m.max(axis=1) for m in masks]
+    masks = [m if h is not None and h.max() > 127 else None for m, h in zip(masks, highest, strict=True)]
     present = np.array([m is not None for m in masks])
     if not present.any():
         return View(camera.projection_matrix(), camera.centre_world(), np.zeros((2, 1, 1), np.uint8), present)
-    union = np.maximum.reduce([m for m in masks if m is not None])
-    rows, columns = np.flatnonzero(union.any(1)), np.flatnonzero(union.any(0))
+    shown = [(m, h) for m, h in zip(masks, highest, strict=True) if m is not None and h is not None]
+    rows = np.flatnonzero(np.maximum.reduce([h for _, h in shown]))
+    band = slice(rows[0], rows[-1] + 1)
+    columns = np.flatnonzero(np.maximum.reduce([m[band].max(axis=0) for m, _ in shown]))
+    height, width = shown[0][0].shape
     y0, x0 = max(0, rows[0] - _BORDER_PX), max(0, columns[0] - _BORDER_PX)
-    y1, x1 = min(union.shape[0], rows[-1] + 1 + _BORDER_PX), min(union.shape[1], columns[-1] + 1 + _BORDER_PX)
+    y1, x1 = min(height, rows[-1] + 1 + _BORDER_PX), min(width, columns[-1] + 1 + _BORDER_PX)
     cut = np.zeros((2, y1 - y0, x1 - x0), np.uint8)
     for r, mask in enumerate(masks):
         if mask is not None:

@@ -132,7 +132,7 @@ class FrameTracker:
     ) -> _Trial:
         solver = solver or self._solver
         solution = solver.solve(start, views, gates, use)
-        return _Trial(solution, *uncovered_px(solver.scans, solution.poses, views), use)
+        return _Trial(solution, *uncovered_px(solver.scans, solution.poses, views, solver.map), use)
 
     def _suspect(self, trial: _Trial) -> Mask:
         """Tell which arches look worse than in recent frames, shape (2,)."""

@@ -150,6 +150,14 @@ class _Partial(NamedTuple):
     coverages: deque[Array]
 
 
+class _Usual(NamedTuple):
+    """Hold what is usual; see the methods of `History`."""
+
+    score: Array
+    residual: Array
+    coverage: Array
+
+
 class History:
     """Remember the quality of recent good frames, to tell a bad one.
 
@@ -162,6 +170,7 @@ class History:
         self._residuals: deque[Array] = deque(maxlen=length)
         self._coverages: deque[Array] = deque(maxlen=length)
         self._partial = _Partial(deque(maxlen=score_length), deque(maxlen=length), deque(maxlen=length))
+        self._usual: _Usual | None = None
 
     def add(self, record: FrameRecord) -> None:
         """Add a frame; only arches tracked without trouble count, see the class."""
@@ -169,6 +178,7 @@ class History:
 
     def add_summary(self, past: FrameSummary) -> None:
         """Add what was kept of a frame."""
+        self._usual = None
         good = past.status == TRACKED
         self._scores.append(np.where(good[:, None], past.score_px, np.nan))
         self._residuals.append(np.where(good, past.residual_px, np.nan))
@@ -181,15 +191,25 @@ class History:
 
     def usual_score(self) -> Array:
         """Return the median score per arch and view [px], shape (2, C); 0 while unknown."""
-        return _median(self._scores, _median(self._partial.scores, 0.0))
+        return self._medians().score
 
     def usual_residual(self) -> Array:
         """Return the median residual per arch [px], shape (2,); infinite while unknown."""
-        return _median(self._residuals, _median(self._partial.residuals, np.inf))
+        return self._medians().residual
 
     def usual_coverage(self) -> Array:
         """Return the median coverage error per arch and view, shape (2, C); 0 while unknown."""
-        return _median(self._coverages, _median(self._partial.coverages, 0.0))
+        return self._medians().coverage
+
+    def _medians(self) -> _Usual:
+        """Return what is usual; found once between two frames, for a dozen questions about each."""
+        if self._usual is None:
+            self._usual = _Usual(
+                _median(self._scores, _median(self._partial.scores, 0.0)),
+                _median(self._residuals, _median(self._partial.residuals, np.inf)),
+                _median(self._coverages, _median(self._partial.coverages, 0.0)),
+            )
+        return self._usual
 
 
 def _median(values: deque[Array], otherwise: float | Array) -> Array:
