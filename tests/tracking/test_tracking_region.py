@@ -23,7 +23,7 @@ from jawusd.tracking.contour.views import Drawn
 from jawusd.tracking.region import performance, rig_tracker
 from jawusd.tracking.region.colours import BINS, PATCHES, TABLES, Areas, CameraColours, colour_bins
 from jawusd.tracking.region.creases import search_creases
-from jawusd.tracking.region.edges import search_borders, sharpen
+from jawusd.tracking.region.edges import _light, search_borders, sharpen
 from jawusd.tracking.region.pace import THOROUGH
 from jawusd.tracking.region.performance import follow_back
 from jawusd.tracking.region.rig_tracker import RigTracker
@@ -304,3 +304,8 @@ def test_teeth_are_found_again_when_lips_open_over_an_open_jaw():
     for frame, true in exact.items():
         assert guide[frame].found.all()
         assert np.linalg.norm(((relative_pose(*guide[frame].poses) - true) @ incisor)[:3]) < 0.5
+
+
+def test_light_of_codes_is_their_power():
+    codes = np.linspace(0.0, 255.0, 5001)
+    np.testing.assert_allclose([_light(code) for code in codes], (codes / 255) ** 2.2, atol=1e-7)

@@ -20,6 +20,8 @@ _MOST_STEPS = 10  # to either side of a sample
 _LEAST_CLEAR = 0.15  # share of the clear log ratio below which an edge is none
 _LEAST_BLUR_PX, _MOST_BLUR_PX, _GAMMA = 1.0, 10.0, 2.2  # of motion taken into account; of the pictures' code
 _SMOOTH_PX = 1.0  # half the width over which slopes are measured
+_PER_CODE = 8  # entries of the table of light for each code
+_LIGHT = (np.arange(255 * _PER_CODE + 1) / (255 * _PER_CODE)) ** _GAMMA
 
 
 @numba.njit(nogil=True, cache=True, inline="always")
@@ -194,6 +196,14 @@ def colour_at(rgb: NDArray[np.uint8], x: float, y: float) -> tuple[float, float,
     )
 
 
+@numba.njit(nogil=True, cache=True, inline="always")
+def _light(code: float) -> float:
+    """Return the light of a code, 0 .. 255, to 1e-7 of white; powers would take half of the time of all else."""
+    x = code * _PER_CODE
+    k = min(int(x), 255 * _PER_CODE - 1)
+    return _LIGHT[k] + (x - k) * (_LIGHT[k + 1] - _LIGHT[k])
+
+
 @numba.njit(nogil=True, cache=True)
 def sharpen(
     samples: Array,
@@ -249,8 +259,8 @@ def sharpen(
             colour = colour_at(rgb, u + t * nx, v + t * ny)
             p = 0.0
             for c in range(3):
-                value = colour[c] / 255
-                p += ((value if power == 1.0 else value**power) - outer[c]) * (inner[c] - outer[c])
+                value = colour[c] / 255 if power == 1.0 else _light(colour[c])
+                p += (value - outer[c]) * (inner[c] - outer[c])
             line[q] = p / norm
         place = _steepest(line, steps, arm)
         if np.isnan(place):

@@ -6,6 +6,7 @@ import math
 import tempfile
 import weakref
 from collections.abc import Iterable, Iterator, MutableMapping
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -123,13 +124,10 @@ def _packed(record: FrameRecord) -> tuple[Array, NDArray[np.float32]]:
 def _unpacked(figures: Array, sums: NDArray[np.float32]) -> FrameRecord:
     # Besides poses, centres, status, losses and iterations there are three figures per arch and view.
     views = (len(figures) - 2 * 16 - 2 * 3 - 2 - 2 * 3 - 1) // (2 * 3)
-    poses, centres, visible, status, used, coverage, losses, iterations = _split(
-        figures, ((2, 4, 4), (2, 3), (2, views), (2,), (2, views), (2, views), (2, 3), (1,))
-    )
-    half = (len(_LOWER[0]),)
-    shapes = [(2, views, *shape) for shape in (half, *_SUM_SHAPES[1:])]
-    parts = _split(sums.astype(np.float64), (*shapes, *shapes, (2, *half), (2, *half)))
-    count = len(shapes)
+    of_figures, of_sums = _places(views)
+    poses, centres, visible, status, used, coverage, losses, iterations = _split(figures, of_figures)
+    parts = _split(sums.astype(np.float64), of_sums)
+    count = len(_SUM_SHAPES)
     silhouette, margin = (OutlineSums(parts[k][..., _MIRROR], *parts[k + 1 : k + count]) for k in (0, count))
     scatters, gum_scatters = (part[:, _MIRROR] for part in parts[-2:])
     solution = Solution(poses, silhouette, margin, centres, scatters, gum_scatters, visible, int(iterations[0]))
@@ -141,9 +139,25 @@ def _joined(arrays: Iterable[ArrayLike]) -> Array:
     return np.concatenate([np.asarray(array, np.float64).ravel() for array in arrays])
 
 
-def _split(flat: Array, shapes: tuple[tuple[int, ...], ...]) -> list[Array]:
-    parts, end = [], 0
+_Places = list[tuple["slice[int, int, int]", tuple[int, ...]]]
+
+
+@lru_cache(maxsize=8)
+def _places(views: int) -> tuple[_Places, _Places]:
+    """Return where the arrays of figures and of sums lie in a packed record, and their shapes."""
+    half = (len(_LOWER[0]),)
+    figures = ((2, 4, 4), (2, 3), (2, views), (2,), (2, views), (2, views), (2, 3), (1,))
+    sums = [(2, views, *shape) for shape in (half, *_SUM_SHAPES[1:])]
+    return _in_a_row(figures), _in_a_row((*sums, *sums, (2, *half), (2, *half)))
+
+
+def _in_a_row(shapes: Iterable[tuple[int, ...]]) -> _Places:
+    out, end = [], 0
     for shape in shapes:
         start, end = end, end + math.prod(shape)
-        parts.append(flat[start:end].reshape(shape))
-    return parts
+        out.append((slice(start, end, 1), shape))
+    return out
+
+
+def _split(flat: Array, places: _Places) -> list[Array]:
+    return [flat[part].reshape(shape) for part, shape in places]
