@@ -8,6 +8,7 @@ import pytest
 from small_take import CAMERAS, FIRST, LANDMARKS, MESHES, OFFSETS, errors_mm, make_capture, track, write_masks
 
 from jawusd.tracking import track_capture
+from jawusd.tracking.contour.equations import OutlineSums
 from jawusd.tracking.initialization.magnification import Magnification
 from jawusd.tracking.sequence.take_checks import OF_COLOURS, OF_MASKS, lens_findings, misfit_findings
 
@@ -137,8 +138,9 @@ def test_only_what_a_lens_can_do_is_put_down_to_it():
 def _fits(share, rough_px, frames=5):
     """Return records of frames in which both arches fit such shares of their contour [-] with such residuals [px]."""
     share, rough = np.array(share)[:, None] * np.ones(3), np.array(rough_px)[:, None] * np.ones(3)
-    outline = SimpleNamespace(score_px=500 * share, weight=np.full((2, 3), 100.0), square=100 * 0.828 * rough**2)
-    solution = SimpleNamespace(outline=outline, visible_px=np.full((2, 3), 500.0))
+    none, weight = OutlineSums.zeros(3), np.full((2, 3), 100.0)
+    edges = none._replace(score_px=500 * share, weight=weight, square=100 * 0.828 * rough**2)
+    solution = SimpleNamespace(silhouette=edges, gingival_margin=none, visible_px=np.full((2, 3), 500.0))
     return {k: SimpleNamespace(solution=solution, status=np.ones(2, np.int8)) for k in range(frames)}
 
 

@@ -8,6 +8,7 @@ import pytest
 from small_take import FIRST, START, errors_mm, make_capture, track, write_masks
 
 from jawusd.formats.tracks import LOST, TRACKED, LostReason
+from jawusd.tracking.contour.equations import OutlineSums
 from jawusd.tracking.contour.frame_record import FrameRecord
 from jawusd.tracking.sequence import well_seen
 from jawusd.tracking.sequence.passes import Passes
@@ -83,8 +84,9 @@ def centres(records):
 def seen(share, rough_px):
     """Return the record of a frame in which such a share of the lower contour fits [-], so roughly [px]."""
     share, rough = (np.array([usual, lower])[:, None] * np.ones(3) for usual, lower in ((0.6, share), (0.6, rough_px)))
-    outline = SimpleNamespace(score_px=500 * share, weight=np.full((2, 3), 100.0), square=100 * 0.828 * rough**2)
-    solution = SimpleNamespace(outline=outline, visible_px=np.full((2, 3), 500.0))
+    none, weight = OutlineSums.zeros(3), np.full((2, 3), 100.0)
+    edges = none._replace(score_px=500 * share, weight=weight, square=100 * 0.828 * rough**2)
+    solution = SimpleNamespace(silhouette=edges, gingival_margin=none, visible_px=np.full((2, 3), 500.0))
     return FrameRecord(solution, np.full(2, TRACKED, np.int8), np.ones((2, 3), bool), np.zeros((2, 3)))
 
 
