@@ -18,11 +18,16 @@ class Tab:
     #: What the page shows once it is there.
     READY = "nearest captured"
     SIZE_PX = (1200, 720)
+    PIXEL_RATIO = 1  # pixels of the screen to one of the page
 
     def __init__(self, chromium, viewer):
         self.viewer, self.complaints, self.elsewhere = viewer, [], []
         before = set(viewer.pages)
-        self.web = chromium.new_page(viewport=dict(zip(("width", "height"), self.SIZE_PX)), accept_downloads=True)
+        self.web = chromium.new_page(
+            viewport=dict(zip(("width", "height"), self.SIZE_PX)),
+            device_scale_factor=self.PIXEL_RATIO,
+            accept_downloads=True,
+        )
         self.web.set_default_timeout(1000 * PATIENCE_S)
         self.web.on("console", self._heard)
         self.web.on("pageerror", lambda error: self.complaints.append(str(error)))
@@ -70,7 +75,8 @@ class Tab:
         camera = self.page.client.camera
         x = matrix_from_wxyz(camera.wxyz).T @ (np.asarray(place) - camera.position)
         box = self.web.locator("canvas").first.bounding_box()
-        scale = 0.5 * camera.image_height / np.tan(0.5 * camera.fov) / x[2]
+        # Not camera.image_height: that counts what is drawn, and viser draws more coarsely when it is slow.
+        scale = 0.5 * box["height"] / np.tan(0.5 * camera.fov) / x[2]
         return box["x"] + 0.5 * box["width"] + scale * x[0], box["y"] + 0.5 * box["height"] + scale * x[1]
 
     def resting_place(self, widget):
