@@ -220,22 +220,27 @@ def report_track(root: Path, counts: list[int]) -> None:
 
 
 def report_many(root: Path, counts: list[int]) -> None:
-    """Build twenty takes with one and with two workers and print how near two come to half the time of one."""
+    """Build twenty takes by one and by two workers and print how near two come to half the time of one."""
     takes = [write_short(root / f"take_{k}", counts[0]) for k in range(MANY)]
-    (root / "list.txt").write_text("".join(f"{take.name}/capture.toml\n" for take in takes))
     cores = sorted(os.sched_getaffinity(0))
-    seconds = {}
-    for name, workers, held in (("two", 2, cores), ("one", 1, cores), ("one on one core", 1, cores[:1])):
-        out = root / f"built_by_{name.replace(' ', '_')}"
-        command = [sys.executable, "-m", "jawusd", "build-many", str(root / "list.txt"), "-o", str(out)]
-        os.sched_setaffinity(0, held)  # those that are started keep to it too
-        clock = time.perf_counter()
-        subprocess.run([*command, "--workers", str(workers)], check=True, capture_output=True)
-        seconds[name] = time.perf_counter() - clock
-        os.sched_setaffinity(0, cores)
-        print(f"{MANY} takes of {counts[0]} frames by {name}: {seconds[name]:.1f} s", flush=True)
-    for name in ("one", "one on one core"):
-        print(f"two: {2 * seconds['two'] / seconds[name]:.2f} of half of {name}")
+    _build_many(takes[:1], root / "warm", 1)  # compiles
+    seconds = {"two": _build_many(takes, root / "two", 2), "one": _build_many(takes, root / "one", 1)}
+    os.sched_setaffinity(0, cores[:1])  # those that are started keep to it too
+    seconds["one on one core"] = _build_many(takes, root / "held", 1)
+    os.sched_setaffinity(0, cores)
+    print(f"{MANY} takes of {counts[0]} frames")
+    for name, spent in seconds.items():
+        print(f"  by {name}: {spent:.1f} s; two workers take {2 * seconds['two'] / spent:.2f} of half of it")
+
+
+def _build_many(takes: list[Path], out: Path, workers: int) -> float:
+    """Build takes and return seconds by the clock."""
+    listed = out.with_suffix(".txt")
+    listed.write_text("".join(f"{take.name}/capture.toml\n" for take in takes))
+    command = [sys.executable, "-m", "jawusd", "build-many", str(listed), "-o", str(out), "--workers", str(workers)]
+    clock = time.perf_counter()
+    subprocess.run(command, check=True, capture_output=True)
+    return time.perf_counter() - clock
 
 
 def main(arguments: list[str]) -> None:
