@@ -91,8 +91,8 @@ def open_context() -> moderngl.Context:
     except Exception as error:  # moderngl raises bare exceptions with the loader's text
         raise MissingDependencyError(
             f"drawing on the GPU needs OpenGL 4.3 through EGL, which did not start ({error}).",
-            hint="Install it, on Debian or Ubuntu: apt-get install libegl1 libgl1-mesa-dri, or the graphics card's own "
-            "driver; or use the CPU backend.",
+            hint="Install it, on Debian or Ubuntu: apt-get install libegl1 libgl1 libgl1-mesa-dri, or the graphics "
+            "card's own driver; or use the CPU backend.",
         ) from error
     if _LAYER_EXTENSION not in context.extensions:
         renderer = context.info["GL_RENDERER"]

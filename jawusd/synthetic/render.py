@@ -276,7 +276,7 @@ def _context() -> moderngl.Context:
     except Exception as error:  # moderngl raises bare exceptions with the loader's text
         raise MissingDependencyError(
             f"rendering needs OpenGL 3.3 through EGL, which did not start ({error}).",
-            hint="Install it, on Debian or Ubuntu: apt-get install libegl1 libgl1-mesa-dri",
+            hint="Install it, on Debian or Ubuntu: apt-get install libegl1 libgl1 libgl1-mesa-dri",
         ) from error
     context.front_face = "cw"  # the pictures are drawn with their first row at the bottom of the target
     return context
