@@ -160,7 +160,9 @@ def test_every_view_is_drawn_in_light_and_dark(tab):
     for name in PRESETS:
         tab.press(name)
         target, eye = preset_view(rest, name, camera.image_width / camera.image_height)
-        until(lambda eye=eye: np.allclose(camera.position, eye, atol=0.1))
+        # When drawing is slow, viser draws more coarsely, and rounding to its pixels may have changed the ratio.
+        rounding = 0.005 * np.linalg.norm(eye - target)
+        until(lambda eye=eye, limit=rounding: np.allclose(camera.position, eye, atol=limit))
         until(lambda target=target: np.allclose(camera.look_at, target, atol=0.1))
         assert (tab.page.scene.grips[0].opacity is None) == (not name.startswith("condyle"))
         time.sleep(0.5)  # the page draws the view
