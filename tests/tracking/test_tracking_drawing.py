@@ -153,3 +153,13 @@ def test_the_next_alignment_is_the_same_without_what_was_drawn_before():
     assert found[0][0] == found[1][0] == 6
     for r in range(2):
         assert vertex_error_mm(MESHES[r], found[1][1][r], found[0][1][r]) < 0.01
+
+
+def test_contours_are_found_where_threads_draw(monkeypatch):
+    view = View(CAMERA.projection_matrix(), CAMERA.centre_world(), np.zeros((2, *SHAPE), np.uint8), np.ones(2, bool))
+    solver, poses = ContourSolver(SCANS, TrackingConfig()), jaw_poses(3)[2]
+    rendering = Rendering(solver, [view])
+    rendering.update(poses)
+    monkeypatch.setattr(ContourSolver, "contour", None)
+    samples, silhouettes = rendering.contour(solver, 0, 0, poses[0])
+    assert 0 < silhouettes <= len(samples)

@@ -98,6 +98,12 @@ class Drawing:
         inverse_depth *= np.float32((self._matrix[2] @ centre) / (matrix[2] @ centre))
         return float(np.arctan2(to_drawn[0, 1] - to_drawn[1, 0], to_drawn[0, 0] + to_drawn[1, 1]))
 
+    def find_contour(self, solver: ContourSolver, arch: int) -> None:
+        """Find the contour of a solver's scan of this arch, as drawn, unless it is known."""
+        if solver not in self._contours:
+            drawn = self._matrix, self._eye, self._labels, self._inverse_depth
+            self._contours[solver] = solver.contour(arch, *drawn)
+
     def contour(
         self, solver: ContourSolver, arch: int, matrix: Array, shape: tuple[int, int], turned_rad: float
     ) -> _Kept:
@@ -111,10 +117,8 @@ class Drawing:
         Returns:
             As `contour_samples`; a copy.
         """
-        kept = self._contours.get(solver)
-        if kept is None:
-            kept = solver.contour(arch, self._matrix, self._eye, self._labels, self._inverse_depth)
-            self._contours[solver] = kept
+        self.find_contour(solver, arch)
+        kept = self._contours[solver]
         out = np.empty_like(kept[0])
         n, silhouettes = _moved(*kept, matrix, np.cos(turned_rad), np.sin(turned_rad), *shape, out)
         return out[:n], silhouettes

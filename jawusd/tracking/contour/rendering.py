@@ -72,5 +72,6 @@ class Rendering:
         T_world_scan = view.T_delay[r] @ pose
         matrix = view.matrix @ T_world_scan
         drawing = self._solver.drawings.of(r, c, view.eye, T_world_scan, matrix, labels.shape)
+        drawing.find_contour(self._solver, r)  # here, where threads draw several views side by side
         at = projected(view.matrix @ pose, self._corners[r])
         self._shown[r, c] = (at, drawing, drawing.show(matrix, labels, depth))

@@ -30,6 +30,7 @@ from jawusd.tracking.contour.rendering import Rendering
 from jawusd.tracking.contour.samples import HABITS, LENGTH, contour_samples
 from jawusd.tracking.contour.scan import ARCHES, Scan, thinned
 from jawusd.tracking.contour.views import Drawn, View, present_masks
+from jawusd.tracking.sharing import Sharing
 
 _ROUGH_FACES = 6_000  # of a crown row in trials: a third of a thinned scan's
 _DENSE_STEPS = 2  # with all faces of a dense scan, after the thinned one has settled
@@ -54,7 +55,7 @@ class ContourSolver:
     def __init__(self, scans: Sequence[Scan], config: TrackingConfig, executor: Executor | None = None) -> None:
         self.scans = tuple(scans)
         self.config = config
-        self.map: Mapper = executor.map if executor else map
+        self.map: Mapper = Sharing(executor) if executor else map
         arms = np.array([[(scan.radius_mm / 2) ** 2] * 3 + [1.0] * 3 for scan in self.scans])
         self._start_strength = config.typical_noise_px3 / config.prediction_mm**2 * arms
         self._towards_gum = _towards_gum(self.scans)
