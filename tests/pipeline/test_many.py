@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 
+import dask
 import psutil
 import pytest
 from distributed import LocalCluster
@@ -190,6 +191,7 @@ def test_local_workers_listen_to_this_machine_alone_and_a_deadly_capture_is_give
         me = psutil.Process()
         heard = [c for p in (me, *me.children(recursive=True)) for c in p.net_connections() if c.status == "LISTEN"]
         assert {c.laddr.ip for c in heard} == {"127.0.0.1"}
+        assert list(client.run(dask.config.get, "distributed.worker.profile.enabled").values()) == [False]
         many.check_workers(client, ROOT)
         with pytest.raises(ClusterError, match="does not see"):
             many.check_workers(client, ROOT / "missing")
