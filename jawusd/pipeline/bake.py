@@ -13,7 +13,7 @@ from jawusd.formats.model import JawModel
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import LANDMARKS
 from jawusd.pipeline.cameras import load_cameras, tracked_cameras
-from jawusd.pipeline.contact import meeting_surfaces, with_contact
+from jawusd.pipeline.contact import meeting_joints, meeting_teeth, with_joints, with_teeth
 from jawusd.pipeline.meshes import BONES
 from jawusd.pipeline.state import Progress, no_progress
 from jawusd.pipeline.subject import Subject, registered_subject
@@ -66,8 +66,9 @@ def bake_subject(
     # Bones come from segmented scans with all their faults; teeth scans stay as they are, vertex for vertex.
     meshes = {key: manifold(mesh) if key in BONES else mesh for key, mesh in subject.meshes.items()}
     if "contact" not in model.meta:  # fitted without the scans
-        placed = (model.arrays[name] for name in ("T_anatomical_skull", "landmarks", "T_rest"))
-        model = with_contact(model, meeting_surfaces(subject.meshes, *placed), progress, regauge=False)
+        axes, landmarks, rest = (model.arrays[name] for name in ("T_anatomical_skull", "landmarks", "T_rest"))
+        model = with_teeth(model, meeting_teeth(subject.meshes, axes, rest), progress, regauge=False)
+        model = with_joints(model, meeting_joints(subject.meshes, axes, landmarks, rest), progress)
     if "velocity_covariance" not in model.arrays and subject.fps is not None:
         model = with_speeds(model, subject.fps)
     moving = len(model.frames) > 0

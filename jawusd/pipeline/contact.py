@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
@@ -26,14 +26,6 @@ if TYPE_CHECKING:
 
 _QUALITY = 88  # of the pictures, JPEG
 _FARTHEST_MM = 1.5  # distances that are measured, see `imaging.collision`
-
-
-@dataclass(frozen=True, eq=False)
-class MeetingSurfaces:
-    """Hold teeth and joints as solids, or why there are none."""
-
-    teeth: Teeth | str
-    joints: Joints | str
 
 
 class ContactSummary(TypedDict, total=False):
@@ -121,49 +113,48 @@ def teeth_of(rig: JawRig, meshes: Mapping[str, Mesh]) -> Teeth:
         raise RigError(f"does not show how the teeth meet: {reason}.") from reason
 
 
-def meeting_surfaces(
-    meshes: Mapping[str, Mesh], T_anatomical_skull: Array, landmarks: Array, T_rest: Array
-) -> MeetingSurfaces:
-    """Return teeth and joints among meshes as solids, or why there are none; what else is given is as in `Subject`.
+def meeting_teeth(meshes: Mapping[str, Mesh], T_anatomical_skull: Array, T_rest: Array) -> Teeth | str:
+    """Return both rows of teeth among meshes as solids, or why there are none; what else is given is as in `Subject`.
 
     Args:
         meshes: Scans and bones, registered as the poses are.
     """
     from jawusd.imaging.contact import NoContact, find_teeth
+
+    if any(name not in meshes for name in TEETH.values()):
+        return "there are no scans of both rows of teeth"
+    try:
+        return find_teeth(meshes[TEETH["upper"]], meshes[TEETH["lower"]], T_anatomical_skull, T_rest)
+    except NoContact as reason:
+        return str(reason)
+
+
+def meeting_joints(
+    meshes: Mapping[str, Mesh], T_anatomical_skull: Array, landmarks: Array, T_rest: Array
+) -> Joints | str:
+    """Return condyles and skull among meshes as solids, or why there are none; see `meeting_teeth`."""
+    from jawusd.imaging.contact import NoContact
     from jawusd.imaging.joints import find_joints
 
-    teeth: Teeth | str = "there are no scans of both rows of teeth"
-    joints: Joints | str = "there are no meshes of both skull and mandible"
-    if all(name in meshes for name in TEETH.values()):
-        try:
-            teeth = find_teeth(meshes[TEETH["upper"]], meshes[TEETH["lower"]], T_anatomical_skull, T_rest)
-        except NoContact as reason:
-            teeth = str(reason)
-    if all(name in meshes for name in BONES):
-        try:
-            joints = find_joints(meshes["skull"], meshes["mandible"], landmarks, T_anatomical_skull, T_rest)
-        except NoContact as reason:
-            joints = str(reason)
-    return MeetingSurfaces(teeth, joints)
+    if any(name not in meshes for name in BONES):
+        return "there are no meshes of both skull and mandible"
+    try:
+        return find_joints(meshes["skull"], meshes["mandible"], landmarks, T_anatomical_skull, T_rest)
+    except NoContact as reason:
+        return str(reason)
 
 
-def with_contact(
-    model: JawModel, surfaces: MeetingSurfaces, progress: Progress = no_progress, *, regauge: bool = True
+def with_teeth(
+    model: JawModel, teeth: Teeth | str, progress: Progress = no_progress, *, regauge: bool = True
 ) -> JawModel:
-    """Return a model with the clearances of teeth and condyles.
+    """Return a model with the clearances of the teeth.
 
-    ``meta["contact"]`` and ``meta["joints"]`` say how deep these run in, or why there are none.
+    ``meta["contact"]`` says how deep these run into each other, or why there are none.
 
     Args:
-        surfaces: Those of the person, see `meeting_surfaces`.
+        teeth: Those of the person, see `meeting_teeth`.
         regauge: Count d1 from where the teeth touch, and end the bound there.
     """
-    model = _with_joints(_with_teeth(model, surfaces.teeth, progress, regauge), surfaces.joints)
-    progress("contact", 3, 3)
-    return model
-
-
-def _with_teeth(model: JawModel, teeth: Teeth | str, progress: Progress, regauge: bool) -> JawModel:
     from jawusd.fitting.glide import follow_teeth
     from jawusd.imaging.contact import sample_field
 
@@ -178,14 +169,23 @@ def _with_teeth(model: JawModel, teeth: Teeth | str, progress: Progress, regauge
     return replace(_known(model, "contact", _summary(field)), arrays={**model.arrays, **field.arrays("teeth")})
 
 
-def _with_joints(model: JawModel, joints: Joints | str) -> JawModel:
+def with_joints(model: JawModel, joints: Joints | str, progress: Progress = no_progress) -> JawModel:
+    """Return a model with the clearances of the condyles; ``meta["joints"]`` is as `with_teeth` says of the teeth.
+
+    Args:
+        joints: Those of the person, see `meeting_joints`.
+    """
     from jawusd.imaging.contact import sample_field
     from jawusd.imaging.joints import STEP_MM
 
     if isinstance(joints, str):
-        return _known(model, "joints", {"missing": joints})
-    field = sample_field(joints, JawRig(model.arrays, model.meta), STEP_MM, np.inf)
-    return replace(_known(model, "joints", _summary(field)), arrays={**model.arrays, **field.arrays("condyles")})
+        model = _known(model, "joints", {"missing": joints})
+    else:
+        field = sample_field(joints, JawRig(model.arrays, model.meta), STEP_MM, np.inf)
+        known, clearances = _known(model, "joints", _summary(field)), field.arrays("condyles")
+        model = replace(known, arrays={**model.arrays, **clearances})
+    progress("contact", 3, 3)
+    return model
 
 
 def _known(model: JawModel, name: str, found: ContactSummary) -> JawModel:

@@ -28,7 +28,15 @@ from jawusd.formats.poses import read_poses
 from jawusd.formats.tracks import Tracks, load_tracks
 from jawusd.geometry import make_transform, matrix_from_wxyz, rigidity_defect, se3_inverse
 from jawusd.geometry.arrays import Array
-from jawusd.pipeline.contact import ContactSummary, contact_words, joint_words, meeting_surfaces, with_contact
+from jawusd.pipeline.contact import (
+    ContactSummary,
+    contact_words,
+    joint_words,
+    meeting_joints,
+    meeting_teeth,
+    with_joints,
+    with_teeth,
+)
 from jawusd.pipeline.markers import marker_poses
 from jawusd.pipeline.state import Progress, no_progress
 from jawusd.pipeline.subject import Subject, registered_subject
@@ -98,15 +106,16 @@ def fit_subject(
     registration = motion.meta.get("registration") if isinstance(motion, Tracks) else None
     if registration is not None:
         subject = registered_subject(subject, {"registration": registration})
-    placed = subject.T_anatomical_skull, subject.landmarks, subject.T_rest
+    axes, rest = subject.T_anatomical_skull, subject.T_rest
     with ThreadPoolExecutor(1) as pool:  # solids take no model, and little of Python's lock, which a fit holds
-        surfaces = pool.submit(meeting_surfaces, subject.meshes, *placed)
+        teeth = pool.submit(meeting_teeth, subject.meshes, axes, rest)
+        joints = pool.submit(meeting_joints, subject.meshes, axes, subject.landmarks, rest)
         model = fit_model(
             motion,
-            T_anatomical_skull=subject.T_anatomical_skull,
+            T_anatomical_skull=axes,
             landmarks=subject.landmarks,
             mandible_vertices=subject.measured_points(),
-            T_rest=subject.T_rest,
+            T_rest=rest,
             config=FittingConfig(method=cast("Method", method)),  # which checks the name
             actor=subject.name,
             progress=partial(progress, "fit"),
@@ -114,7 +123,8 @@ def fit_subject(
         model.meta["inferred"] = list(subject.inferred)
         if registration is not None:
             model.meta["registration"] = registration
-        model = with_contact(model, surfaces.result(), progress)
+        model = with_teeth(model, teeth.result(), progress)
+        model = with_joints(model, joints.result(), progress)
     if subject.fps is None:
         return model
     model.meta["fps"] = subject.fps

@@ -36,7 +36,7 @@ from jawusd.evaluator import JawRig
 from jawusd.formats.capture import load_capture
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import se3_exp, se3_inverse, transform_points
-from jawusd.pipeline.contact import meeting_surfaces, with_contact
+from jawusd.pipeline.contact import meeting_joints, meeting_teeth, with_joints, with_teeth
 from jawusd.pipeline.fit import fit_subject
 from jawusd.pipeline.meshes import load_meshes
 from jawusd.pipeline.subject import Subject, _measured, subject_of_capture
@@ -176,8 +176,9 @@ def measure(case: Case, count: int) -> str:
     plain = fit_subject(Subject(**{**vars(case.subject), "meshes": {}}), (frames, noisy))
     print(f"  fitted after {time.process_time():.0f} s", file=sys.stderr)
     start = time.process_time()
-    placed = (plain.arrays[name] for name in ("T_anatomical_skull", "landmarks", "T_rest"))
-    model = with_contact(plain, meeting_surfaces(case.subject.meshes, *placed))
+    axes, landmarks, rest = (plain.arrays[name] for name in ("T_anatomical_skull", "landmarks", "T_rest"))
+    model = with_teeth(plain, meeting_teeth(case.subject.meshes, axes, rest))
+    model = with_joints(model, meeting_joints(case.subject.meshes, axes, landmarks, rest))
     bake_s = time.process_time() - start
     rig, old = JawRig(model.arrays, model.meta), JawRig(plain.arrays, plain.meta)
     if rig.contact is None:
