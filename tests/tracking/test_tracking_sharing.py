@@ -6,8 +6,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from jawusd.tracking import sharing
-from jawusd.tracking.sharing import Sharing
+from jawusd.tracking.contour import sharing
+from jawusd.tracking.contour.sharing import Sharing
 
 PATIENCE_S = 60
 

@@ -29,8 +29,8 @@ from jawusd.tracking.contour.equations import (
 from jawusd.tracking.contour.rendering import Rendering
 from jawusd.tracking.contour.samples import HABITS, LENGTH, contour_samples
 from jawusd.tracking.contour.scan import ARCHES, Scan, thinned
+from jawusd.tracking.contour.sharing import Sharing
 from jawusd.tracking.contour.views import Drawn, View, present_masks
-from jawusd.tracking.sharing import Sharing
 
 _ROUGH_FACES = 6_000  # of a crown row in trials: a third of a thinned scan's
 _DENSE_STEPS = 2  # with all faces of a dense scan, after the thinned one has settled
