@@ -170,7 +170,9 @@ def with_teeth(
 
 
 def with_joints(model: JawModel, joints: Joints | str, progress: Progress = no_progress) -> JawModel:
-    """Return a model with the clearances of the condyles; ``meta["joints"]`` is as `with_teeth` says of the teeth.
+    """Return a model with the clearances of the condyles.
+
+    ``meta["joints"]`` says how deep these run into the skull, or why there are none.
 
     Args:
         joints: Those of the person, see `meeting_joints`.

@@ -276,7 +276,7 @@ def local_cluster(workers: int, retries: int) -> Iterator[Client]:
     """
     settings = {
         "distributed.scheduler.allowed-failures": retries,
-        # Nobody looks at it, and what every thread does, noted 100 times a second, takes 2 to 3 % of the time.
+        # There is no dashboard to show it, and noting all stacks 100 times a second takes 2 to 3 % of the time.
         "distributed.worker.profile.enabled": False,
     }
     with (

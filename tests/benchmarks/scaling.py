@@ -11,8 +11,8 @@ frame, its ratio to the shortest take's, and peak memory, then the size of what 
 by one, and by one that is held to one core, whose time two should halve. (One alone uses more than a core: stages have
 parts that run side by side.)
 
-Every run is a process of its own; those of `build` and `track` have one thread. FOLDER gets the
-takes, their pictures linked, and the builds. Linux only: memory is the high-water mark that the kernel keeps.
+Every run is a process of its own; those of `build` and `track` have one thread. FOLDER gets the takes, their pictures
+linked, and the builds. Linux only: memory is the high-water mark that the kernel keeps.
 """
 
 from __future__ import annotations

@@ -157,13 +157,18 @@ def test_a_pinned_condyle_stays_and_undo_takes_the_drag_back(tab):
 
 def test_every_view_is_drawn_in_light_and_dark(tab):
     camera, rest = tab.page.client.camera, rest_places(tab.session.rig)
+    # The ratio of the picture, which the view follows, changes in between: viser draws more coarsely when it is slow.
+    ratios = set()
+
+    def shows(name):
+        ratios.add(camera.image_width / camera.image_height)
+        views = [preset_view(rest, name, ratio) for ratio in ratios]
+        return any(np.allclose([camera.look_at, camera.position], view, atol=0.1) for view in views)
+
     for name in PRESETS:
+        shows(name)  # notes the ratio before the press
         tab.press(name)
-        target, eye = preset_view(rest, name, camera.image_width / camera.image_height)
-        # When drawing is slow, viser draws more coarsely, and rounding to its pixels may have changed the ratio.
-        rounding = 0.005 * np.linalg.norm(eye - target)
-        until(lambda eye=eye, limit=rounding: np.allclose(camera.position, eye, atol=limit))
-        until(lambda target=target: np.allclose(camera.look_at, target, atol=0.1))
+        until(lambda name=name: shows(name))
         assert (tab.page.scene.grips[0].opacity is None) == (not name.startswith("condyle"))
         time.sleep(0.5)  # the page draws the view
         tab.picture(f"view_{name.replace(' ', '_')}")
