@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
 from pxr import Ar, Sdf, UsdUtils
@@ -14,20 +16,44 @@ def file_of(identifier: str) -> Path:
     return Path(Ar.SplitPackageRelativePathOuter(path)[0] if Ar.IsPackageRelativePath(path) else path)
 
 
+def file_of_layer(layer: Sdf.Layer) -> Path:
+    """Return the file that a layer was read from; by a search path, it is identified by less."""
+    return file_of(layer.realPath or layer.identifier)
+
+
 def is_layer(asset: str) -> bool:
     """Return whether OpenUSD reads what an asset path names as a layer."""
     return Sdf.FileFormat.FindByExtension(Sdf.Layer.SplitIdentifier(asset)[0]) is not None
 
 
-def escapes(asset: str) -> bool:
-    """Return whether an asset path leaves the folder of the layer that names it."""
-    parts = Sdf.Layer.SplitIdentifier(asset)[0].replace("\\", "/").split("/")
-    depth = 0
-    for part in parts:
-        depth += {"..": -1, ".": 0, "": 0}.get(part, 1)
-        if depth < 0:
-            return True
-    return parts[0] == "" or ":" in parts[0]
+def target_of(layer: Sdf.Layer, asset: str) -> str | None:
+    """Return what an asset path of a layer names: what OpenUSD finds, by search paths too, else where it would lie.
+
+    None for what is no path of this machine, as a drive letter or the scheme of a URL that no resolver knows. The
+    resolver context of the stage has to be bound.
+    """
+    path, arguments = Sdf.Layer.SplitIdentifier(layer.ComputeAbsolutePath(asset))
+    found = str(Ar.GetResolver().Resolve(path))
+    if not found and not os.path.isabs(path):
+        path = path.replace("\\", "/")
+        if ":" in path.split("/")[0]:
+            return None
+        found = os.path.normpath(file_of_layer(layer).parent / path)
+    return Sdf.Layer.CreateIdentifier(found or path, arguments)
+
+
+def evaluated(layer: Sdf.Layer, variables: Mapping[str, object]) -> Sdf.Layer:
+    """Return a layer whose expressions have the values that these variables give; without variables the layer itself.
+
+    Where a layer is found by reference, its own variables count below those of the layers that refer to it.
+    """
+    if not variables:
+        return layer
+    copy = Sdf.Layer.CreateAnonymous(".usda")
+    copy.TransferContent(layer)
+    copy.expressionVariables = dict(variables)
+    asset_paths(copy)
+    return copy
 
 
 def asset_paths(layer: Sdf.Layer) -> list[str]:
@@ -39,17 +65,12 @@ def asset_paths(layer: Sdf.Layer) -> list[str]:
         return asset
 
     edited = layer.dirty
+    silent = UsdUtils.CoalescingDiagnosticDelegate()  # a copy in memory has no folder that templates could lie in
     UsdUtils.ModifyAssetPaths(layer, note)
-    if layer.dirty and not edited:
+    del silent
+    if layer.dirty and not edited and not layer.anonymous:
         layer.Reload(force=True)  # it had expressions, which are now replaced by what they gave
     return [asset for asset in dict.fromkeys(found) if asset]
-
-
-def has_variable_paths(layers: list[Sdf.Layer]) -> bool:
-    """Return whether a layer sets variables while one has expressions for paths: which files these name, is open."""
-    if not any(layer.HasExpressionVariables() for layer in layers):
-        return False  # as nearly always; then expressions with variables name nothing
-    return any("@`" in layer.ExportToString() for layer in layers)
 
 
 def clip_templates(layer: Sdf.Layer) -> list[str]:
@@ -60,10 +81,19 @@ def clip_templates(layer: Sdf.Layer) -> list[str]:
         spec = layer.GetPrimAtPath(path) if path.IsPrimPath() or path.IsPrimVariantSelectionPath() else None
         clips = spec.GetInfo("clips") if spec and spec.HasInfo("clips") else {}
         sets = [values for values in clips.values() if isinstance(values, dict)]
-        found.extend(str(values["templateAssetPath"]) for values in sets if "templateAssetPath" in values)
+        found.extend(
+            _value(layer, str(values["templateAssetPath"])) for values in sets if "templateAssetPath" in values
+        )
 
     layer.Traverse(Sdf.Path.absoluteRootPath, visit)
     return found
+
+
+def _value(layer: Sdf.Layer, text: str) -> str:
+    """Return the value of a text that may be an expression, by the layer's variables."""
+    if not Sdf.VariableExpression.IsExpression(text):
+        return text
+    return str(Sdf.VariableExpression(text).Evaluate(layer.expressionVariables).value or "")
 
 
 def of_template(template: Path) -> list[Path]:

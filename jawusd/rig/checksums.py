@@ -9,7 +9,7 @@ from pathlib import Path
 from pxr import Sdf
 
 from jawusd.errors import RigError
-from jawusd.rig.asset_paths import file_of
+from jawusd.rig.asset_paths import file_of_layer
 
 #: Key in `customLayerData` of `actor.usda`: a dictionary of file names beside it and SHA-256 sums.
 CHECKSUMS = "sha256"
@@ -24,7 +24,7 @@ def record_checksums(layer: Sdf.Layer, folder: Path, names: Iterable[str]) -> No
 def recorded_checksums(layer: Sdf.Layer) -> dict[Path, str]:
     """Return the checksums that a layer records, by file; none of rigs written before there were any."""
     sums = layer.customLayerData.get(CHECKSUMS)
-    folder = file_of(layer.identifier).resolve().parent
+    folder = file_of_layer(layer).resolve().parent
     return {folder / name: str(value) for name, value in sums.items()} if isinstance(sums, dict) else {}
 
 

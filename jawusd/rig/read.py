@@ -16,7 +16,7 @@ from jawusd.evaluator import JawRig
 from jawusd.geometry.arrays import Array
 from jawusd.inputs import check_path
 from jawusd.rig.arrays import read_arrays, read_value
-from jawusd.rig.asset_paths import file_of
+from jawusd.rig.asset_paths import file_of_layer
 from jawusd.rig.child_process import remember, try_in_child
 from jawusd.rig.layout import MADE_FOR, ONNX_ATTRIBUTES, PARAMETERS
 from jawusd.rig.schema import has_jaw_api, rig_prims
@@ -60,7 +60,7 @@ def open_stage(path: PathArg) -> Usd.Stage:
         stage = open_checked(path)
     except MemoryError as error:
         raise RigError("needs more memory than there is.", path=path) from error
-    remember(path, [file_of(layer.identifier) for layer in stage.GetUsedLayers() if not layer.anonymous])
+    remember(path, [file_of_layer(layer) for layer in stage.GetUsedLayers() if not layer.anonymous])
     return stage
 
 

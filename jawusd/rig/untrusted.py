@@ -5,27 +5,36 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import ParamSpec, TypeVar
+from typing import NamedTuple, ParamSpec, TypeVar
 
-from pxr import Sdf, Tf, Usd
+from pxr import Ar, Sdf, Tf, Usd
 
 from jawusd.errors import FormatError, RigError
 from jawusd.formats.allowed_folders import is_allowed
 from jawusd.rig.asset_paths import (
     asset_paths,
     clip_templates,
-    escapes,
+    evaluated,
     file_of,
-    has_variable_paths,
+    file_of_layer,
     is_layer,
     of_template,
+    target_of,
 )
 from jawusd.rig.checksums import check_checksum, recorded_checksums
 from jawusd.rig.nesting import MOST_LEVELS, has_deep_arc, is_too_deep
 from jawusd.rig.schema import SCHEMA_NAME
 
-# an asset path, the folder of the rig that it is part of, and the layer outside whose folder it lies
-_Named = tuple[str, Path | None, str | None]
+
+class _Named(NamedTuple):
+    """A layer that is named by another: where, in which rig's folder, from outside of whose folder, and variables."""
+
+    target: str
+    home: Path | None
+    user: str | None
+    variables: Mapping[str, object]  # of the layers that refer to it
+    is_sublayer: bool = False  # its own variables do not count then
+
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -36,8 +45,8 @@ FAULTS = (
 )  # fmt: skip
 _ALLOW = "If you trust it, allow its folder with --allow or the setting JAWUSD_ALLOW."
 _TOO_DEEP = f"is nested too deeply, at most {MOST_LEVELS} levels are read."
-_UNREADABLE = "is not a USD file that OpenUSD can read."
-_WRITE_OUT = "Write asset paths out, without expressionVariables."
+_UNREADABLE = "is not a USD file that OpenUSD can read"
+_MOST_READINGS = 20_000  # of layers, one for each set of variables
 _OF_A_RIG = ("jaw:formatVersion", "jaw:model", "jaw:bounds", "jaw:decoder")
 
 
@@ -77,16 +86,25 @@ def open_checked(path: Path) -> Usd.Stage:
         layers = check_reach(path)
         stage = Usd.Stage.Open(str(path))
     except (Tf.ErrorException, RuntimeError, ValueError, OSError) as error:
-        raise RigError(_UNREADABLE, path=path) from error
+        raise RigError(_unreadable(path, error), path=path) from error
     if not layers or stage is None:
-        raise RigError(_UNREADABLE, path=path)
+        raise RigError(_unreadable(path), path=path)
     check_composed(stage, layers)
     return stage
+
+
+def _unreadable(file: Path, error: BaseException | None = None) -> str:
+    """Return what is wrong with a file, with what OpenUSD says of it, such as the line of a syntax error."""
+    said = error.args if isinstance(error, Tf.ErrorException) else ()
+    words = next((str(one.commentary).strip() for one in said if getattr(one, "commentary", "")), "")
+    words = words.replace(f"{file}:", "line ", 1)
+    return f"{_UNREADABLE}: {words:.300}" if words else f"{_UNREADABLE}."
 
 
 def check_reach(path: Path) -> list[Sdf.Layer]:
     """Check, before a layer or package is composed, that a rig's layers name only files in their own folder or below.
 
+    Paths count as OpenUSD finds them: absolute ones, by search paths, and by expressions with variables.
     Layers that only use a rig (animation, shots) may name it outside their folder, and nothing else, in values neither:
     what values name is read (ONNX) and packed (pictures). Files that a rig's layers name must lie in the rig's folder,
     with links resolved. Any may lie in folders that were allowed, see `formats.allowed_folders`.
@@ -97,15 +115,25 @@ def check_reach(path: Path) -> list[Sdf.Layer]:
     Raises:
         RigError: A path that is not allowed, or a layer that is damaged.
     """
+    resolver = Ar.GetResolver()
+    with Ar.ResolverContextBinder(resolver.CreateDefaultContextForAsset(str(path))):
+        return _reached(path)
+
+
+def _reached(path: Path) -> list[Sdf.Layer]:
     layers: list[Sdf.Layer] = []
-    seen = set()
+    seen: set[tuple[str, Path | None, bool, str]] = set()
     sums: dict[Path, str] = {}
-    waiting: list[_Named] = [(str(path), None, None)]
+    waiting = [_Named(str(path), None, None, {})]
     while waiting:
-        name, home, user = waiting.pop()
-        if (name, home) in seen:
+        one = waiting.pop()
+        name, home = one.target, one.home
+        key = (name, home, one.is_sublayer, str(sorted(one.variables.items())))
+        if key in seen:
             continue
-        seen.add((name, home))
+        if len(seen) == _MOST_READINGS:
+            raise RigError(f"names layers in more than {_MOST_READINGS} ways, by variables.", path=path)
+        seen.add(key)
         layer = _layer(name, sums)
         if layer is None:
             continue
@@ -113,11 +141,12 @@ def check_reach(path: Path) -> list[Sdf.Layer]:
         sums |= recorded_checksums(layer)
         if home is None and _carries_rig(layer):
             home = file_of(name).resolve().parent
-        if home is None and user is not None:
-            raise RigError(f"names the file {name:.200}, outside its own folder and no rig.", path=user, hint=_ALLOW)
-        waiting += _layers_named(layer, home)
-    if has_variable_paths(layers):
-        raise RigError("names files by variables, which any layer may set.", path=path, hint=_WRITE_OUT)
+        if home is None and one.user is not None:
+            raise RigError(
+                f"names the file {name:.200}, outside its own folder and no rig.", path=one.user, hint=_ALLOW
+            )
+        own = {} if one.is_sublayer else layer.expressionVariables
+        waiting += _layers_named(layer, home, {**own, **one.variables})
     return layers
 
 
@@ -127,45 +156,55 @@ def check_composed(stage: Usd.Stage, checked: list[Sdf.Layer]) -> None:
     Raises:
         RigError: It holds another.
     """
-    known = {file_of(layer.identifier).resolve() for layer in checked}
+    known = {file_of_layer(layer).resolve() for layer in checked}
     for layer in stage.GetUsedLayers():
-        if not layer.anonymous and file_of(layer.identifier).resolve() not in known:
+        if not layer.anonymous and file_of_layer(layer).resolve() not in known:
             raise RigError(
                 f"is composed of {layer.identifier:.200}, which it does not name.", path=checked[0].identifier
             )
 
 
-def _layers_named(layer: Sdf.Layer, home: Path | None) -> list[_Named]:
+def _layers_named(layer: Sdf.Layer, home: Path | None, variables: Mapping[str, object]) -> list[_Named]:
     """Return the layers that a layer names, after checking all files that it names.
 
     Args:
         home: Folder of the rig that the layer is part of; None where it only uses rigs.
+        variables: Those that expressions have in the layer.
     """
-    folder = home or file_of(layer.identifier).resolve().parent
-    templates = clip_templates(layer)
+    folder = home or file_of_layer(layer).resolve().parent
+    read = evaluated(layer, variables)
     named: list[_Named] = []
-    for template in templates:  # first: OpenUSD lists their folders when it is asked for asset paths
-        pattern = file_of(layer.ComputeAbsolutePath(template))
-        _check_inside(layer, template, pattern, folder)
+    for template in clip_templates(read):  # first: OpenUSD lists their folders when it is asked for asset paths
+        pattern = _inside(layer, template, folder)
         for file in of_template(pattern):
-            _check_inside(layer, file.name, file, folder)
-            named.append((str(file), None if is_allowed(file) else home, None))
-    composed = layer.GetCompositionAssetDependencies()
-    for asset in asset_paths(layer):
-        target = layer.ComputeAbsolutePath(asset)
-        file = file_of(target)
+            _inside(layer, str(file), folder)
+            named.append(_Named(str(file), None if is_allowed(file) else home, None, variables))
+    assets = asset_paths(read)
+    composed, sublayers = read.GetCompositionAssetDependencies(), set(read.subLayerPaths)
+    for asset in assets:
         is_part = asset in composed or is_layer(asset)
         if home is not None or not is_part:
-            _check_inside(layer, asset, file, folder)
-        if is_part:
-            inside = is_allowed(file) or file.resolve().is_relative_to(folder)
-            named.append((target, None if is_allowed(file) else home, None if inside else layer.identifier))
+            _inside(layer, asset, folder)
+        target = target_of(layer, asset) if is_part else None
+        if target is None:
+            continue
+        allowed = is_allowed(file_of(target))
+        user = None if allowed or file_of(target).resolve().is_relative_to(folder) else layer.identifier
+        one = _Named(target, None if allowed else home, user, variables)
+        named += [one, one._replace(is_sublayer=True)] if asset in sublayers else [one]
     return named
 
 
-def _check_inside(layer: Sdf.Layer, asset: str, file: Path, folder: Path) -> None:
-    if not is_allowed(file) and (escapes(asset) or not file.resolve().is_relative_to(folder)):
+def _inside(layer: Sdf.Layer, asset: str, folder: Path) -> Path:
+    """Return the file that a layer names.
+
+    Raises:
+        RigError: It lies outside a folder, links resolved, and was not allowed.
+    """
+    target = target_of(layer, asset)
+    if target is None or not (is_allowed(file_of(target)) or file_of(target).resolve().is_relative_to(folder)):
         raise RigError(f"names the file {asset:.200}, outside its own folder.", path=layer.identifier, hint=_ALLOW)
+    return file_of(target)
 
 
 def _layer(name: str, sums: Mapping[Path, str]) -> Sdf.Layer | None:
@@ -186,7 +225,7 @@ def _layer(name: str, sums: Mapping[Path, str]) -> Sdf.Layer | None:
     try:
         layer = Sdf.Layer.FindOrOpen(name)
     except Tf.ErrorException as error:
-        raise RigError(_UNREADABLE, path=file) from error
+        raise RigError(_unreadable(file, error), path=file) from error
     if layer is not None and not _is_whole(layer):
         raise RigError("is damaged: it names prims or properties that it does not hold.", path=file)
     return layer

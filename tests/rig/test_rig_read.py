@@ -13,7 +13,6 @@ from jawusd.evaluator import JawRig
 from jawusd.geometry import make_transform
 from jawusd.rig import describe, load_rig, write_animation
 from jawusd.rig.arrays import model_hash
-from jawusd.rig.asset_paths import escapes
 from jawusd.rig.bake import bake_rig
 
 
@@ -154,7 +153,19 @@ def test_an_attribute_of_another_type_is_refused(anchored_folder):
         load_rig(anchored_folder / "actor.usda")
 
 
-@pytest.mark.parametrize("asset", ["../elsewhere/actor.onnx", "/etc/passwd", "a/../../b.onnx", "C:/x.onnx"])
+@pytest.mark.parametrize(
+    "asset",
+    [
+        "../elsewhere/actor.onnx",
+        "/etc/passwd",
+        "a/../../b.onnx",
+        "C:/x.onnx",
+        "..",
+        "a/../..",
+        "\\\\host\\x",
+        "http://a.b/c.onnx",
+    ],
+)
 def test_asset_paths_may_not_leave_the_folder(anchored_folder, asset):
     actor = anchored_folder / "actor.usda"
     edit(actor, set_value("jaw:onnx", Sdf.AssetPath(asset)))
@@ -185,14 +196,6 @@ def test_what_uses_a_rig_may_reach_out_for_it_only(anchored_folder):
     del other, shot
     with pytest.raises(RigError, match="other.usda, outside its own folder and no rig"):
         load_rig(away / "shot.usda")
-
-
-@pytest.mark.parametrize(
-    ("asset", "leaves"),
-    [("./a", False), ("a/../b", False), ("a/b", False), ("..", True), ("a/../..", True), ("\\\\host\\x", True)],
-)
-def test_escapes(asset, leaves):
-    assert escapes(asset) == leaves
 
 
 def test_files_that_are_no_rig(tmp_path, anchored_folder):
