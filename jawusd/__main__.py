@@ -1,6 +1,17 @@
-"""Run the command line with ``python -m jawusd``."""
+"""The program `jawusd`, also as ``python -m jawusd``."""
 
-from jawusd.cli.main import main
+from __future__ import annotations
+
+from jawusd import guard
+
+
+def main() -> None:
+    """Run the command line in a process with limits, see `jawusd.guard`."""
+    guard.begin()
+    from jawusd.cli.main import main as run
+
+    run()
+
 
 if __name__ == "__main__":
     main()

@@ -14,6 +14,7 @@
       EvaluatorError       exit 9
       OutputError          exit 10  the output cannot be written, or must not be
       ClusterError         exit 11  the workers of a cluster cannot be used
+      ResourceError        exit 12  memory or processor time did not suffice, or a library crashed
 
 A message says where (file, frame, camera), what was found, what is allowed with its unit, and what to do.
 """
@@ -153,6 +154,12 @@ class ClusterError(JawusdError):
     """Report a cluster that does not answer, or whose workers cannot build."""
 
     exit_code = 11
+
+
+class ResourceError(JawusdError):
+    """Report that memory or processor time did not suffice, or that a library crashed."""
+
+    exit_code = 12
 
 
 @contextlib.contextmanager

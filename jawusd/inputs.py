@@ -7,12 +7,13 @@ import unicodedata
 from pathlib import Path
 
 from jawusd.errors import FormatError, JawusdError
+from jawusd.guard import take_in_hand
 
 _LFS = b"version https://git-lfs"
 
 
 def check_input(path: str | os.PathLike[str], error: type[JawusdError] = FormatError) -> None:
-    """Check that something to read is a file. What is missing is left to its reader, which says so.
+    """Check that something to read is a file, and note it as the file in hand. What is missing is left to its reader, which says so.
 
     Pipes that nobody writes to would be waited for, and devices read, for ever.
 
@@ -21,6 +22,7 @@ def check_input(path: str | os.PathLike[str], error: type[JawusdError] = FormatE
     Raises:
         JawusdError: of the given class; it is a folder, a named pipe, a device or a socket.
     """
+    take_in_hand(path)
     there = Path(os.path.realpath(path))  # of a pipe without a name "pipe:[1234]", which does not exist
     try:
         wrong = there.exists() and not there.is_file()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import faulthandler
 import os
 import sys
 import traceback
@@ -16,6 +17,7 @@ from jawusd.cli.commands import Commands
 from jawusd.cli.log import logged
 from jawusd.cli.summaries import EXIT_CODES
 from jawusd.errors import JawusdError, OutputError, explain_missing_packages
+from jawusd.guard import out_of_memory
 
 app = typer.Typer(
     name="jawusd",
@@ -49,6 +51,8 @@ def _root(
         raise typer.Exit
     global _verbose  # errors are printed outside of every context
     _verbose = verbose
+    if verbose:
+        faulthandler.enable()
     if log is not None:
         context.obj = context.with_resource(logged(log, sys.argv[1:]))
 
@@ -58,8 +62,7 @@ _verbose = False
 
 def main() -> None:
     """Run the command line and leave with its exit code: 0 ok, 1 a "no", 2 usage, 3 and up one per error family."""
-    if "PXR_WORK_THREAD_LIMIT" not in os.environ:
-        # Before OpenUSD is loaded: rigs are small, and where it has no threads it can be tried in a fork at any moment.
+    if "PXR_WORK_THREAD_LIMIT" not in os.environ:  # before OpenUSD is loaded: rigs are small
         os.environ |= {"PXR_WORK_THREAD_LIMIT": "1", "TF_ENV_SETTING_ALERTS_ENABLED": "0"}
     # Before numpy is loaded: sums that several threads share differ in their last bits, from which fits end micrometres
     # apart on other machines. The matrices are so small that more threads save nothing.
@@ -68,16 +71,23 @@ def main() -> None:
         with explain_missing_packages():
             app()
     except JawusdError as error:
-        if _verbose:
-            traceback.print_exception(error)
-        typer.echo(f"jawusd: {error}", err=True)
-        sys.exit(error.exit_code)
+        sys.exit(_told(error))
+    except MemoryError as error:
+        sys.exit(_told(out_of_memory(), error))
     except BrokenPipeError:
         # The reader of the pipe (head, less) has closed it.
         sys.stderr.close()
         sys.exit(0)
     except (OSError, RuntimeError) as error:
         sys.exit(_unwritable(error))
+
+
+def _told(error: JawusdError, cause: BaseException | None = None) -> int:
+    """Print an error; return its exit code."""
+    if _verbose:
+        traceback.print_exception(cause or error)
+    typer.echo(f"jawusd: {error}", err=True)
+    return error.exit_code
 
 
 def _unwritable(error: OSError | RuntimeError) -> int:

@@ -38,5 +38,5 @@ SUMMARIES = {
 EXIT_CODES = (
     "Exit codes: 0 done, 1 the answer is no (invalid poses, something missing, a failed build of many), 2 wrong usage, "
     "3 a file is not what it should be, 4 a package is missing, 5 the capture, 6 tracking, 7 fitting, 8 the rig, "
-    "9 the model, 10 the output, 11 a cluster, 130 stopped with Ctrl+C."
+    "9 the model, 10 the output, 11 a cluster, 12 memory did not suffice or a library crashed, 130 stopped with Ctrl+C."
 )

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TypedDict
 
 from jawusd import __version__
+from jawusd.guard import SETTING, machine_memory, memory_limit
 
 _NEEDED_TO_BUILD = ("build",)
 _NEEDED_CODECS = ("h264", "ffv1", "png")
@@ -26,6 +27,7 @@ class Examined(TypedDict):
         extras: packages that each extra lacks.
         graphics: of OpenGL, or why it is not there.
         codecs: what can be decoded, by name.
+        memory_limit_gb: what a command may use of it, 0 for no limit.
         problems: what a build cannot do without.
     """
 
@@ -34,6 +36,7 @@ class Examined(TypedDict):
     system: str
     cores: int
     memory_gb: float | None
+    memory_limit_gb: float
     versions: dict[str, str]
     extras: dict[str, list[str]]
     graphics: str
@@ -65,7 +68,8 @@ def examine() -> Examined:
         "python": platform.python_version(),
         "system": platform.platform(),
         "cores": _cores(),
-        "memory_gb": _memory_gb(),
+        "memory_gb": round(machine_memory() / 1e9, 1) or None,
+        "memory_limit_gb": round(memory_limit() / 1e9, 1),
         "versions": versions,
         "extras": lacking,
         "graphics": _graphics(),
@@ -108,13 +112,6 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _memory_gb() -> float | None:
-    try:
-        return round(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e9, 1)
-    except (AttributeError, ValueError, OSError):  # Windows has no sysconf
-        return None
-
-
 def _graphics() -> str:
     if find_spec("moderngl") is None:
         return "not looked for: moderngl is not installed (extra: demo); only `demo` and `--backend gl` need it"
@@ -145,11 +142,13 @@ def _cache() -> str:
 def examined_lines(found: Examined) -> list[str]:
     """Return what was found as text."""
     memory = "" if found["memory_gb"] is None else f", {found['memory_gb']:g} GB of memory"
+    limit = found["memory_limit_gb"]
     works = [name for name, ok in found["codecs"].items() if ok]
     fails = [name for name, ok in found["codecs"].items() if not ok]
     lines = [
         f"jawusd {found['jawusd']}, Python {found['python']}, {found['system']}",
         f"{found['cores']} cores{memory}, {found['free_gb']:g} GB free here",
+        f"a command may use {f'{limit:g} GB of memory' if limit else 'all memory'} (set {SETTING} to change it)",
         "packages: " + ", ".join(f"{name} {number}" for name, number in found["versions"].items() if number),
     ]
     for extra, lacking in found["extras"].items():

@@ -7,6 +7,7 @@ import hashlib
 import json
 import os
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -24,6 +25,7 @@ CALIBRATION = "calibration.toml"  # made from the boards when the capture names 
 LABELS = "labels"  # folder of the labels of scans that are neither painted nor labelled
 FIRST_PASS = "first_pass.npz"  # tracks without the model's help: what the model is fitted to
 _CHUNK_BYTES = 1 << 20
+_ENDING_S = 2.0  # a killed build holds its lock until the system has taken back its memory
 
 #: Called with (stage, done, total) as work proceeds; total is 0 when unknown.
 Progress = Callable[[str, int, int], None]
@@ -158,7 +160,10 @@ def locked(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise OutputError(f"cannot write here: {error.strerror}.", path=folder, hint=ELSEWHERE) from error
     try:
-        if not _try_lock(handle):
+        deadline = time.monotonic() + _ENDING_S
+        while not (locked := _try_lock(handle)) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        if not locked:
             raise OutputError(
                 "another jawusd build is working in this folder.", path=folder, hint="Wait for it, or name another one."
             )
