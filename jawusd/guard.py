@@ -74,13 +74,10 @@ def memory_limit() -> int:
     named = os.environ.get(SETTING)
     if not named:
         return int(max(_SHARE * machine_memory(), _LEAST_GB * 1e9))
-    try:
-        limit = float(named)
-        if not 0 <= limit < 1e6:
-            raise ValueError
-    except ValueError:
-        raise ResourceError(f"{SETTING} is {named!r}, allowed is a number of GB, 0 for no limit.") from None
-    return int(limit * 1e9)
+    with contextlib.suppress(ValueError):
+        if 0 <= (limit := float(named)) < 1e6:
+            return int(limit * 1e9)
+    raise ResourceError(f"{SETTING} is {named!r}, allowed is a number of GB, 0 for no limit.")
 
 
 def machine_memory() -> int:
