@@ -110,16 +110,16 @@ def _jaw_of_take(rig: JawRig, path: Path, source: Path, fps: float | None, prim:
     import numpy as np
 
     from jawusd.cli.motion import read_pose_table
-    from jawusd.formats.poses import read_parameters, table_columns
+    from jawusd.formats.poses import read_poses_or_parameters
     from jawusd.formats.tracks import load_tracks
 
-    if source.suffix != ".npz" and "d1" in table_columns(source):
-        frames, d = read_parameters(source)
+    if source.suffix != ".npz":
+        frames, d = read_poses_or_parameters(source)
     else:
-        frames, T = read_pose_table(source)
-        d, _ = rig.encode(T)
-        if fps is None and source.suffix == ".npz":
-            fps = load_tracks(source).meta.get("fps")
+        frames, d = read_pose_table(source)
+        fps = fps or load_tracks(source).meta.get("fps")
+    if d.ndim > 2:
+        d, _ = rig.encode(d)
     return np.asarray(frames, dtype=np.float64) / (fps or _rate_of(path, prim)), d
 
 

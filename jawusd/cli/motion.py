@@ -15,7 +15,7 @@ from jawusd.errors import FormatError
 from jawusd.evaluator.clamping import Inside
 from jawusd.evaluator.interpolation import monotone_tangents
 from jawusd.formats.keys import FARTHEST_FRAME, FARTHEST_MM, MOST_FRAMES, Key, Keys, load_keys
-from jawusd.formats.poses import read_parameters, read_poses, table_columns
+from jawusd.formats.poses import read_poses, read_poses_or_parameters
 from jawusd.formats.tracks import load_tracks
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.inputs import check_input
@@ -71,11 +71,9 @@ def read_motion(rig: JawRig, source: Path) -> AuthoredMotion:
         at = np.unique(np.concatenate([np.arange(np.ceil(key_frames[0]), np.floor(key_frames[-1]) + 1), key_frames]))
         d = rig.interpolate(key_frames, key_d, at, method=keys.interpolation, inside=False)
         return AuthoredMotion(at, d, keys.fps, keys)
-    if "d1" in table_columns(source):
-        frames, d = read_parameters(source)
-    else:
-        frames, T = read_poses(source)
-        d, _ = rig.encode(T)
+    frames, d = read_poses_or_parameters(source)
+    if d.ndim > 2:
+        d, _ = rig.encode(d)
     return AuthoredMotion(frames.astype(np.float64), d, None)
 
 

@@ -225,16 +225,16 @@ def _unbaked(rig: JawRig, path: Path, prim: str | None) -> dict[str, list[str] |
 
 def _poses_or_parameters(rig: JawRig, path: Path, prim: str | None) -> tuple[NDArray[np.int64], Array]:
     from jawusd.cli.motion import read_pose_table
-    from jawusd.formats.poses import read_parameters, table_columns
+    from jawusd.formats.poses import read_poses_or_parameters
 
     if path.suffix.lower() in USD_SUFFIXES:
         from jawusd.rig.motion_read import read_poses_of_stage
 
         return read_poses_of_stage(path, prim)
-    if path.suffix != ".npz" and "d1" in table_columns(path):
-        frames, d = read_parameters(path)
-        return frames, rig.pose(d)
-    return read_pose_table(path)
+    if path.suffix == ".npz":
+        return read_pose_table(path)
+    frames, found = read_poses_or_parameters(path)
+    return frames, rig.pose(found) if found.ndim == 2 else found
 
 
 def _validate_rig(path: Path, as_json: bool) -> None:

@@ -24,8 +24,9 @@ from jawusd.errors import FormatError, JawusdError
 from jawusd.evaluator.files import load
 from jawusd.evaluator.rig import JawRig
 from jawusd.geometry.arrays import Array
-from jawusd.inputs import check_input
+from jawusd.tables import read_table
 
+_MAX_BYTES = 1 << 30
 _MATRIX_COLUMNS = [f"m{row}{column}" for row in range(4) for column in range(4)]
 
 
@@ -150,28 +151,16 @@ def _read_poses(path: Path) -> tuple[list[int], Array]:
     Raises:
         FormatError: not such a table, or a cell that is not a number.
     """
-    try:
-        check_input(path)
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError as error:
-        raise FormatError("there is no such file.", path=path) from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise FormatError(f"cannot be read ({error}).", path=path) from error
-    try:
-        table = list(csv.DictReader(text.splitlines(), strict=True))
-    except csv.Error as error:
-        raise FormatError(f"is not a CSV table ({error}).", path=path) from error
-    frames, values = [], []
-    for number, row in enumerate(table, start=1):
-        missing = [name for name in ("frame", *_MATRIX_COLUMNS) if row.get(name) is None]
-        if missing:
-            raise FormatError(f'row {number} has no "{missing[0]}"; needed are frame, m00 ... m33.', path=path)
-        try:
-            frames.append(int(row["frame"]))
-            values.append([float(row[name]) for name in _MATRIX_COLUMNS])
-        except ValueError as error:
-            raise FormatError(f"row {number}: {error}.", path=path) from error
-    return frames, np.array(values, dtype=np.float64).reshape(-1, 4, 4)
+    table = read_table(path, _MAX_BYTES)
+    missing = [name for name in ("frame", *_MATRIX_COLUMNS) if name not in table.header]
+    if missing:
+        raise FormatError(f'has no "{missing[0]}"; needed are frame, m00 ... m33.', path=path)
+    frames = table.numbers([table.header.index("frame")])[:, 0]
+    uneven = np.flatnonzero((frames != np.round(frames)) | ~(np.abs(frames) <= 2**53))
+    if uneven.size:
+        raise FormatError(f"{table.places[uneven[0]]}: frames must be whole numbers.", path=path)
+    values = table.numbers([table.header.index(name) for name in _MATRIX_COLUMNS])
+    return frames.astype(np.int64).tolist(), values.reshape(-1, 4, 4)
 
 
 if __name__ == "__main__":

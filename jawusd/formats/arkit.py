@@ -3,16 +3,15 @@
     Timecode,BlendShapeCount,...,JawForward,JawRight,JawLeft,JawOpen,...
     14:03:52:28.207,61,...,0.01,0,0.02,0.31,...
 
-A time code is HH:MM:SS:FF.fff, FF counted at the rate of the take. At 29.97 and 59.94 frames per second, it may leave
-out the first two or four numbers of every minute that is no tenth ("drop frame", SMPTE ST 12-1), to keep to the clock:
-a semicolon before the frames says so, and so do numbers left out. Column names count without regard to case, any other
-column is ignored. A row whose count is 0 is a moment without a face.
+A time code is HH:MM:SS:FF.fff. FF counts at the rate of the time code, which need not be that of the samples: devices
+that take 60 samples a second on a code of 30 write `.50`, or every code twice. At 29.97 and 59.94 frames per second, it
+may leave out the first two or four numbers of every minute that is no tenth ("drop frame", SMPTE ST 12-1), to keep to
+the clock: a semicolon before the frames says so, and so do numbers left out. Column names count without regard to
+case, any other column is ignored. A row whose count is 0 is a moment without a face.
 """
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 import os
 import re
@@ -23,15 +22,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jawusd.errors import FormatError
-from jawusd.formats.text import read_text
 from jawusd.geometry.arrays import Array
+from jawusd.tables import TextTable, check_width, read_table
 
 JAW_COLUMNS = ("jawopen", "jawleft", "jawright", "jawforward")
 _TIME, _COUNT = "timecode", "blendshapecount"
-_TIMECODE = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})[:;](\d{1,3}(?:\.\d+)?)")
+_TIMECODE = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})[:;](\d{1,3}(?:[.,]\d+)?)")
 _RATES = (24, 25, 30, 48, 50, 60, 100, 120)
 _NTSC_SLACK = 0.006
 _DAY_S = 86_400
+_FEWEST_REPEATED = 3  # time codes, of which most stand in several rows
+_FEWEST_ROWS, _MOST_ROWS = 0.9, 1.02  # in the median second, of the samples a second that were asked for
+_MOST_STEPS_OFF = 2.0  # of the step from one second to the next, from that within seconds
 # ARKit gives 0 to 1. Captures with a personal neutral face or gains go a little beyond; percent, and weights normalised
 # to mean and deviation, go far beyond.
 _LEAST_WEIGHT, _MOST_WEIGHT, _PERCENT = -0.5, 2.0, 10.0
@@ -59,15 +61,18 @@ def shares_of(weights: Array) -> Array:
 def read_arkit(path: str | os.PathLike[str], fps: float | None = None) -> FaceCapture:
     """Read a face capture of Live Link Face.
 
-    Without `fps`, the rate at which the time codes count is found from them; the capture must pass a full second then.
+    Args:
+        path: the CSV.
+        fps: frames per second of the result: those of the samples, those that the time codes count, or a whole
+            multiple or part of the latter. None for the rate of the time codes; they must pass a full second then.
 
     Raises:
         FormatError: not such a table; a value that is no finite number, a time code that does not follow the one
             before, or a rate that does not fit. The message names line and column.
     """
     path = Path(path)
-    rows = _rows(path)
-    columns = [name.strip().lower() for name in rows[0][1]]
+    table = read_table(path, _MAX_BYTES, short_rows=True)
+    columns = [name.lower() for name in table.header]
     for name in (_TIME, *JAW_COLUMNS):
         if columns.count(name) != 1:
             raise FormatError(
@@ -75,55 +80,41 @@ def read_arkit(path: str | os.PathLike[str], fps: float | None = None) -> FaceCa
                 path=path,
                 hint="Live Link Face exports Timecode, JawOpen, JawLeft, JawRight and JawForward.",
             )
-    at = [columns.index(name) for name in (_TIME, *JAW_COLUMNS)]
-    count = columns.index(_COUNT) if _COUNT in columns else None
-    codes, weights, lines = [], [], []
-    for line, row in rows[1:]:
-        face = count is None or len(row) <= count or row[count].strip() != "0"
-        if face and len(row) != len(columns):
-            raise FormatError(f"line {line} has {len(row)} values, the header names {len(columns)}.", path=path)
-        codes.append(_seconds_and_frames(row[at[0]] if len(row) > at[0] else "", line, path))
-        weights.append([_number(row[i], line, rows[0][1][i], path) if face else math.nan for i in at[1:]])
-        lines.append(line)
-    if not codes:
+    if not table.rows:
         raise FormatError("has no rows below the header.", path=path)
-    _check_weights(np.array(weights), lines, path)
-    seconds = np.array([second for second, _ in codes])
+    at, *jaw = (columns.index(name) for name in (_TIME, *JAW_COLUMNS))
+    written = [row[at].strip() if len(row) > at else "" for row in table.rows]
+    codes = np.array([_seconds_and_frame(code, table.named(i, at), path) for i, code in enumerate(written)])
+    seconds, inside = codes[:, 0].astype(np.int64), _spread(codes)
     # Past midnight the time codes start over.
     seconds += _DAY_S * np.concatenate([[0], np.cumsum(np.diff(seconds) < -_DAY_S // 2)])
-    inside = np.array([frame for _, frame in codes])
-    rate = _rate(seconds, inside, lines, fps, path)
-    dropped = _dropped(seconds, inside, rate, fps is None, any(";" in row[at[0]] for _, row in rows[1:]))
+    number = _numbers_per_second(seconds, inside, fps, table, at)
+    dropped = _dropped(seconds, inside, number, any(";" in code for code in written))
+    rate = float(number) if fps is None else fps
     if dropped or _is_of_ntsc(rate):
-        rate = math.ceil(rate) * 1000 / 1001
-    return FaceCapture(
-        _frames(seconds, inside, lines, rate, dropped, path), np.array(weights), rate, rows[1][1][at[0]].strip()
-    )
+        rate = math.ceil(rate - _NTSC_SLACK) * 1000 / 1001
+    frames = _frames(seconds, inside, number, dropped, table, at) * (math.ceil(rate - _NTSC_SLACK) / number)
+    return FaceCapture(np.round(frames, 6), _weights(table, columns, jaw), rate, written[0])
 
 
-def _rows(path: Path) -> list[tuple[int, list[str]]]:
-    """Return the rows that are not empty with their line numbers, the header first."""
-    reader = csv.reader(io.StringIO(read_text(path, _MAX_BYTES, "utf-8-sig"), newline=""), strict=True)
-    try:
-        rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
-    except csv.Error as error:
-        raise FormatError(f"is not a CSV table ({error}).", path=path) from error
-    if not rows:
-        raise FormatError("is empty; the first line must name the columns.", path=path)
-    return rows
+def _weights(table: TextTable, columns: list[str], jaw: list[int]) -> Array:
+    """Return the weights (F, 4), NaN without a face."""
+    count = columns.index(_COUNT) if _COUNT in columns else None
+    seen = [i for i, row in enumerate(table.rows) if count is None or len(row) <= count or row[count].strip() != "0"]
+    for i in seen:
+        check_width(table, i)
+    found = table.numbers(jaw, seen)
+    bad = np.argwhere(~np.isfinite(found))
+    if len(bad):
+        i, k = seen[bad[0, 0]], jaw[bad[0, 1]]
+        raise FormatError(f"{table.named(i, k)} is {table.rows[i][k]}; all weights must be finite.", path=table.path)
+    weights = np.full((len(table.rows), len(jaw)), np.nan)
+    weights[seen] = found
+    _check_weights(weights, table)
+    return weights
 
 
-def _number(text: str, line: int, column: str, path: Path) -> float:
-    try:
-        value = float(text)
-    except ValueError as error:
-        raise FormatError(f'line {line}, column "{column}": "{text}" is not a number.', path=path) from error
-    if not math.isfinite(value):
-        raise FormatError(f'line {line}, column "{column}" is {text}; all weights must be finite.', path=path)
-    return value
-
-
-def _check_weights(weights: Array, lines: list[int], path: Path) -> None:
+def _check_weights(weights: Array, table: TextTable) -> None:
     """Refuse weights on another scale than ARKit's 0 to 1."""
     away = np.abs(np.nan_to_num(weights, nan=0.5) - 0.5)
     row, column = np.unravel_index(int(np.argmax(away)), away.shape)
@@ -136,55 +127,92 @@ def _check_weights(weights: Array, lines: list[int], path: Path) -> None:
         else ("Export the weights as the device gives them, not normalised or scaled.")
     )
     raise FormatError(
-        f'line {lines[row]}, column "{JAW_COLUMNS[column]}" is {worst:g}; weights of ARKit go from 0 to 1, allowed are '
-        f"{_LEAST_WEIGHT:g} to {_MOST_WEIGHT:g}.",
-        path=path,
+        f'{table.places[row]}, column "{JAW_COLUMNS[column]}" is {worst:g}; weights of ARKit go from 0 to 1, allowed '
+        f"are {_LEAST_WEIGHT:g} to {_MOST_WEIGHT:g}.",
+        path=table.path,
         hint=hint,
     )
 
 
-def _seconds_and_frames(text: str, line: int, path: Path) -> tuple[int, float]:
-    found = _TIMECODE.fullmatch(text.strip())
+def _seconds_and_frame(code: str, named: str, path: Path) -> tuple[int, float]:
+    found = _TIMECODE.fullmatch(code)
     if found is None:
-        raise FormatError(f'line {line}, column "Timecode": "{text}" is not HH:MM:SS:FF.fff.', path=path)
+        raise FormatError(f'{named}: "{code}" is not HH:MM:SS:FF.fff.', path=path)
     hours, minutes, seconds = (int(part) for part in found.groups()[:3])
-    return 3600 * hours + 60 * minutes + seconds, float(found[4])
+    return 3600 * hours + 60 * minutes + seconds, float(found[4].replace(",", "."))
 
 
-def _rate(seconds: NDArray[np.int64], inside: Array, lines: list[int], fps: float | None, path: Path) -> float:
-    """Return the given rate, or the lowest usual one above every frame number once a full second was counted."""
+def _spread(codes: Array) -> Array:
+    """Return the frames within the second of rows that share a time code, as evenly as the samples were taken.
+
+    Most codes must stand in several rows. Where there are fewer rows than usual, the last ones of the first code are
+    there, and the first ones of all others.
+
+    Args:
+        codes: seconds and frames within the second, shape (F, 2).
+    """
+    first = np.flatnonzero(np.concatenate([[True], (np.diff(codes, axis=0) != 0).any(axis=1)]))
+    counts = np.diff(np.append(first, len(codes)))
+    usual = int(np.median(counts))
+    if usual < 2 or len(counts) < _FEWEST_REPEATED:
+        return codes[:, 1]
+    sizes = np.maximum(counts, usual)
+    place = np.arange(len(codes)) - np.repeat(first, counts)
+    place[: counts[0]] += sizes[0] - counts[0]
+    return codes[:, 1] + place / np.repeat(sizes, counts)
+
+
+def _numbers_per_second(
+    seconds: NDArray[np.int64], inside: Array, fps: float | None, table: TextTable, column: int
+) -> int:
+    """Return how many numbers the time codes count in a second: the usual rate that best continues across seconds."""
     top = int(np.argmax(inside))
     highest = math.floor(inside[top])
-    if fps is None:
-        # The first and the last second are incomplete: only those between them show where counting starts over.
-        whole = (seconds > seconds[0]) & (seconds < seconds[-1])
-        rates = [rate for rate in _RATES if rate > highest]
-        if not whole.any() or not rates:
-            raise FormatError(
-                "the time codes do not tell the frame rate: they pass no full second, or count above "
-                f"{_RATES[-1]} frames per second.",
-                path=path,
-                hint="Give the rate with --fps.",
-            )
-        return float(rates[0])
-    if highest >= math.ceil(fps):
+    given = 0 if fps is None else math.ceil(fps - _NTSC_SLACK)
+    same = np.diff(seconds) == 0
+    step = float(np.median(np.diff(inside)[same])) if same.any() else 1.0
+    at_rate = round(given * step, 3)  # of codes on which the samples come at the given rate
+    rates = [rate for rate in sorted({*_RATES, given, at_rate}) if rate > highest and rate % 1 == 0]
+    # Not at the start of a minute, where numbers may be left out.
+    turns = np.flatnonzero((np.diff(seconds) == 1) & (seconds[1:] % 60 != 0))
+    # The first and the last second are incomplete: only those between them show how far numbers go.
+    rows_of_whole = np.unique(seconds, return_counts=True)[1][1:-1]
+    found = 0
+    if turns.size and rates and (rows_of_whole.size or given):
+        across = np.median(inside[turns + 1] - inside[turns])
+        off = [abs(across + rate - step) for rate in rates]
+        if min(off) <= _MOST_STEPS_OFF * step:
+            found = int(rates[int(np.argmin(off))])
+    if not found and given and not rows_of_whole.size:
+        found = int(at_rate) if at_rate in _RATES and at_rate > highest and step < 1 else given
+    if not found:
         raise FormatError(
-            f'line {lines[top]}, column "Timecode" counts frame {highest} of a second, at {fps:g} frames per second '
-            f"allowed are 0 .. {math.ceil(fps) - 1}.",
-            path=path,
+            "the time codes do not tell the frame rate: they pass no full second, or count at none of "
+            f"{', '.join(map(str, _RATES))} numbers a second.",
+            path=table.path,
+            hint="Give the rate with --fps." if fps is None else None,
         )
-    return float(fps)
+    samples = float(np.median(rows_of_whole)) if rows_of_whole.size else 0.0
+    fits = not given or not max(given, found) % min(given, found) or _FEWEST_ROWS * given <= samples <= _MOST_ROWS * given
+    if highest >= found or not fits:
+        counted = "" if highest >= found else f" and {found} of them in a second"
+        raise FormatError(
+            f"{table.named(top, column)} counts frame {highest} of a second{counted}, at {fps:g} frames per second "
+            f"allowed are 0 .. {given - 1}.",
+            path=table.path,
+            hint="Leave --fps out; --resample brings the motion to another rate." if counted else None,
+        )
+    return found
 
 
 def _is_of_ntsc(rate: float) -> bool:
     """Tell whether a rate is one like 29.97, short for 30000 / 1001."""
-    return abs(rate - math.ceil(rate) * 1000 / 1001) < _NTSC_SLACK
+    return abs(rate - math.ceil(rate - _NTSC_SLACK) * 1000 / 1001) < _NTSC_SLACK
 
 
-def _dropped(seconds: NDArray[np.int64], inside: Array, rate: float, found: bool, marked: bool) -> int:
+def _dropped(seconds: NDArray[np.int64], inside: Array, number: int, marked: bool) -> int:
     """Return how many numbers the time codes leave out at the start of a minute, 0 where they count them all."""
-    number = math.ceil(rate)
-    if number not in (30, 60) or not (found or _is_of_ntsc(rate)):
+    if number not in (30, 60):
         return 0
     count = number // 15
     if marked:
@@ -197,13 +225,13 @@ def _dropped(seconds: NDArray[np.int64], inside: Array, rate: float, found: bool
 
 
 def _frames(
-    seconds: NDArray[np.int64], inside: Array, lines: list[int], rate: float, dropped: int, path: Path
+    seconds: NDArray[np.int64], inside: Array, number: int, dropped: int, table: TextTable, column: int
 ) -> Array:
-    # A rate like 29.97 counts whole frames: 30 numbers per second of time code.
+    """Return the numbers that the time codes count from the first row on."""
     minutes = seconds // 60
-    frames = seconds * math.ceil(rate) + inside - dropped * (minutes - minutes // 10)
+    frames = seconds * number + inside - dropped * (minutes - minutes // 10)
     steps = np.diff(frames)
     if (steps <= 0).any():
-        line = lines[int(np.argmax(steps <= 0)) + 1]
-        raise FormatError(f'line {line}, column "Timecode" does not come after the row before.', path=path)
-    return np.round(frames - frames[0], 6)
+        row = int(np.argmax(steps <= 0)) + 1
+        raise FormatError(f"{table.named(row, column)} does not come after the row before.", path=table.path)
+    return frames - frames[0]

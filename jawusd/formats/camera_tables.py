@@ -13,8 +13,6 @@ coefficients, and R (3 x 3 or Rodrigues vector) and T, world to camera; names ma
 
 from __future__ import annotations
 
-import csv
-import io
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -23,12 +21,13 @@ import numpy as np
 
 from jawusd.errors import CalibrationError
 from jawusd.formats.camera_xml import Size, known_size, realityscan_lens
-from jawusd.formats.text import read_text
 from jawusd.geometry import Camera, make_transform, rigidity_defect, se3_inverse, so3_exp
 from jawusd.geometry.arrays import Array
+from jawusd.tables import read_table, read_text
 
 _MOST_BYTES = 16 << 20
 _NEEDED = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")
+_LENS = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
 _OPENGL = np.diag([1.0, -1.0, -1.0])
 _MATRIX = re.compile(
     r"^\s*(?P<name>[\w.-]+)\s*:\s*(?:!!opencv-matrix)?\s*\n\s*rows\s*:\s*(?P<rows>\d+)\s*\n\s*cols\s*:\s*(?P<cols>\d+)"
@@ -56,33 +55,26 @@ def load_realityscan_csv(path: Path, sizes: Mapping[str, Size]) -> list[Camera]:
         sizes: (width, height) [px] of the pictures by camera.
 
     Raises:
-        CalibrationError: a column or a size is missing, or a value is none.
-        FormatError: the file cannot be read.
+        CalibrationError: a column or a size is missing, or a value is not finite.
+        FormatError: the file is no table of numbers.
     """
-    lines = [line for line in read_text(path, _MOST_BYTES, "utf-8-sig").splitlines() if line.strip()]
-    lines = [line for line in lines if not line.startswith("#cameras")]
-    try:
-        rows = list(csv.reader(io.StringIO("\n".join(lines))))
-    except csv.Error as error:
-        raise CalibrationError(f"is no table that can be read ({error}).", path=path) from error
-    header = [word.strip().lstrip("#").lower() for word in rows[0]] if rows else []
+    table = read_table(path, _MOST_BYTES, comment="#cameras")
+    header = [word.lstrip("#").strip().lower() for word in table.header]
     lacking = [key for key in _NEEDED if key not in header]
     if lacking:
         raise CalibrationError(
             f"has no column {lacking[0]}; RealityScan's camera parameters have {', '.join(_NEEDED)}.", path=path
         )
+    columns = [k for k, key in enumerate(header) if key in (*_NEEDED[1:], *_LENS)]
+    numbers = table.numbers(columns)
     out = []
-    for number, row in enumerate(rows[1:], start=2):
-        values = dict(zip(header, row))
-        try:
-            found = {key: float(value) for key, value in values.items() if key != "name"}
-        except ValueError as error:
-            raise CalibrationError(f"line {number} holds what is no number ({error}).", path=path) from error
-        if not values.keys() >= set(_NEEDED) or not np.isfinite(list(found.values())).all():
-            raise CalibrationError(f"line {number} has too few values, or one that is not finite.", path=path)
-        name = Path(values["name"].strip().replace("\\", "/")).stem
+    for where, row, values in zip(table.places, table.rows, numbers):
+        if not np.isfinite(values).all():
+            raise CalibrationError(f"{where} has a value that is not finite.", path=path)
+        found = {header[k]: float(value) for k, value in zip(columns, values)}
+        name = Path(row[header.index("name")].strip().replace("\\", "/")).stem
         size = known_size(path, name, sizes)
-        terms = np.array([found.get(key, 0.0) for key in ("k1", "k2", "k3", "k4", "t1", "t2")])
+        terms = np.array([found.get(key, 0.0) for key in _LENS[2:]])
         K, lens = realityscan_lens(path, name, size, found["f"], (found.get("px", 0.0), found.get("py", 0.0)), terms)
         heading, pitch, roll = (np.deg2rad(found[key]) for key in ("heading", "pitch", "roll"))
         turns = so3_exp(np.array([[0, 0, -heading], [pitch, 0, 0], [0, roll, 0]]))

@@ -234,7 +234,7 @@ def _numbers(path: Path, text: str, count: int, what: str) -> Array:
 
 
 def _parsed(path: Path) -> ElementTree.Element:
-    text = read_text(path, _MOST_BYTES, "utf-8-sig")
+    text = read_text(path, _MOST_BYTES)
     if "<!DOCTYPE" in text or "<!ENTITY" in text:  # entities can name other files, and grow without end
         raise CalibrationError("declares a document type, which calibrations do not.", path=path)
     try:

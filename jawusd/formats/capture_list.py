@@ -41,7 +41,7 @@ def load_capture_list(path: str | os.PathLike[str]) -> list[ListedCapture]:
     path = Path(path)
     folder, found = path.resolve().parent, []
     lines: dict[str, int] = {}
-    for number, line in enumerate(read_text(path, _MAX_BYTES, "utf-8-sig").splitlines(), start=1):
+    for number, line in enumerate(read_text(path, _MAX_BYTES).splitlines(), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         item = _listed(line, folder, path, number)

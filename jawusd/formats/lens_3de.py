@@ -149,7 +149,7 @@ def _nuke_name(name: str) -> str:
 def _lens_lines(path: Path) -> list[str] | None:
     """Return the lines of a lens file; none if a text file is something else."""
     try:
-        lines = [line.strip() for line in read_text(path, _MOST_BYTES, "utf-8-sig").splitlines()]
+        lines = [line.strip() for line in read_text(path, _MOST_BYTES).splitlines()]
         numbers = [float(word) for word in lines[1].split()]
         is_lens = len(numbers) == 7 and bool(lines[3]) and lines[2].startswith(("0", "1", "DISTORTION_"))
     except (FormatError, ValueError, IndexError):

@@ -50,7 +50,7 @@ def read_nuke_script(path: Path) -> list[NukeNode]:
     nodes: list[NukeNode] = []
     stack: list[NukeNode | None] = []
     named: dict[str, NukeNode | None] = {}
-    lines = iter(read_text(path, _MOST_BYTES, "utf-8-sig").splitlines())
+    lines = iter(read_text(path, _MOST_BYTES).splitlines())
     for line in lines:
         start = _START.match(line)
         words = line.split()

@@ -1,4 +1,4 @@
-"""Poses and parameters as tables: CSV (comma, semicolon or tab) with a header, or JSON with the same columns.
+"""Poses and parameters as tables: CSV of any locale (see `jawusd.tables`) with a header, or JSON alike.
 
 Poses:      frame, m00, m01, ... m33   (row-major T_skull_mandible [mm])
         or  frame, tx, ty, tz, qw, qx, qy, qz   (scalar-first quaternion)
@@ -7,8 +7,6 @@ Parameters: frame, d1, d2, d3   [mm]
 
 from __future__ import annotations
 
-import csv
-import io
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,9 +16,10 @@ from numpy.typing import NDArray
 
 from jawusd.errors import FormatError
 from jawusd.formats.atomic import write_text_atomic
-from jawusd.formats.text import parse_json, read_text
+from jawusd.formats.text import parse_json
 from jawusd.geometry import make_transform, matrix_from_wxyz, rigidity_defect
 from jawusd.geometry.arrays import Array
+from jawusd.tables import TextTable, read_table, read_text
 
 MATRIX_COLUMNS = tuple(f"m{row}{column}" for row in range(4) for column in range(4))
 QUATERNION_COLUMNS = ("tx", "ty", "tz", "qw", "qx", "qy", "qz")
@@ -31,77 +30,61 @@ _RIGID_TOLERANCE = 1e-3
 _ZERO_QUATERNION = 1e-6
 
 
-def _read_table(path: Path) -> dict[str, list[str]]:
-    """Return the columns of a CSV or JSON table as text."""
-    text = read_text(path, _MAX_BYTES, "utf-8-sig")
-    if path.suffix.lower() == ".json":
-        return _json_columns(text, path)
-    try:
-        rows = list(csv.reader(io.StringIO(text), strict=True, delimiter=_delimiter(text)))
-    except csv.Error as error:
-        raise FormatError(f"is not a CSV table ({error}).", path=path) from error
-    rows = [row for row in rows if row and not row[0].lstrip().startswith("#")]
-    if not rows:
-        raise FormatError("is empty; the first line must name the columns.", path=path)
-    header = [name.strip() for name in rows[0]]
-    if len(set(header)) != len(header):
-        raise FormatError(f"names a column twice: {', '.join(header)}.", path=path)
-    for number, row in enumerate(rows[1:], start=2):
-        if len(row) != len(header):
-            raise FormatError(f"line {number} has {len(row)} values, the header names {len(header)}.", path=path)
-    return {name: [row[i] for row in rows[1:]] for i, name in enumerate(header)}
+def _read_table(path: Path) -> TextTable:
+    if path.suffix.lower() != ".json":
+        table = read_table(path, _MAX_BYTES)
+    else:
+        table = _json_table(path)
+    named = [name for name in table.header if name]
+    if len(set(named)) != len(named):
+        raise FormatError(f"names a column twice: {', '.join(named)}.", path=path)
+    return table
 
 
-def _delimiter(text: str) -> str:
-    """Return what separates the column names: comma, semicolon or tab, whichever is most frequent among them."""
-    header = next((line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")), "")
-    return max(",;\t", key=header.count)
-
-
-def _json_columns(text: str, path: Path) -> dict[str, list[str]]:
-    records = parse_json(text, path)
+def _json_table(path: Path) -> TextTable:
+    records = parse_json(read_text(path, _MAX_BYTES), path)
     if not isinstance(records, list) or not all(isinstance(record, dict) for record in records):
         raise FormatError("must be a JSON list of objects, one per frame.", path=path)
     if not records:
         raise FormatError("is empty.", path=path)
     names = list(records[0])
-    for index, record in enumerate(records):
+    for index, record in enumerate(records, start=1):
         if set(record) != set(names):
             raise FormatError(f"record {index} has other keys than the first one.", path=path)
-    return {name: [str(record[name]) for record in records] for name in names}
+    rows = [[str(record[name]) for name in names] for record in records]
+    return TextTable(path, names, rows, [f"record {index}" for index in range(1, len(rows) + 1)])
 
 
-def _numbers(columns: dict[str, list[str]], names: tuple[str, ...], path: Path) -> Array:
+def _numbers(table: TextTable, names: tuple[str, ...]) -> Array:
     """Return the named columns as finite numbers, shape (F, len(names))."""
-    out = np.empty((len(columns[names[0]]), len(names)))
-    for j, name in enumerate(names):
-        for i, text in enumerate(columns[name]):
-            try:
-                out[i, j] = float(text)
-            except ValueError as error:
-                raise FormatError(f'row {i + 1}, column "{name}": "{text}" is not a number.', path=path) from error
+    columns = [table.header.index(name) for name in names]
+    out = table.numbers(columns)
     bad = np.argwhere(~np.isfinite(out))
     if len(bad):
         i, j = bad[0]
         raise FormatError(
-            f'row {i + 1}, column "{names[j]}" is {columns[names[j]][i]}; all values must be finite.',
-            path=path,
+            f"{table.named(i, columns[j])} is {table.rows[i][columns[j]]}; all values must be finite.",
+            path=table.path,
             hint="Leave out frames without a pose.",
         )
     return out
 
 
-def _frames(columns: dict[str, list[str]], name: str, path: Path) -> NDArray[np.int64]:
-    if name not in columns:
-        raise FormatError(f'has no column "{name}"; it has {", ".join(columns) or "none"}.', path=path)
-    values = _numbers(columns, (name,), path)[:, 0]
+def _frames(table: TextTable, name: str) -> NDArray[np.int64]:
+    if name not in table.header:
+        raise FormatError(f'has no column "{name}"; it has {_listed(table)}.', path=table.path)
+    values = _numbers(table, (name,))[:, 0]
     uneven = np.flatnonzero((values != np.round(values)) | (np.abs(values) > 2**53))
     if uneven.size:
-        row = int(uneven[0])
+        row, column = int(uneven[0]), table.header.index(name)
         raise FormatError(
-            f'row {row + 1}, column "{name}" is {columns[name][row]}; frames must be whole numbers.', path=path
+            f"{table.named(row, column)} is {table.rows[row][column]}; frames must be whole numbers.", path=table.path
         )
     return values.astype(np.int64)
+
+
+def _listed(table: TextTable) -> str:
+    return ", ".join(name for name in table.header if name) or "none"
 
 
 def read_poses(
@@ -117,44 +100,67 @@ def read_poses(
     Raises:
         FormatError: columns missing, a value that is not a finite number, or a matrix that is not rigid.
     """
-    path = Path(path)
-    table = _read_table(path)
+    return _poses_of(_read_table(Path(path)), columns)
+
+
+def read_poses_or_parameters(path: str | os.PathLike[str]) -> tuple[NDArray[np.int64], Array]:
+    """Read frame numbers (F,) and parameters d [mm] (F, 3) or else T_skull_mandible (F, 4, 4) from CSV or JSON.
+
+    Raises:
+        FormatError: columns of neither, a value that is not a finite number, or a matrix that is not rigid.
+    """
+    table = _read_table(Path(path))
+    if PARAMETER_COLUMNS[0] in table.header:
+        return _parameters_of(table)
+    if not any({*names} <= {*table.header} for names in (MATRIX_COLUMNS[:12], QUATERNION_COLUMNS)):
+        raise FormatError(
+            f"has neither the columns {', '.join(PARAMETER_COLUMNS)} (opening, lateral, protrusion [mm]) nor "
+            f"{MATRIX_COLUMNS[0]} ... {MATRIX_COLUMNS[11]} nor {', '.join(QUATERNION_COLUMNS)} (poses); "
+            f"it has {_listed(table)}.",
+            path=table.path,
+        )
+    return _poses_of(table, None)
+
+
+def _poses_of(table: TextTable, columns: Mapping[str, str] | None) -> tuple[NDArray[np.int64], Array]:
     called = {name: name for name in ("frame", *MATRIX_COLUMNS, *QUATERNION_COLUMNS)} | dict(columns or {})
     for name, theirs in (columns or {}).items():
-        if theirs not in table:
-            raise FormatError(f'has no column "{theirs}" to be read as "{name}"; it has {", ".join(table)}.', path=path)
-    if columns and called["frame"] not in table:
-        frames = np.arange(len(next(iter(table.values()))))
+        if theirs not in table.header:
+            raise FormatError(
+                f'has no column "{theirs}" to be read as "{name}"; it has {_listed(table)}.', path=table.path
+            )
+    if columns and called["frame"] not in table.header:
+        frames = np.arange(len(table.rows))
     else:
-        frames = _frames(table, called["frame"], path)
+        frames = _frames(table, called["frame"])
     matrix, quaternion = (tuple(called[name] for name in names) for names in (MATRIX_COLUMNS, QUATERNION_COLUMNS))
-    if all(name in table for name in matrix[:12]):
+    if {*matrix[:12]} <= {*table.header}:
         T = np.tile(np.eye(4), (len(frames), 1, 1))
-        rows = 4 if all(name in table for name in matrix) else 3
-        T[:, :rows] = _numbers(table, matrix[: 4 * rows], path).reshape(-1, rows, 4)
-    elif all(name in table for name in quaternion):
-        values = _numbers(table, quaternion, path)
+        rows = 4 if {*matrix} <= {*table.header} else 3
+        T[:, :rows] = _numbers(table, matrix[: 4 * rows]).reshape(-1, rows, 4)
+    elif {*quaternion} <= {*table.header}:
+        values = _numbers(table, quaternion)
         norm = np.linalg.norm(values[:, 3:], axis=1)
         if (norm < _ZERO_QUATERNION).any():
-            raise FormatError(f"row {int(norm.argmin()) + 1}: the quaternion is zero.", path=path)
+            raise FormatError(f"{table.places[int(norm.argmin())]}: the quaternion is zero.", path=table.path)
         T = make_transform(matrix_from_wxyz(values[:, 3:]), values[:, :3])
     else:
         raise FormatError(
             f"has neither the columns {matrix[0]} ... {matrix[11]} nor {', '.join(quaternion)}; "
-            f"it has {', '.join(table)}.",
-            path=path,
+            f"it has {_listed(table)}.",
+            path=table.path,
             hint=None if columns else "`jawusd fit` takes other names with --columns, e.g. tx=X,ty=Y,...",
         )
-    return frames, _checked_rigid(T, path)
+    return frames, _checked_rigid(T, table)
 
 
-def _checked_rigid(T: Array, path: Path) -> Array:
+def _checked_rigid(T: Array, table: TextTable) -> Array:
     defect = rigidity_defect(T) if len(T) else np.zeros(0)
     if defect.size and defect.max() > _RIGID_TOLERANCE:
         raise FormatError(
-            f"row {int(defect.argmax()) + 1}: the matrix is not rigid (off by {defect.max():.2g}, "
+            f"{table.places[int(defect.argmax())]}: the matrix is not rigid (off by {defect.max():.2g}, "
             f"allowed {_RIGID_TOLERANCE:g}).",
-            path=path,
+            path=table.path,
             hint="Matrices are row-major with the translation [mm] in the last column.",
         )
     return T
@@ -166,22 +172,15 @@ def read_parameters(path: str | os.PathLike[str]) -> tuple[NDArray[np.int64], Ar
     Raises:
         FormatError: columns missing, or a value that is not a finite number.
     """
-    path = Path(path)
-    columns = _read_table(path)
-    frames = _frames(columns, "frame", path)
-    missing = [name for name in PARAMETER_COLUMNS if name not in columns]
+    return _parameters_of(_read_table(Path(path)))
+
+
+def _parameters_of(table: TextTable) -> tuple[NDArray[np.int64], Array]:
+    frames = _frames(table, "frame")
+    missing = [name for name in PARAMETER_COLUMNS if name not in table.header]
     if missing:
-        raise FormatError(f'has no column "{missing[0]}"; it has {", ".join(columns)}.', path=path)
-    return frames, _numbers(columns, PARAMETER_COLUMNS, path)
-
-
-def table_columns(path: str | os.PathLike[str]) -> tuple[str, ...]:
-    """Return the column names of a CSV or JSON table.
-
-    Raises:
-        FormatError: the file is not such a table.
-    """
-    return tuple(_read_table(Path(path)))
+        raise FormatError(f'has no column "{missing[0]}"; it has {_listed(table)}.', path=table.path)
+    return frames, _numbers(table, PARAMETER_COLUMNS)
 
 
 def write_poses(path: str | os.PathLike[str], frames: NDArray[np.int64], T: Array) -> None:

@@ -83,7 +83,7 @@ def test_info_names_actor_and_ranges(model, capsys):
     ("text", "message"),
     [
         ("frame,m00\n1,2\n", 'has no "m01"'),
-        ("frame," + ",".join(f"m{r}{c}" for r in range(4) for c in range(4)) + "\nx" + ",0" * 16 + "\n", "row 1"),
+        ("frame," + ",".join(f"m{r}{c}" for r in range(4) for c in range(4)) + "\nx" + ",0" * 16 + "\n", "line 2"),
         ('"', "not a CSV table"),
     ],
 )

@@ -159,3 +159,93 @@ def test_codes_that_leave_nothing_out_count_every_number(tmp_path, number, fps):
     np.testing.assert_allclose(read_arkit(path, fps=fps).frames, np.arange(130 * number))
     assert read_arkit(path, fps=fps).fps == number * 1000 / 1001
     assert read_arkit(path).fps == number
+
+
+def codes_of(times, number, subframes=True, left_out=0, separator=":", start=0):
+    """Return time codes of times [frames of the code] by counting one by one, with subframes or without."""
+    whole = np.floor(np.asarray(times) + 1e-9).astype(int)
+    counted = drop_frame_codes(int(whole[-1]) + 1, number, left_out, separator, start)
+    return [
+        counted[k][:-4] + (f"{time - k:.3f}"[1:] if subframes else "") for time, k in zip(times, whole, strict=True)
+    ]
+
+
+def written(path, codes):
+    path.write_text("\n".join([HEADER, *(f"{code},61,0,0,0,0,0,0" for code in codes)]))
+    return path
+
+
+FACTOR = 1000 / 1001
+# name: samples per code number, numbers per second, subframes, left out, separator, --fps, wanted frames per second
+RATES = {
+    "60 samples on a code of 30": (2, 30, True, 0, ":", 60, 60),
+    "60 on 30, the code's rate given": (2, 30, True, 0, ":", 30, 30),
+    "60 on 30, none given": (2, 30, True, 0, ":", None, 30),
+    "48 on 24": (2, 24, True, 0, ":", 48, 48),
+    "50 on 25, codes repeated": (2, 25, False, 0, ":", 50, 50),
+    "60 on 30, codes repeated, none given": (2, 30, False, 0, ":", None, 30),
+    "120 on 30, codes repeated": (4, 30, False, 0, ":", 120, 120),
+    "60 on 24, codes repeated": (2.5, 24, False, 0, ":", 60, 60),
+    "60 on 25": (2.4, 25, True, 0, ":", 60, 60),
+    "30 on 60": (0.5, 60, True, 0, ":", 30, 30),
+    "30 on 60, none given": (0.5, 60, True, 0, ":", None, 60),
+    "2 on 60, none given": (1 / 30, 60, True, 0, ":", None, 60),
+    "15, given": (1, 15, True, 0, ":", 15, 15),
+    "drop frame at 30": (1, 30, True, 2, ";", 30, 30 * FACTOR),
+    "drop frame, unmarked, at 30": (1, 30, True, 2, ":", 30, 30 * FACTOR),
+    "drop frame of 30 at 60": (2, 30, True, 2, ";", 60, 60 * FACTOR),
+    "drop frame of 30 at 59.94, codes repeated": (2, 30, False, 2, ";", 59.94, 60 * FACTOR),
+    "59.94 on a code of 29.97 that leaves nothing out": (2, 30, True, 0, ":", 59.94, 60 * FACTOR),
+}
+
+
+@pytest.mark.parametrize("case", RATES)
+def test_the_rates_of_code_and_samples_are_told_apart(tmp_path, case):
+    per_number, number, subframes, left_out, separator, fps, wanted = RATES[case]
+    times = np.arange(round(150 * number * per_number)) / per_number  # two starts of a minute
+    path = written(tmp_path / "face.csv", codes_of(times, number, subframes, left_out, separator))
+    found = read_arkit(path, fps=fps)
+    assert found.fps == pytest.approx(wanted, rel=1e-12)
+    factor = FACTOR if abs(wanted % 1) > 1e-6 else 1
+    late = np.abs(found.frames / found.fps - times / number / factor)
+    # codes without subframes leave the place of 2 or 3 samples within them open
+    assert late.max() < (1 / number / per_number if per_number % 1 and not subframes else 1e-3 / number)
+
+
+@pytest.mark.parametrize(("subframes", "fps"), [(True, 60), (False, 60), (False, 30)])
+def test_samples_on_half_numbers_that_are_missing_leave_gaps_alone(tmp_path, subframes, fps):
+    rows = np.array([k for k in range(1, 600) if k % 37 and k % 90 != 3])  # begins with the second half of a number
+    found = read_arkit(written(tmp_path / "face.csv", codes_of(rows / 2, 30, subframes)), fps=fps)
+    wanted = (rows - 1) * fps / 60
+    off = np.abs(found.frames - wanted) * 60 / fps
+    assert off.max() < 1e-2 if subframes else off[0] == 0 and off.max() < 1.01 and np.median(off) < 1e-6
+
+
+def test_midnight_in_drop_frame_with_half_numbers(tmp_path):
+    seconds = ("23:59:58", "23:59:59", "00:00:00", "00:00:01")  # no minute that leaves numbers out
+    codes = [f"{second};{k:02d}{half}" for second in seconds for k in range(30) for half in (".00", ".50")]
+    found = read_arkit(written(tmp_path / "face.csv", codes), fps=60)
+    np.testing.assert_allclose(found.frames, np.arange(240), atol=1e-6)
+    assert found.fps == 60 * FACTOR
+
+
+@pytest.mark.parametrize(
+    ("number", "fps", "words"),
+    [
+        (30, 24, ("counts frame 29", "30 of them in a second", "--resample")),
+        (25, 24, ("counts frame 24", "25 of them in a second")),
+        (24, 30, ("24 of them in a second", "at 30 frames per second")),
+        (15, None, ("do not tell the frame rate", "--fps")),
+        (15, 50, ("do not tell the frame rate",)),
+    ],
+)
+def test_a_rate_that_does_not_fit_the_code_is_refused(tmp_path, number, fps, words):
+    path = written(tmp_path / "face.csv", codes_of(np.arange(5 * number), number))
+    with pytest.raises(FormatError) as error:
+        read_arkit(path, fps=fps)
+    assert all(word in str(error.value) for word in words)
+
+
+def test_short_takes_with_half_numbers_count_at_half_the_given_rate(tmp_path):
+    path = written(tmp_path / "face.csv", codes_of(np.arange(10, 30) / 2, 30))
+    np.testing.assert_allclose(read_arkit(path, fps=60).frames, np.arange(20), atol=1e-6)

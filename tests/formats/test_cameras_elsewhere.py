@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from jawusd.cli.main import app
-from jawusd.errors import CalibrationError, JawusdError, RigError
+from jawusd.errors import CalibrationError, FormatError, JawusdError, RigError
 from jawusd.formats.calibration import load_calibration, save_calibration
 from jawusd.formats.camera_files import calibration_files, load_cameras_file
 from jawusd.formats.camera_write import save_colmap
@@ -188,11 +188,11 @@ def test_realityscan_csv(tmp_path):
     with pytest.raises(CalibrationError, match="no column heading"):
         load_cameras_file(path, 1000.0, sizes)
     path.write_text("\n".join(lines).replace("38.0", "wide"))
-    with pytest.raises(CalibrationError, match="line 2 holds what is no number"):
+    with pytest.raises(FormatError, match='line 3, column "f": "wide" is not a number'):
         load_cameras_file(path, 1000.0, sizes)
     short = ",".join(lines[2].split(",")[:7])
     path.write_text(f"{'note,' * 8}{lines[1].lstrip('#')}\n{'1,' * 8}{short}\n")
-    with pytest.raises(CalibrationError, match="too few values"):
+    with pytest.raises(FormatError, match="line 2 has 15 values, the header names 24"):
         load_cameras_file(path, 1000.0, sizes)
 
 

@@ -73,9 +73,9 @@ def test_the_last_matrix_row_may_be_left_out(tmp_path, motion):
     [
         (("Frame", "Picture"), MAP, 'no column "Frame" to be read as "frame"'),
         (("Frame", "frame"), None, "--columns"),
-        (("10,", "10.5,"), MAP, 'row 1, column "Frame" is 10.5'),
-        (("11,", "x,"), MAP, 'row 2, column "Frame": "x" is not a number'),
-        (("12,", "nan,"), MAP, 'row 3, column "Frame" is nan'),
+        (("10,", "10.5,"), MAP, 'line 2, column "Frame" is 10.5'),
+        (("11,", "x,"), MAP, 'line 3, column "Frame": "x" is not a number'),
+        (("12,", "nan,"), MAP, 'line 4, column "Frame" is nan'),
     ],
 )
 def test_each_mistake_is_told_with_row_and_column(tmp_path, motion, change, columns, words):
@@ -88,7 +88,7 @@ def test_each_mistake_is_told_with_row_and_column(tmp_path, motion, change, colu
 
 def test_a_zero_quaternion_names_its_row(tmp_path):
     (tmp_path / "p.csv").write_text("Frame,X,Y,Z,I,J,K,W\n1,0,0,0,0,0,0,1\n2,0,0,0,0,0,0,0\n")
-    with pytest.raises(FormatError, match="row 2: the quaternion is zero"):
+    with pytest.raises(FormatError, match="line 3: the quaternion is zero"):
         read_poses(tmp_path / "p.csv", MAP)
 
 

@@ -9,7 +9,7 @@ import pytest
 from jawusd.errors import FormatError, OutputError
 from jawusd.formats.atomic import atomic_path, write_bytes_atomic
 from jawusd.formats.keys import Key, Keys, load_keys, save_keys
-from jawusd.formats.poses import read_parameters, read_poses, table_columns, write_parameters, write_poses
+from jawusd.formats.poses import read_parameters, read_poses, write_parameters, write_poses
 from jawusd.geometry import se3_exp, wxyz_from_matrix
 
 T = se3_exp(np.random.default_rng(0).normal(size=(4, 6)) * [0.2, 0.2, 0.2, 5, 5, 5])
@@ -33,7 +33,6 @@ def test_parameters_round_trip(tmp_path):
     d = np.random.default_rng(1).normal(size=(4, 3))
     write_parameters(tmp_path / "d.csv", FRAMES, d)
     np.testing.assert_array_equal(read_parameters(tmp_path / "d.csv")[1], d)
-    assert table_columns(tmp_path / "d.csv") == ("frame", "d1", "d2", "d3")
 
 
 @pytest.mark.parametrize(
@@ -41,7 +40,7 @@ def test_parameters_round_trip(tmp_path):
     [
         ("", "empty"),
         ("frame,d1,d2,d3\n1,2,3\n", "line 2 has 3 values"),
-        ("frame,d1,d2,d3\n1,2,nan,4\n", 'row 1, column "d2" is nan'),
+        ("frame,d1,d2,d3\n1,2,nan,4\n", 'line 2, column "d2" is nan'),
         ("frame,d1,d2,d3\n1,2,inf,4\n", "finite"),
         ("frame,d1,d2,d3\n1,2,x,4\n", '"x" is not a number'),
         ("frame,d1,d2\n1,2,3\n", 'no column "d3"'),
@@ -60,7 +59,7 @@ def test_poses_that_are_not_rigid_are_refused_with_their_row(tmp_path):
     scaled = T.copy()
     scaled[2, :3, :3] *= 1.1
     write_poses(tmp_path / "p.csv", FRAMES, scaled)
-    with pytest.raises(FormatError, match="row 3"):
+    with pytest.raises(FormatError, match="line 4"):
         read_poses(tmp_path / "p.csv")
     (tmp_path / "q.csv").write_text("frame,tx,ty,tz,qw,qx,qy,qz\n1,0,0,0,0,0,0,0\n")
     with pytest.raises(FormatError, match="quaternion is zero"):
