@@ -18,8 +18,10 @@ import numpy as np
 
 from jawusd.evaluator.curve_formula import catmull_rom
 from jawusd.evaluator.curves import HermiteCurve
+from jawusd.evaluator.formula import BoundFormula
 from jawusd.geometry.arrays import Array
 
+_ARRAYS = ("slice_d1", "slice_directions", "slice_support", "slice_softness_mm", "slice_margin_mm")
 _NEWTON_ITERATIONS = 60
 _ROOT_TOLERANCE_MM = 1e-12
 _CANDIDATE_SLICES = 48
@@ -36,6 +38,7 @@ class SliceHull:
         softness_mm: Radius of the rounding where half-spaces meet.
         offset_mm: Distance by which the bound is wider than its supports.
         slopes: Derivatives of the half-spaces by d, those of the sides by d1 left 0, shape (K + 2, 3).
+        formula: The same bound for one d, in floats.
         first_mm: First captured opening.
         last_mm: Last captured opening.
     """
@@ -44,6 +47,7 @@ class SliceHull:
     directions: Array
     softness_mm: float
     offset_mm: float
+    formula: BoundFormula
     slopes: Array = field(init=False, repr=False)
     first_mm: float = field(init=False, repr=False)
     last_mm: float = field(init=False, repr=False)
@@ -69,6 +73,7 @@ class SliceHull:
             directions=np.asarray(arrays["slice_directions"], dtype=float),
             softness_mm=float(arrays["slice_softness_mm"]),
             offset_mm=float(arrays["slice_margin_mm"]),
+            formula=BoundFormula({name: np.ravel(arrays[name]).tolist() for name in _ARRAYS}),
         )
 
     def signed_distance(self, d: Array) -> Array:

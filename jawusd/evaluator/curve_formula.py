@@ -64,6 +64,25 @@ def curve_tables(name: str, knots: Sequence[float], values: Rows, slopes: Rows) 
 
 def curve(name: str, x: N, tables: Mapping[str, Table], ops: Operations[N, Table]) -> list[N]:
     """Return the point at x of the curve of `curve_tables`, a row."""
+    s, powers = _interval(name, x, tables, ops)
+    return [((c3 * s + c2) * s + c1) * s + c0 for c0, c1, c2, c3 in zip(*powers)]
+
+
+def curve_derivatives(
+    name: str, x: N, tables: Mapping[str, Table], ops: Operations[N, Table]
+) -> tuple[list[N], list[N], list[N]]:
+    """Return the point of `curve` at x, its derivative and its second derivative, a row each."""
+    s, (c0, c1, c2, c3) = _interval(name, x, tables, ops)
+    return (
+        [((d * s + c) * s + b) * s + a for a, b, c, d in zip(c0, c1, c2, c3)],
+        [(3.0 * d * s + 2.0 * c) * s + b for b, c, d in zip(c1, c2, c3)],
+        [6.0 * d * s + 2.0 * c for c, d in zip(c2, c3)],
+    )
+
+
+def _interval(
+    name: str, x: N, tables: Mapping[str, Table], ops: Operations[N, Table]
+) -> tuple[N, Sequence[Sequence[N]]]:
+    """Return how far x lies beyond the start of its interval, and the powers 0..3 of the curve there."""
     found = ops.lookup(x, tables[f"{name}_knot"], [tables[f"{name}_{part}"] for part in _CURVE_TABLES])
-    s = x - found[0][0]
-    return [((c3 * s + c2) * s + c1) * s + c0 for c0, c1, c2, c3 in zip(*found[1:])]
+    return x - found[0][0], found[1:]

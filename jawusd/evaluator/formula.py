@@ -357,3 +357,15 @@ class BoundFormula:
         sides = [d2 * x + d3 * y - h for x, y, h in zip(*ops.columns(tables["directions"]), supports)]
         terms = [x / softness_mm for x in (*sides, first_mm - d1, d1 - last_mm)]
         return offset_mm - softness_mm * ops.log_sum_exp(terms)
+
+    def middle(self, d1: float) -> tuple[float, float]:
+        """Return d2, d3 [mm] in the middle of the section at an opening d1 [mm]: the point with the most even supports.
+
+        For directions spread evenly it is the section's Steiner point, which lies inside.
+        """
+        reach = curve("support", d1, self.tables, FloatOperations())
+        xx = xy = yy = hx = hy = 0.0
+        for (x, y), h in zip(self.tables["directions"], reach):
+            xx, xy, yy, hx, hy = xx + x * x, xy + x * y, yy + y * y, hx + h * x, hy + h * y
+        scale = 1.0 / (xx * yy - xy * xy)
+        return scale * (yy * hx - xy * hy), scale * (xx * hy - xy * hx)

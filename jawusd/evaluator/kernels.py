@@ -16,7 +16,8 @@ from jawusd.evaluator.distances import distance_residual, landmark_vectors
 from jawusd.evaluator.encoding import Encoder
 from jawusd.evaluator.frames import RigFrames
 from jawusd.evaluator.models import JawModelForm
-from jawusd.evaluator.nearest import least_in_valley, nearest_in_valley
+from jawusd.evaluator.nearest import Pull, Vector, lowest_in_valley, nearest_in_valley
+from jawusd.evaluator.operations import triple
 from jawusd.evaluator.solver import Residual, minimise
 from jawusd.evaluator.verdicts import RIGID_TOLERANCE, Limits, Verdicts, judge
 from jawusd.geometry.arrays import Array, Indices
@@ -166,7 +167,8 @@ class NumpyKernels:
     def approach(self, wanted: Array, start: Array) -> tuple[Array, Array]:
         """Return the points (n, 3) [mm] inside nearest to those wanted, and the squared distances (n,)."""
         if len(start) <= _FEW_ROWS:
-            each = [nearest_in_valley(self._bound, *row) for row in zip(wanted, start)]
+            pairs = zip(wanted.tolist(), start.tolist())
+            each = [nearest_in_valley(self._bound.formula, triple(to), triple(x)) for to, x in pairs]
             found = np.array(each).reshape(-1, 3)
             return found, ((found - wanted) ** 2).sum(axis=1)
         identity = np.eye(3)
@@ -180,7 +182,14 @@ class NumpyKernels:
         """Return the d (n, 3) [mm] inside that carry vectors nearest to targets, and the squared distances (n,)."""
         if len(start) == 1:
             residual = distance_residual(self._model.decode_derivative, vectors, targets)
-            found = least_in_valley(self._bound, residual, start[0])[None]
+
+            def pull(x: Vector) -> Pull:
+                r, J = residual(np.array([x]), np.zeros(1, dtype=np.intp))
+                force, (first, second, third) = triple((-(r[0] @ J[0])).tolist()), (J[0].T @ J[0]).tolist()
+                stiffness = (first[0], first[1], first[2], second[1], second[2], third[2])
+                return Pull(float(r[0] @ r[0]), force, stiffness, (first[0] + second[1] + third[2]) / 3.0)
+
+            found = np.array([lowest_in_valley(self._bound.formula, pull, triple(start[0].tolist()))])
             r, _ = residual(found, np.arange(1))
             return found, np.einsum("nm,nm->n", r, r)
         return self._bottom(distance_residual(self._model.decode_derivative, vectors, targets), start)

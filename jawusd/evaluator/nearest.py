@@ -1,38 +1,42 @@
-"""One search inside the bound, step by step in small arrays: no detours over rows.
+"""One search inside the bound in plain floats: for one point, and for the single-file reader.
 
-It is that of `jawusd.evaluator.solver`. Towards a point, as the bound's second derivatives are known, a step takes all
-of them, and only where that leads nowhere the part that is never indefinite.
+The search is that of `jawusd.evaluator.solver`. Towards a point, as the bound's second derivatives are known, a step
+takes all of them, and only where that leads nowhere the part that is never indefinite.
+
+This file imports nothing but the standard library, `curve_formula`, `formula` and `operations`: it is copied into the
+reader, which runs in Python 3.9. Symmetric matrices are six numbers: xx, xy, xz, yy, yz, zz.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
+from jawusd.evaluator.curve_formula import curve_derivatives
+from jawusd.evaluator.formula import BoundFormula
+from jawusd.evaluator.operations import FloatOperations, triple
+from jawusd.geometry.rodrigues import Triple, dot
 
-from jawusd.evaluator.bounds import SliceHull
-from jawusd.evaluator.solver import (
-    INSIDE_MM,
-    ITERATIONS,
-    LARGEST_DAMPING,
-    LEAST_SLOPE,
-    LEAST_STIFFNESS,
-    LONGEST_STEP_MM,
-    PULL,
-    PULL_BACKS,
-    SMALLEST_DAMPING,
-    START_DAMPING,
-    TOLERANCE_MM,
-    TOUCHING_MM,
-    Residual,
-)
-from jawusd.geometry.arrays import Array, Indices
+ITERATIONS = 80
+TOLERANCE_MM = 1e-6
+START_DAMPING = 1e-6
+LARGEST_DAMPING = 1e8
+SMALLEST_DAMPING = 1e-9
+INSIDE_MM = 1e-10  # depth at which a point pulled back onto the surface is left
+LONGEST_STEP_MM = 1.0  # within a bound, where a longer one may land in another valley
+PULL_BACKS = 12
+PULL = 1.01  # a little more than the distance, so that one pull mostly does; what is lost vanishes with the steps
+LEAST_STIFFNESS = 1e-12  # keeps steps finite where nothing depends on a parameter
+LEAST_SLOPE = 1e-6  # squared; keeps pulls finite where the bound is flat
+TOUCHING_MM = 1e-3  # depth up to which a start counts as lying on the bound
 
-_IDENTITY = np.eye(3)
-_ONE_ROW: Indices = np.zeros(1, dtype=np.intp)
+Vector = Triple[float]
+Symmetric = tuple[float, float, float, float, float, float]
+
+_IDENTITY: Symmetric = (1.0, 0.0, 0.0, 1.0, 0.0, 1.0)
+_UNKNOWN: Vector = (math.nan, math.nan, math.nan)
+_FLOATS = FloatOperations()
 
 
 class Pull(NamedTuple):
@@ -40,106 +44,91 @@ class Pull(NamedTuple):
 
     Attributes:
         cost: The squared residual.
-        force: Half its derivative, downhill, shape (3,).
-        stiffness: J^T J of the residual's derivatives J, shape (3, 3).
+        force: Half its derivative, downhill.
+        stiffness: J^T J of the residual's derivatives J.
         scale: A third of the trace of that, which damping is relative to.
     """
 
     cost: float
-    force: Array
-    stiffness: Array
+    force: Vector
+    stiffness: Symmetric
     scale: float
 
 
-@dataclass(frozen=True, eq=False)
-class Place:
-    """The bound around a point.
+class Place(NamedTuple):
+    """The bound around a point: signed distance [mm], its gradient, and its Hessian [1/mm] in two parts.
 
     Attributes:
-        distance: Signed distance [mm].
-        gradient: Its derivative, shape (3,).
-        weights: Share of each half-space, shape (K + 2,).
-        slopes: Derivative of each half-space, shape (K + 2, 3).
-        bends: Second derivatives of the supports by d1, shape (K,) [1/mm].
+        distance: Signed distance [mm], negative inside.
+        gradient: Its derivative.
+        rounding: The Hessian's part from the rounding, never indefinite.
+        bend: What the bending of the supports along d1 takes from the Hessian's first entry.
     """
 
     distance: float
-    gradient: Array
-    weights: Array
-    slopes: Array
-    bends: Array
+    gradient: Vector
+    rounding: Symmetric
+    bend: float
 
 
-def place(bound: SliceHull, d: Array) -> Place:
-    """Return the bound around one d (3,) [mm], as `SliceHull.signed_distance_curvature` has it for rows."""
-    d1, d2, d3 = d.tolist()
-    curve = bound.supports
-    interval = curve.knots.searchsorted(d1, side="right")
-    t = d1 - float(curve.starts[interval])
-    powers = np.array([(1.0, t, t * t, t * t * t), (0.0, 1.0, 2 * t, 3 * t * t), (0.0, 0.0, 2.0, 6 * t)])
-    reach, rises, bends = powers @ curve.coefficients[interval]
-    slopes = bound.slopes.copy()
-    slopes[:-2, 0] = -rises
-    v = np.empty(len(slopes))
-    v[:-2] = bound.directions @ (d2, d3) - reach
-    v[-2:] = bound.first_mm - d1, d1 - bound.last_mm
-    peak = v.max()
-    weights = np.exp((v - peak) / bound.softness_mm)
-    total = weights.sum()
-    weights /= total
-    distance = float(peak) + bound.softness_mm * math.log(total) - bound.offset_mm
-    return Place(distance, weights @ slopes, weights, slopes, bends)
+def place(bound: BoundFormula, d: Vector) -> Place:
+    """Return the bound around d [mm]."""
+    d1, d2, d3 = d
+    first_mm, last_mm, softness_mm, offset_mm = bound.numbers
+    reach, rises, bends = curve_derivatives("support", d1, bound.tables, _FLOATS)
+    sides = [
+        (d2 * x + d3 * y - h, -rise, x, y, bend)
+        for (x, y), h, rise, bend in zip(bound.tables["directions"], reach, rises, bends)
+    ]
+    sides += [(first_mm - d1, -1.0, 0.0, 0.0, 0.0), (d1 - last_mm, 1.0, 0.0, 0.0, 0.0)]
+    peak = max(side[0] for side in sides)
+    total = gx = gy = gz = xx = xy = xz = yy = yz = zz = bend_sum = 0.0
+    for v, x, y, z, bend in sides:
+        weight = math.exp((v - peak) / softness_mm)
+        wx, wy, wz = weight * x, weight * y, weight * z
+        total, gx, gy, gz, bend_sum = total + weight, gx + wx, gy + wy, gz + wz, bend_sum + weight * bend
+        xx, xy, xz, yy, yz, zz = xx + wx * x, xy + wx * y, xz + wx * z, yy + wy * y, yz + wy * z, zz + wz * z
+    g = gx, gy, gz = gx / total, gy / total, gz / total
+    squares = zip((xx, xy, xz, yy, yz, zz), (gx * gx, gx * gy, gx * gz, gy * gy, gy * gz, gz * gz))
+    xx, xy, xz, yy, yz, zz = ((moment / total - square) / softness_mm for moment, square in squares)
+    distance = peak + softness_mm * math.log(total) - offset_mm
+    return Place(distance, g, (xx, xy, xz, yy, yz, zz), bend_sum / total)
 
 
-def nearest_in_valley(bound: SliceHull, wanted: Array, start: Array) -> Array:
-    """Return the point (3,) [mm] inside nearest to one wanted (3,), in the valley that a start inside (3,) lies in."""
+def nearest_in_valley(bound: BoundFormula, wanted: Vector, start: Vector) -> Vector:
+    """Return the point [mm] inside nearest to one wanted, in the valley that a start inside lies in."""
 
-    def pull(x: Array) -> Pull:
-        away = wanted - x
-        return Pull(_squared(away), away, _IDENTITY, 1.0)
+    def pull(x: Vector) -> Pull:
+        away = (wanted[0] - x[0], wanted[1] - x[1], wanted[2] - x[2])
+        return Pull(dot(away, away), away, _IDENTITY, 1.0)
 
-    return _bottom(bound, pull, start, bent=True)
-
-
-def least_in_valley(bound: SliceHull, residual: Residual, start: Array) -> Array:
-    """Return the point (3,) [mm] inside of least squared residual, in the valley that a start inside (3,) lies in.
-
-    Args:
-        bound: The bound.
-        residual: Of one row, its number 0.
-        start: Where to start; NaN comes back where the residual there is.
-    """
-
-    def pull(x: Array) -> Pull:
-        r, J = residual(x[None], _ONE_ROW)
-        stiffness = J[0].T @ J[0]
-        return Pull(_squared(r[0]), -(r[0] @ J[0]), stiffness, float(stiffness.trace()) / 3.0)
-
-    return _bottom(bound, pull, start, bent=False)
+    return lowest_in_valley(bound, pull, start, exact=True)
 
 
-def _bottom(bound: SliceHull, pull: Callable[[Array], Pull], start: Array, *, bent: bool) -> Array:
-    """Return where the cost of a pull is least, shape (3,), in the valley that a start inside (3,) lies in.
+def lowest_in_valley(
+    bound: BoundFormula, pull: Callable[[Vector], Pull], start: Vector, *, exact: bool = False
+) -> Vector:
+    """Return where the cost of a pull is least inside the bound, in the valley that a start inside [mm] lies in.
 
     Args:
         bound: The bound.
         pull: The cost and its model at a point.
-        start: Where to start.
-        bent: Whether the model is exact, so that steps gain by all second derivatives of the bound.
+        start: Where to start; NaN comes back where it or the cost there is not finite.
+        exact: Whether the model is exact, so that steps gain by all second derivatives of the bound.
     """
-    if not math.isfinite(start[0]):
-        return np.full(3, np.nan)
+    if not math.isfinite(sum(start)):
+        return _UNKNOWN
     x, at, now = start, place(bound, start), pull(start)
     if not math.isfinite(now.cost):
-        return np.full(3, np.nan)
-    damping, multiplier, exact = START_DAMPING, 0.0, bent
+        return _UNKNOWN
+    damping, multiplier, bent = START_DAMPING, 0.0, exact
     if at.distance > -TOUCHING_MM:
-        multiplier = max(float(at.gradient @ now.force) / max(_squared(at.gradient), LEAST_SLOPE), 0.0)
+        multiplier = max(dot(at.gradient, now.force) / max(dot(at.gradient, at.gradient), LEAST_SLOPE), 0.0)
     for _ in range(ITERATIONS):
-        step, multiplier = _step(at, now, multiplier, damping, bound.softness_mm, bent=bent)
-        if not max(map(abs, step.tolist())) > TOLERANCE_MM or damping >= LARGEST_DAMPING:
+        step, multiplier = _step(at, now, multiplier, damping, bent=bent)
+        if not max(map(abs, step)) > TOLERANCE_MM or damping >= LARGEST_DAMPING:
             break
-        trial, there = _pulled_inside(bound, x + step)
+        trial, there = pulled_in(bound, _moved(x, 1.0, step))
         then = pull(trial)
         if there.distance <= 0 and then.cost <= now.cost:
             x, at, now, bent, damping = trial, there, then, exact, max(0.1 * damping, SMALLEST_DAMPING)
@@ -150,47 +139,52 @@ def _bottom(bound: SliceHull, pull: Callable[[Array], Pull], start: Array, *, be
     return x
 
 
-def _step(
-    at: Place, now: Pull, multiplier: float, damping: float, softness_mm: float, *, bent: bool
-) -> tuple[Array, float]:
-    """Return the step (3,) of the quadratic model under the linearised bound, and the bound's multiplier."""
-    A = now.stiffness + (damping * now.scale + LEAST_STIFFNESS) * _IDENTITY
-    if multiplier > 0:
-        spread = (at.slopes.T * at.weights) @ at.slopes - np.multiply.outer(at.gradient, at.gradient)
-        A += (multiplier / softness_mm) * spread
-    inverse = _inverse(A)
-    free, inward, first = inverse @ now.force, inverse @ at.gradient, inverse[0]
-    bend = multiplier * float(at.weights[:-2] @ at.bends)
-    left = 1.0 - bend * float(first[0])
-    if bent and left > 0:  # then A less the bend, in its first entry, is definite too (Sherman and Morrison 1950)
-        free = free + (bend * float(free[0]) / left) * first
-        inward = inward + (bend * float(inward[0]) / left) * first
-    over, yields = at.distance + float(at.gradient @ free), float(at.gradient @ inward)
-    multiplier = over / yields if over > 0 and yields > 0 else 0.0
-    step = free - multiplier * inward
-    return step * min(1.0, LONGEST_STEP_MM / max(math.sqrt(_squared(step)), 1e-300)), multiplier
+def pulled_in(bound: BoundFormula, x: Vector, *, opening: float = 1.0) -> tuple[Vector, Place]:
+    """Return a point [mm] moved down the gradient until just inside, and the bound around it.
 
-
-def _inverse(A: Array) -> Array:
-    """Return the inverse of a symmetric matrix (3, 3) that is definite, by cofactors: a third of the time of LAPACK."""
-    (a, p, q), (_, c, s), (_, _, f) = A.tolist()
-    x, y, z = c * f - s * s, q * s - p * f, p * s - q * c
-    scale = 1.0 / ((a * x + p * y + q * z) or 1.0)  # a finite step even where A is singular; damping mends it
-    x, y, z = x * scale, y * scale, z * scale
-    v, w = (p * q - a * s) * scale, (a * c - p * p) * scale
-    return np.array(((x, y, z), (y, (a * f - q * q) * scale, v), (z, v, w)))
-
-
-def _pulled_inside(bound: SliceHull, x: Array) -> tuple[Array, Place]:
-    """Return a point (3,) moved down the gradient until just inside, and the bound around it."""
+    Args:
+        bound: The bound.
+        x: The point.
+        opening: Share of the gradient by d1 that is followed; with 0 the point keeps its opening.
+    """
     at = place(bound, x)
     for _ in range(PULL_BACKS):
         if at.distance <= 0:
             break
-        x = x - (PULL * at.distance + INSIDE_MM) / max(_squared(at.gradient), LEAST_SLOPE) * at.gradient
+        slope = (opening * at.gradient[0], at.gradient[1], at.gradient[2])
+        x = _moved(x, -(PULL * at.distance + INSIDE_MM) / max(dot(slope, slope), LEAST_SLOPE), slope)
         at = place(bound, x)
     return x, at
 
 
-def _squared(x: Array) -> float:
-    return float(x @ x)
+def _step(at: Place, now: Pull, multiplier: float, damping: float, *, bent: bool) -> tuple[Vector, float]:
+    """Return the step of the quadratic model under the linearised bound, and the bound's multiplier."""
+    ease = damping * now.scale + LEAST_STIFFNESS
+    a, p, q, c, s, f = (k + multiplier * r for k, r in zip(now.stiffness, at.rounding))
+    rows = _inverse((a + ease, p, q, c + ease, s, f + ease))
+    free, inward = (triple([dot(row, v) for row in rows]) for v in (now.force, at.gradient))
+    first = rows[0]
+    bend = multiplier * at.bend
+    left = 1.0 - bend * first[0]
+    if bent and left > 0:  # then A less the bend, in its first entry, is definite too (Sherman and Morrison 1950)
+        free = _moved(free, bend * free[0] / left, first)
+        inward = _moved(inward, bend * inward[0] / left, first)
+    over, yields = at.distance + dot(at.gradient, free), dot(at.gradient, inward)
+    multiplier = over / yields if over > 0 and yields > 0 else 0.0
+    step = _moved(free, -multiplier, inward)
+    shorter = min(1.0, LONGEST_STEP_MM / max(math.sqrt(dot(step, step)), 1e-300))
+    return (step[0] * shorter, step[1] * shorter, step[2] * shorter), multiplier
+
+
+def _inverse(matrix: Symmetric) -> tuple[Vector, Vector, Vector]:
+    """Return the rows of the inverse of a definite symmetric matrix, by cofactors."""
+    a, p, q, c, s, f = matrix
+    x, y, z = c * f - s * s, q * s - p * f, p * s - q * c
+    scale = 1.0 / ((a * x + p * y + q * z) or 1.0)  # a finite step even where A is singular; damping corrects it
+    x, y, z = x * scale, y * scale, z * scale
+    v, w = (p * q - a * s) * scale, (a * c - p * p) * scale
+    return (x, y, z), (y, (a * f - q * q) * scale, v), (z, v, w)
+
+
+def _moved(x: Vector, share: float, along: Vector) -> Vector:
+    return x[0] + share * along[0], x[1] + share * along[1], x[2] + share * along[2]

@@ -12,23 +12,25 @@ from typing import Protocol
 
 import numpy as np
 
+from jawusd.evaluator.nearest import (
+    INSIDE_MM,
+    ITERATIONS,
+    LARGEST_DAMPING,
+    LEAST_SLOPE,
+    LEAST_STIFFNESS,
+    LONGEST_STEP_MM,
+    PULL,
+    PULL_BACKS,
+    SMALLEST_DAMPING,
+    START_DAMPING,
+    TOLERANCE_MM,
+    TOUCHING_MM,
+)
 from jawusd.geometry.arrays import Array, Indices, Mask
 
 # (x (k, 3), row numbers (k,)) -> residuals (k, m) and their derivatives by x (k, m, 3)
 Residual = Callable[[Array, Indices], tuple[Array, Array]]
 
-ITERATIONS = 80
-TOLERANCE_MM = 1e-6
-START_DAMPING = 1e-6
-LARGEST_DAMPING = 1e8
-SMALLEST_DAMPING = 1e-9
-INSIDE_MM = 1e-10  # depth at which a point pulled back onto the surface is left
-LONGEST_STEP_MM = 1.0  # within a bound, where a longer one may land in another valley
-PULL_BACKS = 12
-PULL = 1.01  # a little more than the distance, so that one pull mostly does; what is lost vanishes with the steps
-LEAST_STIFFNESS = 1e-12  # keeps steps finite where nothing depends on a parameter
-LEAST_SLOPE = 1e-6  # squared; keeps pulls finite where the bound is flat
-TOUCHING_MM = 1e-3  # depth up to which a start counts as lying on the bound
 _IDENTITY = np.eye(3)
 
 

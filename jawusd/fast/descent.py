@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jawusd.evaluator.solver import (
+from jawusd.evaluator.nearest import (
     INSIDE_MM,
     ITERATIONS,
     LARGEST_DAMPING,

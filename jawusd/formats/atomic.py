@@ -7,7 +7,7 @@ import io
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -117,20 +117,20 @@ def write_text_atomic(path: str | os.PathLike[str], text: str) -> None:
     write_bytes_atomic(path, text.encode())
 
 
-def write_npz_atomic(path: str | os.PathLike[str], arrays: dict[str, ArrayLike]) -> None:
-    """Write a compressed npz atomically, byte for byte the same for the same arrays.
+def write_npz_atomic(path: str | os.PathLike[str], arrays: Mapping[str, ArrayLike], *, packed: bool = True) -> None:
+    """Write an npz atomically, compressed unless it must be quick, byte for byte the same for the same arrays.
+
+    Every array is written row by row: simple readers take no other order.
 
     Raises:
         OutputError: the file cannot be written.
         ValueError: an array would need a pickle.
     """
     buffer = io.BytesIO()
-    checked: dict[str, ArrayLike] = {}
-    for name, value in arrays.items():
-        array = np.asarray(value)
+    rows = {name: np.asarray(value, order="C") for name, value in arrays.items()}
+    for name, array in rows.items():
         if array.dtype.hasobject:
             raise ValueError(f"{name} holds Python objects; files carry plain arrays only")
-        checked[name] = array
     # numpy stamps every member with 1980-01-01, so equal content gives equal bytes.
-    np.savez_compressed(buffer, allow_pickle=False, **checked)
+    (np.savez_compressed if packed else np.savez)(buffer, allow_pickle=False, **rows)
     write_bytes_atomic(path, buffer.getvalue())

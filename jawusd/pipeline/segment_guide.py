@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jawusd.errors import JawusdError
-from jawusd.formats.atomic import write_bytes_atomic
+from jawusd.formats.atomic import write_npz_atomic
 from jawusd.formats.capture import Capture
 from jawusd.formats.finding import Finding
 from jawusd.formats.tracks import Tracks
@@ -45,9 +44,7 @@ def save_guide(folder: Path, inputs: str, guide: Mapping[int, RegionPose]) -> No
         "found": np.stack([guide[frame].found for frame in frames]),
         "covariance": np.stack([guide[frame].covariance for frame in frames]),
     }
-    buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **arrays)
-    write_bytes_atomic(folder / GUIDE, buffer.getvalue())
+    write_npz_atomic(folder / GUIDE, arrays, packed=False)
 
 
 def known_guide(folder: Path, inputs: str) -> dict[int, RegionPose]:

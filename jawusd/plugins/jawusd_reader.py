@@ -9,6 +9,7 @@
     translation, wxyz = jawusd_reader.decompose(T)
     rig.margin(20.0, 3.0, 0.5)               # signed distance to the bound [mm], > 0 inside
     rig.is_inside(20.0, 3.0, 0.5)            # True: a margin of 0 or more
+    rig.project(20.0, 7.6, 9.2)              # the nearest (d1, d2, d3) inside the bound
     rig.ranges(20.0)                         # ((d2 min, d2 max), (d3 min, d3 max)) for sliders
 """
 
@@ -21,10 +22,12 @@ import os
 import struct
 import sys
 import zipfile
+import zlib
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from jawusd.evaluator.formula import MODELS, ON_BOUND_MM, BoundFormula
+from jawusd.evaluator.nearest import nearest_in_valley, pulled_in
 from jawusd.evaluator.operations import FloatOperations, Rows, rows
 from jawusd.evaluator.schema import D_RANGE_ATTRIBUTES, GLIDE_ARRAYS, arrays_of
 from jawusd.geometry.rodrigues import Triple
@@ -40,6 +43,11 @@ LABELS = ("Opening [mm]", "Laterotrusion [mm], + left", "Protrusion [mm], + forw
 
 _NOT_NEEDED = ("codes", "polygon_", "residual_limit_mm", "tolerance_mm")
 _SEARCH_STEPS = 60
+_SLICES = 48  # openings at which a search for the nearest d starts
+_CODES = {
+    "f2": "e", "f4": "f", "f8": "d", "b1": "?", "i1": "b", "i2": "h", "i4": "i", "i8": "q",
+    "u1": "B", "u2": "H", "u4": "I", "u8": "Q",
+}  # fmt: skip
 _OPERATIONS = FloatOperations()
 
 
@@ -60,10 +68,13 @@ def load(path: str, prim_path: str | None = None) -> Rig:
     if str(path).endswith(".npz"):
         return _from_npz(str(path))
     try:
-        from pxr import Usd
+        from pxr import Tf, Usd
     except ImportError:
         raise ReaderError("reading USD needs the pxr modules; without them, load model.npz") from None
-    stage = Usd.Stage.Open(str(path))
+    try:
+        stage = Usd.Stage.Open(str(path))
+    except Tf.ErrorException as error:
+        raise ReaderError(f"{path} cannot be opened ({error})") from None
     if prim_path is not None:
         return from_prim(stage.GetPrimAtPath(prim_path))
     prims = find_rigs(stage)
@@ -134,11 +145,15 @@ def _check_version(version: object) -> None:
 
 
 def _from_npz(path: str) -> Rig:
-    with zipfile.ZipFile(path) as archive:
-        raw = {name[:-4]: archive.read(name) for name in archive.namelist()}
-    if "meta" not in raw:
-        raise ReaderError(f"{path} has no meta: no jaw model")
-    meta = json.loads(_npy(raw["meta"])[1].decode("utf-32-le").rstrip("\0"))
+    try:
+        with zipfile.ZipFile(path) as archive:
+            raw = {name[:-4]: archive.read(name) for name in archive.namelist() if name.endswith(".npy")}
+        if "meta" not in raw:
+            raise ReaderError(f"{path} has no meta: no jaw model")
+        (text,) = _npy("meta", raw["meta"])
+        meta = json.loads(str(text))
+    except (zipfile.BadZipFile, zlib.error, RuntimeError, EOFError, ValueError) as error:
+        raise ReaderError(f"{path} is no jaw model, or damaged ({error})") from None
     family, _, version = str(meta.get("format")).partition("/")
     if family != "jawusd-model":
         raise ReaderError(f"{path} is of format {meta.get('format')}, expected jawusd-model")
@@ -147,26 +162,41 @@ def _from_npz(path: str) -> Rig:
     for name in _attributes_of(meta.get("kind"), "glide_d2" in raw):
         if name not in raw:
             raise ReaderError(f"{path} has no array {name}")
-        arrays[name] = _numbers(*_npy(raw[name]))
+        arrays[name] = [float(x) for x in _npy(name, raw[name])]
     return Rig(meta["kind"], arrays)
 
 
-def _npy(data: bytes) -> tuple[str, bytes]:
-    """Return type and bytes of a .npy file in C order (numpy/lib/format.py)."""
-    long_header = data[6] > 1
-    start = 12 if long_header else 10
-    (length,) = struct.unpack("<I" if long_header else "<H", data[8:start])
-    header = ast.literal_eval(data[start : start + length].decode("latin1"))
-    if header["descr"][0] not in "<|" or header["fortran_order"]:
-        raise ReaderError(f"arrays like {header} are not read")
-    return header["descr"][1:], data[start + length :]
+def _npy(name: str, data: bytes) -> Sequence[float | str]:
+    """Return the values of a .npy file, row by row (numpy/lib/format.py: versions 1 to 3, any order and byte order).
+
+    Raises:
+        ReaderError: It is damaged, or holds neither numbers nor one text.
+    """
+    try:
+        if data[:6] != b"\x93NUMPY":
+            raise ValueError("it does not begin as a .npy file")
+        long_header = data[6] > 1
+        start = 12 if long_header else 10
+        (length,) = struct.unpack("<I" if long_header else "<H", data[8:start])
+        header = ast.literal_eval(data[start : start + length].decode("utf-8" if data[6] > 2 else "latin1"))
+        descr, shape, body = header["descr"], header["shape"], data[start + length :]
+        order = ">" if descr[0] == ">" else "<"
+        if descr[1] == "U":
+            return [body[: 4 * int(descr[2:])].decode("utf-32-be" if order == ">" else "utf-32-le").rstrip("\0")]
+        if descr[1:] not in _CODES:
+            raise ValueError(f"type {descr}")
+        values = struct.unpack(f"{order}{math.prod(shape)}{_CODES[descr[1:]]}", body)
+    except (ValueError, SyntaxError, LookupError, TypeError, struct.error) as error:
+        raise ReaderError(f"array {name} cannot be read ({error})") from None
+    return _by_rows(values, shape) if header["fortran_order"] else values
 
 
-def _numbers(descr: str, body: bytes) -> list[float]:
-    code = {"f8": "d", "f4": "f", "i8": "q", "i4": "i"}.get(descr)
-    if code is None:
-        raise ReaderError(f"arrays of type {descr} are not read")
-    return [float(x) for x in struct.unpack(f"<{len(body) // int(descr[1:])}{code}", body)]
+def _by_rows(values: Sequence[float], shape: Sequence[int]) -> Sequence[float]:
+    """Return the values of an array in the order of rows, given in the order of columns."""
+    places, step = [0], 1
+    for count in shape:
+        places, step = [place + i * step for place in places for i in range(count)], step * count
+    return [values[place] for place in places]
 
 
 class Rig:
@@ -188,6 +218,10 @@ class Rig:
         A = rows(arrays["T_anatomical_skull"], 4)
         self.matrices = (_rigid_inverse(A), _product(A, rows(arrays["T_rest"], 4)))
         self.formula, self._bound = MODELS[kind](arrays), BoundFormula(arrays)
+        first_mm, last_mm, softness_mm, offset_mm = self._bound.numbers
+        beyond = offset_mm - softness_mm  # the rounded ends reach about so far
+        self._spacing_mm = (last_mm - first_mm + 2.0 * beyond) / _SLICES
+        self._openings = [first_mm - beyond + (i + 0.5) * self._spacing_mm for i in range(_SLICES)]
 
     def to_json(self) -> str:
         """Return the rig as text, to be stored inside a scene; `from_json` reads it."""
@@ -208,6 +242,34 @@ class Rig:
     def is_inside(self, d1: float, d2: float, d3: float) -> bool:
         """Tell whether jaw parameters [mm] lie inside the bound: a margin of 0 or more, up to rounding of 1e-6 mm."""
         return self.margin(d1, d2, d3) >= -ON_BOUND_MM
+
+    def project(self, d1: float, d2: float, d3: float) -> Triple[float]:
+        """Return the nearest jaw parameters [mm] inside the bound, d itself where it is; NaN for what is not finite.
+
+        Searched from every opening that may be nearer than the nearest point found so far.
+
+        Raises:
+            ReaderError: The bound is empty.
+        """
+        d = (d1, d2, d3)
+        if not all(map(math.isfinite, d)):
+            return (math.nan, math.nan, math.nan)
+        if self.margin(*d) >= 0.0:
+            return d
+        best, least = None, math.inf
+        for opening in sorted(self._openings, key=lambda opening: abs(opening - d1)):
+            if abs(opening - d1) - self._spacing_mm >= least:
+                break
+            start, at = pulled_in(self._bound, (opening, d2, d3), opening=0.0)
+            if at.distance > 0:
+                start, at = pulled_in(self._bound, (opening, *self._bound.middle(opening)))
+            if at.distance <= 0:
+                found = nearest_in_valley(self._bound, d, start)
+                if (distance := math.dist(found, d)) < least:
+                    best, least = found, distance
+        if best is None:
+            raise ReaderError("the bound of this rig leaves no valid jaw parameters")
+        return best
 
     def ranges(self, d1: float, d2: float = 0.0, d3: float = 0.0) -> tuple[Pair, Pair]:
         """Return the valid (min, max) of d2 through d3, and of d3 through d2, at d1 [mm]; (nan, nan) where none is.

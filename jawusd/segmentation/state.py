@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jawusd.formats.atomic import write_bytes_atomic
+from jawusd.formats.atomic import write_npz_atomic
 from jawusd.geometry.arrays import Array
 from jawusd.npz import DAMAGED
 from jawusd.segmentation.colours import ColourModel
@@ -34,9 +34,7 @@ class ColourStates:
         arrays: dict[str, ArrayLike] = {"frame": frame, "step": step}
         for name, model in self._colours.items():
             arrays[f"seen {name}"], arrays[f"counts {name}"] = model.counts()
-        buffer = io.BytesIO()
-        np.savez(buffer, allow_pickle=False, **arrays)
-        write_bytes_atomic(self._folder / _FILES[frame % 2], buffer.getvalue())
+        write_npz_atomic(self._folder / _FILES[frame % 2], arrays, packed=False)
 
     def take_up(self, done: int, step: int) -> int | None:
         """Restore the latest colours saved up to a frame that is done; step is 1 or -1, forwards or backwards.

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from jawusd.evaluator.solver import ITERATIONS, LARGEST_DAMPING, LEAST_STIFFNESS, SMALLEST_DAMPING, START_DAMPING
+from jawusd.evaluator.nearest import ITERATIONS, LARGEST_DAMPING, LEAST_STIFFNESS, SMALLEST_DAMPING, START_DAMPING
 from jawusd.solvers.charts import Chart
 from jawusd.solvers.solution import applied, capturing, finished, inverse
 

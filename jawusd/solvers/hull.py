@@ -12,10 +12,9 @@ from torch import Tensor
 from jawusd.errors import EvaluatorError
 from jawusd.evaluator.arrays import flat_arrays
 from jawusd.evaluator.bounds import SliceHull
-from jawusd.evaluator.curve_formula import curve
+from jawusd.evaluator.curve_formula import curve, curve_derivatives
 from jawusd.evaluator.formula import BoundFormula
-from jawusd.evaluator.operations import triple
-from jawusd.evaluator.solver import (
+from jawusd.evaluator.nearest import (
     INSIDE_MM,
     ITERATIONS,
     LARGEST_DAMPING,
@@ -26,6 +25,7 @@ from jawusd.evaluator.solver import (
     SMALLEST_DAMPING,
     TOLERANCE_MM,
 )
+from jawusd.evaluator.operations import triple
 from jawusd.geometry.arrays import Array
 from jawusd.solvers.motion import OPERATIONS, Formula
 from jawusd.solvers.solution import applied, capturing, finished, inverse
@@ -97,18 +97,14 @@ class Hull(Formula):
         As in `jawusd.evaluator.bounds`: the sides first, with their second derivatives by d1, then both ends.
         """
         first, last, softness, offset = self.singles.unbind()
-        parts = [self.get_buffer(f"support_{part}") for part in ("start", "power0", "power1", "power2", "power3")]
-        found = OPERATIONS.lookup(d[:, :1], self.get_buffer("support_knot"), parts)
-        (start,), (c0,), (c1,), (c2,), (c3,) = found
-        s = d[:, :1] - start
-        reach, reach_1 = ((c3 * s + c2) * s + c1) * s + c0, (3.0 * c3 * s + 2.0 * c2) * s + c1
+        (reach,), (reach_1,), (reach_11,) = curve_derivatives("support", d[:, :1], self.tables(), OPERATIONS)
         v = torch.cat([d[:, 1:] @ self.directions.T - reach, first - d[:, :1], d[:, :1] - last], dim=1) / softness
-        end = torch.ones_like(s)
+        end = torch.ones_like(d[:, :1])
         along = torch.cat([-reach_1, -end, end], dim=1)
         across = torch.nn.functional.pad(self.directions, (0, 0, 0, 2)).expand(d.shape[0], -1, -1)
         slopes = torch.cat([along[..., None], across], dim=2)
         distance = softness * torch.logsumexp(v, dim=1) - offset
-        return distance, torch.softmax(v, dim=1), slopes, 6.0 * c3 * s + 2.0 * c2
+        return distance, torch.softmax(v, dim=1), slopes, reach_11
 
     def most(self, d: Tensor) -> Tensor:
         """Return a number (n,) [mm] that no margin in the section of d (n, 3) exceeds.

@@ -30,15 +30,14 @@ def test_the_bound_around_a_point_is_that_of_rows(rig):
     d, h = around(rig, 60), 1e-4
     distance, gradient = rig.bound.signed_distance_gradient(d)
     for i, row in enumerate(d):
-        at = place(rig.bound, row)
+        at = place(rig.bound.formula, tuple(row.tolist()))
         assert at.distance == pytest.approx(distance[i], abs=1e-12)
         np.testing.assert_allclose(at.gradient, gradient[i], atol=1e-12)
     inner = d[np.abs(d[:, :1] - rig.bound.supports.knots).min(axis=1) > 2 * h][:20]  # curvature steps at knots
     for row in inner:
-        at = place(rig.bound, row)
-        hessian = (at.slopes.T * at.weights) @ at.slopes - np.outer(at.gradient, at.gradient)
-        hessian /= rig.bound.softness_mm
-        hessian[0, 0] -= at.weights[:-2] @ at.bends
+        at = place(rig.bound.formula, tuple(row.tolist()))
+        hessian = np.array(at.rounding)[[[0, 1, 2], [1, 3, 4], [2, 4, 5]]]
+        hessian[0, 0] -= at.bend
         steps = h * np.eye(3)
         numeric = (rig.bound.signed_distance_gradient(row + steps)[1] - at.gradient) / h
         np.testing.assert_allclose(hessian, numeric, atol=5e-3 * (1 + np.abs(numeric).max()))
@@ -73,7 +72,7 @@ def test_no_point_inside_is_nearer_by_scipy():
 
 def test_a_start_in_the_other_half_of_a_hollow_bound_stays_there():
     bound = RIGS["hollow"].bound
-    wanted = np.array([20.0, 9.0, 0.0])
-    below, above = (nearest_in_valley(bound, wanted, np.array([d1, 0.0, 0.0])) for d1 in (8.0, 34.0))
+    wanted = (20.0, 9.0, 0.0)
+    below, above = (nearest_in_valley(bound.formula, wanted, (d1, 0.0, 0.0)) for d1 in (8.0, 34.0))
     assert below[0] < 20.0 < above[0]
     assert bound.signed_distance(np.array([below, above])).max() <= 0

@@ -168,3 +168,12 @@ def test_model_round_trip(tmp_path):
     assert set(again.arrays) == {"incisor"} and again.meta["kind"] == "x" and again.trained.all()
     with pytest.raises(FormatError, match="jawusd-tracks"):
         load_tracks(tmp_path / "m.npz")
+
+
+def test_arrays_are_written_row_by_row(tmp_path):
+    """Factors of a singular value decomposition come column by column; simple readers take rows alone."""
+    columns = np.asfortranarray(np.arange(12.0).reshape(4, 3))
+    write_npz_atomic(tmp_path / "a.npz", {"columns": columns, "turned": columns[::-1].T, "single": np.float64(2.0)})
+    with np.load(tmp_path / "a.npz") as archive:
+        np.testing.assert_array_equal(archive["columns"], columns)
+        assert all(archive[name].flags.c_contiguous for name in archive.files) and archive["single"].shape == ()

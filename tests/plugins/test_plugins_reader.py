@@ -1,19 +1,27 @@
 """The single-file reader against the evaluator, in this Python and, as one file, in a bare one."""
 
 import ast
+import io
 import json
 import os
+import shutil
 import subprocess
 import sys
+import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
 from example_model import example_arrays, example_meta
+from example_people import person, save
 from example_rig import FPS, example_meshes, example_motion, example_rig
+from key_sets import hollow_rig
 from pxr import Sdf
 from scipy.spatial.transform import Rotation
 
-from jawusd.evaluator import JawRig
+import jawusd
+from jawusd.evaluator import JawRig, load
+from jawusd.evaluator.arrays import flat_arrays
 from jawusd.evaluator.formula import MODELS
 from jawusd.evaluator.schema import KINDS
 from jawusd.formats.model import JawModel, save_model
@@ -21,6 +29,8 @@ from jawusd.plugins import extension, jawusd_reader
 from jawusd.plugins.extension import packed_reader
 from jawusd.rig.bake import bake_rig
 from jawusd.rig.sampling import sample_valid
+
+PYTHONS = ("3.9", "3.10", "3.11", "3.12", "3.13", "3.14")
 
 
 @pytest.fixture(params=["anchored", "additive"])
@@ -76,27 +86,165 @@ def test_ranges_end_on_the_bound(rig, model_file, d1):
     assert all(np.isnan(x) for pair in read.ranges(90.0) for x in pair)
 
 
-def test_bare_interpreter_reads_the_model(rig, model_file):
-    """Isolated, without site packages: neither numpy nor pxr is there."""
-    (model_file.parent / "jawusd_reader.py").write_text(packed_reader())
-    code = f"""
-import sys; sys.path.insert(0, {str(model_file.parent)!r})
-import jawusd_reader, json
+BARE = """
+import sys; sys.path.insert(0, {folder!r})
+import json, jawusd_reader
 assert "numpy" not in sys.modules and "jawusd" not in sys.modules
-rig = jawusd_reader.load({str(model_file)!r})
-print(json.dumps([rig.pose(20.0, 2.0, 0.5), rig.margin(20.0, 2.0, 0.5)]))
+told = {{}}
+for path, rows in json.load(open({asked!r})).items():
+    rig = jawusd_reader.load(path)
+    told[path] = [[rig.pose(*d), rig.margin(*d), rig.project(*d)] for d in rows]
 try:
     jawusd_reader.load("actor.usda")
 except jawusd_reader.ReaderError as error:
-    print(error)
+    told["usd"] = str(error)
+print(json.dumps(told))
 """
-    done = subprocess.run([sys.executable, "-I", "-S", "-c", code], capture_output=True, text=True, env={**os.environ})
+
+
+def bare_python(version):
+    """Return an interpreter of a version, of this system or of pyenv; skip without one."""
+    kept = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
+    places = [shutil.which(f"python{version}"), *sorted(kept.glob(f"{version}.*/bin/python"))]
+    for place in filter(None, places):
+        found = subprocess.run([place, "-I", "-S", "-c", "import sys; print(*sys.version_info[:2], sep='.')"],
+                               capture_output=True, text=True)  # fmt: skip
+        if found.stdout.strip() == version:
+            return place
+    pytest.skip(f"there is no Python {version}")
+
+
+def assert_read_bare(python, files, folder):
+    """Compare what a bare interpreter reads from model files with the evaluator, everywhere and far outside."""
+    (folder / "jawusd_reader.py").write_text(packed_reader())
+    rigs = {str(path): load(path) for path in files}
+    asked = {}
+    for path, rig in rigs.items():
+        low, high = rig.d_range.T
+        wide = np.random.default_rng(4).uniform(low - 5.0, high + 5.0, (40, 3))
+        asked[path] = [*sample_valid(rig, 20, seed=3).tolist(), *wide.tolist(), [0.0, 0.0, 0.0]]
+    (folder / "asked.json").write_text(json.dumps(asked))
+    code = BARE.format(folder=str(folder), asked=str(folder / "asked.json"))
+    done = subprocess.run(
+        [python, "-I", "-S", "-c", code], capture_output=True, text=True
+    )  # isolated, no site packages
     assert done.returncode == 0, done.stderr
-    values, message = done.stdout.splitlines()
-    pose, margin = json.loads(values)
-    np.testing.assert_allclose(pose, rig.pose([20.0, 2.0, 0.5]), atol=1e-11)
-    assert margin == pytest.approx(rig.margin([20.0, 2.0, 0.5]), abs=1e-11)
-    assert "pxr" in message
+    told = json.loads(done.stdout)
+    assert "pxr" in told["usd"]
+    for path, rig in rigs.items():
+        d = np.array(asked[path])
+        poses, margins, inside = (list(column) for column in zip(*told[path]))
+        vertices = rig.arrays["landmarks"]
+        found, wanted = (T[:, :3, :3] @ vertices.T + T[:, :3, 3:] for T in (np.array(poses), rig.pose(d)))
+        assert np.abs(found - wanted).max() < 1e-6  # mm
+        np.testing.assert_allclose(margins, rig.margin(d), atol=1e-6)
+        assert_projected(rig, d, np.array(inside))
+
+
+def assert_projected(rig, d, found):
+    """Valid ones stay; the others come to the bound, no farther than the evaluator brings them."""
+    out = rig.margin(d) < 0
+    assert out.any() and not out.all()
+    np.testing.assert_array_equal(found[~out], d[~out])
+    assert rig.is_inside(found).all()
+    away, allowed = (np.linalg.norm(x - d, axis=1) for x in (found, rig.project(d)))
+    assert (away - allowed).max() < 1e-6  # mm
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("version", PYTHONS)
+def test_every_bare_python_reads_the_model_of_a_build_and_those_of_five_persons(version, example_build, tmp_path):
+    people = [("a", 1.0, 1.0, 0.0), ("b", 0.7, 0.8, 3.0), ("c", 1.3, 1.2, -4.0), ("d", 1.1, 0.6, 8.0)]
+    files = [example_build[0] / "model.npz", *(save(person(*who), tmp_path / f"{who[0]}.npz") for who in people)]
+    files.append(save(person("e", kind="additive"), tmp_path / "e.npz"))
+    assert_read_bare(bare_python(version), files, tmp_path)
+
+
+@pytest.mark.slow
+def test_usd_of_a_build_gives_the_evaluators_poses(example_build):
+    rig = jawusd.load(example_build[0] / "actor.usda")
+    for name in ("model.npz", "actor.usda", "anim_capture.usdc", "actor.usdz"):
+        assert_same_jaw(jawusd_reader.load(example_build[0] / name), rig)
+
+
+def test_this_python_reads_a_model_bare(model_file, tmp_path):
+    assert_read_bare(sys.executable, [model_file], tmp_path)
+
+
+@pytest.mark.parametrize("hollow", [False, True])
+def test_the_nearest_valid_parameters_are_those_of_the_evaluator(rig, hollow):
+    rig = hollow_rig() if hollow else rig  # a narrow waist: two valleys
+    read = jawusd_reader.Rig(rig.kind, flat_arrays(rig.arrays))
+    low, high = rig.d_range.T
+    d = np.random.default_rng(7).uniform(low - 6.0, high + 6.0, (80, 3))
+    d[:2] = [20.0, 7.6, 9.2], [20.0, 1.0, 0.5]
+    assert_projected(rig, d, np.array([read.project(*row) for row in d.tolist()]))
+    assert np.isnan(read.project(np.nan, 0.0, 0.0)).all() and np.isnan(read.project(np.inf, 0.0, 0.0)).all()
+
+
+def test_a_bound_that_leaves_nothing_is_refused(rig):
+    arrays = flat_arrays(rig.arrays) | {"slice_margin_mm": [-50.0]}
+    with pytest.raises(jawusd_reader.ReaderError, match="no valid"):
+        jawusd_reader.Rig(rig.kind, arrays).project(20.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("version", [(1, 0), (2, 0), (3, 0)])
+@pytest.mark.parametrize("dtype", ["<f8", ">f8", ">f4", "<f4", "<f2"])
+@pytest.mark.parametrize("packed", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
+def test_whatever_order_numpy_writes_is_read(model_file, tmp_path, version, dtype, packed):
+    kept = dict(np.load(model_file, allow_pickle=False))
+    with zipfile.ZipFile(tmp_path / "other.npz", "w", packed) as archive:
+        for name, value in kept.items():
+            number = value.dtype.kind == "f"
+            written = np.asfortranarray(
+                value.astype(dtype) if number else value.astype(value.dtype.newbyteorder(dtype[0]))
+            )
+            with archive.open(f"{name}.npy", "w") as member:
+                np.lib.format.write_array(member, written, version, allow_pickle=False)
+    read = jawusd_reader.load(tmp_path / "other.npz")
+    for name, values in read.arrays.items():
+        np.testing.assert_array_equal(values, kept[name].astype(dtype).ravel())
+
+
+def test_every_type_and_shape_of_numbers_is_read():
+    for dtype in ("?", "i1", ">i2", "i4", ">i8", "u1", "u2", ">u4", "u8", "f2", "f4", ">f8"):
+        for shape in ((), (0,), (3,), (2, 3), (2, 3, 4), (1, 4), (4, 1)):
+            whole = (np.arange(np.prod(shape, dtype=int)) % 2).reshape(shape).astype(dtype)
+            for values in (whole, np.asfortranarray(whole), whole.T):
+                written = io.BytesIO()
+                np.lib.format.write_array(written, values)
+                assert list(jawusd_reader._npy("a", written.getvalue())) == values.ravel().tolist()
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda data: data[:-3], "array incisor cannot be read"),
+        (lambda data: b"nothing" + data, "does not begin"),
+        (lambda data: data.replace(b"<f8", b"<c8"), "type <c8"),
+        (lambda data: data.replace(b"'descr'", b"'other'"), "array incisor cannot be read"),
+        (lambda data: data.replace(b"{", b"[", 1), "array incisor cannot be read"),
+        (lambda data: data[:12], "array incisor cannot be read"),
+    ],
+)
+def test_a_damaged_array_is_named(model_file, tmp_path, damage, message):
+    with zipfile.ZipFile(model_file) as archive, zipfile.ZipFile(tmp_path / "other.npz", "w") as other:
+        for name in archive.namelist():
+            data = archive.read(name)
+            other.writestr(name, damage(data) if name == "incisor.npy" else data)
+    with pytest.raises(jawusd_reader.ReaderError, match=message):
+        jawusd_reader.load(tmp_path / "other.npz")
+
+
+def test_what_is_no_archive_is_refused(model_file, tmp_path):
+    whole = model_file.read_bytes()
+    for data in (b"", b"words", whole[:300], whole.replace(b"PK\1\2", b"PK\1\3")):
+        (tmp_path / "other.npz").write_bytes(data)
+        with pytest.raises(jawusd_reader.ReaderError, match="no jaw model, or damaged"):
+            jawusd_reader.load(tmp_path / "other.npz")
+    (tmp_path / "other.usda").write_text("#usda 1.0\n(\n")
+    with pytest.raises(jawusd_reader.ReaderError, match="cannot be opened"):
+        jawusd_reader.load(tmp_path / "other.usda")
 
 
 def test_decompose_agrees_with_scipy():
