@@ -13,8 +13,12 @@ Put both files where the program's Python finds them. `model.npz` is read withou
     recipes.houdini_controls(rig, hou.node("/obj/jaw"))
     recipes.houdini_bake(rig, hou.node("/obj/jaw"), hou.node("/obj/mandible"), 1, 100)
 
-    # Unreal: the mandible's binding in a level sequence, and d1, d2, d3 per frame
+    # Unreal: the mandible's binding in a level sequence, and keys of d1, d2, d3 by frame
     recipes.unreal_keys(rig, binding, {0: (0, 0, 0), 24: (20, 0, 0)})
+
+Every whole frame gets a key, and programs draw straight lines between them: those between sparse keys would leave the
+jaw's path by millimetres. Parameters outside the bound are moved to the nearest inside, and a warning names them;
+`measured=True` keeps them, for takes of the person. Angles go on from frame to frame without turning over.
 
 The mandible's own transform is replaced by T_skull_mandible, below a parent at the skull's pose. Lengths
 are millimetres; where the parent does not scale them, give `scale`, 0.1 for centimetres.
@@ -22,6 +26,8 @@ are millimetres; where the parent does not scale them, give `scale`, 0.1 for cen
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -32,6 +38,61 @@ if TYPE_CHECKING:
     import unreal
 
 Rows = Sequence[Sequence[float]]
+Keys = Mapping[int, Sequence[float]]  # d1, d2, d3 [mm] by frame
+
+_MAYA_ROTATE_ORDERS = ("xyz", "yzx", "zxy", "xzy", "yxz", "zyx")
+
+
+def every_frame(keys: Keys) -> dict[int, list[float]]:
+    """Return d at every whole frame from the first key to the last, on straight lines between keys, as in USD."""
+    found = {}
+    known = sorted(keys)
+    for start, end in zip(known, [*known[1:], known[-1] + 1]):
+        for frame in range(start, end):
+            share = (frame - start) / (end - start)
+            found[frame] = [a + share * (b - a) for a, b in zip(keys[start], keys.get(end, keys[start]))]
+    return found
+
+
+def poses(rig: jawusd_reader.Rig, keys: Keys, *, measured: bool = False) -> dict[int, Rows]:
+    """Return T_skull_mandible [mm] at every key, with a warning where keys lie outside the bound.
+
+    Args:
+        rig: The rig.
+        keys: What to pose.
+        measured: Keep keys outside the bound, as measured poses may lie a little; else the nearest d inside is posed.
+    """
+    outside = {frame: -rig.margin(*d) for frame, d in keys.items() if not rig.is_inside(*d)}
+    if outside:
+        worst = max(outside, key=lambda frame: outside[frame])
+        d = ", ".join(f"{x:.2f}" for x in keys[worst])
+        what = "kept as they are" if measured else "moved to the nearest d inside"
+        warnings.warn(
+            f"{len(outside)} of {len(keys)} frames lie outside the bound and are {what}; "
+            f"the farthest is frame {worst}, d = ({d}) mm, by {outside[worst]:.2f} mm",
+            stacklevel=3,
+        )
+    moved = {frame: rig.project(*keys[frame]) for frame in outside if not measured}
+    return {frame: rig.pose(*moved.get(frame, d)) for frame, d in keys.items()}
+
+
+def nearest_turn(
+    angles: Sequence[float], previous: Sequence[float] | None, middle: int = 1, full: float = 360.0
+) -> list[float]:
+    """Return the Euler angles of the same turn that lie nearest to those of the frame before.
+
+    Args:
+        angles: Three angles; ``full`` is a whole turn in their unit.
+        previous: The angles before; None at the first frame.
+        middle: Which of the three the program applies second.
+        full: A whole turn.
+    """
+    if previous is None:
+        return list(angles)
+    other = [angle + 0.5 * full for angle in angles]
+    other[middle] = 0.5 * full - angles[middle]
+    same = [[a - full * round((a - b) / full) for a, b in zip(turn, previous)] for turn in (angles, other)]
+    return min(same, key=lambda turn: math.dist(turn, previous))
 
 
 def row_matrix(T: Rows, scale: float = 1.0) -> list[float]:
@@ -67,14 +128,34 @@ def maya_controls(rig: jawusd_reader.Rig, name: str = "jaw_controls") -> str:
     return group
 
 
-def maya_bake(rig: jawusd_reader.Rig, controls: str, mandible: str, first: int, last: int, scale: float = 1.0) -> None:
-    """Key the mandible at every frame from first to last by what the controls say there."""
+def maya_bake(
+    rig: jawusd_reader.Rig,
+    controls: str,
+    mandible: str,
+    first: int,
+    last: int,
+    scale: float = 1.0,
+    *,
+    measured: bool = False,
+) -> None:
+    """Key the mandible at every frame from first to last by what the controls say there, see `poses`."""
     from maya import cmds
 
-    for frame in range(first, last + 1):
-        d = [cmds.getAttr(f"{controls}.{parameter}", time=frame) for parameter in jawusd_reader.PARAMETERS]
-        cmds.xform(mandible, matrix=row_matrix(rig.pose(*d), scale), objectSpace=True)
-        cmds.setKeyframe(mandible, attribute=["translate", "rotate"], time=frame)
+    names = [f"{kind}{axis}" for kind in ("translate", "rotate") for axis in "XYZ"]
+    middle = "xyz".index(_MAYA_ROTATE_ORDERS[cmds.getAttr(f"{mandible}.rotateOrder")][1])
+    full = 360.0 if cmds.currentUnit(query=True, angle=True) == "deg" else 2.0 * math.pi
+    keys = {
+        frame: [cmds.getAttr(f"{controls}.{parameter}", time=frame) for parameter in jawusd_reader.PARAMETERS]
+        for frame in range(first, last + 1)
+    }
+    turn = None
+    for frame, T in poses(rig, keys, measured=measured).items():
+        cmds.xform(mandible, matrix=row_matrix(T, scale), objectSpace=True)
+        turn = nearest_turn(cmds.getAttr(f"{mandible}.rotate")[0], turn, middle, full)
+        for name, value in zip(names, (*cmds.getAttr(f"{mandible}.translate")[0], *turn)):
+            cmds.setKeyframe(
+                mandible, attribute=name, time=frame, value=value, inTangentType="linear", outTangentType="linear"
+            )
 
 
 def houdini_controls(rig: jawusd_reader.Rig, node: hou.Node) -> None:
@@ -88,35 +169,59 @@ def houdini_controls(rig: jawusd_reader.Rig, node: hou.Node) -> None:
 
 
 def houdini_bake(
-    rig: jawusd_reader.Rig, controls: hou.Node, mandible: hou.Node, first: int, last: int, scale: float = 1.0
+    rig: jawusd_reader.Rig,
+    controls: hou.Node,
+    mandible: hou.Node,
+    first: int,
+    last: int,
+    scale: float = 1.0,
+    *,
+    measured: bool = False,
 ) -> None:
-    """Key the mandible's object at every frame from first to last by what the controls say there."""
+    """Key the mandible's object at every frame from first to last by what the controls say there, see `poses`."""
     import hou
 
-    for frame in range(first, last + 1):
-        d = [controls.parm(parameter).evalAtFrame(frame) for parameter in jawusd_reader.PARAMETERS]
-        matrix = hou.Matrix4(row_matrix(rig.pose(*d), scale))
-        for name, values in (("t", matrix.extractTranslates()), ("r", matrix.extractRotates())):
+    orders = {
+        "transform_order": mandible.parm("xOrd").evalAsString(),
+        "rotate_order": mandible.parm("rOrd").evalAsString(),
+    }
+    keys = {
+        frame: [controls.parm(parameter).evalAtFrame(frame) for parameter in jawusd_reader.PARAMETERS]
+        for frame in range(first, last + 1)
+    }
+    turn = None
+    for frame, T in poses(rig, keys, measured=measured).items():
+        parts = hou.Matrix4(row_matrix(T, scale)).explode(**orders)
+        turn = nearest_turn(parts["rotate"], turn, "xyz".index(orders["rotate_order"][1]))
+        for name, values in (("t", parts["translate"]), ("r", turn)):
             for parm, value in zip(mandible.parmTuple(name), values):
                 key = hou.Keyframe(value)
                 key.setFrame(frame)
+                key.setExpression("linear()", hou.exprLanguage.Hscript)
                 parm.setKeyframe(key)
 
 
 def unreal_keys(
     rig: jawusd_reader.Rig,
     binding: unreal.MovieSceneBindingProxy,
-    keys: Mapping[int, Sequence[float]],
+    keys: Keys,
     scale: float = 0.1,
+    *,
+    measured: bool = False,
 ) -> None:
-    """Give a mandible's binding in a level sequence a transform track through parameters (d1, d2, d3) [mm] by frame."""
+    """Give a mandible's binding in a level sequence a transform track through keys of (d1, d2, d3) [mm] by frame.
+
+    Keys at every frame from the first to the last, see `every_frame` and `poses`.
+    """
     import unreal
 
     section = binding.add_track(unreal.MovieScene3DTransformTrack).add_section()
     section.set_range(min(keys), max(keys) + 1)
     channels = section.get_all_channels()  # location x y z, rotation roll pitch yaw, scale x y z
-    for frame, d in sorted(keys.items()):
-        location, quaternion = unreal_pose(rig.pose(*d), scale)
-        turn = unreal.Quat(*quaternion).rotator()
-        for channel, value in zip(channels, (*location, turn.roll, turn.pitch, turn.yaw)):
-            channel.add_key(unreal.FrameNumber(frame), value)
+    turn = None
+    for frame, T in poses(rig, every_frame(keys), measured=measured).items():
+        location, quaternion = unreal_pose(T, scale)
+        turned = unreal.Quat(*quaternion).rotator()
+        turn = nearest_turn((turned.roll, turned.pitch, turned.yaw), turn)
+        for channel, value in zip(channels, (*location, *turn)):
+            channel.add_key(unreal.FrameNumber(frame), value, interpolation=unreal.MovieSceneKeyInterpolation.LINEAR)
