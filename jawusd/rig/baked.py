@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from pxr import Usd, UsdGeom
+from pxr import Usd
 
 from jawusd.evaluator import JawRig
 from jawusd.geometry.arrays import Array
 from jawusd.rig.animation import BETWEEN_MM
-from jawusd.rig.bones import bones_of
 from jawusd.rig.layout import PARAMETERS
-from jawusd.rig.motion_read import skull_of, times_between
+from jawusd.rig.motion_read import moving_attributes, poses_in_actor, skull_of, time_codes, times_between
 from jawusd.rig.table import landmark_distance
 
 #: Largest distance [mm] of a baked pose from that of d.
@@ -36,26 +35,15 @@ def looked_at(actor: Usd.Prim, moving: list[Usd.Attribute], by_bones: bool) -> t
     return times, np.where(keyed, BAKED_MM, BAKED_MM + BETWEEN_MM) if len(times) else np.array([BAKED_MM])
 
 
-def skull_moved_mm(actor: Usd.Prim, rig: JawRig) -> float:
+def skull_moved_mm(actor: Usd.Prim, rig: JawRig, path: object) -> float:
     """Return how far transforms or bones move the skull in the actor [mm].
 
     Raises:
-        FormatError: Bones bend it.
+        FormatError: Bones bend it, or it is not there.
     """
-    skull = skull_of(actor)
+    skull = skull_of(actor, path)
     if skull is None:
         return 0.0
-    bones = bones_of(skull)
-    moving = bones.keyed() if bones else [op.GetAttr() for op in UsdGeom.Xformable(skull).GetOrderedXformOps()]
-    times = time_codes(times_between(moving)[0])
-    if bones:
-        poses = bones.poses(actor, times, actor.GetStage().GetRootLayer().identifier)
-    else:
-        placed = [UsdGeom.XformCache(time).ComputeRelativeTransform(skull, actor)[0] for time in times]
-        poses = np.array(placed).swapaxes(1, 2)  # USD multiplies rows from the left
+    times = time_codes(times_between(moving_attributes(skull, actor))[0])
+    poses = poses_in_actor(skull, actor, times, path)
     return float(landmark_distance(rig, poses, np.broadcast_to(np.eye(4), poses.shape)).max())
-
-
-def time_codes(times: Array) -> list[Usd.TimeCode]:
-    """Return time codes; without any time the default one."""
-    return [Usd.TimeCode(time) for time in times.tolist()] or [Usd.TimeCode.Default()]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
-from pxr import Usd, UsdGeom, UsdSkel
+from pxr import Gf, Usd, UsdGeom, UsdSkel
 
 from jawusd.errors import FormatError
 from jawusd.geometry.arrays import Array
@@ -70,8 +70,25 @@ class Bones:
         skinning: UsdSkel.SkinningQuery, skeleton: UsdSkel.SkeletonQuery, actor: Usd.Prim, time: Usd.TimeCode
     ) -> Array:
         moved = skinning.ComputeSkinnedTransform(skeleton.ComputeSkinningTransforms(time), time)
-        placed, _ = UsdGeom.XformCache(time).ComputeRelativeTransform(skeleton.GetPrim(), actor)
+        placed = place_in(actor, skeleton.GetPrim(), UsdGeom.XformCache(time))
         return np.array(moved * placed).T  # USD multiplies rows from the left
+
+    def foreign_joints(self) -> list[str]:
+        """Return the joints that are animated, but that no skeleton has."""
+        found = []
+        for _, skeleton in self._bound:
+            animation = skeleton.GetAnimQuery()
+            moved = animation.GetJointOrder() if animation else []
+            found += [str(joint) for joint in moved if joint not in skeleton.GetJointOrder()]
+        return list(dict.fromkeys(found))
+
+
+def place_in(actor: Usd.Prim, prim: Usd.Prim, cache: UsdGeom.XformCache) -> Gf.Matrix4d:
+    """Return where a prim is in the frame of an actor above it, by way of the world where it does not follow it."""
+    placed, resets = cache.ComputeRelativeTransform(prim, actor)
+    if resets:
+        placed = cache.GetLocalToWorldTransform(prim) * cache.GetLocalToWorldTransform(actor).GetInverse()
+    return placed
 
 
 def bones_of(prim: Usd.Prim) -> Bones | None:

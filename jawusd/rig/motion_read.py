@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,13 +13,14 @@ from jawusd.errors import FormatError
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.geometry.se3 import rigidity_defect
 from jawusd.rig.animation import LOST
-from jawusd.rig.bones import bones_of
-from jawusd.rig.layout import ACTOR, MANDIBLE, PARAMETERS
+from jawusd.rig.bones import bones_of, place_in
+from jawusd.rig.layout import PARAMETERS
 from jawusd.rig.read import find_rig_prim, open_stage
 from jawusd.rig.untrusted import raises_format_error
 
 _MOST_FRAMES = 220_000  # as many as are written, an hour at 60 per second
 _RIGID = 1e-5  # single-precision quaternions, as DCCs write them, stay below
+_APART = 1e-4  # far more than the transforms of two meshes that move together differ by
 
 
 @raises_format_error(0)
@@ -40,40 +41,90 @@ def read_poses_of_stage(path: str | os.PathLike[str], prim_path: str | None = No
     stage = open_stage(path)
     actor = find_rig_prim(stage, path, prim_path)
     times = frames_of_stage(stage, path)
-    return times, poses_at(mandible_of(stage, actor, path), actor, times, path)
+    return times, poses_at(mandible_of(actor, path), actor, times, path)
 
 
 def poses_at(mandible: Usd.Prim, actor: Usd.Prim, times: ArrayLike, path: object) -> Array:
-    """Return T_skull_mandible (F, 4, 4) [mm] of a mandible of an actor at times (F,), by transforms or by bones.
+    """Return where a mandible is in the world, relative to the skull, by transforms or by bones.
+
+    Args:
+        times: shape (F,); without any, the default time is read.
+
+    Returns:
+        T_skull_mandible [mm], shape (F, 4, 4), in the actor's units; without a skull relative to the actor.
 
     Raises:
         FormatError: The motion is not rigid.
     """
-    times = np.asarray(times, dtype=np.float64)
-    bones = bones_of(mandible)
-    if bones is not None:
-        poses = bones.poses(actor, [Usd.TimeCode(time) for time in times.tolist()], path)
-    else:
-        skull = skull_of(actor)
-        poses = np.array([_placed(mandible, skull, actor, time) for time in times.tolist()])
+    codes = time_codes(np.asarray(times, dtype=np.float64))
+    poses, skull = poses_in_actor(mandible, actor, codes, path), skull_of(actor, path)
+    if skull is not None:
+        poses = np.asarray(np.linalg.solve(poses_in_actor(skull, actor, codes, path), poses), np.float64)
     defect = rigidity_defect(poses)
     if not defect.max() <= _RIGID:
         worst = int(np.argmax(np.where(np.isfinite(defect), defect, np.inf)))
         raise FormatError(
-            f"the mandible is not rigid at frame {times[worst]:g} (off by {defect[worst]:.2g}, allowed {_RIGID:g}).",
+            f"the mandible is not rigid at frame {codes[worst]} (off by {defect[worst]:.2g}, allowed {_RIGID:g}).",
             path=str(path),
             hint="Samples of matrices shear in between: key translate and orient.",
         )
     return poses
 
 
-def _placed(mandible: Usd.Prim, skull: Usd.Prim | None, actor: Usd.Prim, time: float) -> Array:
-    cache = UsdGeom.XformCache(Usd.TimeCode(time))
-    moved, _ = cache.ComputeRelativeTransform(mandible, actor)
-    if skull is not None:
-        placed, _ = cache.ComputeRelativeTransform(skull, actor)
-        moved *= placed.GetInverse()
-    return np.array(moved).T  # USD multiplies rows from the left
+def poses_in_actor(prim: Usd.Prim, actor: Usd.Prim, times: Sequence[Usd.TimeCode], path: object) -> Array:
+    """Return what carries the points of the meshes below a prim to the actor's frame, shape (F, 4, 4).
+
+    Raises:
+        FormatError: Bones bend the meshes, or they move in different ways.
+    """
+    bones = bones_of(prim)
+    if bones is not None:
+        return bones.poses(actor, times, path)
+    movers = _movers(prim)
+    moved = np.empty((len(movers), len(times), 4, 4))
+    for k, time in enumerate(times):
+        cache = UsdGeom.XformCache(time)
+        for i, mover in enumerate(movers):
+            moved[i, k] = np.array(place_in(actor, mover, cache)).T  # USD multiplies rows from the left
+    if not np.abs(moved - moved[:1]).max() <= _APART:
+        raise FormatError(
+            f"the meshes below {prim.GetPath()} move in different ways.",
+            path=str(path),
+            hint="Move the prim above them instead.",
+        )
+    first: Array = moved[0]
+    return first
+
+
+def moving_attributes(prim: Usd.Prim, actor: Usd.Prim) -> list[Usd.Attribute]:
+    """Return the attributes that move a prim in its actor: of joints, or the ops of prims from meshes to actor."""
+    bones = bones_of(prim)
+    if bones is not None:
+        return bones.keyed()
+    chain = dict.fromkeys(above for mover in _movers(prim) for above in prims_between(mover, actor))
+    return [op.GetAttr() for above in chain for op in UsdGeom.Xformable(above).GetOrderedXformOps()]
+
+
+def prims_between(prim: Usd.Prim, actor: Usd.Prim) -> list[Usd.Prim]:
+    """Return a prim and those above it that transforms move, up to its actor and without it."""
+    found = []
+    while prim and prim != actor and not prim.IsPseudoRoot():
+        found.append(prim)
+        prim = prim.GetParent()
+    return [one for one in found if one.IsA(UsdGeom.Xformable)]
+
+
+def meshes_below(prim: Usd.Prim) -> list[Usd.Prim]:
+    """Return the active meshes below a prim, of an instance too."""
+    return [mesh for mesh in Usd.PrimRange(prim, Usd.TraverseInstanceProxies()) if mesh.IsA(UsdGeom.Mesh)]
+
+
+def _movers(prim: Usd.Prim) -> list[Usd.Prim]:
+    """Return the meshes below a prim where one of them has transforms of its own, else the prim."""
+    meshes = meshes_below(prim)
+    below = [above for mesh in meshes for above in prims_between(mesh, prim)]
+    own = any(UsdGeom.Xformable(one).GetXformOpOrderAttr().HasAuthoredValue() for one in below)
+    return meshes if own else [prim]
 
 
 @raises_format_error(0)
@@ -132,25 +183,49 @@ def times_between(attributes: Iterable[Usd.Attribute]) -> tuple[Array, Mask]:
     return times, np.isin(times, keys)
 
 
-def mandible_of(stage: Usd.Stage, actor: Usd.Prim, path: object) -> Usd.Prim:
+def time_codes(times: Array) -> list[Usd.TimeCode]:
+    """Return time codes; without any time the default one."""
+    return [Usd.TimeCode(time) for time in times.tolist()] or [Usd.TimeCode.Default()]
+
+
+def mandible_of(actor: Usd.Prim, path: object) -> Usd.Prim:
     """Return the prim that a rig moves.
 
     Raises:
-        FormatError: There is none.
+        FormatError: jaw:mandible names none or several, or one that is not there or cannot move.
     """
-    targets = actor.GetRelationship("jaw:mandible").GetTargets() if actor.HasRelationship("jaw:mandible") else []
-    default = actor.GetPath().AppendPath(MANDIBLE.removeprefix(f"{ACTOR}/"))
-    prim = stage.GetPrimAtPath(targets[0] if targets else default)
-    if not prim or not prim.IsA(UsdGeom.Xformable):
-        raise FormatError(f"{actor.GetPath()} has no mandible that could move.", path=str(path))
-    return prim
+    return _named_by(actor, "jaw:mandible", path)
 
 
-def skull_of(actor: Usd.Prim) -> Usd.Prim | None:
-    """Return the prim of a rig's skull; None where it names none."""
-    targets = actor.GetRelationship("jaw:skull").GetTargets() if actor.HasRelationship("jaw:skull") else []
-    prim = actor.GetStage().GetPrimAtPath(targets[0]) if targets else None
-    return prim if prim and prim.IsA(UsdGeom.Xformable) else None
+def skull_of(actor: Usd.Prim, path: object) -> Usd.Prim | None:
+    """Return the prim of a rig's skull; None where it names none or is inactive: the skull's frame is the actor's.
+
+    Raises:
+        FormatError: jaw:skull names several, or one that is not there.
+    """
+    named = actor.GetRelationship("jaw:skull")
+    found = [actor.GetStage().GetPrimAtPath(target) for target in named.GetTargets()] if named else []
+    return None if all(prim and not prim.IsActive() for prim in found) else _named_by(actor, "jaw:skull", path)
+
+
+def _named_by(actor: Usd.Prim, name: str, path: object) -> Usd.Prim:
+    relationship, stage = actor.GetRelationship(name), actor.GetStage()
+    targets = relationship.GetTargets() if relationship else []
+    if len(targets) != 1:
+        raise FormatError(f"{name} of {actor.GetPath()} names {len(targets)} prims, expected 1.", path=str(path))
+    there = [prim for prim in map(stage.GetPrimAtPath, targets[0].GetPrefixes()) if prim]
+    prim = stage.GetPrimAtPath(targets[0])
+    if there and not there[-1].IsActive():
+        found = f"{there[-1].GetPath()} is inactive."
+    elif not prim or not prim.IsDefined():
+        found = "there is no such prim. Is the geometry (payload) missing, or not loaded?"
+    elif not prim.IsA(UsdGeom.Xformable):
+        found = f"it is of type {prim.GetTypeName() or 'none'}, which nothing moves."
+    elif not targets[0].HasPrefix(actor.GetPath()):
+        found = "it does not lie in the actor."
+    else:
+        return prim
+    raise FormatError(f"{name} names {targets[0]}: {found}", path=str(path))
 
 
 def frames_of_stage(stage: Usd.Stage, path: object) -> NDArray[np.int64]:

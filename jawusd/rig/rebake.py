@@ -23,6 +23,7 @@ from jawusd.rig.motion_read import (
     frames_of_stage,
     key_times,
     mandible_of,
+    moving_attributes,
     poses_at,
     read_parameters_of_stage,
 )
@@ -72,8 +73,8 @@ def departure(path: str | os.PathLike[str], rig: JawRig, prim_path: str | None =
     """
     stage = open_stage(path)
     actor = _actor(stage, path, rig, prim_path)
-    mandible = mandible_of(stage, actor, path)
-    moving, parameters = _moving(mandible), [actor.GetAttribute(name) for name in PARAMETERS]
+    mandible = mandible_of(actor, path)
+    moving, parameters = moving_attributes(mandible, actor), [actor.GetAttribute(name) for name in PARAMETERS]
     sampled = read_parameters_of_stage(path, str(actor.GetPath()))
     if not all(parameters) or (sampled is None and _rank(stage, parameters) >= _rank(stage, moving)):
         return None
@@ -100,7 +101,7 @@ def motion_of_stage(
     """
     stage = open_stage(path)
     actor = _actor(stage, path, rig, prim_path)
-    mandible = mandible_of(stage, actor, path)
+    mandible = mandible_of(actor, path)
     away = departure(path, rig, str(actor.GetPath()))
     if origin is None:
         origin = _origin(stage, actor, mandible, away, path)
@@ -118,7 +119,7 @@ def _origin(stage: Usd.Stage, actor: Usd.Prim, mandible: Usd.Prim, away: Departu
         return "mandible"
     if not away.frames:
         return "d"
-    moving = _moving(mandible)
+    moving = moving_attributes(mandible, actor)
     if not any(key_times(attribute) for attribute in moving):
         return "d"
     ranks = [_rank(stage, attributes) for attributes in ([actor.GetAttribute(name) for name in PARAMETERS], moving)]
@@ -153,12 +154,6 @@ def _held(stage: Usd.Stage, actor: Usd.Prim, path: object) -> tuple[Array, Array
         raise FormatError("its d is not finite.", path=str(path))
     times = np.unique(frames).astype(np.float64)
     return times, np.tile(d, (len(times), 1)), float(stage.GetTimeCodesPerSecond())
-
-
-def _moving(mandible: Usd.Prim) -> list[Usd.Attribute]:
-    """Return the attributes that move a mandible: of its joints or its own ops."""
-    bones = bones_of(mandible)
-    return bones.keyed() if bones else [op.GetAttr() for op in UsdGeom.Xformable(mandible).GetOrderedXformOps()]
 
 
 def _rank(stage: Usd.Stage, attributes: list[Usd.Attribute]) -> float:
@@ -234,8 +229,8 @@ def write_rebaked(
         raise RigError("the layer written goes over the stage and cannot replace it.", path=out)
     stage = open_stage(shot)
     actor = _actor(stage, shot, rig, prim_path)
-    mandible = mandible_of(stage, actor, shot)
-    if not (away_mm := skull_moved_mm(actor, rig)) <= BAKED_MM:
+    mandible = mandible_of(actor, shot)
+    if not (away_mm := skull_moved_mm(actor, rig, shot)) <= BAKED_MM:
         raise RigError(
             f"{actor.GetPath()} has its skull moved by {away_mm:.2f} mm: a mandible baked in it would be off as much.",
             path=str(shot),

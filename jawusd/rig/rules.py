@@ -7,17 +7,17 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from pxr import Gf, Sdf, Usd, UsdGeom
+from pxr import Sdf, Usd, UsdGeom
 
 from jawusd.errors import FormatError, JawusdError
 from jawusd.evaluator import JawRig
 from jawusd.evaluator.verdicts import OUTSIDE, place
 from jawusd.geometry.arrays import Array
-from jawusd.rig import _gf
-from jawusd.rig.baked import BAKED_MM, looked_at, skull_moved_mm, time_codes
+from jawusd.rig.assembly import faults_of_assembly
+from jawusd.rig.baked import BAKED_MM, looked_at, skull_moved_mm
 from jawusd.rig.bones import bones_of
 from jawusd.rig.layout import ONNX_ATTRIBUTES, PARAMETERS, SIDECAR_HASH
-from jawusd.rig.motion_read import times_between
+from jawusd.rig.motion_read import mandible_of, moving_attributes, poses_at, time_codes, times_between
 from jawusd.rig.read import named_models, read_table, rig_of
 from jawusd.rig.sampling import sample_valid
 from jawusd.rig.table import landmark_distance
@@ -60,7 +60,7 @@ def check_model(prim: Usd.Prim) -> Iterator[Finding]:
     own, made_for = named_models(prim)
     if own not in (None, rig.model_hash):
         message = "the model is not the one it was baked from (jaw:modelHash): files of several actors were mixed, "
-        message += "or values were changed by hand. `jawusd publish` gives actors names of their own."
+        message += "or values of it, as ranges, were changed by hand. `jawusd publish` gives actors names of their own."
         yield _finding("error", "Model", prim, message)
     if made_for not in (None, rig.model_hash):
         message = f"the model is not the one that its motion was made with ({PARAMETERS[0]} names another). "
@@ -134,45 +134,46 @@ def check_bounds(prim: Usd.Prim) -> Iterator[Finding]:
 
 def check_mandible(prim: Usd.Prim) -> Iterator[Finding]:
     """Check that the mandible moves as the model does: by translate (double3) and orient (quatd) alone, or by bones."""
-    targets = prim.GetRelationship("jaw:mandible").GetTargets() if prim.HasRelationship("jaw:mandible") else []
-    if len(targets) != 1:
-        yield _finding("error", "Mandible", prim, f"jaw:mandible names {len(targets)} prims, expected 1.")
-        return
     if not prim.IsLoaded():
+        yield _finding("error", "Mandible", prim, "the geometry (payload) is not loaded: nothing can be checked.")
         return
-    mandible = UsdGeom.Xformable(prim.GetStage().GetPrimAtPath(targets[0]))
-    if not mandible:
-        yield _finding("error", "Mandible", prim, f"{targets[0]}, named by jaw:mandible, is no Xformable prim.")
+    try:
+        mandible = mandible_of(prim, _where(prim))
+    except FormatError as error:
+        yield _finding("error", "Mandible", prim, error.message)
         return
-    bones = bones_of(mandible.GetPrim())
-    ops = mandible.GetOrderedXformOps()
-    names = [(op.GetOpName(), op.GetTypeName()) for op in ops]
-    if bones is None and (names != _OPS or mandible.GetResetXformStack()):
+    bones, body = bones_of(mandible), UsdGeom.Xformable(mandible)
+    names = [(op.GetOpName(), op.GetTypeName()) for op in body.GetOrderedXformOps()]
+    if bones is None and (names != _OPS or body.GetResetXformStack()):
         message = f"the ops are {names}, expected translate (double3) and orient (quatd)."
-        yield _finding("error", "Mandible", mandible.GetPrim(), message)
+        if body.GetResetXformStack():
+            message = "!resetXformStack! takes it out of the actor: it stays behind where the actor is moved."
+        yield _finding("error", "Mandible", mandible, message)
         return
     rig = _rig(prim)
     if rig is None:
         return
-    moving = bones.keyed() if bones else [op.GetAttr() for op in ops]
+    moving = moving_attributes(mandible, prim)
     at, allowed_mm = looked_at(prim, moving, bones is not None)
     times = time_codes(at)
     try:
-        baked = bones.poses(prim, times, _where(prim)) if bones else _transforms(moving, times)
-        away_mm = skull_moved_mm(prim, rig)
+        baked = poses_at(mandible, prim, at, _where(prim))
+        away_mm = skull_moved_mm(prim, rig, _where(prim))
     except FormatError as error:
-        yield _finding("error", "Mandible", mandible.GetPrim(), error.message)
+        yield _finding("error", "Mandible", mandible, error.message)
         return
-    still = not any(attribute.GetNumTimeSamples() for attribute in moving)
-    yield from _check_baked(rig, mandible.GetPrim(), times, baked, _parameters(prim, times), allowed_mm, still)
     if not away_mm <= BAKED_MM:
         message = f"the skull is moved in the actor by {away_mm:.3f} mm ({BAKED_MM} allowed): move the actor instead."
         yield _finding("error", "Mandible", prim, message)
+        return
+    still = not any(attribute.GetNumTimeSamples() for attribute in moving)
+    yield from _check_baked(rig, mandible, times, baked, _parameters(prim, times), allowed_mm, still)
 
 
-def _transforms(ops: list[Usd.Attribute], times: list[Usd.TimeCode]) -> Array:
-    translate, orient = ops
-    return np.stack([_gf.transform_from_ops(_at(translate, time), _at(orient, time)) for time in times])
+def check_assembly(prim: Usd.Prim) -> Iterator[Finding]:
+    """Check that what a shot does to an actor leaves its jaw whole, shown, in its place and of its size."""
+    for severity, at, message in faults_of_assembly(prim):
+        yield _finding(severity, "Assembly", at, message)
 
 
 def _check_baked(
@@ -216,6 +217,7 @@ RULES: dict[str, Rule] = {
         "Onnx": check_onnx,
         "Bounds": check_bounds,
         "Mandible": check_mandible,
+        "Assembly": check_assembly,
     }.items()
 }
 
@@ -234,13 +236,6 @@ def _rig(prim: Usd.Prim) -> JawRig | None:
         return rig_of(prim, _where(prim))
     except JawusdError:
         return None
-
-
-def _at(attribute: Usd.Attribute, time: Usd.TimeCode) -> Gf.Vec3d | Gf.Quatd:
-    value = attribute.Get(time)
-    if value is not None:
-        return value
-    return Gf.Quatd(1) if attribute.GetTypeName() == Sdf.ValueTypeNames.Quatd else Gf.Vec3d(0)
 
 
 def _parameters(prim: Usd.Prim, times: list[Usd.TimeCode]) -> Array:

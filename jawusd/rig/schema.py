@@ -43,5 +43,6 @@ def has_jaw_api(prim: Usd.Prim) -> bool:
 
 
 def rig_prims(stage: Usd.Stage) -> list[Usd.Prim]:
-    """Return the prims of a stage that carry JawRigAPI, those inside instances too."""
-    return [prim for prim in stage.Traverse(Usd.TraverseInstanceProxies()) if has_jaw_api(prim)]
+    """Return the active prims of a stage that carry JawRigAPI, those inside instances too, loaded or not."""
+    found = Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsDefined & ~Usd.PrimIsAbstract)
+    return [prim for prim in stage.Traverse(found) if has_jaw_api(prim)]

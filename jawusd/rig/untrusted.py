@@ -97,7 +97,7 @@ def _unreadable(file: Path, error: BaseException | None = None) -> str:
     """Return what is wrong with a file, with what OpenUSD says of it, such as the line of a syntax error."""
     said = error.args if isinstance(error, Tf.ErrorException) else ()
     words = next((str(one.commentary).strip() for one in said if getattr(one, "commentary", "")), "")
-    words = words.replace(f"{file}:", "line ", 1)
+    words = words.replace(f"{file.absolute()}:", "line ", 1)
     return f"{_UNREADABLE}: {words:.300}" if words else f"{_UNREADABLE}."
 
 

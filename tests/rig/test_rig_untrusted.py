@@ -303,6 +303,6 @@ def test_layers_named_in_endlessly_many_ways_are_refused(anchored_folder, monkey
 def test_a_syntax_error_is_named_with_its_line(name, tmp_path):
     (tmp_path / "shot.usda").write_text("#usda 1.0\n( subLayers = [@./below.usda@] )\n")
     (tmp_path / name).write_text('#usda 1.0\ndef "A" {\n    double x = = 3\n}\n')
-    with pytest.raises(RigError, match=r"line 3") as found:
+    with pytest.raises(RigError, match=r"read: line 3") as found:
         open_stage(tmp_path / "shot.usda")
     assert str(found.value.path).endswith(name)

@@ -171,7 +171,7 @@ def test_values_of_other_types_are_findings(declared, anchored_folder):
 
 
 def test_every_rule_has_a_failing_fixture():
-    assert {rule for _, _, rule, _, _ in BROKEN} == set(RULES)
+    assert {rule for _, _, rule, _, _ in BROKEN} == set(RULES) - {"Assembly"}, "that is for test_rig_assembly"
 
 
 def test_rules_are_usdvalidation_validators(anchored_folder):
