@@ -59,7 +59,11 @@ class PickView(Strict):
 class Pick(Strict):
     """Join a vertex of a teeth scan with the pixels where it is seen."""
 
-    vertex: Annotated[int, Field(ge=0), Key("Number of a vertex of the scan.", "1397")]
+    vertex: Annotated[
+        int,
+        Field(ge=0),
+        Key("Number of a vertex of the scan, from 0 in the order of its file; `jawusd view` writes it.", "0"),
+    ]
     views: Annotated[
         tuple[PickView, ...],
         Field(min_length=2),
@@ -163,7 +167,7 @@ class Capture(Strict):
         if self.frames is not None and self.frames[0] >= self.frames[1]:
             raise ValueError(
                 f"frames = {list(self.frames)} is empty, the second number must be larger: it is one past the last "
-                "frame. Write it as frames = [30, 270]"
+                "frame. For example: frames = [30, 270]"
             )
         if self.boards is not None and len(self.boards.videos) != len(names):
             raise ValueError(

@@ -142,7 +142,7 @@ def _wrong_value(
     text = words.format(**{"actual_length": "too many", **values}) if words else _needed(kind, str(problem["msg"]))
     unit = f" ({key.unit})" if key.unit and (" number " in text or kind.startswith(("greater", "less"))) else ""
     shows_form = kind not in ("too_long", "too_short", "string_too_short")
-    hint = f"Write it as {name} = {key.example}." if key.example and shows_form else None
+    hint = f"For example: {name} = {key.example}." if key.example and shows_form else None
     return f"{said or 'the file'}{_found(kind, given)} {text}{unit}.".replace("'", '"'), hint
 
 

@@ -159,7 +159,7 @@ class CameraSource(Strict):
     @model_validator(mode="after")
     def _has_source(self) -> CameraSource:
         if self.video is None and self.masks is None:
-            raise ValueError('has neither video nor masks, one is needed. Write it as video = "left.mp4"')
+            raise ValueError('has neither video nor masks, one is needed. For example: video = "left.mp4"')
         return self
 
     @property

@@ -46,6 +46,23 @@ class Mesh:
         object.__setattr__(self, "faces", faces)
 
 
+def without_loose(
+    vertices: Array, faces: NDArray[np.int64] | NDArray[np.int32], colors: NDArray[np.uint8] | None
+) -> tuple[Array, NDArray[np.uint8] | None]:
+    """Return vertices (V, 3) and colours with those that no face uses moved onto others, spread over all of them.
+
+    So they keep their numbers, which picks name, and neither sizes nor middles nor labels count them.
+    """
+    used = np.zeros(len(vertices), bool)
+    used[faces] = True
+    loose, kept = np.flatnonzero(~used), np.flatnonzero(used)
+    if not loose.size or not kept.size:
+        return vertices, colors
+    source = np.arange(len(vertices))
+    source[loose] = kept[(2 * np.arange(len(loose)) + 1) * len(kept) // (2 * len(loose))]
+    return vertices[source], None if colors is None else colors[source]
+
+
 def painted_labels(mesh: Mesh) -> NDArray[np.uint8] | None:
     """Return GUM, TOOTH or BOUNDARY per vertex of a painted teeth scan, shape (V,); None where it is not painted.
 

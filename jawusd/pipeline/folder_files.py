@@ -20,11 +20,21 @@ _DEPTH = 4
 _BOARD = {"board", "boards", "calib", "calibration", "calibrate", "checker", "checkerboard", "chess", "chessboard"}
 _BOARD |= {"charuco", "chart", "grid", "aruco"}
 _MASK = {"mask", "masks", "matte", "mattes", "roto", "segmentation", "seg"}
-_UPPER = {"upper", "maxilla", "maxillary", "maxillar", "oberkiefer", "ok", "oben", "superior", "top", "u"}
-_LOWER = {"lower", "mandibular", "unterkiefer", "uk", "unten", "inferior", "bottom", "l"}
+_UPPER = {"upper", "maxilla", "maxillary", "maxillar", "maxillaire", "maxilar", "oberkiefer", "oben", "superior"}
+_UPPER |= {"superiore", "superieur"}
+_LOWER = {"lower", "mandibular", "mandibulaire", "unterkiefer", "unten", "inferior", "inferiore", "inferieur"}
+# Upper and lower by words that mean other things, too (left, a first name, a camera above): only names that differ in
+# nothing else are taken.
+_PAIRS = [("u", "l"), ("o", "u"), ("ok", "uk"), ("uj", "lj"), ("max", "mand"), ("mx", "md"), ("sup", "inf")]
+_PAIRS += [("top", "bottom"), ("haut", "bas")]
 _MANDIBLE = {"mandible", "mandibula", "jawbone"}
 _SKULL = {"skull", "cranium", "schaedel", "head"}
 _TEETH = {"teeth", "tooth", "scan", "arch", "dentition", "row", "crowns"}
+_BONE = {"bone", "bones", "jawbone", "knochen"}
+# Words that laboratories write as one, longest first: UPPERJAWSCAN, maxillaryscan.
+_PARTS = _UPPER | _LOWER | _MANDIBLE | _TEETH | {word for pair in _PAIRS for word in pair if len(word) > 2}
+_PARTS |= {"jaw", "scan", "model", "cast", "ok", "uk", "ios", "impression", "anatomy", "export"}
+_PART = "|".join(sorted(_PARTS, key=len, reverse=True))
 _SAID = {"video", "videos", "clip", "clips", "footage", "take", "camera", "cameras", "plates", "png", "exr", "dpx"}
 
 
@@ -53,10 +63,14 @@ def find_files(folder: Path) -> FoundFiles:
     Folders of rigs and hidden ones are left out.
     """
     out = FoundFiles()
-    for path in sorted(_files(folder)):
+    files = sorted(_files(folder))
+    paired = _paired([path for path in files if path.suffix.lower() in MESHES]) | _paired(
+        [path for path in files if path.suffix.lower() in VIDEOS or "%" in path.name]
+    )
+    for path in files:
         suffix, said = path.suffix.lower(), set(words(path))
         if suffix in VIDEOS or "%" in path.name:
-            row = _row(path)
+            row = _arch(set(_parted(path))) or paired.get(path, "")
             if row and (said & _MASK or "%" in path.name):
                 out.masks[path] = row
             elif said & _MASK:
@@ -66,7 +80,7 @@ def find_files(folder: Path) -> FoundFiles:
             else:
                 out.clips.append(path)
         elif suffix in MESHES:
-            out.scans[_part(path)].append(path)
+            out.scans[_part(path, paired.get(path, ""))].append(path)
         elif suffix in _CALIBRATIONS and path.name not in ("capture.toml", "build.json"):
             out.calibrations.append(path)
     scans = out.scans
@@ -93,18 +107,48 @@ def _files(folder: Path) -> Iterable[PurePath]:
         yield from (inside / name for name in names if name not in pictures and not name.startswith("."))
 
 
-def _row(path: PurePath) -> str:
-    said = set(words(path))
+def _parted(path: PurePath) -> list[str]:
+    """Return the words of a path, those written as one taken apart."""
+    whole = rf"(?:{_PART})+"
+    return [part for word in words(path) for part in (re.findall(_PART, word) if re.fullmatch(whole, word) else [word])]
+
+
+def _arch(said: set[str]) -> str:
     upper, lower = said & _UPPER, said & _LOWER
     return "" if bool(upper) == bool(lower) else "upper" if upper else "lower"
 
 
-def _part(path: PurePath) -> str:
-    """Return the key of [scans] for a mesh, "" if its name does not tell; the file's own name goes before folders."""
-    for said in (set(words(PurePath(path.name))), set(words(path))):
-        upper, lower = bool(said & _UPPER), bool(said & _LOWER)
-        if upper != lower and not (said & (_MANDIBLE | _SKULL) and not said & _TEETH and not said & {"upper", "lower"}):
-            return "upper_teeth" if upper else "lower_teeth"
+def _paired(paths: Sequence[PurePath]) -> dict[PurePath, str]:
+    """Return the arches of files whose names differ in one word only, which is one of a pair."""
+    spelt = {tuple(_parted(path)): path for path in paths}
+    pairs = [
+        (path, spelt[other])
+        for own, path in spelt.items()
+        for upper, lower in _PAIRS
+        for place, word in enumerate(own)
+        if word == upper and (other := (*own[:place], lower, *own[place + 1 :])) in spelt
+    ]
+    uppers, lowers = {upper for upper, _ in pairs}, {lower for _, lower in pairs}
+    sure = [pair for pair in pairs if not set(pair) & uppers & lowers]
+    return {upper: "upper" for upper, _ in sure} | {lower: "lower" for _, lower in sure}
+
+
+def _part(path: PurePath, paired: str) -> str:
+    """Return the key of [scans] for a mesh, "" if its name does not tell; the file's own name goes before folders.
+
+    Args:
+        path: the mesh.
+        paired: its arch by a word that means one only beside its counterpart.
+    """
+    own, all_said = set(_parted(PurePath(path.name))), set(_parted(path))
+    for said, arch in ((own, ""), (all_said, ""), (all_said, paired)):
+        arch = _arch(said) or arch
+        if said & _UPPER and said & _LOWER:
+            return ""
+        if said & _BONE and not said & _TEETH and arch:
+            return "mandible" if arch == "lower" else ""
+        if arch and not (said & (_MANDIBLE | _SKULL) and not said & _TEETH and not said & {"upper", "lower"}):
+            return f"{arch}_teeth"
         if said & _MANDIBLE:
             return "lower_teeth" if said & _TEETH else "mandible"
         if said & _SKULL:

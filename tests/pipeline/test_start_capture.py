@@ -180,6 +180,55 @@ def test_scans_are_told_by_name(tmp_path):
     assert str(pair_of["upper_teeth"][0]) == "maxilla.stl" and str(pair_of["lower_teeth"][0]) == "mandible.stl"
 
 
+# Files of a folder as programs and laboratories name them -> upper teeth, lower teeth, mandible, skull, not assigned.
+ARCHES = {
+    "one word": (["4711-upperjaw.ply", "4711-lowerjaw.ply"], "01"),
+    "3Shape": (["a_UpperJawScan.stl", "a_LowerJawScan.stl"], "01"),
+    "capitals": (["UPPERJAWSCAN.STL", "LOWERJAWSCAN.STL"], "01"),
+    "adjectives": (["maxillaryscan.stl", "mandibularscan.stl"], "01"),
+    "arches": (["x_upperarch.obj", "x_lowerarch.obj"], "01"),
+    "teeth": (["upperteeth.ply", "lowerteeth.ply"], "01"),
+    "Medit": (["case-maxilla.stl", "case-mandible.stl"], "01"),
+    "Medit, one word": (["maxillascan.ply", "mandiblescan.ply"], "01"),
+    "iTero": (["77_shell_occlusion_u.stl", "77_shell_occlusion_l.stl"], "01"),
+    "German": (["Oberkieferscan.stl", "Unterkieferscan.stl"], "01"),
+    "German, short": (["Muster_OK.stl", "Muster_UK.stl"], "01"),
+    "German, one letter": (["O_scan.stl", "U_scan.stl"], "01"),
+    "English, one letter": (["U_scan.stl", "L_scan.stl"], "01"),
+    "abbreviated": (["max.stl", "mand.stl"], "01"),
+    "abbreviated, one word": (["maxscan.stl", "mandscan.stl"], "01"),
+    "Spanish": (["arcada_superior.stl", "arcada_inferior.stl"], "01"),
+    "bones": (["upper.ply", "lower.ply", "lowerjawbone.ply", "skull.ply"], "0123"),
+    "an upper bone is not the skull": (["upper.ply", "lower.ply", "upperjawbone.ply"], "01-"),
+    "someone called Max": (["max_lower.stl", "max_upper.stl"], "10"),
+    "Max alone": (["max.stl", "lower.stl"], "-1"),
+    "left and right": (["scan_l.stl", "scan_r.stl"], "--"),
+    "three letters": (["o.stl", "u.stl", "l.stl"], "---"),
+    "both in one": (["upperlowerscan.stl", "a.stl"], "--"),
+    "okay": (["scan_ok.stl", "scan_bad.stl"], "--"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ARCHES)
+def test_arches_by_the_names_that_laboratories_use(tmp_path, name):
+    files, wanted = ARCHES[name]
+    for file in files:
+        (tmp_path / file).touch()
+    found = {str(path): key for key, paths in find_files(tmp_path).scans.items() for path in paths}
+    keys = {"upper_teeth": "0", "lower_teeth": "1", "mandible": "2", "skull": "3", "": "-"}
+    assert "".join(keys[found[file]] for file in files) == wanted
+
+
+def test_masks_of_a_camera_called_l_are_of_the_row_that_the_folder_says(tmp_path):
+    for camera in ("l", "r"):
+        for row in ("upper", "lower"):
+            (tmp_path / "masks" / camera / row).mkdir(parents=True)
+            for k in range(6):
+                (tmp_path / "masks" / camera / row / f"{k:06d}.png").touch()
+    masks = find_files(tmp_path).masks
+    assert len(masks) == 4 and all(path.parts[2] == row for path, row in masks.items())
+
+
 def test_masks_are_told_by_camera_and_row(tmp_path):
     clip(tmp_path / "left.mp4")
     clip(tmp_path / "right.mp4")

@@ -1,0 +1,77 @@
+"""STL, binary and text (3D Systems, "StereoLithography Interface Specification", 1989): no shared points.
+
+Binary: 80 bytes of header, the count, and 50 bytes a triangle: normal, corners, two bytes that colours are put in.
+"""
+
+from __future__ import annotations
+
+import re
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+
+from jawusd.errors import CaptureError
+from jawusd.formats.mesh_data import COPY_AGAIN, MeshData, check_count, cut_off, read_mesh_bytes
+from jawusd.geometry.arrays import Array
+
+_HEADER = 84
+_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+_LENGTHS = (1e-6, 1e5)  # coordinates behind the last triangle within these are triangles, not something else
+_SOLID = re.compile(rb"\n[ \t]*(end)?solid\b[^\n]*")
+_VERTEX = re.compile(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)")
+
+
+def read_stl(path: Path) -> MeshData:
+    """Read an STL file, three vertices a triangle.
+
+    Raises:
+        CaptureError: it is cut off, its count is wrong, or a number is none.
+    """
+    data = read_mesh_bytes(path)
+    begins_as_text = data[:512].removeprefix(b"\xef\xbb\xbf").lstrip()[:5].lower() == b"solid"
+    # The highest byte of a binary count is zero; text holds no zero bytes. Binary headers may begin with "solid", too.
+    corners = _text(path, data) if begins_as_text and 0 not in data[80:_HEADER] else _binary(path, data)
+    return MeshData(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
+
+
+def _binary(path: Path, data: bytes) -> Array:
+    if len(data) < _HEADER:
+        raise CaptureError("is neither a text nor a binary STL file.", path=path, hint="Export it again.")
+    said = int.from_bytes(data[_HEADER - 4 : _HEADER], "little")
+    whole = (len(data) - _HEADER) // _TRIANGLE.itemsize
+    if said > whole:
+        raise cut_off(path, whole, said, "triangles")
+    check_count(path, said, "triangles")
+    rows = np.frombuffer(data, _TRIANGLE, whole, _HEADER)["corners"].astype(np.float64)
+    more = int(_are_triangles(rows[said:]).sum())
+    if more:
+        raise CaptureError(
+            f"says that it has {said} triangles, but {more} more follow.", path=path, hint="Export it again."
+        )
+    return rows[:said]
+
+
+def _are_triangles(corners: Array) -> np.typing.NDArray[np.bool_]:
+    size = np.abs(corners)
+    with np.errstate(invalid="ignore", over="ignore"):
+        lengths = ((size == 0) | ((size > _LENGTHS[0]) & (size < _LENGTHS[1]))).all(axis=(1, 2))
+        area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return np.asarray(lengths & (np.abs(area) > 0).any(axis=1))
+
+
+def _text(path: Path, data: bytes) -> Array:
+    data = (b"\n" + data.removeprefix(b"\xef\xbb\xbf")).lower().replace(b"\r", b"\n")
+    ends = [bool(word) for word in _SOLID.findall(data)]
+    body = _SOLID.sub(b"", data)  # names may hold any words
+    whole = body.count(b"endfacet")
+    facets = body.count(b"facet") - whole
+    check_count(path, facets, "triangles")
+    if facets != whole or ends.count(True) != ends.count(False):
+        raise CaptureError(f'is cut off after {whole} triangles: "endsolid" is missing.', path=path, hint=COPY_AGAIN)
+    rows = _VERTEX.findall(body)
+    if len(rows) != 3 * facets:
+        raise CaptureError(
+            f"has {len(rows)} vertices in {facets} facets, three each are needed.", path=path, hint="Export it again."
+        )
+    return np.fromiter(map(float, chain.from_iterable(rows)), np.float64).reshape(-1, 3, 3)
