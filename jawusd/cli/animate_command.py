@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from jawusd.cli.options import USD_SUFFIXES, Allow, Force, Json, Prim, RigArg
+from jawusd.cli.options import USD_SUFFIXES, Allow, Force, Json, Prim, RigArg, rig_of_folder
 from jawusd.cli.output import refuse_existing
 
 if TYPE_CHECKING:
@@ -74,7 +74,10 @@ def animate(
         typer.Argument(help="keys.json, a CSV of d or of poses, a stage, .fbx or .glb.", show_default=False),
     ] = None,
     retarget_from: Annotated[
-        Path | None, typer.Option(help="Rig the source was made for; also animation layers then.", show_default=False)
+        Path | None,
+        typer.Option(
+            help="Rig the source was made for; also animation layers then.", callback=rig_of_folder, show_default=False
+        ),
     ] = None,
     arkit: Annotated[
         Path | None, typer.Option(help="Instead: ARKit face capture, the CSV of Live Link Face.", show_default=False)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from jawusd.cli.options import Allow, Force, Json, Prim
+from jawusd.cli.options import Allow, Force, Json, Prim, rig_of_folder
 from jawusd.cli.output import emit, progress, refuse_existing
 
 if TYPE_CHECKING:
@@ -28,8 +28,10 @@ def retarget(
         Path | None,
         typer.Argument(help="Motion of --from: an animation layer, keys.json, or a CSV of d or poses."),
     ] = None,
-    source: Annotated[Path | None, typer.Option("--from", help="Rig the motion was made for.")] = None,
-    target: Annotated[Path | None, typer.Option("--to", help="Rig that shall move.")] = None,
+    source: Annotated[
+        Path | None, typer.Option("--from", help="Rig the motion was made for.", callback=rig_of_folder)
+    ] = None,
+    target: Annotated[Path | None, typer.Option("--to", help="Rig that shall move.", callback=rig_of_folder)] = None,
     landmarks: Annotated[
         Path | None, typer.Option(help="Instead of a motion: landmarks (JSON) of a person without a capture.")
     ] = None,
@@ -112,7 +114,10 @@ def library(
     search: Annotated[str | None, typer.Option(help="List only names and paths with this in them.")] = None,
     like: Annotated[Path | None, typer.Option(help="Sort by likeness to these landmarks (JSON).")] = None,
     compare: Annotated[tuple[str, str] | None, typer.Option(help="Two persons, side by side.")] = None,
-    add: Annotated[Path | None, typer.Option(help="Copy this rig (actor.usda or model.npz) in first.")] = None,
+    add: Annotated[
+        Path | None,
+        typer.Option(help="Copy this rig (its folder, actor.usda or model.npz) in first.", callback=rig_of_folder),
+    ] = None,
     name: Annotated[str | None, typer.Option(help="With --add: name of the person; else as the rig says.")] = None,
     plot: Annotated[
         Path | None, typer.Option(help="Folder for ranges.png and ranges.svg: those listed, side by side.")

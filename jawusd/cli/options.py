@@ -58,7 +58,8 @@ Allow = Annotated[
 Prim = Annotated[str | None, typer.Option("--prim", help="Which rig, where a stage has several: the path of its prim.")]
 
 
-def _actor_in_folder(rig: Path | None) -> Path | None:
+def rig_of_folder(rig: Path | None) -> Path | None:
+    """Return the rig's file where the folder of a build is given: the callback of every argument that takes a rig."""
     from jawusd.rig.layout import actor_in_folder
 
     return None if rig is None else actor_in_folder(rig)
@@ -68,7 +69,7 @@ RigArg = Annotated[
     Path,
     typer.Argument(
         help="Folder of a rig, its actor.usda or another layer, or model.npz.",
-        callback=_actor_in_folder,
+        callback=rig_of_folder,
         show_default=False,
     ),
 ]
@@ -76,7 +77,7 @@ OptionalRigArg = Annotated[
     Path | None,
     typer.Argument(
         help="Folder of a rig, actor.usda, another layer, model.npz or tracks.npz.",
-        callback=_actor_in_folder,
+        callback=rig_of_folder,
         show_default=False,
     ),
 ]

@@ -26,7 +26,7 @@ SIDECAR_HASH = "sha256"  # key of the custom data of these attributes
 
 
 def actor_in_folder(path: Path) -> Path:
-    """Return the actor of a rig's folder, other paths as they are.
+    """Return the actor of a rig's folder, as built or as published under another name; other paths as they are.
 
     Raises:
         RigError: a folder without one.
@@ -34,6 +34,9 @@ def actor_in_folder(path: Path) -> Path:
     if not path.is_dir():
         return path
     actor = path / ACTOR_FILE
+    published = [file for file in path.glob("*.usda") if file.with_name(f"{file.stem}_{RIG_FILE}").is_file()]
+    if not actor.exists() and len(published) == 1:
+        return published[0]
     if not actor.exists():
         hint = "Name the folder of a build (jawusd build ... -o FOLDER), or a file of it."
         if (path / "capture.toml").exists():

@@ -147,6 +147,23 @@ def test_animate_takes_motion_of_another_rig(actors, animation, tmp_path):
     assert CliRunner().invoke(app, [str(word) for word in arguments]).exit_code == 2
 
 
+def test_the_folder_of_a_build_stands_for_its_rig(actors, animation, tmp_path):
+    """In every option that takes a rig, of a build and as published under another name."""
+    path, *_ = animation
+    a, b = (actor.parent for actor in actors)
+    CliRunner().invoke(app, ["publish", str(b), "-o", str(tmp_path / "hero"), "--prefix", "hero"])
+    read = {}
+    for name, source, target in (("file", *actors), ("folder", a, b), ("published", a, tmp_path / "hero")):
+        run("retarget", path, "--from", source, "--to", target, "-o", tmp_path / f"{name}.usdc")
+        read[name] = read_poses_of_stage(tmp_path / f"{name}.usdc")[1]
+    np.testing.assert_array_equal(read["file"], read["folder"])
+    np.testing.assert_array_equal(read["file"], read["published"])
+    run("animate", b, path, "--retarget-from", a, "-o", tmp_path / "animated.usdc")
+    np.testing.assert_array_equal(read["file"], read_poses_of_stage(tmp_path / "animated.usdc")[1])
+    run("library", tmp_path / "lib", "--add", a, "--name", "anna")
+    assert jawusd.load(tmp_path / "lib" / "anna" / "model.npz").kind == jawusd.load(a).kind
+
+
 def test_retarget_asks_for_one_thing_and_overwrites_nothing(actors, animation, tmp_path):
     path, *_ = animation
     a, b = actors
