@@ -54,6 +54,16 @@ def _is_glb(path: Path) -> bool:
     return path.suffix.lower() == ".glb"
 
 
+def _clock_line(motion: AuthoredMotion) -> list[str]:
+    """Return what to say where a .glb cannot keep the frame numbers."""
+    from jawusd.rig.glb import frame_at_zero
+
+    zero = frame_at_zero(motion.frames)
+    if not zero:
+        return []
+    return [f"frame {zero:g} is at 0 s: glTF has no times before 0, and none fine enough beyond frame 100000"]
+
+
 def _write(out: Path, rig: Path, loaded: JawRig, motion: AuthoredMotion, rate: float, prim: str | None) -> None:
     from jawusd.rig import write_animation
     from jawusd.rig.glb import write_glb
@@ -127,6 +137,8 @@ def animate(
     knots = knots_of(loaded, motion)
     motion = follow_curves(loaded, motion, knots)
     _write(out, rig, loaded, motion, rate, prim)
+    if _is_glb(out):
+        changes.lines.extend(_clock_line(motion))
     if splines is not None:
         write_splines(splines, out, knots.frames, knots.d, rate, knots.slopes, knots.curved)
     emit_motion(out, rate, motion, changes, as_json)

@@ -193,7 +193,9 @@ def _numbers_per_second(
             hint="Give the rate with --fps." if fps is None else None,
         )
     samples = float(np.median(rows_of_whole)) if rows_of_whole.size else 0.0
-    fits = not given or not max(given, found) % min(given, found) or _FEWEST_ROWS * given <= samples <= _MOST_ROWS * given
+    fits = (
+        not given or not max(given, found) % min(given, found) or _FEWEST_ROWS * given <= samples <= _MOST_ROWS * given
+    )
     if highest >= found or not fits:
         counted = "" if highest >= found else f" and {found} of them in a second"
         raise FormatError(

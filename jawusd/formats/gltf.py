@@ -58,9 +58,22 @@ class Node:
 
 
 def save_glb(
-    path: str | os.PathLike[str], name: str, materials: Mapping[str, Material], nodes: Sequence[Node], generator: str
+    path: str | os.PathLike[str],
+    name: str,
+    materials: Mapping[str, Material],
+    nodes: Sequence[Node],
+    generator: str,
+    extras: Mapping[str, object],
 ) -> None:
     """Write nodes under one root of a name, atomically; times that single precision cannot tell apart are left out.
+
+    Args:
+        path: File to write.
+        name: Of the root, and of the animation.
+        materials: By the names that surfaces use.
+        nodes: What to write.
+        generator: The program that writes.
+        extras: What to note with the animation.
 
     Raises:
         OutputError: the file cannot be written.
@@ -94,7 +107,7 @@ def save_glb(
         "buffers": [{"byteLength": len(builder.data)}],
     }
     if channels:
-        document["animations"] = [{"name": name, "channels": channels, "samplers": samplers}]
+        document["animations"] = [{"name": name, "channels": channels, "samplers": samplers, "extras": dict(extras)}]
     write_bytes_atomic(path, _container(document, bytes(builder.data)))
 
 

@@ -19,6 +19,7 @@ from jawusd.rig.geo import MATERIAL_LOOKS, MESH_PATHS, read_geometry, read_gum, 
 from jawusd.rig.layout import MANDIBLE, SKULL
 from jawusd.rig.scan_look import linear_from_srgb
 
+_HIGHEST_FRAME = 100_000.0  # up to here, single precision is within a hundredth of a frame
 _SCAN = "Scan"  # white: the colours of the vertices multiply it
 
 
@@ -30,9 +31,10 @@ def write_glb(
     d: ArrayLike,
     fps: float,
 ) -> Path:
-    """Write the meshes of an actor and its motion, in the frame of the skull; the first frame is at 0 s.
+    """Write the meshes of an actor and its motion, in the frame of the skull; frame 0 is at 0 s, see `frame_at_zero`.
 
-    The mandible has a key at every whole frame, and more where straight lines between them would leave the model.
+    The mandible has a key at every whole frame, and more where straight lines between them would leave the model. The
+    animation's `extras` name frame rate, first and last frame, and the frame at 0 s.
 
     Args:
         actor: `actor.usda`, or another stage of one actor.
@@ -60,16 +62,26 @@ def write_glb(
         folder, title = MESH_PATHS[name].rsplit("/", 1)
         base = "Placeholder" if name in grown else "Enamel" if name.endswith("teeth") else "Bone"
         parts[folder].append(_surface(title, mesh, base, gums.get(name)))
+    zero = frame_at_zero(frames)
+    clock = {"fps": fps, "frames": frames[[0, -1]].tolist(), "frame_at_zero": zero}
     nodes = [
         Node("Skull", np.eye(4), parts[SKULL]),
-        Node("Mandible", rig.T_rest, parts[MANDIBLE], (times - times[0]) / fps, poses),
+        Node("Mandible", rig.T_rest, parts[MANDIBLE], (times - zero) / fps, poses),
     ]
     materials = {key: Material(*look) for key, look in MATERIAL_LOOKS.items()}
     materials[_SCAN] = Material((1.0, 1.0, 1.0), MATERIAL_LOOKS["Enamel"][1])
     used = {key for surface in (*parts[SKULL], *parts[MANDIBLE]) for key in surface.parts}
     materials = {key: material for key, material in materials.items() if key in used}
-    save_glb(out, str(rig.meta.get("actor") or "Actor"), materials, nodes, f"jawusd {__version__}")
+    save_glb(out, str(rig.meta.get("actor") or "Actor"), materials, nodes, f"jawusd {__version__}", clock)
     return out
+
+
+def frame_at_zero(frames: Array) -> float:
+    """Return the frame of a take, frames (F,), that a .glb has at 0 s: frame 0, so that other programs see its numbers.
+
+    The first frame where that cannot be: glTF has no times before 0, and its single precision would blur high frames.
+    """
+    return 0.0 if frames[0] >= 0 and frames[-1] <= _HIGHEST_FRAME else float(frames[0])
 
 
 def _surface(title: str, mesh: Mesh, base: str, gum: Mask | None) -> Surface:

@@ -101,7 +101,11 @@ def test_animate_reports_what_it_clamps(actor, tmp_path):
 def test_animate_writes_glb(actor, tmp_path):
     keys, glb = tmp_path / "keys.json", tmp_path / "take.glb"
     keys.write_text('{"fps": 24, "keys": [{"frame": 1, "d": [0, 0, 0]}, {"frame": 9, "d": [12, 0, 0]}]}')
-    assert "frames 1 .. 9 at 24 fps" in run("animate", actor, keys, "-o", glb)
+    said = run("animate", actor, keys, "-o", glb)
+    assert "frames 1 .. 9 at 24 fps" in said and "at 0 s" not in said
+    early = keys.with_name("early.json")
+    early.write_text(keys.read_text().replace('"frame": 1,', '"frame": -8,'))
+    assert "frame -8 is at 0 s" in run("animate", actor, early, "-o", tmp_path / "early.glb")
     assert glb.read_bytes()[:4] == b"glTF" and b'"animations"' in glb.read_bytes()
     run("animate", actor, keys, "-o", glb, code=10)  # it exists
     for option, value in (("--splines", tmp_path / "s.usda"), ("--prim", "/Actor")):

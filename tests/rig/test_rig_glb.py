@@ -60,7 +60,7 @@ class Parsed:
             sampler = animation["samplers"][channel["sampler"]]
             found[channel["target"]["path"]] = self.values(sampler["input"])[:, 0], self.values(sampler["output"])
         (times, moved_m), (again, xyzw) = found["translation"], found["rotation"]
-        assert np.array_equal(times, again) and times[0] == 0 and (np.diff(times) > 0).all()
+        assert np.array_equal(times, again) and (np.diff(times) > 0).all()
         return times, make_transform(Rotation.from_quat(xyzw).as_matrix(), moved_m * 1000.0)
 
     def primitives(self, name):
@@ -88,16 +88,16 @@ def take(tmp_path_factory):
 def test_the_mandible_moves_as_the_model_does(take):
     frames, d = example_motion()
     times, poses = take[1].motion()
-    rows = [int(np.argmin(np.abs(times - (frame - frames[0]) / FPS))) for frame in frames]
-    assert np.abs(times[rows] - (frames - frames[0]) / FPS).max() < 1e-6
+    rows = [int(np.argmin(np.abs(times - frame / FPS))) for frame in frames]
+    assert np.abs(times[rows] - frames / FPS).max() < 1e-6 and times[0] == pytest.approx(frames[0] / FPS)
     points = mandible_vertices()
     exact = moved(example_rig().pose(d), points)
     assert np.linalg.norm(moved(poses[rows], points) - exact, axis=2).max() < 1e-4
     # between keys, as readers show it: a straight line, and slerp
-    at = np.linspace(0, times[-1], 997)
-    turned = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))(np.clip(at, 0, times[-1])).as_matrix()
+    at = np.linspace(times[0], times[-1], 997)
+    turned = Slerp(times, Rotation.from_matrix(poses[:, :3, :3]))(np.clip(at, times[0], times[-1])).as_matrix()
     placed = np.stack([np.interp(at, times, column) for column in poses[:, :3, 3].T], axis=1)
-    wanted = np.stack([np.interp(at * FPS + frames[0], frames, column) for column in d.T], axis=1)
+    wanted = np.stack([np.interp(at * FPS, frames, column) for column in d.T], axis=1)
     landmarks = example_rig().arrays["landmarks"]
     exact = moved(example_rig().pose(wanted), landmarks)
     assert np.linalg.norm(moved(make_transform(turned, placed), landmarks) - exact, axis=2).max() < 0.02
@@ -143,12 +143,34 @@ def test_colours_and_texture_coordinates_lie_at_their_corners(take):
     assert white["pbrMetallicRoughness"]["baseColorFactor"] == [1, 1, 1, 1]
 
 
+@pytest.mark.parametrize("first", [0, 1, 1001, 86_400])
+def test_frame_numbers_are_kept(take, tmp_path, first):
+    path = write_glb(tmp_path / "a.glb", take[0], example_rig(), [first, first + 2], [[0, 0, 0], [5, 0, 0]], FPS)
+    parsed = Parsed(path)
+    times, _ = parsed.motion()
+    np.testing.assert_allclose(times[[0, -1]] * FPS, [first, first + 2], atol=0.01)
+    assert parsed.document["animations"][0]["extras"] == {
+        "fps": FPS,
+        "frames": [first, first + 2],
+        "frame_at_zero": 0,
+    }
+
+
+@pytest.mark.parametrize("first", [-5, 2_073_600])
+def test_numbers_that_gltf_cannot_keep_start_at_zero(take, tmp_path, first):
+    """Before frame 0, and a time of day at 24 per second, which single precision knows to a quarter of a frame."""
+    path = write_glb(tmp_path / "a.glb", take[0], example_rig(), [first, first + 2], [[0, 0, 0], [5, 0, 0]], FPS)
+    times, _ = Parsed(path).motion()
+    np.testing.assert_allclose(times[[0, -1]], [0, 2 / FPS], atol=1e-6)
+    assert Parsed(path).document["animations"][0]["extras"]["frame_at_zero"] == first
+
+
 def test_lost_frames_are_bridged_and_empty_takes_refused(take, tmp_path):
     path, rig = take[0], example_rig()
     d = np.array([[0.0, 0, 0], [np.nan] * 3, [8, 0, 0], [np.nan] * 3])
     times, poses = Parsed(write_glb(tmp_path / "a.glb", path, rig, [10, 11, 12, 13], d, FPS)).motion()
-    assert times[-1] == pytest.approx(3 / FPS)
-    for second, expected in ((1 / FPS, [4.0, 0, 0]), (3 / FPS, [8.0, 0, 0])):
+    assert times[-1] == pytest.approx(13 / FPS)
+    for second, expected in ((11 / FPS, [4.0, 0, 0]), (13 / FPS, [8.0, 0, 0])):
         shown = poses[int(np.argmin(np.abs(times - second)))]
         np.testing.assert_allclose(shown, rig.pose(np.array(expected)), atol=1e-4)
     with pytest.raises(RigError, match="nothing to animate"):
