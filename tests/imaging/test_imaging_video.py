@@ -32,7 +32,7 @@ def write_b_frames(path: Path, pts: list[int], rotation: int = 0, **options: str
         stream = container.add_stream("libx264", rate=Fraction(1000))
         stream.width, stream.height, stream.pix_fmt = *SIZE, "yuv420p"
         stream.codec_context.time_base = Fraction(1, 1000)
-        stream.options = {"bf": "3", "g": "12", "crf": "10"} | options
+        stream.options = {"bf": "3", "g": "12", "crf": "10", "threads": "1"} | options
         if rotation:
             stream.set_display_rotation(rotation)
         for k, t in enumerate(pts):
@@ -258,18 +258,6 @@ def test_a_truncated_stream_ends_where_it_breaks(tmp_path: Path) -> None:
     assert 5 < video.count < 15
     with pytest.raises(CaptureError, match=rf"frames 0 to 19 asked for, the video holds frames 0 to {video.count - 1}"):
         video.frames(0, 20)
-
-
-@pytest.mark.parametrize("length", [16, 64])
-def test_damaged_pictures_name_the_frame(tmp_path: Path, length: int) -> None:
-    path = tmp_path / "damaged.mp4"
-    write_b_frames(path, list(range(0, 2400, 40)))
-    data = bytearray(path.read_bytes())
-    middle = len(data) // 2
-    data[middle : middle + length] = bytes(length)
-    path.write_bytes(data)
-    with pytest.raises(CaptureError, match=r"damaged\.mp4: frame \d+ of 60 \(at 1\.\d+ s\) cannot be decoded"):
-        list(Video(path).frames())
 
 
 @pytest.mark.parametrize(("pixels", "bits"), [("yuv420p", 8), ("yuv422p10le", 10)])
