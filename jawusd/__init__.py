@@ -44,7 +44,7 @@ def __dir__() -> list[str]:
     return __all__
 
 
-def load(path: str | PathLike[str], *, prim: str | None = None, fast: bool = False) -> JawRig:
+def load(path: str | PathLike[str], *, prim: str | None = None, fast: bool = False, untrusted: bool = False) -> JawRig:
     """Load a rig for posing, validation and inverse kinematics.
 
     Args:
@@ -52,25 +52,28 @@ def load(path: str | PathLike[str], *, prim: str | None = None, fast: bool = Fal
         prim: Path of the rig's prim, where a stage holds several.
         fast: Compile the most used functions with numba: the same results to 1e-10, several times faster. Needs
             `pip install 'jawusd[fast]'`; the first use after an installation compiles for about a minute.
+        untrusted: Read the file in a second Python with limits of memory and time, some 0.5 s: a file that crashes
+            OpenUSD is then an error, and does not end this program.
 
     Raises:
         FormatError: the file is not a rig, is incomplete, or was written by a newer version.
         RigError: the stage cannot be opened.
+        ResourceError: it needs more memory than there is.
         MissingDependencyError: ``fast`` without numba.
     """
-    if str(path).endswith(".npz"):
+    if untrusted:
+        from jawusd.rig.separate import load_separately
+
+        rig = load_separately(Path(path), prim)
+    elif str(path).endswith(".npz"):
         from jawusd import evaluator
 
         rig = evaluator.load(path)
     else:
-        from jawusd.rig.child_process import begin_in_child
+        from jawusd.rig import load_rig
         from jawusd.rig.layout import actor_in_folder
 
-        actor = actor_in_folder(Path(path))
-        begin_in_child(actor)  # which works while the rest is imported
-        from jawusd.rig import load_rig
-
-        rig = load_rig(actor, prim)
+        rig = load_rig(actor_in_folder(Path(path)), prim)
     if not fast:
         return rig
     from jawusd.fast import accelerate

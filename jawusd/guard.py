@@ -115,14 +115,16 @@ def _lower(kind: int, most: int) -> None:
         resource.setrlimit(kind, (most, hard))
 
 
-def out_of_memory() -> ResourceError:
-    """Return the error for a lack of memory, with the file in hand and the limit."""
+def out_of_memory(path: str | PathLike[str] | None = None) -> ResourceError:
+    """Return the error for a lack of memory over a file, that in hand by default, with the limit."""
     limits = []
     if resource is not None:
         found = (resource.getrlimit(kind)[0] for kind in (resource.RLIMIT_DATA, resource.RLIMIT_AS))
         limits = [limit for limit in found if limit != resource.RLIM_INFINITY]
     allowed = f", {min(limits) / 1e9:.2g} GB" if limits else ""
-    return ResourceError(f"needs more memory than jawusd may use here{allowed}.", path=file_in_hand(), hint=_MORE)
+    return ResourceError(
+        f"needs more memory than jawusd may use here{allowed}.", path=path or file_in_hand(), hint=_MORE
+    )
 
 
 _MORE = f"Set {SETTING} (and ulimit -v) to allow more, or use a smaller input."

@@ -13,7 +13,7 @@ _LFS = b"version https://git-lfs"
 
 
 def check_input(path: str | os.PathLike[str], error: type[JawusdError] = FormatError) -> None:
-    """Check that something to read is a file, and note it as the file in hand. What is missing is left to its reader, which says so.
+    """Check that something to read is a file, and note that it is read. What is missing is left to its reader.
 
     Pipes that nobody writes to would be waited for, and devices read, for ever.
 
@@ -44,7 +44,7 @@ def why_unreadable(path: str | os.PathLike[str]) -> tuple[str, str] | None:
 
 
 def check_path(path: str | os.PathLike[str], error: type[JawusdError]) -> None:
-    """Check that OpenUSD can follow a path: it allows no line breaks and other control characters.
+    """Check that OpenUSD can follow a path: it allows UTF-8 without line breaks and other control characters.
 
     Raises:
         JawusdError: of the given class; it cannot.
@@ -55,3 +55,11 @@ def check_path(path: str | os.PathLike[str], error: type[JawusdError]) -> None:
             path=path,
             hint="Rename the folder, or name another one.",
         )
+    try:
+        os.path.abspath(path).encode()
+    except UnicodeEncodeError:  # Python stands for such bytes by lone surrogates
+        raise error(
+            "the path is not UTF-8, or holds letters that this locale lacks; OpenUSD cannot follow it.",
+            path=path,
+            hint="Rename the folder; where its name is UTF-8, set PYTHONUTF8=1.",
+        ) from None

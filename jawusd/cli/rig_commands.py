@@ -41,13 +41,8 @@ def info(
         return
     if rig is None:
         raise typer.BadParameter("name a file, or give --schema.", param_hint="RIG")
-    if rig.suffix.lower() in USD_SUFFIXES:
-        from jawusd.rig.child_process import begin_in_child
-
-        begin_in_child(rig)  # which works while the rest is imported
-    from jawusd.formats.tracks import is_tracks, load_tracks
-
-    if rig.suffix == ".npz" and is_tracks(rig):
+    if rig.suffix == ".npz":
+        from jawusd.formats.tracks import load_tracks
         from jawusd.pipeline.track import frame_lines, frame_summary, track_lines, track_summary
 
         tracks = load_tracks(rig)
@@ -240,9 +235,6 @@ def _poses_or_parameters(rig: JawRig, path: Path, prim: str | None) -> tuple[NDA
 def _validate_rig(path: Path, as_json: bool) -> None:
     from dataclasses import asdict
 
-    from jawusd.rig.child_process import begin_in_child
-
-    begin_in_child(path)  # which works while the rest is imported
     from jawusd.rig import find_nvidia_validator, nvidia_findings, validate_stage
 
     findings = validate_stage(path)

@@ -301,11 +301,3 @@ def load_tracks(path: str | os.PathLike[str]) -> Tracks:
         meta=cast(TracksMeta, meta),
         solved=take_solved(arrays, count, path),
     )
-
-
-def is_tracks(path: str | os.PathLike[str]) -> bool:
-    """Tell whether a file's format label says that it holds tracks; `load_tracks` checks the rest."""
-    try:
-        return read_npz(path, FAMILY, VERSION) is not None
-    except FormatError:
-        return False

@@ -26,11 +26,11 @@ def read_picture(path: Path, flags: int) -> NDArray[np.uint8] | NDArray[np.uint1
         check_input(path, CaptureError)
         if _pixels(path) > MOST_PX:
             return None
-        image = cv2.imread(str(path), flags)
+        image = cv2.imdecode(np.fromfile(path, np.uint8), flags)  # imread crashes over names that are not UTF-8
         if image is None or image.dtype == np.uint8:
             return None if image is None else np.asarray(image, np.uint8)
         return np.asarray(image, np.uint16)
-    except (OSError, cv2.error, MemoryError, CaptureError):
+    except (OSError, cv2.error, CaptureError):
         return None
 
 

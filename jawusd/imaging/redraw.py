@@ -57,5 +57,4 @@ def write_mask(path: str, mask: NDArray[np.uint8]) -> None:
     Raises:
         OSError: the file cannot be written.
     """
-    if not cv2.imwrite(path, mask, (cv2.IMWRITE_PNG_COMPRESSION, 1)):
-        raise OSError(f"{path} cannot be written")
+    cv2.imencode(".png", mask, (cv2.IMWRITE_PNG_COMPRESSION, 1))[1].tofile(path)

@@ -66,8 +66,6 @@ def viewed_actor(path: str | os.PathLike[str], prim: str | None = None) -> Viewe
 
     path = Path(path)
     path = path / "actor.usda" if path.is_dir() else path
-    if path.suffix == ".npz":
-        raise FormatError("holds a model without meshes; nothing to see.", path=path, hint="Name the actor.usda.")
     rig, about = load_rig(path, prim), describe(path, prim)
     place, fps = about["prim"], float(about["fps"] or DEFAULT_FPS)
     return ViewedActor(

@@ -14,6 +14,9 @@ from jawusd.rig.layers import set_attribute
 
 _TYPES = Sdf.ValueTypeNames
 
+#: Numbers or points in one array of a stage that are read: corners of as many triangles as mesh files may have.
+MOST_VALUES = 30_000_000
+
 
 def model_hash(rig: JawRig) -> str:
     """Return the SHA-256 of a rig's arrays, see `JawRig.model_hash`."""
@@ -75,10 +78,23 @@ def read_value(prim: Usd.Prim, name: str, where: object) -> object:
     """Return the default value of an attribute.
 
     Raises:
-        FormatError: It has none.
+        FormatError: It has none, or too many numbers.
     """
     attribute = prim.GetAttribute(name)
-    value = attribute.Get() if attribute else None
+    value = value_of(attribute, where) if attribute else None
     if value is None:
         raise FormatError(f"{prim.GetPath()} has no value for {name}; this is not a complete jaw rig.", path=str(where))
+    return value
+
+
+def value_of(attribute: Usd.Attribute, where: object, time: Usd.TimeCode | None = None) -> object:
+    """Return the value of an attribute, its default or that at a time; None if there is none.
+
+    Raises:
+        FormatError: It is an array of more than `MOST_VALUES`.
+    """
+    value = attribute.Get(Usd.TimeCode.Default() if time is None else time)
+    if hasattr(value, "__len__") and len(value) > MOST_VALUES:
+        found = f"{attribute.GetPath()} holds {len(value)} values, at most {MOST_VALUES} are read."
+        raise FormatError(found, path=str(where))
     return value

@@ -13,6 +13,7 @@ from jawusd.errors import RigError
 from jawusd.formats.mesh import Mesh, crown_face_mask
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.rig import _gf
+from jawusd.rig.arrays import value_of
 from jawusd.rig.layers import add_pose, define_prim, new_layer, set_attribute, stage_of
 from jawusd.rig.layout import ACTOR, GEO, MANDIBLE, MATERIALS, SKULL
 from jawusd.rig.read import open_stage
@@ -183,11 +184,12 @@ def read_geometry(
         mesh = UsdGeom.Mesh(stage.GetPrimAtPath(place))
         if not mesh or bool(mesh.GetPrim().GetAttribute("jaw:placeholder").Get()) != placeholders:
             continue
-        counts = np.array(mesh.GetFaceVertexCountsAttr().Get() or [])
+        counts = np.array(value_of(mesh.GetFaceVertexCountsAttr(), path) or [])
         if not counts.size or (counts != 3).any():
             raise RigError(f"{place} must be made of triangles.", path=Path(path))
-        vertices = np.array(mesh.GetPointsAttr().Get(), dtype=np.float64)
-        faces = np.array(mesh.GetFaceVertexIndicesAttr().Get(), dtype=np.int32).reshape(-1, 3)
+        points, corners = (value_of(a, path) for a in (mesh.GetPointsAttr(), mesh.GetFaceVertexIndicesAttr()))
+        vertices = np.array(points, dtype=np.float64)
+        faces = np.array(corners, dtype=np.int32).reshape(-1, 3)
         colors, uv = read_look(mesh, len(vertices), len(faces))
         found[name] = Mesh(vertices, faces, colors, uv=uv)
     return found
@@ -208,8 +210,8 @@ def read_gum(path: str | os.PathLike[str], prim_path: str = ACTOR) -> dict[str, 
         mesh = UsdGeom.Mesh(stage.GetPrimAtPath(place))
         subset = UsdGeom.Subset(stage.GetPrimAtPath(f"{place}/{place.rsplit('/', 1)[1]}Gum"))
         if mesh and subset:
-            gum = np.zeros(len(mesh.GetFaceVertexCountsAttr().Get()), dtype=bool)
-            gum[np.array(subset.GetIndicesAttr().Get())] = True
+            gum = np.zeros(np.size(np.array(value_of(mesh.GetFaceVertexCountsAttr(), path))), dtype=np.bool_)
+            gum[np.array(value_of(subset.GetIndicesAttr(), path))] = True
             found[name] = gum
     return found
 

@@ -14,10 +14,9 @@ from pxr import Sdf, Usd, UsdGeom
 from jawusd.errors import EvaluatorError, FormatError, RigError, UnitsError
 from jawusd.evaluator import JawRig
 from jawusd.geometry.arrays import Array
+from jawusd.guard import out_of_memory
 from jawusd.inputs import check_path
-from jawusd.rig.arrays import read_arrays, read_value
-from jawusd.rig.asset_paths import file_of_layer
-from jawusd.rig.child_process import remember, try_in_child
+from jawusd.rig.arrays import read_arrays, read_value, value_of
 from jawusd.rig.layout import MADE_FOR, ONNX_ATTRIBUTES, PARAMETERS
 from jawusd.rig.schema import has_jaw_api, rig_prims
 from jawusd.rig.table import DecoderTable
@@ -48,20 +47,19 @@ def open_stage(path: PathArg) -> Usd.Stage:
     """Open a stage.
 
     Raises:
-        RigError: There is no such file, it is not USD, names files that `check_reach` forbids, or OpenUSD crashes or
-            takes too much memory or time on it.
+        RigError: There is no such file, it is not USD, or names files that `check_reach` forbids.
+        ResourceError: It needs more memory than there is.
     """
     path = Path(path)
     if not path.is_file():
         raise RigError("there is no such file.", path=path)
+    if path.suffix == ".npz":
+        raise RigError("is an npz file, a USD file is needed.", path=path, hint="Name the rig's actor.usda.")
     check_path(path, RigError)
     try:
-        try_in_child(path)
-        stage = open_checked(path)
+        return open_checked(path)
     except MemoryError as error:
-        raise RigError("needs more memory than there is.", path=path) from error
-    remember(path, [file_of_layer(layer) for layer in stage.GetUsedLayers() if not layer.anonymous])
-    return stage
+        raise out_of_memory(path) from error
 
 
 def find_rig_prim(stage: Usd.Stage, where: object, prim_path: str | None = None) -> Usd.Prim:
@@ -240,7 +238,7 @@ def describe(path: PathArg, prim_path: str | None = None) -> Description:
         "onnx": [asset.path for asset in onnx if asset is not None],
         "fps": stage.GetTimeCodesPerSecond(),
         "animation": animation,
-        "meshes": _meshes(prim),
+        "meshes": _meshes(prim, path),
         "placeholders": [p.GetName() for p in _below(prim) if p.GetAttribute("jaw:placeholder").Get()],
         "contact": rig.meta.get("contact"),
         "joints": rig.meta.get("joints"),
@@ -256,10 +254,10 @@ def _speeds(rig: JawRig) -> dict[str, list[float]] | None:
     return {"rms_mm_s": rig.speeds.rms_mm_s.tolist(), "rms_mm_s2": rig.speeds.rms_mm_s2.tolist()}
 
 
-def _meshes(prim: Usd.Prim) -> dict[str, int]:
+def _meshes(prim: Usd.Prim, where: object) -> dict[str, int]:
     """Return the number of points of every mesh below a prim, by name."""
     meshes = [UsdGeom.Mesh(p) for p in _below(prim) if p.IsA(UsdGeom.Mesh)]
-    return {mesh.GetPrim().GetName(): len(mesh.GetPointsAttr().Get() or []) for mesh in meshes}
+    return {mesh.GetPrim().GetName(): len(np.array(value_of(mesh.GetPointsAttr(), where) or [])) for mesh in meshes}
 
 
 def _below(prim: Usd.Prim) -> Usd.PrimRange:

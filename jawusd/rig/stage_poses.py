@@ -20,6 +20,7 @@ from jawusd.geometry.arrays import Array
 from jawusd.geometry.matching import match_points
 from jawusd.geometry.rigid import rigid_fit
 from jawusd.geometry.se3 import se3_inverse, transform_points
+from jawusd.rig.arrays import value_of
 from jawusd.rig.geo import read_geometry
 from jawusd.rig.layout import ACTOR
 from jawusd.rig.motion_read import frames_of_stage
@@ -152,7 +153,7 @@ def _find(stage: Usd.Stage, rest: dict[str, Mesh], names: tuple[str, ...], below
     if below is not None and not (Sdf.Path.IsValidPathString(below) and stage.GetPrimAtPath(below)):
         raise FormatError(f"has no prim {below}.", path=str(path))
     meshes = _meshes(stage.GetPrimAtPath(below) if below is not None else stage.GetPseudoRoot())
-    found = {str(prim.GetPath()): _used_points(prim) for prim in meshes}
+    found = {str(prim.GetPath()): _used_points(prim, path) for prim in meshes}
     wanted = {name: rest[name] for name in names if name in rest}
     doubtful: list[str] = []
     for name, mesh in wanted.items():
@@ -190,10 +191,10 @@ def _meshes(below: Usd.Prim) -> list[Usd.Prim]:
     return [prim for prim in Usd.PrimRange(below, Usd.TraverseInstanceProxies()) if prim.IsA(UsdGeom.Mesh)]
 
 
-def _used_points(prim: Usd.Prim) -> _Points:
+def _used_points(prim: Usd.Prim, where: object) -> _Points:
     mesh, first = UsdGeom.Mesh(prim), Usd.TimeCode.EarliestTime()
-    points = np.array(mesh.GetPointsAttr().Get(first) or np.empty((0, 3)), dtype=np.float64)
-    used = np.unique(np.array(mesh.GetFaceVertexIndicesAttr().Get(first) or [], dtype=np.int64))
+    points = np.array(value_of(mesh.GetPointsAttr(), where, first) or np.empty((0, 3)), dtype=np.float64)
+    used = np.unique(np.array(value_of(mesh.GetFaceVertexIndicesAttr(), where, first) or [], dtype=np.int64))
     used = used[used < len(points)]
     return _Points(points, used, len(np.unique(points[used], axis=0)))
 

@@ -13,6 +13,7 @@ from jawusd.errors import CaptureError
 from jawusd.formats.atomic import write_bytes_atomic
 from jawusd.imaging.mask_files import PngMasks
 from jawusd.imaging.mask_levels import RawImage
+from jawusd.imaging.pictures import read_gray
 
 ARCHES = ("upper", "lower")
 PATTERN = "%06d.png"
@@ -98,8 +99,8 @@ class KeyMasks:
         if source is None or self._folder is None or not 0 <= own < source.count:
             return None
         path = mask_path(self._folder, camera, arch, own)
-        gray = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.exists() else None
-        if gray is not None and _is_strokes(np.asarray(gray, np.uint8)):
+        gray = read_gray(path)
+        if gray is not None and _is_strokes(gray):
             if gray.shape[::-1] != tuple(self._sizes_px[camera]):
                 size = self._sizes_px[camera]
                 raise CaptureError(

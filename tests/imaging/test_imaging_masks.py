@@ -1,5 +1,6 @@
 """Mask sources in every order and encoding, and every way they can be wrong."""
 
+import re
 import struct
 import threading
 import time
@@ -10,8 +11,11 @@ import cv2
 import numpy as np
 import pytest
 
+import jawusd
 from jawusd.errors import CaptureError
 from jawusd.imaging.masks import MaskReader, mask_size_px
+from jawusd.imaging.pictures import read_gray
+from jawusd.imaging.redraw import write_mask
 from jawusd.imaging.timeline import Timeline
 from jawusd.imaging.video_writer import VideoWriter
 
@@ -213,3 +217,14 @@ def test_all_png_encodings(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", ["pattern", "video"])
 def test_size_of_masks_is_read_from_the_files(request, kind):
     assert mask_size_px(request.getfixturevalue(kind)) == SIZE
+
+
+def test_pictures_lie_in_folders_of_any_name(tmp_path):
+    """OpenCV's own readers and writers of files end the process over names that are not UTF-8."""
+    folder = tmp_path / "a\udcff"
+    folder.mkdir()
+    write_mask(str(folder / "1.png"), mask(0))
+    assert np.array_equal(read_gray(folder / "1.png"), mask(0))
+    package = Path(jawusd.__file__).parent
+    named = [path for path in package.rglob("*.py") if re.search(r"cv2\.(imread|imwrite|VideoC|VideoW)", path.read_text())]
+    assert named == []

@@ -1,0 +1,199 @@
+"""Hostile rigs: what limits a process of its own has, what is counted before it is read, and what commands say."""
+
+import os
+import shutil
+import subprocess
+import sys
+import threading
+
+import numpy as np
+import pytest
+from pxr import Sdf, Usd, UsdGeom, Vt
+
+import jawusd
+from jawusd.errors import FormatError, ResourceError, RigError
+from jawusd.formats.allowed_folders import SETTING
+from jawusd.rig import arrays, separate, untrusted
+from jawusd.rig.geo import read_geometry, read_gum
+from jawusd.rig.read import describe, load_rig, open_stage
+
+HEADER = "#usda 1.0\n"
+limits = pytest.mark.skipif(sys.platform != "linux", reason="limits of Linux")
+
+
+def doubling(levels):
+    """Return a layer of 2 ** levels prims."""
+    refers = "".join(
+        f'def "P{i}" {{\ndef "a" ( references = </P{i + 1}> ) {{}}\ndef "b" ( references = </P{i + 1}> ) {{}}\n}}\n'
+        for i in range(levels)
+    )
+    return f'{HEADER}{refers}def "P{levels}" {{}}\n'
+
+
+def nested(levels):
+    """Return a layer that OpenUSD recurses into until its stack ends."""
+    return HEADER + 'def "a" {\n' * levels + "}\n" * levels
+
+
+def enlarged(folder, path, count):
+    """Give an array of a rig so many zeros; the binary layer stays small."""
+    for name in ("geo.usdc", "rig.usdc"):
+        layer = Sdf.Layer.FindOrOpen(str(folder / name))
+        spec = layer.GetAttributeAtPath(path)
+        if spec:
+            kind = Vt.IntArray if spec.typeName == Sdf.ValueTypeNames.IntArray else Vt.DoubleArray
+            spec.default = kind(count)
+            layer.Export(str(folder / "large.usdc"))
+            os.replace(folder / "large.usdc", folder / name)
+    actor = Sdf.Layer.FindOrOpen(str(folder / "actor.usda"))
+    actor.customLayerData = {k: v for k, v in actor.customLayerData.items() if k != "sha256"}
+    actor.Save()
+    return folder / "actor.usda"
+
+
+def test_a_separate_process_gives_the_same_rig(folder):
+    here, there = jawusd.load(folder), jawusd.load(folder, untrusted=True)
+    assert here.model_hash == there.model_hash and here.meta == there.meta
+    assert np.array_equal(here.pose([20.0, 1.0, 2.0]), there.pose([20.0, 1.0, 2.0]))
+
+
+@limits
+def test_what_crashes_openusd_is_an_error(tmp_path):
+    (tmp_path / "deep.usda").write_text(nested(40_000))
+    with pytest.raises(RigError, match=r"deep.usda: ends the process that reads it \(exit code -11\)"):
+        jawusd.load(tmp_path / "deep.usda", untrusted=True)
+
+
+@limits
+def test_what_takes_too_long_is_an_error(tmp_path, monkeypatch):
+    (tmp_path / "bomb.usda").write_text(doubling(28))
+    monkeypatch.setattr(separate, "MOST_CPU_S", 2)
+    with pytest.raises(RigError, match="takes more than 2 s of work"):
+        jawusd.load(tmp_path / "bomb.usda", untrusted=True)
+    monkeypatch.setattr(separate, "MOST_WAIT_S", 0.01)
+    with pytest.raises(RigError, match=r"takes more than 0.01 s to read"):
+        jawusd.load(tmp_path / "bomb.usda", untrusted=True)
+
+
+@limits
+def test_what_needs_too_much_memory_is_an_error(anchored_folder, monkeypatch):
+    actor = enlarged(anchored_folder, "/Actor.jaw:model:tRest", 150_000_000)
+    monkeypatch.setattr(separate, "MOST_MEMORY_GB", 0.8)
+    with pytest.raises((FormatError, ResourceError), match="Corrupt asset|needs more memory"):
+        jawusd.load(actor, untrusted=True)
+
+
+def test_errors_come_back_as_they_are(anchored_folder, tmp_path, monkeypatch):
+    (tmp_path / "none.usda").write_text(HEADER)
+    with pytest.raises(FormatError, match="holds no jaw rig"):
+        jawusd.load(tmp_path / "none.usda", untrusted=True)
+    with pytest.raises(FormatError, match="/Nobody carries no jaw rig"):
+        jawusd.load(anchored_folder, prim="/Nobody", untrusted=True)
+    shutil.move(anchored_folder / "rig.usdc", tmp_path / "rig.usdc")
+    (anchored_folder / "rig.usdc").symlink_to(tmp_path / "rig.usdc")
+    with pytest.raises(RigError, match="outside its own folder") as found:
+        jawusd.load(anchored_folder, untrusted=True)
+    assert "--allow" in found.value.hint
+    monkeypatch.setenv(SETTING, str(tmp_path))
+    assert jawusd.load(anchored_folder, untrusted=True)
+
+
+def test_programs_that_python_is_part_of_start_the_python_beside_them(anchored_folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "maya.bin"))
+    (tmp_path / "mayapy").symlink_to(os.path.realpath(sys.prefix + "/bin/python3"))
+    assert separate._python() == str(tmp_path / "mayapy")
+    (tmp_path / "mayapy").unlink()
+    monkeypatch.setattr(sys, "prefix", str(tmp_path))
+    with pytest.raises(RigError, match="needs a Python to start"):
+        jawusd.load(anchored_folder, untrusted=True)
+
+
+def test_a_rig_is_loaded_in_this_process_from_any_thread(anchored_folder, monkeypatch):
+    monkeypatch.setattr(os, "fork", None)
+    monkeypatch.setattr(subprocess, "Popen", None)
+    found = []
+    thread = threading.Thread(target=lambda: found.append(jawusd.load(anchored_folder)))
+    thread.start()
+    thread.join()
+    assert len(found) == 1
+
+
+
+CORNERS = "/Actor/geo/Mandible/LowerTeethMesh.faceVertexIndices"
+
+
+@pytest.mark.parametrize("read", [load_rig, describe, read_geometry, read_gum])
+def test_arrays_are_counted_before_they_are_used(read, anchored_folder, monkeypatch):
+    monkeypatch.setattr(arrays, "MOST_VALUES", 20)
+    with pytest.raises(FormatError, match=r"values, at most 20 are read"):
+        read(anchored_folder / "actor.usda")
+
+
+def test_prims_and_samples_are_counted(anchored_folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(untrusted, "MOST_SPECS", 10)
+    with pytest.raises(RigError, match="holds more than 10 prims and properties"):
+        open_stage(anchored_folder / "actor.usda")
+    monkeypatch.undo()
+    stage = Usd.Stage.CreateNew(str(tmp_path / "long.usdc"))
+    moved = UsdGeom.Xform.Define(stage, "/A").AddTranslateOp()
+    for frame in range(9):
+        moved.Set((0, 0, frame), frame)
+    stage.Save()
+    monkeypatch.setattr(untrusted, "MOST_SAMPLES", 8)
+    with pytest.raises(RigError, match="holds more than 8 samples of /A.xformOp:translate"):
+        open_stage(tmp_path / "long.usdc")
+
+
+def command(*words, code="", **settings):
+    program = f"from jawusd import guard; guard.begin(); {code}from jawusd.cli.main import main; main()"
+    line = [sys.executable, "-c", program, *map(str, words)]
+    return subprocess.run(line, capture_output=True, text=True, check=False, env={**os.environ, **settings})
+
+
+@limits
+def test_a_small_rig_of_many_faces_is_refused_by_view(anchored_folder):
+    actor = enlarged(anchored_folder, CORNERS, 60_000_000)
+    assert (anchored_folder / "geo.usdc").stat().st_size < 4_000_000
+    done = command("view", actor, JAWUSD_MEMORY_GB="1")
+    assert done.returncode == FormatError.exit_code and done.stderr.count("\n") == 1
+    assert "faceVertexIndices holds 60000000 values, at most 30000000 are read." in done.stderr
+
+
+@limits
+@pytest.mark.parametrize("name", ["info", "validate", "view"])
+def test_commands_end_in_one_message_where_openusd_crashes(name, tmp_path):
+    (tmp_path / "deep.usda").write_text(nested(40_000))
+    done = command(name, tmp_path / "deep.usda")
+    assert done.returncode == ResourceError.exit_code and done.stderr.count("\n") == 1
+    assert done.stderr.startswith(f"jawusd: {tmp_path}/deep.usda: a library crashed")
+
+
+@limits
+def test_commands_end_in_one_message_where_openusd_takes_too_long(tmp_path):
+    (tmp_path / "bomb.usda").write_text(doubling(28))
+    done = command("info", tmp_path / "bomb.usda", code="from jawusd.rig import untrusted; untrusted.MOST_CPU_S = 1; ")
+    assert done.returncode == ResourceError.exit_code and done.stderr.count("\n") == 1
+    assert done.stderr.startswith(f"jawusd: {tmp_path}/bomb.usda: takes too much processor time")
+
+
+@pytest.mark.parametrize("name", ["a\udcff", "a\nb"])
+def test_names_that_openusd_cannot_follow_are_refused_as_such(name, anchored_folder, tmp_path):
+    shutil.copytree(anchored_folder, tmp_path / name)
+    with pytest.raises(RigError, match="OpenUSD cannot follow it"):
+        open_stage(tmp_path / name / "actor.usda")
+
+
+@limits
+def test_letters_that_a_locale_lacks_are_no_fault_of_the_file(anchored_folder, tmp_path):
+    shutil.copytree(anchored_folder, tmp_path / "😀")
+    plain = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    done = command("info", tmp_path / "😀" / "actor.usda", **plain)
+    assert done.returncode == RigError.exit_code and "set PYTHONUTF8=1" in done.stderr
+    assert command("info", tmp_path / "😀" / "actor.usda", LC_ALL="C").returncode == 0
+
+
+def test_npz_files_are_not_called_usd(tmp_path):
+    (tmp_path / "tracks.npz").write_bytes(b"PK\x03\x04 and no more")
+    assert "is not a readable npz file" in command("info", tmp_path / "tracks.npz").stderr
+    for name in ("validate", "view"):
+        assert "is an npz file, a USD file is needed" in command(name, tmp_path / "tracks.npz").stderr
