@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from jawusd.cli.options import USD_SUFFIXES, Allow, Force, Json, Prim, RigArg, load_named
+from jawusd.cli.options import USD_SUFFIXES, Allow, Force, Json, Prim, RigArg, load_named, rig_of_folder
 from jawusd.cli.output import emit, refuse_existing
 from jawusd.errors import JawusdError
 
 if TYPE_CHECKING:
+    from jawusd.cli.motion import AuthoredMotion, Changes
     from jawusd.evaluator import JawRig
     from jawusd.geometry.arrays import Array
     from jawusd.rig.rebake import StageMotion
@@ -86,52 +89,133 @@ def encode(
 
 
 def rebake(
-    rig: RigArg,
-    stage: Annotated[
-        Path, typer.Argument(help="Shot or animation layer, or what was exported of it.", show_default=False)
+    rig: Annotated[
+        Path,
+        typer.Argument(
+            help="The shot; or before a stage that holds copies of a rig's meshes, FBX or glTF: the rig.",
+            metavar="SHOT | RIG STAGE",
+            callback=rig_of_folder,
+            show_default=False,
+        ),
     ],
-    out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="Layer over the stage; <stage>_baked.usdc if not given.")
+    stage: Annotated[
+        Path | None, typer.Argument(help="Shot or animation layer, or what was exported of it.", show_default=False)
     ] = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Layer to write; <shot>_baked.usdc if not given.")
+    ] = None,
+    root: Annotated[bool, typer.Option("--root", help="Let the layer be a new root: it sublayers the shot.")] = False,
     origin: Annotated[
         Origin | None, typer.Option("--from", help="What counts where d and mandible disagree.", show_default=False)
     ] = None,
     mandible: MandiblePrim = None,
     skull: SkullPrim = None,
-    prim: Prim = None,
+    prim: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--prim", help="Which rigs of the shot: paths of their prims; all if not given.", show_default=False
+        ),
+    ] = None,
     allow: Allow = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Give a stage the d and the mandible that belong together, where only one was keyed or moved.
+    """Give the rigs of a shot the d and the mandible that belong together, where only one was keyed or moved.
 
-    The motion is brought inside the bound; what lay outside is reported with its margin. A stage without the rig, that
-    holds copies of its meshes, moved by transforms, bones or point caches, gives a layer over RIG. FBX and glTF
-    are read through Blender.
+    One layer holds the opinions for all rigs, to be sublayered by the shot. Motions are brought inside the bound; what
+    lay outside is reported with its margin. A stage without the rig, that holds copies of its meshes, moved by
+    transforms, bones or point caches, gives a layer over RIG. FBX and glTF are read through Blender.
     """
+    shot = stage or rig
+    out = out or shot.with_name(f"{shot.stem}_baked.usdc")
+    refuse_existing(out, force)
+    taken = [
+        _taken(rig, shot, one, mandible, skull, origin.value if origin else None) for one in _rigs_of(rig, stage, prim)
+    ]
+    stronger = _write_baked(out, rig, shot, taken, root, prim[0] if prim else None)
+    actors = [{"prim": one.found.prim, "from": one.found.origin, **one.judged, **one.changes.figures} for one in taken]
+    result = {"file": str(out), **(actors[0] if len(actors) == 1 else {}), "actors": actors, "stronger": stronger}
+    emit(result, as_json, lambda: _baked_lines(out, shot, taken, stronger))
+
+
+@dataclass(frozen=True)
+class _Taken:
+    """Hold what one rig of a shot is given: as found, inside the bound, and what was changed for that."""
+
+    rig: JawRig
+    found: StageMotion
+    motion: AuthoredMotion
+    changes: Changes
+    judged: dict[str, float]
+
+
+def _rigs_of(rig: Path, stage: Path | None, prims: list[str] | None) -> list[str | None]:
+    """Return which rigs are baked: those named, else all of a shot; None for the only one, or for that of RIG."""
+    if stage is not None and len(prims or ()) > 1:
+        raise typer.BadParameter("RIG STAGE bakes one rig; several are baked with the shot alone.", param_hint="--prim")
+    if prims or stage is not None:
+        return [*prims] if prims else [None]
+    from jawusd.rig.read import find_rig_prim, open_stage
+    from jawusd.rig.schema import rig_prims
+
+    opened = open_stage(rig)
+    return [str(prim.GetPath()) for prim in rig_prims(opened)] or [str(find_rig_prim(opened, rig).GetPath())]
+
+
+def _taken(
+    rig: Path,
+    shot: Path,
+    prim: str | None,
+    mandible: str | None,
+    skull: str | None,
+    origin: Literal["d", "mandible"] | None,
+) -> _Taken:
+    from jawusd.cli.motion import AuthoredMotion, kept_inside
+
+    loaded = load_named(rig, prim, shot)
+    found = read_stage_motion(loaded, rig, shot, prim, mandible, skull, origin)
+    motion, changes = kept_inside(loaded, AuthoredMotion(found.frames, found.d, found.fps))
+    return _Taken(loaded, found, motion, changes, judged_motion(loaded, found.frames, found.d, found.residual_mm))
+
+
+def _write_baked(out: Path, rig: Path, shot: Path, taken: Sequence[_Taken], root: bool, prim: str | None) -> list[str]:
+    """Write the layer; return what is stronger than it in the shot's own layer."""
     import numpy as np
 
-    from jawusd.cli.motion import AuthoredMotion, kept_inside
     from jawusd.rig import write_animation
-    from jawusd.rig.rebake import write_over, write_rebaked
+    from jawusd.rig.rebake import Rebaked, write_over, write_rebaked
 
-    out = out or stage.with_name(f"{stage.stem}_baked.usdc")
-    refuse_existing(out, force)
-    loaded = load_named(rig, prim, stage)
-    found = read_stage_motion(loaded, rig, stage, prim, mandible, skull, origin.value if origin else None)
-    motion, changes = kept_inside(loaded, AuthoredMotion(found.frames, found.d, found.fps))
-    known = np.isfinite(motion.d).all(axis=1)
-    if found.fitted and prim is not None and stage.suffix.lower() not in USD_SUFFIXES:  # else it is the stage's
-        write_over(out, rig, loaded, motion.frames, motion.d, found.fps, prim)
-    elif found.fitted:
-        write_animation(out, rig, motion.frames, motion.d, found.fps, rig=loaded)
+    first = taken[0]
+    motion = first.motion
+    if first.found.fitted and prim is not None and shot.suffix.lower() not in USD_SUFFIXES:  # else it is the shot's
+        write_over(out, rig, first.rig, motion.frames, motion.d, first.found.fps, prim)
+    elif first.found.fitted:
+        write_animation(out, rig, motion.frames, motion.d, first.found.fps, rig=first.rig)
     else:
-        write_rebaked(out, stage, loaded, motion.frames[known], motion.d[known], prim)
-    judged = judged_motion(loaded, found.frames, found.d, found.residual_mm)
-    result = {"file": str(out), "from": found.origin, **judged, **changes.figures}
-    first, last = float(motion.frames[0]), float(motion.frames[-1])
-    head = f"{out}: frames {first:g} .. {last:g} at {found.fps:g} fps, from the {_ORIGINS[found.origin]}"
-    emit(result, as_json, lambda: [head, *judged_lines(judged), *changes.lines[1:]])
+        known = [np.isfinite(one.motion.d).all(axis=1) for one in taken]
+        given = [
+            Rebaked(one.rig, one.motion.frames[seen], one.motion.d[seen], one.found.prim)
+            for one, seen in zip(taken, known, strict=True)
+        ]
+        return write_rebaked(out, shot, given, root=root)
+    return []
+
+
+def _baked_lines(out: Path, shot: Path, taken: Sequence[_Taken], stronger: Sequence[str]) -> list[str]:
+    lines = []
+    for one in taken:
+        first, last = float(one.motion.frames[0]), float(one.motion.frames[-1])
+        head = f"{out}: {one.found.prim}: " if len(taken) > 1 else f"{out}: "
+        lines.append(
+            f"{head}frames {first:g} .. {last:g} at {one.found.fps:g} fps, from the {_ORIGINS[one.found.origin]}"
+        )
+        lines += [*judged_lines(one.judged), *one.changes.lines[1:]]
+    if stronger:
+        lines.append(
+            f"{shot} itself says something else of {', '.join(stronger)}: a layer that it sublayers is weaker."
+        )
+        lines.append("Write a root above it with --root, or sublayer both, this layer first")
+    return lines
 
 
 def publish(
@@ -221,6 +305,9 @@ def _fitted(
     from jawusd.rig.stage_poses import fit_poses_of_stage
 
     _refuse_model(rig)
+    if rig.resolve() == stage.resolve():
+        message = f"meshes of {stage} deform, and are fitted to those of the rig: name the rig before it."
+        raise typer.BadParameter(message, param_hint="RIG")
     found = fit_poses_of_stage(stage, rig, mandible, skull, prim or ACTOR)
     d, residual_mm = loaded.encode(found.T)
     return StageMotion(found.frames.astype(float), d, found.fps, "mandible", residual_mm, fitted=True)

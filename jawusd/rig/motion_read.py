@@ -142,7 +142,16 @@ def read_parameters_of_stage(
         FormatError: No rig or several, or parameters that are not finite.
     """
     stage = open_stage(path)
-    actor = find_rig_prim(stage, path, prim_path)
+    return parameters_of(find_rig_prim(stage, path, prim_path), path)
+
+
+def parameters_of(actor: Usd.Prim, path: object) -> tuple[Array, Array, float] | None:
+    """Read the samples of d of a rig prim, as `read_parameters_of_stage` does.
+
+    Raises:
+        FormatError: Parameters that are not finite, or too many.
+    """
+    stage = actor.GetStage()
     attributes = [actor.GetAttribute(name) for name in PARAMETERS]
     sampled = [key_times(attribute) for attribute in attributes if attribute]
     times = np.unique(np.concatenate([np.zeros(0), *sampled]))

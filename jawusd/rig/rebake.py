@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -24,8 +26,8 @@ from jawusd.rig.motion_read import (
     key_times,
     mandible_of,
     moving_attributes,
+    parameters_of,
     poses_at,
-    read_parameters_of_stage,
 )
 from jawusd.rig.read import find_rig_prim, open_stage, rig_of
 from jawusd.rig.schema import rig_prims
@@ -33,6 +35,7 @@ from jawusd.rig.table import landmark_distance
 from jawusd.rig.untrusted import raises_format_error
 
 Origin = Literal["d", "mandible"]
+_SAME_MM = 1e-6
 
 
 class StageMotion(NamedTuple):
@@ -45,6 +48,7 @@ class StageMotion(NamedTuple):
         origin: What it was read from, the keys of d or the mandible's transforms.
         residual_mm: Distance of the mandible's poses from the model, shape (F,); zero for d.
         fitted: Whether the rig's meshes were fitted to a stage that does not carry the rig.
+        prim: The rig's prim in the stage; empty if fitted.
     """
 
     frames: Array
@@ -53,6 +57,7 @@ class StageMotion(NamedTuple):
     origin: Origin
     residual_mm: Array
     fitted: bool = False
+    prim: str = ""
 
 
 class Departure(NamedTuple):
@@ -72,10 +77,13 @@ def departure(path: str | os.PathLike[str], rig: JawRig, prim_path: str | None =
         FormatError: No rig or several, no mandible, or parameters that are not finite.
     """
     stage = open_stage(path)
-    actor = _actor(stage, path, rig, prim_path)
-    mandible = mandible_of(actor, path)
+    return _departure(_actor(stage, path, rig, prim_path), rig, path)
+
+
+def _departure(actor: Usd.Prim, rig: JawRig, path: object) -> Departure | None:
+    stage, mandible = actor.GetStage(), mandible_of(actor, path)
     moving, parameters = moving_attributes(mandible, actor), [actor.GetAttribute(name) for name in PARAMETERS]
-    sampled = read_parameters_of_stage(path, str(actor.GetPath()))
+    sampled = parameters_of(actor, path)
     if not all(parameters) or (sampled is None and _rank(stage, parameters) >= _rank(stage, moving)):
         return None
     times, allowed_mm = looked_at(actor, moving, bones_of(mandible) is not None)
@@ -102,16 +110,16 @@ def motion_of_stage(
     stage = open_stage(path)
     actor = _actor(stage, path, rig, prim_path)
     mandible = mandible_of(actor, path)
-    away = departure(path, rig, str(actor.GetPath()))
     if origin is None:
-        origin = _origin(stage, actor, mandible, away, path)
-    sampled = read_parameters_of_stage(path, str(actor.GetPath()))
+        origin = _origin(stage, actor, mandible, _departure(actor, rig, path), path)
+    sampled = parameters_of(actor, path)
     if origin == "d":
         sampled = _held(stage, actor, path) if sampled is None else sampled
-        return StageMotion(*sampled, origin, np.zeros(len(sampled[0])))
+        return StageMotion(*sampled, origin, np.zeros(len(sampled[0])), prim=str(actor.GetPath()))
     frames = frames_of_stage(stage, path)
     d, residual_mm = rig.encode(poses_at(mandible, actor, frames, path))
-    return StageMotion(frames.astype(np.float64), d, float(stage.GetTimeCodesPerSecond()), origin, residual_mm)
+    fps = float(stage.GetTimeCodesPerSecond())
+    return StageMotion(frames.astype(np.float64), d, fps, origin, residual_mm, prim=str(actor.GetPath()))
 
 
 def _origin(stage: Usd.Stage, actor: Usd.Prim, mandible: Usd.Prim, away: Departure | None, path: object) -> Origin:
@@ -187,40 +195,43 @@ def write_over(
         JawusdError: As `write_rebaked`.
     """
     step = float(open_stage(stage).GetTimeCodesPerSecond()) / fps
-    known = np.isfinite(d).all(axis=1)
-    return write_rebaked(
-        out,
-        stage,
-        rig,
-        np.asarray(frames, dtype=np.float64)[known] * step,
-        d[known],
-        prim_path,
-        np.asarray(carried) * step,
-    )
+    known, times = np.isfinite(d).all(axis=1), np.asarray(frames, dtype=np.float64) * step
+    write_rebaked(out, stage, [Rebaked(rig, times[known], d[known], prim_path)], np.asarray(carried) * step, root=True)
+    return Path(out)
+
+
+class Rebaked(NamedTuple):
+    """What a rig of a stage is given: times (F,) and d [mm] (F, 3); its prim, where the stage has several."""
+
+    rig: JawRig
+    times: Array
+    d: Array
+    prim: str | None = None
 
 
 def write_rebaked(
     out: str | os.PathLike[str],
     shot: str | os.PathLike[str],
-    rig: JawRig,
-    frames: Array,
-    d: Array,
-    prim_path: str | None = None,
+    motions: Sequence[Rebaked],
     carried: ArrayLike = (),
-) -> Path:
-    """Write a layer over a stage that gives a rig in it d and the mandible's ops that belong to it.
+    *,
+    root: bool = False,
+) -> list[str]:
+    """Write a layer for a stage that gives its rigs d and the mandible's ops that belong to it.
 
     An instance is made editable: its mandible could not be moved otherwise. A rig that follows its skeleton follows its
     transforms from then on.
 
     Args:
-        out: File to write; it sublayers the stage.
-        frames: Times, increasing, shape (F,).
-        d: Jaw parameters [mm], shape (F, 3).
+        out: File to write.
         carried: Times whose d was not seen; see `write_animation`.
+        root: Whether it sublayers the stage; else it is to be sublayered by the stage, or above it.
+
+    Returns:
+        The paths of what the stage's own root layer has opinions on: these are stronger than those of its sublayers.
 
     Raises:
-        RigError: Not a stage, the output is the stage itself, or bones move the mandible that are not those of the rig.
+        RigError: Not a stage, the output is the stage itself, or the mandible would not go where d puts it.
         FormatError: No rig or several, or no mandible.
         OutputError: The file cannot be written.
     """
@@ -228,28 +239,41 @@ def write_rebaked(
     if out.resolve() == Path(shot).resolve():
         raise RigError("the layer written goes over the stage and cannot replace it.", path=out)
     stage = open_stage(shot)
-    actor = _actor(stage, shot, rig, prim_path)
+    layer = _layer_over(stage, np.concatenate([motion.times for motion in motions]))
+    if len(np.atleast_1d(carried)):
+        layer.customLayerData = {**layer.customLayerData, CARRIED: _gf.int_array(np.floor(np.asarray(carried)))}
+    actors = [_actor(stage, shot, motion.rig, motion.prim) for motion in motions]
+    for actor, motion in zip(actors, motions, strict=True):
+        _author(layer, actor, motion, shot)
+    _check_moves(layer, [str(actor.GetPath()) for actor in actors], motions, shot)
+    if root:
+        layer.subLayerPaths.append(relative_path(Path(shot), out))
+    write_layer(layer, out)
+    return [] if root else _stronger_in_root(stage, layer)
+
+
+def _layer_over(stage: Usd.Stage, times: Array) -> Sdf.Layer:
+    """Return a layer in memory with units, rate and span of a stage; without one, with that of times."""
+    layer = new_layer(float(stage.GetTimeCodesPerSecond()))
+    layer.pseudoRoot.SetInfo(UsdGeom.Tokens.metersPerUnit, UsdGeom.GetStageMetersPerUnit(stage))
+    layer.pseudoRoot.SetInfo(UsdGeom.Tokens.upAxis, UsdGeom.GetStageUpAxis(stage))
+    layer.defaultPrim = stage.GetRootLayer().defaultPrim or stage.GetPseudoRoot().GetChildren()[0].GetName()
+    layer.startTimeCode, layer.endTimeCode = float(times.min()), float(times.max())
+    if stage.HasAuthoredTimeCodeRange():
+        layer.startTimeCode, layer.endTimeCode = stage.GetStartTimeCode(), stage.GetEndTimeCode()
+    return layer
+
+
+def _author(layer: Sdf.Layer, actor: Usd.Prim, motion: Rebaked, shot: object) -> None:
     mandible = mandible_of(actor, shot)
-    if not (away_mm := skull_moved_mm(actor, rig, shot)) <= BAKED_MM:
+    if not (away_mm := skull_moved_mm(actor, motion.rig, shot)) <= BAKED_MM:
         raise RigError(
             f"{actor.GetPath()} has its skull moved by {away_mm:.2f} mm: a mandible baked in it would be off as much.",
             path=str(shot),
             hint="Move the actor instead of its skull, or give it the motion: jawusd encode, then jawusd animate.",
         )
-    layer = new_layer(float(stage.GetTimeCodesPerSecond()))
-    layer.pseudoRoot.SetInfo(UsdGeom.Tokens.metersPerUnit, UsdGeom.GetStageMetersPerUnit(stage))
-    layer.pseudoRoot.SetInfo(UsdGeom.Tokens.upAxis, UsdGeom.GetStageUpAxis(stage))
-    layer.defaultPrim = stage.GetRootLayer().defaultPrim or actor.GetPath().GetPrefixes()[0].name
-    layer.subLayerPaths.append(relative_path(Path(shot), out))
-    first, last = float(frames[0]), float(frames[-1])
-    if stage.HasAuthoredTimeCodeRange():
-        first, last = stage.GetStartTimeCode(), stage.GetEndTimeCode()
-    layer.startTimeCode, layer.endTimeCode = first, last
-    if len(np.atleast_1d(carried)):
-        layer.customLayerData = {**layer.customLayerData, CARRIED: _gf.int_array(np.floor(np.asarray(carried)))}
-    author_motion(
-        layer, rig, frames, d, np.array([frames[0], frames[-1]]), (str(actor.GetPath()), str(mandible.GetPath()))
-    )
+    paths = str(actor.GetPath()), str(mandible.GetPath())
+    author_motion(layer, motion.rig, motion.times, motion.d, motion.times[[0, -1]], paths)
     moved = layer.GetPrimAtPath(mandible.GetPath())
     order = Sdf.AttributeSpec(moved, "xformOpOrder", Sdf.ValueTypeNames.TokenArray, Sdf.VariabilityUniform)
     order.default = Vt.TokenArray(["xformOp:translate", "xformOp:orient"])  # whatever it was moved by
@@ -262,6 +286,50 @@ def write_rebaked(
             )
         layer.GetPrimAtPath(actor.GetPath()).variantSelections[MOTION] = TRANSFORMS
     for prefix in mandible.GetPath().GetPrefixes():
-        if stage.GetPrimAtPath(prefix).IsInstance():
+        if actor.GetStage().GetPrimAtPath(prefix).IsInstance():
             layer.GetPrimAtPath(prefix).instanceable = False
-    return write_layer(layer, out)
+
+
+def _check_moves(layer: Sdf.Layer, prims: list[str], motions: Sequence[Rebaked], shot: str | os.PathLike[str]) -> None:
+    """Compose a layer over its stage, and check that its mandibles are where d puts them in the world.
+
+    Raises:
+        RigError: One is not.
+    """
+    root = Sdf.Layer.CreateAnonymous(".usda")
+    root.timeCodesPerSecond = layer.timeCodesPerSecond
+    root.subLayerPaths = [layer.identifier, str(Path(shot).resolve())]
+    composed = Usd.Stage.Open(root)
+    for prim, motion in zip(prims, motions, strict=True):
+        away = _departure(composed.GetPrimAtPath(prim), motion.rig, shot)
+        if away is not None and away.frames:
+            raise RigError(
+                f"the mandible of {prim} would still be {away.largest_mm:.2f} mm from where d puts it.",
+                path=str(shot),
+                hint="Prims above or below the mandible move it, too: `jawusd validate` names them.",
+            )
+
+
+def _stronger_in_root(stage: Usd.Stage, layer: Sdf.Layer) -> list[str]:
+    """Return the paths of a layer's attributes and prims that the root layer of a stage says something else of."""
+    found: list[str] = []
+    root = stage.GetRootLayer()
+
+    def visit(path: Sdf.Path) -> None:
+        if path.IsPrimPropertyPath() and root.GetAttributeAtPath(path):
+            times, attribute = layer.ListTimeSamplesForPath(path), stage.GetAttributeAtPath(path)
+            same = not times and root.GetAttributeAtPath(path).default == layer.GetAttributeAtPath(path).default
+            if path.name in PARAMETERS:  # keys of d that stay as they are
+                now, then = (
+                    [value(time) for time in times] for value in (attribute.Get, partial(layer.QueryTimeSample, path))
+                )
+                same = np.allclose(now, then, rtol=0, atol=_SAME_MM)
+            if not same:
+                found.append(str(path))
+        elif path.IsPrimPath() and (own := root.GetPrimAtPath(path)):
+            over = layer.GetPrimAtPath(path)
+            if any(over.HasInfo(name) and own.HasInfo(name) for name in ("variantSelection", "instanceable")):
+                found.append(str(path))
+
+    layer.Traverse(Sdf.Path.absoluteRootPath, visit)
+    return found

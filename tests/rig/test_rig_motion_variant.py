@@ -14,7 +14,7 @@ from jawusd.rig.geo import MESH_PATHS
 from jawusd.rig.motion_read import read_parameters_of_stage, read_poses_of_stage
 from jawusd.rig.package import write_package
 from jawusd.rig.publish import publish_rig
-from jawusd.rig.rebake import departure, motion_of_stage, write_rebaked
+from jawusd.rig.rebake import Rebaked, departure, motion_of_stage, write_rebaked
 
 FRAMES, D = example_motion()
 OTHER = {30: (4.0, 0.0, 0.0), 69: (4.0, 1.0, 0.5)}
@@ -132,7 +132,7 @@ def test_edited_bones_are_read_and_baked_to_transforms(anchored_folder, tmp_path
     np.testing.assert_allclose(found.d[[0, -1]], [wanted, wanted / 2], atol=1e-4)
     assert [finding.rule for finding in validate_stage(file)] == ["Mandible"]
     out = anchored_folder / "mended.usda"
-    run("rebake", anchored_folder / "actor.usda", file, "-o", out)
+    run("rebake", anchored_folder / "actor.usda", file, "--root", "-o", out)
     assert_valid_usd(out)
     stage = Usd.Stage.Open(str(out))
     assert stage.GetPrimAtPath("/Actor").GetVariantSet("motion").GetVariantSelection() == "transforms"
@@ -150,7 +150,7 @@ def test_d_keyed_over_a_skeleton_is_found_and_mended(anchored_folder):
     assert "Mandible" in run("validate", file, code=1)
     assert "bake it with" in run("validate", anchored_folder / "actor.usda", file, code=1)
     out = anchored_folder / "mended.usda"
-    run("rebake", anchored_folder / "actor.usda", file, "-o", out)
+    run("rebake", anchored_folder / "actor.usda", file, "--root", "-o", out)
     assert_valid_usd(out)
     wanted = example_rig().pose(list(OTHER.values()))
     np.testing.assert_allclose(read_poses_of_stage(out)[1][[0, -1]], wanted, atol=1e-6)
@@ -218,7 +218,7 @@ def test_bones_that_no_variant_takes_away_are_not_written_over(anchored_folder, 
     assert not Usd.Stage.Open(str(package)).GetPrimAtPath("/Actor").GetVariantSets().GetNames()
     np.testing.assert_allclose(motion_of_stage(package, rig).d, D, atol=1e-9)  # d and bones agree
     with pytest.raises(RigError, match="bones move /Actor/geo/Mandible"):
-        write_rebaked(tmp_path / "out.usda", package, rig, FRAMES.astype(float), D)
+        write_rebaked(tmp_path / "out.usda", package, [Rebaked(rig, FRAMES.astype(float), D)])
 
 
 def test_published_rigs_keep_their_skeleton(anchored_folder, tmp_path):
@@ -254,7 +254,7 @@ def test_instances_are_read_and_rebaked(anchored_folder):
     assert Usd.Stage.Open(str(file)).GetPrimAtPath("/Shot/Person").IsInstance()
     np.testing.assert_allclose(read_poses_of_stage(file)[1], example_rig().pose(D), atol=2e-5)
     out = anchored_folder / "own.usda"
-    run("rebake", anchored_folder / "actor.usda", file, "-o", out, "--from", "mandible")
+    run("rebake", anchored_folder / "actor.usda", file, "--root", "-o", out, "--from", "mandible")
     assert_valid_usd(out)
     np.testing.assert_allclose(read_poses_of_stage(out)[1], example_rig().pose(D), atol=1e-4)
     assert not UsdSkel.Root.Find(Usd.Stage.Open(str(out)).GetPrimAtPath("/Shot/Person/geo/Mandible"))
