@@ -15,6 +15,7 @@ import numpy as np
 
 from jawusd.errors import CalibrationError
 from jawusd.formats.atomic import write_text_atomic
+from jawusd.formats.camera_parts import check_lens_model
 from jawusd.formats.text import read_toml
 from jawusd.geometry import Camera, make_transform, rigidity_defect, so3_exp, so3_log
 from jawusd.geometry.arrays import Array
@@ -71,12 +72,7 @@ def _camera(path: Path, table: str, values: object) -> Camera:
     distortion = _numbers(path, table, values, "distortions", ((0,), (4,), (5,), (8,)))
     rotation = _numbers(path, table, values, "rotation", ((3,), (3, 3)))
     translation = _numbers(path, table, values, "translation", ((3,),))
-    if values.get("fisheye"):
-        raise CalibrationError(
-            f"[{table}] is a fisheye camera; only the radial-tangential model is read.",
-            path=path,
-            hint="Undistort the footage first, or calibrate with the standard model.",
-        )
+    check_lens_model(path, f"[{table}]", values)
     if (size < 16).any() or (size != np.round(size)).any():
         raise CalibrationError(f"[{table}] size is {size.tolist()} px, allowed: whole numbers from 16.", path=path)
     if K[0, 0] <= 0 or K[1, 1] <= 0 or np.abs(K[[1, 2, 2], [0, 0, 1]]).max() > 0 or K[2, 2] != 1:

@@ -17,12 +17,11 @@ from pathlib import Path
 import numpy as np
 
 from jawusd.errors import CalibrationError
+from jawusd.formats.camera_parts import CameraFormat, Size, files_in, known_size
 from jawusd.formats.lens_3de import FoundLens, Lens, find_lenses, opencv_of
 from jawusd.formats.nuke_script import SAME, NukeNode, knob_values, read_nuke_script, steady_values
 from jawusd.geometry import Camera, make_transform, se3_inverse, so3_exp
 from jawusd.geometry.arrays import Array
-
-Size = tuple[int, int]
 
 _OPENGL = np.diag([1.0, -1.0, -1.0])
 
@@ -72,14 +71,7 @@ def files_of_3de(path: Path) -> list[Path]:
 
 def _camera(path: Path, node: NukeNode, lenses: list[FoundLens], sizes: Mapping[str, Size]) -> Camera:
     name = node.name
-    if name not in sizes:
-        raise CalibrationError(
-            f"camera {name}: the export does not hold the size of pictures, and there is no footage of that name "
-            f"(there is: {', '.join(sizes) or 'none'}).",
-            path=path,
-            hint="Name each [[camera]] as the Camera node, or give --size.",
-        )
-    size = sizes[name]
+    size = known_size(path, name, sizes)
     focal_mm = float(steady_values(path, node, "focal", (50.0,))[0])
     back = (
         float(steady_values(path, node, "haperture", (24.576,))[0]),
@@ -185,3 +177,8 @@ def _check_same_plate(
             path=path,
             hint="Export camera and lens from the same project.",
         )
+
+
+FORMAT = CameraFormat(
+    lambda path: path.suffix.lower() == ".nk" or bool(files_in(path, ".nk")), load_3de, files_of_3de, lacks_sizes=True
+)

@@ -147,14 +147,28 @@ def _nuke_name(name: str) -> str:
 
 
 def _lens_lines(path: Path) -> list[str] | None:
-    """Return the lines of a lens file; none if a text file is something else."""
+    """Return the lines of a lens file; none if a text file is something else.
+
+    Raises:
+        CalibrationError: it ends as a lens file does, but does not begin so.
+    """
     try:
         lines = [line.strip() for line in read_text(path, _MOST_BYTES).splitlines()]
-        numbers = [float(word) for word in lines[1].split()]
-        is_lens = len(numbers) == 7 and bool(lines[3]) and lines[2].startswith(("0", "1", "DISTORTION_"))
-    except (FormatError, ValueError, IndexError):
+    except FormatError:
         return None
-    return lines if is_lens else None
+    try:
+        numbers = [float(word) for word in lines[1].split()]
+        if len(numbers) == 7 and lines[3] and lines[2].startswith(("0", "1", "DISTORTION_")):
+            return lines
+    except (ValueError, IndexError):
+        pass
+    if "<end_of_file>" in lines:
+        raise CalibrationError(
+            "is a lens file whose first four lines are not name, seven numbers, kind of distortion and model.",
+            path=path,
+            hint="Export the lens again, or take the file away.",
+        )
+    return None
 
 
 def _text_lens(path: Path, lines: list[str]) -> Lens:

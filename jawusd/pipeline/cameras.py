@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from jawusd.errors import CalibrationError, explain_missing_packages
+from jawusd.formats.camera_parts import plain_name
 from jawusd.formats.capture import CameraSource, Capture
 from jawusd.formats.tracks import Tracks
 from jawusd.geometry import Camera
@@ -61,13 +63,16 @@ def _calibrated(capture: Capture) -> list[tuple[Camera, CameraSource]]:
             hint="Name a calibration file there; jawusd calibrate makes one from [boards].",
         )
     found = read_calibration(capture.calibration, capture.calibration_unit_mm, lambda: _recorded_sizes(capture))
-    known = {camera.name: camera for camera in found}
+    # names of a capture have no dots; calibrations of other programs may
+    plain = {plain_name(camera.name): camera for camera in found}
+    known = (plain if len(plain) == len(found) else {}) | {camera.name: camera for camera in found}
     missing = [source.name for source in capture.cameras if source.name not in known]
     if missing:
         raise CalibrationError(
-            f"does not know camera {missing[0]} of the capture; it names {', '.join(known)}.", path=capture.calibration
+            f"does not know camera {missing[0]} of the capture; it names {', '.join(camera.name for camera in found)}.",
+            path=capture.calibration,
         )
-    return [(known[source.name], source) for source in capture.cameras]
+    return [(replace(known[source.name], name=source.name), source) for source in capture.cameras]
 
 
 def _recorded_sizes(capture: Capture) -> dict[str, Size]:

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom
 
 from jawusd.errors import CalibrationError, RigError
+from jawusd.formats.camera_parts import names_of_labels
 from jawusd.geometry.arrays import Array
 from jawusd.geometry.camera import Camera
 from jawusd.geometry.se3 import make_transform, se3_inverse
@@ -29,6 +30,8 @@ LIGHT_PLATE = "plates/{name}/{name}.%06d.exr"  # of a camera whose footage is li
 _SENSOR_WIDTH = 360.0
 _CLIPPING_MM = (1.0, 10_000.0)
 _LARGEST_SKEW = 1e-6
+# By these Omniverse says which lens a camera has, before and since it has schemas for it.
+_LENS_MODELS = ("cameraProjectionType", "omni:lensdistortion:model")
 # Camera and world axes of OpenCV are x right, y down, z forward; those of USD x right, y up, z backward.
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -138,8 +141,9 @@ def write_camera_stage(out: str | os.PathLike[str], cameras: Sequence[Camera]) -
 def read_cameras(path: str | os.PathLike[str], sizes: Callable[[], Mapping[str, tuple[int, int]]]) -> list[Camera]:
     """Read the perspective cameras of a stage, by the names of their prims; lengths in mm, OpenCV axes and pixels.
 
-    The picture spans the aperture, shifted by its offsets; `jaw:imageSize` says its size [px], else the footage, and
-    `jaw:distortion` OpenCV's coefficients. Cameras that move are read at their first time.
+    Prims of one name are called after their paths. The picture spans the aperture, shifted by its offsets;
+    `jaw:imageSize` says its size [px], else the footage, and `jaw:distortion` OpenCV's coefficients. Cameras that move
+    are read at their first time.
 
     Args:
         path: A stage, or Alembic (in cm) where OpenUSD has the plugin for it, as its wheels have not.
@@ -147,7 +151,8 @@ def read_cameras(path: str | os.PathLike[str], sizes: Callable[[], Mapping[str, 
 
     Raises:
         RigError: The stage cannot be opened, names files outside its folder, or holds no perspective camera.
-        CalibrationError: A size is not known.
+        CalibrationError: A size is not known, or a lens is a fisheye or another that OpenCV's coefficients do not
+            describe.
         FormatError: A value has an unexpected type.
     """
     if Path(path).suffix.lower() == ".abc" and Sdf.FileFormat.FindByExtension("abc") is None:
@@ -159,27 +164,44 @@ def read_cameras(path: str | os.PathLike[str], sizes: Callable[[], Mapping[str, 
         )
     stage = open_stage(path)
     mm = UsdGeom.GetStageMetersPerUnit(stage) * 1000.0
-    prims = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Camera)]
+    cameras = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Camera)]
+    # the others are the views of a program from above and from the sides
+    prims = [prim for prim in cameras if UsdGeom.Camera(prim).GetProjectionAttr().Get() != "orthographic"]
+    names = names_of_labels(Path(path), [str(prim.GetPath())[1:] for prim in prims])
     known: Mapping[str, tuple[int, int]] | None = None
     out = []
-    for prim in prims:
+    for name, prim in zip(names, prims, strict=True):
+        _check_lens(path, prim)
         size = prim.GetAttribute("jaw:imageSize").Get() if prim.HasAttribute("jaw:imageSize") else None
         if size is None:
             known = sizes() if known is None else known
-            if prim.GetName() not in known:
+            if name not in known:
                 raise CalibrationError(
-                    f"camera {prim.GetName()} has no jaw:imageSize, and there is no footage of that name.",
+                    f"camera {name} has no jaw:imageSize, and there is no footage of that name.",
                     path=path,
                     hint="Name each [[camera]] as the camera's prim, or give --size.",
                 )
-            size = known[prim.GetName()]
-        out.append(_read_camera(prim, (int(size[0]), int(size[1])), mm))
+            size = known[name]
+        out.append(_read_camera(name, prim, (int(size[0]), int(size[1])), mm))
     if not out:
-        raise RigError("holds no camera.", path=path)
+        raise RigError("holds no camera with perspective.", path=path)
     return out
 
 
-def _read_camera(prim: Usd.Prim, size: tuple[int, int], mm: float) -> Camera:
+def _check_lens(path: str | os.PathLike[str], prim: Usd.Prim) -> None:
+    """Raise if a camera has a fisheye or another lens that only Omniverse knows."""
+    for name in _LENS_MODELS:
+        said = prim.GetAttribute(name).Get() if prim.HasAttribute(name) else None
+        if said and str(said) != "pinhole":
+            raise CalibrationError(
+                f"has {name} = {said}; read are pinholes, with OpenCV's coefficients in jaw:distortion.",
+                path=path,
+                camera=prim.GetName(),
+                hint="Undistort the footage first, or export the camera as a pinhole.",
+            )
+
+
+def _read_camera(name: str, prim: Usd.Prim, size: tuple[int, int], mm: float) -> Camera:
     camera = UsdGeom.Camera(prim)
     samples = UsdGeom.Xformable(prim).GetTimeSamples()
     time = Usd.TimeCode(samples[0]) if samples else Usd.TimeCode.Default()
@@ -192,7 +214,7 @@ def _read_camera(prim: Usd.Prim, size: tuple[int, int], mm: float) -> Camera:
     u, _, vt = np.linalg.svd(placed[:3, :3])  # scales of parents move cameras and change no picture
     T_world_cam = make_transform(u @ vt @ _FLIP[:3, :3], mm * placed[:3, 3])
     lens = prim.GetAttribute("jaw:distortion").Get() if prim.HasAttribute("jaw:distortion") else None
-    return Camera(prim.GetName(), size, K, np.zeros(0) if lens is None else np.array(lens), se3_inverse(T_world_cam))
+    return Camera(name, size, K, np.zeros(0) if lens is None else np.array(lens), se3_inverse(T_world_cam))
 
 
 def _define_camera(stage: Usd.Stage, path: Sdf.Path, camera: Camera, plate: str) -> None:

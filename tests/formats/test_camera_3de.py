@@ -208,6 +208,18 @@ def test_a_lens_is_told_by_its_name(tmp_path):
         load_cameras_file(tmp_path, 10.0, {"left": SIZE})
 
 
+def test_a_damaged_lens_is_not_taken_for_a_remark(tmp_path):
+    (tmp_path / "shot.nk").write_text(SCRIPT + camera_node())
+    (tmp_path / "readme.txt").write_text("solved by hand\n")
+    assert away_px(tmp_path) < 1e-8
+    whole = lens_text(RADIAL, (0.04, 0, 0, 0.01, 0, 0, 0, 0))
+    second = whole.splitlines()[1]
+    for damaged in (whole.replace(second, " ".join(second.split()[:6])), "\n".join(whole.splitlines()[1:]) + "\n"):
+        (tmp_path / "lens.txt").write_text(damaged)
+        with pytest.raises(CalibrationError, match=r"lens\.txt: is a lens file whose first four lines"):
+            away_px(tmp_path)
+
+
 def test_the_scene_above_moves_and_scales_cameras(tmp_path):
     """The same camera, below an axis that turns, shifts and halves the scene."""
     turn, shift = Rotation.from_euler("y", 90, degrees=True), np.array([1.0, 2.0, 3.0])

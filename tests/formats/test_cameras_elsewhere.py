@@ -162,7 +162,7 @@ def test_realityscan_xmp(tmp_path):
     assert away_px(load_cameras_file(tmp_path, 1000.0, sizes), realityscan) < PIXEL
     assert away_px(load_cameras_file(tmp_path / "left.xmp", 1000.0, sizes), realityscan) < PIXEL
     assert [path.name for path in calibration_files(tmp_path)] == ["left.xmp", "right.xmp"]
-    with pytest.raises(CalibrationError, match="does not write the size of pictures"):
+    with pytest.raises(CalibrationError, match="the size of pictures is not in the file"):
         load_cameras_file(tmp_path, 1000.0, {"left": SIZE})
     for square, bent in (('Skew="0"', 'Skew="0.01"'), ('AspectRatio="1"', 'AspectRatio="1.2"')):
         (tmp_path / "left.xmp").write_text(xmp(*POSES["left"]).replace(square, bent))

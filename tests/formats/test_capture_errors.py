@@ -59,7 +59,7 @@ def test_a_good_file_is_read(told):
         ('video = "left.mp4"', 'video = "Left.MP4"', "Did you mean left.mp4?"),
         ('"u.ply"', '"../u.ply"', "leads out of the folder of the capture"),
         ('video = "left.mp4"', "video = 3", 'video = 3: a path in quotes is needed, as "left.mp4"'),
-        ('video = "left.mp4"', "", '[[camera]] 1 ("left"): has neither video nor masks, one is needed. Write'),
+        ('video = "left.mp4"', "", '[[camera]] 1 ("left"): has neither video nor masks, one is needed. For example'),
         ('video = "left.mp4"', 'masks.upper = "a.mkv"', '[[camera]] 1 ("left"), masks lower is missing'),
         ("square_mm = 8.0", 'square_mm = "8 mm"', '[boards] square_mm = "8 mm": a number is needed (mm)'),
         ("square_mm = 8.0", "square_mm = 800.0", "[boards] square_mm = 800.0 must be 200 or less (mm)"),
