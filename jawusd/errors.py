@@ -22,6 +22,7 @@ A message says where (file, frame, camera), what was found, what is allowed with
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Callable, Iterator
 from functools import partial
 from os import PathLike
@@ -41,8 +42,28 @@ _EXTRA_OF_PACKAGE = {
 }
 
 
+# Control characters, marks that turn the direction of text, invisible ones, and bytes of names that are no text.
+_HIDDEN = re.compile(
+    "[\x00-\x1f\x7f-\x9f\u00ad\u061c\u180e\u200b\u200e\u200f\u2028-\u202e\u2060-\u206f\ufeff\ufff9-\ufffb"
+    "\ud800-\udfff\U000e0000-\U000e0fff]"
+)
+_LISTED = "\n  "  # before each of several findings in one message
+
+
+def shown(text: object) -> str:
+    """Return what a file says as one line that can be printed: what would control a terminal is written as escapes."""
+    return _HIDDEN.sub(_escape, str(text))
+
+
+def _escape(found: re.Match[str]) -> str:
+    code = ord(found[0])
+    if 0xDC80 <= code <= 0xDCFF:  # a byte of a name that is not UTF-8
+        return f"\\x{code - 0xDC00:02x}"
+    return found[0].encode("unicode_escape").decode()
+
+
 class JawusdError(Exception):
-    """Carry one clear sentence for the person at the keyboard.
+    """Carry one clear sentence for the person at the keyboard; as text, see `shown`, it can be printed.
 
     Args:
         message: what was found and what is allowed, with units.
@@ -73,11 +94,12 @@ class JawusdError(Exception):
         camera = [] if self.camera is None else [f"camera {self.camera}"]
         frame = [] if self.frame is None else [f"frame {self.frame}"]
         where = ", ".join(camera + frame)
-        return f"{where}: {self.message}" if where else self.message
+        message = _LISTED.join(shown(part) for part in self.message.split(_LISTED))
+        return f"{shown(where)}: {message}" if where else message
 
     def __str__(self) -> str:
-        where = f"{self.path}: " if self.path is not None else ""
-        advice = f" {self.hint}" if self.hint else ""
+        where = f"{shown(self.path)}: " if self.path is not None else ""
+        advice = f" {shown(self.hint)}" if self.hint else ""
         return f"{where}{self.statement()}{advice}"
 
     def __reduce__(self) -> tuple[Callable[[str], JawusdError], tuple[str]]:

@@ -140,8 +140,7 @@ def take_in_hand(path: str | PathLike[str]) -> None:
 def file_in_hand() -> str:
     """Return the file that was noted last, else the command line."""
     noted = bytes(_in_hand).rstrip(b"\0") if _in_hand is not None else b""
-    name = os.fsdecode(noted) if noted else shlex.join(["jawusd", *sys.argv[1:]])
-    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in name)
+    return os.fsdecode(noted) if noted else shlex.join(["jawusd", *sys.argv[1:]])
 
 
 @contextlib.contextmanager

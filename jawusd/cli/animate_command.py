@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from jawusd.cli.options import USD_SUFFIXES, Allow, Force, Json, Prim, RigArg, rig_of_folder
-from jawusd.cli.output import refuse_existing
+from jawusd.formats.atomic import refuse_existing
 
 if TYPE_CHECKING:
     from jawusd.cli.motion import AuthoredMotion

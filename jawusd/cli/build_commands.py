@@ -30,8 +30,9 @@ from jawusd.cli.options import (
     subject_given,
     trajectory_options,
 )
-from jawusd.cli.output import emit, progress, refuse_existing
+from jawusd.cli.output import emit, progress, say
 from jawusd.errors import naming_file
+from jawusd.formats.atomic import refuse_existing
 
 
 class Solver(StrEnum):
@@ -73,6 +74,7 @@ def build(
 ) -> None:
     """Turn a capture into a rig: calibrate if need be, sync, track, fit, track hard frames again, bake."""
     from jawusd.pipeline import build as stages
+    from jawusd.pipeline.build_lines import build_lines
     from jawusd.pipeline.memory import map_large_arrays
 
     map_large_arrays()
@@ -96,8 +98,8 @@ def build(
         emit({"stages": [asdict(stage) for stage in plan]}, as_json, lambda: plan_lines(plan))
         return
     with progress() as report:
-        summary = stages.build(capture, out, options, report, lambda found: typer.echo(found.line(), err=True))
-    emit(summary, as_json, lambda: stages.build_lines(summary))
+        summary = stages.build(capture, out, options, report, lambda found: say(found.line(), err=True))
+    emit(summary, as_json, lambda: build_lines(summary))
 
 
 def track(
@@ -238,7 +240,7 @@ def demo(
     refuse_existing(out / "capture.toml", force)
     with progress() as report:
         write_demo(out, DemoConfig(seed=seed, frames=frames), progress=partial(report, "demo"))
-    typer.echo(str(out / "capture.toml"))
+    say(str(out / "capture.toml"))
 
 
 def build_many(
@@ -294,7 +296,7 @@ def build_many(
         load_capture_list(captures),
         out,
         many.ManyOptions(build, cluster, workers, retries),
-        lambda line: typer.echo(line, err=True),
+        lambda line: say(line, err=True),
     )
     data = {"folder": str(out), "builds": [asdict(outcome) for outcome in outcomes]}
     emit(data, as_json, lambda: many.outcome_lines(outcomes))

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from jawusd.cli.options import CaptureArg, Force, Json, Outside
-from jawusd.cli.output import emit, plain, progress, refuse_existing
+from jawusd.cli.output import emit, plain, progress
+from jawusd.formats.atomic import refuse_existing
 
 if TYPE_CHECKING:
     from jawusd.pipeline.calibrate import SyncResult
@@ -223,12 +224,14 @@ def plates(
     as_json: Json = False,
 ) -> None:
     """Write the footage without lens distortion where the rig's cameras.usda says, numbered by its time codes."""
+    from jawusd.errors import OutputError
     from jawusd.formats.tracks import load_tracks
     from jawusd.pipeline.calibrate import sync_cameras
     from jawusd.pipeline.capture_inputs import open_capture
     from jawusd.pipeline.media import write_plates
 
-    refuse_existing(rig / "plates", force)
+    if (rig / "plates").exists() and not force:
+        raise OutputError("exists already.", path=rig / "plates", hint="Overwrite its pictures with --force.")
     frames = load_tracks(rig / "tracks.npz").frames
     opened = open_capture(capture, allow_outside=allow_outside)
     with progress() as report:

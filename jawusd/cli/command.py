@@ -10,6 +10,7 @@ import typer
 from typer.core import TyperCommand
 
 from jawusd.cli.log import RunLog
+from jawusd.cli.output import say
 from jawusd.errors import JawusdError
 
 #: Exit code of a run stopped with Ctrl+C, as shells report it.
@@ -75,5 +76,5 @@ def with_vectors_split(args: list[str]) -> list[str]:
 
 def interrupted(command: str) -> NoReturn:
     """Say that a command was stopped and what is kept of it, and end with the exit code of that."""
-    typer.echo(f"jawusd {command}: stopped; {_KEPT.get(command, _ELSE)}.", err=True)
+    say(f"jawusd {command}: stopped; {_KEPT.get(command, _ELSE)}.", err=True)
     raise typer.Exit(INTERRUPTED)

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from jawusd.cli.options import Allow, Force, Json, Prim, RigArg
-from jawusd.cli.output import emit, refuse_existing
+from jawusd.cli.output import emit
+from jawusd.formats.atomic import refuse_existing
 
 if TYPE_CHECKING:
     from jawusd.cli.motion import AuthoredMotion

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from jawusd.cli.options import Allow, Force, Json, Prim, rig_of_folder
-from jawusd.cli.output import emit, progress, refuse_existing
+from jawusd.cli.output import emit, progress
+from jawusd.formats.atomic import refuse_existing
 
 if TYPE_CHECKING:
     from jawusd.library.index import Entry, Library

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from jawusd.cli.options import Allow, Outside, Prim, RigArg
+from jawusd.cli.output import say
 from jawusd.cli.solve_commands import Head, ShotArg
 
 
@@ -46,7 +47,7 @@ def live(
     sender = None if osc is None else OscSender(osc)
     viewer = open_viewer(rig, "127.0.0.1", port, prim) if view else None
     if viewer is not None:
-        typer.echo(f"{viewer.url}  (Ctrl+C stops)", err=True)
+        say(f"{viewer.url}  (Ctrl+C stops)", err=True)
     fixed = head is Head.fixed
     try:
         for found in follow(
@@ -56,7 +57,7 @@ def live(
                 sender.send(found)
             if viewer is not None:
                 viewer.show(found.d)
-            typer.echo(json.dumps(found.as_json()))
+            say(json.dumps(found.as_json()))
     except KeyboardInterrupt:
         pass
     finally:

@@ -12,7 +12,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TextIO
 
-from jawusd.errors import OutputError
+from jawusd.errors import OutputError, shown
+from jawusd.formats.atomic import destination, is_stream, open_stream
 
 _CODES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
@@ -29,18 +30,20 @@ class RunLog:
         from jawusd import __version__
 
         self._start = time.monotonic()
+        where = destination(path)
         try:
-            self._file = open(path, "a", encoding="utf-8")  # noqa: SIM115  # open until the run ends
+            to = open_stream(where) if is_stream(where) else where
+            self._file = open(to, "a", encoding="utf-8")  # noqa: SIM115  # open until the run ends
         except OSError as error:
             raise OutputError(f"the log cannot be written: {error.strerror}.", path=path) from error
-        self.line(f"{time.strftime('%Y-%m-%d %H:%M:%S')} jawusd {' '.join(words)}")
+        self.line(f"{time.strftime('%Y-%m-%d %H:%M:%S')} jawusd {' '.join(map(shown, words))}")
         self.line(f"jawusd {__version__}, Python {platform.python_version()}, {platform.platform()}, in {Path.cwd()}")
 
     def line(self, text: str) -> None:
         """Add lines."""
-        for part in _CODES.sub("", text).splitlines():
+        for part in _CODES.sub("", text).split("\n"):
             if part.strip():
-                self._file.write(f"{time.monotonic() - self._start:9.2f}  {part.rstrip()}\n")
+                self._file.write(f"{time.monotonic() - self._start:9.2f}  {shown(part.rstrip())}\n")
         self._file.flush()
 
     def error(self, error: BaseException) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import faulthandler
+import io
 import os
 import sys
 import traceback
@@ -15,6 +16,7 @@ import typer
 from jawusd.cli.command import CONTEXT
 from jawusd.cli.commands import Commands
 from jawusd.cli.log import logged
+from jawusd.cli.output import complain, say
 from jawusd.cli.summaries import EXIT_CODES
 from jawusd.errors import JawusdError, OutputError, explain_missing_packages
 from jawusd.guard import out_of_memory
@@ -47,7 +49,7 @@ def _root(
     if version:
         from jawusd import __version__
 
-        typer.echo(f"jawusd {__version__}")
+        say(f"jawusd {__version__}")
         raise typer.Exit
     global _verbose  # errors are printed outside of every context
     _verbose = verbose
@@ -67,6 +69,9 @@ def main() -> None:
     # Before numpy is loaded: sums that several threads share differ in their last bits, from which fits end micrometres
     # apart on other machines. The matrices are so small that more threads save nothing.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    for stream in (sys.stdout, sys.stderr):  # letters that the terminal's encoding lacks
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     try:
         with explain_missing_packages():
             app()
@@ -86,7 +91,7 @@ def _told(error: JawusdError, cause: BaseException | None = None) -> int:
     """Print an error; return its exit code."""
     if _verbose:
         traceback.print_exception(cause or error)
-    typer.echo(f"jawusd: {error}", err=True)
+    complain(error)
     return error.exit_code
 
 
@@ -102,7 +107,7 @@ def _unwritable(error: OSError | RuntimeError) -> int:
         message = f"{error}."
     else:
         raise error
-    typer.echo(f"jawusd: {message}", err=True)
+    complain(message)
     with contextlib.suppress(OSError):  # what could not be printed would be tried again at the end
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return OutputError.exit_code

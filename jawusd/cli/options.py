@@ -10,6 +10,7 @@ import typer
 
 if TYPE_CHECKING:
     from jawusd.evaluator import JawRig
+    from jawusd.formats.finding import Finding
     from jawusd.pipeline.fit import TrajectoryOptions
     from jawusd.pipeline.subject import Subject
 
@@ -65,11 +66,27 @@ def rig_of_folder(rig: Path | None) -> Path | None:
     return None if rig is None else actor_in_folder(rig)
 
 
+_FOLDER = "jawusd.folder"  # key of what was named for a rig in the context of a command
+
+
+def _noted(context: typer.Context, rig: Path | None) -> Path | None:
+    context.meta[_FOLDER] = rig
+    return rig_of_folder(rig)
+
+
+def changed_in_folder(context: typer.Context) -> list[Finding]:
+    """Return which files are not what the build wrote, if the folder of a build was named for the rig."""
+    from jawusd.pipeline.state import changed_files
+
+    folder = context.meta[_FOLDER]
+    return changed_files(folder) if folder.is_dir() else []
+
+
 RigArg = Annotated[
     Path,
     typer.Argument(
         help="Folder of a rig, its actor.usda or another layer, or model.npz.",
-        callback=rig_of_folder,
+        callback=_noted,
         show_default=False,
     ),
 ]
@@ -77,7 +94,7 @@ OptionalRigArg = Annotated[
     Path | None,
     typer.Argument(
         help="Folder of a rig, actor.usda, another layer, model.npz or tracks.npz.",
-        callback=rig_of_folder,
+        callback=_noted,
         show_default=False,
     ),
 ]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from jawusd.errors import OutputError
+from jawusd.errors import shown
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -19,12 +19,23 @@ if TYPE_CHECKING:
 
 
 def emit(data: Mapping[str, object], as_json: bool, lines: Callable[[], list[str]]) -> None:
-    """Print a result as one JSON object, or else as lines for people."""
+    """Print a result as one JSON object, or as lines for people."""
     if as_json:
         typer.echo(json.dumps(plain(data), indent=1))
     else:
         for line in lines():
-            typer.echo(line)
+            say(line)
+
+
+def say(line: object, err: bool = False) -> None:
+    """Print one line; what files say in it cannot control the terminal, see `shown`."""
+    typer.echo(shown(line), err=err)
+
+
+def complain(text: object) -> None:
+    """Print a message on stderr, which may hold the lines of several findings, after the program's name."""
+    for line in f"jawusd: {text}".split("\n"):
+        say(line, err=True)
 
 
 def plain(value: object) -> object:
@@ -38,16 +49,6 @@ def plain(value: object) -> object:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return str(value) if isinstance(value, Path) else value
-
-
-def refuse_existing(path: Path, force: bool) -> None:
-    """Refuse to overwrite a file unless forced.
-
-    Raises:
-        OutputError: the file exists.
-    """
-    if path.exists() and not force:
-        raise OutputError("exists already.", path=path, hint="Name another file, or overwrite it with --force.")
 
 
 @contextlib.contextmanager

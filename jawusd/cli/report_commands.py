@@ -27,8 +27,9 @@ from jawusd.cli.options import (
     subject_given,
     trajectory_options,
 )
-from jawusd.cli.output import emit, progress, refuse_existing
+from jawusd.cli.output import emit, progress, say
 from jawusd.errors import naming_file
+from jawusd.formats.atomic import refuse_existing
 
 if TYPE_CHECKING:
     from jawusd.formats.experiments import Experiments
@@ -162,6 +163,7 @@ def view(
     """See a rig in the browser, drag it, key it; or a capture's footage, to judge its poses and to set its picks."""
     import webbrowser
 
+    from jawusd.pipeline.state import changed_files
     from jawusd.pipeline.view import open_viewer
     from jawusd.pipeline.view_capture import is_capture, open_capture_viewer
     from jawusd.viewer.server import is_loopback
@@ -173,11 +175,14 @@ def view(
         raise typer.BadParameter("--prim belongs to a rig; a capture has none.")
     if not is_loopback(host):
         may = "write picks into the capture" if capture else "write animations beside the rig"
-        typer.echo(
+        say(
             f"jawusd: warning: listening on {host}: whoever reaches this address sees this person's jaw, without a "
             f"password, and may {may}. `ssh -L 8080:localhost:8080` works without --host.",
             err=True,
         )
+    for folder in (rig, tracks):
+        for found in changed_files(folder) if folder is not None and folder.is_dir() else ():
+            say(found.line(), err=True)
     viewer: PageServer
     if capture:
         with progress() as report:
@@ -185,7 +190,7 @@ def view(
     else:
         viewer = open_viewer(rig, host, port, prim)
     try:
-        typer.echo(f"{viewer.url}  (Ctrl+C stops)")
+        say(f"{viewer.url}  (Ctrl+C stops)")
         if browser:
             webbrowser.open(viewer.url)
         viewer.wait()

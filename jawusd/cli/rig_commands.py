@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from jawusd.cli.options import USD_SUFFIXES, Allow, Json, OptionalRigArg, Prim, RigArg, load_named
+from jawusd.cli.options import USD_SUFFIXES, Allow, Json, OptionalRigArg, Prim, RigArg, changed_in_folder, load_named
 from jawusd.cli.output import emit
 
 if TYPE_CHECKING:
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from jawusd.evaluator import JawRig
+    from jawusd.formats.finding import Finding as Changed
     from jawusd.geometry.arrays import Array
     from jawusd.rig.read import Description
 
@@ -26,6 +27,7 @@ NO = 1
 
 
 def info(
+    context: typer.Context,
     rig: OptionalRigArg = None,
     schema: Annotated[
         bool, typer.Option("--schema", help="Say where the USD schema JawRigAPI is, and how other programs find it.")
@@ -57,8 +59,9 @@ def info(
         raise typer.BadParameter("--frame belongs to tracks.npz.")
     from jawusd.rig import describe
 
-    found = describe(rig, prim)
-    emit(found, as_json, lambda: _info_lines(found))
+    found, changed = describe(rig, prim), changed_in_folder(context)
+    whole = {**found, "changed": [finding.as_json() for finding in changed]}
+    emit(whole, as_json, lambda: [*_info_lines(found), *(finding.line() for finding in changed)])
 
 
 def _print_schema(as_json: bool) -> None:
@@ -150,6 +153,7 @@ def _check_finite(values: Triple, option: str) -> None:
 
 
 def validate(
+    context: typer.Context,
     rig: RigArg,
     poses: Annotated[
         Path | None, typer.Argument(help="CSV or JSON of poses or of d, tracks.npz, or an animated USD stage.")
@@ -168,7 +172,7 @@ def validate(
     A pose is inside the bound, within the tolerance that measured poses have, or outside.
     """
     if poses is None:
-        _validate_rig(rig, as_json)
+        _validate_rig(rig, changed_in_folder(context), as_json)
         return
 
     loaded = load_named(rig, prim, poses)
@@ -232,12 +236,13 @@ def _poses_or_parameters(rig: JawRig, path: Path, prim: str | None) -> tuple[NDA
     return frames, rig.pose(found) if found.ndim == 2 else found
 
 
-def _validate_rig(path: Path, as_json: bool) -> None:
+def _validate_rig(path: Path, changed: list[Changed], as_json: bool) -> None:
     from dataclasses import asdict
 
-    from jawusd.rig import find_nvidia_validator, nvidia_findings, validate_stage
+    from jawusd.rig import Finding, find_nvidia_validator, nvidia_findings, validate_stage
 
-    findings = validate_stage(path)
+    findings = [Finding(one.severity, one.kind, one.path or "", one.message) for one in changed]
+    findings += validate_stage(path)
     nvidia = find_nvidia_validator()
     if nvidia is not None:
         findings += nvidia_findings(path, nvidia)

@@ -9,7 +9,8 @@ from typing import Annotated
 import typer
 
 from jawusd.cli.options import Allow, Force, Json, Outside, Prim, RigArg
-from jawusd.cli.output import emit, progress, refuse_existing
+from jawusd.cli.output import emit, progress
+from jawusd.formats.atomic import refuse_existing
 
 
 class Head(StrEnum):

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from jawusd.cli.options import USD_SUFFIXES, Allow, Force, Json, Prim, RigArg, load_named, rig_of_folder
-from jawusd.cli.output import emit, refuse_existing
+from jawusd.cli.output import emit
 from jawusd.errors import JawusdError
+from jawusd.formats.atomic import refuse_existing
 
 if TYPE_CHECKING:
     from jawusd.cli.motion import AuthoredMotion, Changes

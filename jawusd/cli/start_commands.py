@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 
 from jawusd.cli.options import Force, Json
-from jawusd.cli.output import emit, progress, refuse_existing
+from jawusd.cli.output import emit, progress
+from jawusd.formats.atomic import refuse_existing
 
 
 def init(

@@ -1,56 +1,156 @@
-"""Write files so that a reader never meets half of one: temporary file, fsync, rename."""
+"""Write outputs so that a reader never meets half of one: temporary file, fsync, rename. Pipes and devices stay."""
 
 from __future__ import annotations
 
 import contextlib
+import csv
+import errno
 import io
 import os
 import shutil
+import stat
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import ArrayLike
+from jawusd.errors import OutputError, shown
 
-from jawusd.errors import OutputError
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
 # Prefix of every unfinished file and folder, by which what a killed run leaves behind is recognised and deleted.
 _UNFINISHED = ".jawusd-tmp-"
+_LONGEST_SUFFIX = 16  # bytes; a temporary name fits where the name itself does
 #: What to do where a file or folder cannot be written.
 ELSEWHERE = "Name a place where you may write."
+# What some file systems cannot do: fsync, modes.
+_UNSUPPORTED = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EINVAL, errno.EPERM)
+
+
+def destination(path: str | os.PathLike[str]) -> Path:
+    """Return the file that an output goes to: the path itself, or what a link names within its own folder.
+
+    Raises:
+        OutputError: a folder, a disk, a socket, a link out of its folder, or a name that no file can have.
+    """
+    target = Path(path)
+    try:
+        if is_stream(target):
+            return target
+        if target.is_symlink():
+            target = Path(os.path.realpath(target))
+            if not target.is_relative_to(os.path.realpath(Path(path).parent)):
+                hint = "Delete the link, or name the file itself."
+                raise OutputError(f"is a link out of its folder, to {target}.", path=path, hint=hint)
+        found = _mode(target)
+    except (OSError, ValueError) as error:  # a name that is too long, links in a circle, a null byte
+        raise OutputError(f"cannot write here: {getattr(error, 'strerror', error)}.", path=path) from error
+    if found is not None and not stat.S_ISREG(found):
+        what = "a folder" if stat.S_ISDIR(found) else "neither a file nor a pipe"
+        raise OutputError(f"is {what}; no file takes its place.", path=path, hint="Name another file.")
+    return target
+
+
+def refuse_existing(path: Path, force: bool) -> None:
+    """Check before any work that a file may be written: there is none of that name, or it may be overwritten.
+
+    Raises:
+        OutputError: it exists, or see `destination`.
+    """
+    destination(path)
+    if os.path.lexists(path) and not force and not is_stream(path):
+        raise OutputError("exists already.", path=path, hint="Name another file, or overwrite it with --force.")
+
+
+def is_stream(path: Path) -> bool:
+    """Tell whether a path is written to as it is: a pipe, a device as /dev/null, the file behind /dev/stdout."""
+    found = _mode(path)
+    if found is None:
+        return False
+    return stat.S_ISFIFO(found) or stat.S_ISCHR(found) or _standard(path) is not None
+
+
+def _mode(path: Path) -> int | None:
+    try:
+        return path.stat().st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+
+
+def _standard(path: Path) -> int | None:
+    """Return which standard stream a link as /dev/stdout stands for."""
+    for number in (1, 2):
+        with contextlib.suppress(OSError):
+            if path.is_symlink() and os.path.samestat(path.stat(), os.fstat(number)):
+                return number
+    return None
+
+
+def open_stream(path: Path) -> int:
+    """Return a handle to write to what `is_stream`.
+
+    Raises:
+        OutputError: it cannot be written, or is a pipe that no program reads.
+    """
+    number = _standard(path)
+    if number is not None:
+        return os.dup(number)
+    try:  # opening a pipe that no program reads would wait without an end
+        handle = os.open(path, os.O_WRONLY | getattr(os, "O_NONBLOCK", 0))
+    except OSError as error:
+        why = "no program reads this pipe" if error.errno == errno.ENXIO else error.strerror
+        raise OutputError(f"cannot write here: {why}.", path=path) from error
+    os.set_blocking(handle, True)
+    return handle
 
 
 @contextlib.contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a temporary path beside `path`, of the same suffix, and rename it to `path` when the block ends well.
+    """Yield a temporary path of the same suffix, and rename it to `path` when the block ends well.
 
-    A missing folder is made.
+    A missing folder is made. Links are followed as `destination` says. Pipes and devices get the finished content.
 
     Raises:
-        OutputError: the folder cannot be written, or the disk is full.
+        OutputError: the folder cannot be written, the disk is full, or the output may not go there.
     """
-    target = Path(path)
+    target = destination(path)
+    stream = is_stream(target)
+    suffix = target.suffix if len(os.fsencode(target.suffix)) <= _LONGEST_SUFFIX else ""
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=target.parent, prefix=f"{_UNFINISHED}{target.stem}-", suffix=target.suffix)
+        if not stream:
+            target.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=None if stream else target.parent, prefix=_UNFINISHED, suffix=suffix)
         os.close(handle)
     except OSError as error:
-        raise OutputError(f"cannot write here: {error.strerror}.", path=target, hint=ELSEWHERE) from error
+        raise OutputError(f"cannot write here: {error.strerror}.", path=path, hint=ELSEWHERE) from error
     temporary = Path(name)
     try:
         yield temporary
-        with open(temporary, "rb+") as written:
+        if stream:
+            with open(temporary, "rb") as content, open(open_stream(target), "wb") as sink:
+                shutil.copyfileobj(content, sink)
+            return
+        with open(temporary, "rb+") as written, _unless_unsupported():
             os.fsync(written.fileno())
-        os.chmod(temporary, 0o666 & ~_umask())
+        with _unless_unsupported():
+            os.chmod(temporary, 0o666 & ~_umask())
         os.replace(temporary, target)
         _sync_folder(target.parent)
     except OSError as error:
-        raise OutputError(
-            f"could not be written: {error.strerror}. What was there before is untouched.", path=target
-        ) from error
+        after = "" if stream else " What was there before is untouched."
+        raise OutputError(f"could not be written: {error.strerror}.{after}", path=path) from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _unless_unsupported() -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in _UNSUPPORTED:
+            raise
 
 
 @contextlib.contextmanager
@@ -60,12 +160,14 @@ def scratch_folder(beside: str | os.PathLike[str]) -> Iterator[Path]:
     Raises:
         OutputError: the folder cannot be written.
     """
-    target = Path(beside)
+    target = destination(beside)
+    stream = is_stream(target)
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        folder = Path(tempfile.mkdtemp(dir=target.parent, prefix=_UNFINISHED))
+        if not stream:
+            target.parent.mkdir(parents=True, exist_ok=True)
+        folder = Path(tempfile.mkdtemp(dir=None if stream else target.parent, prefix=_UNFINISHED))
     except OSError as error:
-        raise OutputError(f"cannot write here: {error.strerror}.", path=target, hint=ELSEWHERE) from error
+        raise OutputError(f"cannot write here: {error.strerror}.", path=beside, hint=ELSEWHERE) from error
     try:
         yield folder
     finally:
@@ -112,9 +214,31 @@ def write_text_atomic(path: str | os.PathLike[str], text: str) -> None:
     """Write UTF-8 text to a file atomically.
 
     Raises:
+        OutputError: the file cannot be written, or a name in the text is not UTF-8.
+    """
+    try:
+        data = text.encode()
+    except UnicodeEncodeError as error:  # bytes of names, as Python keeps them
+        name = error.object[max(0, error.start - 20) : error.end + 20]
+        raise OutputError(
+            f'holds UTF-8 text, which cannot say the name in "{name}".', path=path, hint="Rename that file or folder."
+        ) from error
+    write_bytes_atomic(path, data)
+
+
+def write_csv_atomic(
+    path: str | os.PathLike[str], columns: Sequence[str], rows: Iterable[Mapping[str, object]]
+) -> None:
+    """Write a table with a header as CSV atomically; text in it cannot control a terminal.
+
+    Raises:
         OutputError: the file cannot be written.
     """
-    write_bytes_atomic(path, text.encode())
+    text = io.StringIO()
+    table = csv.DictWriter(text, columns, lineterminator="\n")
+    table.writeheader()
+    table.writerows({k: shown(v) if isinstance(v, str) else v for k, v in row.items()} for row in rows)
+    write_text_atomic(path, text.getvalue())
 
 
 def write_npz_atomic(path: str | os.PathLike[str], arrays: Mapping[str, ArrayLike], *, packed: bool = True) -> None:
@@ -126,6 +250,8 @@ def write_npz_atomic(path: str | os.PathLike[str], arrays: Mapping[str, ArrayLik
         OutputError: the file cannot be written.
         ValueError: an array would need a pickle.
     """
+    import numpy as np  # commands check their outputs with this module before they load anything heavy
+
     buffer = io.BytesIO()
     rows = {name: np.asarray(value, order="C") for name, value in arrays.items()}
     for name, array in rows.items():

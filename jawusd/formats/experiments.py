@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import os
 from dataclasses import dataclass
 
 import numpy as np
 
-from jawusd.formats.atomic import write_text_atomic
+from jawusd.formats.atomic import write_csv_atomic
 from jawusd.geometry.arrays import Array
 
 TABLE_COLUMNS = ("experiment", "model", "quantity", "count", "mean_mm", "median_mm", "p95_mm", "max_mm")
@@ -101,8 +99,4 @@ def save_table(path: str | os.PathLike[str], rows: list[dict[str, str | int | fl
     Raises:
         OutputError: the file cannot be written.
     """
-    text = io.StringIO()
-    writer = csv.DictWriter(text, TABLE_COLUMNS, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_text_atomic(path, text.getvalue())
+    write_csv_atomic(path, TABLE_COLUMNS, rows)

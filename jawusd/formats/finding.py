@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Literal
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator
+
+from jawusd.errors import shown
 
 Severity = Literal["error", "warning", "note"]
 
@@ -33,7 +37,7 @@ class Finding:
         where = ", ".join(part for part in (self.path, camera, frame) if part)
         text = f"{self.severity}: {where}: {self.message}" if where else f"{self.severity}: {self.message}"
         end = "" if text.endswith((".", "!", "?")) else "."
-        return f"{text}{end} {self.hint}" if self.hint else text
+        return shown(f"{text}{end} {self.hint}" if self.hint else text)
 
     def as_json(self) -> dict[str, str | float | int]:
         """Return the fields that are set, for JSON."""
@@ -56,3 +60,15 @@ class Finding:
             frame=int(found["frame"]) if "frame" in found else None,
             hint=texts.get("hint"),
         )
+
+
+def _readable(found: dict[str, str | float | int]) -> dict[str, str | float | int]:
+    try:
+        Finding.from_json(found)
+    except OverflowError as error:
+        raise ValueError(str(error)) from error
+    return found
+
+
+#: `Finding.as_json`, as pydantic checks it.
+FoundJson = Annotated[dict[str, str | float | int], AfterValidator(_readable)]

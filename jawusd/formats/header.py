@@ -1,13 +1,18 @@
-"""Check the header of tracks and models: what readers use of it has the types that writers gave it."""
+"""Check the JSON that jawusd stores: what readers use of it has the types that writers gave it."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from typing import Annotated, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from jawusd.errors import FormatError
+
+T = TypeVar("T")
+#: Frames that a camera is off by.
+Frames = Annotated[int, Field(ge=-10_000_000, le=10_000_000)]
 
 _Table = dict[str, dict[str, float]]
 _ByCamera = dict[str, list[float]]
@@ -77,3 +82,17 @@ def check_header(meta: Mapping[str, object], kind: type[_Header], path: str | os
         fault = error.errors()[0]
         name = ".".join(map(str, fault["loc"]))
         raise FormatError(f'"meta" has no readable "{name}": {fault["msg"]}.', path=path) from error
+
+
+def of_kind(found: object, kind: type[T], name: str, path: str | os.PathLike[str], hint: str) -> T:
+    """Return a value of a JSON file by a name as a kind, as a typed dictionary.
+
+    Raises:
+        FormatError: it is of another kind.
+    """
+    try:
+        return TypeAdapter(kind).validate_python(found)
+    except ValidationError as error:
+        fault = error.errors()[0]
+        where = ".".join(map(str, (name, *fault["loc"])))
+        raise FormatError(f"is damaged ({where}: {fault['msg']}).", path=path, hint=hint) from error

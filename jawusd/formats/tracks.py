@@ -6,10 +6,11 @@ import json
 import os
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import TypedDict, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import TypedDict
 
 from jawusd.errors import FormatError
 from jawusd.formats.atomic import write_npz_atomic

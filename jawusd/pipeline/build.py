@@ -5,14 +5,16 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NotRequired, TypedDict, TypeVar, cast
+from typing import NotRequired, TypeVar
+
+from typing_extensions import TypedDict
 
 from jawusd import __version__
-from jawusd.errors import OutputError, explain_missing_packages, naming_file
+from jawusd.errors import CaptureError, JawusdError, OutputError, explain_missing_packages, naming_file
 from jawusd.formats.capture import Capture
-from jawusd.formats.finding import Finding
+from jawusd.formats.finding import Finding, FoundJson
 from jawusd.formats.model import load_model, save_model
 from jawusd.formats.tracks import load_tracks, save_tracks
 from jawusd.pipeline.bake import bake_subject, write_take
@@ -20,16 +22,22 @@ from jawusd.pipeline.calibrate import (
     CalibrationSummary,
     SyncResult,
     calibrate_boards,
-    calibration_lines,
     sync_cameras,
 )
 from jawusd.pipeline.cameras import rescaled_cameras
-from jawusd.pipeline.capture_inputs import input_hashes, open_capture
+from jawusd.pipeline.capture_inputs import InputWatch, open_capture
 from jawusd.pipeline.check import check_capture, refuse_errors
-from jawusd.pipeline.fit import FitSummary, fit_lines, fit_subject, fit_summary
+from jawusd.pipeline.fit import FitSummary, fit_subject, fit_summary
 from jawusd.pipeline.memory import give_back_memory
 from jawusd.pipeline.origin import origin_now
-from jawusd.pipeline.report import BuildFacts, missing_packages, place_of, write_build_report
+from jawusd.pipeline.report import (
+    BuildFacts,
+    CheckResult,
+    ReportSummary,
+    missing_packages,
+    place_of,
+    write_build_report,
+)
 from jawusd.pipeline.scans import all_labelled, store_labels, with_stored_labels
 from jawusd.pipeline.segment_record import delete_masks
 from jawusd.pipeline.state import (
@@ -46,10 +54,7 @@ from jawusd.pipeline.state import (
     no_progress,
 )
 from jawusd.pipeline.subject import subject_of_capture
-from jawusd.pipeline.track import TrackSummary, first_pass, model_pass, track_lines, track_summary
-
-if TYPE_CHECKING:
-    from jawusd.report.verdicts import BuildVerdict
+from jawusd.pipeline.track import TrackSummary, first_pass, model_pass, track_summary
 
 OLD_MASKS = "masks"  # folder in which version 0.1 made masks where the capture named none
 
@@ -79,25 +84,6 @@ class BuildOptions:
     fresh: bool = False
     allow_outside: bool = False
     command: str = ""
-
-
-FoundJson = dict[str, str | float | int]
-
-
-class CheckResult(TypedDict):
-    """Hold `Finding.as_json` of what was found before the first stage."""
-
-    findings: list[FoundJson]
-
-
-class ReportSummary(TypedDict):
-    """Hold the capture's path relative to the rig, `Origin`, and the report's file, or which package it lacks."""
-
-    capture: str
-    origin: NotRequired[dict[str, object]]
-    file: NotRequired[str]
-    verdict: NotRequired[BuildVerdict]
-    missing: NotRequired[str]
 
 
 class BuildSummary(TypedDict):
@@ -142,18 +128,21 @@ def build(
         tell: called, before any work, with everything doubtful that a check of the capture found.
 
     Raises:
-        CaptureError: the check found errors; the message lists all of them.
+        CaptureError: the check found errors, all of which the message lists; or inputs changed while a stage ran.
         JawusdError: one of its kinds; stages finished before stay valid for `resume`.
     """
-    capture = open_capture(capture, allow_outside=options.allow_outside)
-    folder = Path(out)
+
+    def read() -> Capture:
+        return open_capture(capture, allow_outside=options.allow_outside)
+
+    opened, folder = read(), Path(out)
     check_folder(folder, options)
     with locked(folder):
         state = BuildState(folder)
         if options.fresh:
             state.clear()
             delete_masks(folder / OLD_MASKS)
-        return StagedBuild(capture, folder, options, state, progress or no_progress).run(tell)
+        return StagedBuild(opened, folder, options, state, progress or no_progress, read).run(tell)
 
 
 def check_folder(folder: Path, options: BuildOptions) -> None:
@@ -178,15 +167,22 @@ class StagedBuild:
     """One run of the stages over one capture."""
 
     def __init__(
-        self, capture: Capture, folder: Path, options: BuildOptions, state: BuildState, progress: Progress
+        self,
+        capture: Capture,
+        folder: Path,
+        options: BuildOptions,
+        state: BuildState,
+        progress: Progress,
+        read_again: Callable[[], Capture],
     ) -> None:
         self.capture, self.folder, self.options = capture, folder, options
         self.state, self.progress = state, progress
+        self._watch, self._opened, self._read_again = InputWatch(), capture, read_again
         self.reused: list[str] = []
 
     def run(self, tell: Callable[[Finding], None] | None) -> BuildSummary:
         """Run the stages in order, or reuse them."""
-        videos = input_hashes(self.capture, ["videos"])
+        videos = self._watch.hashes(self.capture, ["videos"])
         check = self._checked(videos)
         if tell is not None:
             for found in check.result["findings"]:
@@ -195,12 +191,15 @@ class StagedBuild:
         calibrate = self._calibrated()
         capture, options = self.capture, self.options
         names = [camera.name for camera in capture.cameras]
-        sync = self._stage("sync", self._inputs([], videos, capture.sync.model_dump(), names, capture.fps), self._sync)
+        sync = self._stage(
+            "sync", SyncResult, self._inputs([], videos, capture.sync.model_dump(), names, capture.fps), self._sync
+        )
         # Contents are hashed, not paths: a capture may be moved.
         described = capture.model_dump(mode="json", include={"frames", "bootstrap", "anatomy", "calibration_unit_mm"})
         masks = [camera.masks and camera.masks.labels for camera in capture.cameras]
         track = self._stage(
             "track",
+            TrackSummary,
             self._inputs(
                 ["teeth", "mandible", "calibration", "masks"],
                 described,
@@ -214,16 +213,19 @@ class StagedBuild:
             lambda: self._track(sync.result["offsets"]),
         )
         person = [options.model, capture.name, capture.fps]
-        fit = self._stage("fit", self._inputs([], track.outputs, track.inputs, person), self._fit)
+        fit = self._stage("fit", FitSummary, self._inputs([], track.outputs, track.inputs, person), self._fit)
         aid = self._stage(
             "aid",
+            TrackSummary,
             self._inputs([], track.outputs, track.inputs, fit.outputs),
             lambda: self._aid(sync.result["offsets"]),
         )
-        bake = self._stage("bake", self._inputs(["skull"], fit.outputs, aid.outputs, track.inputs), self._bake)
+        bake = self._stage(
+            "bake", dict[str, object], self._inputs(["skull"], fit.outputs, aid.outputs, track.inputs), self._bake
+        )
         missing = missing_packages()
         inputs = self._inputs([], bake.outputs, bake.inputs, videos, sync.result, missing)
-        report = self._stage("report", inputs, lambda: self._report(missing))
+        report = self._stage("report", ReportSummary, inputs, lambda: self._report(missing))
         stages = (labels, calibrate, track, fit, aid, bake, report)
         outputs = {name for stage in stages if stage for name in stage.outputs}
         return {
@@ -241,19 +243,44 @@ class StagedBuild:
         }
 
     def _inputs(self, parts: Iterable[str], *values: object) -> str:
-        return hash_value([input_hashes(self.capture, parts), *values, __version__])
+        return hash_value([self._watch.hashes(self.capture, parts), *values, __version__])
 
-    def _stage(self, name: str, inputs: str, work: Callable[[], tuple[list[Path], R]]) -> StageRecord[R]:
-        record = self.state.valid(name, inputs)
+    def _stage(self, name: str, kind: type[R], inputs: str, work: Callable[[], tuple[list[Path], R]]) -> StageRecord[R]:
+        record = self._kept(name, kind, inputs)
         if record is not None:
-            self.reused.append(name)
             self.progress(name, 1, 1)
-            # build.json is what this stage wrote: its hash was checked when it was read.
-            return cast("StageRecord[R]", record)
+            return record
         start = time.perf_counter()
         outputs, result = work()
+        self._refuse_changes(name)
         give_back_memory()
         return self.state.finish(name, inputs, outputs, time.perf_counter() - start, result)
+
+    def _kept(self, name: str, kind: type[R], inputs: str) -> StageRecord[R] | None:
+        """Return the record of a stage that need not run."""
+        record = self.state.valid(name, inputs)
+        if record is None:
+            return None
+        self.reused.append(name)
+        return replace(record, result=self.state.result(name, kind))
+
+    def _refuse_changes(self, stage: str) -> None:
+        """Refuse to record a stage whose inputs were edited while it ran: nobody knows what of them it has read.
+
+        A capture.toml that says the same in other words has not changed.
+        """
+        changed = self._watch.changed()
+        try:
+            same = self._read_again() == self._opened
+        except JawusdError:  # it is being saved
+            same = False
+        if changed or not same:
+            raise CaptureError(
+                f"changed while the stage {stage} ran: {', '.join([*changed, *([] if same else ['capture.toml'])])}. "
+                "The stage is not recorded.",
+                path=self._opened.folder,
+                hint="Run the same command again with --resume: stages that do not read it are kept.",
+            )
 
     def _checked(self, videos: dict[str, str]) -> StageRecord[CheckResult]:
         """Check the capture before any work, and refuse it with all errors at once."""
@@ -266,7 +293,7 @@ class StagedBuild:
 
         parts = ["teeth", "mandible", "skull", "calibration", "masks"]
         described = capture.model_dump(mode="json", exclude={"folder"})
-        return self._stage("check", self._inputs(parts, videos, described), work)
+        return self._stage("check", CheckResult, self._inputs(parts, videos, described), work)
 
     def _labelled(self) -> StageRecord[dict[str, str]] | None:
         """Tell crown and gum of the scans apart where neither paint nor a file does."""
@@ -274,7 +301,9 @@ class StagedBuild:
         if all_labelled(capture):
             return None
         none: dict[str, str] = {}
-        record = self._stage("scans", self._inputs(["teeth"]), lambda: (store_labels(capture, folder), none))
+        record = self._stage(
+            "scans", dict[str, str], self._inputs(["teeth"]), lambda: (store_labels(capture, folder), none)
+        )
         self.capture = with_stored_labels(capture, folder)
         return record
 
@@ -289,6 +318,7 @@ class StagedBuild:
         path = self.folder / CALIBRATION
         record = self._stage(
             "calibrate",
+            CalibrationSummary,
             # Without picks, the stated size of the squares is checked with the masks.
             self._inputs(["boards", "teeth", *([] if picks else ["masks", "videos"])], described, picks, names),
             lambda: ([path], calibrate_boards(capture, path, self.progress)),
@@ -333,50 +363,6 @@ class StagedBuild:
         if missing is not None:
             # The rig is complete without; the summary says what is missing and how to get it.
             return [], {"capture": place, "origin": asdict(origin), "missing": missing}
-        facts = BuildFacts(self.state.stages, self.capture, origin)
+        facts = BuildFacts(self.state, self.capture, origin)
         path, verdict = write_build_report(self.folder, facts, self.progress)
         return [path], {"capture": place, "origin": asdict(origin), "file": path.name, "verdict": verdict}
-
-
-def build_lines(summary: BuildSummary) -> list[str]:
-    """Return the summary of a build as text."""
-    offsets = ", ".join(f"{name} {offset:+d}" for name, offset in summary["sync"]["offsets"].items())
-    # What the tracks say of the scans is said with them.
-    known = [Finding.from_json(found).line() for found in summary["track"].get("findings", [])]
-    lines = [Finding.from_json(found).line() for found in summary.get("findings", [])]
-    lines = [line for line in lines if line not in known]
-    if summary["calibrate"]:
-        lines += [
-            "the capture names no calibration: made one from its boards",
-            *calibration_lines(summary["calibrate"]),
-        ]
-    lines += [f"sync ({summary['sync']['method']}): {offsets} frames"]
-    lines += [f"  note: {note}" for note in summary["sync"].get("notes", [])]
-    lines += track_lines(summary["track"])
-    lines += fit_lines(summary["fit"])
-    seconds = ", ".join(
-        f"{name} {'kept' if name in summary['reused'] else f'{value:.1f} s'}"
-        for name, value in summary["seconds"].items()
-    )
-    report = summary["report"]
-    shown = f"{summary['folder']}/{report['file']}" if "file" in report else f"none: {report['missing']}"
-    ends = [f"time: {seconds}", f"rig: {summary['folder']}/actor.usda", f"report: {shown}"]
-    return [*lines, *ends, *_verdict_lines(report)]
-
-
-_MOST_REASONS = 4
-
-
-def _verdict_lines(report: ReportSummary) -> list[str]:
-    """Return the verdict on the build: what the report says, with the figures that make it so."""
-    if "verdict" not in report:
-        return ["verdict: none, there is no report that judges it"]
-    grade, because = report["verdict"]["grade"], report["verdict"]["because"]
-    words = {
-        "good": "good",
-        "look": "usable; look at this in the report first:",
-        "bad": "not usable as it is, because of:",
-        "open": "none, there is nothing to judge it by",
-    }
-    more = [f"and {len(because) - _MOST_REASONS} more"] if len(because) > _MOST_REASONS else []
-    return [f"verdict: {words.get(grade, grade)}", *(f"  {one}" for one in (*because[:_MOST_REASONS], *more))]

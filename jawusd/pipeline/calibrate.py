@@ -6,13 +6,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NotRequired, TypedDict, cast
+from typing import TYPE_CHECKING, NotRequired, cast
+
+from typing_extensions import TypedDict
 
 from jawusd.errors import SyncError, TrackingError, explain_missing_packages, naming_file
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.calibration import save_calibration
 from jawusd.formats.capture import Capture
 from jawusd.formats.clip_source import ClipSource
+from jawusd.formats.header import Frames
 from jawusd.formats.light_curve import LightCurve
 from jawusd.formats.mesh import Mesh
 from jawusd.geometry import Camera
@@ -56,7 +59,7 @@ class CalibrationSummary(TypedDict):
 class SyncResult(TypedDict):
     """Hold the frame offset of every camera to the reference camera [frames], and what the method says of it."""
 
-    offsets: dict[str, int]
+    offsets: dict[str, Frames]
     method: str
     reference: NotRequired[str]
     exact_frames: NotRequired[dict[str, float]]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from jawusd.errors import CaptureError
@@ -53,23 +53,58 @@ def input_files(capture: Capture, names: Iterable[str]) -> dict[str, list[Path]]
     return {part: [path for path in files if path.is_file()] for part, files in parts.items()}
 
 
-def input_hashes(capture: Capture, names: Iterable[str]) -> dict[str, str]:
+def input_hashes(
+    capture: Capture, names: Iterable[str], hashed: Callable[[list[Path]], str] = hash_files
+) -> dict[str, str]:
     """Return the content hashes of parts of a capture; see `input_files`.
+
+    Args:
+        hashed: returns the hash of files.
 
     Raises:
         CaptureError: a file cannot be read.
     """
     try:
         names = list(names)
-        found = {part: hash_files(files) for part, files in input_files(capture, names).items()}
+        found = {part: hashed(files) for part, files in input_files(capture, names).items()}
     except OSError as error:
         raise CaptureError(f"cannot be read: {error.strerror}.", path=error.filename) from error
     if "videos" in names:  # how footage is read is part of what it shows
         keys = {"timecode", "start_frame", "fps", "colour_space", "pixel_aspect"}
         found["footage as read"] = hash_value([camera.model_dump(include=keys) for camera in capture.cameras])
         if capture.colour_config is not None:
-            found["colour config"] = hash_files([capture.colour_config])
+            found["colour config"] = hashed([capture.colour_config])
     return found
+
+
+class InputWatch:
+    """Hash inputs, and notice what has changed since; files that look untouched are not read again."""
+
+    def __init__(self) -> None:
+        self._asked: list[tuple[Capture, list[str], dict[str, str]]] = []
+        self._known: dict[tuple[object, ...], str] = {}
+
+    def hashes(self, capture: Capture, names: Iterable[str]) -> dict[str, str]:
+        """Return `input_hashes`, which raises CaptureError, and remember them."""
+        names = list(names)
+        found = input_hashes(capture, names, self._hash)
+        self._asked.append((capture, names, found))
+        return found
+
+    def changed(self) -> list[str]:
+        """Return the parts that are not what they were when they were hashed, by the names of `input_files`."""
+        parts: set[str] = set()
+        for capture, names, before in self._asked:
+            now = input_hashes(capture, names, self._hash)
+            parts |= {part for part in before.keys() | now.keys() if before.get(part) != now.get(part)}
+        return sorted(parts)
+
+    def _hash(self, files: list[Path]) -> str:
+        states = [(path, path.stat()) for path in files]
+        key = tuple((p, s.st_dev, s.st_ino, s.st_size, s.st_mtime_ns, s.st_ctime_ns) for p, s in states)
+        if key not in self._known:
+            self._known[key] = hash_files(files)
+        return self._known[key]
 
 
 def _sequence_files(path: Path) -> list[Path]:

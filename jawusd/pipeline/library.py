@@ -15,6 +15,7 @@ import numpy as np
 from jawusd.errors import EvaluatorError, FormatError, OutputError, explain_missing_packages
 from jawusd.evaluator import JawRig, load
 from jawusd.evaluator.sections import SMALLEST_REACH_MM
+from jawusd.formats.atomic import refuse_existing
 from jawusd.formats.model import JawModel, load_model, save_model
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.library.index import MODEL_FILE, Entry, Library, load_donors, scan_library
@@ -72,8 +73,7 @@ def add_rig(folder: str | os.PathLike[str], source: Path, name: str | None, forc
     # The place is inside the library by its name; a link lying there could still lead out of it.
     if place.is_symlink() or (place / MODEL_FILE).is_symlink():
         raise OutputError("is a link; rigs are written into the library itself.", path=place)
-    if (place / MODEL_FILE).exists() and not force:
-        raise OutputError("exists already.", path=place, hint="Give another --name, or overwrite it with --force.")
+    refuse_existing(place / MODEL_FILE, force)
     save_model(place / MODEL_FILE, _as_model(rig, source, called))
     return place / MODEL_FILE
 
@@ -101,8 +101,7 @@ def plot_ranges(entries: Sequence[Entry], folder: Path, force: bool) -> list[Pat
     from jawusd.report.ranges import RANGES, draw_ranges
 
     for suffix in (".png", ".svg"):
-        if (folder / (RANGES + suffix)).exists() and not force:
-            raise OutputError("exists already.", path=folder / (RANGES + suffix), hint="Overwrite with --force.")
+        refuse_existing(folder / (RANGES + suffix), force)
     return draw_ranges([(entry.actor, entry.ranges_mm) for entry in entries], folder)
 
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import csv
-import io
 import json
 import logging
 import signal
@@ -35,7 +33,7 @@ from distributed.utils import silence_logging_cmgr
 
 from jawusd import __version__
 from jawusd.errors import ClusterError, JawusdError
-from jawusd.formats.atomic import write_text_atomic
+from jawusd.formats.atomic import write_csv_atomic, write_text_atomic
 from jawusd.formats.capture_list import ListedCapture
 from jawusd.pipeline.build import BuildOptions, FitSummary, build, check_folder
 from jawusd.pipeline.memory import map_large_arrays
@@ -135,7 +133,9 @@ def build_many(captures: Sequence[ListedCapture], root: Path, options: ManyOptio
         try:
             for outcome in _run(client, captures, root, options.build, notify):
                 found[outcome.name] = outcome
-                notify(f"[{len(found)}/{len(captures)}] {outcome.name}: {outcome.error or outcome.status}")
+                said = f"[{len(found)}/{len(captures)}] {outcome.name}: {outcome.error or outcome.status}"
+                for line in said.split("\n"):
+                    notify(line)
         finally:
             outcomes = [found.get(c.name, Outcome(c.name, str(c.path), STOPPED)) for c in captures]
             _write(root, outcomes)
@@ -151,7 +151,7 @@ def outcome_lines(outcomes: Sequence[Outcome]) -> list[str]:
         figures += [(o.sigma_incisor_mm, 10, ".3f"), (o.seconds, 7, ".1f")]
         cells = "  ".join(f"{'-' if value is None else format(value, form):>{w}}" for value, w, form in figures)
         lines.append(f"{o.name:<{width}}  {o.status:<7}  {cells}")
-    return lines + [f"{o.name}: {o.error}" for o in outcomes if o.error]
+    return lines + [line for o in outcomes if o.error for line in f"{o.name}: {o.error}".split("\n")]
 
 
 def _run(
@@ -251,11 +251,7 @@ def _progress(run: str, name: str) -> Progress:
 def _write(root: Path, outcomes: Sequence[Outcome]) -> None:
     rows = [asdict(outcome) for outcome in outcomes]
     write_text_atomic(root / SUMMARY_JSON, json.dumps({"format": "jawusd-builds/1", "builds": rows}, indent=1) + "\n")
-    text = io.StringIO()
-    table = csv.DictWriter(text, [field.name for field in fields(Outcome)], lineterminator="\n")
-    table.writeheader()
-    table.writerows(rows)
-    write_text_atomic(root / SUMMARY_CSV, text.getvalue())
+    write_csv_atomic(root / SUMMARY_CSV, [field.name for field in fields(Outcome)], rows)
 
 
 class _IgnoreInterrupt(WorkerPlugin):

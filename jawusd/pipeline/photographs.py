@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import CaptureError, OutputError, explain_missing_packages
+from jawusd.errors import CaptureError, explain_missing_packages
+from jawusd.formats.atomic import refuse_existing
 from jawusd.formats.photographs import AlignedPhotos, save_photographs
 from jawusd.imaging.meshio import load_mesh
 from jawusd.imaging.overlay import save_png
@@ -62,10 +63,7 @@ def align_photograph_files(
     for name in names:
         if names.count(name) > 1:
             raise CaptureError(f'two pictures are called "{name}".', hint="Photographs go by their file names.")
-    if (folder / RESULT).exists() and not force:
-        raise OutputError(
-            "exists already.", path=folder / RESULT, hint="Name another folder, or overwrite it with --force."
-        )
+    refuse_existing(folder / RESULT, force)
     pictures = [_read(path) for path in paths]
     drawings = [read_drawing(picture, name) for picture, name in zip(pictures, names, strict=True)]
     meshes = [load_mesh(path) for path in (upper_teeth, lower_teeth)]

@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import TypeVar
 
 from jawusd.errors import explain_missing_packages
 from jawusd.formats.capture import Capture
@@ -49,12 +49,11 @@ class _Stop(Exception):
 class _Plan(StagedBuild):
     """Walk through a build's stages as far as they are kept."""
 
-    def _stage(self, name: str, inputs: str, work: Callable[[], tuple[list[Path], R]]) -> StageRecord[R]:
-        record = self.state.valid(name, inputs)
+    def _stage(self, name: str, kind: type[R], inputs: str, work: Callable[[], tuple[list[Path], R]]) -> StageRecord[R]:
+        record = self._kept(name, kind, inputs)
         if record is None:
             raise _Stop
-        self.reused.append(name)
-        return cast("StageRecord[R]", record)
+        return record
 
 
 @explain_missing_packages()
@@ -71,7 +70,7 @@ def plan_build(capture: Capture | str | os.PathLike[str], out: Path, options: Bu
     recorded = dict(state.stages)
     kept: list[str] = []
     if not options.fresh:
-        plan = _Plan(opened, out, options, state, no_progress)
+        plan = _Plan(opened, out, options, state, no_progress, lambda: opened)
         with contextlib.suppress(_Stop):
             plan.run(None)
         kept = plan.reused

@@ -8,12 +8,14 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar, cast
+from typing import NotRequired, TypeVar
+
+from typing_extensions import TypedDict
 
 from jawusd.errors import FormatError, JawusdError, MissingDependencyError, explain_missing_packages
 from jawusd.formats.capture import Capture
 from jawusd.formats.experiments import Experiments, save_table
-from jawusd.formats.finding import Finding
+from jawusd.formats.finding import Finding, FoundJson
 from jawusd.formats.model import JawModel, load_model
 from jawusd.formats.report import CameraFacts, Origin, Overlay, ReportData, RigFacts
 from jawusd.formats.tracks import Tracks, load_tracks
@@ -36,9 +38,8 @@ from jawusd.pipeline.state import (
     no_progress,
 )
 from jawusd.pipeline.subject import Subject, subject_of_build
-
-if TYPE_CHECKING:
-    from jawusd.report.verdicts import BuildVerdict
+from jawusd.report.facts import SyncFacts
+from jawusd.report.verdicts import BuildVerdict
 
 T = TypeVar("T")
 
@@ -50,11 +51,27 @@ _NETWORKS = (
 )
 
 
+class CheckResult(TypedDict):
+    """Hold what was found before the first stage."""
+
+    findings: list[FoundJson]
+
+
+class ReportSummary(TypedDict):
+    """Hold the capture's path relative to the rig, `Origin`, and the report's file, or which package it lacks."""
+
+    capture: NotRequired[str]
+    origin: NotRequired[dict[str, object]]
+    file: NotRequired[str]
+    verdict: NotRequired[BuildVerdict]
+    missing: NotRequired[str]
+
+
 @dataclass(frozen=True)
 class BuildFacts:
     """Say what a finished build left behind."""
 
-    stages: Stages  # record of each stage
+    state: BuildState
     capture: Capture | None  # the capture it was made from, None where it is not available
     origin: Origin
     why_not: str = ""  # why there is no capture
@@ -117,18 +134,18 @@ def _without_pictures(
         actor=subject.name,
         tracks=tracks,
         model=model,
-        sync=facts.stages["sync"].result if "sync" in facts.stages else {},
+        sync=facts.state.result("sync", SyncFacts) or {},
         cameras=attempt("cameras", left_out, lambda: _cameras(facts)) or (),
         inferred=tuple(fit_summary(model).get("inferred", ())),
-        seconds={name: record.seconds for name, record in facts.stages.items() if name != "report"},
-        hashes=_hashes(facts.stages),
+        seconds={name: record.seconds for name, record in facts.state.stages.items() if name != "report"},
+        hashes=_hashes(facts.state.stages),
         origin=facts.origin,
         rig=_rig_facts(folder),
         experiments=experiments,
         overlays=(),
         parts=attempt("3-D replay", left_out, lambda: replay_parts(folder, model)) or (),
         left_out=tuple(left_out),
-        findings=_check_findings(facts.stages),
+        findings=_check_findings(facts.state),
     )
 
 
@@ -148,7 +165,7 @@ def report_build(
         allow_outside: let paths in the capture leave its folder.
 
     Raises:
-        FormatError: not the folder of a build, or a damaged one.
+        FormatError: not the folder of a build, a damaged one, or one whose files are not what the build wrote.
         MissingDependencyError, RigError, OutputError: see `write_build_report`.
         CaptureError: the capture named cannot be read.
     """
@@ -160,6 +177,9 @@ def report_build(
         )
     with locked(folder):
         state = BuildState(folder)
+        if changed := [found for found in state.changed() if found.path != REPORT_FILE]:
+            listed = "".join(f"\n  {found.line()}" for found in changed)
+            raise FormatError(f"files of this build are not what it wrote:{listed}", path=folder)
         given = open_capture(capture, allow_outside=allow_outside) if capture is not None else None
         facts = build_facts(folder, state, given, allow_outside=allow_outside)
         path, verdict = write_build_report(folder, facts, progress, experiments)
@@ -201,17 +221,17 @@ def build_facts(folder: Path, state: BuildState, capture: Capture | None, *, all
         allow_outside: let paths in the capture leave its folder.
     """
     record = state.stages.get("report")
-    found = record.result if record else {}
-    stages, origin, place = state.stages, recorded_origin(found), found.get("capture")
+    origin = recorded_origin(record.result if record else {})
+    place = (state.result("report", ReportSummary) or {}).get("capture")
     if capture is not None:
-        return BuildFacts(stages, as_built(capture, folder), origin)
+        return BuildFacts(state, as_built(capture, folder), origin)
     if not place:
-        return BuildFacts(stages, None, origin, "the build does not say where its capture is: name it with --capture.")
+        return BuildFacts(state, None, origin, "the build does not say where its capture is: name it with --capture.")
     path = folder / str(place)
     try:
-        return BuildFacts(stages, as_built(open_capture(path, allow_outside=allow_outside), folder), origin)
+        return BuildFacts(state, as_built(open_capture(path, allow_outside=allow_outside), folder), origin)
     except JawusdError as error:
-        return BuildFacts(stages, None, origin, f"the capture is not at hand ({error}): name it with --capture.")
+        return BuildFacts(state, None, origin, f"the capture is not at hand ({error}): name it with --capture.")
 
 
 def as_built(capture: Capture, folder: Path) -> Capture:
@@ -243,13 +263,16 @@ def attempt(what: str, left_out: list[str], work: Callable[[], T]) -> T | None:
 def _overlays(facts: BuildFacts, tracks: Tracks) -> tuple[Overlay, ...]:
     if facts.capture is None:
         raise FormatError(facts.why_not)
-    return draw_worst_frames(facts.capture, recorded_offsets(facts.stages), tracks)
+    return draw_worst_frames(facts.capture, recorded_offsets(facts.state), tracks)
 
 
-def recorded_offsets(stages: Stages) -> dict[str, int]:
-    """Return the frame offset of every camera as a build found it; empty if it did not come that far."""
-    offsets = stages["sync"].result["offsets"] if "sync" in stages else {}
-    return {str(name): int(offset) for name, offset in offsets.items()} if isinstance(offsets, dict) else {}
+def recorded_offsets(state: BuildState) -> dict[str, int]:
+    """Return the frame offset of every camera as a build found it; empty if it did not come that far.
+
+    Raises:
+        FormatError: build.json is damaged.
+    """
+    return (state.result("sync", SyncFacts) or {}).get("offsets", {})
 
 
 def _cameras(facts: BuildFacts) -> tuple[CameraFacts, ...]:
@@ -284,11 +307,10 @@ def _rig_facts(folder: Path) -> RigFacts:
     return RigFacts(error_mm, tuple(f"{finding.severity}: {finding.message}" for finding in found))
 
 
-def _check_findings(stages: Stages) -> tuple[Finding, ...]:
+def _check_findings(state: BuildState) -> tuple[Finding, ...]:
     """Return what the check before the first stage found."""
-    record = stages.get("check")
-    found = cast("list[dict[str, str | float | int]]", record.result.get("findings", [])) if record else []
-    return tuple(Finding.from_json(one) for one in found)
+    found = state.result("check", CheckResult)
+    return tuple(Finding.from_json(one) for one in found["findings"]) if found else ()
 
 
 def _hashes(stages: Stages) -> dict[str, str]:

@@ -10,7 +10,8 @@ from typing import TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import OutputError, explain_missing_packages
+from jawusd.errors import explain_missing_packages
+from jawusd.formats.atomic import refuse_existing
 from jawusd.formats.capture import Capture, Scans
 from jawusd.formats.mesh import Mesh, painted_labels, tooth_labels
 from jawusd.formats.scan_labels import ScanLabels, labels_path, save_scan_labels
@@ -72,8 +73,7 @@ def label_scans(
     opened = open_capture(capture, allow_outside=allow_outside)
     folder = opened.scans.labels if out is None else Path(out)
     picture = (opened.folder if out is None else Path(out)) / PICTURE
-    if picture.exists() and not force:
-        raise OutputError("exists already.", path=picture, hint="Name another folder, or overwrite it with --force.")
+    refuse_existing(picture, force)
     progress("scans", 0, 2)
     scans = labelled_teeth(opened, folder, ignore_files=force)
     progress("scans", 1, 2)

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import json
+import logging
+import math
 import os
+import re
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Generic, TypeVar
 
 from jawusd.errors import FormatError, OutputError
-from jawusd.formats.atomic import ELSEWHERE, clear_unfinished, write_text_atomic
+from jawusd.formats.atomic import ELSEWHERE, clear_unfinished, destination, write_text_atomic
+from jawusd.formats.finding import Finding
+from jawusd.formats.text import parse_json, read_text
 from jawusd.inputs import check_input, check_path
 from jawusd.npz import check_format
 
@@ -26,6 +32,12 @@ LABELS = "labels"  # folder of the labels of scans that are neither painted nor 
 FIRST_PASS = "first_pass.npz"  # tracks without the model's help: what the model is fitted to
 _CHUNK_BYTES = 1 << 20
 _ENDING_S = 2.0  # a killed build holds its lock until the system has taken back its memory
+_MOST_BYTES = 64 << 20  # of build.json, which names the masks of the longest takes
+_SHA256 = re.compile(r"[0-9a-f]{64}")
+# What a lock that another process holds is reported as; all others mean that there are no locks.
+_HELD = (errno.EAGAIN, errno.EWOULDBLOCK, errno.EACCES, errno.EDEADLK)
+_MAKE_AGAIN = "Make it again with `jawusd build ... --resume`, or put back the file that the build wrote."
+_AGAIN = "Delete it, or build with --fresh into a new folder."
 
 #: Called with (stage, done, total) as work proceeds; total is 0 when unknown.
 Progress = Callable[[str, int, int], None]
@@ -40,7 +52,7 @@ def hash_files(paths: Iterable[Path]) -> str:
     total = hashlib.sha256()
     for path in paths:
         check_input(path)
-        total.update(path.name.encode() + b"\0")
+        total.update(os.fsencode(path.name) + b"\0")
         with open(path, "rb") as handle:
             while chunk := handle.read(_CHUNK_BYTES):
                 total.update(chunk)
@@ -86,11 +98,36 @@ class BuildState:
         record = self.stages.get(stage)
         if record is None or record.inputs != inputs:
             return None
-        for name, expected in record.outputs.items():
-            path = self.folder / name
-            if not path.is_file() or hash_files([path]) != expected:
-                return None
-        return record
+        return None if any(self._changed(*output) for output in record.outputs.items()) else record
+
+    def changed(self) -> list[Finding]:
+        """Return an error for every file that is missing, or is not what the build wrote."""
+        outputs = [output for record in self.stages.values() for output in record.outputs.items()]
+        return [
+            Finding("build_changed", "error", f"{message} since the build", path=name, hint=_MAKE_AGAIN)
+            for name, expected in sorted(outputs)
+            if (message := self._changed(name, expected))
+        ]
+
+    def _changed(self, name: str, expected: str) -> str:
+        path = self.folder / name
+        try:
+            if not path.is_file():
+                return "is missing"
+            return "" if hash_files([path]) == expected else "was changed or exchanged"
+        except OSError as error:
+            return f"cannot be read ({error.strerror})"
+
+    def result(self, stage: str, kind: type[R]) -> R | None:
+        """Return the result of a stage, checked to be of a kind; None if the stage has not ended.
+
+        Raises:
+            FormatError: it is of another kind.
+        """
+        from jawusd.formats.header import of_kind  # which few commands need
+
+        record = self.stages.get(stage)
+        return None if record is None else of_kind(record.result, kind, stage, self.folder / BUILD_FILE, _AGAIN)
 
     def finish(self, stage: str, inputs: str, outputs: Iterable[Path], seconds: float, result: R) -> StageRecord[R]:
         """Record a stage whose output files are complete, and write build.json; see `StageRecord`.
@@ -120,16 +157,37 @@ class BuildState:
 
 def _read(path: Path) -> dict[str, StageRecord[Mapping[str, object]]]:
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = parse_json(read_text(path, _MOST_BYTES), path)
+        if not isinstance(data, dict):
+            raise ValueError("is no object")
         check_format(data.get("format"), FAMILY, VERSION, path)
-        # The values of results are not checked one by one; the hash shows that they are what jawusd wrote.
+        # The hash shows that results are what jawusd wrote, unless somebody forged it: see `BuildState.result`.
         if data["sha256"] != hash_value(data["stages"]):
             raise ValueError("changed since it was written")
-        return {str(name): StageRecord(**record) for name, record in data["stages"].items()}
-    except (OSError, ValueError, TypeError, AttributeError, KeyError, RecursionError) as error:
-        raise FormatError(
-            f"is damaged ({error}).", path=path, hint="Delete it, or build with --fresh into a new folder."
-        ) from error
+        return {str(name): _record(found) for name, found in data["stages"].items()}
+    except (ValueError, TypeError, AttributeError, KeyError, OverflowError, RecursionError) as error:
+        raise FormatError(f"is damaged ({error}).", path=path, hint=_AGAIN) from error
+
+
+def _record(found: Mapping[str, object]) -> StageRecord[Mapping[str, object]]:
+    inputs, outputs, seconds, result = (found[name] for name in ("inputs", "outputs", "seconds", "result"))
+    if not (isinstance(inputs, str) and isinstance(outputs, dict) and isinstance(result, dict)):
+        raise ValueError("inputs are no text, or outputs or result no table")
+    for name, value in outputs.items():
+        place = PurePosixPath(name)
+        if place.is_absolute() or ".." in place.parts or not _SHA256.fullmatch(str(value)):
+            raise ValueError(f'outputs hold "{name}", which is no file of the folder with its hash')
+    if not isinstance(seconds, int | float) or not math.isfinite(float(seconds)):
+        raise ValueError("seconds are no number")
+    return StageRecord(inputs, outputs, float(seconds), result)
+
+
+def changed_files(folder: Path) -> list[Finding]:
+    """Return what is wrong with the files of a build, nothing for a folder that no build wrote; see `BuildState`."""
+    try:
+        return BuildState(folder).changed()
+    except FormatError as error:
+        return [Finding("build_changed", "error", error.message, path=BUILD_FILE, hint=error.hint)]
 
 
 def make_folder(path: Path) -> None:
@@ -149,41 +207,54 @@ def make_folder(path: Path) -> None:
 def locked(folder: Path) -> Iterator[None]:
     """Hold the output folder for one build; the system releases the lock when the process ends, however it ends.
 
-    What a killed build left unfinished is deleted.
+    What a killed build left unfinished is deleted. Where the file system has no locks, a warning says so.
 
     Raises:
-        OutputError: the folder cannot be written, or another build holds it.
+        OutputError: the folder cannot be written, another build holds it, or its labels would go elsewhere by a link.
     """
     make_folder(folder)
     try:
-        handle = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT, 0o644)
+        handle = os.open(destination(folder / LOCK_FILE), os.O_RDWR | os.O_CREAT, 0o644)
     except OSError as error:
         raise OutputError(f"cannot write here: {error.strerror}.", path=folder, hint=ELSEWHERE) from error
     try:
-        deadline = time.monotonic() + _ENDING_S
-        while not (locked := _try_lock(handle)) and time.monotonic() < deadline:
-            time.sleep(0.05)
-        if not locked:
-            raise OutputError(
-                "another jawusd build is working in this folder.", path=folder, hint="Wait for it, or name another one."
-            )
-        clear_unfinished(folder)
+        if (folder / LABELS).is_symlink():
+            raise OutputError("is a link; a build writes into its own folder only.", path=folder / LABELS)
+        if _lock(handle, folder):
+            clear_unfinished(folder)
         yield
     finally:
         os.close(handle)
 
 
-def _try_lock(handle: int) -> bool:
-    """Take the operating system's lock on an open file; the system frees it when the process dies."""
-    try:
-        if sys.platform == "win32":
-            import msvcrt
+def _lock(handle: int, folder: Path) -> bool:
+    """Take the operating system's lock on an open file; return False, with a warning, where there are no locks.
 
-            msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
-        else:
-            import fcntl
+    Raises:
+        OutputError: another process holds it.
+    """
+    deadline = time.monotonic() + _ENDING_S
+    while True:
+        try:
+            _take(handle)
+            return True
+        except OSError as error:
+            if error.errno not in _HELD:
+                message = f"there are no locks here ({error.strerror}); start no second build in this folder"
+                logging.getLogger(__name__).warning(Finding("no_lock", "warning", message, path=str(folder)).line())
+                return False
+            if time.monotonic() > deadline:
+                hint = "Wait for it, or name another one."
+                raise OutputError("another jawusd build is working in this folder.", path=folder, hint=hint) from error
+        time.sleep(0.05)
 
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        return False
-    return True
+
+def _take(handle: int) -> None:
+    if sys.platform == "win32":
+        import msvcrt
+
+        msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
+    else:
+        import fcntl
+
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)

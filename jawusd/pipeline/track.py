@@ -6,15 +6,16 @@ import math
 import os
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NotRequired, TypedDict
+from typing import TYPE_CHECKING, NotRequired
 
 import numpy as np
+from typing_extensions import TypedDict
 
 from jawusd.errors import TrackingError, explain_missing_packages, naming_file
 from jawusd.evaluator import JawRig
 from jawusd.formats.capture import Capture
 from jawusd.formats.coverage import used_coverage
-from jawusd.formats.finding import Finding
+from jawusd.formats.finding import Finding, FoundJson
 from jawusd.formats.model import JawModel
 from jawusd.formats.tracks import LOST, PARTIAL, RECOVERED, LostReason, Registration, Tracks, TrackStatus, save_tracks
 from jawusd.geometry import LANDMARKS
@@ -54,7 +55,7 @@ class TrackSummary(TypedDict):
     gum_bias_px: NotRequired[dict[str, list[float]]]  # the same at the gum line
     gum_line_mm: NotRequired[list[float]]  # of both arches, towards the gum along the surface
     registration: NotRequired[Registration]  # of the lower scan, from frames with the teeth together
-    findings: NotRequired[list[dict[str, str | float | int]]]  # what is doubtful about the take: `Finding.as_json`
+    findings: NotRequired[list[FoundJson]]  # what is doubtful about the take: `Finding.as_json`
 
 
 class ArchSummary(TypedDict):

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from jawusd.errors import FormatError, OutputError, RigError, explain_missing_packages
 from jawusd.evaluator import JawRig
+from jawusd.formats.atomic import refuse_existing
 from jawusd.formats.mesh import Mesh
 from jawusd.formats.tracks import load_tracks
 from jawusd.geometry.arrays import Array, Mask
@@ -187,8 +188,7 @@ def save_motion(actor: Path, rig: JawRig, name: str, clip: Clip, overwrite: bool
             f'"{name}" is no name for an animation: anim, then letters, digits, _ or -, then .usdc or .usda.'
         )
     target = actor.parent / name
-    if target.exists() and not overwrite:
-        raise OutputError("exists already.", path=target, hint="Choose another name, or tick overwrite.")
+    refuse_existing(target, overwrite)
     if prim is not None:
         return write_over(target, actor, rig, clip.frames, clip.d, clip.fps, prim)
     return write_animation(target, actor, clip.frames, clip.d, clip.fps, rig=rig)

@@ -157,7 +157,7 @@ def _poses(capture: Capture, tracks: Path | None) -> Tracks | None:
 def _offsets(capture: Capture, build: Path | None, progress: Progress) -> dict[str, int]:
     """Return the frame offsets the build found, else find them."""
     if build is not None:
-        found = recorded_offsets(BuildState(build).stages)
+        found = recorded_offsets(BuildState(build))
         if found:
             return found
     return sync_cameras(capture, progress)["offsets"]

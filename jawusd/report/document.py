@@ -14,6 +14,7 @@ import numpy as np
 from markupsafe import Markup, escape
 from numpy.typing import NDArray
 
+from jawusd.errors import shown
 from jawusd.formats.atomic import write_text_atomic
 from jawusd.formats.contact import DEEP, TOUCHING
 from jawusd.formats.finding import Finding
@@ -91,6 +92,7 @@ def page_environment() -> jinja2.Environment:
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
+        finalize=lambda value: shown(value) if type(value) is str else value,  # own HTML is Markup
     )
     environment.filters |= {"worded": worded, "figure": figure}
     return environment
@@ -98,7 +100,7 @@ def page_environment() -> jinja2.Environment:
 
 def worded(text: str) -> Markup:
     """Return a sentence as HTML, what stands between two backticks as code."""
-    parts = re.split(r"`([^`]*)`", str(text))  # what the group holds comes at odd places
+    parts = re.split(r"`([^`]*)`", shown(text))  # what the group holds comes at odd places
     return Markup().join(Markup("<code>{}</code>").format(p) if k % 2 else escape(p) for k, p in enumerate(parts))
 
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TypedDict, cast
+from typing import cast
 
+from typing_extensions import TypedDict
+
+from jawusd.formats.header import Frames
 from jawusd.formats.report import ReportData
 from jawusd.formats.tracks import Registration
 
@@ -14,7 +17,7 @@ class SyncFacts(TypedDict, total=False):
     """What the sync stage found, by camera."""
 
     method: str
-    offsets: dict[str, int]
+    offsets: dict[str, Frames]
     confidence: dict[str, float]
 
 

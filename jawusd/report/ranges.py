@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from jawusd.errors import shown
 from jawusd.evaluator.frames import motions_of_poses
 from jawusd.formats.model import JawModel
 from jawusd.formats.tracks import Tracks
@@ -108,14 +109,14 @@ def ranges_figure(people: Sequence[tuple[str, dict[str, list[float]]]]) -> Figur
         people: name of each actor, and lowest and highest value [mm] by "opening", "laterotrusion", "protrusion"; the
             first 400 are drawn.
     """
-    shown = list(people)[:_MOST_ROWS]
-    figure, axes = new_figure(9.0, _MARGINS_IN + _ROW_IN * max(len(shown), 2), 1, 3, sharey=True)
-    rows = range(len(shown))
+    drawn = list(people)[:_MOST_ROWS]
+    figure, axes = new_figure(9.0, _MARGINS_IN + _ROW_IN * max(len(drawn), 2), 1, 3, sharey=True)
+    rows = range(len(drawn))
     for axis, (key, (title, color)) in zip(axes, _PARAMETERS.items(), strict=True):
-        ends = [ranges[key] for _, ranges in shown]
+        ends = [ranges[key] for _, ranges in drawn]
         axis.barh(rows, [high - low for low, high in ends], left=[low for low, _ in ends], color=color, height=0.7)
         axis.axvline(0.0, color=BLACK, lw=0.8)
         axis.set(title=title, xlabel="[mm]")
-    axes[0].set_yticks(rows, [name[:30].replace("$", r"\$") for name, _ in shown])  # a $ starts a formula
+    axes[0].set_yticks(rows, [shown(name)[:30] for name, _ in drawn])
     axes[0].invert_yaxis()
     return figure

@@ -11,7 +11,9 @@ import matplotlib
 from markupsafe import Markup, escape
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
+from jawusd.errors import shown
 from jawusd.formats.atomic import write_bytes_atomic
 
 if TYPE_CHECKING:
@@ -79,6 +81,9 @@ def figure_bytes(figure: Figure, kind: str, dpi: int, *, transparent: bool = Fal
     """Return a figure as a file of a kind, without dates and versions, so that equal figures give equal bytes."""
     drawn = io.BytesIO()
     metadata = {"Software": None} if kind == "png" else {"Date": None}
+    for text in figure.findobj(Text):  # names in it control nothing, and a $ in one starts no formula
+        text.set_text("\n".join(map(shown, text.get_text().split("\n"))))
+        text.set_parse_math("$" not in text.get_text())
     with matplotlib.rc_context(SETTINGS):
         figure.savefig(drawn, format=kind, dpi=dpi, transparent=transparent, metadata=metadata)
     return drawn.getvalue()

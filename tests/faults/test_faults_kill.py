@@ -16,12 +16,14 @@ import pytest
 from faults import digests, records, stages, unfinished
 from package_copy import ROOT
 
+ENVIRONMENT = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests' / 'support'}"}
 PROGRAM = """
 import sys, time
 import numpy as np
 from pathlib import Path
 from jawusd.formats.atomic import scratch_folder, write_npz_atomic
 from jawusd.pipeline import build
+from stage_results import stage_result
 
 def stub(number, name):
     def work(self, *_):
@@ -31,7 +33,7 @@ def stub(number, name):
             with scratch_folder(path) as folder:
                 (folder / "half").write_bytes(b"x")
                 write_npz_atomic(path, {"a": rng.normal(size=20_000)})
-        return paths, {"offsets": {"cam0": 0, "cam1": 2, "cam2": -1}, "stage": name}
+        return paths, stage_result(name, {"cam0": 0, "cam1": 2, "cam2": -1})
     setattr(build.StagedBuild, f"_{name}", work)
 
 for number, name in enumerate(("sync", "track", "fit", "aid", "bake", "report")):
@@ -44,7 +46,7 @@ build.build(sys.argv[1], sys.argv[2], build.BuildOptions(resume=True), lambda *_
 def start(out):
     command = [sys.executable, "-c", PROGRAM, str(ROOT / "examples" / "capture"), str(out)]
     process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)}, start_new_session=True
+        command, stdout=subprocess.PIPE, text=True, env=ENVIRONMENT, start_new_session=True
     )
     assert process.stdout.readline().strip() == "ready"
     return process

@@ -5,10 +5,12 @@ import shutil
 
 import pytest
 from package_copy import ROOT
+from stage_results import stage_result
 
-from jawusd.pipeline import build
+from jawusd.errors import CaptureError
+from jawusd.pipeline import build, capture_inputs
 from jawusd.pipeline.build import BuildOptions
-from jawusd.pipeline.capture_inputs import input_files, open_capture
+from jawusd.pipeline.capture_inputs import InputWatch, input_files, open_capture
 
 EXAMPLE = ROOT / "examples" / "capture"
 FROM_TRACK = ["track", "fit", "aid", "bake", "report"]
@@ -27,14 +29,15 @@ def capture(tmp_path):
 @pytest.fixture
 def rebuilt(monkeypatch, tmp_path, capture):
     """Return a function that builds with stages that only write what they depend on, and says which ones ran."""
-    ran = []
+    ran, meanwhile = [], {}
 
     def stub(name, write):
         def work(self, *_):
             ran.append(name)
+            meanwhile.pop(name, lambda: None)()
             path = self.folder / f"{name}.txt"
             path.write_text(write(self))
-            return [path], {"offsets": self.capture.sync.offsets or OFFSETS}
+            return [path], stage_result(name, self.capture.sync.offsets or OFFSETS)
 
         monkeypatch.setattr(build.StagedBuild, f"_{name}", work)
 
@@ -46,8 +49,12 @@ def rebuilt(monkeypatch, tmp_path, capture):
     monkeypatch.setattr(build, "check_capture", lambda *_, **__: [])
     monkeypatch.setattr(build, "all_labelled", lambda _: True)
 
-    def run(**options):
+    def run(during=None, change=None, **options):
+        """Build; make a change of the capture while a stage runs."""
         ran.clear()
+        meanwhile.clear()
+        if during:
+            meanwhile[during] = lambda: change(capture)
         build.build(capture, tmp_path / "out", BuildOptions(resume=True, **options), lambda *_: None)
         return list(ran)
 
@@ -142,3 +149,60 @@ def test_files_beside_numbered_masks_do_not_count(capture):
     edit("masks/cam0/upper.mkv", "masks/cam0/numbered/%06d.png")(capture)
     found = input_files(open_capture(capture), ["masks"])["masks cam0 upper"]
     assert [path.name for path in found] == ["000001.png", "000002.png"]
+
+
+@pytest.mark.parametrize("stage", ["track", "fit", "aid"])
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (grow("masks/cam1/lower.mkv"), "masks cam1 lower"),
+        (grow("scans/upper_teeth.ply"), "upper_teeth"),
+        (grow("video/cam2.mp4"), "video cam2"),
+        (grow("calibration.toml"), "calibration"),
+        (edit("frames = [20, 320]", "frames = [20, 300]"), r"capture\.toml"),
+        (edit("[motion]", "[motion"), r"capture\.toml"),
+        (lambda folder: (folder / "masks/cam0/upper.mkv").unlink(), "masks cam0 upper"),
+    ],
+)
+def test_inputs_that_change_while_a_stage_runs_stop_the_build(rebuilt, capture, stage, change, named):
+    with pytest.raises(CaptureError, match=rf"changed while the stage {stage} ran: .*{named}.* is not recorded"):
+        rebuilt(during=stage, change=change)
+
+
+def test_a_stage_that_met_edited_inputs_runs_again(rebuilt, capture):
+    with pytest.raises(CaptureError, match="aid"):
+        rebuilt(during="aid", change=grow("masks/cam1/lower.mkv"))
+    assert rebuilt() == FROM_TRACK
+    with pytest.raises(CaptureError, match="bake"):
+        rebuilt(during="bake", change=edit('name = "synthetic_0"', 'name = "other"'), model="pca")
+    assert rebuilt(model="pca") == ["fit", "aid", "bake", "report"]
+
+
+def touch(name):
+    return lambda folder: os.utime(folder / name)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        touch("masks/cam1/lower.mkv"),
+        grow("masks/cam1/notes.txt"),
+        edit("[motion]", "# a remark\n[motion]"),
+        lambda folder: replace(folder / "scans/upper_teeth.ply", bytes),
+    ],
+)
+def test_what_only_looks_like_a_change_stops_nothing(rebuilt, capture, change):
+    (capture / "masks/cam1/notes.txt").write_text("x")
+    assert rebuilt(during="track", change=change) == ["sync", *FROM_TRACK]
+
+
+def test_untouched_inputs_are_read_once(capture, monkeypatch):
+    read = []
+    monkeypatch.setattr(capture_inputs, "hash_files", lambda files: read.extend(files) or str(files))
+    watch, opened = InputWatch(), open_capture(capture)
+    for _ in range(3):
+        assert watch.hashes(opened, ["masks", "teeth"]) and watch.changed() == []
+    assert len(read) == len(set(read)) == 8
+    grow("masks/cam1/lower.mkv")(capture)
+    watch.changed()
+    assert len(read) == 9

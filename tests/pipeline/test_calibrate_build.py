@@ -14,7 +14,8 @@ from jawusd.cli.main import app
 from jawusd.errors import CalibrationError
 from jawusd.formats.calibration import load_calibration
 from jawusd.geometry import triangulate
-from jawusd.pipeline.build import BuildOptions, build, build_lines
+from jawusd.pipeline.build import BuildOptions, build
+from jawusd.pipeline.build_lines import build_lines
 from jawusd.pipeline.calibrate import calibrate_boards, calibration_lines
 from jawusd.pipeline.cameras import load_cameras
 from jawusd.pipeline.capture_inputs import input_files, open_capture

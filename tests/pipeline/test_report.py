@@ -16,7 +16,7 @@ from jawusd.errors import FormatError
 from jawusd.evaluator import JawRig
 from jawusd.formats.model import load_model, save_model
 from jawusd.formats.tracks import load_tracks, save_tracks
-from jawusd.pipeline.build import build_lines
+from jawusd.pipeline.build_lines import build_lines
 from jawusd.pipeline.media import chosen_frames
 from jawusd.pipeline.report import missing_packages, report_build
 from jawusd.pipeline.state import BuildState

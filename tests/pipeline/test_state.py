@@ -1,5 +1,7 @@
 """The record of finished stages, and the lock of the output folder."""
 
+import errno
+import fcntl
 import json
 import os
 import signal
@@ -9,7 +11,9 @@ import sys
 import pytest
 
 from jawusd.errors import FormatError, OutputError
-from jawusd.pipeline.state import BUILD_FILE, BuildState, hash_files, hash_value, locked
+from jawusd.pipeline.calibrate import SyncResult
+from jawusd.pipeline.report import CheckResult
+from jawusd.pipeline.state import BUILD_FILE, LABELS, BuildState, changed_files, hash_files, hash_value, locked
 
 
 def finished(folder):
@@ -85,3 +89,108 @@ def test_two_builds_on_one_folder_the_second_refuses_until_the_first_dies(tmp_pa
         holder.stdout.close()
     with locked(tmp_path):
         pass
+
+
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL, errno.EIO])
+def test_a_file_system_without_locks_is_a_warning(tmp_path, monkeypatch, caplog, number):
+    def none(*_):
+        raise OSError(number, os.strerror(number))
+
+    (tmp_path / ".jawusd-tmp-of-another").write_text("x")
+    monkeypatch.setattr(fcntl, "flock", none)
+    with locked(tmp_path):
+        # another build may be at work: what is unfinished may be its own
+        assert (tmp_path / ".jawusd-tmp-of-another").exists()
+    assert "there are no locks here" in caplog.text and os.strerror(number) in caplog.text
+
+
+@pytest.mark.parametrize("name", [".jawusd-lock", LABELS])
+def test_links_out_of_the_folder_are_not_followed(tmp_path, name):
+    folder, outside = tmp_path / "out", tmp_path / "outside"
+    folder.mkdir()
+    (folder / name).symlink_to(outside)
+    with pytest.raises(OutputError, match="is a link"), locked(folder):
+        pass
+    assert not outside.exists()
+
+
+def forged(folder, change):
+    """Change build.json and the hash that it carries."""
+    path = folder / BUILD_FILE
+    data = json.loads(path.read_text())
+    change(data["stages"])
+    data["sha256"] = hash_value(data["stages"])
+    path.write_text(json.dumps(data))
+
+
+def nested(levels):
+    value = []
+    for _ in range(levels):
+        value = [value]
+    return value
+
+
+RECORDS = {
+    "outputs a list": lambda stages: stages["track"].update(outputs=["a.bin"]),
+    "outputs of numbers": lambda stages: stages["track"].update(outputs={"a.bin": 3}),
+    "outputs elsewhere": lambda stages: stages["track"].update(outputs={"../a.bin": "0" * 64}),
+    "outputs from the root": lambda stages: stages["track"].update(outputs={"/etc/passwd": "0" * 64}),
+    "no outputs": lambda stages: stages["track"].pop("outputs"),
+    "a stage as text": lambda stages: stages.update(track="done"),
+    "seconds as text": lambda stages: stages["track"].update(seconds="long"),
+    "seconds huge": lambda stages: stages["track"].update(seconds=10**400),
+    "seconds infinite": lambda stages: stages["track"].update(seconds=float("inf")),
+    "inputs a list": lambda stages: stages["track"].update(inputs=[]),
+    "result a list": lambda stages: stages["track"].update(result=[1]),
+}
+
+
+@pytest.mark.parametrize("name", RECORDS)
+def test_a_forged_record_is_one_clear_error(tmp_path, name):
+    finished(tmp_path)
+    forged(tmp_path, RECORDS[name])
+    with pytest.raises(FormatError, match="is damaged"):
+        BuildState(tmp_path)
+    assert [found.kind for found in changed_files(tmp_path)] == ["build_changed"]
+
+
+def test_a_record_nested_beyond_reason_is_one_clear_error(tmp_path):
+    finished(tmp_path)
+    text = (tmp_path / BUILD_FILE).read_text()
+    (tmp_path / BUILD_FILE).write_text(text.replace("[\n", "[" * 50_000, 1).replace("3\n", "]" * 50_000 + "3\n", 1))
+    with pytest.raises(FormatError, match=BUILD_FILE):
+        BuildState(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "offsets", ["2", ["a"], {"cam": "soon"}, {"cam": 10**400}, {"cam": 1.5}, {"cam": float("nan")}, None, nested(200)]
+)
+def test_forged_results_are_one_clear_error(tmp_path, offsets):
+    state = BuildState(tmp_path)
+    state.finish("sync", "", [], 1.0, {"offsets": offsets, "method": "given"})
+    with pytest.raises(FormatError, match=r"is damaged \(sync\.offsets"):
+        BuildState(tmp_path).result("sync", SyncResult)
+
+
+@pytest.mark.parametrize("found", [{"frame": float("inf")}, {"frame": "x"}, {"value": "x"}, "text", {"kind": []}])
+def test_forged_findings_are_one_clear_error(tmp_path, found):
+    BuildState(tmp_path).finish("check", "", [], 1.0, {"findings": [found]})
+    with pytest.raises(FormatError, match=r"is damaged \(check\.findings"):
+        BuildState(tmp_path).result("check", CheckResult)
+
+
+@pytest.mark.parametrize("damage", ["content", "missing", "cut", "folder", "pipe"])
+def test_files_that_are_not_what_the_build_wrote_are_named(tmp_path, damage):
+    state = finished(tmp_path)
+    assert state.changed() == [] and changed_files(tmp_path) == []
+    path = tmp_path / "a.bin"
+    if damage in ("missing", "folder", "pipe"):
+        path.unlink()
+    if damage == "folder":
+        path.mkdir()
+    elif damage == "pipe":
+        os.mkfifo(path)
+    elif damage != "missing":
+        path.write_bytes(b"two" if damage == "content" else b"o")
+    (found,) = changed_files(tmp_path)
+    assert (found.severity, found.path) == ("error", "a.bin") and "since the build" in found.message
