@@ -112,12 +112,16 @@ def _charuco(boards: Boards) -> Search:
             f"[boards] a ChArUco board of {boards.cols} x {boards.rows} inner corners needs {markers} markers, "
             f"{boards.dictionary} has {known}."
         )
-    board = cv2.aruco.CharucoBoard(size, boards.square_mm, float(boards.marker_mm or 0), dictionary)
-    detector = cv2.aruco.CharucoDetector(board)
+    # Before version 4.6, OpenCV began boards of an even number of rows with the other colour; shops still sell them.
+    detectors = [_charuco_detector(boards, size, legacy) for legacy in (False, True)[: 2 - size[1] % 2]]
 
     def search(image: NDArray[np.uint8]) -> Array | None:
-        corners, ids, _, _ = detector.detectBoard(np.ascontiguousarray(image))
-        if ids is None or len(ids) < _FEWEST_CORNERS:
+        for detector in list(detectors):
+            corners, ids, _, _ = detector.detectBoard(np.ascontiguousarray(image))
+            if ids is not None and len(ids) >= _FEWEST_CORNERS:
+                detectors.sort(key=lambda other: other is not detector)  # which the next picture shows, too
+                break
+        else:
             return None
         out = np.full((boards.cols * boards.rows, 2), np.nan)
         out[np.ravel(ids)] = np.reshape(corners, (-1, 2))
@@ -127,6 +131,12 @@ def _charuco(boards: Boards) -> Search:
         return out if whole else None
 
     return search
+
+
+def _charuco_detector(boards: Boards, size: tuple[int, int], legacy: bool) -> cv2.aruco.CharucoDetector:
+    board = cv2.aruco.CharucoBoard(size, boards.square_mm, float(boards.marker_mm or 0), _dictionary(boards))
+    board.setLegacyPattern(legacy)
+    return cv2.aruco.CharucoDetector(board)
 
 
 def _dictionary(boards: Boards) -> cv2.aruco.Dictionary:

@@ -1,6 +1,7 @@
 """Finding boards in drawn pictures whose corners are known."""
 
 from fractions import Fraction
+from functools import partial
 
 import av
 import cv2
@@ -101,6 +102,24 @@ def test_charuco_in_numbered_pictures_keeps_the_numbers_of_its_corners(tmp_path)
         for v, T in enumerate(POSES):
             exact = opencv_pixels(camera, grid @ T[:3, :3].T + T[:3, 3])
             assert np.nanmax(np.abs(found.corners_px[c, v] - exact)) < 0.5
+
+
+@pytest.mark.parametrize("legacy", [True, False])
+@pytest.mark.parametrize(("cols", "rows"), [(7, 5), (6, 5), (4, 7), (6, 4), (7, 6)])
+def test_charuco_boards_of_before_opencv_4_6_are_found(tmp_path, cols, rows, legacy):
+    """Boards of an even number of rows of squares, (7, 5), (6, 5) and (4, 7), were drawn otherwise."""
+    about = {"pattern": "charuco", "dictionary": "DICT_4X4_50", "marker_mm": 5.5, "cols": cols, "rows": rows}
+    images = pictures(board(**about), partial(charuco, legacy=legacy), T_world_board=POSES[:3])
+    images[1][1][:] = 110  # a picture without a board
+    boards = board(**about, videos=write_pictures(tmp_path, images))
+    found = find_boards(NAMES, boards, quiet)
+    assert found.missed == {"c0": [], "c1": [3]}
+    grid = corner_grid(boards)
+    for c, camera in enumerate(CAMERAS):
+        for v, T in enumerate(POSES[:3]):
+            if (c, v) != (1, 1):
+                exact = opencv_pixels(camera, grid @ T[:3, :3].T + T[:3, 3])
+                assert np.abs(found.corners_px[c, v] - exact).max() < 0.5
 
 
 @pytest.mark.parametrize("sigma", [1.0, 2.0, 3.0])

@@ -68,11 +68,12 @@ def chessboard(boards, px_per_square=60):
     return _rimmed(image.astype(np.uint8), boards, px_per_square)
 
 
-def charuco(boards, px_per_square=60):
-    """Draw a ChArUco board with a white rim, as `chessboard`."""
+def charuco(boards, px_per_square=60, legacy=False):
+    """Draw a ChArUco board with a white rim, as `chessboard`; legacy: as OpenCV did before version 4.6."""
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, boards.dictionary))
     size = (boards.cols + 1, boards.rows + 1)
     board = cv2.aruco.CharucoBoard(size, boards.square_mm, boards.marker_mm, dictionary)
+    board.setLegacyPattern(legacy)
     image = board.generateImage((size[0] * px_per_square, size[1] * px_per_square), marginSize=0)
     return _rimmed(image, boards, px_per_square)
 
