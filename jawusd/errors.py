@@ -31,6 +31,7 @@ _EXTRA_OF_PACKAGE = {
     "moderngl": "demo",
     "viser": "view",
     "PyOpenColorIO": "colour",
+    "ezc3d": "c3d",
     "h5py": "hdf5",
     "pythonosc": "live",
     "dask": "many",

@@ -4,7 +4,8 @@ One place decides for all readers:
 
 * the encoding: UTF-8, or UTF-16 and UTF-32 as the byte order mark or the first bytes say;
 * the ends of lines: LF, CRLF, CR;
-* the separator: tab, semicolon or comma, the first that splits header and first row alike; a line `sep=;` names it;
+* the separator: tab, semicolon or comma, the first that splits header and first row alike, or the header; a line
+  `sep=;` names it;
 * the decimal sign: a point, or a comma in tables whose numbers have no points. Thousands separators are not read, and
   `1,234` alone, which may be either, is refused.
 
@@ -155,8 +156,16 @@ def check_width(table: TextTable, index: int, separator: str = "") -> None:
         )
 
 
-def split_rows(text: str, path: Path, comment: str = "#") -> tuple[list[tuple[int, list[str]]], str]:
-    """Return the rows of a table that are not blank, with their line numbers, and what separates the cells.
+def split_rows(
+    text: str, path: Path, comment: str = "#", blank_rows: bool = False
+) -> tuple[list[tuple[int, list[str]]], str]:
+    """Return the rows of a table with their line numbers, and what separates the cells.
+
+    Args:
+        text: of the file.
+        path: the file, for messages.
+        comment: what lines that are skipped begin with.
+        blank_rows: rows of several blank cells count, but at the end.
 
     Raises:
         FormatError: quotes that do not match.
@@ -166,15 +175,23 @@ def split_rows(text: str, path: Path, comment: str = "#") -> tuple[list[tuple[in
     reader = csv.reader(io.StringIO(text[named.end() :] if named else text), delimiter=separator, strict=True)
     above = 1 if named else 0
     try:
-        rows = [(reader.line_num + above, row) for row in reader if any(map(str.strip, row))]
+        rows = [(reader.line_num + above, row) for row in reader if blank_rows and len(row) > 1 or _is_filled(row)]
     except csv.Error as error:
         raise FormatError(f"is not a CSV table ({error}).", path=path) from error
+    while rows and not _is_filled(rows[-1][1]):
+        rows.pop()
     return [(line, row) for line, row in rows if not row[0].lstrip().startswith(comment)], separator
 
 
+def _is_filled(row: Sequence[str]) -> bool:
+    return any(map(str.strip, row))
+
+
 def _separator(text: str, comment: str) -> str:
+    """Return what separates the cells of the first line that is split, see the module."""
     lines = (line for line in io.StringIO(text) if line.strip() and not line.lstrip().startswith(comment))
-    first, second = next(lines, ""), next(lines, "")
+    first = next((line for line in lines if any(sign in line for sign in SEPARATORS)), "")
+    second = next(lines, "")
     widths = {sign: [len(row) for row in csv.reader([first, second], delimiter=sign)] for sign in SEPARATORS}
     splitting = [sign for sign, (width, *_) in widths.items() if width > 1]
     alike = [sign for sign in splitting if len(set(widths[sign])) == 1]

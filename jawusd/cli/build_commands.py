@@ -187,10 +187,10 @@ def fit(
     from jawusd.pipeline.fit import fit_lines, fit_subject, fit_summary, read_motion
 
     refuse_existing(out, force)
-    motion = read_motion(poses, trajectory_options(columns, length_unit, invert, rest_frame, group, rigid))
+    motion, fps = read_motion(poses, trajectory_options(columns, length_unit, invert, rest_frame, group, rigid))
     subject = subject_given(poses.stem, capture, upper_teeth, lower_teeth, mandible, landmarks, allow_outside)
     with progress() as report, naming_file(poses):
-        fitted = fit_subject(subject, motion, model.value, report)
+        fitted = fit_subject(subject, motion, model.value, report, fps)
     save_model(out, fitted)
     summary = fit_summary(fitted)
     emit({**summary, "file": str(out)}, as_json, lambda: fit_lines(summary))

@@ -87,7 +87,7 @@ def report(
     for path in stage.experiment_files(folder):
         refuse_existing(path, force)
     poses = stage.fitted_poses(source) if source.is_dir() else source
-    motion = read_motion(poses, options)
+    motion, _ = read_motion(poses, options)
     given = (capture, upper_teeth, lower_teeth, mandible, landmarks)
     built = source.is_dir() and not any(given)
     subject = subject_of_build(source) if built else subject_given(source.stem, *given, allow_outside)

@@ -1,151 +1,310 @@
-"""Tables of marker positions, as optical systems write them, and the rigid bodies that carry the markers.
+"""Tables of marker positions, as optical systems write them.
 
-Tables, one row of x, y, z of every marker per frame, frames numbered from 0:
+Tables, one row of x, y, z of every marker per frame, frames numbered from 0, of any locale (see `jawusd.tables`):
 
-* numbers alone, separated by spaces, as Northern Digital's `opto2ascii` writes them; a marker out of sight is a huge
-  number there (-3.697314e28), or nan;
+* numbers alone, as Northern Digital's `opto2ascii` writes them;
 * a probe of ArtiSynth (Modelling Guide, "Numeric probes", text format): `start stop scale`, then `interpolation size
-  step`, then the rows. A marker per file is common: a pattern of numbered files is read as one table.
+  step`, then the rows. A marker per file is common: a pattern of numbered files is read as one table;
+* 3D data of Qualisys Track Manager (TSV export): lines of `KEY value`, of which `MARKER_NAMES` is needed; in mm;
+* TRC of Motion Analysis and OpenSim: `DataRate`, `NumMarkers`, `Units` above their values, then `Frame#`, `Time`;
+* CSV of Vicon Nexus, its section `Trajectories`; model outputs and devices are passed over.
 
-Rigid bodies: a marker description file of Northern Digital (`.rig`), which names its markers by their numbers in the
-table, or these numbers alone.
+A marker is out of sight where a coordinate is blank, nan or huge (-3.697314e28), or all three are exactly 0. Frames
+that a numbered table leaves out are frames without markers.
 """
 
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from jawusd.errors import FormatError
+from jawusd.errors import FormatError, UnitsError
 from jawusd.formats.numbered import is_pattern, numbered_files
-from jawusd.formats.text import read_text
 from jawusd.geometry.arrays import Array
+from jawusd.tables import read_text, split_rows, to_numbers
 
+READ = (
+    "Read are C3D, TSV of Qualisys Track Manager (3D), TRC, CSV of Vicon Nexus (Trajectories), probes of ArtiSynth, "
+    "and rows of numbers alone."
+)
+#: Endings of files that hold markers or motion in ways that are not read.
+_NOT_READ = {
+    ".mat": "a MATLAB file",
+    ".qtm": "a project file of Qualisys Track Manager",
+    ".mot": "a motion file of OpenSim",
+    ".sto": "a storage file of OpenSim",
+    ".bvh": "a skeleton",
+    ".fbx": "an FBX scene",
+    ".xlsx": "a workbook",
+    ".xls": "a workbook",
+    ".json": "JSON",
+}
+_LENGTHS = ("mm", "cm", "m")
 _MAX_BYTES = 1 << 28
+_MOST_FRAMES = 10_000_000
 _OUT_OF_SIGHT = 1e20  # and beyond: no length
 _INTERPOLATIONS = ("step", "linear", "parabolic", "cubic", "cubicstep", "quadraticstep", "sphericallinear")
-_RIG_COUNT = "number of markers"
+_LEADING_ZERO = re.compile(r"[+-]?0\d+")
+
+_Rows = list[tuple[int, list[str]]]
 
 
-@dataclass(frozen=True)
-class RigidBody:
-    """Hold what is known of a rigid body: its markers' numbers, counted from 1, and their positions on it.
+@dataclass(frozen=True, eq=False)
+class MarkerTable:
+    """Hold the markers of a take.
 
     Attributes:
-        markers: numbers in the table.
-        points: positions in the body's own frame, shape (N, 3), in the unit of its file; None where only the numbers
-            are known.
+        points: positions in the file's unit, shape (F, N, 3), NaN where a marker was not seen.
+        names: of the markers, empty where the file names none.
+        unit: of the positions, "mm", "cm" or "m"; None where the file does not say it.
+        fps: frames per second, None where the file does not say it.
     """
 
-    markers: tuple[int, ...]
-    points: Array | None
+    points: Array
+    names: tuple[str, ...] = ()
+    unit: str | None = None
+    fps: float | None = None
+
+    def __post_init__(self) -> None:
+        """Mark what is out of sight."""
+        with np.errstate(invalid="ignore"):
+            seen = (np.abs(self.points) < _OUT_OF_SIGHT).all(axis=-1) & (self.points != 0).any(axis=-1)
+        self.points[~seen] = np.nan
 
 
-def read_markers(path: str | os.PathLike[str]) -> Array:
-    """Read marker positions (F, N, 3) in the unit of the file, NaN where a marker was not seen.
+def read_markers(path: str | os.PathLike[str]) -> MarkerTable:
+    """Read marker positions from text.
 
     Args:
         path: a table, or a pattern (`Marker%d_Traj.txt`) of numbered tables of the same length, whose markers are put
             side by side in the order of the numbers.
 
     Raises:
-        FormatError: not such a table, a value that is not a number, or tables of different lengths.
+        FormatError: not such a table, a value that is not a number, tables of different lengths, or a file that ends
+            before its last frame.
         CaptureError: a pattern without files.
     """
     path = Path(path)
     if not is_pattern(path):
         return _read_table(path)
     tables = {file: _read_table(file) for file in numbered_files(path).values()}
-    counts = {file.name: len(table) for file, table in tables.items()}
+    counts = {file.name: len(table.points) for file, table in tables.items()}
     if len(set(counts.values())) > 1:
         lengths = ", ".join(f"{name} has {count}" for name, count in counts.items())
         raise FormatError(f"the tables have different numbers of frames: {lengths}.", path=path)
-    return np.concatenate(list(tables.values()), axis=1)
+    first, *_ = tables.values()
+    if len({(table.unit, table.fps) for table in tables.values()}) > 1:
+        raise FormatError("the tables have different units or rates.", path=path)
+    points = np.concatenate([table.points for table in tables.values()], axis=1)
+    return MarkerTable(points, sum((table.names for table in tables.values()), ()), first.unit, first.fps)
 
 
-def _read_table(path: Path) -> Array:
-    lines = [line for line in read_text(path, _MAX_BYTES).splitlines() if line.strip()]
-    rows = [line.split() for line in lines]
-    size = None
-    if len(rows) > 1 and rows[1][0].lower() in _INTERPOLATIONS:
-        size, rows = _probe_size(rows, path), rows[2:]
+def _read_table(path: Path) -> MarkerTable:
+    kind = _NOT_READ.get(path.suffix.lower())
+    if kind is not None:
+        raise FormatError(f"is {kind}, no table of markers that is read.", path=path, hint=READ)
+    rows, separator = split_rows(read_text(path, _MAX_BYTES), path, blank_rows=True)
     if not rows:
         raise FormatError("holds no frames.", path=path)
-    first = len(lines) - len(rows) + 1
-    width = len(rows[0]) if size is None else size
-    if width % 3:
-        raise FormatError(f"has {width} numbers per frame; three per marker are expected.", path=path)
-    for number, row in enumerate(rows, start=first):
-        if len(row) != width:
-            raise FormatError(f"line {number} has {len(row)} numbers, {width} are expected.", path=path)
-    try:
-        values = np.array(rows, dtype=np.float64)
-    except ValueError as error:
+    if max(len(row) for _, row in rows) == 1:  # blanks alone
+        rows = [(line, row[0].split()) for line, row in rows]
+    keys = [row[0].strip().lower() for _, row in rows]
+    if "marker_names" in keys or "data_included" in keys:
+        return _read_qtm(rows, path)
+    if "frame#" in keys:
+        return _read_trc(rows, keys.index("frame#"), path)
+    if "trajectories" in keys:
+        return _read_vicon(rows[keys.index("trajectories") :], path)
+    sections = [row[0].strip() for _, row in rows if row[0].strip().lower() in ("model outputs", "devices", "joints")]
+    if sections or keys[0] == "format version":
+        what = f"has the sections {', '.join(sections)} of Vicon Nexus" if sections else "is a CSV of OptiTrack Motive"
+        raise FormatError(f"{what}, no table of markers that is read.", path=path, hint=READ)
+    return MarkerTable(_plain(rows, separator, path))
+
+
+def _plain(rows: _Rows, separator: str, path: Path) -> Array:
+    """Return the positions of numbers alone, or of an ArtiSynth probe, shape (F, N, 3)."""
+    if any(len(cell.split()) > 1 for _, row in rows for cell in row):  # blanks beside separators
+        rows = [(line, separator.join(row).split()) for line, row in rows]
+    if len(rows) > 1 and rows[1][1][0].strip().lower() in _INTERPOLATIONS:
+        width, rows = _probe_size(rows[1][1], path), rows[2:]
+    else:
+        width = len(rows[0][1])
+    if not rows:
+        raise FormatError("holds no frames.", path=path)
+    if any(re.match(r"[^\W\d_]", cell.strip()) and cell.strip().lower() != "nan" for cell in rows[0][1]):
+        shown = " ".join(rows[0][1])[:60]
+        raise FormatError(f'is not a table of marker positions: line {rows[0][0]} is "{shown}".', path=path, hint=READ)
+    cells = [cell.strip() for _, row in rows for cell in row] if separator == "," else []
+    if any(map(_LEADING_ZERO.fullmatch, cells)) and not any("." in cell for cell in cells):
         raise FormatError(
-            f"is not a table of marker positions ({error}).", path=path, hint="Rows of numbers alone are read."
-        ) from error
-    points = values.reshape(len(rows), -1, 3)
-    with np.errstate(invalid="ignore"):
-        seen = (np.abs(points) < _OUT_OF_SIGHT).all(axis=-1)
-    points[~seen] = np.nan
-    return points
+            "has decimal commas and commas between the numbers.", path=path, hint="Write decimals with points."
+        )
+    for line, row in rows:
+        if len(row) != width:
+            raise FormatError(f"line {line} has {len(row)} numbers, {width} are expected.", path=path)
+    while width % 3 and not any(row[width - 1].strip() for _, row in rows):  # blank columns at the end
+        width -= 1
+    if width % 3:
+        raise FormatError(f"has {width} numbers per frame; three per marker are expected.", path=path, hint=READ)
+    return _positions(rows, slice(0, width), path)
 
 
-def _probe_size(rows: list[list[str]], path: Path) -> int:
+def _positions(rows: _Rows, columns: slice, path: Path) -> Array:
+    """Return cells as positions (F, N, 3); what is blank or missing at the end is NaN."""
+    width = columns.stop - columns.start
+    cells = []
+    for line, row in rows:
+        found = [cell if cell.strip() else "nan" for cell in row[columns]]
+        if len(found) % 3 or any(cell.strip() for cell in row[columns.stop :]):
+            end = len(row) - columns.start
+            raise FormatError(f"line {line} has {end} numbers, {width} are expected.", path=path)
+        cells.append(found + ["nan"] * (width - len(found)))
+
+    def named(i: int, j: int) -> str:
+        return f"line {rows[i][0]}, marker {j // 3 + 1}, {'xyz'[j % 3]}"
+
+    return to_numbers(cells, named, path).reshape(len(rows), -1, 3)
+
+
+def _read_qtm(rows: _Rows, path: Path) -> MarkerTable:
+    """Read the 3D data of a TSV of Qualisys Track Manager."""
+    keys = {row[0].strip().upper(): [cell.strip() for cell in row[1:] if cell.strip()] for _, row in rows[:40]}
+    included = "".join(keys.get("DATA_INCLUDED", ["3D"])[:1])
+    if included != "3D" or "MARKER_NAMES" not in keys:
+        raise FormatError(f"holds {included} data of Qualisys Track Manager, not the markers.", path=path, hint=READ)
+    names = tuple(keys["MARKER_NAMES"])
+    count = _whole(keys.get("NO_OF_MARKERS"), len(names), "NO_OF_MARKERS", path)
+    if count != len(names):
+        raise FormatError(f"says that it has {count} markers and names {len(names)}.", path=path)
+    data = [(line, row) for line, row in rows if _is_number_or_blank(row[0])]
+    header = next((row for _, row in rows if row[0].strip().lower() == "frame"), [])
+    first = [cell.strip().lower() in ("frame", "time") for cell in header[:2]].count(True)
+    if not header:  # frame and time stand before the markers where there are two numbers more
+        filled = max((k + 1 for _, row in data for k, cell in enumerate(row) if cell.strip()), default=0)
+        first = max(filled - 3 * count, 0)
+    points = _positions(data, slice(first, first + 3 * count), path)
+    _check_count(_whole(keys.get("NO_OF_FRAMES"), len(data), "NO_OF_FRAMES", path), len(data), path)
+    fps = _rate(keys.get("FREQUENCY"), "FREQUENCY", path)
+    return MarkerTable(points, names, "mm", fps)
+
+
+def _read_trc(rows: _Rows, at: int, path: Path) -> MarkerTable:
+    """Read a TRC; `at` is the row that names the markers."""
+    keys: dict[str, list[str]] = {}
+    for (_, above), (_, below) in zip(rows[:at], rows[1:at]):
+        if above[0].strip().lower() == "datarate":
+            keys = {key.strip().lower(): [value.strip()] for key, value in zip(above, below)}
+    names = tuple(cell.strip() for cell in rows[at][1][2:] if cell.strip())
+    count = _whole(keys.get("nummarkers"), len(names), "NumMarkers", path)
+    if count != len(names):
+        raise FormatError(f"says that it has {count} markers and names {len(names)}.", path=path)
+    data = [(line, row) for line, row in rows[at + 1 :] if row[0].strip() and row[0].strip().lower() != "x1"]
+    points = _positions(data, slice(2, 2 + 3 * count), path)
+    _check_count(_whole(keys.get("numframes"), len(data), "NumFrames", path), len(data), path)
+    unit = "".join(keys.get("units", []))
+    return MarkerTable(
+        _with_gaps(data, points, path), names, length_unit(unit, path), _rate(keys.get("datarate"), "", path)
+    )
+
+
+def _read_vicon(rows: _Rows, path: Path) -> MarkerTable:
+    """Read the section Trajectories of a CSV of Vicon Nexus: title, rate, names, columns, units, then the frames."""
+    if len(rows) < 5:
+        raise FormatError("its section Trajectories has no frames.", path=path)
+    named, columns, units = ([cell.strip() for cell in row] for _, row in rows[2:5])
+    data = []
+    for line, row in rows[5:]:
+        if not row[0].strip().isdigit():
+            break
+        data.append((line, row))
+    places = [
+        k for k, name in enumerate(named) if name and [cell.upper() for cell in columns[k : k + 3]] == ["X", "Y", "Z"]
+    ]
+    if not places or not data:
+        raise FormatError("its section Trajectories has no markers, or no frames.", path=path)
+    found = {units[k].lower() for k in places if k < len(units)}
+    if len(found) != 1:
+        raise FormatError(f"its markers have the units {', '.join(sorted(found))}; one is expected.", path=path)
+    points = np.concatenate(
+        [_positions([(line, row[k : k + 3]) for line, row in data], slice(0, 3), path) for k in places], axis=1
+    )
+    names = tuple(named[k] for k in places)
+    return MarkerTable(
+        _with_gaps(data, points, path), names, length_unit(found.pop(), path), _rate(rows[1][1], "", path)
+    )
+
+
+def _with_gaps(data: _Rows, points: Array, path: Path) -> Array:
+    """Return positions with a frame of NaN for each number that the first column leaves out."""
+    numbers = to_numbers([row[:1] for _, row in data], lambda i, _: f"line {data[i][0]}, frame", path)[:, 0]
+    steps = np.diff(numbers)
+    if (steps < 1).any() or (numbers % 1 != 0).any():
+        line = data[int(np.argmax(steps < 1)) + 1][0]
+        raise FormatError(f"line {line}: frames must be whole numbers that rise.", path=path)
+    rows = (numbers - numbers[:1]).astype(np.int64)
+    if rows.size and rows[-1] >= _MOST_FRAMES:
+        raise FormatError(f"runs over {rows[-1] + 1} frames, at most {_MOST_FRAMES} are read.", path=path)
+    whole = np.full((int(rows.max(initial=-1)) + 1, *points.shape[1:]), np.nan)
+    whole[rows] = points
+    return whole
+
+
+def _is_number_or_blank(cell: str) -> bool:
+    return not cell.strip() or cell.strip().lower() == "nan" or not re.match(r"[^\W\d]", cell.strip())
+
+
+def _check_count(said: int, found: int, path: Path) -> None:
+    if not found:
+        raise FormatError("holds no frames.", path=path)
+    if found != said:
+        raise FormatError(
+            f"is cut off or was cut by hand: it says that it has {said} frames, and holds {found}.",
+            path=path,
+            hint="Export it again, or correct the number in its header.",
+        )
+
+
+def _whole(cells: list[str] | None, default: int, key: str, path: Path) -> int:
+    if not cells:
+        return default
+    value = to_numbers([cells[:1]], lambda *_: key, path)[0, 0]
+    if value % 1 != 0 or not 0 <= value <= _MOST_FRAMES:
+        raise FormatError(f"{key} is {cells[0]}, a whole number is expected.", path=path)
+    return int(value)
+
+
+def _rate(cells: list[str] | None, key: str, path: Path) -> float | None:
+    if not cells:
+        return None
+    value = float(to_numbers([cells[:1]], lambda *_: key or "the rate", path)[0, 0])
+    if not 0 < value < np.inf:
+        raise FormatError(f"{key or 'the rate'} is {cells[0]}, more than 0 per second is expected.", path=path)
+    return value
+
+
+def length_unit(unit: str, path: Path) -> str | None:
+    """Return a unit that a file names in lower case, None if it names none.
+
+    Raises:
+        UnitsError: it is not read.
+    """
+    unit = unit.strip()
+    if unit and unit.lower() not in _LENGTHS:
+        raise UnitsError(f'lengths are in "{unit}", read are {", ".join(_LENGTHS)}.', path=path)
+    return unit.lower() or None
+
+
+def _probe_size(row: list[str], path: Path) -> int:
     """Return how many numbers a frame of an ArtiSynth probe has."""
     try:
-        return int(rows[1][1])
+        return int(row[1])
     except (IndexError, ValueError) as error:
         raise FormatError(
             'line 2 is not that of an ArtiSynth probe, as "Linear 9 0.02" (interpolation, numbers per frame, step).',
             path=path,
         ) from error
-
-
-def read_body(description: str | os.PathLike[str]) -> RigidBody:
-    """Read a rigid body: a marker description file (.rig), or the numbers of its markers (`5,6,7,8`).
-
-    Raises:
-        FormatError: neither of them, fewer than three markers, or a marker named twice.
-    """
-    text = os.fspath(description)
-    numbers = [piece.strip() for piece in text.split(",")]
-    if all(piece.isascii() and piece.isdigit() for piece in numbers):
-        return _checked(RigidBody(tuple(int(piece) for piece in numbers), None), text)
-    return _checked(_read_rig(Path(description)), text)
-
-
-def _read_rig(path: Path) -> RigidBody:
-    """Read Northern Digital's marker description: a count, then `number x y z views` per marker."""
-    lines = read_text(path, _MAX_BYTES, "latin-1").splitlines()
-    counts = [line.partition(";")[0].strip() for line in lines if _RIG_COUNT in line.lower()]
-    if len(counts) != 1 or not counts[0].isdigit():
-        raise FormatError(
-            f'is not a marker description: no line tells the "{_RIG_COUNT}".',
-            path=path,
-            hint="Name a .rig file, or the numbers of the rigid body's markers, as 5,6,7,8.",
-        )
-    header = next((k for k, line in enumerate(lines) if line.split()[:4] == ["Marker", "X", "Y", "Z"]), len(lines))
-    rows = [line.split() for line in lines[header + 1 :] if line.strip()]
-    try:
-        markers = tuple(int(row[0]) for row in rows)
-        points = np.array([[float(value) for value in row[1:4]] for row in rows]).reshape(-1, 3)
-    except (IndexError, ValueError) as error:
-        raise FormatError(f'a marker is not written as "number x y z views" ({error}).', path=path) from error
-    if len(markers) != int(counts[0]):
-        raise FormatError(f"says that it has {counts[0]} markers and lists {len(markers)}.", path=path)
-    if not np.isfinite(points).all():
-        raise FormatError("holds a position that is not a finite number.", path=path)
-    return RigidBody(markers, points)
-
-
-def _checked(body: RigidBody, where: str) -> RigidBody:
-    numbers = ", ".join(map(str, body.markers))
-    if len(set(body.markers)) != len(body.markers) or min(body.markers, default=1) < 1:
-        raise FormatError(f"markers {numbers}: each must be named once, counted from 1.", path=where)
-    if len(body.markers) < 3:
-        raise FormatError(f"names the markers {numbers or 'none'}; three or more are needed.", path=where)
-    return body

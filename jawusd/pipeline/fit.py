@@ -38,7 +38,7 @@ from jawusd.pipeline.contact import (
     with_joints,
     with_teeth,
 )
-from jawusd.pipeline.markers import marker_poses
+from jawusd.pipeline.markers import LENGTH_UNITS_MM, marker_poses
 from jawusd.pipeline.state import Progress, no_progress
 from jawusd.pipeline.subject import Subject, registered_subject
 
@@ -52,8 +52,6 @@ Poses = tuple[NDArray[np.int64], Array]
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
 RAW_GROUP = "T_model_origin_mand_landmark_t"
-LENGTH_UNITS_MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
-
 _HDF5_UNITS_MM = {"mm": 1.0, "m": 1000.0}
 _RIGID_TOLERANCE = 1e-3
 _MOST_NUMBERS = 16_000_000  # a million 4 x 4 matrices
@@ -65,7 +63,7 @@ class TrajectoryOptions:
 
     # our column names to the file's, see `formats.poses.read_poses`; tables only
     columns: Mapping[str, str] = field(default_factory=dict)
-    length_unit: str = "mm"  # of the translations, a key of `LENGTH_UNITS_MM`; tables only, HDF5 files name theirs
+    length_unit: str = "mm"  # a key of `LENGTH_UNITS_MM`, for files that do not name theirs
     invert: bool = False  # the poses map skull to mandible
     # a frame with the teeth in occlusion: the jaw is measured from there, so that the file's mandible frame may lie
     # anywhere on the mandible; None: the poses are identity in occlusion
@@ -91,11 +89,16 @@ class FitSummary(TypedDict, total=False):
 
 @explain_missing_packages()
 def fit_subject(
-    subject: Subject, motion: Tracks | Poses, method: str = "anchored", progress: Progress = no_progress
+    subject: Subject,
+    motion: Tracks | Poses,
+    method: str = "anchored",
+    progress: Progress = no_progress,
+    fps: float | None = None,
 ) -> JawModel:
     """Fit the jaw model of a person.
 
     Args:
+        fps: frames per second that the file of the poses says; None for the subject's.
         method: "anchored", "additive", "paper" or "pca".
 
     Raises:
@@ -126,10 +129,11 @@ def fit_subject(
             model.meta["registration"] = registration
         model = with_teeth(model, teeth.result(), progress)
         model = with_joints(model, joints.result(), progress)
-    if subject.fps is None:
+    fps = fps or subject.fps
+    if fps is None:
         return model
-    model.meta["fps"] = subject.fps
-    return with_speeds(model, subject.fps)
+    model.meta["fps"] = fps
+    return with_speeds(model, fps)
 
 
 def fit_summary(model: JawModel) -> FitSummary:
@@ -154,32 +158,40 @@ def fit_lines(summary: FitSummary) -> list[str]:
     return lines + [f"  warning: {warning['message']}" for warning in summary.get("warnings", [])]
 
 
-def read_motion(path: str | os.PathLike[str], options: TrajectoryOptions | None = None) -> Tracks | Poses:
-    """Read tracks from tracks.npz, or poses from any other file; see `read_trajectory`.
+def read_motion(
+    path: str | os.PathLike[str], options: TrajectoryOptions | None = None
+) -> tuple[Tracks | Poses, float | None]:
+    """Read tracks from tracks.npz, or poses from any other file with the rate it says; see `read_trajectory`.
 
     Raises:
         FormatError: not such a file, or options given for tracks.
         MissingDependencyError: HDF5 without h5py.
     """
     if Path(path).suffix != ".npz":
-        return read_trajectory(path, options or TrajectoryOptions())
+        frames, T, fps = read_trajectory(path, options or TrajectoryOptions())
+        return (frames, T), fps
     if options not in (None, TrajectoryOptions()):
         raise FormatError("are tracks; columns, units and rest frame are for poses from elsewhere.", path=path)
-    return load_tracks(path)
+    return load_tracks(path), None
 
 
-def read_trajectory(path: str | os.PathLike[str], options: TrajectoryOptions) -> Poses:
+def read_trajectory(
+    path: str | os.PathLike[str], options: TrajectoryOptions
+) -> tuple[NDArray[np.int64], Array, float | None]:
     """Read poses from a CSV or JSON table, a table of markers, or HDF5 (.h5, .hdf5) of jaw-tracking-system.
+
+    Returns frame numbers (F,), T_skull_mandible [mm] (F, 4, 4), NaN where there is no pose, and frames per second,
+    None where the file does not say them.
 
     Raises:
         FormatError: not such a file; an option that does not suit it; the rest frame is missing or has no pose.
         MissingDependencyError: HDF5 without h5py.
     """
-    path = Path(path)
+    path, fps = Path(path), None
     if options.rigid:
         if options.columns or options.group:
             raise FormatError("columns and groups are for poses; a table of markers has rigid bodies.", path=path)
-        T = marker_poses(path, options.rigid, options.rest_frame, LENGTH_UNITS_MM[options.length_unit])
+        T, fps = marker_poses(path, options.rigid, options.rest_frame, options.length_unit)
         frames = np.arange(len(T))
     elif path.suffix.lower() in HDF5_SUFFIXES:
         if options.rest_frame is None:
@@ -196,7 +208,7 @@ def read_trajectory(path: str | os.PathLike[str], options: TrajectoryOptions) ->
         T = se3_inverse(T)
     if options.rest_frame is not None:
         T = T @ se3_inverse(_pose_at(frames, T, options.rest_frame, path))
-    return frames, T
+    return frames, T, fps
 
 
 def _pose_at(frames: NDArray[np.int64], T: Array, wanted: int, path: Path) -> Array:

@@ -1,12 +1,17 @@
 """Poses of tables of markers: against the motion they were made from, with markers missing and misplaced."""
 
+import sys
+import warnings
+
+import c3d
+import ezc3d
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jawusd.errors import FormatError
+from jawusd.errors import FormatError, MissingDependencyError
 from jawusd.pipeline.fit import TrajectoryOptions, read_trajectory
-from jawusd.pipeline.markers import marker_poses
+from jawusd.pipeline.markers import marker_poses, read_c3d
 
 COUNT = 12
 HEAD = np.array([[-12.5, -36, 78], [-61, -37, 82], [-7, 38.5, 83], [-59, 42, 88]])
@@ -56,14 +61,14 @@ def bodies(tmp_path):
 
 
 def test_poses_of_described_bodies(tmp_path, markers, bodies, jaw):
-    np.testing.assert_allclose(marker_poses(write(tmp_path, markers), bodies), jaw, atol=1e-5)
+    np.testing.assert_allclose(marker_poses(write(tmp_path, markers), bodies)[0], jaw, atol=1e-5)
 
 
 def test_one_missing_marker_of_four_costs_nothing_two_cost_the_frame(tmp_path, markers, bodies, jaw):
     markers[3, 6] = -3.697314e28
     markers[5, 0] = np.nan
     markers[7, [4, 7]] = -3.697314e28
-    T = marker_poses(write(tmp_path, markers), bodies)
+    T, _ = marker_poses(write(tmp_path, markers), bodies)
     kept = np.delete(np.arange(COUNT), 7)
     np.testing.assert_allclose(T[kept], jaw[kept], atol=1e-5)
     assert np.isnan(T[7]).all()
@@ -71,7 +76,7 @@ def test_one_missing_marker_of_four_costs_nothing_two_cost_the_frame(tmp_path, m
 
 def test_a_marker_that_jumps_costs_the_frame(tmp_path, markers, bodies, jaw):
     markers[4, 5] += [0, 6, 0]
-    T = marker_poses(write(tmp_path, markers), bodies)
+    T, _ = marker_poses(write(tmp_path, markers), bodies)
     assert np.isnan(T[4]).all()
     np.testing.assert_allclose(np.delete(T, 4, 0), np.delete(jaw, 4, 0), atol=1e-5)
 
@@ -80,7 +85,7 @@ def test_triples_without_a_description_have_their_shape_at_the_rest_frame(tmp_pa
     # the frame of the head is then that of the camera at rest
     camera_at_rest = np.eye(4)
     camera_at_rest[:3, 3] = [400, 400, -2600]
-    T = marker_poses(write(tmp_path, markers), {"head": "1,2,3", "jaw": "5,6,8"}, rest_frame=0)
+    T, _ = marker_poses(write(tmp_path, markers), {"head": "1,2,3", "jaw": "5,6,8"}, rest_frame=0)
     np.testing.assert_allclose(np.linalg.inv(camera_at_rest) @ T @ camera_at_rest, jaw, atol=1e-5)
 
 
@@ -89,7 +94,7 @@ def test_fit_reads_markers_in_centimetres_relative_to_a_rest_frame(tmp_path, mar
     camera = motions(1, 0.3, 60)[1]
     camera[:3, 3] += [400, 400, -2600]
     options = TrajectoryOptions(rigid={"head": "1,2,3,4", "jaw": "5,6,7,8"}, rest_frame=0, length_unit="cm")
-    frames, T = read_trajectory(path, options)
+    frames, T, _ = read_trajectory(path, options)
     np.testing.assert_array_equal(frames, range(COUNT - 1))
     relative = jaw[1:] @ np.linalg.inv(jaw[1])
     np.testing.assert_allclose(np.linalg.inv(camera) @ T @ camera, relative, atol=1e-5)
@@ -121,6 +126,126 @@ def test_a_body_whose_markers_are_exchanged_is_refused(tmp_path, markers, bodies
 
 
 def test_markers_on_a_line_give_no_pose(tmp_path):
-    line = np.tile(np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]]), (3, 1, 1))
+    line = np.tile(np.array([[1.0, 0, 0], [2, 0, 0], [3, 0, 0]]), (3, 1, 1))
     with pytest.raises(FormatError, match="do not lie on one line"):
         marker_poses(write(tmp_path, line), {"jaw": "1,2,3"}, 0)
+
+
+NAMES = ("HL", "HR", "HF", "HB", "JL", "JR", "JF", "JB")
+
+
+def write_c3d(path, markers, unit="mm", scale=1.0, names=NAMES, hidden=np.nan):
+    """Write by ezc3d; `hidden` stands for the coordinates of markers out of sight."""
+    file = ezc3d.c3d()
+    point = file["parameters"]["POINT"]
+    point["RATE"]["value"], point["UNITS"]["value"], point["LABELS"]["value"] = [120], [unit], list(names)
+    seen = np.isfinite(markers).all(axis=2).T
+    points = np.where(np.isfinite(markers), markers * scale, hidden)
+    file["data"]["points"] = np.concatenate([points.transpose(2, 1, 0), np.ones((1, *seen.shape))])
+    file["data"]["meta_points"]["residuals"] = np.where(seen, 0.0, -1.0)[None]
+    file["data"]["meta_points"]["camera_masks"] = np.zeros((7, *seen.shape), dtype=bool)
+    file.write(str(path))
+    return path
+
+
+def write_c3d_by_peer(path, markers, names=NAMES):
+    """Write by the package c3d, which keeps a residual per point: -1 is out of sight."""
+    writer = c3d.Writer(point_rate=120.0, analog_rate=0, point_units="mm")
+    for frame in markers:
+        seen = np.isfinite(frame).all(axis=1)
+        rows = np.column_stack([np.where(seen[:, None], frame, 123.0), np.where(seen, 0.0, -1.0), np.zeros(len(frame))])
+        writer.add_frames([(rows, np.empty((0, 0)))])
+    writer.set_point_labels(names)
+    with open(path, "wb") as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # no analog data
+        writer.write(file)
+    return path
+
+
+def read_c3d_by_peer(path):
+    with open(path, "rb") as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # no analog data
+        frames = [points for _, points, _ in c3d.Reader(file).read_frames(copy=True)]
+    points = np.array(frames)
+    return np.where(points[..., 3:4] < 0, np.nan, points[..., :3])
+
+
+C3D = {
+    "NaN": lambda path, markers: write_c3d(path, markers),
+    "0": lambda path, markers: write_c3d(path, markers, hidden=0.0),
+    "residual -1 alone": lambda path, markers: write_c3d(path, markers, hidden=12.0),
+    "metres": lambda path, markers: write_c3d(path, markers, "m", 1e-3),
+    "subject before the name": lambda path, markers: write_c3d(path, markers, names=[f"Anna:{n}" for n in NAMES]),
+    "by another program": write_c3d_by_peer,
+}
+
+
+@pytest.mark.parametrize("case", C3D)
+def test_c3d_is_read_as_its_writers_and_a_peer_say(tmp_path, markers, jaw, case):
+    markers[3, 5] = np.nan
+    markers[6, [4, 5]] = np.nan
+    path = C3D[case](tmp_path / "take.c3d", markers)
+    found = read_c3d(path)
+    scale = 1e-3 if case == "metres" else 1.0
+    np.testing.assert_allclose(found.points, markers * scale, rtol=1e-6)
+    assert (found.unit, found.fps) == ("m" if case == "metres" else "mm", 120)
+    assert [name.rpartition(":")[2] for name in found.names] == list(NAMES)
+    if case in ("residual -1 alone", "metres", "by another program"):
+        np.testing.assert_allclose(read_c3d_by_peer(path), found.points, rtol=1e-6)
+    bodies = {"head": "HL,HR,HF,HB", "jaw": "JL,JR,JF,JB"}
+    T, fps = marker_poses(path, bodies, rest_frame=0)
+    assert fps == 120 and np.isnan(T[6]).all()
+    camera_at_rest = np.eye(4)
+    camera_at_rest[:3, 3] = [400, 400, -2600]
+    T = np.linalg.inv(camera_at_rest) @ T @ camera_at_rest
+    np.testing.assert_allclose(np.delete(T, 6, 0), np.delete(jaw, 6, 0), atol=2e-3)  # of single precision at 2.6 m
+
+
+def test_each_mistake_of_a_c3d_is_named(tmp_path, markers):
+    path = write_c3d(tmp_path / "take.c3d", markers)
+    whole = path.read_bytes()
+    for size in (0, 100, 511, 700, 1100, len(whole) - 1500):
+        path.write_bytes(whole[:size])
+        with pytest.raises(FormatError, match="is not a C3D file that can be read" if size < 512 else "is cut off"):
+            read_c3d(path)
+    path.write_text("frame,x,y,z\n" * 100)
+    with pytest.raises(FormatError, match="is not a C3D file that can be read"):
+        read_c3d(path)
+    write_c3d(path, markers, unit="in")
+    with pytest.raises(FormatError, match='lengths are in "in", read are mm, cm, m'):
+        read_c3d(path)
+    with pytest.raises(FormatError, match="no such file"):
+        read_c3d(tmp_path / "none.c3d")
+
+
+@pytest.mark.parametrize(
+    ("names", "rigid", "words"),
+    [
+        (NAMES, "JL,JR,JX", "HL, HR, .*, JB; the rigid body of the jaw names marker JX"),
+        (("JL", *NAMES[1:]), "JL,JR,JF", "names marker JL 2 times"),
+        (("8", "7", "6", "5", "4", "3", "2", "1"), "5,6,7", '"5" is the name of marker 4 and the number of another'),
+    ],
+)
+def test_names_that_do_not_tell_the_marker_are_refused(tmp_path, markers, names, rigid, words):
+    path = write_c3d(tmp_path / "take.c3d", markers, names=names)
+    with pytest.raises(FormatError, match=words):
+        marker_poses(path, {"jaw": rigid}, rest_frame=0)
+
+
+def test_a_marker_hidden_at_rest_is_named(tmp_path, markers):
+    markers[0, 6] = 0.0
+    with pytest.raises(FormatError, match="all markers of the jaw: 7 is out of sight"):
+        marker_poses(write(tmp_path, markers), {"jaw": "5,6,7,8"}, rest_frame=0)
+
+
+def test_a_unit_that_contradicts_the_file_is_refused(tmp_path, markers):
+    path = write_c3d(tmp_path / "take.c3d", markers, "m", 1e-3)
+    with pytest.raises(FormatError, match="lengths are in m, --length-unit says cm"):
+        marker_poses(path, {"jaw": "5,6,7,8"}, rest_frame=0, unit="cm")
+
+
+def test_without_ezc3d_the_extra_is_named(tmp_path, markers, monkeypatch):
+    path = write_c3d(tmp_path / "take.c3d", markers)
+    monkeypatch.setitem(sys.modules, "ezc3d", None)
+    with pytest.raises(MissingDependencyError, match=r"jawusd\[c3d\]"):
+        read_c3d(path)

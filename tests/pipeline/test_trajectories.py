@@ -56,7 +56,7 @@ def test_cut_files_are_read_by_their_transforms(tmp_path, poses):
 def test_the_rest_frame_takes_the_place_of_the_scans(tmp_path, poses):
     truth, landmark_frame = poses
     path = write(tmp_path / "jaw.h5", landmark_frame)
-    _, T = read_trajectory(path, TrajectoryOptions(rest_frame=0))
+    _, T, _ = read_trajectory(path, TrajectoryOptions(rest_frame=0))
     np.testing.assert_allclose(T, truth, atol=1e-9)
     with pytest.raises(FormatError, match="--rest-frame"):
         read_trajectory(path, TrajectoryOptions())
@@ -67,14 +67,14 @@ def test_units_and_direction_of_a_table(tmp_path, poses):
     turned = np.linalg.inv(truth)
     turned[:, :3, 3] /= 10
     write_poses(tmp_path / "p.csv", np.arange(COUNT), turned)
-    _, T = read_motion(tmp_path / "p.csv", TrajectoryOptions(length_unit="cm", invert=True))
+    (_, T), _ = read_motion(tmp_path / "p.csv", TrajectoryOptions(length_unit="cm", invert=True))
     np.testing.assert_allclose(T, truth, atol=1e-9)
 
 
 def test_a_rest_frame_works_for_tables_and_inverted_poses(tmp_path, poses):
     truth, elsewhere = poses
     write_poses(tmp_path / "p.csv", 5 + np.arange(COUNT), np.linalg.inv(elsewhere))
-    _, T = read_trajectory(tmp_path / "p.csv", TrajectoryOptions(invert=True, rest_frame=5))
+    _, T, _ = read_trajectory(tmp_path / "p.csv", TrajectoryOptions(invert=True, rest_frame=5))
     np.testing.assert_allclose(T, truth, atol=1e-9)
     with pytest.raises(FormatError, match="has no frame 4; it has 5 to 12"):
         read_trajectory(tmp_path / "p.csv", TrajectoryOptions(rest_frame=4))

@@ -40,7 +40,7 @@ def read_tracks(place, path):
     from jawusd.pipeline.fit import read_motion
     from jawusd.pipeline.track import track_summary
 
-    tracks = read_motion(path)
+    tracks, _ = read_motion(path)
     tracks.tracked()
     track_summary(tracks)
 

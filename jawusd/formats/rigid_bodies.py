@@ -1,0 +1,82 @@
+"""Rigid bodies that carry markers.
+
+They are a marker description file of Northern Digital (`.rig`), which names its markers by their numbers in the table,
+or these numbers alone, or the names of markers.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from jawusd.errors import FormatError
+from jawusd.geometry.arrays import Array
+from jawusd.tables import read_text
+
+_MAX_BYTES = 1 << 24
+_RIG_COUNT = "number of markers"
+
+
+@dataclass(frozen=True)
+class RigidBody:
+    """Hold what is known of a rigid body: its markers and their positions on it.
+
+    Attributes:
+        markers: numbers in the table, counted from 1, or names.
+        points: positions in the body's own frame, shape (N, 3), in the unit of its file; None where only the markers
+            are known.
+    """
+
+    markers: tuple[int | str, ...]
+    points: Array | None
+
+
+def read_body(description: str | os.PathLike[str]) -> RigidBody:
+    """Read a rigid body: a marker description file (.rig), or the numbers or names of its markers (`5,6,7,8`).
+
+    Raises:
+        FormatError: neither of them, fewer than three markers, or a marker named twice.
+    """
+    text = os.fspath(description)
+    numbers = [piece.strip() for piece in text.split(",")]
+    if all(piece.isascii() and piece.isdigit() for piece in numbers):
+        return _checked(RigidBody(tuple(int(piece) for piece in numbers), None), text)
+    if len(numbers) > 1 and not Path(text).is_file():
+        return _checked(RigidBody(tuple(numbers), None), text)
+    return _checked(_read_rig(Path(description)), text)
+
+
+def _read_rig(path: Path) -> RigidBody:
+    """Read Northern Digital's marker description: a count, then `number x y z views` per marker."""
+    lines = read_text(path, _MAX_BYTES, "latin-1").splitlines()
+    counts = [line.partition(";")[0].strip() for line in lines if _RIG_COUNT in line.lower()]
+    if len(counts) != 1 or not counts[0].isdigit():
+        raise FormatError(
+            f'is not a marker description: no line tells the "{_RIG_COUNT}".',
+            path=path,
+            hint="Name a .rig file, or the numbers or names of the rigid body's markers, as 5,6,7,8 or HL,HR,HF.",
+        )
+    header = next((k for k, line in enumerate(lines) if line.split()[:4] == ["Marker", "X", "Y", "Z"]), len(lines))
+    rows = [line.split() for line in lines[header + 1 :] if line.strip()]
+    try:
+        markers = tuple(int(row[0]) for row in rows)
+        points = np.array([[float(value) for value in row[1:4]] for row in rows]).reshape(-1, 3)
+    except (IndexError, ValueError) as error:
+        raise FormatError(f'a marker is not written as "number x y z views" ({error}).', path=path) from error
+    if len(markers) != int(counts[0]):
+        raise FormatError(f"says that it has {counts[0]} markers and lists {len(markers)}.", path=path)
+    if not np.isfinite(points).all():
+        raise FormatError("holds a position that is not a finite number.", path=path)
+    return RigidBody(markers, points)
+
+
+def _checked(body: RigidBody, where: str) -> RigidBody:
+    numbers = ", ".join(map(str, body.markers))
+    if len(set(body.markers)) != len(body.markers) or 0 in body.markers or "" in body.markers:
+        raise FormatError(f"markers {numbers}: each must be named once, counted from 1.", path=where)
+    if len(body.markers) < 3:
+        raise FormatError(f"names the markers {numbers or 'none'}; three or more are needed.", path=where)
+    return body
