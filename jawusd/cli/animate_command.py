@@ -100,7 +100,11 @@ def animate(
     ] = None,
     out: Annotated[Path, typer.Option("-o", "--out", help="Animation layer, or .glb for the web.")] = Path("anim.usdc"),
     fps: Annotated[
-        float | None, typer.Option(min=0.001, help="Frames per second; else from the keys or time codes, or the rig's.")
+        float | None,
+        typer.Option(
+            min=0.001,
+            help="Frames per second; of --arkit those wanted; else from the keys or time codes, or the rig's.",
+        ),
     ] = None,
     resample: Annotated[
         float | None,

@@ -143,7 +143,7 @@ def read_face(rig: JawRig, source: Path, fps: float | None, mapping: Path | None
 
     Args:
         source: CSV of Live Link Face.
-        fps: rate of the time codes, None to find it from them.
+        fps: frames per second of the motion, None for the rate of the time codes.
         mapping: file of `jawusd arkit-fit`, None for shares.
 
     Raises:

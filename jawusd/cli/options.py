@@ -133,7 +133,7 @@ ColumnsOption = Annotated[
         show_default=False,
     ),
 ]
-UnitOption = Annotated[LengthUnit, typer.Option(help="Unit of a table's translations.")]
+UnitOption = Annotated[LengthUnit, typer.Option(help="Unit of lengths, where the file does not say it.")]
 InvertOption = Annotated[bool, typer.Option("--invert", help="The poses map skull to mandible.")]
 RestOption = Annotated[
     int | None,
@@ -145,8 +145,9 @@ RigidOption = Annotated[
     typer.Option(
         metavar="BODY=MARKERS",
         help="The file holds markers; which of them are fixed to jaw=... and, unless it stands still, head=...: their "
-        "numbers, as jaw=5,6,7,8 (with --rest-frame), or a marker description, as jaw=jaw.rig. Tables of numbers "
-        "alone and ArtiSynth probes are read, marker%d.txt as one. May be repeated.",
+        "numbers or names, as jaw=5,6,7,8 or jaw=JL,JR,JF (with --rest-frame), or a marker description, as "
+        "jaw=jaw.rig. C3D, TRC, QTM (TSV), Vicon CSV, tables of numbers alone and ArtiSynth probes are read, "
+        "marker%d.txt as one. May be repeated.",
         show_default=False,
     ),
 ]

@@ -8,14 +8,15 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
-from jawusd.errors import FormatError
 from jawusd.formats.atomic import write_text_atomic
-from jawusd.formats.text import read_text
+from jawusd.formats.text import parse_model
 from jawusd.geometry.arrays import Array
+from jawusd.tables import read_text
 
 _MAX_BYTES = 1 << 20
+_WITHIN = "numbers within +-10000"
 _Number = Annotated[float, Field(allow_inf_nan=False, ge=-1e4, le=1e4)]
 _Weights = tuple[_Number, _Number, _Number, _Number]
 
@@ -30,13 +31,15 @@ class ArkitMapping(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    format: Literal["jawusd-arkit/1"] = "jawusd-arkit/1"
-    actor: str
-    neutral: _Weights
-    dead_zone: tuple[Annotated[_Number, Field(ge=0)], ...] = Field(min_length=4, max_length=4)
-    rest_mm: tuple[_Number, _Number, _Number]
-    gain_mm: tuple[_Weights, _Weights, _Weights]
-    opened_gain_mm: tuple[_Weights, _Weights, _Weights]
+    format: Literal["jawusd-arkit/1"] = Field("jawusd-arkit/1", description='"jawusd-arkit/1"')
+    actor: str = Field(description="the actor's name")
+    neutral: _Weights = Field(description=f"four {_WITHIN}")
+    dead_zone: tuple[Annotated[_Number, Field(ge=0)], ...] = Field(
+        min_length=4, max_length=4, description=f"four {_WITHIN}, none below 0"
+    )
+    rest_mm: tuple[_Number, _Number, _Number] = Field(description=f"three {_WITHIN} [mm]")
+    gain_mm: tuple[_Weights, _Weights, _Weights] = Field(description=f"three rows of four {_WITHIN} [mm]")
+    opened_gain_mm: tuple[_Weights, _Weights, _Weights] = Field(description=f"three rows of four {_WITHIN} [mm]")
 
     def d(self, weights: Array) -> Array:
         """Return the jaw parameters [mm], shape (..., 3), of weights (..., 4); NaN gives NaN."""
@@ -59,14 +62,8 @@ def load_mapping(path: str | os.PathLike[str]) -> ArkitMapping:
         FormatError: not such a file; the message names the entry.
     """
     path = Path(path)
-    text = read_text(path, _MAX_BYTES)
-    try:
-        return ArkitMapping.model_validate_json(text)
-    except ValidationError as error:
-        problem = error.errors()[0]
-        where = ".".join(str(part) for part in problem["loc"])
-        hint = "Such a file is written by `jawusd arkit-fit`."
-        raise FormatError(f"{where or 'the file'}: {problem['msg']}.", path=path, hint=hint) from error
+    hint = "Such a file is written by `jawusd arkit-fit`."
+    return parse_model(read_text(path, _MAX_BYTES), path, ArkitMapping, hint)
 
 
 def save_mapping(path: str | os.PathLike[str], mapping: ArkitMapping) -> None:

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from jawusd.errors import FormatError
 from jawusd.formats.atomic import write_text_atomic
-from jawusd.formats.text import read_text
+from jawusd.formats.text import parse_model
 from jawusd.geometry.arrays import Array
+from jawusd.tables import read_text
 
 #: Keys are written out frame by frame: an hour at 60 per second fits.
 MOST_FRAMES, FARTHEST_FRAME = 220_000, 1e9
@@ -29,8 +29,10 @@ class Key(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    frame: Finite
-    d: tuple[_Parameter, _Parameter, _Parameter]
+    frame: Finite = Field(description="a number")
+    d: tuple[_Parameter, _Parameter, _Parameter] = Field(
+        description=f"three numbers: opening, lateral, protrusion [mm], each within +-{FARTHEST_MM:g}"
+    )
 
 
 class Keys(BaseModel):
@@ -38,9 +40,9 @@ class Keys(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    fps: Annotated[float, Field(gt=0, le=10000, allow_inf_nan=False)]
-    interpolation: Literal["linear", "smooth"] = "linear"
-    keys: Annotated[tuple[Key, ...], Field(min_length=1)]
+    fps: float = Field(gt=0, le=10000, allow_inf_nan=False, description="a number above 0, at most 10000 [1/s]")
+    interpolation: Literal["linear", "smooth"] = Field("linear", description='"linear" or "smooth"')
+    keys: tuple[Key, ...] = Field(min_length=1, description='a list of keys, as [{"frame": 0, "d": [0, 0, 0]}]')
 
     @model_validator(mode="after")
     def _rising(self) -> Keys:
@@ -65,13 +67,7 @@ def load_keys(path: str | os.PathLike[str]) -> Keys:
         FormatError: not such a file; the message names the entry.
     """
     path = Path(path)
-    text = read_text(path, _MAX_BYTES)
-    try:
-        return Keys.model_validate_json(text)
-    except ValidationError as error:
-        problem = error.errors()[0]
-        where = ".".join(str(part) for part in problem["loc"])
-        raise FormatError(f"{where or 'the file'}: {problem['msg']}.", path=path) from error
+    return parse_model(read_text(path, _MAX_BYTES), path, Keys)
 
 
 def save_keys(path: str | os.PathLike[str], keys: Keys) -> None:

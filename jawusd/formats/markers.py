@@ -151,17 +151,16 @@ def _plain(rows: _Rows, separator: str, path: Path) -> Array:
         width -= 1
     if width % 3:
         raise FormatError(f"has {width} numbers per frame; three per marker are expected.", path=path, hint=READ)
-    return _positions(rows, slice(0, width), path)
+    return _positions(rows, 0, width, path)
 
 
-def _positions(rows: _Rows, columns: slice, path: Path) -> Array:
+def _positions(rows: _Rows, first: int, width: int, path: Path) -> Array:
     """Return cells as positions (F, N, 3); what is blank or missing at the end is NaN."""
-    width = columns.stop - columns.start
     cells = []
     for line, row in rows:
-        found = [cell if cell.strip() else "nan" for cell in row[columns]]
-        if len(found) % 3 or any(cell.strip() for cell in row[columns.stop :]):
-            end = len(row) - columns.start
+        found = [cell if cell.strip() else "nan" for cell in row[first : first + width]]
+        if len(found) % 3 or any(cell.strip() for cell in row[first + width :]):
+            end = len(row) - first
             raise FormatError(f"line {line} has {end} numbers, {width} are expected.", path=path)
         cells.append(found + ["nan"] * (width - len(found)))
 
@@ -187,7 +186,7 @@ def _read_qtm(rows: _Rows, path: Path) -> MarkerTable:
     if not header:  # frame and time stand before the markers where there are two numbers more
         filled = max((k + 1 for _, row in data for k, cell in enumerate(row) if cell.strip()), default=0)
         first = max(filled - 3 * count, 0)
-    points = _positions(data, slice(first, first + 3 * count), path)
+    points = _positions(data, first, 3 * count, path)
     _check_count(_whole(keys.get("NO_OF_FRAMES"), len(data), "NO_OF_FRAMES", path), len(data), path)
     fps = _rate(keys.get("FREQUENCY"), "FREQUENCY", path)
     return MarkerTable(points, names, "mm", fps)
@@ -204,7 +203,7 @@ def _read_trc(rows: _Rows, at: int, path: Path) -> MarkerTable:
     if count != len(names):
         raise FormatError(f"says that it has {count} markers and names {len(names)}.", path=path)
     data = [(line, row) for line, row in rows[at + 1 :] if row[0].strip() and row[0].strip().lower() != "x1"]
-    points = _positions(data, slice(2, 2 + 3 * count), path)
+    points = _positions(data, 2, 3 * count, path)
     _check_count(_whole(keys.get("numframes"), len(data), "NumFrames", path), len(data), path)
     unit = "".join(keys.get("units", []))
     return MarkerTable(
@@ -231,7 +230,7 @@ def _read_vicon(rows: _Rows, path: Path) -> MarkerTable:
     if len(found) != 1:
         raise FormatError(f"its markers have the units {', '.join(sorted(found))}; one is expected.", path=path)
     points = np.concatenate(
-        [_positions([(line, row[k : k + 3]) for line, row in data], slice(0, 3), path) for k in places], axis=1
+        [_positions([(line, row[k : k + 3]) for line, row in data], 0, 3, path) for k in places], axis=1
     )
     names = tuple(named[k] for k in places)
     return MarkerTable(

@@ -7,9 +7,15 @@ import os
 import re
 import tomllib
 from pathlib import Path
+from typing import TypeVar
+
+from pydantic import BaseModel, ValidationError
 
 from jawusd.errors import FormatError
+from jawusd.formats.capture_keys import table_model
 from jawusd.tables import read_text
+
+Model = TypeVar("Model", bound=BaseModel)
 
 _MOST_TOML_BYTES = 4 << 20
 _SHOWN = 80  # characters of a line
@@ -59,3 +65,41 @@ def parse_json(text: str, path: Path) -> object:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
         raise FormatError(f"is not JSON ({error}).", path=path) from error
+
+
+def parse_model(text: str, path: Path, model: type[Model], hint: str | None = None) -> Model:
+    """Return a JSON text read from a file as a model, whose fields say in their descriptions what they need.
+
+    Raises:
+        FormatError: it is not JSON, or a value is missing or wrong.
+    """
+    data = parse_json(text, path)
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        raise FormatError(f"{_fault(error, model)}.", path=path, hint=hint) from error
+
+
+def _fault(error: ValidationError, model: type[BaseModel]) -> str:
+    """Return what is wrong in words, as `keys, entry 1: d needs three numbers`."""
+    problem = error.errors()[0]
+    kind, given = problem["type"], problem["input"]
+    names: list[str] = []
+    needed, above, at = "a JSON object", model, model
+    for part in problem["loc"]:
+        if isinstance(part, str):
+            field = None if at is None else at.model_fields.get(part)
+            names.append(part)
+            above, at = at, None if field is None else table_model(field)[0]
+            needed = (field and field.description) or problem["msg"]
+        elif at is not None:
+            names.append(f"entry {part + 1}")
+            needed = "a JSON object"
+    name = names.pop() if names else "the file"
+    where = f"{', '.join(names)}: " if names else ""
+    if kind == "value_error":
+        return str(problem["ctx"]["error"])
+    if kind == "extra_forbidden":
+        return f'{where}there is no key "{name}"; allowed are {", ".join(above.model_fields)}'
+    found = "" if isinstance(given, dict | list) else f", found {json.dumps(given, default=str):.80}"
+    return f"{where}{name} needs {needed}{found}"

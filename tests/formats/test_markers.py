@@ -134,8 +134,8 @@ def qtm_with_frames(rows):
 
 
 def trc(rows, unit="mm", sign="\t", frames=None, said=6):
-    keys = "DataRate CameraRate NumFrames NumMarkers Units OrigDataRate OrigDataStartFrame OrigNumFrames".split()
-    head = [["PathFileType", "4", "(X/Y/Z)", "take.trc"], keys, ["120", "120", str(said), "4", unit, "120", "1", "6"]]
+    keys = ["DataRate", "CameraRate", "NumFrames", "NumMarkers", "Units", "OrigDataRate"]
+    head = [["PathFileType", "4", "(X/Y/Z)", "take.trc"], keys, ["120", "120", str(said), "4", unit, "120"]]
     head += [["Frame#", "Time", *sum(([name, "", ""] for name in NAMES), [])]]
     head += [["", "", *(f"{axis}{k}" for k in range(1, 5) for axis in "XYZ")], [""]]
     frames = frames or range(1, len(rows) + 1)
