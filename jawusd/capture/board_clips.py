@@ -49,6 +49,11 @@ class BoardClip:
         """Return whether successive pictures are moments of one motion."""
         return self._video is not None
 
+    @property
+    def is_interlaced(self) -> bool:
+        """Return whether pictures are marked as woven of two instants, as far as they were read."""
+        return self._video is not None and self._video.is_interlaced
+
     def pictures(self, wanted: list[int]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
         """Yield (number, gray picture) of the given numbers, in order.
 

@@ -14,6 +14,7 @@ from jawusd.capture.board_detection import corners_and_width, detector, shown_in
 from jawusd.errors import CalibrationError
 from jawusd.formats.capture import Boards
 from jawusd.geometry.arrays import Array, Mask
+from jawusd.imaging.clip import INTERLACED, INTERLACED_HINT
 
 MOST_VIEWS = 80  # more add minutes, not accuracy
 _LOOKED_AT = 6  # pictures searched for another board
@@ -84,6 +85,7 @@ def find_boards(names: tuple[str, ...], boards: Boards, progress: Callable[[int,
         _refuse_other_board(name, clip, chosen, boards, int(mask.sum()))
     blurred = seen & (widths > _limits_px(widths)[:, None])
     _refuse_blur(names, clips, widths, blurred)
+    notes += [f"camera {name}: {INTERLACED}. {INTERLACED_HINT}" for name, c in zip(names, clips) if c.is_interlaced]
     corners[blurred] = np.nan
     used = (seen & ~blurred).any(0)
     numbers = np.array(chosen)
@@ -132,6 +134,13 @@ def _limits_px(widths: Array) -> Array:
 def _refuse_other_board(name: str, clip: BoardClip, chosen: list[int], boards: Boards, found: int) -> None:
     """Raise if the pictures show another board than the one described, or none at all."""
     missed = found < len(chosen) / 2
+    if missed and clip.is_interlaced:
+        raise CalibrationError(
+            f"the board is found in {found} of {len(chosen)} pictures: {INTERLACED}.",
+            camera=name,
+            path=clip.path,
+            hint=INTERLACED_HINT,
+        )
     if not missed and boards.pattern == "chessboard":
         return  # part of another ChArUco board may pass for the one described
     some = [image for _, image in clip.pictures(chosen[:: max(1, len(chosen) // _LOOKED_AT)])]

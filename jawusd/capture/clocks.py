@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 from jawusd.capture.light import Offset
 from jawusd.errors import CaptureError, SyncError
@@ -12,10 +12,29 @@ from jawusd.imaging.clip import Clip
 from jawusd.imaging.footage import open_clip
 
 _DAY_S = 86400
+_RATE_TOLERANCE = 1e-3
+_NEARLY_WHOLE = 0.01
+_FASTEST_USUAL = 30.5  # frames per second; of faster pictures, two or four often share a number of a time code
 
 
-def offsets_by_clock(capture: Capture) -> dict[str, Offset]:
-    """Return the offset of every camera by `[sync] method`, "timecode" or "numbers".
+def refuse_other_rates(clips: Mapping[str, Clip], reference: str) -> None:
+    """Raise an error if a clip runs at another rate than that of the reference camera.
+
+    Raises:
+        SyncError: one does.
+    """
+    rate = clips[reference].timeline.rate
+    for name, clip in clips.items():
+        if abs(clip.timeline.rate / rate - 1) > _RATE_TOLERANCE:
+            raise SyncError(
+                f"camera {name} runs at {clip.timeline.rate:.6g} frames per second, camera {reference} at {rate:.6g}.",
+                path=clip.path,
+                hint="Offsets in whole frames need equal rates: convert the videos to one rate.",
+            )
+
+
+def offsets_by_clock(capture: Capture) -> tuple[dict[str, Offset], tuple[str, ...]]:
+    """Return the offset of every camera by `[sync] method`, "timecode" or "numbers", and remarks for the user.
 
     Raises:
         SyncError: a camera has no video, or its clip no such clock; the clips share no instant; or their rates differ.
@@ -27,13 +46,15 @@ def offsets_by_clock(capture: Capture) -> dict[str, Offset]:
         if camera.clip is None:
             raise SyncError("has no video, so there is no clock to align it by.", camera=camera.name, path=path)
         clips[camera.name] = open_clip(camera.clip)
-    starts = _timecodes(clips) if capture.sync.method == "timecode" else _numbers(capture, clips)
+    refuse_other_rates(clips, capture.reference)
+    by_code = capture.sync.method == "timecode"
+    starts = _timecodes(clips) if by_code else _numbers(capture, clips)
     reference = starts[capture.reference]
     day = round(_DAY_S * clips[capture.reference].timeline.rate)
     out = {}
     for name, start in starts.items():
         offset = start - reference
-        if capture.sync.method == "timecode" and abs(offset) > day // 2:
+        if by_code and abs(offset) > day // 2:
             offset -= day if offset > 0 else -day  # recorded over midnight
         if offset >= clips[capture.reference].timeline.count or -offset >= clips[name].timeline.count:
             raise SyncError(
@@ -45,7 +66,38 @@ def offsets_by_clock(capture: Capture) -> dict[str, Offset]:
                 "[sync] offsets.",
             )
         out[name] = Offset(offset, float(offset), 0.0, 0, 1.0)
-    return out
+    return out, tuple(_notes(clips)) if by_code else ()
+
+
+def _notes(clips: Mapping[str, Clip]) -> Iterator[str]:
+    for name, clip in clips.items():
+        rate, counted = clip.timeline.rate, clip.timecode_fps
+        if counted is None and rate > _FASTEST_USUAL:
+            yield (
+                f"camera {name}: its time code is taken to count each of the {rate:.6g} pictures of a second; its file "
+                "does not say"
+            )
+        elif counted is not None and (shared := round(rate / counted)) > 1:
+            yield (
+                f"camera {name}: its time code counts {counted:.6g} numbers of a second, {shared} pictures share one: "
+                f"the offset is known to {shared} frames only"
+            )
+
+
+def _frames_of_number(clip: Clip) -> int:
+    """Return how many pictures share a number of the time code.
+
+    Raises:
+        CaptureError: no whole number of them.
+    """
+    ratio = clip.timeline.rate / (clip.timecode_fps or clip.timeline.rate)
+    if round(ratio) < 1 or abs(ratio / round(ratio) - 1) > _NEARLY_WHOLE:
+        raise CaptureError(
+            f"the time code counts {clip.timecode_fps:.6g} numbers of a second, the clip has {clip.timeline.rate:.6g} "
+            "pictures: no whole number of pictures for each.",
+            hint="Give the time code of the first picture at the rate of the clip, or align by light.",
+        )
+    return round(ratio)
 
 
 def _timecodes(clips: Mapping[str, Clip]) -> dict[str, int]:
@@ -59,9 +111,10 @@ def _timecodes(clips: Mapping[str, Clip]) -> dict[str, int]:
                 hint='Give that of the first picture, timecode = "HH:MM:SS:FF" in its [[camera]], or align by light.',
             )
         try:
-            out[name] = frame_of_timecode(clip.timecode, clip.timeline.rate)
+            shared = _frames_of_number(clip)
+            out[name] = shared * frame_of_timecode(clip.timecode, clip.timeline.rate / shared)
         except CaptureError as error:
-            raise SyncError(error.message, camera=name, path=clip.path) from error
+            raise SyncError(error.message, camera=name, path=clip.path, hint=error.hint) from error
     return out
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jawusd.capture.clocks import offsets_by_clock
+from jawusd.capture.clocks import offsets_by_clock, refuse_other_rates
 from jawusd.capture.light import Offset, find_flashes, find_steps, match_steps, mean_brightness, on_grid
 from jawusd.capture.sound import RATE_HZ, match_sounds
 from jawusd.errors import SyncError
@@ -26,7 +26,6 @@ from jawusd.imaging.clip import Clip
 from jawusd.imaging.footage import open_clip
 from jawusd.imaging.video import Video
 
-_RATE_TOLERANCE = 1e-3
 _FPS_TOLERANCE = 5e-3  # people write 24 for 23.976
 _EARLY_S = 2.0  # people stop their cameras one after the other
 
@@ -68,7 +67,8 @@ def estimate_offsets(capture: Capture) -> Alignment:
             )
     if capture.sync.method in ("timecode", "numbers"):
         by = "time code" if capture.sync.method == "timecode" else "picture numbers"
-        return Alignment(capture.reference, offsets_by_clock(capture), by)
+        offsets, notes = offsets_by_clock(capture)
+        return Alignment(capture.reference, offsets, by, notes)
     found = align_videos(videos, capture.reference, by_light=capture.sync.method != "audio")
     rate = open_clip(videos[capture.reference]).timeline.rate
     if abs(rate / capture.fps - 1) < _FPS_TOLERANCE:
@@ -91,13 +91,7 @@ def align_videos(videos: Mapping[str, Path | ClipSource], reference: str, *, by_
     opened = {name: open_clip(clip) for name, clip in videos.items()}
     hint = _offsets_hint(videos)
     rate = opened[reference].timeline.rate
-    for name, video in opened.items():
-        if abs(video.timeline.rate / rate - 1) > _RATE_TOLERANCE:
-            raise SyncError(
-                f"camera {name} runs at {video.timeline.rate:.6g} frames per second, camera {reference} at {rate:.6g}.",
-                path=video.path,
-                hint="Offsets in whole frames need equal rates: convert the videos to one rate.",
-            )
+    refuse_other_rates(opened, reference)
     notes = _missing_pictures(opened)
     with ThreadPoolExecutor(max_workers=len(opened)) as pool:
         dark = None

@@ -1,8 +1,8 @@
 """Time code: the count of frames since midnight that cameras write to their files, SMPTE ST 12-1.
 
-Numbers after "HH:MM:SS:" count frames of a second. At 29.97 and 59.94 frames per second the count may leave out the
-first two or four numbers of every minute but each tenth ("drop frame", written with ";" or "." before the frames), to
-keep to the clock.
+Numbers after "HH:MM:SS:" count frames of a second. At 29.97, 59.94 and 119.88 frames per second the count may leave
+out the first two, four or eight numbers of every minute but each tenth ("drop frame", written with ";" or "." before
+the frames), to keep to the clock.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ def frame_of_timecode(text: str, fps: float) -> int:
     total = (3600 * hours + 60 * minutes + seconds) * number + frame
     if found[4] == ":":
         return total
-    if number not in (30, 60):
+    if number not in (30, 60, 120):
         raise CaptureError(
-            f'the time code "{text}" drops frame numbers; that is done at 29.97 and 59.94, not at {fps:g}.'
+            f'the time code "{text}" drops frame numbers; that is done at 29.97, 59.94 and 119.88, not at {fps:g}.'
         )
     dropped = number // 15
     if frame < dropped and seconds == 0 and minutes % 10:

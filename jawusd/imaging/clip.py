@@ -15,6 +15,13 @@ from jawusd.geometry.arrays import Array
 from jawusd.imaging.pixels import Colour, ColourPicture, Slices
 from jawusd.imaging.timeline import Timeline
 
+#: What is wrong with an interlaced clip, and what to do.
+INTERLACED = "its pictures are marked as interlaced: each is woven of two instants, half a frame apart"
+INTERLACED_HINT = (
+    "Record progressive pictures; or make a picture of each instant and double fps, for all clips alike: "
+    "ffmpeg -i IN -vf bwdif=mode=send_field -c:v libx264 -crf 12 OUT.mp4."
+)
+
 
 @dataclass(frozen=True, eq=False)
 class VideoFrame:
@@ -40,6 +47,8 @@ class Clip(ABC):
         size_px: (width, height) after rotation.
         pixel_aspect: width of a pixel over its height, after rotation, as the file says; pictures are left as stored.
         timecode: of the first picture, as HH:MM:SS:FF; "" if the file has none.
+        timecode_fps: how many frames per second it counts; None if the file does not say.
+        is_interlaced: pictures, as far as they were decoded, are marked as woven of two instants.
         has_alpha: the pictures carry transparency.
         is_gray: they are stored as one channel.
         is_rgb: they are stored as red, green and blue.
@@ -56,6 +65,8 @@ class Clip(ABC):
     size_px: tuple[int, int]
     pixel_aspect: float
     timecode: str
+    timecode_fps: float | None = None
+    is_interlaced: bool = False
     has_alpha: bool
     is_gray: bool
     is_rgb: bool

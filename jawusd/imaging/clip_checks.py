@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from jawusd.errors import JawusdError
 from jawusd.formats.finding import Finding
 from jawusd.formats.numbered import gaps
-from jawusd.imaging.clip import Clip
+from jawusd.imaging.clip import INTERLACED, INTERLACED_HINT, Clip
 from jawusd.imaging.picture_sequence import PictureSequence
 
 # Cameras that drift apart by less than this over a take keep their offset [frames].
@@ -18,7 +18,10 @@ _MISSING_SHARE = 0.01  # of the frames without a picture of their own that a con
 
 
 def decoded_findings(video: Clip, camera: str) -> Iterator[Finding]:
-    """Decode the first, the middle and the last picture of a clip; yield an error for each that cannot be."""
+    """Decode the first, the middle and the last picture of a clip; yield an error for each that cannot be.
+
+    Say, too, whether pictures are woven of two instants.
+    """
     for number in sorted({0, video.count // 2, video.count - 1}):
         try:
             next(iter(video.frames(number, number + 1, threads=1)))
@@ -32,6 +35,8 @@ def decoded_findings(video: Clip, camera: str) -> Iterator[Finding]:
                 frame=number,
                 hint=error.hint,
             )
+    if video.is_interlaced:
+        yield Finding("interlaced", "warning", INTERLACED, path=str(video.path), camera=camera, hint=INTERLACED_HINT)
 
 
 def rate_findings(videos: Mapping[str, Clip], fps: float, path: str) -> Iterator[Finding]:

@@ -24,8 +24,8 @@ PICTURES = (
 )  # fmt: skip
 
 
-# Decoders that raise errors for damage only if they are asked to, checksums included. Not all: that of TIFF refuses good
-# files then, and others gain nothing.
+# Decoders that raise errors for damage only if they are asked to, checksums included. Not all: that of TIFF refuses
+# good files then, and others gain nothing.
 _STRICT = {"err_detect": "crccheck+bitstream+buffer+explode"}
 _STRICT_CODECS = ("hevc", "mjpeg", "png")
 _REVERSED = bytes(int(f"{value:08b}"[::-1], 2) for value in range(256))

@@ -28,6 +28,7 @@ def open_clip(source: ClipSource | Path) -> Clip:
         if is_pattern(source.path)
         else Video(source.path, source.colour_space, source.colour_config)
     )
-    clip.timecode = source.timecode or clip.timecode
+    if source.timecode:
+        clip.timecode, clip.timecode_fps = source.timecode, None
     clip.pixel_aspect = source.pixel_aspect or clip.pixel_aspect
     return clip

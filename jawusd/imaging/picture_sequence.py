@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -20,6 +21,7 @@ from jawusd.imaging.timeline import Timeline
 
 #: Rate where neither the capture nor the files say one: the least usual that people mean.
 _USUAL_RATE = 24.0
+_FASTEST_COUNT = 30.0  # of time codes in headers [frames per second]
 _AHEAD = 2  # pictures decoded ahead
 
 
@@ -49,6 +51,8 @@ class PictureSequence(Clip):
         self.keys = np.arange(self.count)
         self.start_s, self.rotation_deg = 0.0, 0
         self.timecode = header.timecode
+        # Headers have room for 39 frames of a second: of faster pictures, several share a number (SMPTE ST 12-3).
+        self.timecode_fps = self.fps / math.ceil(self.fps / _FASTEST_COUNT - 0.01)
         self.pixel_aspect = header.pixel_aspect
         self._space = source.colour_space or header.colour_space
         first = self._stored(0)

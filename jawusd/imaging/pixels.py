@@ -5,15 +5,17 @@ from __future__ import annotations
 import re
 from fractions import Fraction
 from functools import lru_cache
-from typing import Literal, TypeAlias
+from typing import Literal, TypeAlias, cast
 
 import av
 import av.filter
 import cv2
 import numpy as np
+from av.sidedata.sidedata import SideData
 from av.video.reformatter import Interpolation
 from numpy.typing import DTypeLike, NDArray
 
+from jawusd.errors import CaptureError
 from jawusd.imaging.display import to_display
 
 Colour = Literal["gray", "rgb", "rgba"]
@@ -34,6 +36,41 @@ _PLANAR_VIDEO_RANGE = ("yuv420p", "yuv422p", "yuv444p", "nv12", "nv21")
 _PLANAR_FULL_RANGE = ("gray", "yuvj420p", "yuvj422p", "yuvj444p")
 # Planar formats of more than 8 bits in two bytes each, lowest first; p010 and its like have them in the highest.
 _DEEP = re.compile(r"(yuva?4\d\dp|p0)(10|12|14|16)le")
+
+
+_QUARTER_TURN = np.array([[0.0, -1.0], [1.0, 0.0]])  # counter-clockwise, as display matrices have it: rows map x and y
+
+
+def turn_deg(frame: av.VideoFrame) -> int:
+    """Return the counter-clockwise turn that a file asks for: 0, 90, 180 or 270.
+
+    Raises:
+        CaptureError: its display matrix mirrors the picture, or is no quarter turn.
+    """
+    try:
+        stored = frame.side_data.get("DISPLAYMATRIX")
+    except ValueError:  # beside something that PyAV does not know, as Exif: the turn alone can be asked for
+        return frame.rotation % 360
+    if stored is None:
+        return 0
+    rows = np.frombuffer(bytes(cast(SideData, stored)), np.int32, 9).reshape(3, 3)[:2, :2].astype(float)
+    lengths = np.linalg.norm(rows, axis=1, keepdims=True)
+    if not lengths.all():
+        return 0  # a matrix of zeros says nothing
+    rows /= lengths  # players scale pictures to the size of the track anyhow
+    for quarters in range(4):
+        if np.allclose(rows, np.linalg.matrix_power(_QUARTER_TURN, quarters), atol=1e-3):
+            return 90 * quarters
+    if np.linalg.det(rows) < 0:
+        raise CaptureError(
+            "the file asks to be shown mirrored; cameras see no mirrored teeth.",
+            hint="Switch mirroring off in the camera. If the stored picture is as the camera saw it, drop the mark: "
+            "ffmpeg -display_rotation 0 -i IN -c copy OUT.",
+        )
+    raise CaptureError(
+        f"the file asks for a turn by {frame.rotation} degrees or a skew; only quarter turns are allowed.",
+        hint="Re-encode it, for example: ffmpeg -i IN -c:v libx264 -crf 12 OUT.mp4.",
+    )
 
 
 @lru_cache(maxsize=16)

@@ -13,6 +13,7 @@ from pathlib import Path
 import av
 import numpy as np
 from numpy.typing import NDArray
+from PIL import ExifTags, Image
 
 from jawusd.errors import CaptureError
 from jawusd.imaging.containers import PICTURES, open_container
@@ -25,6 +26,7 @@ _MOST_HEADER_BYTES = 1 << 16
 #: Most pixels of a picture, those of 8K: a few bytes can declare one that fills the memory, at up to 28 bytes a pixel.
 MOST_STORED_PX = 36_000_000
 _EXR, _DPX = b"\x76\x2f\x31\x01", (b"SDPX", b"XPDS")
+_QUARTERS, _MIRRORED = {3: 2, 6: 3, 8: 1}, (2, 4, 5, 7)  # orientations of Exif
 _DPX_LOG = (1, 3)  # transfer characteristics of printing density and of logarithm, SMPTE ST 268-1 table 5A
 
 
@@ -56,12 +58,29 @@ def read_stored(path: Path) -> StoredPicture:
     try:
         with open_container(path, PICTURES, MOST_STORED_PX) as container:
             frame = next(container.decode(video=0))
-            return StoredPicture(*_pixels(frame))
+            pixels, largest = _pixels(frame)
+            return StoredPicture(np.rot90(pixels, _quarters(path)), largest)
     except MemoryError as error:
         raise CaptureError("the picture needs more memory than there is.", path=path, hint=_HINT) from error
     except (av.FFmpegError, OSError, StopIteration, IndexError, ValueError) as error:
         what = f"the picture cannot be read, it is damaged or has more than {MOST_STORED_PX} px ({error!s:.100})."
         raise CaptureError(what, path=path, hint=_HINT) from error
+
+
+def _quarters(path: Path) -> int:
+    """Return how many quarters of a turn, counter-clockwise, the Exif data of a picture ask for.
+
+    Raises:
+        CaptureError: they ask for it to be mirrored.
+    """
+    try:
+        with Image.open(path) as image:
+            orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
+    except Exception:  # what Pillow does not know (EXR, DPX) has none
+        return 0
+    if orientation in _MIRRORED:
+        raise CaptureError("the file asks to be shown mirrored; cameras see no mirrored teeth.", path=path, hint=_HINT)
+    return _QUARTERS.get(orientation, 0)
 
 
 def _pixels(frame: av.VideoFrame) -> tuple[Stored, int]:

@@ -15,12 +15,13 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from jawusd.errors import CaptureError
+from jawusd.errors import CaptureError, naming_file
+from jawusd.formats.quicktime import timecode_rates
 from jawusd.imaging.clip import Clip, VideoFrame
 from jawusd.imaging.containers import open_container, slices_are_whole
 from jawusd.imaging.display import to_display
 from jawusd.imaging.pictures import MOST_PX
-from jawusd.imaging.pixels import Colour, ColourPicture, DecodedPicture, Slices, coloured, converted, deep_rgb
+from jawusd.imaging.pixels import Colour, ColourPicture, DecodedPicture, Slices, coloured, converted, deep_rgb, turn_deg
 from jawusd.imaging.timeline import Timeline
 from jawusd.inputs import check_input, why_unreadable
 
@@ -31,6 +32,7 @@ _ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
 # Decoders that report damage whatever the number of threads. Those that conceal it (H.264, MPEG-4) mark a picture when
 # it is finished, after threads have handed it out: with eight, a third of what one thread finds in H.264 was missed.
 _THREADED = ("hevc", "prores", "ffv1")
+_PROGRESSIVE = (0, 1)  # FFmpeg's order of fields: not known, or none
 
 
 class Video(Clip):
@@ -68,6 +70,9 @@ class Video(Clip):
             self.fps = float(stream.average_rate or 0)
             stored_aspect = stream.sample_aspect_ratio
             self.timecode = _timecode(container, stream)
+            rates = {float(rate) for rate in timecode_rates(self.path)} if self.timecode else set()
+            self.timecode_fps = rates.pop() if len(rates) == 1 else None
+            self.is_interlaced = stream.codec_context.field_order not in _PROGRESSIVE
             hidden = {key.lower(): value for key, value in stream.metadata.items()}.get("alpha_mode") == "1"
             self._alpha_decoder = _ALPHA_DECODERS.get(stream.codec_context.name) if hidden else None
         self.count = len(self._pts)
@@ -83,15 +88,9 @@ class Video(Clip):
         self.start_s = float(self._pts[0] * self._time_base)
         self.times_s = (self._pts - self._pts[0]) * self._time_base
         self.timeline = Timeline(self.times_s, self.fps)
-        self.rotation_deg = 0
         first = next(self._decode(0, 1, threads=1))[1]
-        if first.rotation % 90:
-            raise CaptureError(
-                f"the file asks for a turn by {first.rotation} degrees; only quarter turns can be honoured.",
-                path=path,
-                hint=_REENCODE,
-            )
-        self.rotation_deg = first.rotation % 360
+        with naming_file(path):
+            self.rotation_deg = turn_deg(first)
         aspect = float(stored_aspect or 1) or 1.0  # 0 is not known
         self.pixel_aspect = 1 / aspect if self.rotation_deg in (90, 270) else aspect
         turned = self.rotation_deg in (90, 270)
@@ -204,6 +203,7 @@ class Video(Clip):
                         continue
                     if frame.pts > self._pts[wanted] or damaged:
                         break
+                    self.is_interlaced = self.is_interlaced or bool(frame.interlaced_frame)
                     yield wanted, frame
                     wanted += 1
             except av.FFmpegError as error:

@@ -215,6 +215,37 @@ def test_a_clip_cut_short_is_used_and_said(tmp_path):
     assert "different numbers of pictures (c0 12, c1 8)" in found.notes[0]
 
 
+def write_woven(folder, images, order):
+    """Write pictures whose odd rows show the next pose, marked as fields."""
+    paths = []
+    for c, camera in enumerate(images):
+        path = folder / f"c{c}.mp4"
+        with av.open(str(path), "w") as container:
+            stream = container.add_stream("libx264", rate=25, options={"crf": "10", "x264-params": f"{order}=1"})
+            stream.width, stream.height, stream.pix_fmt = 640, 480, "yuv420p"
+            for image, later in zip(camera, [*camera[1:], camera[-1]]):
+                picture = image.copy()
+                picture[1::2] = later[1::2]
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="gray")))
+            container.mux(stream.encode(None))
+        paths.append(path)
+    return tuple(paths)
+
+
+@pytest.mark.parametrize("order", ["tff", "bff"])
+def test_the_board_is_not_blamed_for_woven_pictures(tmp_path, order):
+    videos = write_woven(tmp_path, pictures(board()), order)
+    with pytest.raises(CalibrationError, match=r"marked as interlaced: each is woven of two instants") as error:
+        find_boards(NAMES, board(videos=videos), quiet)
+    assert "boards" not in str(error.value) and "bwdif" in error.value.hint
+
+
+def test_boards_held_still_in_interlaced_clips_are_used_and_named(tmp_path):
+    still = [[camera[0]] * 6 for camera in pictures(board(), T_world_board=POSES[:1])]
+    found = find_boards(NAMES, board(videos=write_woven(tmp_path, still, "tff")), quiet)
+    assert len(found.notes) == 2 and all("woven of two instants" in note for note in found.notes)
+
+
 def test_clips_of_variable_rate_are_matched_by_time(tmp_path):
     images = pictures(board())
     paths = []

@@ -39,7 +39,7 @@ def test_damage_in_slice_data_is_found_whatever_the_threads(codec, least, tmp_pa
     path = write_clip(tmp_path, codec)
     data, places = path.read_bytes(), packets(path)
     found = {threads: [] for threads in THREADS}
-    for at, size in places:
+    for at, size in places[::3]:
         path.write_bytes(with_zeros(data, at + size // 2))
         for threads in THREADS:
             found[threads].append(error(path, threads) is not None)

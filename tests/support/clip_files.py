@@ -76,6 +76,18 @@ def write_prores(path: Path, images: np.ndarray, fps: Fraction, timecode: str = 
     return path
 
 
+def counting_at(path: Path, rate: Fraction, start: int) -> Path:
+    """Let the time code track of a QuickTime file count at a rate [frames per second] from a number of frames."""
+    with av.open(str(path)) as container:
+        at = next(packet.pos for packet in container.demux() if packet.size == 4)
+    data = bytearray(path.read_bytes())
+    data[at : at + 4] = struct.pack(">I", start)
+    entry = data.rindex(b"tmcd", 0, data.rindex(b"stts"))
+    struct.pack_into(">2IB", data, entry + 20, rate.numerator, rate.denominator, -(-rate.numerator // rate.denominator))
+    path.write_bytes(data)
+    return path
+
+
 def with_exr_header(path: Path, **values: bytes) -> Path:
     """Put attributes into the header of an EXR file: name_type = value, as timeCode_timecode = 8 bytes."""
     data = path.read_bytes()

@@ -10,7 +10,7 @@ import av
 import cv2
 import numpy as np
 
-SIZE = (160, 96)
+SIZE = (320, 192)
 #: By codec: encoder, pixels, suffix, options. One thread: with more, x264 and x265 write other bytes every time.
 CODECS = {
     "h264": ("libx264", "yuv420p", ".mp4", {"crf": "18", "g": "12", "bf": "2", "threads": "1"}),
@@ -22,7 +22,7 @@ CODECS = {
 
 def moving_picture(k: int) -> np.ndarray:
     """Return a picture (h, w, 3) uint8 of blurred noise that moves, with a little noise of its own."""
-    texture = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 256, (200, 400)).astype(np.float32), (0, 0), 1.5)
+    texture = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 256, (240, 520)).astype(np.float32), (0, 0), 1.5)
     shown = texture[10 + k % 40 :, 2 * k % 200 :][: SIZE[1], : SIZE[0]]
     noisy = 4 * (shown - 127) + 120 + np.random.default_rng(k).normal(size=shown.shape)
     gray = np.clip(noisy, 0, 255).astype(np.uint8)
