@@ -108,7 +108,8 @@ def test_charuco_in_numbered_pictures_keeps_the_numbers_of_its_corners(tmp_path)
 @pytest.mark.parametrize(("cols", "rows"), [(7, 5), (6, 5), (4, 7), (6, 4), (7, 6)])
 def test_charuco_boards_of_before_opencv_4_6_are_found(tmp_path, cols, rows, legacy):
     """Boards of an even number of rows of squares, (7, 5), (6, 5) and (4, 7), were drawn otherwise."""
-    about = {"pattern": "charuco", "dictionary": "DICT_4X4_50", "marker_mm": 5.5, "cols": cols, "rows": rows}
+    about = {"pattern": "charuco", "dictionary": "DICT_4X4_50", "marker_mm": 6.5, "square_mm": 9.0}
+    about |= {"cols": cols, "rows": rows}
     images = pictures(board(**about), partial(charuco, legacy=legacy), T_world_board=POSES[:3])
     images[1][1][:] = 110  # a picture without a board
     boards = board(**about, videos=write_pictures(tmp_path, images))
