@@ -11,8 +11,21 @@ from jawusd.cli.options import USD_SUFFIXES, Allow, Force, Json, Prim, RigArg, r
 from jawusd.formats.atomic import refuse_existing
 
 if TYPE_CHECKING:
-    from jawusd.cli.motion import AuthoredMotion
+    from jawusd.cli.motion import AuthoredMotion, Changes
     from jawusd.evaluator import JawRig
+
+Rate = Annotated[
+    float | None,
+    typer.Option(
+        min=0.001, help="Frames per second; of --arkit those wanted; else from the keys or time codes, or the rig's."
+    ),
+]
+RetargetFrom = Annotated[
+    Path | None,
+    typer.Option(
+        help="Rig the source was made for; also animation layers then.", callback=rig_of_folder, show_default=False
+    ),
+]
 
 
 def _source_motion(loaded: JawRig, rig: Path, source: Path, prim: str | None) -> AuthoredMotion:
@@ -24,6 +37,17 @@ def _source_motion(loaded: JawRig, rig: Path, source: Path, prim: str | None) ->
     own = None if source.suffix.lower() in USD_SUFFIXES else prim  # a stage may have the rig elsewhere
     found = read_stage_motion(loaded, rig, source, own, None, None, None)
     return AuthoredMotion(found.frames, found.d, found.fps)
+
+
+def _kept(loaded: JawRig, source: Path | None, motion: AuthoredMotion) -> tuple[AuthoredMotion, Changes]:
+    """Return the motion inside the bound and what was changed; a stage, FBX or glTF in which nothing moves is named."""
+    from jawusd.cli.motion import kept_inside
+    from jawusd.cli.stage_commands import holds_stage, moved_mm, still_lines
+
+    kept, changes = kept_inside(loaded, motion)
+    if source is not None and holds_stage(source):
+        changes.lines.extend(still_lines(moved_mm(loaded, motion.d), len(motion.d)))
+    return kept, changes
 
 
 def _refuse_conflicts(
@@ -83,12 +107,7 @@ def animate(
         Path | None,
         typer.Argument(help="keys.json, a CSV of d or of poses, a stage, .fbx or .glb.", show_default=False),
     ] = None,
-    retarget_from: Annotated[
-        Path | None,
-        typer.Option(
-            help="Rig the source was made for; also animation layers then.", callback=rig_of_folder, show_default=False
-        ),
-    ] = None,
+    retarget_from: RetargetFrom = None,
     arkit: Annotated[
         Path | None, typer.Option(help="Instead: ARKit face capture, the CSV of Live Link Face.", show_default=False)
     ] = None,
@@ -99,13 +118,7 @@ def animate(
         ),
     ] = None,
     out: Annotated[Path, typer.Option("-o", "--out", help="Animation layer, or .glb for the web.")] = Path("anim.usdc"),
-    fps: Annotated[
-        float | None,
-        typer.Option(
-            min=0.001,
-            help="Frames per second; of --arkit those wanted; else from the keys or time codes, or the rig's.",
-        ),
-    ] = None,
+    fps: Rate = None,
     resample: Annotated[
         float | None,
         typer.Option("--resample", min=0.001, help="Frames per second of the layer, where the source has others."),
@@ -119,7 +132,7 @@ def animate(
     """Write an animation layer over a rig, or meshes and motion as .glb; clamping to the bound is reported."""
     import jawusd
     from jawusd.cli.face_commands import read_face
-    from jawusd.cli.motion import carried_over, emit_motion, follow_curves, kept_inside, knots_of
+    from jawusd.cli.motion import carried_over, emit_motion, follow_curves, knots_of
     from jawusd.cli.resampling import resampled
     from jawusd.rig import describe, write_splines
 
@@ -137,7 +150,7 @@ def animate(
     if resample is not None:
         motion, rate = resampled(loaded, motion, rate, resample), resample
     if retarget_from is None:
-        motion, changes = kept_inside(loaded, motion)
+        motion, changes = _kept(loaded, source, motion)
     knots = knots_of(loaded, motion)
     motion = follow_curves(loaded, motion, knots)
     _write(out, rig, loaded, motion, rate, prim)

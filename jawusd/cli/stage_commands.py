@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
-from dataclasses import dataclass
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from jawusd.cli.options import USD_SUFFIXES, Allow, Force, Json, Prim, RigArg, load_named, rig_of_folder
+from jawusd.cli.options import USD_SUFFIXES, Allow, Force, Json, Prim, RigArg, load_named
 from jawusd.cli.output import emit
 from jawusd.errors import JawusdError
 from jawusd.formats.atomic import refuse_existing
 
 if TYPE_CHECKING:
-    from jawusd.cli.motion import AuthoredMotion, Changes
     from jawusd.evaluator import JawRig
     from jawusd.geometry.arrays import Array
     from jawusd.rig.rebake import StageMotion
@@ -28,13 +24,6 @@ MandiblePrim = Annotated[
     typer.Option("--mandible", help="Of a stage: prim that holds the mandible's meshes, where names do not tell."),
 ]
 SkullPrim = Annotated[str | None, typer.Option("--skull", help="The same of skull or upper teeth.")]
-
-
-class Origin(StrEnum):
-    """Name what a motion can be read from."""
-
-    d = "d"
-    mandible = "mandible"
 
 
 def encode(
@@ -86,137 +75,8 @@ def encode(
     judged = judged_motion(loaded, frames, d, residual_mm)
     result = {**judged, "file": str(out), "poses": len(d), "encoded": int(known.sum()), "residual_mm": size}
     head = f"{out}: {result['encoded']} of {len(d)} poses, residual {size}"
-    emit(result, as_json, lambda: [head, *judged_lines(judged)[1:]])
-
-
-def rebake(
-    rig: Annotated[
-        Path,
-        typer.Argument(
-            help="The shot; or before a stage that holds copies of a rig's meshes, FBX or glTF: the rig.",
-            metavar="SHOT | RIG STAGE",
-            callback=rig_of_folder,
-            show_default=False,
-        ),
-    ],
-    stage: Annotated[
-        Path | None, typer.Argument(help="Shot or animation layer, or what was exported of it.", show_default=False)
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="Layer to write; <shot>_baked.usdc if not given.")
-    ] = None,
-    root: Annotated[bool, typer.Option("--root", help="Let the layer be a new root: it sublayers the shot.")] = False,
-    origin: Annotated[
-        Origin | None, typer.Option("--from", help="What counts where d and mandible disagree.", show_default=False)
-    ] = None,
-    mandible: MandiblePrim = None,
-    skull: SkullPrim = None,
-    prim: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--prim", help="Which rigs of the shot: paths of their prims; all if not given.", show_default=False
-        ),
-    ] = None,
-    allow: Allow = None,
-    force: Force = False,
-    as_json: Json = False,
-) -> None:
-    """Give the rigs of a shot the d and the mandible that belong together, where only one was keyed or moved.
-
-    One layer holds the opinions for all rigs, to be sublayered by the shot. Motions are brought inside the bound; what
-    lay outside is reported with its margin. A stage without the rig, that holds copies of its meshes, moved by
-    transforms, bones or point caches, gives a layer over RIG. FBX and glTF are read through Blender.
-    """
-    shot = stage or rig
-    out = out or shot.with_name(f"{shot.stem}_baked.usdc")
-    refuse_existing(out, force)
-    taken = [
-        _taken(rig, shot, one, mandible, skull, origin.value if origin else None) for one in _rigs_of(rig, stage, prim)
-    ]
-    stronger = _write_baked(out, rig, shot, taken, root, prim[0] if prim else None)
-    actors = [{"prim": one.found.prim, "from": one.found.origin, **one.judged, **one.changes.figures} for one in taken]
-    result = {"file": str(out), **(actors[0] if len(actors) == 1 else {}), "actors": actors, "stronger": stronger}
-    emit(result, as_json, lambda: _baked_lines(out, shot, taken, stronger))
-
-
-@dataclass(frozen=True)
-class _Taken:
-    """Hold what one rig of a shot is given: as found, inside the bound, and what was changed for that."""
-
-    rig: JawRig
-    found: StageMotion
-    motion: AuthoredMotion
-    changes: Changes
-    judged: dict[str, float]
-
-
-def _rigs_of(rig: Path, stage: Path | None, prims: list[str] | None) -> list[str | None]:
-    """Return which rigs are baked: those named, else all of a shot; None for the only one, or for that of RIG."""
-    if stage is not None and len(prims or ()) > 1:
-        raise typer.BadParameter("RIG STAGE bakes one rig; several are baked with the shot alone.", param_hint="--prim")
-    if prims or stage is not None:
-        return [*prims] if prims else [None]
-    from jawusd.rig.read import find_rig_prim, open_stage
-    from jawusd.rig.schema import rig_prims
-
-    opened = open_stage(rig)
-    return [str(prim.GetPath()) for prim in rig_prims(opened)] or [str(find_rig_prim(opened, rig).GetPath())]
-
-
-def _taken(
-    rig: Path,
-    shot: Path,
-    prim: str | None,
-    mandible: str | None,
-    skull: str | None,
-    origin: Literal["d", "mandible"] | None,
-) -> _Taken:
-    from jawusd.cli.motion import AuthoredMotion, kept_inside
-
-    loaded = load_named(rig, prim, shot)
-    found = read_stage_motion(loaded, rig, shot, prim, mandible, skull, origin)
-    motion, changes = kept_inside(loaded, AuthoredMotion(found.frames, found.d, found.fps))
-    return _Taken(loaded, found, motion, changes, judged_motion(loaded, found.frames, found.d, found.residual_mm))
-
-
-def _write_baked(out: Path, rig: Path, shot: Path, taken: Sequence[_Taken], root: bool, prim: str | None) -> list[str]:
-    """Write the layer; return what is stronger than it in the shot's own layer."""
-    import numpy as np
-
-    from jawusd.rig import write_animation
-    from jawusd.rig.rebake import Rebaked, write_over, write_rebaked
-
-    first = taken[0]
-    motion = first.motion
-    if first.found.fitted and prim is not None and shot.suffix.lower() not in USD_SUFFIXES:  # else it is the shot's
-        write_over(out, rig, first.rig, motion.frames, motion.d, first.found.fps, prim)
-    elif first.found.fitted:
-        write_animation(out, rig, motion.frames, motion.d, first.found.fps, rig=first.rig)
-    else:
-        known = [np.isfinite(one.motion.d).all(axis=1) for one in taken]
-        given = [
-            Rebaked(one.rig, one.motion.frames[seen], one.motion.d[seen], one.found.prim)
-            for one, seen in zip(taken, known, strict=True)
-        ]
-        return write_rebaked(out, shot, given, root=root)
-    return []
-
-
-def _baked_lines(out: Path, shot: Path, taken: Sequence[_Taken], stronger: Sequence[str]) -> list[str]:
-    lines = []
-    for one in taken:
-        first, last = float(one.motion.frames[0]), float(one.motion.frames[-1])
-        head = f"{out}: {one.found.prim}: " if len(taken) > 1 else f"{out}: "
-        lines.append(
-            f"{head}frames {first:g} .. {last:g} at {one.found.fps:g} fps, from the {_ORIGINS[one.found.origin]}"
-        )
-        lines += [*judged_lines(one.judged), *one.changes.lines[1:]]
-    if stronger:
-        lines.append(
-            f"{shot} itself says something else of {', '.join(stronger)}: a layer that it sublayers is weaker."
-        )
-        lines.append("Write a root above it with --root, or sublayer both, this layer first")
-    return lines
+    still = still_lines(judged["moved_mm"], len(d)) if holds_stage(poses) else []
+    emit(result, as_json, lambda: [head, *judged_lines(judged)[1:], *still])
 
 
 def publish(
@@ -248,7 +108,7 @@ def publish(
     emit({"files": files}, as_json, lambda: files)
 
 
-_ORIGINS = {"d": "values of d", "mandible": "mandible's transforms"}
+_STILL_MM = 0.01  # ten times what single precision does to a jaw that stays still
 
 
 def read_stage_motion(
@@ -329,6 +189,7 @@ def judged_motion(rig: JawRig, frames: Array, d: Array, residual_mm: Array) -> d
     worst = int(np.argmin(margin))
     return {
         "frames": len(frames),
+        "moved_mm": moved_mm(rig, d),
         "largest_residual_mm": float(np.nanmax(residual_mm, initial=0.0)),
         "off_model": int((residual_mm > rig.limits.residual_mm).sum()),
         "outside": int(outside.sum()),
@@ -336,6 +197,23 @@ def judged_motion(rig: JawRig, frames: Array, d: Array, residual_mm: Array) -> d
         "worst_frame": float(frames[worst]),
         "worst_margin_mm": float(margin[worst]),
     }
+
+
+def moved_mm(rig: JawRig, d: Array) -> float:
+    """Return how far a landmark of the mandible comes from where it is in the first pose of a motion d (F, 3) [mm]."""
+    import numpy as np
+
+    from jawusd.geometry import transform_points
+
+    places = transform_points(rig.pose(d[np.isfinite(d).all(axis=1)]), rig.landmarks)
+    return float(np.linalg.norm(places - places[:1], axis=-1).max(initial=0.0))
+
+
+def still_lines(largest_mm: float, frames: int) -> list[str]:
+    """Return what is said of a stage whose mandible stays where it is, as it does where only drivers or d moved it."""
+    if largest_mm > _STILL_MM:
+        return []
+    return [f"the mandible does not move, in {frames} frames: exported without baking? Bake it to keys first"]
 
 
 def judged_lines(judged: dict[str, float]) -> list[str]:

@@ -64,3 +64,10 @@ def test_own_glb_becomes_a_layer_again(folder, tmp_path, monkeypatch, blender):
         np.testing.assert_array_equal(times, FRAMES)
         np.testing.assert_allclose(d, D, atol=1e-3)
         run("validate", folder / "actor.usda", tmp_path / f"{command}.usdc")
+
+
+@pytest.mark.parametrize("d", [np.zeros((3, 3)), np.zeros((1, 3))], ids=["still", "one pose"])
+def test_a_take_without_motion_is_said_to_have_none(folder, tmp_path, monkeypatch, d):
+    glb = write_glb(tmp_path / "take.glb", folder / "actor.usda", example_rig(), np.arange(len(d)) * 10, d, FPS)
+    monkeypatch.setenv("JAWUSD_BLENDER", str(environment("blender45") / "bin" / "python"))
+    assert "the mandible does not move" in run("encode", folder / "actor.usda", glb, "-o", tmp_path / "d.csv")

@@ -72,6 +72,26 @@ def test_exports_come_back_to_d_and_to_a_valid_layer(folder, kind, cached):
         assert_valid_usd(folder / name)
 
 
+@pytest.mark.parametrize("frames", [len(D), 1])
+def test_a_take_without_motion_is_said_to_have_none(frames, anchored_folder):
+    """As exports are whose drivers were not baked: all is well but that nothing moves."""
+    actor, path = anchored_folder / "actor.usda", anchored_folder / "still.usda"
+    exported(path, np.tile(example_rig().pose(np.zeros(3)), (len(D), 1, 1)))
+    if frames == 1:
+        stage = Usd.Stage.Open(str(path))
+        stage.SetEndTimeCode(stage.GetStartTimeCode())
+        stage.Save()
+    said = f"the mandible does not move, in {frames} frames: exported without baking?"
+    for command, name in (("encode", "d.csv"), ("rebake", "anim.usdc"), ("animate", "again.usdc")):
+        assert said in run(command, actor, path, "-o", anchored_folder / name)
+    found = json.loads(run("encode", actor, path, "-o", anchored_folder / "e.csv", "--json"))
+    assert found["moved_mm"] < 0.001
+    moving = exported(anchored_folder / "moving.usda", example_rig().pose(D))
+    found = json.loads(run("encode", actor, moving, "-o", anchored_folder / "f.csv", "--json"))
+    assert found["moved_mm"] > 5
+    assert "does not move" not in run("encode", actor, moving, "-o", anchored_folder / "g.csv")
+
+
 def test_edited_bones_come_back(folder, kind):
     """The skeleton variant with a key changed: one pose outside the bound, reported and brought inside."""
     rig, (frames, d) = example_rig(kind), example_motion()
