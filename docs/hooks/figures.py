@@ -192,7 +192,7 @@ def stages():
     """Draw the stages of a build and what each hands on."""
     names = (
         ("sync", "offsets of cameras"), ("track", "poses of both rows"), ("fit", "model and bound"),
-        ("aid", "hard frames again"), ("bake", "OpenUSD rig"),
+        ("refine", "hard frames again"), ("bake", "OpenUSD rig"),
     )  # fmt: skip
     parts = []
     for k, (name, what) in enumerate(names):
@@ -201,7 +201,7 @@ def stages():
         if k:
             parts.append(arrow((x - 20, 63), (x - 2, 63)))
     parts += [path([(471, 40), (471, 20), (205, 20), (205, 36)], "thin"), text(338, 14, "", "middle", "small")]
-    return svg(680, 126, "The stages of a build: sync, track, fit, aid, bake", parts)
+    return svg(680, 126, "The stages of a build: sync, track, fit, refine, bake", parts)
 
 
 def bound():

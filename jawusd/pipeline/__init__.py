@@ -1,1 +1,1 @@
-"""The stages wired together: sync, track, fit, aid, bake; resumable, one folder per actor."""
+"""The stages wired together: sync, track, fit, refine, bake; resumable, one folder per actor."""

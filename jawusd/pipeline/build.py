@@ -1,34 +1,25 @@
-"""From a capture to a rig in one call; finished stages are kept, and reused when nothing they read has changed."""
+"""From a capture to a rig: the stages in order, each reused when nothing it reads has changed."""
 
 from __future__ import annotations
 
 import os
-import time
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import NotRequired, TypeVar
 
 from typing_extensions import TypedDict
 
-from jawusd import __version__
-from jawusd.errors import CaptureError, JawusdError, OutputError, explain_missing_packages, naming_file
+from jawusd.errors import explain_missing_packages, naming_file
 from jawusd.formats.capture import Capture
 from jawusd.formats.finding import Finding, FoundJson
 from jawusd.formats.model import load_model, save_model
 from jawusd.formats.tracks import load_tracks, save_tracks
 from jawusd.pipeline.bake import bake_subject, write_take
-from jawusd.pipeline.calibrate import (
-    CalibrationSummary,
-    SyncResult,
-    calibrate_boards,
-    sync_cameras,
-)
+from jawusd.pipeline.calibrate import CalibrationSummary, SyncResult, calibrate_boards, sync_cameras
 from jawusd.pipeline.cameras import rescaled_cameras
-from jawusd.pipeline.capture_inputs import InputWatch, open_capture
+from jawusd.pipeline.capture_inputs import open_capture
 from jawusd.pipeline.check import check_capture, refuse_errors
 from jawusd.pipeline.fit import FitSummary, fit_subject, fit_summary
-from jawusd.pipeline.memory import give_back_memory
 from jawusd.pipeline.origin import origin_now
 from jawusd.pipeline.report import (
     BuildFacts,
@@ -40,30 +31,17 @@ from jawusd.pipeline.report import (
 )
 from jawusd.pipeline.scans import all_labelled, store_labels, with_stored_labels
 from jawusd.pipeline.segment_record import delete_masks
-from jawusd.pipeline.state import (
-    BUILD_FILE,
-    CALIBRATION,
-    FIRST_PASS,
-    LABELS,
-    LOCK_FILE,
-    BuildState,
-    Progress,
-    StageRecord,
-    hash_value,
-    locked,
-    no_progress,
-)
+from jawusd.pipeline.state import CALIBRATION, FIRST_PASS, LABELS, Progress, no_progress
 from jawusd.pipeline.subject import subject_of_capture
 from jawusd.pipeline.track import TrackSummary, first_pass, model_pass, track_summary
+from jawusd.pipeline.workspace import Stage, Workspace, opened
 
 OLD_MASKS = "masks"  # folder in which version 0.1 made masks where the capture named none
-
-R = TypeVar("R", bound=Mapping[str, object])
 
 
 @dataclass(frozen=True)
 class BuildOptions:
-    """Choose how to build.
+    """Options of a build.
 
     Attributes:
         model: "anchored", "additive", "paper" or "pca".
@@ -87,7 +65,7 @@ class BuildOptions:
 
 
 class BuildSummary(TypedDict):
-    """Hold what a build found.
+    """The result of a build.
 
     Attributes:
         files: names of all files written, relative to the folder.
@@ -103,12 +81,23 @@ class BuildSummary(TypedDict):
     files: list[str]
     seconds: dict[str, float]
     reused: list[str]
-    findings: NotRequired[list[FoundJson]]
+    findings: list[FoundJson]
     calibrate: CalibrationSummary | None
     sync: SyncResult
     track: TrackSummary
     fit: FitSummary
     report: ReportSummary
+
+
+CHECK = Stage("check", CheckResult, 8.0)
+SCANS = Stage("scans", dict[str, str], 5.0)
+CALIBRATE = Stage("calibrate", CalibrationSummary, 60.0)
+SYNC = Stage("sync", SyncResult, 3.0)
+TRACK = Stage("track", TrackSummary, 10.0, 0.15)
+FIT = Stage("fit", FitSummary, 15.0)
+REFINE = Stage("refine", TrackSummary, 5.0, 0.03)
+BAKE = Stage("bake", dict[str, object], 5.0)
+REPORT = Stage("report", ReportSummary, 15.0)
 
 
 @explain_missing_packages()
@@ -125,7 +114,7 @@ def build(
         capture: the capture, its capture.toml or the folder that holds it.
         out: the rig's folder.
         progress: called with (stage, done, total) as work proceeds.
-        tell: called, before any work, with everything doubtful that a check of the capture found.
+        tell: called, before any work, with every finding of the check of the capture.
 
     Raises:
         CaptureError: the check found errors, all of which the message lists; or inputs changed while a stage ran.
@@ -135,234 +124,142 @@ def build(
     def read() -> Capture:
         return open_capture(capture, allow_outside=options.allow_outside)
 
-    opened, folder = read(), Path(out)
-    check_folder(folder, options)
-    with locked(folder):
-        state = BuildState(folder)
+    folder = Path(out)
+    with opened(folder, read, resume=options.resume, fresh=options.fresh, progress=progress or no_progress) as run:
         if options.fresh:
-            state.clear()
             delete_masks(folder / OLD_MASKS)
-        return StagedBuild(opened, folder, options, state, progress or no_progress, read).run(tell)
+        return run_stages(run, options, tell)
 
 
-def check_folder(folder: Path, options: BuildOptions) -> None:
-    """Check that a build may go to a folder.
+def run_stages(run: Workspace, options: BuildOptions, tell: Callable[[Finding], None] | None) -> BuildSummary:
+    """Run the stages of a build in order, or reuse them.
 
-    Raises:
-        OutputError: it is a file, or holds other files, or a build that is neither to be continued nor deleted.
+    Each call names the parts of the capture and the settings that a stage depends on. Contents are hashed, not paths,
+    so that a capture may be moved.
     """
-    if folder.is_file():
-        raise OutputError("is a file; the rig needs a folder.", path=folder, hint="Name a new folder.")
-    if not folder.is_dir() or options.resume or options.fresh:
-        return
-    if (folder / BUILD_FILE).exists():
-        raise OutputError(
-            "holds an earlier build.", path=folder, hint="Continue it with --resume, or start over with --fresh."
-        )
-    if any(entry.name != LOCK_FILE for entry in folder.iterdir()):
-        raise OutputError("exists and is not empty.", path=folder, hint="Name a new folder.")
+    capture, videos = run.capture, run.hashes(["videos"])
+    names = [camera.name for camera in capture.cameras]
 
+    described = capture.model_dump(mode="json", exclude={"folder"})
+    inputs = ["teeth", "mandible", "skull", "calibration", "masks"]
+    check = run.run(CHECK, inputs, [videos, described], lambda: _check(run))
+    if tell is not None:
+        for found in check.result["findings"]:
+            tell(Finding.from_json(found))
 
-class StagedBuild:
-    """One run of the stages over one capture."""
+    scans = None
+    if not all_labelled(capture):
+        scans = run.run(SCANS, ["teeth"], [], lambda: _label_scans(run))
+        run.capture = with_stored_labels(run.capture, run.folder / LABELS)
 
-    def __init__(
-        self,
-        capture: Capture,
-        folder: Path,
-        options: BuildOptions,
-        state: BuildState,
-        progress: Progress,
-        read_again: Callable[[], Capture],
-    ) -> None:
-        self.capture, self.folder, self.options = capture, folder, options
-        self.state, self.progress = state, progress
-        self._watch, self._opened, self._read_again = InputWatch(), capture, read_again
-        self.reused: list[str] = []
-
-    def run(self, tell: Callable[[Finding], None] | None) -> BuildSummary:
-        """Run the stages in order, or reuse them."""
-        videos = self._watch.hashes(self.capture, ["videos"])
-        check = self._checked(videos)
-        if tell is not None:
-            for found in check.result["findings"]:
-                tell(Finding.from_json(found))
-        labels = self._labelled()
-        calibrate = self._calibrated()
-        capture, options = self.capture, self.options
-        names = [camera.name for camera in capture.cameras]
-        sync = self._stage(
-            "sync", SyncResult, self._inputs([], videos, capture.sync.model_dump(), names, capture.fps), self._sync
-        )
-        # Contents are hashed, not paths: a capture may be moved.
-        described = capture.model_dump(mode="json", include={"frames", "bootstrap", "anatomy", "calibration_unit_mm"})
-        masks = [camera.masks and camera.masks.labels for camera in capture.cameras]
-        track = self._stage(
-            "track",
-            TrackSummary,
-            self._inputs(
-                ["teeth", "mandible", "calibration", "masks"],
-                described,
-                names,
-                masks,
-                rescaled_cameras(self.capture),
-                sync.result["offsets"],
-                [options.solver, options.backend],
-                [] if any(camera.masks for camera in capture.cameras) else videos,
-            ),
-            lambda: self._track(sync.result["offsets"]),
-        )
-        person = [options.model, capture.name, capture.fps]
-        fit = self._stage("fit", FitSummary, self._inputs([], track.outputs, track.inputs, person), self._fit)
-        aid = self._stage(
-            "aid",
-            TrackSummary,
-            self._inputs([], track.outputs, track.inputs, fit.outputs),
-            lambda: self._aid(sync.result["offsets"]),
-        )
-        bake = self._stage(
-            "bake", dict[str, object], self._inputs(["skull"], fit.outputs, aid.outputs, track.inputs), self._bake
-        )
-        missing = missing_packages()
-        inputs = self._inputs([], bake.outputs, bake.inputs, videos, sync.result, missing)
-        report = self._stage("report", ReportSummary, inputs, lambda: self._report(missing))
-        stages = (labels, calibrate, track, fit, aid, bake, report)
-        outputs = {name for stage in stages if stage for name in stage.outputs}
-        return {
-            "capture": capture.name,
-            "folder": str(self.folder),
-            "files": sorted(outputs),
-            "seconds": {name: record.seconds for name, record in self.state.stages.items()},
-            "reused": self.reused,
-            "findings": check.result["findings"],
-            "calibrate": calibrate.result if calibrate else None,
-            "sync": sync.result,
-            "track": aid.result,
-            "fit": fit.result,
-            "report": report.result,
-        }
-
-    def _inputs(self, parts: Iterable[str], *values: object) -> str:
-        return hash_value([self._watch.hashes(self.capture, parts), *values, __version__])
-
-    def _stage(self, name: str, kind: type[R], inputs: str, work: Callable[[], tuple[list[Path], R]]) -> StageRecord[R]:
-        record = self._kept(name, kind, inputs)
-        if record is not None:
-            self.progress(name, 1, 1)
-            return record
-        start = time.perf_counter()
-        outputs, result = work()
-        self._refuse_changes(name)
-        give_back_memory()
-        return self.state.finish(name, inputs, outputs, time.perf_counter() - start, result)
-
-    def _kept(self, name: str, kind: type[R], inputs: str) -> StageRecord[R] | None:
-        """Return the record of a stage that need not run."""
-        record = self.state.valid(name, inputs)
-        if record is None:
-            return None
-        self.reused.append(name)
-        return replace(record, result=self.state.result(name, kind))
-
-    def _refuse_changes(self, stage: str) -> None:
-        """Refuse to record a stage whose inputs were edited while it ran: nobody knows what of them it has read.
-
-        A capture.toml that says the same in other words has not changed.
-        """
-        changed = self._watch.changed()
-        try:
-            same = self._read_again() == self._opened
-        except JawusdError:  # it is being saved
-            same = False
-        if changed or not same:
-            raise CaptureError(
-                f"changed while the stage {stage} ran: {', '.join([*changed, *([] if same else ['capture.toml'])])}. "
-                "The stage is not recorded.",
-                path=self._opened.folder,
-                hint="Run the same command again with --resume: stages that do not read it are kept.",
-            )
-
-    def _checked(self, videos: dict[str, str]) -> StageRecord[CheckResult]:
-        """Check the capture before any work, and refuse it with all errors at once."""
-        capture = self.capture
-
-        def work() -> tuple[list[Path], CheckResult]:
-            findings = check_capture(capture, self.folder, progress=self.progress)
-            refuse_errors(findings, capture)
-            return [], {"findings": [finding.as_json() for finding in findings]}
-
-        parts = ["teeth", "mandible", "skull", "calibration", "masks"]
-        described = capture.model_dump(mode="json", exclude={"folder"})
-        return self._stage("check", CheckResult, self._inputs(parts, videos, described), work)
-
-    def _labelled(self) -> StageRecord[dict[str, str]] | None:
-        """Tell crown and gum of the scans apart where neither paint nor a file does."""
-        capture, folder = self.capture, self.folder / LABELS
-        if all_labelled(capture):
-            return None
-        none: dict[str, str] = {}
-        record = self._stage(
-            "scans", dict[str, str], self._inputs(["teeth"]), lambda: (store_labels(capture, folder), none)
-        )
-        self.capture = with_stored_labels(capture, folder)
-        return record
-
-    def _calibrated(self) -> StageRecord[CalibrationSummary] | None:
-        """Calibrate from the boards if the capture names no calibration but has boards."""
-        capture = self.capture
-        if capture.calibration is not None or capture.boards is None:
-            return None
-        described = capture.boards.model_dump(mode="json", exclude={"videos"})
+    calibration = None
+    if capture.calibration is None and capture.boards is not None:
+        boards = capture.boards.model_dump(mode="json", exclude={"videos"})
         picks = capture.bootstrap.model_dump(mode="json") if capture.bootstrap else None
-        names = [camera.name for camera in capture.cameras]
-        path = self.folder / CALIBRATION
-        record = self._stage(
-            "calibrate",
-            CalibrationSummary,
-            # Without picks, the stated size of the squares is checked with the masks.
-            self._inputs(["boards", "teeth", *([] if picks else ["masks", "videos"])], described, picks, names),
-            lambda: ([path], calibrate_boards(capture, path, self.progress)),
+        # Without picks, the stated size of the squares is checked with the masks.
+        inputs = ["boards", "teeth", *([] if picks else ["masks", "videos"])]
+        calibration = run.run(CALIBRATE, inputs, [boards, picks, names], lambda: _calibrate(run))
+        run.capture = run.capture.model_copy(
+            update={"calibration": run.folder / CALIBRATION, "calibration_unit_mm": 1.0}
         )
-        self.capture = capture.model_copy(update={"calibration": path, "calibration_unit_mm": 1.0})
-        return record
 
-    def _sync(self) -> tuple[list[Path], SyncResult]:
-        return [], sync_cameras(self.capture, self.progress)
+    sync = run.run(SYNC, [], [videos, capture.sync.model_dump(), names, capture.fps], lambda: _sync(run))
+    offsets = sync.result["offsets"]
 
-    def _track(self, offsets: dict[str, int]) -> tuple[list[Path], TrackSummary]:
-        options = self.options
-        tracks = first_pass(self.capture, offsets, options.jobs, self.progress, options.solver, options.backend)
-        path = self.folder / FIRST_PASS
-        save_tracks(path, tracks)
-        return [path], track_summary(tracks)
+    described = capture.model_dump(mode="json", include={"frames", "bootstrap", "anatomy", "calibration_unit_mm"})
+    labels = [camera.masks and camera.masks.labels for camera in capture.cameras]
+    footage = [] if any(camera.masks for camera in capture.cameras) else videos
+    solver = [options.solver, options.backend]
+    settings: list[object] = [described, names, labels, rescaled_cameras(run.capture), offsets, solver, footage]
+    inputs = ["teeth", "mandible", "calibration", "masks"]
+    track = run.run(TRACK, inputs, settings, lambda: _track(run, options, offsets))
 
-    def _fit(self) -> tuple[list[Path], FitSummary]:
-        tracks = load_tracks(self.folder / FIRST_PASS)
-        with naming_file(self.capture.folder / "capture.toml"):
-            subject = subject_of_capture(self.capture)
-            model = fit_subject(subject, tracks, self.options.model, self.progress)
-        path = self.folder / "model.npz"
-        save_model(path, model)
-        return [path], fit_summary(model)
+    settings = [track.outputs, track.inputs, [options.model, capture.name, capture.fps]]
+    fit = run.run(FIT, [], settings, lambda: _fit(run, options))
 
-    def _aid(self, offsets: dict[str, int]) -> tuple[list[Path], TrackSummary]:
-        first, model = load_tracks(self.folder / FIRST_PASS), load_model(self.folder / "model.npz")
-        tracks = model_pass(self.capture, offsets, first, model, self.options.jobs, self.progress)
-        path = self.folder / "tracks.npz"
-        save_tracks(path, tracks)
-        return [path], track_summary(tracks)
+    settings = [track.outputs, track.inputs, fit.outputs]
+    refine = run.run(REFINE, [], settings, lambda: _refine(run, options, offsets))
 
-    def _bake(self) -> tuple[list[Path], dict[str, object]]:
-        subject, model = subject_of_capture(self.capture), load_model(self.folder / "model.npz")
-        files = bake_subject(subject, model, self.folder, self.progress)
-        take = write_take(self.capture, load_tracks(self.folder / "tracks.npz"), self.folder)
-        return [*files, *take], {}
+    settings = [fit.outputs, refine.outputs, track.inputs]
+    bake = run.run(BAKE, ["skull"], settings, lambda: _bake(run))
 
-    def _report(self, missing: str | None) -> tuple[list[Path], ReportSummary]:
-        place, origin = place_of(self.capture, self.folder), origin_now(self.options.command)
-        if missing is not None:
-            # The rig is complete without; the summary says what is missing and how to get it.
-            return [], {"capture": place, "origin": asdict(origin), "missing": missing}
-        facts = BuildFacts(self.state, self.capture, origin)
-        path, verdict = write_build_report(self.folder, facts, self.progress)
-        return [path], {"capture": place, "origin": asdict(origin), "file": path.name, "verdict": verdict}
+    missing = missing_packages()
+    settings = [bake.outputs, bake.inputs, videos, sync.result, missing]
+    report = run.run(REPORT, [], settings, lambda: _report(run, options, missing))
+
+    written = [stage.outputs for stage in (scans, calibration, track, fit, refine, bake, report) if stage]
+    return {
+        "capture": capture.name,
+        "folder": str(run.folder),
+        "files": sorted({name for outputs in written for name in outputs}),
+        "seconds": {name: record.seconds for name, record in run.state.stages.items()},
+        "reused": run.reused,
+        "findings": check.result["findings"],
+        "calibrate": calibration.result if calibration else None,
+        "sync": sync.result,
+        "track": refine.result,
+        "fit": fit.result,
+        "report": report.result,
+    }
+
+
+def _check(run: Workspace) -> tuple[list[Path], CheckResult]:
+    """Check the capture before any work, and refuse it with all errors at once."""
+    findings = check_capture(run.capture, run.folder, progress=run.progress)
+    refuse_errors(findings, run.capture)
+    return [], {"findings": [finding.as_json() for finding in findings]}
+
+
+def _label_scans(run: Workspace) -> tuple[list[Path], dict[str, str]]:
+    """Tell crown from gum in scans without paint and without a file of labels."""
+    return store_labels(run.capture, run.folder / LABELS), {}
+
+
+def _calibrate(run: Workspace) -> tuple[list[Path], CalibrationSummary]:
+    path = run.folder / CALIBRATION
+    return [path], calibrate_boards(run.capture, path, run.progress)
+
+
+def _sync(run: Workspace) -> tuple[list[Path], SyncResult]:
+    return [], sync_cameras(run.capture, run.progress)
+
+
+def _track(run: Workspace, options: BuildOptions, offsets: dict[str, int]) -> tuple[list[Path], TrackSummary]:
+    tracks = first_pass(run.capture, offsets, options.jobs, run.progress, options.solver, options.backend)
+    path = run.folder / FIRST_PASS
+    save_tracks(path, tracks)
+    return [path], track_summary(tracks)
+
+
+def _fit(run: Workspace, options: BuildOptions) -> tuple[list[Path], FitSummary]:
+    tracks = load_tracks(run.folder / FIRST_PASS)
+    with naming_file(run.capture.folder / "capture.toml"):
+        subject = subject_of_capture(run.capture)
+        model = fit_subject(subject, tracks, options.model, run.progress)
+    path = run.folder / "model.npz"
+    save_model(path, model)
+    return [path], fit_summary(model)
+
+
+def _refine(run: Workspace, options: BuildOptions, offsets: dict[str, int]) -> tuple[list[Path], TrackSummary]:
+    first, model = load_tracks(run.folder / FIRST_PASS), load_model(run.folder / "model.npz")
+    tracks = model_pass(run.capture, offsets, first, model, options.jobs, run.progress)
+    path = run.folder / "tracks.npz"
+    save_tracks(path, tracks)
+    return [path], track_summary(tracks)
+
+
+def _bake(run: Workspace) -> tuple[list[Path], dict[str, object]]:
+    subject, model = subject_of_capture(run.capture), load_model(run.folder / "model.npz")
+    files = bake_subject(subject, model, run.folder, run.progress)
+    take = write_take(run.capture, load_tracks(run.folder / "tracks.npz"), run.folder)
+    return [*files, *take], {}
+
+
+def _report(run: Workspace, options: BuildOptions, missing: str | None) -> tuple[list[Path], ReportSummary]:
+    place, origin = place_of(run.capture, run.folder), origin_now(options.command)
+    if missing is not None:
+        # The rig is complete without it; the summary names the missing packages.
+        return [], {"capture": place, "origin": asdict(origin), "missing": missing}
+    path, verdict = write_build_report(run.folder, BuildFacts(run.state, run.capture, origin), run.progress)
+    return [path], {"capture": place, "origin": asdict(origin), "file": path.name, "verdict": verdict}

@@ -35,9 +35,10 @@ from jawusd import __version__
 from jawusd.errors import ClusterError, JawusdError
 from jawusd.formats.atomic import write_csv_atomic, write_text_atomic
 from jawusd.formats.capture_list import ListedCapture
-from jawusd.pipeline.build import BuildOptions, FitSummary, build, check_folder
+from jawusd.pipeline.build import BuildOptions, FitSummary, build
 from jawusd.pipeline.memory import map_large_arrays
 from jawusd.pipeline.state import Progress, make_folder
+from jawusd.pipeline.workspace import check_folder
 
 SUMMARY_JSON, SUMMARY_CSV = "builds.json", "builds.csv"
 BUILT, KEPT, FAILED, STOPPED = "built", "kept", "failed", "stopped"
@@ -121,7 +122,7 @@ def build_many(captures: Sequence[ListedCapture], root: Path, options: ManyOptio
     """
     root = root.resolve()
     for item in captures:
-        check_folder(root / item.name, options.build)
+        check_folder(root / item.name, resume=options.build.resume, fresh=options.build.fresh)
     make_folder(root)
     if options.cluster is None:
         cluster = local_cluster(options.workers or min(CPU_COUNT, len(captures)), options.retries)

@@ -205,7 +205,7 @@ def model_pass(
             meshes["lower_teeth"],
             tracking_config(capture),
             threads=jobs,
-            progress=partial(progress, "aid"),
+            progress=partial(progress, "refine"),
         )
 
 

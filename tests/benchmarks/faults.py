@@ -25,8 +25,8 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 from faults import REPORT, digests, finish, kill, records, stages, start_build, unfinished, wait_for_stage
 
-STAGES = ("sync", "track", "fit", "aid", "bake", "report")
-ORDER = ("sync", "fit", "bake", "track", "aid", "report")  # neighbours are far apart: a build gets one after the other
+STAGES = ("sync", "track", "fit", "refine", "bake", "report")
+ORDER = ("sync", "fit", "bake", "track", "refine", "report")  # neighbours are far apart
 START_S = 3.0  # until the program is loaded
 
 

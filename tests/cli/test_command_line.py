@@ -130,7 +130,7 @@ def test_a_dry_run_writes_nothing(tmp_path):
     assert done.exit_code == 0 and not (tmp_path / "out").exists()
     *stages, total = done.stdout.splitlines()
     names = [line.split()[0] for line in stages]
-    assert [name for name in names if name != "scans"] == ["check", "sync", "track", "fit", "aid", "bake", "report"]
+    assert [name for name in names if name != "scans"] == ["check", "sync", "track", "fit", "refine", "bake", "report"]
     assert all("runs, about" in line for line in stages) and "nothing was written" in total
 
 

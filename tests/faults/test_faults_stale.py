@@ -13,7 +13,7 @@ from jawusd.pipeline.build import BuildOptions
 from jawusd.pipeline.capture_inputs import InputWatch, input_files, open_capture
 
 EXAMPLE = ROOT / "examples" / "capture"
-FROM_TRACK = ["track", "fit", "aid", "bake", "report"]
+FROM_TRACK = ["track", "fit", "refine", "bake", "report"]
 OFFSETS = {"cam0": 0, "cam1": 2, "cam2": -1}
 
 
@@ -32,18 +32,18 @@ def rebuilt(monkeypatch, tmp_path, capture):
     ran, meanwhile = [], {}
 
     def stub(name, write):
-        def work(self, *_):
+        def work(run, *others):
             ran.append(name)
             meanwhile.pop(name, lambda: None)()
-            path = self.folder / f"{name}.txt"
-            path.write_text(write(self))
-            return [path], stage_result(name, self.capture.sync.offsets or OFFSETS)
+            path = run.folder / f"{name}.txt"
+            path.write_text(write(run, *others))
+            return [path], stage_result(name, run.capture.sync.offsets or OFFSETS)
 
-        monkeypatch.setattr(build.StagedBuild, f"_{name}", work)
+        monkeypatch.setattr(build, f"_{name}", work)
 
-    for name in ("sync", "track", "aid", "bake", "report"):
-        stub(name, lambda _: "always the same")
-    stub("fit", lambda self: f"{self.capture.name} {self.capture.fps} {self.options.model}")
+    for name in ("sync", "track", "refine", "bake", "report"):
+        stub(name, lambda *_: "always the same")
+    stub("fit", lambda run, options: f"{run.capture.name} {run.capture.fps} {options.model}")
     monkeypatch.setattr(build, "build_summary", dict, raising=False)
     # files are changed, not made to be read
     monkeypatch.setattr(build, "check_capture", lambda *_, **__: [])
@@ -103,8 +103,8 @@ def bone_as_another(folder):
         (grow("masks/cam1/lower.mkv"), FROM_TRACK),
         (grow("calibration.toml"), FROM_TRACK),
         (grow("video/cam2.mp4"), ["sync", "report"]),
-        (edit("fps = 24.0", "fps = 24.5"), ["sync", "fit", "aid", "bake", "report"]),
-        (edit('name = "synthetic_0"', 'name = "other"'), ["fit", "aid", "bake", "report"]),
+        (edit("fps = 24.0", "fps = 24.5"), ["sync", "fit", "refine", "bake", "report"]),
+        (edit('name = "synthetic_0"', 'name = "other"'), ["fit", "refine", "bake", "report"]),
         (edit("frames = [20, 320]", "frames = [20, 300]"), FROM_TRACK),
         (edit("x = 793.13", "x = 793.5"), FROM_TRACK),
         (edit("[motion]", "[anatomy.landmarks]\nincisor = [0.0, 1.0, 2.0]\n\n[motion]"), FROM_TRACK),
@@ -124,7 +124,7 @@ def test_a_change_redoes_exactly_what_depends_on_it(rebuilt, capture, change, st
 @pytest.mark.parametrize(
     ("options", "stale"),
     [
-        ({"model": "additive"}, ["fit", "aid", "bake", "report"]),
+        ({"model": "additive"}, ["fit", "refine", "bake", "report"]),
         ({"solver": "paper"}, FROM_TRACK),
         ({"solver": "contour", "jobs": 7}, []),
     ],
@@ -151,7 +151,7 @@ def test_files_beside_numbered_masks_do_not_count(capture):
     assert [path.name for path in found] == ["000001.png", "000002.png"]
 
 
-@pytest.mark.parametrize("stage", ["track", "fit", "aid"])
+@pytest.mark.parametrize("stage", ["track", "fit", "refine"])
 @pytest.mark.parametrize(
     ("change", "named"),
     [
@@ -170,12 +170,12 @@ def test_inputs_that_change_while_a_stage_runs_stop_the_build(rebuilt, capture, 
 
 
 def test_a_stage_that_met_edited_inputs_runs_again(rebuilt, capture):
-    with pytest.raises(CaptureError, match="aid"):
-        rebuilt(during="aid", change=grow("masks/cam1/lower.mkv"))
+    with pytest.raises(CaptureError, match="refine"):
+        rebuilt(during="refine", change=grow("masks/cam1/lower.mkv"))
     assert rebuilt() == FROM_TRACK
     with pytest.raises(CaptureError, match="bake"):
         rebuilt(during="bake", change=edit('name = "synthetic_0"', 'name = "other"'), model="pca")
-    assert rebuilt(model="pca") == ["fit", "aid", "bake", "report"]
+    assert rebuilt(model="pca") == ["fit", "refine", "bake", "report"]
 
 
 def touch(name):

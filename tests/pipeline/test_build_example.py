@@ -130,7 +130,7 @@ def test_a_second_build_needs_a_word_and_resume_reuses_everything(built):
     with pytest.raises(OutputError, match="--resume"):
         build(EXAMPLE, out, BuildOptions(), quiet)
     again = build(EXAMPLE, out, BuildOptions(resume=True), quiet)
-    assert again["reused"] == ["check", "sync", "track", "fit", "aid", "bake", "report"]
+    assert again["reused"] == ["check", "sync", "track", "fit", "refine", "bake", "report"]
 
 
 @pytest.mark.slow

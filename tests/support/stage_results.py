@@ -11,7 +11,7 @@ _TRACK = {
     "sigma_mm": {"incisor": 0.1},
     "coverage_error_percent": None,
 }
-_RESULTS = {"track": _TRACK, "aid": _TRACK, "report": {"capture": "../capture"}}
+_RESULTS = {"track": _TRACK, "refine": _TRACK, "report": {"capture": "../capture"}}
 
 
 def stage_result(name, offsets):
