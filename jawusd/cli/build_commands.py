@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from jawusd.cli.command import command_line
+from jawusd.cli.command import command_line, stopped_by_signals
 from jawusd.cli.options import (
     CaptureArg,
     CaptureOption,
@@ -292,12 +292,9 @@ def build_many(
         allow_outside=allow_outside,
         command=command_line(context),
     )
-    outcomes = many.build_many(
-        load_capture_list(captures),
-        out,
-        many.ManyOptions(build, cluster, workers, retries),
-        lambda line: say(line, err=True),
-    )
+    options = many.ManyOptions(build, cluster, workers, retries)
+    with stopped_by_signals():
+        outcomes = many.build_many(load_capture_list(captures), out, options, lambda line: say(line, err=True))
     data = {"folder": str(out), "builds": [asdict(outcome) for outcome in outcomes]}
     emit(data, as_json, lambda: many.outcome_lines(outcomes))
     if any(outcome.status == many.FAILED for outcome in outcomes):

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import shlex
+import signal
+from collections.abc import Iterator
+from types import FrameType
 from typing import NoReturn
 
 import typer
@@ -47,8 +51,8 @@ class Command(TyperCommand):
         """Run, and say on Ctrl+C what is kept."""
         try:
             return super().invoke(ctx)
-        except KeyboardInterrupt:
-            interrupted(self.name or "")
+        except KeyboardInterrupt as stop:
+            interrupted(self.name or "", stop.exit_code if isinstance(stop, _StoppedError) else INTERRUPTED)
         except (JawusdError, OSError, RuntimeError) as error:
             if isinstance(ctx.obj, RunLog) and not isinstance(error, typer.Exit):
                 ctx.obj.error(error)
@@ -74,7 +78,35 @@ def with_vectors_split(args: list[str]) -> list[str]:
     return out
 
 
-def interrupted(command: str) -> NoReturn:
+class _StoppedError(KeyboardInterrupt):
+    """A signal other than Ctrl+C, which ends a command in the same way."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.exit_code = 128 + number  # as shells report it
+
+
+@contextlib.contextmanager
+def stopped_by_signals() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP end the work inside as Ctrl+C does, so that it leaves nothing behind."""
+
+    def stop(number: int, _: FrameType | None) -> NoReturn:
+        for other in taken:  # whatever comes next, the work is being ended
+            signal.signal(other, signal.SIG_IGN)
+        raise _StoppedError(number)
+
+    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    taken = [number for number in numbers if signal.getsignal(number) is signal.SIG_DFL]  # nohup ignores one
+    for number in taken:
+        signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        for number in taken:
+            signal.signal(number, signal.SIG_DFL)
+
+
+def interrupted(command: str, exit_code: int = INTERRUPTED) -> NoReturn:
     """Say that a command was stopped and what is kept of it, and end with the exit code of that."""
     say(f"jawusd {command}: stopped; {_KEPT.get(command, _ELSE)}.", err=True)
-    raise typer.Exit(INTERRUPTED)
+    raise typer.Exit(exit_code)

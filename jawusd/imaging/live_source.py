@@ -17,6 +17,7 @@ from jawusd.imaging import live_clock
 from jawusd.imaging.pixels import ColourPicture, DecodedPicture
 from jawusd.imaging.video import Video
 
+_WAIT_S = 0.1
 _KEPT = 8  # last pictures: more than those of an instant that waits for its turn
 # How PyAV names cameras of this machine, by the beginning of their address.
 _DEVICES = {"linux": ("/dev/", "v4l2"), "darwin": ("avfoundation:", "avfoundation"), "win32": ("video=", "dshow")}
@@ -48,16 +49,36 @@ class LiveSource:
         self._kept: deque[LivePicture] = deque(maxlen=_KEPT)
         self._changed, self._stopped = threading.Condition(), threading.Event()
         self._open, self._playing, self._begin_s = threading.Event(), threading.Event(), 0.0
+        self._streams, self._heard_s = not Path(where).is_file(), 0.0
         self._error: CaptureError | None = None
         self.ended = False
 
     def open(self, from_s: float = 0.0) -> None:
         """Open the source in its thread, a file at a time since the sources' recordings began [s]; see `play`."""
+        self._heard_s = live_clock.now_s()
         threading.Thread(target=self._read, args=(from_s,), daemon=True).start()
 
-    def wait_open(self) -> None:
-        """Wait until the source is open or has failed."""
-        self._open.wait()
+    def wait_open(self, silence_s: float) -> None:
+        """Wait until the source is open or has failed.
+
+        Raises:
+            CaptureError: see `refuse_silence`.
+        """
+        while not self._open.wait(_WAIT_S):
+            self.refuse_silence(silence_s)
+
+    def refuse_silence(self, silence_s: float) -> None:
+        """Refuse a device or stream that has sent no picture for so long [s].
+
+        Raises:
+            CaptureError: it has not.
+        """
+        if self._streams and not self.ended and live_clock.now_s() - self._heard_s > silence_s:
+            raise CaptureError(
+                f"has sent no picture for {silence_s:g} s.",
+                path=self.where,
+                hint="Is the camera on, and its program sending? Allow more with --silence.",
+            )
 
     def play(self, begin_s: float) -> None:
         """Give out pictures; those of a file as if the recordings began at a time of `live_clock.now_s`."""
@@ -95,7 +116,7 @@ class LiveSource:
 
     def _read(self, from_s: float) -> None:
         try:
-            pictures = self._file(from_s) if Path(self.where).is_file() else self._stream()
+            pictures = self._stream() if self._streams else self._file(from_s)
             for picture in pictures:
                 if picture.rgb.shape[1::-1] != self._size_px:
                     found, wanted = "{} x {}".format(*picture.rgb.shape[1::-1]), "{} x {}".format(*self._size_px)
@@ -134,7 +155,8 @@ class LiveSource:
             with av.open(address, format=name if device else None) as container:
                 for frame in container.decode(video=0):
                     self._open.set()
-                    yield LivePicture(live_clock.now_s(), DecodedPicture(frame, 0))
+                    self._heard_s = live_clock.now_s()
+                    yield LivePicture(self._heard_s, DecodedPicture(frame, 0))
         except (av.FFmpegError, OSError, IndexError) as error:
             raise CaptureError(
                 f"cannot be read ({error}).",

@@ -88,6 +88,7 @@ def live(
     fixed_head: bool = False,
     jobs: int = 2,
     seconds: float | None = None,
+    silence_s: float = 10.0,
     allow_outside: bool = False,
 ) -> Iterator[LiveFrame]:
     """Yield what is known of instant after instant; pictures that come too fast are left out.
@@ -101,6 +102,7 @@ def live(
         fixed_head: the cameras are worn: the head hardly moves before them.
         jobs: threads that search and follow the teeth.
         seconds: after which to end; None goes on until the sources end.
+        silence_s: how long a device or stream may send no picture [s].
         allow_outside: let paths in the capture leave its folder.
 
     Raises:
@@ -114,7 +116,7 @@ def live(
         pool = stack.enter_context(ThreadPoolExecutor(jobs))
         follower = _Follower(capture, jaw, sources or {}, fixed_head, pool)
         stack.callback(follower.stop)
-        yield from follower.run(seconds)
+        yield from follower.run(seconds, silence_s)
 
 
 def next_instant(times_s: Sequence[Sequence[float]], after_s: float) -> float | None:
@@ -193,18 +195,18 @@ class _Follower:
         for source in self._sources.values():
             source.stop()
 
-    def run(self, seconds: float | None) -> Iterator[LiveFrame]:
+    def run(self, seconds: float | None, silence_s: float) -> Iterator[LiveFrame]:
         """Yield instants until the sources end."""
         start = self._begin_in_files() if self._files else 0
         for source in self._sources.values():
             source.open(start * self._period_s)
         for source in self._sources.values():
-            source.wait_open()
+            source.wait_open(silence_s)
         begin = live_clock.now_s() - start * self._period_s
         for source in self._sources.values():
             source.play(begin)
         last, blind_since = begin + (start - 0.5) * self._period_s, 0.0
-        while (at := self._next(last)) is not None:
+        while (at := self._next(last, silence_s)) is not None:
             if seconds is not None and at - begin > start * self._period_s + seconds:
                 return
             pictures = self._pictures(at)
@@ -271,7 +273,7 @@ class _Follower:
         if near is not None:
             self._learn(pictures, near)
 
-    def _next(self, last: float) -> float | None:
+    def _next(self, last: float, silence_s: float) -> float | None:
         """Wait for an instant after the last one that all sources have; return its time, None at the end."""
         after = last + 0.5 * self._period_s
         while True:
@@ -280,6 +282,7 @@ class _Follower:
                 return at
             for source in self._sources.values():
                 source.wait(after, _WAIT_S)
+                source.refuse_silence(silence_s)
 
     def _pictures(self, at: float) -> Pictures:
         """Return the pictures of an instant, None of sources that have none near it."""

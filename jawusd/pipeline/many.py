@@ -277,8 +277,8 @@ def local_cluster(workers: int, retries: int) -> Iterator[Client]:
         "distributed.worker.profile.enabled": False,
     }
     with (
-        dask.config.set(settings),
         tempfile.TemporaryDirectory(prefix="jawusd-") as scratch,
+        dask.config.set(settings | {"temporary-directory": scratch}),
         LocalCluster(
             n_workers=workers,
             threads_per_worker=1,

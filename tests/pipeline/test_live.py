@@ -1,6 +1,7 @@
 """The example's videos as cameras that run."""
 
 import json
+import os
 import re
 import socket
 import subprocess
@@ -55,7 +56,7 @@ def film(tmp_path):
 def played(*arguments):
     source = LiveSource(*arguments)
     source.open()
-    source.wait_open()
+    source.wait_open(20.0)
     begin = time.monotonic()
     source.play(begin)
     return source, begin
@@ -88,6 +89,60 @@ def test_sources_that_cannot_be_used_are_refused(film, where, size):
             source.wait(np.inf, 0.1)
             source.times_s()
     assert source.ended
+
+
+@pytest.fixture
+def silent():
+    """Return the address of a server that takes connections and says nothing."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        yield f"tcp://127.0.0.1:{server.getsockname()[1]}"
+
+
+def test_a_source_that_connects_and_is_silent_is_not_waited_for(silent):
+    source = LiveSource(silent, (64, 48))
+    source.open()
+    with pytest.raises(CaptureError, match=r"tcp.*has sent no picture for 0.5 s"):
+        source.wait_open(0.5)
+    source.stop()
+
+
+def test_a_source_that_falls_silent_is_not_waited_for(film, tmp_path):
+    """The film's first pictures come through a pipe, which then stays open."""
+    pipe = tmp_path / "camera.ts"
+    os.mkfifo(pipe)
+    with av.open(film) as read, av.open(str(tmp_path / "film.ts"), "w") as write:
+        stream = write.add_stream_from_template(read.streams.video[0])
+        for packet in read.demux(video=0):
+            if packet.dts is not None:
+                packet.stream = stream
+                write.mux(packet)
+    source = LiveSource(str(pipe), (64, 48))
+    source.open()
+    with open(pipe, "wb") as camera:
+        camera.write((tmp_path / "film.ts").read_bytes() * 4)
+        camera.flush()
+        source.wait_open(20.0)
+        source.play(live_clock.now_s())
+        with pytest.raises(CaptureError, match="has sent no picture for 1 s"):
+            for _ in range(200):
+                source.wait(np.inf, 0.1)
+                source.refuse_silence(1.0)
+        assert source.times_s()
+
+
+@pytest.mark.slow
+def test_live_ends_where_no_camera_sends(rig, silent):
+    with pytest.raises(CaptureError, match="has sent no picture for 0.5 s"):
+        list(live(rig, EXAMPLE, dict.fromkeys(("cam0", "cam1", "cam2"), silent), silence_s=0.5))
+
+
+def test_files_may_begin_late(film):
+    source = LiveSource(film, (64, 48), -30.0)
+    source.open()
+    source.wait_open(1e-9)
+    source.play(live_clock.now_s())
+    source.refuse_silence(1e-9)
+    source.stop()
 
 
 def test_instants_are_taken_in_turn_and_left_out_when_too_old():

@@ -96,14 +96,22 @@ def test_a_killed_worker_and_a_bad_capture_leave_the_rest_as_serial_builds_make_
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
-def test_an_interrupt_leaves_no_process_and_no_half_file(shoot, tmp_path):
+@pytest.mark.parametrize(
+    ("send", "number"), [(os.killpg, signal.SIGINT), (os.kill, signal.SIGTERM), (os.killpg, signal.SIGTERM),
+                         (os.kill, signal.SIGHUP)],
+    ids=["Ctrl+C", "kill", "end of a service", "end of a terminal"],
+)  # fmt: skip
+def test_an_interrupt_leaves_no_process_and_no_half_file(shoot, tmp_path, monkeypatch, send, number):
     (tmp_path / "list.txt").write_text(f"{shoot / 'take'}\n")
+    (tmp_path / "scratch").mkdir()
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "scratch"))
     process = started(tmp_path)
     worker_on(process, tmp_path / "out" / "take")
     children = psutil.Process(process.pid).children(recursive=True)
-    os.killpg(process.pid, signal.SIGINT)
+    send(process.pid, number)
     _, told = process.communicate(timeout=60)
-    assert process.returncode == 130 and "Traceback" not in told, told
+    assert process.returncode == 128 + number and "Traceback" not in told, told
+    assert os.listdir(tmp_path / "scratch") == [] and (tmp_path / "out" / "builds.csv").is_file()
     assert psutil.wait_procs(children, timeout=5)[1] == []
     assert set(os.listdir(tmp_path / "out" / "take")) <= {".jawusd-lock", "build.json"}
     (row,) = json.loads((tmp_path / "out" / "builds.json").read_text())["builds"]
