@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from jawusd.errors import CaptureError
-from jawusd.formats.mesh_data import COPY_AGAIN, MeshData, check_count, cut_off, read_mesh_bytes
+from jawusd.formats.mesh_data import COPY_AGAIN, MOST_TRIANGLES, MeshData, check_count, cut_off, read_mesh_bytes
 from jawusd.geometry.arrays import Array
 
 _HEADER = 84
@@ -40,6 +40,12 @@ def _binary(path: Path, data: bytes) -> Array:
         raise CaptureError("is neither a text nor a binary STL file.", path=path, hint="Export it again.")
     said = int.from_bytes(data[_HEADER - 4 : _HEADER], "little")
     whole = (len(data) - _HEADER) // _TRIANGLE.itemsize
+    if said > max(whole, MOST_TRIANGLES):  # of a writer that did not know it, or of no STL at all
+        raise CaptureError(
+            f"says that it has {said:,} triangles, but there is room for {whole:,}.",
+            path=path,
+            hint="Export it again, under a name that says its format.",
+        )
     if said > whole:
         raise cut_off(path, whole, said, "triangles")
     check_count(path, said, "triangles")

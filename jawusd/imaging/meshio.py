@@ -32,6 +32,7 @@ _DIAGONAL_MM = {"scan": (20.0, 80.0, 150.0), "bone": (50.0, 200.0, 500.0)}
 _UNITS_MM = {"metres": 1000.0, "centimetres": 10.0, "inches": 25.4, "micrometres": 0.001}
 
 
+@np.errstate(invalid="ignore", over="ignore")  # damaged numbers are named, where faces use them
 def load_mesh(path: str | os.PathLike[str], kind: Literal["scan", "bone"] = "scan") -> Mesh:
     """Read a triangle mesh [mm] from PLY, STL, OBJ or 3Shape DCM, its vertices in the order of the file.
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdShade
 
 from jawusd.errors import RigError
-from jawusd.formats.mesh import Mesh, crown_face_mask
+from jawusd.formats.mesh import Mesh, crown_face_mask, without_loose
 from jawusd.geometry.arrays import Array, Mask
 from jawusd.rig import _gf
 from jawusd.rig.arrays import value_of
@@ -191,7 +192,9 @@ def read_geometry(
         vertices = np.array(points, dtype=np.float64)
         faces = np.array(corners, dtype=np.int32).reshape(-1, 3)
         colors, uv = read_look(mesh, len(vertices), len(faces))
-        found[name] = Mesh(vertices, faces, colors, uv=uv)
+        read = Mesh(vertices, faces, colors, uv=uv)
+        vertices, colors = without_loose(read.vertices, read.faces, read.colors)
+        found[name] = replace(read, vertices=vertices, colors=colors)
     return found
 
 

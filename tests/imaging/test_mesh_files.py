@@ -251,6 +251,8 @@ REFUSED_STL = {
     "binary, begins with solid, cut": (stl(b"solid x")[:-60], "is cut off: 190 of 192 triangles"),
     "count too large": (stl(said=4_000), "is cut off: 192 of 4000 triangles"),
     "count too small": (stl(said=100), "says that it has 100 triangles, but 92 more follow"),
+    "count unknown": (stl(said=0xFFFFFFFF), "says that it has 4,294,967,295 triangles, but there is room for 192"),
+    "text of another kind": (b"hello, this is no STL file\n" * 20, "there is room for 9"),
     "count zero": (stl(said=0), "says that it has 0 triangles, but 192 more follow"),
     "text, cut in a number": (text_stl()[:9000].encode(), "is cut off after .* triangles"),
     "text, cut between triangles": (text_stl().split("endfacet\n")[0].encode() + b"endfacet\n", "cut off after 1 tri"),

@@ -28,6 +28,17 @@ def test_meshes_come_back_in_single_precision(tmp_path):
         np.testing.assert_array_equal(found[name].faces, mesh.faces)
 
 
+def test_vertices_that_no_face_uses_lie_where_others_do(tmp_path):
+    meshes = example_meshes()
+    upper = meshes["upper_teeth"]
+    loose = np.concatenate([upper.vertices, [(900.0, 0, 0), (0, -9e3, 5)]])
+    colors = None if upper.colors is None else np.concatenate([upper.colors, upper.colors[:2]])
+    found = read_geometry(bake(tmp_path, {**meshes, "upper_teeth": replace(upper, vertices=loose, colors=colors)}))
+    assert len(found["upper_teeth"].vertices) == len(loose)
+    np.testing.assert_array_equal(found["upper_teeth"].vertices[:-2], upper.vertices.astype(np.float32))
+    assert np.isin(found["upper_teeth"].vertices[-2:], upper.vertices.astype(np.float32)).all()
+
+
 def test_colours_and_texture_coordinates_of_scans_are_kept(tmp_path):
     meshes = scanned_meshes()
     upper = meshes["upper_teeth"]
