@@ -48,7 +48,8 @@ def load(path: str | PathLike[str], *, prim: str | None = None, fast: bool = Fal
     """Load a rig for posing, validation and inverse kinematics.
 
     Args:
-        path: Folder of a rig, its `actor.usda` (or any layer or package that carries the rig), or a `model.npz`.
+        path: Folder of a rig, its `actor.usda` (or any layer or package that carries the rig), a `model.npz`, or its
+            `actor.onnx`: then onnxruntime computes poses and judges them, in single precision.
         prim: Path of the rig's prim, where a stage holds several.
         fast: Compile the most used functions with numba: the same results to 1e-10, several times faster. Needs
             `pip install 'jawusd[fast]'`; the first use after an installation compiles for about a minute.
@@ -59,8 +60,15 @@ def load(path: str | PathLike[str], *, prim: str | None = None, fast: bool = Fal
         FormatError: the file is not a rig, is incomplete, or was written by a newer version.
         RigError: the stage cannot be opened.
         ResourceError: it needs more memory than there is.
-        MissingDependencyError: ``fast`` without numba.
+        MissingDependencyError: ``fast`` without numba, a `.onnx` without onnxruntime.
+        ValueError: ``fast`` or ``untrusted`` with a `.onnx`.
     """
+    if str(path).endswith(".onnx"):
+        if fast or untrusted:
+            raise ValueError("a .onnx runs in onnxruntime, in this process: fast and untrusted are for other files")
+        from jawusd.rig.onnx_rig import load_onnx
+
+        return load_onnx(path, prim)
     if untrusted:
         from jawusd.rig.separate import load_separately
 

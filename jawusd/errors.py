@@ -37,7 +37,21 @@ _EXTRA_OF_PACKAGE = {
     "dask": "many",
     "distributed": "many",
     **dict.fromkeys(
-        ("PIL", "av", "cv2", "jinja2", "matplotlib", "numba", "onnx", "pyfqmr", "scipy", "shapely", "torch", "trimesh"),
+        (
+            "PIL",
+            "av",
+            "cv2",
+            "jinja2",
+            "matplotlib",
+            "numba",
+            "onnx",
+            "onnxruntime",
+            "pyfqmr",
+            "scipy",
+            "shapely",
+            "torch",
+            "trimesh",
+        ),
         "build",
     ),
 }

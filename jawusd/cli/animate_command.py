@@ -78,27 +78,29 @@ def _is_glb(path: Path) -> bool:
     return path.suffix.lower() == ".glb"
 
 
-def _clock_line(motion: AuthoredMotion) -> list[str]:
-    """Return what to say where a .glb cannot keep the frame numbers."""
-    from jawusd.rig.glb import frame_at_zero
-
-    zero = frame_at_zero(motion.frames)
-    if not zero:
-        return []
-    return [f"frame {zero:g} is at 0 s: glTF has no times before 0, and none fine enough beyond frame 100000"]
-
-
-def _write(out: Path, rig: Path, loaded: JawRig, motion: AuthoredMotion, rate: float, prim: str | None) -> None:
-    from jawusd.rig import write_animation
-    from jawusd.rig.glb import write_glb
+def _write(
+    out: Path, rig: Path, loaded: JawRig, motion: AuthoredMotion, rate: float, prim: str | None, splines: Path | None
+) -> tuple[AuthoredMotion, list[str]]:
+    """Write a layer or a .glb, and the keys as splines; return the motion written and what to say about it."""
+    from jawusd.cli.motion import follow_curves, knots_of
+    from jawusd.rig import write_animation, write_splines
+    from jawusd.rig.glb import frame_at_zero, write_glb
     from jawusd.rig.rebake import write_over
 
+    knots = knots_of(loaded, motion)
+    motion = follow_curves(loaded, motion, knots)
     if _is_glb(out):
         write_glb(out, rig, loaded, motion.frames, motion.d, rate)
+        if zero := frame_at_zero(motion.frames):
+            why = "glTF has no times before 0, and none fine enough beyond frame 100000"
+            return motion, [f"frame {zero:g} is at 0 s: {why}"]
     elif prim is not None:
         write_over(out, rig, loaded, motion.frames, motion.d, rate, prim)
     else:
         write_animation(out, rig, motion.frames, motion.d, rate)
+    if splines is not None:
+        write_splines(splines, out, knots.frames, knots.d, rate, knots.slopes, knots.curved)
+    return motion, []
 
 
 def animate(
@@ -132,9 +134,9 @@ def animate(
     """Write an animation layer over a rig, or meshes and motion as .glb; clamping to the bound is reported."""
     import jawusd
     from jawusd.cli.face_commands import read_face
-    from jawusd.cli.motion import carried_over, emit_motion, follow_curves, knots_of
+    from jawusd.cli.motion import carried_over, emit_motion
     from jawusd.cli.resampling import resampled
-    from jawusd.rig import describe, write_splines
+    from jawusd.rig import describe
 
     _refuse_conflicts(source, arkit, retarget_from, mapping, resample, prim, splines, out)
     for path in filter(None, (out, splines)):
@@ -151,11 +153,6 @@ def animate(
         motion, rate = resampled(loaded, motion, rate, resample), resample
     if retarget_from is None:
         motion, changes = _kept(loaded, source, motion)
-    knots = knots_of(loaded, motion)
-    motion = follow_curves(loaded, motion, knots)
-    _write(out, rig, loaded, motion, rate, prim)
-    if _is_glb(out):
-        changes.lines.extend(_clock_line(motion))
-    if splines is not None:
-        write_splines(splines, out, knots.frames, knots.d, rate, knots.slopes, knots.curved)
+    motion, said = _write(out, rig, loaded, motion, rate, prim, splines)
+    changes.lines.extend(said)
     emit_motion(out, rate, motion, changes, as_json)

@@ -148,14 +148,18 @@ class NumpyKernels:
         T = usable_rows(T)
         known = np.isfinite(T[:, :1, :1])
         rigid = known[:, 0, 0] & (in_chunks(rigidity_defect, np.where(known, T, np.eye(4))) <= RIGID_TOLERANCE)
-        return pairs_in_chunks(self._encoder.encode, np.where(rigid[:, None, None], T, np.nan))
+        return self.nearest(np.where(rigid[:, None, None], T, np.nan))
+
+    def nearest(self, T: Array) -> tuple[Array, Array]:
+        """Return the d (n, 3) [mm] of the poses nearest to T (n, 4, 4), and the residuals (n,) [mm]; NaN for NaN."""
+        return pairs_in_chunks(self._encoder.encode, T)
 
     def judge_poses(self, T: Array, limits: Limits) -> Verdicts:
         """Return verdicts on poses T_skull_mandible (n, 4, 4)."""
         T = usable_rows(T)
         finite = np.asarray(np.isfinite(T).all(axis=(1, 2)))
         rigid = in_chunks(rigidity_defect, np.where(finite[:, None, None], T, np.eye(4))) <= RIGID_TOLERANCE
-        d, residual_mm = pairs_in_chunks(self._encoder.encode, np.where((finite & rigid)[:, None, None], T, np.nan))
+        d, residual_mm = self.nearest(np.where((finite & rigid)[:, None, None], T, np.nan))
         return judge(finite, rigid, residual_mm, self.margins(d), d, limits)
 
     def judge_parameters(self, d: Array, limits: Limits) -> Verdicts:

@@ -28,6 +28,7 @@ from jawusd.rig.layout import (
     RIG_FILE,
     SKEL_FILE,
 )
+from jawusd.rig.onnx_check import check_written
 from jawusd.rig.onnx_sidecar import decode_model, encode_model, write_onnx
 from jawusd.rig.package import write_package
 from jawusd.rig.placeholder import grow_placeholder
@@ -94,6 +95,8 @@ def bake_rig(
         write_onnx(folder / ONNX_FILE, decode_model(rig)),
         write_onnx(folder / ENCODE_FILE, encode_model(rig)),
     ]
+    for sidecar in (ONNX_FILE, ENCODE_FILE):
+        check_written(folder / sidecar, rig)
     interface = interface_layer(rig, name, meshes, fps, proxies or ())
     record_sidecars(interface, folder)
     record_checksums(interface, folder, [path.name for path in written if path.suffix == ".usdc"])

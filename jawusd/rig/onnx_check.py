@@ -1,23 +1,72 @@
-"""Compare an ONNX sidecar with its model, with the onnx package's own reference evaluator."""
+"""Run ONNX sidecars and compare them with their model.
+
+They run in onnxruntime where it is installed, else in the reference evaluator of the package onnx, which is slower.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import os
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import onnx
+from numpy.typing import NDArray
+from onnx.external_data_helper import convert_model_from_external_data
 from onnx.reference import ReferenceEvaluator
 
-from jawusd.errors import FormatError, JawusdError
+from jawusd.errors import FormatError, JawusdError, RigError
 from jawusd.evaluator import JawRig
 from jawusd.geometry.arrays import Array
 from jawusd.inputs import check_input
 from jawusd.rig.arrays import model_hash
 from jawusd.rig.onnx_graph import float_type
 from jawusd.rig.onnx_sidecar import FORMAT
+from jawusd.rig.sampling import sample_valid
 from jawusd.rig.table import landmark_distance
+
+#: No landmark may be farther from the model [mm].
+ALLOWED_MM = 0.01
+PROBES = 100
+
+Floats = NDArray[np.float32] | NDArray[np.float64]
+# (names of outputs, inputs by name) -> outputs
+Run = Callable[[Sequence[str], Mapping[str, Floats]], list[Array]]
+
+
+def runner(graph: bytes) -> Run:
+    """Return what runs a graph, serialised as `load_sidecar` gave it, on one thread, with inputs of any float type."""
+    model = onnx.load_from_string(graph)
+    dtype = float_type(model)
+    try:
+        import onnxruntime
+    except ImportError:
+        run = ReferenceEvaluator(model).run
+    else:
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = 1
+        options.log_severity_level = 4  # what fails is raised, too
+        # optimising takes longer than thousands of poses gain
+        options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
+        run = onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"]).run
+
+    def in_its_type(outputs: Sequence[str], inputs: Mapping[str, Floats]) -> list[Array]:
+        found = run(list(outputs), {name: value.astype(dtype) for name, value in inputs.items()})
+        return [np.asarray(value, dtype=np.float64) for value in found]
+
+    return in_its_type
+
+
+def check_written(path: str | os.PathLike[str], rig: JawRig) -> None:
+    """Check that a sidecar that was just written gives what its model does.
+
+    Raises:
+        RigError: It is too far from the model, or cannot be run.
+    """
+    error_mm = onnx_error_mm(path, rig, sample_valid(rig, PROBES))
+    if not error_mm <= ALLOWED_MM:
+        raise RigError(f"is {error_mm:.3f} mm from the model, allowed {ALLOWED_MM} mm.", path=path)
 
 
 def onnx_error_mm(path: str | os.PathLike[str], rig: JawRig, d: Array, recorded: str | None = None) -> float:
@@ -34,7 +83,7 @@ def onnx_error_mm(path: str | os.PathLike[str], rig: JawRig, d: Array, recorded:
     Raises:
         FormatError: Not the file of the rig, not an ONNX file of jawusd, or made from another model.
     """
-    model = _load(path, rig, recorded)
+    model = load_sidecar(path, rig, recorded)
     try:
         return _error_mm(model, rig, d)
     except JawusdError:
@@ -45,20 +94,24 @@ def onnx_error_mm(path: str | os.PathLike[str], rig: JawRig, d: Array, recorded:
 
 def _error_mm(model: onnx.ModelProto, rig: JawRig, d: Array) -> float:
     dtype = float_type(model)
-    run = ReferenceEvaluator(model).run
+    run = runner(model.SerializeToString())
     if model.graph.input[0].name == "d":
         d = d.astype(dtype)
         exact = rig.pose(d.astype(np.float64))
-        (pose,) = run(["pose"], {"d": d})
-        found = np.asarray(pose, dtype=np.float64)
+        (found,) = run(["pose"], {"d": d})
     else:
         exact = rig.pose(d).astype(dtype).astype(np.float64)
-        (encoded,) = run(["d"], {"pose": exact.astype(dtype)})
-        found = rig.pose(np.asarray(encoded))
+        (encoded,) = run(["d"], {"pose": exact})
+        found = rig.pose(encoded)
     return float(landmark_distance(rig, found, exact).max())
 
 
-def _load(path: str | os.PathLike[str], rig: JawRig, recorded: str | None) -> onnx.ModelProto:
+def load_sidecar(path: str | os.PathLike[str], rig: JawRig, recorded: str | None = None) -> onnx.ModelProto:
+    """Read a graph that was made from the model of a rig.
+
+    Raises:
+        FormatError: As `onnx_error_mm` says.
+    """
     check_input(path)
     try:
         content = Path(path).read_bytes()
@@ -67,10 +120,13 @@ def _load(path: str | os.PathLike[str], rig: JawRig, recorded: str | None) -> on
     if recorded is not None and hashlib.sha256(content).hexdigest() != recorded:
         raise FormatError("is not the file baked with the rig (SHA-256 differs); bake the rig again.", path=path)
     try:
-        model = onnx.load_from_string(content)  # as bytes: weights in other files are not looked for
+        model = onnx.load_from_string(content)
         onnx.checker.check_model(model)
+        convert_model_from_external_data(model)  # raises where weights lie in other files, which runtimes would read
     except Exception as error:  # the protobuf and onnx exceptions share no base
         raise FormatError(f"is not a valid ONNX file ({type(error).__name__}).", path=path) from error
+    if model.functions or model.graph.sparse_initializer:  # where the check for other files does not look
+        raise FormatError("has functions or sparse weights, which graphs of jawusd have not.", path=path)
     properties = {entry.key: entry.value for entry in model.metadata_props}
     if properties.get("format") != FORMAT:
         raise FormatError(f"has the format {properties.get('format')!r}, expected {FORMAT!r}.", path=path)

@@ -21,7 +21,6 @@ from jawusd.rig.arrays import model_hash
 from jawusd.rig.onnx_encode import add_encoder
 from jawusd.rig.onnx_graph import FloatType, Graph, Value
 from jawusd.rig.onnx_model import add_margin, add_twist, decode_motion, images
-from jawusd.rig.onnx_packing import packed
 
 FORMAT = "jawusd-onnx/1"
 OPSET = 17
@@ -60,7 +59,6 @@ def decode_model(rig: JawRig, dtype: FloatType = np.float32) -> onnx.ModelProto:
     g.op("Reshape", flat, g.constant([-1, 4, 4], np.int64), name="pose")
     g.op("Squeeze", add_margin(g, rig, d), g.constant([1], np.int64), name="margin")
     outputs: Shapes = {"pose": ["N", 4, 4], "twist": ["N", 6], "margin": ["N"]}
-    g = packed(g, {"d": 3}, list(outputs))
     return _model(g, rig, "jaw_decode", decode_model.__doc__, {"d": ["N", 3]}, outputs)
 
 

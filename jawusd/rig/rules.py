@@ -24,10 +24,8 @@ from jawusd.rig.table import landmark_distance
 from jawusd.rig.untrusted import FAULTS, fault_message
 
 _TABLE_SLACK_MM = 0.01  # the table states its error over more parameters than are tried here
-_ONNX_MM = 0.01
 _OPS = [("xformOp:translate", "double3"), ("xformOp:orient", "quatd")]
 _PROBES = 500
-_ONNX_PROBES = 100
 
 
 @dataclass(frozen=True)
@@ -95,11 +93,11 @@ def check_onnx(prim: Usd.Prim) -> Iterator[Finding]:
     if rig is None or not assets:
         return
     try:
-        from jawusd.rig.onnx_check import onnx_error_mm
+        from jawusd.rig.onnx_check import ALLOWED_MM, PROBES, onnx_error_mm
     except ImportError:
         yield _finding("info", "Onnx", prim, "not checked: the package onnx is not installed (jawusd[build]).")
         return
-    d = sample_valid(rig, _ONNX_PROBES)
+    d = sample_valid(rig, PROBES)
     for asset, recorded in assets.items():
         if not asset.resolvedPath:
             yield _finding("error", "Onnx", prim, f"{asset.path} is not there.")
@@ -109,8 +107,8 @@ def check_onnx(prim: Usd.Prim) -> Iterator[Finding]:
         except JawusdError as error:
             yield _finding("error", "Onnx", prim, f"{asset.path} {error.message}")
             continue
-        if not error_mm <= _ONNX_MM:
-            message = f"{asset.path} is {error_mm:.3f} mm from the model, allowed {_ONNX_MM} mm."
+        if not error_mm <= ALLOWED_MM:
+            message = f"{asset.path} is {error_mm:.3f} mm from the model, allowed {ALLOWED_MM} mm."
             yield _finding("error", "Onnx", prim, message)
 
 

@@ -62,7 +62,21 @@ def ownership():
 
 
 def test_every_heavy_package_has_an_owner():
-    owned = {"torch", "scipy", "shapely", "numba", "cv2", "av", "trimesh", "moderngl", "pyfqmr", "pxr", "onnx", "bpy"}
+    owned = {
+        "torch",
+        "scipy",
+        "shapely",
+        "numba",
+        "cv2",
+        "av",
+        "trimesh",
+        "moderngl",
+        "pyfqmr",
+        "pxr",
+        "onnx",
+        "onnxruntime",
+        "bpy",
+    }
     assert owned | {"typer", "rich", "matplotlib", "jinja2", "h5py", "dask", "viser", "pydantic"} <= set(ownership())
 
 

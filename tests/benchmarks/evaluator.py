@@ -245,8 +245,6 @@ def checks(rigs: dict[str, evaluator.JawRig], table: dict[str, dict[int, float]]
         if kind == "numpy":
             rows.append(("one pose, table / onnxruntime call", ratio("pose, table"), f"<= {bar['table']}"))
             rows.append(("100,000 poses, table [M/s]", rate("pose, table"), f">= {bar['table rate']}"))
-            sidecar = table["actor.onnx"][1] / table[f"{REFERENCE} beside actor.onnx"][1]
-            rows.append(("actor.onnx / onnxruntime call", sidecar, "<= 12"))
         else:
             rows.append(("encoding of one pose / onnxruntime call", ratio("encode"), "<= 1.5"))
             rows.append(("verdict on one pose / onnxruntime call", ratio("validate poses"), "<= 1.8"))

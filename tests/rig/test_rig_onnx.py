@@ -1,15 +1,26 @@
 """The ONNX sidecar against the evaluator, run by onnxruntime."""
 
+import pickle
+import shutil
+import sys
+
 import numpy as np
 import onnx
 import onnxruntime
 import pytest
-from example_rig import example_rig, mandible_vertices, moved
+from example_model import example_arrays, example_meta
+from example_people import save
+from example_rig import FPS, example_meshes, example_rig, mandible_vertices, moved, touching_rig
+from onnx.reference import ReferenceEvaluator
 
-from jawusd.errors import FormatError
+import jawusd
+from jawusd.errors import FormatError, RigError
+from jawusd.evaluator import JawRig
 from jawusd.geometry import se3_exp
+from jawusd.rig import onnx_check
 from jawusd.rig.arrays import model_hash
-from jawusd.rig.onnx_check import onnx_error_mm
+from jawusd.rig.bake import bake_rig
+from jawusd.rig.onnx_check import check_written, onnx_error_mm
 from jawusd.rig.onnx_sidecar import OPSET, decode_model, encode_model, write_onnx
 from jawusd.rig.sampling import sample_valid
 
@@ -32,6 +43,32 @@ def test_graph_equals_the_evaluator(kind, dtype, pose_mm, relative):
     assert np.linalg.norm(difference, axis=-1).max() < pose_mm
     np.testing.assert_allclose(twist, rig.twist(exact), atol=60 * relative)
     np.testing.assert_allclose(margin, rig.margin(exact), atol=60 * relative)
+
+
+RIGS = {
+    "anchored, touching": touching_rig,
+    "additive, touching": lambda: touching_rig("additive"),
+    "few centres": lambda: JawRig(example_arrays(centres=20), example_meta()),
+    "many centres": lambda: JawRig(example_arrays(centres=120), example_meta()),
+}
+
+
+@pytest.mark.parametrize("name", RIGS)
+def test_graphs_of_other_rigs_equal_the_evaluator(name):
+    rig = RIGS[name]()
+    d = sample_valid(rig, 300, seed=8)
+    pose, twist, margin = run(rig, d, np.float64)
+    np.testing.assert_allclose(pose, rig.pose(d), atol=1e-11)
+    np.testing.assert_allclose(twist, rig.twist(d), atol=1e-11)
+    np.testing.assert_allclose(margin, rig.margin(d), atol=1e-11)
+
+
+@pytest.mark.parametrize("name", ["anchored, touching", "additive, touching"])
+def test_what_overflows_far_away_spoils_nothing_nearer(name):
+    """At ten metres the series of large angles overflow in single precision; the pose does not use them there."""
+    d = 1e4 * np.random.default_rng(2).normal(size=(100, 3))
+    for found in run(RIGS[name](), d, np.float32):
+        assert np.isfinite(found).all()
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-12, 1e-7, 1e-3, 3.0])
@@ -110,7 +147,7 @@ def test_file_says_what_it_is(kind, tmp_path):
     assert (properties["twist_order"], properties["kind"]) == ("omega v", kind)
     assert model.opset_import[0].version == OPSET
     assert [entry.name for entry in model.graph.output] == ["pose", "twist", "margin"]
-    assert path.stat().st_size < 100_000
+    assert path.stat().st_size < 60_000
 
 
 def test_check_measures_the_distance_and_refuses_other_files(kind, tmp_path):
@@ -129,3 +166,102 @@ def test_check_measures_the_distance_and_refuses_other_files(kind, tmp_path):
     onnx.save(model, path)
     with pytest.raises(FormatError, match="jawusd-onnx/1"):
         onnx_error_mm(path, rig, d)
+
+
+@pytest.mark.parametrize("installed", [True, False])
+def test_what_was_written_is_checked_by_either_runtime(kind, tmp_path, monkeypatch, installed):
+    rig, used = example_rig(kind), []
+    monkeypatch.setattr(onnx_check, "ReferenceEvaluator", lambda model: used.append(1) or ReferenceEvaluator(model))
+    if not installed:
+        monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    path = write_onnx(tmp_path / "actor.onnx", decode_model(rig))
+    check_written(path, rig)
+    assert bool(used) != installed
+    model = decode_model(rig)
+    bite = rig.T_rest[:3].T.reshape(1, 12).astype(np.float32)
+    (weights,) = [x for x in model.graph.initializer if np.array_equal(onnx.numpy_helper.to_array(x), bite)]
+    bite[0, 9] += 0.02  # mm, to the left
+    weights.CopyFrom(onnx.numpy_helper.from_array(bite, weights.name))
+    write_onnx(path, model)
+    with pytest.raises(RigError, match=r"actor.onnx: is 0\.020 mm from the model, allowed 0.01 mm"):
+        check_written(path, rig)
+
+
+def test_weights_in_other_files_are_not_read(tmp_path, monkeypatch):
+    rig = example_rig()
+    model = decode_model(rig)
+    weights = model.graph.initializer[0]
+    weights.data_location = onnx.TensorProto.EXTERNAL
+    weights.ClearField("raw_data")
+    entry = weights.external_data.add()
+    entry.key, entry.value = "location", "weights.bin"
+    (tmp_path / "weights.bin").write_bytes(bytes(1000))
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(FormatError, match="not a valid ONNX file"):
+        onnx_error_mm(write_onnx(tmp_path / "actor.onnx", model), rig, sample_valid(rig, 5))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Return a baked example rig."""
+    made = tmp_path_factory.mktemp("actor")
+    bake_rig(made, example_rig(), example_meshes(), name="x", fps=FPS, table_size=17)
+    return made
+
+
+def outside_and_inside(rig):
+    """Return parameters everywhere and far outside."""
+    low, high = rig.d_range.T
+    return np.random.default_rng(5).uniform(low - 5, high + 5, (300, 3))
+
+
+def test_a_rig_of_its_onnx_file_poses_and_judges(folder):
+    rig, exact = jawusd.load(folder / "actor.onnx"), example_rig()
+    d = outside_and_inside(exact)
+    vertices = mandible_vertices()
+    assert np.linalg.norm(moved(rig.pose(d), vertices) - moved(exact.pose(d), vertices), axis=-1).max() < 0.01
+    assert np.abs(rig.pose(d) - exact.pose(d)).max() > 0  # single precision: the graph has computed it
+    np.testing.assert_allclose(rig.twist(d), exact.twist(d), atol=1e-3)
+    np.testing.assert_allclose(rig.margin(d), exact.margin(d), atol=1e-4)
+    T = exact.pose(d)
+    for found, wanted in zip(
+        (rig.validate(T), rig.validate_parameters(d)), (exact.validate(T), exact.validate_parameters(d))
+    ):
+        np.testing.assert_array_equal(found.valid, wanted.valid)
+        np.testing.assert_array_equal(found.reason, wanted.reason)
+    np.testing.assert_allclose(rig.encode(T).d, d, atol=1e-3)
+    assert rig.is_inside(rig.project(d)).all()  # on the bound, too
+    for single in d[:5]:
+        np.testing.assert_allclose(rig.pose(single), exact.pose(single), atol=1e-3)
+        assert rig.is_inside(single) == exact.is_inside(single)
+    assert np.isnan(rig.pose([[np.nan, 0, 0], [1e12, 0, 0]])[:, :3]).any() and np.isnan(rig.margin([np.inf, 0, 0]))
+    again = pickle.loads(pickle.dumps(rig))
+    np.testing.assert_array_equal(again.pose(d), rig.pose(d))
+
+
+def test_a_model_beside_the_onnx_file_will_do_and_encoding_falls_back(folder, tmp_path):
+    shutil.copy(folder / "actor.onnx", tmp_path / "actor.onnx")
+    with pytest.raises(FormatError, match=r"beside neither actor.usda nor model.npz"):
+        jawusd.load(tmp_path / "actor.onnx")
+    save(example_rig(), tmp_path / "model.npz")
+    rig = jawusd.load(tmp_path / "actor.onnx")
+    np.testing.assert_allclose(rig.pose([20.0, 1, 0.5]), example_rig().pose([20.0, 1, 0.5]), atol=1e-3)
+    np.testing.assert_allclose(rig.encode(example_rig().pose([20.0, 1, 0.5])).d, [20, 1, 0.5], atol=1e-8)
+
+
+def test_onnx_files_that_cannot_pose_are_refused(folder, tmp_path):
+    (copied := tmp_path / "actor").mkdir()
+    save(example_rig(), copied / "model.npz")
+    for name, make, message in (
+        ("encode.onnx", lambda: (folder / "actor_encode.onnx").read_bytes(), "encodes poses"),
+        ("other.onnx", lambda: decode_model(example_rig("additive")).SerializeToString(), "another model"),
+        ("cut.onnx", lambda: (folder / "actor.onnx").read_bytes()[:5000], "not a valid ONNX file"),
+    ):
+        (copied / name).write_bytes(make())
+        with pytest.raises(FormatError, match=message):
+            jawusd.load(copied / name)
+    with pytest.raises(FormatError, match="cannot be read|no such file"):
+        jawusd.load(copied / "missing.onnx")
+    for option in ("fast", "untrusted"):
+        with pytest.raises(ValueError, match="onnxruntime"):
+            jawusd.load(folder / "actor.onnx", **{option: True})

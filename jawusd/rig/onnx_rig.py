@@ -1,0 +1,107 @@
+"""A rig whose poses, twists, margins and encoding onnxruntime computes from its ONNX sidecars, in single precision."""
+
+from __future__ import annotations
+
+import os
+from functools import cached_property, partial
+from pathlib import Path
+
+import numpy as np
+
+from jawusd.errors import FormatError, MissingDependencyError
+
+try:
+    import onnxruntime  # noqa: F401
+except ModuleNotFoundError as error:
+    raise MissingDependencyError("ONNX files run in onnxruntime.", hint="pip install 'jawusd[build]'") from error
+
+from jawusd.evaluator import JawRig
+from jawusd.evaluator.batching import usable_rows
+from jawusd.evaluator.files import load
+from jawusd.evaluator.kernels import NumpyKernels, RigParts
+from jawusd.geometry.arrays import Array
+from jawusd.rig.onnx_check import Run, load_sidecar, runner
+from jawusd.rig.read import load_rig
+
+# Single precision cannot tell the two sides of the bound apart: this near to it, the exact margin decides.
+_NEAR_MM = 1e-3
+
+
+def load_onnx(path: str | os.PathLike[str], prim: str | None = None) -> JawRig:
+    """Load the rig that an ONNX file lies beside, to be computed by that file.
+
+    The file `X.onnx` decodes, `X_encode.onnx`, where it is there, encodes. The rig, `X.usda` or `model.npz` in the same
+    folder, gives what graphs do not hold: limits, landmarks, searches inside the bound.
+
+    Raises:
+        FormatError: No rig beside it, not a decoding graph of jawusd, or made from another model.
+    """
+    path = Path(path)
+    actor, model = path.with_suffix(".usda"), path.with_name("model.npz")
+    if not actor.is_file() and not model.is_file():
+        raise FormatError(
+            f"lies beside neither {actor.name} nor {model.name}, which hold the limits of the rig.",
+            path=path,
+            hint="Load it in the folder of its rig; a runtime of its own needs the .onnx alone.",
+        )
+    rig = load_rig(actor, prim) if actor.is_file() else load(model)
+    decode = load_sidecar(path, rig)
+    if [entry.name for entry in decode.graph.input] != ["d"]:
+        raise FormatError('encodes poses; name the file that decodes, of the input "d".', path=path)
+    beside = path.with_name(f"{path.stem}_encode.onnx")
+    encode = load_sidecar(beside, rig).SerializeToString() if beside.is_file() else None
+    found = JawRig(rig.arrays, rig.meta, kernels=partial(OnnxKernels, decode.SerializeToString(), encode))
+    try:
+        found.pose(np.zeros(3))
+    except Exception as error:  # damaged graphs raise errors of any type, depending on the operator
+        raise FormatError(f"cannot be run ({type(error).__name__}).", path=path) from error
+    return found
+
+
+class OnnxKernels(NumpyKernels):
+    """`Kernels` that run ONNX graphs for poses, twists, margins and the nearest pose, and numpy for the rest."""
+
+    def __init__(self, decode: bytes, encode: bytes | None, parts: RigParts) -> None:
+        super().__init__(parts)
+        self._files = decode, encode
+
+    def pose(self, d1: float, d2: float, d3: float) -> Array:
+        """Return T_skull_mandible (4, 4) of one d [mm]."""
+        return self.poses(np.array([(d1, d2, d3)]))[0]
+
+    def margin(self, d1: float, d2: float, d3: float) -> float:
+        """Return the margin [mm] of one d [mm]."""
+        return float(self.margins(np.array([(d1, d2, d3)]))[0])
+
+    def poses(self, d: Array) -> Array:
+        """Return the poses T_skull_mandible (n, 4, 4) of d (n, 3) [mm]."""
+        return self._decoded("pose", d)
+
+    def twists(self, d: Array) -> Array:
+        """Return the twists (n, 6) log(pose(d) rest^-1), skull frame, of d (n, 3) [mm]."""
+        return self._decoded("twist", d)
+
+    def margins(self, d: Array) -> Array:
+        """Return the margins (n,) [mm] of d (n, 3) [mm]."""
+        margins = self._decoded("margin", d)
+        near = np.abs(margins) < _NEAR_MM
+        margins[near] = super().margins(d[near])
+        return margins
+
+    def nearest(self, T: Array) -> tuple[Array, Array]:
+        """Return the d (n, 3) [mm] of the poses nearest to T (n, 4, 4), and the residuals (n,) [mm]."""
+        if self._encode is None:
+            return super().nearest(T)
+        d, residual_mm = self._encode(["d", "residual"], {"pose": T})
+        return d, residual_mm
+
+    def _decoded(self, output: str, d: Array) -> Array:
+        return self._decode([output], {"d": usable_rows(d)})[0]
+
+    @cached_property
+    def _decode(self) -> Run:
+        return runner(self._files[0])
+
+    @cached_property
+    def _encode(self) -> Run | None:
+        return None if self._files[1] is None else runner(self._files[1])
