@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import tomllib
 from collections.abc import Iterator
@@ -28,7 +29,9 @@ def write_bootstrap(path: str | os.PathLike[str], picks: Bootstrap, expected: Bo
     path = Path(path).resolve()  # a link stays a link
     check_input(path)
     try:
-        text = path.read_bytes().decode("utf-8-sig")
+        data = path.read_bytes()
+        encoding = json.detect_encoding(data)  # as `jawusd.tables.read_text` does, and keeps
+        text = data.decode(encoding)
         found = tomllib.loads(text).get(_TABLE)
         there = None if found is None else Bootstrap.model_validate(found)
     except OSError as error:
@@ -51,7 +54,7 @@ def write_bootstrap(path: str | os.PathLike[str], picks: Bootstrap, expected: Bo
             path=path,
             hint=f"Bring [{_TABLE}] into the form of tables, [{_TABLE}] and [[{_TABLE}.upper]], or delete it.",
         ) from error
-    write_bytes_atomic(path, changed.encode())
+    write_bytes_atomic(path, changed.encode(encoding))
 
 
 def with_bootstrap(text: str, picks: Bootstrap) -> str:

@@ -9,8 +9,8 @@ Tables, one row of x, y, z of every marker per frame, frames numbered from 0, of
 * TRC of Motion Analysis and OpenSim: `DataRate`, `NumMarkers`, `Units` above their values, then `Frame#`, `Time`;
 * CSV of Vicon Nexus, its section `Trajectories`; model outputs and devices are passed over.
 
-A marker is out of sight where a coordinate is blank, nan or huge (-3.697314e28), or all three are exactly 0. Frames
-that a numbered table leaves out are frames without markers.
+A marker is out of sight where a coordinate is blank, nan or huge (-3.697314e28), or all three are exactly 0 (not in
+probes, which are simulated). Frames that a numbered table leaves out are frames without markers.
 """
 
 from __future__ import annotations
@@ -69,11 +69,19 @@ class MarkerTable:
     unit: str | None = None
     fps: float | None = None
 
-    def __post_init__(self) -> None:
-        """Mark what is out of sight."""
-        with np.errstate(invalid="ignore"):
-            seen = (np.abs(self.points) < _OUT_OF_SIGHT).all(axis=-1) & (self.points != 0).any(axis=-1)
-        self.points[~seen] = np.nan
+
+def mark_hidden(points: Array, zeros: bool = True) -> Array:
+    """Return positions (F, N, 3) with NaN where a marker is out of sight.
+
+    Args:
+        points: as a file holds them.
+        zeros: a marker at exactly 0 0 0 is out of sight.
+    """
+    with np.errstate(invalid="ignore"):
+        seen = (np.abs(points) < _OUT_OF_SIGHT).all(axis=-1)
+    if zeros:
+        seen &= (points != 0).any(axis=-1)
+    return np.where(seen[..., None], points, np.nan)
 
 
 def read_markers(path: str | os.PathLike[str]) -> MarkerTable:
@@ -130,7 +138,8 @@ def _plain(rows: _Rows, separator: str, path: Path) -> Array:
     """Return the positions of numbers alone, or of an ArtiSynth probe, shape (F, N, 3)."""
     if any(len(cell.split()) > 1 for _, row in rows for cell in row):  # blanks beside separators
         rows = [(line, separator.join(row).split()) for line, row in rows]
-    if len(rows) > 1 and rows[1][1][0].strip().lower() in _INTERPOLATIONS:
+    probe = len(rows) > 1 and rows[1][1][0].strip().lower() in _INTERPOLATIONS
+    if probe:
         width, rows = _probe_size(rows[1][1], path), rows[2:]
     else:
         width = len(rows[0][1])
@@ -151,11 +160,13 @@ def _plain(rows: _Rows, separator: str, path: Path) -> Array:
         width -= 1
     if width % 3:
         raise FormatError(f"has {width} numbers per frame; three per marker are expected.", path=path, hint=READ)
-    return _positions(rows, 0, width, path)
+    return _positions(rows, 0, width, path, zeros=not probe)
 
 
-def _positions(rows: _Rows, first: int, width: int, path: Path) -> Array:
-    """Return cells as positions (F, N, 3); what is blank or missing at the end is NaN."""
+def _positions(rows: _Rows, first: int, width: int, path: Path, zeros: bool = True) -> Array:
+    """Return cells as positions (F, N, 3), NaN where a marker is out of sight; blanks at the end may be missing."""
+    if not rows or not width:
+        raise FormatError("holds no frames, or no markers.", path=path)
     cells = []
     for line, row in rows:
         found = [cell if cell.strip() else "nan" for cell in row[first : first + width]]
@@ -167,7 +178,7 @@ def _positions(rows: _Rows, first: int, width: int, path: Path) -> Array:
     def named(i: int, j: int) -> str:
         return f"line {rows[i][0]}, marker {j // 3 + 1}, {'xyz'[j % 3]}"
 
-    return to_numbers(cells, named, path).reshape(len(rows), -1, 3)
+    return mark_hidden(to_numbers(cells, named, path).reshape(len(rows), -1, 3), zeros)
 
 
 def _read_qtm(rows: _Rows, path: Path) -> MarkerTable:
@@ -258,8 +269,6 @@ def _is_number_or_blank(cell: str) -> bool:
 
 
 def _check_count(said: int, found: int, path: Path) -> None:
-    if not found:
-        raise FormatError("holds no frames.", path=path)
     if found != said:
         raise FormatError(
             f"is cut off or was cut by hand: it says that it has {said} frames, and holds {found}.",

@@ -63,7 +63,17 @@ def parse_json(text: str, path: Path) -> object:
     """
     try:
         return json.loads(text)
-    except (ValueError, RecursionError) as error:
+    except json.JSONDecodeError as error:
+        line = text.split("\n")[error.lineno - 1].strip()
+        before = text[: error.pos].rstrip()[-1:]
+        hint = "Put names and text in straight double quotes, commas between entries, none after the last."
+        if re.match(r"//|/\*|#", text[error.pos :]):
+            hint = "Take comments out: JSON has none."
+        elif before == ",":
+            hint = "Take out the comma before it, or add what should follow."
+        said = f"line {error.lineno}, {line[:_SHOWN]}: {error.msg}" if line else f"line {error.lineno}: {error.msg}"
+        raise FormatError(f"is not JSON: {said}.", path=path, hint=hint) from error
+    except (ValueError, RecursionError) as error:  # of numbers of more than 4300 digits, or lists in lists
         raise FormatError(f"is not JSON ({error}).", path=path) from error
 
 
@@ -85,7 +95,9 @@ def _fault(error: ValidationError, model: type[BaseModel]) -> str:
     problem = error.errors()[0]
     kind, given = problem["type"], problem["input"]
     names: list[str] = []
-    needed, above, at = "a JSON object", model, model
+    needed = "a JSON object"
+    above: type[BaseModel] | None = model
+    at: type[BaseModel] | None = model
     for part in problem["loc"]:
         if isinstance(part, str):
             field = None if at is None else at.model_fields.get(part)
@@ -99,7 +111,7 @@ def _fault(error: ValidationError, model: type[BaseModel]) -> str:
     where = f"{', '.join(names)}: " if names else ""
     if kind == "value_error":
         return str(problem["ctx"]["error"])
-    if kind == "extra_forbidden":
+    if kind == "extra_forbidden" and above is not None:
         return f'{where}there is no key "{name}"; allowed are {", ".join(above.model_fields)}'
     found = "" if isinstance(given, dict | list) else f", found {json.dumps(given, default=str):.80}"
     return f"{where}{name} needs {needed}{found}"

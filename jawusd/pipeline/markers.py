@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from jawusd.errors import FormatError, explain_missing_packages
-from jawusd.formats.markers import MarkerTable, length_unit, read_markers
+from jawusd.formats.markers import MarkerTable, length_unit, mark_hidden, read_markers
 from jawusd.formats.rigid_bodies import RigidBody, read_body
 from jawusd.geometry import rigid_fits, se3_inverse
 from jawusd.geometry.arrays import Array
@@ -98,6 +98,7 @@ def read_c3d(path: str | os.PathLike[str]) -> MarkerTable:
             hint="Export the take as TRC or CSV, or in parts.",
         )
     points[hidden] = np.nan
+    points = mark_hidden(points)
     fps = float(rate[0]) if len(rate) and rate[0] > 0 else None
     return MarkerTable(
         points, tuple(name.strip() for name in names[: points.shape[1]]), length_unit("".join(unit[:1]), path), fps

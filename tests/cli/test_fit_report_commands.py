@@ -87,6 +87,13 @@ def test_the_same_poses_give_the_same_model_however_they_are_written(given, tmp_
     body = f"jaw={given / 'jaw.rig'}"
     run("fit", given / "markers.asc", *whose, "--rigid", body, "-o", tmp_path / "d.npz")
     np.testing.assert_allclose(load_model(tmp_path / "d.npz").d, ours.d, atol=0.05)
+    markers = np.loadtxt(given / "markers.asc").reshape(FRAMES, 4, 3)
+    head = f"NO_OF_FRAMES\t{FRAMES}\nNO_OF_MARKERS\t4\nFREQUENCY\t120\nDATA_INCLUDED\t3D\nMARKER_NAMES\tA\tB\tC\tD"
+    np.savetxt(tmp_path / "qtm.tsv", markers.reshape(FRAMES, -1), "%.9f", "\t", header=head, comments="")
+    rest = ("--rigid", "jaw=A,B,C,D", "--rest-frame", 0)
+    run("fit", tmp_path / "qtm.tsv", *whose, *rest, "-o", tmp_path / "e.npz")
+    named = load_model(tmp_path / "e.npz")
+    assert named.meta["fps"] == 120 and "fps" not in ours.meta
     # A fit of few poses at five landmarks magnifies the last digits of the poses; HDF5 has one pose more, the first.
     np.testing.assert_allclose(foreign.d, ours.d, atol=0.05)
     assert np.median(np.abs(hdf5.d[1:] - ours.d)) < 0.05

@@ -103,6 +103,16 @@ def test_picks_somebody_else_wrote_meanwhile_are_not_overwritten(tmp_path):
     assert Bootstrap.model_validate(tomllib.loads(path.read_text())["bootstrap"]) == picks(shift=1.0)
 
 
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_the_encoding_of_the_file_stays(tmp_path, encoding):
+    path = tmp_path / "capture.toml"
+    path.write_bytes((BEFORE + "# Zähne\r\n").encode(encoding))
+    write_bootstrap(path, picks(), None)
+    assert path.read_bytes().startswith("\ufeff".encode("utf-16-le" if encoding == "utf-16" else "utf-8"))
+    text = path.read_bytes().decode(encoding)
+    assert "# Zähne\r\n" in text and Bootstrap.model_validate(tomllib.loads(text)["bootstrap"]) == picks()
+
+
 def test_a_link_stays_a_link(tmp_path):
     real = tmp_path / "real.toml"
     real.write_text(BEFORE)

@@ -15,7 +15,7 @@ def written(tmp_path, text):
 
 
 def test_paths_are_relative_to_the_list_and_names_follow_from_them(tmp_path):
-    text = '# a shoot\n\nday/anna/capture.toml\n  ben , again\n/abs/eve.toml\n"c, d", cd\n../up\n'
+    text = '# a shoot\n\nday/anna/capture.toml\n  ben , again\n/abs/eve.toml\n"c, d", cd,\n../up,,\n'
     assert load_capture_list(written(tmp_path, text)) == [
         ListedCapture(tmp_path / "day/anna/capture.toml", "anna"),
         ListedCapture(tmp_path / "ben", "again"),

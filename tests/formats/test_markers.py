@@ -35,6 +35,8 @@ def test_a_probe_of_artisynth_and_one_in_a_file_per_marker(tmp_path):
     (tmp_path / "probe.txt").write_text(PROBE)
     expected = [[[395.9, 355.5, -6.02], [401.0, 362.6, 32.4]], [[395.8, 355.4, -6.01], [401.1, 362.7, 32.5]]]
     np.testing.assert_array_equal(read_markers(tmp_path / "probe.txt").points, expected)
+    (tmp_path / "zero.txt").write_text(PROBE.replace("395.9 355.5 -6.02", "0 0 0"))
+    np.testing.assert_array_equal(read_markers(tmp_path / "zero.txt").points[0, 0], [0, 0, 0])  # a simulation's
     for marker in (0, 1):
         rows = "\n".join(" ".join(map(str, frame[marker])) for frame in expected)
         (tmp_path / f"Marker{marker + 1}_Traj.txt").write_text(f"0 0.04 1\nLinear 3 0.02\n{rows}\n")

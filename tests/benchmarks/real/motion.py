@@ -13,7 +13,8 @@ from sources import CHEWING, OPTOTRAK
 
 from jawusd.fitting.coverage import missing_movements, shown_parameters
 from jawusd.fitting.data import SubjectAnatomy, TrainingData, select_poses
-from jawusd.formats.markers import read_body, read_markers
+from jawusd.formats.markers import read_markers
+from jawusd.formats.rigid_bodies import read_body
 from jawusd.geometry import (
     make_transform,
     rigid_fits,
@@ -60,7 +61,7 @@ def speech(data: Path) -> tuple[Take, Take]:
     plates = {name: str(folder / f"{name}.rig") for name in ("head", "jaw")}
     points = read_body(plates["jaw"]).points
     anatomy = SubjectAnatomy.of(T_ANATOMICAL_HEAD, SPEECH_LANDMARKS, points, None)
-    spoken, clenched = (marker_poses(folder / f"{name}.asc", plates) for name in ("dms1", "cln1"))
+    spoken, clenched = (marker_poses(folder / f"{name}.asc", plates)[0] for name in ("dms1", "cln1"))
     taken = select_poses(np.arange(len(spoken)), spoken, anatomy).data
     return Take(taken, spoken, points), Take(taken, clenched, points)
 
@@ -68,7 +69,7 @@ def speech(data: Path) -> tuple[Take, Take]:
 def chewing(data: Path) -> Take:
     """Return the take of chewing, measured at its three markers; nothing but the motion tells how the head lies."""
     folder = CHEWING.found(data) / "XML_Processing"
-    points = read_markers(folder / "Marker%d_Traj.txt")
+    points = read_markers(folder / "Marker%d_Traj.txt").points
     T, _ = rigid_fits(points[0], points)
     anatomy = SubjectAnatomy.of(*anatomy_of_motion(T, points[0]), points[0], None)
     return Take(select_poses(np.arange(len(T)), T, anatomy).data, T, points[0])
@@ -164,7 +165,7 @@ def lacking(data: TrainingData) -> None:
 
 def incisor_path(data: Path) -> None:
     """Print how the points of `JMA_position.txt`, beside the chewing take, move: not as points of a jaw do."""
-    points = read_markers(CHEWING.found(data) / "XML_Processing" / "JMA_position.txt")
+    points = read_markers(CHEWING.found(data) / "XML_Processing" / "JMA_position.txt").points
     T, _ = rigid_fits(points[0], points)
     moved = np.linalg.norm(points - points[0], axis=-1).max()
     turned = np.degrees(np.linalg.norm(so3_log(T[:, :3, :3]), axis=1)).max()
