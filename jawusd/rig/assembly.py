@@ -11,8 +11,9 @@ from pxr import Sdf, Usd, UsdGeom
 from jawusd.errors import FormatError
 from jawusd.geometry.arrays import Array
 from jawusd.rig.bones import bones_of
+from jawusd.rig.keys import time_codes, times_between
 from jawusd.rig.layout import MOTION, SKELETON
-from jawusd.rig.motion_read import mandible_of, meshes_below, prims_between, skull_of, time_codes, times_between
+from jawusd.rig.motion_read import mandible_of, meshes_below, prims_between, skull_of
 
 _UNEVEN = 1e-3  # of the scales of three axes, far above single precision: 0.1 mm of a jaw
 _SIZES = 0.5, 2.0  # no head is twice another: beyond, the units were mixed up

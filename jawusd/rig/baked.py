@@ -8,8 +8,9 @@ from pxr import Usd
 from jawusd.evaluator import JawRig
 from jawusd.geometry.arrays import Array
 from jawusd.rig.animation import BETWEEN_MM
+from jawusd.rig.keys import time_codes, times_between
 from jawusd.rig.layout import PARAMETERS
-from jawusd.rig.motion_read import moving_attributes, poses_in_actor, skull_of, time_codes, times_between
+from jawusd.rig.motion_read import moving_attributes, poses_in_actor, skull_of
 from jawusd.rig.table import landmark_distance
 
 #: Largest distance [mm] of a baked pose from that of d.

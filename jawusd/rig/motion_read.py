@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pxr import Usd, UsdGeom
 
 from jawusd.errors import FormatError
-from jawusd.geometry.arrays import Array, Mask
+from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import rigidity_defect
 from jawusd.rig.animation import LOST
 from jawusd.rig.bones import bones_of, place_in
+from jawusd.rig.keys import MOST_FRAMES, key_times, time_codes, values_at
 from jawusd.rig.layout import PARAMETERS
 from jawusd.rig.read import find_rig_prim, open_stage
 from jawusd.rig.untrusted import raises_format_error
 
-_MOST_FRAMES = 220_000  # as many as are written, an hour at 60 per second
 _RIGID = 1e-5  # single-precision quaternions, as DCCs write them, stay below
 _APART = 1e-4  # far more than the transforms of two meshes that move together differ by
 
@@ -157,9 +157,9 @@ def parameters_of(actor: Usd.Prim, path: object) -> tuple[Array, Array, float] |
     times = np.unique(np.concatenate([np.zeros(0), *sampled]))
     if len(sampled) < len(PARAMETERS) or not len(times):
         return None
-    if len(times) > _MOST_FRAMES:
-        raise FormatError(f"has {len(times)} samples of d, at most {_MOST_FRAMES} are read.", path=str(path))
-    d = np.array([[attribute.Get(time) for attribute in attributes] for time in times], dtype=np.float64)
+    if len(times) > MOST_FRAMES:
+        raise FormatError(f"has {len(times)} samples of d, at most {MOST_FRAMES} are read.", path=str(path))
+    d = np.array([values_at(attribute, times.tolist()) for attribute in attributes], dtype=np.float64).T
     if not np.isfinite(d).all():
         raise FormatError("its samples of d hold values that are not finite.", path=str(path))
     listed = stage.GetRootLayer().customLayerData.get(LOST, [])
@@ -167,34 +167,6 @@ def parameters_of(actor: Usd.Prim, path: object) -> tuple[Array, Array, float] |
     order = np.argsort(np.concatenate([times, lost]))
     all_d = np.concatenate([d, np.full((len(lost), 3), np.nan)])
     return np.concatenate([times, lost])[order], all_d[order], float(stage.GetTimeCodesPerSecond())
-
-
-def key_times(attribute: Usd.Attribute) -> list[float]:
-    """Return the times at which an attribute has samples; of a spline its knots and the whole frames between them."""
-    if not hasattr(attribute, "HasSpline") or not attribute.HasSpline():  # OpenUSD before 25.05 has no splines
-        return list(attribute.GetTimeSamples())
-    knots = np.array(sorted(attribute.GetSpline().GetKnots()))
-    first, last = np.ceil(knots.min(initial=np.inf)), np.floor(knots.max(initial=-np.inf))
-    if not last - first < _MOST_FRAMES:
-        return knots.tolist()
-    return np.union1d(knots, np.arange(first, last + 1)).tolist()
-
-
-def times_between(attributes: Iterable[Usd.Attribute]) -> tuple[Array, Mask]:
-    """Return the times at which one of several attributes has samples, and the whole frames between them.
-
-    Returns:
-        Times, increasing, shape (n,), and which of them have samples, shape (n,).
-    """
-    keys = np.unique(np.concatenate([np.zeros(0), *(key_times(attribute) for attribute in attributes)]))
-    first, last = np.ceil(keys.min(initial=np.inf)), np.floor(keys.max(initial=-np.inf))
-    times = np.union1d(keys, np.arange(first, last + 1)) if 0 <= last - first < _MOST_FRAMES else keys
-    return times, np.isin(times, keys)
-
-
-def time_codes(times: Array) -> list[Usd.TimeCode]:
-    """Return time codes; without any time the default one."""
-    return [Usd.TimeCode(time) for time in times.tolist()] or [Usd.TimeCode.Default()]
 
 
 def mandible_of(actor: Usd.Prim, path: object) -> Usd.Prim:
@@ -250,10 +222,10 @@ def frames_of_stage(stage: Usd.Stage, path: object) -> NDArray[np.int64]:
             hint="Name an animation layer, or set both in the shot.",
         )
     first, last = int(np.ceil(stage.GetStartTimeCode())), int(np.floor(stage.GetEndTimeCode()))
-    if not 0 < last - first + 1 <= _MOST_FRAMES:
+    if not 0 < last - first + 1 <= MOST_FRAMES:
         raise FormatError(
             f"its time codes run from {stage.GetStartTimeCode():g} to {stage.GetEndTimeCode():g}: no whole frame, or "
-            f"more than {_MOST_FRAMES}.",
+            f"more than {MOST_FRAMES}.",
             path=str(path),
         )
     return np.arange(first, last + 1)

@@ -17,6 +17,7 @@ from jawusd.geometry.arrays import Array
 from jawusd.guard import out_of_memory
 from jawusd.inputs import check_path
 from jawusd.rig.arrays import read_arrays, read_value, value_of
+from jawusd.rig.keys import key_times
 from jawusd.rig.layout import MADE_FOR, ONNX_ATTRIBUTES, PARAMETERS
 from jawusd.rig.schema import has_jaw_api, rig_prims
 from jawusd.rig.table import DecoderTable
@@ -212,7 +213,7 @@ def describe(path: PathArg, prim_path: str | None = None) -> Description:
     rig = rig_of(prim, path)
     table = read_table(prim, path)
     names = np.array(read_value(prim, "jaw:landmarks:names", path)).tolist()
-    samples = prim.GetAttribute(PARAMETERS[0]).GetTimeSamples()
+    samples = key_times(prim.GetAttribute(PARAMETERS[0]))
     animation = {"samples": len(samples), "first": samples[0], "last": samples[-1]} if samples else None
     onnx = [prim.GetAttribute(name).Get() for name in ONNX_ATTRIBUTES]
     return {

@@ -19,11 +19,11 @@ from jawusd.rig import _gf
 from jawusd.rig.animation import CARRIED, author_motion
 from jawusd.rig.baked import BAKED_MM, looked_at, skull_moved_mm
 from jawusd.rig.bones import bones_of
+from jawusd.rig.keys import key_times
 from jawusd.rig.layers import new_layer, relative_path, write_layer
 from jawusd.rig.layout import MOTION, PARAMETERS, SKELETON, TRANSFORMS
 from jawusd.rig.motion_read import (
     frames_of_stage,
-    key_times,
     mandible_of,
     moving_attributes,
     parameters_of,

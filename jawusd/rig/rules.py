@@ -16,8 +16,9 @@ from jawusd.geometry.arrays import Array
 from jawusd.rig.assembly import faults_of_assembly
 from jawusd.rig.baked import BAKED_MM, looked_at, skull_moved_mm
 from jawusd.rig.bones import bones_of
+from jawusd.rig.keys import time_codes, times_between
 from jawusd.rig.layout import ONNX_ATTRIBUTES, PARAMETERS, SIDECAR_HASH
-from jawusd.rig.motion_read import mandible_of, moving_attributes, poses_at, time_codes, times_between
+from jawusd.rig.motion_read import mandible_of, moving_attributes, poses_at
 from jawusd.rig.read import named_models, read_table, rig_of
 from jawusd.rig.sampling import sample_valid
 from jawusd.rig.table import landmark_distance
