@@ -1,8 +1,8 @@
 """The jaw model's formulas, stated once for every kind of number.
 
-Each function takes numbers that know ``+ - * /`` (floats, numpy arrays, torch tensors, values of an ONNX graph, sockets
-of Blender nodes) and, where a formula needs more, an `Operations` object for that kind of number. The torch layer, the
-ONNX exporter, the Blender nodes and the single-file reader are built from `MODELS` and `BoundFormula`;
+Each function takes numbers that know ``+ - * /`` (floats, numpy arrays, torch tensors, values of an ONNX
+graph) and, where a formula needs more, an `Operations` object for that kind of number. The torch layer, the
+ONNX exporter and the single-file reader are built from `MODELS` and `BoundFormula`;
 `jawusd.evaluator.derivatives` is the one other statement, with derivatives, for floats, compiled code and numpy.
 
 This file imports nothing but the standard library, `jawusd.evaluator.operations` and `jawusd.geometry.rodrigues`: all

@@ -1,7 +1,7 @@
 """Hand out what runs inside other programs.
 
 python -m jawusd.plugins jawusd_blender.zip    the Blender extension
-python -m jawusd.plugins FOLDER                reader, recipes for Maya, Houdini and Unreal, Geometry Nodes maker
+python -m jawusd.plugins FOLDER                reader, and recipes for Maya, Houdini and Unreal
 """
 
 import sys

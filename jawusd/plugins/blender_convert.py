@@ -10,8 +10,12 @@ from __future__ import annotations
 
 import os
 import sys
+import traceback
 
 import bpy
+
+_STILL = 1e-6  # what a curve of an object at rest varies by
+_PLACES = ("location", "rotation", "scale", "pose.bones")
 
 
 def convert(source: str, target: str, fps: float) -> None:
@@ -22,6 +26,7 @@ def convert(source: str, target: str, fps: float) -> None:
     if source.lower().endswith(".fbx"):
         bpy.ops.preferences.addon_enable(module="io_scene_fbx")
         bpy.ops.import_scene.fbx(filepath=source, anim_offset=0.0)
+        _choose_takes()
     else:
         bpy.ops.preferences.addon_enable(module="io_scene_gltf2")
         bpy.ops.import_scene.gltf(filepath=source)
@@ -31,8 +36,43 @@ def convert(source: str, target: str, fps: float) -> None:
     bpy.ops.wm.usd_export(filepath=target, export_animation=True, export_armatures=True, export_materials=False)
 
 
+def _choose_takes() -> None:
+    """Let every object play the take of an FBX file in which it moves.
+
+    Blender exports every action on every object by default, the camera's on the jaw too, and reads the first one.
+
+    Raises:
+        ValueError: A mesh moves in several takes: which one was meant cannot be told.
+    """
+    for found in bpy.data.objects:
+        if not any(item.type == "MESH" for item in (found, *found.children_recursive)):
+            continue
+        moving = [action for action in bpy.data.actions if action.name.startswith(f"{found.name}|") and _moves(action)]
+        if len(moving) > 1:
+            names = ", ".join(action.name for action in moving)
+            raise ValueError(f"export it with All Actions off: {found.name} moves in several takes, {names}")
+        if moving:
+            data = found.animation_data
+            data.action = moving[0]
+            if hasattr(data, "action_slot"):  # Blender 4.4 and later, which do not choose one
+                data.action_slot = data.action_suitable_slots[0]
+
+
+def _moves(action: bpy.types.Action) -> bool:
+    """Return whether an action moves an object or its bones."""
+    layers = getattr(action, "layers", None)  # not in Blender 4.2
+    bags = [bag for layer in layers for strip in layer.strips for bag in strip.channelbags] if layers else [action]
+    curves = [curve for bag in bags for curve in bag.fcurves if curve.data_path.startswith(_PLACES)]
+    values = [[point.co[1] for point in curve.keyframe_points] for curve in curves]
+    return any(max(row) - min(row) > _STILL for row in values if row)
+
+
 if __name__ == "__main__":
-    given = sys.argv[sys.argv.index("--") + 1 :]
-    convert(given[0], given[1], float(given[2]))
+    given, failed = sys.argv[sys.argv.index("--") + 1 :], False
+    try:
+        convert(given[0], given[1], float(given[2]))
+    except Exception:  # the last line of the traceback is what jawusd reports
+        traceback.print_exc()
+        failed = True
     sys.stdout.flush()
-    os._exit(0)  # the module hangs at a normal exit in some versions
+    os._exit(failed)  # the module hangs at a normal exit in some versions

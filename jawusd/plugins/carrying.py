@@ -9,10 +9,7 @@ from pathlib import Path
 
 _ROOT = Path(__file__).parents[1]
 _OURS = re.compile(r"^(\s*)from jawusd((?:\.\w+)*) import", re.MULTILINE)
-# Scripts look for the reader beside themselves; carried, it is a module of the package.
-_BESIDE = re.compile(r"^sys\.path\.insert\(.*\)\n|^import jawusd_reader$|^from jawusd_reader import", re.MULTILINE)
 _VERSION = re.compile(r"^__version__ = .*$", re.MULTILINE)
-_READER = "jawusd.plugins.jawusd_reader"
 
 
 def carried_files(stubs: Iterable[Path]) -> dict[str, str]:
@@ -53,10 +50,8 @@ def _collect(tree: ast.Module, sources: dict[str, str]) -> None:
 def _imported(tree: ast.Module) -> Iterator[str]:
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names if alias.name.split(".")[0] in ("jawusd", "jawusd_reader")]
-            if names and names != ["jawusd_reader"]:
+            if any(alias.name.split(".")[0] == "jawusd" for alias in node.names):
                 raise ValueError(f"line {node.lineno}: {ast.unparse(node)!r} cannot be carried")
-            yield from [_READER] if names else ()
         elif isinstance(node, ast.ImportFrom) and str(node.module).split(".")[0] == "jawusd":
             for alias in node.names:
                 below = f"{node.module}.{alias.name}"
@@ -67,14 +62,7 @@ def _relative(module: str, source: str) -> str:
     """Return the source of a module with its imports of jawusd relative to where it is carried."""
     inside = module.split(".")[1:]
     dots = "." * (len(inside) + (_file(module).name == "__init__.py"))
-    source = _OURS.sub(lambda found: f"{found[1]}from {dots}{found[2][1:]} import", source)
-
-    def beside(found: re.Match[str]) -> str:
-        if found[0].startswith("sys"):
-            return ""
-        return "from . import jawusd_reader" if found[0].startswith("import") else "from .jawusd_reader import"
-
-    return _BESIDE.sub(beside, source)
+    return _OURS.sub(lambda found: f"{found[1]}from {dots}{found[2][1:]} import", source)
 
 
 def _file(module: str) -> Path:

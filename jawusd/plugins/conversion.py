@@ -10,7 +10,6 @@ import sys
 from pathlib import Path
 
 from jawusd.errors import FormatError, MissingDependencyError
-from jawusd.formats.gltf import frame_rate
 from jawusd.inputs import check_input
 
 #: Files that Blender reads for jawusd.
@@ -28,7 +27,7 @@ def converted(path: str | os.PathLike[str], folder: str | os.PathLike[str], fps:
     Args:
         path: An .fbx, .glb or .gltf file.
         folder: Where the stage is written.
-        fps: Frames per second of files that do not say, as glTF ones of other programs.
+        fps: Frames per second of files that do not say, as glTF ones.
 
     Raises:
         MissingDependencyError: There is no Blender.
@@ -38,7 +37,7 @@ def converted(path: str | os.PathLike[str], folder: str | os.PathLike[str], fps:
     check_input(path)
     if not path.is_file():
         raise FormatError("there is no such file.", path=path)
-    command = [*_blender(path), "--", str(path.resolve()), str(target), repr(frame_rate(path) or fps)]
+    command = [*_blender(path), "--", str(path.resolve()), str(target), repr(fps)]
     # plugins of this process are not meant for Blender's own OpenUSD
     alone = {name: value for name, value in os.environ.items() if name != "PXR_PLUGINPATH_NAME"}
     try:

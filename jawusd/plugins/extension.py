@@ -13,7 +13,7 @@ from jawusd.plugins.carrying import carried_files
 
 _HERE = Path(__file__).parent
 _READER = "jawusd_reader.py"
-_SCRIPTS = ("jawusd_recipes.py", "blender_nodes.py")
+_SCRIPTS = ("jawusd_recipes.py",)
 # one fixed time: equal sources give equal bytes
 _ZIP_TIME = (1980, 1, 1, 0, 0, 0)
 
@@ -27,8 +27,6 @@ def build_extension(out: Path) -> Path:
     sources = [*sorted((_HERE / "blender").glob("*.py")), _HERE / "blender" / "blender_manifest.toml"]
     contents = {source.name: source.read_bytes() for source in sources}
     carried = carried_files(sorted((_HERE / "blender").glob("*.pyi")))
-    # as one file, the reader also has the names of the formulas that the nodes are made of
-    carried[f"jawusd/plugins/{_READER}"] = packed_reader()
     contents |= {name: source.encode() for name, source in sorted(carried.items())}
     with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in contents.items():

@@ -18,9 +18,10 @@ def test_zip_holds_manifest_modules_and_reader(tmp_path):
     assert first.read_bytes() == second.read_bytes()
     with zipfile.ZipFile(first) as archive:
         names = set(archive.namelist())
-        own = {"__init__.py", "handle.py", "jaw.py", "operators.py", "panel.py", "scene.py", "blender_manifest.toml"}
-        assert {name for name in names if "/" not in name} == own | {"carried.py", "carried_usd.py"}
-        assert {"jawusd/evaluator/rig.py", "jawusd/rig/animation.py", "jawusd/plugins/blender_nodes.py"} <= names
+        own = {f"{name}.py" for name in ("__init__", "bake", "handle", "jaw", "operators", "panel", "scene")}
+        own |= {"blender_manifest.toml", "carried.py", "carried_usd.py"}
+        assert {name for name in names if "/" not in name} == own
+        assert {"jawusd/evaluator/rig.py", "jawusd/rig/animation.py", "jawusd/plugins/jawusd_reader.py"} <= names
         manifest = tomllib.loads(archive.read("blender_manifest.toml").decode())
         assert manifest["type"] == "add-on" and manifest["schema_version"] == "1.0.0"
         for name in names - {"blender_manifest.toml"}:

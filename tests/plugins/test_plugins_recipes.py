@@ -317,7 +317,7 @@ def test_one_command_copies_the_scripts(tmp_path):
     done = subprocess.run(
         [sys.executable, "-m", "jawusd.plugins", str(tmp_path / "scripts")], check=True, capture_output=True, text=True
     )
-    names = {"jawusd_reader.py", "jawusd_recipes.py", "blender_nodes.py"}
+    names = {"jawusd_reader.py", "jawusd_recipes.py"}
     assert {path.name for path in (tmp_path / "scripts").iterdir()} == names
     assert {Path(line).name for line in done.stdout.split()} == names
 

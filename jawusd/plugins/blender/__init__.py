@@ -5,9 +5,12 @@ The extension is built by `python -m jawusd.plugins FILE.zip`, which puts what i
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Mapping
+
 import bpy
 
-from . import carried, handle, jaw, operators, panel, scene
+from . import bake, carried, handle, jaw, operators, panel, scene
 
 
 class JawUsdHook(bpy.types.USDHook):
@@ -26,6 +29,13 @@ class JawUsdHook(bpy.types.USDHook):
             scene.take_rate(stage)
         scene.add_plates(stage, prim_map)
         return linked
+
+
+def glTF2_pre_export_callback(export_settings: Mapping[str, logging.Logger]) -> None:
+    """Warn of a jaw that a glTF file would hold without its motion; Blender's exporter calls it by this name."""
+    warning = bake.warning(bpy.context.scene)
+    if warning:
+        export_settings["log"].warning(warning)
 
 
 def register() -> None:

@@ -4,10 +4,9 @@
 from jawusd.errors import JawusdError as JawusdError
 from jawusd.evaluator import JawRig as JawRig
 from jawusd.geometry.arrays import Array as Array
+from jawusd.geometry.quaternion import continuous_wxyz as continuous_wxyz
 from jawusd.geometry.quaternion import wxyz_from_matrix as wxyz_from_matrix
 from jawusd.geometry.se3 import transform_point as transform_point
-from jawusd.plugins.blender_nodes import add_driven_nodes as add_driven_nodes
 from jawusd.plugins.jawusd_reader import LABELS as LABELS
 from jawusd.plugins.jawusd_reader import PARAMETERS as PARAMETERS
 from jawusd.plugins.jawusd_reader import find_blender_pxr as find_blender_pxr
-from jawusd.plugins.jawusd_reader import find_rigs as find_rigs

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import io
 import json
 import zlib
@@ -20,13 +21,15 @@ if TYPE_CHECKING:
 PrimMap = Mapping["Sdf.Path", list[bpy.types.ID]]  # prim path to the objects and data made from it
 
 SOURCE, KEEP, FPS = "jawusd_source", "keep_valid", "jawusd_fps"
-_STORE, _ACTOR = "jawusd_rig", "jawusd_actor"
-_FUNCTION = "jawusd_channel"
-_CHANNELS = (("location", 3), ("rotation_quaternion", 4))
-# Blender 5.0 sets driven values within 1e-4 of 0 or 1 to it: in a unit quaternion up to 0.02 mm at the chin. Places are
-# driven this far from where they are, and moved back by `delta_location`; quaternions are normalised before use, so
-# longer ones lose nothing.
-_AWAY_MM, _QUATERNION_LENGTH = 256.0, 1024.0
+_STORE, _ACTOR, _FIXED = "jawusd_rig", "jawusd_actor", "jawusd_fixed"
+_FUNCTION, _OLD_FUNCTION = "jawusd_offset", "jawusd_channel"
+# A driver that fails, as all do where the add-on is missing or scripts are off, gives 0. So the mandible's own
+# transform is its rest pose, and what is driven are offsets from it that are 0 there: the translation, and x, y, z of a
+# quaternion whose w stays as it is.
+_CHANNELS = (*(("delta_location", i) for i in range(3)), *(("delta_rotation_quaternion", i) for i in (1, 2, 3)))
+# Quaternions are normalised before use. Blender 5.0 sets driven values within 1e-4 of 0 or 1 to it, in a unit
+# quaternion up to 0.02 mm at the chin.
+_QUATERNION_W = 1024.0
 
 _rigs: dict[str, carried.JawRig] = {}  # by the text stored in the actor
 _poses: dict[tuple[str, float, float, float, bool], tuple[float, ...]] = {}
@@ -35,20 +38,18 @@ _poses: dict[tuple[str, float, float, float, bool], tuple[float, ...]] = {}
 def link_rigs(stage: Usd.Stage, prim_map: PrimMap) -> bool:
     """Add sliders, drivers and keys to the rigs of an imported stage; return whether there is one.
 
-    Rigs that bones move are left to them: drivers would move the mandible once more.
+    Rigs that cannot have sliders stay as imported; the panel says why.
     """
     from . import carried_usd
 
-    prims = carried.find_rigs(stage)
+    prims = carried_usd.rig_prims(stage)
     for prim in prims:
-        mandible_path = prim.GetRelationship("jaw:mandible").GetTargets()[0]
-        actor = _object_of(prim_map, prim.GetPath())
-        mandible = _object_of(prim_map, mandible_path)
+        actor, mandible = (_object_of(prim_map, path) for path in (prim.GetPath(), _mandible_path(prim)))
         if actor is None or mandible is None:
-            print(f"jawusd: {prim.GetPath()} was not imported with its mandible; the rig stays as baked")
+            _leave(prim, _nearest_object(prim_map, prim.GetPath()))
             continue
         if any(modifier.type == "ARMATURE" for mesh in meshes_of(mandible) for modifier in mesh.modifiers):
-            print(f"jawusd: bones move {prim.GetPath()}; for sliders import it with motion = transforms")
+            actor[_FIXED] = f"{prim.GetPath()}: bones move it. For sliders import it with motion = transforms."
             continue
         actor[SOURCE] = _source_of(prim)
         actor[FPS] = stage.GetTimeCodesPerSecond()
@@ -61,6 +62,26 @@ def link_rigs(stage: Usd.Stage, prim_map: PrimMap) -> bool:
     return bool(prims)
 
 
+def _mandible_path(prim: Usd.Prim) -> Sdf.Path:
+    return prim.GetRelationship("jaw:mandible").GetTargets()[0]
+
+
+def _leave(prim: Usd.Prim, nearest: bpy.types.Object | None) -> None:
+    """Note at an object why a rig below it has no sliders."""
+    if prim.IsInstance() or prim.IsInstanceProxy():
+        why = 'it is instanced. For sliders import it with "Scene Instancing" off.'
+    else:
+        why = "its mandible was not imported. For sliders import all of it."
+    print(f"jawusd: {prim.GetPath()}: {why}")
+    if nearest is not None:
+        nearest[_FIXED] = "\n".join(filter(None, (nearest.get(_FIXED), f"{prim.GetPath()}: {why}")))
+
+
+def fixed() -> list[str]:
+    """Return a line for each rig in the file that has no sliders: its prim, why, and what to do."""
+    return [line for found in bpy.data.objects for line in str(found.get(_FIXED, "")).splitlines()]
+
+
 def actors() -> list[bpy.types.Object]:
     """Return the objects that carry a rig."""
     return [found for found in bpy.data.objects if _STORE in found]
@@ -69,10 +90,16 @@ def actors() -> list[bpy.types.Object]:
 def mandible_of(actor: bpy.types.Object) -> bpy.types.Object:
     """Return the object that an actor moves.
 
-    Library overrides of reopened files point to the actor in the library: there the hierarchy tells.
+    Library overrides of reopened files point to the actor in the library: look below the actor first.
+
+    Raises:
+        carried.JawusdError: It was deleted.
     """
     below = [found for found in actor.children_recursive if _ACTOR in found]
-    return below[0] if below else next(found for found in bpy.data.objects if found.get(_ACTOR) == actor)
+    below += [found for found in bpy.data.objects if found.get(_ACTOR) == actor]
+    if not below:
+        raise carried.JawusdError(f"{actor.name} has no mandible any more.", hint="Import the rig again.")
+    return below[0]
 
 
 def meshes_of(mandible: bpy.types.Object) -> list[bpy.types.Object]:
@@ -133,15 +160,17 @@ def _source_of(prim: Usd.Prim) -> str:
 
 def _object_of(prim_map: PrimMap, path: Sdf.Path) -> bpy.types.Object | None:
     """Return the object made from a prim; of a prim merged with its only child, the child's."""
-    exact = [found for found in prim_map.get(path, []) if isinstance(found, bpy.types.Object)]
-    if exact:
-        return exact[0]
-    for other, made in prim_map.items():
-        if str(other).startswith(f"{path}/"):
-            for found in made:
-                if isinstance(found, bpy.types.Object):
-                    return found
-    return None
+    below = [other for other in prim_map if str(other).startswith(f"{path}/")]
+    return next((found for other in (path, *below) for found in _objects(prim_map, other)), None)
+
+
+def _nearest_object(prim_map: PrimMap, path: Sdf.Path) -> bpy.types.Object | None:
+    """Return the object made from a prim, or from the nearest one above it."""
+    return next((found for other in reversed(path.GetPrefixes()) for found in _objects(prim_map, other)), None)
+
+
+def _objects(prim_map: PrimMap, path: Sdf.Path) -> list[bpy.types.Object]:
+    return [found for found in prim_map.get(path, []) if isinstance(found, bpy.types.Object)]
 
 
 def _add_sliders(actor: bpy.types.Object, rig: carried.JawRig, values: list[float]) -> None:
@@ -163,87 +192,108 @@ def _set_limits(actor: bpy.types.Object, rig: carried.JawRig) -> None:
 
 
 def drive(mandible: bpy.types.Object, actor: bpy.types.Object) -> None:
-    """Let d1, d2, d3 of the actor drive the mandible, instead of the cached motion of the file."""
+    """Let d1, d2, d3 of the actor drive the mandible, instead of the cached motion of the file or keys."""
     for constraint in list(mandible.constraints):
         if constraint.type == "TRANSFORM_CACHE":
             mandible.constraints.remove(constraint)
+    release(mandible)
     mandible[_ACTOR] = actor
     mandible.rotation_mode = "QUATERNION"
-    mandible.delta_location = [-_AWAY_MM] * 3
-    channel = 0
-    for path, count in _CHANNELS:
-        for index in range(count):
-            driver = mandible.driver_add(path, index).driver
-            driver.type = "SCRIPTED"
-            driver.use_self = True
-            for name in (*carried.PARAMETERS, KEEP):
-                variable = driver.variables.new()
-                variable.name = name
-                variable.targets[0].id = actor
-                variable.targets[0].data_path = f'["{name}"]'
-            driver.expression = f"{_FUNCTION}(self, d1, d2, d3, {KEEP}, {channel})"
-            channel += 1
+    rest = rig_of(actor).pose((0.0, 0.0, 0.0))
+    mandible.location, mandible.rotation_quaternion = rest[:3, 3], carried.wxyz_from_matrix(rest[:3, :3])
+    mandible.delta_rotation_quaternion = (_QUATERNION_W, 0.0, 0.0, 0.0)
+    for channel, (path, index) in enumerate(_CHANNELS):
+        driver = mandible.driver_add(path, index).driver
+        driver.type = "SCRIPTED"
+        driver.use_self = True
+        for name in (*carried.PARAMETERS, KEEP):
+            variable = driver.variables.new()
+            variable.name = name
+            variable.targets[0].id = actor
+            variable.targets[0].data_path = f'["{name}"]'
+        driver.expression = f"{_FUNCTION}(self, d1, d2, d3, {KEEP}, {channel})"
 
 
 def release(mandible: bpy.types.Object) -> None:
-    """Remove the drivers of a mandible; it goes back to where it is at rest in its parent."""
-    for path, _ in _CHANNELS:
-        mandible.driver_remove(path)
-    mandible.delta_location = [0.0] * 3
-    mandible.location, mandible.rotation_quaternion = [0.0] * 3, [1.0, 0.0, 0.0, 0.0]
+    """Remove the drivers of a mandible, and its offset from its own transform."""
+    for curve in _drivers(mandible, (_FUNCTION, _OLD_FUNCTION)):
+        mandible.driver_remove(curve.data_path, curve.array_index)
+    mandible.delta_location, mandible.delta_rotation_quaternion = [0.0] * 3, [1.0, 0.0, 0.0, 0.0]
+
+
+def is_driven(mandible: bpy.types.Object) -> bool:
+    """Return whether the sliders move a mandible, rather than keys of its own."""
+    return bool(_drivers(mandible, (_FUNCTION,)))
+
+
+def _drivers(mandible: bpy.types.Object, functions: tuple[str, ...]) -> list[bpy.types.FCurve]:
+    """Return the drivers of a mandible that call one of the functions."""
+    data = mandible.animation_data
+    return [curve for curve in data.drivers if curve.driver.expression.startswith(functions)] if data else []
 
 
 def _key(actor: bpy.types.Object, prim: Usd.Prim) -> None:
-    """Give the sliders the samples of the file as linearly interpolated keys."""
+    """Give the sliders the samples and splines of the file as linearly interpolated keys."""
+    from . import carried_usd
+
     for name in carried.PARAMETERS:
         attribute = prim.GetAttribute(f"jaw:{name}")
-        times = attribute.GetTimeSamples()
-        for time in times:
-            actor[name] = attribute.Get(time)
-            actor.keyframe_insert(f'["{name}"]', frame=time)
+        times = carried_usd.key_times(attribute)
+        for time, value in zip(times, carried_usd.values_at(attribute, times)):
+            if value is not None:
+                actor[name] = value
+                actor.keyframe_insert(f'["{name}"]', frame=time)
     for curve in curves(actor):
         for point in curve.keyframe_points:
             point.interpolation = "LINEAR"
 
 
-def curves(actor: bpy.types.Object) -> list[bpy.types.FCurve]:
-    """Return the curves of the actor's action, in layers (Blender 4.4 and later) or without."""
-    action = actor.animation_data.action if actor.animation_data else None
-    if action is None:
+def curves(found: bpy.types.Object) -> list[bpy.types.FCurve]:
+    """Return the curves of an object's action."""
+    return [curve for held in curve_lists(found) for curve in held]
+
+
+def curve_lists(found: bpy.types.Object) -> list[bpy.types.bpy_prop_collection[bpy.types.FCurve]]:
+    """Return what holds the curves of an object: its slot in the action (Blender 4.4 and later), or the action."""
+    data = found.animation_data
+    if data is None or data.action is None:
         return []
-    if not getattr(action, "layers", None):
-        return list(action.fcurves)
-    bags = [bag for layer in action.layers for strip in layer.strips for bag in strip.channelbags]
-    return [curve for bag in bags for curve in bag.fcurves]
+    if not hasattr(data.action, "slots"):
+        return [data.action.fcurves]
+    bags = [bag for layer in data.action.layers for strip in layer.strips for bag in strip.channelbags]
+    return [bag.fcurves for bag in bags if bag.slot_handle == data.action_slot_handle]
 
 
-def _channel(mandible: bpy.types.Object, d1: float, d2: float, d3: float, keep: float, channel: int) -> float:
-    """Return one channel of the mandible's location (mm, the actor is scaled) and quaternion: the driver function."""
+def _offset(mandible: bpy.types.Object, d1: float, d2: float, d3: float, keep: float, channel: int) -> float:
+    """Return one channel of the mandible's offset from its rest pose (mm, the actor is scaled): the driver function."""
     actor = mandible[_ACTOR]
     key = (actor[_STORE], d1, d2, d3, bool(keep))
     if key not in _poses:
-        _poses.clear()  # the seven channels of one pose follow one another
+        _poses.clear()  # the six channels of one pose follow one another
         rig = rig_of(actor)
-        T = rig.pose(_kept(rig, (d1, d2, d3)) if keep else (d1, d2, d3))
-        turn = _QUATERNION_LENGTH * carried.wxyz_from_matrix(T[:3, :3])
-        _poses[key] = (*(T[:3, 3] + _AWAY_MM).tolist(), *turn.tolist())
+        T, rest = rig.pose(_kept(rig, (d1, d2, d3)) if keep else (d1, d2, d3)), rig.pose((0.0, 0.0, 0.0))
+        w, *turn = carried.wxyz_from_matrix(T[:3, :3] @ rest[:3, :3].T).tolist()
+        _poses[key] = (*(T[:3, 3] - rest[:3, 3]).tolist(), *(_QUATERNION_W / w * x for x in turn))
     return _poses[key][channel]
 
 
 @bpy.app.handlers.persistent
 def _install(*_: object) -> None:
     """Register the driver function, which Blender drops with every file it opens."""
-    bpy.app.driver_namespace[_FUNCTION] = _channel
+    bpy.app.driver_namespace[_FUNCTION] = _offset
     _poses.clear()
-    for mandible in bpy.data.objects:
+    for mandible in (found for found in bpy.data.objects if _ACTOR in found):
+        if _drivers(mandible, (_OLD_FUNCTION,)):
+            with contextlib.suppress(carried.JawusdError):  # the panel says that it cannot be read
+                drive(mandible, mandible[_ACTOR])
         # Blender marks a driver whose function was missing as broken and does not try again
-        for curve in mandible.animation_data.drivers if _ACTOR in mandible and mandible.animation_data else ():
+        for curve in _drivers(mandible, (_FUNCTION,)):
             curve.driver.expression = str(curve.driver.expression)
 
 
 def register() -> None:
     """Install the driver function, also in files to be opened and in the one that is open."""
-    bpy.app.driver_namespace[_FUNCTION] = _channel
+    bpy.app.driver_namespace[_FUNCTION] = _offset
     bpy.app.handlers.load_post.append(_install)
     bpy.app.timers.register(_install, first_interval=0.0)  # add-ons see no objects while they are enabled
 

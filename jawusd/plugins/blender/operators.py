@@ -1,4 +1,4 @@
-"""The buttons of the panel: key, handle, export, geometry nodes."""
+"""The buttons of the panel: key, handle, export, bake."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import bpy
 import numpy as np
 from bpy_extras.io_utils import ExportHelper
 
-from . import carried, handle, jaw
+from . import bake, carried, handle, jaw
 
 _CHIN_HALF_WIDTH_MM = 10.0
 
@@ -80,47 +80,77 @@ class JAWUSD_OT_export(bpy.types.Operator, ExportHelper):
         from . import carried_usd
 
         actor, scene = _actor(self), context.scene
-        present = scene.frame_current
-        frames, d = np.arange(scene.frame_start, scene.frame_end + 1.0), []
-        for frame in frames.astype(int).tolist():
-            scene.frame_set(frame)
-            d.append(jaw.shown(actor, jaw.parameters(actor)))
-        scene.frame_set(present)
+        frames = range(scene.frame_start, scene.frame_end + 1)
+        d = bake.parameters_over(actor, scene, frames)
         rig, rate = jaw.rig_of(actor), scene.render.fps / scene.render.fps_base
         try:
-            inside = rig.keep_inside(frames, d)
+            inside = rig.keep_inside(np.array(frames, dtype=np.float64), d)
             carried_usd.write_animation(self.filepath, actor[jaw.SOURCE], inside.times, inside.d, rate, rig=rig)
         except carried.JawusdError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        moved = float(np.linalg.norm(inside.d[inside.given] - np.array(d), axis=1).max())
+        moved = float(np.linalg.norm(inside.d[inside.given] - d, axis=1).max())
         self.report({"INFO"}, f"{len(frames)} frames, moved by {moved:.2f} mm at most to stay inside the bound")
         return {"FINISHED"}
 
 
-class JAWUSD_OT_nodes(bpy.types.Operator):
-    """The operator behind the geometry nodes button."""
+class JAW_OT_bake_to_keys(bpy.types.Operator):
+    """The operator behind the bake button: `bpy.ops.jaw.bake_to_keys()` from scripts."""
 
-    bl_idname = "jawusd.nodes"
-    bl_label = "Use Geometry Nodes"
+    bl_idname = "jaw.bake_to_keys"
+    bl_label = "Bake to Keys"
     bl_description = (
-        "Pose the meshes by geometry nodes, which need neither the add-on nor scripts; sliders and keys stay"
+        "Key the mandible at every frame and take it from the sliders: for FBX, glTF, game engines and render farms"
     )
+    bl_options = {"REGISTER", "UNDO"}
+
+    __annotations__ = {
+        "actor": bpy.props.StringProperty(description="Whose jaw; all in the file where it is empty"),
+        "frames": bpy.props.EnumProperty(
+            items=[
+                ("SCENE", "Scene", "From the start to the end of the scene"),
+                ("TAKE", "Take", "From the first to the last key of the sliders"),
+            ]
+        ),
+    }
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """Bake."""
+        chosen, scene = [found for found in jaw.actors() if self.actor in ("", found.name)], context.scene
+        if not chosen:
+            self.report({"ERROR"}, f"There is no such jaw rig ({self.actor or 'any'}). Import one from USD.")
+            return {"CANCELLED"}
+        try:
+            spans = [bake.frames_of(actor, scene, self.frames) for actor in chosen]
+            for actor, frames in zip(chosen, spans):
+                bake.bake(actor, scene, frames)
+        except carried.JawusdError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        names = ", ".join(f"{actor.name}: frames {span[0]} .. {span[-1]}" for actor, span in zip(chosen, spans))
+        self.report({"INFO"}, f"{names}. The sliders move the jaw again after {JAW_OT_use_sliders.bl_label}")
+        return {"FINISHED"}
+
+
+class JAW_OT_use_sliders(bpy.types.Operator):
+    """The operator behind the button that takes a bake back."""
+
+    bl_idname = "jaw.use_sliders"
+    bl_label = "Use Sliders"
+    bl_description = "Remove the keys that were baked; the sliders move the jaw again"
     bl_options = {"REGISTER", "UNDO"}
 
     __annotations__ = {"actor": bpy.props.StringProperty()}
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        """Replace the drivers by nodes."""
-        actor = _actor(self)
-        mandible = jaw.mandible_of(actor)
-        jaw.release(mandible)
-        rig = jaw.rig_of(actor)
-        carried.add_driven_nodes(rig.kind, rig.arrays, jaw.meshes_of(mandible), actor)
+        """Drive the mandible again."""
+        mandible = jaw.mandible_of(_actor(self))
+        bake.forget(mandible)
+        jaw.drive(mandible, _actor(self))
         return {"FINISHED"}
 
 
-_CLASSES = (JAWUSD_OT_key, JAWUSD_OT_handle, JAWUSD_OT_export, JAWUSD_OT_nodes)
+_CLASSES = (JAWUSD_OT_key, JAWUSD_OT_handle, JAWUSD_OT_export, JAW_OT_bake_to_keys, JAW_OT_use_sliders)
 
 
 def register() -> None:

@@ -1,10 +1,10 @@
-"""The sidebar panel: sliders of the rigs in the scene, and whether their pose is valid."""
+"""The panels: sliders of the rigs in the scene, whether their pose is valid, and what an export would lose."""
 
 from __future__ import annotations
 
 import bpy
 
-from . import carried, jaw, operators
+from . import bake, carried, jaw, operators
 
 
 class JAWUSD_PT_sliders(bpy.types.Panel):
@@ -17,8 +17,8 @@ class JAWUSD_PT_sliders(bpy.types.Panel):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        """Show the panel when the scene has a rig."""
-        return bool(jaw.actors())
+        """Show the panel when the file has a rig."""
+        return bool(jaw.actors() or jaw.fixed())
 
     def draw(self, context: bpy.types.Context) -> None:
         """Draw sliders, bound and buttons of every rig."""
@@ -26,7 +26,7 @@ class JAWUSD_PT_sliders(bpy.types.Panel):
             box = self.layout.box()
             box.label(text=actor.name)
             try:
-                rig = jaw.rig_of(actor)
+                rig, driven = jaw.rig_of(actor), jaw.is_driven(jaw.mandible_of(actor))
             except carried.JawusdError as error:
                 box.label(text=str(error), icon="ERROR")
                 continue
@@ -44,7 +44,41 @@ class JAWUSD_PT_sliders(bpy.types.Panel):
                 button = row.operator(operators.JAWUSD_OT_handle.bl_idname, text=f"Handle: {place.lower()}")
                 button.actor, button.at = actor.name, place
             box.operator(operators.JAWUSD_OT_export.bl_idname).actor = actor.name
-            box.operator(operators.JAWUSD_OT_nodes.bl_idname).actor = actor.name
+            row = box.row()
+            if driven:
+                for frames in ("SCENE", "TAKE"):
+                    button = row.operator(operators.JAW_OT_bake_to_keys.bl_idname, text=f"Bake: {frames.lower()}")
+                    button.actor, button.frames = actor.name, frames
+                box.label(text="FBX, glTF and render farms need baked keys", icon="INFO")
+            else:
+                row.operator(operators.JAW_OT_use_sliders.bl_idname).actor = actor.name
+                box.label(text="Baked to keys: the sliders do not move the jaw", icon="INFO")
+        for text in jaw.fixed():
+            self.layout.label(text=text, icon="LOCKED")
+
+
+class JAW_PT_export(bpy.types.Panel):
+    """What an export loses, beside its settings in the file browser."""
+
+    bl_label = "Jaw"
+    bl_space_type = "FILE_BROWSER"
+    bl_region_type = "TOOL_PROPS"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Show the panel where a format is exported that holds no drivers, of a file with a rig."""
+        exporter = context.space_data.active_operator
+        return exporter is not None and exporter.bl_idname in bake.SETTINGS and bool(jaw.actors())
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw the warning, the bake, and the settings of the exporter that matter."""
+        warning, exporter = bake.warning(context.scene), context.space_data.active_operator
+        if warning:
+            self.layout.label(text=warning, icon="ERROR")
+            self.layout.operator(operators.JAW_OT_bake_to_keys.bl_idname)
+        for name, advice in bake.SETTINGS[exporter.bl_idname].items():
+            self.layout.label(text=advice)
+            self.layout.prop(exporter, name)
 
 
 def _readout(rig: carried.JawRig, d: tuple[float, float, float]) -> list[tuple[str, str]]:
@@ -58,11 +92,16 @@ def _readout(rig: carried.JawRig, d: tuple[float, float, float]) -> list[tuple[s
     return lines
 
 
+_CLASSES = (JAWUSD_PT_sliders, JAW_PT_export)
+
+
 def register() -> None:
-    """Register the panel."""
-    bpy.utils.register_class(JAWUSD_PT_sliders)
+    """Register the panels."""
+    for cls in _CLASSES:
+        bpy.utils.register_class(cls)
 
 
 def unregister() -> None:
-    """Unregister it."""
-    bpy.utils.unregister_class(JAWUSD_PT_sliders)
+    """Unregister them."""
+    for cls in reversed(_CLASSES):
+        bpy.utils.unregister_class(cls)

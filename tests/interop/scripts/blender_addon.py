@@ -129,12 +129,22 @@ def dragged(way):
     return found
 
 
-def with_nodes(d):
-    """Let geometry nodes pose the mandible, the add-on disabled; return the vertices of its mesh."""
-    bpy.ops.jawusd.nodes(actor="Actor")
-    bpy.ops.preferences.addon_disable(module="bl_ext.test_repository.jawusd_blender")
-    posed(d)
-    return vertices()
+def from_older_version(package, folder, take, d):
+    """Reopen a file as the add-on before 0.3.0 saved it; return the mandible posed by d."""
+    bpy.ops.wm.read_homefile(use_empty=True)
+    bpy.ops.wm.usd_import(filepath=take)
+    mandible, actor = bpy.data.objects["Mandible"], bpy.data.objects["Actor"]
+    actor.animation_data_clear()
+    package.jaw.release(mandible)
+    mandible.delta_location = [-256.0] * 3
+    for channel, (path, index) in enumerate(
+        [("location", i) for i in range(3)] + [("rotation_quaternion", i) for i in range(4)]
+    ):
+        mandible.driver_add(path, index).driver.expression = f"jawusd_channel(self, d1, d2, d3, keep_valid, {channel})"
+    path = os.path.join(folder, "older.blend")
+    bpy.ops.wm.save_as_mainfile(filepath=path)
+    bpy.ops.wm.open_mainfile(filepath=path)
+    return posed(d)
 
 
 def vertices():
@@ -178,9 +188,8 @@ def main(archive, folder, take, poses, bones):
     posed(poses["inside"][0])
     result["dragged"] = dragged((1.0, -3.0, 1.0))
     result["frames"] = [scene.frame_start, scene.frame_end]
-    result["nodes"] = with_nodes(poses["inside"][0])
-    bpy.ops.preferences.addon_enable(module="bl_ext.test_repository.jawusd_blender")
     result["bones"] = by_bones(package, bones)
+    result["older"] = from_older_version(package, folder, take, poses["inside"][1])
     result["overridden"] = overridden(package, folder, take, poses["outside"][0])
     print("RESULT " + json.dumps(result))
 
