@@ -5,6 +5,7 @@ fuzz_structures.py), or made from the grammar of USD and from schemas (fuzz_gram
 that may use 2 GB of address space. One row per reader:
 
     accepted, refused   the input was read, or ended in a JawusdError
+    ended               the copy of the worker that reads USD was ended by a signal: one message of a command
     tracebacks          ended in any other exception, or killed the process (crashes: how many of them)
     hangs               more than 10 s of processor time, or 180 s of waiting
     memory              largest resident memory of the process while reading [MB], about 300 of it before it reads
@@ -37,13 +38,13 @@ def main() -> None:
     options = parser.parse_args()
     shares = {reader: FEWER.get(reader, 1.0) for reader in options.readers}
     counts = {reader: -int(-options.inputs * share // sum(shares.values())) for reader, share in shares.items()}
-    title = f"{'reader':<14}{'inputs':>7}{'accepted':>9}{'refused':>8}{'tracebacks':>11}{'(crashes)':>10}{'hangs':>6}"
+    title = f"{'reader':<14}{'inputs':>7}{'accepted':>9}{'refused':>8}{'ended':>6}{'tracebacks':>11}{'(crashes)':>10}{'hangs':>6}"
     print(f"{title}{'memory':>8}{'slowest':>8}{'escapes':>8}", flush=True)
     bad = []
     with tempfile.TemporaryDirectory() as folder:
         for reader, found in run(Path(folder) / "work", counts, options.seed):
             bad += [(reader, *fault) for fault in found.bad]
-            row = f"{reader:<14}{counts[reader]:>7}{found.accepted:>9}{found.refused:>8}"
+            row = f"{reader:<14}{counts[reader]:>7}{found.accepted:>9}{found.refused:>8}{found.ended:>6}"
             row += f"{found.traceback + found.crash:>11}{found.crash:>10}{found.hang:>6}"
             print(f"{row}{found.peak_mb:>8.0f}{found.seconds:>8.1f}{found.escape:>8}", flush=True)
     print(f"{sum(counts.values())} inputs, {len(bad)} faults")

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 HERE = Path(__file__).parent
+HELD = ("accepted", "refused", "ended")
 MOST_CPU_S, MOST_WALL_S = 10.0, 180.0
 READERS = (
     "capture.toml", "calibration", "PNG masks", "video masks", "PLY, STL, OBJ", "tracks npz", "model npz", "keys",
@@ -24,6 +25,7 @@ class Tally:
 
     accepted: int = 0
     refused: int = 0
+    ended: int = 0
     traceback: int = 0
     crash: int = 0
     hang: int = 0
@@ -37,7 +39,7 @@ class Tally:
         setattr(self, outcome, getattr(self, outcome) + 1)
         self.peak_mb = max(self.peak_mb, answer.get("peak_mb", 0.0))
         self.seconds = max(self.seconds, answer.get("seconds", 0.0))
-        if outcome not in ("accepted", "refused"):
+        if outcome not in HELD:
             self.bad.append((what, outcome, answer["error"]))
 
 

@@ -1,7 +1,8 @@
 """Damage files and read them, in a process of its own: python fuzz_worker.py FOLDER < requests > answers (JSON lines).
 
 Request {"reader", "seed"}: damage one of the reader's files as the seed says and read it. Answer {"outcome", "error",
-"peak_mb", "seconds"}; outcome is accepted, refused, traceback or escape. Seconds are the process's own.
+"peak_mb", "seconds"}; outcome is accepted, refused, ended (a copy that read it, by a signal), traceback or escape.
+Seconds are the process's own.
 """
 
 import json
@@ -14,7 +15,10 @@ import traceback
 import warnings
 from pathlib import Path
 
+from forked import in_copy
+
 MEMORY = 2 << 30
+OF_OPENUSD = ("usda", "usdc", "usdz", "USD grammar")  # read in copies of this process
 CANARY = "not to be read"
 
 
@@ -63,7 +67,7 @@ class Guard:
                 self.look(event, path)
         elif event in self._PATHS:
             self.look(event, args[0])
-        elif event in self._NEVER and args[:1] != (sys.executable,):  # which reads once more what ended a child
+        elif event in self._NEVER:
             Guard.found = f"{event} {args!r:.100}"
 
     @staticmethod
@@ -96,8 +100,6 @@ def answer(request, targets, folder):
     """Do one request."""
     import numpy as np
 
-    from jawusd.errors import JawusdError
-
     options = targets[request["reader"]]
     rng = np.random.default_rng([request["seed"], sum(request["reader"].encode())])
     target = options[rng.integers(len(options))]
@@ -111,6 +113,21 @@ def answer(request, targets, folder):
     before = outside(place.parent)
     with open("/proc/self/clear_refs", "w") as handle:
         handle.write("5")  # forget the peak so far
+    forked = request["reader"] in OF_OPENUSD
+    found = in_copy(lambda: outcome(target, place, path)) if forked else outcome(target, place, path)
+    if isinstance(found, str):
+        found = {"outcome": "ended", "error": found}
+    if outside(place.parent) != before:
+        found |= {"outcome": "escape", "error": f"{before} became {outside(place.parent)}"}
+    if path.exists():
+        shutil.copyfile(target.folder / target.file, path)
+    return found | {"file": target.file}
+
+
+def outcome(target, place, path):
+    """Read a damaged file and return how that went."""
+    from jawusd.errors import JawusdError
+
     Guard.found, Guard.watching = None, True
     start = time.process_time()
     outcome, error = "accepted", None
@@ -118,18 +135,17 @@ def answer(request, targets, folder):
         target.read(place, path)
     except JawusdError as refusal:
         outcome, error = "refused", str(refusal)[:300]
+    except MemoryError:  # which commands say in one line
+        outcome, error = "refused", "memory"
     except PermissionError as escape:
         outcome, error = "escape", str(escape)
     except BaseException:
         outcome, error = "traceback", traceback.format_exc()[-1500:]
     seconds = time.process_time() - start
     Guard.watching = False
-    peak = status_mb("VmHWM")
-    if Guard.found is not None or outside(place.parent) != before:
-        outcome, error = "escape", Guard.found or f"{before} became {outside(place.parent)}"
-    if path.exists():
-        shutil.copyfile(target.folder / target.file, path)
-    return {"outcome": outcome, "error": error, "peak_mb": peak, "seconds": round(seconds, 3), "file": target.file}
+    if Guard.found is not None:
+        outcome, error = "escape", Guard.found
+    return {"outcome": outcome, "error": error, "peak_mb": status_mb("VmHWM"), "seconds": round(seconds, 3)}
 
 
 def damaged(target, rng):

@@ -14,6 +14,8 @@ import sys
 from pathlib import Path
 from random import Random
 
+from forked import in_copy
+
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 STRACE = shutil.which("strace")
@@ -108,24 +110,27 @@ _STEPS = {
 }
 
 
-def main(folder):
-    """Run the commands; print how many ended well."""
+def _ends_well(step, shot):
     import typer
 
     from jawusd.errors import JawusdError
 
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(JawusdError, typer.Exit):
+        step(shot)
+        return True
+    return False
+
+
+def main(folder):
+    """Run the commands, each in a copy of this process; print how many ended well."""
     rigs = sorted(path for path in folder.iterdir() if path.is_dir())
     counts = dict.fromkeys(_STEPS, 0)
     for name, step in _STEPS.items():
         for number, rig in enumerate([rigs[0], *rigs]):  # what is imported on first use is read before the first mark
             if number:
                 _mark(rig, name)
-            with contextlib.redirect_stdout(io.StringIO()):
-                try:
-                    step(rig / ("shot.usda" if number else "actor.usda"))
-                    counts[name] += bool(number)
-                except (JawusdError, typer.Exit):
-                    pass
+            ended = in_copy(lambda: _ends_well(step, rig / "shot.usda")) if number else step(rig / "actor.usda")
+            counts[name] += ended is True
         _mark(rigs[0], _BETWEEN)
     print(f"{len(rigs)} rigs; ended well: " + ", ".join(f"{name} {count}" for name, count in counts.items()))
 
