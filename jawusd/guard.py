@@ -29,6 +29,7 @@ except ImportError:  # on Windows, which has no such limits
 SETTING = "JAWUSD_MEMORY_GB"
 
 _SHARE, _LEAST_GB = 0.75, 4.0  # of the machine's memory; ordinary builds take less than the least
+_LEAST_SPACE_GB = 1.5  # 1.3 GB with OpenUSD's libraries
 _CHILD = "_JAWUSD_CHILD"  # marks the child where processes cannot fork
 _SI_KERNEL = 0x80  # of Linux's siginfo.h: a terminal sent the signal, to the child as well
 _PR_SET_PDEATHSIG = 1  # of Linux's prctl.h
@@ -47,6 +48,7 @@ def begin() -> None:
     global _in_hand
     try:
         limit = memory_limit()
+        _check_space()
     except ResourceError as error:
         _leave_with(error)
     if os.environ.pop(_CHILD, None):
@@ -90,6 +92,16 @@ def machine_memory() -> int:
         with contextlib.suppress(OSError, ValueError):  # "max"
             found = min(found, int(Path(name).read_text()))
     return found
+
+
+def _check_space() -> None:
+    """Refuse less address space than OpenUSD's libraries need: others report what they lack as damage of files."""
+    space = -1 if resource is None else resource.getrlimit(resource.RLIMIT_AS)[0]  # -1: no limit
+    if 0 <= space < _LEAST_SPACE_GB * 1e9:
+        found = (
+            f"address space is limited to {space / 1e9:.2g} GB (ulimit -v), at least {_LEAST_SPACE_GB:g} GB are needed."
+        )
+        raise ResourceError(found)
 
 
 def limit_process(memory: int, cpu_s: int | None = None) -> None:

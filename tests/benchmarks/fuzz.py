@@ -38,8 +38,8 @@ def main() -> None:
     options = parser.parse_args()
     shares = {reader: FEWER.get(reader, 1.0) for reader in options.readers}
     counts = {reader: -int(-options.inputs * share // sum(shares.values())) for reader, share in shares.items()}
-    title = f"{'reader':<14}{'inputs':>7}{'accepted':>9}{'refused':>8}{'ended':>6}{'tracebacks':>11}{'(crashes)':>10}{'hangs':>6}"
-    print(f"{title}{'memory':>8}{'slowest':>8}{'escapes':>8}", flush=True)
+    title = f"{'reader':<14}{'inputs':>7}{'accepted':>9}{'refused':>8}{'ended':>6}{'tracebacks':>11}{'(crashes)':>10}"
+    print(f"{title}{'hangs':>6}{'memory':>8}{'slowest':>8}{'escapes':>8}", flush=True)
     bad = []
     with tempfile.TemporaryDirectory() as folder:
         for reader, found in run(Path(folder) / "work", counts, options.seed):

@@ -73,6 +73,16 @@ def test_the_limit_is_a_share_of_the_machine_that_can_be_set(monkeypatch):
         assert guarded("", env={guard.SETTING: wrong}).stderr.startswith("jawusd: JAWUSD_MEMORY_GB is")
 
 
+@pytest.mark.parametrize("most_mb", [60, 300, 900])
+def test_too_little_address_space_is_one_message(most_mb):
+    """Libraries crash there, or call good files damaged."""
+    limited = f"import resource; resource.setrlimit(resource.RLIMIT_AS, ({most_mb} << 20,) * 2); "
+    line = [sys.executable, "-c", limited + "from jawusd.__main__ import main; main()", "check", "capture.toml"]
+    done = subprocess.run(line, capture_output=True, text=True, check=False)
+    assert done.returncode == ResourceError.exit_code and done.stderr.count("\n") == 1
+    assert "(ulimit -v), at least 1.5 GB are needed" in done.stderr
+
+
 def test_no_core_files_are_left():
     assert guarded("print(resource.getrlimit(resource.RLIMIT_CORE)[0])").stdout == "0\n"
 

@@ -11,6 +11,7 @@ import re
 import shutil
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from random import Random
 
@@ -129,8 +130,11 @@ def main(folder):
         for number, rig in enumerate([rigs[0], *rigs]):  # what is imported on first use is read before the first mark
             if number:
                 _mark(rig, name)
-            ended = in_copy(lambda: _ends_well(step, rig / "shot.usda")) if number else step(rig / "actor.usda")
-            counts[name] += ended is True
+            run = partial(_ends_well, step, rig / ("shot.usda" if number else "actor.usda"))
+            if number:
+                counts[name] += in_copy(run) is True
+            else:
+                run()
         _mark(rigs[0], _BETWEEN)
     print(f"{len(rigs)} rigs; ended well: " + ", ".join(f"{name} {count}" for name, count in counts.items()))
 
