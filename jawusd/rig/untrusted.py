@@ -44,7 +44,7 @@ FAULTS = (
     ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError, Tf.ErrorException,
 )  # fmt: skip
 #: Processor time [s] for opening a stage in a guarded process. Rigs take 0.02 s, stages of a million prims some five.
-MOST_CPU_S = 30
+MOST_CPU_S = 20
 _ALLOW = "If you trust it, allow its folder with --allow or the setting JAWUSD_ALLOW."
 _UNREADABLE = "is not a USD file that OpenUSD can read"
 #: Prims and properties in a layer, and samples of an attribute, that are read.
