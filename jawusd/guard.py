@@ -7,9 +7,9 @@ parent does nothing but wait: it passes signals and the exit code on.
 from __future__ import annotations
 
 import contextlib
+import gc
 import mmap
 import os
-import shlex
 import signal
 import sys
 import time
@@ -59,6 +59,7 @@ def begin() -> None:
     passed = {getattr(signal, name) for name in _PASSED}
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {*passed, signal.SIGCHLD})
     parent = os.getpid()
+    gc.freeze()  # collections would copy what parent and child share
     child = os.fork()
     if child:
         _leave_as(_wait(child, passed))
@@ -151,6 +152,8 @@ def take_in_hand(path: str | PathLike[str]) -> None:
 
 def file_in_hand() -> str:
     """Return the file that was noted last, else the command line."""
+    import shlex
+
     noted = bytes(_in_hand).rstrip(b"\0") if _in_hand is not None else b""
     return os.fsdecode(noted) if noted else shlex.join(["jawusd", *sys.argv[1:]])
 

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TextIO
 
 from jawusd.errors import OutputError, shown
-from jawusd.formats.atomic import destination, is_stream, open_stream
 
 _CODES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
@@ -28,6 +27,7 @@ class RunLog:
             OutputError: it cannot be written.
         """
         from jawusd import __version__
+        from jawusd.formats.atomic import destination, is_stream, open_stream
 
         self._start = time.monotonic()
         where = destination(path)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import faulthandler
 import io
 import os
 import sys
@@ -54,6 +53,8 @@ def _root(
     global _verbose  # errors are printed outside of every context
     _verbose = verbose
     if verbose:
+        import faulthandler
+
         faulthandler.enable()
     if log is not None:
         context.obj = context.with_resource(logged(log, sys.argv[1:]))

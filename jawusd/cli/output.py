@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -21,6 +20,8 @@ if TYPE_CHECKING:
 def emit(data: Mapping[str, object], as_json: bool, lines: Callable[[], list[str]]) -> None:
     """Print a result as one JSON object, or as lines for people."""
     if as_json:
+        import json
+
         typer.echo(json.dumps(plain(data), indent=1))
     else:
         for line in lines():
