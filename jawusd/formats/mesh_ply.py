@@ -173,15 +173,17 @@ def _numbers(text: bytes) -> tuple[Array, str | None]:
     """Return the numbers of a text up to the first word that is none, and that word unless it is the last."""
     words = text.split()
     try:
-        return np.array(words, dtype="S").astype(np.float64), None
+        return np.fromiter(map(float, words), np.float64, len(words)), None
     except ValueError:
-        for k, word in enumerate(words):
+        whole = 0
+        for word in words:
             try:
                 float(word)
             except ValueError:
-                shown = word.decode("utf-8", errors="replace") if k + 1 < len(words) else None
-                return np.array(words[:k], dtype="S").astype(np.float64), shown
-        raise
+                break
+            whole += 1
+        shown = words[whole].decode("utf-8", errors="replace") if whole + 1 < len(words) else None
+        return np.fromiter(map(float, words[:whole]), np.float64, whole), shown
 
 
 def _check_columns(path: Path, text: bytes, rows: int, used: int) -> None:

@@ -4,6 +4,7 @@ The files are written here, byte by byte, from one surface of known quads; what 
 """
 
 import struct
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -137,6 +138,15 @@ def test_ply_is_read(tmp_path: Path, name: str) -> None:
     mesh = load_mesh(tmp_path / "a.ply")
     is_the_surface(mesh)
     np.testing.assert_allclose(mesh.vertices, POINTS, atol=1e-4)  # in the order of the file
+
+
+def test_a_long_word_in_a_text_takes_no_memory_for_every_other_word(tmp_path: Path) -> None:
+    (tmp_path / "a.ply").write_bytes(ply("", QUADS) + b"x" * 40_000_000 + b" end\n")
+    tracemalloc.start()
+    is_the_surface(load_mesh(tmp_path / "a.ply"))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 400e6  # as many copies of the word as there are numbers would be 30 GB
 
 
 def lines(data: bytes, count: int) -> bytes:
