@@ -36,6 +36,7 @@ from jawusd.pipeline.subject import subject_of_build
 from jawusd.pipeline.view import ContactView, open_viewer
 from jawusd.report.figures import condyle_figure
 from jawusd.report.style import BLUE, VERMILION, figure_bytes
+from jawusd.rig import describe
 
 ROOT = Path(__file__).resolve().parents[1]
 CAPTURE = ROOT / "examples" / "capture"
@@ -124,7 +125,7 @@ def contacts(out: Path, folder: Path) -> Path:
     """Draw where teeth touch in the closed bite and in a glide to the left, as articulating paper marks them."""
     actor = out / "actor.usda"
     rig = jawusd.load(actor)
-    view, left = ContactView(actor, rig, "/Actor"), 0.6 * float(rig.ranges(0.0).d2_max)
+    view, left = ContactView(actor, rig, describe(actor)["prim"]), 0.6 * float(rig.ranges(0.0).d2_max)
     poses = {"closed bite": (0.0, 0.0, 0.0), f"gliding {left:.1f} mm to the left": (0.0, left, 0.0)}
     pictures = [Image.fromarray(view.draw(np.array(d))) for d in poses.values()]
     font, line = ImageFont.load_default(20), 44

@@ -15,7 +15,6 @@ import jawusd
 from jawusd.rig import write_animation
 
 FPS = 24.0
-MANDIBLE = "/Actor/geo/Mandible"
 
 
 def main() -> None:
@@ -44,7 +43,7 @@ def main() -> None:
     write_animation(options.out, options.rig, kept.times, kept.d, FPS)
 
     stage = Usd.Stage.Open(str(options.out))
-    mandible = UsdGeom.Xformable(stage.GetPrimAtPath(MANDIBLE))
+    mandible = UsdGeom.Xformable(stage.GetDefaultPrim().GetPrimAtPath("geo/Mandible"))
     incisor = np.append(rig.landmarks[0], 1.0)
     print(f"{options.out}: frames {stage.GetStartTimeCode():g} .. {stage.GetEndTimeCode():g}")
     for label, at in (("at whole frames", times), ("half way between", times[:-1] + 0.5)):

@@ -18,13 +18,16 @@ def main(stage: Path, out: Path) -> None:
     bpy.ops.wm.read_homefile(use_empty=True)
     bpy.ops.wm.usd_import(filepath=str(stage.resolve()), relative_path=False)
     scene, teeth = bpy.context.scene, bpy.data.objects["LowerTeethMesh"]
+    actor = teeth
+    while actor.parent is not None:
+        actor = actor.parent
     print(f"objects: {', '.join(sorted(thing.name for thing in bpy.data.objects))}")
     print(f"Blender {bpy.app.version_string}: frames {scene.frame_start} .. {scene.frame_end}")
 
     travelled_mm, rest = 0.0, None
     for frame in range(scene.frame_start, scene.frame_end + 1):
         scene.frame_set(frame)
-        to_actor = bpy.data.objects["Actor"].matrix_world.inverted() @ teeth.matrix_world
+        to_actor = actor.matrix_world.inverted() @ teeth.matrix_world
         place = to_actor @ teeth.data.vertices[0].co
         rest = place.copy() if rest is None else rest
         travelled_mm = max(travelled_mm, (place - rest).length)

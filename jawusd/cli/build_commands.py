@@ -23,6 +23,7 @@ from jawusd.cli.options import (
     MandibleOption,
     Method,
     Outside,
+    PrimName,
     RestOption,
     RigidOption,
     UnitOption,
@@ -69,6 +70,7 @@ def build(
         bool, typer.Option("--dry-run", help="Say which stages would run, which are kept, and about how long.")
     ] = False,
     jobs: Jobs = 2,
+    prim_name: PrimName = None,
     allow_outside: Outside = False,
     as_json: Json = False,
 ) -> None:
@@ -87,6 +89,7 @@ def build(
         resume=resume,
         fresh=fresh,
         allow_outside=allow_outside,
+        prim_name=prim_name,
         command=command_line(context),
     )
     if dry_run:
@@ -205,6 +208,7 @@ def bake(
     mandible: MandibleOption = None,
     fps: Annotated[float, typer.Option(min=0.001, help="Frames per second of a person without a capture.")] = 24.0,
     table: Annotated[int, typer.Option(help="Knots per axis of the sampled decoder: 17, 33 or 65.")] = 33,
+    prim_name: PrimName = None,
     force: Force = False,
     allow_outside: Outside = False,
     as_json: Json = False,
@@ -219,7 +223,7 @@ def bake(
     subject = subject_given(name, capture, upper_teeth, lower_teeth, mandible, None, allow_outside)
     check_same_jaw(subject, loaded)
     with progress() as report:
-        files = bake_subject(subject, loaded, out, report, fps=fps, table_size=table)
+        files = bake_subject(subject, loaded, out, report, fps=fps, table_size=table, prim_name=prim_name)
     emit({"files": files}, as_json, lambda: [str(path) for path in files])
 
 

@@ -59,6 +59,23 @@ Allow = Annotated[
 Prim = Annotated[str | None, typer.Option("--prim", help="Which rig, where a stage has several: the path of its prim.")]
 
 
+def _prim_name(name: str | None) -> str | None:
+    from jawusd.rig.layout import check_prim_name
+
+    return None if name is None else check_prim_name(name)
+
+
+PrimName = Annotated[
+    str | None,
+    typer.Option(
+        "--prim-name",
+        callback=_prim_name,
+        help="Name of the actor's prim and joints; else after the actor.",
+        show_default=False,
+    ),
+]
+
+
 def rig_of_folder(rig: Path | None) -> Path | None:
     """Return the rig's file where the folder of a build is given: the callback of every argument that takes a rig."""
     from jawusd.rig.layout import actor_in_folder

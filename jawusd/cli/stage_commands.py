@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from jawusd.cli.options import USD_SUFFIXES, Allow, Force, Json, Prim, RigArg, load_named
+from jawusd.cli.options import USD_SUFFIXES, Allow, Force, Json, Prim, PrimName, RigArg, load_named
 from jawusd.cli.output import emit
 from jawusd.errors import JawusdError
 from jawusd.formats.atomic import refuse_existing
@@ -90,6 +90,7 @@ def publish(
     prefix: Annotated[
         str | None, typer.Option(help="Start of every file's name; the actor's name if not given.", show_default=False)
     ] = None,
+    prim_name: PrimName = None,
     force: Force = False,
     allow: Allow = None,
     as_json: Json = False,
@@ -100,11 +101,11 @@ def publish(
 
     refuse_existing(out, force)
     if not source.is_dir():
-        if out.suffix.lower() != ".usdz" or prefix is not None:
-            raise typer.BadParameter("of a shot, name a .usdz and no prefix.", param_hint="--out")
+        if out.suffix.lower() != ".usdz" or prefix is not None or prim_name is not None:
+            raise typer.BadParameter("of a shot, name a .usdz, and neither prefix nor prim.", param_hint="--out")
         files = [str(write_package(out, source))]
     else:
-        files = [str(path) for path in publish_rig(source, out, prefix)]
+        files = [str(path) for path in publish_rig(source, out, prefix, prim_name)]
     emit({"files": files}, as_json, lambda: files)
 
 
@@ -161,7 +162,6 @@ def holds_stage(path: Path) -> bool:
 def _fitted(
     loaded: JawRig, rig: Path, stage: Path, mandible: str | None, skull: str | None, prim: str | None
 ) -> StageMotion:
-    from jawusd.rig.layout import ACTOR
     from jawusd.rig.rebake import StageMotion
     from jawusd.rig.stage_poses import fit_poses_of_stage
 
@@ -169,7 +169,7 @@ def _fitted(
     if rig.resolve() == stage.resolve():
         message = f"meshes of {stage} deform, and are fitted to those of the rig: name the rig before it."
         raise typer.BadParameter(message, param_hint="RIG")
-    found = fit_poses_of_stage(stage, rig, mandible, skull, prim or ACTOR)
+    found = fit_poses_of_stage(stage, rig, mandible, skull, prim)
     d, residual_mm = loaded.encode(found.T)
     return StageMotion(found.frames.astype(float), d, found.fps, "mandible", residual_mm, fitted=True)
 

@@ -47,12 +47,14 @@ def bake_subject(
     *,
     fps: float = DEFAULT_FPS,
     table_size: int = 33,
+    prim_name: str | None = None,
 ) -> list[Path]:
     """Write the rig of a person with meshes, and the captured motion if the model has any; return the files.
 
     Args:
         fps: frames per second if the subject has none.
         table_size: knots per axis of the sampled decoder, 17, 33 or 65.
+        prim_name: of the actor's prim; None: after the person.
 
     Raises:
         RigError, OutputError: the rig cannot be written.
@@ -61,6 +63,7 @@ def bake_subject(
     from jawusd.imaging.decimation import bone_proxy_of, proxy_of
     from jawusd.imaging.mesh_cleaning import manifold
     from jawusd.rig.bake import bake_rig
+    from jawusd.rig.layout import prim_name_of
 
     subject = registered_subject(subject, model.meta)
     # Bones come from segmented scans with all their faults; teeth scans stay as they are, vertex for vertex.
@@ -82,6 +85,7 @@ def bake_subject(
         frames=model.frames if moving else None,
         d=model.d if moving else None,
         table_size=table_size,
+        prim_name=prim_name or prim_name_of(subject.name),
         proxies={
             key: (bone_proxy_of if key in BONES else proxy_of)(mesh, _PROXY_FACES)
             for key, mesh in meshes.items()

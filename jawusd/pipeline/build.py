@@ -51,6 +51,7 @@ class BuildOptions:
         resume: continue an earlier build in the folder.
         fresh: delete an earlier build in the folder first.
         allow_outside: let paths in the capture leave its folder.
+        prim_name: of the actor's prim; None: after the capture's name.
         command: the command line that asks for it, for the report.
     """
 
@@ -61,6 +62,7 @@ class BuildOptions:
     resume: bool = False
     fresh: bool = False
     allow_outside: bool = False
+    prim_name: str | None = None
     command: str = ""
 
 
@@ -180,8 +182,8 @@ def run_stages(run: Workspace, options: BuildOptions, tell: Callable[[Finding], 
     settings = [track.outputs, track.inputs, fit.outputs]
     refine = run.run(REFINE, [], settings, lambda: _refine(run, options, offsets))
 
-    settings = [fit.outputs, refine.outputs, track.inputs]
-    bake = run.run(BAKE, ["skull"], settings, lambda: _bake(run))
+    settings = [fit.outputs, refine.outputs, track.inputs, options.prim_name]
+    bake = run.run(BAKE, ["skull"], settings, lambda: _bake(run, options))
 
     missing = missing_packages()
     settings = [bake.outputs, bake.inputs, videos, sync.result, missing]
@@ -249,9 +251,9 @@ def _refine(run: Workspace, options: BuildOptions, offsets: dict[str, int]) -> t
     return [path], track_summary(tracks)
 
 
-def _bake(run: Workspace) -> tuple[list[Path], dict[str, object]]:
+def _bake(run: Workspace, options: BuildOptions) -> tuple[list[Path], dict[str, object]]:
     subject, model = subject_of_capture(run.capture), load_model(run.folder / "model.npz")
-    files = bake_subject(subject, model, run.folder, run.progress)
+    files = bake_subject(subject, model, run.folder, run.progress, prim_name=options.prim_name)
     take = write_take(run.capture, load_tracks(run.folder / "tracks.npz"), run.folder)
     return [*files, *take], {}
 

@@ -21,9 +21,10 @@ from jawusd.geometry.quaternion import wxyz_from_matrix
 from jawusd.geometry.se3 import make_transform
 from jawusd.geometry.so3 import so3_exp
 from jawusd.rig import _gf
-from jawusd.rig.layers import new_layer, relative_path, stage_of, write_layer
+from jawusd.rig.layers import named_after, new_layer, relative_path, stage_of, write_layer
 from jawusd.rig.layout import ACTOR, MADE_FOR, MANDIBLE, PARAMETERS
-from jawusd.rig.read import load_rig
+from jawusd.rig.read import load_rig, open_stage
+from jawusd.rig.schema import rig_prims
 from jawusd.rig.skel import offer_skeleton
 from jawusd.rig.table import landmark_distance
 
@@ -102,7 +103,24 @@ def write_animation(
     author_motion(layer, rig, frames[known], d[known], frames[[0, -1]])
     if paths := list(skinned):
         offer_skeleton(layer, rig, paths)
-    return write_layer(layer, out)
+    return write_layer(named_after(layer, root_prim_of(actor)), out)
+
+
+def root_prim_of(actor: Path) -> str:
+    """Return the name of the root prim of an actor's file, which carries the rig.
+
+    Raises:
+        RigError: It carries it elsewhere.
+    """
+    stage = open_stage(actor)
+    names = [prim.GetName() for prim in rig_prims(stage) if prim.GetPath().IsRootPrimPath()]
+    if len(names) != 1:
+        raise RigError(
+            "has no rig in one root prim, which the layer would stand on.",
+            path=actor,
+            hint="Name the rig of a shot with --prim.",
+        )
+    return names[0]
 
 
 def bake_times(rig: JawRig, frames: Array, d: Array, span: Array) -> tuple[Array, Array]:
@@ -231,10 +249,10 @@ def write_splines(
         raise ValueError(f"slopes (F, 3) and curved (F - 1,) are needed, got {tangents.shape} and {cubic.shape}")
     if not len(frames) or not np.isfinite(d).all() or not (np.diff(frames) > 0).all():
         raise RigError("keys need increasing frames and finite values.", path=out)
-    layer = new_layer(fps)
+    layer = new_layer(fps, f"/{root_prim_of(Path(animation))}")
     layer.startTimeCode, layer.endTimeCode = float(frames[0]), float(frames[-1])
     stage = stage_of(layer)
-    actor = stage.OverridePrim(ACTOR)
+    actor = stage.OverridePrim(f"/{layer.defaultPrim}")
     for name, values, tangent in zip(PARAMETERS, d.T, tangents.T, strict=True):
         spline = _spline(frames, values, tangent, cubic)
         actor.CreateAttribute(name, Sdf.ValueTypeNames.Double, custom=True).SetSpline(spline)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pxr import Sdf
 
 from jawusd.errors import RigError
 from jawusd.evaluator import JawRig
@@ -17,8 +18,9 @@ from jawusd.rig.author import decoder_layer, interface_layer, record_sidecars
 from jawusd.rig.checksums import record_checksums
 from jawusd.rig.detail import proxy_layer
 from jawusd.rig.geo import MESH_PATHS, build_geometry, check_meshes
-from jawusd.rig.layers import write_layer
+from jawusd.rig.layers import named_after, write_layer
 from jawusd.rig.layout import (
+    ACTOR,
     ACTOR_FILE,
     ENCODE_FILE,
     GEO_FILE,
@@ -27,6 +29,7 @@ from jawusd.rig.layout import (
     PROXY_FILE,
     RIG_FILE,
     SKEL_FILE,
+    check_prim_name,
 )
 from jawusd.rig.onnx_check import check_written
 from jawusd.rig.onnx_sidecar import decode_model, encode_model, write_onnx
@@ -49,6 +52,7 @@ def bake_rig(
     d: ArrayLike | None = None,
     table_size: int = DEFAULT_SIZE,
     proxies: Mapping[str, Mesh] | None = None,
+    prim_name: str = Sdf.Path(ACTOR).name,
 ) -> list[Path]:
     """Write a rig: interface, decoder, geometry, ONNX graphs, captured motion if there is one, skeleton, package.
 
@@ -64,6 +68,7 @@ def bake_rig(
         d: Parameters of the captured frames (F, 3) [mm], NaN where lost.
         table_size: Values per axis of the sampled decoder, 17, 33 or 65.
         proxies: Stand-ins of few faces for some of the meshes, by the same names; they make a variant.
+        prim_name: Of the actor's prim; joints have it in front.
 
     Returns:
         The files, in the order written.
@@ -79,6 +84,7 @@ def bake_rig(
     if not fps > 0:
         raise RigError(f"{fps} frames per second; it must be more than 0.", path=folder)
     check_meshes(meshes)
+    check_prim_name(prim_name)
     placeholder = None
     if "mandible" not in meshes:
         grown = grow_placeholder(rig, meshes["lower_teeth"])
@@ -86,12 +92,12 @@ def bake_rig(
     geometry = build_geometry(meshes, rig.T_rest, placeholder)
     moving = np.concatenate([meshes[key].vertices for key in ("mandible", "lower_teeth")])
     table = build_table(rig, moving, table_size)
-    written = [write_layer(geometry, folder / GEO_FILE)]
+    written = [write_layer(named_after(geometry, prim_name), folder / GEO_FILE)]
     if proxies:
         thinned = proxy_layer(proxies, meshes, rig.T_rest, placeholder)
-        written.append(write_layer(thinned, folder / PROXY_FILE))
+        written.append(write_layer(named_after(thinned, prim_name), folder / PROXY_FILE))
     written += [
-        write_layer(decoder_layer(rig, table), folder / RIG_FILE),
+        write_layer(named_after(decoder_layer(rig, table), prim_name), folder / RIG_FILE),
         write_onnx(folder / ONNX_FILE, decode_model(rig)),
         write_onnx(folder / ENCODE_FILE, encode_model(rig)),
     ]
@@ -100,8 +106,8 @@ def bake_rig(
     interface = interface_layer(rig, name, meshes, fps, proxies or ())
     record_sidecars(interface, folder)
     record_checksums(interface, folder, [path.name for path in written if path.suffix == ".usdc"])
-    written.append(write_layer(interface, folder / ACTOR_FILE))
-    written.append(write_skel(folder / SKEL_FILE, rig, list(meshes), fps, frames, d))
+    written.append(write_layer(named_after(interface, prim_name), folder / ACTOR_FILE))
+    written.append(write_skel(folder / SKEL_FILE, rig, list(meshes), fps, frames, d, prim_name))
     shown = folder / ACTOR_FILE
     if frames is not None and d is not None:
         skinned = [MESH_PATHS[key] for key in meshes]

@@ -16,11 +16,12 @@ from jawusd.geometry.arrays import Array
 from jawusd.geometry.camera import Camera
 from jawusd.geometry.se3 import make_transform, se3_inverse
 from jawusd.rig import _gf
+from jawusd.rig.animation import root_prim_of
 from jawusd.rig.layers import add_pose, define_prim, new_layer, relative_path, set_attribute, stage_of, write_layer
 from jawusd.rig.read import open_stage
 from jawusd.rig.untrusted import raises_format_error
 
-TAKE, TAKE_ACTOR, TAKE_CAMERAS = "/Take", "/Take/Actor", "/Take/Cameras"
+TAKE, TAKE_CAMERAS = "/Take", "/Take/Cameras"
 
 # Undistorted images of a camera, relative to the take, numbered by time code.
 PLATE = "plates/{name}/{name}.%06d.jpg"
@@ -82,7 +83,8 @@ def write_cameras(
     layer.startTimeCode, layer.endTimeCode = float(frames[0]), float(frames[-1])
     define_prim(layer, TAKE, "Xform").kind = Kind.Tokens.assembly
     define_prim(layer, TAKE_CAMERAS, "Scope")
-    shown = define_prim(layer, TAKE_ACTOR, "Xform")
+    place = f"{TAKE}/{root_prim_of(Path(actor))}"
+    shown = define_prim(layer, place, "Xform")
     stage = stage_of(layer)
     add_pose(stage.GetPrimAtPath(TAKE), _FLIP)
     for name, camera in zip(names, cameras, strict=True):
@@ -92,7 +94,7 @@ def write_cameras(
     del stage
     layer.subLayerPaths.append(relative_path(motion, out))
     shown.referenceList.prependedItems = [Sdf.Reference(relative_path(Path(actor), out))]
-    moving = _motion_layer(frames[known], T_world_skull[known], fps)
+    moving = _motion_layer(place, frames[known], T_world_skull[known], fps)
     return [write_layer(moving, motion), write_layer(layer, out)]
 
 
@@ -101,14 +103,14 @@ def _prim_name(name: str) -> str:
     return cleaned if cleaned[:1].isalpha() else f"cam_{cleaned}"
 
 
-def _motion_layer(frames: Array, T_world_skull: Array, fps: float) -> Sdf.Layer:
+def _motion_layer(place: str, frames: Array, T_world_skull: Array, fps: float) -> Sdf.Layer:
     """Return the layer that moves the actor with the head."""
     layer = new_layer(fps, TAKE)
-    for path in (TAKE, TAKE_ACTOR):
+    for path in (TAKE, place):
         define_prim(layer, path, "Xform")
     stage = stage_of(layer)
-    add_pose(stage.GetPrimAtPath(TAKE_ACTOR), T_world_skull[0])
-    translate, orient = UsdGeom.Xformable(stage.GetPrimAtPath(TAKE_ACTOR)).GetOrderedXformOps()
+    add_pose(stage.GetPrimAtPath(place), T_world_skull[0])
+    translate, orient = UsdGeom.Xformable(stage.GetPrimAtPath(place)).GetOrderedXformOps()
     samples = zip(frames.tolist(), _gf.translations(T_world_skull), _gf.rotations(T_world_skull), strict=True)
     for frame, translation, rotation in samples:
         translate.Set(translation, frame)

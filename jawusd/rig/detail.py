@@ -15,10 +15,10 @@ from jawusd.formats.mesh import Mesh
 from jawusd.geometry.arrays import Array
 from jawusd.rig.geo import MESH_PATHS, build_geometry
 from jawusd.rig.layers import stage_of
-from jawusd.rig.layout import ACTOR, BOTH, DETAIL, MANDIBLE, PROXY, PROXY_FILE, SCAN
+from jawusd.rig.layout import ACTOR, BESIDE, BOTH, DETAIL, MANDIBLE, PROXY, PROXY_FILE, SCAN
 from jawusd.rig.scan_look import hide_look
 
-_BESIDE = "/ActorWithProxies"
+_BESIDE = ACTOR + BESIDE
 
 
 def proxy_layer(

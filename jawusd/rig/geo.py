@@ -17,8 +17,9 @@ from jawusd.rig import _gf
 from jawusd.rig.arrays import value_of
 from jawusd.rig.layers import add_pose, define_prim, new_layer, set_attribute, stage_of
 from jawusd.rig.layout import ACTOR, GEO, MANDIBLE, MATERIALS, SKULL
-from jawusd.rig.read import open_stage
+from jawusd.rig.read import find_rig_prim, open_stage
 from jawusd.rig.scan_look import read_look, write_look
+from jawusd.rig.schema import rig_prims
 from jawusd.rig.untrusted import raises_format_error
 
 # Every mesh name is unique: Blender merges an Xform with an only child and keeps the child's name.
@@ -162,13 +163,13 @@ def vertex_normals(mesh: Mesh) -> Array:
 
 @raises_format_error(0)
 def read_geometry(
-    path: str | os.PathLike[str], prim_path: str = ACTOR, *, placeholders: bool = False
+    path: str | os.PathLike[str], prim_path: str | None = None, *, placeholders: bool = False
 ) -> dict[str, Mesh]:
     """Read the meshes of a rig, as in `geo.usdc`: those of anatomy, or the placeholders.
 
     Args:
         path: A layer or package with the meshes, or a stage that references them.
-        prim_path: The prim that carries the rig.
+        prim_path: The prim that carries the rig; None: the only one, or the default prim of a layer without rigs.
         placeholders: Which of both.
 
     Returns:
@@ -181,7 +182,7 @@ def read_geometry(
     """
     stage = open_stage(path)
     found = {}
-    for name, place in _mesh_paths(prim_path).items():
+    for name, place in _mesh_paths(stage, path, prim_path).items():
         mesh = UsdGeom.Mesh(stage.GetPrimAtPath(place))
         if not mesh or bool(mesh.GetPrim().GetAttribute("jaw:placeholder").Get()) != placeholders:
             continue
@@ -199,7 +200,7 @@ def read_geometry(
 
 
 @raises_format_error(0)
-def read_gum(path: str | os.PathLike[str], prim_path: str = ACTOR) -> dict[str, Mask]:
+def read_gum(path: str | os.PathLike[str], prim_path: str | None = None) -> dict[str, Mask]:
     """Return which faces (F,) of the teeth meshes are gum, by the names of `MESH_PATHS`.
 
     Meshes without such a subset are missing.
@@ -209,7 +210,7 @@ def read_gum(path: str | os.PathLike[str], prim_path: str = ACTOR) -> dict[str, 
     """
     stage = open_stage(path)
     found = {}
-    for name, place in _mesh_paths(prim_path).items():
+    for name, place in _mesh_paths(stage, path, prim_path).items():
         mesh = UsdGeom.Mesh(stage.GetPrimAtPath(place))
         subset = UsdGeom.Subset(stage.GetPrimAtPath(f"{place}/{place.rsplit('/', 1)[1]}Gum"))
         if mesh and subset:
@@ -219,5 +220,8 @@ def read_gum(path: str | os.PathLike[str], prim_path: str = ACTOR) -> dict[str, 
     return found
 
 
-def _mesh_paths(prim_path: str) -> dict[str, str]:
+def _mesh_paths(stage: Usd.Stage, where: object, prim_path: str | None) -> dict[str, str]:
+    if prim_path is None:
+        default = stage.GetDefaultPrim()
+        prim_path = str((default if default and not rig_prims(stage) else find_rig_prim(stage, where)).GetPath())
     return {name: prim_path + path.removeprefix(ACTOR) for name, path in MESH_PATHS.items()}

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterable, Iterator
+import re
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import TypeVar
 
-from pxr import Sdf, Tf, Usd, UsdGeom, UsdUtils
+from pxr import Sdf, Tf, Usd, UsdGeom, UsdUtils, Vt
 
 from jawusd import __version__
 from jawusd.errors import OutputError, RigError
@@ -15,8 +17,10 @@ from jawusd.formats.atomic import atomic_path
 from jawusd.geometry.arrays import Array
 from jawusd.inputs import check_path
 from jawusd.rig import _gf
-from jawusd.rig.layout import ACTOR
+from jawusd.rig.layout import ACTOR, BESIDE
 from jawusd.rig.schema import SCHEMA_NAME
+
+T = TypeVar("T")
 
 # What OpenUSD 26.11 says of every spline that it writes.
 _OF_SPLINES = "inner looping is deprecated"
@@ -39,6 +43,61 @@ def new_layer(fps: float | None = None, default_prim: str = ACTOR) -> Sdf.Layer:
         layer.timeCodesPerSecond = fps
         layer.framesPerSecond = fps
     return layer
+
+
+def named_after(layer: Sdf.Layer, name: str, before: str = Sdf.Path(ACTOR).name, files: str = ".*") -> Sdf.Layer:
+    """Give the actor's prims and joints in a layer in memory another name, with all paths that lead to them.
+
+    Args:
+        layer: Changed in place, and returned.
+        before: The name that the actor's prim has in the layer; its joints may have none in front yet.
+        files: Pattern of the asset paths whose prims are renamed as well.
+    """
+    renamed_prims = {Sdf.Path(f"/{before}{end}"): Sdf.Path(f"/{name}{end}") for end in ("", BESIDE)}
+
+    def renamed(path: Sdf.Path) -> Sdf.Path:
+        first = path.GetPrefixes()[0] if path.GetPrefixes() else path
+        return path.ReplacePrefix(first, renamed_prims.get(first, first))
+
+    def moved(arc: Sdf.Reference | Sdf.Payload) -> Sdf.Reference | Sdf.Payload:
+        if not re.fullmatch(files, arc.assetPath):
+            return arc
+        more = (arc.customData,) if isinstance(arc, Sdf.Reference) else ()
+        return type(arc)(arc.assetPath, renamed(arc.primPath), arc.layerOffset, *more)
+
+    def visit(path: Sdf.Path) -> None:
+        spec = layer.GetPrimAtPath(path) if path.IsPrimVariantSelectionPath() else layer.GetObjectAtPath(path)
+        if isinstance(spec, Sdf.RelationshipSpec):
+            _replace(spec.targetPathList, renamed)
+        elif isinstance(spec, Sdf.AttributeSpec):
+            _replace(spec.connectionPathList, renamed)
+            if spec.name == "joints" and spec.default is not None:
+                spec.default = Vt.TokenArray([_joint(joint, name, before) for joint in spec.default])
+        elif isinstance(spec, Sdf.PrimSpec) and not path.IsAbsoluteRootPath():
+            _replace(spec.referenceList, moved)
+            _replace(spec.payloadList, moved)
+            _replace(spec.inheritPathList, renamed)
+
+    layer.Traverse(Sdf.Path.absoluteRootPath, visit)
+    for prim in list(layer.rootPrims):
+        prim.name = renamed(prim.path).name
+    if layer.defaultPrim == before:
+        layer.defaultPrim = name
+    return layer
+
+
+def _replace(items: object, change: Callable[[T], T]) -> None:
+    """Change the items of a list operation of OpenUSD where they are."""
+    for group in ("explicitItems", "prependedItems", "appendedItems", "addedItems", "deletedItems"):
+        old = list(getattr(items, group))
+        new = [change(item) for item in old]
+        if new != old:
+            setattr(items, group, new)
+
+
+def _joint(joint: str, name: str, before: str) -> str:
+    """Return the path of a joint with the actor's name in front of each of its parts."""
+    return "/".join(f"{name}_{part.removeprefix(f'{before}_')}" for part in joint.split("/"))
 
 
 def stage_of(layer: Sdf.Layer) -> Usd.Stage:

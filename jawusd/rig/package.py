@@ -11,7 +11,7 @@ from pxr import Gf, Sdf, Usd, UsdUtils
 from jawusd.errors import RigError
 from jawusd.formats.atomic import atomic_path, scratch_folder
 from jawusd.rig.checksums import CHECKSUMS
-from jawusd.rig.layout import ACTOR, ONNX_ATTRIBUTES
+from jawusd.rig.layout import ONNX_ATTRIBUTES
 from jawusd.rig.read import open_stage
 from jawusd.rig.schema import has_jaw_api
 
@@ -36,7 +36,8 @@ def write_package(out: str | os.PathLike[str], source: str | os.PathLike[str]) -
     out = Path(out)
     layer = _flattened(open_stage(source), source)
     with scratch_folder(out) as scratch:
-        flat = scratch / _INSIDE[layer.GetPrimAtPath(ACTOR) is None]
+        rigs = [path for path in _rigs_in(layer) if not path.IsRootPrimPath()]
+        flat = scratch / _INSIDE[bool(rigs)]
         if not layer.Export(str(flat)):
             raise RigError("OpenUSD could not flatten it.", path=source)
         os.utime(flat, (_ZIP_EPOCH, _ZIP_EPOCH))
@@ -48,9 +49,7 @@ def write_package(out: str | os.PathLike[str], source: str | os.PathLike[str]) -
 
 def _flattened(stage: Usd.Stage, source: str | os.PathLike[str]) -> Sdf.Layer:
     layer = stage.Flatten(addSourceFileComment=False)
-    # in the layer, not in the stage: what instances share, it holds once and elsewhere
-    flat = Usd.Stage.Open(layer)
-    rigs = [prim.GetPath() for prim in flat.TraverseAll() if has_jaw_api(prim)]
+    rigs = _rigs_in(layer)
     if not rigs:
         raise RigError("holds no jaw rig.", path=source)
     layer.customLayerData = {key: value for key, value in layer.customLayerData.items() if key != CHECKSUMS}
@@ -67,6 +66,12 @@ def _flattened(stage: Usd.Stage, source: str | os.PathLike[str]) -> Sdf.Layer:
         actor.assetInfo = {key: value for key, value in dict(actor.assetInfo).items() if key != "identifier"}
     _avoid_whole(layer)
     return layer
+
+
+def _rigs_in(layer: Sdf.Layer) -> list[Sdf.Path]:
+    """Return the prims that carry a rig in a flat layer, not in a stage: what instances share, it holds elsewhere."""
+    flat = Usd.Stage.Open(layer)
+    return [prim.GetPath() for prim in flat.TraverseAll() if has_jaw_api(prim)]
 
 
 def _avoid_whole(layer: Sdf.Layer) -> None:

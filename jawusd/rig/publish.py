@@ -14,8 +14,18 @@ from jawusd.formats.allowed_folders import is_allowed
 from jawusd.formats.atomic import atomic_path
 from jawusd.inputs import check_input
 from jawusd.rig.checksums import record_checksums
-from jawusd.rig.layers import write_layer
-from jawusd.rig.layout import ACTOR_FILE, ENCODE_FILE, GEO_FILE, ONNX_FILE, PACKAGE_FILE, PROXY_FILE, RIG_FILE
+from jawusd.rig.layers import named_after, write_layer
+from jawusd.rig.layout import (
+    ACTOR_FILE,
+    ENCODE_FILE,
+    GEO_FILE,
+    ONNX_FILE,
+    PACKAGE_FILE,
+    PROXY_FILE,
+    RIG_FILE,
+    check_prim_name,
+    prim_name_of,
+)
 from jawusd.rig.package import write_package
 from jawusd.rig.read import describe, open_stage
 
@@ -25,13 +35,16 @@ _FIRST = (GEO_FILE, PROXY_FILE, RIG_FILE, ONNX_FILE, ENCODE_FILE, ACTOR_FILE)  #
 _CAPTURED = "anim_capture.usdc"
 
 
-def publish_rig(folder: str | os.PathLike[str], out: str | os.PathLike[str], prefix: str | None = None) -> list[Path]:
+def publish_rig(
+    folder: str | os.PathLike[str], out: str | os.PathLike[str], prefix: str | None = None, prim_name: str | None = None
+) -> list[Path]:
     """Copy the layers and graphs of a rig's folder to another one, with a prefix to every name, and pack it anew.
 
     `actor.usda` becomes `hero.usda`, `rig.usdc` `hero_rig.usdc`; what the layers name is renamed in them.
 
     Args:
         prefix: Starts every name; None: the actor's name, as far as it makes file names.
+        prim_name: Of the actor's prim, and in front of joints; None: after the actor.
 
     Returns:
         The files, in the order written.
@@ -59,7 +72,8 @@ def publish_rig(folder: str | os.PathLike[str], out: str | os.PathLike[str], pre
     for name in names:
         _check_own(folder / name)
     out.mkdir(parents=True, exist_ok=True)
-    written = [_copy(folder / name, out / new, names) for name, new in names.items()]
+    prims = Sdf.Path(described["prim"]).name, check_prim_name(prim_name or prim_name_of(described["actor"]))
+    written = [_copy(folder / name, out / new, names, prims) for name, new in names.items()]
     shown = names.get(_CAPTURED, names[ACTOR_FILE])
     return [*written, write_package(out / _named(prefix, PACKAGE_FILE), out / shown)]
 
@@ -80,7 +94,8 @@ def _named(prefix: str, name: str) -> str:
     return prefix + (name.removeprefix("actor") if name.startswith("actor") else f"_{name}")
 
 
-def _copy(source: Path, target: Path, names: dict[str, str]) -> Path:
+def _copy(source: Path, target: Path, names: dict[str, str], prims: tuple[str, str]) -> Path:
+    """Copy a file with the names of files and of the actor's prim, before and after, changed in it."""
     if source.suffix in _COPIED:
         with atomic_path(target) as temporary:
             shutil.copyfile(source, temporary)
@@ -93,6 +108,7 @@ def _copy(source: Path, target: Path, names: dict[str, str]) -> Path:
         return f"./{names[parts[0]]}" if len(parts) == 1 and parts[0] in names else asset
 
     UsdUtils.ModifyAssetPaths(layer, renamed)
+    named_after(layer, prims[1], prims[0], "|".join(["", *(rf"\./{re.escape(new)}" for new in names.values())]))
     if source.name == ACTOR_FILE:
         record_checksums(
             layer, target.parent, [names[name] for name in (GEO_FILE, PROXY_FILE, RIG_FILE) if name in names]

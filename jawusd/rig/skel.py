@@ -16,7 +16,7 @@ from jawusd.geometry.arrays import Array
 from jawusd.geometry.se3 import make_transform, se3_inverse, transform_points
 from jawusd.rig import _gf
 from jawusd.rig.geo import MESH_PATHS
-from jawusd.rig.layers import define_prim, new_layer, stage_of, write_layer
+from jawusd.rig.layers import define_prim, named_after, new_layer, stage_of, write_layer
 from jawusd.rig.layout import ACTOR, GEO, GEO_FILE, MANDIBLE, MOTION, SKEL_FILE, SKELETON, SKULL, TRANSFORMS
 
 _TYPES = Sdf.ValueTypeNames
@@ -33,6 +33,7 @@ def write_skel(
     fps: float,
     frames: ArrayLike | None = None,
     d: ArrayLike | None = None,
+    prim_name: str = Sdf.Path(ACTOR).name,
 ) -> Path:
     """Write the skeleton beside `geo.usdc`, whose meshes it binds rigidly to two joints.
 
@@ -44,6 +45,7 @@ def write_skel(
         mesh_names: The meshes in `geo.usdc`, names as in `MESH_PATHS`.
         frames: Frame numbers (F,), increasing; without them the jaw stays in the closed bite.
         d: Parameters (F, 3) [mm]; rows with NaN get no key.
+        prim_name: Of the actor's prim; joints have it in front.
 
     Raises:
         OutputError: The file cannot be written.
@@ -58,7 +60,8 @@ def write_skel(
         layer.startTimeCode, layer.endTimeCode = float(keys[0]), float(keys[-1])
     _bind(layer, rig, [Sdf.Path(MESH_PATHS[name]) for name in mesh_names], Sdf.Path(SKEL), Sdf.Path(MANDIBLE))
     root.payloadList.prependedItems = [Sdf.Payload(f"./{GEO_FILE}")]
-    return write_layer(layer, Path(out))
+    del stage
+    return write_layer(named_after(layer, prim_name), Path(out))
 
 
 def offer_skeleton(layer: Sdf.Layer, rig: JawRig, meshes: Iterable[str]) -> None:

@@ -22,7 +22,6 @@ from jawusd.geometry.rigid import rigid_fit
 from jawusd.geometry.se3 import se3_inverse, transform_points
 from jawusd.rig.arrays import value_of
 from jawusd.rig.geo import read_geometry
-from jawusd.rig.layout import ACTOR
 from jawusd.rig.motion_read import frames_of_stage
 from jawusd.rig.read import find_rig_prim, open_stage
 from jawusd.rig.schema import rig_prims
@@ -78,7 +77,7 @@ def fit_poses_of_stage(
     actor: str | os.PathLike[str],
     mandible: str | None = None,
     skull: str | None = None,
-    rig_prim: str = ACTOR,
+    rig_prim: str | None = None,
 ) -> StagePoses:
     """Fit the meshes of an actor to a stage at every whole frame.
 
@@ -87,7 +86,7 @@ def fit_poses_of_stage(
         actor: The rig's own file, which gives the meshes in their frames.
         mandible: Prim to look below for the lower teeth or the mandible; None: everywhere.
         skull: The same for the upper teeth or the skull.
-        rig_prim: Which rig of the file.
+        rig_prim: Which rig of the file, where it has several.
 
     Raises:
         RigError: Not a stage.

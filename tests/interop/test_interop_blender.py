@@ -48,7 +48,7 @@ def test_vertices_are_where_the_model_puts_them(folder, blender, name):
             places = np.array(found["frames"][str(frames[k])][mesh])
             assert np.linalg.norm(places - expected, axis=1).max() < 0.01
     if name in ("actor_skel.usdc", "skeleton.usda"):
-        assert found["bones"] == ["skull", "jaw"] and max(found["actions"].values()) == len(frames)
+        assert found["bones"] == ["Actor_skull", "Actor_jaw"] and max(found["actions"].values()) == len(frames)
     else:
         assert not found["bones"]
     if name != "actor_skel.usdc":

@@ -74,8 +74,8 @@ def test_every_usd_file_passes_every_validator(built):
 def test_the_baked_ops_are_the_evaluators_poses_at_every_captured_frame(built):
     out, _ = built
     stage = Usd.Stage.Open(str(out / "anim_capture.usdc"))
-    mandible = UsdGeom.Xformable(stage.GetPrimAtPath("/Actor/geo/Mandible"))
-    prim, rig = stage.GetPrimAtPath("/Actor"), jawusd.load(out / "actor.usda")
+    mandible = UsdGeom.Xformable(stage.GetDefaultPrim().GetPrimAtPath("geo/Mandible"))
+    prim, rig = stage.GetDefaultPrim(), jawusd.load(out / "actor.usda")
     vertices = points_of_mandible()
     tracks = load_tracks(out / "tracks.npz")
     for frame in tracks.frames:

@@ -200,8 +200,8 @@ BROKEN = [
     (block_the_motion, "Mandible", "from that of d"),
     (refer_to_a_missing_file, "CompositionError", "nothing.usda"),
     (refer_to_a_missing_actor, "CompositionError", "nothing.usda"),
-    (rename_the_joints, "Assembly", "the joints skull/jaw are animated"),
-    (rename_the_joints_of_the_variant_that_is_not_chosen, "Assembly", "the joints skull/jaw are animated"),
+    (rename_the_joints, "Assembly", "the joints Actor_skull/Actor_jaw are animated"),
+    (rename_the_joints_of_the_variant_that_is_not_chosen, "Assembly", "the joints Actor_skull/Actor_jaw are animated"),
 ]
 
 

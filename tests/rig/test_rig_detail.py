@@ -85,11 +85,11 @@ def test_published_rigs_keep_their_proxies(baked, tmp_path):
     assert "hero_proxy.usdc" in files
     stage = Usd.Stage.Open(str(tmp_path / "lib" / "hero.usda"))
     stage.SetEditTarget(stage.GetSessionLayer())
-    stage.GetPrimAtPath("/Actor").GetVariantSet("detail").SetVariantSelection("proxy")
-    points = UsdGeom.Mesh(stage.GetPrimAtPath("/Actor/geo/Skull/SkullMesh")).GetPointsAttr().Get()
+    stage.GetDefaultPrim().GetVariantSet("detail").SetVariantSelection("proxy")
+    points = UsdGeom.Mesh(stage.GetPrimAtPath("/someone/geo/Skull/SkullMesh")).GetPointsAttr().Get()
     np.testing.assert_array_equal(points, PROXIES["skull"].vertices.astype(np.float32))
-    stage.GetPrimAtPath("/Actor").GetVariantSet("detail").SetVariantSelection("both")
-    points = UsdGeom.Mesh(stage.GetPrimAtPath("/Actor/geo/Skull/SkullProxy")).GetPointsAttr().Get()
+    stage.GetDefaultPrim().GetVariantSet("detail").SetVariantSelection("both")
+    points = UsdGeom.Mesh(stage.GetPrimAtPath("/someone/geo/Skull/SkullProxy")).GetPointsAttr().Get()
     np.testing.assert_array_equal(points, PROXIES["skull"].vertices.astype(np.float32))
 
 

@@ -81,7 +81,7 @@ def test_splines_are_published_without_a_warning_of_openusd(anchored_folder, tmp
     publish_rig(anchored_folder, tmp_path / "lib", "hero")
     assert capfd.readouterr().err == ""
     stage = Usd.Stage.Open(str(tmp_path / "lib" / "hero_splines.usda"))
-    assert stage.GetPrimAtPath("/Actor").GetAttribute("jaw:d1").GetSpline().Eval(40) == 9
+    assert stage.GetDefaultPrim().GetAttribute("jaw:d1").GetSpline().Eval(40) == 9
 
 
 @pytest.mark.parametrize("file", ["actor.usda", "anim_capture.usdc"])
